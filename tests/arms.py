@@ -34,9 +34,11 @@ def problem_of(model, mount, q, flange=None, noise=None):
     poses = model.robot.base_from_flange(q)
     seen = invert(robot_part(poses if flange is None else flange, mount) @ X) @ Z
     errors = ArmErrors(model.basis(q), ERROR_RAD, 0.0, of_links=True)
-    spread = np.tile(np.diag(CAMERA_SIGMAS**2), (len(q), 1, 1))
+    covariance = np.tile(np.diag(CAMERA_SIGMAS**2), (len(q), 1, 1))
     effect = replace(errors.effect(ROBOT, values=model.values), values=np.zeros(len(model.values)))
-    return chain(mount, poses, seen if noise is None else seen @ noise, spread, effects=[effect])
+    return chain(
+        mount, poses, seen if noise is None else seen @ noise, covariance, effects=[effect]
+    )
 
 
 def arm_data(robot, q, mount="eye-in-hand", blocks=("links",)):
@@ -44,15 +46,15 @@ def arm_data(robot, q, mount="eye-in-hand", blocks=("links",)):
     model = erring(robot, blocks)
     problem = problem_of(model, mount, q)
     state = State(np.stack([X, Z]), np.zeros(len(model.values)))
-    spread = covariance_of(problem, Solution(state, NOISE))
+    covariance = covariance_of(problem, Solution(state, NOISE))
     return ArmData(
         problem,
         state,
         NOISE,
-        spread,
+        covariance,
         ROBOT,
         model,
-        np.arange(12, len(spread)),
+        np.arange(12, len(covariance)),
         ERROR_RAD,
         np.arange(len(q)),
         q,

@@ -42,7 +42,7 @@ def edge_bound(cell: Cell, views: Sequence[int] | None = None) -> FloatArray:
     prior = np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3) ** -2.0
     for at in range(len(cell.corners)) if views is None else views:
         slope = (
-            _slopes(lambda it, at=at: _pixels(cell, at, it), shared + 6) / options.pixel_sigma_px
+            _jacobian(lambda it, at=at: _pixels(cell, at, it), shared + 6) / options.pixel_sigma_px
         )
         by_shared, by_slack = slope[:, :shared], slope[:, shared:]
         between = by_slack.T @ by_shared
@@ -53,7 +53,7 @@ def edge_bound(cell: Cell, views: Sequence[int] | None = None) -> FloatArray:
     return np.asarray((scaled * np.outer(scale, scale))[:12, :12])
 
 
-def _slopes(function: Callable[[FloatArray], FloatArray], size: int) -> FloatArray:
+def _jacobian(function: Callable[[FloatArray], FloatArray], size: int) -> FloatArray:
     if not size:
         return np.zeros((len(function(np.zeros(0))), 0))
     steps = _STEP * np.eye(size)
@@ -86,12 +86,12 @@ def workspace_bound_m(cell: Cell, q: FloatArray) -> float:
         cell: The cell.
         q: (k, n) postures at which the error counts, as the encoders have them [rad].
     """
-    spread = _arm_bound(cell)
+    covariance = _arm_bound(cell)
     at = np.zeros(3) if cell.options.mount == "eye-in-hand" else centre_m(cell.sheet)
     turn = np.concatenate([np.cross(at, np.eye(3)), np.eye(3)], axis=1)
     stood = [_held(cell, it) for it in q]
-    slopes = [turn @ _carried(cell, it) @ _pose_slopes(cell, it) for it in stood]
-    return float(np.sqrt(np.mean([np.trace(it @ spread @ it.T) for it in slopes])))
+    jacobian = [turn @ _carried(cell, it) @ _pose_jacobian(cell, it) for it in stood]
+    return float(np.sqrt(np.mean([np.trace(it @ covariance @ it.T) for it in jacobian])))
 
 
 def compliance_bound(cell: Cell) -> FloatArray:
@@ -110,26 +110,26 @@ def _arm_bound(cell: Cell) -> FloatArray:
     information = np.diag(np.concatenate([np.zeros(12), arm**-2.0, look**-2.0]))
     for view, pose in enumerate(cell.cam_from_target):
         seen, held = cell.corners[view].ids, _held(cell, cell.joints[view], view)
-        by_pose = _slopes(lambda it, pose=pose, seen=seen: _seen(cell, pose @ exp(it), seen), 6)
-        by_look = _slopes(lambda it, pose=pose, seen=seen: _seen(cell, pose, seen, it), len(look))
-        moved, by_flange = np.split(_pose_slopes(cell, held, slack=True), [size], axis=1)
-        slopes = np.hstack([by_pose @ moved, by_look]) / cell.options.pixel_sigma_px
-        by_slack = by_pose @ by_flange / cell.options.pixel_sigma_px
-        between = by_slack.T @ slopes
+        by_pose = _jacobian(lambda it, pose=pose, seen=seen: _seen(cell, pose @ exp(it), seen), 6)
+        by_look = _jacobian(lambda it, pose=pose, seen=seen: _seen(cell, pose, seen, it), len(look))
+        moved, flange_jacobian = np.split(_pose_jacobian(cell, held, slack=True), [size], axis=1)
+        jacobian = np.hstack([by_pose @ moved, by_look]) / cell.options.pixel_sigma_px
+        by_slack = by_pose @ flange_jacobian / cell.options.pixel_sigma_px
+        between = by_slack.T @ jacobian
         own = by_slack.T @ by_slack + np.linalg.inv(_slack(cell, held))
-        information += slopes.T @ slopes - between.T @ np.linalg.solve(own, between)
+        information += jacobian.T @ jacobian - between.T @ np.linalg.solve(own, between)
     scale = 1.0 / np.sqrt(np.diag(information))
-    spread = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
-    return np.asarray(spread[:size, :size])
+    covariance = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
+    return np.asarray(covariance[:size, :size])
 
 
 def _slack(cell: Cell, held: "_Held") -> FloatArray:
     """Covariance (6, 6) of the flange's error at a stop: what it does not repeat, and ripple."""
     options, arm, q = cell.options, cell.true_arm, held.standing
-    spread = np.diag(np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3) ** 2)
+    covariance = np.diag(np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3) ** 2)
     middle = invert(forward(arm, q[None])[0])
-    turned = _slopes(lambda it: log(middle @ forward(arm, (q + it)[None])[0]), len(q))
-    return np.asarray(spread + options.ripple_sigma_rad**2 * turned @ turned.T)
+    turned = _jacobian(lambda it: log(middle @ forward(arm, (q + it)[None])[0]), len(q))
+    return np.asarray(covariance + options.ripple_sigma_rad**2 * turned @ turned.T)
 
 
 def _look_sigmas(cell: Cell) -> FloatArray:
@@ -191,11 +191,11 @@ def _arm_sigmas(cell: Cell) -> FloatArray:
     return np.repeat(each, count)
 
 
-def _pose_slopes(cell: Cell, held: _Held, *, slack: bool = False) -> FloatArray:
+def _pose_jacobian(cell: Cell, held: _Held, *, slack: bool = False) -> FloatArray:
     """How `cam_from_target` (6) moves with x, z and the arm, and with the flange's error."""
     size = 12 + len(_arm_sigmas(cell)) + (6 if slack else 0)
     middle = invert(_pose(cell, held, np.zeros(size)))
-    return _slopes(lambda it: log(middle @ _pose(cell, held, it)), size)
+    return _jacobian(lambda it: log(middle @ _pose(cell, held, it)), size)
 
 
 def _pose(cell: Cell, held: _Held, change: FloatArray) -> FloatArray:

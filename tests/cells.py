@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.cameras import detect_targets
 from visioncal.calibration.stages.joints import Matched
@@ -57,17 +57,17 @@ def session_of(cell: Cell) -> Session:
     )
 
 
-def known_of(cell: Cell, *, joints: bool = True, robot: Robot | None = None, **changes) -> Known:
+def known_of(cell: Cell, *, joints: bool = True, robot: Robot | None = None, **changes) -> RunState:
     """What is known after detection; without `joints`, poses are all that is said of the robot."""
     model = load_robot(cell.options.robot) if robot is None else robot
     known = joints or robot is not None
     matched = Matched(model, dict(enumerate(cell.joints)) if joints else {}) if known else None
     reported = Reported(dict(enumerate(cell.base_from_flange)), matched=matched)
-    known = replace(Known(session_of(cell)), robots={"": reported}, **changes)
+    known = replace(RunState(session_of(cell)), robots={"": reported}, **changes)
     return detect_targets(known, {it.view: it for it in cell.corners})
 
 
-def calibrated(cell: Cell, **changes) -> Known:
+def calibrated(cell: Cell, **changes) -> RunState:
     """What is known at the end of the way."""
     known = known_of(cell, **changes)
     for stage in STAGES:
@@ -76,7 +76,7 @@ def calibrated(cell: Cell, **changes) -> Known:
     return known
 
 
-def calibrated_sweep(moved: Sweep) -> Known:
+def calibrated_sweep(moved: Sweep) -> RunState:
     """What is known at the end of the way, from the corners of a sweep's frames."""
     known = replace(known_of(moved.cell, joints=False), robots={})
     views = [
@@ -91,7 +91,7 @@ def calibrated_sweep(moved: Sweep) -> Known:
     return known
 
 
-def error_of(cell: Cell, known: Known) -> np.ndarray:
+def error_of(cell: Cell, known: RunState) -> np.ndarray:
     """(6 + 6 b,) right perturbations of all edges, true to estimated (rotation, translation)."""
     true = np.array(list(cell.transforms.values()))
     return log(invert(true) @ known.solved.state.edges).ravel()

@@ -62,5 +62,5 @@ def solved(problem: Problem, solver: str = "joint") -> Solved:
         noise = starting_noise(problem)
         fit = Solution(state, estimate_noise(problem, state, noise, from_above=True))
     check_observability(problem, fit.state, fit.noise, mount)
-    spread = covariance_of(problem, fit)
-    return Solved(problem, fit, spread, directions(problem, fit.state, spread, mount))
+    covariance = covariance_of(problem, fit)
+    return Solved(problem, fit, covariance, directions(problem, fit.state, covariance, mount))

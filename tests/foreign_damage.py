@@ -193,8 +193,8 @@ def damage(recording: Recording, kind, chance) -> Path:
     """Damages one file of a recording, and says which."""
     source = recording.source
     files = [source] if source.is_file() else [it for it in source.rglob("*") if it.is_file()]
-    files += [it for it in (recording.wishes.camera_file,) if it is not None]
-    files += [Path(it) for it in (recording.wishes.intrinsics,) if it is not None]
+    files += [it for it in (recording.requested.camera_file,) if it is not None]
+    files += [Path(it) for it in (recording.requested.intrinsics,) if it is not None]
     texts = sorted(it for it in files if it.suffix != ".png") or files
     path = chance.choice(texts)
     data = kind(path.read_bytes() or b"0", chance)
@@ -209,7 +209,7 @@ def damage(recording: Recording, kind, chance) -> Path:
 def ending(recording: Recording, dest: Path) -> str:
     """Converts, and says how it ended."""
     try:
-        convert(recording.source, dest, wishes=recording.wishes)
+        convert(recording.source, dest, requested=recording.requested)
     except DataError as error:
         return "" if str(error).strip() and len(str(error)) < 1500 else f"message: {error}"[:300]
     except BaseException:  # noqa: BLE001 - what escapes is what is looked for

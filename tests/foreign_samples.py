@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.transforms import exp, invert
-from visioncal.interchange.formats import PoseWishes, Wishes
+from visioncal.interchange.formats import ImportOptions, PoseImportOptions
 
 COUNT = 9
 CHARUCO = "charuco_5x7_36.195mm_18.256mm_DICT_6X6_250"
@@ -19,8 +19,8 @@ CHARUCO = "charuco_5x7_36.195mm_18.256mm_DICT_6X6_250"
 def _world():
     rng = np.random.default_rng(3)
     home = exp(np.array([2.0, 0.4, 0.3, 0.4, -0.2, 0.5]))
-    spread = rng.uniform(-1, 1, (COUNT, 6)) * [0.5, 0.5, 0.9, 0.1, 0.1, 0.1]
-    base_from_flange = home @ exp(spread)
+    covariance = rng.uniform(-1, 1, (COUNT, 6)) * [0.5, 0.5, 0.9, 0.1, 0.1, 0.1]
+    base_from_flange = home @ exp(covariance)
     flange_from_cam = exp(np.array([0.1, -0.2, 1.5, 0.05, 0.01, 0.08]))
     base_from_target = home @ flange_from_cam @ exp(np.array([0.1, 0, 0, -0.1, -0.05, 0.6]))
     return base_from_flange, invert(base_from_flange @ flange_from_cam) @ base_from_target
@@ -34,7 +34,7 @@ class Recording:
     """A recording that was written: where it lies, and what the user says of it."""
 
     source: Path
-    wishes: Wishes
+    requested: ImportOptions
 
 
 def quaternions(poses):
@@ -75,7 +75,7 @@ def industrial(folder: Path) -> Recording:
         "intrinsics: {fx: 60.0, fy: 60.0, cx: 32.0, cy: 24.0}\nstatic_camera: false\n"
     )
     _write(folder / "cal_data.yaml", text)
-    return Recording(folder, Wishes())
+    return Recording(folder, ImportOptions())
 
 
 def kinematics(folder: Path) -> Recording:
@@ -84,7 +84,7 @@ def kinematics(folder: Path) -> Recording:
         pose = _keyed(row).replace("\n", "\n    ")
         text += f"'15937{at:03d}':\n  camera_joints: []\n  pose:\n    {pose}\n"
         text += f"  target_joints:\n  - {0.1 * at}\n  - {0.2 * at}\n"
-    return Recording(_write(folder / "measurements.yaml", text), Wishes())
+    return Recording(_write(folder / "measurements.yaml", text), ImportOptions())
 
 
 def visp(folder: Path) -> Recording:
@@ -100,7 +100,7 @@ def visp(folder: Path) -> Recording:
         "<v0>24.5</v0><kud>-0.125</kud><kdu>0.13</kdu></model></camera></root>\n",
     )
     _write(folder / "chessboard-data.txt", "Chessboard\n9 x 6\nsquare size: 0.0236 m\n")
-    return Recording(folder, Wishes(mount="eye-in-hand"))
+    return Recording(folder, ImportOptions(mount="eye-in-hand"))
 
 
 def zivid(folder: Path) -> Recording:
@@ -111,7 +111,7 @@ def zivid(folder: Path) -> Recording:
         text = "__version__:\n  serializer: 1\n  data: 1\nFloatMatrix:\n  Data:\n    [\n"
         _write(folder / f"pos{at:02d}.yaml", f"{text}{data}\n    ]\n")
         picture(folder / f"img{at:02d}.png")
-    return Recording(folder, Wishes(mount="eye-in-hand", target="checkerboard_9x6_25mm"))
+    return Recording(folder, ImportOptions(mount="eye-in-hand", target="checkerboard_9x6_25mm"))
 
 
 def _ros_transform(row, indent: str) -> str:
@@ -132,7 +132,7 @@ def easy_handeye_file(path: Path, robot_poses, camera_poses) -> Path:
 
 def easy_handeye(folder: Path) -> Recording:
     source = easy_handeye_file(folder / "cell.samples", BASE_FROM_FLANGE, CAM_FROM_TARGET)
-    return Recording(source, Wishes(mount="eye-in-hand"))
+    return Recording(source, ImportOptions(mount="eye-in-hand"))
 
 
 def moveit_yaml(folder: Path) -> Recording:
@@ -140,12 +140,14 @@ def moveit_yaml(folder: Path) -> Recording:
     for robot, camera in zip(BASE_FROM_FLANGE, CAM_FROM_TARGET, strict=True):
         text += f"- effector_wrt_world: {robot.reshape(-1).tolist()}\n"
         text += f"  object_wrt_sensor: {camera.reshape(-1).tolist()}\n"
-    return Recording(_write(folder / "samples.yaml", text), Wishes(mount="eye-in-hand"))
+    return Recording(_write(folder / "samples.yaml", text), ImportOptions(mount="eye-in-hand"))
 
 
 def moveit_json(folder: Path) -> Recording:
     pairs = np.stack([BASE_FROM_FLANGE, CAM_FROM_TARGET], axis=1).tolist()
-    return Recording(_write(folder / "pairs.json", json.dumps(pairs)), Wishes(mount="eye-in-hand"))
+    return Recording(
+        _write(folder / "pairs.json", json.dumps(pairs)), ImportOptions(mount="eye-in-hand")
+    )
 
 
 def views_json(folder: Path) -> Recording:
@@ -160,7 +162,7 @@ def views_json(folder: Path) -> Recording:
             "seen": True,
         }
         _write(folder / f"pose_{at:02d}.json", json.dumps(record))
-    return Recording(folder, Wishes(mount="eye-in-hand"))
+    return Recording(folder, ImportOptions(mount="eye-in-hand"))
 
 
 def views_npz(folder: Path) -> Recording:
@@ -172,7 +174,7 @@ def views_npz(folder: Path) -> Recording:
         millimetres[:3, 3] *= 1e3
         np.savetxt(folder / f"pose_{at:03d}.txt", millimetres, fmt="%.17g")
         np.savez(folder / f"boardpose_{at:03d}.npz", rvec=camera[3:, None], tvec=camera[:3, None])
-    return Recording(folder, Wishes(mount="eye-in-hand", robot=PoseWishes(unit="mm")))
+    return Recording(folder, ImportOptions(mount="eye-in-hand", robot=PoseImportOptions(unit="mm")))
 
 
 def opencv_matrices(folder: Path) -> Recording:
@@ -182,7 +184,7 @@ def opencv_matrices(folder: Path) -> Recording:
             data = ", ".join(map(repr, pose.reshape(-1).tolist()))
             text += f"{name}_{at}: !!opencv-matrix\n   rows: 4\n   cols: 4\n   dt: d\n"
             text += f"   data: [ {data} ]\n"
-    return Recording(_write(folder / "poses.yml", text), Wishes(mount="eye-in-hand"))
+    return Recording(_write(folder / "poses.yml", text), ImportOptions(mount="eye-in-hand"))
 
 
 def kuka_csv(folder: Path) -> Recording:
@@ -193,10 +195,10 @@ def kuka_csv(folder: Path) -> Recording:
     camera = tuple(names.split(",")[6:13])
     return Recording(
         _write(folder / "log.csv", text),
-        Wishes(
+        ImportOptions(
             mount="eye-in-hand",
-            robot=PoseWishes(("X", "Y", "Z", "A", "B", "C"), form="kuka"),
-            camera=PoseWishes(camera),
+            robot=PoseImportOptions(("X", "Y", "Z", "A", "B", "C"), form="kuka"),
+            camera=PoseImportOptions(camera),
         ),
     )
 
@@ -205,7 +207,7 @@ def plain_table(folder: Path) -> Recording:
     rows = np.hstack([quaternions(BASE_FROM_FLANGE), quaternions(CAM_FROM_TARGET)])
     folder.mkdir(parents=True, exist_ok=True)
     np.savetxt(folder / "poses.txt", rows, fmt="%.17g", header="robot, camera")
-    return Recording(folder / "poses.txt", Wishes(mount="eye-in-hand"))
+    return Recording(folder / "poses.txt", ImportOptions(mount="eye-in-hand"))
 
 
 def stacked_npz(folder: Path) -> Recording:
@@ -218,7 +220,7 @@ def stacked_npz(folder: Path) -> Recording:
         rvecs=camera[:, 3:],
         tvecs=camera[:, :3],
     )
-    return Recording(folder / "all.npz", Wishes(mount="eye-in-hand"))
+    return Recording(folder / "all.npz", ImportOptions(mount="eye-in-hand"))
 
 
 def keyed_json(folder: Path) -> Recording:
@@ -238,10 +240,10 @@ def keyed_json(folder: Path) -> Recording:
     names = tuple(f"robot_pose.position.{it}" for it in "xyz")
     return Recording(
         _write(folder / "log.json", json.dumps({"samples": rows})),
-        Wishes(
+        ImportOptions(
             mount="eye-in-hand",
-            robot=PoseWishes((*names, "robot_pose.rpy"), form="rpy"),
-            camera=PoseWishes(("b",), inverse=True),
+            robot=PoseImportOptions((*names, "robot_pose.rpy"), form="rpy"),
+            camera=PoseImportOptions(("b",), inverse=True),
         ),
     )
 
@@ -255,8 +257,8 @@ def images_and_table(folder: Path) -> Recording:
         picture(folder / f"shot{at}.png")
     _write(folder / "robot.csv", text)
     names = ("x", "y", "z", "qw", "qx", "qy", "qz")
-    wishes = Wishes(mount="eye-in-hand", target=CHARUCO, robot=PoseWishes(names))
-    return Recording(folder, wishes)
+    requested = ImportOptions(mount="eye-in-hand", target=CHARUCO, robot=PoseImportOptions(names))
+    return Recording(folder, requested)
 
 
 def streams(folder: Path) -> Recording:
@@ -267,8 +269,8 @@ def streams(folder: Path) -> Recording:
     for name, poses, ahead_s in (("robot", exp(swing), 0), ("camera", invert(exp(swing)), 0.1)):
         rows = np.hstack([times_s[:, None] + ahead_s, quaternions(poses)])
         np.savetxt(folder / f"{name}.csv", rows, "%.9f", delimiter=",")
-    wishes = Wishes(mount="eye-in-hand", camera_file=folder / "camera.csv")
-    return Recording(folder / "robot.csv", wishes)
+    requested = ImportOptions(mount="eye-in-hand", camera_file=folder / "camera.csv")
+    return Recording(folder / "robot.csv", requested)
 
 
 def separate_lens(folder: Path) -> Recording:
@@ -279,7 +281,7 @@ def separate_lens(folder: Path) -> Recording:
     text += "   data: [ 60., 0., 32., 0., 60., 24., 0., 0., 1. ]\n"
     text += "distortion_coefficients: [-0.25, 0.125, 0, 0, 0]\n"
     lens = _write(folder / "lens.yml", text)
-    return replace(recording, wishes=replace(recording.wishes, intrinsics=str(lens)))
+    return replace(recording, requested=replace(recording.requested, intrinsics=str(lens)))
 
 
 RECORDINGS: Mapping[str, Callable[[Path], Recording]] = {

@@ -74,15 +74,15 @@ class Answer:
         return {
             "words": dict(self.words),
             "edges": {
-                name: {"matrix": edge[:3].round(12).tolist(), "sigma": _sigma(spread)}
-                for name, (edge, spread) in self.edges.items()
+                name: {"matrix": edge[:3].round(12).tolist(), "sigma": _sigma(covariance)}
+                for name, (edge, covariance) in self.edges.items()
             },
             "sigmas": {name: float(f"{it:.6g}") for name, it in self.sigmas.items()},
         }
 
 
-def _sigma(spread: np.ndarray) -> list[float]:
-    return [float(f"{it:.6g}") for it in np.sqrt(np.diag(spread))]
+def _sigma(covariance: np.ndarray) -> list[float]:
+    return [float(f"{it:.6g}") for it in np.sqrt(np.diag(covariance))]
 
 
 def _flat(noise: Mapping[str, Any], prefix: str = "") -> dict[str, float]:
@@ -273,10 +273,10 @@ def away_in_sigmas(answer: Answer, before: Mapping[str, Any]) -> float:
 def sigmas_apart(answer: Answer, before: Mapping[str, Any]) -> float:
     """By which share the sigma of an edge's component differs the most."""
     worst = 0.0
-    for name, (_, spread) in answer.edges.items():
+    for name, (_, covariance) in answer.edges.items():
         then = np.array(before["edges"][name]["sigma"])
         asked = then > 0.0
-        now = np.sqrt(np.diag(spread))[asked]
+        now = np.sqrt(np.diag(covariance))[asked]
         worst = max(worst, float(np.abs(now / then[asked] - 1.0).max(initial=0.0)))
     return worst
 

@@ -9,7 +9,7 @@ from cells import calibrated, known_of
 from test_kinematics import WRONG_LINKS, target_in_camera
 
 from visioncal.calibration.pipeline.result import result_of
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.transforms import exp
 from visioncal.core.types import Corners, FloatArray, Mount
 from visioncal.results import Calibration
@@ -98,7 +98,7 @@ def _detected(cell: Cell, view: int, pose: FloatArray, rng: np.random.Generator)
     return Corners(view, ids, px[ids] + noise, cell.options.blur_px)
 
 
-def known_again(cell: Cell, rng: np.random.Generator, change: Change | None = None) -> Known:
+def known_again(cell: Cell, rng: np.random.Generator, change: Change | None = None) -> RunState:
     """What is known of such stops after detection."""
     return known_of(again(cell, rng, change))
 

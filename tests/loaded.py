@@ -3,7 +3,7 @@
 import numpy as np
 from tracked import known_of
 
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.types import FloatArray
 from visioncal.simulation import Payload, arm_named, forward
 from visioncal.simulation.sag import giving_of, sagging
@@ -25,7 +25,7 @@ def postures(count: int, seed: int = 0) -> FloatArray:
     return np.repeat(above(NOMINAL, count, np.random.default_rng(seed)), len(LOADS_N), axis=0)
 
 
-def loaded(seed: int = 0, count: int = 15, sigma_m: float = 3e-5) -> tuple[Shop, Known]:
+def loaded(seed: int = 0, count: int = 15, sigma_m: float = 3e-5) -> tuple[Shop, RunState]:
     """The truth, and what is made of it."""
     options = Tracked(
         robot=NOMINAL.name,
@@ -51,7 +51,7 @@ def deflection_m(shop: Shop, q: FloatArray, load: Payload) -> FloatArray:
     return np.asarray(moved[:, :3, 3])
 
 
-def predicted_m(known: Known, q: FloatArray, load: Payload) -> FloatArray:
+def predicted_m(known: RunState, q: FloatArray, load: Payload) -> FloatArray:
     """(m, 3) how the calibrated model says that it does [m]."""
     from visioncal.robot import Loads
 

@@ -7,7 +7,7 @@ import numpy as np
 from cells import known_of
 
 from visioncal.calibration.guess import Guess, guess_reading
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.core.conventions import ROTATION_FORMS, UNITS_M, PoseNumbers, Reading
 from visioncal.core.transforms import invert
@@ -61,7 +61,7 @@ def sound(robot: FloatArray, camera: FloatArray, mount: Mount, **more) -> Poses:
     return Poses(numbers(robot), numbers(camera), mount, robot, mount, **more)
 
 
-def measured(cell: Cell) -> Known:
+def measured(cell: Cell) -> RunState:
     """What is known of a cell once the target's poses are."""
     known = known_of(cell)
     for stage in STAGES:

@@ -68,17 +68,17 @@ def network_bound(cell: Network, reference: str = "base_a") -> Bound:
         between = np.zeros((len(sigmas), size))
         own = np.diag(sigmas**-2.0)
         for sight in (it for it in cell.sights if it.stop == stop):
-            slopes, slack = _slopes(cell, sight, places, robots, size)
-            information += slopes.T @ slopes
-            between += slack.T @ slopes
+            jacobian, slack = _jacobian(cell, sight, places, robots, size)
+            information += jacobian.T @ jacobian
+            between += slack.T @ jacobian
             own += slack.T @ slack
         information -= between.T @ np.linalg.solve(own, between)
     scale = 1.0 / np.sqrt(np.diag(information))
-    spread = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
-    return Bound(frames, spread[: 6 * len(frames), : 6 * len(frames)])
+    covariance = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
+    return Bound(frames, covariance[: 6 * len(frames), : 6 * len(frames)])
 
 
-def _slopes(
+def _jacobian(
     cell: Network, sight: Sight, places: Mapping[str, slice], robots: list[str], size: int
 ) -> tuple[FloatArray, FloatArray]:
     """How one sight's pixels move with the unknowns and the flanges, in units of their noise."""
@@ -90,16 +90,18 @@ def _slopes(
     if sight.stop < 0:
         # Of its lens alone: the board was anywhere.
         keys = [it for it in keys if it.startswith(("size", "lens"))]
-    slopes, slack = np.zeros((2 * len(sight.exact.ids), size)), []
+    jacobian, slack = np.zeros((2 * len(sight.exact.ids), size)), []
     for key in keys:
         width = places[key].stop - places[key].start
-        slopes[:, places[key]] = _differences(cell, sight, key, width)
+        jacobian[:, places[key]] = _differences(cell, sight, key, width)
     for robot in robots:
         mine = robot in carriers and sight.stop >= 0
         slack.append(
-            _differences(cell, sight, f"flange {robot}", 6) if mine else np.zeros((len(slopes), 6))
+            _differences(cell, sight, f"flange {robot}", 6)
+            if mine
+            else np.zeros((len(jacobian), 6))
         )
-    every = np.concatenate([slopes, *slack], axis=1) / cell.options.pixel_sigma_px
+    every = np.concatenate([jacobian, *slack], axis=1) / cell.options.pixel_sigma_px
     if sight.stop < 0:
         free = _differences(cell, sight, "pose", 6) / cell.options.pixel_sigma_px
         every = every - free @ np.linalg.lstsq(free, every, rcond=None)[0]

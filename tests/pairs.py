@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from cells import calibrated
 
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.transforms import exp, invert
 from visioncal.estimation.chain import edge_names
 from visioncal.results import Calibration, Edge, Rms, Validation, Verdict, ViewResult
@@ -73,10 +73,10 @@ def with_moved_result(calibration: Calibration, cell: Cell, twist: np.ndarray) -
     )
 
 
-def calibration_of(known: Known, name: str = "cell") -> Calibration:
+def calibration_of(known: RunState, name: str = "cell") -> Calibration:
     """A calibration with what a comparison looks at."""
     result = known.solved
-    spread = result.covariance
+    covariance = result.covariance
     names = edge_names(known.session.mount)
     return Calibration(
         session_name=name,
@@ -84,7 +84,7 @@ def calibration_of(known: Known, name: str = "cell") -> Calibration:
         created="2026-11-20T10:11:12+00:00",
         mount=known.session.mount,
         edges={
-            edge: Edge(pose, spread[part, part])
+            edge: Edge(pose, covariance[part, part])
             for edge, pose, part in zip(
                 names,
                 result.state.edges,
@@ -92,7 +92,7 @@ def calibration_of(known: Known, name: str = "cell") -> Calibration:
                 strict=True,
             )
         },
-        joint_covariance=spread[:12, :12],
+        joint_covariance=covariance[:12, :12],
         solvers={},
         noise={"pixel_px": known.pixel_px or 0.0},
         views=tuple(ViewResult(view, view in known.used) for view in known.base_from_flange),

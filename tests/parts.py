@@ -89,7 +89,7 @@ def some_touches(
     return FeatureTouches(names, tuple(kinds), placed(frame, local), np.zeros((len(kinds), 3, 3)))
 
 
-def slopes(function: Callable[[FloatArray], FloatArray], size: int) -> FloatArray:
+def jacobian(function: Callable[[FloatArray], FloatArray], size: int) -> FloatArray:
     """Derivatives (..., size) of a function of (size,) numbers at zero, by central differences."""
     steps = _STEP * np.eye(size)
     return np.stack([(function(it) - function(-it)) / (2 * _STEP) for it in steps], axis=-1)
@@ -97,7 +97,7 @@ def slopes(function: Callable[[FloatArray], FloatArray], size: int) -> FloatArra
 
 def point_bound(frame: FloatArray, nominal: FloatArray, spreads: FloatArray) -> FloatArray:
     """Least covariance (6, 6) of a frame from points with (n, 3, 3) covariances (Cramer-Rao)."""
-    by_step = slopes(lambda it: placed(moved(frame, it), nominal), 6)
+    by_step = jacobian(lambda it: placed(moved(frame, it), nominal), 6)
     return np.linalg.inv(np.einsum("nij,nik,nkl->jl", by_step, np.linalg.inv(spreads), by_step))
 
 
@@ -117,7 +117,7 @@ def feature_bound(frame: FloatArray, touches: FeatureTouches, sigma_m: float) ->
                 moved(frame, step[:6]), (point + np.pad(step[6:], (0, 9 - len(step))))[None]
             )
 
-        by_step = slopes(touched, size)[0] / sigma_m
+        by_step = jacobian(touched, size)[0] / sigma_m
         whole = by_step.T @ by_step
         across = whole[:6, 6:]
         total += whole[:6, :6] - across @ np.linalg.solve(whole[6:, 6:], across.T)

@@ -9,7 +9,7 @@ from cells import session_of
 from scipy.spatial.transform import Rotation
 
 from visioncal.calibration.pipeline.guess_inputs import reading_hint
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.cameras import detect_targets
 from visioncal.core.errors import VisioncalError
@@ -26,7 +26,7 @@ BEFORE = {"ur3e": "ur3", "ur5e": "ur5", "ur10e": "ur10"}
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
+class Identifiability:
     """What a session tells of its robot.
 
     Attributes:
@@ -44,7 +44,7 @@ class Told:
     words: str = ""
 
     @classmethod
-    def of(cls, cell: Cell, *, with_poses: bool) -> "Told":
+    def of(cls, cell: Cell, *, with_poses: bool) -> "Identifiability":
         """A sound session."""
         poses = cell.base_from_flange if with_poses else None
         return cls(cell, cell.joints, poses, read_robot_document(cell.options.robot))
@@ -61,9 +61,9 @@ class Told:
             views.append(View(at, image=f"{at}.png", numbers=numbers))
         return replace(session_of(self.cell), views=tuple(views), robot_document=self.robot)
 
-    def known(self, **changes) -> Iterator[Known]:
+    def known(self, **changes) -> Iterator[RunState]:
         """What is known after each stage; detection is given."""
-        known = Known(self.session, **changes)
+        known = RunState(self.session, **changes)
         for stage in STAGES:
             if stage.name == "detect":
                 known = detect_targets(known, {it.view: it for it in self.cell.corners})
@@ -71,7 +71,7 @@ class Told:
                 known = stage.run(known)
             yield known
 
-    def seen(self) -> Known:
+    def seen(self) -> RunState:
         """What is known once the joints were looked at."""
         return next(
             it for it, stage in zip(self.known(), STAGES, strict=False) if stage.name == "joints"
@@ -90,14 +90,14 @@ class Told:
         return reading_hint(self.seen())
 
 
-Plant = Callable[[Told, np.random.Generator], Told]
+Plant = Callable[[Identifiability, np.random.Generator], Identifiability]
 
 
-def _degrees(told: Told, _: np.random.Generator) -> Told:
+def _degrees(told: Identifiability, _: np.random.Generator) -> Identifiability:
     return replace(told, joints=np.rad2deg(told.joints), words="the angles in degrees")
 
 
-def _columns(told: Told, rng: np.random.Generator) -> Told:
+def _columns(told: Identifiability, rng: np.random.Generator) -> Identifiability:
     pair = np.sort(rng.choice(told.joints.shape[1], 2, replace=False))
     order = np.arange(told.joints.shape[1])
     order[pair] = pair[::-1]
@@ -105,30 +105,30 @@ def _columns(told: Told, rng: np.random.Generator) -> Told:
     return replace(told, joints=told.joints[:, order], words=words)
 
 
-def _sign(told: Told, rng: np.random.Generator) -> Told:
+def _sign(told: Identifiability, rng: np.random.Generator) -> Identifiability:
     at = int(rng.integers(told.joints.shape[1]))
     signs = np.where(np.arange(told.joints.shape[1]) == at, -1.0, 1.0)
     return replace(told, joints=told.joints * signs, words=f"q{at + 1}_rad of the opposite sign")
 
 
-def _base_link(told: Told, _: np.random.Generator) -> Told:
+def _base_link(told: Identifiability, _: np.random.Generator) -> Identifiability:
     poses = None if told.poses is None else HALF_TURN @ told.poses
     return replace(told, poses=poses, words="base_link was taken for base")
 
 
-def _convention(told: Told, _: np.random.Generator) -> Told:
+def _convention(told: Identifiability, _: np.random.Generator) -> Identifiability:
     """A standard table that is declared modified."""
     robot = {**told.robot, "convention": "modified"}
     return replace(told, robot=robot, words="read as standard")
 
 
-def _generation(told: Told, _: np.random.Generator) -> Told:
+def _generation(told: Identifiability, _: np.random.Generator) -> Identifiability:
     true = told.cell.options.robot
     words = f"the arm a {true} and not a {BEFORE[true]}"
     return replace(told, robot=read_robot_document(BEFORE[true]), words=words)
 
 
-def _encoder(told: Told, rng: np.random.Generator) -> Told:
+def _encoder(told: Identifiability, rng: np.random.Generator) -> Identifiability:
     """An encoder that lost ten degrees; where poses are told, they come from the same encoder."""
     at, sign = int(rng.integers(1, 5)), (-1.0, 1.0)[rng.integers(2)]
     zeros = np.zeros(told.joints.shape[1])
@@ -139,7 +139,7 @@ def _encoder(told: Told, rng: np.random.Generator) -> Told:
     return replace(told, joints=joints, poses=poses, words=f"zero of {robot.joint_names[at]}")
 
 
-def _rows(told: Told, rng: np.random.Generator) -> Told:
+def _rows(told: Identifiability, rng: np.random.Generator) -> Identifiability:
     """The joints of two views exchanged; without poses the guess of poses names them."""
     pair = np.sort(rng.choice(len(told.joints), 2, replace=False))
     order = np.arange(len(told.joints))
@@ -162,7 +162,7 @@ SLIPS: Mapping[str, Plant] = {
 }
 
 
-def is_named(told: Told, name: str) -> bool:
+def is_named(told: Identifiability, name: str) -> bool:
     """Whether what was planted is named."""
     said = told.said()
     if name == "two rows exchanged" and told.poses is None:
@@ -170,24 +170,24 @@ def is_named(told: Told, name: str) -> bool:
     return told.words in said
 
 
-def with_tool(told: Told, rng: np.random.Generator) -> Told:
+def with_tool(told: Identifiability, rng: np.random.Generator) -> Identifiability:
     """Poses of a tool's tip."""
     tool = compose(Rotation.from_rotvec(rng.normal(0.0, 0.5, 3)).as_matrix(), rng.normal(0, 0.1, 3))
     return replace(told, poses=told.poses @ tool)
 
 
-def in_the_world(told: Told, rng: np.random.Generator) -> Told:
+def in_the_world(told: Identifiability, rng: np.random.Generator) -> Identifiability:
     """Poses in a frame of the world, in which the arm stands somewhere."""
     turn = Rotation.from_euler("z", rng.uniform(0.3, 2.6)).as_matrix()
     return replace(told, poses=compose(turn, rng.uniform(-1.0, 1.0, 3)) @ told.poses)
 
 
-def as_built(told: Told, _: np.random.Generator) -> Told:
+def as_built(told: Identifiability, _: np.random.Generator) -> Identifiability:
     """Poses of a controller that knows how its own arm was built."""
     return replace(told, poses=told.cell.true_base_from_flange)
 
 
-def with_stray_offset(told: Told, rng: np.random.Generator) -> Told:
+def with_stray_offset(told: Identifiability, rng: np.random.Generator) -> Identifiability:
     """A joint that was assembled two degrees off; the controller does not know."""
     zeros = np.zeros(told.joints.shape[1])
     zeros[rng.integers(len(zeros))] = np.deg2rad(2.0)
@@ -208,7 +208,7 @@ ALARMS = (
 )
 
 
-def alarms(told: Told) -> tuple[str, ...]:
+def alarms(told: Identifiability) -> tuple[str, ...]:
     """What is said that accuses somebody's input."""
     said = told.said()
     return tuple(it for it in ALARMS if it in said)

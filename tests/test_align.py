@@ -99,7 +99,7 @@ def test_the_covariance_of_a_chain_is_that_of_its_edges(clean):
     flange = exp(np.array([0.3, -0.2, 0.5, 0.4, 0.1, 0.6]))
     poses = {"b": flange}
     chain = found.between("cam_left", "target_plate_b", poses)
-    step, slopes = 1e-6, np.zeros((6, 6 * len(edges)))
+    step, jacobian = 1e-6, np.zeros((6, 6 * len(edges)))
     for at in range(6 * len(edges)):
         twist = np.zeros(6)
         twist[at % 6] = step
@@ -107,8 +107,8 @@ def test_the_covariance_of_a_chain_is_that_of_its_edges(clean):
         moved = replace(found.edges[name], matrix=found.edges[name].matrix @ exp(twist))
         other = replace(found, edges={**found.edges, name: moved})
         there = other.between("cam_left", "target_plate_b", poses).matrix
-        slopes[:, at] = log(invert(chain.matrix) @ there) / step
-    expected = slopes @ found.joint_covariance @ slopes.T
+        jacobian[:, at] = log(invert(chain.matrix) @ there) / step
+    expected = jacobian @ found.joint_covariance @ jacobian.T
     # Forward differences of 1e-6 are exact to 1e-6 of themselves.
     np.testing.assert_allclose(chain.covariance, expected, rtol=1e-4, atol=1e-13)
 

@@ -50,10 +50,13 @@ def test_poses_and_cost_follow_lens_and_board_as_their_derivatives_say():
         limit = 0.01 * np.abs(slope).max()
         np.testing.assert_allclose(middle.by_shared[:, :, at], slope, atol=limit)
         cost = np.sum(ahead.residuals**2) - np.sum(behind.residuals**2)
-        pull, curvature = 4 * steps[at] * middle.shared_pull[at], middle.shared_information[at, at]
+        gradient, curvature = (
+            4 * steps[at] * middle.shared_gradient[at],
+            middle.shared_information[at, at],
+        )
         if at != 9 + SCALE:
             # Of a symmetric difference the third order is left: small beside the second.
-            assert cost == pytest.approx(pull, abs=0.02 * 2 * curvature * steps[at] ** 2)
+            assert cost == pytest.approx(gradient, abs=0.02 * 2 * curvature * steps[at] ** 2)
 
 
 def test_the_poses_take_their_share_of_the_information_and_no_more():
@@ -116,7 +119,7 @@ def test_a_bent_board_is_noticed_and_costs_nothing(given):
     assert lengths[3] < 1.2 * lengths[1]
 
 
-def surprise(cell, known, size=12) -> float:
+def mahalanobis_sq(cell, known, size=12) -> float:
     """Squared error of the edges in units of the stated covariance: chi-square if that is true."""
     error = error_of(cell, known)[:size]
     return float(error @ np.linalg.solve(known.solved.covariance[:size, :size], error))
@@ -134,7 +137,7 @@ def test_a_board_within_what_is_stated_is_measured_and_not_accused(mount):
     assert "% larger than stated" in sentence
     assert "which what is stated allows (to within 0.1 %)" in sentence
     assert known.verdict.status == "good"
-    assert surprise(cell, known) < UNLIKELY
+    assert mahalanobis_sq(cell, known) < UNLIKELY
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
@@ -147,7 +150,7 @@ def test_a_size_that_is_contradicted_is_dropped_and_no_arm_is_blamed(mount, scal
     assert any("which is not what is stated" in it for it in known.verdict.reasons)
     assert known.verdict.status == "check"
     assert known.robot_arm.errors is None or not known.robot_arm.errors.is_significant
-    assert surprise(cell, known) < UNLIKELY
+    assert mahalanobis_sq(cell, known) < UNLIKELY
     # Left as stated, the camera would be off by 5 mm and more.
     assert np.linalg.norm(error_of(cell, known)[3:6]) < 0.5e-3
 
@@ -160,7 +163,7 @@ def test_a_size_that_is_held_counts_by_what_the_views_say_against_it():
     for seed in range(12):
         scale = 1.0 + 1e-3 * rng.standard_normal()
         cell = simulate(replace(coarse, seed=seed, board_scale=scale))
-        seen.append(surprise(cell, calibrated(cell)))
+        seen.append(mahalanobis_sq(cell, calibrated(cell)))
     # Twelve chi-squares of twelve: 144 +- 17, and 199 in one of a thousand.
     assert sum(seen) < chi2.ppf(0.999, 144)
     assert sum(seen) > chi2.ppf(0.001, 144)
@@ -189,7 +192,7 @@ def test_intrinsics_that_are_held_against_the_images_are_named_and_counted():
     assert 'intrinsics = "hold" keeps them' in sentence
     assert known.verdict.status != "good"
     assert not lens_is_free(known)
-    assert surprise(cell, known) < UNLIKELY
+    assert mahalanobis_sq(cell, known) < UNLIKELY
 
 
 @pytest.mark.parametrize("options", [FINE, replace(FINE, seed=11)])
@@ -198,7 +201,7 @@ def test_right_intrinsics_and_a_flat_board_are_refined_without_a_doubt(options):
     known = with_lens(cell, np.zeros(4), intrinsics="refine")
     assert lens_is_free(known)
     assert known.verdict.status == "good"
-    assert surprise(cell, known) < UNLIKELY
+    assert mahalanobis_sq(cell, known) < UNLIKELY
 
 
 def test_intrinsics_within_their_stated_sigma_are_refined_without_a_doubt():
@@ -206,7 +209,7 @@ def test_intrinsics_within_their_stated_sigma_are_refined_without_a_doubt():
     known = with_lens(cell, np.array([2.0, 2.0, -1.5, 1.0]), matrix_sigma_px=2.0)
     assert known.verdict.status == "good"
     assert any("refined within what is stated" in it for it in known.verdict.reasons)
-    assert surprise(cell, known) < UNLIKELY
+    assert mahalanobis_sq(cell, known) < UNLIKELY
 
 
 def test_given_intrinsics_that_do_not_fit_are_refined_or_held_as_asked():

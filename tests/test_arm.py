@@ -57,8 +57,8 @@ def test_a_wrong_arm_is_noticed_and_counts_in_the_covariance(mount, joints):
         assert 4e-4 < known.robot_arm.errors.sigma < 3e-3
         told = known.notes if joints else known.warnings
         assert any(("was calibrated" if joints else "arm's posture") in it for it in told)
-        error, spread = error_of(cell, known), known.solved.covariance[:12, :12]
-        surprises.append(error @ np.linalg.solve(spread, error) / 12)
+        error, covariance = error_of(cell, known), known.solved.covariance[:12, :12]
+        surprises.append(error @ np.linalg.solve(covariance, error) / 12)
     # Without it, this is about a hundred.
     assert np.mean(surprises) < 2.0
 

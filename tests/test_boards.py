@@ -13,7 +13,7 @@ from visioncal.calibration.pipeline.guess_inputs import guess_session
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.detect import detect
-from visioncal.calibration.verification.calibration_prior import Footing
+from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import exp, invert, log
 from visioncal.estimation.workspace import postures
@@ -78,9 +78,9 @@ def test_all_boards_are_placed_as_well_as_their_sigmas_say():
         )
         known = calibrated(cell, joints=False)
         assert len(known.used) == len(cell.corners)
-        error, spread = error_of(cell, known), result_of(known).joint_covariance
+        error, covariance = error_of(cell, known), result_of(known).joint_covariance
         assert error.shape == (18,)
-        squares += float(error @ np.linalg.solve(spread, error))
+        squares += float(error @ np.linalg.solve(covariance, error))
         count += len(error)
     # Both tails at one in ten thousand.
     assert chi2.ppf(1e-4, count) < squares < chi2.ppf(1.0 - 1e-4, count)
@@ -183,9 +183,9 @@ def test_one_view_places_a_board():
     assert edges["base_from_target_second"].sigma_mm > edges["base_from_target_first"].sigma_mm
     true = cell.transforms["base_from_target_second"]
     away = log(invert(true) @ edges["base_from_target_second"].matrix)
-    spread = edges["base_from_target_second"].covariance
+    covariance = edges["base_from_target_second"].covariance
     # One draw of chi-square with six degrees of freedom, at one in ten thousand.
-    assert away @ np.linalg.solve(spread, away) < chi2.ppf(1.0 - 1e-4, 6)
+    assert away @ np.linalg.solve(covariance, away) < chi2.ppf(1.0 - 1e-4, 6)
     # Without that view nothing places the board: it has no part in what is held out.
     assert np.isnan(known.solved.held_out.away_m).sum() == 1
     assert np.isfinite(known.findings.held_out.mm)
@@ -224,9 +224,9 @@ def test_measured_poses_of_two_boards_will_do(tmp_path, mount):
     assert list(result.edges) == list(cell.transforms)
     for name, true in cell.transforms.items():
         away = log(invert(true) @ result.edges[name].matrix)
-        spread = result.edges[name].covariance
+        covariance = result.edges[name].covariance
         # Chi-square with six degrees of freedom at one in ten thousand; the noise is estimated.
-        assert away @ np.linalg.solve(spread, away) < 1.5 * chi2.ppf(1.0 - 1e-4, 6)
+        assert away @ np.linalg.solve(covariance, away) < 1.5 * chi2.ppf(1.0 - 1e-4, 6)
 
 
 def test_each_image_is_searched_for_its_own_board(tmp_path):
@@ -293,9 +293,11 @@ def test_what_is_written_of_the_fit_is_read_back(given):
     """Further boards are written relative to the first."""
     known = calibrated(simulate(replace(TWO, seed=2, state_intrinsics=given, **WRONG_LINKS)))
     assert known.robot_arm.model is not None
-    footing, solved = Footing.of(result_of(known)), known.solved
-    np.testing.assert_allclose(footing.state.edges, solved.state.edges, atol=1e-12)
+    prior_calibration, solved = CalibrationPrior.of(result_of(known)), known.solved
+    np.testing.assert_allclose(prior_calibration.state.edges, solved.state.edges, atol=1e-12)
     sigmas = np.sqrt(np.diag(solved.covariance))
     # Slopes there and back undo each other up to rounding.
     scale = np.outer(sigmas, sigmas)
-    np.testing.assert_allclose(footing.covariance / scale, solved.covariance / scale, atol=1e-6)
+    np.testing.assert_allclose(
+        prior_calibration.covariance / scale, solved.covariance / scale, atol=1e-6
+    )

@@ -59,11 +59,13 @@ def test_stops_move_with_a_change_as_its_derivatives_say(mount, size):
                 beside = at.copy()
                 beside[unknown] += sign * step
                 stops = _at(data, belief, cause, beside, 1.0)
-                ends.append(stops.residuals + stops.slopes @ beside)
+                ends.append(stops.residuals + stops.jacobian @ beside)
             slope = (ends[0] - ends[1]) / (2 * step)
             # The series of the right Jacobian is cut where it is exact to 1e-9 up to 0.5 rad, and
             # to some 1e-3 at two radians.
-            assert found.slopes[:, unknown] == pytest.approx(slope, abs=1e-7 if size < 1 else 2e-2)
+            assert found.jacobian[:, unknown] == pytest.approx(
+                slope, abs=1e-7 if size < 1 else 2e-2
+            )
 
 
 @pytest.mark.parametrize("mount", MOUNTS)

@@ -52,7 +52,7 @@ def found(cell, session):
     return aligned(cell, session, "thermal")
 
 
-def surprise(cell, found, frame):
+def mahalanobis_sq(cell, found, frame):
     """Squared error of a frame in the base of the robot that warms up, over its covariance."""
     edge = found.between("base_a", frame)
     away = log(invert(cell.between("base_a", frame)) @ edge.matrix)
@@ -62,9 +62,9 @@ def surprise(cell, found, frame):
 def test_frames_are_those_of_the_cold_arm(cell, session, found):
     without = aligned(cell, session, "hand-eye")
     for frame in ("base_b", "cam_left"):
-        assert surprise(cell, found, frame) < OF_SIX
+        assert mahalanobis_sq(cell, found, frame) < OF_SIX
         # Drift of some 0.3 mm that is taken for noise moves them by many sigmas.
-        assert surprise(cell, without, frame) > 100.0
+        assert mahalanobis_sq(cell, without, frame) > 100.0
 
 
 def test_coefficients_are_within_their_sigmas(found, tmp_path):

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.calibration.pipeline import STAGES, calibrate
 from visioncal.calibration.pipeline.result import result_of
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.clocks import set_clocks
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.offset import LARGEST_SIGMA_S, Clock
@@ -309,7 +309,7 @@ def test_a_stated_offset_stands_where_motion_does_not_tell_it():
 
 
 def test_what_is_open_about_the_clocks_counts(session):
-    known = Known(session)
+    known = RunState(session)
     for stage in STAGES[: [it.name for it in STAGES].index("clock") + 1]:
         known = stage.run(known)
     spreads = []

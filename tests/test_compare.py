@@ -85,8 +85,8 @@ def test_a_moved_camera_moves_its_result_alike(mount: Mount) -> None:
         # The flange's error has a lever a millimetre longer: a hundredth of the camera's 100 mm.
         away = log(invert(edge.matrix) @ moved.edges[name].matrix)
         assert np.abs(away / sigmas).max() < 1e-2
-        spread = (edge.covariance - moved.edges[name].covariance) / np.outer(sigmas, sigmas)
-        assert np.abs(spread).max() < 1e-2
+        covariance = (edge.covariance - moved.edges[name].covariance) / np.outer(sigmas, sigmas)
+        assert np.abs(covariance).max() < 1e-2
 
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
@@ -147,7 +147,9 @@ def test_covariances_are_added_in_one_tangent_space() -> None:
         spreads.append(root @ root.T)
     first = exp(np.array([0.3, -0.2, 1.1, 0.1, 0.2, 0.3]))
     second = first @ exp(np.array([0.7, -0.6, 0.4, 0.2, -0.2, 0.15]))
-    noise = [rng.multivariate_normal(np.zeros(6), spread, size=40_000) for spread in spreads]
+    noise = [
+        rng.multivariate_normal(np.zeros(6), covariance, size=40_000) for covariance in spreads
+    ]
     sampled = log(invert(first @ exp(noise[0])) @ (second @ exp(noise[1])))
     (edge, _) = compare(with_edge(first, spreads[0]), with_edge(second, spreads[1])).edges
     # 40000 samples show a variance to 0.7 %; the nonlinear rest is a thousandth.

@@ -73,8 +73,8 @@ def test_motion_is_measured_with_its_direction(target):
     # Of one exposure: the mean of the picture at places a quarter of a pixel apart.
     height, width = image.shape
     wu, wv = np.fft.rfftfreq(width), np.fft.fftfreq(height)[:, None]
-    spread = sum(np.exp(-2j * np.pi * (wu * u + wv * v)) for u, v in steps) / len(steps)
-    moved = np.fft.irfft2(np.fft.rfft2(image - 210.0) * spread, s=image.shape) + 210.0
+    covariance = sum(np.exp(-2j * np.pi * (wu * u + wv * v)) for u, v in steps) / len(steps)
+    moved = np.fft.irfft2(np.fft.rfft2(image - 210.0) * covariance, s=image.shape) + 210.0
     moved = np.clip(np.rint(moved), 0, 255).astype(np.uint8)
     ids = np.arange(len(truth))
     seen = refine(moved, target, ids, truth)
@@ -179,10 +179,10 @@ def test_derivatives_of_the_blur(torch):
     wu = torch.linspace(-6, 6, 7, dtype=torch.float64)
     wv = torch.linspace(-5, 6, 6, dtype=torch.float64)[:, None]
     start = np.array([0.7, 1.5, 2.0, -1.0])
-    value, *slopes = transfer(Blur.of(start), wu, wv)
+    value, *jacobian = transfer(Blur.of(start), wu, wv)
     assert float(value.abs().max()) <= 1.0
     step = 1e-5
-    for slope, change in zip(slopes, step * np.eye(4), strict=True):
+    for slope, change in zip(jacobian, step * np.eye(4), strict=True):
         ends = [transfer(Blur.of(start + it), wu, wv)[0] for it in (change, -change)]
         # torch's Bessel functions are good to 5e-7.
         assert float(((ends[0] - ends[1]) / (2 * step) - slope).abs().max()) < 1e-6

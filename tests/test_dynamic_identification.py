@@ -104,10 +104,10 @@ def test_breaking_loose_is_found():
             np.log(humps.speed_rad_s / built.gears.stribeck_speed),
         ]
     )
-    spread = result.covariance[size:, size:]
+    covariance = result.covariance[size:, size:]
     # Chance exceeds 33 with 12 degrees of freedom once in a thousand.
-    assert away @ np.linalg.solve(spread, away) < 33.0
-    assert np.sqrt(np.diag(spread)[6:]).max() < 0.05
+    assert away @ np.linalg.solve(covariance, away) < 33.0
+    assert np.sqrt(np.diag(covariance)[6:]).max() < 0.05
 
 
 def test_planned_sweeps_tell_friction():

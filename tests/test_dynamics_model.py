@@ -85,7 +85,7 @@ def test_encoders_may_be_eccentric():
 
     def energy(t):
         q, dq, _ = course(t)
-        speeds = robot.chain.slopes(q) * dq
+        speeds = robot.chain.jacobian(q) * dq
         (mass,) = mass_matrices(robot, robot.inertias, q)
         frames = robot.link_frames(q[0])[:-1]
         masses = robot.masses
@@ -94,7 +94,7 @@ def test_encoders_may_be_eccentric():
 
     q, dq, ddq = course(0.7)
     torques = joint_torques(robot, robot.inertias, q, dq, ddq)
-    power = float(torques[0] @ (robot.chain.slopes(q) * dq)[0])
+    power = float(torques[0] @ (robot.chain.jacobian(q) * dq)[0])
     # A central difference of some hundred watts; its third derivative is some 1e4 W/s^2.
     changed = (energy(0.7 + 1e-5) - energy(0.7 - 1e-5)) / 2e-5
     assert changed == pytest.approx(power, rel=1e-6)
@@ -224,8 +224,8 @@ def pushed(gain, push):
     arm = ArmDynamics(robot, robot.inertias, friction)
     times = np.arange(0.0, 2.0, 0.002)
     waves = np.sin(np.outer(times, [1.0, 1.3, 1.7, 2.1, 2.5, 3.0]))
-    slopes = np.gradient(waves, times, axis=0, edge_order=2)
-    q, dq = 0.5 * waves, 0.5 * slopes
+    jacobian = np.gradient(waves, times, axis=0, edge_order=2)
+    q, dq = 0.5 * waves, 0.5 * jacobian
     ddq = np.gradient(dq, times, axis=0, edge_order=2)
     external = np.where(times[:, None] >= 1.0, push, 0.0)
     measured = Measured(Motion(times, q, dq, ddq), arm.torques(q, dq, ddq) - external)

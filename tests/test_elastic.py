@@ -153,14 +153,14 @@ def test_predictions_move_with_springs_as_their_derivatives_say():
     loads = Loads.alike(3, 5.0, (0.0, 0.02, 0.1), (3.0, 0.0, -20.0))
     model = ArmModel(robot, np.eye(4), {"compliance": 1.0}, np.full(6, 1e-2), 200.0)
     middle, step = invert(model.base_from_flange(q, loads)), 1e-6
-    slopes = model.basis(q, loads)
+    jacobian = model.basis(q, loads)
     for at in range(6):
         change = step * np.eye(6)[at]
         ends = [
             log(middle @ model.moved(it).base_from_flange(q, loads)) for it in (change, -change)
         ]
         # An arm that bends more has other levers, by as much as it bends: left out.
-        assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(slopes[:, :, at], abs=0.02)
+        assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(jacobian[:, :, at], abs=0.02)
 
 
 def test_a_loaded_arm_read_by_a_tracker():

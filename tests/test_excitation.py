@@ -49,9 +49,9 @@ def test_a_series_begins_and_ends_at_rest_where_it_began():
 def test_speeds_and_accelerations_are_derivatives():
     motion = some_series().sampled(2000.0)
     for values, rates in ((motion.q, motion.dq), (motion.dq, motion.ddq)):
-        slopes = np.gradient(values, motion.times_s, axis=0)[1:-1]
+        jacobian = np.gradient(values, motion.times_s, axis=0)[1:-1]
         # Central differences err by a sixth of the third derivative times the squared step.
-        assert np.abs(slopes - rates[1:-1]).max() < 1e-5 * np.abs(rates).max()
+        assert np.abs(jacobian - rates[1:-1]).max() < 1e-5 * np.abs(rates).max()
 
 
 def test_a_shrunk_series_moves_less_about_the_same_middle():
@@ -63,14 +63,14 @@ def test_a_shrunk_series_moves_less_about_the_same_middle():
     assert np.abs(small.sampled(50.0).ddq[[0, -1]]).max() < 1e-12
 
 
-def test_the_smooth_condition_tends_to_the_condition_and_knows_its_slopes():
+def test_the_smooth_condition_tends_to_the_condition_and_knows_its_jacobian():
     rows = np.random.default_rng(2).normal(size=(30, 5)) * [1.0, 40.0, 0.1, 3.0, 1.0]
     unit = rows / np.linalg.norm(rows, axis=0)
     # A power mean of five values is within the fifth root's logarithm over the power of the most.
     value = smooth_condition(rows, 200.0)[0]
     assert value == pytest.approx(np.log(np.linalg.cond(unit)), abs=np.log(5) / 200.0)
     for sharpness in (1.0, 8.0):
-        slopes = smooth_condition(rows, sharpness)[1]
+        jacobian = smooth_condition(rows, sharpness)[1]
         flat = rows.ravel()
         for place in range(0, flat.size, 17):
             step = np.zeros(flat.size)
@@ -81,11 +81,11 @@ def test_the_smooth_condition_tends_to_the_condition_and_knows_its_slopes():
             )
             numeric = (ahead - behind) / (2.0 * step[place])
             # Central differences at this step round at 1e-9 of the value over the step.
-            assert slopes.ravel()[place] == pytest.approx(numeric, rel=1e-4, abs=1e-6)
+            assert jacobian.ravel()[place] == pytest.approx(numeric, rel=1e-4, abs=1e-6)
 
 
 @pytest.mark.parametrize("far", [0.01, 0.5])
-def test_the_objective_knows_its_slopes(far):
+def test_the_objective_knows_its_jacobian(far):
     """Within the limits, and with all of them broken: ranges, rates, torques and distances."""
     centre = compose(np.eye(3), np.array([0.4, 0.0, 0.4]))
     post = Body("post", 0, "box", np.array([0.1, 0.1, 0.8]), centre)
@@ -104,12 +104,12 @@ def test_the_objective_knows_its_slopes(far):
     def along(step: float) -> float:
         return objective.value(free + step * direction, 4.0, price)[0]
 
-    slopes = objective.value(free, 4.0, price)[1]
+    jacobian = objective.value(free, 4.0, price)[1]
     for seed in range(3):
         direction = np.random.default_rng(seed).normal(size=free.size)
         numeric = (along(1e-5) - along(-1e-5)) / 2e-5
         # Forward differences with steps of 1e-6 in the regressor and 1e-5 in the distances.
-        assert slopes @ direction == pytest.approx(numeric, rel=2e-3, abs=1e-3)
+        assert jacobian @ direction == pytest.approx(numeric, rel=2e-3, abs=1e-3)
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from parts import away, even, feature_bound, placed, slopes, some_frame, some_touches
+from parts import away, even, feature_bound, jacobian, placed, some_frame, some_touches
 from scipy.stats import f as f_distribution
 from scipy.stats import kstest
 
@@ -41,7 +41,7 @@ def test_derivatives_are_those_of_the_residuals():
     rng = np.random.default_rng(2)
     _, touches = touched(2, ONE_EACH * 2)
     problem, state = FeatureProblem(touches), some_frame(rng)
-    found = slopes(lambda step: problem.linearise(problem.move(state, step)).residuals, 6)
+    found = jacobian(lambda step: problem.linearise(problem.move(state, step)).residuals, 6)
     # Central differences of lengths near a metre are exact to some 1e-9.
     assert np.abs(problem.linearise(state).jacobian - found).max() < 1e-8
 

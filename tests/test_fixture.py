@@ -309,8 +309,8 @@ def test_errors_that_points_share_are_carried_to_the_answer():
     measured = touched_points(rows, tool(), Noise.of_robot(0.0, 1e-6), None)
     # As if the whole set were turned about the base, and shifted.
     sigmas = np.array([1e-4, 2e-4, 3e-4, 1e-4, 1e-4, 5e-5])
-    slopes = np.concatenate([sigmas * _turning(it) for it in measured.points])
-    shared = replace(measured, common=slopes @ slopes.T)
+    jacobian = np.concatenate([sigmas * _turning(it) for it in measured.points])
+    shared = replace(measured, common=jacobian @ jacobian.T)
     found = drawn_fixture(shared, drawing(1e-3 * CAD_MM), Setting()).edge
     moves = []
     for step in np.diag(sigmas):

@@ -30,7 +30,7 @@ import visioncal
 from visioncal.core.conventions import Reading
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert, pose_difference
-from visioncal.interchange.formats import PoseWishes, Wishes, convert, read_foreign
+from visioncal.interchange.formats import ImportOptions, PoseImportOptions, convert, read_foreign
 from visioncal.interchange.formats.intrinsics import read_intrinsics
 from visioncal.session import Session
 from visioncal.session.columns import POSE
@@ -44,7 +44,7 @@ def poses_of(session, name):
 @pytest.mark.parametrize("make", RECORDINGS.values(), ids=RECORDINGS.keys())
 def test_every_form_gives_the_same_poses(make, tmp_path):
     recording = make(tmp_path / "in")
-    convert(recording.source, tmp_path / "out", wishes=recording.wishes)
+    convert(recording.source, tmp_path / "out", requested=recording.requested)
     session = Session.load(tmp_path / "out")
     robot, camera = poses_of(session, "base_from_flange"), poses_of(session, "cam_from_target")
     assert robot is not None or camera is not None
@@ -58,19 +58,19 @@ def test_every_form_gives_the_same_poses(make, tmp_path):
 
 def test_what_a_form_says_besides_poses_is_kept(tmp_path):
     recording = industrial(tmp_path / "in")
-    session = convert(recording.source, tmp_path / "out", wishes=recording.wishes)
+    session = convert(recording.source, tmp_path / "out", requested=recording.requested)
     assert session.mount == "eye-in-hand"
     assert (session.target.columns, session.target.rows) == (5, 7)
     assert session.target.dictionary == "DICT_6X6_250"
     assert session.resolution == (64, 48)  # from the images, which the source does not describe
     assert any("no distortion" in it for it in session.warnings)
-    estimated = replace(recording.wishes, intrinsics="estimate")
-    assert convert(recording.source, tmp_path / "free", wishes=estimated).camera is None
+    estimated = replace(recording.requested, intrinsics="estimate")
+    assert convert(recording.source, tmp_path / "free", requested=estimated).camera is None
 
 
 def test_visps_lens_and_note(tmp_path):
     recording = visp(tmp_path / "in")
-    session = convert(recording.source, tmp_path / "out", wishes=recording.wishes)
+    session = convert(recording.source, tmp_path / "out", requested=recording.requested)
     np.testing.assert_array_equal(session.camera.matrix, [60.5, 60.25, 32.5, 24.5])
     np.testing.assert_array_equal(session.camera.distortion, [-0.125, 0, 0, 0, 0])
     assert session.target.square_m == 0.0236
@@ -79,7 +79,7 @@ def test_visps_lens_and_note(tmp_path):
 
 def test_joints_stand_where_there_are_no_poses(tmp_path):
     recording = kinematics(tmp_path / "in")
-    session = convert(recording.source, tmp_path / "out", wishes=recording.wishes)
+    session = convert(recording.source, tmp_path / "out", requested=recording.requested)
     assert session.mount == "eye-to-hand"
     assert session.views[3].base_from_flange() is None
     assert session.views[3].joints_rad.tolist() == [0.1 * 3, 0.2 * 3]
@@ -87,27 +87,27 @@ def test_joints_stand_where_there_are_no_poses(tmp_path):
 
 def test_the_samples_of_a_camera_on_the_base_are_inverted(tmp_path):
     recording = easy_handeye(tmp_path / "in")
-    wishes = replace(recording.wishes, mount="eye-to-hand")
-    session = convert(recording.source, tmp_path / "out", wishes=wishes)
+    requested = replace(recording.requested, mount="eye-to-hand")
+    session = convert(recording.source, tmp_path / "out", requested=requested)
     # One inversion in double precision.
     np.testing.assert_allclose(
         poses_of(session, "base_from_flange"), invert(BASE_FROM_FLANGE), atol=1e-14
     )
-    as_is = replace(wishes, robot=PoseWishes(inverse=False))
-    session = convert(recording.source, tmp_path / "as is", wishes=as_is)
+    as_is = replace(requested, robot=PoseImportOptions(inverse=False))
+    session = convert(recording.source, tmp_path / "as is", requested=as_is)
     np.testing.assert_allclose(poses_of(session, "base_from_flange"), BASE_FROM_FLANGE, atol=1e-14)
 
 
 def test_numbers_in_our_own_form_stay_as_they_are_written(tmp_path):
     recording = plain_table(tmp_path / "in")
-    session = convert(recording.source, tmp_path / "out", wishes=recording.wishes)
+    session = convert(recording.source, tmp_path / "out", requested=recording.requested)
     read = np.array([[view.numbers[name] for name in POSE] for view in session.views])
     np.testing.assert_array_equal(read, quaternions(BASE_FROM_FLANGE))
 
 
 def test_other_columns_are_passed_through_as_text(tmp_path):
     recording = kuka_csv(tmp_path / "in")
-    session = convert(recording.source, tmp_path / "out", wishes=recording.wishes)
+    session = convert(recording.source, tmp_path / "out", requested=recording.requested)
     assert {view.text["operator"] for view in session.views} == {"Ann"}
     assert "X" not in session.columns
 
@@ -118,7 +118,7 @@ def test_other_values_of_a_document_are_kept(tmp_path):
     for at, row in enumerate(document["samples"]):
         row |= {"lamp": {"on": True, "ampere": 0.25 * at}, "corners": [[0.0, 0.0]] * (at + 3)}
     recording.source.write_text(json.dumps(document))
-    session = convert(recording.source, tmp_path / "out", wishes=recording.wishes)
+    session = convert(recording.source, tmp_path / "out", requested=recording.requested)
     assert session.views[3].text["lamp.ampere"] == "0.75"
     assert session.views[3].text["lamp.on"] == "True"
     assert not [it for it in session.columns if "corners" in it or "robot_pose" in it]
@@ -133,8 +133,10 @@ def test_columns_that_only_sound_like_ours_get_another_name(tmp_path):
         cells = [*map(repr, row), *(extra | {"camera": f"cam {at % 2}"}).values(), "warm-up"]
         text += ",".join(cells) + "\n"
     (tmp_path / "log.csv").write_text(text)
-    wishes = Wishes(mount="eye-in-hand", robot=PoseWishes(tuple(own), unit="m"), joints=("a",))
-    session = convert(tmp_path / "log.csv", tmp_path / "out", wishes=wishes)
+    requested = ImportOptions(
+        mount="eye-in-hand", robot=PoseImportOptions(tuple(own), unit="m"), joints=("a",)
+    )
+    session = convert(tmp_path / "log.csv", tmp_path / "out", requested=requested)
     assert {f"source_{it}" for it in extra} < set(session.columns)
     assert session.views[0].text["group"] == "warm-up"
     assert session.views[0].text["source_role"] == "tester"
@@ -143,7 +145,7 @@ def test_columns_that_only_sound_like_ours_get_another_name(tmp_path):
 def test_images_are_copied_and_missing_ones_named(tmp_path):
     recording = industrial(tmp_path / "in")
     (recording.source / "images/4.png").unlink()
-    session = convert(recording.source, tmp_path / "out", wishes=recording.wishes)
+    session = convert(recording.source, tmp_path / "out", requested=recording.requested)
     assert any("images/4.png. --images names" in it for it in session.warnings)
     kept = (tmp_path / "out/images/3.png").read_bytes()
     assert kept == (recording.source / "images/3.png").read_bytes()
@@ -156,15 +158,15 @@ def test_images_that_lie_elsewhere_are_found_by_number(tmp_path):
     elsewhere.mkdir()
     for at in range(9):
         (recording.source / f"images/{at}.png").rename(elsewhere / f"{at:02d}.png")
-    wishes = replace(recording.wishes, images=elsewhere)
-    session = convert(recording.source, tmp_path / "out", wishes=wishes)
+    requested = replace(recording.requested, images=elsewhere)
+    session = convert(recording.source, tmp_path / "out", requested=requested)
     assert [view.image for view in session.views] == [f"images/{at:02d}.png" for at in range(9)]
     assert all(session.images.exists(view.image) for view in session.views)
 
 
 def test_a_lens_in_a_file_of_its_own(tmp_path):
     recording = separate_lens(tmp_path / "in")
-    session = convert(recording.source, tmp_path / "out", wishes=recording.wishes)
+    session = convert(recording.source, tmp_path / "out", requested=recording.requested)
     assert session.camera.matrix.tolist() == [60, 60, 32, 24]
     assert session.views[0].text["lamp"] == "on"
 
@@ -173,27 +175,27 @@ def test_as_many_images_as_poses_are_needed(tmp_path):
     recording = images_and_table(tmp_path / "in")
     (recording.source / "shot5.png").unlink()
     with pytest.raises(DataError, match=r"8 images \(shot0.png ... shot8.png\).* 9 poses"):
-        convert(recording.source, tmp_path / "out", wishes=recording.wishes)
+        convert(recording.source, tmp_path / "out", requested=recording.requested)
     assert not (tmp_path / "out").exists()
 
 
 def test_images_are_taken_in_natural_order(tmp_path):
     recording = images_and_table(tmp_path / "in")
     (recording.source / "shot1.png").rename(recording.source / "shot10.png")
-    session = convert(recording.source, tmp_path / "out", wishes=recording.wishes)
+    session = convert(recording.source, tmp_path / "out", requested=recording.requested)
     assert session.views[1].image == "images/shot2.png"
     assert session.views[-1].image == "images/shot10.png"
 
 
 @pytest.mark.parametrize(
-    ("wishes", "words"),
+    ("requested", "words"),
     [
-        ({"robot": PoseWishes(("X", "Y", "Q"))}, "it has X, Y, Z, A, B, C"),
-        ({"robot": PoseWishes(("X", "Y"))}, "have 2 numbers; a pose has"),
-        ({"robot": PoseWishes(("X", "Y", "Z", "A", "B", "operator"))}, "holds 'Ann'"),
-        ({"robot": PoseWishes(("X", "Y", "Z", "A", "B", "C"), form="kuko")}, "kuka"),
-        ({"robot": PoseWishes(("X", "Y", "Z", "A", "B", "C"), form="abb")}, "has 3 numbers"),
-        ({"robot": PoseWishes(("X", "Y", "Z", "A", "B", "C"), unit="feet")}, "m, cm, mm"),
+        ({"robot": PoseImportOptions(("X", "Y", "Q"))}, "it has X, Y, Z, A, B, C"),
+        ({"robot": PoseImportOptions(("X", "Y"))}, "have 2 numbers; a pose has"),
+        ({"robot": PoseImportOptions(("X", "Y", "Z", "A", "B", "operator"))}, "holds 'Ann'"),
+        ({"robot": PoseImportOptions(("X", "Y", "Z", "A", "B", "C"), form="kuko")}, "kuka"),
+        ({"robot": PoseImportOptions(("X", "Y", "Z", "A", "B", "C"), form="abb")}, "has 3 numbers"),
+        ({"robot": PoseImportOptions(("X", "Y", "Z", "A", "B", "C"), unit="feet")}, "m, cm, mm"),
         ({"mount": None}, "--mount"),
         ({"target": "chekerboard_9x6_25mm"}, "checkerboard_9x6_23.6mm"),
         ({"target": "charuco_5x7_30mm_40mm_DICT_6X6_250"}, "less than square_m"),
@@ -204,10 +206,12 @@ def test_images_are_taken_in_natural_order(tmp_path):
         ({"images": Path("no such folder"), "target": "checkerboard_9x6_25mm"}, "no images"),
     ],
 )
-def test_mistakes_are_answered_with_what_there_is(tmp_path, wishes, words):
+def test_mistakes_are_answered_with_what_there_is(tmp_path, requested, words):
     recording = kuka_csv(tmp_path / "in")
     with pytest.raises(DataError) as caught:
-        convert(recording.source, tmp_path / "out", wishes=replace(recording.wishes, **wishes))
+        convert(
+            recording.source, tmp_path / "out", requested=replace(recording.requested, **requested)
+        )
     assert words in str(caught.value)
     assert not (tmp_path / "out").exists()
 
@@ -215,7 +219,9 @@ def test_mistakes_are_answered_with_what_there_is(tmp_path, wishes, words):
 def test_without_names_the_fields_are_listed(tmp_path):
     (tmp_path / "log.csv").write_text("alpha,beta\n1,2\n3,4\n")
     with pytest.raises(DataError, match="it has alpha, beta"):
-        convert(tmp_path / "log.csv", tmp_path / "out", wishes=Wishes(mount="eye-in-hand"))
+        convert(
+            tmp_path / "log.csv", tmp_path / "out", requested=ImportOptions(mount="eye-in-hand")
+        )
 
 
 def test_a_row_that_says_nothing_is_left_out_by_name(tmp_path):
@@ -223,7 +229,7 @@ def test_a_row_that_says_nothing_is_left_out_by_name(tmp_path):
     (recording.source / "pose_03.json").write_text(
         json.dumps({"O_T_EE": BASE_FROM_FLANGE[3].reshape(-1).tolist(), "joint_pose": [0.0] * 7})
     )
-    session = convert(recording.source, tmp_path / "out", wishes=recording.wishes)
+    session = convert(recording.source, tmp_path / "out", requested=recording.requested)
     assert [view.number for view in session.views] == [0, 1, 2, 4, 5, 6, 7, 8]
     assert any("1 of 9 rows are left out" in it and "pose_03.json" in it for it in session.warnings)
 
@@ -233,22 +239,22 @@ def test_a_path_that_leaves_the_folder_is_refused(tmp_path):
     file = recording.source / "cal_data.yaml"
     file.write_text(file.read_text().replace("poses/0.yaml", "../secret.yaml"))
     with pytest.raises(DataError, match="or leaves the folder"):
-        convert(recording.source, tmp_path / "out", wishes=recording.wishes)
+        convert(recording.source, tmp_path / "out", requested=recording.requested)
 
 
 @pytest.mark.parametrize("make", RECORDINGS.values(), ids=RECORDINGS.keys())
 def test_what_the_user_says_of_poses_is_applied_in_every_form(make, tmp_path):
     recording = make(tmp_path / "in")
-    plain = read_foreign(recording.source, recording.wishes)
+    plain = read_foreign(recording.source, recording.requested)
     said = {
-        whose: replace(getattr(recording.wishes, whose), unit="cm", inverse=whose == "robot")
+        whose: replace(getattr(recording.requested, whose), unit="cm", inverse=whose == "robot")
         for whose in ("robot", "camera")
     }
-    read = read_foreign(recording.source, replace(recording.wishes, **said))
-    for whose, wishes in said.items():
+    read = read_foreign(recording.source, replace(recording.requested, **said))
+    for whose, requested in said.items():
         before, after = getattr(plain, whose), getattr(read, whose)
         if before is not None and before.there.any():
-            assert after.reading == Reading(before.reading.rotation, "cm", wishes.inverse)
+            assert after.reading == Reading(before.reading.rotation, "cm", requested.inverse)
             np.testing.assert_array_equal(after.positions, before.positions)
 
 
@@ -265,8 +271,8 @@ def test_the_offset_of_two_clocks_is_found(tmp_path, ahead_s):
         np.savetxt(
             tmp_path / f"{name}.csv", rows, "%.17g", delimiter=",", header=columns, comments=""
         )
-    wishes = Wishes(mount="eye-in-hand", camera_file=tmp_path / "camera.csv")
-    session = convert(tmp_path / "robot.csv", tmp_path / "out", wishes=wishes)
+    requested = ImportOptions(mount="eye-in-hand", camera_file=tmp_path / "camera.csv")
+    session = convert(tmp_path / "robot.csv", tmp_path / "out", requested=requested)
     # All of both streams is kept as it was, and nothing is stated of the clocks.
     assert len(session.views) == len(camera_s)
     np.testing.assert_array_equal(session.streams["robot"].stamps_s, robot_s)
@@ -283,9 +289,9 @@ def test_streams_of_different_motions_are_refused(tmp_path):
     for name, poses in (("robot", swung(stamps)), ("camera", swung(1.7 * stamps + 3))):
         rows = np.hstack([stamps[:, None], quaternions(poses)])
         np.savetxt(tmp_path / f"{name}.txt", rows, "%.17g")
-    wishes = Wishes(mount="eye-in-hand", camera_file=tmp_path / "camera.txt")
+    requested = ImportOptions(mount="eye-in-hand", camera_file=tmp_path / "camera.txt")
     with pytest.raises(DataError, match="of the same motion"):
-        convert(tmp_path / "robot.txt", tmp_path / "out", wishes=wishes)
+        convert(tmp_path / "robot.txt", tmp_path / "out", requested=requested)
 
 
 FLANGE_FROM_CAM_BACK = exp(np.array([0.1, -0.2, 1.5, 0.05, 0.01, 0.08]))

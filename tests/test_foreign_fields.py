@@ -15,11 +15,11 @@ from visioncal.cli.app import app
 from visioncal.core.conventions import ROTATION_FORMS, PoseNumbers, Reading
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert
-from visioncal.interchange.formats import PoseWishes, Wishes, assemble, read_foreign
+from visioncal.interchange.formats import ImportOptions, PoseImportOptions, assemble, read_foreign
 from visioncal.interchange.formats.intrinsics import read_intrinsics
 from visioncal.session import Session
 
-HAND = Wishes(mount="eye-in-hand")
+HAND = ImportOptions(mount="eye-in-hand")
 
 
 @pytest.fixture
@@ -42,21 +42,21 @@ def vector(pose):
 
 # How the robot's stream is written, and what the user then says.
 WRITTEN = {
-    "millimetres": (lambda it: it, 1e3, PoseWishes(unit="mm")),
-    "inverse": (invert, 1.0, PoseWishes(inverse=True)),
-    "by name": (lambda it: it, 1.0, PoseWishes(form="ros")),
+    "millimetres": (lambda it: it, 1e3, PoseImportOptions(unit="mm")),
+    "inverse": (invert, 1.0, PoseImportOptions(inverse=True)),
+    "by name": (lambda it: it, 1.0, PoseImportOptions(form="ros")),
 }
 
 
 @pytest.mark.parametrize(("turned", "scale", "said"), WRITTEN.values(), ids=WRITTEN.keys())
 def test_what_is_said_of_a_stream_holds_once(tmp_path, turned, scale, said):
     recording = streams(tmp_path)
-    wanted = read_foreign(recording.source, recording.wishes).robot
+    wanted = read_foreign(recording.source, recording.requested).robot
     table = np.loadtxt(recording.source, delimiter=",")
     poses = PoseNumbers(table[:, 1:4], table[:, 4:], Reading(), tuple(map(str, table[:, 0])))
     written = quaternions(turned(poses.poses())) * ([scale] * 3 + [1] * 4)
     np.savetxt(recording.source, np.hstack([table[:, :1], written]), "%.12f", delimiter=",")
-    found = read_foreign(recording.source, replace(recording.wishes, robot=said)).robot
+    found = read_foreign(recording.source, replace(recording.requested, robot=said)).robot
     # Of moments that are equally slow the last digit decides which are taken.
     common = sorted(set(found.places) & set(wanted.places))
     assert len(common) > 10
@@ -76,8 +76,8 @@ def test_a_translation_called_t_is_no_time(rows):
             "camera_pose": CAM_FROM_TARGET[at].tolist(),
         }
     )
-    wishes = replace(HAND, robot=PoseWishes(("t", "R")))
-    assert read_foreign(source, wishes).stamps_s is None
+    requested = replace(HAND, robot=PoseImportOptions(("t", "R")))
+    assert read_foreign(source, requested).stamps_s is None
     # One number a row, but of the robot's pose.
     single = rows(
         lambda at: (
@@ -85,25 +85,25 @@ def test_a_translation_called_t_is_no_time(rows):
             | {"rvec": vector(BASE_FROM_FLANGE[at])["rvec"]}
         )
     )
-    wishes = replace(HAND, robot=PoseWishes(("t", "x", "y", "rvec")))
-    assert read_foreign(single, wishes).stamps_s is None
+    requested = replace(HAND, robot=PoseImportOptions(("t", "x", "y", "rvec")))
+    assert read_foreign(single, requested).stamps_s is None
     timed = rows(lambda at: {"t": 0.5 * at, "robot_pose": BASE_FROM_FLANGE[at].tolist()})
     assert read_foreign(timed, HAND).stamps_s[2] == 1.0
 
 
 def test_the_robots_fields_are_not_the_cameras_as_well(rows):
     alone = rows(lambda at: vector(BASE_FROM_FLANGE[at]))
-    wishes = replace(HAND, robot=PoseWishes(("tvec", "rvec")))
-    assert read_foreign(alone, wishes).camera is None
+    requested = replace(HAND, robot=PoseImportOptions(("tvec", "rvec")))
+    assert read_foreign(alone, requested).camera is None
     both = rows(
         lambda at: {"robot": vector(BASE_FROM_FLANGE[at]), "board": vector(CAM_FROM_TARGET[at])}
     )
-    named = replace(HAND, robot=PoseWishes(("robot.tvec", "robot.rvec")))
+    named = replace(HAND, robot=PoseImportOptions(("robot.tvec", "robot.rvec")))
     found = read_foreign(both, named)
     # One conversion to a vector and back, in double precision.
     np.testing.assert_allclose(found.camera.poses(), CAM_FROM_TARGET, atol=1e-14)
     with pytest.raises(DataError, match=r"'tvec' may be robot\.tvec, board\.tvec"):
-        read_foreign(both, replace(HAND, robot=PoseWishes(("tvec", "rvec"))))
+        read_foreign(both, replace(HAND, robot=PoseImportOptions(("tvec", "rvec"))))
 
 
 def test_half_a_pose_is_refused_by_its_row(tmp_path):
@@ -218,7 +218,7 @@ def test_a_stream_with_wide_gaps_is_told_so(tmp_path):
     table = np.loadtxt(recording.source, delimiter=",")
     np.savetxt(recording.source, table[::7], "%.9f", delimiter=",")
     with pytest.raises(DataError, match=r"0\.35 s apart; where the gap is 0\.25 s or more"):
-        read_foreign(recording.source, recording.wishes)
+        read_foreign(recording.source, recording.requested)
 
 
 def test_an_offset_where_the_search_ends_is_refused(tmp_path):
@@ -228,9 +228,9 @@ def test_an_offset_where_the_search_ends_is_refused(tmp_path):
     for name, poses, ahead_s in (("robot", exp(swing), 0), ("camera", invert(exp(swing)), 6)):
         rows = np.hstack([times_s[:, None] + ahead_s, quaternions(poses)])
         np.savetxt(tmp_path / f"{name}.csv", rows, "%.9f", delimiter=",")
-    wishes = replace(HAND, camera_file=tmp_path / "camera.csv")
+    requested = replace(HAND, camera_file=tmp_path / "camera.csv")
     with pytest.raises(DataError, match=r"\+5\.00 s apart, where the search ends"):
-        read_foreign(tmp_path / "robot.csv", wishes)
+        read_foreign(tmp_path / "robot.csv", requested)
 
 
 def test_rows_that_hold_poses_are_not_taken_for_names_of_files(tmp_path):

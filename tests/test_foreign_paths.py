@@ -12,17 +12,23 @@ from foreign_samples import BASE_FROM_FLANGE, CHARUCO, picture, quaternions, vis
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import natural
-from visioncal.interchange.formats import PoseWishes, Wishes, assemble, convert, read_foreign
+from visioncal.interchange.formats import (
+    ImportOptions,
+    PoseImportOptions,
+    assemble,
+    convert,
+    read_foreign,
+)
 from visioncal.interchange.formats.finding import images_named, listed
 
-WISHES = Wishes(mount="eye-in-hand", target=CHARUCO)
+WISHES = ImportOptions(mount="eye-in-hand", target=CHARUCO)
 
 
 @pytest.fixture
 def naming(tmp_path):
     """Writes a table whose rows name these images, and reads it."""
 
-    def assembled(*names, wishes=WISHES):
+    def assembled(*names, requested=WISHES):
         poses = quaternions(BASE_FROM_FLANGE).tolist()
         lines = [
             ",".join([name, *map(repr, pose)])
@@ -30,7 +36,7 @@ def naming(tmp_path):
         ]
         header = "image,x,y,z,qx,qy,qz,qw"
         (tmp_path / "poses.csv").write_text("\n".join([header, *lines]), encoding="utf-8")
-        return assemble(read_foreign(tmp_path / "poses.csv", wishes))
+        return assemble(read_foreign(tmp_path / "poses.csv", requested))
 
     return assembled
 
@@ -158,13 +164,13 @@ def test_a_size_that_is_no_number_is_left_aside(tmp_path):
     recording = visp(tmp_path)
     note = tmp_path / "chessboard-data.txt"
     note.write_text("Chessboard\n9 x 6\nsquare size: 0.02.5 m\n")
-    assert read_foreign(recording.source, recording.wishes).target is None
+    assert read_foreign(recording.source, recording.requested).target is None
 
 
 def test_a_recording_keeps_its_robots_reading_beside_its_images(tmp_path):
     recording = visp(tmp_path / "in")
-    said = replace(recording.wishes, robot=PoseWishes(inverse=True))
-    session = convert(recording.source, tmp_path / "out", wishes=said)
+    said = replace(recording.requested, robot=PoseImportOptions(inverse=True))
+    session = convert(recording.source, tmp_path / "out", requested=said)
     found = session.views[2].base_from_flange().inv().as_matrix()
     # Through a rotation vector and a quaternion, in double precision.
     np.testing.assert_allclose(found, BASE_FROM_FLANGE[2], atol=1e-14)

@@ -17,7 +17,7 @@ SIGMA = 1e-4
 class Lines:
     """Groups `slopes @ x = values`, of which the last residual may be unobserved."""
 
-    slopes: np.ndarray
+    jacobian: np.ndarray
     values: np.ndarray
     observed: np.ndarray
     known: np.ndarray
@@ -29,8 +29,10 @@ class Lines:
 
     def linearise(self, state):
         """Gives the residuals and their slopes."""
-        residuals = np.where(self.observed, self.slopes @ state - self.values, 0.0)
-        return Groups(residuals, self.slopes * self.observed[:, :, None], self.observed, self.known)
+        residuals = np.where(self.observed, self.jacobian @ state - self.values, 0.0)
+        return Groups(
+            residuals, self.jacobian * self.observed[:, :, None], self.observed, self.known
+        )
 
     def move(self, state, step):
         """Takes a step."""
@@ -38,24 +40,24 @@ class Lines:
 
     def _solve(self, rows):
         seen = self.observed[rows]
-        return np.linalg.lstsq(self.slopes[rows][seen], self.values[rows][seen], rcond=None)[0]
+        return np.linalg.lstsq(self.jacobian[rows][seen], self.values[rows][seen], rcond=None)[0]
 
 
 def lines(seed, count=10, sigma=SIGMA, known=0.0, partial=False):
     rng = np.random.default_rng(seed)
-    slopes = rng.standard_normal((count, 3, 6))
+    jacobian = rng.standard_normal((count, 3, 6))
     noise = np.hypot(sigma, known) * rng.standard_normal((count, 3))
     observed = np.ones((count, 3), dtype=bool)
     observed[::2, 2] = not partial
     return Lines(
-        slopes, slopes @ TRUTH + noise, observed, np.tile(known**2 * np.eye(3), (count, 1, 1))
+        jacobian, jacobian @ TRUTH + noise, observed, np.tile(known**2 * np.eye(3), (count, 1, 1))
     )
 
 
 def shifted(problem, at, by):
     values = problem.values.copy()
     values[at] += by
-    return Lines(problem.slopes, values, problem.observed, problem.known)
+    return Lines(problem.jacobian, values, problem.observed, problem.known)
 
 
 def test_exact_groups_give_the_exact_answer():
@@ -79,8 +81,8 @@ def test_the_covariance_is_the_scatter(partial):
     assert fit.freedom == freedom
     # Six times an F of (6, freedom): its mean over 200 fits stays within five standard errors.
     mean = 6 * freedom / (freedom - 2)
-    spread = np.sqrt(12 * (freedom + 4) / (freedom - 4)) * freedom / (freedom - 2)
-    assert abs(np.mean(squared) - mean) < 5 * spread / np.sqrt(200)
+    covariance = np.sqrt(12 * (freedom + 4) / (freedom - 4)) * freedom / (freedom - 2)
+    assert abs(np.mean(squared) - mean) < 5 * covariance / np.sqrt(200)
     # Restricted likelihood is unbiased here; a chi-square of so many has this standard error.
     assert abs(np.mean(levels) / SIGMA**2 - 1) < 5 * np.sqrt(2 / freedom / 200)
 
@@ -100,11 +102,11 @@ def test_what_is_known_beforehand_is_no_part_of_the_level():
     # hundred to 3 %; and a level that comes out below none counts as none, which adds a quarter.
     assert abs(np.mean(np.square(levels)) / SIGMA**2 - 1) < 0.8
     problem = lines(1, sigma=0.0, known=SIGMA)
-    bare = Lines(problem.slopes, problem.slopes @ TRUTH, problem.observed, problem.known)
+    bare = Lines(problem.jacobian, problem.jacobian @ TRUTH, problem.observed, problem.known)
     fit = fit_groups(bare)
     assert fit.sigma < 0.01 * SIGMA
     assert fit.sigma_95[0] == 0.0
-    expected = np.linalg.inv(np.einsum("mij,mik->jk", bare.slopes, bare.slopes)) * SIGMA**2
+    expected = np.linalg.inv(np.einsum("mij,mik->jk", bare.jacobian, bare.jacobian)) * SIGMA**2
     assert fit.covariance == pytest.approx(expected, rel=1e-3, abs=1e-6 * expected.max())
 
 
@@ -130,44 +132,46 @@ def test_just_the_wrong_groups_are_left_out(count, wrong):
         found = agreeing_groups(problem)
         assert np.flatnonzero(~found.agrees).tolist() == list(range(wrong))
         assert not found.doubtful.any()
-        assert (found.surprise[:wrong] > found.limit[:wrong]).all()
+        assert (found.mahalanobis_sq[:wrong] > found.limit[:wrong]).all()
 
 
-def test_a_surprise_is_the_distance_from_what_the_others_predict():
+def test_a_mahalanobis_sq_is_the_distance_from_what_the_others_predict():
     problem = lines(3)
     found = agreeing_groups(problem)
     others = np.arange(10) != 4
-    slopes, values = problem.slopes[others].reshape(-1, 6), problem.values[others].ravel()
-    predicted = np.linalg.lstsq(slopes, values, rcond=None)[0]
-    away = problem.slopes[4] @ predicted - problem.values[4]
-    spread = np.eye(3) + problem.slopes[4] @ np.linalg.solve(slopes.T @ slopes, problem.slopes[4].T)
-    squared = away @ np.linalg.solve(spread, away) / found.fit.sigma**2
-    assert found.surprise[4] == pytest.approx(squared / 3, rel=1e-6)
+    jacobian, values = problem.jacobian[others].reshape(-1, 6), problem.values[others].ravel()
+    predicted = np.linalg.lstsq(jacobian, values, rcond=None)[0]
+    away = problem.jacobian[4] @ predicted - problem.values[4]
+    covariance = np.eye(3) + problem.jacobian[4] @ np.linalg.solve(
+        jacobian.T @ jacobian, problem.jacobian[4].T
+    )
+    squared = away @ np.linalg.solve(covariance, away) / found.fit.sigma**2
+    assert found.mahalanobis_sq[4] == pytest.approx(squared / 3, rel=1e-6)
 
 
 def test_a_group_that_alone_determines_a_direction_is_not_accused():
     problem = lines(5)
-    slopes = problem.slopes.copy()
-    slopes[1:, :, 5] = 0.0
-    alone = Lines(slopes, slopes @ TRUTH, problem.observed, problem.known)
+    jacobian = problem.jacobian.copy()
+    jacobian[1:, :, 5] = 0.0
+    alone = Lines(jacobian, jacobian @ TRUTH, problem.observed, problem.known)
     noise = SIGMA * np.random.default_rng(6).standard_normal((10, 3))
     alone = shifted(alone, slice(None), noise)
     # An error along the direction that only the first group sees is a change of the unknown.
-    found = agreeing_groups(shifted(alone, 0, slopes[0] @ np.array([0, 0, 0, 0, 0, 0.05])))
+    found = agreeing_groups(shifted(alone, 0, jacobian[0] @ np.array([0, 0, 0, 0, 0, 0.05])))
     assert found.agrees.all()
     assert found.fit.state[5] == pytest.approx(TRUTH[5] + 0.05, abs=20 * SIGMA)
 
 
 def test_where_nothing_tells_which_is_wrong_both_stay_and_are_doubtful():
     problem = lines(7)
-    slopes = problem.slopes.copy()
-    slopes[2:, :, 3:] = 0.0
-    slopes[:2] = 0.0
-    slopes[:2, :, 3:] = np.eye(3)
+    jacobian = problem.jacobian.copy()
+    jacobian[2:, :, 3:] = 0.0
+    jacobian[:2] = 0.0
+    jacobian[:2, :, 3:] = np.eye(3)
     # Two groups see three unknowns that no other does, and disagree about them.
-    values = slopes @ TRUTH + SIGMA * np.random.default_rng(8).standard_normal((10, 3))
+    values = jacobian @ TRUTH + SIGMA * np.random.default_rng(8).standard_normal((10, 3))
     values[0] += 0.01
-    found = agreeing_groups(Lines(slopes, values, problem.observed, problem.known))
+    found = agreeing_groups(Lines(jacobian, values, problem.observed, problem.known))
     assert found.agrees.all()
     assert np.flatnonzero(found.doubtful).tolist() == [0, 1]
     assert not found.explained

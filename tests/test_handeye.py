@@ -15,7 +15,7 @@ from visioncal.core.errors import DegenerateError
 from visioncal.core.transforms import adjoint, compose, exp, invert, log
 from visioncal.estimation.chain import chain, robot_part
 from visioncal.estimation.closed_form import SOLVERS
-from visioncal.estimation.linalg import covariance, damped_step, spectrum
+from visioncal.estimation.linalg import covariance_from, damped_step, spectrum
 from visioncal.estimation.parts import ROBOT, Effect, Noise, State
 from visioncal.estimation.solve import estimate_noise, fit_problem, solve_problem, starting_noise
 from visioncal.estimation.variance import Knowledge
@@ -59,9 +59,9 @@ def some_motion(count, seed=0, tilt=0.5):
 def test_jacobian_agrees_with_central_differences(mount):
     x, z = some_edges()
     rng = np.random.default_rng(0)
-    by_camera, by_flange = rng.normal(size=(2, 5, 6, 3))
+    by_camera, flange_jacobian = rng.normal(size=(2, 5, 6, 3))
     known = Knowledge(np.eye(3), np.zeros(3))
-    effect = Effect.free("any", known, by_camera, {ROBOT: by_flange})
+    effect = Effect.free("any", known, by_camera, {ROBOT: flange_jacobian})
     problem = made_up(some_motion(5), x, z, Noise.of_robot(0.05, 0.02), mount=mount)
     problem, state = problem.with_effects([effect]), State(np.array([x, z]), np.zeros(3))
     analytic, step = problem.linear(state).jacobian, 1e-6
@@ -169,8 +169,8 @@ def test_the_whole_chain_states_its_errors_honestly(mount, given, coarse):
             )
         )
         known = calibrated(cell)
-        error, spread = error_of(cell, known), known.solved.covariance[:12, :12]
-        surprises.append(error @ np.linalg.solve(spread, error) / 12)
+        error, covariance = error_of(cell, known), known.solved.covariance[:12, :12]
+        surprises.append(error @ np.linalg.solve(covariance, error) / 12)
         noises.append(known.solved.noise.robots[0])
         assert known.pixel_px == pytest.approx(0.1, rel=0.1)
     # The mean of 8 chi-square of 12 has the standard deviation 0.144: four of it. The estimated
@@ -330,20 +330,20 @@ def test_noise_of_exact_data_is_nil_and_nothing_divides_by_it():
 
 
 def test_a_covariance_is_found_where_the_eigenvalues_do_not_converge(monkeypatch):
-    slopes = np.random.default_rng(5).standard_normal((3, 20, 6))
-    information = np.swapaxes(slopes, 1, 2) @ slopes
+    jacobian = np.random.default_rng(5).standard_normal((3, 20, 6))
+    information = np.swapaxes(jacobian, 1, 2) @ jacobian
 
     def give_up(_):
         raise np.linalg.LinAlgError("Eigenvalues did not converge")
 
     monkeypatch.setattr(np.linalg, "eigh", give_up)
-    np.testing.assert_allclose(covariance(information), np.linalg.inv(information), rtol=1e-8)
+    np.testing.assert_allclose(covariance_from(information), np.linalg.inv(information), rtol=1e-8)
     with pytest.raises(np.linalg.LinAlgError):
-        covariance(np.full((2, 6, 6), np.nan))
+        covariance_from(np.full((2, 6, 6), np.nan))
 
 
 def test_no_information_at_all_gives_a_finite_covariance():
-    found = covariance(np.stack([np.zeros((6, 6)), np.eye(6)]))
+    found = covariance_from(np.stack([np.zeros((6, 6)), np.eye(6)]))
     assert np.isfinite(found).all()
     assert found[0].diagonal().min() > 1e12
     assert found[1] == pytest.approx(np.eye(6))
@@ -353,7 +353,7 @@ def test_linear_algebra_says_what_it_sees():
     rng = np.random.default_rng(0)
     tall = rng.normal(size=(30, 4)) * [1.0, 1e3, 1e-3, 1.0]
     information = tall.T @ tall
-    np.testing.assert_allclose(covariance(information), np.linalg.inv(information), rtol=1e-8)
+    np.testing.assert_allclose(covariance_from(information), np.linalg.inv(information), rtol=1e-8)
     assert spectrum(information).ratio > 0.1  # the units of the columns do not matter
     tall[:, 3] = tall[:, 0]
     assert spectrum(tall.T @ tall).ratio < 1e-12

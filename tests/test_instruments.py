@@ -68,8 +68,11 @@ def test_errors_follow_their_covariance_and_reach_their_bound(options):
     for seed in range(20):
         shop = tracked(replace(options, seed=seed))
         known = solved_of(session_of(shop))
-        error, spread = errors_of(shop, known)[kept], known.solved.covariance[np.ix_(kept, kept)]
-        by_sigma.append(error @ np.linalg.solve(spread, error) / len(kept))
+        error, covariance = (
+            errors_of(shop, known)[kept],
+            known.solved.covariance[np.ix_(kept, kept)],
+        )
+        by_sigma.append(error @ np.linalg.solve(covariance, error) / len(kept))
         by_bound.append(error @ np.linalg.solve(mounting_bound(shop), error) / len(kept))
     # The mean of 20 chi-squares of 9 or 12 degrees of freedom over these has a sigma of 0.1.
     assert np.mean(by_sigma) == pytest.approx(1.0, abs=0.3)
@@ -121,8 +124,8 @@ def test_so_many_values_are_told_of_a_six_axis_arm(options, rank):
 def test_twenty_three_values_are_told_by_one_point_with_base_and_tool_known():
     shop = tracked(replace(POINT, stops=60))
     steps = 1e-5 * np.eye(48)[12:]
-    slopes = [(reads(shop, step) - reads(shop, -step)).ravel() / 2e-5 for step in steps]
-    values = np.linalg.svd(np.array(slopes), compute_uv=False)
+    jacobian = [(reads(shop, step) - reads(shop, -step)).ravel() / 2e-5 for step in steps]
+    values = np.linalg.svd(np.array(jacobian), compute_uv=False)
     assert int(np.sum(values > 1e-7 * values[0])) == 23
 
 

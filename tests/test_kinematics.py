@@ -173,7 +173,7 @@ def test_predictions_move_as_their_derivatives_say(mount):
     middle = target_in_camera(mount, *edges, model.robot.base_from_flange(q))
     problem = known.solved.problem.with_effects([])
     pair = ArmPair.of(problem, State(edges, np.zeros(0)), ROBOT)
-    slopes = pair.slopes(model.base_from_flange(q), model.basis(q))[1]
+    jacobian = pair.jacobian(model.base_from_flange(q), model.basis(q))[1]
     for at in range(size):
         change = np.zeros(size)
         change[at] = step
@@ -189,7 +189,7 @@ def test_predictions_move_as_their_derivatives_say(mount):
             for it in (change, -change)
         ]
         # Steps are composed with values of some mrad, whose product is left out.
-        assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(slopes[:, :, at], abs=5e-3)
+        assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(jacobian[:, :, at], abs=5e-3)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)

@@ -104,9 +104,9 @@ def test_what_moves_a_ray_agrees_with_central_differences(exact_cell, seed):
         [locate(calibration, px + sign * shift, plane, at.base_from_flange)[0] for sign in (1, -1)]
         for shift in 0.1 * np.eye(2)
     ]
-    slopes = np.array([(a.p_base - b.p_base) / 0.2 for a, b in pixels]).T
+    jacobian = np.array([(a.p_base - b.p_base) / 0.2 for a, b in pixels]).T
     # Truncation: a tenth of a pixel in a thousand, squared.
-    np.testing.assert_allclose(found.parts["pixels"], slopes @ slopes.T, rtol=1e-5, atol=1e-14)
+    np.testing.assert_allclose(found.parts["pixels"], jacobian @ jacobian.T, rtol=1e-5, atol=1e-14)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -159,14 +159,14 @@ def test_the_robots_noise_at_the_stop_agrees_with_central_differences(in_hand):
         3,
     )
     step = 1e-4
-    slopes = np.array(
+    jacobian = np.array(
         [
             locate(calibration, px, plane, at.base_from_flange @ exp(twist))[0].p_base
             - locate(calibration, px, plane, at.base_from_flange @ exp(-twist))[0].p_base
             for twist in step * np.eye(6)
         ]
     ).T / (2 * step)
-    expected = slopes @ np.diag(sigma**2) @ slopes.T
+    expected = jacobian @ np.diag(sigma**2) @ jacobian.T
     # Truncation: 1e-4 squared, relative.
     np.testing.assert_allclose(
         found.parts["robot"], expected, atol=1e-6 * float(np.trace(expected))
@@ -266,10 +266,10 @@ def test_lens_and_edge_have_one_covariance():
             ]
         )
         rows = np.r_[0:6, 12 : len(joint)]
-        spread = joint[np.ix_(rows, rows)] * np.outer(scale[rows], scale[rows])
+        covariance = joint[np.ix_(rows, rows)] * np.outer(scale[rows], scale[rows])
         white = error * scale[rows]
-        surprises.append(white @ np.linalg.solve(spread, white) / len(error))
-        together.append(np.abs(spread[:6, 6:]).max())
+        surprises.append(white @ np.linalg.solve(covariance, white) / len(error))
+        together.append(np.abs(covariance[:6, 6:]).max())
     # 12 runs of 15 degrees of freedom: sqrt(2 / 180) = 0.11; the noise is estimated, too.
     assert np.mean(surprises) == pytest.approx(1.0, abs=0.4)
     # What makes this a test of the cross block: centre and rotation err almost as one, and a wrong

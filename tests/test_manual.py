@@ -12,7 +12,7 @@ from visioncal.core.documents.pendants import is_marked_pose, possible_forms, re
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.transforms import compose
 from visioncal.interchange.exports import export
-from visioncal.interchange.formats import PoseWishes, Wishes
+from visioncal.interchange.formats import ImportOptions, PoseImportOptions
 from visioncal.interchange.formats.columns import foreign_from, read_fields
 from visioncal.live.drivers.manual import ManualArm
 from visioncal.live.drivers.protocols import Arm
@@ -130,7 +130,7 @@ def test_a_file_with_a_pose_a_line_says_itself_what_it_means(tmp_path, form):
     rotations = CASES["any"][:4]
     for images in (True, False):
         fields = read_fields(a_file(tmp_path / "poses.txt", rotations, form, images))
-        foreign = foreign_from(fields, Wishes())
+        foreign = foreign_from(fields, ImportOptions())
         assert foreign.notes == ()
         # Exports are written to the nanometre and to 1e-8 deg.
         assert np.abs(foreign.robot.poses() - compose(np.array(rotations), SHIFT)).max() < 2e-9
@@ -152,9 +152,9 @@ def test_a_file_of_poses_names_the_line_that_is_wrong(tmp_path):
 
 def test_another_form_than_the_lines_have_is_refused(tmp_path):
     fields = read_fields(a_file(tmp_path / "poses.txt", CASES["any"][:3]))
-    foreign_from(fields, Wishes(robot=PoseWishes(form="kuka")))
+    foreign_from(fields, ImportOptions(robot=PoseImportOptions(form="kuka")))
     with pytest.raises(DataError, match="written as KUKA"):
-        foreign_from(fields, Wishes(robot=PoseWishes(form="fanuc")))
+        foreign_from(fields, ImportOptions(robot=PoseImportOptions(form="fanuc")))
 
 
 def test_only_marks_and_names_make_a_pose_of_a_line():

@@ -8,7 +8,7 @@ from cells import calibrated, error_of, known_of
 from scipy.spatial.transform import Rotation
 
 from visioncal.calibration.pipeline import calibrate
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.cell import read_cell
 from visioncal.core.errors import DegenerateError
@@ -50,7 +50,7 @@ def away(found: Calibration) -> np.ndarray:
     return log(invert(X) @ found.transforms["flange_from_cam"].as_matrix())
 
 
-def run(cell: Cell, prior: dict[str, dict[str, float]]) -> Known:
+def run(cell: Cell, prior: dict[str, dict[str, float]]) -> RunState:
     """Calibrates a cell whose session knows something beforehand."""
     known = known_of(cell, level="hand-eye")
     document = {**known.session.document, "prior": prior}
@@ -76,11 +76,11 @@ def test_four_axes_give_a_result_with_a_measured_height_and_none_without():
             and it.endswith("the views alone leave it open.")
             for it in found.verdict.reasons
         )
-        spread, off = found.covariance("flange_from_cam"), away(found)
+        covariance, off = found.covariance("flange_from_cam"), away(found)
         # What was measured is all that is known of the height.
-        height = X[2, :3] @ spread[3:, 3:] @ X[2, :3]
+        height = X[2, :3] @ covariance[3:, 3:] @ X[2, :3]
         assert np.sqrt(height) == pytest.approx(SIGMA_M, rel=0.05)
-        squares.append(off @ np.linalg.solve(spread, off))
+        squares.append(off @ np.linalg.solve(covariance, off))
     # Sixty squares: a mean of 1 to within 0.18; the noise is itself estimated from each session.
     assert 0.6 < np.mean(squares) / 6.0 < 1.6
 
@@ -178,6 +178,6 @@ def test_a_plan_counts_what_was_measured():
     (world,) = worlds_of(
         [begun.cell], PURPOSES["hand-eye"], cell.joints[:1], recorded=begun.recorded
     )
-    spread = world.covariance(np.arange(0))
+    covariance = world.covariance(np.arange(0))
     # Without a further stop: the three lengths are known to what they were measured to, or better.
-    assert np.sqrt(np.diag(spread)[3:6]).max() < 1.05 * SIGMA_M
+    assert np.sqrt(np.diag(covariance)[3:6]).max() < 1.05 * SIGMA_M

@@ -142,12 +142,12 @@ def test_the_size_of_an_arms_errors_is_known_as_well_as_these_are_told():
     errors = ArmErrors(np.zeros((8, 6, 6)), 1e-3, 100.0, True)
     erring = problem.with_effects([errors.effect("a")])
     arm = erring.effect_columns["arm of a"]
-    spread = np.zeros((erring.size, erring.size))
-    spread[arm, arm] = np.diag([1e-6, 1e-6, 0.0, 0.0, 0.0, 0.0])
+    covariance = np.zeros((erring.size, erring.size))
+    covariance[arm, arm] = np.diag([1e-6, 1e-6, 0.0, 0.0, 0.0, 0.0])
     # The place of a frame makes up for one that is not told.
-    spread[0, arm.start] = spread[arm.start, 0] = -5e-7
-    spread[0, 0] = 3e-7
-    more = covariance_of_size(erring, spread, "a", errors)
+    covariance[0, arm.start] = covariance[arm.start, 0] = -5e-7
+    covariance[0, 0] = 3e-7
+    more = covariance_of_size(erring, covariance, "a", errors)
     # Student's t of four degrees has twice the variance of the normal.
     np.testing.assert_allclose(np.diag(more[arm, arm]), [1e-6, 1e-6, 0.0, 0.0, 0.0, 0.0])
     assert more[0, arm.start] == pytest.approx(-5e-7)
@@ -163,8 +163,8 @@ def test_the_budget_adds_up(given):
     whole = covariance_of(result.problem, result.fit)[:12, :12]
     # An identity; what is left is rounding of an inverse with a condition of 1e10.
     np.testing.assert_allclose(sum(parts.values()), whole, rtol=1e-4, atol=1e-6 * whole.max())
-    budget, spread = known.work.budget_mm, result.covariance[:6, :6]
-    at_work = point_covariance(result.state.edges[0], spread, known.work.point_cam)
+    budget, covariance = known.work.budget_mm, result.covariance[:6, :6]
+    at_work = point_covariance(result.state.edges[0], covariance, known.work.point_cam)
     assert budget["total"] == pytest.approx(1e3 * np.sqrt(np.trace(at_work)), rel=1e-4)
     assert ("intrinsics" in budget) == (not given)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from slips import (
     SLIPS,
-    Told,
+    Identifiability,
     alarms,
     as_built,
     in_the_world,
@@ -51,7 +51,7 @@ def parameters(known):
 
 
 def planted(name, *, with_poses, seed=0):
-    told = Told.of(IN_HAND, with_poses=with_poses)
+    told = Identifiability.of(IN_HAND, with_poses=with_poses)
     return SLIPS[name](told, np.random.default_rng(seed))
 
 
@@ -61,14 +61,16 @@ def test_slips_are_named(name, with_poses):
     if name == "base_link for base" and not with_poses:
         pytest.skip("the target may stand anywhere: no camera tells how the base is turned")
     for seed, cell in enumerate(CELLS.values()):
-        told = SLIPS[name](Told.of(cell, with_poses=with_poses), np.random.default_rng(seed))
+        told = SLIPS[name](
+            Identifiability.of(cell, with_poses=with_poses), np.random.default_rng(seed)
+        )
         assert is_named(told, name), told.said()
 
 
 @pytest.mark.parametrize("change", [as_built, in_the_world, with_stray_offset, with_tool])
 def test_sound_sessions_raise_no_alarm(change):
     for seed, cell in enumerate(CELLS.values()):
-        told = change(Told.of(cell, with_poses=True), np.random.default_rng(seed))
+        told = change(Identifiability.of(cell, with_poses=True), np.random.default_rng(seed))
         assert not alarms(told), told.said()
 
 
@@ -149,7 +151,7 @@ def test_readings_that_no_row_tells_apart_are_all_named():
 
 @pytest.mark.parametrize("with_poses", [True, False])
 def test_a_lost_encoder_is_found_and_not_thrown_away(with_poses):
-    told = Told.of(IN_HAND, with_poses=with_poses)
+    told = Identifiability.of(IN_HAND, with_poses=with_poses)
     zeros = np.deg2rad([0.0, 0.0, 10.0, 0.0, 0.0, 0.0])
     joints = told.joints - zeros
     poses = load_robot("ur5e").base_from_flange(joints) if with_poses else None
@@ -171,7 +173,7 @@ def test_a_lost_encoder_is_found_and_not_thrown_away(with_poses):
 
 
 def test_zeros_that_differ_between_poses_and_joints_are_named():
-    told = Told.of(IN_HAND, with_poses=True)
+    told = Identifiability.of(IN_HAND, with_poses=True)
     off = np.deg2rad([0.0, 0.0, 10.0, 0.0, 0.0, 0.0])
     session = replace(told, joints=told.joints - off).session
     matched = match_joints(session.views, load_robot("ur5e"))
@@ -181,7 +183,7 @@ def test_zeros_that_differ_between_poses_and_joints_are_named():
 
 
 def test_one_row_of_wrong_joints_costs_its_view_alone():
-    told = Told.of(IN_HAND, with_poses=True)
+    told = Identifiability.of(IN_HAND, with_poses=True)
     joints = told.joints.copy()
     joints[5, 1] += 0.3
     known = finished(replace(told, joints=joints))
@@ -191,7 +193,7 @@ def test_one_row_of_wrong_joints_costs_its_view_alone():
 
 
 def test_one_row_of_a_wrong_pose_is_left_to_the_consensus():
-    told = Told.of(IN_HAND, with_poses=True)
+    told = Identifiability.of(IN_HAND, with_poses=True)
     poses = told.poses.copy()
     poses[5] = poses[5] @ exp(np.array([0.0, 0.0, 0.0, 0.03, 0.0, 0.0]))
     known = finished(replace(told, poses=poses))
@@ -200,7 +202,7 @@ def test_one_row_of_a_wrong_pose_is_left_to_the_consensus():
 
 
 def test_an_arm_in_the_world_is_calibrated_where_it_stands():
-    told = in_the_world(Told.of(IN_HAND, with_poses=True), np.random.default_rng(0))
+    told = in_the_world(Identifiability.of(IN_HAND, with_poses=True), np.random.default_rng(0))
     known = finished(told)
     assert known.robot_arm.kinematics.level == "geometry"
     found = known.robot_arm.model.robot.base_from_flange(told.joints)

@@ -46,10 +46,10 @@ def test_the_chance_is_that_of_drawn_errors(freedom: float, places: int, flat: f
 
 
 def test_round_errors_have_the_closed_form() -> None:
-    spread = 1e-8 * np.eye(6)[None]
+    covariance = 1e-8 * np.eye(6)[None]
     radius = 1e-4 * np.sqrt(chi2_limit(0.05, 3))
-    assert radius_within(spread, 0.95) == pytest.approx(radius, rel=2e-3)
-    assert chance_within(spread, np.inf, np.inf) == 1.0
+    assert radius_within(covariance, 0.95) == pytest.approx(radius, rel=2e-3)
+    assert chance_within(covariance, np.inf, np.inf) == 1.0
     assert chance_within(np.zeros((1, 6, 6)), 1e-3, 1e-3) == 1.0
     assert radius_within(np.zeros((1, 6, 6)), 0.95) == 0.0
 
@@ -62,7 +62,7 @@ def test_picks_err_as_the_chain_does(mount: str) -> None:
     (picks,) = known.findings.picks
     rng, count = np.random.default_rng(0), 20_000
     result = known.solved
-    spread = np.linalg.cholesky(result.covariance[:6, :6])
+    covariance = np.linalg.cholesky(result.covariance[:6, :6])
     views = rng.integers(len(known.used), size=count)
     problem = known.solved.problem
     flange = known.robot_arm.poses[problem.observations.stops][views]
@@ -73,7 +73,7 @@ def test_picks_err_as_the_chain_does(mount: str) -> None:
     def noise():
         return exp(sigmas * rng.standard_normal((count, 6)))
 
-    off = exp(rng.standard_normal((count, 6)) @ spread.T)
+    off = exp(rng.standard_normal((count, 6)) @ covariance.T)
     camera = result.state.edges[0]
     if mount == "eye-in-hand":
         away = flange @ (noise() @ camera @ off - camera) @ seen
@@ -90,8 +90,8 @@ def test_picks_err_as_the_chain_does(mount: str) -> None:
 
 def of_size(sigma_mm: float, camera: str = "cam", robot: str = "robot") -> Picks:
     """Picks that err alike along all axes."""
-    spread = np.diag(np.repeat([1e-4, 1e-3 * sigma_mm], 3) ** 2)[None]
-    return Picks(camera, robot, {"calibration": spread}, np.inf, 0.5)
+    covariance = np.diag(np.repeat([1e-4, 1e-3 * sigma_mm], 3) ** 2)[None]
+    return Picks(camera, robot, {"calibration": covariance}, np.inf, 0.5)
 
 
 NEED = Need(0.5)

@@ -249,8 +249,8 @@ def test_a_device_is_held_where_automatic_exposure_and_focus_went(monkeypatch):
 
 def test_what_is_wished_is_set_from_the_start(monkeypatch):
     _, seen = a_device(monkeypatch, is_colour=False)
-    wishes = DeviceWishes((640, 400), 5000, 200, 90, {"rate_hz": "20"})
-    camera = OakCamera(wishes)
+    requested = DeviceWishes((640, 400), 5000, 200, 90, {"rate_hz": "20"})
+    camera = OakCamera(requested)
     camera.close()
     assert seen.initial.getExposureTime().total_seconds() == pytest.approx(5e-3)
     assert (seen.initial.getSensitivity(), seen.initial.getLensPosition()) == (200, 90)

@@ -31,9 +31,9 @@ def test_just_the_wrong_views_are_left_out(world, wrong):
         assert set(range(20)) - set(known.used) == set(cell.wrong_views)
         for view in cell.wrong_views:
             assert "times the noise" in known.reasons[view]
-        error, spread = error_of(cell, known), known.solved.covariance[:12, :12]
+        error, covariance = error_of(cell, known), known.solved.covariance[:12, :12]
         # Chi-square of 12 stays under 39 in all but one case of ten thousand.
-        assert error @ np.linalg.solve(spread, error) < 39.0
+        assert error @ np.linalg.solve(covariance, error) < 39.0
 
 
 def test_of_hundreds_of_uneven_views_several_are_taken_in_by_one_fit(monkeypatch):

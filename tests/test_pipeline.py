@@ -39,10 +39,10 @@ def with_camera(cell, off_px=(0, 0, 0, 0), **table):
     return replace(told, document=told.document | {"camera": told.document["camera"] | table})
 
 
-def surprise(cell, known):
+def mahalanobis_sq(cell, known):
     """Squared error of both edges over the covariance, divided by their twelve numbers."""
-    error, spread = error_of(cell, known), known.solved.covariance[:12, :12]
-    return error @ np.linalg.solve(spread, error) / 12
+    error, covariance = error_of(cell, known), known.solved.covariance[:12, :12]
+    return error @ np.linalg.solve(covariance, error) / 12
 
 
 def test_intrinsics_are_refined_where_they_are_asked_to_be():
@@ -56,7 +56,7 @@ def test_intrinsics_are_refined_where_they_are_asked_to_be():
         sigma = np.sqrt(np.diag(known.solved.covariance)[12:16])
         # Chi-square of four under 23.5 in all but one case of ten thousand, were they independent.
         assert np.all(np.abs(refined.matrix - cell.options.camera.matrix) < 4.5 * sigma)
-        surprises.append(surprise(cell, known))
+        surprises.append(mahalanobis_sq(cell, known))
     # Mean of 4 chi-square of 12 over 12: sigma 0.2.
     assert np.mean(surprises) == pytest.approx(1.0, abs=0.8)
 
@@ -71,7 +71,7 @@ def test_a_matrix_known_to_a_pixel_is_counted_as_such(mode):
         told = with_camera(cell, off, matrix_sigma_px=0.5, intrinsics=mode)
         known = calibrated(cell, session=told)
         assert known.work.budget_mm["intrinsics"] > 0.0
-        surprises.append(surprise(cell, known))
+        surprises.append(mahalanobis_sq(cell, known))
     # Mean of 8 chi-square of 12 over 12: sigma 0.14; four sigma, and held values err a bit more.
     assert 0.4 < np.mean(surprises) < 1.8
 
@@ -84,7 +84,7 @@ def test_a_fisheye_camera_goes_the_whole_way(given):
         known = calibrated(cell := simulate(options))
         assert known.used == tuple(range(20))
         assert len(known.fitted.looks.lens_of("cam")) == 8
-        surprises.append(surprise(cell, known))
+        surprises.append(mahalanobis_sq(cell, known))
     # Mean of 4 chi-square of 12 over 12: sigma 0.2.
     assert np.mean(surprises) == pytest.approx(1.0, abs=0.8)
 

@@ -94,11 +94,11 @@ def test_the_robots_noise_is_carried_to_the_touched_point():
     tool, point = compose(TURN.as_matrix(), TIP), np.array([*POINTS[0], 1.0])
     known = problem.linearise(Placed(tool, POINTS[:1])).known
     for at, flange in enumerate(made.touches.base_from_flange):
-        slopes = [
+        jacobian = [
             (invert(flange @ exp(step) @ tool) - invert(flange @ exp(-step) @ tool)) @ point / 2e-5
             for step in 1e-5 * np.eye(6)
         ]
-        slope = np.array(slopes)[:, :3].T * np.repeat([1e-3, 2e-3], 3)
+        slope = np.array(jacobian)[:, :3].T * np.repeat([1e-3, 2e-3], 3)
         # The floor of a micrometre is 2.5e-7 of the level.
         assert known[at] == pytest.approx(slope @ slope.T, rel=1e-5, abs=1e-11)
 
@@ -113,8 +113,8 @@ def test_error_and_covariance_agree_with_each_other_and_with_the_bound(job):
         error = error_of(fit.flange_from_tool) if job.axes else np.zeros(6)
         if not job.axes:
             error[3:] = fit.flange_from_tool[:3, 3] - TIP
-        spread = fit.covariance[np.ix_(free, free)]
-        squared.append(error[free] @ np.linalg.solve(spread, error[free]))
+        covariance = fit.covariance[np.ix_(free, free)]
+        squared.append(error[free] @ np.linalg.solve(covariance, error[free]))
         errors.append(error[3:] @ error[3:])
         least.append(np.trace(bound(made)[3:, 3:]))
     size = len(free)
@@ -139,7 +139,7 @@ def test_one_wrong_touch_in_ten_is_left_out(spoil, seed):
     fit = fit_pivot(spoil(touched(Job(noise=ROBOT), seed).touches), ROBOT)
     assert rejected(fit) == [4]
     assert fit.belongs_to[4] is None
-    assert fit.surprise[4] > fit.limit[4]
+    assert fit.mahalanobis_sq[4] > fit.limit[4]
     # What is left errs as ten touches of 0.1 mm do: half of that, and six times it for certain.
     assert np.linalg.norm(fit.flange_from_tool[:3, 3] - TIP) < 6e-4
 

@@ -10,7 +10,7 @@ from planned import plan_cell, postures_in_view, so_far_of, true_cell
 
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp
-from visioncal.estimation.linalg import covariance, covariance_root
+from visioncal.estimation.linalg import covariance_from, covariance_root
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.solve import fisher_information
 from visioncal.live.planning.accuracy import Wish
@@ -107,10 +107,10 @@ def test_the_choice_is_nearly_the_best_of_all(criterion):
     world = worlds_of([true_cell(CELL)], HAND_EYE, few)[0]
 
     def value(rows):
-        spread = world.covariance(list(rows))
+        covariance = world.covariance(list(rows))
         if criterion == "I":
-            return float(np.trace(world.counted @ spread))
-        return float(np.linalg.slogdet(spread)[1])
+            return float(np.trace(world.counted @ covariance))
+        return float(np.linalg.slogdet(covariance)[1])
 
     values = sorted(value(it) for it in combinations(range(12), 4))
     found = value(chosen([world], 4, criterion=criterion).rows)
@@ -149,8 +149,8 @@ def test_what_is_known_beforehand_may_be_singular_to_rounding(views):
 
 
 def test_no_information_at_all_is_a_large_variance_and_no_nan():
-    assert np.isfinite(covariance(np.zeros((2, 6, 6)))).all()
-    assert covariance(np.zeros((6, 6)))[0, 0] > 1e12
+    assert np.isfinite(covariance_from(np.zeros((2, 6, 6)))).all()
+    assert covariance_from(np.zeros((6, 6)))[0, 0] > 1e12
 
 
 def test_it_stops_when_the_wish_is_predicted(views):
@@ -233,8 +233,8 @@ def test_five_planned_stops_make_a_session_about_one_axis_solvable(mount):
     assert "->" in added.helps[-1].words
     rows = added.design.rows
     known = calibrated(simulate(free, np.concatenate([cell.joints, q[rows]])), level="hand-eye")
-    spread = known.solved.covariance
-    obtained = 1e3 * np.sqrt(np.trace(spread[3:6, 3:6]))
+    covariance = known.solved.covariance
+    obtained = 1e3 * np.sqrt(np.trace(covariance[3:6, 3:6]))
     # The noise of 13 stops is told to a fifth, and that of 8 beforehand to a fourth.
     assert obtained == pytest.approx(added.design.predicted.mm, rel=0.45)
 
@@ -287,8 +287,8 @@ def test_before_any_stop_the_prediction_is_the_sigma_of_the_session(options):
     world = worlds_of([begun.cell], HAND_EYE, cell.joints[:3], recorded=begun.recorded)[0]
     solved = found.known.solved
     # Values that are held cost by how far the data pull at them: that is told of data alone.
-    spread = solved.covariance - solved.beside.get("held_values", 0.0)
-    sigmas = np.sqrt(np.diag(spread)[:6])
+    covariance = solved.covariance - solved.beside.get("held_values", 0.0)
+    sigmas = np.sqrt(np.diag(covariance)[:6])
     # The plan's weak prior of 0.2 m and rad is all that differs.
     assert np.sqrt(np.diag(world.covariance([]))[:6]) == pytest.approx(sigmas, rel=1e-4)
     three = world.covariance(range(3))
@@ -320,8 +320,8 @@ def test_errors_of_the_arm_count_in_the_prediction_as_in_the_result(case):
     # can be told beforehand.
     beside = ("held_values", "size of arm errors")
     untold = sum((known.solved.beside.get(it, 0.0) for it in beside), 0.0)
-    spread = known.solved.covariance - untold
-    obtained = 1e3 * np.sqrt(np.trace(spread[3:6, 3:6]))
+    covariance = known.solved.covariance - untold
+    obtained = 1e3 * np.sqrt(np.trace(covariance[3:6, 3:6]))
     world = worlds_of([begun.cell], HAND_EYE, q, recorded=begun.recorded)[0]
     # A result holds the board's size; in the plan it is open, and takes up errors of the arm.
     assert mm(world, []) == pytest.approx(obtained, rel=0.01)

@@ -7,11 +7,11 @@ import pytest
 from parts import (
     away,
     even,
+    jacobian,
     noise_of,
     pairs_of,
     placed,
     point_bound,
-    slopes,
     some_drawing,
     some_frame,
     uneven,
@@ -53,7 +53,7 @@ def test_derivatives_are_those_of_the_residuals(scaled):
     rng = np.random.default_rng(2)
     problem = PointProblem(pairs_of(some_drawing(rng, 5), rng.normal(size=(5, 3))), scaled)
     state = Placed(some_frame(rng), 1.3 if scaled else 1.0)
-    found = slopes(
+    found = jacobian(
         lambda step: problem.linearise(problem.move(state, step)).residuals, 7 if scaled else 6
     )
     # Central differences of lengths near a metre are exact to some 1e-9.
@@ -316,5 +316,5 @@ def test_the_frame_moves_with_each_point_as_it_says():
 
     # Of exact points; the steps of a micrometre leave 1e-8 of a gain near one, and some of its
     # slope: a frame turns by radians a metre over points of 0.1 m.
-    expected = np.moveaxis(slopes(moved, 15).reshape(6, 5, 3), 0, 1)
+    expected = np.moveaxis(jacobian(moved, 15).reshape(6, 5, 3), 0, 1)
     assert np.abs(found - expected).max() < 1e-4

@@ -25,7 +25,7 @@ from rigs import (
 from visioncal import align, calibrate
 from visioncal.calibration.pipeline import run
 from visioncal.calibration.stages.detect import detect
-from visioncal.calibration.verification.calibration_prior import Footing
+from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.calibration.verification.prediction import see_again
 from visioncal.core.errors import DataError
 from visioncal.core.quantiles import chi2_limit
@@ -84,8 +84,8 @@ def test_the_camera_is_where_it_is_within_its_sigmas(tmp_path):
     for at, rig in enumerate(RIGS):
         for seed in range(SEEDS):
             folder = write_rig(tmp_path / f"{at}_{seed}", replace(rig, seed=seed))
-            error, spread = x_of(calibrate(folder))
-            squares[at, seed] = error @ np.linalg.solve(spread, error)
+            error, covariance = x_of(calibrate(folder))
+            squares[at, seed] = error @ np.linalg.solve(covariance, error)
     # Sums are chi-square of as many numbers, which chance leaves in one of a thousand cases; the
     # noise of the robot is known to 10 % from so few stops, and its square to 20 %.
     for sums, freedom in ((squares.sum(axis=1), 6 * SEEDS), (squares.sum(), 6 * squares.size)):
@@ -110,10 +110,12 @@ def test_points_that_are_not_where_the_table_has_them_are_named(tmp_path):
     write_rig(tmp_path / "fresh", replace(rig, views=6))
     (folder / "target.csv").replace(tmp_path / "fresh" / "target.csv")
     fresh = Session.load(tmp_path / "fresh")
-    free = Footing.of(again).free
+    free = CalibrationPrior.of(again).free
     moved = free.corners_after(np.zeros(len(free.columns)))[4] - free.positions[4]
     assert moved == pytest.approx(result.stages["rig"]["shape"][4])
-    assert see_again(fresh, Footing.of(again)).known.pixel_px == pytest.approx(NOISE_PX, rel=0.15)
+    assert see_again(fresh, CalibrationPrior.of(again)).known.pixel_px == pytest.approx(
+        NOISE_PX, rel=0.15
+    )
 
 
 def test_sigmas_weigh_the_corners(tmp_path):

@@ -67,12 +67,12 @@ def with_values(problem, rng):
     known = [Knowledge(np.eye(it), np.zeros(it)) for it in (1, 2)]
     held = [np.zeros(it, dtype=bool) for it in (1, 2)]
     by_sensor = rng.normal(size=(len(problem), 6, 1)) * 1e-3
-    by_flange = {"a": rng.normal(size=(len(problem.poses["a"]), 6, 2)) * 1e-3}
+    flange_jacobian = {"a": rng.normal(size=(len(problem.poses["a"]), 6, 2)) * 1e-3}
     concerned = np.arange(len(problem)) % 2 == 0
     return problem.with_effects(
         [
             Effect("sensors", np.full(1, 0.2), known[0], held[0], by_sensor),
-            Effect("flanges", np.zeros(2), known[1], held[1], None, by_flange, concerned),
+            Effect("flanges", np.zeros(2), known[1], held[1], None, flange_jacobian, concerned),
         ]
     )
 
@@ -162,9 +162,9 @@ def test_the_fit_is_as_good_as_its_covariance_says():
         cell, problem = problem_of(seed)
         fit = fit_problem(problem, true_state(cell, problem.tree))
         assert fit.settled
-        spread = covariance_of(problem, fit)
+        covariance = covariance_of(problem, fit)
         error = away(cell, problem, fit.state)
-        squares.append(error @ np.linalg.solve(spread, error) / len(error))
+        squares.append(error @ np.linalg.solve(covariance, error) / len(error))
         levels.append(fit.noise.robots[:, 1])
     # Chi-square of 6 x 36: a standard deviation of 0.1; the levels' own errors add some.
     assert 0.7 < np.mean(squares) < 1.5
@@ -185,9 +185,9 @@ def test_the_level_of_a_sensor_is_found():
     cell, problem = problem_of(6)
     sensors = np.array([0 if it == "cam_left" else -1 for it in problem.observations.observers])
     # What cam_left says of its own noise is three times too little.
-    spread = problem.observations.covariance / np.where(sensors == 0, 9.0, 1.0)[:, None, None]
+    covariance = problem.observations.covariance / np.where(sensors == 0, 9.0, 1.0)[:, None, None]
     problem = replace(
-        problem, observations=replace(problem.observations, sensors=sensors, covariance=spread)
+        problem, observations=replace(problem.observations, sensors=sensors, covariance=covariance)
     )
     fit = fit_problem(problem, true_state(cell, problem.tree))
     # Some 150 residuals tell it to 6 %.
@@ -298,10 +298,10 @@ def test_a_prior_of_an_edge_pulls_it_by_its_share_of_the_information():
     cell, problem = problem_of(14)
     state = true_state(cell, problem.tree)
     plain, _ = solve_problem(problem, state, NOISE)
-    spread = covariance_of(problem, Solution(plain, NOISE))[problem.edge_columns("target_a")]
+    covariance = covariance_of(problem, Solution(plain, NOISE))[problem.edge_columns("target_a")]
     at = problem.unknown["target_a"]
     turn, place = plain.edges[at][:3, :3], plain.edges[at][:3, 3]
-    before = turn @ spread[3:, problem.edge_columns("target_a")][:, 3:] @ turn.T
+    before = turn @ covariance[3:, problem.edge_columns("target_a")][:, 3:] @ turn.T
     sigma_m = float(np.sqrt(before[0, 0]))
     prior = FramePrior("flange_a", "target_a", (0,), (place[0] + 1e-4,), sigma_m)
     found, _ = solve_problem(replace(problem, priors=(prior,)), plain, NOISE)
@@ -313,7 +313,7 @@ def test_a_prior_of_an_edge_pulls_it_by_its_share_of_the_information():
     assert (turned @ block @ turned.T)[0, 0] == pytest.approx(0.5 * sigma_m**2, rel=0.02)
 
 
-def test_priors_of_frames_have_the_slopes_of_central_differences():
+def test_priors_of_frames_have_the_jacobian_of_central_differences():
     cell, problem = problem_of(15, stops=4)
     rotation = pose((4, -2, -58), (0.0, 0.0, 0.0))[:3, :3]
     state, step = true_state(cell, problem.tree), 1e-6
@@ -322,11 +322,11 @@ def test_priors_of_frames_have_the_slopes_of_central_differences():
         FramePrior("cam_left", "cam_right", (0, 2), (0.1, 0.2), 1e-3),
         FramePrior("flange_b", "target_b", (0, 1, 2), (0.0, 0.0, 0.1), 1e-3, rotation, 2e-3),
     ):
-        _, slopes = problem.prior_rows(prior, state)
+        _, jacobian = problem.prior_rows(prior, state)
         for at, column in enumerate(np.eye(problem.size) * step):
             ends = [problem.prior_rows(prior, state.moved(it))[0] for it in (column, -column)]
             # In units of sigmas of a millimetre: rounding of 1e-16 m over steps of 1e-6.
-            np.testing.assert_allclose((ends[0] - ends[1]) / (2 * step), slopes[:, at], atol=1e-6)
+            np.testing.assert_allclose((ends[0] - ends[1]) / (2 * step), jacobian[:, at], atol=1e-6)
 
 
 def test_repeated_views_of_a_still_board_count_as_one():

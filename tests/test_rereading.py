@@ -15,7 +15,7 @@ from visioncal.cli.app import app
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert
 from visioncal.interchange.formats import (
-    Wishes,
+    ImportOptions,
     assemble,
     guess_foreign,
     load_in_doubt,
@@ -156,7 +156,7 @@ def late(tmp_path):
         rows = [{name: it[at].tolist() for name, it in keyed.items()} for at in range(len(joints))]
         (tmp_path / "log.json").write_text(json.dumps(rows))
         foreign = read_foreign(
-            tmp_path / "log.json", Wishes(mount="eye-in-hand", robot_model="ur5e")
+            tmp_path / "log.json", ImportOptions(mount="eye-in-hand", robot_model="ur5e")
         )
         return foreign, joints
 

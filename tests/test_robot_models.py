@@ -91,7 +91,7 @@ def slope(poses, size: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("robot", [*robots(), other(load_robot("ur5e")), other(of_urdf())])
-def test_jacobians_are_the_slopes_of_the_forward_kinematics(robot: Robot) -> None:
+def test_jacobians_are_the_jacobian_of_the_forward_kinematics(robot: Robot) -> None:
     q, count = some_joints(robot), robot.joint_count
     turning = np.where(robot.chain.prismatic[:, None], [1, 1, 0, 0], 1).ravel()
 

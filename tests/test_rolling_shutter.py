@@ -8,7 +8,7 @@ from cells import calibrated_sweep
 from swept_cells import HOW, cell_of, swept_session
 
 from visioncal.calibration.pipeline import align, calibrate
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages import clock
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import MOUNTS
@@ -36,7 +36,7 @@ def swept(seed: int, how: SweepOptions = HURRIED, **options) -> Sweep:
     return sweep(CellOptions(seed=seed, pixel_sigma_px=0.1, **options), how)
 
 
-def x_error(moved: Sweep, known: Known) -> np.ndarray:
+def x_error(moved: Sweep, known: RunState) -> np.ndarray:
     """(6,) right perturbation of the camera's edge, true to estimated."""
     return log(invert(next(iter(moved.cell.transforms.values()))) @ known.solved.state.edges[0])
 
@@ -72,13 +72,13 @@ def test_corners_move_with_the_readout_as_differences_say():
     assert 0.3 < shares.max() <= 0.5
     twists = np.random.default_rng(1).normal(size=(len(stack.views), 6))
     step_s = 1e-6
-    _, slopes = delayed_points(stack, shares, twists, np.array([READOUT_S]))
+    _, jacobian = delayed_points(stack, shares, twists, np.array([READOUT_S]))
     ahead, behind = (
         delayed_points(stack, shares, twists, np.array([READOUT_S + it]))[0]
         for it in (step_s, -step_s)
     )
     # Places of 0.3 m at rounding over the step.
-    np.testing.assert_allclose(slopes[:, :, 0], (ahead - behind) / (2 * step_s), atol=1e-8)
+    np.testing.assert_allclose(jacobian[:, :, 0], (ahead - behind) / (2 * step_s), atol=1e-8)
 
 
 def test_the_simulation_takes_every_row_at_its_own_time():
@@ -109,9 +109,9 @@ def test_the_readout_is_found_and_the_camera_is_where_it_is(seed, mount, monkeyp
     # Four sigma, of which none is so large that this were easy: a hundredth of the readout.
     assert abs(found.time_s - READOUT_S) < 4.0 * found.sigma_s
     assert found.sigma_s < 0.01 * READOUT_S
-    error, spread = x_error(moved, known), known.solved.covariance[:6, :6]
+    error, covariance = x_error(moved, known), known.solved.covariance[:6, :6]
     # Six degrees of freedom: one in ten thousand is beyond.
-    assert distance(error, spread) < 27.9
+    assert distance(error, covariance) < 27.9
     assert known.pixel_px == pytest.approx(0.1, rel=0.05)
     assert known.verdict.status == "good"
     with monkeypatch.context() as ignoring:
@@ -119,7 +119,7 @@ def test_the_readout_is_found_and_the_camera_is_where_it_is(seed, mount, monkeyp
         wrong = calibrated_sweep(moved)
     # Five sigma of what is possible.
     away = x_error(moved, wrong)[3:]
-    assert np.linalg.norm(away) > 5.0 * np.sqrt(np.trace(spread[3:, 3:]))
+    assert np.linalg.norm(away) > 5.0 * np.sqrt(np.trace(covariance[3:, 3:]))
 
 
 @pytest.mark.parametrize("seed", [3, 4])

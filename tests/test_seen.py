@@ -106,7 +106,7 @@ def test_what_moves_a_sight_agrees_with_central_differences(mount, parent):
             for sign in (1, -1)
         )
         slope = log(invert(placed(eye, behind)) @ placed(eye, ahead)) / 2e-4
-        np.testing.assert_allclose(here.by_flange[:, at], slope, atol=1e-6)
+        np.testing.assert_allclose(here.flange_jacobian[:, at], slope, atol=1e-6)
 
 
 @pytest.mark.parametrize("target", [BOARD, MARKER], ids=["board", "marker"])
@@ -190,7 +190,7 @@ def test_images_of_one_stop_share_the_robots_error(cell):
     (sight,) = sights_of(made, parent, place_of(made, parent, rng), rng, count=1)
     eye = Eye.of(calibration)
     (place, *_) = places(eye, sight, see(eye, sight.seen, BOARD, "image", 0.1), parent)
-    robot = place.by_flange @ eye.flange_noise @ place.by_flange.T
+    robot = place.flange_jacobian @ eye.flange_noise @ place.flange_jacobian.T
     same = [replace(sight, label=f"image {at}") for at in range(4)]
     found = place_seen(calibration, same, BOARD, parent, sigma_px=0.1)
     # The pixels' noise is averaged, that of the one stop is not.

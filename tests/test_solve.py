@@ -34,12 +34,12 @@ def answered(given, **changes):
 def test_residuals_of_views_left_out_are_those_of_fits_without_them(given):
     problem, fit = answered(given, views=12, seed=3)
     predicted = left_out_residuals(problem, fit.state, fit.noise)
-    spread = problem.total_covariance(problem.linear(fit.state), fit.noise)
+    covariance = problem.total_covariance(problem.linear(fit.state), fit.noise)
     for view in range(12):
         others = np.arange(12) != view
         without, _ = solve_problem(problem.subset(others), fit.state, fit.noise)
         refitted = problem.linear(without).residuals[view]
-        sigma = np.sqrt(np.diagonal(spread[view]))
+        sigma = np.sqrt(np.diagonal(covariance[view]))
         # To first order: what is left is the curvature over a step of the size of the noise.
         np.testing.assert_allclose(predicted[view], refitted, atol=0.01 * sigma.max())
 
@@ -60,7 +60,7 @@ def test_a_stop_seen_twice_half_as_well_is_one_seen_once(mount):
     problem, fit = answered(False, views=8, seed=2, mount=mount)
     arm = 1e-3 * np.random.default_rng(0).standard_normal((8, 6, 2))
     known = Knowledge(np.eye(2), np.zeros(2))
-    errors = Effect.free("arm", known, by_flange={ROBOT: arm})
+    errors = Effect.free("arm", known, flange_jacobian={ROBOT: arm})
     problem = problem.with_effects([*problem.effects, errors])
     state = replace(fit.state, values=problem.start_values)
     twice = doubled(problem)
@@ -95,14 +95,14 @@ def test_views_of_a_stop_move_with_the_lens_by_their_information():
 
 
 @LENS
-def test_the_likelihood_slopes_as_its_differences_say(given):
+def test_the_likelihood_jacobian_as_its_differences_say(given):
     problem, fit = answered(given, views=10, seed=4)
     state = fit.state.moved(np.full(problem.size, 1e-5))
     found = robot_likelihood(problem, state, fit.noise)
-    errors, slopes = found.reduced.errors, found.reduced.slopes[:, :, found.moving]
+    errors, jacobian = found.reduced.errors, found.reduced.jacobian[:, :, found.moving]
 
     def at(logs):
-        return _likelihood(errors, slopes, found.components, found.known, logs, RATIO_PRIOR)
+        return _likelihood(errors, jacobian, found.components, found.known, logs, RATIO_PRIOR)
 
     logs, step = np.log(2.0 * fit.noise.robots[0]), 1e-4
     for level in range(2):

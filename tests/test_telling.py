@@ -17,7 +17,7 @@ from visioncal.calibration.stages.arm_identifiability import tell
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert, log
 from visioncal.estimation.indices import Indices
-from visioncal.estimation.linalg import covariance
+from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.parameters import free_parameters, parameter_moves
 from visioncal.estimation.parts import Effect
 from visioncal.estimation.problem import Problem
@@ -25,7 +25,7 @@ from visioncal.estimation.solve import fisher_information
 from visioncal.estimation.variance import Knowledge
 from visioncal.estimation.workspace import postures
 from visioncal.robot import CONVENTIONS, Robot, convert_table, load_robot, robot_names, table_of
-from visioncal.robot.slopes import number_slopes, table_moves
+from visioncal.robot.slopes import number_jacobian, table_moves
 from visioncal.robot.tables import table_document, table_from_document
 from visioncal.simulation import simulate
 
@@ -95,7 +95,7 @@ def test_the_flange_moves_with_a_table_as_its_derivatives_say(name, convention):
     table = convert_table(table_from_document(robot.document), convention)
     q = postures(robot)[:2]
     middle = robot.base_from_flange(q)
-    numbers, _ = number_slopes(table, q)
+    numbers, _ = number_jacobian(table, q)
     for place, column in enumerate(("theta_rad", "d_m", "a_m", "alpha_rad", "beta_rad")):
         values = getattr(table, column)
         for row in range(len(values)):
@@ -148,9 +148,9 @@ def test_a_second_board_adds_six_values(mount):
     place = Effect.free("board", Knowledge(np.zeros((6, 6)), np.zeros(6)), seen)
     problem = arm.problem.with_effects([place, *arm.problem.effects])
     state = replace(arm.state, values=problem.start_values)
-    spread = covariance(fisher_information(problem, state, arm.noise))
+    covariance = covariance_from(fisher_information(problem, state, arm.noise))
     further = {"frames": np.arange(18), "columns": 6 + arm.columns}
-    telling = tell(replace(arm, problem=problem, state=state, covariance=spread, **further))
+    telling = tell(replace(arm, problem=problem, state=state, covariance=covariance, **further))
     told = telling.told
     assert (told.columns, told.identifiable, told.told) == (54, 36, 36)
     # Half of the stops have a board of their own to place: they tell less of the arm.
@@ -262,11 +262,11 @@ def test_the_worth_of_a_stop_is_that_of_a_fit_without_it(mount):
     telling = tell(arm)
     anywhere = postures(arm.model.robot)
     flange = arm.model.base_from_flange(anywhere)
-    poses, slopes = arm.pair.slopes(flange, arm.basis(anywhere))
-    place = arm.pair.place_slopes(poses, slopes, arm.at)
+    poses, jacobian = arm.pair.jacobian(flange, arm.basis(anywhere))
+    place = arm.pair.place_jacobian(poses, jacobian, arm.at)
 
     def variance(problem: Problem) -> float:
-        fitted = covariance(fisher_information(problem, arm.state, arm.noise))
+        fitted = covariance_from(fisher_information(problem, arm.state, arm.noise))
         return float(np.mean(np.einsum("mij,jk,mik->m", place, fitted, place)))
 
     whole = variance(arm.problem)

@@ -16,7 +16,7 @@ from visioncal import Session
 from visioncal.calibration.pipeline import calibrate
 from visioncal.calibration.stages.thermal_inputs import inputs_of
 from visioncal.calibration.verification import verify
-from visioncal.calibration.verification.calibration_prior import Footing
+from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import invert, log
 from visioncal.interchange.exports import document
@@ -68,7 +68,7 @@ def test_a_hundred_minutes_predict_five_hours(learnt, told, limit):
     assert np.median(found.true) > 2e-4
     assert found.share < limit
     # Root mean squares of 60 places that share 18 or 24 parameters.
-    assert 0.4 < found.surprise < 1.8
+    assert 0.4 < found.mahalanobis_sq < 1.8
 
 
 def test_coefficients_are_within_their_sigmas(learnt):
@@ -101,8 +101,8 @@ def test_what_is_open_about_the_drift_counts_in_the_edges_covariance(learnt):
     budget = known.stages["uncertainty"]["budget_mm"]
     assert 0.0 < budget["temperature"] < budget["total"]
     # A check has no use for what the drift's parameters are: the edges' covariance has them.
-    footing = Footing.of(known)
-    assert footing.covariance[:12, :12] == pytest.approx(known.joint_covariance, rel=1e-9)
+    prior_calibration = CalibrationPrior.of(known)
+    assert prior_calibration.covariance[:12, :12] == pytest.approx(known.joint_covariance, rel=1e-9)
 
 
 def test_a_check_says_that_it_takes_the_arm_for_cold(learnt):
@@ -167,23 +167,23 @@ def test_links_follow_the_differential_equation(kind):
 
 
 @pytest.mark.parametrize("kind", ["temperatures", "currents"])
-def test_slopes_are_those_of_small_changes(kind):
+def test_jacobian_are_those_of_small_changes(kind):
     heating, heat = Heating(kind, np.linspace(300.0, 3000.0, 6), np.linspace(1, 2, 6)), inputs(kind)
     at_s, step = np.linspace(100.0, 7000.0, 9), 1e-5
-    slopes = heating.slopes(heat, at_s)
+    jacobian = heating.jacobian(heat, at_s)
     for which in range(heating.size // 6):
         change = np.zeros(heating.size)
         change[6 * which : 6 * which + 6] = step
         ahead, behind = (heating.changed(it).links_c(heat, at_s) for it in (change, -change))
         # Central differences of steps of 1e-5 are good to about 1e-9 of the rise.
-        assert slopes[:, :, which] == pytest.approx((ahead - behind) / (2 * step), abs=1e-6)
+        assert jacobian[:, :, which] == pytest.approx((ahead - behind) / (2 * step), abs=1e-6)
 
 
 def test_the_flange_moves_with_the_parameters_as_it_is_told():
     heat, at_s, step = inputs(), np.linspace(100.0, 7000.0, 7), 1e-4
     before = model()
     links = before.heating.links_c(heat, at_s)
-    basis = before.basis(Q, links, before.heating.slopes(heat, at_s))
+    basis = before.basis(Q, links, before.heating.jacobian(heat, at_s))
     scales = np.repeat([1e-5, 1e-6, 1.0, 1.0], 6)
     for at in range(24):
         poses = []
@@ -216,7 +216,7 @@ def test_the_compensator_follows_what_the_fit_computes(kind):
         following.base_from_flange(Q), abs=2e-7
     )
     # What is open about time constants and gains is followed along.
-    heated = np.tile(drifting.heating.slopes(heat, heat.stamps_s[-1:]), (len(Q), 1, 1))
+    heated = np.tile(drifting.heating.jacobian(heat, heat.stamps_s[-1:]), (len(Q), 1, 1))
     sigma_m = drifting.sigma_m(Q, links, heated)
     assert following.sigma_m(Q) == pytest.approx(sigma_m, rel=1e-9)
     assert (sigma_m > drifting.sigma_m(Q, links)).all()

@@ -7,7 +7,7 @@ import pytest
 from cells import known_of
 
 from visioncal.calibration.pipeline.result import result_of
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.pipeline.view_evidence import view_evidence
 from visioncal.simulation import Cell, CellOptions, fine_camera, simulate
@@ -31,7 +31,7 @@ def cell() -> Cell:
 
 
 @pytest.fixture(scope="module")
-def known(cell: Cell) -> Known:
+def known(cell: Cell) -> RunState:
     """A session with a bad arm, four of whose views are held back."""
     known = known_of(cell)
     views = tuple(

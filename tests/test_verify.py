@@ -20,7 +20,7 @@ from visioncal.calibration.verification import (
     sentences,
     to_document,
 )
-from visioncal.calibration.verification.calibration_prior import Footing
+from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.calibration.verification.check import check
 from visioncal.calibration.verification.messages import _signed_axis
 from visioncal.calibration.verification.prediction import known_before, see_again, seen_by
@@ -39,8 +39,12 @@ MOUNTS = ("eye-in-hand", "eye-to-hand")
 
 
 def checked(place, rng, change=None, **options):
-    footing = Footing.of(place.calibration)
-    return check(seen_by(known_again(place.cell, rng, change), footing), footing, **options)
+    prior_calibration = CalibrationPrior.of(place.calibration)
+    return check(
+        seen_by(known_again(place.cell, rng, change), prior_calibration),
+        prior_calibration,
+        **options,
+    )
 
 
 def names(found):
@@ -73,10 +77,10 @@ def test_a_bumped_camera_is_told_with_its_size_and_direction(place):
     assert names(found) == ["camera"]
     assert not found.passed
     assert found.explained
-    values, spread = found.named[0].explained.values, found.named[0].explained.covariance
+    values, covariance = found.named[0].explained.values, found.named[0].explained.covariance
     error = values - bump
     # Chi-square of six exceeds 22.5 in one case of a thousand.
-    assert error @ np.linalg.solve(spread, error) < 22.5
+    assert error @ np.linalg.solve(covariance, error) < 22.5
     told = to_document(found, ())["changes"][0]
     assert told["moved_mm"] == pytest.approx(1.0, abs=4 * told["sigma_mm"])
     assert "The camera moved by" in sentences(found)[0]
@@ -131,11 +135,13 @@ def test_two_changes_more_noise_and_a_wrong_view_are_told(place):
     assert names(found) == ["camera_and_board"]
     assert set(to_document(found, ())["changes"][0]) >= {"camera", "board"}
     assert names(checked(place, rng, Change(noise_factor=8.0))) == ["robot_noise"]
-    footing, cell = Footing.of(place.calibration), again(place.cell, rng)
+    prior_calibration, cell = CalibrationPrior.of(place.calibration), again(place.cell, rng)
     # The third image was taken at another pose than is written beside it.
     wrong = cell.joints.copy()
     wrong[2] = wrong[2] + 0.02
-    found = check(seen_by(known_of(replace(cell, joints=wrong)), footing), footing)
+    found = check(
+        seen_by(known_of(replace(cell, joints=wrong)), prior_calibration), prior_calibration
+    )
     assert names(found) == ["view 2"]
     assert "View 2 alone contradicts" in sentences(found)[0]
 
@@ -175,14 +181,14 @@ def test_an_arm_off_by_its_posture_raises_no_alarm_near_the_calibration():
     options = CellOptions(dh_sigma_m=5e-4, dh_sigma_rad=1e-3, seed=3)
     cell = simulate(replace(options, views=FITTED + 20))
     calibration = result_of(calibrated(part(cell, range(FITTED)), joints=False))
-    footing = Footing.of(calibration)
-    assert footing.arm == "poses"
+    prior_calibration = CalibrationPrior.of(calibration)
+    assert prior_calibration.arm == "poses"
     # What the fit has in common with errors that only count in it leaves a covariance one.
-    assert np.linalg.eigvalsh(footing.covariance)[0] > -1e-12
+    assert np.linalg.eigvalsh(prior_calibration.covariance)[0] > -1e-12
     rng = np.random.default_rng(8)
     for _ in range(4):
         known = known_of(again(cell, rng), joints=False)
-        assert check(seen_by(known, footing), footing).passed
+        assert check(seen_by(known, prior_calibration), prior_calibration).passed
 
 
 @pytest.mark.parametrize("weighed", [True, False])
@@ -194,36 +200,40 @@ def test_a_bent_arm_under_its_loads_is_no_change(weighed):
     robot = load_robot("ur10e") if weighed else replace(load_robot("ur10e"), masses=None)
     lot = result_of(calibrated(part(cell, range(FITTED)), robot=robot))
     assert lot.stages["kinematics"]["level"] == "elastic"
-    rng, footing = np.random.default_rng(4), Footing.of(lot)
-    found = check(seen_by(known_of(again(cell, rng), robot=robot), footing), footing)
+    rng, prior_calibration = np.random.default_rng(4), CalibrationPrior.of(lot)
+    found = check(
+        seen_by(known_of(again(cell, rng), robot=robot), prior_calibration), prior_calibration
+    )
     assert found.passed, found.misfit
     bumped = again(cell, rng, Change(camera=knock(rng, 2.0, 0.0)))
-    assert not check(seen_by(known_of(bumped, robot=robot), footing), footing).passed
+    assert not check(
+        seen_by(known_of(bumped, robot=robot), prior_calibration), prior_calibration
+    ).passed
 
 
 def test_one_of_two_boards_that_moved_is_named():
     cell = simulate(replace(ANYHOW, second=Second(turn_rad=0.6, tilt_rad=0.2), views=40, seed=2))
     calibration = result_of(calibrated(cell))
-    footing = Footing.of(calibration)
-    assert len(footing.boards) == 2
+    prior_calibration = CalibrationPrior.of(calibration)
+    assert len(prior_calibration.boards) == 2
     known = known_of(cell)
     shown = cell.shown.boards
     pushed = np.array([0.0, 0.0, 0.0, 0.0, 3e-3, 0.0])
-    assert check(seen_by(known, footing), footing).passed
+    assert check(seen_by(known, prior_calibration), prior_calibration).passed
     assert shown.max() == 1
-    moved = seen_by(known, footing)
+    moved = seen_by(known, prior_calibration)
     # Some stops show both.
     assert len(moved.problem) > moved.stops == 40
     mine = np.array([shown[views[0]] for views in moved.views]) == 1
     seen = moved.problem.observations
     measured = np.where(mine[:, None, None], seen.measured @ exp(pushed), seen.measured)
     pushed = replace(moved.problem, observations=replace(seen, measured=measured))
-    found = check(replace(moved, problem=pushed), footing)
-    assert names(found) == [f"board {tuple(footing.targets)[1]}"]
-    axes = footing.state.edges[1 + footing.boards.index(1), :3, :3]
+    found = check(replace(moved, problem=pushed), prior_calibration)
+    assert names(found) == [f"board {tuple(prior_calibration.targets)[1]}"]
+    axes = prior_calibration.state.edges[1 + prior_calibration.boards.index(1), :3, :3]
     assert sentences(found)[0].endswith(f"along the base's {_signed_axis(axes[:, 1])}.")
     with pytest.raises(DataError, match="several boards") as refused:
-        check(moved, footing, board_placed_anew=True)
+        check(moved, prior_calibration, board_placed_anew=True)
     assert "the one that moved is named" in refused.value.next_step
 
 
@@ -249,31 +259,34 @@ def test_a_calibration_holds_by_its_own_session_of_which_it_left_views_out(tmp_p
 def test_boards_are_those_of_the_same_name_or_print_however_many_a_session_has(tmp_path):
     cell = simulate(CellOptions(views=24, second=Second(), seed=3))
     two = Session.load(write_session(cell, tmp_path / "two", images=False))
-    footing = Footing.of(calibrate(two))
+    prior_calibration = CalibrationPrior.of(calibrate(two))
     named = dict(reversed(two.targets.items()))
     turned = replace(two, targets=named)
-    assert check(see_again(turned, footing), footing).passed
+    assert check(see_again(turned, prior_calibration), prior_calibration).passed
     for name, board in two.targets.items():
         shown = tuple(it for it in two.views if it.text["target"] == name)
         alone = {key: it for key, it in two.document.items() if key != "targets"}
         one = replace(two, document=alone, target=board, targets={}, views=shown)
-        found = check(see_again(one, footing), footing)
+        found = check(see_again(one, prior_calibration), prior_calibration)
         assert found.passed
         assert found.seen.stops == len(shown)
         with pytest.raises(DataError, match="which of the targets"):
-            see_again(replace(one, target=None), footing)
+            see_again(replace(one, target=None), prior_calibration)
         with pytest.raises(DataError, match="columns = 11"):
-            see_again(replace(turned, targets={**named, name: replace(board, columns=11)}), footing)
+            see_again(
+                replace(turned, targets={**named, name: replace(board, columns=11)}),
+                prior_calibration,
+            )
         with pytest.raises(DataError, match="is none of those") as refused:
-            see_again(two, Footing.of(calibrate(one)))
+            see_again(two, CalibrationPrior.of(calibrate(one)))
         assert "that target alone" in refused.value.next_step
         with pytest.raises(DataError, match="is none of those"):
-            see_again(replace(one, target=replace(board, columns=11)), footing)
+            see_again(replace(one, target=replace(board, columns=11)), prior_calibration)
 
 
 def test_other_cells_are_refused_by_what_differs():
     place = usual("eye-in-hand")
-    footing = Footing.of(place.calibration)
+    prior_calibration = CalibrationPrior.of(place.calibration)
     session = session_of(place.cell)
     other = replace(session.target, columns=11)
     for wrong, words in (
@@ -282,20 +295,20 @@ def test_other_cells_are_refused_by_what_differs():
         (replace(session, robot_document=load_robot("ur10e").document), "another robot"),
     ):
         with pytest.raises(DataError, match=words):
-            known_before(wrong, footing)
+            known_before(wrong, prior_calibration)
     known = known_again(place.cell, np.random.default_rng(9))
     with pytest.raises(DataError, match="no joint angles"):
-        seen_by(known.with_robot("", replace(known.reported, matched=None)), footing)
+        seen_by(known.with_robot("", replace(known.reported, matched=None)), prior_calibration)
     look = known.cameras["cam"]
     with pytest.raises(DataError, match="640 x 480"):
-        seen_by(known.with_camera("cam", replace(look, resolution=(640, 480))), footing)
+        seen_by(known.with_camera("cam", replace(look, resolution=(640, 480))), prior_calibration)
     older = dict(place.calibration.stages)
     del older["joint_fit"]
     with pytest.raises(DataError, match="an older version"):
-        Footing.of(replace(place.calibration, stages=older))
+        CalibrationPrior.of(replace(place.calibration, stages=older))
     spoilt = {**place.calibration.stages, "joint_fit": {"boards": [""], "covariance": [[1.0]]}}
     with pytest.raises(DataError, match="joint_fit cannot be read"):
-        Footing.of(replace(place.calibration, stages=spoilt))
+        CalibrationPrior.of(replace(place.calibration, stages=spoilt))
 
 
 def test_triggers_fire_by_their_limits_and_say_what_is_not_known(tmp_path):

@@ -33,7 +33,7 @@ def test_weight_is_among_the_functions(bare):
     values = functions.bends(bare, q).reshape(-1, functions.size)
     shares, *_ = np.linalg.lstsq(values, torques.ravel(), rcond=None)
     assert values @ shares == pytest.approx(torques.ravel(), abs=1e-6)
-    again = np.einsum("mjk,jk->mj", bare.weight_slopes(q), functions.moments(shares))
+    again = np.einsum("mjk,jk->mj", bare.weight_jacobian(q), functions.moments(shares))
     assert again == pytest.approx(torques, abs=1e-6)
 
 

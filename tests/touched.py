@@ -110,12 +110,12 @@ def bound(made: Made) -> np.ndarray:
         away = rotation.inv().apply(point - place - made.truly.apply(slack[3:6])) - tip
         return tool.inv().apply(away)
 
-    slopes = _slopes(lambda it: seen(it, np.zeros(9)), size)
-    slacks = _slopes(lambda it: seen(np.zeros(size), it), 9)
+    jacobian = _jacobian(lambda it: seen(it, np.zeros(9)), size)
+    slacks = _jacobian(lambda it: seen(np.zeros(size), it), 9)
     rows = {"point": [0, 1, 2], "z": [0, 1], "xz": [1]}
     information = np.zeros((size, size))
     for at, kind in enumerate(kinds):
-        slope, by_slack = slopes[at][rows[kind]], slacks[at][rows[kind]] * sigmas
+        slope, by_slack = jacobian[at][rows[kind]], slacks[at][rows[kind]] * sigmas
         information += slope.T @ np.linalg.solve(by_slack @ by_slack.T, slope)
     free = np.arange(0 if job.axes else 3, size)
     least = np.zeros((size, size))
@@ -123,7 +123,7 @@ def bound(made: Made) -> np.ndarray:
     return least[:6, :6]
 
 
-def _slopes(function: Callable[[np.ndarray], np.ndarray], size: int) -> np.ndarray:
+def _jacobian(function: Callable[[np.ndarray], np.ndarray], size: int) -> np.ndarray:
     # Small enough for central differences to be exact to 1e-9, large enough for rounding.
     steps = 1e-5 * np.eye(size)
     return np.stack([(function(it) - function(-it)) / 2e-5 for it in steps], axis=-1)

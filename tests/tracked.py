@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import FloatArray
@@ -16,23 +16,23 @@ from visioncal.simulation.arms import forward, link_frames
 from visioncal.simulation.tracked import Shop
 
 
-def known_of(session: Session, **changes) -> Known:
+def known_of(session: Session, **changes) -> RunState:
     """What is known at the end of the way."""
-    known = replace(Known(session), **changes)
+    known = replace(RunState(session), **changes)
     for stage in STAGES:
         known = stage.run(known)
     return known
 
 
-def errors_of(shop: Shop, known: Known) -> FloatArray:
+def errors_of(shop: Shop, known: RunState) -> FloatArray:
     """(12,) right perturbations of both edges, true to estimated (rotation, translation)."""
     true = np.array([shop.base_from_instrument, shop.flange_from_probe])
     return log(invert(true) @ known.solved.state.edges[:2]).ravel()
 
 
-def solved_of(session: Session, **changes) -> Known:
+def solved_of(session: Session, **changes) -> RunState:
     """What is known once both edges are, with the nominal arm unless a `level` is asked for."""
-    known = replace(Known(session), **({"level": "hand-eye"} | changes))
+    known = replace(RunState(session), **({"level": "hand-eye"} | changes))
     for stage in STAGES:
         known = stage.run(known)
     return known
@@ -48,20 +48,20 @@ def information(shop: Shop, arm_columns: bool = False) -> FloatArray:
     options = shop.options
     size = 12 + 3 * (len(options.points) - 1) + 36 * arm_columns
     steps = 1e-5 * np.eye(size)
-    slopes = np.stack([(reads(shop, it) - reads(shop, -it)) / 2e-5 for it in steps], axis=-1)
+    jacobian = np.stack([(reads(shop, it) - reads(shop, -it)) / 2e-5 for it in steps], axis=-1)
     slack = 1e-5 * np.eye(6)
     nothing = np.zeros(size)
-    by_flange = np.stack(
+    flange_jacobian = np.stack(
         [(reads(shop, nothing, it) - reads(shop, nothing, -it)) / 2e-5 for it in slack], axis=-1
     )
-    sigmas = np.full(slopes.shape[1], options.sigma_m)
+    sigmas = np.full(jacobian.shape[1], options.sigma_m)
     if options.poses:
         sigmas[:3] = options.sigma_rad
     repeats = np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3) ** 2
     total = np.zeros((size, size))
-    for slope, moved in zip(slopes, by_flange, strict=True):
-        spread = np.diag(sigmas**2) + (moved * repeats) @ moved.T
-        total += slope.T @ np.linalg.solve(spread, slope)
+    for slope, moved in zip(jacobian, flange_jacobian, strict=True):
+        covariance = np.diag(sigmas**2) + (moved * repeats) @ moved.T
+        total += slope.T @ np.linalg.solve(covariance, slope)
     return total
 
 

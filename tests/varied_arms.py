@@ -54,9 +54,9 @@ class Arm:
             miss = np.concatenate([wanted[:, :3, 3] - tips[:, :3, 3], turn.as_rotvec()], axis=1)
             axes = frames[..., :3, 2]
             arms = tips[:, None, :3, 3] - frames[..., :3, 3]
-            slopes = np.concatenate([np.cross(axes, arms), axes], axis=2).swapaxes(1, 2)
-            damped = slopes @ slopes.swapaxes(1, 2) + 1e-6 * np.eye(6)
-            step = (slopes.swapaxes(1, 2) @ np.linalg.solve(damped, miss[..., None]))[..., 0]
+            jacobian = np.concatenate([np.cross(axes, arms), axes], axis=2).swapaxes(1, 2)
+            damped = jacobian @ jacobian.swapaxes(1, 2) + 1e-6 * np.eye(6)
+            step = (jacobian.swapaxes(1, 2) @ np.linalg.solve(damped, miss[..., None]))[..., 0]
             q += np.clip(step, -0.3, 0.3)
             if np.abs(miss).max() < SETTLED:
                 break

@@ -541,8 +541,8 @@ def _look(rng: np.random.Generator, it: Cell, board: Print) -> np.ndarray | None
     lens = it.lens
     size = np.array(lens.resolution)
     for attempt in range(60):
-        spread = 0.35 if board.kind != "charuco" else 0.25
-        px = 0.5 * (size - 1) + rng.uniform(-1, 1, 2) * spread * size * (1 - attempt / 80)
+        covariance = 0.35 if board.kind != "charuco" else 0.25
+        px = 0.5 * (size - 1) + rng.uniform(-1, 1, 2) * covariance * size * (1 - attempt / 80)
         ray = np.append(lens.plane_of(px[None])[0], 1.0)
         ray /= np.linalg.norm(ray)
         scale = rng.uniform(0.85, 1.25) * (1 + attempt / 60)

@@ -72,7 +72,7 @@ class Drift:
         return float(np.sqrt(np.sum(self.left**2) / np.sum(self.true**2)))
 
     @property
-    def surprise(self) -> float:
+    def mahalanobis_sq(self) -> float:
         """What is left over what was expected; of root mean squares."""
         return float(np.sqrt(np.mean((self.left / self.sigma) ** 2)))
 
@@ -92,9 +92,9 @@ def drift_of(found: Warmed) -> Drift:
         for it in (really, np.full_like(really, heat.ambient_c))
     )
     warm, before = (model.base_from_flange(q, it)[:, :3, 3] for it in (links, cold))
-    slopes = model.heating.slopes(found.whole, at_s)
+    jacobian = model.heating.jacobian(found.whole, at_s)
     return Drift(
         np.linalg.norm(hot - still, axis=1),
         np.linalg.norm(warm - before - (hot - still), axis=1),
-        model.sigma_m(q, links, slopes),
+        model.sigma_m(q, links, jacobian),
     )

@@ -52,7 +52,7 @@ class Outcome:
     error_s: float
     sigma_s: float
     away_mm: float
-    surprise: float
+    mahalanobis_sq: float
 
 
 def of_one_sweep(task: tuple[World, int]) -> Outcome | None:
@@ -89,7 +89,7 @@ def row(world: World, found: list[Outcome | None]) -> str:
         f"{np.median(sigmas_ms):.3f}",
         f"{over:.2f}",
         f"{np.median([it.away_mm for it in kept]):.3f}",
-        f"{np.mean([it.surprise for it in kept]) / 6:.2f}",
+        f"{np.mean([it.mahalanobis_sq for it in kept]) / 6:.2f}",
         str(len(found) - len(kept)),
     )
     return "| " + " | ".join(cells) + " |"

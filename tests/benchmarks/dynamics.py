@@ -91,9 +91,9 @@ def world(job: tuple[int, Exercise]) -> World:
     )
 
 
-def chi2(away: FloatArray, spread: FloatArray) -> float:
+def chi2(away: FloatArray, covariance: FloatArray) -> float:
     """Squared errors in units of their covariance."""
-    return float(away @ np.linalg.solve(spread, away))
+    return float(away @ np.linalg.solve(covariance, away))
 
 
 def humps_chi2(found: Identification, built) -> float:

@@ -50,14 +50,14 @@ FEATURES = {
 class Trial:
     """One fit: squared errors (2,) of rotation and offset, those of the bound, and the rest.
 
-    `surprise` is the squared error over the covariance, and `inside` whether the 95 % region holds
-    the true frame: of chi-square, or of F where the noise's level is estimated.
+    `mahalanobis_sq` is the squared error over the covariance, and `inside` whether the 95 % region
+    holds the true frame: of chi-square, or of F where the noise's level is estimated.
     """
 
     squares: FloatArray
     bounds: FloatArray
     plain: FloatArray
-    surprise: float
+    mahalanobis_sq: float
     inside: bool
     accused: int
 
@@ -88,14 +88,14 @@ def trial(seed: int, count: int, known: bool) -> Trial:
     )
     found = fit_points(pairs)
     error = away(found.base_from_fixture, frame)
-    surprise = float(error @ np.linalg.solve(found.covariance, error))
+    mahalanobis_sq = float(error @ np.linalg.solve(found.covariance, error))
     limit = chi2.ppf(0.95, 6) if known else f_limit(found.agreement.fit.freedom)
     return Trial(
         parts_of(error**2),
         parts_of(np.diag(point_bound(frame, nominal, spreads))),
         parts_of(away(unweighted(pairs), frame) ** 2),
-        surprise,
-        bool(surprise < limit),
+        mahalanobis_sq,
+        bool(mahalanobis_sq < limit),
         int(np.sum(~found.agreement.agrees)),
     )
 
@@ -108,13 +108,13 @@ def feature_trial(seed: int, kinds: Sequence[str]) -> Trial:
         replace(exact, points=exact.points + EVEN_M * rng.normal(size=(len(exact), 3)))
     )
     error = away(found.base_from_fixture, frame)
-    surprise = float(error @ np.linalg.solve(found.agreement.fit.covariance, error))
+    mahalanobis_sq = float(error @ np.linalg.solve(found.agreement.fit.covariance, error))
     return Trial(
         parts_of(error**2),
         parts_of(np.diag(feature_bound(frame, exact, EVEN_M))),
         np.full(2, np.nan),
-        surprise,
-        bool(surprise < f_limit(found.agreement.fit.freedom)),
+        mahalanobis_sq,
+        bool(mahalanobis_sq < f_limit(found.agreement.fit.freedom)),
         int(np.sum(~found.agreement.agrees)),
     )
 
@@ -124,16 +124,16 @@ def accuracy_row(name: str, trials: Sequence[Trial], expected: str) -> str:
     share = np.sqrt(np.mean([it.squares for it in trials], axis=0) / bounds)
     plain = np.sqrt(np.mean([it.plain for it in trials], axis=0) / bounds)
     beside = "-" if np.isnan(plain[0]) else f"{plain[0]:.2f}, {plain[1]:.2f}"
-    surprise = np.mean([it.surprise for it in trials])
+    mahalanobis_sq = np.mean([it.mahalanobis_sq for it in trials])
     alarms = sum(it.accused > 0 for it in trials)
     inside = 100 * np.mean([it.inside for it in trials])
     return (
-        f"| {name} | {share[0]:.2f}, {share[1]:.2f} | {beside} | {surprise:.2f} ({expected}) | "
-        f"{inside:.1f} % | {alarms} in {len(trials)} |"
+        f"| {name} | {share[0]:.2f}, {share[1]:.2f} | {beside} "
+        f"| {mahalanobis_sq:.2f} ({expected}) | {inside:.1f} % | {alarms} in {len(trials)} |"
     )
 
 
-def expected_surprise(freedom: int) -> str:
+def expected_mahalanobis_sq(freedom: int) -> str:
     """Mean of six times F(6, freedom), where it has one."""
     # Under five degrees it has no variance, and no sample's mean comes near it.
     return f"{6 * freedom / (freedom - 2):.2f}" if freedom > 4 else "without a variance"
@@ -201,13 +201,15 @@ def accuracy() -> list[str]:
         known = [trial(seed, count, known=True) for seed in range(SEEDS)]
         rows.append(accuracy_row(f"{count} points, uneven noise, known", known, "6, or less"))
         unknown = [trial(seed, count, known=False) for seed in range(SEEDS)]
-        expected = expected_surprise(3 * count - 6)
+        expected = expected_mahalanobis_sq(3 * count - 6)
         rows.append(accuracy_row(f"{count} points, even noise, unknown", unknown, expected))
     for name, kinds in FEATURES.items():
         touched = [feature_trial(seed, kinds) for seed in range(SEEDS)]
         freedom = sum({"origin": 3, "x": 2, "xy": 1}[it] for it in kinds) - 6
         rows.append(
-            accuracy_row(f"origin, x, xy: {name}, unknown", touched, expected_surprise(freedom))
+            accuracy_row(
+                f"origin, x, xy: {name}, unknown", touched, expected_mahalanobis_sq(freedom)
+            )
         )
     return rows
 

@@ -112,8 +112,8 @@ def squared(error: FloatArray) -> list[float]:
     return [float(error[:3] @ error[:3]), float(error[3:6] @ error[3:6])]
 
 
-def surprise(error: FloatArray, spread: FloatArray) -> float:
-    return float(error @ np.linalg.solve(spread, error)) / len(error)
+def mahalanobis_sq(error: FloatArray, covariance: FloatArray) -> float:
+    return float(error @ np.linalg.solve(covariance, error)) / len(error)
 
 
 def against_the_bound(task: tuple[World, int]) -> list[float] | None:
@@ -129,7 +129,7 @@ def against_the_bound(task: tuple[World, int]) -> list[float] | None:
         *squared(error),
         float(np.trace(bound[:3, :3])),
         float(np.trace(bound[3:6, 3:6])),
-        surprise(error, known.solved.covariance[:12, :12]),
+        mahalanobis_sq(error, known.solved.covariance[:12, :12]),
         float(len(known.used) < row.options.views),
         *np.square(opencv_errors(cell)).ravel(),
     ]
@@ -175,7 +175,7 @@ def with_wrong_views(task: tuple[World, int, int]) -> list[float] | None:
         float(np.trace(bound[3:6, 3:6])),
         float(out == set(cell.wrong_views)),
         float(bool(set(cell.wrong_views) - out)),
-        surprise(error, known.solved.covariance[:12, :12]),
+        mahalanobis_sq(error, known.solved.covariance[:12, :12]),
     ]
 
 
@@ -210,9 +210,9 @@ def with_a_wrong_arm(task: tuple[CellOptions, bool, int]) -> list[float] | None:
         known = calibrated(cell, joints=joints)
     except VisioncalError:
         return None
-    error, spread = error_of(cell, known), known.solved.covariance[:12, :12]
+    error, covariance = error_of(cell, known), known.solved.covariance[:12, :12]
     flagged = any("the arm" in it.lower() for it in known.verdict.reasons)
-    return [*squared(error), surprise(error, spread), float(flagged)]
+    return [*squared(error), mahalanobis_sq(error, covariance), float(flagged)]
 
 
 def arm_table(pool, seeds: int) -> str:
@@ -317,14 +317,14 @@ def healthy(seed: int) -> float:
 
 def real_folds(path: Path, repeats: int) -> tuple[float, float]:
     """Held-out position [mm] and rotation [deg] of the board, rms over repeated 5-fold."""
-    from visioncal.calibration.pipeline.run_state import Known
+    from visioncal.calibration.pipeline.run_state import RunState
     from visioncal.calibration.pipeline.solving import solve
     from visioncal.calibration.pipeline.steps import STAGES
     from visioncal.calibration.stages.cell import read_cell
     from visioncal.estimation.parts import State
 
     session = Session.load(path)
-    seen = Known(session)
+    seen = RunState(session)
     for stage in STAGES:
         if stage.name in ("robot", "detect", "intrinsics", "pnp"):
             seen = stage.run(seen)

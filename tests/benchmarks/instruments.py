@@ -21,7 +21,7 @@ from tracked import (
     solved_of,
 )
 
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.parts import State
@@ -55,7 +55,7 @@ def prose(text: str) -> str:
     return textwrap.fill(" ".join(text.split()), 100, break_on_hyphens=False)
 
 
-def places(known: Known, q: FloatArray) -> FloatArray:
+def places(known: RunState, q: FloatArray) -> FloatArray:
     """(k, 3) where a calibration has the first point, in the instrument's frame."""
     x, z = known.solved.state.edges
     robot = known.robot if known.robot_arm.model is None else known.robot_arm.model.robot
@@ -77,10 +77,10 @@ def workspace_bound(shop: Shop, q: FloatArray) -> float:
     root = (vectors[:, told] / np.sqrt(values[told])) * scale[:, None]
     first = slice(3, 6) if shop.options.poses else slice(0, 3)
     steps = 1e-5 * np.eye(len(whole))
-    slopes = np.stack(
+    jacobian = np.stack(
         [(reads(shop, it, q=q) - reads(shop, -it, q=q))[:, first] / 2e-5 for it in steps], axis=-1
     )
-    return float(np.sqrt(np.mean(np.sum((slopes @ root) ** 2, axis=(1, 2)))))
+    return float(np.sqrt(np.mean(np.sum((jacobian @ root) ** 2, axis=(1, 2)))))
 
 
 def frames_row(options: Tracked, worlds: int) -> str:
@@ -90,9 +90,12 @@ def frames_row(options: Tracked, worlds: int) -> str:
     for seed in range(worlds):
         shop = tracked(replace(options, seed=seed))
         known = solved_of(session_of(shop))
-        error, spread = errors_of(shop, known)[kept], known.solved.covariance[np.ix_(kept, kept)]
+        error, covariance = (
+            errors_of(shop, known)[kept],
+            known.solved.covariance[np.ix_(kept, kept)],
+        )
         by_bound.append(error @ np.linalg.solve(mounting_bound(shop), error) / len(kept))
-        by_sigma.append(error @ np.linalg.solve(spread, error) / len(kept))
+        by_sigma.append(error @ np.linalg.solve(covariance, error) / len(kept))
     return f"{np.sqrt(np.mean(by_bound)):.2f} | {np.mean(by_sigma):.2f}"
 
 
@@ -194,16 +197,16 @@ def before_mm(size: float, seed: int) -> float:
 
 def parameter_conditions(shop: Shop) -> tuple[float, float, float, float]:
     """Conditions of Phi^T Phi over the 23 told combinations: own errors, SI, mm and rad, scaled."""
-    slopes = parameter_slopes(shop)
+    jacobian = parameter_jacobian(shop)
     lengths = np.repeat([1.0, 1.0, 0.0, 0.0, 0.0], [6, 6, 6, 6, 4]) > 0.0
     found = []
     for scale in (
         np.where(lengths, 5e-4, 1e-3),
         np.ones(28),
         np.where(lengths, 1e-3, 1.0),
-        1.0 / np.maximum(np.linalg.norm(slopes, axis=0), 1e-12),
+        1.0 / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-12),
     ):
-        values = np.linalg.svd(slopes * scale, compute_uv=False)
+        values = np.linalg.svd(jacobian * scale, compute_uv=False)
         told = values[values > 1e-7 * values[0]]
         if len(told) != 23:
             raise AssertionError(f"{len(told)} combinations are told, not 23")
@@ -211,7 +214,7 @@ def parameter_conditions(shop: Shop) -> tuple[float, float, float, float]:
     return tuple(found)
 
 
-def parameter_slopes(shop: Shop) -> FloatArray:
+def parameter_jacobian(shop: Shop) -> FloatArray:
     """(3 s, 28) derivatives of the reflector's place by a, d, alpha, offset and four betas."""
     arm, step = shop.arm, 1e-6
 
@@ -265,7 +268,7 @@ def irb120() -> str:
     return "\n".join((prose(text), "", head, "| --- | --- | --- | --- |", *lines))
 
 
-def nominal_fit(known: Known) -> FloatArray:
+def nominal_fit(known: RunState) -> FloatArray:
     """(4, 4) the instrument's frame as the nominal arm has it."""
     readings = known.readings
     flange = {view: known.base_from_flange[view] for view in known.used}
@@ -310,7 +313,7 @@ def talos() -> str:
     )
 
 
-def told(known: Known) -> str:
+def told(known: RunState) -> str:
     """What the method says of its trust."""
     held, levels = known.findings.held_out, known.robot_arm.kinematics.levels
     workspace_mm = known.findings.arms[0].workspace_mm

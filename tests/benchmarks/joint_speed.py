@@ -18,7 +18,7 @@ from visioncal.core.transforms import adjoint, exp, inverse_right_jacobian, inve
 from visioncal.core.types import FloatArray
 from visioncal.estimation.chain import chain
 from visioncal.estimation.corners import CornerStack, reproject
-from visioncal.estimation.linalg import covariance
+from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.poses import fit_poses
 from visioncal.estimation.solve import solve_problem
@@ -58,9 +58,9 @@ class ViewCost(pyceres.CostFunction):
     def Evaluate(self, parameters, residuals, jacobians) -> bool:  # noqa: N802 - its interface
         """Fills in residuals and derivatives, as Ceres asks for them."""
         steps = np.array(parameters)
-        by_x, by_z, by_flange = exp(steps)
+        by_x, by_z, flange_jacobian = exp(steps)
         from_x, z = self.start.edges @ [by_x, by_z]
-        pose = invert(self.robot @ by_flange @ from_x) @ z
+        pose = invert(self.robot @ flange_jacobian @ from_x) @ z
         at = reproject(self.stack, self.camera, pose[None], lens=False)
         residuals[:] = at.residuals.ravel() / PIXEL_PX
         if jacobians is not None:
@@ -81,10 +81,10 @@ def by_pyceres(cell: Cell, stacks: list[CornerStack], start: State) -> State:
     problem = pyceres.Problem()
     x, z = np.zeros(6), np.zeros(6)
     flanges = [np.zeros(6) for _ in stacks]
-    spread = np.diag(np.repeat(NOISE.robots[0] ** 2, 3))
+    covariance = np.diag(np.repeat(NOISE.robots[0] ** 2, 3))
     for stack, robot, flange in zip(stacks, cell.base_from_flange, flanges, strict=True):
         problem.add_residual_block(ViewCost(stack, cell, robot, start), None, [x, z, flange])
-        prior = pyceres.factors.NormalPrior(np.zeros(6), spread)
+        prior = pyceres.factors.NormalPrior(np.zeros(6), covariance)
         problem.add_residual_block(prior, None, [flange])
     options = pyceres.SolverOptions()
     options.linear_solver_type = pyceres.LinearSolverType.DENSE_SCHUR
@@ -99,8 +99,8 @@ def by_visioncal(cell: Cell, stack: CornerStack, start: State) -> State:
         x, z = start.edges
         predicted = invert(cell.base_from_flange @ x) @ z
         fit = fit_poses(stack, cell.options.camera, predicted)
-        spread = PIXEL_PX**2 * covariance(fit.information)
-        problem = chain("eye-in-hand", cell.base_from_flange, fit.cam_from_target, spread)
+        covariance = PIXEL_PX**2 * covariance_from(fit.information)
+        problem = chain("eye-in-hand", cell.base_from_flange, fit.cam_from_target, covariance)
         return solve_problem(problem, start, NOISE)[0]
 
 

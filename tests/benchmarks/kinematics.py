@@ -19,7 +19,7 @@ from cells import calibrated, known_of
 from results import first, wished, write_section
 from test_kinematics import WRONG_LINKS, error_m
 
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages import kinematics as levels
 from visioncal.estimation.parts import Noise, State
@@ -80,7 +80,7 @@ def dirty(options: CellOptions) -> tuple[float, ...]:
     return tuple(1e3 * it for it in errors)
 
 
-def without_blocks(cell: Cell, **changes: object) -> Known:
+def without_blocks(cell: Cell, **changes: object) -> RunState:
     """The same way with a flat board, the lens as stated and no eccentricity."""
     told = known_of(cell).session
     camera = told.document["camera"] | {"intrinsics": "hold"}
@@ -94,7 +94,7 @@ def without_blocks(cell: Cell, **changes: object) -> Known:
     return known
 
 
-def corners_alone(known: Known) -> Known:
+def corners_alone(known: RunState) -> RunState:
     """The same unknowns with the robot's stops taken for exact: a fit of reprojection alone."""
     exact = Noise.of_robot(1e-6, 1e-6)
     arm, problem, state = known.robot_arm, known.solved.problem, known.solved.state

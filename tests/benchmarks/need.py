@@ -21,7 +21,7 @@ from results import wished, write_section
 from scipy.spatial.transform import RigidTransform
 
 from visioncal.calibration.pipeline.result import result_of
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.core.errors import VisioncalError
 from visioncal.core.transforms import exp, invert, rotation_angle
@@ -85,7 +85,7 @@ def of_one_cell(seed: int) -> Outcome | None:
     return Outcome(kind, both, picks.probability(need), float(np.mean(landed)))
 
 
-def of_poses(cell: Cell) -> Known:
+def of_poses(cell: Cell) -> RunState:
     """What is known at the end of the way from measured poses, which are exact."""
     rows = [
         [str(at), *numbers(robot), *numbers(camera)]
@@ -95,7 +95,7 @@ def of_poses(cell: Cell) -> Known:
     ]
     document = {"schema": 1, "name": "poses", "mount": cell.options.mount}
     columns = ("view", *POSE, *(f"cft_{name}" for name in POSE))
-    known = Known(Session.assemble(document, columns, rows, MemoryImages({})))
+    known = RunState(Session.assemble(document, columns, rows, MemoryImages({})))
     for stage in STAGES:
         known = stage.run(known)
     return known
@@ -107,7 +107,9 @@ def numbers(matrix: FloatArray) -> list[str]:
     return [repr(float(it)) for it in (*pose.translation, *pose.rotation.as_quat())]
 
 
-def lands(cell: Cell, known: Known, eye: Eye | None, need: Need, rng: np.random.Generator) -> bool:
+def lands(
+    cell: Cell, known: RunState, eye: Eye | None, need: Need, rng: np.random.Generator
+) -> bool:
     """Looks at a thing and goes there; whether that is near enough."""
     at, middle = int(rng.integers(len(cell.cam_from_target))), np.array([0.0, 0.0, 0.0, 1.0])
     true, found = next(iter(cell.transforms.values())), known.solved.state.edges[0]

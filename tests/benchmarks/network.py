@@ -74,13 +74,13 @@ def clean(seed: int) -> Clean:
     found = aligned(cell)
     taken = time.process_time() - begin
     bound = network_bound(cell)
-    error, spread = away(cell, found, ["base_b"]), found.edge_of("base_b").covariance
+    error, covariance = away(cell, found, ["base_b"]), found.edge_of("base_b").covariance
     frames = [it.partition("_from_")[2] for it in found.edges]
     every = away(cell, found, frames)
     return Clean(
         error,
         np.diag(bound.of("base_b")),
-        float(error @ np.linalg.solve(spread, error)) / 6,
+        float(error @ np.linalg.solve(covariance, error)) / 6,
         float(every @ np.linalg.solve(found.joint_covariance, every)) / len(every),
         taken,
     )

@@ -18,7 +18,7 @@ from results import few, first, wished, write_section
 from test_candidates import cell_of, whole
 from test_kinematics import WRONG_LINKS, error_m
 
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp
 from visioncal.core.types import FloatArray
@@ -70,13 +70,13 @@ def expected_mm(truth: World, rows: FloatArray) -> float:
     return 1e3 * float(np.sqrt(np.trace(truth.place @ truth.covariance(rows))))
 
 
-def arm_error(cell: Cell, known: Known) -> FloatArray:
+def arm_error(cell: Cell, known: RunState) -> FloatArray:
     """Error all over the workspace [mm]."""
     model = known.robot_arm.model
     return 1e3 * np.array([error_m(cell, known, known.robot if model is None else model.robot)])
 
 
-def edge_error(cell: Cell, known: Known) -> FloatArray:
+def edge_error(cell: Cell, known: RunState) -> FloatArray:
     """Errors of x: offset [mm] and rotation [deg]."""
     away = error_of(cell, known)
     return np.array([1e3 * np.linalg.norm(away[3:6]), np.rad2deg(np.linalg.norm(away[:3]))])
@@ -217,15 +217,15 @@ def one_axis(mount: str, seed: int) -> tuple[float, ...]:
     return predicted.mm, predicted.deg, *equal, *obtained, *error
 
 
-def sigmas(spread: FloatArray) -> tuple[float, float]:
+def sigmas(covariance: FloatArray) -> tuple[float, float]:
     """Of x: offset [mm] and rotation [deg]."""
     return (
-        1e3 * float(np.sqrt(np.trace(spread[3:6, 3:6]))),
-        float(np.rad2deg(np.sqrt(np.trace(spread[:3, :3])))),
+        1e3 * float(np.sqrt(np.trace(covariance[3:6, 3:6]))),
+        float(np.rad2deg(np.sqrt(np.trace(covariance[:3, :3])))),
     )
 
 
-def at_noise(begun: Begun, added: FloatArray, known: Known) -> tuple[float, float]:
+def at_noise(begun: Begun, added: FloatArray, known: RunState) -> tuple[float, float]:
     """The prediction at the noise that the whole session shows."""
     noise = known.solved.noise
     scale = (known.pixel_px / begun.cell.pixel_px) ** 2

@@ -34,7 +34,7 @@ from visioncal.live.rehearsal.bench import Bench
 from visioncal.live.rehearsal.camera import RehearsalCamera
 from visioncal.live.rehearsal.cell import RehearsalOptions, RehearsedCell, rehearsed_cell
 from visioncal.live.rehearsal.controller import spawn
-from visioncal.live.rehearsal.fault_injection import Trouble
+from visioncal.live.rehearsal.fault_injection import Faults
 from visioncal.live.rehearsal.options import ControllerOptions
 from visioncal.live.rehearsal.truth import TruthClient
 from visioncal.live.rehearsal.witness import Witness, pace_of
@@ -111,7 +111,7 @@ def faults(folder: Path) -> str:
         "| fault | told after [s] | the arm stood after [s] | views kept | in the end | message |",
         "|---|---:|---:|---:|---:|---|",
     ]
-    for fault in first(get_args(Trouble)):
+    for fault in first(get_args(Faults)):
         place = folder / fault
         _, scene, bench = stage(place, FAULT_STOPS)
         with closing(bench):

@@ -13,7 +13,7 @@ import numpy as np
 from cells import calibrated_sweep
 from results import few, first, wished, write_section
 
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages import clock
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import FloatArray
@@ -52,7 +52,8 @@ class Outcome:
     """One sweep: the readout's error and sigma [s], and the camera's place.
 
     `away_mm` is how far it is off, `ignoring_mm` where the readout is ignored, both beside the
-    sigma that it has where it is not; `surprise` the squared error in units of its covariance.
+    sigma that it has where it is not; `mahalanobis_sq` the squared error in units of its
+    covariance.
     """
 
     error_s: float
@@ -61,7 +62,7 @@ class Outcome:
     away_mm: float
     sigma_mm: float
     ignoring_mm: float
-    surprise: float
+    mahalanobis_sq: float
 
 
 def of_one_sweep(task: tuple[World, int]) -> Outcome:
@@ -71,7 +72,7 @@ def of_one_sweep(task: tuple[World, int]) -> Outcome:
     moved = sweep(replace(world.cell, seed=seed), how)
     known = calibrated_sweep(moved)
     (found,) = known.clock.delays
-    error, spread = x_error(moved, known), known.solved.covariance[:6, :6]
+    error, covariance = x_error(moved, known), known.solved.covariance[:6, :6]
     ignoring = np.full(6, np.nan)
     if seed < IGNORED:
         look, clock.find_delays = clock.find_delays, lambda *_: (None, ())
@@ -82,13 +83,13 @@ def of_one_sweep(task: tuple[World, int]) -> Outcome:
         found.sigma_s,
         found.is_clear,
         1e3 * float(np.linalg.norm(error[3:])),
-        1e3 * float(np.sqrt(np.trace(spread[3:, 3:]))),
+        1e3 * float(np.sqrt(np.trace(covariance[3:, 3:]))),
         1e3 * float(np.linalg.norm(ignoring[3:])),
-        float(error @ np.linalg.solve(spread, error)) / 6.0,
+        float(error @ np.linalg.solve(covariance, error)) / 6.0,
     )
 
 
-def x_error(moved: Sweep, known: Known) -> FloatArray:
+def x_error(moved: Sweep, known: RunState) -> FloatArray:
     """(6,) right perturbation of the camera's edge, true to estimated."""
     return log(invert(next(iter(moved.cell.transforms.values()))) @ known.solved.state.edges[0])
 
@@ -105,7 +106,7 @@ def row(world: World, found: list[Outcome]) -> str:
         f"{np.sqrt(np.mean((errors_ms / sigmas_ms) ** 2)):.2f}",
         f"{np.median([it.away_mm for it in found]):.3f}",
         f"{np.median([it.sigma_mm for it in found]):.3f}",
-        f"{np.mean([it.surprise for it in found]):.2f}",
+        f"{np.mean([it.mahalanobis_sq for it in found]):.2f}",
         f"{np.nanmedian([it.ignoring_mm for it in found]):.3f}",
         f"{np.nanmedian([it.ignoring_mm / it.sigma_mm for it in found]):.1f}",
     )

@@ -44,7 +44,7 @@ class Outcome:
     tip: float
     least_tip: float
     linear: float
-    surprise: float
+    mahalanobis_sq: float
     lost: int
 
 
@@ -60,14 +60,14 @@ def fitted(task: tuple[Job, int]) -> Outcome:
         answer[:3, :3] = TURN.as_matrix()
         to_tool[3:, 3:] = TURN.as_matrix().T
     error, linear = error_of(answer), error_of(compose(TURN.as_matrix(), linear_tip(made)))
-    spread = (to_tool @ fit.covariance @ to_tool.T)[np.ix_(free, free)]
+    covariance = (to_tool @ fit.covariance @ to_tool.T)[np.ix_(free, free)]
     return Outcome(
         float(error[:3] @ error[:3]),
         float(np.trace(least[:3, :3])),
         float(error[3:] @ error[3:]),
         float(np.trace(least[3:, 3:])),
         float(linear[3:] @ linear[3:]),
-        float(error[free] @ np.linalg.solve(spread, error[free])),
+        float(error[free] @ np.linalg.solve(covariance, error[free])),
         int(np.sum(~fit.agrees)),
     )
 
@@ -105,7 +105,7 @@ def accuracy(run: Callable[..., Iterator[Outcome]]) -> list[str]:
         lost = sum(it.lost > 0 for it in done)
         rows.append(
             f"| {name} | {1e3 * tip:.4f} | {tip / least:.3f} | {linear / least:.3f} | {rotation} | "
-            f"{np.mean([it.surprise for it in done if not it.lost]) / size:.2f} | {lost} |"
+            f"{np.mean([it.mahalanobis_sq for it in done if not it.lost]) / size:.2f} | {lost} |"
         )
     return rows
 

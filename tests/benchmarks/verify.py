@@ -17,7 +17,7 @@ import numpy as np
 from later import ANYHOW, Change, Lot, knock, known_again, lot
 from results import few, first, wished, write_section
 
-from visioncal.calibration.verification.calibration_prior import Footing
+from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.calibration.verification.check import check
 from visioncal.calibration.verification.prediction import seen_by
 from visioncal.core.types import Mount
@@ -76,13 +76,15 @@ def counted(job: tuple[CellOptions, int]) -> dict[str, tuple[np.ndarray, float]]
 
 def _tallied(place: Lot, name: str, checks: int) -> tuple[np.ndarray, float]:
     """How often the right change was named, named alone, and any at all; and CPU seconds."""
-    footing, case = Footing.of(place.calibration), CASES[name]
+    prior_calibration, case = CalibrationPrior.of(place.calibration), CASES[name]
     rng = np.random.default_rng([place.cell.options.seed, list(CASES).index(name)])
     tally, seconds = np.zeros(3), 0.0
     for _ in range(checks):
         known = known_again(place.cell, rng, case.draw(rng))
         begun = time.process_time()
-        named = [it.name for it in check(seen_by(known, footing), footing).named] or ["none"]
+        named = [
+            it.name for it in check(seen_by(known, prior_calibration), prior_calibration).named
+        ] or ["none"]
         seconds += time.process_time() - begun
         tally += [named[0] == case.right, named == [case.right], named != ["none"]]
     return tally, seconds

@@ -118,7 +118,7 @@ def outcome(seed: int) -> Outcome:
     found = align(it.session, corners=it.corners)
     names = [edge.partition("_from_")[2] for edge in found.edges]
     rows = np.array([name in it.cell.parents for name in names])
-    spread = found.joint_covariance[np.ix_(*[np.repeat(rows, 6)] * 2)]
+    covariance = found.joint_covariance[np.ix_(*[np.repeat(rows, 6)] * 2)]
     error = np.concatenate(
         [
             log(invert(_true(it.cell, name, found.reference)) @ found.edge_of(name).matrix)
@@ -130,7 +130,7 @@ def outcome(seed: int) -> Outcome:
     (clock,) = found.details["clocks"].values()
     floor = found.stages["boards"]["floor"]
     return Outcome(
-        float(error @ np.linalg.solve(spread, error)) / len(error),
+        float(error @ np.linalg.solve(covariance, error)) / len(error),
         1e3 * float(np.sqrt(np.mean(error.reshape(-1, 6)[:, 3:] ** 2))),
         np.concatenate(offsets),
         (clock["camera_minus_robot_s"] - AHEAD_S) / clock["sigma_s"],

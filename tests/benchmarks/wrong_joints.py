@@ -16,7 +16,7 @@ import numpy as np
 from results import wished, write_section
 from slips import (
     SLIPS,
-    Told,
+    Identifiability,
     alarms,
     as_built,
     in_the_world,
@@ -33,7 +33,7 @@ ROBOTS = ("ur3e", "ur5e", "ur10e")
 # Departures of lengths [m] and angles [rad].
 ARMS = {"0.5 mm, 1 mrad": (5e-4, 1e-3), "2 mm, 3 mrad": (2e-3, 3e-3)}
 USUAL = "0.5 mm, 1 mrad"
-SOUND: dict[str, Callable[[Told, np.random.Generator], Told]] = {
+SOUND: dict[str, Callable[[Identifiability, np.random.Generator], Identifiability]] = {
     "as it is": lambda told, _: told,
     "a joint 2 deg off": with_stray_offset,
     "a tool on the flange": with_tool,
@@ -67,7 +67,7 @@ def looked_at(arm: str, seed: int) -> dict[Key, bool]:
     """Which slips are named in one cell, and which sound sessions of it are accused."""
     of, found = cell(arm, seed), {}
     for with_poses in (True, False):
-        told = Told.of(of, with_poses=with_poses)
+        told = Identifiability.of(of, with_poses=with_poses)
         for name, change in {**(SLIPS if arm == USUAL else {}), **SOUND}.items():
             if name in OF_POSES and not with_poses:
                 continue

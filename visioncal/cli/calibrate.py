@@ -9,7 +9,7 @@ import typer
 from rich.markup import escape
 
 from visioncal.calibration.pipeline import run, run_dense
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.running import check_dense, check_solver
 from visioncal.cli.align import align_into
 from visioncal.cli.console import messages, print_summary, shown_progress, tell_written
@@ -76,9 +76,9 @@ def calibrate_command(
     """
     loaded = Session.load(session).needing(need_mm, need_deg)
     if is_whole_cell(loaded):
-        check_solver(Known(loaded, solver=solver))
+        check_solver(RunState(loaded, solver=solver))
         if dense:
-            check_dense(Known(loaded))
+            check_dense(RunState(loaded))
         found = align_into(session, loaded, out, level=level, convention=convention, quiet=as_json)
         document = whole_document(found)
         if as_json:

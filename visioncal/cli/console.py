@@ -14,7 +14,7 @@ from rich.table import Table
 from visioncal.core.errors import VisioncalError
 from visioncal.core.files import some_of
 from visioncal.core.transforms import pose_difference
-from visioncal.core.types import Progress as Told
+from visioncal.core.types import Progress as Identifiability
 from visioncal.interchange.outputs import Written
 from visioncal.results import Calibration, Sight, Verdict, ViewResult
 
@@ -33,7 +33,7 @@ def messages() -> Console:
 
 
 @contextmanager
-def shown_progress(quiet: bool) -> Iterator[Told]:
+def shown_progress(quiet: bool) -> Iterator[Identifiability]:
     """Shows a bar of the stage at work, where somebody looks at a terminal."""
     columns = (
         TextColumn("{task.description:<12}"),

@@ -12,7 +12,13 @@ from visioncal.cli import convert_options as option
 from visioncal.cli.console import messages, shown_progress
 from visioncal.cli.guessed import print_guess
 from visioncal.core.errors import DataError
-from visioncal.interchange.formats import Foreign, PoseWishes, Wishes, convert, guess_foreign
+from visioncal.interchange.formats import (
+    Foreign,
+    ImportOptions,
+    PoseImportOptions,
+    convert,
+    guess_foreign,
+)
 from visioncal.session import Session
 
 
@@ -50,9 +56,9 @@ def convert_command(
     """
     robot_names = option.names_in(robot_columns, "--robot-columns")
     camera_names = option.names_in(camera_columns, "--camera-columns")
-    wishes = Wishes(
-        robot=PoseWishes(robot_names, robot_form, robot_unit, robot_inverse),
-        camera=PoseWishes(camera_names, camera_form, camera_unit, camera_inverse),
+    requested = ImportOptions(
+        robot=PoseImportOptions(robot_names, robot_form, robot_unit, robot_inverse),
+        camera=PoseImportOptions(camera_names, camera_form, camera_unit, camera_inverse),
         joints=option.names_in(joint_columns, "--joint-columns"),
         joints_deg=joint_unit == "deg",
         image=image_column,
@@ -68,7 +74,7 @@ def convert_command(
     if yes and not guess:
         raise DataError("--yes takes the best guess; it needs --guess.", culprits=["--yes"])
     choose = partial(_chosen, yes=yes) if guess else None
-    session = convert(source, dest, wishes=wishes, form=form, force=force, choose=choose)
+    session = convert(source, dest, requested=requested, form=form, force=force, choose=choose)
     for warning in session.warnings:
         messages().print(escape(f"note: {warning}"))
     messages().print(escape(f"wrote {dest}\nsha256 {session.digest()}"))

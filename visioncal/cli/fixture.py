@@ -120,11 +120,11 @@ def fixture_command(
     refuse_given({"--camera": camera, "--target": target}, "touches need no camera")
     place = Place.of(name, calibration, out, Choice(robot=robot), ARM, force=force)
     touched_with = _tool(tool, place.calibration, robot)
-    wishes = touch_wishes(
+    requested = touch_wishes(
         robot_columns, robot_form, robot_unit, robot_inverse, joint_columns, joint_unit
     )
     frame = touched_fixture(
-        read_touches(touches, wishes, robot, positions=touched_with is None),
+        read_touches(touches, requested, robot, positions=touched_with is None),
         touched_with,
         drawing,
         place.calibration,

@@ -14,7 +14,7 @@ from visioncal.cli.convert_options import names_in
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import pose_difference
-from visioncal.interchange.formats import PoseWishes, Wishes
+from visioncal.interchange.formats import ImportOptions, PoseImportOptions
 from visioncal.interchange.merge_results import rewrite
 from visioncal.interchange.outputs import RECORDING, Written
 from visioncal.interchange.result_files import load_result
@@ -166,10 +166,10 @@ def touch_wishes(
     inverse: bool | None,
     joint_columns: str | None,
     joint_unit: str,
-) -> Wishes:
+) -> ImportOptions:
     """What the user says of how touches are written."""
-    return Wishes(
-        robot=PoseWishes(names_in(columns, "--robot-columns"), form, unit, inverse),
+    return ImportOptions(
+        robot=PoseImportOptions(names_in(columns, "--robot-columns"), form, unit, inverse),
         joints=names_in(joint_columns, "--joint-columns"),
         joints_deg=joint_unit == "deg",
     )

@@ -72,9 +72,9 @@ def record_command(
         single=is_folder(camera),
         lost=CaptureOptions.lost if drives else 0,
     )
-    wishes = DeviceWishes(_size(resolution), exposure_us, gain, focus)
+    requested = DeviceWishes(_size(resolution), exposure_us, gain, focus)
     wish = ArmWish("", not drives or dry_run, _asked, pose_form)
-    with ended_like_ctrl_c(), _opened(arm, wish, camera, wishes) as cell:
+    with ended_like_ctrl_c(), _opened(arm, wish, camera, requested) as cell:
         scene.check(cell.camera.resolution, drives=drives)
         if dry_run:
             _tell(departure(cell, scene.planned, (), taking), cell, taking)
@@ -98,7 +98,7 @@ def record_command(
 
 
 @contextmanager
-def _opened(arm: str, wish: ArmWish, camera: str, wishes: DeviceWishes) -> Iterator[LiveCell]:
+def _opened(arm: str, wish: ArmWish, camera: str, requested: DeviceWishes) -> Iterator[LiveCell]:
     """Opens both devices; the block's end lets go of them."""
     with closing(open_arm(arm, wish)) as opened:
         if not wish.watch_only and not isinstance(opened, MovingArm):
@@ -107,7 +107,7 @@ def _opened(arm: str, wish: ArmWish, camera: str, wishes: DeviceWishes) -> Itera
                 culprits=[opened.name],
                 next_step="Guide it by hand: --follow.",
             )
-        with closing(open_camera(camera, wishes)) as device:
+        with closing(open_camera(camera, requested)) as device:
             yield LiveCell(opened, device, HostClock())
 
 

@@ -25,7 +25,7 @@ from visioncal.live.drivers.extras import client_library
 from visioncal.live.rehearsal.bench import Bench
 from visioncal.live.rehearsal.cell import RehearsalOptions, RehearsedCell, rehearsed_cell
 from visioncal.live.rehearsal.compared import Explained, edge_errors, explained
-from visioncal.live.rehearsal.fault_injection import Trouble
+from visioncal.live.rehearsal.fault_injection import Faults
 from visioncal.live.rehearsal.witness import Pace, Witness, pace_of
 from visioncal.results import Calibration
 
@@ -47,7 +47,7 @@ def rehearse_command(
     views: Annotated[int, typer.Option(min=5, max=200, help="Number of planned stops.")] = 16,
     seed: Annotated[int, typer.Option(min=0, help="Another cell for every number.")] = 0,
     fault: Annotated[
-        Trouble | None,
+        Faults | None,
         typer.Option(
             help="Let this happen half way: what is said, and how to go on.", show_default=False
         ),
@@ -75,7 +75,7 @@ def rehearse_command(
 
 
 def _rehearse(
-    options: RehearsalOptions, out: Path, fault: Trouble | None, *, view: bool
+    options: RehearsalOptions, out: Path, fault: Faults | None, *, view: bool
 ) -> "_Rehearsal":
     """Plans, records and calibrates."""
     begun = time.monotonic()

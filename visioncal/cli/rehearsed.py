@@ -24,7 +24,7 @@ from visioncal.live.planning.purposes import purpose_of
 from visioncal.live.planning.written import plan_document
 from visioncal.live.rehearsal.bench import Bench
 from visioncal.live.rehearsal.cell import RehearsalOptions, RehearsedCell
-from visioncal.live.rehearsal.fault_injection import Befalling, Trouble
+from visioncal.live.rehearsal.fault_injection import Befalling, Faults
 from visioncal.session import Session
 
 # The pace at which a UR moves where its program says nothing else; nobody stands beside this one.
@@ -88,7 +88,7 @@ def recorded(
     scene: Scene,
     folder: Path,
     watchers: Sequence[Watcher],
-    fault: Trouble | None,
+    fault: Faults | None,
     *,
     view: bool,
     resume: bool = False,

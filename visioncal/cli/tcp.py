@@ -93,11 +93,11 @@ def tcp_command(
         return
     refuse_given({"--camera": camera, "--target": target}, "touches need no camera")
     refuse_given({"--point-mm": point}, "touches say where the tool's point is")
-    wishes = touch_wishes(
+    requested = touch_wishes(
         robot_columns, robot_form, robot_unit, robot_inverse, joint_columns, joint_unit
     )
     place = Place.of(name, calibration, out, Choice(robot=robot), ARM, force=force)
-    rows = read_touches(touches, wishes, robot)
+    rows = read_touches(touches, requested, robot)
     frame = touched_tool(
         rows,
         place.calibration,

@@ -14,7 +14,7 @@ from scipy.linalg import cholesky, solve_triangular
 from visioncal.core.types import FloatArray, Mask
 from visioncal.dynamics.base import BaseModel
 from visioncal.estimation.levenberg_marquardt import Linearised, descend
-from visioncal.estimation.linalg import covariance, damped_step
+from visioncal.estimation.linalg import covariance_from, damped_step
 from visioncal.robot import Inertias, LogCholesky
 
 # Links differ from what is known of them by about so much in each coordinate: a third of their
@@ -46,14 +46,14 @@ class Consistent:
 
 
 def fit_consistent(
-    base: BaseModel, values: FloatArray, spread: FloatArray, known: Inertias
+    base: BaseModel, values: FloatArray, covariance: FloatArray, known: Inertias
 ) -> Consistent:
     """Finds the bodies, near known ones, whose base parameters are nearest to measured ones.
 
     Args:
         base: The model.
         values: (b,) measured base parameters.
-        spread: (b, b) their covariance.
+        covariance: (b, b) their covariance.
         known: The links as they are known before.
 
     Raises:
@@ -63,7 +63,7 @@ def fit_consistent(
     names = base.model.names[10 * joints :]
     held = np.zeros(len(names), dtype=bool)
     positive = np.array([it.startswith(_POSITIVE) for it in names], dtype=bool)
-    problem = _Problem(base, values, _Whitened.of(spread), LogCholesky.around(known), held)
+    problem = _Problem(base, values, _Whitened.of(covariance), LogCholesky.around(known), held)
     for _ in range(len(names) + 1):
         state, _ = descend(problem.start(), problem.linearised, _SETTLED)
         wrong = positive & (state.own < 0.0) & ~problem.held
@@ -72,8 +72,8 @@ def fit_consistent(
         # A negative one is held at zero: it is noise, or the torques are of another model.
         problem = replace(problem, held=problem.held | wrong)
     information, _, _ = problem.normal(state)
-    slopes = problem.slopes(state)
-    posterior = slopes @ covariance(information) @ slopes.T
+    jacobian = problem.jacobian(state)
+    posterior = jacobian @ covariance_from(information) @ jacobian.T
     away = problem.whitened.of_vector(values - base.of(problem.standard(state)))
     return Consistent(problem.standard(state), posterior, float(away @ away))
 
@@ -86,9 +86,9 @@ class _Whitened:
     scale: FloatArray
 
     @classmethod
-    def of(cls, spread: FloatArray) -> "_Whitened":
-        scale = np.sqrt(np.diag(spread))
-        return cls(cholesky(spread / np.outer(scale, scale), lower=True), scale)
+    def of(cls, covariance: FloatArray) -> "_Whitened":
+        scale = np.sqrt(np.diag(covariance))
+        return cls(cholesky(covariance / np.outer(scale, scale), lower=True), scale)
 
     def of_vector(self, away: FloatArray) -> FloatArray:
         scaled = away / self.scale.reshape(-1, *[1] * (away.ndim - 1))
@@ -126,22 +126,22 @@ class _Problem:
     def standard(self, state: _State) -> FloatArray:
         return np.concatenate([self.coordinates.values(state.links).ravel(), state.own])
 
-    def slopes(self, state: _State) -> FloatArray:
+    def jacobian(self, state: _State) -> FloatArray:
         """(p, p) derivatives of the standard parameters by the unknowns."""
         count, own = state.links.size, state.own.size
-        slopes = np.zeros((count + own, count + own))
+        jacobian = np.zeros((count + own, count + own))
         for joint, block in enumerate(self.coordinates.jacobians(state.links)):
             rows = slice(10 * joint, 10 * joint + 10)
-            slopes[rows, rows] = PRIOR_SIGMA * block
-        slopes[range(count, count + own), range(count, count + own)] = ~self.held
-        return slopes
+            jacobian[rows, rows] = PRIOR_SIGMA * block
+        jacobian[range(count, count + own), range(count, count + own)] = ~self.held
+        return jacobian
 
     def normal(self, state: _State) -> tuple[FloatArray, FloatArray, float]:
         """Information, gradient and cost by the unknowns."""
         prior = np.zeros(state.links.size + state.own.size)
         prior[: state.links.size] = state.links.ravel() / PRIOR_SIGMA
         residual = self.whitened.of_vector(self.base.of(self.standard(state)) - self.values)
-        jacobian = self.whitened.of_vector(self.base.dependence @ self.slopes(state))
+        jacobian = self.whitened.of_vector(self.base.dependence @ self.jacobian(state))
         known = np.zeros(prior.size)
         known[: state.links.size] = 1.0
         known[state.links.size :][self.held] = 1.0

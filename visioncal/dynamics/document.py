@@ -59,18 +59,18 @@ def stribeck_rows(identified: Identified) -> list[dict[str, Any]]:
     for at, joint in enumerate(humps.joints.tolist()):
         sliding = names.index(f"Fc{joint + 1}")
         hump, log = (identified.base.rank + at + part * count for part in (0, 1))
-        spread = identified.covariance[np.ix_([sliding, hump], [sliding, hump])]
+        covariance = identified.covariance[np.ix_([sliding, hump], [sliding, hump])]
         coulomb, extra = float(identified.values[sliding]), float(humps.hump_nm[at])
         slope = np.array([-extra / coulomb**2, 1.0 / coulomb])
         rows.append(
             {
                 "joint": joint + 1,
                 "hump_nm": extra,
-                "hump_sigma_nm": float(np.sqrt(spread[1, 1])),
+                "hump_sigma_nm": float(np.sqrt(covariance[1, 1])),
                 "static_nm": coulomb + extra,
-                "static_sigma_nm": float(np.sqrt(spread.sum())),
+                "static_sigma_nm": float(np.sqrt(covariance.sum())),
                 "static_over_coulomb": 1.0 + extra / coulomb,
-                "static_over_coulomb_sigma": float(np.sqrt(slope @ spread @ slope)),
+                "static_over_coulomb_sigma": float(np.sqrt(slope @ covariance @ slope)),
                 "speed_rad_s": float(humps.speed_rad_s[at]),
                 "speed_sigma_rad_s": float(
                     humps.speed_rad_s[at] * np.sqrt(identified.covariance[log, log])

@@ -64,13 +64,13 @@ def drive_gains(
     """
     robot = base.model.robot
 
-    def pull(motion: Motion) -> FloatArray:
+    def load(motion: Motion) -> FloatArray:
         return np.asarray(body_regressor(robot, motion.q, motion.dq, motion.ddq) @ body)
 
     streams = (*empty, *loaded)
     own = np.concatenate([it.filtered(base.regressor) for it in streams])
     pulls = np.concatenate(
-        [np.zeros_like(it.torques_nm) for it in empty] + [it.filtered(pull) for it in loaded]
+        [np.zeros_like(it.torques_nm) for it in empty] + [it.filtered(load) for it in loaded]
     )
     currents = np.concatenate([it.torques_nm for it in streams])
     used = np.concatenate([it.used for it in streams])
@@ -89,20 +89,20 @@ def drive_gains(
     return gains
 
 
-def _gain(own: FloatArray, pull: FloatArray, currents: FloatArray) -> tuple[float, float]:
-    """A joint's gain and its sigma, from rows of what it takes (m, b), the pull, the currents."""
+def _gain(own: FloatArray, load: FloatArray, currents: FloatArray) -> tuple[float, float]:
+    """A joint's gain and its sigma, from rows of what it takes (m, b), the load, the currents."""
     acts = own.any(axis=0)
     lengths = np.linalg.norm(own[:, acts], axis=0)
     directions, upper, _ = qr(own[:, acts] / lengths, mode="economic", pivoting=True)
     left = np.abs(np.diag(upper))
     directions = directions[:, left > _RANK * left[0]]
-    pull = pull - directions @ (directions.T @ pull)
+    load = load - directions @ (directions.T @ load)
     currents = currents - directions @ (directions.T @ currents)
-    square = float(pull @ pull)
+    square = float(load @ load)
     if square <= 0.0:
         return 0.0, np.inf
-    share = float(pull @ currents) / square
-    rest = currents - share * pull
+    share = float(load @ currents) / square
+    rest = currents - share * load
     freedom = max(len(rest) - directions.shape[1] - 1, 1)
     sigma = float(np.sqrt(rest @ rest / freedom / square))
     if share == 0.0:

@@ -121,8 +121,8 @@ def _of_range(identified: Identified) -> Iterator[tuple[Status, str]]:
     base = identified.base
     motion = random_motion(base.model, np.random.default_rng(0))
     x = base.regressor(motion)
-    spread = identified.covariance[: base.rank, : base.rank]
-    sigma = np.sqrt(np.mean(np.einsum("mnp,pq,mnq->mn", x, spread, x, optimize=True), axis=0))
+    covariance = identified.covariance[: base.rank, : base.rank]
+    sigma = np.sqrt(np.mean(np.einsum("mnp,pq,mnq->mn", x, covariance, x, optimize=True), axis=0))
     share = sigma / np.sqrt(np.mean((x @ identified.values) ** 2, axis=0))
     if share.max() > _POOR:
         yield (

@@ -77,15 +77,15 @@ class Objective:
         numbers = self.series(free).free
         told, by_told = self._condition(numbers, sharpness, price)
         lost, by_lost = self._beyond(numbers)
-        slopes = _back(self._basis, by_told) + price * _back(self._looks, by_lost)
-        return told + price * lost, slopes.ravel()
+        jacobian = _back(self._basis, by_told) + price * _back(self._looks, by_lost)
+        return told + price * lost, jacobian.ravel()
 
     def _condition(
         self, numbers: FloatArray, sharpness: float, price: float
     ) -> tuple[float, list[FloatArray]]:
         """Condition and torques, with derivatives (m, n) by positions, speeds, accelerations."""
         states = [it @ numbers.T for it in self._basis]
-        rows, slopes = self._regressors(states)
+        rows, jacobian = self._regressors(states)
         weighted = (rows * self._weights[:, None]).reshape(-1, rows.shape[2])
         value, by_weighted = smooth_condition(weighted, sharpness)
         by_rows = by_weighted.reshape(rows.shape) * self._weights[:, None]
@@ -94,7 +94,7 @@ class Objective:
             # As dear as the limits that are looked at more often.
             value += price * _LOOKS * lost
             by_rows = by_rows + price * _LOOKS * by_torque[:, :, None] * self._nominal
-        by_states = np.einsum("kmjp,mjp->mk", slopes, by_rows, optimize=True)
+        by_states = np.einsum("kmjp,mjp->mk", jacobian, by_rows, optimize=True)
         return value, np.split(by_states, len(states), axis=1)
 
     def _regressors(self, states: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
@@ -124,7 +124,7 @@ class Objective:
 
     def _near(self, q: FloatArray) -> tuple[float, FloatArray]:
         """What the distances lack, squared, with derivatives (m, n) by the positions."""
-        value, slopes = 0.0, np.zeros_like(q)
+        value, jacobian = 0.0, np.zeros_like(q)
         for row, posture in enumerate(q):
             lacks = self._lacking(posture)
             if not lacks.any():
@@ -133,8 +133,8 @@ class Objective:
             for joint in range(len(posture)):
                 moved = posture.copy()
                 moved[joint] += _STEP_CLEAR
-                slopes[row, joint] = 2.0 * lacks @ (self._lacking(moved) - lacks) / _STEP_CLEAR
-        return value, slopes
+                jacobian[row, joint] = 2.0 * lacks @ (self._lacking(moved) - lacks) / _STEP_CLEAR
+        return value, jacobian
 
     def _lacking(self, posture: FloatArray) -> FloatArray:
         """(k,) how much each pair's distance lacks, in its unit; zero for those far apart."""
@@ -149,7 +149,7 @@ def _hinge(values: FloatArray, limits: FloatArray) -> tuple[float, FloatArray]:
     return float(np.sum(beyond**2)), 2.0 * beyond * np.sign(values) / limits
 
 
-def _back(basis: tuple[FloatArray, ...], slopes: list[FloatArray]) -> FloatArray:
+def _back(basis: tuple[FloatArray, ...], jacobian: list[FloatArray]) -> FloatArray:
     """(n, k) derivatives by the free numbers, of those (m, n) by the states."""
-    found = sum(values.T @ it for values, it in zip(basis, slopes, strict=True))
+    found = sum(values.T @ it for values, it in zip(basis, jacobian, strict=True))
     return np.asarray(found).T

@@ -58,8 +58,8 @@ class Payload:
     @property
     def centre_sigma_m(self) -> FloatArray:
         """(3,) standard deviations of its centre [m]."""
-        slopes = np.column_stack([-self.centre_m, np.eye(3)]) / self.mass_kg
-        return np.asarray(np.sqrt(np.diag(slopes @ self.covariance[:4, :4] @ slopes.T)))
+        jacobian = np.column_stack([-self.centre_m, np.eye(3)]) / self.mass_kg
+        return np.asarray(np.sqrt(np.diag(jacobian @ self.covariance[:4, :4] @ jacobian.T)))
 
     @property
     def inertia_kg_m2(self) -> FloatArray:

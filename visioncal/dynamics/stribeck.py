@@ -18,7 +18,7 @@ from visioncal.dynamics.friction import sign
 from visioncal.dynamics.motion import Motion
 from visioncal.dynamics.regression import Block, Regression, regress
 from visioncal.estimation.levenberg_marquardt import Linearised, descend
-from visioncal.estimation.linalg import covariance, damped_step, gram
+from visioncal.estimation.linalg import covariance_from, damped_step, gram
 
 # Where the search begins, and what it stays within [rad/s].
 _STARTS, _SLOWEST, _FASTEST = (0.01, 0.03, 0.08), 1e-3, 0.5
@@ -59,7 +59,7 @@ class Stribeck:
         torques[:, self.joints] = self.hump_nm * self.shapes(motion)
         return torques
 
-    def slopes(self, motion: Motion) -> FloatArray:
+    def jacobian(self, motion: Motion) -> FloatArray:
         """(m, 2 a) derivatives by the hump, and by the logarithm of its speed."""
         shapes = self.shapes(motion)
         squares = (motion.dq[:, self.joints] / self.speed_rad_s) ** 2
@@ -195,14 +195,14 @@ class _Weighted:
         count, size = len(at.joints), len(self.right)
         a, b = self._normal(replace(at, hump_nm=np.ones(count)))
         linear, speeds = slice(size + count), slice(size + count, None)
-        spread = covariance(a[linear, linear])
-        best = spread @ b[linear]
+        covariance = covariance_from(a[linear, linear])
+        best = covariance @ b[linear]
         humps = best[size:]
         cross = humps[:, None] * a[speeds, linear]
         return _Look(
             replace(at, hump_nm=humps),
             self.total - float(best @ b[linear]),
-            np.outer(humps, humps) * a[speeds, speeds] - cross @ spread @ cross.T,
+            np.outer(humps, humps) * a[speeds, speeds] - cross @ covariance @ cross.T,
             cross @ best - humps * b[speeds],
         )
 
@@ -212,10 +212,10 @@ class _Weighted:
         a, b = np.zeros((size + 2 * count, size + 2 * count)), np.zeros(size + 2 * count)
         a[:size, :size], b[:size] = self.information, self.right
         for stream, block, weight in zip(self.streams, self.blocks, self.weights, strict=True):
-            slopes = stream.filtered(humps.slopes)
+            jacobian = stream.filtered(humps.jacobian)
             for at, joint in enumerate(humps.joints):
                 own = [size + at, size + count + at]
-                columns = slopes[:, [at, count + at]] * weight[:, joint, None]
+                columns = jacobian[:, [at, count + at]] * weight[:, joint, None]
                 a[:size, own] += block.x[:, joint].T @ columns
                 a[np.ix_(own, own)] += columns.T @ columns
                 b[own] += columns.T @ block.y[:, joint]
@@ -230,9 +230,9 @@ def _with_humps(
     count = len(humps.joints)
     added = []
     for stream, block in zip(streams, blocks, strict=True):
-        slopes = stream.filtered(humps.slopes)
+        jacobian = stream.filtered(humps.jacobian)
         more = np.zeros((*block.y.shape, 2 * count))
         for at, joint in enumerate(humps.joints):
-            more[:, joint, [at, count + at]] = slopes[:, [at, count + at]]
+            more[:, joint, [at, count + at]] = jacobian[:, [at, count + at]]
         added.append(replace(block, x=np.concatenate([block.x, more], axis=2)))
     return added

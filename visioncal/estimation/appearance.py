@@ -17,7 +17,7 @@ from scipy.linalg import block_diag
 
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Target
 from visioncal.estimation.corners import CornerStack, reproject
-from visioncal.estimation.linalg import covariance
+from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.parts import Effect
 from visioncal.estimation.poses import fit_poses
 from visioncal.estimation.variance import Knowledge
@@ -126,7 +126,7 @@ class Appearance:
 
 
 @dataclass(frozen=True, eq=False)
-class Free:
+class LensBoardParameters:
     """Which unknowns of an appearance are free, and what is known of them without the robot.
 
     Attributes:
@@ -136,7 +136,7 @@ class Free:
         columns: (k,) the free ones' places among the appearance's values.
         anchored: (k,) mask of those that stay where they are, and count in the covariance only.
         information: (k, k) on them, from the corners and from what is known beforehand.
-        pull: (k,) half the gradient of what is known, at their present values.
+        gradient: (k,) half the gradient of what is known, at their present values.
     """
 
     appearance: Appearance
@@ -145,11 +145,11 @@ class Free:
     columns: IntArray
     anchored: Mask
     information: FloatArray
-    pull: FloatArray
+    gradient: FloatArray
 
     def effect(self, shift: FloatArray) -> Effect:
         """Puts it as the chain takes it, with the (m, 6, k) shifts of its views."""
-        known = Knowledge(self.information, self.pull)
+        known = Knowledge(self.information, self.gradient)
         return replace(Effect.free(LENS_AND_BOARD, known, shift), held=self.anchored)
 
     @property
@@ -191,7 +191,7 @@ class Compressed:
     residuals: FloatArray
 
     @property
-    def shared_pull(self) -> FloatArray:
+    def shared_gradient(self) -> FloatArray:
         """(k,) that of all views together."""
         return np.asarray(self.shared_pulls.sum(axis=0))
 
@@ -249,7 +249,7 @@ def compress_points(
     now = reproject(stack, camera, fit.cam_from_target, lens=lens)
     by_shared = np.concatenate([now.by_intrinsics, now.by_pose[:, :, 3:] @ by_values], axis=2)
     between = stack.products_by_view(now.by_pose, by_shared)
-    answer = -covariance(fit.information) @ between
+    answer = -covariance_from(fit.information) @ between
     # What is left once the poses have followed, squared: never less than none, and as exact as the
     # square of their error. A difference of two squares would magnify it a millionfold.
     left = by_shared + now.by_pose @ answer[stack.view_of]

@@ -84,7 +84,7 @@ class ArmErrors:
         information = np.eye(size) / self.sigma**2
         known = Knowledge(information, information @ at)
         held = np.zeros(size, dtype=bool)
-        return Effect(f"{name} of {robot}", at, known, held, by_flange={robot: self.basis})
+        return Effect(f"{name} of {robot}", at, known, held, flange_jacobian={robot: self.basis})
 
 
 def link_basis(robot: Robot, joints_rad: FloatArray) -> FloatArray:
@@ -174,11 +174,11 @@ def _most_likely_size(
         The size, and the negative logarithm of its restricted likelihood.
     """
     reduced, components = likelihood.reduced, likelihood.components
-    width, columns = reduced.errors.shape[1], reduced.slopes.shape[2]
+    width, columns = reduced.errors.shape[1], reduced.jacobian.shape[2]
     units, places = np.divmod(np.arange(size), width)
     count = int(units[-1]) + 1
-    slopes, part = np.zeros((count, width, columns)), np.zeros((count, width, width))
-    slopes[units, places, columns - size + np.arange(size)] = 1.0
+    jacobian, part = np.zeros((count, width, columns)), np.zeros((count, width, width))
+    jacobian[units, places, columns - size + np.arange(size)] = 1.0
     part[units, places, places] = 1.0
     parts = np.zeros((len(components.parts) + 1, len(reduced.errors) + count, width, width))
     parts[:-1, :-count], parts[-1, -count:] = components.parts, part
@@ -189,7 +189,7 @@ def _most_likely_size(
         reduced=replace(
             reduced,
             errors=np.pad(reduced.errors, ((0, count), (0, 0))),
-            slopes=np.concatenate([reduced.slopes, slopes]),
+            jacobian=np.concatenate([reduced.jacobian, jacobian]),
         ),
         components=Components(np.concatenate([components.known, rest]), parts),
     )
@@ -229,12 +229,12 @@ def misfit_covariance(
     Returns:
         (p, p) among the unknowns.
     """
-    answer = errors.sigma * misfit_slopes(problem, state, noise, robot, errors)
+    answer = errors.sigma * misfit_jacobian(problem, state, noise, robot, errors)
     return np.asarray(answer @ answer.T)
 
 
 def covariance_of_size(
-    problem: Problem, spread: FloatArray, robot: str, errors: ArmErrors
+    problem: Problem, covariance: FloatArray, robot: str, errors: ArmErrors
 ) -> FloatArray:
     """What it adds to a fit's covariance that the size of an arm's errors was estimated, too.
 
@@ -244,7 +244,7 @@ def covariance_of_size(
 
     Args:
         problem: The observations, with these errors among the unknowns.
-        spread: (p, p) the fit's covariance.
+        covariance: (p, p) the fit's covariance.
         robot: The robot.
         errors: The arm's errors.
 
@@ -252,13 +252,13 @@ def covariance_of_size(
         (p, p) among the unknowns.
     """
     arm, variance = problem.effect_columns[f"arm of {robot}"], errors.sigma**2
-    with_arm = spread[arm]
+    with_arm = covariance[arm]
     told = len(with_arm) - float(np.trace(with_arm[:, arm])) / variance
     # Two or fewer would leave it without bound.
     return np.asarray(2.0 / (max(told - 2.0, 1.0) * variance) * with_arm.T @ with_arm)
 
 
-def misfit_slopes(
+def misfit_jacobian(
     problem: Problem, state: State, noise: Noise, robot: str, errors: ArmErrors
 ) -> FloatArray:
     """How a fit that takes errors of the arm for white noise moves with them.

@@ -96,7 +96,7 @@ class ArmPair:
         errors = linear.by_errors[:, :, 6 * slot : 6 * slot + 6]
         return replace(linear, by_errors=errors), here.predicted(edges)
 
-    def slopes(
+    def jacobian(
         self, base_from_flange: FloatArray, moved: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """How the pose of the observed moves with all edges and with anything of the arm.
@@ -112,7 +112,7 @@ class ArmPair:
         # Residuals fall as what is predicted moves on.
         return poses, -np.concatenate([linear.jacobian, linear.by_errors @ moved], axis=2)
 
-    def frame_slopes(self, base_from_flange: FloatArray) -> FloatArray:
+    def frame_jacobian(self, base_from_flange: FloatArray) -> FloatArray:
         """(k, 6, 12) how the flange moves with the frames of its base and of what it carries."""
         branches = self.problem.tree.branches
         flange = next(name for name, it in branches.items() if it.robot == self.robot)
@@ -121,14 +121,14 @@ class ArmPair:
         of_end = np.broadcast_to(adjoint(flange_from_end), (len(base_from_flange), 6, 6))
         return np.concatenate([adjoint(invert(base_from_flange)), of_end], axis=2)
 
-    def place_slopes(self, poses: FloatArray, slopes: FloatArray, at: FloatArray) -> FloatArray:
+    def place_jacobian(self, poses: FloatArray, jacobian: FloatArray, at: FloatArray) -> FloatArray:
         """How the place of what the arm carries moves, seen from what stands still.
 
         That is the observer's origin seen from what it observes, or a point of that seen from it.
 
         Args:
             poses: (k, 4, 4) `observer_from_observed`.
-            slopes: (k, 6, p) their right perturbations.
+            jacobian: (k, 6, p) their right perturbations.
             at: (3,) the point of what is observed, in its frame [m].
 
         Returns:
@@ -137,16 +137,16 @@ class ArmPair:
         places = np.broadcast_to(at, (len(poses), 3))
         if self.is_observer_carried:
             places = invert(poses)[:, :3, 3]
-        return np.asarray(-skew(places) @ slopes[:, :3] + slopes[:, 3:])
+        return np.asarray(-skew(places) @ jacobian[:, :3] + jacobian[:, 3:])
 
     def weight(self, noise: Noise, measured: Mask) -> FloatArray:
         """(6, 6) what makes noise like the pair's white; nothing of what is not measured."""
         linear = self.problem.linear(self.state, ideal=True)
-        spread = self.problem.total_covariance(linear, noise)[self.rows][:, measured][
+        covariance = self.problem.total_covariance(linear, noise)[self.rows][:, measured][
             :, :, measured
         ]
         found = np.zeros((6, 6))
-        root = np.linalg.cholesky(np.linalg.inv(spread).mean(axis=0))
+        root = np.linalg.cholesky(np.linalg.inv(covariance).mean(axis=0))
         found[np.ix_(measured, measured)] = root.T
         return found
 
@@ -188,7 +188,7 @@ class ArmData:
     measured: Mask = field(default_factory=lambda: np.ones(6, dtype=bool))
 
     @property
-    def spread(self) -> FloatArray:
+    def arm_covariance(self) -> FloatArray:
         """(p, p) covariance of its errors."""
         return self.covariance[np.ix_(self.columns, self.columns)]
 

@@ -50,8 +50,8 @@ def bends_seen(arm: ArmData, torques: FloatArray) -> FloatArray:
         (m, n) [rad]; NaN where the torque is too small to tell.
     """
     model, problem = arm.model, arm.problem
-    residuals, slopes = whitened(problem, arm.state, arm.noise, ideal=False)
-    springs = slopes[:, :, arm.columns[model.place_of(COMPLIANCE)]]
+    residuals, jacobian = whitened(problem, arm.state, arm.noise, ideal=False)
+    springs = jacobian[:, :, arm.columns[model.place_of(COMPLIANCE)]]
     of = [problem.observations.stops == stop for stop in arm.stops.tolist()]
     pulled = np.array([np.einsum("mij,mi->j", springs[it], residuals[it]) for it in of])
     square = np.array([np.einsum("mij,mij->j", springs[it], springs[it]) for it in of])
@@ -83,13 +83,13 @@ def payload_factor(arm: ArmData) -> Factor | None:
     bends = np.einsum("mij,mj->mi", robot.axis_jacobian(bent), model.compliance * more)
     moved[arm.stops] = bends[:, :, None]
     nothing = Knowledge(np.zeros((1, 1)), np.zeros(1))
-    one = Effect.free("payload", nothing, by_flange={arm.robot: moved})
+    one = Effect.free("payload", nothing, flange_jacobian={arm.robot: moved})
     widened = problem.with_effects([*problem.effects, one])
     there = State(arm.state.edges, np.append(arm.state.values, 0.0))
     information, gradient = normal_equations(widened, there, arm.noise)
-    spread = covariance_among(information, widened.moving)
-    sigma = float(np.sqrt(spread[-1, -1]))
-    return Factor(1.0 - float(spread[-1] @ gradient), sigma)
+    covariance = covariance_among(information, widened.moving)
+    sigma = float(np.sqrt(covariance[-1, -1]))
+    return Factor(1.0 - float(covariance[-1] @ gradient), sigma)
 
 
 def flange_bends(model: ArmModel, q: FloatArray, loads: Loads | None = None) -> FloatArray:

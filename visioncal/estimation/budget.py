@@ -68,9 +68,9 @@ def covariance_by_source(
     known = problem.knowledge(state).information
     owned = np.concatenate([*sources.columns.values(), np.zeros(0, np.int64)])
     for prior in problem.priors:
-        _, slopes = problem.prior_rows(prior, state)
-        known = known - slopes.T @ slopes
-        pulled = slopes @ carried
+        _, jacobian = problem.prior_rows(prior, state)
+        known = known - jacobian.T @ jacobian
+        pulled = jacobian @ carried
         found[sources.priors] += pulled.T @ pulled
     for name, columns in sources.columns.items():
         share = np.where(np.isin(owned, columns), 0.5, 0.0)
@@ -91,9 +91,9 @@ def _weighted(problem: Problem, linear: Linear, own: FloatArray, noise: Noise) -
     found[rest] = weights @ found[rest]
     errors = problem.error_covariance(noise)
     joined, units = rest[of[rest] >= 0], of[rest][of[rest] >= 0]
-    slopes = linear.by_errors[joined]
-    turned = np.swapaxes(slopes, 1, 2)
-    weighted = weights[of[rest] >= 0] @ slopes
+    jacobian = linear.by_errors[joined]
+    turned = np.swapaxes(jacobian, 1, 2)
+    weighted = weights[of[rest] >= 0] @ jacobian
     shape = errors.shape
     told, asked = np.zeros(shape), np.zeros((len(errors), shape[1], linear.size))
     np.add.at(told, units, turned @ weighted)
@@ -127,9 +127,9 @@ def _by_errors(
     return found
 
 
-def radius95(spread: FloatArray) -> float:
+def radius95(covariance: FloatArray) -> float:
     """Radius of the ball that holds a Gaussian with 95 % (three-moment fit of Imhof 1961)."""
-    values = np.maximum(np.linalg.eigvalsh(spread), 0.0)
+    values = np.maximum(np.linalg.eigvalsh(covariance), 0.0)
     first, second, third = (float(np.sum(values**power)) for power in (1, 2, 3))
     if not third > 0.0:
         return 0.0
@@ -138,16 +138,16 @@ def radius95(spread: FloatArray) -> float:
     return float(np.sqrt(max(quantile, 0.0)))
 
 
-def point_covariance(edge: FloatArray, spread: FloatArray, point: FloatArray) -> FloatArray:
+def point_covariance(edge: FloatArray, covariance: FloatArray, point: FloatArray) -> FloatArray:
     """Covariance of a point that an uncertain transform carries.
 
     Args:
         edge: (4, 4) `a_from_b`.
-        spread: (6, 6) of its right perturbation (rotation, translation).
+        covariance: (6, 6) of its right perturbation (rotation, translation).
         point: (3,) in frame b, exact [m].
 
     Returns:
         (3, 3) of the point in frame a [m^2].
     """
     slope = edge[:3, :3] @ np.concatenate([-skew(point), np.eye(3)], axis=1)
-    return np.asarray(slope @ spread @ slope.T)
+    return np.asarray(slope @ covariance @ slope.T)

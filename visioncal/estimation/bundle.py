@@ -13,7 +13,7 @@ from visioncal.core.transforms import exp
 from visioncal.core.types import Camera, FloatArray
 from visioncal.estimation.corners import CornerStack, Reprojection, reproject
 from visioncal.estimation.levenberg_marquardt import Linearised, descend
-from visioncal.estimation.linalg import covariance, damped_step
+from visioncal.estimation.linalg import covariance_from, damped_step
 from visioncal.vision.camera import intrinsics, with_intrinsics
 
 # The intrinsics (4 + k,) and the poses (v, 4, 4).
@@ -63,7 +63,7 @@ class _Blocks:
         """
         damped = self.by_pose + damping * self.by_pose * np.eye(6)
         right = np.concatenate([self.between, self.pose_gradient[:, :, None]], axis=2)
-        answer = covariance(damped) @ right
+        answer = covariance_from(damped) @ right
         taken = np.swapaxes(self.between, 1, 2) @ answer
         taken = taken.sum(axis=0)
         return (
@@ -114,8 +114,8 @@ def _finished(
 ) -> BundleFit:
     information, _, _ = _blocks(stack, now).reduced(0.0)
     sigma_px = stack.sigma_px(now.residuals, 6 * len(poses) + len(information))
-    spread = sigma_px**2 * covariance(information)
-    return BundleFit(camera, poses, now.residuals, sigma_px, spread, settled)
+    covariance = sigma_px**2 * covariance_from(information)
+    return BundleFit(camera, poses, now.residuals, sigma_px, covariance, settled)
 
 
 def _blocks(stack: CornerStack, at: Reprojection) -> _Blocks:

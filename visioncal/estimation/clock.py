@@ -17,7 +17,7 @@ from visioncal.estimation.clock_correlation import NEAR_S, WIDEST_OFFSET_S, WIND
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.clock import clock_effect
 from visioncal.estimation.effects.delays import Delay, compress_delayed, shares_of, target_twists
-from visioncal.estimation.linalg import covariance, gram
+from visioncal.estimation.linalg import covariance_from, gram
 from visioncal.estimation.outliers import closed_form
 from visioncal.estimation.parts import Effect, State
 from visioncal.estimation.problem import Problem
@@ -110,13 +110,13 @@ class _Late:
         prior = np.array([it.sigma_s for it in self.delays]) ** -2.0
         known = Knowledge(
             weight * seen.shared_information + np.diag(prior),
-            weight * seen.shared_pull + prior * self.times_s,
+            weight * seen.shared_gradient + prior * self.times_s,
         )
         problem = chain(
             frames.mount,
             flange,
             seen.cam_from_target,
-            covariance(weight * seen.information),
+            covariance_from(weight * seen.information),
             effects=[clock_effect(speeds), Effect.free("delays", known, seen.by_shared)],
         )
         return problem, weight * seen.shared_pulls
@@ -259,8 +259,8 @@ def clock_problem(robot: Trajectory, frames: Frames, offset_s: float) -> Problem
 def _sound(problem: Problem, fit: Solution) -> Mask:
     """Which frames agree with the others."""
     linear = problem.linear(fit.state)
-    residuals, spread = linear.residuals, problem.total_covariance(linear, fit.noise)
-    squares = np.einsum("mi,mij,mj->m", residuals, np.linalg.inv(spread), residuals)
+    residuals, covariance = linear.residuals, problem.total_covariance(linear, fit.noise)
+    squares = np.einsum("mi,mij,mj->m", residuals, np.linalg.inv(covariance), residuals)
     return np.asarray(squares <= _OUTLYING**2 * float(np.median(squares)))
 
 
@@ -274,8 +274,8 @@ def _sigmas_s(
     (the jackknife over clusters; Bell and McCaffrey 2002).
     """
     # A direction without information has a very large variance here.
-    spread = covariance(fisher_information(problem, fit.state, fit.noise))
-    independent = np.diag(spread)[12:]
+    covariance = covariance_from(fisher_information(problem, fit.state, fit.noise))
+    independent = np.diag(covariance)[12:]
     stretches = np.unique((stamps_s - stamps_s[0]) // _STRETCH_S, return_inverse=True)[1]
     count = int(stretches.max()) + 1
     if count < _FEWEST_STRETCHES:
@@ -284,12 +284,12 @@ def _sigmas_s(
     residuals, jacobian = linear.residuals, linear.jacobian
     blocks = problem.total_covariance(linear, fit.noise)
     weighted = np.linalg.solve(blocks, np.concatenate([jacobian, residuals[:, :, None]], axis=2))
-    information, moved = covariance(spread), np.zeros((count, jacobian.shape[2]))
+    information, moved = covariance_from(covariance), np.zeros((count, jacobian.shape[2]))
     for stretch in range(count):
         mine = stretches == stretch
         both = gram(jacobian[mine], weighted[mine])
         both[len(both) - pulls.shape[1] :, -1] += pulls[mine].sum(axis=0)
         # Without the stretch: its own leverage would hide how far it is off.
-        moved[stretch] = covariance(information - both[:, :-1]) @ both[:, -1]
+        moved[stretch] = covariance_from(information - both[:, :-1]) @ both[:, -1]
     together = moved.T @ moved * (count - 1) / count
     return np.sqrt(np.maximum(independent, np.diag(together)[12:])), count - 1.0

@@ -169,8 +169,10 @@ class _Turning:
         if not told > 0.0:
             return np.inf
         # Pairs that share a stretch of time err alike.
-        spread = float(np.sqrt(np.mean((off - off.mean()) ** 2) * max(self.per_window, 1.0) / told))
-        return float(np.hypot(spread, _LEAST_SIGMA_S))
+        covariance = float(
+            np.sqrt(np.mean((off - off.mean()) ** 2) * max(self.per_window, 1.0) / told)
+        )
+        return float(np.hypot(covariance, _LEAST_SIGMA_S))
 
 
 def _common_s(robot: Trajectory, frames: Frames) -> float:

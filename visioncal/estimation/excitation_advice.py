@@ -55,7 +55,7 @@ def joints_to_move(
         if best is None or tried[best] <= now:
             break
         found.append(best)
-        q, now = _spread(robot, q, best.joint, best.wanted), tried[best]
+        q, now = _range_of(robot, q, best.joint, best.wanted), tried[best]
     return tuple(found)
 
 
@@ -68,16 +68,18 @@ def _tried(
     for span in _SPANS_RAD:
         for joint in np.flatnonzero(moved < span).tolist():
             move = Move(joint, float(moved[joint]), span)
-            tried[move] = told(_spread(robot, q, joint, span))
+            tried[move] = told(_range_of(robot, q, joint, span))
         if max(tried.values(), default=0) >= wanted:
             break
     return tried
 
 
-def _spread(robot: Robot, q: FloatArray, joint: int, span: float) -> FloatArray:
+def _range_of(robot: Robot, q: FloatArray, joint: int, span: float) -> FloatArray:
     lower, upper = (limit[joint] for limit in turning_range(robot))
     middle = 0.5 * (q[:, joint].min() + q[:, joint].max())
     order = np.random.default_rng(joint).permutation(len(q))
-    spread = q.copy()
-    spread[:, joint] = np.clip(middle + span * np.linspace(-0.5, 0.5, len(q)), lower, upper)[order]
-    return spread
+    covariance = q.copy()
+    covariance[:, joint] = np.clip(middle + span * np.linspace(-0.5, 0.5, len(q)), lower, upper)[
+        order
+    ]
+    return covariance

@@ -19,7 +19,7 @@ from visioncal.core.transforms import compose, exp, skew
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.group_outliers import Agreement, agreeing_groups
 from visioncal.estimation.groups import GroupFit, Groups
-from visioncal.estimation.linalg import covariance
+from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.observability import SIGMA_LIMIT_M, Direction
 from visioncal.estimation.placing import (
     LEAST_NOISE_M,
@@ -121,7 +121,7 @@ class FeatureFit:
     def covariance_at(self, noise_m: float) -> FloatArray:
         """(6, 6) covariance of the frame, were that the noise beyond what is known [m]."""
         fit = self.agreement.fit
-        return covariance(fit.groups.subset(fit.used).information(noise_m))
+        return covariance_from(fit.groups.subset(fit.used).information(noise_m))
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,10 +150,10 @@ class FeatureProblem:
         touches, rotation = self.touches, state[:3, :3]
         local = (touches.points - state[:3, 3]) @ rotation
         zero = np.array([_ZEROS[kind] for kind in touches.kinds])
-        slopes = np.concatenate([skew(local), np.tile(-np.eye(3), (len(local), 1, 1))], axis=2)
+        jacobian = np.concatenate([skew(local), np.tile(-np.eye(3), (len(local), 1, 1))], axis=2)
         return Groups(
             np.where(zero, local, 0.0),
-            np.where(zero[:, :, None], slopes, 0.0),
+            np.where(zero[:, :, None], jacobian, 0.0),
             zero,
             rotation.T @ touches.covariances @ rotation,
         )

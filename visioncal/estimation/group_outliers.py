@@ -9,7 +9,7 @@ import numpy as np
 from visioncal.core.quantiles import chi2_limit, f_limit
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.groups import GroupFit, GroupProblem, State, descended, fit_groups
-from visioncal.estimation.linalg import covariance, gram, squared_lengths
+from visioncal.estimation.linalg import covariance_from, gram, squared_lengths
 from visioncal.estimation.robust import Distances, half_of, settled, trimmed_start, widened
 
 # Noise leaves sound groups out in one set of a thousand.
@@ -27,8 +27,9 @@ class Agreement(Generic[State]):
     Attributes:
         fit: From the groups that agree.
         agrees: (m,) mask of them.
-        surprise: (m,) squared Mahalanobis distance of each group from what the others predict, over
-            the number of directions in which they predict it: one on average where it is noise.
+        mahalanobis_sq: (m,) squared Mahalanobis distance of each group from what the others
+            predict, over the number of directions in which they predict it: one on average where
+            it is noise.
         limit: (m,) what it may be; infinite where the others do not predict the group at all.
         doubtful: (m,) groups of which some are wrong, while nothing tells which: all of them stay.
         explained: Whether noise explains the groups that stay: none is doubtful, and their misfit
@@ -37,7 +38,7 @@ class Agreement(Generic[State]):
 
     fit: GroupFit[State]
     agrees: Mask
-    surprise: FloatArray
+    mahalanobis_sq: FloatArray
     limit: FloatArray
     doubtful: Mask
     explained: bool
@@ -103,10 +104,10 @@ def distances(fit: GroupFit[State]) -> Distances:
     (1982, section 2.2): its covariance is that of the noise less what the fit has taken.
     """
     groups = fit.groups
-    spread = groups.spread(fit.sigma)
+    covariance = groups.covariance(fit.sigma)
     taken = groups.jacobian @ fit.covariance @ np.swapaxes(groups.jacobian, 1, 2)
-    left = spread + np.where(fit.used, -1.0, 1.0)[:, None, None] * taken
-    squares, directions = squared_lengths(groups.residuals, left, spread)
+    left = covariance + np.where(fit.used, -1.0, 1.0)[:, None, None] * taken
+    squares, directions = squared_lengths(groups.residuals, left, covariance)
     directions = directions - np.sum(~groups.observed, axis=1)
     # The level is estimated from the residuals that stay, which gives the squares the tails of an F
     # distribution; and the sets that stay were chosen for their small level among all of their
@@ -158,14 +159,16 @@ def _doubtful(fit: GroupFit[State]) -> Mask:
 def _left_without(fit: GroupFit[State], used: Mask) -> FloatArray:
     """What is left (m,) of the whitened squared residuals without each group of a mask in turn."""
     inside = fit.groups.subset(used)
-    spread = inside.spread(fit.sigma)
-    fitted = covariance(inside.information(fit.sigma))
-    pull = gram(np.linalg.solve(spread, inside.jacobian), inside.residuals)
-    residuals = inside.residuals - inside.jacobian @ (fitted @ pull)
-    whole = np.einsum("mi,mi->", residuals, np.linalg.solve(spread, residuals[..., None])[..., 0])
+    covariance = inside.covariance(fit.sigma)
+    fitted = covariance_from(inside.information(fit.sigma))
+    gradient = gram(np.linalg.solve(covariance, inside.jacobian), inside.residuals)
+    residuals = inside.residuals - inside.jacobian @ (fitted @ gradient)
+    whole = np.einsum(
+        "mi,mi->", residuals, np.linalg.solve(covariance, residuals[..., None])[..., 0]
+    )
     taken = inside.jacobian @ fitted @ np.swapaxes(inside.jacobian, 1, 2)
     left = np.full(len(used), np.inf)
-    left[used] = whole - squared_lengths(residuals, spread - taken, spread)[0]
+    left[used] = whole - squared_lengths(residuals, covariance - taken, covariance)[0]
     return np.asarray(np.maximum(left, np.finfo(float).eps * whole))
 
 
@@ -173,6 +176,6 @@ def _is_explained(fit: GroupFit[State], expected_sigma: float) -> bool:
     inside = fit.groups.subset(fit.used)
     if fit.freedom < 1:
         return True
-    white = np.linalg.solve(inside.spread(expected_sigma), inside.residuals[..., None])[..., 0]
+    white = np.linalg.solve(inside.covariance(expected_sigma), inside.residuals[..., None])[..., 0]
     misfit = float(np.sum(inside.residuals * white))
     return misfit <= float(chi2_limit(_FALSE_ALARM, fit.freedom))

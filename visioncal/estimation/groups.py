@@ -14,7 +14,7 @@ import numpy as np
 
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.levenberg_marquardt import Linearised, descend
-from visioncal.estimation.linalg import covariance, damped_step, gram, spectrum
+from visioncal.estimation.linalg import covariance_from, damped_step, gram, spectrum
 from visioncal.estimation.variance import (
     LEAST_SIGMA,
     Components,
@@ -61,7 +61,7 @@ class Groups:
             self.known[chosen],
         )
 
-    def spread(self, sigma: float) -> FloatArray:
+    def covariance(self, sigma: float) -> FloatArray:
         """Covariances (m, d, d) at a level of noise [m]; one where nothing was observed."""
         return self._components().total(np.array([sigma]))
 
@@ -86,7 +86,7 @@ class Groups:
 
     def information(self, sigma: float) -> FloatArray:
         """Fisher information (p, p) on the unknowns at a level of noise [m]."""
-        weighted = np.linalg.solve(self.spread(sigma), self.jacobian)
+        weighted = np.linalg.solve(self.covariance(sigma), self.jacobian)
         return gram(self.jacobian, weighted)
 
     @property
@@ -146,7 +146,7 @@ class GroupFit(Generic[State]):
         By these an error that several groups share, and that their weights do not know of, is
         carried to the answer.
         """
-        weights = np.linalg.inv(self.groups.spread(self.sigma))
+        weights = np.linalg.inv(self.groups.covariance(self.sigma))
         weighted = np.where(self.used[:, None, None], weights @ self.groups.jacobian, 0.0)
         return np.asarray(-self.covariance @ np.swapaxes(weighted, 1, 2))
 
@@ -185,7 +185,7 @@ def fit_groups(
     sigma, settled = _rms(groups.subset(chosen)), False
     for _ in range(_ROUNDS):
         # Held at the start: weights that follow the state would reward states with large noise.
-        weights = np.asarray(np.linalg.inv(groups.spread(sigma)), dtype=float)
+        weights = np.asarray(np.linalg.inv(groups.covariance(sigma)), dtype=float)
         state, settled = descended(problem, state, chosen, weights)
         groups = problem.linearise(state)
         before, sigma = sigma, groups.subset(chosen).level(max(sigma, LEAST_SIGMA))[0]
@@ -207,8 +207,8 @@ def _finished(
     freedom = inside.freedom
     if freedom < 1:
         sigma = max(expected_sigma, LEAST_SIGMA)
-    spread = covariance(inside.information(sigma))
-    return GroupFit(state, spread, sigma, freedom, groups, chosen, settled)
+    covariance = covariance_from(inside.information(sigma))
+    return GroupFit(state, covariance, sigma, freedom, groups, chosen, settled)
 
 
 def _rms(groups: Groups) -> float:

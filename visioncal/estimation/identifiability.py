@@ -16,7 +16,7 @@ LEAST_SHARE = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
+class Identifiability:
     """What stops tell of an arm.
 
     Attributes:
@@ -35,7 +35,7 @@ class Told:
 
 
 @dataclass(frozen=True, eq=False)
-class Slopes:
+class Jacobians:
     """How what is seen moves with the frames at both ends and the arm's errors.
 
     Attributes:
@@ -58,7 +58,7 @@ class Slopes:
         return basis.shape[1], self.arm - basis @ (basis.T @ self.arm)
 
 
-def what_is_told(stops: Slopes, anywhere: Slopes) -> Told:
+def what_is_told(stops: Jacobians, anywhere: Jacobians) -> Identifiability:
     """Counts what stops tell, and what any stops could.
 
     Args:
@@ -71,7 +71,7 @@ def what_is_told(stops: Slopes, anywhere: Slopes) -> Told:
     seen, values, here = _told(stops)
     # What is identifiable and not among what is told; both are spanned by unit vectors.
     missing = np.linalg.svd(can.T - here.T @ (here @ can.T), full_matrices=False)[0]
-    return Told(
+    return Identifiability(
         columns=stops.frames.shape[1] + stops.arm.shape[1],
         identifiable=most + len(can) + stops.frames.shape[1] - anywhere.frames.shape[1],
         told=seen + len(values),
@@ -80,15 +80,15 @@ def what_is_told(stops: Slopes, anywhere: Slopes) -> Told:
     )
 
 
-def count_told(slopes: Slopes) -> int:
+def count_told(jacobian: Jacobians) -> int:
     """How many values and combinations are told better than they were known before."""
-    seen, values, _ = _told(slopes)
+    seen, values, _ = _told(jacobian)
     return seen + len(values)
 
 
-def _told(slopes: Slopes) -> tuple[int, FloatArray, FloatArray]:
+def _told(jacobian: Jacobians) -> tuple[int, FloatArray, FloatArray]:
     """Directions of the frames, and values and directions (k, p) of the arm that are told."""
-    seen, free = slopes.free()
+    seen, free = jacobian.free()
     sizes, turned = right_vectors(free)
     return seen, sizes[sizes > 1.0], turned[sizes > 1.0]
 

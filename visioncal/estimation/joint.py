@@ -16,7 +16,7 @@ from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.corners import floored_sigma_px
-from visioncal.estimation.effects.lenses import Looks, Seen
+from visioncal.estimation.effects.lenses import CameraParameters, Seen
 from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
@@ -104,12 +104,12 @@ class Fitted:
         return np.asarray(self.fit.state.values[: len(free)] - self.seen.looks.values[free])
 
     @property
-    def looks(self) -> Looks:
+    def looks(self) -> CameraParameters:
         """Lenses and boards as they came out; what was held is where it was."""
         free = self.seen.free
         return self.seen.looks.with_values(free, self.fit.state.values[: len(free)])
 
-    def spread(self) -> FloatArray:
+    def covariance(self) -> FloatArray:
         """(p, p) covariance of what the fit moves, where it was measured."""
         return fitted_covariance(self.problem, self.fit.state, self.fit.noise)
 
@@ -120,7 +120,7 @@ class Fitted:
 
 
 def settle(
-    looks: Looks,
+    looks: CameraParameters,
     side: Side,
     moving: IntArray,
     frames: Mapping[str, FloatArray],
@@ -152,14 +152,16 @@ def settle(
         ) from error
 
 
-def again(fitted: Fitted, side: Side, moving: IntArray, looks: Looks | None = None) -> Fitted:
+def again(
+    fitted: Fitted, side: Side, moving: IntArray, looks: CameraParameters | None = None
+) -> Fitted:
     """Settles once more from an answer, with other values free, or by other priors."""
     return settle(looks or fitted.looks, side, moving, fitted.frames, fitted.others)
 
 
 def _settled(side: Side, fitted: Fitted) -> Fitted:
     for _ in range(_ROUNDS):
-        sigma = np.sqrt(np.diag(fitted.spread())[fitted.columns])
+        sigma = np.sqrt(np.diag(fitted.covariance())[fitted.columns])
         if np.all(np.abs(fitted.change) <= _SETTLED * sigma):
             break
         fitted = _fitted(side, _stepped(fitted), fitted.frames, fitted.others)
@@ -226,13 +228,13 @@ def measured_scale(side: Side, fitted: Fitted, board: int = 0) -> MeasuredScale:
     stated, known = looks.stated_scale_sigma(board), float(looks.prior_sigma[place] ** -2.0)
     problem, there = _at(side, fitted, fitted.seen.freed(np.union1d(fitted.moving, place)))
     information, gradient = normal_equations(problem, there, fitted.fit.noise)
-    spread = covariance_among(information, problem.moving)
+    covariance = covariance_among(information, problem.moving)
     at = fitted.columns.start + int(np.searchsorted(fitted.seen.free, place))
     # What was stated is taken away again: without it the rest may leave the size open.
-    measured = 1.0 / float(spread[at, at]) - known
+    measured = 1.0 / float(covariance[at, at]) - known
     if measured <= _UNMEASURED * known:
         return MeasuredScale(board, 0.0, np.inf, stated)
-    with_stated = float(fitted.looks.values[place]) - float(spread[at] @ gradient)
+    with_stated = float(fitted.looks.values[place]) - float(covariance[at] @ gradient)
     return MeasuredScale(
         board,
         with_stated * (1.0 + known / measured),
@@ -241,7 +243,7 @@ def measured_scale(side: Side, fitted: Fitted, board: int = 0) -> MeasuredScale:
     )
 
 
-def moved_surprise(fitted: Fitted, places: IntArray) -> float:
+def moved_mahalanobis_sq(fitted: Fitted, places: IntArray) -> float:
     """Squared distance of some values from the stated ones, in units of their covariance.
 
     Args:
@@ -250,7 +252,7 @@ def moved_surprise(fitted: Fitted, places: IntArray) -> float:
     """
     at = fitted.columns.start + np.searchsorted(fitted.seen.free, places)
     away = (fitted.looks.values - fitted.looks.stated)[places]
-    return float(away @ np.linalg.solve(fitted.spread()[np.ix_(at, at)], away))
+    return float(away @ np.linalg.solve(fitted.covariance()[np.ix_(at, at)], away))
 
 
 def contradicted_lens(fitted: Fitted, camera: str) -> bool:

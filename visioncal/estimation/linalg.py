@@ -43,7 +43,7 @@ def spectrum(information: FloatArray) -> Spectrum:
     return Spectrum(np.maximum(values, 0.0), directions / np.linalg.norm(directions, axis=0))
 
 
-def covariance(information: FloatArray) -> FloatArray:
+def covariance_from(information: FloatArray) -> FloatArray:
     """Inverts (..., n, n) information matrices, scaled first to a unit diagonal.
 
     A direction without information gets a large but finite variance, never a NaN; whoever asks
@@ -55,7 +55,7 @@ def covariance(information: FloatArray) -> FloatArray:
 
 
 def covariance_root(information: FloatArray) -> FloatArray:
-    """Factors `covariance(information)` as (..., n, n) `root @ root^T`, however singular."""
+    """Factors `covariance_from(information)` as (..., n, n) `root @ root^T`, however singular."""
     values, vectors, scale = _floored(information)
     return np.asarray(scale[..., :, None] * vectors / np.sqrt(values)[..., None, :])
 
@@ -81,7 +81,7 @@ def covariance_among(information: FloatArray, among: Mask) -> FloatArray:
     """
     found = np.zeros_like(information)
     places = np.ix_(among, among)
-    found[places] = covariance(information[places])
+    found[places] = covariance_from(information[places])
     return found
 
 
@@ -134,7 +134,7 @@ def damped_step(
 
 
 def squared_lengths(
-    residuals: FloatArray, left: FloatArray, spread: FloatArray
+    residuals: FloatArray, left: FloatArray, covariance: FloatArray
 ) -> tuple[FloatArray, IntArray]:
     """Squared lengths of residuals in units of a covariance, where that has not vanished.
 
@@ -143,12 +143,12 @@ def squared_lengths(
     Args:
         residuals: (m, d) residuals.
         left: (m, d, d) their covariances: those of the noise, less what a fit has taken.
-        spread: (m, d, d) covariances of the noise.
+        covariance: (m, d, d) covariances of the noise.
 
     Returns:
         (m,) squared lengths, and (m,) in how many directions they were measured.
     """
-    root = np.linalg.cholesky(spread)
+    root = np.linalg.cholesky(covariance)
     inverse = np.linalg.inv(root)
     values, vectors = np.linalg.eigh(inverse @ left @ np.swapaxes(inverse, 1, 2))
     white = (np.swapaxes(vectors, 1, 2) @ inverse @ residuals[:, :, None])[:, :, 0]

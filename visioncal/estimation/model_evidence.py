@@ -53,7 +53,7 @@ class Cause:
     Attributes:
         name: Which.
         by_sensor: (n, 6, p) how each measured pose has to be moved to undo it, on its right.
-        by_flange: (s, 6, p) how the flange has to be at each stop, on its right.
+        flange_jacobian: (s, 6, p) how the flange has to be at each stop, on its right.
         units: (p,) the size of each unknown, for a change of one metre.
         start: (p,) where to look for it.
         noise_factors: What the noise of the stops may have grown by, where that is the change.
@@ -61,7 +61,7 @@ class Cause:
 
     name: str
     by_sensor: FloatArray
-    by_flange: FloatArray
+    flange_jacobian: FloatArray
     units: FloatArray
     start: FloatArray
     noise_factors: tuple[float, ...] = ()
@@ -114,12 +114,12 @@ def explain(problem: Problem, belief: Belief, cause: Cause | None = None) -> Exp
     grown = cause.trials[int(np.argmax(scores))][1]
     stops = _at(problem, belief, cause, stops.values, grown)
     # The change's size is left to the stops: what is known of it beforehand would shrink it.
-    mean, spread = _posterior(stops, widest_m * units)
+    mean, covariance = _posterior(stops, widest_m * units)
     pulled = float(np.sum((mean / (widest_m * units)) ** 2))
     return Explained(
         float(np.logaddexp.reduce(scores) - np.log(len(scores))),
         mean,
-        spread,
+        covariance,
         grown,
         _misfit(stops, widest_m * units)[0] - pulled,
         len(stops.residuals) - len(units),
@@ -130,15 +130,15 @@ def explain(problem: Problem, belief: Belief, cause: Cause | None = None) -> Exp
 class _Stops:
     """The residuals (n,) of all stops as they are linear in a cause's unknowns around some values.
 
-    `residuals` are those at zero, by that linearisation; `slopes` (n, p), `spread` (n, n) of the
-    noise and of the calibration's unknowns together, which are so small that they stay where the
-    calibration has them.
+    `residuals` are those at zero, by that linearisation; `jacobian` (n, p), `covariance` (n, n) of
+    the noise and of the calibration's unknowns together, which are so small that they stay where
+    the calibration has them.
     """
 
     values: FloatArray
     residuals: FloatArray
-    slopes: FloatArray
-    spread: FloatArray
+    jacobian: FloatArray
+    covariance: FloatArray
 
 
 def _nothing(problem: Problem) -> Cause:
@@ -169,11 +169,11 @@ def _at(
     without, known = undone(problem, cause, values), len(belief.covariance)
     linear = without.linear(with_change(belief.state, cause))
     noise = replace(belief.noise, robots=factor * belief.noise.robots)
-    slopes = linear.jacobian.reshape(-1, without.size)
-    before, own = slopes[:, :known], slopes[:, known:]
-    spread = _spread(without, linear, noise) + before @ belief.covariance @ before.T
-    spread += _LEAST_SIGMA**2 * np.eye(len(spread))
-    return _Stops(values, linear.residuals.reshape(-1) - own @ values, own, spread)
+    jacobian = linear.jacobian.reshape(-1, without.size)
+    before, own = jacobian[:, :known], jacobian[:, known:]
+    covariance = _spread(without, linear, noise) + before @ belief.covariance @ before.T
+    covariance += _LEAST_SIGMA**2 * np.eye(len(covariance))
+    return _Stops(values, linear.residuals.reshape(-1) - own @ values, own, covariance)
 
 
 def _spread(problem: Problem, linear: Linear, noise: Noise) -> FloatArray:
@@ -182,8 +182,8 @@ def _spread(problem: Problem, linear: Linear, noise: Noise) -> FloatArray:
     for unit, errors in enumerate(problem.error_covariance(noise)):
         rows = np.flatnonzero(of == unit)
         places = (6 * rows[:, None] + np.arange(6)).ravel()
-        slopes = linear.by_errors[rows].reshape(-1, errors.shape[0])
-        found[np.ix_(places, places)] += slopes @ errors @ slopes.T
+        jacobian = linear.by_errors[rows].reshape(-1, errors.shape[0])
+        found[np.ix_(places, places)] += jacobian @ errors @ jacobian.T
     return np.asarray(found)
 
 
@@ -200,16 +200,16 @@ def undone(problem: Problem, cause: Cause, values: FloatArray) -> Problem:
     Returns:
         The stops, with the p unknowns as their last effect.
     """
-    by_sensor, by_flange = (
-        _stepped(slopes, values) for slopes in (cause.by_sensor, cause.by_flange)
+    by_sensor, flange_jacobian = (
+        _stepped(jacobian, values) for jacobian in (cause.by_sensor, cause.flange_jacobian)
     )
     carried, seen = adjoint(invert(by_sensor.moved)), problem.observations
     nothing = Knowledge(np.zeros((len(values), len(values))), np.zeros(len(values)))
     ((robot, poses),) = problem.poses.items()
-    changed = Effect.free("change", nothing, by_sensor.slopes, {robot: by_flange.slopes})
+    changed = Effect.free("change", nothing, by_sensor.jacobian, {robot: flange_jacobian.jacobian})
     return replace(
         problem,
-        poses={robot: poses @ by_flange.moved},
+        poses={robot: poses @ flange_jacobian.moved},
         observations=replace(
             seen,
             measured=seen.measured @ by_sensor.moved,
@@ -228,15 +228,15 @@ class _Step:
     """Motions (m, 4, 4) by some values, and how they go on with them: (m, 6, p), on the right."""
 
     moved: FloatArray
-    slopes: FloatArray
+    jacobian: FloatArray
 
 
-def _stepped(slopes: FloatArray, values: FloatArray) -> _Step:
-    twists = slopes @ values
+def _stepped(jacobian: FloatArray, values: FloatArray) -> _Step:
+    twists = jacobian @ values
     # Beyond, the series does not converge; no cause that leads there explains anything.
     near = np.linalg.norm(twists[:, :3], axis=1) < np.pi
     onward = inverse_right_jacobian(np.where(near[:, None], twists, 0.0))
-    return _Step(exp(twists), np.asarray(np.linalg.solve(onward, slopes), dtype=float))
+    return _Step(exp(twists), np.asarray(np.linalg.solve(onward, jacobian), dtype=float))
 
 
 def _score(stops: _Stops, sigmas: FloatArray, freedom: float) -> float:
@@ -257,13 +257,13 @@ def _misfit(stops: _Stops, sigmas: FloatArray) -> tuple[float, float]:
 
 def _posterior(stops: _Stops, sigmas: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean (p,) and covariance (p, p) of a cause's values, given the residuals."""
-    carried = stops.slopes * sigmas**2
+    carried = stops.jacobian * sigmas**2
     taken = cho_solve(_root(stops, sigmas), carried)
     return -taken.T @ stops.residuals, np.diag(sigmas**2) - carried.T @ taken
 
 
 def _root(stops: _Stops, sigmas: FloatArray) -> tuple[FloatArray, bool]:
     """Cholesky's root of the residuals' covariance, for a cause of some size."""
-    total = stops.spread + (stops.slopes * sigmas**2) @ stops.slopes.T
+    total = stops.covariance + (stops.jacobian * sigmas**2) @ stops.jacobian.T
     root, lower = cho_factor(total, lower=True)
     return np.asarray(root), bool(lower)

@@ -13,7 +13,7 @@ import numpy as np
 from visioncal.core.quantiles import chi2_limit, f_limit
 from visioncal.core.transforms import adjoint, exp, invert, log
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.linalg import covariance, spectrum
+from visioncal.estimation.linalg import covariance_from, spectrum
 from visioncal.estimation.parts import State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import (
@@ -247,12 +247,12 @@ def _best_steps(
     part = problem.subset(np.isin(np.arange(len(problem)), rows))
     order = np.argsort(part.observations.stops, kind="stable")
     asked = part.change_of(frame, fit.state)[order]
-    spread = _asked_spread(part, fit, frame)[order]
+    covariance = _asked_spread(part, fit, frame)[order]
     stops, explained = part.observations.stops[order], agrees[rows][order]
     open_rows = np.flatnonzero(~explained)
     some = open_rows[np.linspace(0, len(open_rows) - 1, min(_ASKED, len(open_rows))).astype(int)]
     apart = log(invert(asked[some])[:, None] @ asked[None])
-    both = spread[some][:, None] + spread[None]
+    both = covariance[some][:, None] + covariance[None]
     squares = np.einsum("abi,abi->ab", apart, np.linalg.solve(both, apart[..., None])[..., 0])
     alike = squares < _MARGIN**2 * chi2_limit(_FALSE_ALARM / len(problem), 6)
     gains = np.cumsum((alike.astype(int) - explained.astype(int))[:, ::-1], axis=1)[:, ::-1]
@@ -268,7 +268,7 @@ def _best_steps(
         gain = int(gains[at, begin]) if left[at] else 0
         if gain >= _FEWEST and _is_enough(after, explained, stops, begin):
             # The mean of all that ask for this step, each with its own information.
-            weights = np.linalg.inv(spread[after])
+            weights = np.linalg.inv(covariance[after])
             pulls = np.einsum("nij,nj->i", weights, apart[at, after])
             mean = np.linalg.solve(weights.sum(axis=0), pulls)
             change = asked[some[at]] @ exp(mean)
@@ -290,9 +290,9 @@ def _is_enough(after: Mask, explained: Mask, stops: IntArray, begin: int) -> boo
 def _asked_spread(problem: Problem, fit: Solution, frame: str) -> FloatArray:
     """Covariances (n, 6, 6) of the changes that observations ask for."""
     linear = problem.linear(fit.state, ideal=True)
-    spread = problem.total_covariance(linear, fit.noise)
+    covariance = problem.total_covariance(linear, fit.noise)
     back = np.linalg.inv(linear.jacobian[:, :, problem.edge_columns(frame)])
-    return np.asarray(back @ spread @ np.swapaxes(back, 1, 2))
+    return np.asarray(back @ covariance @ np.swapaxes(back, 1, 2))
 
 
 def slight_move(problem: Problem, fit: Solution, movable: Sequence[str]) -> Move | None:
@@ -310,17 +310,17 @@ def slight_move(problem: Problem, fit: Solution, movable: Sequence[str]) -> Move
         seen[frame] = set(stops[_FEWEST : 1 - _FEWEST].tolist())
     tried = int(problem.observations.stops.max()) + 1
     best, limit = None, _move_limit(problem, len(movable) * tried)
-    for stop, information, pull in equations_from(problem, fit):
+    for stop, information, gradient in equations_from(problem, fit):
         for frame in (it for it in movable if stop in seen[it]):
             at = problem.edge_columns(frame)
             across = information[at]
             own = across[:, at] - across @ known @ across.T
             if spectrum(across[:, at]).ratio < _TAKEN or spectrum(own).values[0] < _TAKEN:
                 continue
-            step = -covariance(own) @ pull[at]
-            surprise = float(-step @ pull[at])
-            if surprise > limit:
-                best, limit = (frame, stop, step), surprise
+            step = -covariance_from(own) @ gradient[at]
+            mahalanobis_sq = float(-step @ gradient[at])
+            if mahalanobis_sq > limit:
+                best, limit = (frame, stop, step), mahalanobis_sq
     if best is None:
         return None
     frame, stop, step = best

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.core.types import FloatArray
-from visioncal.estimation.identifiability import LEAST_SHARE, Slopes, right_vectors
+from visioncal.estimation.identifiability import LEAST_SHARE, Jacobians, right_vectors
 from visioncal.estimation.parameters import Parameter
 from visioncal.robot import Robot, parallel_axes
 
@@ -39,16 +39,16 @@ class Null:
     frames: FloatArray
 
 
-def null_of(slopes: Slopes) -> Null:
+def null_of(jacobian: Jacobians) -> Null:
     """Finds what no stops can tell.
 
     Args:
-        slopes: By the frames and by the table's numbers, at postures all over the workspace.
+        jacobian: By the frames and by the table's numbers, at postures all over the workspace.
     """
-    _, free = slopes.free()
+    _, free = jacobian.free()
     sizes, turned = right_vectors(free)
     directions = _echelon(turned[sizes <= LEAST_SHARE * sizes[0]])
-    made_up = np.linalg.lstsq(slopes.frames, slopes.arm @ directions.T, rcond=LEAST_SHARE)[0]
+    made_up = np.linalg.lstsq(jacobian.frames, jacobian.arm @ directions.T, rcond=LEAST_SHARE)[0]
     return Null(directions, np.asarray(made_up))
 
 
@@ -65,7 +65,7 @@ def _echelon(rows: FloatArray) -> FloatArray:
     return np.where(np.abs(rows) < _NOTHING, 0.0, rows)
 
 
-def imitated(numbers: Slopes, arm: Slopes, directions: FloatArray) -> FloatArray:
+def imitated(numbers: Jacobians, arm: Jacobians, directions: FloatArray) -> FloatArray:
     """The least changes of a table's numbers that do what some errors of the arm do.
 
     Args:

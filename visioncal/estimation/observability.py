@@ -158,11 +158,11 @@ def _refuse_vague(problem: Problem, state: State, noise: Noise, scene: Scene) ->
     """Refuses frames whose predicted sigmas are over the limit."""
     most = np.array([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M])
     plausible = replace(noise, robots=np.minimum(noise.robots, most))
-    spread = covariance_among(fisher_information(problem, state, plausible), problem.counted)
+    covariance = covariance_among(fisher_information(problem, state, plausible), problem.counted)
     beyond = [
         (frame, it)
         for frame in problem.unknown
-        for it in frame_directions(problem, state, spread, frame, scene.names[frame])
+        for it in frame_directions(problem, state, covariance, frame, scene.names[frame])
         if it.sigma > it.limit
     ]
     if beyond:
@@ -176,20 +176,20 @@ def _refuse_vague(problem: Problem, state: State, noise: Noise, scene: Scene) ->
 
 
 def frame_directions(
-    problem: Problem, state: State, spread: FloatArray, frame: str, names: tuple[str, str]
+    problem: Problem, state: State, covariance: FloatArray, frame: str, names: tuple[str, str]
 ) -> tuple[Direction, ...]:
     """The worst directions of a frame: of its offset and, where it has one, of its rotation.
 
     Args:
         problem: The observations.
         state: The answer.
-        spread: (p, p) covariance of the unknowns.
+        covariance: (p, p) covariance of the unknowns.
         frame: The frame.
         names: What it is called, and the frame that it hangs on.
     """
     columns = problem.edge_columns(frame)
     edge = state.edges[problem.unknown[frame]]
-    found = edge_directions(edge, spread[columns, columns], *names)
+    found = edge_directions(edge, covariance[columns, columns], *names)
     return found[:1] if frame in problem.points else found
 
 
@@ -214,38 +214,38 @@ def _scene(problem: Problem, mount: Mount) -> Scene:
 
 
 def directions(
-    problem: Problem, state: State, spread: FloatArray, mount: Mount
+    problem: Problem, state: State, covariance: FloatArray, mount: Mount
 ) -> tuple[Direction, ...]:
     """The worst directions of the camera's edge and then of each target's, offset before rotation.
 
     Args:
         problem: What the views measured.
         state: The answer.
-        spread: (p, p) covariance of the unknowns.
+        covariance: (p, p) covariance of the unknowns.
         mount: Where the camera is.
     """
     return tuple(
         it
         for frame, names in _names(problem, mount).items()
-        for it in frame_directions(problem, state, spread, frame, names)
+        for it in frame_directions(problem, state, covariance, frame, names)
     )
 
 
 def edge_directions(
-    matrix: FloatArray, spread: FloatArray, thing: str, frame: str
+    matrix: FloatArray, covariance: FloatArray, thing: str, frame: str
 ) -> tuple[Direction, Direction]:
     """The worst directions of an edge: of its offset, and of its rotation.
 
     Args:
         matrix: (4, 4) the edge.
-        spread: (6, 6) its covariance.
+        covariance: (6, 6) its covariance.
         thing: What it places, in words.
         frame: The frame that this hangs on, in words.
     """
     found = []
     for is_rotation in (False, True):
         at = slice(0, 3) if is_rotation else slice(3, 6)
-        values, vectors = np.linalg.eigh(spread[at, at])
+        values, vectors = np.linalg.eigh(covariance[at, at])
         limit = SIGMA_LIMIT_RAD if is_rotation else SIGMA_LIMIT_M
         words = _words(thing, frame, matrix[:3, :3] @ vectors[:, -1], is_rotation)
         sigma = float(np.sqrt(max(values[-1], 0.0)))

@@ -10,7 +10,7 @@ from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.robot import FUNCTION_NAMES, DHTable
-from visioncal.robot.slopes import ROW_NAMES, number_slopes, table_moves
+from visioncal.robot.slopes import ROW_NAMES, number_jacobian, table_moves
 
 _LENGTHS = ("d", "a")
 _ROW = len(ROW_NAMES)
@@ -113,7 +113,7 @@ def parameter_moves(model: ArmModel, table: DHTable, parameters: Sequence[Parame
     return moves
 
 
-def parameter_slopes(
+def parameter_jacobian(
     table: DHTable, parameters: Sequence[Parameter], q: FloatArray, mounted: FloatArray
 ) -> FloatArray:
     """How the reported frame moves with the numbers of a table.
@@ -127,7 +127,7 @@ def parameter_slopes(
     Returns:
         (m, 6, k) right perturbations.
     """
-    rows, functions = number_slopes(table, q)
+    rows, functions = number_jacobian(table, q)
     columns = [
         rows[:, :, it.link, it.place]
         if it.place < _ROW

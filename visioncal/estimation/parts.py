@@ -88,7 +88,7 @@ class Effect:
             gradient (k,) at these values.
         held: (k,) which of them stay there, and count in the covariance.
         by_sensor: (n, 6, k) how the measured poses move with them, on their right; None for not.
-        by_flange: By robot, (s, 6, k) how its flange moves at each stop, on its right.
+        flange_jacobian: By robot, (s, 6, k) how its flange moves at each stop, on its right.
         concerned: (n,) the observations at which flanges move so; None for all.
     """
 
@@ -97,7 +97,7 @@ class Effect:
     known: Knowledge
     held: Mask
     by_sensor: FloatArray | None = None
-    by_flange: Mapping[str, FloatArray] = field(default_factory=dict)
+    flange_jacobian: Mapping[str, FloatArray] = field(default_factory=dict)
     concerned: Mask | None = None
 
     @classmethod
@@ -106,11 +106,13 @@ class Effect:
         name: str,
         known: Knowledge,
         by_sensor: FloatArray | None = None,
-        by_flange: Mapping[str, FloatArray] = MappingProxyType({}),
+        flange_jacobian: Mapping[str, FloatArray] = MappingProxyType({}),
     ) -> "Effect":
         """An effect of free values, linearised where they are zero."""
-        size = len(known.pull)
-        return cls(name, np.zeros(size), known, np.zeros(size, dtype=bool), by_sensor, by_flange)
+        size = len(known.gradient)
+        return cls(
+            name, np.zeros(size), known, np.zeros(size, dtype=bool), by_sensor, flange_jacobian
+        )
 
     def __len__(self) -> int:
         return len(self.values)
@@ -129,14 +131,14 @@ class Effect:
 
     def of_stops(self, chosen: Mask) -> "Effect":
         """Returns it for the stops of an (s,) mask."""
-        by_flange = {name: it[chosen] for name, it in self.by_flange.items()}
-        return replace(self, by_flange=by_flange)
+        flange_jacobian = {name: it[chosen] for name, it in self.flange_jacobian.items()}
+        return replace(self, flange_jacobian=flange_jacobian)
 
-    def flange_slopes(self, robot: str, stops: IntArray) -> FloatArray:
+    def jacobian_of_flange(self, robot: str, stops: IntArray) -> FloatArray:
         """(n, 6, k) how a robot's flange moves at observations of (n,) stops."""
-        if robot not in self.by_flange:
+        if robot not in self.flange_jacobian:
             return np.zeros((len(stops), 6, len(self)))
-        found = self.by_flange[robot][stops]
+        found = self.flange_jacobian[robot][stops]
         return found if self.concerned is None else found * self.concerned[:, None, None]
 
 
@@ -185,16 +187,18 @@ class FramePrior:
         """
         rows = list(self.axes)
         away = (found[rows, 3] - np.array(self.values_m)) / self.sigma_m
-        slopes = np.concatenate([np.zeros((len(rows), 3)), found[rows, :3] / self.sigma_m], axis=1)
+        jacobian = np.concatenate(
+            [np.zeros((len(rows), 3)), found[rows, :3] / self.sigma_m], axis=1
+        )
         if self.rotation is None:
-            return away, slopes
+            return away, jacobian
         between = np.eye(4)
         between[:3, :3] = self.rotation.T @ found[:3, :3]
         turn = log(between[None])
         by_turn = inverse_right_jacobian(turn)[0, :3] / self.sigma_rad
         return (
             np.concatenate([turn[0, :3] / self.sigma_rad, away]),
-            np.concatenate([by_turn, slopes]),
+            np.concatenate([by_turn, jacobian]),
         )
 
 

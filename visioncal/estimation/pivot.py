@@ -38,9 +38,9 @@ class PivotFit:
         points_covariance: (k, 3, 3) of them [m^2].
         agrees: (n,) touches that the answer was made from.
         doubtful: (n,) touches of which some are wrong, while nothing tells which: all are used.
-        explained: Whether noise explains the used touches (see `agreement.Agreement`).
-        surprise: (n,) squared Mahalanobis distance of each touch from what the others predict, one
-            on average where it is noise.
+        explained: Whether noise explains the used touches (see `group_outliers.Agreement`).
+        mahalanobis_sq: (n,) squared Mahalanobis distance of each touch from what the others
+            predict, one on average where it is noise.
         limit: (n,) what it may be; infinite where the others do not predict the touch.
         residuals_m: (n,) how far each touched point is off in the tool [m], in as many directions
             as its kind observes.
@@ -58,7 +58,7 @@ class PivotFit:
     agrees: Mask
     doubtful: Mask
     explained: bool
-    surprise: FloatArray
+    mahalanobis_sq: FloatArray
     limit: FloatArray
     residuals_m: FloatArray
     belongs_to: tuple[int | None, ...]
@@ -167,21 +167,21 @@ def _result(
     problem: TouchProblem, found: Agreement[Placed], worst: tuple[Direction, ...]
 ) -> PivotFit:
     fit, edge = found.fit, 6 if problem.oriented else 3
-    spread = np.zeros((6, 6))
-    spread[6 - edge :, 6 - edge :] = fit.covariance[:edge, :edge]
+    covariance = np.zeros((6, 6))
+    covariance[6 - edge :, 6 - edge :] = fit.covariance[:edge, :edge]
     count = len(fit.state.points)
     blocks = fit.covariance[edge:, edge:].reshape(count, 3, count, 3)
     at = np.arange(count)
     return PivotFit(
         fit.state.flange_from_tool,
         problem.oriented,
-        spread,
+        covariance,
         fit.state.points,
         blocks[at, :, at, :],
         found.agrees,
         found.doubtful,
         found.explained,
-        found.surprise,
+        found.mahalanobis_sq,
         found.limit,
         np.linalg.norm(fit.groups.residuals, axis=1),
         _belonging(problem, found),
@@ -199,7 +199,9 @@ def _belonging(problem: TouchProblem, found: Agreement[Placed]) -> tuple[int | N
         fit = fit_groups(problem, ~suspects, fit.state)
     belongs: list[int | None] = [None] * len(suspects)
     for at in np.flatnonzero(suspects):
-        ratios = [_surprise_at(problem, fit, int(at), it) for it in range(len(fit.state.points))]
+        ratios = [
+            _mahalanobis_sq_at(problem, fit, int(at), it) for it in range(len(fit.state.points))
+        ]
         ratios[problem.touches.points[at]] = np.inf
         best = int(np.argmin(ratios))
         if ratios[best] < 1.0:
@@ -207,7 +209,7 @@ def _belonging(problem: TouchProblem, found: Agreement[Placed]) -> tuple[int | N
     return tuple(belongs)
 
 
-def _surprise_at(problem: TouchProblem, fit: GroupFit[Placed], at: int, point: int) -> float:
+def _mahalanobis_sq_at(problem: TouchProblem, fit: GroupFit[Placed], at: int, point: int) -> float:
     """Squared distance of one touch from where it had been if of a point, over its limit."""
     if not np.any(fit.used & (problem.touches.points == point)):
         return float("inf")
@@ -217,6 +219,8 @@ def _surprise_at(problem: TouchProblem, fit: GroupFit[Placed], at: int, point: i
     groups = touched.linearise(fit.state)
     rows = groups.observed[at]
     residual, slope = groups.residuals[at][rows], groups.jacobian[at][rows]
-    spread = groups.spread(fit.sigma)[at][np.ix_(rows, rows)] + slope @ fit.covariance @ slope.T
+    covariance = (
+        groups.covariance(fit.sigma)[at][np.ix_(rows, rows)] + slope @ fit.covariance @ slope.T
+    )
     limit = f_limit(_FALSE_ALARM, len(residual), max(fit.freedom, 1))
-    return float(residual @ np.linalg.solve(spread, residual) / (len(residual) * limit))
+    return float(residual @ np.linalg.solve(covariance, residual) / (len(residual) * limit))

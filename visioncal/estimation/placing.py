@@ -9,7 +9,7 @@ from visioncal.core.files import some_of
 from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.groups import GroupFit, State
-from visioncal.estimation.linalg import covariance
+from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.observability import (
     SIGMA_LIMIT_M,
     SIGMA_LIMIT_RAD,
@@ -59,13 +59,13 @@ def worst_directions(
         The offset's worst direction in the base, and the rotation's in the fixture.
     """
     level = TOUCH_NOISE_M if sigma_m is None else min(max(sigma_m, LEAST_NOISE_M), SIGMA_LIMIT_M)
-    spread = covariance(fit.groups.subset(fit.used).information(level))[:6, :6]
-    return worst_of(base_from_fixture, spread, "fixture", "base", centre)
+    covariance = covariance_from(fit.groups.subset(fit.used).information(level))[:6, :6]
+    return worst_of(base_from_fixture, covariance, "fixture", "base", centre)
 
 
 def worst_of(
     matrix: FloatArray,
-    spread: FloatArray,
+    covariance: FloatArray,
     thing: str,
     parent: str,
     centre: FloatArray | None = None,
@@ -74,7 +74,7 @@ def worst_of(
 
     Args:
         matrix: (4, 4) the frame in its parent.
-        spread: (6, 6) covariance of its right perturbation (rotation [rad], translation [m]).
+        covariance: (6, 6) covariance of its right perturbation (rotation [rad], translation [m]).
         thing: What the frame is of, for messages.
         parent: What it hangs on, likewise.
         centre: (3,) where the offset counts, in the frame [m]; its origin where None.
@@ -84,14 +84,14 @@ def worst_of(
     """
     point = np.zeros(3) if centre is None else centre
     at_centre = matrix[:3, :3] @ np.hstack([-skew(point), np.eye(3)])
-    values, vectors = np.linalg.eigh(at_centre @ spread @ at_centre.T)
+    values, vectors = np.linalg.eigh(at_centre @ covariance @ at_centre.T)
     offset = Direction(
         f"the {thing}'s offset along the {parent}'s {axis_words(vectors[:, -1])}",
         float(np.sqrt(values[-1])),
         SIGMA_LIMIT_M,
         is_rotation=False,
     )
-    values, vectors = np.linalg.eigh(spread[:3, :3])
+    values, vectors = np.linalg.eigh(covariance[:3, :3])
     rotation = Direction(
         f"the {thing}'s rotation about its {axis_words(vectors[:, -1])}",
         float(np.sqrt(values[-1])),

@@ -209,7 +209,9 @@ def _sound(agreement: Agreement[Placed]) -> Mask:
 
 def _as_scaled(scaled: Agreement[Placed], fit: GroupFit[Placed]) -> Agreement[Placed]:
     """What agrees behind a scale, with the fit that has none: noise does not explain that one."""
-    return Agreement(fit, fit.used, scaled.surprise, scaled.limit, scaled.doubtful, explained=False)
+    return Agreement(
+        fit, fit.used, scaled.mahalanobis_sq, scaled.limit, scaled.doubtful, explained=False
+    )
 
 
 def _scale_of(fit: GroupFit[Placed]) -> Scale:

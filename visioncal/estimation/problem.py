@@ -22,7 +22,7 @@ from scipy.sparse.csgraph import connected_components
 
 from visioncal.core.transforms import adjoint, exp, inverse_right_jacobian, invert, log
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.linalg import covariance
+from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.parts import Effect, FramePrior, Noise, Observations, State
 from visioncal.estimation.tree import Step, Tree
 from visioncal.estimation.variance import Knowledge
@@ -47,7 +47,7 @@ class Block:
 
     rows: IntArray
     columns: IntArray
-    slopes: FloatArray
+    jacobian: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,15 +72,15 @@ class Linear:
         """(n, 6, p) the Jacobian as one."""
         found = np.zeros((len(self.residuals), 6, self.size))
         for it in self.blocks:
-            found[np.ix_(it.rows, np.arange(6), it.columns)] = it.slopes
+            found[np.ix_(it.rows, np.arange(6), it.columns)] = it.jacobian
         return found
 
-    def spread(self, covariance: FloatArray) -> FloatArray:
+    def covariance(self, covariance: FloatArray) -> FloatArray:
         """Covariances (n, 6, 6) of what a (p, p) one of the unknowns predicts."""
         found = np.zeros((len(self.residuals), 6, 6))
         for it in self.blocks:
             among = covariance[np.ix_(it.columns, it.columns)]
-            found[it.rows] = it.slopes @ among @ np.swapaxes(it.slopes, 1, 2)
+            found[it.rows] = it.jacobian @ among @ np.swapaxes(it.jacobian, 1, 2)
         return found
 
 
@@ -153,37 +153,37 @@ class Problem:
         if len(first) == len(units):
             return self
         seen, by_sensor = self.observations.take(first), self.by_sensor[first]
-        measured, spread = seen.measured.copy(), seen.covariance.copy()
-        information, pull = np.zeros((by_sensor.shape[2],) * 2), np.zeros(by_sensor.shape[2])
+        measured, covariance = seen.measured.copy(), seen.covariance.copy()
+        information, gradient = np.zeros((by_sensor.shape[2],) * 2), np.zeros(by_sensor.shape[2])
         for unit in np.flatnonzero(np.bincount(units) > 1).tolist():
             rows = np.flatnonzero(units == unit)
             weights = np.tile(np.eye(6), (len(rows), 1, 1))
             if not self.is_combined:
-                weights = covariance(self.observations.covariance[rows])
-            mean = covariance(weights.sum(axis=0))
+                weights = covariance_from(self.observations.covariance[rows])
+            mean = covariance_from(weights.sum(axis=0))
             shares = mean @ weights
             away = log(invert(measured[unit]) @ self.observations.measured[rows])
             shift = np.einsum("mij,mj->i", shares, away)
             measured[unit] = measured[unit] @ exp(shift)
             by_sensor[unit] = np.einsum("mij,mjk->ik", shares, self.by_sensor[rows])
             if not self.is_combined:
-                spread[unit] = mean
-                slopes = self.by_sensor[rows] - by_sensor[unit]
-                weighted = np.swapaxes(slopes, 1, 2) @ weights
-                information += np.sum(weighted @ slopes, axis=0)
-                pull += np.einsum("mij,mj->i", weighted, away - shift)
+                covariance[unit] = mean
+                jacobian = self.by_sensor[rows] - by_sensor[unit]
+                weighted = np.swapaxes(jacobian, 1, 2) @ weights
+                information += np.sum(weighted @ jacobian, axis=0)
+                gradient += np.einsum("mij,mj->i", weighted, away - shift)
         effects, at = [], 0
         for it in self.effects:
             mine = slice(at, at + len(it))
             at += len(it)
             known = Knowledge(
-                it.known.information + information[mine, mine], it.known.pull + pull[mine]
+                it.known.information + information[mine, mine], it.known.gradient + gradient[mine]
             )
             moved = None if it.by_sensor is None else by_sensor[:, :, mine]
             effects.append(replace(it.take(first), known=known, by_sensor=moved))
         return replace(
             self,
-            observations=replace(seen, measured=measured, covariance=spread),
+            observations=replace(seen, measured=measured, covariance=covariance),
             effects=tuple(effects),
         )
 
@@ -341,12 +341,14 @@ class Problem:
         return found
 
     @cached_property
-    def by_flange(self) -> Mapping[str, FloatArray]:
+    def flange_jacobian(self) -> Mapping[str, FloatArray]:
         """By robot, (n, 6, k) how its flange moves with all effects; of unmoved robots, nothing."""
-        robots = dict.fromkeys(robot for it in self.effects for robot in it.by_flange)
+        robots = dict.fromkeys(robot for it in self.effects for robot in it.flange_jacobian)
         stops = self.observations.stops
         return {
-            robot: np.concatenate([it.flange_slopes(robot, stops) for it in self.effects], axis=2)
+            robot: np.concatenate(
+                [it.jacobian_of_flange(robot, stops) for it in self.effects], axis=2
+            )
             for robot in robots
         }
 
@@ -359,11 +361,11 @@ class Problem:
         for it in self.effects:
             columns = self.effect_columns[it.name]
             change = self.values_of(it.name, state) - it.values
-            gradient[columns] = it.known.pull + it.known.information @ change
+            gradient[columns] = it.known.gradient + it.known.information @ change
         for prior in self.priors:
-            away, slopes = self.prior_rows(prior, state)
-            information += slopes.T @ slopes
-            gradient += slopes.T @ away
+            away, jacobian = self.prior_rows(prior, state)
+            information += jacobian.T @ jacobian
+            gradient += jacobian.T @ away
         return Knowledge(np.asarray(information), gradient)
 
     def prior_rows(self, prior: FramePrior, state: State) -> tuple[FloatArray, FloatArray]:
@@ -377,15 +379,15 @@ class Problem:
                 moved = -adjoint(invert(before)) if step.is_up else adjoint(invert(rest))
                 by_edges[:, self.edge_columns(step.frame)] += moved
             rest = before
-        away, slopes = prior.whitened(rest)
-        return away, slopes @ by_edges
+        away, jacobian = prior.whitened(rest)
+        return away, jacobian @ by_edges
 
     def cost_of_knowledge(self, state: State) -> float:
         """The squared error of what is known, in units of its sigmas, up to a constant."""
         cost = 0.0
         for it in self.effects:
             change = self.values_of(it.name, state) - it.values
-            cost += float(change @ (2.0 * it.known.pull + it.known.information @ change))
+            cost += float(change @ (2.0 * it.known.gradient + it.known.information @ change))
         for prior in self.priors:
             away, _ = self.prior_rows(prior, state)
             cost += float(away @ away)
@@ -395,7 +397,7 @@ class Problem:
         """(4, 4) or (m, 4, 4) `parent_from_frame` of a step at some observations."""
         if step.robot:
             poses = self.poses[step.robot][self.observations.stops[rows]]
-            moves = self.by_flange.get(step.robot)
+            moves = self.flange_jacobian.get(step.robot)
             if moves is None:
                 return poses
             return np.asarray(poses @ exp(moves[rows] @ (state.values - self.start_values)))
@@ -454,15 +456,15 @@ class Problem:
         blocks = []
         for group, (values, by_sensor) in zip(self.groups, self._moved_groups, strict=True):
             rows = group.rows
-            edges, effects = self._slopes(group, values, state, errors)
+            edges, effects = self._jacobian(group, values, state, errors)
             moved = by_measured[rows] @ by_sensor + by_predicted[rows] @ effects
-            slopes = [by_predicted[rows] @ it for it in edges.values()]
+            jacobian = [by_predicted[rows] @ it for it in edges.values()]
             columns = [np.arange(self.size)[self.edge_columns(it)] for it in edges]
             blocks.append(
                 Block(
                     rows,
                     np.concatenate([*columns, 6 * len(self.unknown) + values]),
-                    np.concatenate([*slopes, moved], axis=2),
+                    np.concatenate([*jacobian, moved], axis=2),
                 )
             )
         for rows in self.repeats:
@@ -480,13 +482,13 @@ class Problem:
             by_sensor = self.by_sensor[group.rows]
             moved = by_sensor.any(axis=(0, 1))
             for step in group.path:
-                if step.robot in self.by_flange:
-                    moved |= self.by_flange[step.robot][group.rows].any(axis=(0, 1))
+                if step.robot in self.flange_jacobian:
+                    moved |= self.flange_jacobian[step.robot][group.rows].any(axis=(0, 1))
             values = np.flatnonzero(moved)
             found.append((values, by_sensor[:, :, values]))
         return tuple(found)
 
-    def _slopes(
+    def _jacobian(
         self, group: _Group, values: IntArray, state: State, errors: FloatArray
     ) -> tuple[dict[str, FloatArray], FloatArray]:
         """How the predicted poses of a group move, on their right.
@@ -516,8 +518,8 @@ class Problem:
                 for slot in range(members.shape[1]):
                     rows = group.rows[mine[:, slot]]
                     errors[rows, :, 6 * slot : 6 * slot + 6] += moved[mine[:, slot]]
-            if step.robot in self.by_flange:
-                effects += moved @ self.by_flange[step.robot][group.rows][:, :, values]
+            if step.robot in self.flange_jacobian:
+                effects += moved @ self.flange_jacobian[step.robot][group.rows][:, :, values]
             rest = before
         return edges, effects
 
@@ -563,8 +565,8 @@ class Problem:
         rows = of >= 0
         if rows.any():
             # Slots of robots that are not on an observation's path move nothing of it.
-            slopes, errors = linear.by_errors[rows], self.error_covariance(noise)[of[rows]]
-            found[rows] += slopes @ errors @ np.swapaxes(slopes, 1, 2)
+            jacobian, errors = linear.by_errors[rows], self.error_covariance(noise)[of[rows]]
+            found[rows] += jacobian @ errors @ np.swapaxes(jacobian, 1, 2)
         return found
 
     def error_covariance(self, noise: Noise) -> FloatArray:

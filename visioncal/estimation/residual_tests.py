@@ -72,7 +72,7 @@ def neighbours(problem: Problem, state: State, noise: Noise, robot: str) -> Neig
         own = information - known.information
         # Leaving the block out takes its information, too.
         without = covariance_among(whole - own, moving)
-        moved = (without @ (gradient - known.pull))[edges]
+        moved = (without @ (gradient - known.gradient))[edges]
         likely = (without @ own @ fitted)[edges, edges] @ metric
         seen += float(moved @ metric @ moved)
         expected += float(np.trace(likely))
@@ -101,7 +101,7 @@ def drift(problem: Problem, state: State, noise: Noise, robot: str) -> Drift | N
     time = np.linspace(-0.5, 0.5, len(stops))[:, None, None]
     creep[stops] = adjoint(invert(poses[stops])) * time
     nothing, freely = np.zeros(6), Knowledge(np.zeros((6, 6)), np.zeros(6))
-    effect = Effect("creep", nothing, freely, nothing > 0.0, by_flange={robot: creep})
+    effect = Effect("creep", nothing, freely, nothing > 0.0, flange_jacobian={robot: creep})
     widened = problem.with_effects([*problem.effects, effect])
     there = State(state.edges, np.concatenate([state.values, nothing]))
     information, gradient = normal_equations(widened, there, noise)

@@ -88,7 +88,7 @@ class CornerProblem:
         """Puts the problem together from the corners by view, and the shares of those that repeat.
 
         Where a view has no share, it counts as one. Weights that nobody has stated are left to
-        `Looks.weighed`: what lens and board do to a view had passed for its noise.
+        `CameraParameters.weighed`: what lens and board do to a view had passed for its noise.
         """
         positions = numbered_positions(scene.targets)
         stack = CornerStack.of(corners, positions)

@@ -9,8 +9,8 @@ from scipy.linalg import block_diag
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.levenberg_marquardt import Linearised, descend
 from visioncal.estimation.linalg import (
-    covariance,
     covariance_among,
+    covariance_from,
     damped_step,
     gram,
     squared_lengths,
@@ -29,7 +29,7 @@ _ROUNDS, _SETTLED = 20, 1e-10
 # Noise levels that change by less have settled, far below what is known of them.
 _LEVELS_SETTLED = 1e-3
 # Arms and cameras err by some 0.6 mm for each mrad, give or take a factor of five.
-RATIO_PRIOR = RatioPrior(ratio=0.6, spread=1.5)
+RATIO_PRIOR = RatioPrior(ratio=0.6, covariance=1.5)
 # Robots' noise levels are started from above: at least here [rad and m].
 _START_SIGMA = 5e-4
 # Where they are sought again, it is from so much above where they were.
@@ -62,7 +62,7 @@ class Reduced:
         gradient: (p,) half the gradient of the squared error.
         cost: The squared error.
         errors: (u, 6 w) what each unit says of its flanges' errors.
-        slopes: (u, 6 w, p) how that moves with the unknowns.
+        jacobian: (u, 6 w, p) how that moves with the unknowns.
         covariance: (u, 6 w, 6 w) of it, by the observations alone.
     """
 
@@ -70,7 +70,7 @@ class Reduced:
     gradient: FloatArray
     cost: float
     errors: FloatArray
-    slopes: FloatArray
+    jacobian: FloatArray
     covariance: FloatArray
 
 
@@ -149,14 +149,14 @@ def reduce(problem: Problem, state: State, linear: Linear, covariance: FloatArra
     for block in linear.blocks:
         # Residuals are the last column.
         columns = np.append(block.columns, size)
-        every = np.concatenate([block.slopes, linear.residuals[block.rows, :, None]], axis=2)
+        every = np.concatenate([block.jacobian, linear.residuals[block.rows, :, None]], axis=2)
         single = alone[block.rows]
         if single.any():
             rows = block.rows[single]
             turned = np.linalg.inv(linear.by_errors[rows, :, :6])
             answer[np.ix_(of[rows], np.arange(6), columns)] = turned @ every[single]
-            spread = turned @ covariance[rows] @ np.swapaxes(turned, 1, 2)
-            inverse[of[rows], :6, :6] = spread
+            turned_covariance = turned @ covariance[rows] @ np.swapaxes(turned, 1, 2)
+            inverse[of[rows], :6, :6] = turned_covariance
             inverse[of[rows], 6:, 6:] = ANYTHING * np.eye(width - 6)
         rows, every = block.rows[~single], every[~single]
         if not len(rows):
@@ -169,10 +169,10 @@ def reduce(problem: Problem, state: State, linear: Linear, covariance: FloatArra
         order = np.argsort(of[rows], kind="stable")
         units, first = np.unique(of[rows[order]], return_index=True)
         by_errors = linear.by_errors[rows[order]]
-        slopes = np.swapaxes(by_errors, 1, 2)
-        own[units] += np.add.reduceat(slopes @ weights[order] @ by_errors, first)
+        jacobian = np.swapaxes(by_errors, 1, 2)
+        own[units] += np.add.reduceat(jacobian @ weights[order] @ by_errors, first)
         of_both = np.ix_(units, np.arange(width), columns)
-        cross[of_both] += np.add.reduceat(slopes @ weighted[order], first)
+        cross[of_both] += np.add.reduceat(jacobian @ weighted[order], first)
     joined = np.setdiff1d(np.arange(len(members)), of[alone])
     inverse[joined], blind[joined] = _pseudo_inverse(own[joined])
     answer[joined] = inverse[joined] @ cross[joined]
@@ -181,7 +181,7 @@ def reduce(problem: Problem, state: State, linear: Linear, covariance: FloatArra
     known = problem.knowledge(state)
     return Reduced(
         total[:-1, :-1] + known.information,
-        total[:-1, -1] + known.pull,
+        total[:-1, -1] + known.gradient,
         float(total[-1, -1]) + problem.cost_of_knowledge(state),
         answer[:, :, -1],
         answer[:, :, :-1],
@@ -203,10 +203,10 @@ def _pseudo_inverse(information: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _whole(reduced: Reduced, errors: FloatArray) -> tuple[FloatArray, FloatArray, float]:
     """Information (p, p), gradient (p,) and cost with what the units say, flanges erring."""
     weights = np.linalg.inv(reduced.covariance + errors)
-    weighted = weights @ reduced.slopes
+    weighted = weights @ reduced.jacobian
     cost = np.einsum("ui,uij,uj->", reduced.errors, weights, reduced.errors)
     return (
-        reduced.information + gram(reduced.slopes, weighted),
+        reduced.information + gram(reduced.jacobian, weighted),
         reduced.gradient + gram(weighted, reduced.errors),
         reduced.cost + float(cost),
     )
@@ -262,8 +262,8 @@ def held_shift(problem: Problem, solution: Solution) -> FloatArray:
     held = problem.counted & ~problem.moving
     if not held.any():
         return np.zeros(problem.size)
-    pull = normal_equations(problem, solution.state, solution.noise)[1]
-    return np.asarray(-covariance_of(problem, solution) @ np.where(held, pull, 0.0))
+    gradient = normal_equations(problem, solution.state, solution.noise)[1]
+    return np.asarray(-covariance_of(problem, solution) @ np.where(held, gradient, 0.0))
 
 
 def covariance_of(problem: Problem, solution: Solution) -> FloatArray:
@@ -362,7 +362,7 @@ class RobotLikelihood:
         seen = np.flatnonzero(self.seen).tolist()
         sigmas, value = estimate_sigmas(
             self.reduced.errors,
-            self.reduced.slopes[:, :, self.moving],
+            self.reduced.jacobian[:, :, self.moving],
             self.components,
             self.known,
             start.ravel(),
@@ -410,7 +410,7 @@ def posterior(problem: Problem, state: State, noise: Noise) -> tuple[FloatArray,
     errors = problem.error_covariance(noise)
     known = covariance_among(_whole(reduced, errors)[0], problem.moving)
     of, _ = problem.units
-    residuals, slopes = linear.residuals.copy(), linear.jacobian
+    residuals, jacobian = linear.residuals.copy(), linear.jacobian
     gone = np.zeros_like(weights)
     rows = of >= 0
     if rows.any():
@@ -420,9 +420,9 @@ def posterior(problem: Problem, state: State, noise: Noise) -> tuple[FloatArray,
         by_errors = linear.by_errors[rows]
         flange = (gain @ reduced.errors[:, :, None])[of[rows]]
         residuals[rows] -= (by_errors @ flange)[:, :, 0]
-        slopes[rows] -= by_errors @ (gain @ reduced.slopes)[of[rows]]
+        jacobian[rows] -= by_errors @ (gain @ reduced.jacobian)[of[rows]]
         gone[rows] = by_errors @ left[of[rows]] @ np.swapaxes(by_errors, 1, 2)
-    gone = gone + slopes @ known @ np.swapaxes(slopes, 1, 2)
+    gone = gone + jacobian @ known @ np.swapaxes(jacobian, 1, 2)
     squares = np.einsum("ni,nij,nj->n", residuals, weights, residuals)
     directions = np.where(problem.observations.has_rotation, 6.0, 3.0)
     return squares, directions - np.einsum("nij,nji->n", weights, gone)
@@ -447,7 +447,7 @@ def mahalanobis_sq(
     linear = problem.linear(solution.state)
     known = fitted_covariance(problem.subset(used), solution.state, solution.noise)
     noise = problem.total_covariance(linear, solution.noise)
-    left = noise + np.where(used, -1.0, 1.0)[:, None, None] * linear.spread(known)
+    left = noise + np.where(used, -1.0, 1.0)[:, None, None] * linear.covariance(known)
     squares, directions = squared_lengths(linear.residuals, left, noise)
     unmeasured = 6 - problem.observations.directions
     return squares, np.asarray(directions - unmeasured, dtype=float)
@@ -461,19 +461,19 @@ def left_out_residuals(problem: Problem, state: State, noise: Noise) -> FloatArr
     """
     linear, fitted = problem.linear(state), fitted_covariance(problem, state, noise)
     total = problem.total_covariance(linear, noise)
-    left = total - linear.spread(fitted)
-    found = (total @ covariance(left) @ linear.residuals[:, :, None])[:, :, 0]
+    left = total - linear.covariance(fitted)
+    found = (total @ covariance_from(left) @ linear.residuals[:, :, None])[:, :, 0]
     errors, own, jacobian = (
         problem.error_covariance(noise),
         problem.covariance(noise),
         linear.jacobian,
     )
     for unit, rows in problem.shared_units:
-        by_errors, slopes = (
+        by_errors, own_jacobian = (
             it[rows].reshape(6 * len(rows), -1) for it in (linear.by_errors, jacobian)
         )
         among = block_diag(*own[rows]) + by_errors @ errors[unit] @ by_errors.T
-        without = covariance(among - slopes @ fitted @ slopes.T)
+        without = covariance_from(among - own_jacobian @ fitted @ own_jacobian.T)
         found[rows] = (among @ without @ linear.residuals[rows].ravel()).reshape(-1, 6)
     return np.asarray(found)
 
@@ -507,9 +507,9 @@ def whitened(
     found = np.asarray(np.linalg.solve(np.linalg.cholesky(total), rows))
     errors = problem.error_covariance(noise)
     for unit, of in problem.shared_units:
-        slopes = by_errors[of].reshape(len(of) * len(kept), -1)
-        among = block_diag(*own[of]) + slopes @ errors[unit] @ slopes.T
-        flat = rows[of].reshape(len(slopes), -1)
+        jacobian = by_errors[of].reshape(len(of) * len(kept), -1)
+        among = block_diag(*own[of]) + jacobian @ errors[unit] @ jacobian.T
+        flat = rows[of].reshape(len(jacobian), -1)
         found[of] = np.linalg.solve(np.linalg.cholesky(among), flat).reshape(rows[of].shape)
     return found[:, :, -1], found[:, :, :-1]
 
@@ -547,9 +547,9 @@ def equations_from(
         total = total + gram(every[mine], weighted)
         for unit in np.unique(of[mine][of[mine] >= 0]).tolist():
             rows = of[mine] == unit
-            slopes = linear.by_errors[mine[rows]]
-            own = inverse[unit] + gram(slopes, weights[mine[rows]] @ slopes)
-            cross = gram(slopes, weighted[rows])
+            jacobian = linear.by_errors[mine[rows]]
+            own = inverse[unit] + gram(jacobian, weights[mine[rows]] @ jacobian)
+            cross = gram(jacobian, weighted[rows])
             total -= cross.T @ np.linalg.solve(own, cross)
         yield stop, total[:-1, :-1], total[:-1, -1]
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.estimation.linalg import covariance, covariance_among, gram
+from visioncal.estimation.linalg import covariance_among, covariance_from, gram
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import fisher_information, whitened
@@ -39,12 +39,12 @@ def stop_worth(
     moving = np.isin(np.arange(problem.size), free) & problem.counted
     fitted = covariance_among(fisher_information(problem, state, noise), moving)
     fitted = fitted[np.ix_(free, free)]
-    slopes = whitened(problem, state, noise)[1][:, :, free]
+    jacobian = whitened(problem, state, noise)[1][:, :, free]
     mean = gram(place, place) / len(place)
     growth = np.zeros(len(stops))
     for at, stop in enumerate(stops.tolist()):
-        rows = slopes[problem.observations.stops == stop].reshape(-1, len(free))
+        rows = jacobian[problem.observations.stops == stop].reshape(-1, len(free))
         gain = rows @ fitted
-        left = covariance(np.eye(len(rows)) - gain @ rows.T)
+        left = covariance_from(np.eye(len(rows)) - gain @ rows.T)
         growth[at] = np.sum(left * (gain @ mean @ gain.T))
     return np.asarray(growth / np.sum(fitted * mean))

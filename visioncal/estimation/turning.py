@@ -7,7 +7,7 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.groups import GroupFit
-from visioncal.estimation.linalg import covariance, spectrum
+from visioncal.estimation.linalg import covariance_from, spectrum
 from visioncal.estimation.observability import (
     SIGMA_LIMIT_M,
     SIGMA_LIMIT_RAD,
@@ -104,16 +104,16 @@ def check_turning(problem: TouchProblem, fit: GroupFit[Placed]) -> tuple[Directi
 
 
 def _worst(problem: TouchProblem, fit: GroupFit[Placed], level: float) -> tuple[Direction, ...]:
-    spread = covariance(fit.groups.subset(fit.used).information(level))
+    covariance = covariance_from(fit.groups.subset(fit.used).information(level))
     first = 3 if problem.oriented else 0
     to_flange = fit.state.flange_from_tool[:3, :3]
-    tip = to_flange @ spread[first : first + 3, first : first + 3] @ to_flange.T
+    tip = to_flange @ covariance[first : first + 3, first : first + 3] @ to_flange.T
     values, vectors = np.linalg.eigh(tip)
     several = values[-2] > SIGMA_LIMIT_M**2
     words = "from the flange" if several else f"along the flange's {axis_words(vectors[:, -1])}"
     found = [_direction(f"the tip's offset {words}", values[-1], SIGMA_LIMIT_M, is_rotation=False)]
     if problem.oriented:
-        values, vectors = np.linalg.eigh(spread[:3, :3])
+        values, vectors = np.linalg.eigh(covariance[:3, :3])
         words = f"the tool's rotation about its {axis_words(vectors[:, -1])}"
         found.append(_direction(words, values[-1], SIGMA_LIMIT_RAD, is_rotation=True))
     return tuple(found)

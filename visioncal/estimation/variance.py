@@ -44,11 +44,11 @@ class Knowledge:
 
     Attributes:
         information: (p, p), zero on those of which nothing is known.
-        pull: (p,) half the gradient of what is known, at the present state.
+        gradient: (p,) half the gradient of what is known, at the present state.
     """
 
     information: FloatArray
-    pull: FloatArray
+    gradient: FloatArray
 
 
 @dataclass(frozen=True)
@@ -57,12 +57,12 @@ class RatioPrior:
 
     Attributes:
         ratio: The second over the first, typically.
-        spread: Standard deviation of the ratio's logarithm.
+        covariance: Standard deviation of the ratio's logarithm.
         places: Which two sigmas these are; of several pairs, all of them.
     """
 
     ratio: float
-    spread: float
+    covariance: float
     places: tuple[tuple[int, int], ...] = ((0, 1),)
 
 
@@ -144,16 +144,16 @@ def profile_interval(
     if 2.0 * (here - lowest) > _SURPRISE_95:
         lowest = here
 
-    def surprise(logarithm: float) -> float:
+    def mahalanobis_sq(logarithm: float) -> float:
         return 2.0 * (profile(logarithm) - lowest) - _SURPRISE_95
 
     def crossing(side: float, beyond: float) -> float:
         inner, outer = 0.0, _FIRST_WIDTH
-        while surprise(middle + side * outer) <= 0.0:
+        while mahalanobis_sq(middle + side * outer) <= 0.0:
             if outer == _WIDEST:
                 return beyond
             inner, outer = outer, min(2.0 * outer, _WIDEST)
-        width = brentq(lambda it: surprise(middle + side * it), inner, outer, xtol=0.02)
+        width = brentq(lambda it: mahalanobis_sq(middle + side * it), inner, outer, xtol=0.02)
         return float(np.exp(middle + side * width))
 
     return crossing(-1.0, 0.0), crossing(1.0, float(np.exp(middle + _WIDEST)))
@@ -181,15 +181,15 @@ def _likelihood(
     weights = np.linalg.inv(total)
     weighted = weights @ jacobian
     root = covariance_root(gram(jacobian, weighted) + known.information)
-    pull = gram(weighted, residuals) + known.pull
-    best = root @ (root.T @ pull)
+    gradient = gram(weighted, residuals) + known.gradient
+    best = root @ (root.T @ gradient)
     left = residuals - jacobian @ best
     pulled = (weights @ left[:, :, None])[:, :, 0]
     value = 0.5 * float(
         np.linalg.slogdet(total)[1].sum()
         - 2.0 * np.linalg.slogdet(root)[1]
         + np.einsum("mi,mi->", left, pulled)
-        + best @ (known.information @ best - 2 * known.pull)
+        + best @ (known.information @ best - 2 * known.gradient)
     )
     # How the residuals' covariance grows with the logarithm of each sigma.
     growth = 2 * sigmas[:, None, None, None] ** 2 * components.parts
@@ -217,8 +217,8 @@ def _likelihood(
         return _Likelihood(value, slope, curvature)
     lean = np.zeros((len(prior.places), len(logs)))
     for row, (first, second) in zip(lean, prior.places, strict=True):
-        row[first], row[second] = -1.0 / prior.spread, 1.0 / prior.spread
-    offset = lean @ logs - np.log(prior.ratio) / prior.spread
+        row[first], row[second] = -1.0 / prior.covariance, 1.0 / prior.covariance
+    offset = lean @ logs - np.log(prior.ratio) / prior.covariance
     return _Likelihood(
         value + 0.5 * float(offset @ offset), slope + offset @ lean, curvature + lean.T @ lean
     )

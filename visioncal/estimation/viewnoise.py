@@ -34,11 +34,11 @@ def weights_by_view(squares: FloatArray, freedom: FloatArray) -> FloatArray | No
         return None
     # Logarithms of the views' variances, without bias, and their own variances.
     logs = np.log(squares / 2.0) - digamma(freedom / 2.0)
-    spread = polygamma(1, freedom / 2.0)
-    about = logs - np.average(logs, weights=1.0 / spread)
-    if np.sum(about**2 / spread) < chi2_limit(_FALSE_ALARM, len(logs) - 1):
+    covariance = polygamma(1, freedom / 2.0)
+    about = logs - np.average(logs, weights=1.0 / covariance)
+    if np.sum(about**2 / covariance) < chi2_limit(_FALSE_ALARM, len(logs) - 1):
         return None
-    between = float(np.clip(np.var(logs, ddof=1) - np.mean(spread), *_BETWEEN))
+    between = float(np.clip(np.var(logs, ddof=1) - np.mean(covariance), *_BETWEEN))
     half = float(np.exp(brentq(lambda it: polygamma(1, np.exp(it)) - between, *_LOGS)))
     scale = np.exp(np.mean(logs) + digamma(half))
     variances = (scale + squares / 2.0) / (half + freedom / 2.0)

@@ -152,14 +152,14 @@ class Stop:
 
     Attributes:
         base_from_cam: (4, 4).
-        by_flange: (6, 6) how it moves, on its right, with the flange; zero for a camera that
+        flange_jacobian: (6, 6) how it moves, on its right, with the flange; zero for a camera that
             stands still.
         flange_noise: (6, 6) covariance of the flange by its noise.
         arm_basis: (6, p) how the flange errs with the arm's posture; see `Eye.arm_basis`.
     """
 
     base_from_cam: FloatArray
-    by_flange: FloatArray
+    flange_jacobian: FloatArray
     flange_noise: FloatArray
     arm_basis: FloatArray
 
@@ -226,14 +226,14 @@ def _together(
     independent then.
     """
     size = 4 + len(camera.distortion)
-    spread = np.zeros((6 + size, 6 + size))
-    spread[:6, :6] = edge
+    covariance = np.zeros((6 + size, 6 + size))
+    covariance[:6, :6] = edge
     if lens is not None:
-        spread[6:, 6:] = lens
+        covariance[6:, 6:] = lens
     if lens is not None and between is not None:
-        spread[6:, :6] = between[:, :6]
-        spread[:6, 6:] = between[:, :6].T
-    return spread
+        covariance[6:, :6] = between[:, :6]
+        covariance[:6, 6:] = between[:, :6].T
+    return covariance
 
 
 def _flange_sigmas(calibration: Calibration) -> FloatArray:

@@ -149,7 +149,7 @@ def reasons_of(
     words = []
     for at in range(len(residuals_m)):
         off = off_words(
-            float(residuals_m[at]), float(agreement.surprise[at]), float(agreement.limit[at])
+            float(residuals_m[at]), float(agreement.mahalanobis_sq[at]), float(agreement.limit[at])
         )
         if agreement.doubtful[at]:
             words.append(f"{off}: one of those that contradict each other")

@@ -276,8 +276,8 @@ def _details(placed: _Placed, point: FloatArray, calibration: Calibration) -> di
     }
 
 
-def _length_mm(spread: FloatArray) -> float:
-    return float(1e3 * np.sqrt(np.trace(spread[3:, 3:])))
+def _length_mm(covariance: FloatArray) -> float:
+    return float(1e3 * np.sqrt(np.trace(covariance[3:, 3:])))
 
 
 def rests_on_camera(frame: Frame) -> bool:

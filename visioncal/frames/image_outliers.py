@@ -13,7 +13,7 @@ import numpy as np
 from visioncal.core.quantiles import chi2_limit, f_limit
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.linalg import covariance, squared_lengths
+from visioncal.estimation.linalg import covariance_from, squared_lengths
 from visioncal.estimation.robust import Distances, settled
 from visioncal.frames.single_view import Place
 
@@ -26,7 +26,7 @@ _STEPS, _SETTLED = 10, 1e-12
 
 
 @dataclass(frozen=True, eq=False)
-class Sights:
+class CandidateViews:
     """The places of m images, each with the poses that it allows.
 
     Attributes:
@@ -43,7 +43,7 @@ class Sights:
 
     def own(self, place: Place) -> FloatArray:
         """(6, 6) covariance of a place by what is its image's own: pixels, and robot."""
-        carried = place.by_flange @ self.flange_noise @ place.by_flange.T
+        carried = place.flange_jacobian @ self.flange_noise @ place.flange_jacobian.T
         return np.asarray(place.pixels + carried)
 
     @property
@@ -82,7 +82,7 @@ class Agreement:
         picks: (m,) which of its poses each image has.
         agrees: (m,) mask.
         away: (m, 6) by how much each image puts the target away from the mean.
-        surprise: (m,) the same as a squared Mahalanobis distance; six on average where it is
+        mahalanobis_sq: (m,) the same as a squared Mahalanobis distance; six on average where it is
             noise.
         limit: What it may be.
         variance: Of what is each image's own, in units of what was expected; one at the least.
@@ -93,13 +93,13 @@ class Agreement:
     picks: IntArray
     agrees: Mask
     away: FloatArray
-    surprise: FloatArray
+    mahalanobis_sq: FloatArray
     limit: float
     variance: float
     rival: FloatArray | None
 
 
-def agreeing(sights: Sights) -> Agreement:
+def agreeing(sights: CandidateViews) -> Agreement:
     """Finds the images that put the target in one place.
 
     Where no more than half agree, nothing tells which are right: all stay.
@@ -116,7 +116,7 @@ def agreeing(sights: Sights) -> Agreement:
 class _Search:
     """The search among images, each with one of its poses."""
 
-    sights: Sights
+    sights: CandidateViews
     picks: IntArray
 
     def fit(self, used: Mask, _: Agreement) -> Agreement:
@@ -124,10 +124,10 @@ class _Search:
 
     def distances(self, _: Mask, fit: Agreement) -> Distances:
         six = np.full(len(self.picks), 6.0)
-        return Distances(fit.surprise, six, fit.variance * fit.limit * np.ones_like(six))
+        return Distances(fit.mahalanobis_sq, six, fit.variance * fit.limit * np.ones_like(six))
 
 
-def _core(sights: Sights) -> tuple[IntArray, Mask]:
+def _core(sights: CandidateViews) -> tuple[IntArray, Mask]:
     """The half of the images that gather about one place, and the poses that take them there."""
     best: tuple[float, IntArray, FloatArray] | None = None
     half = len(sights.views) // 2 + 1
@@ -144,7 +144,7 @@ def _core(sights: Sights) -> tuple[IntArray, Mask]:
     return picks, agrees
 
 
-def _nearest(sights: Sights, seed: Place) -> tuple[FloatArray, IntArray]:
+def _nearest(sights: CandidateViews, seed: Place) -> tuple[FloatArray, IntArray]:
     """Squared distance (m,) of each image's nearest pose from a place, and which one it is."""
     own, found = sights.own(seed), []
     for view in sights.views:
@@ -157,7 +157,7 @@ def _nearest(sights: Sights, seed: Place) -> tuple[FloatArray, IntArray]:
     return np.array([it[0] for it in found]), np.array([it[1] for it in found], dtype=np.int64)
 
 
-def _judged(sights: Sights, picks: IntArray, agrees: Mask) -> Agreement:
+def _judged(sights: CandidateViews, picks: IntArray, agrees: Mask) -> Agreement:
     """The mean of some images, and how far all of them are from it."""
     chosen = [view[at] for view, at in zip(sights.views, picks, strict=True)]
     mean = _mean(sights, chosen, agrees)
@@ -171,20 +171,22 @@ def _judged(sights: Sights, picks: IntArray, agrees: Mask) -> Agreement:
     variance = max(float(squared[agrees].sum()) / (6.0 * others), 1.0) if others else 1.0
     # An image inside the mean has drawn it to itself; its share is taken out.
     left = own + shared + np.where(inside, -1.0, 1.0) * mean.own
-    surprise = squared_lengths(away, left, own)[0] if others else np.where(agrees, 0.0, squared)
+    mahalanobis_sq = (
+        squared_lengths(away, left, own)[0] if others else np.where(agrees, 0.0, squared)
+    )
     return Agreement(
         mean,
         picks,
         agrees,
         away,
-        surprise,
+        mahalanobis_sq,
         sights.limit,
         variance,
         _rival(sights, mean.matrix, agrees, variance),
     )
 
 
-def _mean(sights: Sights, chosen: Sequence[Place], agrees: Mask) -> Mean:
+def _mean(sights: CandidateViews, chosen: Sequence[Place], agrees: Mask) -> Mean:
     """Weighs images by what is their own; what they share cannot be averaged by weights."""
     weights = np.array(
         [
@@ -192,7 +194,7 @@ def _mean(sights: Sights, chosen: Sequence[Place], agrees: Mask) -> Mean:
             for it, ok in zip(chosen, agrees, strict=True)
         ]
     )
-    own = covariance(weights.sum(axis=0))
+    own = covariance_from(weights.sum(axis=0))
     gains = own @ weights
     matrices = np.array([it.matrix for it in chosen])
     matrix = matrices[int(np.flatnonzero(agrees)[0])]
@@ -205,7 +207,9 @@ def _mean(sights: Sights, chosen: Sequence[Place], agrees: Mask) -> Mean:
     return Mean(matrix, own, gains, by_common)
 
 
-def _rival(sights: Sights, matrix: FloatArray, agrees: Mask, variance: float) -> FloatArray | None:
+def _rival(
+    sights: CandidateViews, matrix: FloatArray, agrees: Mask, variance: float
+) -> FloatArray | None:
     """Another place that all agreeing images allow: a mirrored or a turned target's."""
     limit = variance * sights.limit
     first = sights.views[int(np.flatnonzero(agrees)[0])]

@@ -104,7 +104,7 @@ def _on_plane(
     place = stop.point(point_cam)
     # The point stays on the plane: what moves its ray carries it there along the ray.
     kept = np.eye(3) - np.outer(along, plane.normal) / rise
-    by_px, by_lens = _ray_slopes(eye, point_cam)
+    by_px, by_lens = _ray_jacobian(eye, point_cam)
     turned = kept @ stop.base_from_cam[:3, :3]
     by_camera = kept @ stop.by_camera(point_cam)
     by_plane = np.outer(along / rise, np.append(-place, 1.0))
@@ -121,7 +121,7 @@ _LOOK_AT_PLANE = (
 )
 
 
-def _ray_slopes(eye: Eye, point_cam: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _ray_jacobian(eye: Eye, point_cam: FloatArray) -> tuple[FloatArray, FloatArray]:
     """How the point at this depth moves with its pixel, (3, 2), and with the lens, (3, k)."""
     seen = project_with_jacobian(eye.camera, point_cam[None])
     inverse = np.zeros((3, 2))
@@ -133,16 +133,16 @@ def _camera_parts(
     eye: Eye, stop: Stop, by_camera: FloatArray, by_lens: FloatArray
 ) -> dict[str, FloatArray]:
     """What the calibration and the robot add to a place, by how it moves with camera and lens."""
-    by_flange = by_camera @ stop.by_flange
+    flange_jacobian = by_camera @ stop.flange_jacobian
     return {
         "calibration": _carried(np.concatenate([by_camera, by_lens], axis=1), eye.covariance),
-        "robot": _carried(by_flange, stop.flange_noise),
-        "arm": _carried(by_flange @ stop.arm_basis, np.eye(stop.arm_basis.shape[1])),
+        "robot": _carried(flange_jacobian, stop.flange_noise),
+        "arm": _carried(flange_jacobian @ stop.arm_basis, np.eye(stop.arm_basis.shape[1])),
     }
 
 
-def _carried(slope: FloatArray, spread: FloatArray) -> FloatArray:
-    return np.asarray(slope @ spread @ slope.T)
+def _carried(slope: FloatArray, covariance: FloatArray) -> FloatArray:
+    return np.asarray(slope @ covariance @ slope.T)
 
 
 def _located(

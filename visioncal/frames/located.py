@@ -45,7 +45,7 @@ class Located:
     def budget_mm(self) -> dict[str, float]:
         """Standard deviation of the place by source, and their `total` [mm]."""
         every = {**self.parts, "total": self.covariance}
-        return {name: _length_mm(spread) for name, spread in every.items()}
+        return {name: _length_mm(covariance) for name, covariance in every.items()}
 
     @property
     def largest(self) -> str:
@@ -93,5 +93,5 @@ def _quantile95(count: float, freedom: float) -> float:
     return float(f_limit(0.05, count, min(freedom, 1e6)))
 
 
-def _length_mm(spread: FloatArray) -> float:
-    return float(1e3 * np.sqrt(max(np.trace(spread), 0.0)))
+def _length_mm(covariance: FloatArray) -> float:
+    return float(1e3 * np.sqrt(max(np.trace(covariance), 0.0)))

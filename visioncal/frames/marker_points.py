@@ -10,7 +10,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.types import Corners, FloatArray, Image, Target
 from visioncal.frames.camera_chain import Eye
-from visioncal.frames.image_outliers import Agreement, Sights, agreeing
+from visioncal.frames.image_outliers import Agreement, CandidateViews, agreeing
 from visioncal.frames.single_view import (
     Place,
     Sight,
@@ -106,7 +106,9 @@ def seen_markers(
             next_step="Take an image that shows it whole, with its white margin; or leave it out.",
         )
     common = common_covariance(eye, markers[0].looks[0].scale_sigma)
-    found = [agreeing(Sights(it.views, eye.flange_noise, common, eye.freedom)) for it in markers]
+    found = [
+        agreeing(CandidateViews(it.views, eye.flange_noise, common, eye.freedom)) for it in markers
+    ]
     warnings = [
         told
         for marker, agreement in zip(markers, found, strict=True)
@@ -182,10 +184,10 @@ def _shares(found: Agreement, views: Sequence[Sequence[Place]]) -> list[tuple[Pl
 
 def _own(marker: _Marker, found: Agreement) -> FloatArray:
     """(3, 3) covariance of a centre by the pixels of its images."""
-    spread = np.sum(
+    covariance = np.sum(
         [slope @ it.pixels @ slope.T for it, slope in _shares(found, marker.views)], axis=0
     )
-    return np.asarray(found.variance * spread)
+    return np.asarray(found.variance * covariance)
 
 
 def _shared(
@@ -203,7 +205,7 @@ def _shared(
             marker.images, _shares(agreement, marker.views), strict=True
         ):
             by_common[at] += slope @ place.by_common
-            by_stop[image, at] = np.sqrt(agreement.variance) * slope @ place.by_flange
+            by_stop[image, at] = np.sqrt(agreement.variance) * slope @ place.flange_jacobian
     flat = by_common.reshape(3 * len(markers), -1)
     stops = by_stop.reshape(images, 3 * len(markers), 6)
     return np.asarray(

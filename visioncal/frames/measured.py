@@ -146,11 +146,11 @@ def touched_points(
     """
     if tool is None:
         poses, away = _tip_poses(rows), np.zeros(3)
-        spread, axis = np.zeros((3, 3)), np.array([0.0, 0.0, 1.0])
+        covariance, axis = np.zeros((3, 3)), np.array([0.0, 0.0, 1.0])
     else:
         poses, away = flange_poses(rows, robot, calibration), tool.edge.matrix[:3, 3]
         turn = tool.edge.matrix[:3, :3]
-        spread = turn @ tool.edge.covariance[3:, 3:] @ turn.T
+        covariance = turn @ tool.edge.covariance[3:, 3:] @ turn.T
         # A tool whose rotation was not measured points more or less along the flange's z.
         axis = turn[:, 2] if tool.oriented else np.array([0.0, 0.0, 1.0])
     refuse_copies(poses, rows.places)
@@ -166,7 +166,7 @@ def touched_points(
         tuple(it.strip() for it in rows.points),
         there @ away + poses[:, :3, 3],
         there @ lever @ np.swapaxes(there, 1, 2),
-        flat @ spread @ flat.T,
+        flat @ covariance @ flat.T,
         -(turns @ axis),
     )
 

@@ -71,8 +71,8 @@ class Plane:
         slope[3, :3] = origin @ by_rotation
         slope[3, 3:] = normal @ rotation
         offset = float(normal @ origin) + _length(z_m)
-        spread = slope @ edge.covariance @ slope.T + _offset_covariance(sigma_m)
-        return cls(normal, _length(offset), spread)
+        covariance = slope @ edge.covariance @ slope.T + _offset_covariance(sigma_m)
+        return cls(normal, _length(offset), covariance)
 
 
 def _length(value_m: float) -> float:

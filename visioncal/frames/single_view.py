@@ -58,15 +58,15 @@ class Place:
     Attributes:
         matrix: (4, 4) `parent_from_target`.
         pixels: (6, 6) covariance of its right perturbation by the pixels' noise.
-        by_flange: (6, 6) how it moves with the flange at this stop; zero where none is between. Of
-            k images of one stop it is sqrt(k) times as much: their mean then has the variance of
-            the error that they share.
+        flange_jacobian: (6, 6) how it moves with the flange at this stop; zero where none is
+            between. Of k images of one stop it is sqrt(k) times as much: their mean then has the
+            variance of the error that they share.
         by_common: (6, c) how it moves with what all images share: see `common_covariance`.
     """
 
     matrix: FloatArray
     pixels: FloatArray
-    by_flange: FloatArray
+    flange_jacobian: FloatArray
     by_common: FloatArray
 
 
@@ -120,18 +120,18 @@ def places(
         )
     checked_pose(flange, f"{sight.label}: base_from_flange")
     if parent == "base":
-        by_flange = adjoint(invert(eye.edge @ view.cam_from_target))
-        return _carried(eye, view, flange @ eye.edge, by_flange, flange, of_stop)
+        flange_jacobian = adjoint(invert(eye.edge @ view.cam_from_target))
+        return _carried(eye, view, flange @ eye.edge, flange_jacobian, flange, of_stop)
     flange_from_cam = invert(flange) @ eye.edge
-    by_flange = -adjoint(invert(flange_from_cam @ view.cam_from_target))
-    return _carried(eye, view, flange_from_cam, by_flange, flange, of_stop)
+    flange_jacobian = -adjoint(invert(flange_from_cam @ view.cam_from_target))
+    return _carried(eye, view, flange_from_cam, flange_jacobian, flange, of_stop)
 
 
 def _carried(
     eye: Eye,
     view: SeenTarget,
     parent_from_cam: FloatArray,
-    by_flange: FloatArray,
+    flange_jacobian: FloatArray,
     base_from_flange: FloatArray,
     of_stop: int,
 ) -> tuple[Place, ...]:
@@ -141,9 +141,14 @@ def _carried(
         Place(
             parent_from_cam @ pose,
             view.covariance[at],
-            np.sqrt(of_stop) * by_flange[at],
+            np.sqrt(of_stop) * flange_jacobian[at],
             np.concatenate(
-                [by_edge[at], view.by_lens[at], view.by_scale[at][:, None], by_flange[at] @ arm],
+                [
+                    by_edge[at],
+                    view.by_lens[at],
+                    view.by_scale[at][:, None],
+                    flange_jacobian[at] @ arm,
+                ],
                 axis=1,
             ),
         )

@@ -18,7 +18,7 @@ from visioncal.estimation.appearance import (
 )
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.gating import gate
-from visioncal.estimation.linalg import covariance
+from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.planar import determines_pose
 from visioncal.frames.camera_chain import Eye
 from visioncal.vision.finders import NotFound, find_target
@@ -82,13 +82,15 @@ def see(
     noise_px = eye.noise_px(corners.stated_px if sigma_px is None else sigma_px)
     with one_blas_thread():
         poses, corners, squares = _fitted(eye.camera, corners, target, label, noise_px)
-        looks = [_slopes(eye.camera, poses, at, corners, target) for at in range(len(poses.turns))]
+        looks = [
+            _jacobian(eye.camera, poses, at, corners, target) for at in range(len(poses.turns))
+        ]
     noise_px, warnings = _noise(noise_px, squares, 2 * len(corners.ids) - 6, label)
     # Exact corners show no noise; a millionth of a pixel keeps their covariance a covariance.
     variance, lens = max(noise_px, 1e-6) ** 2, 4 + len(eye.camera.distortion)
     return SeenTarget(
         np.array([it.cam_from_target[0] for it in looks]),
-        np.array([variance * covariance(it.information[0]) for it in looks]),
+        np.array([variance * covariance_from(it.information[0]) for it in looks]),
         np.array([it.by_shared[0, :, :lens] for it in looks]),
         np.array([_by_scale(it.by_shared[0, :, lens:], target) for it in looks]),
         target.square_sigma_m / target.square_m,
@@ -164,7 +166,7 @@ def _fitted(
     return poses, corners, float(np.sum(residuals[passed.mask] ** 2))
 
 
-def _slopes(
+def _jacobian(
     camera: Camera, poses: ViewPoses, at: int, corners: Corners, target: Target
 ) -> Compressed:
     """One of the poses with all that moves it, under the numbering that it stands for."""

@@ -10,7 +10,7 @@ from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import adjoint, compose, invert, pose_difference
 from visioncal.core.types import FloatArray, Mask, Target
 from visioncal.frames.camera_chain import Eye
-from visioncal.frames.image_outliers import Agreement, Sights, agreeing
+from visioncal.frames.image_outliers import Agreement, CandidateViews, agreeing
 from visioncal.frames.single_view import (
     Parent,
     Sight,
@@ -128,7 +128,7 @@ def place_looks(
     views = all_places(eye, sights, looks, parent)
     common = common_covariance(eye, looks[0].scale_sigma)
     stops = len({it.stop_key for it in sights}) if needs_robot(eye, parent) else None
-    found = agreeing(Sights(views, eye.flange_noise, common, eye.freedom))
+    found = agreeing(CandidateViews(views, eye.flange_noise, common, eye.freedom))
     labels = tuple(it.label for it in sights)
     return Seen(
         found.mean.matrix,
@@ -181,7 +181,7 @@ def doubts(
             "checks it. Take others, from other sides."
         )
     elif _is_torn(found):
-        worst = int(np.where(found.agrees, found.surprise, -1.0).argmax())
+        worst = int(np.where(found.agrees, found.mahalanobis_sq, -1.0).argmax())
         yield (
             f"The images disagree, by up to {_distance(found, worst)}, and with {count} of them "
             "nothing tells which are right: take more."
@@ -197,7 +197,9 @@ def doubts(
 
 def _is_torn(found: Agreement) -> bool:
     """Whether images stayed in although they contradict each other."""
-    return bool(np.any((found.surprise > found.limit)[found.agrees])) and bool(found.agrees.all())
+    return bool(np.any((found.mahalanobis_sq > found.limit)[found.agrees])) and bool(
+        found.agrees.all()
+    )
 
 
 def _distance(found: Agreement, at: int) -> str:

@@ -161,7 +161,9 @@ def _observations(fit: PivotFit, touches: Touches) -> Iterator[Observation]:
 
 def _wrong(fit: PivotFit, touches: Touches, at: int) -> str:
     """Says what is wrong with a touch, or may be."""
-    words = off_words(float(fit.residuals_m[at]), float(fit.surprise[at]), float(fit.limit[at]))
+    words = off_words(
+        float(fit.residuals_m[at]), float(fit.mahalanobis_sq[at]), float(fit.limit[at])
+    )
     if fit.doubtful[at]:
         return f"{words}: one of the touches that contradict each other"
     belongs = fit.belongs_to[at]
@@ -228,8 +230,8 @@ def _details(fit: PivotFit, touches: Touches) -> dict[str, Any]:
             for name, point in zip(touches.names, fit.points, strict=True)
         },
         "points_sigma_mm": {
-            _point_name(name): 1e3 * float(np.sqrt(np.trace(spread)))
-            for name, spread in zip(touches.names, fit.points_covariance, strict=True)
+            _point_name(name): 1e3 * float(np.sqrt(np.trace(covariance)))
+            for name, covariance in zip(touches.names, fit.points_covariance, strict=True)
         },
     }
 

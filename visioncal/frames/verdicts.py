@@ -107,10 +107,10 @@ def noisy(
         )
 
 
-def off_words(residual_m: float, surprise: float, limit: float) -> str:
+def off_words(residual_m: float, mahalanobis_sq: float, limit: float) -> str:
     """Says how far off something is that does not agree: `2.1 mm off, 5 times what ... allow`."""
     off = f"{figure(1e3 * residual_m)} mm off"
-    over = float(np.sqrt(surprise / limit))
+    over = float(np.sqrt(mahalanobis_sq / limit))
     return f"{off}, {figure(over)} times what the others allow" if over > 1.0 else off
 
 

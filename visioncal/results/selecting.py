@@ -53,8 +53,8 @@ def selected_fields(cell: Alignment, choice: Choice, needs: Collection[Part]) ->
     chosen = _chosen(cell, choice, needs)
     chain = _chain(cell, chosen)
     nothing = np.zeros((0, len(cell.joint_covariance)))
-    slopes = np.concatenate([nothing, *(it[1] for it in chain.values())])
-    spread = slopes @ cell.joint_covariance @ slopes.T
+    jacobian = np.concatenate([nothing, *(it[1] for it in chain.values())])
+    covariance = jacobian @ cell.joint_covariance @ jacobian.T
     arm = cell.arms.get(chosen.robot or "robot", RobotResult())
     sights = [
         it
@@ -65,16 +65,16 @@ def selected_fields(cell: Alignment, choice: Choice, needs: Collection[Part]) ->
     return whole_fields(cell) | {
         "mount": chosen.mount,
         "edges": {
-            name: Edge(matrix, spread[6 * at : 6 * at + 6, 6 * at : 6 * at + 6])
+            name: Edge(matrix, covariance[6 * at : 6 * at + 6, 6 * at : 6 * at + 6])
             for at, (name, (matrix, _)) in enumerate(chain.items())
         },
-        "joint_covariance": spread,
+        "joint_covariance": covariance,
         "noise": _noise(cell, chosen, rms),
         "views": view_results(sights),
         "rms": rms,
         "validation": _validation(cell, sights),
         "verdict": _verdict(cell),
-        "camera": _camera(cell.cameras.get(chosen.camera), slopes),
+        "camera": _camera(cell.cameras.get(chosen.camera), jacobian),
         "robot": arm.model,
         "frames": _placed(cell, chosen),
         "stages": {
@@ -82,7 +82,7 @@ def selected_fields(cell: Alignment, choice: Choice, needs: Collection[Part]) ->
             **_clock(cell, chosen),
             **_intervals(cell, chosen),
             **_shapes(cell, chosen),
-            **_joint_fit(cell, chosen, slopes),
+            **_joint_fit(cell, chosen, jacobian),
         },
         "cell": None,
         "need": None if cell.need is None else cell.need.of(*_pair(chosen)),
@@ -162,11 +162,11 @@ def _noise(cell: Alignment, chosen: Chosen, rms: Rms) -> dict[str, float]:
     return found
 
 
-def _camera(result: CameraResult | None, slopes: FloatArray) -> CameraResult | None:
+def _camera(result: CameraResult | None, jacobian: FloatArray) -> CameraResult | None:
     if result is None or result.edge_covariance is None:
         return result
     return CameraResult(
-        result.camera, result.estimated, result.covariance, result.edge_covariance @ slopes.T
+        result.camera, result.estimated, result.covariance, result.edge_covariance @ jacobian.T
     )
 
 
@@ -196,10 +196,10 @@ def _placed(cell: Alignment, chosen: Chosen) -> dict[str, Frame]:
         elif parent.startswith("base") and not robots_between(cell.frames, chosen.base, parent):
             way, placed = cell.between(chosen.base, parent), frame.edge
             carry = adjoint(invert(placed.matrix))
-            spread = carry @ way.covariance @ carry.T + placed.covariance
+            covariance = carry @ way.covariance @ carry.T + placed.covariance
             if not placed.oriented:
-                spread[:3], spread[:, :3] = 0.0, 0.0
-            edge = Edge(way.matrix @ placed.matrix, spread)
+                covariance[:3], covariance[:, :3] = 0.0, 0.0
+            edge = Edge(way.matrix @ placed.matrix, covariance)
             found[f"base_from_{child}"] = replace(frame, edge=edge)
     return found
 
@@ -225,7 +225,7 @@ def _shapes(cell: Alignment, chosen: Chosen) -> dict[str, Any]:
     return {kind: it[name] for kind, it in parts.items() if name in it}
 
 
-def _joint_fit(cell: Alignment, chosen: Chosen, slopes: FloatArray) -> dict[str, Any]:
+def _joint_fit(cell: Alignment, chosen: Chosen, jacobian: FloatArray) -> dict[str, Any]:
     """What `verify` predicts with: both edges, and lens and board as far as they are free."""
     fit = cell.stages.get("joint_fit")
     if fit is None or not (chosen.camera and chosen.target):
@@ -237,7 +237,7 @@ def _joint_fit(cell: Alignment, chosen: Chosen, slopes: FloatArray) -> dict[str,
         lens_count = 4 + len(known.camera.distortion)
     looks: list[int] = []
     columns: list[int] = []
-    at = slopes.shape[1]
+    at = jacobian.shape[1]
     for part, name, first in (("cameras", camera, 0), ("targets", target, lens_count)):
         for it, places in fit[part].items():
             if it == name:
@@ -245,7 +245,7 @@ def _joint_fit(cell: Alignment, chosen: Chosen, slopes: FloatArray) -> dict[str,
                 columns += range(at, at + len(places))
             at += len(places)
     full = np.array(fit["covariance"], dtype=float)
-    carried = block_diag(slopes, np.eye(at)[columns][:, slopes.shape[1] :])
+    carried = block_diag(jacobian, np.eye(at)[columns][:, jacobian.shape[1] :])
     return {
         "joint_fit": {
             "targets": {"": cell.targets[target]} if target in cell.targets else {},

@@ -78,7 +78,7 @@ def reached_from(
         going, frames, left = going[far], frames[far], left[far]
         if step == _STEPS or not len(going):
             break
-        jacobian = _slopes(chain, frames)
+        jacobian = _jacobian(chain, frames)
         gram = jacobian @ np.swapaxes(jacobian, 1, 2)
         damping = np.sum(left**2, axis=1) + _FLOOR
         gram += damping[:, None, None] * np.eye(6)
@@ -97,7 +97,7 @@ def _left(base_from_tip: FloatArray, wanted: FloatArray) -> FloatArray:
     return np.concatenate([Rotation.from_matrix(turn).as_rotvec(), way], axis=1)
 
 
-def _slopes(chain: Chain, frames: FloatArray) -> FloatArray:
+def _jacobian(chain: Chain, frames: FloatArray) -> FloatArray:
     """How the tip moves (m, 6, n) with the joints, along the base's axes."""
     joints, tip = frames[:, :-1], frames[:, -1]
     axes = (joints[..., :3, :3] @ chain.axes[:, :, None])[..., 0]

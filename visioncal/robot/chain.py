@@ -98,7 +98,7 @@ class Chain:
                 break
         return np.asarray(q)
 
-    def slopes(self, q: FloatArray) -> FloatArray:
+    def jacobian(self, q: FloatArray) -> FloatArray:
         """Derivatives (m, n) of the effective positions by (m, n) `q`."""
         sine, cosine = self._eccentricity
         return np.asarray(self.functions[:, 1] + sine * np.cos(q) - cosine * np.sin(q))

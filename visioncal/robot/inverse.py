@@ -242,7 +242,7 @@ class Inverse:
         for _ in range(_STEPS):
             if size < _DONE or damping > _HARSHEST:
                 break
-            jacobian = self._slopes(rotation, light)
+            jacobian = self._jacobian(rotation, light)
             while damping <= _HARSHEST:
                 moved = _moved(positions, error, jacobian, damping * size + _FLOOR, bounds)
                 next_error, rotation = self._left(goal, moved, light)
@@ -275,7 +275,7 @@ class Inverse:
         error[:3], error[3:] = goal_from_flange.translation, light * pin.log3(rotation)
         return error, rotation
 
-    def _slopes(self, rotation: FloatArray, light: float) -> FloatArray:
+    def _jacobian(self, rotation: FloatArray, light: float) -> FloatArray:
         """How the joints change what is left (6, n), where `_left` was called last."""
         import pinocchio as pin
 

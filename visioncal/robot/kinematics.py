@@ -123,7 +123,7 @@ def gravity_torques(model: "pin.Model", positions: FloatArray, gravity: FloatArr
     return np.array(held).reshape(positions.shape)
 
 
-def weight_slopes(model: "pin.Model", positions: FloatArray, gravity: FloatArray) -> FloatArray:
+def weight_jacobian(model: "pin.Model", positions: FloatArray, gravity: FloatArray) -> FloatArray:
     """How the joints would be turned by the weight of what hangs on them.
 
     Args:

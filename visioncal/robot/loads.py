@@ -234,4 +234,4 @@ def bends(
     yields = compliance * load_torques(robot, stands, loads)
     if moments is None:
         return np.asarray(yields)
-    return np.asarray(yields + np.einsum("mjk,jk->mj", robot.weight_slopes(stands), moments))
+    return np.asarray(yields + np.einsum("mjk,jk->mj", robot.weight_jacobian(stands), moments))

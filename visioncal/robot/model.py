@@ -23,7 +23,7 @@ from visioncal.robot.kinematics import (
     gravity_torques,
     joint_frames,
     placement_derivatives,
-    weight_slopes,
+    weight_jacobian,
 )
 from visioncal.robot.loads import (
     MASS_KEYS,
@@ -215,7 +215,7 @@ class Robot:
         Raises:
             DataError: The number of joints differs from the robot's.
         """
-        return self.axis_jacobian(q) * self.chain.slopes(np.asarray(q, dtype=float))[:, None, :]
+        return self.axis_jacobian(q) * self.chain.jacobian(np.asarray(q, dtype=float))[:, None, :]
 
     def function_jacobian(self, q: FloatArray) -> FloatArray:
         """How the flange moves when the joints' functions change.
@@ -267,7 +267,7 @@ class Robot:
         """
         return gravity_torques(self._model, self._effective(q), self.gravity)
 
-    def weight_slopes(self, q: FloatArray) -> FloatArray:
+    def weight_jacobian(self, q: FloatArray) -> FloatArray:
         """How the weight of what hangs on the joints turns them.
 
         Args:
@@ -280,7 +280,7 @@ class Robot:
         Raises:
             DataError: The number of joints differs from the robot's.
         """
-        return weight_slopes(self._model, self._effective(q), self.gravity)
+        return weight_jacobian(self._model, self._effective(q), self.gravity)
 
     def load_torques(self, q: FloatArray, loads: Loads | None = None) -> FloatArray:
         """What weight, payload and force turn the joints by; see `loads.load_torques`."""

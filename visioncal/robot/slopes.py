@@ -59,7 +59,7 @@ def table_moves(
     return moves
 
 
-def number_slopes(table: DHTable, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+def number_jacobian(table: DHTable, q: FloatArray) -> tuple[FloatArray, FloatArray]:
     """How the flange moves with the numbers of a table.
 
     Args:

@@ -110,7 +110,7 @@ def effective_states(
             culprits=[robot.name],
         )
     chain = robot.chain
-    slopes = chain.slopes(q)
+    jacobian = chain.jacobian(q)
     if not chain.functions[:, 2:].any():
-        return chain.effective(q), slopes * dq, slopes * ddq
-    return chain.effective(q), slopes * dq, slopes * ddq + chain.curvatures(q) * dq**2
+        return chain.effective(q), jacobian * dq, jacobian * ddq
+    return chain.effective(q), jacobian * dq, jacobian * ddq + chain.curvatures(q) * dq**2

@@ -31,8 +31,8 @@ class WeightFunctions:
     def of(cls, robot: Robot) -> "WeightFunctions":
         """Finds the functions of an arm, by postures all around."""
         q = np.random.default_rng(0).uniform(-np.pi, np.pi, (_POSTURES, robot.joint_count))
-        slopes = np.moveaxis(robot.weight_slopes(q), 1, 0)
-        return cls(tuple(_independent(it) for it in slopes))
+        jacobian = np.moveaxis(robot.weight_jacobian(q), 1, 0)
+        return cls(tuple(_independent(it) for it in jacobian))
 
     @property
     def size(self) -> int:
@@ -41,10 +41,10 @@ class WeightFunctions:
 
     def bends(self, robot: Robot, q: FloatArray) -> FloatArray:
         """The functions' values at (m, n) joint angles: (m, n, size), each for its joint alone."""
-        slopes = robot.weight_slopes(q)
+        jacobian = robot.weight_jacobian(q)
         values, at = np.zeros((*q.shape, self.size)), 0
         for joint, part in enumerate(self.parts):
-            values[:, joint, at : at + part.shape[1]] = slopes[:, joint] @ part
+            values[:, joint, at : at + part.shape[1]] = jacobian[:, joint] @ part
             at += part.shape[1]
         return values
 
@@ -57,8 +57,8 @@ class WeightFunctions:
         return np.array(rows)
 
 
-def _independent(slopes: FloatArray) -> FloatArray:
+def _independent(jacobian: FloatArray) -> FloatArray:
     """Combinations (4 n, r) of columns of (m, 4 n) slopes that are independent, of unit size."""
-    _, sizes, across = np.linalg.svd(slopes, full_matrices=False)
+    _, sizes, across = np.linalg.svd(jacobian, full_matrices=False)
     kept = sizes > _RANK * max(float(sizes.max(initial=0.0)), 1.0)
-    return np.asarray(np.sqrt(len(slopes)) * across[kept].T / sizes[kept])
+    return np.asarray(np.sqrt(len(jacobian)) * across[kept].T / sizes[kept])

@@ -164,11 +164,11 @@ def real_dynamics(
 
 def _off(body: Body, share: float, rng: np.random.Generator) -> Body:
     kg = body.kg * np.exp(share * rng.standard_normal())
-    spread = 0.5 * np.trace(body.inertia_kg_m2) * np.eye(3) - body.inertia_kg_m2
+    covariance = 0.5 * np.trace(body.inertia_kg_m2) * np.eye(3) - body.inertia_kg_m2
     stretch = np.sqrt(kg / body.kg) * (np.eye(3) + 0.5 * share * rng.standard_normal((3, 3)))
-    spread = stretch @ spread @ stretch.T
+    covariance = stretch @ covariance @ stretch.T
     centre = body.centre_m + 0.01 * rng.standard_normal(3)
-    return Body(float(kg), centre, np.trace(spread) * np.eye(3) - spread)
+    return Body(float(kg), centre, np.trace(covariance) * np.eye(3) - covariance)
 
 
 def drive_torques(built: DynamicArm, q: FloatArray, dq: FloatArray, ddq: FloatArray) -> FloatArray:

@@ -79,8 +79,8 @@ def between(raster: Raster, values: FloatArray, rows: slice = slice(None)) -> Fl
     """
     # The mean is kept apart: single precision is then spent on the differences.
     mean = values.mean()
-    spread = np.asarray(values - mean, np.float32)
-    found = raster.down[rows] @ (spread @ raster.across.T)
+    covariance = np.asarray(values - mean, np.float32)
+    found = raster.down[rows] @ (covariance @ raster.across.T)
     found += np.float32(mean)
     return np.asarray(found, np.float32)
 

@@ -75,9 +75,9 @@ class Fit:
 def is_about_one_axis(rotations: FloatArray) -> bool:
     """Whether (n, 3, 3) rotations differ by turns about one axis at most: such tell too little."""
     # Turning about one axis leaves what lies along it in place: the last value vanishes.
-    spread = np.linalg.svd((rotations - rotations.mean(axis=0)).reshape(-1, 3), compute_uv=False)
-    spread /= np.sqrt(len(rotations))
-    return bool(spread[2] < max(_SECOND_AXIS * spread[0], _LEAST_TURN_RAD))
+    singular = np.linalg.svd((rotations - rotations.mean(axis=0)).reshape(-1, 3), compute_uv=False)
+    singular /= np.sqrt(len(rotations))
+    return bool(singular[2] < max(_SECOND_AXIS * singular[0], _LEAST_TURN_RAD))
 
 
 def kept_count(rows: int) -> int:

@@ -22,7 +22,7 @@ from visioncal.calibration.pipeline.solving import Solved, sensors_of
 from visioncal.calibration.stages.arms import ArmFound
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.clock import Pair
-from visioncal.calibration.stages.diagnose import Misfit, misfits
+from visioncal.calibration.stages.diagnose import ResidualTest, misfits
 from visioncal.calibration.stages.image_delays import FoundDelay
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.offset import Clock
@@ -59,7 +59,7 @@ class Answer:
     problem: Problem
     covariance: FloatArray
     beside: Mapping[str, FloatArray]
-    misfits: Mapping[str, Misfit]
+    misfits: Mapping[str, ResidualTest]
     arms: Mapping[str, ArmFound]
     held_out: HeldOut
     moved: tuple[Moved, ...]
@@ -160,15 +160,15 @@ def answer_of(
     # A closed form is not at rest, and that would pass for a misfit.
     found = misfits(part, fit if solved.solver == "joint" else fit_problem(part, fit.state))
     beside = covariance_beside_noise(part, fit, solved.arms, found, is_fit=solved.solver == "joint")
-    spread = sum(beside.values(), covariance_of(part, fit))
+    covariance = sum(beside.values(), covariance_of(part, fit))
     faults, held_out = pose_faults(solved), left_out(solved)
     return Answer(
         solved,
         part,
-        spread,
+        covariance,
         beside,
         found,
-        _arms_found(solved, spread, convention),
+        _arms_found(solved, covariance, convention),
         held_out,
         movements(solved),
         faults,
@@ -178,13 +178,13 @@ def answer_of(
 
 
 def _arms_found(
-    solved: Solved, spread: FloatArray, convention: Convention | None
+    solved: Solved, covariance: FloatArray, convention: Convention | None
 ) -> dict[str, ArmFound]:
     """What the stops tell of the arms, by robot."""
     agreed, middles = solved.agreed, middles_of(solved.cell)
     part = solved.part
     return {
-        name: arm.found(part, agreed.fit, spread, middles, convention)
+        name: arm.found(part, agreed.fit, covariance, middles, convention)
         for name, arm in solved.arms.items()
     }
 

@@ -7,7 +7,7 @@ import numpy as np
 from visioncal.calibration.stages import thermal
 from visioncal.calibration.stages.arms import ArmFound, RobotArm
 from visioncal.calibration.stages.cell import Cell, robot_key
-from visioncal.calibration.stages.diagnose import Misfit, misfit_words
+from visioncal.calibration.stages.diagnose import ResidualTest, misfit_words
 from visioncal.calibration.stages.kinematics import doubts, findings
 from visioncal.calibration.stages.reported_poses import Reported
 from visioncal.core.errors import DataError, DegenerateError
@@ -36,7 +36,7 @@ def covariance_beside_noise(
     problem: Problem,
     fit: Solution,
     arms: Mapping[str, RobotArm],
-    found: Mapping[str, Misfit],
+    found: Mapping[str, ResidualTest],
     *,
     is_fit: bool = True,
 ) -> dict[str, FloatArray]:
@@ -57,9 +57,9 @@ def covariance_beside_noise(
             errors = misfit_covariance(problem, fit.state, fit.noise, robot, arm.errors)
             parts[f"arm{_of(arms, robot)}"] = errors
         elif arm.errors is not None:
-            spread = covariance_of(problem, fit)
+            covariance = covariance_of(problem, fit)
             parts[f"size of arm errors{_of(arms, robot)}"] = covariance_of_size(
-                problem, spread, robot, arm.errors
+                problem, covariance, robot, arm.errors
             )
     for robot, it in found.items():
         if it.alike.is_significant:
@@ -75,7 +75,7 @@ def _of(arms: Mapping[str, RobotArm], robot: str) -> str:
 
 def doubts_of_arms(
     arms: Mapping[str, RobotArm],
-    found: Mapping[str, Misfit],
+    found: Mapping[str, ResidualTest],
     told: Mapping[str, ArmFound],
     asked: str,
 ) -> Iterator[str]:
@@ -94,7 +94,7 @@ def notes_on_arms(arms: Mapping[str, RobotArm], told: Mapping[str, ArmFound]) ->
             yield _of_robot(arms, robot, words)
 
 
-def _doubts(arm: RobotArm, found: Misfit | None, asked: str) -> Iterator[str]:
+def _doubts(arm: RobotArm, found: ResidualTest | None, asked: str) -> Iterator[str]:
     if arm.joints_rad is None and asked not in ("auto", "hand-eye"):
         yield "It stays as it reports itself: its errors take joint angles and a known model."
     elif arm.thermal is None and asked == thermal.LEVEL:

@@ -68,9 +68,9 @@ def budget_mm(solved: Solved, beside: Mapping[str, FloatArray]) -> dict[str, dic
     return found
 
 
-def root_trace(spread: FloatArray) -> float:
+def root_trace(covariance: FloatArray) -> float:
     """Root of the trace: of two sources that make up for each other, one may be under zero."""
-    return float(max(np.trace(spread), 0.0) ** 0.5)
+    return float(max(np.trace(covariance), 0.0) ** 0.5)
 
 
 @dataclass(frozen=True, eq=False)

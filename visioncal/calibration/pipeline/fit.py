@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray
-from visioncal.estimation.arm import misfit_slopes
+from visioncal.estimation.arm import misfit_jacobian
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.effects.lenses import LENSES
 from visioncal.session import frame_name
@@ -17,7 +17,7 @@ from visioncal.vision.targets import target_document
 CONDITIONS = ("ambient_c", "payload_kg")
 
 
-def fit_document(known: Known) -> dict[str, Any] | None:
+def fit_document(known: RunState) -> dict[str, Any] | None:
     """Writes all unknowns of the fit with their covariance; None where an instrument read them.
 
     The unknowns are, in this order: both edges of the chain, lens and board as far as something is
@@ -39,7 +39,7 @@ def fit_document(known: Known) -> dict[str, Any] | None:
     }
 
 
-def conditions_document(known: Known) -> dict[str, float]:
+def conditions_document(known: RunState) -> dict[str, float]:
     """The mean conditions of the used views; those that a used view does not say are left out."""
     views = [it for it in known.session.views if it.number in known.used]
     return {
@@ -49,7 +49,7 @@ def conditions_document(known: Known) -> dict[str, float]:
     }
 
 
-def _arm(known: Known) -> dict[str, Any] | None:
+def _arm(known: RunState) -> dict[str, Any] | None:
     """What the arm's errors are of, and what they were found to be beside the arm that is told."""
     arm = known.robot_arm
     model, errors = arm.model, arm.errors
@@ -88,22 +88,22 @@ def _by_stop(model: ArmModel) -> dict[str, Any]:
     return document
 
 
-def _covariance(known: Known) -> FloatArray:
+def _covariance(known: RunState) -> FloatArray:
     """The fit's own, and beside it what it has in common with errors that only count in it."""
     answer, arm, written = known.solved, known.robot_arm, _written(known)
     own = written @ answer.covariance @ written.T
     if arm.errors is None or arm.errors.is_estimated:
         return own
-    slopes = written @ misfit_slopes(
+    jacobian = written @ misfit_jacobian(
         answer.problem, answer.state, answer.noise, arm.robot, arm.errors
     )
-    size, variance = slopes.shape[1], arm.errors.sigma**2
+    size, variance = jacobian.shape[1], arm.errors.sigma**2
     # The fit is off by its slopes times the errors; the truth is off from the fit the other way.
-    between = -variance * slopes
+    between = -variance * jacobian
     return np.block([[own, between], [between.T, variance * np.eye(size)]])
 
 
-def _written(known: Known) -> FloatArray:
+def _written(known: RunState) -> FloatArray:
     """(w, p) how what is written moves with the fit's unknowns.
 
     Further boards are written relative to the first; clocks and drift are left out.

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from visioncal.calibration.guess import Guess, guess_reading
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.clocks import waits_for_clock
 from visioncal.calibration.stages.init_frames import place
@@ -44,10 +44,10 @@ def guess_session(
         DegenerateError: Too few views have both poses, or the lens cannot be estimated.
         ConvergenceError: The intrinsics do not come to rest.
     """
-    return guess_seen(_seen(Known(session, progress)), robot)
+    return guess_seen(_seen(RunState(session, progress)), robot)
 
 
-def guess_seen(seen: Known, robot: PoseNumbers | None = None) -> Guess:
+def guess_seen(seen: RunState, robot: PoseNumbers | None = None) -> Guess:
     """Does what `guess_session` does once the camera's poses are known.
 
     Args:
@@ -84,7 +84,7 @@ def seen_poses(session: Session, *, progress: Progress | None = None) -> PoseNum
         DegenerateError: The lens cannot be estimated.
         ConvergenceError: The intrinsics do not come to rest.
     """
-    seen = _seen(Known(session, progress))
+    seen = _seen(RunState(session, progress))
     return _camera_numbers(replace(seen, poses=seen.poses_of_one_board))
 
 
@@ -123,7 +123,7 @@ def numbers_in(session: Session, columns: tuple[str, ...]) -> PoseNumbers:
     return PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), _places(session))
 
 
-def reading_hint(seen: Known) -> str:
+def reading_hint(seen: RunState) -> str:
     """Says which reading of the poses would explain a calibration that failed.
 
     Args:
@@ -142,7 +142,7 @@ def reading_hint(seen: Known) -> str:
     return f"{guess.sentence} To read it so: visioncal convert SESSION FIXED --guess."
 
 
-def is_suspect(known: Known) -> bool:
+def is_suspect(known: RunState) -> bool:
     """Whether a finished calibration looks as if its poses had been misread."""
     verdict, findings = known.verdict, known.findings
     if verdict is None or findings is None or verdict.status == "good":
@@ -151,7 +151,7 @@ def is_suspect(known: Known) -> bool:
     return out or is_scattered(findings) or known.robot is not None
 
 
-def _told_in_time(seen: Known) -> PoseNumbers:
+def _told_in_time(seen: RunState) -> PoseNumbers:
     """The robot's numbers out of its stream, at the views' times; NaN where it has none."""
     numbers = np.full((len(seen.session.views), 7), np.nan)
     for at, view in enumerate(seen.session.views):
@@ -161,7 +161,7 @@ def _told_in_time(seen: Known) -> PoseNumbers:
     return PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), _places(seen.session))
 
 
-def _seen(known: Known) -> Known:
+def _seen(known: RunState) -> RunState:
     # Which moment of a stream a view belongs to is told by how both turned, however they are read.
     names = (*_SEEING, "robot", "clock") if waits_for_clock(known.session) else _SEEING
     for stage in STAGES:
@@ -170,7 +170,7 @@ def _seen(known: Known) -> Known:
     return known
 
 
-def _seen_ways(seen: Known, robot: PoseNumbers) -> Iterator[PoseNumbers]:
+def _seen_ways(seen: RunState, robot: PoseNumbers) -> Iterator[PoseNumbers]:
     """The camera's poses as the declared robot would have them, and then by the images alone.
 
     They differ where an image allows several poses: the wrong robot would choose wrong ones.
@@ -182,7 +182,7 @@ def _seen_ways(seen: Known, robot: PoseNumbers) -> Iterator[PoseNumbers]:
     yield _camera_numbers(seen)
 
 
-def _chosen(seen: Known, robot: PoseNumbers) -> Known:
+def _chosen(seen: RunState, robot: PoseNumbers) -> RunState:
     """Chooses among the poses that an image allows by the declared robot."""
     base_from_flange = dict(
         zip((it.number for it in seen.session.views), robot.poses(), strict=True)
@@ -199,7 +199,7 @@ def _chosen(seen: Known, robot: PoseNumbers) -> Known:
     return replace(seen, poses={it.view: it for it in found.views})
 
 
-def _camera_numbers(seen: Known) -> PoseNumbers:
+def _camera_numbers(seen: RunState) -> PoseNumbers:
     """The target's poses, of each view the best by its image, or as the session gives them."""
     if not seen.corners:
         numbers = numbers_in(seen.session, MEASURED_CAM_POSE)

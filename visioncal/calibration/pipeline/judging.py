@@ -10,7 +10,7 @@ from visioncal.calibration.pipeline.arm_results import doubts_of_arms, notes_on_
 from visioncal.calibration.pipeline.budget import columns_of_boards, middles_of
 from visioncal.calibration.pipeline.fault_messages import by_way_of, moved_words
 from visioncal.calibration.pipeline.network_ties import robot_motion, untied_words
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.judge import Arm, Findings, Pair, Place, Sensor
 from visioncal.calibration.stages.need import Fitted, picks_of
@@ -35,7 +35,7 @@ from visioncal.results import HELD_BACK, Edge, Sight
 from visioncal.results.whole import holdout_rms, left_out_rms, rms_of, view_results
 
 
-def findings_of(known: Known) -> Findings:
+def findings_of(known: RunState) -> Findings:
     """Puts together what a session is judged by."""
     answer, solved = known.solved, known.fitted
     tree = solved.cell.tree
@@ -72,7 +72,7 @@ def findings_of(known: Known) -> Findings:
     )
 
 
-def _pickable(known: Known) -> Fitted:
+def _pickable(known: RunState) -> Fitted:
     """What picks are predicted from."""
     answer, solved = known.solved, known.fitted
     freedom = [freedom_of(it.tolist()) for it in answer.intervals]
@@ -90,7 +90,7 @@ def _pickable(known: Known) -> Fitted:
     )
 
 
-def _untied(known: Known) -> Iterator[str]:
+def _untied(known: RunState) -> Iterator[str]:
     for frame in known.fitted.untied:
         if known.mount is not None and frame.startswith("target"):
             yield f"No usable view shows {frame.replace('_', ' ', 1)}: it has no place."
@@ -101,7 +101,7 @@ def _untied(known: Known) -> Iterator[str]:
 _Parts: TypeAlias = tuple[Sequence[Direction], Sequence[Place], Sequence[str]]
 
 
-def _of_pair(known: Known) -> _Parts:
+def _of_pair(known: RunState) -> _Parts:
     """The worst directions and the place of work of one camera and one robot."""
     answer, work = known.solved, known.work
     budget = {name.replace("_", " "): mm for name, mm in work.budget_mm.items()}
@@ -110,7 +110,7 @@ def _of_pair(known: Known) -> _Parts:
     return directions(answer.problem, answer.state, answer.covariance, mount), [place], ()
 
 
-def _of_cell(known: Known) -> _Parts:
+def _of_cell(known: RunState) -> _Parts:
     """The worst directions and the frames of a whole cell, and what moved in it."""
     answer, solved = known.solved, known.fitted
     edges, budget = answer.last_edges, answer.budget_mm
@@ -130,7 +130,7 @@ def _mount(sights: Sequence[Sight]) -> Mount:
     return "instrument" if is_read else "eye-to-hand"
 
 
-def _clock_words(known: Known) -> Iterator[str]:
+def _clock_words(known: RunState) -> Iterator[str]:
     """Says what the fit makes of clocks that the motion told."""
     for pair, clock in known.solved.clocks(known).items():
         if known.mount is None and clock is not known.clocks[pair].clock:
@@ -213,7 +213,7 @@ def _arms(answer: Answer) -> list[Arm]:
     return found
 
 
-def check_answer(known: Known) -> None:
+def check_answer(known: RunState) -> None:
     """Refuses motion that does not determine a frame well enough for anybody.
 
     Raises:

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.types import IntArray
 from visioncal.estimation.appearance import BOARD_NAMES, shape_slices
 from visioncal.results import CameraResult
@@ -12,14 +12,14 @@ from visioncal.session import frame_name
 from visioncal.session.frames import thing_name
 
 
-def cameras_of(known: Known) -> dict[str, CameraResult]:
+def cameras_of(known: RunState) -> dict[str, CameraResult]:
     """The cameras by their frames, as the fit has them, with what is open about them.
 
     A camera's covariance, the edges', and that of both together are blocks of one matrix. Given
     intrinsics of which only a part is open, the matrix and not the distortion, have zeros for the
     rest.
     """
-    solved, spread, edges = known.fitted, known.solved.covariance, 6 * len(known.solved.edges)
+    solved, covariance, edges = known.fitted, known.solved.covariance, 6 * len(known.solved.edges)
     seen, looks = solved.seen, solved.looks
     # Measured poses do without a camera; whoever looks through it later does not.
     found = {
@@ -38,43 +38,43 @@ def cameras_of(known: Known) -> dict[str, CameraResult]:
         if free.any():
             at = solved.columns_of(lens[free])
             own, shared = np.zeros((len(lens),) * 2), np.zeros((len(lens), edges))
-            own[np.ix_(free, free)] = spread[np.ix_(at, at)]
-            shared[free] = spread[at, :edges]
+            own[np.ix_(free, free)] = covariance[np.ix_(at, at)]
+            shared[free] = covariance[at, :edges]
             found[name] = CameraResult(looks.camera(name), estimated, own, shared)
     return found
 
 
-def fit_section(known: Known) -> dict[str, Any]:
+def fit_section(known: RunState) -> dict[str, Any]:
     """`joint_fit` of a whole cell.
 
     That is which values of each camera's lens and each target's shape are among the unknowns,
     cameras first, and the covariance of transforms and these.
     """
-    solved, spread, edges = known.fitted, known.solved.covariance, 6 * len(known.solved.edges)
+    solved, covariance, edges = known.fitted, known.solved.covariance, 6 * len(known.solved.edges)
     seen, looks = solved.seen, solved.looks
     if seen is None or looks is None:
-        return {"cameras": {}, "targets": {}, "covariance": spread[:edges, :edges].tolist()}
+        return {"cameras": {}, "targets": {}, "covariance": covariance[:edges, :edges].tolist()}
     columns = [*range(edges), *solved.columns_of(seen.free).tolist()]
     return {
         "cameras": {
             thing_name(it, "camera"): _among(seen.free, at) for it, at in looks.lenses.items()
         },
         "targets": {name: _among(seen.free, it) for name, it in _shapes(known).items()},
-        "covariance": spread[np.ix_(columns, columns)].tolist(),
+        "covariance": covariance[np.ix_(columns, columns)].tolist(),
     }
 
 
-def shape_sections(known: Known) -> dict[str, Any]:
+def shape_sections(known: RunState) -> dict[str, Any]:
     """`boards` and `rigs`: the targets as they were found to be; of rigs those that are not exact.
 
     Where there is one target without a name they are `board` or `rig`, without another key.
     """
-    solved, spread = known.fitted, known.solved.covariance
+    solved, covariance = known.fitted, known.solved.covariance
     seen, looks = solved.seen, solved.looks
     if seen is None or looks is None:
         return {}
     sigmas = np.zeros(len(looks.values))
-    sigmas[seen.free] = np.sqrt(np.diag(spread))[solved.columns_of(seen.free)]
+    sigmas[seen.free] = np.sqrt(np.diag(covariance))[solved.columns_of(seen.free)]
     found: dict[str, dict[str, Any]] = {"boards": {}, "rigs": {}}
     boards, placed = known.session.boards, solved.part.tree.branches
     shapes = zip(_shapes(known).items(), boards.items(), strict=True)
@@ -99,7 +99,7 @@ def shape_sections(known: Known) -> dict[str, Any]:
     return {kind: it for kind, it in found.items() if it}
 
 
-def _shapes(known: Known) -> dict[str, slice]:
+def _shapes(known: RunState) -> dict[str, slice]:
     """Where each target's shape stands among the values of lenses and boards."""
     looks = known.fitted.looks
     if looks is None:

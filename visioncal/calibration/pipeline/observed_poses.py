@@ -12,7 +12,7 @@ from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.refine import remade
 from visioncal.core.types import Corners, FloatArray, IntArray
-from visioncal.estimation.appearance import Free
+from visioncal.estimation.appearance import LensBoardParameters
 from visioncal.estimation.chain import chain, edge_names
 from visioncal.estimation.parts import ROBOT
 from visioncal.estimation.problem import Problem
@@ -20,7 +20,7 @@ from visioncal.session import frame_name
 
 
 @dataclass(frozen=True, eq=False)
-class Looked(Observed):
+class ObservedPoses(Observed):
     """What was observed, and what it is seen with; nothing of that is estimated here.
 
     Attributes:
@@ -34,7 +34,7 @@ class Looked(Observed):
     boards: tuple[int, ...] = (0,)
     frames: Mapping[str, FloatArray] = field(default_factory=dict)
     used: tuple[int, ...] = ()
-    free: Free | None = None
+    free: LensBoardParameters | None = None
     calibrated: RobotArm | None = None
 
     @classmethod

@@ -9,7 +9,7 @@ import numpy as np
 from visioncal.calibration.pipeline.fit import conditions_document, fit_document
 from visioncal.calibration.pipeline.holdout import held_by_both_arms
 from visioncal.calibration.pipeline.lens_documents import cameras_of, shape_sections
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.whole import alignment_of, arm_documents
 from visioncal.calibration.stages.handeye import compare_solvers
 from visioncal.calibration.stages.need import need_met
@@ -26,7 +26,7 @@ _NO_POSE = (
 )
 
 
-def result_of(known: Known) -> Calibration:
+def result_of(known: RunState) -> Calibration:
     """Puts together what is known when all steps have run.
 
     Raises:
@@ -62,7 +62,7 @@ def result_of(known: Known) -> Calibration:
     )
 
 
-def _edge_names(known: Known) -> dict[str, str]:
+def _edge_names(known: RunState) -> dict[str, str]:
     """The names of the edges by the frames that they place, the camera's first.
 
     Of points that an instrument read, the first is the probe.
@@ -75,7 +75,7 @@ def _edge_names(known: Known) -> dict[str, str]:
     return names
 
 
-def _solvers(known: Known, names: Mapping[str, str]) -> dict[str, SolverResult]:
+def _solvers(known: RunState, names: Mapping[str, str]) -> dict[str, SolverResult]:
     answer, mount = known.solved, known.session.mount
     found = compare_solvers(answer.problem, answer.state, mount, known.solver)
     return {
@@ -88,7 +88,7 @@ def _solvers(known: Known, names: Mapping[str, str]) -> dict[str, SolverResult]:
     }
 
 
-def _views(known: Known) -> tuple[ViewResult, ...]:
+def _views(known: RunState) -> tuple[ViewResult, ...]:
     """What became of each view of the session, in its order."""
     seen = {it.view: it for it in view_results(known.solved.sights)}
     return tuple(
@@ -97,14 +97,14 @@ def _views(known: Known) -> tuple[ViewResult, ...]:
     )
 
 
-def _reason(known: Known, row: View) -> str:
+def _reason(known: RunState, row: View) -> str:
     """Why a row tells of no chain."""
     if row.is_of_lens:
         return _OF_LENS
     return known.reasons.get(row.number) or (HELD_BACK if row.holdout else _NO_POSE)
 
 
-def _further(known: Known) -> dict[str, Any]:
+def _further(known: RunState) -> dict[str, Any]:
     """What was refined beside the edges, and where the uncertainty comes from."""
     documents: dict[str, Any] = {}
     for it in known.clocks.values():
@@ -121,7 +121,7 @@ def _further(known: Known) -> dict[str, Any]:
     return documents
 
 
-def _arm(known: Known) -> dict[str, Any]:
+def _arm(known: RunState) -> dict[str, Any]:
     """What was found of the arm."""
     arm = known.robot_arm
     documents = arm_documents(known, arm.robot)
@@ -132,7 +132,7 @@ def _arm(known: Known) -> dict[str, Any]:
     return documents
 
 
-def _instrument(known: Known, readings: Readings) -> dict[str, Any]:
+def _instrument(known: RunState, readings: Readings) -> dict[str, Any]:
     """The instrument as it was taken, and the places of the points that it read on the flange."""
     instrument = readings.instrument
     stated = {
@@ -156,7 +156,7 @@ def _instrument(known: Known, readings: Readings) -> dict[str, Any]:
     return document
 
 
-def _uncertainty(known: Known) -> dict[str, Any]:
+def _uncertainty(known: RunState) -> dict[str, Any]:
     work, answer = known.work, known.solved
     of = "combined" if answer.problem.is_combined else "robot"
     (turn_rad, shift_m) = answer.intervals[0]
@@ -174,7 +174,7 @@ def _uncertainty(known: Known) -> dict[str, Any]:
     }
 
 
-def _noise(known: Known) -> dict[str, float]:
+def _noise(known: RunState) -> dict[str, float]:
     """Standard deviations per axis: of corners and flange, or of both as one without corners."""
     sigma_rad, sigma_m = known.solved.noise.robots[0].tolist()
     of = "combined" if known.solved.problem.is_combined else "robot"

@@ -21,7 +21,7 @@ from visioncal.session.single import is_whole_cell
 
 
 @dataclass(frozen=True, eq=False)
-class Known(Observed):
+class RunState(Observed):
     """Everything that is known of a session at some point of the way.
 
     Attributes:

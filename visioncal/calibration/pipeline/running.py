@@ -6,7 +6,7 @@ from pathlib import Path
 
 from visioncal.calibration.pipeline.guess_inputs import is_suspect, reading_hint
 from visioncal.calibration.pipeline.result import result_of
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.pipeline.view_evidence import view_evidence
 from visioncal.calibration.stages.causes import with_misread
@@ -65,7 +65,7 @@ def known_at_first(
     solver: SolverName = "joint",
     level: str,
     convention: Convention | None,
-) -> Known:
+) -> RunState:
     """What is known at the start, checked."""
     if solver not in SOLVER_NAMES:
         raise DataError(f"solver {solver!r} is not one of {', '.join(SOLVER_NAMES)}.")
@@ -73,12 +73,12 @@ def known_at_first(
     if convention is not None and convention not in CONVENTIONS:
         raise DataError(f"convention {convention!r} is not one of {', '.join(CONVENTIONS)}.")
     loaded = session if isinstance(session, Session) else Session.load(session)
-    known = Known(loaded, progress, solver=solver, level=level, convention=convention)
+    known = RunState(loaded, progress, solver=solver, level=level, convention=convention)
     check_solver(known)
     return known
 
 
-def check_solver(known: Known) -> None:
+def check_solver(known: RunState) -> None:
     """Refuses a closed form for a whole cell.
 
     Raises:
@@ -92,7 +92,7 @@ def check_solver(known: Known) -> None:
         )
 
 
-def check_dense(known: Known) -> None:
+def check_dense(known: RunState) -> None:
     """Refuses dense corners for a whole cell.
 
     Raises:
@@ -106,10 +106,10 @@ def check_dense(known: Known) -> None:
         )
 
 
-def run_steps(known: Known) -> Known:
+def run_steps(known: RunState) -> RunState:
     """Takes a session through all steps."""
     progress = known.progress
-    seen: Known | None = None
+    seen: RunState | None = None
     with one_blas_thread():
         for at, stage in enumerate(STAGES):
             if progress is not None:
@@ -128,7 +128,7 @@ def run_steps(known: Known) -> Known:
         return _with_reading(known, seen)
 
 
-def _with_hint(error: VisioncalError, seen: Known | None) -> VisioncalError:
+def _with_hint(error: VisioncalError, seen: RunState | None) -> VisioncalError:
     """Adds to an error, once the target's poses are known, what leads on.
 
     That is how the robot's poses should be read, or else what proposes the views that are missing.
@@ -143,7 +143,7 @@ def _with_hint(error: VisioncalError, seen: Known | None) -> VisioncalError:
     return type(error)(error.message, culprits=error.culprits, next_step=next_step)
 
 
-def _with_reading(known: Known, seen: Known | None) -> Known:
+def _with_reading(known: RunState, seen: RunState | None) -> RunState:
     """Adds to a poor verdict how the poses should be read, where that explains it."""
     if known.verdict is None or seen is None or not is_suspect(known):
         return known

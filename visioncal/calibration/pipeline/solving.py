@@ -23,7 +23,7 @@ from visioncal.calibration.stages.validate import chain_rms_px
 from visioncal.core.errors import DegenerateError
 from visioncal.core.types import FloatArray, IntArray, Mask, SolverName, Target
 from visioncal.estimation.arm import rows_of
-from visioncal.estimation.effects.lenses import LENSES, Looks, Seen
+from visioncal.estimation.effects.lenses import LENSES, CameraParameters, Seen
 from visioncal.estimation.joint import Fitted
 from visioncal.estimation.joint import settle as settle_looks
 from visioncal.estimation.observability import FEWEST_VIEWS, refuse_too_few
@@ -84,11 +84,11 @@ class Solved:
             yield from found_of_looks(side, Fitted(self.seen, part, self.agreed.fit))
 
     @property
-    def looks(self) -> Looks | None:
+    def looks(self) -> CameraParameters | None:
         """Lenses and boards as they were found; None without images."""
         return self.looks_at(self.agreed.fit.state)
 
-    def looks_at(self, state: State) -> Looks | None:
+    def looks_at(self, state: State) -> CameraParameters | None:
         """Lenses and boards as some state has them; None without images."""
         if self.seen is None:
             return None
@@ -465,14 +465,14 @@ def problem_of(cell: Cell, views: Sequence[ViewPoses]) -> Problem:
         levels.get(row.seer, -1) if is_sensed(row.seer, view) else -1
         for row, view in zip(cell.rows, views, strict=True)
     ]
-    spread = np.array([it.covariance[0] for it in views])
+    covariance = np.array([it.covariance[0] for it in views])
     places = np.array([it.is_place for it in cell.rows], dtype=bool)
-    spread[given] = _NOMINAL
+    covariance[given] = _NOMINAL
     turned = {row.seen for row, place in zip(cell.rows, places.tolist(), strict=True) if not place}
     # What one camera measured with one robot, without a word of its noise, has that of both as one.
     is_combined = cell.mount is not None and cell.mount != "instrument" and bool(given.any())
     if is_combined:
-        sensors, spread = [-1] * len(views), np.zeros((len(views), 6, 6))
+        sensors, covariance = [-1] * len(views), np.zeros((len(views), 6, 6))
     return Problem(
         cell.tree,
         cell.poses,
@@ -482,7 +482,7 @@ def problem_of(cell: Cell, views: Sequence[ViewPoses]) -> Problem:
             np.array([it.station for it in cell.rows]),
             np.array(sensors, dtype=np.int64),
             np.array([it.cam_from_target[0] for it in views]),
-            spread,
+            covariance,
             ~places,
         ),
         priors=cell.priors,

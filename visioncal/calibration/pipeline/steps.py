@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from visioncal.calibration.pipeline.answer import answer_of
 from visioncal.calibration.pipeline.judging import check_answer, findings_of
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.solving import solve
 from visioncal.calibration.pipeline.unused_facts import not_used
 from visioncal.calibration.stages.cameras import detect_targets, estimate_lenses, locate_targets
@@ -34,10 +34,10 @@ class Stage:
     """One step of the way, by the name that progress shows."""
 
     name: str
-    run: Callable[[Known], Known]
+    run: Callable[[RunState], RunState]
 
 
-def _read_robot(known: Known) -> Known:
+def _read_robot(known: RunState) -> RunState:
     session = known.session
     if not session.views:
         what = "streams and no views" if session.streams else "no views"
@@ -54,7 +54,7 @@ def _read_robot(known: Known) -> Known:
     return known if waits_for_clock(session) else _reported(known)
 
 
-def _reported(known: Known) -> Known:
+def _reported(known: RunState) -> RunState:
     """Takes up what is reported of the robots."""
     known = read_robots(known)
     if known.mount is None:
@@ -77,7 +77,7 @@ def _reported(known: Known) -> Known:
     return known
 
 
-def _readings(known: Known) -> Known:
+def _readings(known: RunState) -> RunState:
     """Takes up what instruments read."""
     if known.mount == "instrument":
         readings = read_instrument(known.session)
@@ -97,34 +97,34 @@ def _readings(known: Known) -> Known:
     return replace(known, poses={**known.poses, **poses})
 
 
-def _detect(known: Known) -> Known:
+def _detect(known: RunState) -> RunState:
     return detect_targets(known, known.found_before)
 
 
-def _clock(known: Known) -> Known:
+def _clock(known: RunState) -> RunState:
     """Gives views that have a time alone the robot's poses out of its stream."""
     return _reported(set_clocks(known)) if waits_for_clock(known.session) else known
 
 
-def _joints(known: Known) -> Known:
+def _joints(known: RunState) -> RunState:
     """Refuses joints that only fit what the camera sees where they are read otherwise."""
     drops = known.level != "hand-eye"
     return check_joints(known, drops=drops, takes=drops and known.solver == "joint")
 
 
-def _solve(known: Known) -> Known:
+def _solve(known: RunState) -> RunState:
     cell = read_cell(known)
     return replace(known, read=cell, fit=solve(cell, known, known.level, known.solver))
 
 
-def _examine(known: Known) -> Known:
+def _examine(known: RunState) -> RunState:
     check_answer(known)
     answer = answer_of(known.cell, known, known.fitted, known.convention)
     out = (it for it in answer.sights if not it.used and it.view not in known.held_back)
     return replace(known, answer=answer).noting(Rejection(it.view, it.reason) for it in out)
 
 
-def _judge(known: Known) -> Known:
+def _judge(known: RunState) -> RunState:
     findings = findings_of(known)
     known = replace(known, warnings=tuple(findings.warnings), notes=tuple(findings.notes))
     return replace(known, findings=findings, verdict=judge(findings))

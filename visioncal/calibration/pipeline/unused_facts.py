@@ -2,11 +2,11 @@
 
 from collections.abc import Iterator
 
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell import pair_edges
 
 
-def not_used(known: Known) -> Iterator[str]:
+def not_used(known: RunState) -> Iterator[str]:
     """Says what the session declares and this version leaves aside."""
     session = known.session
     if known.mount is None:

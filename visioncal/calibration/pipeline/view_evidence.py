@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.calibration.pipeline.holdout import held_back
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell import robot_key
 from visioncal.calibration.stages.validate import predict_corners
 from visioncal.core.types import Corners, FloatArray
@@ -14,7 +14,7 @@ from visioncal.session.observations import Observation
 from visioncal.vision.targets import first_corners
 
 
-def view_evidence(known: Known) -> tuple[ViewEvidence, ...]:
+def view_evidence(known: RunState) -> tuple[ViewEvidence, ...]:
     """Collects what was seen and computed of each view."""
     solved, state = known.fitted, known.solved.state
     held = held_back(solved, known)
@@ -36,7 +36,7 @@ def view_evidence(known: Known) -> tuple[ViewEvidence, ...]:
 
 
 def _evidence(
-    known: Known, view: int, found: ViewEvidence | None, row: Observation | None
+    known: RunState, view: int, found: ViewEvidence | None, row: Observation | None
 ) -> ViewEvidence:
     if found is None:
         poses = known.poses.get(view)
@@ -49,7 +49,7 @@ def _evidence(
     return replace(found, corners=corners, base_from_flange=_flange(known, view, row))
 
 
-def _flange(known: Known, view: int, row: Observation | None) -> FloatArray | None:
+def _flange(known: RunState, view: int, row: Observation | None) -> FloatArray | None:
     """(4, 4) where the robot stood: by the calibrated arm where there is one."""
     if row is not None and len(row.robots) == 1:
         arm = known.fitted.arms.get(robot_key(next(iter(row.robots))))
@@ -58,7 +58,7 @@ def _flange(known: Known, view: int, row: Observation | None) -> FloatArray | No
     return known.base_from_flange.get(view)
 
 
-def _own_numbers(known: Known, corners: Corners) -> Corners:
+def _own_numbers(known: RunState, corners: Corners) -> Corners:
     """The corners of a view by their numbers on its own board, again."""
     if len(known.session.boards) < 2 or not len(corners.ids):
         return corners
@@ -67,7 +67,7 @@ def _own_numbers(known: Known, corners: Corners) -> Corners:
 
 
 def _predicted(
-    known: Known, seer: str, cam_from_target: FloatArray, corners: Corners
+    known: RunState, seer: str, cam_from_target: FloatArray, corners: Corners
 ) -> FloatArray | None:
     looks = known.fitted.looks
     if looks is None or seer not in looks.problems:

@@ -8,7 +8,7 @@ import numpy as np
 from visioncal.calibration.pipeline.judging import weakest_link
 from visioncal.calibration.pipeline.lens_documents import cameras_of, fit_section, shape_sections
 from visioncal.calibration.pipeline.network_ties import untied_words
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell import robot_key
 from visioncal.calibration.stages.need import need_met
 from visioncal.estimation.arm import stops_of
@@ -17,7 +17,7 @@ from visioncal.robot import Robot
 from visioncal.vision.targets import target_document
 
 
-def alignment_of(known: Known) -> Alignment:
+def alignment_of(known: RunState) -> Alignment:
     """Puts together what is known of a whole cell when all steps have run.
 
     Raises:
@@ -68,7 +68,7 @@ def alignment_of(known: Known) -> Alignment:
     )
 
 
-def _arms(known: Known) -> dict[str, RobotResult]:
+def _arms(known: RunState) -> dict[str, RobotResult]:
     session, solved = known.session, known.fitted
     models = session.robot_documents
     found = {
@@ -80,7 +80,7 @@ def _arms(known: Known) -> dict[str, RobotResult]:
     return found
 
 
-def arm_documents(known: Known, robot: str) -> dict[str, Any]:
+def arm_documents(known: RunState, robot: str) -> dict[str, Any]:
     """What was found of a robot's arm, as calibration.json has it: one section a stage."""
     solved, answer, first = known.fitted, known.solved, dict[int, int]()
     for row in solved.cell.rows:
@@ -90,13 +90,13 @@ def arm_documents(known: Known, robot: str) -> dict[str, Any]:
     return solved.arms[robot].at(stops).documents(found, [first[it] for it in stops.tolist()])
 
 
-def _details(known: Known) -> dict[str, Any]:
+def _details(known: RunState) -> dict[str, Any]:
     """What was found of clocks."""
     clocks = known.solved.clocks(known)
     return {"clocks": {it.words: at.document() for it, at in clocks.items()}} if clocks else {}
 
 
-def _intervals(known: Known) -> dict[str, dict[str, list[float]]]:
+def _intervals(known: RunState) -> dict[str, dict[str, list[float]]]:
     """95 % intervals of the levels of robots, as the noise names them."""
     pairs = zip(known.solved.problem.robots, known.solved.intervals, strict=True)
     return {

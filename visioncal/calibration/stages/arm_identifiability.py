@@ -13,7 +13,12 @@ from visioncal.core.types import FloatArray
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.armpair import ArmData, ArmPair
 from visioncal.estimation.excitation_advice import Move, joints_to_move
-from visioncal.estimation.identifiability import Slopes, Told, count_told, what_is_told
+from visioncal.estimation.identifiability import (
+    Identifiability,
+    Jacobians,
+    count_told,
+    what_is_told,
+)
 from visioncal.estimation.indices import Indices
 from visioncal.estimation.null_space import (
     dominant_words,
@@ -26,8 +31,8 @@ from visioncal.estimation.null_space import (
 from visioncal.estimation.parameters import (
     Parameter,
     free_parameters,
+    parameter_jacobian,
     parameter_moves,
-    parameter_slopes,
 )
 from visioncal.estimation.solve import whitened
 from visioncal.estimation.stop_influence import stop_worth
@@ -83,7 +88,7 @@ class Telling:
 
     convention: Convention
     estimates: tuple[Estimate, ...]
-    told: Told
+    told: Identifiability
     indices: Indices | None
     not_told: tuple[str, ...]
     advice: str
@@ -173,7 +178,7 @@ def tell(arm: ArmData, convention: Convention | None = None) -> Telling:
             lacking = _Lacking(
                 imitated(by_numbers, by_arm, told.missing), _moves(arm, told, weight)
             )
-        place = _place_slopes(arm, anywhere)
+        place = _place_jacobian(arm, anywhere)
         seen = arm.covariance[np.ix_(arm.chain, arm.chain)]
         sigmas_m = np.sqrt(np.einsum("mij,jk,mik->m", place, seen, place))
         fitted = (arm.problem, arm.state, arm.noise)
@@ -229,35 +234,35 @@ def _stated_table(robot: Robot) -> DHTable:
     return table_of(robot, "standard")
 
 
-def _at_stops(arm: ArmData) -> Slopes:
+def _at_stops(arm: ArmData) -> Jacobians:
     """The stops' slopes, in units of their noise."""
-    _, slopes = whitened(arm.problem, arm.state, arm.noise, arm.measured)
-    flat = slopes.reshape(-1, arm.problem.size)
-    return Slopes(flat[:, arm.frames], flat[:, arm.columns] * arm.error_rad)
+    _, jacobian = whitened(arm.problem, arm.state, arm.noise, arm.measured)
+    flat = jacobian.reshape(-1, arm.problem.size)
+    return Jacobians(flat[:, arm.frames], flat[:, arm.columns] * arm.error_rad)
 
 
-def _at(arm: ArmData, q: FloatArray, weight: FloatArray) -> Slopes:
+def _at(arm: ArmData, q: FloatArray, weight: FloatArray) -> Jacobians:
     """Slopes at any postures, in units of a noise like the stops'."""
     flange = arm.model.base_from_flange(q)
     return _through(arm.pair, flange, arm.basis(q) * arm.error_rad, weight)
 
 
-def _by_numbers(arm: ArmData, numbers: _Numbers, q: FloatArray, weight: FloatArray) -> Slopes:
+def _by_numbers(arm: ArmData, numbers: _Numbers, q: FloatArray, weight: FloatArray) -> Jacobians:
     """Slopes by the nominal arm's numbers, whose axes are exactly as they are meant."""
     model, parameters = arm.model, numbers.parameters
-    moved = parameter_slopes(numbers.before, parameters, q, model.flange_from_reported)
+    moved = parameter_jacobian(numbers.before, parameters, q, model.flange_from_reported)
     flange = model.nominal.base_from_flange(q) @ model.flange_from_reported
     return _through(arm.pair, flange, moved * [it.unit for it in parameters], weight)
 
 
-def _through(pair: ArmPair, flange: FloatArray, moved: FloatArray, weight: FloatArray) -> Slopes:
+def _through(pair: ArmPair, flange: FloatArray, moved: FloatArray, weight: FloatArray) -> Jacobians:
     """Slopes of the pair by the frames at both ends, and by (k, 6, p) motions of the flange."""
     carried = weight @ pair.at(flange)[0].by_errors
-    frames, arm = carried @ pair.frame_slopes(flange), carried @ moved
-    return Slopes(frames.reshape(-1, 12), arm.reshape(-1, moved.shape[2]))
+    frames, arm = carried @ pair.frame_jacobian(flange), carried @ moved
+    return Jacobians(frames.reshape(-1, 12), arm.reshape(-1, moved.shape[2]))
 
 
-def _moves(arm: ArmData, told: Told, weight: FloatArray) -> tuple[Move, ...]:
+def _moves(arm: ArmData, told: Identifiability, weight: FloatArray) -> tuple[Move, ...]:
     """The joints that would tell what is missing, for noise that is alike at all stops."""
 
     def count(q: FloatArray) -> int:
@@ -266,18 +271,18 @@ def _moves(arm: ArmData, told: Told, weight: FloatArray) -> tuple[Move, ...]:
     return joints_to_move(arm.model.robot, arm.q, count, told.identifiable - told.told)
 
 
-def _place_slopes(arm: ArmData, q: FloatArray) -> FloatArray:
+def _place_jacobian(arm: ArmData, q: FloatArray) -> FloatArray:
     """How the place of what the flange carries moves with the chain's unknowns, (k, 3, f + p)."""
-    poses, moved = arm.pair.slopes(arm.model.base_from_flange(q), arm.basis(q))
+    poses, moved = arm.pair.jacobian(arm.model.base_from_flange(q), arm.basis(q))
     edges = moved.shape[2] - len(arm.columns)
-    slopes = np.zeros((len(q), 6, arm.problem.size))
-    slopes[:, :, :edges], slopes[:, :, arm.columns] = moved[:, :, :edges], moved[:, :, edges:]
-    return arm.pair.place_slopes(poses, slopes[:, :, arm.chain], arm.at)
+    jacobian = np.zeros((len(q), 6, arm.problem.size))
+    jacobian[:, :, :edges], jacobian[:, :, arm.columns] = moved[:, :, :edges], moved[:, :, edges:]
+    return arm.pair.place_jacobian(poses, jacobian[:, :, arm.chain], arm.at)
 
 
 def _estimates(arm: ArmData, numbers: _Numbers) -> Iterator[Estimate]:
     links = arm.error_rad * arm.model.weights.get("links", 1.0)
-    sigmas = np.sqrt(np.einsum("ij,jk,ik->i", numbers.moves, arm.spread, numbers.moves))
+    sigmas = np.sqrt(np.einsum("ij,jk,ik->i", numbers.moves, arm.arm_covariance, numbers.moves))
     for parameter, sigma, moves in zip(numbers.parameters, sigmas, numbers.moves, strict=True):
         # Where the base or the flange takes a number's place it is as open as it was beforehand.
         known = 0.0 if moves.any() else links * parameter.unit
@@ -300,7 +305,9 @@ def _missing_words(lacking: _Lacking, parameters: Sequence[Parameter], robot: Ro
     return f"{moved} only, too little to tell {named}"
 
 
-def _advice(lacking: _Lacking, told: Told, parameters: Sequence[Parameter], robot: Robot) -> str:
+def _advice(
+    lacking: _Lacking, told: Identifiability, parameters: Sequence[Parameter], robot: Robot
+) -> str:
     further = "Add stops in which the arm stands otherwise, all over the workspace."
     if lacking.moves:
         joints = [

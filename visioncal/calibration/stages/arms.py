@@ -278,7 +278,11 @@ class RobotArm:
         return found
 
     def _seen(
-        self, problem: Problem, fit: Solution, spread: FloatArray, middles: Mapping[str, FloatArray]
+        self,
+        problem: Problem,
+        fit: Solution,
+        covariance: FloatArray,
+        middles: Mapping[str, FloatArray],
     ) -> ArmData | None:
         """What was seen of its errors; None where it stands as stated."""
         columns = problem.effect_columns.get(f"arm of {self.robot}")
@@ -297,7 +301,7 @@ class RobotArm:
             problem,
             fit.state,
             fit.noise,
-            spread,
+            covariance,
             self.robot,
             self.model,
             every[columns],
@@ -314,7 +318,7 @@ class RobotArm:
         self,
         problem: Problem,
         fit: Solution,
-        spread: FloatArray,
+        covariance: FloatArray,
         middles: Mapping[str, FloatArray],
         convention: Convention | None = None,
     ) -> ArmFound:
@@ -323,7 +327,7 @@ class RobotArm:
         Args:
             problem: The observations that agree, with its errors among the unknowns.
             fit: Their fit.
-            spread: (p, p) its covariance.
+            covariance: (p, p) its covariance.
             middles: (3,) the middle of each printed target by its frame, in that [m].
             convention: Of the table that is wanted; see `stages.arm_identifiability`.
         """
@@ -333,7 +337,7 @@ class RobotArm:
             stops = replace(seen.warming, places=stops_of(problem, self.robot))
             views = [] if seen.heat is None else seen.heat.views.tolist()
             drift = drift_document(self.drift, stops, views, problem, fit)
-        data = self._seen(problem, fit, spread, middles)
+        data = self._seen(problem, fit, covariance, middles)
         if data is None or self.kinematics is None:
             return ArmFound(drift=drift)
         # With nothing but play and springs its numbers are as stated.
@@ -341,7 +345,7 @@ class RobotArm:
         return ArmFound(
             tell(data, convention) if erring else None,
             springs_of(data, self.kinematics.errors),
-            plays_of(data.model, data.spread),
+            plays_of(data.model, data.arm_covariance),
             drift,
         )
 

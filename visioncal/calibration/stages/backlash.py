@@ -43,17 +43,17 @@ class Play:
         return abs(self.deadband_rad) > _SURE * self.sigma_rad
 
 
-def plays_of(model: ArmModel, spread: FloatArray) -> tuple[Play, ...]:
+def plays_of(model: ArmModel, covariance: FloatArray) -> tuple[Play, ...]:
     """Tells the play of each joint; nothing where stops did not come from both sides.
 
     Args:
         model: The arm.
-        spread: (p, p) covariance of its errors.
+        covariance: (p, p) covariance of its errors.
     """
     if BACKLASH not in model.weights:
         return ()
     place = model.place_of(BACKLASH)
-    sigmas = model.weights[BACKLASH] * np.sqrt(np.diag(spread)[place])
+    sigmas = model.weights[BACKLASH] * np.sqrt(np.diag(covariance)[place])
     names = model.nominal.joint_names
     columns = zip(names, model.backlash.tolist(), sigmas.tolist(), strict=True)
     return tuple(Play(name, band, sigma) for name, band, sigma in columns)

@@ -94,9 +94,11 @@ def locate_targets(seen: T) -> T:
         fitted = {view: it for view, it in corners.items() if view not in seen.held_back}
         if look.lens is None or not fitted:
             continue
-        camera, spread = look.lens.camera, look.lens.covariance
+        camera, covariance = look.lens.camera, look.lens.covariance
         with _naming(session, frame):
-            found = estimate_poses(fitted, targets, camera, 0 if spread is None else len(spread))
+            found = estimate_poses(
+                fitted, targets, camera, 0 if covariance is None else len(covariance)
+            )
         rest = {view: it for view, it in corners.items() if view in seen.held_back}
         held = measure_poses(rest, targets, camera, found.sigma_px)
         poses |= {it.view: it for it in (*found.views, *held)}

@@ -212,10 +212,10 @@ def _straightened(
         sweep.camera,
         late,
     )
-    slopes = {view: it for view, it in found.slopes.items() if view in clock.speeds}
+    jacobian = {view: it for view, it in found.jacobian.items() if view in clock.speeds}
     places = {it: at for at, it in enumerate(late.delays)}
     delays = tuple(
-        replace(it, slopes={view: by[:, places[it.of]] for view, by in slopes.items()})
+        replace(it, jacobian={view: by[:, places[it.of]] for view, by in jacobian.items()})
         if it.of in places
         else it
         for it in clock.delays

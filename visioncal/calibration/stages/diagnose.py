@@ -15,7 +15,7 @@ _FEWEST_STOPS = 6
 
 
 @dataclass(frozen=True)
-class Misfit:
+class ResidualTest:
     """What the residuals of one robot's stops show beyond noise.
 
     Attributes:
@@ -27,7 +27,7 @@ class Misfit:
     moved: Drift | None
 
 
-def misfits(problem: Problem, fit: Solution) -> dict[str, Misfit]:
+def misfits(problem: Problem, fit: Solution) -> dict[str, ResidualTest]:
     """Tests the residuals of each robot's stops for what is no noise; of few stops, none.
 
     Args:
@@ -38,11 +38,11 @@ def misfits(problem: Problem, fit: Solution) -> dict[str, Misfit]:
     for robot in problem.robots:
         if len(stops_of(problem, robot)) >= _FEWEST_STOPS:
             fitted = (problem, fit.state, fit.noise, robot)
-            found[robot] = Misfit(neighbours(*fitted), drift(*fitted))
+            found[robot] = ResidualTest(neighbours(*fitted), drift(*fitted))
     return found
 
 
-def misfit_words(found: Misfit, arm: ArmErrors | None, *, calibrated: bool) -> Iterator[str]:
+def misfit_words(found: ResidualTest, arm: ArmErrors | None, *, calibrated: bool) -> Iterator[str]:
     """Words what of a robot's residuals is no noise, and what it probably is."""
     alike, moved = found.alike, found.moved
     if arm is not None and arm.is_significant and not calibrated:

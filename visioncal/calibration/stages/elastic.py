@@ -166,7 +166,7 @@ def springs_of(arm: ArmData, errors: Mapping[str, ArmErrors]) -> Elastic | None:
     sigmas = np.full(model.nominal.joint_count, prior)
     bends_rad = np.full(torques.shape, np.nan)
     if COMPLIANCE in model.weights:
-        variances = np.diag(arm.spread)[model.place_of(COMPLIANCE)]
+        variances = np.diag(arm.arm_covariance)[model.place_of(COMPLIANCE)]
         sigmas = compliance_unit(model) * np.sqrt(variances)
         bends_rad = bends_seen(arm, torques)
     told = (np.abs(torques).max(axis=0) > _LOADED_NM) & (sigmas < _TOLD * prior)

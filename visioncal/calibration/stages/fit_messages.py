@@ -16,7 +16,7 @@ from visioncal.estimation.joint import (
     chance_limit,
     contradicted_lens,
     measured_scale,
-    moved_surprise,
+    moved_mahalanobis_sq,
 )
 from visioncal.estimation.scene import ONLY_CAMERA, Scene
 from visioncal.estimation.solve import held_shift
@@ -214,7 +214,9 @@ def _moves(fitted: Fitted, places: IntArray) -> bool:
 
 def _moved(fitted: Fitted, places: IntArray) -> bool:
     """Whether values were moved from what is stated by more than chance."""
-    return _moves(fitted, places) and moved_surprise(fitted, places) > chance_limit(len(places))
+    return _moves(fitted, places) and moved_mahalanobis_sq(fitted, places) > chance_limit(
+        len(places)
+    )
 
 
 def _px(values: FloatArray) -> str:

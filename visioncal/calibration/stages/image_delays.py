@@ -23,7 +23,7 @@ from visioncal.estimation.effects.delays import (
     shares_of,
     target_twists,
 )
-from visioncal.estimation.linalg import covariance
+from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.parts import Effect
 from visioncal.estimation.trajectory import Trajectory
 from visioncal.estimation.variance import Knowledge
@@ -39,7 +39,7 @@ class FoundDelay:
         sigma_s: Its standard deviation [s].
         is_clear: Whether it is beyond chance, and was taken into account.
         resolution: Of the images [px].
-        slopes: (6,) how each view's `cam_from_target` moves with it, by view.
+        jacobian: (6,) how each view's `cam_from_target` moves with it, by view.
     """
 
     of: Delay
@@ -47,14 +47,14 @@ class FoundDelay:
     sigma_s: float
     is_clear: bool
     resolution: tuple[int, int]
-    slopes: Mapping[int, FloatArray] = field(default_factory=dict)
+    jacobian: Mapping[int, FloatArray] = field(default_factory=dict)
 
     def effect(self, views: Sequence[int], name: str = "") -> Effect:
         """Its error as an unknown of some views; see `Clock.effects`."""
         still = np.zeros(6)
-        slopes = np.array([self.slopes.get(it, still) for it in views]).reshape(-1, 6, 1)
+        jacobian = np.array([self.jacobian.get(it, still) for it in views]).reshape(-1, 6, 1)
         known = Knowledge(np.array([[self.sigma_s**-2.0]]), np.zeros(1))
-        return Effect.free(name or self.of.name, known, slopes)
+        return Effect.free(name or self.of.name, known, jacobian)
 
     def document(self) -> dict[str, object]:
         """What calibration.json says of it."""
@@ -105,11 +105,11 @@ class Straight:
 
     Attributes:
         poses: The views' poses, made anew where each has just one.
-        slopes: (6, k) how they move with the k times, by view.
+        jacobian: (6, k) how they move with the k times, by view.
     """
 
     poses: Mapping[int, ViewPoses]
-    slopes: Mapping[int, FloatArray]
+    jacobian: Mapping[int, FloatArray]
 
 
 def straighten(
@@ -142,9 +142,11 @@ def straighten(
         plain = replace(stack, weights=None)
         late_px = _projected(plain.with_points(there), camera, found.cam_from_target)
         px = stack.px + _projected(plain, camera, found.cam_from_target) - late_px
-    spread = sigma_px**2 * covariance(found.information)
+    covariance = sigma_px**2 * covariance_from(found.information)
     poses = {
-        it.view: _with_corners(it, px[stack.view_of == at], found.cam_from_target[at], spread[at])
+        it.view: _with_corners(
+            it, px[stack.view_of == at], found.cam_from_target[at], covariance[at]
+        )
         for at, it in enumerate(seen)
     }
     return Straight(poses, dict(zip(poses, found.by_shared, strict=True)))
@@ -156,11 +158,11 @@ def _projected(stack: CornerStack, camera: Camera, poses: FloatArray) -> FloatAr
 
 
 def _with_corners(
-    view: ViewPoses, px: FloatArray, pose: FloatArray, spread: FloatArray
+    view: ViewPoses, px: FloatArray, pose: FloatArray, covariance: FloatArray
 ) -> ViewPoses:
     if view.corners is None:
         return view
     view = replace(view, corners=replace(view.corners, px=px))
     if len(view.cam_from_target) > 1:
         return view
-    return replace(view, cam_from_target=pose[None], covariance=spread[None])
+    return replace(view, cam_from_target=pose[None], covariance=covariance[None])

@@ -240,9 +240,9 @@ def _causes(fit: BundleFit) -> Iterator[str]:
             "by 30 to 45 degrees."
         )
     distance = np.linalg.norm(poses[:, :3, 3], axis=1)
-    spread = distance.max() / distance.min()
-    if spread < _DISTANCE_SPREAD and tilt.max() < 2 * _TILT_SPREAD_DEG:
-        yield f"All views are from one distance (within {100 * (spread - 1):.0f} %): vary it."
+    covariance = distance.max() / distance.min()
+    if covariance < _DISTANCE_SPREAD and tilt.max() < 2 * _TILT_SPREAD_DEG:
+        yield f"All views are from one distance (within {100 * (covariance - 1):.0f} %): vary it."
 
 
 def _unvisited(stack: CornerStack, resolution: tuple[int, int]) -> list[str]:

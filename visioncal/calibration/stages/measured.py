@@ -70,10 +70,10 @@ class Component:
             found_sigma_m: What the answer is known to [m].
         """
         own = max(found_sigma_m**-2.0 - sigma_m**-2.0, 0.0)
-        spread = np.inf if own == 0.0 else 1.0 / np.sqrt(own)
+        covariance = np.inf if own == 0.0 else 1.0 / np.sqrt(own)
         # Both together are their mean, each weighted with its information.
-        seen = stated_m + off_m + off_m * (spread / sigma_m) ** 2
-        return cls(label, stated_m, sigma_m, float(seen), float(spread))
+        seen = stated_m + off_m + off_m * (covariance / sigma_m) ** 2
+        return cls(label, stated_m, sigma_m, float(seen), float(covariance))
 
     @property
     def remark(self) -> str:
@@ -100,7 +100,7 @@ class Component:
 def components(
     problem: Problem,
     state: State,
-    spread: FloatArray,
+    covariance: FloatArray,
     priors: Sequence[FramePrior],
 ) -> tuple[Component, ...]:
     """The measured components of priors beside what the observations alone say of them.
@@ -108,18 +108,18 @@ def components(
     Args:
         problem: The observations in the fit.
         state: The answer.
-        spread: (p, p) covariance of the unknowns.
+        covariance: (p, p) covariance of the unknowns.
         priors: Priors, in the problem or left out of it.
     """
-    return tuple(it for prior in priors for it in _components(prior, problem, state, spread))
+    return tuple(it for prior in priors for it in _components(prior, problem, state, covariance))
 
 
 def _components(
-    prior: FramePrior, problem: Problem, state: State, spread: FloatArray
+    prior: FramePrior, problem: Problem, state: State, covariance: FloatArray
 ) -> Iterator[Component]:
-    away, slopes = problem.prior_rows(prior, state)
+    away, jacobian = problem.prior_rows(prior, state)
     used = {it.name for it in problem.priors}
-    sigmas = np.sqrt(np.einsum("dp,pq,dq->d", slopes, spread, slopes)) * prior.sigma_m
+    sigmas = np.sqrt(np.einsum("dp,pq,dq->d", jacobian, covariance, jacobian)) * prior.sigma_m
     # Behind those of the rotation, which no word is said of.
     places = slice(len(away) - len(prior.axes), len(away))
     for axis, stated, off, sigma in zip(

@@ -28,7 +28,7 @@ from visioncal.calibration.stages.validate import HeldOut
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import adjoint, invert, skew
 from visioncal.core.types import FloatArray, IntArray, Need
-from visioncal.estimation.arm import ArmErrors, misfit_slopes
+from visioncal.estimation.arm import ArmErrors, misfit_jacobian
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.tolerance_probability import chance_within, radius_within
@@ -189,13 +189,13 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
             at_m = np.where(carries[:, None], at_m, np.array(need.at))
     linear, covariance, parts = looking.linear(state, ideal=True), fitted.covariance, {}
     if unfitted is not None:
-        off = unfitted.sigma * misfit_slopes(fitted.whole, state, noise, robot, unfitted)
+        off = unfitted.sigma * misfit_jacobian(fitted.whole, state, noise, robot, unfitted)
         # Errors that follow the posture are why neighbours err alike.
         covariance = covariance - fitted.inflation * off @ off.T
         parts["arm"] = _left_by_arm(fitted, robot, unfitted, off)
     elif errors is not None:
         parts["arm"] = _of_arm(problem, robot, errors)
-    parts["calibration"] = linear.spread(covariance)
+    parts["calibration"] = linear.covariance(covariance)
     if problem.is_combined:
         # Noise of both as one counts as the robot's, where it carries the camera.
         turned = adjoint(in_base)
@@ -279,9 +279,9 @@ def _carried(poses: FloatArray, points: FloatArray) -> FloatArray:
 
 def _at_points(spreads: FloatArray, points_m: FloatArray) -> FloatArray:
     """(n, 6, 6) of rotation and of (n, 3) points, by those of their frame's twist."""
-    slopes = np.broadcast_to(np.eye(6), spreads.shape).copy()
-    slopes[:, 3:, :3] = -skew(points_m)
-    return np.asarray(slopes @ spreads @ np.swapaxes(slopes, 1, 2))
+    jacobian = np.broadcast_to(np.eye(6), spreads.shape).copy()
+    jacobian[:, 3:, :3] = -skew(points_m)
+    return np.asarray(jacobian @ spreads @ np.swapaxes(jacobian, 1, 2))
 
 
 def _left_by_arm(fitted: Fitted, robot: str, errors: ArmErrors, off: FloatArray) -> FloatArray:
@@ -296,24 +296,24 @@ def _left_by_arm(fitted: Fitted, robot: str, errors: ArmErrors, off: FloatArray)
     problem, state = fitted.problem, fitted.state
     widened = problem.with_effects([*problem.effects, errors.effect(robot)])
     values = np.concatenate([state.values, np.zeros(off.shape[1])])
-    slopes = widened.linear(replace(state, values=values), ideal=True).jacobian
+    jacobian = widened.linear(replace(state, values=values), ideal=True).jacobian
     size = problem.size
-    left = slopes[:, :, :size] @ off - errors.sigma * slopes[:, :, size:]
+    left = jacobian[:, :, :size] @ off - errors.sigma * jacobian[:, :, size:]
     return np.asarray(left @ np.swapaxes(left, 1, 2))
 
 
 def _of_arm(problem: Problem, robot: str, errors: ArmErrors) -> FloatArray:
     """(n, 6, 6) what errors that follow the posture make of a place, as a twist of the base."""
     stops = problem.observations.stops
-    slopes = errors.sigma * adjoint(problem.poses[robot][stops]) @ errors.basis[stops]
-    return np.asarray(slopes @ np.swapaxes(slopes, 1, 2))
+    jacobian = errors.sigma * adjoint(problem.poses[robot][stops]) @ errors.basis[stops]
+    return np.asarray(jacobian @ np.swapaxes(jacobian, 1, 2))
 
 
 def _unpredicted(fitted: Fitted) -> FloatArray:
     """(6, 6) by how much left-out views err more than is predicted, and than chance lets them."""
     problem, noise = fitted.problem, fitted.noise
     linear = problem.linear(fitted.state, ideal=True)
-    expected = linear.spread(fitted.covariance) + problem.total_covariance(linear, noise)
+    expected = linear.covariance(fitted.covariance) + problem.total_covariance(linear, noise)
     held, found = fitted.held_out, np.zeros((6, 6))
     for away, axes in ((held.away_rad, slice(0, 3)), (held.away_m, slice(3, 6))):
         known = np.isfinite(away)

@@ -12,7 +12,7 @@ from visioncal.core.types import FloatArray, IntArray, Mask, Mount
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.chain import chain
 from visioncal.estimation.closed_form import SOLVERS
-from visioncal.estimation.linalg import covariance, spectrum
+from visioncal.estimation.linalg import covariance_from, spectrum
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.robust import nearest, trimmed_start, trimmed_sum
 from visioncal.estimation.solve import fisher_information
@@ -174,7 +174,7 @@ def hand_eye(
     information = fisher_information(problem, state, _USUAL)
     if spectrum(information).ratio < _NULL_RATIO:
         return None
-    variances = np.diag(covariance(information)).reshape(4, 3).sum(axis=1)
+    variances = np.diag(covariance_from(information)).reshape(4, 3).sum(axis=1)
     x, z = np.sqrt(variances[1::2]) + LEVER_M * np.sqrt(variances[::2])
     # Views that agree badly tell less than their motion would.
     worse = max(typical / _USUAL.robots[0, 1], 1.0)

@@ -16,7 +16,7 @@ from visioncal.estimation.corners import (
     reproject,
 )
 from visioncal.estimation.gating import gate
-from visioncal.estimation.linalg import covariance
+from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.planar import planar_poses
 from visioncal.estimation.poses import PoseFit, fit_poses
 from visioncal.session import Session
@@ -159,21 +159,23 @@ def _with_rivals(
     turns_of = [rotation_transforms(it) for it in targets]
     firsts = first_corners(targets)
     boards = np.searchsorted(firsts, stack.ids[stack.starts], side="right") - 1
-    spreads = [floored_sigma_px(sigma_px) ** 2 * covariance(it.information) for it in (best, other)]
+    spreads = [
+        floored_sigma_px(sigma_px) ** 2 * covariance_from(it.information) for it in (best, other)
+    ]
     views = []
     for at, (view, board) in enumerate(zip(stack.views, boards.tolist(), strict=True)):
         turns = turns_of[board]
         turned = adjoint(invert(turns))
         rival = _is_rival(mean_squares[0][at], mean_squares[1][at], stack.counts[at], sigma_px)
         fits = (best, other) if rival else (best,)
-        spread = [turned @ it[at] @ np.swapaxes(turned, 1, 2) for it in spreads[: len(fits)]]
+        covariance = [turned @ it[at] @ np.swapaxes(turned, 1, 2) for it in spreads[: len(fits)]]
         views.append(
             ViewPoses(
                 view,
                 _surviving(stack, at),
                 np.concatenate([it.cam_from_target[at] @ turns for it in fits]),
                 tuple(range(len(turns))) * len(fits),
-                np.concatenate(spread),
+                np.concatenate(covariance),
                 np.zeros((len(turns) * len(fits), 6, 0)),
                 board,
                 int(firsts[board]),
@@ -246,8 +248,8 @@ def _is_rival(best: float, other: float, corners: int, sigma_px: float) -> bool:
     """Whether the mirrored pose explains a view's corners about as well as the better one."""
     if np.isclose(best, other, rtol=1e-6, atol=0.0):
         return False  # both starts ran into the same pose
-    surprise = corners * (other - best) / floored_sigma_px(sigma_px) ** 2
-    return bool(other < _RIVAL_RATIO**2 * best or surprise < _RIVAL_CHI2)
+    mahalanobis_sq = corners * (other - best) / floored_sigma_px(sigma_px) ** 2
+    return bool(other < _RIVAL_RATIO**2 * best or mahalanobis_sq < _RIVAL_CHI2)
 
 
 def _surviving(stack: CornerStack, at: int) -> Corners:

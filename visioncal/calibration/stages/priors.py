@@ -49,37 +49,37 @@ def _prior(name: str, table: PriorTable, tree: Tree) -> FramePrior:
     return found
 
 
-def most_contradicted(problem: Problem, state: State, spread: FloatArray) -> FramePrior | None:
+def most_contradicted(problem: Problem, state: State, covariance: FloatArray) -> FramePrior | None:
     """The prior that the observations contradict most; None where they contradict none.
 
     Args:
         problem: The observations in the fit.
         state: The answer.
-        spread: (p, p) covariance of the unknowns.
+        covariance: (p, p) covariance of the unknowns.
     """
     found = [
         (it.contradiction, at)
         for at, prior in enumerate(problem.priors)
-        for it in components(problem, state, spread, [prior])
+        for it in components(problem, state, covariance, [prior])
         if it.is_contradicted
     ]
     return problem.priors[max(found)[1]] if found else None
 
 
 def prior_words(
-    problem: Problem, state: State, spread: FloatArray, stated: Iterable[FramePrior]
+    problem: Problem, state: State, covariance: FloatArray, stated: Iterable[FramePrior]
 ) -> Iterator[tuple[str, bool]]:
     """Says what became of priors, and whether that is a reason for doubt.
 
     Args:
         problem: The observations in the fit, with the priors that these do not contradict.
         state: The answer.
-        spread: (p, p) covariance of the unknowns.
+        covariance: (p, p) covariance of the unknowns.
         stated: All priors.
     """
     used = {it.name for it in problem.priors}
     for prior in stated:
-        found = components(problem, state, spread, [prior])
+        found = components(problem, state, covariance, [prior])
         if prior.name in used:
             yield from ((it.remark, False) for it in found)
         elif found:

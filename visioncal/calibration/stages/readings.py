@@ -125,10 +125,10 @@ def read_instruments(session: Session) -> dict[int, ViewPoses]:
 
 def _sighting(view: int, probe: FloatArray, instrument: Instrument) -> ViewPoses:
     """A probe (4, 4) as an instrument saw it."""
-    spread = np.zeros((6, 6))
-    spread[range(3), range(3)] = (instrument.sigma_rad or 0.0) ** 2
-    spread[range(3, 6), range(3, 6)] = instrument.sigmas_m(probe[None, :3, 3])[0] ** 2
-    return ViewPoses(view, None, probe[None], (0,), spread[None], np.zeros((1, 6, 0)))
+    covariance = np.zeros((6, 6))
+    covariance[range(3), range(3)] = (instrument.sigma_rad or 0.0) ** 2
+    covariance[range(3, 6), range(3, 6)] = instrument.sigmas_m(probe[None, :3, 3])[0] ** 2
+    return ViewPoses(view, None, probe[None], (0,), covariance[None], np.zeros((1, 6, 0)))
 
 
 def exchanged_points(seen: Observed, readings: Readings) -> tuple[Rejection, ...]:

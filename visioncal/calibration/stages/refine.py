@@ -12,11 +12,11 @@ from visioncal.core.types import Corners, FloatArray, IntArray
 from visioncal.estimation.appearance import (
     Appearance,
     Compressed,
-    Free,
+    LensBoardParameters,
     compress,
 )
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
-from visioncal.estimation.effects.lenses import Looks, Seen
+from visioncal.estimation.effects.lenses import CameraParameters, Seen
 from visioncal.estimation.joint import (
     Fitted,
     MeasuredScale,
@@ -26,32 +26,32 @@ from visioncal.estimation.joint import (
     chance_limit,
     contradicted_lens,
     measured_scale,
-    moved_surprise,
+    moved_mahalanobis_sq,
     settle,
 )
-from visioncal.estimation.linalg import covariance
+from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.estimation.parts import State
 from visioncal.estimation.solve import covariance_of, left_out_residuals
 
 
-def free_of(seen: Seen) -> Free:
+def free_of(seen: Seen) -> LensBoardParameters:
     """Lens and boards of the only camera, and what is open about them."""
     looks, known = seen.looks, seen.known
     ((name, problem),) = looks.problems.items()
-    return Free(
+    return LensBoardParameters(
         Appearance(looks.camera(name), looks.values[looks.boards]),
         problem.basis,
         problem.positions,
         seen.free,
         seen.held,
         known.information,
-        known.pull,
+        known.gradient,
     )
 
 
 def refined(
-    side: FramesSide, looks: Looks, frames: Mapping[str, FloatArray]
+    side: FramesSide, looks: CameraParameters, frames: Mapping[str, FloatArray]
 ) -> tuple[Fitted, FramesSide]:
     """Fits lenses, boards and frames to all corners together; see `chosen`.
 
@@ -76,7 +76,7 @@ def refined(
 
 
 def _equally_weighed(
-    side: FramesSide, looks: Looks, frames: Mapping[str, FloatArray]
+    side: FramesSide, looks: CameraParameters, frames: Mapping[str, FloatArray]
 ) -> tuple[Fitted, FramesSide]:
     """Fits all with the weights that the corners have.
 
@@ -116,7 +116,7 @@ def _still_asked_for(erring: Side, stated: Fitted, answer: Fitted) -> Fitted:
         for it in freed
         if np.isin(it, answer.moving).all()
         and not np.isin(it, stated.moving).any()
-        and moved_surprise(wide, it) > chance_limit(len(it))
+        and moved_mahalanobis_sq(wide, it) > chance_limit(len(it))
     ]
     sizes, wide = _still_other_sizes(erring, wide)
     places = np.concatenate([stated.moving, *kept, *sizes])
@@ -227,9 +227,9 @@ def _worst(fitted: Fitted) -> FloatArray:
     looks, fit = fitted.problem.effects[:1], fitted.fit
     problem = fitted.problem.with_effects(looks)
     values = fit.state.values[: sum(map(len, looks))]
-    spread = covariance_of(problem, replace(fit, state=State(fit.state.edges, values)))
+    covariance = covariance_of(problem, replace(fit, state=State(fit.state.edges, values)))
     places = np.arange(6 * len(problem.unknown)).reshape(-1, 3)
-    return np.sqrt([np.linalg.eigvalsh(spread[np.ix_(it, it)])[-1] for it in places])
+    return np.sqrt([np.linalg.eigvalsh(covariance[np.ix_(it, it)])[-1] for it in places])
 
 
 def _contested(side: Side, answer: Fitted) -> list[str]:
@@ -249,7 +249,9 @@ def _contested(side: Side, answer: Fitted) -> list[str]:
     ]
 
 
-def remade(views: Sequence[ViewPoses], free: Free, sigma_px: float) -> tuple[ViewPoses, ...]:
+def remade(
+    views: Sequence[ViewPoses], free: LensBoardParameters, sigma_px: float
+) -> tuple[ViewPoses, ...]:
     """Makes the poses of views anew that had no part in the fit.
 
     Args:
@@ -312,10 +314,10 @@ def _corners(views: Sequence[ViewPoses]) -> dict[int, Corners]:
 def _remade(
     view: ViewPoses, compressed: Compressed, columns: IntArray, sigma_px: float, at: int
 ) -> ViewPoses:
-    spread = floored_sigma_px(sigma_px) ** 2 * covariance(compressed.information[at])
+    covariance = floored_sigma_px(sigma_px) ** 2 * covariance_from(compressed.information[at])
     return replace(
         view,
         cam_from_target=compressed.cam_from_target[at][None],
-        covariance=spread[None],
+        covariance=covariance[None],
         by_shared=compressed.by_shared[at][None, :, columns],
     )

@@ -10,7 +10,7 @@ from visioncal.calibration.stages.arms import RobotArm, effects_of
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.types import Corners, Mask
 from visioncal.estimation.arm import ArmErrors
-from visioncal.estimation.effects.lenses import Looks, Seen
+from visioncal.estimation.effects.lenses import CameraParameters, Seen
 from visioncal.estimation.joint import Fitted
 from visioncal.estimation.parts import Effect, Noise
 from visioncal.estimation.problem import Problem
@@ -63,11 +63,11 @@ class FramesSide:
         places, problem = {view: at for at, view in enumerate(seen.views)}, self.observed
         rows = np.array([places.get(it, -1) for it in self.views], dtype=np.int64)
         mine, before = rows >= 0, problem.observations
-        measured, spread = before.measured.copy(), before.covariance.copy()
-        measured[mine], spread[mine] = seen.looks.poses[rows[mine]], seen.spread[rows[mine]]
+        measured, covariance = before.measured.copy(), before.covariance.copy()
+        measured[mine], covariance[mine] = seen.looks.poses[rows[mine]], seen.covariance[rows[mine]]
         arms = effects_of(self.arms, freely=self.freely)
         return replace(
-            problem, observations=replace(before, measured=measured, covariance=spread)
+            problem, observations=replace(before, measured=measured, covariance=covariance)
         ).with_effects([seen.effect(rows), *self.effects, *arms])
 
     def with_errors(self, fitted: Fitted) -> Self:
@@ -83,7 +83,9 @@ class FramesSide:
         """Frees errors of the arms; see `joint.Side`."""
         return replace(self, freely=freely)
 
-    def looks(self, scenes: Mapping[str, Scene], views: Mapping[str, Sequence[ViewPoses]]) -> Looks:
+    def looks(
+        self, scenes: Mapping[str, Scene], views: Mapping[str, Sequence[ViewPoses]]
+    ) -> CameraParameters:
         """Corners, and lenses and boards as they are stated.
 
         Args:
@@ -99,7 +101,7 @@ class FramesSide:
             poses[frame] = np.array(
                 [it.cam_from_target[0] for it in views[frame] if it.view in corners]
             )
-        return Looks.of(problems, poses)
+        return CameraParameters.of(problems, poses)
 
     @property
     def _shares(self) -> dict[int, float]:

@@ -217,11 +217,11 @@ def _course(fit: ThermalFit, q: FloatArray) -> list[dict[str, float]]:
     links = model.heating.links_c(inputs, at_s)
     rows = np.tile(q, (len(at_s), 1))
     moved = np.linalg.norm(model.motion(rows, links)[:, :3, 3], axis=1)
-    sigma = model.sigma_m(rows, links, model.heating.slopes(inputs, at_s))
+    sigma = model.sigma_m(rows, links, model.heating.jacobian(inputs, at_s))
     rises = model.rises(links).max(axis=1)
     return [
-        {"stamp_s": at, "drift_mm": 1e3 * drift, "sigma_mm": 1e3 * spread, "rise_k": rise}
-        for at, drift, spread, rise in zip(
+        {"stamp_s": at, "drift_mm": 1e3 * drift, "sigma_mm": 1e3 * covariance, "rise_k": rise}
+        for at, drift, covariance, rise in zip(
             at_s.tolist(), moved.tolist(), sigma.tolist(), rises.tolist(), strict=True
         )
     ]

@@ -160,15 +160,15 @@ def fit_thermal(
         warm, at = warming.problem(found.values), warming.at(found)
         gain = _unlikeliness(problem, cold.state, noise) - _unlikeliness(warm, at, noise)
         information = fisher_information(warm, at, noise)
-        spread = covariance_among(information, warm.counted)[-warming.size :, -warming.size :]
+        covariance = covariance_among(information, warm.counted)[-warming.size :, -warming.size :]
         before_m = _rms_m(problem, cold.state, stops.robot)
         after_m = _rms_m(warm, at, stops.robot)
     model, sigmas = warming.model(found.values), warming.sigmas
     return ThermalFit(
-        replace(model, covariance=spread * np.outer(sigmas, sigmas)),
+        replace(model, covariance=covariance * np.outer(sigmas, sigmas)),
         found.values,
         sigmas,
-        np.sqrt(np.diag(spread)),
+        np.sqrt(np.diag(covariance)),
         2.0 * gain,
         before_m,
         after_m,
@@ -276,13 +276,13 @@ def _effect(
 ) -> Effect:
     """The parameters as unknowns at all of so many stops, in units of (p,) sigmas."""
     links = model.heating.links_c(inputs, stops.stamps_s)
-    heated = model.heating.slopes(inputs, stops.stamps_s)
+    heated = model.heating.jacobian(inputs, stops.stamps_s)
     basis = np.zeros((count, 6, len(values)))
     basis[stops.places] = model.basis(stops.q, links, heated) * sigmas
     known = Knowledge(np.eye(len(values)), values)
     nothing = np.zeros(len(values), dtype=bool)
     name = f"temperature of {stops.robot}"
-    return Effect(name, values, known, nothing, by_flange={stops.robot: basis})
+    return Effect(name, values, known, nothing, flange_jacobian={stops.robot: basis})
 
 
 def _start(robot: Robot, nominal: Robot, inputs: Inputs) -> ThermalModel:

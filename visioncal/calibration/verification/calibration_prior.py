@@ -12,7 +12,7 @@ from visioncal.core.types import FloatArray, Target
 from visioncal.estimation.appearance import (
     BOARD_NAMES,
     Appearance,
-    Free,
+    LensBoardParameters,
     board_prior,
     boards_basis,
 )
@@ -31,7 +31,7 @@ ArmKind: TypeAlias = Literal["none", "model", "links", "poses"]
 
 
 @dataclass(frozen=True, eq=False)
-class Footing:
+class CalibrationPrior:
     """The fit of a calibration: its unknowns, their covariance, and the noise.
 
     Attributes:
@@ -58,7 +58,7 @@ class Footing:
     model: ArmModel | None
 
     @classmethod
-    def of(cls, calibration: Calibration) -> "Footing":
+    def of(cls, calibration: Calibration) -> "CalibrationPrior":
         """Reads it from a calibration.
 
         Raises:
@@ -88,13 +88,13 @@ class Footing:
             ) from error
 
     @property
-    def free(self) -> Free | None:
+    def free(self) -> LensBoardParameters | None:
         """Lens and board as the calibration found them; None without a camera or a target."""
         camera = self.calibration.camera
         if camera is None or not self.targets:
             return None
         targets, size = tuple(self.targets.values()), len(self.looks)
-        return Free(
+        return LensBoardParameters(
             Appearance(camera.camera, _shape(self.calibration, self.targets)),
             boards_basis(targets),
             numbered_positions(targets),
@@ -128,34 +128,34 @@ class Footing:
         """Degrees of freedom that the noise was estimated with, at most as many as matter."""
         return min(self.calibration.noise_dof, _MOST_FREEDOM)
 
-    def placed_anew(self, z: FloatArray, sigmas: FloatArray) -> "Footing":
+    def placed_anew(self, z: FloatArray, sigmas: FloatArray) -> "CalibrationPrior":
         """The same with an only board that lies somewhere else.
 
         Args:
             z: (4, 4) about where.
             sigmas: (6,) how roughly that is known.
         """
-        spread = self.covariance.copy()
-        spread[6:12], spread[:, 6:12] = 0.0, 0.0
-        spread[6:12, 6:12] = np.diag(sigmas**2)
+        covariance = self.covariance.copy()
+        covariance[6:12], covariance[:, 6:12] = 0.0, 0.0
+        covariance[6:12, 6:12] = np.diag(sigmas**2)
         moved = replace(self.state, edges=np.stack([self.state.edges[0], z]))
-        return replace(self, state=moved, covariance=spread)
+        return replace(self, state=moved, covariance=covariance)
 
 
-def _read(calibration: Calibration, document: Mapping[str, Any]) -> Footing:
+def _read(calibration: Calibration, document: Mapping[str, Any]) -> CalibrationPrior:
     names = document["boards"]
     x_name, z_name = edge_names(calibration.mount)
     placed = [calibration.edges[f"{z_name}_{it}" if it else z_name].matrix for it in names]
     targets = {
         name: target_from_document(it, name or "target") for name, it in document["targets"].items()
     }
-    spread, looks = read_covariance(document, "covariance", (-1, -1)), tuple(document["looks"])
+    covariance, looks = read_covariance(document, "covariance", (-1, -1)), tuple(document["looks"])
     arm = document.get("arm", {"of": "none", "values": []})
     size = len(arm["values"])
-    slopes = _slopes(np.array(placed), len(looks), size)
-    if spread.shape != (slopes.shape[1],) * 2:
-        raise ValueError(f"covariance has the shape {spread.shape}")
-    return Footing(
+    jacobian = _jacobian(np.array(placed), len(looks), size)
+    if covariance.shape != (jacobian.shape[1],) * 2:
+        raise ValueError(f"covariance has the shape {covariance.shape}")
+    return CalibrationPrior(
         calibration,
         targets,
         tuple(list(targets).index(it) for it in names) if targets else (0,),
@@ -163,7 +163,7 @@ def _read(calibration: Calibration, document: Mapping[str, Any]) -> Footing:
             np.stack([calibration.edges[x_name].matrix, *placed]),
             np.concatenate([np.zeros(len(looks)), np.array(arm["values"], dtype=float)]),
         ),
-        slopes @ spread @ slopes.T,
+        jacobian @ covariance @ jacobian.T,
         looks,
         arm["of"],
         size,
@@ -171,7 +171,7 @@ def _read(calibration: Calibration, document: Mapping[str, Any]) -> Footing:
     )
 
 
-def _slopes(placed: FloatArray, looks: int, arm: int) -> FloatArray:
+def _jacobian(placed: FloatArray, looks: int, arm: int) -> FloatArray:
     """How edges and values move with the unknowns as they are written.
 
     Written are the camera's edge and the first board's, then lens and boards, then where each
@@ -183,15 +183,15 @@ def _slopes(placed: FloatArray, looks: int, arm: int) -> FloatArray:
         arm: How many are of the arm.
     """
     edges, behind = 6 + 6 * len(placed), 6 * len(placed) + 6 + looks
-    slopes = np.zeros((edges + looks + arm, behind + arm))
-    slopes[:12, :12] = np.eye(12)
-    slopes[edges : edges + looks, 12 : 12 + looks] = np.eye(looks)
-    slopes[edges + looks :, behind:] = np.eye(arm)
+    jacobian = np.zeros((edges + looks + arm, behind + arm))
+    jacobian[:12, :12] = np.eye(12)
+    jacobian[edges : edges + looks, 12 : 12 + looks] = np.eye(looks)
+    jacobian[edges + looks :, behind:] = np.eye(arm)
     for row, carried in enumerate(adjoint(invert(placed[1:]) @ placed[0])):
         # z_k exp(d_k) = z_1 exp(d_1) exp(-d) target_1_from_target_k
         mine, at = slice(12 + 6 * row, 18 + 6 * row), 12 + looks + 6 * row
-        slopes[mine, 6:12], slopes[mine, at : at + 6] = carried, -carried
-    return slopes
+        jacobian[mine, 6:12], jacobian[mine, at : at + 6] = carried, -carried
+    return jacobian
 
 
 def _model(arm: Robot | None, document: Mapping[str, Any]) -> ArmModel | None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.calibration.verification.calibration_prior import Footing
+from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.calibration.verification.prediction import Seen
 from visioncal.core.transforms import adjoint, invert, log
 from visioncal.core.types import FloatArray
@@ -28,23 +28,25 @@ _FACTORS = (2.0, 4.0, 8.0, 16.0, 32.0)
 _KNOCK = np.repeat([TURN_PER_M, 1.0], 3)
 
 
-def causes_of(seen: Seen, footing: Footing, *, board_placed_anew: bool) -> tuple[Cause, ...]:
+def causes_of(
+    seen: Seen, prior_calibration: CalibrationPrior, *, board_placed_anew: bool
+) -> tuple[Cause, ...]:
     """The single causes that a check of these stops compares.
 
     Args:
         seen: The stops.
-        footing: What the calibration rests on.
+        prior_calibration: What the calibration rests on.
         board_placed_anew: Whether the board's place is nothing to be checked.
     """
     camera = _camera(seen)
-    boards = () if board_placed_anew else tuple(_boards(seen, footing))
+    boards = () if board_placed_anew else tuple(_boards(seen, prior_calibration))
     return (
         camera,
         *boards,
-        *(_both(camera, it) for it in boards if _tell_both(seen, footing)),
-        *_joints(seen, footing),
+        *(_both(camera, it) for it in boards if _tell_both(seen, prior_calibration)),
+        *_joints(seen, prior_calibration),
         _noise(seen),
-        *_views(seen, footing),
+        *_views(seen, prior_calibration),
     )
 
 
@@ -59,10 +61,10 @@ def _camera(seen: Seen) -> Cause:
     return _cause(CAMERA, seen, _KNOCK, by_sensor=moved)
 
 
-def _boards(seen: Seen, footing: Footing) -> Iterator[Cause]:
+def _boards(seen: Seen, prior_calibration: CalibrationPrior) -> Iterator[Cause]:
     """Each board's edge: a twist on its right."""
-    names, away = tuple(footing.targets) or ("",), log(seen.away(footing))
-    for at, board in enumerate(footing.boards):
+    names, away = tuple(prior_calibration.targets) or ("",), log(seen.away(prior_calibration))
+    for at, board in enumerate(prior_calibration.boards):
         mine = seen.boards == at
         if not mine.any():
             continue
@@ -70,9 +72,9 @@ def _boards(seen: Seen, footing: Footing) -> Iterator[Cause]:
         yield _cause(f"{BOARD} {names[board]}".strip(), seen, _KNOCK, by_sensor, start=start)
 
 
-def _tell_both(seen: Seen, footing: Footing) -> bool:
+def _tell_both(seen: Seen, prior_calibration: CalibrationPrior) -> bool:
     """Whether camera and board at once are worth a thought: they fit any two stops."""
-    return len(footing.boards) == 1 and len(seen.problem) >= FEWEST_VIEWS
+    return len(prior_calibration.boards) == 1 and len(seen.problem) >= FEWEST_VIEWS
 
 
 def _both(camera: Cause, board: Cause) -> Cause:
@@ -80,30 +82,30 @@ def _both(camera: Cause, board: Cause) -> Cause:
     return Cause(
         BOTH,
         np.concatenate([camera.by_sensor, board.by_sensor], axis=2),
-        np.concatenate([camera.by_flange, board.by_flange], axis=2),
+        np.concatenate([camera.flange_jacobian, board.flange_jacobian], axis=2),
         np.concatenate([camera.units, board.units]),
         np.concatenate([camera.start, np.zeros(len(board.units))]),
     )
 
 
-def _joints(seen: Seen, footing: Footing) -> Iterator[Cause]:
+def _joints(seen: Seen, prior_calibration: CalibrationPrior) -> Iterator[Cause]:
     """One offset a joint, and one stretch of all lengths."""
-    model, q = _arm(seen, footing), seen.joints_rad
+    model, q = _arm(seen, prior_calibration), seen.joints_rad
     if model is None or q is None:
         return
     offsets, robot = model.columns("offsets", q), model.robot
     for joint in range(robot.joint_count):
         unit = 1.0 if robot.chain.prismatic[joint] else TURN_PER_M
         column = offsets[:, :, joint : joint + 1]
-        yield _cause(f"{JOINT} {joint + 1}", seen, np.array([unit]), by_flange=column)
-    yield _cause(LENGTH, seen, np.ones(1), by_flange=_stretch(robot, q)[:, :, None])
+        yield _cause(f"{JOINT} {joint + 1}", seen, np.array([unit]), flange_jacobian=column)
+    yield _cause(LENGTH, seen, np.ones(1), flange_jacobian=_stretch(robot, q)[:, :, None])
 
 
-def _arm(seen: Seen, footing: Footing) -> ArmModel | None:
+def _arm(seen: Seen, prior_calibration: CalibrationPrior) -> ArmModel | None:
     """The arm that offsets are of; the nominal one where none was calibrated."""
-    robot, matched = footing.calibration.calibrated_robot, seen.known.reported.matched
-    if footing.model is not None or robot is None:
-        return footing.model
+    robot, matched = prior_calibration.calibration.calibrated_robot, seen.known.reported.matched
+    if prior_calibration.model is not None or robot is None:
+        return prior_calibration.model
     reported = np.eye(4) if matched is None else matched.flange_from_reported
     return ArmModel(robot, reported, {}, np.zeros(0))
 
@@ -121,11 +123,11 @@ def _noise(seen: Seen) -> Cause:
     return replace(_cause(NOISE, seen, np.zeros(0)), noise_factors=_FACTORS)
 
 
-def _views(seen: Seen, footing: Footing) -> Iterator[Cause]:
+def _views(seen: Seen, prior_calibration: CalibrationPrior) -> Iterator[Cause]:
     """Each stop by itself: its image belongs to another pose, or something slipped meanwhile."""
     if seen.stops < 2:
         return
-    away, placed = log(seen.away(footing)), footing.state.edges[1:][seen.boards]
+    away, placed = log(seen.away(prior_calibration)), prior_calibration.state.edges[1:][seen.boards]
     for stop in range(seen.stops):
         mine = seen.problem.observations.stops == stop
         first = int(np.argmax(mine))
@@ -140,7 +142,7 @@ def _cause(
     seen: Seen,
     units: FloatArray,
     by_sensor: FloatArray | None = None,
-    by_flange: FloatArray | None = None,
+    flange_jacobian: FloatArray | None = None,
     start: FloatArray | None = None,
 ) -> Cause:
     still = np.zeros((len(seen.problem), 6, len(units)))
@@ -148,7 +150,7 @@ def _cause(
     return Cause(
         name,
         still if by_sensor is None else by_sensor,
-        resting if by_flange is None else by_flange,
+        resting if flange_jacobian is None else flange_jacobian,
         units,
         np.zeros(len(units)) if start is None else start,
     )

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import fdtrc
 
-from visioncal.calibration.verification.calibration_prior import Footing
+from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.calibration.verification.causes import BOTH, CAMERA, NOISE, causes_of, kind_of
 from visioncal.calibration.verification.prediction import Seen, asked_of_boards, see_again
 from visioncal.core.errors import DataError
@@ -62,7 +62,7 @@ class Check:
     Attributes:
         calibration: The one that was checked.
         seen: The stops.
-        footing: What the calibration rests on.
+        prior_calibration: What the calibration rests on.
         away: (m, 6) where each sight places its board, from where it was (rotation [rad],
             translation [m]), in its frame.
         left: (m, 6) the same with the likeliest change undone, where one was found.
@@ -80,7 +80,7 @@ class Check:
 
     calibration: Calibration
     seen: Seen
-    footing: Footing
+    prior_calibration: CalibrationPrior
     away: FloatArray
     left: FloatArray
     log_evidence: float
@@ -129,30 +129,34 @@ def verify(
     session, calibration = picked(session, calibration, Choice(camera, robot, target))
     # What the calibration has left out contradicts it now as it did then.
     without = {it.view: it.reason for it in calibration.views if is_its_own and not it.used}
-    footing = Footing.of(calibration)
-    seen = see_again(session, footing, progress, without)
-    return check(seen, footing, board_placed_anew=board_placed_anew)
+    prior_calibration = CalibrationPrior.of(calibration)
+    seen = see_again(session, prior_calibration, progress, without)
+    return check(seen, prior_calibration, board_placed_anew=board_placed_anew)
 
 
-def check(seen: Seen, footing: Footing, *, board_placed_anew: bool = False) -> Check:
+def check(
+    seen: Seen, prior_calibration: CalibrationPrior, *, board_placed_anew: bool = False
+) -> Check:
     """Compares what may have changed by stops that have been looked at; see `verify`."""
     if board_placed_anew:
-        if len(footing.boards) > 1:
+        if len(prior_calibration.boards) > 1:
             raise DataError(
                 "verify: the calibration has several boards; where one was placed anew it is not "
                 "known which of them still stand where they were.",
                 next_step="Leave --board-moved out: each board is compared by itself, and the one "
                 "that moved is named. Or verify with views of the boards that stayed.",
             )
-        moved = mean_transform(seen.away(footing))
-        footing = footing.placed_anew(footing.state.edges[1] @ moved, _ANYWHERE)
+        moved = mean_transform(seen.away(prior_calibration))
+        prior_calibration = prior_calibration.placed_anew(
+            prior_calibration.state.edges[1] @ moved, _ANYWHERE
+        )
     belief = Belief(
-        footing.state,
-        footing.covariance,
-        footing.noise(from_corners=seen.from_corners),
-        footing.freedom,
+        prior_calibration.state,
+        prior_calibration.covariance,
+        prior_calibration.noise(from_corners=seen.from_corners),
+        prior_calibration.freedom,
     )
-    causes = causes_of(seen, footing, board_placed_anew=board_placed_anew)
+    causes = causes_of(seen, prior_calibration, board_placed_anew=board_placed_anew)
     with one_blas_thread():
         nothing = explain(seen.problem, belief)
         found = [explain(seen.problem, belief, it) for it in causes]
@@ -164,21 +168,21 @@ def check(seen: Seen, footing: Footing, *, board_placed_anew: bool = False) -> C
     log_evidence = evidence - nothing.likelihood
     named = () if log_evidence < np.log(EVIDENCE) else _not_told_apart(suspects)
     camera = next(it for it in suspects if it.name == CAMERA)
-    away = log(seen.away(footing))
+    away = log(seen.away(prior_calibration))
     left = _left(seen, belief, causes[order[0]], suspects[0].explained) if named else away
     return Check(
-        footing.calibration,
+        prior_calibration.calibration,
         seen,
-        footing,
+        prior_calibration,
         away,
         left,
         log_evidence,
         nothing.misfit,
         nothing.freedom,
-        float(fdtrc(nothing.freedom, footing.freedom, nothing.misfit / nothing.freedom)),
+        float(fdtrc(nothing.freedom, prior_calibration.freedom, nothing.misfit / nothing.freedom)),
         suspects,
         named,
-        _is_explained(suspects[0], footing.freedom),
+        _is_explained(suspects[0], prior_calibration.freedom),
         np.sqrt(np.diag(camera.explained.covariance)),
     )
 

@@ -140,16 +140,16 @@ def _motion_document(moved: Motion) -> dict[str, Any]:
 def motions(check: Check, suspect: Suspect) -> dict[str, Motion]:
     """How far the camera, a board, or the board of one view moved, by their names."""
     names = (CAMERA, BOARD) if kind_of(suspect.name) == BOTH else (suspect.name,)
-    values, spread = suspect.explained.values, suspect.explained.covariance
+    values, covariance = suspect.explained.values, suspect.explained.covariance
     parts = [slice(6 * at, 6 * at + 6) for at in range(len(names))]
     return {
-        name: _motion(check, name, values[it], spread[it, it])
+        name: _motion(check, name, values[it], covariance[it, it])
         for name, it in zip(names, parts, strict=True)
     }
 
 
-def _motion(check: Check, name: str, twist: FloatArray, spread: FloatArray) -> Motion:
-    x, *boards = check.footing.state.edges
+def _motion(check: Check, name: str, twist: FloatArray, covariance: FloatArray) -> Motion:
+    x, *boards = check.prior_calibration.state.edges
     hand = check.calibration.mount == "eye-in-hand"
     if name == CAMERA:
         rotation, point, parent = x[:3, :3], np.zeros(3), "tool" if hand else "base"
@@ -162,8 +162,8 @@ def _motion(check: Check, name: str, twist: FloatArray, spread: FloatArray) -> M
     # How the point goes on moving with the twist, by its right perturbation.
     onward = np.linalg.inv(inverse_right_jacobian(twist))
     slope = moved[:3, :3] @ np.concatenate([-skew(point), np.eye(3)], axis=1) @ onward
-    mm, sigma_mm = _length(shift, slope @ spread @ slope.T)
-    turn, sigma = _length(twist[:3], spread[:3, :3])
+    mm, sigma_mm = _length(shift, slope @ covariance @ slope.T)
+    turn, sigma = _length(twist[:3], covariance[:3, :3])
     return Motion(
         1e3 * mm,
         1e3 * sigma_mm,
@@ -177,26 +177,26 @@ def _motion(check: Check, name: str, twist: FloatArray, spread: FloatArray) -> M
 def _board(check: Check, name: str) -> int:
     """The place among the calibration's boards of the one that a cause is about."""
     kind, _, which = name.partition(" ")
-    footing, seen = check.footing, check.seen
+    prior_calibration, seen = check.prior_calibration, check.seen
     if kind == BOARD:
-        names = list(footing.targets)
-        return footing.boards.index(names.index(which)) if which in names else 0
+        names = list(prior_calibration.targets)
+        return prior_calibration.boards.index(names.index(which)) if which in names else 0
     return int(seen.boards[[int(which) in it for it in seen.views]][0])
 
 
 def _middle(check: Check, place: int) -> FloatArray:
     """(3,) middle of one of the calibration's boards, in its frame [m]."""
-    targets = tuple(check.footing.targets.values())
+    targets = tuple(check.prior_calibration.targets.values())
     if not targets:
         return np.zeros(3)
-    return np.asarray(corner_positions(targets[check.footing.boards[place]]).mean(axis=0))
+    return np.asarray(corner_positions(targets[check.prior_calibration.boards[place]]).mean(axis=0))
 
 
-def _length(vector: FloatArray, spread: FloatArray) -> tuple[float, float]:
+def _length(vector: FloatArray, covariance: FloatArray) -> tuple[float, float]:
     """Length of a (3,) vector, and its standard deviation along itself."""
     length = float(np.linalg.norm(vector))
     along = vector / length if length > 0.0 else np.full(3, 1.0 / np.sqrt(3.0))
-    return length, float(np.sqrt(max(float(along @ spread @ along), 0.0)))
+    return length, float(np.sqrt(max(float(along @ covariance @ along), 0.0)))
 
 
 def _signed_axis(vector: FloatArray) -> str:

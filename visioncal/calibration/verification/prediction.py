@@ -7,10 +7,10 @@ from reprlib import repr as shorten
 import numpy as np
 
 from visioncal.calibration.pipeline import STAGES
-from visioncal.calibration.pipeline.observed_poses import Looked
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.observed_poses import ObservedPoses
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.pose_ambiguity import choose_by
-from visioncal.calibration.verification.calibration_prior import Footing
+from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, pose_difference
 from visioncal.core.types import FloatArray, IntArray, Progress, Rejection, Target
@@ -45,7 +45,7 @@ class Seen:
         warnings: What is odd, in sentences.
     """
 
-    known: Looked
+    known: ObservedPoses
     problem: Problem
     views: tuple[tuple[int, ...], ...]
     warnings: tuple[str, ...]
@@ -65,9 +65,9 @@ class Seen:
         """(m,) which of the calibration's boards each sight is of."""
         return np.array([self.problem.unknown[it] - 1 for it in self.problem.observations.observed])
 
-    def away(self, footing: Footing) -> FloatArray:
+    def away(self, prior_calibration: CalibrationPrior) -> FloatArray:
         """(m, 4, 4) by how much its board has moved, on its right, as each sight places it."""
-        return asked_of_boards(self.problem, footing.state)
+        return asked_of_boards(self.problem, prior_calibration.state)
 
     @property
     def from_corners(self) -> bool:
@@ -77,7 +77,7 @@ class Seen:
 
 def see_again(
     session: Session,
-    footing: Footing,
+    prior_calibration: CalibrationPrior,
     progress: Progress | None = None,
     without: Mapping[int, str] | None = None,
 ) -> Seen:
@@ -85,7 +85,7 @@ def see_again(
 
     Args:
         session: Of the same cell.
-        footing: The calibration's.
+        prior_calibration: The calibration's.
         progress: Told of long work.
         without: Views that are not to be looked at, and why not.
 
@@ -93,33 +93,35 @@ def see_again(
         DataError: It is of another mount, camera, target or robot, lacks joint angles that the
             calibrated arm needs, or shows nothing.
     """
-    known = _STAGES["robot"](known_before(session, footing, progress))
+    known = _STAGES["robot"](known_before(session, prior_calibration, progress))
     known = _STAGES["detect"](known)
     rejected = {it: why for it, why in (without or {}).items() if it not in known.held_back}
-    return seen_by(known.noting(Rejection(*it) for it in rejected.items()), footing)
+    return seen_by(known.noting(Rejection(*it) for it in rejected.items()), prior_calibration)
 
 
-def known_before(session: Session, footing: Footing, progress: Progress | None = None) -> Known:
+def known_before(
+    session: Session, prior_calibration: CalibrationPrior, progress: Progress | None = None
+) -> RunState:
     """What is known before anything is looked at: that the session is of the same cell.
 
     Raises:
         DataError: It is of another mount, target or robot.
     """
-    calibration = footing.calibration
+    calibration = prior_calibration.calibration
     check_mount(session, calibration)
-    session = _with_its_targets(session, footing)
+    session = _with_its_targets(session, prior_calibration)
     document, robot = session.robot_document, calibration.robot
     if robot is not None and document is not None:
         _check_robot(session, Robot.from_document(document), robot)
     if robot is not None:
         # As calibrated, with its base in the frame of the poses.
         session = replace(session, robot_document=robot.document)
-    return Known(session, progress)
+    return RunState(session, progress)
 
 
-def seen_by(known: Known, footing: Footing) -> Seen:
+def seen_by(known: RunState, prior_calibration: CalibrationPrior) -> Seen:
     """Carries on where targets have been detected; see `see_again`."""
-    calibration = footing.calibration
+    calibration = prior_calibration.calibration
     for frame, look in known.cameras.items():
         if look.resolution is None:
             continue
@@ -134,7 +136,7 @@ def seen_by(known: Known, footing: Footing) -> Seen:
         known = known.with_camera(frame, replace(look, lens=lens))
     # Of a sweep the slower views are taken, in which the offset's error is lost in the robot's.
     known = replace(_STAGES["clock"](_STAGES["pnp"](known)), clocks={})
-    looked = _posed(_with_arm(Looked.of(known), footing), footing)
+    looked = _posed(_with_arm(ObservedPoses.of(known), prior_calibration), prior_calibration)
     problem = looked.problem(looked.used)
     sights = problem.of_one_stop
     return Seen(
@@ -143,7 +145,7 @@ def seen_by(known: Known, footing: Footing) -> Seen:
         tuple(
             tuple(np.array(looked.used)[sights == at].tolist()) for at in range(sights.max() + 1)
         ),
-        tuple(_warnings(looked, footing)),
+        tuple(_warnings(looked, prior_calibration)),
     )
 
 
@@ -156,10 +158,10 @@ def asked_of_boards(problem: Problem, state: State) -> FloatArray:
     return asked
 
 
-def _with_arm(known: Looked, footing: Footing) -> Looked:
+def _with_arm(known: ObservedPoses, prior_calibration: CalibrationPrior) -> ObservedPoses:
     """Takes the arm for what the calibration has it for."""
-    known = replace(known, calibrated=replace(known.robot_arm, model=footing.model))
-    if footing.arm in ("none", "poses"):
+    known = replace(known, calibrated=replace(known.robot_arm, model=prior_calibration.model))
+    if prior_calibration.arm in ("none", "poses"):
         return known
     if known.robot_arm.joints_rad is None:
         missing = [it.number for it in known.session.views if it.joints_rad is None]
@@ -172,11 +174,11 @@ def _with_arm(known: Looked, footing: Footing) -> Looked:
     return known
 
 
-def _posed(known: Looked, footing: Footing) -> Looked:
+def _posed(known: ObservedPoses, prior_calibration: CalibrationPrior) -> ObservedPoses:
     """Chooses each view's pose by the calibration, and makes it by its lens and boards."""
-    mount, targets = known.session.mount, tuple(footing.targets.values())
-    x, *placed = footing.state.edges
-    order = {board: at for at, board in enumerate(footing.boards)}
+    mount, targets = known.session.mount, tuple(prior_calibration.targets.values())
+    x, *placed = prior_calibration.state.edges
+    order = {board: at for at, board in enumerate(prior_calibration.boards)}
     views, chosen = [], []
     for view in (it.number for it in known.session.views):
         poses = known.poses.get(view)
@@ -194,25 +196,27 @@ def _posed(known: Looked, footing: Footing) -> Looked:
             "robot.",
             culprits=known.lost_views,
         )
-    known = replace(known, used=tuple(views), boards=footing.boards, free=footing.free)
-    known = replace(known, frames=known.framed(footing.state.edges)).posed(chosen)
+    known = replace(
+        known, used=tuple(views), boards=prior_calibration.boards, free=prior_calibration.free
+    )
+    known = replace(known, frames=known.framed(prior_calibration.state.edges)).posed(chosen)
     if known.free is not None and all(it.corners is not None for it in chosen):
         known = known.with_noise(_noise_px(known)).posed(chosen)
-    return _with_errors(known, footing)
+    return _with_errors(known, prior_calibration)
 
 
-def _with_errors(known: Looked, footing: Footing) -> Looked:
+def _with_errors(known: ObservedPoses, prior_calibration: CalibrationPrior) -> ObservedPoses:
     """Adds the arm's errors as unknowns, as the calibration's covariance has them."""
-    if footing.arm == "none":
+    if prior_calibration.arm == "none":
         return known
     arm = known.robot_arm
-    if footing.arm == "poses":
+    if prior_calibration.arm == "poses":
         arm = replace(arm, joints_rad=None)
     errors = ArmErrors(arm.basis, 1.0, np.inf, of_links=True)
     return replace(known, calibrated=replace(arm, errors=errors))
 
 
-def _noise_px(known: Looked) -> float:
+def _noise_px(known: ObservedPoses) -> float:
     """Noise of a corner's coordinate around the poses, by lens and boards as calibrated [px]."""
     corners = {view: it for view, it in zip(known.used, known.seen(known.used), strict=True) if it}
     free = known.free
@@ -225,7 +229,7 @@ def _noise_px(known: Looked) -> float:
     return stack.sigma_px(left, 6 * len(corners))
 
 
-def _with_its_targets(session: Session, footing: Footing) -> Session:
+def _with_its_targets(session: Session, prior_calibration: CalibrationPrior) -> Session:
     """Numbers the session's targets as the calibration does, by their names.
 
     The only one of a session has no name: where several were calibrated with, it is the one among
@@ -234,17 +238,17 @@ def _with_its_targets(session: Session, footing: Footing) -> Session:
     Raises:
         DataError: They are others than were calibrated with, or it is not known which of them.
     """
-    known, shown = footing.targets, session.boards
+    known, shown = prior_calibration.targets, session.boards
     if len(known) < 2 and len(shown) < 2:
         if any(view.image or view.has_corners for view in session.views):
-            _check_targets(session, footing)
+            _check_targets(session, prior_calibration)
         return session
     name = ""
     if "" in shown:
         alike = [it for it, target in known.items() if not _differing(target, shown[""])]
         name = alike[0] if len(alike) == 1 else ""
     if not name:
-        _check_targets(session, footing)
+        _check_targets(session, prior_calibration)
     if not shown:
         raise DataError(
             f"session {session.name!r} does not say which of the targets that were calibrated with "
@@ -266,25 +270,25 @@ def _differing(ours: Target, theirs: Target) -> list[str]:
     return [it for it in differing if it != "square_sigma_m"]
 
 
-def _check_targets(session: Session, footing: Footing) -> None:
+def _check_targets(session: Session, prior_calibration: CalibrationPrior) -> None:
     """Refuses other targets than were calibrated with; how well a size is known may differ."""
-    if not footing.targets:
+    if not prior_calibration.targets:
         raise DataError(
-            f"calibration {footing.calibration.session_name!r} was made from measured poses, and "
-            f"does not say of which target; session {session.name!r} has images.",
+            f"calibration {prior_calibration.calibration.session_name!r} was made from measured "
+            f"poses, and does not say of which target; session {session.name!r} has images.",
             culprits=["session.toml: target"],
             next_step="Give the target's poses (cft_x_m ...) as when it was calibrated.",
         )
     for name, target in session.boards.items():
-        known = footing.targets.get(name)
+        known = prior_calibration.targets.get(name)
         if known is None:
-            there = ", ".join(it or "one without a name" for it in footing.targets)
+            there = ", ".join(it or "one without a name" for it in prior_calibration.targets)
             raise DataError(
                 f"session {session.name!r}: target {name or target.name!r} is none of those that "
                 f"were calibrated with ({there}).",
                 culprits=["session.toml: target"],
                 next_step="Verify with views of that target alone."
-                if "" in footing.targets
+                if "" in prior_calibration.targets
                 else "Name the targets as in the calibration's session.",
             )
         ours, theirs = target_document(known), target_document(target)
@@ -324,17 +328,17 @@ def _check_robot(session: Session, stated: Robot, known: Robot) -> None:
         )
 
 
-def _warnings(known: Looked, footing: Footing) -> Iterator[str]:
+def _warnings(known: ObservedPoses, prior_calibration: CalibrationPrior) -> Iterator[str]:
     """What is odd about the session."""
     yield from dict.fromkeys(known.warnings)
-    if "thermal" in footing.calibration.stages:
-        cold_c = float(footing.calibration.drift.reference_c.mean())
+    if "thermal" in prior_calibration.calibration.stages:
+        cold_c = float(prior_calibration.calibration.drift.reference_c.mean())
         yield (
             "The calibrated arm drifts with its temperature, and a check takes it for as warm as "
             f"it was at the start (about {cold_c:.0f} deg C): one at work looks longer, or as if "
             "its joints had slipped. Verify with the arm as warm as then."
         )
-    before, now = footing.calibration.noise.get("pixel_px"), known.pixel_px
+    before, now = prior_calibration.calibration.noise.get("pixel_px"), known.pixel_px
     if before is not None and now is not None and now > _WORTH_A_WORD * max(before, 1e-3):
         yield (
             f"The corners scatter by {now:.2g} px around the target's poses, and by {before:.2g} "

@@ -21,4 +21,4 @@ def clock_effect(
     """
     known = Knowledge(np.array([[sigma_s**-2.0]]), np.zeros(1))
     # The farther the camera's clock is ahead, the earlier the robot's own time.
-    return Effect.free(name, known, by_flange={robot: -speeds[:, :, None]})
+    return Effect.free(name, known, flange_jacobian={robot: -speeds[:, :, None]})

@@ -101,5 +101,5 @@ def compress_delayed(
         times_s: (k,) where to linearise [s].
         starts: (v, 4, 4) `cam_from_target` to start from.
     """
-    points, slopes = delayed_points(stack, shares, twists, times_s)
-    return compress_points(stack.with_points(points), camera, starts, slopes, lens=False)
+    points, jacobian = delayed_points(stack, shares, twists, times_s)
+    return compress_points(stack.with_points(points), camera, starts, jacobian, lens=False)

@@ -13,7 +13,7 @@ import numpy as np
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.estimation.appearance import Appearance, Compressed, compress
 from visioncal.estimation.corners import floored_sigma_px
-from visioncal.estimation.linalg import covariance
+from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.parts import Effect
 from visioncal.estimation.scene import CornerProblem
 from visioncal.estimation.variance import Knowledge
@@ -24,7 +24,7 @@ LENSES = "lenses and boards"
 
 
 @dataclass(frozen=True, eq=False)
-class Looks:
+class CameraParameters:
     """The cameras' corners, and what lenses and boards are taken to be.
 
     Attributes:
@@ -38,7 +38,9 @@ class Looks:
     poses: FloatArray
 
     @classmethod
-    def of(cls, problems: Mapping[str, CornerProblem], poses: Mapping[str, FloatArray]) -> "Looks":
+    def of(
+        cls, problems: Mapping[str, CornerProblem], poses: Mapping[str, FloatArray]
+    ) -> "CameraParameters":
         """Lenses and boards as they are stated or were estimated before.
 
         Args:
@@ -109,7 +111,9 @@ class Looks:
     @cached_property
     def stated(self) -> FloatArray:
         """(k,) the values as they are stated, or were estimated before."""
-        return Looks.of(self.problems, {name: np.zeros((0, 4, 4)) for name in self.problems}).values
+        return CameraParameters.of(
+            self.problems, {name: np.zeros((0, 4, 4)) for name in self.problems}
+        ).values
 
     @property
     def first(self) -> IntArray:
@@ -142,7 +146,7 @@ class Looks:
         """Whether all cameras show more corners than it takes to free lens and board."""
         return all(it.has_spare_corners for it in self.problems.values())
 
-    def without_prior(self, places: Iterable[int]) -> "Looks":
+    def without_prior(self, places: Iterable[int]) -> "CameraParameters":
         """The same, some values of which nobody has stated."""
         gone = np.array([*places])
         problems = {
@@ -151,7 +155,7 @@ class Looks:
         }
         return replace(self, problems=problems)
 
-    def contesting(self, names: Collection[str]) -> "Looks":
+    def contesting(self, names: Collection[str]) -> "CameraParameters":
         """The same, the intrinsics of some cameras being held although corners contradict them."""
         problems = {
             name: replace(it, contested=it.contested or name in names)
@@ -159,7 +163,7 @@ class Looks:
         }
         return replace(self, problems=problems)
 
-    def weighed(self, seen: "Seen") -> "Looks":
+    def weighed(self, seen: "Seen") -> "CameraParameters":
         """The same, views weighing as the residuals of all corners ask for."""
         problems = {
             name: replace(it, stack=it.stack.weighed(own.residuals))
@@ -171,7 +175,7 @@ class Looks:
         """A camera with its lens as it is taken to be."""
         return with_intrinsics(self.problems[name].scene.camera, self.values[self.lenses[name]])
 
-    def with_values(self, free: IntArray, found: FloatArray) -> "Looks":
+    def with_values(self, free: IntArray, found: FloatArray) -> "CameraParameters":
         """Returns them with (f,) values at some places."""
         values = self.values.copy()
         values[free] = found
@@ -181,7 +185,7 @@ class Looks:
         """Compresses all corners, (f,) values being free."""
         found, sigmas = [], []
         information = np.zeros((len(self.values), len(self.values)))
-        pull = np.zeros(len(self.values))
+        gradient = np.zeros(len(self.values))
         begin = 0
         for name, problem in self.problems.items():
             end = begin + len(problem.stack.views)
@@ -198,12 +202,12 @@ class Looks:
             sigma = problem.sigma_px(compressed, np.flatnonzero(np.isin(places, moving)))
             weight = 1.0 / floored_sigma_px(sigma) ** 2
             information[np.ix_(places, places)] += weight * compressed.shared_information
-            pull[places] += weight * compressed.shared_pull
+            gradient[places] += weight * compressed.shared_gradient
             found.append(compressed)
             sigmas.append(sigma)
             begin = end
         poses = np.concatenate([it.cam_from_target for it in found])
-        corners = Knowledge(information, pull)
+        corners = Knowledge(information, gradient)
         looks = replace(self, poses=poses)
         return Seen(looks, np.sort(moving), tuple(found), tuple(sigmas), corners)
 
@@ -227,7 +231,7 @@ class Seen:
         corners: What the corners say of all values, the poses being free.
     """
 
-    looks: Looks
+    looks: CameraParameters
     moving: IntArray
     compressed: tuple[Compressed, ...]
     sigmas_px: tuple[float, ...]
@@ -250,19 +254,19 @@ class Seen:
         prior = 1.0 / looks.prior_sigma[free] ** 2
         return Knowledge(
             self.corners.information[np.ix_(free, free)] + np.diag(prior),
-            self.corners.pull[free] + prior * (looks.values - looks.stated)[free],
+            self.corners.gradient[free] + prior * (looks.values - looks.stated)[free],
         )
 
-    def freed(self, moving: IntArray, looks: Looks | None = None) -> "Seen":
+    def freed(self, moving: IntArray, looks: CameraParameters | None = None) -> "Seen":
         """The same with other values moving, or with other priors."""
         return replace(self, moving=np.sort(moving), looks=looks or self.looks)
 
     @property
-    def spread(self) -> FloatArray:
+    def covariance(self) -> FloatArray:
         """Covariances (v, 6, 6) of all views' poses."""
         return np.concatenate(
             [
-                floored_sigma_px(sigma) ** 2 * covariance(it.information)
+                floored_sigma_px(sigma) ** 2 * covariance_from(it.information)
                 for it, sigma in zip(self.compressed, self.sigmas_px, strict=True)
             ]
         )

@@ -11,7 +11,7 @@ usual name of a field needs no format: it is added to the keys in `poses`, `fiel
 
 from visioncal.interchange.formats.assemble import assemble
 from visioncal.interchange.formats.foreign import Foreign
-from visioncal.interchange.formats.import_options import PoseWishes, Wishes
+from visioncal.interchange.formats.import_options import ImportOptions, PoseImportOptions
 from visioncal.interchange.formats.registry import (
     FOREIGN_FORMATS,
     OWN_FORMATS,
@@ -30,8 +30,8 @@ __all__ = [
     "FOREIGN_FORMATS",
     "OWN_FORMATS",
     "Foreign",
-    "PoseWishes",
-    "Wishes",
+    "ImportOptions",
+    "PoseImportOptions",
     "assemble",
     "convert",
     "guess_foreign",

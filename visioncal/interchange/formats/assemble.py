@@ -16,7 +16,7 @@ from visioncal.core.files import MOST_IMAGE_BYTES, absence, read_bytes, some_of
 from visioncal.core.types import Mount
 from visioncal.interchange.formats.boards import described_target, target_name
 from visioncal.interchange.formats.foreign import Foreign, Sweep, rows_of
-from visioncal.interchange.formats.import_options import Wishes
+from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.intrinsics import read_intrinsics
 from visioncal.robot import ROBOT_SUFFIXES, Robot, read_robot_document
 from visioncal.session import MemoryImages, Session, Stream
@@ -45,33 +45,33 @@ class FileImages:
         return not self.absence(path)
 
 
-def wished(foreign: Foreign, wishes: Wishes) -> Foreign:
+def wished(foreign: Foreign, requested: ImportOptions) -> Foreign:
     """Adds to a recording what the user says of it besides how its poses are written.
 
     Raises:
         DataError: A name that the user gives is not known, or a file that he names is wrong.
     """
-    if wishes.mount is not None:
-        foreign = replace(foreign, mount=wishes.mount)
-    if wishes.target is not None:
-        foreign = replace(foreign, target=described_target(wishes.target))
-    if wishes.tip is not None and wishes.robot_model is None:
+    if requested.mount is not None:
+        foreign = replace(foreign, mount=requested.mount)
+    if requested.target is not None:
+        foreign = replace(foreign, target=described_target(requested.target))
+    if requested.tip is not None and requested.robot_model is None:
         raise DataError("--tip needs the robot that it is of; name it with --robot-model.")
-    if wishes.robot_model is not None:
-        tip = {} if wishes.tip is None else {"tip": wishes.tip}
-        foreign = replace(foreign, arm={"model": wishes.robot_model} | tip)
-    return _with_lens(foreign, wishes)
+    if requested.robot_model is not None:
+        tip = {} if requested.tip is None else {"tip": requested.tip}
+        foreign = replace(foreign, arm={"model": requested.robot_model} | tip)
+    return _with_lens(foreign, requested)
 
 
-def _with_lens(foreign: Foreign, wishes: Wishes) -> Foreign:
+def _with_lens(foreign: Foreign, requested: ImportOptions) -> Foreign:
     lens, notes = dict(foreign.lens or {}), foreign.notes
-    if wishes.intrinsics == "estimate":
+    if requested.intrinsics == "estimate":
         lens = {it: lens[it] for it in ("name", "model", "resolution") if it in lens}
-    elif wishes.intrinsics is not None:
-        lens, more = read_intrinsics(Path(wishes.intrinsics))
+    elif requested.intrinsics is not None:
+        lens, more = read_intrinsics(Path(requested.intrinsics))
         notes = (*notes, *more)
-    if wishes.resolution is not None:
-        lens["resolution"] = list(wishes.resolution)
+    if requested.resolution is not None:
+        lens["resolution"] = list(requested.resolution)
     return replace(foreign, lens=lens or None, notes=notes)
 
 

@@ -30,7 +30,7 @@ from visioncal.interchange.formats.fields import (
 from visioncal.interchange.formats.finding import images_beside, images_named, is_image_name, listed
 from visioncal.interchange.formats.foreign import Foreign
 from visioncal.interchange.formats.format import ForeignFormat
-from visioncal.interchange.formats.import_options import Wishes
+from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.pairing import with_camera_file
 from visioncal.interchange.formats.pendants import pendant_fields
 from visioncal.interchange.formats.poses import (
@@ -127,7 +127,7 @@ def _numbered(document: Mapping[str, object]) -> dict[int, dict[str, object]]:
     return dict(sorted(rows.items()))
 
 
-def _read_file(path: Path, wishes: Wishes) -> Foreign:
+def _read_file(path: Path, requested: ImportOptions) -> Foreign:
     """Reads one file with a row a view, or the only one in a folder of images."""
     file = _pose_file(path)
     if file is None:
@@ -135,9 +135,9 @@ def _read_file(path: Path, wishes: Wishes) -> Foreign:
             f"{path}: one file of poses ({', '.join(ENDINGS)}) is needed.", culprits=[str(path)]
         )
     fields = read_fields(file)
-    if wishes.camera_file is None:
-        return foreign_from(fields, wishes, images=path if path.is_dir() else None)
-    return with_camera_file(fields, read_fields(wishes.camera_file), wishes)
+    if requested.camera_file is None:
+        return foreign_from(fields, requested, images=path if path.is_dir() else None)
+    return with_camera_file(fields, read_fields(requested.camera_file), requested)
 
 
 def _pose_file(path: Path) -> Path | None:
@@ -149,25 +149,27 @@ def _pose_file(path: Path) -> Path | None:
     return next((it[0] for it in (files, named) if len(it) == 1), None)
 
 
-def foreign_from(fields: Fields, wishes: Wishes, *, images: Path | None = None) -> Foreign:
+def foreign_from(
+    fields: Fields, requested: ImportOptions, *, images: Path | None = None
+) -> Foreign:
     """Takes rows of named values for a recording, as their names or the user say.
 
     Args:
         fields: The rows.
-        wishes: What the user says of them.
+        requested: What the user says of them.
         images: A folder that holds the images, where the source is one.
 
     Raises:
         DataError: There are no poses and no joints in it.
     """
     unnamed = unnamed_columns(fields)
-    given = (*wishes.robot.names, *wishes.camera.names, *wishes.joints)
+    given = (*requested.robot.names, *requested.camera.names, *requested.joints)
     used = {fields.find(it) for it in given}
-    robot_names = pose_names(fields, wishes.robot.names, unnamed["robot"], ROBOT_KEYS, used)
+    robot_names = pose_names(fields, requested.robot.names, unnamed["robot"], ROBOT_KEYS, used)
     used.update(robot_names)
-    camera_names = pose_names(fields, wishes.camera.names, unnamed["camera"], CAMERA_KEYS, used)
+    camera_names = pose_names(fields, requested.camera.names, unnamed["camera"], CAMERA_KEYS, used)
     used.update(camera_names)
-    joint_names = wishes.joints or _joint_names(fields, used)
+    joint_names = requested.joints or _joint_names(fields, used)
     used.update(joint_names)
     if not robot_names and not joint_names:
         raise DataError(
@@ -179,21 +181,21 @@ def foreign_from(fields: Fields, wishes: Wishes, *, images: Path | None = None) 
     notes: tuple[str, ...] = ()
     robot, camera = PoseNumbers.nowhere(fields.places), None
     if robot_names:
-        robot, notes = poses_from(fields, robot_names, wishes.robot, "robot")
+        robot, notes = poses_from(fields, robot_names, requested.robot, "robot")
     if camera_names:
-        camera, more = poses_from(fields, camera_names, wishes.camera, "camera")
+        camera, more = poses_from(fields, camera_names, requested.camera, "camera")
         notes = (*notes, *more)
     stamps = stamp_name(fields, used)
     if stamps and stamps in unnamed["time"]:
         notes = (*notes, f"Column {stamps} is taken for times, as the source does not say.")
     used |= {stamps, "view"} if view_numbers(fields) else {stamps}
-    paths, image_name, more = _images(fields, wishes, images, used)
+    paths, image_name, more = _images(fields, requested, images, used)
     return Foreign(
         name=fields.name,
         robot=robot,
         camera=camera,
         images=paths,
-        joints_rad=joints_from(fields, joint_names, degrees=wishes.joints_deg)
+        joints_rad=joints_from(fields, joint_names, degrees=requested.joints_deg)
         if joint_names
         else None,
         stamps_s=in_seconds(fields.column(stamps)[:, 0]) if stamps else None,
@@ -216,17 +218,17 @@ def _joint_names(fields: Fields, taken: Collection[str]) -> tuple[str, ...]:
 
 
 def _images(
-    fields: Fields, wishes: Wishes, folder: Path | None, taken: Collection[str]
+    fields: Fields, requested: ImportOptions, folder: Path | None, taken: Collection[str]
 ) -> tuple[tuple[Path | None, ...], str, tuple[str, ...]]:
     """Pairs the rows with images: (paths, the field that names them, what was assumed)."""
-    beside = wishes.images or folder
-    name = fields.find(wishes.image) if wishes.image else _image_name(fields, beside, taken)
+    beside = requested.images or folder
+    name = fields.find(requested.image) if requested.image else _image_name(fields, beside, taken)
     if name in fields.texts:
-        return images_named(fields.texts[name], fields.folder, wishes.images), name, ()
+        return images_named(fields.texts[name], fields.folder, requested.images), name, ()
     if beside is None:
         return (), "", ()
     views, numbered = fields.views or tuple(range(len(fields))), bool(fields.views)
-    paths, notes = images_beside(beside, wishes.images, views, fields.places, numbered=numbered)
+    paths, notes = images_beside(beside, requested.images, views, fields.places, numbered=numbered)
     return paths, "", notes
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from visioncal.interchange.formats.foreign import Foreign
-from visioncal.interchange.formats.import_options import Wishes
+from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.session import Session
 
 
@@ -43,4 +43,4 @@ class ForeignFormat:
     name: str
     words: str
     recognises: Callable[[Path], bool]
-    read: Callable[[Path, Wishes], Foreign]
+    read: Callable[[Path, ImportOptions], Foreign]

@@ -11,7 +11,7 @@ from visioncal.core.types import Mount
 
 
 @dataclass(frozen=True)
-class PoseWishes:
+class PoseImportOptions:
     """Where poses stand and how they are written; what is None or empty is left to the source.
 
     Attributes:
@@ -62,7 +62,7 @@ def _check(what: str, name: str, known: Sequence[str]) -> None:
 
 
 @dataclass(frozen=True)
-class Wishes:
+class ImportOptions:
     """Everything that the user says of a recording.
 
     Attributes:
@@ -81,8 +81,8 @@ class Wishes:
         tip: The frame that the poses are of.
     """
 
-    robot: PoseWishes = PoseWishes()
-    camera: PoseWishes = PoseWishes()
+    robot: PoseImportOptions = PoseImportOptions()
+    camera: PoseImportOptions = PoseImportOptions()
     joints: tuple[str, ...] = ()
     joints_deg: bool = False
     image: str | None = None

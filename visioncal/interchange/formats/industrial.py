@@ -15,7 +15,7 @@ from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.finding import below, head, images_named, listed, number_in
 from visioncal.interchange.formats.foreign import Foreign
 from visioncal.interchange.formats.format import ForeignFormat
-from visioncal.interchange.formats.import_options import Wishes
+from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.intrinsics import intrinsics_from
 
 # Others keep the pose itself there.
@@ -38,7 +38,7 @@ def _kinematic_file(path: Path) -> Path | None:
     return next((it for it in files if "target_joints:" in head(it)), None)
 
 
-def _read_hand_eye(path: Path, wishes: Wishes) -> Foreign:
+def _read_hand_eye(path: Path, requested: ImportOptions) -> Foreign:
     """Reads cal_data.yaml with a pose file and an image a row.
 
     The poses are of the robot's flange in its base; `static_camera` tells the mount.
@@ -66,16 +66,16 @@ def _read_hand_eye(path: Path, wishes: Wishes) -> Foreign:
         )
     notes: list[str] = []
     # What the user says stands in place of what the source does.
-    lens = None if wishes.intrinsics else _lens(document, str(file), notes)
-    target = None if wishes.target else _target(document, notes)
+    lens = None if requested.intrinsics else _lens(document, str(file), notes)
+    target = None if requested.target else _target(document, notes)
     numbered = [number_in(it) for it in places]
     views = tuple(it for it in numbered if it is not None)
     return Foreign(
         name=file.parent.name,
-        robot=wishes.robot.applied_to(
+        robot=requested.robot.applied_to(
             PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), tuple(places))
         ),
-        images=images_named(names, file.parent, wishes.images),
+        images=images_named(names, file.parent, requested.images),
         mount=None if static is None else "eye-to-hand" if static else "eye-in-hand",
         target=target,
         lens=lens,
@@ -139,7 +139,7 @@ def _integer(value: object, where: str) -> int:
     return int(found)
 
 
-def _read_kinematics(path: Path, wishes: Wishes) -> Foreign:
+def _read_kinematics(path: Path, requested: ImportOptions) -> Foreign:
     """Reads kinematic measurements: cam_from_target with the joints of either chain."""
     file = _required(_kinematic_file(path), path, "a file with camera_joints and target_joints")
     document = mapping(read_yaml(file), str(file))
@@ -164,7 +164,7 @@ def _read_kinematics(path: Path, wishes: Wishes) -> Foreign:
     return Foreign(
         name=file.stem,
         robot=PoseNumbers.nowhere(places),
-        camera=wishes.camera.applied_to(camera),
+        camera=requested.camera.applied_to(camera),
         joints_rad=np.array(joints[moving[0]]),
         mount="eye-to-hand" if moving == ["target_joints"] else "eye-in-hand",
         columns={"source_row": tuple(str(it) for it in document)},

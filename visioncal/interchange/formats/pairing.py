@@ -9,12 +9,14 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.interchange.formats.fields import Fields, stamp_name, unnamed_columns
 from visioncal.interchange.formats.foreign import Foreign, Sweep
-from visioncal.interchange.formats.import_options import PoseWishes, Wishes
+from visioncal.interchange.formats.import_options import ImportOptions, PoseImportOptions
 from visioncal.interchange.formats.poses import CAMERA_KEYS, ROBOT_KEYS, pose_names, poses_from
 from visioncal.interchange.formats.streams import pair_streams, seconds
 
 
-def with_camera_file(robot_fields: Fields, camera_fields: Fields, wishes: Wishes) -> Foreign:
+def with_camera_file(
+    robot_fields: Fields, camera_fields: Fields, requested: ImportOptions
+) -> Foreign:
     """Joins a file of the robot's poses with one of the camera's.
 
     By time where both have times, else row by row.
@@ -22,10 +24,10 @@ def with_camera_file(robot_fields: Fields, camera_fields: Fields, wishes: Wishes
     Raises:
         DataError: Either holds no poses, they are not as many, or their motions do not agree.
     """
-    robot, robot_names, first = _poses(robot_fields, wishes.robot, "robot", ROBOT_KEYS)
+    robot, robot_names, first = _poses(robot_fields, requested.robot, "robot", ROBOT_KEYS)
     # A file of the camera's poses alone calls them what a robot's file calls its own.
     keys = (*CAMERA_KEYS, *ROBOT_KEYS)
-    camera, camera_names, second = _poses(camera_fields, wishes.camera, "camera", keys)
+    camera, camera_names, second = _poses(camera_fields, requested.camera, "camera", keys)
     notes = (*first, *second)
     robot_stamp = stamp_name(robot_fields, robot_names)
     camera_stamp = stamp_name(camera_fields, camera_names)
@@ -39,10 +41,10 @@ def with_camera_file(robot_fields: Fields, camera_fields: Fields, wishes: Wishes
 
 
 def _poses(
-    fields: Fields, wishes: PoseWishes, whose: str, keys: Sequence[tuple[str, ...]]
+    fields: Fields, requested: PoseImportOptions, whose: str, keys: Sequence[tuple[str, ...]]
 ) -> tuple[PoseNumbers, tuple[str, ...], tuple[str, ...]]:
     """Takes the poses of one file: (poses, the fields that hold them, what was assumed)."""
-    names = pose_names(fields, wishes.names, unnamed_columns(fields)["robot"], keys, ())
+    names = pose_names(fields, requested.names, unnamed_columns(fields)["robot"], keys, ())
     if not names:
         raise DataError(
             f"{fields.name}: which of its fields are the {whose}'s poses is not known; it has "
@@ -50,7 +52,7 @@ def _poses(
             culprits=[fields.name],
             next_step=f"Name them with --{whose}-columns.",
         )
-    poses, notes = poses_from(fields, names, wishes, whose)
+    poses, notes = poses_from(fields, names, requested, whose)
     return poses, names, notes
 
 

@@ -12,7 +12,7 @@ from visioncal.core.documents import as_numbers
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.fields import Fields
-from visioncal.interchange.formats.import_options import PoseWishes
+from visioncal.interchange.formats.import_options import PoseImportOptions
 from visioncal.session.columns import SELECTORS
 
 # Names under which pose pairs are commonly stored, the most telling first.
@@ -126,7 +126,7 @@ def pose_names(
 
 
 def poses_from(
-    fields: Fields, names: Sequence[str], wishes: PoseWishes, whose: str
+    fields: Fields, names: Sequence[str], requested: PoseImportOptions, whose: str
 ) -> tuple[PoseNumbers, tuple[str, ...]]:
     """Takes poses out of fields.
 
@@ -137,7 +137,7 @@ def poses_from(
     Args:
         fields: The fields.
         names: Which of them hold the poses.
-        wishes: What the user says of them.
+        requested: What the user says of them.
         whose: `robot` or `camera`, for messages.
 
     Returns:
@@ -147,13 +147,13 @@ def poses_from(
         DataError: There are no such fields, or their numbers make up no pose.
     """
     if whose == "robot" and fields.form:
-        wishes = _with_own_form(fields, wishes)
+        requested = _with_own_form(fields, requested)
     blocks = [fields.column(it) for it in names]
     sizes = [it.shape[1] for it in blocks]
     places = fields.places
     if sum(sizes) in (12, 16) and 9 not in sizes:
         numbers = PoseNumbers(*_matrices(np.hstack(blocks)), Reading("matrix"), places)
-        return _checked(wishes.applied_to(numbers), wishes, whose, ())
+        return _checked(requested.applied_to(numbers), requested, whose, ())
     positions, rotations, turned = _split(blocks, names)
     if rotations.shape[1] not in (3, 4, 9) or positions.shape[1] != 3:
         raise DataError(
@@ -162,23 +162,23 @@ def poses_from(
             culprits=list(names),
             next_step=f"Name the fields of the {whose}'s poses with --{whose}-columns.",
         )
-    rotation, notes = _likely_rotation(rotations.shape[1], turned, wishes, whose)
+    rotation, notes = _likely_rotation(rotations.shape[1], turned, requested, whose)
     numbers = PoseNumbers(positions, rotations, Reading(rotation), places)
     if names[0].endswith("_m"):
-        wishes = replace(wishes, unit=wishes.unit or "m")
-    return _checked(wishes.applied_to(numbers), wishes, whose, notes)
+        requested = replace(requested, unit=requested.unit or "m")
+    return _checked(requested.applied_to(numbers), requested, whose, notes)
 
 
-def _with_own_form(fields: Fields, wishes: PoseWishes) -> PoseWishes:
+def _with_own_form(fields: Fields, requested: PoseImportOptions) -> PoseImportOptions:
     """Reads the robot's poses in the form that their rows say."""
-    if wishes.form not in (None, fields.form):
+    if requested.form not in (None, fields.form):
         raise DataError(
             f"{fields.places[0]}: the pose is written as {POSE_FORMS[fields.form].words}, not as "
-            f"{wishes.form}.",
+            f"{requested.form}.",
             culprits=[fields.places[0]],
             next_step="Leave --robot-form out.",
         )
-    return replace(wishes, form=fields.form)
+    return replace(requested, form=fields.form)
 
 
 def joints_from(fields: Fields, names: Sequence[str], *, degrees: bool) -> FloatArray:
@@ -205,13 +205,13 @@ def joints_from(fields: Fields, names: Sequence[str], *, degrees: bool) -> Float
 
 
 def check_radians(
-    poses: PoseNumbers, wishes: PoseWishes, whose: str, *, guesses: bool = True
+    poses: PoseNumbers, requested: PoseImportOptions, whose: str, *, guesses: bool = True
 ) -> None:
     """Checks that angles of which nobody says what they are can be radians.
 
     Args:
         poses: The poses.
-        wishes: What the user says of them.
+        requested: What the user says of them.
         whose: `robot` or `camera`, for messages.
         guesses: Whether the command can try other readings.
 
@@ -228,7 +228,7 @@ def check_radians(
         raise DataError(
             f"{poses.places[row]}: the {whose}'s rotation has an angle of {largest[row]:.4g}, "
             "too large for radians"
-            + ("." if wishes.form else ", and the source does not say what it is."),
+            + ("." if requested.form else ", and the source does not say what it is."),
             culprits=[poses.places[row]],
             next_step=f"Say --{whose}-form: kuka, or doosan, where the angles are A, B, C; fanuc "
             "for W, P, R; yaskawa or staubli for Rx, Ry, Rz; rotation-vector-deg, euler-ZYX-deg ..."
@@ -293,7 +293,7 @@ def _split(
 
 
 def _likely_rotation(
-    size: int, names: Sequence[str], wishes: PoseWishes, whose: str
+    size: int, names: Sequence[str], requested: PoseImportOptions, whose: str
 ) -> tuple[str, tuple[str, ...]]:
     if size == 9:
         return "matrix", ()
@@ -302,7 +302,7 @@ def _likely_rotation(
         # ABB counts q1 to q4 from the scalar on.
         counted = [it[-2:].lower() for it in names] == ["q1", "q2", "q3", "q4"]
         rotation = f"quaternion-{'wxyz' if counted or ends == 'wxyz' else 'xyzw'}"
-        if wishes.form is not None or counted or ends in ("xyzw", "wxyz"):
+        if requested.form is not None or counted or ends in ("xyzw", "wxyz"):
             return rotation, ()
         return rotation, (
             f"The {whose}'s quaternions are taken for x, y, z, w, as the source does not say; "
@@ -311,7 +311,7 @@ def _likely_rotation(
     joined = " ".join(names).lower()
     if _ANGLES_NAME.search(joined):
         return "euler-xyz-rad", ()
-    if wishes.form is None and "rvec" not in joined:
+    if requested.form is None and "rvec" not in joined:
         return "rotation-vector", (
             f"The {whose}'s rotations ({', '.join(names)}) are taken for rotation vectors in "
             f"radians, as the source does not say; --{whose}-form names another form.",
@@ -320,7 +320,7 @@ def _likely_rotation(
 
 
 def _checked(
-    numbers: PoseNumbers, wishes: PoseWishes, whose: str, notes: tuple[str, ...]
+    numbers: PoseNumbers, requested: PoseImportOptions, whose: str, notes: tuple[str, ...]
 ) -> tuple[PoseNumbers, tuple[str, ...]]:
     infinite = np.isinf(numbers.positions).any(axis=1) | np.isinf(numbers.rotations).any(axis=1)
     if infinite.any():
@@ -330,7 +330,7 @@ def _checked(
             culprits=[place],
             next_step="Correct it, or leave the whole pose of that row empty.",
         )
-    if wishes.unit is None and wishes.form not in POSE_FORMS:
+    if requested.unit is None and requested.form not in POSE_FORMS:
         notes = (
             *notes,
             f"The {whose}'s positions are taken for metres, as the source does not say; "

@@ -13,7 +13,7 @@ from visioncal.interchange.formats.finding import listed
 from visioncal.interchange.formats.folder import FOLDER
 from visioncal.interchange.formats.foreign import Foreign
 from visioncal.interchange.formats.format import ForeignFormat, OwnFormat
-from visioncal.interchange.formats.import_options import Wishes
+from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.industrial import HAND_EYE, KINEMATICS
 from visioncal.interchange.formats.poses import check_radians
 from visioncal.interchange.formats.recording import RECORDING
@@ -39,7 +39,7 @@ FOREIGN_FORMATS: tuple[ForeignFormat, ...] = (
     TABLE,
 )
 
-_NO_WISHES = Wishes()
+_NO_WISHES = ImportOptions()
 
 # Tries other readings of the poses, and settles which is right.
 Choose: TypeAlias = Callable[[Session | Foreign], Candidate]
@@ -49,7 +49,7 @@ def convert(
     source: Path,
     dest: Path,
     *,
-    wishes: Wishes = _NO_WISHES,
+    requested: ImportOptions = _NO_WISHES,
     form: str | None = None,
     force: bool = False,
     choose: Choose | None = None,
@@ -61,7 +61,7 @@ def convert(
     Args:
         source: The session, in any of `OWN_FORMATS`, or a recording in any of `FOREIGN_FORMATS`.
         dest: Where to; its suffix says in which form, and none of theirs means a folder.
-        wishes: What is to be known of somebody else's recording beyond what it says.
+        requested: What is to be known of somebody else's recording beyond what it says.
         form: The name of its format, where it is not to be recognised.
         force: Whether a file that is there may be replaced; a folder never is.
         choose: Called, where it is in doubt how the poses are meant, with what was read; what it
@@ -71,19 +71,19 @@ def convert(
         The session.
 
     Raises:
-        DataError: `source` is neither, `wishes` are not for it, `dest` is taken, cannot be written
-            or, read again, is another session.
+        DataError: `source` is neither, `requested` is not for it, `dest` is taken, cannot be
+            written or, read again, is another session.
     """
     _check_dest(source, dest, force=force)
     own = next((it for it in OWN_FORMATS if form is None and it.recognises(source)), None)
     if own is None:
-        foreign = read_foreign(source, wishes, form)
+        foreign = read_foreign(source, requested, form)
         if choose is None:
-            check_radians(foreign.robot, wishes.robot, "robot")
+            check_radians(foreign.robot, requested.robot, "robot")
             if foreign.camera is not None:
-                check_radians(foreign.camera, wishes.camera, "camera")
+                check_radians(foreign.camera, requested.camera, "camera")
         session = assemble(foreign if choose is None else reread(foreign, choose(foreign)))
-    elif wishes != _NO_WISHES:
+    elif requested != _NO_WISHES:
         raise DataError(
             f"{source} is a session already; what describes poses and cameras is for somebody "
             "else's recording.",
@@ -100,20 +100,20 @@ def convert(
     return session
 
 
-def read_foreign(source: Path, wishes: Wishes, form: str | None = None) -> Foreign:
+def read_foreign(source: Path, requested: ImportOptions, form: str | None = None) -> Foreign:
     """Reads somebody else's recording, as the user says that it is to be read.
 
     Args:
         source: A file or folder in any of `FOREIGN_FORMATS`.
-        wishes: What the user says of it.
+        requested: What the user says of it.
         form: The name of its format; None to recognise it.
 
     Raises:
         DataError: It is of no known format, or something in it is wrong.
     """
     # Two files are two tables, whatever the first of them looks like.
-    form = form or (TABLE.name if wishes.camera_file is not None else None)
-    return wished(_foreign_format(source, form).read(source, wishes), wishes)
+    form = form or (TABLE.name if requested.camera_file is not None else None)
+    return wished(_foreign_format(source, form).read(source, requested), requested)
 
 
 def write_session(session: Session, dest: Path) -> None:

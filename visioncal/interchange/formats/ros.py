@@ -10,7 +10,7 @@ from visioncal.core.errors import DataError
 from visioncal.interchange.formats.finding import head
 from visioncal.interchange.formats.foreign import Foreign
 from visioncal.interchange.formats.format import ForeignFormat
-from visioncal.interchange.formats.import_options import Wishes
+from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.poses import as_matrix, matrix_numbers
 
 
@@ -23,7 +23,7 @@ def _is_easy_handeye(path: Path) -> bool:
     )
 
 
-def _read_easy_handeye(path: Path, wishes: Wishes) -> Foreign:
+def _read_easy_handeye(path: Path, requested: ImportOptions) -> Foreign:
     """Reads a .samples file: a list of `robot` and `tracking` as geometry_msgs/Transform.
 
     With the camera on the base the sampler stores the robot's pose inverted, so that one solver
@@ -38,8 +38,8 @@ def _read_easy_handeye(path: Path, wishes: Wishes) -> Foreign:
         robot.append(_transform(entry.get("robot"), f"{where}: robot"))
         camera.append(_transform(entry.get("tracking", entry.get("optical")), f"{where}: tracking"))
         places.append(where)
-    inverse = wishes.mount == "eye-to-hand"
-    poses = wishes.robot.applied_to(_numbers(robot, places, inverse=inverse))
+    inverse = requested.mount == "eye-to-hand"
+    poses = requested.robot.applied_to(_numbers(robot, places, inverse=inverse))
     note = (
         "inverted, as easy_handeye2 stores them with the camera on the base"
         if poses.reading.inverse
@@ -48,7 +48,7 @@ def _read_easy_handeye(path: Path, wishes: Wishes) -> Foreign:
     return Foreign(
         name=path.stem,
         robot=poses,
-        camera=wishes.camera.applied_to(_numbers(camera, places, inverse=False)),
+        camera=requested.camera.applied_to(_numbers(camera, places, inverse=False)),
         notes=(f"The robot's poses are read {note}.",),
     )
 
@@ -77,7 +77,7 @@ def _is_moveit(path: Path) -> bool:
     return named or nested
 
 
-def _read_moveit(path: Path, wishes: Wishes) -> Foreign:
+def _read_moveit(path: Path, requested: ImportOptions) -> Foreign:
     """Reads MoveIt's samples: the effector in the world, the object in the sensor, as matrices.
 
     Either a list of mappings, as its panel saves them, or of pairs, as its tests keep them.
@@ -96,8 +96,8 @@ def _read_moveit(path: Path, wishes: Wishes) -> Foreign:
         places.append(where)
     return Foreign(
         name=path.stem,
-        robot=wishes.robot.applied_to(matrix_numbers(np.array(robot), places)),
-        camera=wishes.camera.applied_to(matrix_numbers(np.array(camera), places)),
+        robot=requested.robot.applied_to(matrix_numbers(np.array(robot), places)),
+        camera=requested.camera.applied_to(matrix_numbers(np.array(camera), places)),
     )
 
 

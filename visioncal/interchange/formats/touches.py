@@ -13,7 +13,7 @@ from visioncal.frames.drawing_points import NominalPoints
 from visioncal.frames.touches import TouchRows, touches_of
 from visioncal.interchange.formats.columns import foreign_from, read_fields, view_numbers
 from visioncal.interchange.formats.fields import Fields, unnamed_columns
-from visioncal.interchange.formats.import_options import PoseWishes, Wishes
+from visioncal.interchange.formats.import_options import ImportOptions, PoseImportOptions
 from visioncal.interchange.formats.poses import ROBOT_KEYS, check_radians, pose_names
 from visioncal.session import Session
 from visioncal.session.columns import joint_columns
@@ -22,14 +22,14 @@ _NAMES = ("point", "name", "label", "id")
 
 
 def read_touches(
-    path: Path, wishes: Wishes, robot: str | None = None, *, positions: bool = False
+    path: Path, requested: ImportOptions, robot: str | None = None, *, positions: bool = False
 ) -> TouchRows:
     """Reads touches.
 
     Args:
         path: A table with the columns of views.csv, `kind` and `point`; of these, only the pose or
             the joints have to be there. Or a session, whose rows have them.
-        wishes: How poses and joints are written, where the columns do not say.
+        requested: How poses and joints are written, where the columns do not say.
         robot: Which robot of a whole cell is meant, where a session or a column `robot` has more.
         positions: Whether positions will do where the table has no rotations: x_m, y_m, z_m, or
             x, y, z with the unit given.
@@ -41,10 +41,10 @@ def read_touches(
         return touches_of(Session.load(path), robot)
     fields = _of_robot(read_fields(path), robot)
     unnamed = unnamed_columns(fields)["robot"]
-    named = pose_names(fields, wishes.robot.names, unnamed, ROBOT_KEYS, ())
-    if positions and (not named or (wishes.robot.names and len(named) == 3)):
-        return _rows_of(fields, path, _positions_alone(fields, wishes.robot), None)
-    joints = wishes.joints or joint_columns(tuple(fields.numbers))
+    named = pose_names(fields, requested.robot.names, unnamed, ROBOT_KEYS, ())
+    if positions and (not named or (requested.robot.names and len(named) == 3)):
+        return _rows_of(fields, path, _positions_alone(fields, requested.robot), None)
+    joints = requested.joints or joint_columns(tuple(fields.numbers))
     if not named and not joints and _has_axes(fields):
         raise DataError(
             f"{path.name} has positions without rotations, and a tip beside the flange needs both.",
@@ -52,8 +52,8 @@ def read_touches(
             next_step="Add the rotations, or name all columns with --robot-columns; or, for a "
             "fixture, say --tool none where the positions are of the tip itself.",
         )
-    foreign = foreign_from(fields, wishes)
-    check_radians(foreign.robot, wishes.robot, "robot", guesses=False)
+    foreign = foreign_from(fields, requested)
+    check_radians(foreign.robot, requested.robot, "robot", guesses=False)
     return _rows_of(fields, path, foreign.robot.poses(), foreign.joints_rad)
 
 
@@ -97,12 +97,12 @@ def _rows_of(
     )
 
 
-def _positions_alone(fields: Fields, wishes: PoseWishes) -> FloatArray:
+def _positions_alone(fields: Fields, requested: PoseImportOptions) -> FloatArray:
     """Poses (n, 4, 4) without rotations."""
-    form = POSE_FORMS.get(wishes.form or "")
-    unit = wishes.unit or (form.unit if form else None)
+    form = POSE_FORMS.get(requested.form or "")
+    unit = requested.unit or (form.unit if form else None)
     poses = np.full((len(fields), 4, 4), np.nan)
-    poses[:, :3, 3] = _coordinates(fields, *_axes(fields, unit, "--robot-unit", wishes.names))
+    poses[:, :3, 3] = _coordinates(fields, *_axes(fields, unit, "--robot-unit", requested.names))
     return poses
 
 

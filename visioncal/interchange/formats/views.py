@@ -13,7 +13,7 @@ from visioncal.interchange.formats.fields import fields_of_records, flattened
 from visioncal.interchange.formats.finding import listed, number_in
 from visioncal.interchange.formats.foreign import Foreign
 from visioncal.interchange.formats.format import ForeignFormat
-from visioncal.interchange.formats.import_options import Wishes
+from visioncal.interchange.formats.import_options import ImportOptions
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ def _view_folder(path: Path) -> Path | None:
     return next((it for it in folders if _families(it)), None)
 
 
-def _read_views(path: Path, wishes: Wishes) -> Foreign:
+def _read_views(path: Path, requested: ImportOptions) -> Foreign:
     """Reads a folder with a file a view, or several kinds of file a view."""
     folder = _view_folder(path)
     if folder is None:
@@ -67,7 +67,7 @@ def _read_views(path: Path, wishes: Wishes) -> Foreign:
     ]
     name = (path if folder == path else folder.parent).resolve().name
     fields = fields_of_records(records, places, name, folder, tuple(views))
-    return foreign_from(fields, wishes)
+    return foreign_from(fields, requested)
 
 
 def _record(path: Path) -> dict[str, object]:

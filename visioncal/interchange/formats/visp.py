@@ -14,7 +14,7 @@ from visioncal.core.types import MOUNTS, Mount
 from visioncal.interchange.formats.finding import images_beside, listed, number_in
 from visioncal.interchange.formats.foreign import Foreign
 from visioncal.interchange.formats.format import ForeignFormat
-from visioncal.interchange.formats.import_options import Wishes
+from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.intrinsics import read_intrinsics
 
 # `franka_pose_rPe_3.yaml`: the end effector in the robot's reference frame.
@@ -27,7 +27,7 @@ def _pose_files(path: Path) -> tuple[Path, ...]:
     return tuple(it for it in listed(path) if _POSE_NAME.fullmatch(it.name))
 
 
-def _read(path: Path, wishes: Wishes) -> Foreign:
+def _read(path: Path, requested: ImportOptions) -> Foreign:
     """Reads the folder; a pose is tx, ty, tz [m] and theta-u [rad] (ViSP, vpPoseVector)."""
     files = _pose_files(path)
     if not files:
@@ -37,14 +37,14 @@ def _read(path: Path, wishes: Wishes) -> Foreign:
     views = tuple(number_in(it.name) or 0 for it in files)
     places = tuple(it.name for it in files)
     notes: list[str] = []
-    images, paired = images_beside(path, wishes.images, views, places, numbered=True)
+    images, paired = images_beside(path, requested.images, views, places, numbered=True)
     robot = PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading("rotation-vector"), places)
     return Foreign(
         name=path.resolve().name,
-        robot=wishes.robot.applied_to(robot),
+        robot=requested.robot.applied_to(robot),
         images=images,
         mount=_mount(path, notes),
-        target=None if wishes.target else _target(path, notes),
+        target=None if requested.target else _target(path, notes),
         lens=_lens(path, notes),
         views=views,
         notes=(*notes, *paired),

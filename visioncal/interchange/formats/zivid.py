@@ -11,7 +11,7 @@ from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.finding import head, images_beside, listed, number_in
 from visioncal.interchange.formats.foreign import Foreign
 from visioncal.interchange.formats.format import ForeignFormat
-from visioncal.interchange.formats.import_options import Wishes
+from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.poses import as_matrix, matrix_numbers
 
 _POSE_NAME = re.compile(r"(pos|pose|robot_pose)_?[0-9]+\.ya?ml", re.IGNORECASE)
@@ -24,7 +24,7 @@ def _pose_files(path: Path) -> tuple[Path, ...]:
     return named if named and re.search("FloatMatrix|PoseState", head(named[0])) else ()
 
 
-def _read(path: Path, wishes: Wishes) -> Foreign:
+def _read(path: Path, requested: ImportOptions) -> Foreign:
     """Reads pos01.yaml ... (Zivid SDK, Matrix4x4; older samples, OpenCV's `PoseState`)."""
     files = _pose_files(path)
     if not files:
@@ -33,10 +33,10 @@ def _read(path: Path, wishes: Wishes) -> Foreign:
     numbers = [number_in(it.name) for it in files]
     views = tuple(it for it in numbers if it is not None)
     places = tuple(it.name for it in files)
-    images, notes = images_beside(path, wishes.images, views, places, numbered=True)
+    images, notes = images_beside(path, requested.images, views, places, numbered=True)
     return Foreign(
         name=path.resolve().name,
-        robot=wishes.robot.applied_to(matrix_numbers(matrices, places, unit="mm")),
+        robot=requested.robot.applied_to(matrix_numbers(matrices, places, unit="mm")),
         images=images,
         views=views,
         notes=notes,

@@ -51,7 +51,7 @@ def open_arm(words: str, wish: ArmWish, openers: Mapping[str, ArmOpener] | None 
 
 
 def open_camera(
-    words: str, wishes: DeviceWishes, openers: Mapping[str, CameraOpener] | None = None
+    words: str, requested: DeviceWishes, openers: Mapping[str, CameraOpener] | None = None
 ) -> CameraDevice:
     """Opens a camera; the arguments are like those of `open_arm`.
 
@@ -60,7 +60,7 @@ def open_camera(
         DriverError: It cannot be opened.
     """
     kind, _, address = words.partition(":")
-    return _opener(kind, CAMERAS if openers is None else openers, "--camera")(address, wishes)
+    return _opener(kind, CAMERAS if openers is None else openers, "--camera")(address, requested)
 
 
 def is_folder(words: str) -> bool:
@@ -99,16 +99,16 @@ def _manual(wish: ArmWish) -> Arm:
     return ManualArm(wish.ask, wish.form)
 
 
-def _oak(address: str, wishes: DeviceWishes) -> CameraDevice:
+def _oak(address: str, requested: DeviceWishes) -> CameraDevice:
     from visioncal.live.drivers.oak import OakCamera
 
-    return OakCamera(wishes, device=address or None)
+    return OakCamera(requested, device=address or None)
 
 
-def _uvc(address: str, wishes: DeviceWishes) -> CameraDevice:
+def _uvc(address: str, requested: DeviceWishes) -> CameraDevice:
     from visioncal.live.drivers.uvc import UvcCamera
 
-    return UvcCamera(int(address or 0) if (address or "0").isdecimal() else address, wishes)
+    return UvcCamera(int(address or 0) if (address or "0").isdecimal() else address, requested)
 
 
 def _folder(address: str, _: DeviceWishes) -> CameraDevice:

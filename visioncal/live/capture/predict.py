@@ -48,8 +48,8 @@ class PlannedAccuracy:
         rows = [at for at, view in enumerate(self.views) if view in set(views)]
         if not rows:
             return None
-        spread = self.world.covariance(rows)
-        place, turn = (np.trace(it @ spread) for it in (self.world.place, self.world.turn))
+        covariance = self.world.covariance(rows)
+        place, turn = (np.trace(it @ covariance) for it in (self.world.place, self.world.turn))
         return Accuracy(1e3 * float(np.sqrt(place)), float(np.rad2deg(np.sqrt(turn))))
 
     def close(self) -> None:
@@ -92,6 +92,6 @@ def _calibrated(folder: Path) -> Accuracy | None:
         return None
     if known.answer is None:
         return None
-    spread = known.answer.covariance[:6, :6]
-    place, turn = float(np.trace(spread[3:, 3:])), float(np.trace(spread[:3, :3]))
+    covariance = known.answer.covariance[:6, :6]
+    place, turn = float(np.trace(covariance[3:, 3:])), float(np.trace(covariance[:3, :3]))
     return Accuracy(1e3 * float(np.sqrt(place)), float(np.rad2deg(np.sqrt(turn))))

@@ -34,8 +34,8 @@ class OakCamera:
     went. All of it is in `settings`.
 
     Args:
-        wishes: What is asked of it; `more` may name the `socket` (CAM_A), `rate_hz`, and `raw`, a
-            file to record every frame into, `.avi` or `.mkv`.
+        requested: What is asked of it; `more` may name the `socket` (CAM_A), `rate_hz`, and `raw`,
+            a file to record every frame into, `.avi` or `.mkv`.
         device: Which OAK, by its id, its address or its USB path; None for the only one.
 
     Raises:
@@ -43,29 +43,29 @@ class OakCamera:
         DataError: Frames cannot be recorded into that file.
     """
 
-    def __init__(self, wishes: DeviceWishes | None = None, *, device: str | None = None) -> None:
+    def __init__(self, requested: DeviceWishes | None = None, *, device: str | None = None) -> None:
         dai = depthai()
-        wishes = wishes or DeviceWishes()
-        self._socket, rate_hz = _options(wishes.more)
+        requested = requested or DeviceWishes()
+        self._socket, rate_hz = _options(requested.more)
         with ExitStack() as closing:
             opened = _opened(dai, device)
             closing.callback(opened.close)
             with told_by(dai, "The OAK", "does not start"):
                 sensor = _sensor(opened, self._socket)
                 self._name = f"{opened.getDeviceName()} {self._socket} ({sensor.sensorName})"
-                self._resolution = wishes.resolution or _fitting(sensor.width, sensor.height)
+                self._resolution = requested.resolution or _fitting(sensor.width, sensor.height)
                 calibration = opened.readCalibrationOrDefault()
-                wishes = _focused(wishes, calibration, sensor)
+                requested = _focused(requested, calibration, sensor)
                 pipeline = dai.Pipeline(opened)
                 node = pipeline.create(dai.node.Camera).build(sensor.socket)
-                output = self._output(dai, node, wishes, sensor, rate_hz)
+                output = self._output(dai, node, requested, sensor, rate_hz)
                 control = node.inputControl.createInputQueue()
-            raw = wishes.more.get("raw")
+            raw = requested.more.get("raw")
             self._end = FrameEnd(
                 dai, pipeline, output, self._name, raw=None if raw is None else Path(raw)
             )
             closing.callback(self._end.close)
-            held = self._held(dai, wishes, sensor, control)
+            held = self._held(dai, requested, sensor, control)
             self._factory, known = self._intrinsics(calibration, sensor)
             self._settings = MappingProxyType({"rate_hz": rate_hz, **known, **held})
             self._closing = closing.pop_all()
@@ -114,13 +114,13 @@ class OakCamera:
         self._closing.close()
 
     def _output(
-        self, dai: ModuleType, node: Handle, wishes: DeviceWishes, sensor: Handle, rate_hz: float
+        self, dai: ModuleType, node: Handle, requested: DeviceWishes, sensor: Handle, rate_hz: float
     ) -> Handle:
         """Sets what is known beforehand, and asks the camera's node for pictures."""
-        if wishes.focus is not None:
-            node.initialControl.setManualFocus(wishes.focus)
-        if wishes.exposure_us is not None and wishes.gain is not None:
-            node.initialControl.setManualExposure(wishes.exposure_us, wishes.gain)
+        if requested.focus is not None:
+            node.initialControl.setManualFocus(requested.focus)
+        if requested.exposure_us is not None and requested.gain is not None:
+            node.initialControl.setManualExposure(requested.exposure_us, requested.gain)
         is_colour = dai.CameraSensorType.COLOR in sensor.supportedTypes
         kind = dai.ImgFrame.Type.BGR888i if is_colour else dai.ImgFrame.Type.GRAY8
         # The factory's matrix is for pictures that are scaled and cropped, and still distorted.
@@ -128,7 +128,7 @@ class OakCamera:
         return node.requestOutput(self._resolution, kind, crop, rate_hz, False)
 
     def _held(
-        self, dai: ModuleType, wishes: DeviceWishes, sensor: Handle, control_queue: Handle
+        self, dai: ModuleType, requested: DeviceWishes, sensor: Handle, control_queue: Handle
     ) -> dict[str, str | float]:
         """Holds what the camera set by itself, and tells what it is."""
         told = self._end.message(_FIRST_S)
@@ -142,14 +142,14 @@ class OakCamera:
                 next_step="Look at its cable: USB 3 and short; and at its power.",
             )
         found_us = round(1e6 * told.getExposureTime().total_seconds())
-        exposure_us = found_us if wishes.exposure_us is None else wishes.exposure_us
-        gain = told.getSensitivity() if wishes.gain is None else wishes.gain
+        exposure_us = found_us if requested.exposure_us is None else requested.exposure_us
+        gain = told.getSensitivity() if requested.gain is None else requested.gain
         held: dict[str, str | float] = {"exposure_us": exposure_us, "gain": gain}
         control = dai.CameraControl()
         control.setManualExposure(exposure_us, gain)
         control.setAutoWhiteBalanceLock(True)
         if sensor.hasAutofocus:
-            held["focus"] = told.getLensPosition() if wishes.focus is None else wishes.focus
+            held["focus"] = told.getLensPosition() if requested.focus is None else requested.focus
             control.setManualFocus(int(held["focus"]))
         control_queue.send(control)
         return held
@@ -226,11 +226,11 @@ def _fitting(width: int, height: int) -> tuple[int, int]:
     return width // parts // 2 * 2, height // parts // 2 * 2
 
 
-def _focused(wishes: DeviceWishes, calibration: Handle, sensor: Handle) -> DeviceWishes:
+def _focused(requested: DeviceWishes, calibration: Handle, sensor: Handle) -> DeviceWishes:
     """Focuses where the factory calibrated, unless another focus is wished."""
-    if wishes.focus is not None or not sensor.hasAutofocus:
-        return wishes
-    return replace(wishes, focus=_calibrated_focus(calibration, sensor))
+    if requested.focus is not None or not sensor.hasAutofocus:
+        return requested
+    return replace(requested, focus=_calibrated_focus(calibration, sensor))
 
 
 def _calibrated_focus(calibration: Handle, sensor: Handle) -> int | None:

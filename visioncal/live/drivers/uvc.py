@@ -41,24 +41,24 @@ class UvcCamera:
 
     Args:
         source: The camera's index, the path of its device, a URL, or a video file.
-        wishes: What is asked of it; of a URL, which resolution it is to have.
+        requested: What is asked of it; of a URL, which resolution it is to have.
 
     Raises:
         DriverError: It cannot be opened or gives no picture, or refuses what is wished.
     """
 
-    def __init__(self, source: int | str, wishes: DeviceWishes | None = None) -> None:
-        wishes = wishes or DeviceWishes()
+    def __init__(self, source: int | str, requested: DeviceWishes | None = None) -> None:
+        requested = requested or DeviceWishes()
         self._name = f"camera {without_password(str(source))}"
-        self._exposure_s = 1e-6 * (wishes.exposure_us or 0)
+        self._exposure_s = 1e-6 * (requested.exposure_us or 0)
         settings: dict[str, str | float] = {}
         self._feed: Newest[bytes] | Newest[Image] | FilePictures
-        pictures = _multipart(source, wishes)
+        pictures = _multipart(source, requested)
         if pictures is not None:
             self._feed = Newest(pictures, self.name)
         else:
             capture = _opened(source, self.name)
-            settings = _set(capture, wishes)
+            settings = _set(capture, requested)
             # A device has no number of pictures.
             if int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) > 0:
                 self._feed = FilePictures(capture, self.name)
@@ -69,7 +69,7 @@ class UvcCamera:
         self._settings = MappingProxyType(settings)
         try:
             first = self._frame(*self._feed.first(_OPENING_S))
-            self._check_resolution(first, wishes.resolution, "gives")
+            self._check_resolution(first, requested.resolution, "gives")
         except BaseException:
             self.close()
             raise
@@ -144,12 +144,12 @@ def _scheme(source: int | str) -> str:
     return scheme.lower() if found else ""
 
 
-def _multipart(source: int | str, wishes: DeviceWishes) -> MultipartPictures | None:
+def _multipart(source: int | str, requested: DeviceWishes) -> MultipartPictures | None:
     """The JPEG files of a URL that sends such; None for every other source."""
     if not _scheme(source):
         return None
     url = str(source)
-    if (wishes.exposure_us, wishes.gain, wishes.focus) != (None, None, None):
+    if (requested.exposure_us, requested.gain, requested.focus) != (None, None, None):
         raise DriverError(
             f"The camera {without_password(url)} cannot be set from here: a URL gives nothing but "
             "pictures.",
@@ -180,20 +180,20 @@ def _opened(source: int | str, name: str) -> cv2.VideoCapture:
     return capture
 
 
-def _set(capture: cv2.VideoCapture, wishes: DeviceWishes) -> dict[str, str | float]:
+def _set(capture: cv2.VideoCapture, requested: DeviceWishes) -> dict[str, str | float]:
     """Sets what is wished, stops the focus from moving by itself, and asks what came of it."""
-    if wishes.resolution is not None:
-        capture.set(cv2.CAP_PROP_FRAME_WIDTH, wishes.resolution[0])
-        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, wishes.resolution[1])
+    if requested.resolution is not None:
+        capture.set(cv2.CAP_PROP_FRAME_WIDTH, requested.resolution[0])
+        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, requested.resolution[1])
     capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
     capture.set(cv2.CAP_PROP_AUTOFOCUS, 0)
-    if wishes.focus is not None:
-        capture.set(cv2.CAP_PROP_FOCUS, wishes.focus)
-    if wishes.exposure_us is not None:
+    if requested.focus is not None:
+        capture.set(cv2.CAP_PROP_FOCUS, requested.focus)
+    if requested.exposure_us is not None:
         capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, _MANUAL_EXPOSURE)
-        capture.set(cv2.CAP_PROP_EXPOSURE, round(1e-6 * wishes.exposure_us / _EXPOSURE_UNIT_S))
-    if wishes.gain is not None:
-        capture.set(cv2.CAP_PROP_GAIN, wishes.gain)
+        capture.set(cv2.CAP_PROP_EXPOSURE, round(1e-6 * requested.exposure_us / _EXPOSURE_UNIT_S))
+    if requested.gain is not None:
+        capture.set(cv2.CAP_PROP_GAIN, requested.gain)
     told = {
         "exposure": capture.get(cv2.CAP_PROP_EXPOSURE),
         "auto_exposure": capture.get(cv2.CAP_PROP_AUTO_EXPOSURE),

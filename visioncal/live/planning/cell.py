@@ -103,7 +103,7 @@ class PlanCell:
         pixel_px: Noise of a corner, per axis [px].
         limits: What every stop and every way between two of them keeps.
         boxes: What else stands in the cell.
-        spread: (12, 12) covariance of both edges together (rotation, translation; right
+        covariance: (12, 12) covariance of both edges together (rotation, translation; right
             perturbations), where recorded stops tell it: then both sigmas are typical of it. None
             where the sigmas say all.
     """
@@ -120,7 +120,7 @@ class PlanCell:
     pixel_px: float
     limits: Limits = field(default_factory=Limits)
     boxes: tuple[Box, ...] = ()
-    spread: FloatArray | None = None
+    covariance: FloatArray | None = None
 
     def __post_init__(self) -> None:
         if corner_positions(self.target)[:, 2].any():
@@ -173,10 +173,10 @@ class PlanCell:
         """
         rng = np.random.default_rng(seed)
         draws = rng.standard_normal((count, 12))
-        if self.spread is None:
+        if self.covariance is None:
             twists = draws * np.tile(np.repeat([self.sigma_rad, self.sigma_m], 3), 2)
         else:
-            values, vectors = np.linalg.eigh(self.spread)
+            values, vectors = np.linalg.eigh(self.covariance)
             twists = draws @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
         moves = exp(twists.reshape(count, 2, 6))
         return tuple(replace(self, x=self.x @ by_x, z=self.z @ by_z) for by_x, by_z in moves)

@@ -17,7 +17,7 @@ from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.appearance import (
     SCALE,
     Appearance,
-    Free,
+    LensBoardParameters,
     board_prior,
     compress,
     shape_basis,
@@ -27,7 +27,7 @@ from visioncal.estimation.armmodel import COMPLIANCE, ArmModel, block_size
 from visioncal.estimation.armpair import ArmPair
 from visioncal.estimation.chain import chain
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
-from visioncal.estimation.linalg import covariance, gram
+from visioncal.estimation.linalg import covariance_from, gram
 from visioncal.estimation.parts import Effect, Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import fisher_information
@@ -71,7 +71,7 @@ class Recorded:
 
     problem: Problem
     edges: FloatArray
-    free: Free
+    free: LensBoardParameters
     q: FloatArray | None
     noise: Noise
     first_corner: int = 0
@@ -107,7 +107,7 @@ class World:
         looks: How many of the unknowns are of lens and boards; they stand behind the edges.
         misfit: (k, 6, a) how residuals at each stop move, in sigmas of noise, with errors of the
             arm that a fit takes for noise, in sigmas of theirs.
-        pull: (p, a) how the recorded stops' gradient moves with them.
+        gradient: (p, a) how the recorded stops' gradient moves with them.
     """
 
     factors: FloatArray
@@ -119,7 +119,7 @@ class World:
     units: FloatArray
     looks: int
     misfit: FloatArray
-    pull: FloatArray
+    gradient: FloatArray
 
     def with_known_looks(self) -> "World":
         """Returns the world as it is where lens and board are known exactly."""
@@ -135,18 +135,18 @@ class World:
             self.units[kept],
             0,
             self.misfit,
-            self.pull[kept],
+            self.gradient[kept],
         )
 
     def without_misfit(self) -> "World":
         """Returns the world as it is where a fit takes no errors of the arm for noise."""
-        return replace(self, misfit=self.misfit[:, :, :0], pull=self.pull[:, :0])
+        return replace(self, misfit=self.misfit[:, :, :0], gradient=self.gradient[:, :0])
 
     def covariance(self, rows: Sequence[int] | IntArray | Mask) -> FloatArray:
         """Covariance (p, p) of the unknowns from some candidates and what is recorded."""
         taken = self.factors[rows]
-        fitted = covariance(self.prior + self.recorded + gram(taken, taken))
-        off = fitted @ (self.pull + gram(taken, self.misfit[rows]))
+        fitted = covariance_from(self.prior + self.recorded + gram(taken, taken))
+        off = fitted @ (self.gradient + gram(taken, self.misfit[rows]))
         return np.asarray(fitted + off @ off.T)
 
 
@@ -206,7 +206,7 @@ def stop_factors(
             cell.mount,
             flange,
             poses[seen],
-            floored_sigma_px(cell.pixel_px) ** 2 * covariance(found.information),
+            floored_sigma_px(cell.pixel_px) ** 2 * covariance_from(found.information),
             effects=[_effect(known, [found.by_shared[:, :, free.columns], elsewhere])],
         )
         arm = None if recorded is None else recorded.arm
@@ -222,14 +222,14 @@ def stop_factors(
 
 
 def place_sigmas(
-    cell: PlanCell, purpose: Purpose, spread: FloatArray, workspace: Box | None = None
+    cell: PlanCell, purpose: Purpose, covariance: FloatArray, workspace: Box | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """Predicts how surely the arm's places are known all over its workspace.
 
     Args:
         cell: The cell, taken as it is guessed to be.
         purpose: What is unknown; one that judges the workspace.
-        spread: (p, p) covariance of the unknowns, as `World.covariance` has it.
+        covariance: (p, p) covariance of the unknowns, as `World.covariance` has it.
         workspace: The part of it that counts; None for all.
 
     Returns:
@@ -237,22 +237,22 @@ def place_sigmas(
         as a whole, roots of the covariances' traces [m].
     """
     at = _inside(cell, workspace)
-    slopes = _workspace_slopes(cell, purpose, at)
-    arm = slopes.shape[2] - 12
-    rows = np.concatenate([np.arange(12), np.arange(len(spread) - arm, len(spread))])
-    inner = spread[np.ix_(rows, rows)]
+    jacobian = _workspace_jacobian(cell, purpose, at)
+    arm = jacobian.shape[2] - 12
+    rows = np.concatenate([np.arange(12), np.arange(len(covariance) - arm, len(covariance))])
+    inner = covariance[np.ix_(rows, rows)]
     carried = cell.robot.base_from_flange(at) @ (cell.x if cell.mount == "eye-in-hand" else cell.z)
-    return carried[:, :3, 3], np.sqrt(np.einsum("wij,jk,wik->w", slopes, inner, slopes))
+    return carried[:, :3, 3], np.sqrt(np.einsum("wij,jk,wik->w", jacobian, inner, jacobian))
 
 
-def stated(cell: PlanCell) -> Free:
+def stated(cell: PlanCell) -> LensBoardParameters:
     """Lens and board as they are stated, the board's size being open by as much as is stated."""
     positions = corner_positions(cell.target)
     shape = board_prior(cell.target)
     look = Appearance(cell.camera, np.zeros(len(shape)))
     # The places of a rig's points are taken for what its table says.
     sized = np.array([] if cell.target.kind == "points" else [SCALE], dtype=np.int64)
-    return Free(
+    return LensBoardParameters(
         look,
         shape_basis(cell.target),
         positions,
@@ -288,7 +288,7 @@ def _world(
     scale = np.ones(every)
     scale[:size] = inflation**-0.5
     factors, known = scale * factors, np.outer(scale, scale) * known
-    of_looks = np.sqrt(np.diag(covariance(shared))) if looks else np.zeros(0)
+    of_looks = np.sqrt(np.diag(covariance_from(shared))) if looks else np.zeros(0)
     units = np.concatenate([_EDGE_UNITS, of_looks, np.full(arm, sigma)])
     if purpose.judged == "sight":
         judged = _of_sight(cell, arm, q)
@@ -428,25 +428,25 @@ def _of_workspace(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """What counts of what the arm carries: its place seen from what stands still."""
     at = _inside(cell, workspace)
-    place = _mean_square(_workspace_slopes(cell, purpose, at))
-    turn = _mean_square(_arm_slopes(cell, purpose, at)[2][:, :3])
+    place = _mean_square(_workspace_jacobian(cell, purpose, at))
+    turn = _mean_square(_arm_jacobian(cell, purpose, at)[2][:, :3])
     return place, place, turn
 
 
-def _workspace_slopes(cell: PlanCell, purpose: Purpose, at: FloatArray) -> FloatArray:
+def _workspace_jacobian(cell: PlanCell, purpose: Purpose, at: FloatArray) -> FloatArray:
     """(w, 3, 12 + a) how the places of what the arm carries move with edges and arm."""
-    pair, poses, slopes = _arm_slopes(cell, purpose, at)
-    return pair.place_slopes(poses, slopes, corner_positions(cell.target).mean(axis=0))
+    pair, poses, jacobian = _arm_jacobian(cell, purpose, at)
+    return pair.place_jacobian(poses, jacobian, corner_positions(cell.target).mean(axis=0))
 
 
-def _arm_slopes(
+def _arm_jacobian(
     cell: PlanCell, purpose: Purpose, at: FloatArray
 ) -> tuple[ArmPair, FloatArray, FloatArray]:
     """The camera and the board, and their (w, 4, 4) poses with slopes (w, 6, 12 + a)."""
     model, flange = _model(cell.robot, purpose), cell.robot.base_from_flange(at)
     problem = chain(cell.mount, flange[:1], cell.cam_from_target(at[:1]))
     pair = ArmPair.of(problem, State(np.stack([cell.x, cell.z]), np.zeros(0)), problem.robots[0])
-    return pair, *pair.slopes(flange, model.basis(at))
+    return pair, *pair.jacobian(flange, model.basis(at))
 
 
 def _inside(cell: PlanCell, workspace: Box | None) -> FloatArray:
@@ -467,10 +467,10 @@ def _inside(cell: PlanCell, workspace: Box | None) -> FloatArray:
     return at[within][:_POSTURES]
 
 
-def _mean_square(slopes: FloatArray) -> FloatArray:
+def _mean_square(jacobian: FloatArray) -> FloatArray:
     """Mean over m of slopes^T slopes: (m, 3, p) to (p, p)."""
-    rows = slopes.reshape(-1, slopes.shape[2])
-    return np.asarray(rows.T @ rows / len(slopes))
+    rows = jacobian.reshape(-1, jacobian.shape[2])
+    return np.asarray(rows.T @ rows / len(jacobian))
 
 
 def _widened(square: FloatArray, looks: int) -> FloatArray:

@@ -159,8 +159,8 @@ def make_plan(
     stops = _stops(cell, request, found, world, chosen_stops, numbers, begun)
     map_m, map_sigma_m = np.zeros((0, 3)), np.zeros(0)
     if request.purpose.judged == "workspace" and not design.predicted.is_open:
-        spread = world.covariance(design.rows)
-        map_m, map_sigma_m = place_sigmas(cell, request.purpose, spread, request.workspace)
+        covariance = world.covariance(design.rows)
+        map_m, map_sigma_m = place_sigmas(cell, request.purpose, covariance, request.workspace)
     wish = request.wish
     return Plan(
         cell,

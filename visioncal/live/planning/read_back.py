@@ -126,7 +126,7 @@ def _cell(content: Mapping[str, Any]) -> PlanCell:
     }
     # A cell without a floor has none in its file either, where the default is the base's height.
     limits.setdefault("floor_m", None)
-    spread = guesses.get("covariance")
+    covariance = guesses.get("covariance")
     return PlanCell(
         cast("Mount", mount),
         Robot.from_document(content["robot"]),
@@ -143,7 +143,7 @@ def _cell(content: Mapping[str, Any]) -> PlanCell:
             Box(it["name"], _array(it["base_from_box"], (4, 4)), _array(it["size_m"], (3,)))
             for it in content["boxes"]
         ),
-        None if spread is None else _array(spread, (12, 12)),
+        None if covariance is None else _array(covariance, (12, 12)),
     )
 
 

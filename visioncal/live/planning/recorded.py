@@ -4,8 +4,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from visioncal.calibration.pipeline.observed_poses import Looked
-from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.observed_poses import ObservedPoses
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.solving import Solved
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.arms import RobotArm
@@ -16,7 +16,7 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import FloatArray, Mount, Progress
-from visioncal.estimation.appearance import Free
+from visioncal.estimation.appearance import LensBoardParameters
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.chain import robot_part
 from visioncal.estimation.linalg import covariance_among
@@ -80,7 +80,7 @@ class Begun:
 class SoFar:
     """What is known of a session, and why no more."""
 
-    known: Known
+    known: RunState
     refusal: str = field(default="")
 
 
@@ -95,7 +95,7 @@ def so_far(session: Session, *, level: str = "hand-eye", progress: Progress | No
     Raises:
         DataError: The input is wrong or shows no target.
     """
-    known = Known(session, progress, level=level)
+    known = RunState(session, progress, level=level)
     for at, stage in enumerate(STAGES):
         if progress is not None:
             progress(stage.name, at, len(STAGES))
@@ -134,8 +134,10 @@ def begin(
         raise _lacking(known)
     with one_blas_thread():
         told = _guessed(known, guess) if known.fit is None else _fitted(known, known.fit)
-        edges, spread = _nearest(told.problem, told.state, told.noise, known.session.mount, guess)
-    sigmas = np.sqrt(np.diag(spread).reshape(2, 2, 3).mean(axis=(0, 2)))
+        edges, covariance = _nearest(
+            told.problem, told.state, told.noise, known.session.mount, guess
+        )
+    sigmas = np.sqrt(np.diag(covariance).reshape(2, 2, 3).mean(axis=(0, 2)))
     if sigmas[0] > _TOO_VAGUE_RAD or sigmas[1] > _TOO_VAGUE_M:
         raise _too_vague(known, len(told.views))
     arm = told.arm
@@ -152,7 +154,7 @@ def begin(
         known.pixel_px,
         limits or Limits(),
         boxes,
-        spread,
+        covariance,
     )
     alike = () if known.answer is None else (it.alike for it in known.answer.misfits.values())
     recorded = Recorded(
@@ -185,13 +187,13 @@ class _Told:
     problem: Problem
     state: State
     noise: Noise
-    free: Free
+    free: LensBoardParameters
     arm: RobotArm
     board: int
     views: tuple[int, ...]
 
 
-def _fitted(known: Known, solved: Solved) -> _Told:
+def _fitted(known: RunState, solved: Solved) -> _Told:
     """What the fit of a session tells, even where that leaves a direction open."""
     if solved.seen is None:
         raise _lacking(known)
@@ -225,9 +227,9 @@ def _fitted(known: Known, solved: Solved) -> _Told:
     )
 
 
-def _guessed(known: Known, guess: Guess | None) -> _Told:
+def _guessed(known: RunState, guess: Guess | None) -> _Told:
     """What stops tell that are too few for a fit, beside a guess."""
-    looked = Looked.of(known)
+    looked = ObservedPoses.of(known)
     views = [it for it in known.poses if it in known.base_from_flange and it not in known.held_back]
     if guess is None or not views:
         raise _too_vague(known, len(views))
@@ -284,8 +286,10 @@ def _nearest(
         # What is shared has settled before; it may follow, but it does not move.
         step[6 * len(state.edges) :] = 0.0
         state = state.moved(step)
-    spread = covariance_among(fisher_information(problem, state, noise) + weights, problem.counted)
-    return state.edges, spread[:12, :12]
+    covariance = covariance_among(
+        fisher_information(problem, state, noise) + weights, problem.counted
+    )
+    return state.edges, covariance[:12, :12]
 
 
 def _weights(mount: Mount, guess: Guess | None) -> FloatArray:
@@ -304,7 +308,7 @@ def _away(edges: FloatArray, guess: Guess | None) -> FloatArray:
     return np.concatenate([np.zeros(3), local[0], np.zeros(3), local[1]])
 
 
-def _lacking(known: Known) -> DataError:
+def _lacking(known: RunState) -> DataError:
     session, missing = known.session, []
     if known.robot is None:
         missing.append("a model of its robot ([robot] model)")
@@ -321,7 +325,7 @@ def _lacking(known: Known) -> DataError:
     )
 
 
-def _too_vague(known: Known, stops: int) -> DataError:
+def _too_vague(known: RunState, stops: int) -> DataError:
     return DataError(
         f"session {known.session.name!r}: its {stops} usable stop{'s' if stops != 1 else ''} "
         "of the robot do not tell where camera and board are, not even roughly.",

@@ -52,9 +52,9 @@ class Variance:
     roots: FloatArray
     rest: float
 
-    def of(self, spread: FloatArray) -> float:
+    def of(self, covariance: FloatArray) -> float:
         """The variance with an (r, r) covariance."""
-        return float(np.sum((self.roots @ spread) * self.roots)) + self.rest
+        return float(np.sum((self.roots @ covariance) * self.roots)) + self.rest
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class Reduced:
         watched: (r, r) of edges and arm in their units, as far as the candidates tell them well;
             the largest variance among them counts for E.
         misfit: (k, 6, a) and
-        pull: (r, a) by errors of the arm that a fit takes for noise; see `World`.
+        gradient: (r, a) by errors of the arm that a fit takes for noise; see `World`.
     """
 
     factors: FloatArray
@@ -82,7 +82,7 @@ class Reduced:
     told: FloatArray
     watched: FloatArray
     misfit: FloatArray
-    pull: FloatArray
+    gradient: FloatArray
 
 
 def reduced(world: World, criterion: Criterion) -> Reduced:
@@ -118,7 +118,7 @@ def reduced(world: World, criterion: Criterion) -> Reduced:
         np.eye(len(share))[:, share > _LEAST_SHARE**2 * share.max(initial=0.0)],
         watched,
         world.misfit,
-        basis.T @ (out.T @ world.pull),
+        basis.T @ (out.T @ world.gradient),
     )
 
 
@@ -150,7 +150,7 @@ class Selection:
     @classmethod
     def of(cls, problem: tuple[Reduced, ...], criterion: Criterion) -> "Selection":
         """No candidates, but what is recorded."""
-        starts, pulls = ((it.start for it in problem), (it.pull for it in problem))
+        starts, pulls = ((it.start for it in problem), (it.gradient for it in problem))
         return cls(problem, criterion, (), tuple(starts), tuple(pulls))
 
     @cached_property
@@ -194,15 +194,15 @@ class Selection:
         """What is minimised: a mean variance over the worlds, above zero."""
         return float(np.mean([self._value(*it) for it in self._worlds()]))
 
-    def _value(self, world: Reduced, spread: FloatArray) -> float:
+    def _value(self, world: Reduced, covariance: FloatArray) -> float:
         if self.criterion in ("I", "A"):
-            return world.counted.of(spread)
+            return world.counted.of(covariance)
         if self.criterion == "E":
-            return float(np.linalg.eigvalsh(_watched(world, spread)).max(initial=0.0))
-        return float(np.exp(np.linalg.slogdet(spread)[1] / max(len(spread), 1)))
+            return float(np.linalg.eigvalsh(_watched(world, covariance)).max(initial=0.0))
+        return float(np.exp(np.linalg.slogdet(covariance)[1] / max(len(covariance), 1)))
 
     def _worlds(self) -> Iterator[tuple[Reduced, FloatArray]]:
-        answers = (it @ pull for it, pull in zip(self.spreads, self.pulls, strict=True))
+        answers = (it @ gradient for it, gradient in zip(self.spreads, self.pulls, strict=True))
         totals = (it + off @ off.T for it, off in zip(self.spreads, answers, strict=True))
         return zip(self.problem, totals, strict=True)
 
@@ -227,8 +227,8 @@ class Selection:
     @property
     def accuracy(self) -> Accuracy:
         """What is predicted."""
-        place = np.mean([world.place.of(spread) for world, spread in self._worlds()])
-        turn = np.mean([world.turn.of(spread) for world, spread in self._worlds()])
+        place = np.mean([world.place.of(covariance) for world, covariance in self._worlds()])
+        turn = np.mean([world.turn.of(covariance) for world, covariance in self._worlds()])
         return Accuracy(1e3 * float(np.sqrt(place)), float(np.rad2deg(np.sqrt(turn))))
 
     def best_to_add(self) -> int:
@@ -252,26 +252,26 @@ class Selection:
         return promising[int(np.argmin(values))]
 
     def _gains(
-        self, world: Reduced, spread: FloatArray, rows: list[int], sign: float
+        self, world: Reduced, covariance: FloatArray, rows: list[int], sign: float
     ) -> FloatArray:
         """How much smaller the value would be with each of (k,) rows more, or less."""
         factors = world.factors[rows]
-        carried = factors @ spread
+        carried = factors @ covariance
         changed = np.eye(6) + sign * carried @ np.swapaxes(factors, 1, 2)
         if self.criterion in ("D", "O1"):
             return np.asarray(np.linalg.slogdet(changed)[1])
-        roots = world.counted.roots if self.criterion != "E" else _peak(world, spread)
+        roots = world.counted.roots if self.criterion != "E" else _peak(world, covariance)
         moved = carried @ roots.T
         squares = moved @ np.swapaxes(moved, 1, 2)
         return np.asarray(sign * np.trace(np.linalg.solve(changed, squares), axis1=1, axis2=2))
 
 
-def _watched(world: Reduced, spread: FloatArray) -> FloatArray:
-    return np.asarray(world.watched @ spread @ world.watched.T)
+def _watched(world: Reduced, covariance: FloatArray) -> FloatArray:
+    return np.asarray(world.watched @ covariance @ world.watched.T)
 
 
-def _peak(world: Reduced, spread: FloatArray) -> FloatArray:
+def _peak(world: Reduced, covariance: FloatArray) -> FloatArray:
     """(r, r) roots of the slope of the mean of a high power of the variances."""
-    values, vectors = np.linalg.eigh(_watched(world, spread))
+    values, vectors = np.linalg.eigh(_watched(world, covariance))
     weights = (np.maximum(values, 0.0) / values[-1]) ** (_POWER - 1)
     return np.asarray(np.sqrt(weights)[:, None] * (vectors.T @ world.watched))

@@ -208,8 +208,8 @@ def _cell_document(cell: PlanCell) -> dict[str, Any]:
         "limits": _limits_document(cell.limits),
         "boxes": [_box_document(it) for it in cell.boxes],
     }
-    if cell.spread is not None:
-        document["guesses"]["covariance"] = cell.spread.tolist()
+    if cell.covariance is not None:
+        document["guesses"]["covariance"] = cell.covariance.tolist()
     return document
 
 

@@ -15,7 +15,7 @@ from visioncal.live.rehearsal.camera import Fault as CameraFault
 from visioncal.live.rehearsal.truth import Fault, TruthClient
 
 # What can be rehearsed; the last two befall the camera, at a stop.
-Trouble: TypeAlias = Literal[
+Faults: TypeAlias = Literal[
     "protective-stop",
     "emergency-stop",
     "remote-off",
@@ -59,7 +59,7 @@ class Befalling:
         q: (n,) where the arm was then [rad]; empty before.
     """
 
-    def __init__(self, bench: Bench, fault: Trouble, after: int) -> None:
+    def __init__(self, bench: Bench, fault: Faults, after: int) -> None:
         self._bench, self._fault, self._after = bench, fault, after
         self.befell_s: float | None = None
         self.q: FloatArray = np.zeros(0)

@@ -79,8 +79,8 @@ class CellScene:
             for it, on in self.found.frames.items()
             if on == paths.CELL_FRAME
         ]
-        spread = np.ptp(np.array([np.zeros(3), *places]), axis=0)
-        return max(float(np.linalg.norm(spread)), 0.5)
+        extent = np.ptp(np.array([np.zeros(3), *places]), axis=0)
+        return max(float(np.linalg.norm(extent)), 0.5)
 
     def flange(self, frame: str, view: int) -> FloatArray | None:
         """(4, 4) `base_from_flange` at the stop of a view; None where nothing tells it."""

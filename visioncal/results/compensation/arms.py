@@ -79,8 +79,8 @@ class CalibratedArm:
         Returns:
             (m, n) degrees a millimetre, large near singular postures; zero for a prismatic joint.
         """
-        joints_by_flange = np.linalg.pinv(self.real.joint_jacobian(q))
-        turns = np.linalg.norm(joints_by_flange[:, :, 3:], axis=2)
+        joints_flange_jacobian = np.linalg.pinv(self.real.joint_jacobian(q))
+        turns = np.linalg.norm(joints_flange_jacobian[:, :, 3:], axis=2)
         return np.where(self.real.chain.prismatic, 0.0, 1e-3 * np.rad2deg(turns))
 
 

@@ -56,13 +56,13 @@ class _Sample:
         rest: (n,) where they would come to rest [deg C].
         driven: (n,) what of that is by motor currents [K].
         links: (n,) what they have [deg C].
-        slopes: (n, s) how that moves with the heating's parameters; see `Heating.slopes`.
+        jacobian: (n, s) how that moves with the heating's parameters; see `Heating.jacobian`.
     """
 
     rest: FloatArray
     driven: FloatArray
     links: FloatArray
-    slopes: FloatArray
+    jacobian: FloatArray
 
 
 class OnlineCompensator:
@@ -135,8 +135,8 @@ class OnlineCompensator:
         mean = 0.5 * (rest + last.rest)
         by = 0.5 * (driven + last.driven)
         links = heating.step(last.links, mean, seconds)
-        slopes = heating.step_slopes(last.slopes, last.links, mean, by, seconds)
-        return _Sample(rest, driven, links, slopes)
+        jacobian = heating.step_jacobian(last.jacobian, last.links, mean, by, seconds)
+        return _Sample(rest, driven, links, jacobian)
 
     @property
     def links_c(self) -> FloatArray:
@@ -169,8 +169,8 @@ class OnlineCompensator:
             DataError: Nothing was fed yet.
         """
         now = self._now
-        slopes = np.broadcast_to(now.slopes, (len(q), *now.slopes.shape))
-        return self._model.sigma_m(q, now.links, slopes)
+        jacobian = np.broadcast_to(now.jacobian, (len(q), *now.jacobian.shape))
+        return self._model.sigma_m(q, now.links, jacobian)
 
     def advice(self, q: FloatArray, limit_um_min: float) -> Advice:
         """Says whether the arm is warm enough to work, and else how long to wait.
@@ -188,10 +188,10 @@ class OnlineCompensator:
         if found is None:
             return Advice(None, limit_um_min, None)
         speeds, tau_s = found
-        slopes = 1e6 * _MINUTES * self._model.slopes(q[None])[0, 3:]
+        jacobian = 1e6 * _MINUTES * self._model.jacobian(q[None])[0, 3:]
         ahead = np.arange(0.0, _AHEAD_S, _EVERY_S)
         speeds = speeds * np.exp(-ahead[:, None] / tau_s)
-        rates = np.linalg.norm(speeds @ slopes.T, axis=1)
+        rates = np.linalg.norm(speeds @ jacobian.T, axis=1)
         over = np.flatnonzero(rates >= limit_um_min)
         if not len(over):
             wait = 0.0

@@ -85,9 +85,9 @@ class Heating:
         """(n,) temperatures some time after others, under a constant rest [deg C]."""
         return np.asarray(rest + np.exp(-seconds / self.tau_s) * (before - rest))
 
-    def step_slopes(
+    def step_jacobian(
         self,
-        slopes: FloatArray,
+        jacobian: FloatArray,
         before: FloatArray,
         rest: FloatArray,
         driven: FloatArray,
@@ -96,7 +96,7 @@ class Heating:
         """How temperatures some time after others move with the parameters.
 
         Args:
-            slopes: (n, s) how they moved with them before, as `slopes` has them.
+            jacobian: (n, s) how they moved with them before, as `jacobian` has them.
             before: (n,) what they were [deg C].
             rest: (n,) where they would come to rest [deg C].
             driven: (n,) what of that is by motor currents [K].
@@ -107,7 +107,7 @@ class Heating:
         """
         share = seconds / self.tau_s
         kept = np.exp(-share)
-        after = kept[:, None] * slopes
+        after = kept[:, None] * jacobian
         after[:, 0] += kept * share * (before - rest)
         if self.kind == "currents":
             after[:, 1] += (1.0 - kept) * driven
@@ -117,7 +117,7 @@ class Heating:
         """(m, n) temperatures of the links at some times [deg C]."""
         return self._at(inputs, at_s, self._course(inputs)[0])
 
-    def slopes(self, inputs: Inputs, at_s: FloatArray) -> FloatArray:
+    def jacobian(self, inputs: Inputs, at_s: FloatArray) -> FloatArray:
         """How the temperatures move with the parameters.
 
         Returns:

@@ -109,7 +109,7 @@ class ThermalModel:
         turned = self.robot.function_jacobian(q).reshape(len(q), 6, count, 4)[..., 0]
         return np.asarray(grown), np.asarray(turned)
 
-    def slopes(self, q: FloatArray) -> FloatArray:
+    def jacobian(self, q: FloatArray) -> FloatArray:
         """(m, 6, n) how the flange moves with the temperature of each link [rad and m for 1 K]."""
         grown, turned = self.columns(q)
         return np.asarray(grown * self.growth_per_k + turned * self.drift_rad_per_k)
@@ -117,7 +117,7 @@ class ThermalModel:
     def motion(self, q: FloatArray, links_c: FloatArray) -> FloatArray:
         """(m, 4, 4) how the flange has moved from the reference, in its own frame."""
         rises = self.rises(links_c)
-        return exp(np.einsum("mij,mj->mi", self.slopes(q), np.broadcast_to(rises, q.shape)))
+        return exp(np.einsum("mij,mj->mi", self.jacobian(q), np.broadcast_to(rises, q.shape)))
 
     def base_from_flange(self, q: FloatArray, links_c: FloatArray) -> FloatArray:
         """Where the flange stands.
@@ -149,13 +149,13 @@ class ThermalModel:
             q: (m, n) joint angles [rad].
             links_c: (m, n) temperatures of the links [deg C].
             heated: (m, n, k) how these move with the k kinds of the heating's parameters
-                (`Heating.slopes`).
+                (`Heating.jacobian`).
 
         Returns:
             (m, 6, p) right perturbations.
         """
         grown, turned = self.columns(q)
-        rises, by_link = self.rises(links_c)[:, None, :], self.slopes(q)
+        rises, by_link = self.rises(links_c)[:, None, :], self.jacobian(q)
         parts = [by_link * heated[:, None, :, at] for at in range(heated.shape[2])]
         return np.concatenate([grown * rises, turned * rises, *parts], axis=2)
 
@@ -177,8 +177,8 @@ class ThermalModel:
         none = np.zeros((*q.shape, 0))
         moved = self.basis(q, links_c, none if heated is None else heated)[:, 3:]
         size = moved.shape[2]
-        spread = moved @ self.covariance[:size, :size] @ np.swapaxes(moved, 1, 2)
-        return np.asarray(np.sqrt(np.trace(spread, axis1=1, axis2=2)))
+        covariance = moved @ self.covariance[:size, :size] @ np.swapaxes(moved, 1, 2)
+        return np.asarray(np.sqrt(np.trace(covariance, axis1=1, axis2=2)))
 
     def rises(self, links_c: FloatArray) -> FloatArray:
         """How much warmer than at the reference links are [K].

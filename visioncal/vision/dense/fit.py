@@ -146,18 +146,18 @@ def fit_corners(
             pixels = smooth(pixels[None, None], (_TAPS, _TAPS), (smooth_px, smooth_px))[0, 0]
         scene = _Scene(pixels, Print.of(target), board, smooth_px)
         best = _started(scene, px, widths_px)
-        found, good, slopes = px, np.ones(len(px), bool), np.zeros((len(px), 2, 2))
+        found, good, jacobian = px, np.ones(len(px), bool), np.zeros((len(px), 2, 2))
         for _ in range(_PASSES):
             reach = Blur.of(best[:4]).reach_px
-            patches = _Patches.cut(scene, found, good, np.arange(len(px)), reach, slopes)
+            patches = _Patches.cut(scene, found, good, np.arange(len(px)), reach, jacobian)
             sample = _spread(good, _BLUR_SAMPLE)
             best = _searched(patches.at(sample), best, _BLUR_TURNS)[0]
             shift, sums = _settled(patches, best)
-            lit = replace(patches, slopes=_light(patches, sums, good))
+            lit = replace(patches, jacobian=_light(patches, sums, good))
             tried, tried_sums = _settled(lit, best, shift)
             is_lit = tried_sums.cost(good) < _LIT * sums.cost(good)
             if is_lit:
-                patches, shift, sums, slopes = lit, tried, tried_sums, lit.slopes
+                patches, shift, sums, jacobian = lit, tried, tried_sums, lit.jacobian
             moved = found + shift
             good = _good(patches, sums, moved - px)
             found = np.where(good[:, None], moved, px)
@@ -199,7 +199,7 @@ class _Patches:
         grey: (n, w, w) the image, less 128.
         weights: (n, w, w) 1 for pixels that count, 0 for others.
         off: (n, 2, w) places of columns and rows from the corner [px].
-        slopes: (n, 2, 2) derivatives of offset and contrast by u and v [grey levels a pixel].
+        jacobian: (n, 2, 2) derivatives of offset and contrast by u and v [grey levels a pixel].
         inside: (n,) the share of a patch that is inside the image.
     """
 
@@ -210,7 +210,7 @@ class _Patches:
     grey: "Tensor"
     weights: "Tensor"
     off: "Tensor"
-    slopes: FloatArray
+    jacobian: FloatArray
     inside: FloatArray
 
     @classmethod
@@ -221,7 +221,7 @@ class _Patches:
         good: Mask,
         chosen: IntArray,
         blur_px: float,
-        slopes: FloatArray,
+        jacobian: FloatArray,
     ) -> Self:
         """Cuts the patches of the chosen ones among corners, whose good ones make the maps."""
         torch = library("torch")
@@ -240,15 +240,15 @@ class _Patches:
         centre = np.rint(start).astype(int)
         # A map is smooth: quartics through 5 x 5 of its values are as good as all.
         nodes = np.cos(np.pi * (np.arange(5) + 0.5) / 5)
-        spread = np.vander(2 * places / size, 5) @ np.linalg.inv(np.vander(nodes, 5))
+        covariance = np.vander(2 * places / size, 5) @ np.linalg.inv(np.vander(nodes, 5))
         grid = np.stack(np.meshgrid(nodes, nodes), axis=-1).reshape(-1, 2) * size / 2
         values = on_board(centre[:, None] + grid).reshape(-1, 5, 5, 2)
 
         def tensor(array: npt.NDArray[Any]) -> "Tensor":
             return torch.as_tensor(array, dtype=torch.float32, device=scene.pixels.device)
 
-        spread, corners = tensor(spread), tensor(scene.board[chosen])
-        x, y = (spread @ tensor(values[..., axis]) @ spread.T for axis in (0, 1))
+        covariance, corners = tensor(covariance), tensor(scene.board[chosen])
+        x, y = (covariance @ tensor(values[..., axis]) @ covariance.T for axis in (0, 1))
         widths = tensor(DRAWN_PX * np.linalg.norm(normals, axis=2))[:, :, None, None]
         board_x, board_y = (it + corners[:, axis, None, None] for axis, it in enumerate((x, y)))
         drawn = scene.printed.drawn(board_x, board_y, widths[:, 0], widths[:, 1])
@@ -287,7 +287,7 @@ class _Patches:
             grey - 128.0,
             weights.to(torch.float32),
             tensor(off),
-            slopes[chosen],
+            jacobian[chosen],
             np.asarray(share, float),
         )
 
@@ -337,8 +337,8 @@ class _Patches:
         light = found[:, 0]
         toned = light + q * light * (1.0 - light)
         found[:, 1:] *= (1.0 + q * (1.0 - 2.0 * light))[:, None]
-        slopes = torch.as_tensor(self.slopes, dtype=torch.float32, device=self.grey.device)
-        plane = torch.einsum("nlk,nkw->nlkw", slopes, self.off)
+        jacobian = torch.as_tensor(self.jacobian, dtype=torch.float32, device=self.grey.device)
+        plane = torch.einsum("nlk,nkw->nlkw", jacobian, self.off)
         offset, gain = (plane[:, it, 0, None, :] + plane[:, it, 1, :, None] for it in (0, 1))
         parts = [torch.ones_like(light), toned, found[:, 1], found[:, 2]]
         if blurs:
@@ -529,7 +529,7 @@ def _light(patches: _Patches, sums: _Sums, good: Mask) -> FloatArray:
     """(n, 2, 2) slopes of offset and contrast, by a quadratic surface over the image."""
     good = good & _alike(sums.misfit)
     if good.sum() < _FEWEST_LIT:
-        return np.zeros_like(patches.slopes)
+        return np.zeros_like(patches.jacobian)
     middle = patches.px.mean(axis=0)
     scale = float(np.abs(patches.px - middle).max())
     u, v = ((patches.px - middle) / scale).T

@@ -179,15 +179,15 @@ def _blobs(image: Image) -> _Blobs:
         area = of["m00"]
         if area < _LEAST_AREA:
             continue
-        spread = np.array([[of["mu20"], of["mu11"]], [of["mu11"], of["mu02"]]]) / area
-        ellipse = 4.0 * np.pi * np.sqrt(max(np.linalg.det(spread), 0.0))
+        covariance = np.array([[of["mu20"], of["mu11"]], [of["mu11"], of["mu02"]]]) / area
+        ellipse = 4.0 * np.pi * np.sqrt(max(np.linalg.det(covariance), 0.0))
         if area < _FILL * ellipse or ellipse <= 0.0:
             continue
         fills.append(area / ellipse)
         middles.append((of["m10"] / area, of["m01"] / area))
         # A contour runs through the outermost dark pixels' centres, half a pixel inside the edge.
         radius = np.sqrt(area / np.pi)
-        moments.append(((radius + 0.5) / radius) ** 2 * spread)
+        moments.append(((radius + 0.5) / radius) ** 2 * covariance)
     found = _Blobs(np.reshape(middles, (-1, 2)), np.reshape(moments, (-1, 2, 2)), np.array(fills))
     # What is larger than its surroundings has an edge inside too, not far from the outer one.
     found = found.at(np.argsort(-found.diameters, kind="stable"))

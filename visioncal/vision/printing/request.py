@@ -112,13 +112,13 @@ def _target(request: Request, square_mm: float) -> Target:
     document |= {"size_m" if of_tags else "square_m": side_m}
     if of_tags:
         document |= {"dictionary": request.dictionary or APRILGRID_DICTIONARY}
-    wishes: dict[str, float | None] = {"id": request.marker_id} if of_tags else {}
+    requested: dict[str, float | None] = {"id": request.marker_id} if of_tags else {}
     if request.kind != "marker":
-        wishes |= {"columns": request.columns, "rows": request.rows}
+        requested |= {"columns": request.columns, "rows": request.rows}
     if request.kind == "aprilgrid":
         spacing = _SPACING if request.spacing is None else request.spacing
-        wishes |= {"spacing": spacing, "border": request.border}
-    document |= {key: value for key, value in wishes.items() if value is not None}
+        requested |= {"spacing": spacing, "border": request.border}
+    document |= {key: value for key, value in requested.items() if value is not None}
     if request.kind == "circles":
         share = _DIAMETER_SHARE * (1.4 if request.asymmetric else 1.0)
         diameter_mm = round(share * square_mm, 6)
