@@ -17,6 +17,7 @@ def test_a_wheel_carries_its_data_and_finds_it(tmp_path):
         archive.extractall(site)
         names = archive.namelist()
     assert not [name for name in names if name.startswith(("tests/", "targets/"))]
+    assert not [name for name in names if name.endswith(".md")]
     code = (
         "import visioncal.vision.targets as t, visioncal.robot as r, visioncal.present.report;"
         "target, _ = t.load_target('charuco_9x6_30mm', None);"

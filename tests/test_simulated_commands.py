@@ -1,4 +1,4 @@
-"""What `simulate` writes is what each command of the README reads; its truth is what they find."""
+"""What `simulate` writes is what each command reads; its truth is what they find."""
 
 import json
 from dataclasses import asdict
@@ -326,9 +326,9 @@ def test_a_sweep_comes_after_what_was_pushed(place):
     assert len(away) > 10
 
 
-def test_the_readmes_cell_can_be_made(tmp_path):
-    readme = Path(__file__).parents[1].joinpath("README.md").read_text(encoding="utf-8")
-    (shown,) = [it for it in readme.split("```toml")[1:] if "[[moved]]" in it]
+def test_the_page_s_cell_can_be_made(tmp_path):
+    page = Path(__file__).parents[1].joinpath("visioncal/simulation/README.md")
+    (shown,) = [it for it in page.read_text("utf-8").split("```toml")[1:] if "[[moved]]" in it]
     (tmp_path / "cell.toml").write_text(shown.partition("```")[0])
     cell = simulate_network(read_cell(str(tmp_path / "cell.toml")))
     assert cell.sights

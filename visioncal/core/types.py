@@ -50,7 +50,7 @@ class Need:
 class Target:
     """A printed target or a rig of known points, as its `.toml` declares it.
 
-    Its frame is defined in the README; that of a rig is the one that its table is in.
+    Its frame is defined in core/README.md; that of a rig is the one that its table is in.
 
     Attributes:
         name: The name under which a session asks for it.

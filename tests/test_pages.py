@@ -1,0 +1,204 @@
+"""The pages are true of the program: their links, commands, names, paths and quotations."""
+
+import re
+import shlex
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+import typer
+from recipes import BLOCK, FOLDER
+
+import visioncal
+from visioncal.cli.app import app
+
+ROOT = Path(__file__).parents[1]
+FRONT = ROOT / "README.md"
+PACKAGES = sorted(it.parent for it in (ROOT / "visioncal").glob("*/__init__.py"))
+PAGES = [
+    FRONT,
+    ROOT / "visioncal" / "README.md",
+    *(it / "README.md" for it in PACKAGES),
+    *sorted(FOLDER.glob("*.md")),
+]
+every_page = pytest.mark.parametrize("page", PAGES, ids=lambda it: str(it.relative_to(ROOT)))
+
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+# An indented line after an empty one, or within an indented block, is code.
+INDENTED = re.compile(r"(?:^ {4,}\S.*\n)+", re.MULTILINE)
+SPAN = re.compile(r"`([^`]+)`")
+# Where a command of ours begins, and where the shell's business begins again.
+COMMAND = re.compile(r"(?:^|\$ |&& )visioncal (.*)")
+SHELL = re.compile(r" (?:\|\||&&|\||>\S*)(?: |$)")
+
+
+def text_of(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
+
+
+@cache
+def code_of(page: Path) -> tuple[str, ...]:
+    """The blocks of code of a page, fenced ones and indented ones."""
+    text = text_of(page)
+    fenced = re.findall(r"^ *```.*?\n(.*?)^ *```", text, re.MULTILINE | re.DOTALL)
+    plain = re.sub(r"^ *```.*?^ *```", "", text, flags=re.MULTILINE | re.DOTALL)
+    return (*fenced, *INDENTED.findall(plain))
+
+
+@cache
+def spans_of(page: Path) -> tuple[str, ...]:
+    """What a page has between single backticks, line breaks taken out."""
+    plain = re.sub(r"^ *```.*?^ *```", "", text_of(page), flags=re.MULTILINE | re.DOTALL)
+    return tuple(" ".join(it.split()) for it in SPAN.findall(INDENTED.sub("", plain)))
+
+
+def anchors(page: Path) -> set[str]:
+    """Names of a page's headings, as links call them."""
+    heads = re.findall(r"^#+ (.*)$", text_of(page), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", it.lower()).replace(" ", "-") for it in heads}
+
+
+def words_of(line: str) -> list[str]:
+    return [it for it in shlex.split(SHELL.split(line)[0], comments=True) if it != "..."]
+
+
+@cache
+def commands_of(page: Path) -> tuple[tuple[str, ...], ...]:
+    """The words of each command line in the code of a page."""
+    lines = "\n".join(code_of(page)).replace("\\\n", " ").splitlines()
+    found = [COMMAND.search(it.strip()) for it in lines]
+    return tuple(tuple(words_of(it[1])) for it in found if it)
+
+
+@cache
+def mentions_of(page: Path) -> tuple[tuple[str, ...], ...]:
+    """The words of each command that a page has in its sentences."""
+    found = [COMMAND.match(it) for it in spans_of(page)]
+    return tuple(tuple(words_of(it[1])) for it in found if it)
+
+
+def command_of(words: tuple[str, ...]) -> tuple[typer.core.TyperCommand, list[str], str]:
+    """The command that words begin with, what follows, and its name."""
+    command, left, name = typer.main.get_command(app), list(words), []
+    while hasattr(command, "commands"):
+        assert left, f"visioncal {' '.join(words)} names no command"
+        assert left[0] in command.commands, f"visioncal has no command {' '.join(words)}"
+        command = command.commands[left[0]]
+        name.append(left.pop(0))
+    return command, left, " ".join(name)
+
+
+def parse(words: tuple[str, ...], *, whole: bool) -> None:
+    """Parses a command line without running it.
+
+    Args:
+        words: What follows `visioncal`.
+        whole: Whether it is complete: values are converted, and what is required has to be there.
+            Else its options alone are looked at.
+    """
+    command, left, name = command_of(words)
+    try:
+        if whole:
+            command.make_context(name, left)
+            return
+        _, rest, _ = command.make_parser(command.context_class(command)).parse_args(left)
+    except Exception as error:  # typer's, whose module differs between its versions
+        raise AssertionError(f"visioncal {' '.join(words)}: {error}") from error
+    assert not rest, f"visioncal {' '.join(words)}: {rest}"
+
+
+@every_page
+def test_links_lead_somewhere(page):
+    for link in LINK.findall(text_of(page)):
+        if link.startswith("http"):
+            continue
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        assert target.exists(), f"{page}: {link}"
+        assert not anchor or anchor in anchors(target), f"{page}: {link}"
+
+
+@every_page
+def test_commands_can_be_typed(page):
+    for words in commands_of(page):
+        parse(words, whole=True)
+    for words in mentions_of(page):
+        if words[0] != "COMMAND":
+            parse(words, whole=False)
+
+
+@every_page
+def test_what_a_page_names_is_there(page):
+    for name in spans_of(page):
+        if re.fullmatch(r"visioncal(\.\w+)+", name):
+            assert found(name), f"{page}: {name}"
+        elif re.fullmatch(r"[\w/]+/\w+\.py", name):
+            assert any((it / name).is_file() for it in (ROOT, ROOT / "visioncal")), (
+                f"{page}: {name}"
+            )
+    for block in code_of(page):
+        for name in re.findall(r"(?<!from )\bvisioncal\.([A-Za-z]\w+)\(", block):
+            assert hasattr(visioncal, name), f"{page}: visioncal.{name}"
+
+
+def found(name: str) -> bool:
+    """Whether a dotted name is a module, or something in one."""
+    try:
+        import_module(name)
+    except ModuleNotFoundError:
+        module, _, last = name.rpartition(".")
+        return hasattr(import_module(module), last)
+    return True
+
+
+def test_every_command_is_on_a_page():
+    words = [it for page in PAGES for it in (*commands_of(page), *mentions_of(page))]
+    named = {command_of(it)[2] for it in words if it[0] != "COMMAND"}
+
+    def leaves(command, name):
+        if not hasattr(command, "commands"):
+            return {name}
+        inner = command.commands.items()
+        return {leaf for key, it in inner for leaf in leaves(it, f"{name} {key}".strip())}
+
+    assert leaves(typer.main.get_command(app), "") == named
+
+
+def test_the_front_page_is_short():
+    assert len(text_of(FRONT).splitlines()) <= 260
+
+
+def test_the_front_page_shows_what_recipes_print():
+    """Recipes are run; see test_cookbook."""
+    expected = [
+        " ".join(text.split())
+        for page in FOLDER.glob("*.md")
+        for language, _, text in BLOCK.findall(text_of(page))
+        if language == "expect"
+    ]
+    shown = [
+        " ".join(text.split())
+        for language, _, text in BLOCK.findall(text_of(FRONT))
+        if language == "text"
+    ]
+    assert len(shown) >= 7
+    for it in shown:
+        assert any(it in text for text in expected), it
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "calibrate session --neeed-mm 0.3",
+        "calibrate",
+        "correct targets.csv",
+        "simulate folder --board chess",
+        "simulate folder --views many",
+        "calibate session",
+        "export out --to ros extra",
+    ],
+)
+def test_a_wrong_command_line_is_noticed(words):
+    with pytest.raises(AssertionError, match="visioncal"):
+        parse(tuple(words.split()), whole=True)
