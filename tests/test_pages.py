@@ -11,6 +11,7 @@ import typer
 from recipes import BLOCK, FOLDER
 
 import visioncal
+from visioncal import dynamics
 from visioncal.cli.app import app
 
 ROOT = Path(__file__).parents[1]
@@ -140,6 +141,11 @@ def test_what_a_page_names_is_there(page):
     for block in code_of(page):
         for name in re.findall(r"(?<!from )\bvisioncal\.([A-Za-z]\w+)\(", block):
             assert hasattr(visioncal, name), f"{page}: visioncal.{name}"
+    for kind, name in re.findall(r"\b([A-Z][a-z]\w+)\.([a-z]\w+)", text_of(page)):
+        if known := getattr(visioncal, kind, None) or getattr(dynamics, kind, None):
+            assert name in dir(known) or name in known.__dataclass_fields__, (
+                f"{page}: {kind}.{name}"
+            )
 
 
 def found(name: str) -> bool:
@@ -152,17 +158,26 @@ def found(name: str) -> bool:
     return True
 
 
-def test_every_command_is_on_a_page():
+def test_every_command_and_option_is_on_a_page():
+    text = "\n".join(map(text_of, PAGES))
     words = [it for page in PAGES for it in (*commands_of(page), *mentions_of(page))]
     named = {command_of(it)[2] for it in words if it[0] != "COMMAND"}
+    for name, command in leaves(typer.main.get_command(app), ""):
+        assert name in named, f"no page has visioncal {name}"
+        for it in command.params:
+            flags = [*it.opts, *it.secondary_opts]
+            assert flags == [it.name] or any(
+                re.search(rf"(?<![\w-]){flag}(?![\w-])", text) for flag in flags
+            ), f"no page has {flags} of visioncal {name}"
 
-    def leaves(command, name):
-        if not hasattr(command, "commands"):
-            return {name}
-        inner = command.commands.items()
-        return {leaf for key, it in inner for leaf in leaves(it, f"{name} {key}".strip())}
 
-    assert leaves(typer.main.get_command(app), "") == named
+def leaves(command, name):
+    """The commands of a group and of its groups, each with its name."""
+    if not hasattr(command, "commands"):
+        yield name, command
+        return
+    for key, it in command.commands.items():
+        yield from leaves(it, f"{name} {key}".strip())
 
 
 def test_the_front_page_is_short():
