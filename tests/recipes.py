@@ -1,4 +1,4 @@
-"""Reads the cookbook's pages, and runs one in the current folder as its reader would."""
+"""Reads pages, and runs what they show in the current folder as their readers would."""
 
 import re
 import shlex
@@ -65,6 +65,15 @@ def run(page: Path) -> None:
             Path(block.name).parent.mkdir(parents=True, exist_ok=True)
             Path(block.name).write_text(block.text, encoding="utf-8")
     assert status == 0, f"{page.name}, at its end: {said}"
+
+
+def run_example(text: str, page: str) -> None:
+    """Runs a block of lines `$ visioncal ...`, each with what it prints under it."""
+    for part in text.split("$ visioncal ")[1:]:
+        line, _, expected = part.replace("\\\n", " ").partition("\n")
+        done = visioncal(*shlex.split(line, comments=True))
+        assert done.status == 0, f"{page}: {line}: {done.err}"
+        match(expected, done.out + done.err, page)
 
 
 def match(expected: str, said: str, page: str) -> None:

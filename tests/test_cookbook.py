@@ -1,7 +1,24 @@
-"""Every recipe of the cookbook is run, and prints what its page shows."""
+"""Every recipe, and every example that makes its own data, prints what its page shows."""
+
+import re
+from pathlib import Path
 
 import pytest
-from recipes import FOLDER, match, run
+from recipes import FOLDER, match, run, run_example
+
+PACKAGES = Path(__file__).parents[1] / "visioncal"
+# Blocks of a package's page that begin with a simulation.
+EXAMPLES = {
+    page: found
+    for page in sorted(PACKAGES.glob("*/README.md"))
+    if (
+        found := re.findall(
+            r"^( {4}\$ visioncal simulate .*\n(?: {4,}\S.*\n)*)",
+            page.read_text("utf-8"),
+            re.MULTILINE,
+        )
+    )
+}
 
 PAGES = sorted(set(FOLDER.glob("*.md")) - {FOLDER / "README.md"})
 
@@ -10,6 +27,13 @@ PAGES = sorted(set(FOLDER.glob("*.md")) - {FOLDER / "README.md"})
 def test_a_recipe_prints_what_it_shows(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run(page)
+
+
+@pytest.mark.parametrize("page", EXAMPLES, ids=lambda it: it.parent.name)
+def test_an_example_prints_what_its_page_shows(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for block in EXAMPLES[page]:
+        run_example(block, page.parent.name)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda it: it.stem)
