@@ -22,6 +22,7 @@ PAGES = [
     ROOT / "visioncal" / "README.md",
     *(it / "README.md" for it in PACKAGES),
     *sorted(FOLDER.glob("*.md")),
+    *sorted((ROOT / ".github").glob("*.md")),
 ]
 every_page = pytest.mark.parametrize("page", PAGES, ids=lambda it: str(it.relative_to(ROOT)))
 
