@@ -1,12 +1,15 @@
-"""Runs a command inside the tests' own process, and writes the tables that it reads."""
+"""Runs commands, in this process where that will do, and writes the tables that they read."""
 
 import csv
 import io
+import os
+import subprocess
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TextIO
 from unittest.mock import patch
 
 import numpy as np
@@ -27,15 +30,39 @@ class Done:
     err: str
 
 
+# A wide terminal, so that messages are not folded.
+_WIDE = {"COLUMNS": "300"}
+
+
 def visioncal(*arguments: object) -> Done:
+    """Runs a command in this process."""
     out, err, status = io.StringIO(), io.StringIO(), 0
     words = ["visioncal", *map(str, arguments)]
-    with patch.object(sys, "argv", words), redirect_stdout(out), redirect_stderr(err):
+    with (
+        patch.object(sys, "argv", words),
+        patch.dict(os.environ, _WIDE),
+        redirect_stdout(out),
+        redirect_stderr(err),
+    ):
         try:
             main()
         except SystemExit as stop:
             status = int(stop.code or 0)
     return Done(status, out.getvalue(), err.getvalue())
+
+
+def started(*arguments: object, stdout: int | TextIO = subprocess.PIPE) -> Done:
+    """Runs a command as a process of its own, as a user does: for what only that can show."""
+    done = subprocess.run(
+        [sys.executable, "-m", "visioncal", *map(str, arguments)],
+        check=False,
+        stdout=stdout,
+        stderr=subprocess.PIPE,
+        text=True,
+        encoding="utf-8",
+        env=os.environ | _WIDE | {"PYTHONWARNINGS": "error", "PYTHONUTF8": "1"},
+    )
+    return Done(done.returncode, done.stdout or "", done.stderr)
 
 
 def write_poses(

@@ -4,7 +4,7 @@ Two robots on one floor, cameras that stand still or ride on a flange, boards on
 the flanges. A stop is one posture of every robot; at each, every camera sees some of the boards.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -156,10 +156,3 @@ def away(world, problem, state):
         turn = Rotation.from_matrix(between[:3, :3]).as_rotvec()
         found.append(np.concatenate([turn, between[:3, 3]]))
     return np.concatenate(found)
-
-
-def swapped(problem, robot, first, second):
-    """The problem with a robot's poses of two stops exchanged."""
-    poses = problem.poses[robot].copy()
-    poses[[first, second]] = poses[[second, first]]
-    return replace(problem, poses={**problem.poses, robot: poses})

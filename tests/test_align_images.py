@@ -26,7 +26,6 @@ from visioncal.simulation import (
 SMALL = replace(wide_camera(), resolution=(640, 480), matrix=np.array([560.0, 559.0, 321.0, 238.0]))
 LARGE = replace(wide_camera(), resolution=(800, 600), matrix=np.array([760.0, 761.0, 398.0, 301.0]))
 PLAIN = replace(checkerboard_target(), name="6x5", columns=6, rows=5)
-MARKED = replace(charuco_target(), name="5x4", columns=5, rows=4, square_m=0.04, marker_m=0.03)
 OPTIONS = NetworkOptions(
     robots=(RobotAt("a", (-0.6, 0.0, 0.0)), RobotAt("b", (0.6, 0.05, 0.02))),
     cameras=(

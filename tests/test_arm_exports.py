@@ -1,9 +1,6 @@
 """Exports of the calibrated arm: what is read back is calibration.base_from_flange."""
 
 import json
-import os
-import subprocess
-import sys
 import tomllib
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -11,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from commands import visioncal
 from placed import alone, tool
 from readers import ARM_FORMATS, rx, ry, rz, transform
 from samples import made_up
@@ -236,20 +234,12 @@ def test_the_command_writes_the_arm_and_warns(tmp_path):
     result = calibrated(load_robot("ur5e"), waves=True)
     result.save(tmp_path / "calibration.json")
     out = tmp_path / "arm.toml"
-    done = subprocess.run(
-        [
-            *(sys.executable, "-m", "visioncal", "export", str(tmp_path)),
-            *("--to", "robot-dh", "--convention", "standard", "-o", str(out)),
-        ],
-        check=False,
-        capture_output=True,
-        text=True,
-        encoding="utf-8",
-        env=os.environ | {"COLUMNS": "300", "PYTHONWARNINGS": "error", "PYTHONUTF8": "1"},
+    done = visioncal(
+        *("export", tmp_path, "--to", "robot-dh", "--convention", "standard", "-o", out)
     )
-    assert (done.returncode, done.stdout) == (0, ""), done.stderr
-    assert "have no place in it" in done.stderr
-    assert "--convention hayati" in done.stderr
+    assert (done.status, done.out) == (0, ""), done.err
+    assert "have no place in it" in done.err
+    assert "--convention hayati" in done.err
     loaded = load_placed(tmp_path)
     assert off(load_robot(str(out)), loaded) < EXACT
 

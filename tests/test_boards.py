@@ -4,14 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cells import calibrated, error_of, known_of
+from cells import calibrated, error_of
 from rerun.chunk import RrdReader
 from scipy.stats import chi2
 
 from visioncal.calibration.pipeline import run
 from visioncal.calibration.pipeline.guess_inputs import guess_session
 from visioncal.calibration.pipeline.result import result_of
-from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.detect import detect
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.core.errors import DataError, DegenerateError
@@ -39,17 +38,6 @@ NEAR = Second(turn_rad=0.6, tilt_rad=0.2)
 TWO = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1, robot="ur5e", views=16, second=Second())
 WRONG_LINKS = {"dh_sigma_m": 5e-4, "dh_sigma_rad": 1e-3}
 MOUNTS = ("eye-in-hand", "eye-to-hand")
-
-
-def known_before(cell, name):
-    """What is known before a stage."""
-    known = known_of(cell)
-    for stage in STAGES:
-        if stage.name == name:
-            return known
-        if stage.name not in ("robot", "detect"):
-            known = stage.run(known)
-    raise AssertionError(name)
 
 
 def without(cell, views):

@@ -1,32 +1,19 @@
 """The commands as a user runs them: exit status, messages, and the files that appear."""
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from commands import started, visioncal
 from rich.text import Text
 from typer.main import get_command
 
 from visioncal.cli.app import app
 from visioncal.core.errors import DataError
+from visioncal.robot import robot_names
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, read_truth, simulate, truth_path, write_session
-
-
-def visioncal(*arguments, cwd=None):
-    # A wide terminal, so that messages are not folded.
-    return subprocess.run(
-        [sys.executable, "-m", "visioncal", *map(str, arguments)],
-        check=False,
-        capture_output=True,
-        text=True,
-        encoding="utf-8",
-        cwd=cwd,
-        env=os.environ | {"COLUMNS": "300", "PYTHONWARNINGS": "error", "PYTHONUTF8": "1"},
-    )
+from visioncal.vision.targets import target_names
 
 
 @pytest.fixture(scope="module")
@@ -38,30 +25,30 @@ def poor(tmp_path_factory) -> Path:
 
 def test_calibrate_writes_three_files_and_says_how_good_it_is(rendered, tmp_path):
     out = tmp_path / "out put, größer"
-    done = visioncal("calibrate", rendered, "-o", out, "-v")
-    assert done.returncode == 0, done.stderr
+    done = started("calibrate", rendered, "-o", out, "-v")
+    assert done.status == 0, done.err
     assert {path.name for path in out.iterdir()} == {
         "calibration.json",
         "report.html",
         "recording.rrd",
     }
-    assert done.stdout == ""
-    assert done.stderr.startswith("good")
-    assert "flange_from_cam" in done.stderr
-    assert "daniilidis" in done.stderr
+    assert done.out == ""
+    assert done.err.startswith("good")
+    assert "flange_from_cam" in done.err
+    assert "daniilidis" in done.err
 
 
 def test_json_goes_to_stdout_and_is_the_file(rendered, tmp_path):
     done = visioncal("calibrate", rendered, "-o", tmp_path / "out", "--json")
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout) == json.loads((tmp_path / "out/calibration.json").read_text())
+    assert done.status == 0, done.err
+    assert json.loads(done.out) == json.loads((tmp_path / "out/calibration.json").read_text())
 
 
 def test_calibrating_the_recording_gives_the_same_numbers(rendered, tmp_path):
     done = visioncal("calibrate", rendered, "-o", tmp_path / "a", "--need-mm", "0.5")
-    assert done.returncode == 0
+    assert done.status == 0
     again = visioncal("calibrate", tmp_path / "a/recording.rrd", "-o", tmp_path / "b")
-    assert again.returncode == 0, again.stderr
+    assert again.status == 0, again.err
     first, second = (
         json.loads((tmp_path / name / "calibration.json").read_text()) for name in "ab"
     )
@@ -73,11 +60,11 @@ def test_no_result_is_status_2_with_one_message_and_leaves_the_folder_alone(poor
     out = tmp_path / "out"
     out.mkdir()
     (out / "calibration.json").write_text("an earlier result")
-    done = visioncal("calibrate", poor, "-o", out)
-    assert done.returncode == 2
-    assert done.stdout == ""
-    assert "the camera's offset along the tool's" in done.stderr
-    assert "Traceback" not in done.stderr
+    done = started("calibrate", poor, "-o", out)
+    assert done.status == 2
+    assert done.out == ""
+    assert "the camera's offset along the tool's" in done.err
+    assert "Traceback" not in done.err
     assert [path.name for path in out.iterdir()] == ["calibration.json"]
     assert (out / "calibration.json").read_text() == "an earlier result"
 
@@ -95,8 +82,8 @@ def test_a_message_leaves_out_the_middle_of_what_nobody_reads():
 
 def test_an_error_as_json_has_its_parts(poor, tmp_path):
     done = visioncal("calibrate", poor, "-o", tmp_path / "out", "--json")
-    assert done.returncode == 2
-    error = json.loads(done.stdout)["error"]
+    assert done.status == 2
+    error = json.loads(done.out)["error"]
     assert set(error) == {"class", "message", "culprits", "next"}
     assert error["class"] == "DegenerateError"
     assert error["culprits"]
@@ -114,24 +101,25 @@ def test_an_error_as_json_has_its_parts(poor, tmp_path):
         (["fly"], "No such command"),
     ],
 )
-def test_mistakes_at_the_command_line_are_status_2(arguments, words, tmp_path):
-    done = visioncal(*arguments, cwd=tmp_path)
-    assert done.returncode == 2
-    assert words in done.stderr
-    assert "Traceback" not in done.stderr
+def test_mistakes_at_the_command_line_are_status_2(arguments, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    done = visioncal(*arguments)
+    assert done.status == 2
+    assert words in done.err
+    assert "Traceback" not in done.err
 
 
 def test_a_folder_that_cannot_be_written_is_named(rendered, tmp_path):
     (tmp_path / "taken").write_text("a file where the folder should be")
     done = visioncal("calibrate", rendered, "-o", tmp_path / "taken")
-    assert done.returncode == 2
-    assert "taken" in done.stderr
-    assert "Traceback" not in done.stderr
+    assert done.status == 2
+    assert "taken" in done.err
+    assert "Traceback" not in done.err
 
 
 def test_simulate_writes_arms_that_warm_up_and_arms_that_bend(tmp_path):
     warm = visioncal("simulate", tmp_path / "warm", "--warm-up", "--currents", "--views", 12)
-    assert warm.returncode == 0, warm.stderr
+    assert warm.status == 0, warm.err
     session = Session.load(tmp_path / "warm")
     # Twelve views of a cold arm, and then six of them again every five minutes for 100 minutes.
     assert len(session.views) == 12 + 19 * 6
@@ -140,7 +128,7 @@ def test_simulate_writes_arms_that_warm_up_and_arms_that_bend(tmp_path):
     assert len(heat["growth_per_k"]) == 6
     loads = ("--payload-kg", 0, "--payload-kg", 5)
     bending = ("--stiffness-knm", 10, "--no-images", "--views", 4)
-    assert visioncal("simulate", tmp_path / "bent", *bending, *loads).returncode == 0
+    assert visioncal("simulate", tmp_path / "bent", *bending, *loads).status == 0
     carried = [it.numbers["payload_kg"] for it in Session.load(tmp_path / "bent").views]
     assert carried == [0.0, 5.0, 0.0, 5.0]
     truth = read_truth(tmp_path / "bent")
@@ -150,26 +138,27 @@ def test_simulate_writes_arms_that_warm_up_and_arms_that_bend(tmp_path):
 def test_simulate_writes_a_session_and_its_truth_beside_it(tmp_path):
     folder = tmp_path / "cell"
     done = visioncal("simulate", folder, "--views", 4, "--mount", "eye-to-hand", "--no-images")
-    assert done.returncode == 0, done.stderr
+    assert done.status == 0, done.err
     assert truth_path(folder).exists()
     assert not any("truth" in path.name for path in folder.rglob("*"))
     assert set(read_truth(folder).transforms) == {"base_from_cam", "flange_from_target"}
     again = visioncal("simulate", folder, "--views", 4, "--no-images")
-    assert again.returncode == 2
-    assert "cell" in again.stderr
+    assert again.status == 2
+    assert "cell" in again.err
 
 
-def test_demo_compares_itself_with_the_truth(tmp_path):
+def test_demo_compares_itself_with_the_truth(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     for _ in range(2):  # a second run replaces the first
-        done = visioncal("demo", "--views", 8, cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
-    assert "against the truth" in done.stderr
+        done = visioncal("demo", "--views", 8)
+        assert done.status == 0, done.err
+    assert "against the truth" in done.err
     assert (tmp_path / "demo/result/report.html").stat().st_size > 10_000
 
 
 def test_help_and_version_name_the_program():
-    assert "calibrate" in visioncal("--help").stdout
-    assert visioncal("--version").stdout.strip().count(".") == 2
+    assert "calibrate" in started("--help").out
+    assert visioncal("--version").out.strip().count(".") == 2
 
 
 def test_help_loses_no_unit_to_markup():
@@ -186,13 +175,7 @@ def test_help_loses_no_unit_to_markup():
     assert [name for name, it in every if Text.from_markup(it).plain != it] == []
 
 
-def test_boards_and_robots_are_found_from_any_folder(tmp_path):
-    code = "from visioncal.vision.targets import target_names;"
-    code += "from visioncal.robot import robot_names;"
-    code += "print(*target_names(), *robot_names())"
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=True
-    )
-    assert {"charuco_9x6_30mm", "checkerboard_9x6_25mm", "ur10e", "panda"} <= set(
-        done.stdout.split()
-    )
+def test_boards_and_robots_are_found_from_any_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = {*target_names(), *robot_names()}
+    assert {"charuco_9x6_30mm", "checkerboard_9x6_25mm", "ur10e", "panda"} <= names

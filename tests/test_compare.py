@@ -1,14 +1,13 @@
 """Two calibrations of one cell: noise stays noise, and what moved is found and named."""
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import visioncal
 from pairs import (
     calibrated_cell,
     halves,
@@ -203,13 +202,6 @@ def test_different_mounts_have_nothing_in_common() -> None:
     assert "The mounts differ" in comparison.findings[0]
 
 
-def visioncal(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "visioncal", *map(str, arguments)],
-        check=False, capture_output=True, text=True, encoding="utf-8",
-    )  # fmt: skip
-
-
 def test_command_prints_to_stdout_and_ends_well_either_way(tmp_path: Path) -> None:
     first, second = pair("eye-in-hand", 0)
     first.save(tmp_path / "calibration.json")
@@ -218,10 +210,10 @@ def test_command_prints_to_stdout_and_ends_well_either_way(tmp_path: Path) -> No
     second.save(tmp_path / "same.json")
     for name, words in (("same", "No transform changed"), ("moved", "The camera moved")):
         done = visioncal("diff", tmp_path, tmp_path / f"{name}.json")
-        assert done.returncode == 0, done.stderr
-        assert done.stderr == ""
-        assert words in done.stdout
-    printed = visioncal("diff", tmp_path, tmp_path / "moved.json", "--json").stdout
+        assert done.status == 0, done.err
+        assert done.err == ""
+        assert words in done.out
+    printed = visioncal("diff", tmp_path, tmp_path / "moved.json", "--json").out
     files = (Calibration.load(tmp_path), Calibration.load(tmp_path / "moved.json"))
     assert json.loads(printed) == to_document(compare(*files))
     assert "null" not in printed
@@ -233,5 +225,5 @@ def test_command_prints_to_stdout_and_ends_well_either_way(tmp_path: Path) -> No
 def test_command_names_what_is_no_calibration(tmp_path: Path) -> None:
     (tmp_path / "other.json").write_text("{}")
     done = visioncal("diff", tmp_path / "other.json", tmp_path)
-    assert done.returncode == 2
-    assert "other.json" in done.stderr
+    assert done.status == 2
+    assert "other.json" in done.err

@@ -1,12 +1,11 @@
 """Converting sessions: the same facts in another form, and nothing overwritten."""
 
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from commands import visioncal
 from samples import made_up
 from typer.testing import CliRunner
 
@@ -110,13 +109,12 @@ def test_what_is_no_session_is_named(tmp_path: Path, name: str) -> None:
 
 
 def test_the_command_converts_and_refuses(folder: Path, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "visioncal", "convert", str(folder), str(tmp_path / "new.rrd")]
-    done = subprocess.run(command, check=False, capture_output=True, text=True, encoding="utf-8")
-    assert done.returncode == 0, done.stderr
-    assert Session.load(folder).digest() in done.stderr
-    again = subprocess.run(command, check=False, capture_output=True, text=True, encoding="utf-8")
-    assert again.returncode == 2
-    assert "--force" in again.stderr
+    done = visioncal("convert", folder, tmp_path / "new.rrd")
+    assert done.status == 0, done.err
+    assert Session.load(folder).digest() in done.err
+    again = visioncal("convert", folder, tmp_path / "new.rrd")
+    assert again.status == 2
+    assert "--force" in again.err
 
 
 @pytest.fixture
@@ -145,27 +143,13 @@ def test_no_answer_writes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_session_whose_poses_are_misread_is_mended(misread: Session, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "visioncal", "convert", str(tmp_path / "mm")]
-    asked = subprocess.run(
-        [*command, str(tmp_path / "no"), "--guess"],
-        check=False,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        encoding="utf-8",
-    )
-    assert asked.returncode == 2
-    assert "--yes" in asked.stderr
+    asked = visioncal("convert", tmp_path / "mm", tmp_path / "no", "--guess")
+    assert asked.status == 2
+    assert "--yes" in asked.err
     assert not (tmp_path / "no").exists()
-    done = subprocess.run(
-        [*command, str(tmp_path / "mended"), "--guess", "--yes"],
-        check=False,
-        capture_output=True,
-        text=True,
-        encoding="utf-8",
-    )
-    assert done.returncode == 0, done.stderr
-    assert "positions in mm" in done.stderr
+    done = visioncal("convert", tmp_path / "mm", tmp_path / "mended", "--guess", "--yes")
+    assert done.status == 0, done.err
+    assert "positions in mm" in done.err
     mended = Session.load(tmp_path / "mended")
     for old, new in zip(misread.views, mended.views, strict=True):
         # Multiplied by 1000 and divided again, each rounded once.
@@ -177,10 +161,7 @@ def test_a_session_whose_poses_are_misread_is_mended(misread: Session, tmp_path:
 def test_what_describes_somebody_elses_poses_is_refused_for_a_session(
     folder: Path, tmp_path: Path
 ) -> None:
-    command = [sys.executable, "-m", "visioncal", "convert", str(folder), str(tmp_path / "new")]
-    done = subprocess.run(
-        [*command, "--robot-unit", "mm"], check=False, capture_output=True, text=True
-    )
-    assert done.returncode == 2
-    assert "is a session already" in done.stderr
+    done = visioncal("convert", folder, tmp_path / "new", "--robot-unit", "mm")
+    assert done.status == 2
+    assert "is a session already" in done.err
     assert not (tmp_path / "new").exists()

@@ -1,9 +1,6 @@
 """Exports: what others read is the transform that was calibrated, whoever reads it."""
 
 import json
-import os
-import subprocess
-import sys
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +10,7 @@ import numpy as np
 import pytest
 import readers
 import yaml
+from commands import started, visioncal
 from placed import fixture, tool
 from readers import FIXTURE_READERS, READERS, TOOL_READERS
 from rotations import CASES
@@ -316,16 +314,8 @@ def test_names_that_are_not_known_get_a_hint(name, edge, words):
     assert words in str(caught.value)
 
 
-def visioncal(*arguments, stdout=subprocess.PIPE):
-    return subprocess.run(
-        [sys.executable, "-m", "visioncal", "export", *map(str, arguments)],
-        check=False,
-        stdout=stdout,
-        stderr=subprocess.PIPE,
-        text=True,
-        encoding="utf-8",
-        env=os.environ | {"COLUMNS": "300", "PYTHONWARNINGS": "error", "PYTHONUTF8": "1"},
-    )
+def exporting(*arguments):
+    return visioncal("export", *arguments)
 
 
 @pytest.fixture(scope="module")
@@ -337,40 +327,40 @@ def saved(tmp_path_factory):
 
 
 def test_the_command_prints_the_document_and_nothing_else(saved):
-    done = visioncal(saved, "--to", "ros")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout == export(SAMPLE, "ros")
+    done = started("export", saved, "--to", "ros")
+    assert (done.status, done.err) == (0, "")
+    assert done.out == export(SAMPLE, "ros")
 
 
 def test_the_command_writes_a_file_once(saved, tmp_path):
     out = tmp_path / "camera.urdf"
     chosen = ["--edge", "base_from_target", "--inverse", "--parent", "board", "--child", "world"]
-    done = visioncal(saved / "calibration.json", "--to", "urdf", "-o", out, *chosen)
-    assert (done.returncode, done.stdout) == (0, ""), done.stderr
+    done = exporting(saved / "calibration.json", "--to", "urdf", "-o", out, *chosen)
+    assert (done.status, done.out) == (0, ""), done.err
     written = out.read_text(encoding="utf-8")
     # Written with all digits.
     assert off(written, "urdf", invert(SAMPLE.edges["base_from_target"].matrix)) < 1e-9
-    again = visioncal(saved, "--to", "text", "-o", out)
-    assert again.returncode == 2
-    assert "--force" in again.stderr
+    again = exporting(saved, "--to", "text", "-o", out)
+    assert again.status == 2
+    assert "--force" in again.err
     assert out.read_text(encoding="utf-8") == written
-    assert visioncal(saved, "--to", "text", "-o", out, "--force").returncode == 0
+    assert exporting(saved, "--to", "text", "-o", out, "--force").status == 0
     assert np.array_equal(readers.plain(out.read_text()), SAMPLE.edges["flange_from_cam"].matrix)
 
 
 def test_a_bad_verdict_is_exported_with_a_warning(tmp_path):
     verdict = Verdict("bad", ("The views disagree by 14 mm.",))
     replace(SAMPLE, verdict=verdict).save(tmp_path / "calibration.json")
-    done = visioncal(tmp_path, "--to", "ur")
-    assert done.returncode == 0
-    assert "14 mm" in done.stderr
-    assert "# verdict bad; sigma" in done.stdout
+    done = exporting(tmp_path, "--to", "ur")
+    assert done.status == 0
+    assert "14 mm" in done.err
+    assert "# verdict bad; sigma" in done.out
 
 
 def test_the_command_lists_its_formats():
-    done = visioncal("--list")
-    assert done.returncode == 0, done.stderr
-    assert [line.split()[0] for line in done.stdout.splitlines()] == NAMES
+    done = exporting("--list")
+    assert done.status == 0, done.err
+    assert [line.split()[0] for line in done.out.splitlines()] == NAMES
 
 
 @pytest.mark.parametrize(
@@ -385,33 +375,33 @@ def test_the_command_lists_its_formats():
     ],
 )
 def test_mistakes_are_status_2_and_write_nothing(saved, arguments, words):
-    done = visioncal(saved, *arguments)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert words in done.stderr
-    assert "Traceback" not in done.stderr
+    done = exporting(saved, *arguments)
+    assert (done.status, done.out) == (2, "")
+    assert words in done.err
+    assert "Traceback" not in done.err
 
 
 def test_a_dash_is_stdout(saved):
-    done = visioncal(saved, "--to", "ros", "-o", "-")
-    assert (done.returncode, done.stdout) == (0, export(SAMPLE, "ros"))
+    done = exporting(saved, "--to", "ros", "-o", "-")
+    assert (done.status, done.out) == (0, export(SAMPLE, "ros"))
     assert not Path("-").exists()
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
 def test_a_full_disk_behind_stdout_is_told(saved):
     with Path("/dev/full").open("w") as full:
-        done = visioncal(saved, "--to", "ros", stdout=full)
-    assert done.returncode == 2
-    assert "stdout cannot be written" in done.stderr
-    assert "Traceback" not in done.stderr
+        done = started("export", saved, "--to", "ros", stdout=full)
+    assert done.status == 2
+    assert "stdout cannot be written" in done.err
+    assert "Traceback" not in done.err
 
 
 @pytest.mark.parametrize("name", ["", "session.toml"])
 def test_a_session_is_to_be_calibrated_first(tmp_path, name):
     (tmp_path / "session.toml").write_text("schema = 1\n", encoding="utf-8")
-    done = visioncal(tmp_path / name, "--to", "ur")
-    assert (done.returncode, done.stdout) == (2, "")
-    assert f"Run visioncal calibrate {tmp_path}" in done.stderr
+    done = exporting(tmp_path / name, "--to", "ur")
+    assert (done.status, done.out) == (2, "")
+    assert f"Run visioncal calibrate {tmp_path}" in done.err
 
 
 def test_frame_names_of_an_edited_calibration_are_checked_too(tmp_path):
@@ -421,6 +411,6 @@ def test_frame_names_of_an_edited_calibration_are_checked_too(tmp_path):
     name = 'x"\n_from_y'
     document["transforms"] = {name: document["transforms"]["flange_from_cam"]}
     path.write_text(json.dumps(document), encoding="utf-8")
-    done = visioncal(path, "--to", "ros-launch", "--edge", name)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert "frame's name" in done.stderr
+    done = exporting(path, "--to", "ros-launch", "--edge", name)
+    assert (done.status, done.out) == (2, "")
+    assert "frame's name" in done.err

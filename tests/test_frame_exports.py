@@ -1,15 +1,13 @@
 """Exports of tools and fixtures: what a controller reads is the frame, as its maker writes it."""
 
-import os
 import re
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
 import placed
 import pytest
 import readers
+from commands import visioncal
 from placed import BASE_FROM_FIXTURE, FIXTURE, FLANGE_FROM_TOOL, TOOL, fixture, tool
 from readers import FIXTURE_READERS, READERS, TOOL_READERS
 from rotations import CASES
@@ -434,13 +432,8 @@ def test_no_source_leaves_its_comment(name):
 # --- Files and the command.
 
 
-def visioncal(*arguments):
-    return subprocess.run(
-        [sys.executable, "-m", "visioncal", "export", *map(str, arguments)],
-        check=False,
-        capture_output=True,
-        env=os.environ | {"COLUMNS": "300", "PYTHONWARNINGS": "error", "PYTHONUTF8": "1"},
-    )
+def exporting(*arguments):
+    return visioncal("export", *arguments)
 
 
 def test_a_file_of_frames_is_known_by_its_content(tmp_path):
@@ -472,12 +465,12 @@ def test_a_broken_file_is_named(tmp_path, text):
 
 def test_the_command_writes_what_the_library_does(tmp_path):
     ALONE.save(tmp_path / "frames.json")
-    done = visioncal(tmp_path, "--to", "kuka-tool", "--number", "4")
-    assert (done.returncode, done.stderr) == (0, b"")
-    assert done.stdout.decode() == export(ALONE, "kuka-tool", Selection(number=4))
+    done = exporting(tmp_path, "--to", "kuka-tool", "--number", "4")
+    assert (done.status, done.err) == (0, "")
+    assert done.out == export(ALONE, "kuka-tool", Selection(number=4))
     out = tmp_path / "SET_UF2.LS"
-    done = visioncal(tmp_path, "--to", "fanuc-uframe", "--number", "2", "-o", out)
-    assert done.returncode == 0, done.stderr
+    done = exporting(tmp_path, "--to", "fanuc-uframe", "--number", "2", "-o", out)
+    assert done.status == 0, done.err
     # A controller's listing has its lines ended as on its own disk.
     assert out.read_bytes().decode() == export(ALONE, "fanuc-uframe", Selection(number=2))
     assert b"/END\r\n" in out.read_bytes()
@@ -486,16 +479,16 @@ def test_the_command_writes_what_the_library_does(tmp_path):
 def test_the_command_takes_a_load_and_warns_without_one(tmp_path):
     CELL.save(tmp_path / "calibration.json")
     load = ["--mass-kg", "5", "--cog-mm", "23", "0", "-75.5"]
-    done = visioncal(tmp_path, "--to", "abb-tooldata", *load)
-    assert (done.returncode, done.stderr) == (0, b"")
-    assert readers.rapid(done.stdout.decode())[2][2][:2] == [5, [23, 0, -75.5]]
-    done = visioncal(tmp_path, "--to", "abb-tooldata")
-    assert done.returncode == 0
-    assert b"warning:" in done.stderr
-    assert b"LoadIdentify" in done.stderr
-    done = visioncal(tmp_path, "--to", "abb-tooldata", "--mass-kg", "5")
-    assert (done.returncode, done.stdout) == (2, b"")
-    assert b"--cog-mm" in done.stderr
+    done = exporting(tmp_path, "--to", "abb-tooldata", *load)
+    assert (done.status, done.err) == (0, "")
+    assert readers.rapid(done.out)[2][2][:2] == [5, [23, 0, -75.5]]
+    done = exporting(tmp_path, "--to", "abb-tooldata")
+    assert done.status == 0
+    assert "warning:" in done.err
+    assert "LoadIdentify" in done.err
+    done = exporting(tmp_path, "--to", "abb-tooldata", "--mass-kg", "5")
+    assert (done.status, done.out) == (2, "")
+    assert "--cog-mm" in done.err
 
 
 def test_the_verdict_of_the_frame_is_what_is_warned_of():
