@@ -1,5 +1,6 @@
 """Every recipe, and every example that makes its own data, prints what its page shows."""
 
+import json
 import re
 from pathlib import Path
 
@@ -34,6 +35,9 @@ def test_an_example_prints_what_its_page_shows(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for block in EXAMPLES[page]:
         run_example(block, page.parent.name)
+    documented = set(re.findall(r"\w+", (PACKAGES / "results" / "README.md").read_text("utf-8")))
+    for path in tmp_path.glob("*/calibration.json"):
+        assert json.loads(path.read_text("utf-8")).keys() <= documented
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda it: it.stem)
