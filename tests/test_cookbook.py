@@ -1,4 +1,4 @@
-"""Every recipe, and every example that makes its own data, prints what its page shows."""
+"""Every recipe, and every example that needs no data, prints what its page shows."""
 
 import json
 import re

@@ -1,7 +1,9 @@
 """The pages are true of the program: their links, commands, names, paths and quotations."""
 
+import csv
 import re
 import shlex
+import shutil
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -183,6 +185,22 @@ def leaves(command, name):
 
 def test_the_front_page_is_short():
     assert len(text_of(FRONT).splitlines()) <= 260
+
+
+def test_the_front_page_s_session_is_calibrated(rendered, tmp_path):
+    """Its session.toml and the columns of its views.csv, with a cell's pictures and poses."""
+    blocks = BLOCK.findall(text_of(FRONT))
+    (declared,) = [text for language, _, text in blocks if language == "toml"]
+    (head,) = re.findall(r"^(view,image,.*)$", text_of(FRONT), re.MULTILINE)
+    with (rendered / "views.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    (tmp_path / "session.toml").write_text(declared)
+    shutil.copytree(rendered / "images", tmp_path / "images")
+    with (tmp_path / "views.csv").open("w", newline="") as file:
+        table = csv.DictWriter(file, head.split(","), extrasaction="ignore")
+        table.writeheader()
+        table.writerows(rows)
+    assert visioncal.calibrate(visioncal.Session.load(tmp_path)).verdict.status == "good"
 
 
 def test_the_front_page_shows_what_recipes_print():
