@@ -315,6 +315,7 @@ ERRING = (
 )
 
 
+@pytest.mark.slow
 def test_arms_that_err_are_named_and_their_offsets_found_where_that_is_asked_for():
     cell = simulate_network(NetworkOptions(robots=ERRING, stops=STOPS))
     session = network_session(cell, "cell", seen="names")
@@ -489,6 +490,7 @@ def test_a_camera_that_a_board_ties_either_way_round_is_refused():
         aligned(cell)
 
 
+@pytest.mark.slow
 def test_rows_held_back_have_no_part_in_frames_lenses_and_noise(clean):
     cell, _ = clean
     session = network_session(cell, "cell", seen="names")
@@ -618,6 +620,7 @@ def reported(cell, robot, poses):
     return session, {it.view: it for it in cell.corners}
 
 
+@pytest.mark.slow
 def test_what_is_no_noise_of_a_robot_is_said_of_that_robot():
     cell = simulate_network(NetworkOptions(stops=40))
     share = np.linspace(-0.5, 0.5, 40)[:, None]
@@ -637,6 +640,7 @@ def test_what_is_no_noise_of_a_robot_is_said_of_that_robot():
     assert squared < 22.0
 
 
+@pytest.mark.slow
 def test_a_board_of_another_size_is_found_beside_arms_that_err():
     robots = (
         RobotAt("a", (-0.6, 0.0, 0.0), offset_sigma_rad=1e-3),
@@ -670,6 +674,7 @@ def test_boards_of_three_sizes_are_found_beside_arms_that_err():
     assert max(found.noise[it]["translation_mm"] for it in "ab") < 0.06
 
 
+@pytest.mark.slow
 def test_errors_of_an_arm_that_are_free_on_the_way_may_be_no_unknowns_at_the_end():
     """Boards of slightly other sizes look like errors of both arms, until they are free."""
     scales = 1.0 + 1e-3 * np.random.default_rng([47, 41]).standard_normal(3)

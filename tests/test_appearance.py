@@ -103,7 +103,11 @@ def test_a_flat_board_of_the_stated_size_stays_so(given):
         assert np.all(looks.values[looks.boards] == 0.0)
 
 
-@pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens estimated"])
+@pytest.mark.parametrize(
+    "given",
+    [True, pytest.param(False, marks=pytest.mark.slow)],
+    ids=["lens given", "lens estimated"],
+)
 def test_a_bent_board_is_noticed_and_costs_nothing(given):
     errors = {0.0: [], 3e-4: []}
     for bow_m, kept in errors.items():
@@ -155,6 +159,7 @@ def test_a_size_that_is_contradicted_is_dropped_and_no_arm_is_blamed(mount, scal
     assert np.linalg.norm(error_of(cell, known)[3:6]) < 0.5e-3
 
 
+@pytest.mark.slow
 def test_a_size_that_is_held_counts_by_what_the_views_say_against_it():
     """Sizes drawn as the file states them, an arm too coarse to measure them."""
     rng = np.random.default_rng(1)

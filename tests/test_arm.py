@@ -44,7 +44,9 @@ def test_base_and_flange_move_the_flange_as_their_basis_says():
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
-@pytest.mark.parametrize("joints", [True, False], ids=["joints", "poses only"])
+@pytest.mark.parametrize(
+    "joints", [pytest.param(True, marks=pytest.mark.slow), False], ids=["joints", "poses only"]
+)
 def test_a_wrong_arm_is_noticed_and_counts_in_the_covariance(mount, joints):
     surprises = []
     for seed in range(6):
@@ -87,6 +89,7 @@ def test_white_noise_is_not_taken_for_a_wrong_arm(mount, sigma):
             assert calibrated(simulate(options), joints=joints).robot_arm.errors is None
 
 
+@pytest.mark.slow
 def test_estimating_the_links_along_makes_the_answer_better():
     errors = {True: [], False: []}
     for seed in range(6):

@@ -54,6 +54,7 @@ def without(cell, views):
     )
 
 
+@pytest.mark.slow
 def test_all_boards_are_placed_as_well_as_their_sigmas_say():
     """Ten cells, each with boards whose sizes are off by what their files allow."""
     squares, count = 0.0, 0
@@ -96,6 +97,7 @@ def test_boards_have_names_and_a_common_covariance(mount):
         assert np.linalg.norm((invert(true) @ park[name])[:3, 3]) < 2e-3
 
 
+@pytest.mark.slow
 def test_two_boards_tell_more_of_an_arm_than_one():
     """The same number of views, and the tool's place all over the workspace."""
     ratios = []
@@ -112,7 +114,9 @@ def test_two_boards_tell_more_of_an_arm_than_one():
     assert np.median(ratios) < 0.8
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize(
+    "mount", ["eye-in-hand", pytest.param("eye-to-hand", marks=pytest.mark.slow)]
+)
 def test_each_board_adds_six_values_that_are_told(mount):
     """Everett and Hsu (1988): 4 a revolute joint, 6 for the frames, and 6 a further board."""
     cell = simulate(replace(TWO, **WRONG_LINKS, mount=mount, views=24, seed=1))

@@ -334,6 +334,7 @@ def test_a_wrong_view_spoils_the_verdict(tmp_path):
     assert any("were left out" in it for it in verdict.reasons)
 
 
+@pytest.mark.slow
 def test_a_wrong_lens_spoils_the_verdict(rendered, session_copy):
     text = (session_copy / "session.toml").read_text(encoding="utf-8")
     truth = read_truth(rendered).camera
@@ -479,6 +480,7 @@ def test_options_that_do_not_exist_are_refused(rendered):
         visioncal.calibrate(rendered, level="seven")
 
 
+@pytest.mark.slow
 def test_numbers_do_not_depend_on_the_board_turned_round(tmp_path):
     """A board whose two ends look alike gives the same camera, whichever end comes first."""
     target = replace(checkerboard_target(), name="even", columns=9, rows=7, square_m=0.02)

@@ -57,6 +57,7 @@ def test_a_camera_that_saw_nothing_else_is_placed_as_its_covariance_says(swept, 
     assert found.session_sha256 == session.digest()
 
 
+@pytest.mark.slow
 def test_what_is_stated_of_one_camera_is_contradicted_by_name(swept):
     _, session, corners = swept
     document = {**session.document, "clocks": {"side": {"camera_minus_robot_s": 0.02}}}

@@ -147,6 +147,7 @@ def test_simulate_writes_a_session_and_its_truth_beside_it(tmp_path):
     assert "cell" in again.err
 
 
+@pytest.mark.slow
 def test_demo_compares_itself_with_the_truth(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for _ in range(2):  # a second run replaces the first

@@ -40,7 +40,9 @@ def pair(mount: Mount, seed: int) -> tuple[Calibration, Calibration]:
     return calibrated_cell(first), calibrated_cell(second)
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize(
+    "mount", ["eye-in-hand", pytest.param("eye-to-hand", marks=pytest.mark.slow)]
+)
 def test_noise_is_no_change(mount: Mount) -> None:
     compared = [compare(*pair(mount, seed)) for seed in range(PAIRS)]
     # One in a hundred may be told apart: two of eight come once in four hundred such runs.

@@ -45,6 +45,7 @@ def carrying():
     return cell, calibrated(cell)
 
 
+@pytest.mark.slow
 def test_a_sagging_arm_is_calibrated_all_over_its_workspace():
     cell = simulate(replace(SAGGING, seed=0))
     known, nominal = calibrated(cell), calibrated(cell, joints=False)
@@ -128,6 +129,7 @@ def test_stops_are_planned_that_tell_springs():
         stop_factors(bare, PURPOSES["elastic"], q)
 
 
+@pytest.mark.slow
 def test_a_payload_that_is_not_as_stated_is_told(carrying):
     cell, known = carrying
     factor = known.arm_found.springs.payload
@@ -139,6 +141,7 @@ def test_a_payload_that_is_not_as_stated_is_told(carrying):
     assert wrong.verdict.status != "good"
 
 
+@pytest.mark.slow
 def test_a_stiff_arm_is_not_made_to_bend():
     known = calibrated(simulate(replace(GOOD, views=40, seed=3, payloads=CARRIED)))
     assert known.robot_arm.kinematics.level == "nominal"
@@ -163,6 +166,7 @@ def test_predictions_move_with_springs_as_their_derivatives_say():
         assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(jacobian[:, :, at], abs=0.02)
 
 
+@pytest.mark.slow
 def test_a_loaded_arm_read_by_a_tracker():
     """Loads of 10, 20 and 50 N on a shoulder of 1.4e6 and an elbow of 9e5 N m/rad."""
     shop, known = loaded(seed=2)

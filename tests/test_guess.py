@@ -392,6 +392,7 @@ def test_a_real_stream_that_is_inverse_is_named(real_data):
     assert guess.best.words == "the camera's poses inverse"
 
 
+@pytest.mark.slow
 def test_real_poses_are_not_accused_and_planted_mistakes_in_them_are_named(real_data):
     for name, poses in real_sets(real_data):
         assert not guessed(poses).stands_out, name

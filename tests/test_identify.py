@@ -166,6 +166,7 @@ def test_a_blurred_checkerboard_is_not_doubted(sigma_px):
     assert not any("ChArUco" in note for note in identity.notes)
 
 
+@pytest.mark.slow
 def test_a_large_picture_is_searched_reduced_too():
     page = cv2.GaussianBlur(printed(SHIPPED["charuco_9x6_30mm"], 320), (0, 0), 3.0)
     noise = 120.0 * np.random.default_rng(1).normal(size=page.shape)

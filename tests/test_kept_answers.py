@@ -9,7 +9,17 @@ EDGE_SIGMAS = 1e-3
 LEVEL_SHARE = 2e-3
 
 
-@pytest.mark.parametrize("name", sorted(cases()))
+# Those of more than two seconds whose effect is in a quicker cell, too.
+SLOW = {
+    "cell, both", "cell, camera bumped", "cell, half seen", "cell, kinematics",
+    "cell, lens estimated, one in hand", "cell, offsets", "cell, tracker", "cell, wrong arms",
+    "cell, wrong arms as reported", "cell, wrong rows", "springs, 1",
+    "sweep to hand", "tracker, places, wrong arm",
+}  # fmt: skip
+NAMES = [pytest.param(it, marks=pytest.mark.slow if it in SLOW else ()) for it in sorted(cases())]
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_a_cell_has_the_answer_that_is_kept(name):
     answer, before = answer_of(cases()[name]), kept()[name]
     assert dict(answer.words) == before["words"]

@@ -56,6 +56,7 @@ def error_m(cell, known, robot):
     return float(np.sqrt(np.mean(np.sum(away**2, axis=1))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_an_arm_off_by_a_millimetre_is_calibrated_all_over_its_workspace(mount):
     shares = []
@@ -84,6 +85,7 @@ def test_offsets_alone_are_told_from_wrong_links():
     assert found == pytest.approx(true, abs=3e-4)
 
 
+@pytest.mark.slow
 def test_links_that_are_off_by_little_count_in_the_covariance():
     # Off by hardly more than the arm repeats to, in all parameters alike: offsets of the joints
     # explain most of what twelve views show, and leave the first and the last link for exact.
@@ -99,6 +101,7 @@ def test_links_that_are_off_by_little_count_in_the_covariance():
     assert squares < 68.0
 
 
+@pytest.mark.slow
 def test_an_eccentric_gear_is_told():
     cell = simulate(replace(WRONG_LINKS, seed=2, views=40))
     # The encoders of joints 2 and 3 tell what their axes do but for a wave of 1 mrad.
@@ -112,6 +115,7 @@ def test_an_eccentric_gear_is_told():
     assert known.robot_arm.model.robot.chain.functions[1:3, 2] == pytest.approx(1e-3, abs=5e-4)
 
 
+@pytest.mark.slow
 def test_a_wrong_gear_ratio_is_told():
     cell = simulate(replace(WRONG_LINKS, seed=2, views=40, branches=True))
     reported = cell.joints.copy()
@@ -125,6 +129,7 @@ def test_a_wrong_gear_ratio_is_told():
     assert known.robot_arm.model.robot.chain.functions[1:4, 1] == pytest.approx(1.001, abs=2e-4)
 
 
+@pytest.mark.slow
 def test_a_dirty_cell_is_calibrated_all_over_its_workspace():
     """Bent board, lens a little off, eccentric and rippling joints, size known to 0.02 %."""
     target = replace(WRONG_LINKS.target, square_sigma_m=2e-4 * WRONG_LINKS.target.square_m)
@@ -192,6 +197,7 @@ def test_predictions_move_as_their_derivatives_say(mount):
         assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(jacobian[:, :, at], abs=5e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_the_workspace_sigma_is_the_bound_and_holds_the_error(mount):
     sure = replace(WRONG_LINKS.target, square_sigma_m=1e-5 * WRONG_LINKS.target.square_m)
@@ -228,6 +234,7 @@ def test_the_result_holds_the_calibrated_arm(tmp_path):
     assert np.array_equal(result.robot.base_from_flange(q), known.robot.base_from_flange(q))
 
 
+@pytest.mark.slow
 def test_touches_close_on_the_calibrated_arm():
     cell = simulate(replace(WRONG_LINKS, seed=5, views=40))
     result = result_of(calibrated(cell))

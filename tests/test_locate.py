@@ -220,7 +220,10 @@ def test_exact_sights_give_exact_places(exact_cell):
     "options",
     [
         CellOptions(views=10, robot_sigma_m=3e-4, robot_sigma_rad=5e-4, pixel_sigma_px=0.1),
-        CellOptions(views=10, mount="eye-to-hand", pixel_sigma_px=0.1, state_intrinsics=False),
+        pytest.param(
+            CellOptions(views=10, mount="eye-to-hand", pixel_sigma_px=0.1, state_intrinsics=False),
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=MOUNTS,
 )
@@ -245,6 +248,7 @@ def test_the_region_holds_the_true_place(options):
         assert np.mean(near) == pytest.approx(0.95, abs=0.08)
 
 
+@pytest.mark.slow
 def test_lens_and_edge_have_one_covariance():
     surprises, together = [], []
     for seed in range(12):

@@ -1,10 +1,12 @@
 """Real arms that others measured with an instrument, against plain least squares."""
 
 import numpy as np
+import pytest
 import thirdparty
 from tracked import known_of
 
 
+@pytest.mark.slow
 def test_an_irb_120_by_a_measuring_arm(real_data):
     known = known_of(thirdparty.irb120(real_data))
     # 4.67 mm in the mean, the frames fitted.
@@ -35,6 +37,7 @@ def test_a_six_axis_arm_by_a_laser(real_data):
     assert known.findings.held_out.mm < 0.13
 
 
+@pytest.mark.slow
 def test_a_humanoid_by_contacts(real_data):
     held = list(range(3, 61, 10))
     known = known_of(thirdparty.talos(real_data, held))

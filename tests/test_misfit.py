@@ -86,6 +86,7 @@ def test_a_closed_form_is_not_taken_for_a_misfit(changes):
         assert found.moved is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_independent_noise_gives_neighbours_no_more_than_their_share(mount):
     factors = []
@@ -112,6 +113,7 @@ def test_stops_that_err_in_groups_are_noticed():
     assert any("Neighbouring stops err alike" in it for it in known.warnings)
 
 
+@pytest.mark.slow
 def test_intervals_of_the_noise_hold_the_truth():
     inside, count = np.zeros(2), 20
     truth = np.array([5e-5, 3e-5])

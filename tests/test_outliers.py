@@ -60,6 +60,7 @@ def test_two_exchanged_rows_are_found():
     assert set(range(20)) - set(known.used) == {4, 11}
 
 
+@pytest.mark.slow
 def test_where_nothing_agrees_nothing_is_left_out():
     known = calibrated(simulate(replace(WORLDS["fine, given"], seed=2)))
     problem = known.solved.problem.with_effects([])

@@ -103,7 +103,16 @@ def test_the_robots_noise_is_carried_to_the_touched_point():
         assert known[at] == pytest.approx(slope @ slope.T, rel=1e-5, abs=1e-11)
 
 
-@pytest.mark.parametrize("job", [Job(noise=ROBOT), Job(tips=6, axes=2), Job(tips=4, points=3)])
+@pytest.mark.parametrize(
+    "job",
+    [
+        Job(tips=6, axes=2),
+        *(
+            pytest.param(it, marks=pytest.mark.slow)
+            for it in (Job(noise=ROBOT), Job(tips=4, points=3))
+        ),
+    ],
+)
 def test_error_and_covariance_agree_with_each_other_and_with_the_bound(job):
     squared, errors, least = [], [], []
     for seed in range(60):

@@ -79,6 +79,7 @@ RIGS = (
 )
 
 
+@pytest.mark.slow
 def test_the_camera_is_where_it_is_within_its_sigmas(tmp_path):
     squares = np.zeros((len(RIGS), SEEDS))
     for at, rig in enumerate(RIGS):

@@ -28,6 +28,7 @@ EXTRAS = ("rtde_control", "rtde_receive", "depthai")
 MISSING = [it for it in EXTRAS if importlib.util.find_spec(it) is None]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("patient")
 @pytest.mark.skipif(bool(MISSING), reason=f"pip install '.[ur,oak]' brings {', '.join(MISSING)}")
 def test_a_rehearsal_through_a_protective_stop_is_as_near_to_the_truth_as_it_says(tmp_path):

@@ -99,8 +99,15 @@ def test_the_simulation_takes_every_row_at_its_own_time():
     assert max(away_px) > 2.0
 
 
-@MOUNTED
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize(
+    ("seed", "mount"),
+    [
+        (1, "eye-in-hand"),
+        pytest.param(1, "eye-to-hand", marks=pytest.mark.slow),
+        pytest.param(2, "eye-in-hand", marks=pytest.mark.slow),
+        pytest.param(2, "eye-to-hand", marks=pytest.mark.slow),
+    ],
+)
 def test_the_readout_is_found_and_the_camera_is_where_it_is(seed, mount, monkeypatch):
     moved = swept(seed, mount=mount)
     known = calibrated_sweep(moved)
@@ -122,7 +129,7 @@ def test_the_readout_is_found_and_the_camera_is_where_it_is(seed, mount, monkeyp
     assert np.linalg.norm(away) > 5.0 * np.sqrt(np.trace(covariance[3:, 3:]))
 
 
-@pytest.mark.parametrize("seed", [3, 4])
+@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.slow)])
 def test_a_global_shutter_is_not_mistaken(seed):
     known = calibrated_sweep(swept(seed, replace(HURRIED, readout_s=0.0)))
     (found,) = known.clock.delays

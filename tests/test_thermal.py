@@ -116,6 +116,7 @@ def test_a_check_says_that_it_takes_the_arm_for_cold(learnt):
     assert not failed.passed
 
 
+@pytest.mark.slow
 def test_an_arm_that_is_off_is_calibrated_beside_its_drift():
     found = warmed(replace(CELL, mount="eye-to-hand", dh_sigma_m=3e-4, dh_sigma_rad=5e-4, seed=2))
     assert found.calibration.stages["kinematics"]["level"] == "geometry"

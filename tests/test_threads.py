@@ -8,6 +8,7 @@ from threading import Barrier
 
 import cv2
 import matplotlib as mpl
+import pytest
 from kept import assert_same_evidence
 from threadpoolctl import threadpool_info
 
@@ -18,7 +19,6 @@ from visioncal.present.recording import read_evidence
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate, write_session
 
-THREADS = 4
 CREATED = "2026-11-21T00:00:00+00:00"
 
 
@@ -27,7 +27,8 @@ def settings():
     return cv2.getNumThreads(), blas, dict(mpl.rcParams)
 
 
-def test_threads_write_what_one_alone_writes(tmp_path):
+@pytest.mark.parametrize("threads", [2, pytest.param(4, marks=pytest.mark.slow)])
+def test_threads_write_what_one_alone_writes(tmp_path, threads):
     write_session(simulate(CellOptions(views=6, seed=2)), tmp_path / "cell")
     session = Session.load(tmp_path / "cell")
 
@@ -39,11 +40,11 @@ def test_threads_write_what_one_alone_writes(tmp_path):
         write_outputs(tmp_path / str(number), session, found)
         return tmp_path / str(number)
 
-    alone = written(THREADS, Barrier(1))
+    alone = written(threads, Barrier(1))
     before = settings()
-    barrier = Barrier(THREADS)
-    with ThreadPoolExecutor(THREADS) as pool:
-        folders = list(pool.map(lambda number: written(number, barrier), range(THREADS)))
+    barrier = Barrier(threads)
+    with ThreadPoolExecutor(threads) as pool:
+        folders = list(pool.map(lambda number: written(number, barrier), range(threads)))
     assert settings() == before
     evidence = read_evidence(alone / "recording.rrd")
     for folder in folders:

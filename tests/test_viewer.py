@@ -353,6 +353,7 @@ VERDICT = (0.55, 0.1, 1.0, 0.36)
 IMAGE = (0.55, 0.42, 1.0, 0.79)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not RASTERISERS, reason="no software rasteriser (mesa-vulkan-drivers) here")
 def test_the_native_viewer_draws_it(recordings, tmp_path):
     port = free_port()

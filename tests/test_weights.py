@@ -52,6 +52,7 @@ def test_an_arm_of_unknown_weight_is_calibrated_with_its_sag(bare):
     assert result.base_from_flange(q).as_matrix() == pytest.approx(ours, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_payloads_tell_its_stiffness(bare):
     known = calibrated(simulate(replace(SAGGING, views=60, payloads=CARRIED, seed=5)), robot=bare)
     for at in (1, 2):
