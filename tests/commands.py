@@ -5,17 +5,20 @@ import io
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 from unittest.mock import patch
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from typer.core import TyperGroup
+from typer.main import get_command
 
-from visioncal.cli.app import main
+from visioncal.cli.app import app, main
+from visioncal.cli.lazy import LazyGroup
 from visioncal.core.types import FloatArray
 
 QUATERNIONS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
@@ -63,6 +66,17 @@ def started(*arguments: object, stdout: int | TextIO = subprocess.PIPE) -> Done:
         env=os.environ | _WIDE | {"PYTHONWARNINGS": "error", "PYTHONUTF8": "1"},
     )
     return Done(done.returncode, done.stdout or "", done.stderr)
+
+
+def every_command(group: Any = None, before: str = "") -> Iterator[tuple[str, Any]]:
+    """All commands with their parameters, by the words that are typed for them."""
+    group = group or get_command(app)
+    for name, listed in group.commands.items():
+        command = group.imported(name) if isinstance(group, LazyGroup) else listed
+        if isinstance(command, TyperGroup):
+            yield from every_command(command, f"{before}{name} ")
+        else:
+            yield f"{before}{name}", command
 
 
 def write_poses(

@@ -25,11 +25,12 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from unittest.mock import patch
 
-import typer
+from commands import every_command
 from mutators import mutate
 from sound_inputs import MAKERS, Inputs, typed
 
-from visioncal.cli import app as application
+from visioncal.cli import console
+from visioncal.cli.app import main
 from visioncal.core.errors import VisioncalError
 from visioncal.present import viewer
 
@@ -209,15 +210,6 @@ EXCHANGED = ("pairs", "out", "board.rrd", "another.rrd", "old.rrd", "touches.csv
              "network_out", "arm.json")  # fmt: skip
 
 
-def commands(app: typer.Typer = application.app, before: str = "") -> Iterator[str]:
-    """Names all commands of the application, as they are typed."""
-    for it in app.registered_commands:
-        yield f"{before}{it.name}"
-    for group in app.registered_groups:
-        if group.typer_instance is not None:
-            yield from commands(group.typer_instance, f"{before}{group.name} ")
-
-
 @dataclass(frozen=True)
 class Ended:
     """How a command ended on a broken input.
@@ -376,7 +368,7 @@ def _memory(pid: int, field: str) -> int:
 def _called(words: Sequence[str], answers: str) -> _Done:
     """Calls the application as its entry point does."""
     out, err, errors = io.StringIO(), io.StringIO(), []
-    report = application.report_error
+    report = console.report_error
 
     def reported(error: VisioncalError, *, as_json: bool) -> None:
         errors.append(error)
@@ -387,13 +379,13 @@ def _called(words: Sequence[str], answers: str) -> _Done:
     with (
         patch.object(sys, "argv", ["visioncal", *words]),
         patch.object(sys, "stdin", io.StringIO(answers)),
-        patch.object(application, "report_error", reported),
+        patch.object(console, "report_error", reported),
         patch.object(viewer, "review_native", lambda _: None),
         redirect_stdout(out),
         redirect_stderr(err),
     ):
         try:
-            application.main()
+            main()
         except SystemExit as stop:
             status = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
         except BaseException:  # noqa: BLE001 - what escapes is what is looked for
@@ -562,7 +554,7 @@ def _killed(worker: _Worker, seed: int, readings: Sequence[Reading], why: str) -
 def missing_commands() -> tuple[str, ...]:
     """Commands that nobody says how to call, and calls of commands that there are not."""
     said = {it.command for it in READINGS} | set(READS_NOTHING)
-    return tuple(sorted(said.symmetric_difference(commands())))
+    return tuple(sorted(said.symmetric_difference(dict(every_command()))))
 
 
 def unknown_inputs() -> set[str]:

@@ -100,13 +100,20 @@ def test_heavy_libraries_enter_in_one_place():
     ("imported", "unwanted"),
     [
         (
-            "visioncal.cli, visioncal.calibration.pipeline",
+            "visioncal.cli.calibrate, visioncal.cli.record",
             {"depthai", "rtde_control", "rtde_receive", "torch", "kornia"},
         ),
-        # Every command waits for what is loaded here, `--help` too.
+        # Every command waits for what is loaded here, `--help` and `--version` too.
         (
             "visioncal.cli.app",
-            {"rerun", "pinocchio", "coal", "matplotlib", "scipy.signal", "scipy.stats"},
+            {"numpy", "rich", "visioncal.core.types"},
+        ),
+        ("visioncal", {"numpy", "typer", "visioncal.core.types"}),
+        # A place of a pixel is a millisecond's work.
+        (
+            "visioncal.cli.locate",
+            {"rerun", "pinocchio", "coal", "matplotlib", "scipy.optimize", "scipy.signal"}
+            | {"scipy.stats", "visioncal.calibration.pipeline", "visioncal.dynamics"},
         ),
     ],
 )

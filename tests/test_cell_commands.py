@@ -8,7 +8,7 @@ import pytest
 from commands import turned_poses, visioncal, write_poses
 from whole_cells import LATER, OPTIONS, misfit, part, recorded, saved, simulated, truth
 
-from visioncal.cli.console import unused_words
+from visioncal.cli.summary import unused_words
 from visioncal.frames.frame_from_images import seen_frame
 from visioncal.frames.locate import locate
 from visioncal.frames.plane import Plane

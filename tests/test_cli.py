@@ -4,11 +4,12 @@ import json
 from pathlib import Path
 
 import pytest
-from commands import started, visioncal
+from commands import every_command, started, visioncal
 from rich.text import Text
 from typer.main import get_command
 
 from visioncal.cli.app import app
+from visioncal.cli.lazy import LazyGroup
 from visioncal.core.errors import DataError
 from visioncal.robot import robot_names
 from visioncal.session import Session
@@ -162,16 +163,23 @@ def test_help_and_version_name_the_program():
     assert visioncal("--version").out.strip().count(".") == 2
 
 
+@pytest.mark.parametrize("path", [(), ("dynamics",)])
+def test_the_listing_has_the_first_words_of_each_command_s_own_help(path):
+    group = get_command(app)
+    for name in path:
+        group = group.imported(name)
+    assert isinstance(group, LazyGroup)
+    own = {it: group.imported(it).help.split("\n\n")[0] for it in group.listed}
+    assert group.listed == {it: " ".join(words.split()) for it, words in own.items()}
+
+
 def test_help_loses_no_unit_to_markup():
     """In the terminal's markup `[mm]` is a style, and what is written so is not shown."""
-
-    def texts(command, name):
-        yield name, command.help
-        yield from ((f"{name} {it.name}", getattr(it, "help", None)) for it in command.params)
-        for sub, it in getattr(command, "commands", {}).items():
-            yield from texts(it, f"{name} {sub}")
-
-    every = [(name, it) for name, it in texts(get_command(app), "visioncal") if it]
+    every = [
+        (f"{name} {it.name}", getattr(it, "help", None) or "")
+        for name, command in every_command()
+        for it in (command, *command.params)
+    ]
     assert len(every) > 100
     assert [name for name, it in every if Text.from_markup(it).plain != it] == []
 

@@ -10,13 +10,14 @@ from pathlib import Path
 
 import pytest
 import typer
+from commands import every_command
 from recipes import BLOCK, FOLDER
 
 import visioncal
 from visioncal import dynamics
-from visioncal.cli.app import app
 
 ROOT = Path(__file__).parents[1]
+COMMANDS = dict(every_command())
 FRONT = ROOT / "README.md"
 PACKAGES = sorted(it.parent for it in (ROOT / "visioncal").glob("*/__init__.py"))
 PAGES = [
@@ -84,13 +85,11 @@ def mentions_of(page: Path) -> tuple[tuple[str, ...], ...]:
 
 def command_of(words: tuple[str, ...]) -> tuple[typer.core.TyperCommand, list[str], str]:
     """The command that words begin with, what follows, and its name."""
-    command, left, name = typer.main.get_command(app), list(words), []
-    while hasattr(command, "commands"):
-        assert left, f"visioncal {' '.join(words)} names no command"
-        assert left[0] in command.commands, f"visioncal has no command {' '.join(words)}"
-        command = command.commands[left[0]]
-        name.append(left.pop(0))
-    return command, left, " ".join(name)
+    for count in (1, 2):
+        name = " ".join(words[:count])
+        if command := COMMANDS.get(name):
+            return command, list(words[count:]), name
+    raise AssertionError(f"visioncal {' '.join(words)} names no command")
 
 
 def parse(words: tuple[str, ...], *, whole: bool) -> None:
@@ -165,22 +164,13 @@ def test_every_command_and_option_is_on_a_page():
     text = "\n".join(map(text_of, PAGES))
     words = [it for page in PAGES for it in (*commands_of(page), *mentions_of(page))]
     named = {command_of(it)[2] for it in words if it[0] != "COMMAND"}
-    for name, command in leaves(typer.main.get_command(app), ""):
+    for name, command in COMMANDS.items():
         assert name in named, f"no page has visioncal {name}"
         for it in command.params:
             flags = [*it.opts, *it.secondary_opts]
             assert flags == [it.name] or any(
                 re.search(rf"(?<![\w-]){flag}(?![\w-])", text) for flag in flags
             ), f"no page has {flags} of visioncal {name}"
-
-
-def leaves(command, name):
-    """The commands of a group and of its groups, each with its name."""
-    if not hasattr(command, "commands"):
-        yield name, command
-        return
-    for key, it in command.commands.items():
-        yield from leaves(it, f"{name} {key}".strip())
 
 
 def test_the_front_page_is_short():

@@ -18,7 +18,7 @@ from scipy.spatial.transform import RigidTransform
 from scipy.stats import chi2, norm
 from varied_cells import Cell, cell, write
 
-import visioncal.cli.app
+import visioncal.cli.console
 from visioncal import Session
 from visioncal.cli.review import find_recording
 from visioncal.core.errors import VisioncalError
@@ -159,7 +159,7 @@ def _stepped(done: Walk, command: str) -> Iterator[None]:
 def _run(done: Walk, command: str, *arguments: object) -> Done | None:
     """Runs a command; None where there is no result. A check that says no is one."""
     told: list[VisioncalError] = []
-    report = visioncal.cli.app.report_error
+    report = visioncal.cli.console.report_error
 
     def noted(error: VisioncalError, *, as_json: bool) -> None:
         told.append(error)
@@ -167,7 +167,7 @@ def _run(done: Walk, command: str, *arguments: object) -> Done | None:
 
     begun = time.perf_counter()
     try:
-        with patch.object(visioncal.cli.app, "report_error", noted):
+        with patch.object(visioncal.cli.console, "report_error", noted):
             end = run(command, *arguments)
     except Exception:  # noqa: BLE001 - a bug of any kind is what is looked for
         done.steps.append(Step(command, 1, trace=traceback.format_exc()))

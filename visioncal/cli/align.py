@@ -9,15 +9,11 @@ import typer
 from rich.markup import escape
 
 from visioncal.calibration.pipeline import align
-from visioncal.cli.console import (
-    messages,
-    print_verdict,
-    shown_progress,
-    tell_written,
-    unused_words,
-)
+from visioncal.cli.console import messages, tell_written
 from visioncal.cli.needs import NeedDeg, NeedMm
 from visioncal.cli.pointing import naming, told_verdict
+from visioncal.cli.progress import shown_progress
+from visioncal.cli.summary import print_verdict, unused_words
 from visioncal.core.number_format import figure
 from visioncal.interchange.merge_results import leftover
 from visioncal.interchange.outputs import write_alignment
@@ -45,7 +41,7 @@ def align_command(
         bool, typer.Option("--json", help="Print alignment.json to stdout.")
     ] = False,
 ) -> None:
-    """Put a whole cell in one frame: several robots, cameras and boards, adjusted together.
+    """Put several robots, cameras and boards in one frame, adjusted together.
 
     Writes calibration.json (every frame with its covariance, each robot's and camera's noise, what
     moved, and every observation that disagrees), the same in the older form of alignment.json,

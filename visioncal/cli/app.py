@@ -2,61 +2,51 @@
 
 import sys
 from errno import ENAMETOOLONG
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import typer
 
-from visioncal.cli.align import align_command
-from visioncal.cli.calibrate import calibrate_command
-from visioncal.cli.console import EXIT_NO_RESULT, report_error
-from visioncal.cli.convert import convert_command
-from visioncal.cli.correct import correct_command
-from visioncal.cli.demo import demo_command
-from visioncal.cli.diff import diff_command
-from visioncal.cli.dynamics import dynamics_app
-from visioncal.cli.export import export_command
-from visioncal.cli.fixture import fixture_command
-from visioncal.cli.locate import locate_command
-from visioncal.cli.plan import plan_command
-from visioncal.cli.record import record_command
-from visioncal.cli.rehearse import rehearse_command
-from visioncal.cli.report import report_command
-from visioncal.cli.review import review_command
-from visioncal.cli.simulate import simulate_command
+from visioncal.cli.lazy import LazyGroup
 from visioncal.cli.streams import guarded_streams
-from visioncal.cli.target import target_app
-from visioncal.cli.tcp import tcp_command
-from visioncal.cli.verify import verify_command
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.version import __version__
 
+
+class _Commands(LazyGroup):
+    """All commands, in the order of their work."""
+
+    listed: ClassVar = {
+        "demo": "Simulate a UR cell, calibrate it from its images, and compare with the truth.",
+        "plan": "Propose the robot stops that tell most, or those to add to a session.",
+        "record": "Record a session: drive the stops of a plan, or follow an arm guided by hand.",
+        "rehearse": "Plan, record and calibrate a simulated cell by the real client libraries.",
+        "calibrate": "Turn a session into a hand-eye calibration, with reasons to trust it or not.",
+        "align": "Put several robots, cameras and boards in one frame, adjusted together.",
+        "report": "Make the report of an earlier calibration again.",
+        "verify": "Tell whether a calibration still holds, and what has changed if it does not.",
+        "diff": "Tell what changed between two calibrations, and what is only noise.",
+        "convert": "Write a session as a folder or a recording, or make one of another program's.",
+        "export": "Write a result, or the calibrated arm, in another program's or robot's format.",
+        "tcp": "Find a tool's tip, and its rotation, from touches of fixed points; or from images.",
+        "locate": "Locate what an image shows in the robot's base, with its uncertainty.",
+        "fixture": "Find a fixture in the base, from touches of it or of a drawing's points.",
+        "correct": "Correct targets so that the arm reaches them by its nominal controller.",
+        "review": "Open a recording in the rerun viewer, on this machine alone.",
+        "simulate": "Write a simulated session, and its truth in a file beside it.",
+        "target": "Print a board at its exact size, or name the one in a photograph.",
+        "dynamics": "Identify an arm's inertias and friction, and weigh what it carries.",
+    }
+
+
 app = typer.Typer(
     name="visioncal",
+    cls=_Commands,
     help="Calibrates vision-guided robot cells with a printed board, and says how far the result "
     "can be trusted.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command("demo")(demo_command)
-app.command("plan")(plan_command)
-app.command("record")(record_command)
-app.command("rehearse")(rehearse_command)
-app.command("calibrate")(calibrate_command)
-app.command("align")(align_command)
-app.command("report")(report_command)
-app.command("verify")(verify_command)
-app.command("diff")(diff_command)
-app.command("convert")(convert_command)
-app.command("export")(export_command)
-app.command("tcp")(tcp_command)
-app.command("locate")(locate_command)
-app.command("fixture")(fixture_command)
-app.command("correct")(correct_command)
-app.command("review")(review_command)
-app.command("simulate")(simulate_command)
-app.add_typer(target_app, name="target")
-app.add_typer(dynamics_app, name="dynamics")
 
 
 def _show_version(wanted: bool) -> None:
@@ -81,11 +71,16 @@ def main() -> None:
         try:
             app()
         except VisioncalError as error:
-            report_error(error, as_json="--json" in sys.argv[1:])
-            sys.exit(EXIT_NO_RESULT)
+            _refuse(error)
         except OSError as error:
             if error.errno != ENAMETOOLONG:
                 raise
-            named = DataError(f"{error.filename} is longer than the name of any file.")
-            report_error(named, as_json="--json" in sys.argv[1:])
-            sys.exit(EXIT_NO_RESULT)
+            _refuse(DataError(f"{error.filename} is longer than the name of any file."))
+
+
+def _refuse(error: VisioncalError) -> None:
+    # Consoles take longer to import than `--version` takes.
+    from visioncal.cli.console import EXIT_NO_RESULT, report_error
+
+    report_error(error, as_json="--json" in sys.argv[1:])
+    sys.exit(EXIT_NO_RESULT)

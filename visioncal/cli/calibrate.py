@@ -12,9 +12,11 @@ from visioncal.calibration.pipeline import run, run_dense
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.running import check_dense, check_solver
 from visioncal.cli.align import align_into
-from visioncal.cli.console import messages, print_summary, shown_progress, tell_written
+from visioncal.cli.console import messages, tell_written
 from visioncal.cli.needs import NeedDeg, NeedMm
 from visioncal.cli.pointing import naming, told_of
+from visioncal.cli.progress import shown_progress
+from visioncal.cli.summary import print_summary
 from visioncal.core.types import SolverName
 from visioncal.interchange.merge_results import leftover
 from visioncal.interchange.outputs import write_outputs

@@ -9,8 +9,9 @@ from rich.markup import escape
 from visioncal.calibration.guess import Candidate, Guess
 from visioncal.calibration.pipeline.guess_inputs import guess_session
 from visioncal.cli import convert_options as option
-from visioncal.cli.console import messages, shown_progress
+from visioncal.cli.console import messages
 from visioncal.cli.guessed import print_guess
+from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
 from visioncal.interchange.formats import (
     Foreign,
@@ -49,7 +50,7 @@ def convert_command(
     guess: option.TryOthers = False,
     yes: option.TakeBest = False,
 ) -> None:
-    """Write a session as a folder or as a recording, or make one of somebody else's recording.
+    """Write a session as a folder or a recording, or make one of another program's.
 
     Between our own forms nothing is lost, which digests prove. Exit status 0: it is written; 2:
     nothing was written, and the message says what is missing or wrong.

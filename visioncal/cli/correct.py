@@ -110,7 +110,7 @@ def correct_command(
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the targets as JSON.")] = False,
 ) -> None:
-    """Turn targets into those that make the real arm reach them through its nominal controller.
+    """Correct targets so that the arm reaches them by its nominal controller.
 
     Exit status 2: nothing was written, for the reason given; targets out of reach are named.
     """

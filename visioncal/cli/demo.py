@@ -10,7 +10,9 @@ from rich.markup import escape
 
 from visioncal.calibration.pipeline import run
 from visioncal.cli.against_truth import truth_table
-from visioncal.cli.console import messages, print_summary, shown_progress, tell_written
+from visioncal.cli.console import messages, tell_written
+from visioncal.cli.progress import shown_progress
+from visioncal.cli.summary import print_summary
 from visioncal.interchange.outputs import write_outputs
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, read_truth, simulate, truth_path, write_session

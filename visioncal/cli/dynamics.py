@@ -1,21 +1,28 @@
 """`visioncal dynamics`: its commands."""
 
+from typing import ClassVar
+
 import typer
 
-from visioncal.cli.dynamics_gains import dynamics_gains_command
-from visioncal.cli.dynamics_identify import dynamics_identify_command, dynamics_validate_command
-from visioncal.cli.dynamics_payload import dynamics_payload_command
-from visioncal.cli.dynamics_plan import dynamics_plan_command
-from visioncal.cli.dynamics_record import dynamics_record_command
+from visioncal.cli.lazy import LazyGroup
+
+
+class _Commands(LazyGroup):
+    """Its commands, in the order of their work."""
+
+    prefix = "dynamics_"
+    listed: ClassVar = {
+        "plan": "Plan the motions that tell an arm's inertias and friction.",
+        "record": "Record angles, speeds and motor currents at the controller's full rate.",
+        "identify": "Identify an arm's inertias and friction from the torques of its motions.",
+        "validate": "Predict the torques of other motions, and say how near that comes.",
+        "payload": "Weigh what the arm carries, by how much more its drives gave than without it.",
+        "gains": "Find how much torque a drive's current makes, by a body that is known.",
+    }
+
 
 dynamics_app = typer.Typer(
-    help="Identify an arm's inertias and friction: plan the motions that tell them, fit their "
-    "torques, see what that predicts, and weigh what the arm carries.",
+    cls=_Commands,
+    help="Identify an arm's inertias and friction, and weigh what it carries.",
     no_args_is_help=True,
 )
-dynamics_app.command("plan")(dynamics_plan_command)
-dynamics_app.command("record")(dynamics_record_command)
-dynamics_app.command("identify")(dynamics_identify_command)
-dynamics_app.command("validate")(dynamics_validate_command)
-dynamics_app.command("payload")(dynamics_payload_command)
-dynamics_app.command("gains")(dynamics_gains_command)

@@ -1,7 +1,6 @@
-"""`visioncal dynamics identify` and `validate`."""
+"""`visioncal dynamics identify`."""
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -10,16 +9,15 @@ from rich.markup import escape
 from rich.table import Table
 
 from visioncal.cli.choosing import RobotName
-from visioncal.cli.console import messages, print_verdict, tell_written
+from visioncal.cli.console import messages, tell_written
 from visioncal.cli.dynamics_options import (
-    AgainstOption,
     CutoffOption,
     GainsOption,
     SessionArgument,
     StreamOption,
-    identified_of,
     number_list,
 )
+from visioncal.cli.summary import print_verdict
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.dynamics.document import stribeck_rows, to_document
@@ -27,8 +25,7 @@ from visioncal.dynamics.friction import FrictionTerms
 from visioncal.dynamics.identified import CLASSES, FILE, NOT_TOLD, Identified
 from visioncal.dynamics.identify import SLOW_RAD_S, Options
 from visioncal.dynamics.judge import judge
-from visioncal.dynamics.run import Request, identify_session, validate_session
-from visioncal.dynamics.validate import Prediction, validate
+from visioncal.dynamics.run import Request, identify_session
 from visioncal.interchange.outputs import write_dynamics
 from visioncal.results import Verdict
 from visioncal.session import Session
@@ -98,32 +95,6 @@ def dynamics_identify_command(
         messages().print("nothing was written: -o names a folder for it")
 
 
-def dynamics_validate_command(
-    session: SessionArgument,
-    against: AgainstOption = None,
-    stream: StreamOption = None,
-    cutoff_hz: CutoffOption = None,
-    gains: GainsOption = None,
-    robot: RobotName = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print figures as JSON.")] = False,
-) -> None:
-    """Predict the torques of other motions, and say how near that comes.
-
-    Exit status 0: there are figures; 2: there are none, for the reason given.
-    """
-    identified = identified_of(against, "validate")
-    request = Request(
-        tuple(stream or ()), "", cutoff_hz, number_list(gains, "--gains"), robot=robot
-    )
-    predictions = validate_session(Session.load(session), identified, request)
-    if as_json:
-        typer.echo(json.dumps([_figures(it) for it in predictions], indent=2))
-        return
-    for prediction in predictions:
-        messages().print(escape(prediction.label))
-        _tell_prediction(identified, prediction)
-
-
 def _terms(words: str) -> FrictionTerms:
     """The terms of friction that the user names.
 
@@ -187,29 +158,3 @@ def _joint_table(identified: Identified) -> Table:
         row = [None if it[at] is None else figure(float(it[at] or 0.0)) for it in told.values()]
         table.add_row(str(joint), *row)
     return table
-
-
-def _tell_prediction(identified: Identified, prediction: Prediction) -> None:
-    found = validate(identified, prediction)
-    fitted = identified.fitted_rms_nm
-    table = Table("joint", "predicted to [N m]", "of its range", "fitted to [N m]", box=None)
-    for joint, name in enumerate(identified.robot.joint_names):
-        table.add_row(
-            name,
-            figure(float(found.rms_nm[joint])),
-            f"{figure(100.0 * float(found.shares[joint]))} %",
-            figure(float(fitted[joint])),
-        )
-    messages().print(table)
-
-
-def _figures(prediction: Prediction) -> dict[str, str | Sequence[float]]:
-    rms_nm = prediction.rms_nm(prediction.predicted_nm)
-    figures: dict[str, str | Sequence[float]] = {
-        "stream": prediction.label,
-        "rms_nm": rms_nm.tolist(),
-        "torque_nm": prediction.torque_nm.tolist(),
-    }
-    if prediction.consistent_nm is not None:
-        figures["consistent_rms_nm"] = prediction.rms_nm(prediction.consistent_nm).tolist()
-    return figures

@@ -8,10 +8,11 @@ import typer
 from rich.markup import escape
 
 from visioncal.cli import motion_options as options
-from visioncal.cli.console import messages, shown_progress, tell_written
+from visioncal.cli.console import messages, tell_written
 from visioncal.cli.numbers import numbers_in
 from visioncal.cli.plan_options import BoxOption, Clearance, Floor, Margin
 from visioncal.cli.planned_cell import box_of, floor_of
+from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.types import FloatArray

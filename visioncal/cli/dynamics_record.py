@@ -29,7 +29,7 @@ def dynamics_record_command(
         float, typer.Option(min=0.5, help="At rest for so many seconds, the motion is over.")
     ] = 3.0,
 ) -> None:
-    """Record a motion's angles, speeds and motor currents at the controller's full rate.
+    """Record angles, speeds and motor currents at the controller's full rate.
 
     The motion is another's: start its program (such as excitation.script of `dynamics plan`) on the
     pendant once this command waits for it. Exit status 0: it is recorded; 2: it is not.

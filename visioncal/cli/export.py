@@ -86,7 +86,7 @@ def export_command(
         typer.Option("--list", callback=_show_formats, is_eager=True, help="List the formats."),
     ] = False,
 ) -> None:
-    """Write a result in another program's or a robot's format, or the arm that was calibrated.
+    """Write a result, or the calibrated arm, in another program's or robot's format.
 
     The transform a_from_b is the pose of b in a: its parent is a, its child b. Exit status 2:
     nothing was written, for the reason given.

@@ -28,11 +28,11 @@ from visioncal.cli.framing import (
     tell,
     touch_wishes,
 )
+from visioncal.cli.refusing import refuse_given
 from visioncal.cli.seeing import (
     PointOption,
     frame_by_images,
     image_session,
-    refuse_given,
     touch_options,
 )
 from visioncal.core.errors import DataError
@@ -88,7 +88,7 @@ def fixture_command(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Find a fixture in the base, from touches of its features or of a drawing's points.
+    """Find a fixture in the base, from touches of it or of a drawing's points.
 
     A touch of kind origin is at the fixture's origin; of kind x, on its positive x axis; of kind
     xy, in its xy plane on the side of positive y: one of each at least. With --cad, three points or

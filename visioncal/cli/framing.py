@@ -9,8 +9,9 @@ from typing import Annotated, TypeAlias
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import messages, print_verdict, tell_written
+from visioncal.cli.console import messages, tell_written
 from visioncal.cli.convert_options import names_in
+from visioncal.cli.summary import print_verdict
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import pose_difference

@@ -11,12 +11,12 @@ import typer
 from rich.markup import escape
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from visioncal.calibration.stages.observed import by_reason
 from visioncal.cli.choosing import CameraName, RobotName
-from visioncal.cli.console import messages, shown_progress
+from visioncal.cli.console import messages
 from visioncal.cli.numbers import numbers_in
 from visioncal.cli.planes import FORMS, plane_of
-from visioncal.cli.seeing import refuse_given
+from visioncal.cli.progress import shown_progress
+from visioncal.cli.refusing import refuse_given
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
@@ -24,10 +24,7 @@ from visioncal.core.types import FloatArray, Target
 from visioncal.frames.camera_chain import Eye
 from visioncal.frames.locate import locate, locate_target
 from visioncal.frames.located import Located
-from visioncal.frames.picks import locate_views
-from visioncal.frames.session_observations import pose_of
 from visioncal.frames.target_in_image import check_size
-from visioncal.interchange.formats.boards import described_target
 from visioncal.interchange.result_files import load_result
 from visioncal.results import Calibration, Edge
 from visioncal.results.selecting import boards_before
@@ -111,7 +108,7 @@ def locate_command(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the places as JSON.")] = False,
 ) -> None:
-    """Tell where something that an image shows lies in the robot's base, and how surely.
+    """Locate what an image shows in the robot's base, with its uncertainty.
 
     It is a target, or a pixel whose plane is known. Exit status 2: there is no place, for the
     reason given.
@@ -208,6 +205,8 @@ def _flange_of(
     session: Session, views: Sequence[View], calibration: Calibration
 ) -> FloatArray | None:
     """Where the flange was at the one view that is meant; a camera that stands still needs none."""
+    from visioncal.frames.session_observations import pose_of
+
     check_mount(session, calibration)
     if calibration.mount == "eye-to-hand":
         return None
@@ -266,6 +265,10 @@ def _by_views(
     *,
     quiet: bool,
 ) -> tuple[_Found, ...]:
+    # A pixel is placed in a millisecond, and need not wait for what sessions take to import.
+    from visioncal.calibration.stages.observed import by_reason
+    from visioncal.frames.picks import locate_views
+
     with shown_progress(quiet=quiet) as told:
         picks = locate_views(
             session, calibration, point_m, among=views, sigma_px=sigma_px, progress=told
@@ -306,6 +309,8 @@ def _by_image(
 def _target(words: str, result: Calibration) -> Target:
     if result.cell is not None and words in result.cell.targets:
         return target_from_document(result.cell.targets[words], words)
+    from visioncal.interchange.formats.boards import described_target
+
     return target_from_document(described_target(words), Path(words).stem)
 
 

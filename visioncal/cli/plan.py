@@ -8,7 +8,7 @@ import typer
 from rich.markup import escape
 
 from visioncal.cli import plan_options as options
-from visioncal.cli.console import messages, shown_progress, tell_written
+from visioncal.cli.console import messages, tell_written
 from visioncal.cli.numbers import numbers_in
 from visioncal.cli.planned_cell import (
     CellWords,
@@ -20,6 +20,7 @@ from visioncal.cli.planned_cell import (
     find_source,
     floor_of,
 )
+from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.types import FloatArray, Progress

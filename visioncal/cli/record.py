@@ -55,7 +55,7 @@ def record_command(
     focus: options.Focus = None,
     as_json: options.AsJson = False,
 ) -> None:
-    """Record a session: drive the stops of a plan, or follow an arm that is guided by hand.
+    """Record a session: drive the stops of a plan, or follow an arm guided by hand.
 
     Every view is on the disk before the next is taken. Exit status 0: all views are there; 2: the
     recording ended before, the arm stands still, and --resume goes on.

@@ -14,8 +14,9 @@ import typer
 from rich.markup import escape
 
 from visioncal.cli.against_truth import truth_table
-from visioncal.cli.console import messages, print_summary, tell_written
+from visioncal.cli.console import messages, tell_written
 from visioncal.cli.rehearsed import TAKING, Recorded, calibrated, planned, recorded
+from visioncal.cli.summary import print_summary
 from visioncal.core.errors import DataError
 from visioncal.core.files import write_atomically
 from visioncal.core.types import CameraMount
@@ -57,7 +58,7 @@ def rehearse_command(
         bool, typer.Option("--json", help="Print rehearsal.json to stdout.")
     ] = False,
 ) -> None:
-    """Plan, record and calibrate a simulated cell through the real client libraries.
+    """Plan, record and calibrate a simulated cell by the real client libraries.
 
     The controller is a process on this machine that speaks a UR's protocols, with an arm that is
     not quite as it should be; the camera draws what that arm sees. Nothing real moves. Exit status

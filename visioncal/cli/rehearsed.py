@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from visioncal.calibration.pipeline import Run, run
-from visioncal.cli.console import messages, report_error, shown_progress, tell_written
+from visioncal.cli.console import messages, report_error, tell_written
 from visioncal.cli.interrupts import ended_like_ctrl_c
+from visioncal.cli.progress import shown_progress
 from visioncal.cli.record import ViewLines, driven
 from visioncal.cli.recorded_cell import Scene, facts_of, scene_of, shown_in
 from visioncal.core.errors import DataError, DriverError, VisioncalError

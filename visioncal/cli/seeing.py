@@ -7,11 +7,11 @@ from typing import Annotated, TypeAlias
 import numpy as np
 import typer
 
-from visioncal.cli.console import shown_progress
 from visioncal.cli.framing import Place
 from visioncal.cli.numbers import numbers_in
+from visioncal.cli.progress import shown_progress
+from visioncal.cli.refusing import refuse_given
 from visioncal.core.errors import DataError
-from visioncal.core.files import some_of
 from visioncal.frames.drawing_points import NominalPoints
 from visioncal.frames.fixture_from_markers import marked_fixture
 from visioncal.frames.frame_from_images import seen_frame
@@ -82,21 +82,6 @@ def touch_options(
         "--robot-model": model,
         "--touch-noise-mm": noise_mm,
     }
-
-
-def refuse_given(options: Mapping[str, object], why: str) -> None:
-    """Refuses options that have no use here.
-
-    Args:
-        options: By their names; None for those that were not given.
-        why: They have none, in words.
-
-    Raises:
-        DataError: One is given.
-    """
-    given = [name for name, value in options.items() if value is not None]
-    if given:
-        raise DataError(f"{some_of(given)}: {why}.", culprits=given, next_step="Leave it out.")
 
 
 def camera_of(place: Place, session: Session) -> Calibration:

@@ -5,7 +5,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from visioncal.cli.console import messages, shown_progress
+from visioncal.cli.console import messages
+from visioncal.cli.progress import shown_progress
 from visioncal.cli.simulated import given_for
 from visioncal.cli.simulated_cell import CENTRE_M, Along, Read, exercise_options, whole_cell
 from visioncal.core.types import CameraMount

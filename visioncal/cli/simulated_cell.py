@@ -6,7 +6,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from visioncal.cli.console import shown_progress
+from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
 from visioncal.session import frame_name
 from visioncal.simulation import (

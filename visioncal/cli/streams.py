@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from typing import Any, TextIO, cast
 
-from visioncal.cli.console import EXIT_NO_RESULT, report_error
 from visioncal.core.errors import DataError
 
 # As a shell reports a program that SIGPIPE ended.
@@ -32,6 +31,9 @@ def guarded_streams() -> Iterator[None]:
 def _end(error: OSError) -> None:
     if isinstance(error, BrokenPipeError):
         raise SystemExit(_EXIT_BROKEN_PIPE) from error
+    # A console takes longer to import than `--version` takes.
+    from visioncal.cli.console import EXIT_NO_RESULT, report_error
+
     failure = DataError(
         f"stdout cannot be written: {error.strerror or error}.",
         culprits=["stdout"],

@@ -28,11 +28,11 @@ from visioncal.cli.framing import (
     tell,
     touch_wishes,
 )
+from visioncal.cli.refusing import refuse_given
 from visioncal.cli.seeing import (
     PointOption,
     frame_by_images,
     image_session,
-    refuse_given,
     touch_options,
 )
 from visioncal.frames.naming import transform_name

@@ -19,7 +19,8 @@ from visioncal.calibration.verification import (
     verify,
 )
 from visioncal.cli.choosing import CameraName, RobotName, TargetName
-from visioncal.cli.console import messages, shown_progress, tell_written
+from visioncal.cli.console import messages, tell_written
+from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
 from visioncal.interchange.outputs import REPORT, VERIFY, Written, refuse_calibration, write_check
 from visioncal.interchange.result_files import load_result

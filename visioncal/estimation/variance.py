@@ -5,7 +5,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
 
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.linalg import covariance_root, gram
@@ -138,6 +137,9 @@ def profile_interval(
         Low and high: a low of zero where the residuals do not speak against no noise at all, and a
         high of fifty times the sigma where they do not speak against that.
     """
+    # An import as long as that of all the rest, which locating needs not.
+    from scipy.optimize import brentq
+
     middle = float(np.log(max(sigma, LEAST_SIGMA)))
     # A fit that rests at another maximum than the highest has its interval about that.
     here = profile(middle)

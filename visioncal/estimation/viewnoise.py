@@ -6,7 +6,6 @@ views are draws of one inverse gamma distribution, whose two parameters all view
 """
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.special import digamma, polygamma
 
 from visioncal.core.quantiles import chi2_limit
@@ -38,6 +37,9 @@ def weights_by_view(squares: FloatArray, freedom: FloatArray) -> FloatArray | No
     about = logs - np.average(logs, weights=1.0 / covariance)
     if np.sum(about**2 / covariance) < chi2_limit(_FALSE_ALARM, len(logs) - 1):
         return None
+    # Few views come here, and none that is located.
+    from scipy.optimize import brentq
+
     between = float(np.clip(np.var(logs, ddof=1) - np.mean(covariance), *_BETWEEN))
     half = float(np.exp(brentq(lambda it: polygamma(1, np.exp(it)) - between, *_LOGS)))
     scale = np.exp(np.mean(logs) + digamma(half))

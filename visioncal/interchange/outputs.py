@@ -5,21 +5,21 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
-from visioncal.calibration.pipeline import Run as Calibrated
-from visioncal.calibration.verification import Check, Outcome
 from visioncal.core.errors import DataError
 from visioncal.core.files import write_atomically
 from visioncal.core.output_generations import write_generation
-from visioncal.dynamics import FILE as DYNAMICS
-from visioncal.dynamics import Run
-from visioncal.dynamics.planned import MotionPlan
-from visioncal.dynamics.written import MOTION_FILES, motion_files
-from visioncal.live.planning.plan import Plan
-from visioncal.live.planning.written import program_of, stops_table
-from visioncal.results import Alignment, Calibration
-from visioncal.session import Session
+
+# Whoever writes one kind of result need not wait for the imports of all the others.
+if TYPE_CHECKING:
+    from visioncal.calibration.pipeline import Run as Calibrated
+    from visioncal.calibration.verification import Check, Outcome
+    from visioncal.dynamics import Run
+    from visioncal.dynamics.planned import MotionPlan
+    from visioncal.live.planning.plan import Plan
+    from visioncal.results import Alignment
+    from visioncal.session import Session
 
 CALIBRATION, REPORT, RECORDING = "calibration.json", "report.html", "recording.rrd"
 VERIFY = "verify.json"
@@ -56,7 +56,7 @@ class Written:
 
 
 def write_outputs(
-    folder: Path, session: Session | None, run: Calibrated, note: str = ""
+    folder: Path, session: "Session | None", run: "Calibrated", note: str = ""
 ) -> Written:
     """Writes the three files into a folder, all at once whenever it is killed.
 
@@ -96,7 +96,9 @@ def write_outputs(
     return _write(folder, {CALIBRATION: run.calibration.save}, drawings, (ALIGNMENT,))
 
 
-def write_check(folder: Path, check: Check, triggers: Sequence[Outcome], document: str) -> Written:
+def write_check(
+    folder: Path, check: "Check", triggers: "Sequence[Outcome]", document: str
+) -> Written:
     """Writes a check's page and JSON into a folder, all at once.
 
     Args:
@@ -135,7 +137,7 @@ def refuse_calibration(folder: Path) -> None:
         )
 
 
-def write_alignment(folder: Path, session: Session | None, found: Alignment) -> Written:
+def write_alignment(folder: Path, session: "Session | None", found: "Alignment") -> Written:
     """Writes the alignment of a cell, its report and its recording into a folder, all at once.
 
     Args:
@@ -165,11 +167,13 @@ def write_alignment(folder: Path, session: Session | None, found: Alignment) -> 
             write_cell_recording(path, session, found, cell_blueprint(session, found))
 
         drawings[RECORDING] = record
+    from visioncal.results import Calibration
+
     results = {CALIBRATION: Calibration.whole(found).save, ALIGNMENT: found.save}
     return _write(folder, results, drawings)
 
 
-def write_plan(folder: Path, plan: Plan, document: Mapping[str, Any]) -> Written:
+def write_plan(folder: Path, plan: "Plan", document: Mapping[str, Any]) -> Written:
     """Writes a plan's table, program, preview and JSON into a folder, all at once.
 
     Args:
@@ -194,6 +198,8 @@ def write_plan(folder: Path, plan: Plan, document: Mapping[str, Any]) -> Written
         preview = preview_of(plan, f"plan for {plan.cell.robot.name}, {plan.cell.target.name}")
         write_preview(path, preview, plan_blueprint(preview))
 
+    from visioncal.live.planning.written import program_of, stops_table
+
     texts = {PLAN: _json(document), STOPS: stops_table(plan)}
     if program := program_of(plan):
         texts[PROGRAM] = program
@@ -202,7 +208,7 @@ def write_plan(folder: Path, plan: Plan, document: Mapping[str, Any]) -> Written
 
 
 def write_motions(
-    folder: Path, plan: MotionPlan, rate_hz: float, document: Mapping[str, Any]
+    folder: Path, plan: "MotionPlan", rate_hz: float, document: Mapping[str, Any]
 ) -> Written:
     """Writes planned motions as tables, programs, preview and JSON, all at once.
 
@@ -229,12 +235,14 @@ def write_motions(
         preview = motion_preview(plan)
         write_motion_preview(path, preview, motion_blueprint(preview))
 
+    from visioncal.dynamics.written import MOTION_FILES, motion_files
+
     texts = {PLAN: _json(document), **motion_files(plan, rate_hz)}
     results = {name: _text(text) for name, text in texts.items()}
     return _write(folder, results, {PREVIEW: draw}, MOTION_FILES)
 
 
-def write_dynamics(folder: Path, run: Run) -> Written:
+def write_dynamics(folder: Path, run: "Run") -> Written:
     """Writes identified dynamics, their report and recording into a folder, all at once.
 
     Args:
@@ -259,7 +267,9 @@ def write_dynamics(folder: Path, run: Run) -> Written:
 
         write_dynamics_recording(path, run, dynamics_blueprint(run))
 
-    return _write(folder, {DYNAMICS: run.identified.save}, {REPORT: report, RECORDING: record})
+    from visioncal.dynamics import FILE
+
+    return _write(folder, {FILE: run.identified.save}, {REPORT: report, RECORDING: record})
 
 
 def _write(

@@ -4,16 +4,18 @@ import json
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import absence, read_bytes
-from visioncal.dynamics import FILE as DYNAMICS
-from visioncal.dynamics import Identified
 from visioncal.interchange.outputs import CALIBRATION, RECORDING
 from visioncal.results import Alignment, Calibration, FrameFile, to_document
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
 from visioncal.session.choosing import ANY, ARM, PARTS, Choice, Part
+
+if TYPE_CHECKING:
+    from visioncal.dynamics import Identified
 
 # What tells the folder of a session.
 _SESSION = "session.toml"
@@ -101,7 +103,7 @@ def load_placed(path: Path, robot: str | None = None) -> Calibration | FrameFile
     return load_calibration(path, Choice(robot=robot), ARM)
 
 
-def load_exportable(path: Path) -> Calibration | FrameFile | Alignment | Identified:
+def load_exportable(path: Path) -> "Calibration | FrameFile | Alignment | Identified":
     """Loads what `load_placed` does, the alignment of a whole cell, or an arm's dynamics.
 
     Args:
@@ -112,6 +114,10 @@ def load_exportable(path: Path) -> Calibration | FrameFile | Alignment | Identif
         DataError: There is none of them, or it cannot be read.
     """
     alone = path.is_dir() and not (path / CALIBRATION).exists()
+    # Half a second to import, which loading a calibration need not wait for.
+    from visioncal.dynamics import FILE as DYNAMICS
+    from visioncal.dynamics import Identified
+
     file = path / DYNAMICS if alone and (path / DYNAMICS).is_file() else path
     if "base" in _content(file) and "transforms" not in _content(file):
         return Identified.load(file)

@@ -1,0 +1,75 @@
+"""Results as they are summed up for people."""
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+
+from rich.markup import escape
+from rich.table import Table
+
+from visioncal.cli.console import messages
+from visioncal.core.files import some_of
+from visioncal.core.transforms import pose_difference
+from visioncal.results import Calibration, Sight, Verdict, ViewResult
+
+_COLOURS = {"good": "bold green", "check": "bold yellow", "bad": "bold red"}
+_SAME_REASON = 20  # more views of one reason share a line
+
+
+def print_verdict(verdict: Verdict, name: str) -> None:
+    """Prints whether something can be trusted, and why."""
+    console, colour = messages(), _COLOURS[verdict.status]
+    console.print(f"[{colour}]{verdict.status}[/]  {escape(name)}")
+    for line in verdict.lines:
+        console.print(f"  - {escape(line)}")
+
+
+def print_summary(calibration: Calibration, *, verbose: bool) -> None:
+    """Prints a result for people: the verdict first, then the figures it rests on."""
+    console = messages()
+    print_verdict(calibration.verdict, calibration.session_name)
+    for name, edge in calibration.edges.items():
+        x, y, z = 1e3 * edge.transform.translation
+        console.print(
+            f"{name}: ({x:.2f}, {y:.2f}, {z:.2f}) mm, sigma {edge.sigma_mm:.2g} mm"
+            + (f" and {edge.sigma_deg:.2g} deg" if edge.oriented else ", its rotation not measured")
+        )
+    used = sum(view.used for view in calibration.views)
+    held = calibration.validation.held_out
+    console.print(
+        f"{used} of {len(calibration.views)} views used; left out of the fit they are predicted to "
+        f"{held.mm:.2g} mm"
+        + ("" if held.deg is None else f", {held.deg:.2g} deg")
+        + (f", {held.px:.2g} px" if held.px else "")
+    )
+    for words in unused_words(calibration.views):
+        console.print(f"  {escape(words)}")
+    if verbose:
+        console.print(_solver_table(calibration))
+
+
+def unused_words(views: Iterable[ViewResult | Sight]) -> Iterator[str]:
+    """The views that are not used, each with its reason; many of one reason in one line."""
+    found: dict[tuple[str, str], list[int]] = defaultdict(list)
+    for it in views:
+        of = f" ({it.seer} of {it.seen})" if isinstance(it, Sight) else ""
+        if not it.used:
+            found[of, it.reason].append(it.view)
+    for (of, reason), mine in found.items():
+        if len(mine) > _SAME_REASON:
+            yield f"{len(mine)} views ({some_of([*map(str, mine)], 3)}){of}: {reason}"
+        else:
+            yield from (f"view {view}{of}: {reason}" for view in mine)
+
+
+def _solver_table(calibration: Calibration) -> Table:
+    differences = [f"{name} differs by" for name in calibration.edges]
+    table = Table("solver", "rms, mm", "rms, deg", *differences, box=None)
+    for name, result in calibration.solvers.items():
+        away = [
+            pose_difference(edge.transform.as_matrix(), result.transforms[it].as_matrix())
+            for it, edge in calibration.edges.items()
+        ]
+        cells = [f"{mm:.3f} mm, {deg:.4f} deg" for mm, deg in away]
+        deg = "" if result.rms_deg is None else f"{result.rms_deg:.4f}"
+        table.add_row(name, f"{result.rms_mm:.3f}", deg, *cells)
+    return table
