@@ -200,7 +200,7 @@ def test_lenses_come_from_images_of_their_own():
     assert len(found.sights) == len(cell.sights) - 24
 
 
-@pytest.mark.parametrize("mode", ["auto", "hold"])
+@pytest.mark.parametrize("mode", ["auto", pytest.param("hold", marks=pytest.mark.slow)])
 def test_a_lens_that_is_stated_wrong_is_refined_or_kept_as_asked(clean, mode):
     cell, right = clean
     session = network_session(cell, "cell", seen="names")
@@ -658,6 +658,7 @@ def test_a_board_of_another_size_is_found_beside_arms_that_err():
     assert {found.arms[it].stages["kinematics"]["level"] for it in "ab"} == {"offsets"}
 
 
+@pytest.mark.slow
 def test_boards_of_three_sizes_are_found_beside_arms_that_err():
     """What all three have in common the arms' links may have, too: free together none is clear."""
     robots = (replace(it, offset_sigma_rad=1e-3) for it in NetworkOptions().robots)

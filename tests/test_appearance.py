@@ -94,7 +94,11 @@ def test_the_corners_alone_do_not_tell_the_size():
     np.testing.assert_allclose(grown.residuals, middle.residuals, atol=1e-4)
 
 
-@pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens estimated"])
+@pytest.mark.parametrize(
+    "given",
+    [True, pytest.param(False, marks=pytest.mark.slow)],
+    ids=["lens given", "lens estimated"],
+)
 def test_a_flat_board_of_the_stated_size_stays_so(given):
     for seed in range(4):
         known = calibrated(simulate(replace(FINE, state_intrinsics=given, seed=seed)))

@@ -214,6 +214,7 @@ def test_exact_pose_pairs_give_the_exact_edges(mount, tmp_path):
     assert "pixel_px" not in calibration.noise
 
 
+@pytest.mark.slow
 def test_a_checkerboard_and_a_fixed_camera(tmp_path):
     options = CellOptions(
         mount="eye-to-hand", views=12, target=checkerboard_target(), distance_m=(0.5, 0.8), seed=5

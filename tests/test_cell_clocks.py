@@ -75,6 +75,7 @@ def test_a_clock_of_no_camera_is_refused(swept):
         align(replace(session, document=document), corners=corners)
 
 
+@pytest.mark.slow
 def test_rows_whose_motion_tells_no_offset_are_left_out_and_say_so(swept):
     """Some frames of the sweep: too few to say when."""
     _, session, corners = swept

@@ -45,6 +45,7 @@ def test_json_goes_to_stdout_and_is_the_file(rendered, tmp_path):
     assert json.loads(done.out) == json.loads((tmp_path / "out/calibration.json").read_text())
 
 
+@pytest.mark.slow
 def test_calibrating_the_recording_gives_the_same_numbers(rendered, tmp_path):
     done = visioncal("calibrate", rendered, "-o", tmp_path / "a", "--need-mm", "0.5")
     assert done.status == 0

@@ -22,9 +22,19 @@ EXAMPLES = {
 }
 
 PAGES = sorted(set(FOLDER.glob("*.md")) - {FOLDER / "README.md"})
+QUICK = (
+    "an_arm_with_a_urdf",
+    "fixed_camera_over_a_bin",
+    "weekly_check_by_cron",
+    "pictures_and_a_table",
+)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda it: it.stem)
+# The quicker ones are run each time.
+RUN = [pytest.param(it, marks=() if it.stem in QUICK else pytest.mark.slow) for it in PAGES]
+
+
+@pytest.mark.parametrize("page", RUN, ids=lambda it: it.stem)
 def test_a_recipe_prints_what_it_shows(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run(page)

@@ -110,6 +110,7 @@ def test_breaking_loose_is_found():
     assert np.sqrt(np.diag(covariance)[6:]).max() < 0.05
 
 
+@pytest.mark.slow
 def test_planned_sweeps_tell_friction():
     """Joints move one at a time, and those at rest are held by what nothing foretells."""
     rng = np.random.default_rng(3)

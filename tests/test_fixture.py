@@ -114,7 +114,7 @@ def test_the_tips_error_is_a_pure_offset_where_all_touches_stand_alike(features)
     assert np.abs(more[:3]).max() < 1e-12
 
 
-@pytest.mark.parametrize("features", [False, True])
+@pytest.mark.parametrize("features", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_the_error_over_its_sigma_is_as_it_should_be(features):
     squares = []
     noise = Noise.of_robot(1e-4, 3e-5)
@@ -176,7 +176,11 @@ def test_features_that_were_touched_once_are_named():
     assert reason.startswith("The origin was touched once only")
 
 
-@pytest.mark.parametrize("chosen", [[0, 1, 3, 4], [0, 1, 3, 4, 6, 6]], ids=["four", "six"])
+@pytest.mark.parametrize(
+    "chosen",
+    [[0, 1, 3, 4], pytest.param([0, 1, 3, 4, 6, 6], marks=pytest.mark.slow)],
+    ids=["four", "six"],
+)
 def test_few_touches_that_agree_by_chance_are_not_believed(chosen):
     kinds = tuple(KINDS[it] for it in chosen)
     squares = []

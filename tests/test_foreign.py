@@ -353,9 +353,9 @@ def test_intrinsics_of_numpy_and_of_a_fisheye(tmp_path):
         read_intrinsics(tmp_path / "omni.yaml")
 
 
-def test_damaged_recordings_end_in_a_clear_message_or_a_session(tmp_path):
-    """510 of them, in bounded memory; `foreign_damage.py` lists the kinds of damage."""
-    count = 510
+@pytest.mark.parametrize("count", [170, pytest.param(510, marks=pytest.mark.slow)])
+def test_damaged_recordings_end_in_a_clear_message_or_a_session(tmp_path, count):
+    """In bounded memory; `foreign_damage.py` lists the kinds of damage."""
     script = Path(__file__).with_name("foreign_damage.py")
     done = subprocess.run(
         [sys.executable, "-W", "error", script, tmp_path, str(count)],

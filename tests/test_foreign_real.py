@@ -95,6 +95,7 @@ def test_industrial_calibration(real_data, calibrated):
     assert away_mm(result, "base_from_cam", x_mm) < 0.3 * sigma_mm
 
 
+@pytest.mark.slow
 def test_visp_in_the_hand(real_data, calibrated):
     result, _ = calibrated(
         real_data / "visp_franka_hand_eye/data-eye-in-hand",
@@ -197,6 +198,7 @@ def test_two_streams_with_clocks_of_their_own(real_data, calibrated):
     assert np.median([it.residual_deg for it in used]) < 0.5
 
 
+@pytest.mark.slow
 def test_streams_read_the_wrong_way_round_do_not_close(real_data, calibrated):
     folder = real_data / "pose_pairs_small/ethz_unsynchronised_streams"
     robot, camera = (

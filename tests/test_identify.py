@@ -60,7 +60,13 @@ def assert_named(identity, target):
         assert target.dictionary in (identity.dictionary, *identity.larger)
 
 
-@pytest.mark.parametrize("target", (SHIPPED | ODD).values(), ids=SHIPPED | ODD)
+@pytest.mark.parametrize(
+    "target",
+    [
+        pytest.param(it, marks=pytest.mark.slow if name == "legacy, tags" else (), id=name)
+        for name, it in (SHIPPED | ODD).items()
+    ],
+)
 def test_a_print_is_named(target):
     identity = print_named(target)
     assert_named(identity, target)
@@ -216,7 +222,17 @@ REAL = {
 }
 
 
-@pytest.mark.parametrize(("pattern", "expected"), REAL.items(), ids=str)
+LARGE = (
+    "sessions/ric_charuco_eye_to_hand/images/*.png",
+    "doosan_a0509_charuco/intrinsics_images/*.jpg",
+)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "expected"),
+    [pytest.param(*it, marks=pytest.mark.slow if it[0] in LARGE else ()) for it in REAL.items()],
+    ids=str,
+)
 def test_real_photographs_are_named(real_data, pattern, expected):
     (kind, columns, rows, dictionary), share = expected
     files = sorted(real_data.glob(pattern))

@@ -201,6 +201,7 @@ def test_95_percent_lie_within_the_radius(variances):
     assert np.mean(draws < radius**2) == pytest.approx(0.95, abs=0.004)
 
 
+@pytest.mark.slow
 def test_errors_follow_the_stated_covariance_with_the_misfit_tests_on():
     surprises = []
     for seed in range(12):

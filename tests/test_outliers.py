@@ -23,7 +23,7 @@ WORLDS = {
 
 
 @pytest.mark.parametrize("world", WORLDS)
-@pytest.mark.parametrize("wrong", [0, 2, 6])
+@pytest.mark.parametrize("wrong", [0, pytest.param(2, marks=pytest.mark.slow), 6])
 def test_just_the_wrong_views_are_left_out(world, wrong):
     for seed in range(4):
         cell = simulate(replace(WORLDS[world], wrong_views=wrong, seed=seed))

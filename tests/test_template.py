@@ -40,7 +40,10 @@ def rms(errors):
         (CHECKERBOARD, replace(SMALL, uneven=0.5), 0.015),
         (CHECKERBOARD, replace(SMALL, bayer=True), 0.02),
         (CHECKERBOARD, replace(SMALL, tilt_deg=60, square_px=30), 0.015),
-        (CHECKERBOARD, replace(SMALL, square_px=60, bend=0.15, noise=1), 0.006),
+        pytest.param(
+            *(CHECKERBOARD, replace(SMALL, square_px=60, bend=0.15, noise=1), 0.006),
+            marks=pytest.mark.slow,
+        ),
         (CHECKERBOARD, replace(SMALL, levels=(0, 330)), 0.015),
         (CHARUCO, replace(SMALL, square_px=36), 0.01),
         (CHARUCO, replace(SMALL, square_px=36, jpeg=75, uneven=0.5), 0.015),
