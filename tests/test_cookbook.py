@@ -40,6 +40,7 @@ def test_a_recipe_prints_what_it_shows(page, tmp_path, monkeypatch):
     run(page)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", EXAMPLES, ids=lambda it: it.parent.name)
 def test_an_example_prints_what_its_page_shows(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
