@@ -80,10 +80,10 @@ def poses(session, robot):
 
 
 def test_a_sound_cell_is_good_and_says_how_good(session):
-    verdict = align(session).verdict
-    assert verdict.status == "good"
-    (reason,) = verdict.reasons
-    used = sum(it.used for it in align(session).sights)
+    found = align(session)
+    assert found.verdict.status == "good"
+    (reason,) = found.verdict.reasons
+    used = sum(it.used for it in found.sights)
     assert reason.startswith(
         f"All {used} used views agree: left out of the fit, they are predicted"
     )
@@ -139,6 +139,7 @@ def test_a_camera_whose_corners_are_bad_is_named(session):
     assert not any(it.startswith(("cam_left: ", "cam_hand: ")) for it in verdict.reasons)
 
 
+@pytest.mark.slow
 def test_a_board_of_another_size_is_named():
     boards = (*CELL.boards[:2], replace(CELL.boards[2], target=checkerboard_target(), scale=1.004))
     verdict = align(recorded(simulate_network(replace(CELL, boards=boards)))).verdict
@@ -155,6 +156,7 @@ def test_a_board_that_is_bent_is_named():
     assert sum("not flat" in it for it in verdict.reasons) == 1
 
 
+@pytest.mark.slow
 def test_a_lens_that_is_not_as_stated_is_named(session):
     document = deepcopy(dict(session.document))
     matrix = document["cameras"]["right"]["matrix"]

@@ -83,6 +83,7 @@ def test_centres_are_as_exact_as_the_image(target, shot, most_px):
     assert np.abs(error.mean(axis=0)).max() < 4 * most_px / np.sqrt(len(error))
 
 
+@pytest.mark.slow
 def test_large_circles_are_refined_in_a_smaller_image():
     image, truth = photograph(EVEN, replace(SHOT, square_px=90), 1)
     error = numbered(find_target(image, EVEN), truth) - truth
@@ -117,8 +118,15 @@ def test_a_photograph_names_it(target):
     assert same == target
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
-@pytest.mark.parametrize("target", [circles_target(), symmetric_circles_target()])
+@pytest.mark.parametrize(
+    ("target", "mount"),
+    [
+        (circles_target(), "eye-to-hand"),
+        (symmetric_circles_target(), "eye-in-hand"),
+        pytest.param(circles_target(), "eye-in-hand", marks=pytest.mark.slow),
+        pytest.param(symmetric_circles_target(), "eye-to-hand", marks=pytest.mark.slow),
+    ],
+)
 def test_a_cell_is_calibrated_with_it(tmp_path, mount, target):
     cell = simulate(CellOptions(target=target, views=12, mount=mount, seed=4))
     write_session(cell, tmp_path / "s")

@@ -275,6 +275,7 @@ def periodic() -> Session:
     return streamed("periodic", (frames_s, seen), (times_s, way[0]))
 
 
+@pytest.mark.slow
 def test_motion_that_repeats_itself_is_told_by_what_is_stated():
     with pytest.raises(DegenerateError, match=r"the motion repeats itself: offsets of .* ms"):
         calibrate(periodic())
