@@ -537,6 +537,7 @@ def with_elbow_of_b(session, change):
     return replace(session, views=tuple(views))
 
 
+@pytest.mark.slow
 def test_joints_of_one_robot_are_held_against_what_the_cameras_see(clean):
     cell, _ = clean
     session, corners = network_session(cell, "cell", seen="names"), dict(enumerate(cell.corners))

@@ -71,6 +71,7 @@ def test_pictures_of_several_cameras_are_one_cell(out):
     assert not found.cameras["cam_left"].estimated
 
 
+@pytest.mark.slow
 def test_the_recording_is_the_session_and_holds_the_result(folder, out, tmp_path):
     recording = out / "recording.rrd"
     assert Session.load(recording).digest() == Session.load(folder).digest()

@@ -117,7 +117,9 @@ def test_a_photograph_names_it(target):
     assert replace(found, square_sigma_m=target.square_sigma_m) == target
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize(
+    "mount", ["eye-in-hand", pytest.param("eye-to-hand", marks=pytest.mark.slow)]
+)
 def test_a_cell_is_calibrated_with_it(tmp_path, mount):
     cell = simulate(CellOptions(target=aprilgrid_target(), views=12, mount=mount, seed=4))
     write_session(cell, tmp_path / "s")

@@ -75,7 +75,7 @@ def test_measured_poses_alone_tell_a_wrong_arm_too(dh, tmp_path):
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
-@pytest.mark.parametrize("sigma", [5e-5, 5e-4])
+@pytest.mark.parametrize("sigma", [5e-5, pytest.param(5e-4, marks=pytest.mark.slow)])
 def test_white_noise_is_not_taken_for_a_wrong_arm(mount, sigma):
     for seed in range(5):
         options = CellOptions(

@@ -234,6 +234,7 @@ def test_noise_refuses_nothing():
     assert sum("Left out of the fit, views disagree" in it for it in verdict.reasons) == 1
 
 
+@pytest.mark.slow
 def test_a_robot_all_of_whose_views_disagree_is_named():
     boards = (*CELL.boards[:2], replace(CELL.boards[2], target=checkerboard_target(), scale=1.01))
     session = recorded(simulate_network(replace(CELL, boards=boards, stops=24)))

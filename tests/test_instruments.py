@@ -28,6 +28,11 @@ from visioncal.simulation.tracked import THREE, Tracked, session_of, tracked
 
 PROBE, POINT, POINTS = Tracked(poses=True), Tracked(), Tracked(points=THREE)
 KINDS = pytest.mark.parametrize("options", [PROBE, POINT, POINTS], ids=["probe", "point", "three"])
+PROBE_FIRST = pytest.mark.parametrize(
+    "options",
+    [PROBE, *(pytest.param(it, marks=pytest.mark.slow) for it in (POINT, POINTS))],
+    ids=["probe", "point", "three"],
+)
 WRONG = {"dh_sigma_m": 5e-4, "dh_sigma_rad": 1e-3}
 
 
@@ -61,7 +66,7 @@ def test_an_unknown_instrument_is_refused(arguments, words):
         stated_instrument(*arguments)
 
 
-@KINDS
+@PROBE_FIRST
 def test_errors_follow_their_covariance_and_reach_their_bound(options):
     kept = np.arange(12) if options.poses else np.r_[:6, 9:12]
     by_sigma, by_bound = [], []
@@ -104,7 +109,7 @@ def test_an_arm_off_by_millimetres_is_calibrated_all_over_its_workspace(options)
 
 @pytest.mark.parametrize(
     ("options", "rank"),
-    [(PROBE, 30), (POINT, 27), (POINTS, 33)],
+    [(PROBE, 30), (POINT, 27), pytest.param(POINTS, 33, marks=pytest.mark.slow)],
     ids=["probe", "point", "three"],
 )
 def test_so_many_values_are_told_of_a_six_axis_arm(options, rank):
@@ -142,7 +147,7 @@ def test_without_a_model_poses_give_the_frames_alone(tmp_path):
     assert all(it["sigma_mm"] < 0.02 for it in result.stages["points"])
 
 
-@KINDS
+@PROBE_FIRST
 def test_outputs_are_whole_and_the_recording_gives_them_again(options, tmp_path):
     session_of(tracked(replace(options, **WRONG))).save(tmp_path / "shop")
     out = tmp_path / "out"
@@ -189,6 +194,7 @@ def test_wrong_rows_are_named_and_left_out():
     assert known.robot_arm.kinematics.level == "geometry"
 
 
+@pytest.mark.slow
 def test_exchanged_points_are_named():
     shop = tracked(replace(POINTS, **WRONG))
     rows = list(shop.rows)
@@ -215,6 +221,7 @@ def test_an_instrument_that_sinks_is_told(options):
     assert moved == pytest.approx(0.5, rel=0.5)
 
 
+@pytest.mark.slow
 def test_views_that_are_held_back_are_predicted():
     shop = tracked(replace(POINTS, **WRONG, stops=36))
     session = session_of(shop)
