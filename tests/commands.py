@@ -34,16 +34,16 @@ class Done:
 
 
 # A wide terminal, so that messages are not folded.
-_WIDE = {"COLUMNS": "300"}
+_WIDE = 300
 
 
-def visioncal(*arguments: object) -> Done:
+def visioncal(*arguments: object, columns: int = _WIDE) -> Done:
     """Runs a command in this process."""
     out, err, status = io.StringIO(), io.StringIO(), 0
     words = ["visioncal", *map(str, arguments)]
     with (
         patch.object(sys, "argv", words),
-        patch.dict(os.environ, _WIDE),
+        patch.dict(os.environ, {"COLUMNS": str(columns)}),
         redirect_stdout(out),
         redirect_stderr(err),
     ):
@@ -63,7 +63,7 @@ def started(*arguments: object, stdout: int | TextIO = subprocess.PIPE) -> Done:
         stderr=subprocess.PIPE,
         text=True,
         encoding="utf-8",
-        env=os.environ | _WIDE | {"PYTHONWARNINGS": "error", "PYTHONUTF8": "1"},
+        env=os.environ | {"COLUMNS": str(_WIDE), "PYTHONWARNINGS": "error", "PYTHONUTF8": "1"},
     )
     return Done(done.returncode, done.stdout or "", done.stderr)
 

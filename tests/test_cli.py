@@ -1,19 +1,29 @@
 """The commands as a user runs them: exit status, messages, and the files that appear."""
 
 import json
+import re
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from commands import every_command, started, visioncal
-from rich.text import Text
 from typer.main import get_command
 
+from visioncal.calibration.stages.kinematics import ASKED
 from visioncal.cli.app import app
 from visioncal.cli.lazy import LazyGroup
+from visioncal.core.conventions import POSE_FORMS, UNITS_M
 from visioncal.core.errors import DataError
-from visioncal.robot import robot_names
+from visioncal.core.types import Mount, SolverName
+from visioncal.interchange.exports import EXPORT_FORMATS
+from visioncal.interchange.formats import FOREIGN_FORMATS
+from visioncal.live.capture.options import Keep
+from visioncal.live.planning.purposes import PURPOSES
+from visioncal.live.planning.selection import Criterion
+from visioncal.robot import Convention, robot_names
 from visioncal.session import Session
-from visioncal.simulation import CellOptions, read_truth, simulate, truth_path, write_session
+from visioncal.simulation import ARMS, CellOptions, read_truth, simulate, truth_path, write_session
+from visioncal.vision.dense.library import DEVICES
 from visioncal.vision.targets import target_names
 
 
@@ -174,15 +184,37 @@ def test_the_listing_has_the_first_words_of_each_command_s_own_help(path):
     assert group.listed == {it: " ".join(words.split()) for it, words in own.items()}
 
 
-def test_help_loses_no_unit_to_markup():
-    """In the terminal's markup `[mm]` is a style, and what is written so is not shown."""
-    every = [
-        (f"{name} {it.name}", getattr(it, "help", None) or "")
-        for name, command in every_command()
-        for it in (command, *command.params)
-    ]
-    assert len(every) > 100
-    assert [name for name, it in every if Text.from_markup(it).plain != it] == []
+@pytest.mark.parametrize("columns", [80, 200])
+def test_help_has_every_word_within_the_terminal(columns):
+    """Markup takes `[mm]` for a style, and columns beside each other cut names and words off."""
+    for name, command in every_command():
+        shown = visioncal(*name.split(), "--help", columns=columns).out
+        assert max(map(len, shown.splitlines())) <= columns
+        for it in (command, *command.params):
+            for words in (getattr(it, "help", None) or "", *getattr(it, "opts", ())):
+                assert "".join(words.split()) in "".join(shown.split()), (name, it.name)
+
+
+CHOICES = {
+    "calibrate": {"level": (*ASKED, "hand-eye"), "solver": get_args(SolverName), "device": DEVICES},
+    "align": {"level": (*(it for it in ASKED if it != "thermal"), "hand-eye")},
+    "plan": {"purpose": PURPOSES, "criterion": get_args(Criterion), "mount": get_args(Mount)},
+    "record": {"pose_form": ("ours", *POSE_FORMS), "keep": get_args(Keep)},
+    "simulate": {"robot": ARMS},
+    "export": {"to": [it.name for it in EXPORT_FORMATS], "convention": get_args(Convention)},
+    "convert": {"form": [it.name for it in FOREIGN_FORMATS], "robot_unit": UNITS_M},
+    "fixture": {"cad_unit": UNITS_M},
+}
+
+
+@pytest.mark.parametrize("name", CHOICES)
+def test_help_lists_what_can_be_chosen(name):
+    command = get_command(app).imported(name)
+    context = command.make_context(name, [], resilient_parsing=True)
+    params = {it.name: it for it in command.params}
+    for option, choices in CHOICES[name].items():
+        words = set(re.split(r"[^\w-]+", " ".join(params[option].get_help_record(context))))
+        assert set(choices) <= words, option
 
 
 def test_boards_and_robots_are_found_from_any_folder(tmp_path, monkeypatch):

@@ -31,8 +31,9 @@ def align_command(
     level: Annotated[
         str,
         typer.Option(
-            help="The arms: auto, hand-eye (none comes out), offsets (of their joints), "
-            "kinematics, elastic (joints that bend, too)."
+            metavar="auto|hand-eye|offsets|kinematics|elastic",
+            help="The arms: hand-eye (none comes out), offsets (of their joints), kinematics, "
+            "elastic (joints that bend, too).",
         ),
     ] = "auto",
     need_mm: NeedMm = None,

@@ -44,8 +44,9 @@ app = typer.Typer(
     help="Calibrates vision-guided robot cells with a printed board, and says how far the result "
     "can be trusted.",
     no_args_is_help=True,
+    rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
 )
 
 

@@ -39,8 +39,9 @@ def calibrate_command(
     level: Annotated[
         str,
         typer.Option(
-            help="The arm: auto, hand-eye (none comes out), offsets (of its joints), kinematics, "
-            "elastic (joints that bend, too), thermal (drift with temperature, too)."
+            metavar="auto|hand-eye|offsets|kinematics|elastic|thermal",
+            help="The arm: hand-eye (none comes out), offsets (of its joints), kinematics, elastic "
+            "(joints that bend, too), thermal (drift with temperature, too).",
         ),
     ] = "auto",
     convention: Annotated[
@@ -59,7 +60,9 @@ def calibrate_command(
             "motion or badly lit; needs torch and kornia (the extra dense).",
         ),
     ] = False,
-    device: Annotated[str, typer.Option(help="What --dense works on: auto, cpu or cuda.")] = "auto",
+    device: Annotated[
+        str, typer.Option(metavar="auto|cpu|cuda", help="What --dense works on.")
+    ] = "auto",
     as_json: Annotated[
         bool, typer.Option("--json", help="Print calibration.json to stdout.")
     ] = False,

@@ -5,6 +5,7 @@ from typing import Annotated, Literal, TypeAlias
 
 import typer
 
+from visioncal.core.conventions import POSE_FORMS, UNITS_M
 from visioncal.core.errors import DataError
 from visioncal.core.types import CameraMount
 from visioncal.interchange.formats import FOREIGN_FORMATS
@@ -14,12 +15,15 @@ _CAMERA = "Its camera"
 _OTHER = "The recording itself"
 _DOUBT = "Poses that may be misread, of a session as well"
 
-_FORMS = "ur, kuka, fanuc, abb ..., or a rotation such as euler-ZYX-deg, quaternion-wxyz"
+_FORMS = f"{', '.join(POSE_FORMS)}, or a rotation such as euler-ZYX-deg, quaternion-wxyz"
+_UNITS = "|".join(UNITS_M)
 _FORMATS = ", ".join(it.name for it in FOREIGN_FORMATS)
 
 
-def _option(*names: str, panel: str, words: str) -> object:
-    return typer.Option(*names, help=words, rich_help_panel=panel, show_default=False)
+def _option(*names: str, panel: str, words: str, metavar: str | None = None) -> object:
+    return typer.Option(
+        *names, help=words, rich_help_panel=panel, show_default=False, metavar=metavar
+    )
 
 
 Source: TypeAlias = Annotated[
@@ -69,7 +73,7 @@ RobotForm: TypeAlias = Annotated[
     str | None, _option("--robot-form", panel=_POSES, words=f"How they are written: {_FORMS}.")
 ]
 RobotUnit: TypeAlias = Annotated[
-    str | None, _option("--robot-unit", panel=_POSES, words="m, cm, mm, um or inch.")
+    str | None, _option("--robot-unit", panel=_POSES, metavar=_UNITS, words="Of their positions.")
 ]
 RobotInverse: TypeAlias = Annotated[
     bool | None,
@@ -90,7 +94,7 @@ CameraForm: TypeAlias = Annotated[
     str | None, _option("--camera-form", panel=_POSES, words="As --robot-form.")
 ]
 CameraUnit: TypeAlias = Annotated[
-    str | None, _option("--camera-unit", panel=_POSES, words="As --robot-unit.")
+    str | None, _option("--camera-unit", panel=_POSES, metavar=_UNITS, words="Of their positions.")
 ]
 CameraInverse: TypeAlias = Annotated[
     bool | None,

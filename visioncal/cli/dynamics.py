@@ -25,4 +25,5 @@ dynamics_app = typer.Typer(
     cls=_Commands,
     help="Identify an arm's inertias and friction, and weigh what it carries.",
     no_args_is_help=True,
+    rich_markup_mode=None,
 )

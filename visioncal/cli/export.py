@@ -1,7 +1,7 @@
 """`visioncal export`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_args
 
 import typer
 from rich.markup import escape
@@ -12,6 +12,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, read_text, write_atomically
 from visioncal.interchange.exports import EXPORT_FORMATS, Load, Selection, document
 from visioncal.interchange.result_files import load_exportable
+from visioncal.robot import Convention
 
 
 def _show_formats(wanted: bool) -> None:
@@ -31,7 +32,14 @@ def export_command(
             "a file of frames."
         ),
     ],
-    to: Annotated[str, typer.Option("--to", help="The format; --list shows them all.")],
+    to: Annotated[
+        str,
+        typer.Option(
+            "--to",
+            metavar="FORMAT",
+            help=f"{', '.join(it.name for it in EXPORT_FORMATS)}; --list says what each is.",
+        ),
+    ],
     out: Annotated[
         Path | None,
         typer.Option("-o", "--out", help="The file to write; otherwise, or as -, stdout."),
@@ -65,7 +73,11 @@ def export_command(
     ] = None,
     convention: Annotated[
         str | None,
-        typer.Option("--convention", help="robot-dh: standard, modified (Craig) or hayati."),
+        typer.Option(
+            "--convention",
+            metavar="|".join(get_args(Convention)),
+            help="robot-dh: of its joint table; modified is Craig's.",
+        ),
     ] = None,
     calibration_hash: Annotated[
         str | None,

@@ -35,6 +35,7 @@ from visioncal.cli.seeing import (
     image_session,
     touch_options,
 )
+from visioncal.core.conventions import UNITS_M
 from visioncal.core.errors import DataError
 from visioncal.frames.fixture import touched_fixture
 from visioncal.frames.measured import NO_TOOL, Tool
@@ -63,7 +64,8 @@ def fixture_command(
         ),
     ] = None,
     cad_unit: Annotated[
-        str | None, typer.Option("--cad-unit", help="What x, y, z in it are in: mm, m, inch.")
+        str | None,
+        typer.Option("--cad-unit", metavar="|".join(UNITS_M), help="What x, y, z in it are in."),
     ] = None,
     tool: Annotated[
         str | None,

@@ -1,5 +1,6 @@
-"""Groups of commands that are imported when they are asked for."""
+"""Commands with help in plain text, and groups that import one when it is asked for."""
 
+from collections import defaultdict
 from collections.abc import Mapping
 from importlib import import_module
 from typing import Any, ClassVar
@@ -7,6 +8,25 @@ from typing import Any, ClassVar
 import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command, get_group
+
+
+class PlainCommand(TyperCommand):
+    """A command whose help has its options under the headings of their panels.
+
+    It knows no markup, which takes `[mm]` for a style, and no columns beside each other, for which
+    a terminal of 80 columns has no room.
+    """
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401 - typer's own types
+        """Writes them."""
+        panels: dict[str, list[tuple[str, str]]] = defaultdict(list)
+        for it in self.get_params(ctx):
+            if record := it.get_help_record(ctx):
+                named = getattr(it, "rich_help_panel", None)
+                panels[named or f"{it.param_type_name.capitalize()}s"].append(record)
+        for name, records in panels.items():
+            with formatter.section(name):
+                formatter.write_dl(records)
 
 
 class LazyGroup(TyperGroup):
@@ -27,6 +47,11 @@ class LazyGroup(TyperGroup):
         for name, words in self.listed.items():
             self.add_command(TyperCommand(name, help=words))
 
+    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401, ARG002 - typer's
+        """Writes the listing; typer cuts its lines off."""
+        with formatter.section("Commands"):
+            formatter.write_dl(list(self.listed.items()))
+
     def resolve_command(self, *arguments: Any) -> Any:  # noqa: ANN401 - of typer's own types
         """Imports the command that the first argument names."""
         name, command, rest = super().resolve_command(*arguments)
@@ -39,6 +64,6 @@ class LazyGroup(TyperGroup):
         module = import_module(f"visioncal.cli.{own}")
         if hasattr(module, f"{own}_app"):
             return get_group(getattr(module, f"{own}_app"))
-        app = typer.Typer(add_completion=False)
-        app.command(name)(getattr(module, f"{own}_command"))
+        app = typer.Typer(add_completion=False, rich_markup_mode=None)
+        app.command(name, cls=PlainCommand)(getattr(module, f"{own}_command"))
         return get_command(app)

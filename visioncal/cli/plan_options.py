@@ -35,7 +35,10 @@ Out: TypeAlias = Annotated[
 AsJson: TypeAlias = Annotated[bool, typer.Option("--json", help="Print plan.json to stdout.")]
 
 For: TypeAlias = Annotated[
-    str, typer.Option("--for", help=f"{', '.join(PURPOSES)}.", rich_help_panel=_WHAT)
+    str,
+    typer.Option(
+        "--for", metavar="|".join(PURPOSES), help="What they are for.", rich_help_panel=_WHAT
+    ),
 ]
 Stops: TypeAlias = Annotated[
     int | None,

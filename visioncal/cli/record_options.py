@@ -5,6 +5,7 @@ from typing import Annotated, TypeAlias
 
 import typer
 
+from visioncal.core.conventions import POSE_FORMS
 from visioncal.core.types import CameraMount
 from visioncal.live.capture.options import Keep
 
@@ -92,7 +93,12 @@ MountOption: TypeAlias = Annotated[
 ]
 PoseForm: TypeAlias = Annotated[
     str | None,
-    _option("--pose-form", panel=_CELL, words="With a manual arm: ur, kuka, abb, fanuc or ours."),
+    _option(
+        "--pose-form",
+        panel=_CELL,
+        metavar="|".join(("ours", *POSE_FORMS)),
+        words="With a manual arm: how poses are typed.",
+    ),
 ]
 
 Frames: TypeAlias = Annotated[

@@ -8,7 +8,7 @@ from contextlib import closing
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import typer
 from rich.markup import escape
@@ -50,7 +50,9 @@ def rehearse_command(
     fault: Annotated[
         Faults | None,
         typer.Option(
-            help="Let this happen half way: what is said, and how to go on.", show_default=False
+            metavar="FAULT",
+            help=f"Let this happen half way: {', '.join(get_args(Faults))}.",
+            show_default=False,
         ),
     ] = None,
     view: Annotated[bool, typer.Option("--view", help="Show it in the rerun viewer.")] = False,

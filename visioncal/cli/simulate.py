@@ -56,7 +56,7 @@ def simulate_command(
     folder: Annotated[Path, typer.Argument(help="Where to write the session.")],
     mount: Annotated[CameraMount, typer.Option(help="Where the camera is.")] = "eye-in-hand",
     views: Annotated[int, typer.Option(min=1, help="Number of views.")] = 20,
-    robot: Annotated[str, typer.Option(help=f"{', '.join(ARMS)}.")] = "ur10e",
+    robot: Annotated[str, typer.Option(metavar="|".join(ARMS), help="The arm.")] = "ur10e",
     camera: Annotated[
         Literal["wide", "fine", "fisheye"],
         typer.Option(help="1280 x 800, 2448 x 2048, or a fisheye."),

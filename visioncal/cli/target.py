@@ -8,6 +8,7 @@ import typer
 from rich.markup import escape
 
 from visioncal.cli.console import messages
+from visioncal.cli.lazy import PlainCommand
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, write_atomically
 from visioncal.core.types import Target
@@ -33,6 +34,7 @@ from visioncal.vision.targets import (
 target_app = typer.Typer(
     help="Print a board at its exact size, or name the one in a photograph.",
     no_args_is_help=True,
+    rich_markup_mode=None,
 )
 
 # The options that describe a board, by its kind.
@@ -65,7 +67,7 @@ _USED: dict[_Described, tuple[str, ...]] = {
 _PAGES = ("A4", "A3", "A2", "A1", "A0")
 
 
-@target_app.command("make")
+@target_app.command("make", cls=PlainCommand)
 def make_command(
     target: Annotated[
         str | None,
@@ -201,7 +203,7 @@ def _pages(page: str | None, landscape: bool | None, *, larger: bool) -> tuple[P
     return tuple(it for name in names for it in pages_named(name, landscape))
 
 
-@target_app.command("check")
+@target_app.command("check", cls=PlainCommand)
 def check_command(
     image: Annotated[Path, typer.Argument(help="A photograph of the board: png, jpg or tif.")],
     square_mm: Annotated[
