@@ -47,5 +47,5 @@ def made_up_cell(seed: int) -> Alignment:
         moved=(),
         untied=(),
         weakest="target_plate is the least known.",
-        verdict=Verdict("good", ("It fits.",)),
+        verdict=Verdict.of("good", "It fits."),
     )

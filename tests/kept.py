@@ -118,7 +118,7 @@ def kept_calibration() -> Calibration:
         (ViewResult(7, used=True, residual_mm=0.1, residual_deg=0.2), ViewResult(4, used=False)),
         Rms(0.1, 0.2),
         Validation("none", Rms(0.3, 0.4)),
-        Verdict("check", ("too few views",)),
+        Verdict.of("check", "too few views"),
     )
 
 

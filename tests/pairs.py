@@ -98,7 +98,7 @@ def calibration_of(known: RunState, name: str = "cell") -> Calibration:
         views=tuple(ViewResult(view, view in known.used) for view in known.base_from_flange),
         rms=Rms(0.1, 0.01),
         validation=Validation("none", Rms(0.1, 0.01)),
-        verdict=Verdict("good", ()),
+        verdict=Verdict("good"),
         camera=known.camera,
     )
 

@@ -7,7 +7,7 @@ from visioncal.results import Edge, Frame, FrameFile, Observation, Verdict
 
 TOOL, FIXTURE = "flange_from_tool", "base_from_fixture"
 CREATED = "2026-11-20T12:13:14+00:00"
-GOOD = Verdict("good", ("The tip is determined to 0.22 mm.",))
+GOOD = Verdict.of("good", "The tip is determined to 0.22 mm.")
 FLANGE_FROM_TOOL = exp(np.array([0.1, -0.4, 2.0, 0.0338, 0.001, 0.0768]))
 BASE_FROM_FIXTURE = exp(np.array([0.01, 0.02, -1.1, 0.71, -0.33, 0.12]))
 # [rad], [m]

@@ -193,12 +193,10 @@ def _calibration(
         views,
         Rms(0.31, 0.024, px),
         Validation("5-fold over stops", Rms(0.36, 0.03, px), None),
-        Verdict(
+        Verdict.of(
             "check",
-            (
-                "Position is determined to 0.33 mm and orientation to 0.017 deg.",
-                f"2 of {len(views)} views were not used; view 6 disagrees: look at <its> image.",
-            ),
+            "Position is determined to 0.33 mm and orientation to 0.017 deg.",
+            f"2 of {len(views)} views were not used; view 6 disagrees: look at <its> image.",
         ),
         CameraResult(
             CAMERA, estimated=True, covariance=np.diag([0.4, 0.4, 0.6, 0.6] + [1e-3] * 5) ** 2
@@ -250,7 +248,7 @@ def tool_frame() -> Frame:
         rms_mm=0.31,
         noise_mm=0.21,
         observations=tuple(touches),
-        verdict=Verdict("check", (f"Touch {WRONG_TOUCH} is not used: {WRONG_REASON}. Repeat it.",)),
+        verdict=Verdict.of("check", f"Touch {WRONG_TOUCH} is not used: {WRONG_REASON}. Repeat it."),
         details={
             "cone_deg": 43.71,
             "point_m": [0.61, -0.12, 0.034],
@@ -276,5 +274,5 @@ def fixture_frame() -> Frame:
         observations=tuple(
             Observation(name, used=True, kind="origin", residual_mm=0.1) for name in ("1", "2", "3")
         ),
-        verdict=Verdict("good", ("Position is determined to 0.15 mm.",)),
+        verdict=Verdict.of("good", "Position is determined to 0.15 mm."),
     )

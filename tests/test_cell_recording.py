@@ -68,7 +68,7 @@ def true_alignment(cell, session) -> Alignment:
         moved=(),
         untied=(),
         weakest="",
-        verdict=Verdict("good", ()),
+        verdict=Verdict("good"),
     )
 
 

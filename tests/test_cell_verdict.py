@@ -82,7 +82,8 @@ def poses(session, robot):
 def test_a_sound_cell_is_good_and_says_how_good(session):
     found = align(session)
     assert found.verdict.status == "good"
-    (reason,) = found.verdict.reasons
+    good_for, reason = found.verdict.reasons
+    assert good_for.startswith("It is good for tasks of ")
     used = sum(it.used for it in found.sights)
     assert reason.startswith(
         f"All {used} used views agree: left out of the fit, they are predicted"

@@ -349,7 +349,7 @@ def test_the_command_writes_a_file_once(saved, tmp_path):
 
 
 def test_a_bad_verdict_is_exported_with_a_warning(tmp_path):
-    verdict = Verdict("bad", ("The views disagree by 14 mm.",))
+    verdict = Verdict.of("bad", "The views disagree by 14 mm.")
     replace(SAMPLE, verdict=verdict).save(tmp_path / "calibration.json")
     done = exporting(tmp_path, "--to", "ur")
     assert done.status == 0

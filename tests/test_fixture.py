@@ -23,7 +23,7 @@ from visioncal.frames.touches import TouchRows, check_lengths
 from visioncal.results import Edge, FrameFile, Verdict
 
 TIP = made.FLANGE_FROM_TOOL[:3, 3]
-GOOD = Verdict("good", ())
+GOOD = Verdict("good")
 # A tip that is known worst along the tool's z [m].
 TIP_SIGMA = np.diag([5e-5, 5e-5, 4e-4])
 FRAME = some_frame(np.random.default_rng(5))
@@ -299,7 +299,7 @@ def test_few_noisy_or_uncertain_points_are_doubted():
 @pytest.mark.parametrize(("tools", "fixtures"), [("check", "check"), ("bad", "bad")])
 def test_a_tool_in_doubt_makes_its_fixture_doubtful(tools, fixtures):
     rows = rows_of(touching(1e-3 * CAD_MM, np.random.default_rng(1), NOISE_M), points=NAMES)
-    doubtful = tool(verdict=Verdict(tools, ("The tip wobbles.",)))
+    doubtful = tool(verdict=Verdict.of(tools, "The tip wobbles."))
     frame = touched_fixture(rows, doubtful, drawing(1e-3 * CAD_MM))
     assert frame.verdict.status == fixtures
     assert "flange_from_tool, is in doubt itself" in frame.verdict.reasons[0]

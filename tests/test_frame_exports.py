@@ -395,7 +395,7 @@ def test_a_name_that_urscript_does_not_take_is_refused(bad):
 
 def test_a_frame_has_its_own_origin_and_worth():
     # The calibration itself comes from another file, of another day, with another verdict.
-    frames = fixture(source="points.csv", verdict=Verdict("good", ()))
+    frames = fixture(source="points.csv", verdict=Verdict("good"))
     notes = export(replace(SAMPLE, frames=frames), "text", Selection(FIXTURE)).splitlines()[:3]
     assert notes[0] == (
         f"# calibrated by visioncal from 'points.csv', {placed.CREATED}: pivot over 10 touches"
@@ -492,9 +492,9 @@ def test_the_command_takes_a_load_and_warns_without_one(tmp_path):
 
 
 def test_the_verdict_of_the_frame_is_what_is_warned_of():
-    bad = Verdict("bad", ("Touch 4 is off by 7 mm.",))
+    bad = Verdict.of("bad", "Touch 4 is off by 7 mm.")
     frames = tool(verdict=bad) | fixture()
-    cell = replace(SAMPLE, frames=frames, verdict=Verdict("bad", ("The views disagree.",)))
+    cell = replace(SAMPLE, frames=frames, verdict=Verdict.of("bad", "The views disagree."))
     assert any("7 mm" in it for it in document(cell, "ur-tcp").warnings)
     assert document(cell, "ur-feature").warnings == ()
     assert any("views disagree" in it for it in document(cell, "ros").warnings)

@@ -34,7 +34,6 @@ from visioncal.present.recording import (
 )
 from visioncal.present.recording.details import details
 from visioncal.present.recording.uncertainty import SIGMAS_95
-from visioncal.present.report.advice import next_steps
 from visioncal.present.report.page import render
 from visioncal.present.report.tools import frame_cards
 from visioncal.results import Calibration, Frame, Verdict, to_document
@@ -128,11 +127,11 @@ def test_a_rotation_that_was_not_measured_is_not_given_as_one(page):
 
 
 def test_doubtful_frames_are_among_the_next_steps(sample):
-    steps = next_steps(sample.calibration, ())
+    steps = [it.words for it in sample.calibration.next_steps]
     assert [it for it in steps if "flange_from_tool" in it]
     assert not [it for it in steps if "base_from_fixture" in it]
-    good = replace(sample.calibration, verdict=Verdict("good", ()))
-    assert "Settle what is said of flange_from_tool" in next_steps(good, ())[-1]
+    good = replace(sample.calibration, verdict=Verdict("good"))
+    assert "what was found of flange_from_tool" in good.next_steps[-1].words
 
 
 def test_calibrations_without_frames_say_nothing_of_them():
@@ -142,7 +141,7 @@ def test_calibrations_without_frames_say_nothing_of_them():
 
 
 def test_frames_without_observations_or_residuals_still_have_a_report(sample):
-    bare = replace(tool_frame(), observations=(), details={}, verdict=Verdict("good", ()))
+    bare = replace(tool_frame(), observations=(), details={}, verdict=Verdict("good"))
     words = of_frames(Page(render(with_frame(sample, bare), None, ())))
     assert "observations 0 used of 0" in words
     assert "off by" not in words

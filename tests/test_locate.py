@@ -365,7 +365,7 @@ def test_what_may_mislead_is_told(in_hand):
     (found,) = locate(calibration, px, grazing, at.base_from_flange)
     assert "limit 5" in found.warnings[0]
     assert found.sigma_mm.max() > 2.0
-    bad = replace(calibration, verdict=Verdict("bad", ("The views disagree.",)))
+    bad = replace(calibration, verdict=Verdict.of("bad", "The views disagree."))
     (found,) = locate(bad, px, straight, at.base_from_flange)
     assert "verdict is bad: The views disagree." in found.warnings[0]
 

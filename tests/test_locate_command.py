@@ -29,9 +29,9 @@ def cell(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp("the cell, größer")
     frame = fixture_frame()
     level = Edge(np.eye(4), np.diag([1e-7] * 3 + [1e-7] * 3))
-    frames = {"base_from_jig": replace(frame, edge=level, verdict=Verdict("good", ()))}
+    frames = {"base_from_jig": replace(frame, edge=level, verdict=Verdict("good"))}
     frames["base_from_loose"] = replace(
-        frames["base_from_jig"], verdict=Verdict("bad", ("Loose.",))
+        frames["base_from_jig"], verdict=Verdict.of("bad", "Loose.")
     )
     replace(calibration, frames=frames).save(folder / "calibration.json")
     session_of(made, [*shots(made, 3), Shot(3, None)]).save(folder / "part")

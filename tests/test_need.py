@@ -14,6 +14,7 @@ from visioncal.calibration.stages.need import Picks, need_met
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import exp
 from visioncal.core.types import Need
+from visioncal.core.verdict import remarks
 from visioncal.estimation.tolerance_probability import chance_within, radius_within
 from visioncal.results import Calibration, NeedMet, Picker, Rms, to_document
 from visioncal.results.verdicts import need_document, read_need
@@ -106,7 +107,7 @@ def test_the_verdict_is_about_the_need(sigma_mm: float, status: str) -> None:
     assert "where the views looked lands within 0.5 mm with a probability of" in verdict.reasons[0]
     assert verdict.good_for_mm == pytest.approx(sigma_mm * np.sqrt(7.815), rel=5e-3)
     causes = [] if status == "good" else ["calibration"]
-    assert [it.cause for it in verdict.causes] == causes
+    assert [it.kind for it in verdict.causes] == causes
 
 
 def test_both_have_to_hold() -> None:
@@ -124,7 +125,7 @@ def test_both_have_to_hold() -> None:
         ({"stops": 8}, 0.0),
         ({"away_mm": 1.0}, 10.0),
         ({"away_deg": 0.1}, 10.0),
-        ({"warnings": ("The board is upside down.",)}, np.inf),
+        ({"warnings": remarks(["It is upside down."])}, np.inf),
         ({"pixel_px": 4.0}, np.inf),
     ],
 )
@@ -137,7 +138,7 @@ def test_limits_give_way_to_the_need_and_what_is_unexplained_does_not(changes, g
         assert judge(replace(found, need=Need(1e3))).status == "check"
         return
     assert plain.good_for_mm == pytest.approx(max(good_from_mm, 0.28), rel=0.01)
-    assert f"It is good for tasks of {good_from_mm:g}" in plain.reasons[0] or not good_from_mm
+    assert f"It is good for tasks of {good_from_mm:g}" in plain.reasons[-1] or not good_from_mm
     assert judge(replace(found, need=Need(plain.good_for_mm))).status == "good"
     assert judge(replace(found, need=Need(0.9 * plain.good_for_mm))).status == "check"
 

@@ -1,31 +1,32 @@
 """Causes of doubts: how likely each is, what competes, and what stands on top."""
 
-import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from samples import made_up
 from scipy.special import chdtrc
 from test_need import NEED
 from test_verdict import SOUND, changed, directions, left_out
 
-from visioncal.calibration.stages import causes as ranking
-from visioncal.calibration.stages.causes import EVIDENCE, with_misread
+from visioncal.calibration.stages.causes import read_otherwise, with_misread
+from visioncal.calibration.stages.fit_messages import scale_found
 from visioncal.calibration.stages.judge import judge
 from visioncal.calibration.stages.need import Picks
-from visioncal.cli.pointing import told_of
-from visioncal.results import Cause, Rms, Verdict
+from visioncal.core.verdict import CALIBRATE, GUESS, PLAN, Finding, Step, Verdict, with_paths
+from visioncal.estimation.joint import MeasuredScale
+from visioncal.results import Rms
 from visioncal.results.verdicts import read_verdict, verdict_document
 
-EXCHANGED = "Views 3 and 4 are exchanged: the image of each fits the pose in the other's row."
-POSTURE = "Residuals follow the arm's posture (likelihood ratio 45, noise stays under 15.1)"
-DRIFT = "Residuals drift with time: from the first stop to the last, base or target moved."
-SIZE = (
-    "By the robot's motion the board is 0.47 % larger than stated (sigma 0.06 %): squares of "
-    "36.36 mm, which is not what is stated (to within 0.08 %)."
+EXCHANGED = Finding(
+    "exchanged_views",
+    "Views 3 and 4 are exchanged: the image of each fits the pose in the other's row.",
+    Step("Exchange them.", CALIBRATE),
+    (3, 4),
 )
+POSTURE = Finding("arm_errors", "Residuals follow the arm's posture.", mahalanobis_sq=45.0)
+DRIFT = Finding("moved_slowly", "Residuals drift with time.")
+SIZE = scale_found("board", 0.03, MeasuredScale(0, 4.7e-3, 6e-4, 8e-4))
 
 
 def chi2_chance(square: float) -> float:
@@ -33,7 +34,7 @@ def chi2_chance(square: float) -> float:
 
 
 def ids(verdict: Verdict) -> list[str]:
-    return [it.cause for it in verdict.causes]
+    return [it.kind for it in verdict.causes]
 
 
 def test_a_good_result_has_no_causes() -> None:
@@ -48,7 +49,7 @@ def test_exchanged_rows_come_first_with_what_is_left_without_them() -> None:
     assert first.without_it == (
         "Without them, views that are left out in turn agree to 0.11 mm and 0.011 deg."
     )
-    assert "visioncal calibrate SESSION" in first.do
+    assert first.do == EXCHANGED.do
     assert verdict.causes == tuple(sorted(verdict.causes, key=lambda it: -it.probability))
 
 
@@ -65,18 +66,18 @@ def test_explanations_of_one_misfit_share_it(warnings, chances) -> None:
     """By the bound of Sellke, Bayarri and Berger on what a chance says, none of them among them."""
     verdict = judge(changed(SOUND, warnings=warnings, away_mm=1.0))
     odds = {text: -1.0 / (np.e * p * np.log(p)) for text, p in zip(warnings, chances, strict=True)}
-    found = {it.sentence: it.probability for it in verdict.causes}
+    found = {it.words: it.probability for it in verdict.causes}
     for text in warnings:
-        assert found[text] == pytest.approx(odds[text] / (1.0 + sum(odds.values())))
-    (unexplained,) = (it for it in verdict.causes if it.cause == "unexplained")
+        assert found[text.words] == pytest.approx(odds[text] / (1.0 + sum(odds.values())))
+    (unexplained,) = (it for it in verdict.causes if it.kind == "unexplained")
     assert unexplained.probability == pytest.approx(1.0 / (1.0 + sum(odds.values())))
     assert sum(it.probability for it in verdict.causes) == pytest.approx(1.0)
 
 
 def test_what_nothing_explains_is_the_cause_itself() -> None:
     (only,) = judge(changed(SOUND, away_mm=1.0)).causes
-    assert (only.cause, only.probability) == ("unexplained", 1.0)
-    assert "convert SESSION FIXED --guess" in only.do
+    assert (only.kind, only.probability) == ("unexplained", 1.0)
+    assert only.do.command == GUESS
 
 
 @pytest.mark.parametrize(
@@ -97,7 +98,12 @@ def test_errors_that_are_too_large_come_from_their_sources(need) -> None:
     without = f"Without it 95 % of picks land within {0.3 * np.sqrt(7.815):.2f} mm"
     assert verdict.causes[0].without_it.startswith(without)
     assert ("within what is needed" in verdict.causes[0].without_it) == (need is not None)
-    assert "visioncal plan SESSION --add 5" in verdict.causes[1].do
+    # No command proposes views of an arm whose model nobody knows.
+    assert "visioncal plan proposes them" in verdict.causes[1].do.words
+    assert not verdict.causes[1].do.command
+    (arm,) = found.arms
+    known = judge(replace(found, arms=(replace(arm, modelled=True),)))
+    assert known.causes[1].do.command == PLAN
     # What can be had without them is no cause of a doubt about something else.
     met = replace(found, need=None, worst=directions(1e-4), warnings=(DRIFT,))
     assert ids(judge(met)) == ["moved_slowly"]
@@ -105,49 +111,61 @@ def test_errors_that_are_too_large_come_from_their_sources(need) -> None:
 
 def test_poses_that_are_misread_explain_the_rest() -> None:
     before = judge(changed(SOUND, warnings=(DRIFT,)))
-    after = with_misread(before, "The quaternions are w, x, y, z.")
+    after = with_misread(before, read_otherwise("The quaternions are w, x, y, z."))
     assert ids(after) == ["misread_poses", "moved_slowly"]
     assert sum(it.probability for it in after.causes) <= 1.0
-    assert after.reasons == ("The quaternions are w, x, y, z.", *before.reasons)
+    assert after.top[0].startswith("Most likely (98 %): The quaternions are w, x, y, z.")
+    assert after.reasons[1:] == before.reasons
 
 
-def test_three_stand_on_top_and_nothing_is_said_twice() -> None:
-    reasons = ("A is wrong. Look at A.", "B is odd.", "C is odd.", "D is odd.", "A note.")
-    odd = (0.9, 0.8, 0.7, 0.1)
-    causes = tuple(
-        Cause(it[0].lower(), p, it.split(". ")[0], "Without it all is well.")
-        for it, p in zip(reasons[:4], odd, strict=True)
+def test_the_cause_its_cost_and_what_to_do_come_first() -> None:
+    found = (
+        Finding("place", "A point is placed to 4 mm.", Step("Add views."), is_fatal=True),
+        Finding("something_odd", "It is odd."),
+        Finding("lens", "The lens is another.", Step("Leave it out."), probability=0.2),
+        DRIFT,
+        replace(EXCHANGED, probability=0.7, without_it="Without them all is well."),
+        Finding("holdout", "Held back.", Step("Add views."), probability=0.01),
     )
-    lines = Verdict("check", reasons, causes=causes).lines
-    assert lines[0] == "Most likely (90 %): A is wrong. Look at A. Without it all is well."
-    assert lines[1].startswith("Then (80 %): B is odd.")
-    assert lines[3:] == ("D is odd.", "A note.")
-    sized = Verdict(
-        "bad", ("Only so many land.",), causes=(Cause("noise", 0.6, "It is.", "", "Do."),)
+    verdict = Verdict("bad", found)
+    assert verdict.top == (
+        f"Most likely (70 %): {EXCHANGED.words} Without them all is well.",
+        "A point is placed to 4 mm.",
+        "Possibly (20 %): The lens is another.",
     )
-    assert sized.lines == ("Only so many land.", "Most likely (60 %): It is. Do.")
-    assert Verdict("good", ("Fine.",)).lines == ("Fine.",)
+    assert verdict.rest == ("It is odd.", DRIFT.words, "Held back.")
+    assert verdict.next_steps == (EXCHANGED.do, Step("Add views."), Step("Leave it out."))
+    assert Verdict.of("good", "Fine.").top == ("Fine.",)
 
 
-def test_causes_are_kept_and_name_the_session(tmp_path: Path) -> None:
+def test_findings_are_kept_and_name_the_session(tmp_path: Path) -> None:
     verdict = judge(changed(SOUND, warnings=(EXCHANGED,), stops=8))
     assert read_verdict(verdict_document(verdict)) == verdict
-    named = told_of(replace(made_up(2).calibration, verdict=verdict), tmp_path / "my cell").verdict
-    assert f"visioncal calibrate '{tmp_path}/my cell'" in named.causes[0].do
+    named = verdict.with_paths(tmp_path / "my cell", "out")
+    command = f"visioncal calibrate '{tmp_path}/my cell' -o out"
+    assert named.next_steps[0].command == command
+    assert command in named.reasons[-1]
+    folder = tmp_path / "cell"
+    assert with_paths(GUESS, folder) == f"visioncal convert {folder} {folder}-fixed --guess"
+    recording = tmp_path / "cell.rrd"
+    recording.touch()
+    assert with_paths(GUESS, recording).endswith(f"cell.rrd {folder}-fixed --guess")
 
 
-def test_what_stages_say_is_what_the_ranking_listens_for() -> None:
-    """A sentence that is worded anew would silently be a remark."""
-    package = Path(ranking.__file__).parents[1]
-    said = re.sub(
-        r'"\s*\n\s*f?"', "", "\n".join(it.read_text("utf-8") for it in package.rglob("*.py")
-                                       if it.name != "causes.py")
-    )  # fmt: skip
-    for words, cause in ranking._SAID.items():
-        assert cause in EVIDENCE
-        for part in words.split("|"):
-            text = re.sub(r"[()]|\.\*.*", "", part).strip()
-            assert text in said, part
+def test_verdicts_of_earlier_files_say_the_same() -> None:
+    causes = [
+        {"cause": "lens", "probability": 0.9, "sentence": "It is another.", "do": "Measure it."},
+        {"cause": "calibration", "probability": 0.4, "sentence": "Much comes from it."},
+    ]
+    reasons = ["Views disagree.", "It is another. Hold it."]
+    old = read_verdict({"status": "bad", "reasons": reasons, "causes": causes})
+    assert [it.kind for it in old.causes] == ["lens", "calibration"]
+    assert old.top == (
+        "Most likely (90 %): It is another. Hold it.",
+        "Possibly (40 %): Much comes from it.",
+        "Views disagree.",
+    )
+    assert old.next_steps == (Step("Measure it."),)
 
 
 def _scattered() -> Verdict:

@@ -80,7 +80,7 @@ def test_results_are_appended_and_the_last_one_counts(sample: Sample, captured: 
     before = captured.read_bytes()[: scan(captured).end]
     layout = blueprint(sample.session)
     append_results(captured, sample.session, sample.calibration, sample.evidence, layout)
-    better = replace(sample.calibration, verdict=Verdict("good", ()))
+    better = replace(sample.calibration, verdict=Verdict("good"))
     append_results(captured, sample.session, better, sample.evidence[:4])
     assert captured.read_bytes().startswith(before)
     calibration = read_calibration(captured)
@@ -109,7 +109,7 @@ def test_rerun_reads_what_was_appended_as_one_recording(sample: Sample, captured
 def test_interrupted_append_leaves_the_results_before(sample: Sample, captured: Path) -> None:
     append_results(captured, sample.session, sample.calibration, sample.evidence)
     first = captured.stat().st_size
-    better = replace(sample.calibration, verdict=Verdict("good", ()))
+    better = replace(sample.calibration, verdict=Verdict("good"))
     append_results(captured, sample.session, better, sample.evidence[:4])
     data = captured.read_bytes()
     rng = random.Random(6)

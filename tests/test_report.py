@@ -21,11 +21,19 @@ from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import load_stored
 from visioncal.present.recording import write_recording
 from visioncal.present.report import write_report
-from visioncal.present.report.advice import listed, next_steps, suspects
+from visioncal.present.report.advice import listed, suspects
 from visioncal.present.report.page import render
 from visioncal.present.report.thumbnails import thumbnail
 from visioncal.present.report.trends import twist_of
-from visioncal.results import Calibration, CameraResult, Rms, Verdict, VerdictStatus
+from visioncal.results import (
+    Calibration,
+    CameraResult,
+    Finding,
+    Rms,
+    Step,
+    Verdict,
+    VerdictStatus,
+)
 from visioncal.robot import load_robot
 from visioncal.session import MemoryImages
 from visioncal.simulation import CellOptions, simulate, write_session
@@ -43,7 +51,7 @@ def html(sample: Sample) -> str:
 
 def test_verdict_comes_first_with_its_reasons(sample: Sample, html: str) -> None:
     words = Page(html).words
-    places = [words.index("Check: usable once")]
+    places = [words.index("Check before use")]
     places += [words.index(reason) for reason in sample.calibration.verdict.reasons]
     places += [words.index(heading) for heading in ("flange_from_cam", "base_from_target")]
     places += [
@@ -54,12 +62,12 @@ def test_verdict_comes_first_with_its_reasons(sample: Sample, html: str) -> None
 
 
 @pytest.mark.parametrize(
-    ("status", "word"), [("good", "Good:"), ("check", "Check:"), ("bad", "Bad:")]
+    ("status", "word"), [("good", "Good:"), ("check", "Check before use"), ("bad", "Bad:")]
 )
 def test_verdict_is_told_by_word_and_colour(
     sample: Sample, status: VerdictStatus, word: str
 ) -> None:
-    verdict = Verdict(status, ("One reason.",))
+    verdict = Verdict.of(status, "One reason.")
     html = render(replace(sample.calibration, verdict=verdict), None, ())
     assert f'class="verdict {status}"' in html
     assert word in Page(html).words
@@ -80,20 +88,23 @@ def with_outliers(sample: Sample, status: VerdictStatus) -> Calibration:
         replace(view, residual_mm=9.5) if view.view in (1, 4) else view
         for view in sample.calibration.views
     )
-    reason = (
-        "Views disagree by 2.6 mm (doubt begins at 2), rms. Possible causes: a board that moved.",
-        "Its z is weakly determined. Add views tilted by 20 degrees.",
-        "Its y is weakly determined. Add views tilted by 20 degrees.",
+    tilted = Step("Add views tilted by 20 degrees.", "visioncal plan SESSION --add 5")
+    found = (
+        Finding("weak_motion", "Its z is weakly determined.", tilted),
+        Finding("place", "Its y is weakly determined.", tilted),
+        Finding("wrong_views", "View 1 is wrong.", Step("Look at it."), (1,), 0.9),
+        Finding("lens", "The lens is another.", Step("Measure it."), probability=0.3),
+        Finding("note", "It was cold."),
     )
-    return replace(sample.calibration, views=views, verdict=Verdict(status, reason))
+    return replace(sample.calibration, views=views, verdict=Verdict(status, found))
 
 
 def test_wrong_views_are_named_and_marked(sample: Sample) -> None:
     html = render(with_outliers(sample, "bad"), sample.session, sample.evidence)
     words, rows = Page(html).words, [" ".join(row.split()) for row in Page(html).rows]
     steps = words[words.index("What to do next") : words.index("camera position, sigma")]
-    assert "Look at views 1 and 4:" in steps
     assert steps.count("Add views tilted by 20 degrees.") == 1
+    assert steps.index("Look at it.") < steps.index("Add views") < steps.index("Measure it.")
     for view in (1, 4):
         assert any(row.startswith(f"view {view} used off by 9.5 mm") for row in rows)
         assert any(row.startswith(f"{view} ") and row.endswith(" look") for row in rows)
@@ -102,16 +113,15 @@ def test_wrong_views_are_named_and_marked(sample: Sample) -> None:
 def test_good_results_have_no_doubtful_views_and_say_what_they_are_for(sample: Sample) -> None:
     words = Page(render(with_outliers(sample, "good"), None, ())).words
     assert "to look at" not in words
-    assert "Use flange_from_cam as it stands" in words
 
 
-def test_advice_without_outliers_points_at_what_views_share(sample: Sample) -> None:
-    calibration = replace(sample.calibration, verdict=with_outliers(sample, "check").verdict)
-    steps = next_steps(calibration, suspects(calibration))
-    assert steps[0] == (
-        "No view stands out, so look for what all of them share: a board that moved."
-    )
-    assert steps[1:] == ("Add views tilted by 20 degrees.",)
+def test_three_findings_are_read_first_and_the_rest_is_folded(sample: Sample) -> None:
+    html = render(with_outliers(sample, "bad"), None, ())
+    first, folded = html.split("<details><summary>What else was found (2)")[:2]
+    assert "Most likely (90 %): View 1 is wrong." in first
+    assert "Possibly (30 %): The lens is another." in first
+    assert "Its z is weakly determined." in first
+    assert "It was cold." in folded.split("</details>")[0]
 
 
 def test_sources_of_uncertainty_are_told_with_their_shares(sample: Sample) -> None:
@@ -192,7 +202,6 @@ def test_views_that_contradict_the_others_are_set_apart(sample: Sample) -> None:
     assert f"view 6 not used {CONTRADICTS}" in rows
     assert any(row.startswith("6 ") and row.endswith(" left out") for row in rows)
     assert any(row.startswith("3 ") and row.endswith(" no") for row in rows)
-    assert "Find out what went wrong with view 6, which the result does not use" in page.words
     assert "Red: left out, since it contradicts the others." in page.words
     # Its picture shows how far off it is.
     assert html[html.index("View 6:") - 2000 : html.index("View 6:")].count("<path d=") > 10

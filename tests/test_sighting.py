@@ -177,7 +177,7 @@ def test_sessions_of_another_camera_are_refused():
 def test_doubts_of_calibration_and_sigma_are_told():
     cell, calibration = calibrated_cell(IN_HAND)
     session = session_of(cell, shots(cell, 3))
-    bad = replace(calibration, verdict=Verdict("bad", ("The views disagree.",)))
+    bad = replace(calibration, verdict=Verdict.of("bad", "The views disagree."))
     frame = seen_frame(session, bad, "fixture")
     assert frame.verdict.status == "bad"
     assert "The views disagree." in frame.verdict.reasons[0]

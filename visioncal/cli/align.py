@@ -11,7 +11,7 @@ from rich.markup import escape
 from visioncal.calibration.pipeline import align
 from visioncal.cli.console import messages, tell_written
 from visioncal.cli.needs import NeedDeg, NeedMm
-from visioncal.cli.pointing import naming, told_verdict
+from visioncal.cli.pointing import naming
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.summary import print_verdict, unused_words
 from visioncal.core.number_format import figure
@@ -67,13 +67,14 @@ def align_into(
 ) -> Alignment:
     """Aligns the cell of a session from some path, writes the result and tells of it."""
     left = leftover(out)
-    with naming(path), shown_progress(quiet=quiet) as told:
+    with naming(path, out), shown_progress(quiet=quiet) as told:
         result = align(session, level=level, convention=convention, progress=told)
+    result = replace(result, verdict=result.verdict.with_paths(path, out))
     if left is not None:
         left.keep()
     written = write_alignment(out, session, result)
     if not quiet:
-        _tell(replace(result, verdict=told_verdict(result.verdict, path)))
+        _tell(result)
     if left is not None:
         messages().print(escape(left.words))
     tell_written(written, quiet=quiet)

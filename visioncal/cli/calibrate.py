@@ -1,6 +1,7 @@
 """`visioncal calibrate`."""
 
 import json
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -14,7 +15,7 @@ from visioncal.calibration.pipeline.running import check_dense, check_solver
 from visioncal.cli.align import align_into
 from visioncal.cli.console import messages, tell_written
 from visioncal.cli.needs import NeedDeg, NeedMm
-from visioncal.cli.pointing import naming, told_of
+from visioncal.cli.pointing import naming
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.summary import print_summary
 from visioncal.core.types import SolverName
@@ -90,19 +91,22 @@ def calibrate_command(
             typer.echo(json.dumps(document, indent=2))
         return
     left = leftover(out)
-    with naming(session), shown_progress(quiet=as_json) as told:
+    with naming(session, out), shown_progress(quiet=as_json) as told:
         calibrated = partial(run_dense, device=device) if dense else run
         result = calibrated(
             loaded, solver=solver, level=level, convention=convention, progress=told
         )
         told("write", 0, 1)
+        calibration = result.calibration
+        named = replace(calibration, verdict=calibration.verdict.with_paths(session, out))
+        result = replace(result, calibration=named)
         if left is not None:
             left.keep()
         written = write_outputs(out, loaded, result)
     if as_json:
         typer.echo(json.dumps(to_document(result.calibration), indent=2))
     else:
-        print_summary(told_of(result.calibration, session), verbose=verbose)
+        print_summary(result.calibration, verbose=verbose)
     if left is not None:
         messages().print(escape(left.words))
     tell_written(written, quiet=as_json)

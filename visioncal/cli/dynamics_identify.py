@@ -114,7 +114,9 @@ def _terms(words: str) -> FrictionTerms:
 
 def _tell(identified: Identified) -> None:
     console, judged = messages(), judge(identified)
-    print_verdict(Verdict(judged.status, judged.reasons), f"dynamics of {identified.robot.name}")
+    print_verdict(
+        Verdict.of(judged.status, *judged.reasons), f"dynamics of {identified.robot.name}"
+    )
     for stream in identified.streams:
         left = f", {stream.left_out} torques left out" if stream.left_out else ""
         console.print(

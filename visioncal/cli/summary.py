@@ -1,7 +1,7 @@
 """Results as they are summed up for people."""
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 from rich.markup import escape
 from rich.table import Table
@@ -9,7 +9,7 @@ from rich.table import Table
 from visioncal.cli.console import messages
 from visioncal.core.files import some_of
 from visioncal.core.transforms import pose_difference
-from visioncal.results import Calibration, Sight, Verdict, ViewResult
+from visioncal.results import Calibration, Sight, Step, Verdict, ViewResult
 
 _COLOURS = {"good": "bold green", "check": "bold yellow", "bad": "bold red"}
 _SAME_REASON = 20  # more views of one reason share a line
@@ -19,8 +19,24 @@ def print_verdict(verdict: Verdict, name: str) -> None:
     """Prints whether something can be trusted, and why."""
     console, colour = messages(), _COLOURS[verdict.status]
     console.print(f"[{colour}]{verdict.status}[/]  {escape(name)}")
-    for line in verdict.lines:
+    for line in verdict.top:
         console.print(f"  - {escape(line)}")
+    print_steps(verdict.next_steps)
+    if verdict.rest:
+        console.print("What else was found:")
+    for line in verdict.rest:
+        console.print(f"  - {escape(line)}")
+
+
+def print_steps(steps: Sequence[Step]) -> None:
+    """Prints what to do next, each command on a line of its own."""
+    console = messages()
+    if steps:
+        console.print("What to do next:")
+    for at, step in enumerate(steps, 1):
+        console.print(f"  {at}. {escape(step.words)}")
+        if step.command:
+            console.print(f"     [bold]{escape(step.command)}[/]")
 
 
 def print_summary(calibration: Calibration, *, verbose: bool) -> None:

@@ -8,8 +8,8 @@ import numpy as np
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
 from visioncal.core.types import Mask
+from visioncal.core.verdict import AGREEMENT, Finding, Verdict
 from visioncal.estimation.observability import Direction
-from visioncal.results import Verdict, VerdictStatus
 
 
 @dataclass(frozen=True)
@@ -23,10 +23,9 @@ class Doubt:
 def verdict_of(doubts: Sequence[Doubt], praise: str) -> Verdict:
     """Makes a verdict: `bad` with a reason that settles it, `check` with doubts, else `good`."""
     if not doubts:
-        return Verdict("good", (praise,))
-    status: VerdictStatus = "bad" if any(it.is_fatal for it in doubts) else "check"
-    ordered = sorted(doubts, key=lambda it: not it.is_fatal)
-    return Verdict(status, tuple(it.sentence for it in ordered))
+        return Verdict("good", (Finding(AGREEMENT, praise),))
+    findings = [Finding("remark", it.sentence, is_fatal=it.is_fatal) for it in doubts]
+    return Verdict.by(findings, Finding(AGREEMENT, praise))
 
 
 def weak_directions(

@@ -1,5 +1,6 @@
 """The result of a calibration, its frames, and how they stand on disk."""
 
+from visioncal.core.verdict import Finding, Step, Verdict, VerdictStatus
 from visioncal.results.alignment import Alignment, Moved, Sight, Untied
 from visioncal.results.document import to_document
 from visioncal.results.edge import Edge
@@ -7,15 +8,12 @@ from visioncal.results.frame import Frame, FrameFile, Observation
 from visioncal.results.parts import (
     HELD_BACK,
     CameraResult,
-    Cause,
     NeedMet,
     Picker,
     Rms,
     RobotResult,
     SolverResult,
     Validation,
-    Verdict,
-    VerdictStatus,
     ViewResult,
 )
 from visioncal.results.picking import picked
@@ -26,8 +24,8 @@ __all__ = [
     "Alignment",
     "Calibration",
     "CameraResult",
-    "Cause",
     "Edge",
+    "Finding",
     "Frame",
     "FrameFile",
     "Moved",
@@ -38,6 +36,7 @@ __all__ = [
     "RobotResult",
     "Sight",
     "SolverResult",
+    "Step",
     "Untied",
     "Validation",
     "Verdict",

@@ -14,13 +14,14 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean, read_bytes, write_atomically
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray
+from visioncal.core.verdict import Verdict
 from visioncal.core.version import __version__
 from visioncal.estimation.tree import Branch, Step, Tree
 from visioncal.results.edge import Edge, edge_document, read_covariance, read_edge
 from visioncal.results.forms import CAMERA, MOVED, SCHEMA, UNTIED, VERDICT, VIEW, Form, check
 from visioncal.results.frame import Frame, present
 from visioncal.results.lens import camera_document, read_camera
-from visioncal.results.parts import CameraResult, NeedMet, RobotResult, Verdict
+from visioncal.results.parts import CameraResult, NeedMet, RobotResult
 from visioncal.results.verdicts import (
     need_document,
     read_need,

@@ -20,6 +20,16 @@ VERDICT: Form = {
     "causes?": [
         {"cause": str, "probability": float, "sentence": str, "without_it?": str, "do?": str}
     ],
+    "findings?": [
+        {
+            "kind": str,
+            "words": str,
+            "do?": {"words": str, "command?": str},
+            "views?": [int],
+            "probability?": float,
+            "without_it?": str,
+        }
+    ],
 }
 _NEED: Form = {
     "mm?": float,

@@ -9,10 +9,10 @@ from typing import Any, Self
 from visioncal.core.documents import parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, write_atomically
+from visioncal.core.verdict import Verdict
 from visioncal.core.version import __version__
 from visioncal.results.edge import Edge, edge_document, read_edge
 from visioncal.results.forms import FRAME, check
-from visioncal.results.parts import Verdict
 from visioncal.results.verdicts import read_verdict, verdict_document
 
 _SCHEMA = 1

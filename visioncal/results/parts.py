@@ -2,19 +2,15 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeAlias
+from typing import Any
 
 from scipy.spatial.transform import RigidTransform
 
-from visioncal.core.number_format import percent
 from visioncal.core.types import Camera, FloatArray, Need
 from visioncal.robot import Robot
 
-VerdictStatus: TypeAlias = Literal["good", "check", "bad"]
 # Why a view is in no fit although nothing is wrong with it.
 HELD_BACK = "held out of the fit by the session (role = holdout)"
-# So many causes stand on top, if they are as likely as this.
-_SHOWN_CAUSES, _LEAST_LIKELY = 3, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,64 +113,6 @@ class Validation:
     method: str
     held_out: Rms
     holdout: Rms | None = None
-
-
-@dataclass(frozen=True)
-class Cause:
-    """What may be why a result is not good.
-
-    Attributes:
-        cause: What it is, as a short name that stays.
-        probability: How likely it is.
-        sentence: What it is, with its figures.
-        without_it: What the result would be without it, in a sentence; empty where not computed.
-        do: What to do about it; a command where one does it.
-    """
-
-    cause: str
-    probability: float
-    sentence: str
-    without_it: str = ""
-    do: str = ""
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """Whether the result can be trusted.
-
-    Attributes:
-        status: In one word.
-        reasons: Why, in plain sentences.
-        good_for_mm: The least need that it would be good for [mm]; None where something is
-            unexplained, and it is good for none.
-        causes: What may be why it is not good, likeliest first.
-    """
-
-    status: VerdictStatus
-    reasons: tuple[str, ...]
-    good_for_mm: float | None = None
-    causes: tuple[Cause, ...] = ()
-
-    @property
-    def lines(self) -> tuple[str, ...]:
-        """The reasons for people: the likeliest causes on top with how likely they are.
-
-        What a cause says in other words than a reason comes behind what it explains.
-        """
-        top = [it for it in self.causes if it.probability >= _LEAST_LIKELY][:_SHOWN_CAUSES]
-        told, words = [*self.reasons], []
-        for at, cause in enumerate(top):
-            mine = [it for it in told if it.startswith(cause.sentence)]
-            told = [it for it in told if it not in mine]
-            # A reason says itself what to do.
-            rest = (cause.without_it,) if mine else (cause.without_it, cause.do)
-            said = filter(None, (*(mine or [cause.sentence]), *rest))
-            how = "Then" if at else "Most likely"
-            words.append(f"{how} ({percent(cause.probability)}): {' '.join(said)}")
-        sentences = tuple(it.sentence for it in self.causes)
-        of_causes = [at for at, it in enumerate(self.reasons) if it.startswith(sentences)]
-        first = min(of_causes, default=len(self.reasons))
-        return (*told[:first], *words, *told[first:])
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from visioncal.core.documents import parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, write_atomically
 from visioncal.core.types import FloatArray, Mount
+from visioncal.core.verdict import Step, Verdict
 from visioncal.estimation.intervals import freedom_of
 from visioncal.results.alignment import FILE as ALIGNMENT
 from visioncal.results.alignment import Alignment, is_alignment
@@ -26,7 +27,6 @@ from visioncal.results.parts import (
     Rms,
     SolverResult,
     Validation,
-    Verdict,
     ViewResult,
 )
 from visioncal.results.selecting import selected_fields, whole_fields
@@ -80,6 +80,13 @@ class Calibration:
     stages: Mapping[str, Any] = field(default_factory=dict)
     cell: Alignment | None = None
     need: NeedMet | None = None
+
+    @property
+    def next_steps(self) -> tuple[Step, ...]:
+        """What to do about what was found, of tools and fixtures, too; the most pressing first."""
+        doubtful = (name for name, it in self.frames.items() if it.verdict.status != "good")
+        frames = (Step(f"Read what was found of {name} before it is used.") for name in doubtful)
+        return (*self.verdict.next_steps, *frames)
 
     @classmethod
     def whole(cls, cell: Alignment) -> Self:

@@ -9,10 +9,11 @@ from scipy.linalg import block_diag
 
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray
+from visioncal.core.verdict import Finding, Verdict
 from visioncal.results.alignment import Alignment, Sight
 from visioncal.results.edge import Edge
 from visioncal.results.frame import Frame
-from visioncal.results.parts import CameraResult, Rms, RobotResult, Validation, Verdict
+from visioncal.results.parts import CameraResult, Rms, RobotResult, Validation
 from visioncal.results.whole import holdout_rms, left_out_rms, rms_of, view_results
 from visioncal.session.choosing import PARTS, Choice, Chosen, Part, choose
 from visioncal.session.frames import CELL, frames_of_kind, robots_between, thing_name
@@ -173,12 +174,13 @@ def _camera(result: CameraResult | None, jacobian: FloatArray) -> CameraResult |
 def _verdict(cell: Alignment) -> Verdict:
     if "arms" not in cell.details:
         return cell.verdict
-    words = (
+    found = Finding(
+        "arm_left_out",
         "The whole cell was fitted with errors of its arms, which this part of it does not have: "
-        "by the poses as they are reported it is off by as much."
+        "by the poses as they are reported it is off by as much.",
     )
     status = "check" if cell.verdict.status == "good" else cell.verdict.status
-    return Verdict(status, (words, *cell.verdict.reasons))
+    return replace(cell.verdict, status=status, findings=(found, *cell.verdict.findings))
 
 
 def _placed(cell: Alignment, chosen: Chosen) -> dict[str, Frame]:

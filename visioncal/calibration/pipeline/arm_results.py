@@ -4,14 +4,15 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from visioncal.calibration.stages import thermal
+from visioncal.calibration.stages import diagnose, thermal
 from visioncal.calibration.stages.arms import ArmFound, RobotArm
 from visioncal.calibration.stages.cell import Cell, robot_key
-from visioncal.calibration.stages.diagnose import ResidualTest, misfit_words
+from visioncal.calibration.stages.diagnose import ResidualTest
 from visioncal.calibration.stages.kinematics import doubts, findings
 from visioncal.calibration.stages.reported_poses import Reported
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.types import FloatArray
+from visioncal.core.verdict import NOTE, Finding, remarks
 from visioncal.estimation.arm import covariance_of_size, misfit_covariance
 from visioncal.estimation.parts import State
 from visioncal.estimation.problem import Problem
@@ -78,11 +79,11 @@ def doubts_of_arms(
     found: Mapping[str, ResidualTest],
     told: Mapping[str, ArmFound],
     asked: str,
-) -> Iterator[str]:
-    """Words what speaks against the robots."""
+) -> Iterator[Finding]:
+    """Finds what speaks against the robots."""
     for robot, arm in arms.items():
-        for words in (*_doubts(arm, found.get(robot), asked), *told[robot].doubts()):
-            yield _of_robot(arms, robot, words)
+        for it in (*_doubts(arm, found.get(robot), asked), *told[robot].doubts()):
+            yield it.of(_called(arms, robot))
 
 
 def notes_on_arms(arms: Mapping[str, RobotArm], told: Mapping[str, ArmFound]) -> Iterator[str]:
@@ -90,25 +91,29 @@ def notes_on_arms(arms: Mapping[str, RobotArm], told: Mapping[str, ArmFound]) ->
     for robot, arm in arms.items():
         drifts = () if arm.thermal is None else thermal.findings(arm.thermal)
         chosen = () if arm.kinematics is None else findings(arm.kinematics)
-        for words in (*drifts, *chosen, *told[robot].notes()):
-            yield _of_robot(arms, robot, words)
+        for it in remarks((*drifts, *chosen, *told[robot].notes()), NOTE):
+            yield it.of(_called(arms, robot)).words
 
 
-def _doubts(arm: RobotArm, found: ResidualTest | None, asked: str) -> Iterator[str]:
+def _doubts(arm: RobotArm, found: ResidualTest | None, asked: str) -> Iterator[Finding]:
     if arm.joints_rad is None and asked not in ("auto", "hand-eye"):
-        yield "It stays as it reports itself: its errors take joint angles and a known model."
+        yield Finding(
+            "level",
+            "It stays as it reports itself: its errors take joint angles and a known model.",
+        )
     elif arm.thermal is None and asked == thermal.LEVEL:
-        yield "Nothing tells how it drifts with its temperature: that stays in its noise."
+        words = "Nothing tells how it drifts with its temperature: that stays in its noise."
+        yield Finding("level", words)
     if arm.kinematics is not None:
         yield from doubts(arm.kinematics)
     if found is not None:
         calibrated = arm.model is not None
-        yield from misfit_words(found, arm.errors, calibrated=calibrated)
+        yield from diagnose.doubts(found, arm.errors, calibrated=calibrated)
 
 
-def _of_robot(arms: Mapping[str, RobotArm], robot: str, words: str) -> str:
-    """Names, of several robots, the one that a sentence is of."""
-    return words if len(arms) == 1 else f"Robot {robot}: {words[0].lower()}{words[1:]}"
+def _called(arms: Mapping[str, RobotArm], robot: str) -> str:
+    """Names, of several robots, the one that a finding is of."""
+    return "" if len(arms) == 1 else f"Robot {robot}"
 
 
 def with_drifts(

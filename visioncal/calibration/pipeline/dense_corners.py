@@ -135,6 +135,6 @@ def _images(dense: Dense) -> Iterator[dict[str, Any]]:
 def _telling(found: Run, document: dict[str, Any], words: list[str]) -> Run:
     """The result with what is said of dense corners."""
     calibration: Calibration = found.calibration
-    verdict = replace(calibration.verdict, reasons=(*calibration.verdict.reasons, *words))
+    verdict = calibration.verdict.noting(words)
     stages = {**calibration.stages, **({"dense": document} if document else {})}
     return replace(found, calibration=replace(calibration, verdict=verdict, stages=stages))

@@ -13,6 +13,7 @@ from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import distances, mean_transform, pose_difference
 from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.core.verdict import CALIBRATE, Finding, Step
 from visioncal.estimation.problem import Problem
 from visioncal.results import Moved
 
@@ -24,6 +25,7 @@ _FEWEST = 2
 
 # So many views of a fault are named, and so many stops that an observation fits.
 _LISTED, _NAMED = 8, 3
+_EXCHANGE = Step("Exchange these rows in views.csv, and calibrate again.", CALIBRATE)
 
 
 @dataclass(frozen=True)
@@ -31,12 +33,12 @@ class PoseFault:
     """What is wrong with the poses of a robot.
 
     Attributes:
-        words: What it is, in sentences.
+        found: What it is.
         rows: The observations that it explains.
         short: The same as a clause, for each of these; empty where the sentences are enough.
     """
 
-    words: str
+    found: Finding
     rows: tuple[int, ...]
     short: str = ""
 
@@ -118,16 +120,18 @@ def movements(solved: Solved) -> tuple[Moved, ...]:
     return tuple(found)
 
 
-def moved_words(moved: Moved) -> str:
+def moved_found(moved: Moved) -> Finding:
     """Says that something moved."""
     what = "was bumped" if moved.frame.startswith("cam") else "moved"
     rivals = (
         f" (or {' or '.join(moved.rivals)} did: this session cannot tell)" if moved.rivals else ""
     )
-    return (
+    return Finding(
+        "moved_frame",
         f"{moved.frame} {what} between stops {moved.last_stop} and {moved.first_stop}, by "
         f"{figure(moved.shift_mm)} mm and {figure(moved.turn_deg)} deg{rivals}; the result has it "
-        f"where it stood last, and as {moved.before} where it stood before."
+        f"where it stood last, and as {moved.before} where it stood before.",
+        Step(f"Fasten {moved.frame}, and record again."),
     )
 
 
@@ -152,10 +156,11 @@ def _exchanged_views(solved: Solved, mutual: Mapping[int, int]) -> Iterator[Pose
         if first < second:
             words = (
                 f"Views {rows[first].view} and {rows[second].view} are exchanged: the image of "
-                "each fits the pose in the other's row. They were left out: exchange them in "
-                "views.csv, and calibrate again."
+                "each fits the pose in the other's row. They were left out."
             )
-            yield PoseFault(words, (first, second))
+            views = (rows[first].view, rows[second].view)
+            found = Finding("exchanged_views", words, _EXCHANGE, views)
+            yield PoseFault(found, (first, second))
 
 
 def by_way_of(problem: Problem, robot: str) -> Mask:
@@ -166,9 +171,12 @@ def by_way_of(problem: Problem, robot: str) -> Mask:
     return found
 
 
+def _numbers(solved: Solved, rows: Sequence[int]) -> tuple[int, ...]:
+    return tuple(solved.cell.rows[it].view for it in rows)
+
+
 def _views(solved: Solved, rows: Sequence[int]) -> str:
-    views = [str(solved.cell.rows[it].view) for it in rows]
-    return f"views {some_of(views, _LISTED)}"
+    return f"views {some_of([*map(str, _numbers(solved, rows))], _LISTED)}"
 
 
 def _pushed_bases(solved: Solved) -> list[PoseFault]:
@@ -192,9 +200,11 @@ def _pushed_bases(solved: Solved) -> list[PoseFault]:
         words = (
             f"All {len(after)} views by way of {flange} from stop "
             f"{solved.cell.stops[int(stops[after].min())]} on disagree with those before{as_if}: "
-            f"{branch.parent} is where it stood before. Align the stops from there on alone."
+            f"{branch.parent} is where it stood before."
         )
-        found.append(PoseFault(words, tuple(after.tolist())))
+        step = Step("Fasten it, and align the stops from there on alone.")
+        pushed = Finding("something_moved", words, step, _numbers(solved, after.tolist()))
+        found.append(PoseFault(pushed, tuple(after.tolist())))
     return found
 
 
@@ -225,13 +235,14 @@ def _wrong_poses(solved: Solved, explained: set[int]) -> Iterator[PoseFault]:
                     f"Robot {branch.robot} did not stand at stop {solved.cell.stops[stop]} where "
                     f"its pose says: all {len(rows)} views by way of it disagree with the others, "
                     f"as if it had been moved by {moved}, and were left out "
-                    f"({_views(solved, rows.tolist())}). Correct its pose there, or leave the stop "
-                    "out."
+                    f"({_views(solved, rows.tolist())})."
                 )
+                step = Step("Correct its pose there in views.csv, or leave the stop out.")
+                found = Finding("wrong_pose", words, step, _numbers(solved, rows.tolist()))
                 short = (
                     f"the pose of robot {branch.robot} at stop {solved.cell.stops[stop]} is wrong"
                 )
-                yield PoseFault(words, tuple(rows.tolist()), short)
+                yield PoseFault(found, tuple(rows.tolist()), short)
 
 
 def reasons(solved: Solved, faults: Sequence[PoseFault]) -> dict[int, str]:
@@ -336,5 +347,7 @@ def _exchanged(solved: Solved, mutual: Mapping[int, int]) -> list[PoseFault]:
                     f"{short[0].upper()}{short[1:]}: {_views(solved, at_both)} were left out. Each "
                     "pose is right at the other's stop."
                 )
-                found.append(PoseFault(words, tuple(at_both), short))
+                both_views = _numbers(solved, at_both)
+                swapped = Finding("exchanged_views", words, _EXCHANGE, both_views)
+                found.append(PoseFault(swapped, tuple(at_both), short))
     return found

@@ -10,12 +10,14 @@ from scipy.spatial.transform import RigidTransform
 from visioncal.calibration.guess import Guess, guess_reading
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.stages.causes import read_otherwise
 from visioncal.calibration.stages.clocks import waits_for_clock
 from visioncal.calibration.stages.init_frames import place
 from visioncal.calibration.stages.judge import is_scattered
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.errors import VisioncalError
 from visioncal.core.types import FloatArray, Progress
+from visioncal.core.verdict import Finding
 from visioncal.estimation.chain import chain
 from visioncal.robot import Robot
 from visioncal.session import Session
@@ -123,23 +125,21 @@ def numbers_in(session: Session, columns: tuple[str, ...]) -> PoseNumbers:
     return PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), _places(session))
 
 
-def reading_hint(seen: RunState) -> str:
+def reading_hint(seen: RunState) -> Finding | None:
     """Says which reading of the poses would explain a calibration that failed.
 
     Args:
         seen: What is known once the camera's poses are.
 
     Returns:
-        A sentence with the command that applies it; empty where no reading stands out.
+        It, with the command that applies it; None where no reading stands out.
     """
     try:
         guess = guess_seen(seen)
     except VisioncalError:
         # Too little to guess from: what failed has been said already.
-        return ""
-    if not guess.stands_out:
-        return ""
-    return f"{guess.sentence} To read it so: visioncal convert SESSION FIXED --guess."
+        return None
+    return read_otherwise(guess.sentence) if guess.stands_out else None
 
 
 def is_suspect(known: RunState) -> bool:

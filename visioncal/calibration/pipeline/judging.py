@@ -8,7 +8,7 @@ import numpy as np
 from visioncal.calibration.pipeline.answer import Answer
 from visioncal.calibration.pipeline.arm_results import doubts_of_arms, notes_on_arms
 from visioncal.calibration.pipeline.budget import columns_of_boards, middles_of
-from visioncal.calibration.pipeline.fault_messages import by_way_of, moved_words
+from visioncal.calibration.pipeline.fault_messages import by_way_of, moved_found
 from visioncal.calibration.pipeline.network_ties import robot_motion, untied_words
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell import Cell
@@ -18,6 +18,7 @@ from visioncal.calibration.stages.priors import prior_words
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
 from visioncal.core.types import Mask, Mount, Rejection
+from visioncal.core.verdict import NOTE, Finding, Step
 from visioncal.estimation.arm import stops_of
 from visioncal.estimation.budget import radius95
 from visioncal.estimation.intervals import freedom_of
@@ -53,10 +54,10 @@ def findings_of(known: RunState) -> Findings:
         worst,
         places,
         (
-            *(it.words for it in answer.faults),
+            *(it.found for it in answer.faults),
             *doubts_of_arms(solved.arms, answer.misfits, answer.arms, solved.asked),
             *known.warnings,
-            *(words for words, is_doubt in of_rest if is_doubt),
+            *(it for it in of_rest if it.kind != NOTE),
             *warnings,
             *_untied(known),
         ),
@@ -64,7 +65,7 @@ def findings_of(known: RunState) -> Findings:
             *known.notes,
             *_clock_words(known),
             *notes_on_arms(solved.arms, answer.arms),
-            *(words for words, is_doubt in of_rest if not is_doubt),
+            *(it.reason for it in of_rest if it.kind == NOTE),
         ),
         known.mount or _mount(tied),
         known.session.need,
@@ -90,15 +91,17 @@ def _pickable(known: RunState) -> Fitted:
     )
 
 
-def _untied(known: RunState) -> Iterator[str]:
+def _untied(known: RunState) -> Iterator[Finding]:
     for frame in known.fitted.untied:
         if known.mount is not None and frame.startswith("target"):
-            yield f"No usable view shows {frame.replace('_', ' ', 1)}: it has no place."
+            words = f"No usable view shows {frame.replace('_', ' ', 1)}: it has no place."
+            yield Finding("unseen_target", words)
         else:
-            yield f"{frame} is tied to nothing. {untied_words(known.cell, frame)}"
+            step = Step(untied_words(known.cell, frame))
+            yield Finding("untied", f"{frame} is tied to nothing.", step)
 
 
-_Parts: TypeAlias = tuple[Sequence[Direction], Sequence[Place], Sequence[str]]
+_Parts: TypeAlias = tuple[Sequence[Direction], Sequence[Place], Sequence[Finding]]
 
 
 def _of_pair(known: RunState) -> _Parts:
@@ -121,7 +124,7 @@ def _of_cell(known: RunState) -> _Parts:
             Place(frame, budget[frame], 1e3 * radius95(edge.covariance[3:, 3:]))
             for frame, edge in edges.items()
         ],
-        [moved_words(it) for it in answer.moved],
+        [moved_found(it) for it in answer.moved],
     )
 
 

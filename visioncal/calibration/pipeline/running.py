@@ -139,7 +139,7 @@ def _with_hint(error: VisioncalError, seen: RunState | None) -> VisioncalError:
     (planned,) = with_proposal([error.next_step], modelled=seen.robot is not None)
     next_step = planned if seen.scenes else error.next_step
     if hint:
-        next_step = f"{hint} {error.next_step}".strip()
+        next_step = hint.reason
     return type(error)(error.message, culprits=error.culprits, next_step=next_step)
 
 
@@ -148,6 +148,6 @@ def _with_reading(known: RunState, seen: RunState | None) -> RunState:
     if known.verdict is None or seen is None or not is_suspect(known):
         return known
     hint = reading_hint(seen)
-    if not hint:
+    if hint is None:
         return known
     return replace(known, verdict=with_misread(known.verdict, hint))

@@ -22,6 +22,7 @@ from visioncal.calibration.stages.side import FramesSide
 from visioncal.calibration.stages.validate import chain_rms_px
 from visioncal.core.errors import DegenerateError
 from visioncal.core.types import FloatArray, IntArray, Mask, SolverName, Target
+from visioncal.core.verdict import Finding
 from visioncal.estimation.arm import rows_of
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, Seen
 from visioncal.estimation.joint import Fitted
@@ -76,7 +77,7 @@ class Solved:
         """The observations that the fit was made from."""
         return self.agreed.problem.subset(self.agreed.used)
 
-    def found_of_looks(self) -> Iterator[tuple[str, bool]]:
+    def found_of_looks(self) -> Iterator[Finding]:
         """Says what was found of lenses and boards; see `stages.fit_messages`."""
         if self.seen is not None:
             part = self.agreed.problem.subset(self.agreed.used)

@@ -26,6 +26,7 @@ from visioncal.calibration.stages.readings import (
 from visioncal.calibration.stages.robots import check_joints, read_robots
 from visioncal.core.errors import DataError
 from visioncal.core.types import Rejection
+from visioncal.core.verdict import remarks
 from visioncal.session import STREAMS
 
 
@@ -47,7 +48,7 @@ def _read_robot(known: RunState) -> RunState:
             next_step="Calibration needs views.csv; streams of torques alone are for visioncal "
             "dynamics identify.",
         )
-    known = known.noting((), (*session.warnings, *not_used(known)))
+    known = known.noting((), (*remarks(session.warnings), *not_used(known)))
     if len(known.held_back) == len(session.views):
         raise all_held_back(known)
     # Views that have a time alone get their poses once the camera's are known.

@@ -4,9 +4,10 @@ from collections.abc import Iterator
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell import pair_edges
+from visioncal.core.verdict import Finding
 
 
-def not_used(known: RunState) -> Iterator[str]:
+def not_used(known: RunState) -> Iterator[Finding]:
     """Says what the session declares and this version leaves aside."""
     session = known.session
     if known.mount is None:
@@ -18,11 +19,12 @@ def not_used(known: RunState) -> Iterator[str]:
         reason = f"what is unknown of this session is {' and '.join(names)}"
         if known.solver != "joint":
             reason = f"the closed form {known.solver} cannot"
-        yield f"[prior.{edge}] was not used: {reason}."
+        yield Finding("unused", f"[prior.{edge}] was not used: {reason}.")
     readings = sum(view.reading_m is not None for view in session.views)
     if readings and session.mount != "instrument":
-        yield (
+        yield Finding(
+            "unused",
             f"{readings} rows have an instrument's readings (meas_ columns), which were not used: "
             "where images or measured poses (cft_ columns) are there, these are. A session with "
-            "the readings alone calibrates the arm by the instrument."
+            "the readings alone calibrates the arm by the instrument.",
         )

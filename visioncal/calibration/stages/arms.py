@@ -24,6 +24,7 @@ from visioncal.calibration.stages.thermal import (
 from visioncal.calibration.stages.thermal_fit import Stops, ThermalFit
 from visioncal.core.transforms import distances, invert, mean_transform
 from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.core.verdict import Finding
 from visioncal.estimation.arm import (
     ArmErrors,
     find_arm_errors,
@@ -69,7 +70,7 @@ class ArmFound:
         if self.springs is not None:
             yield from elastic.remarks(self.springs)
 
-    def doubts(self) -> Iterator[str]:
+    def doubts(self) -> Iterator[Finding]:
         """Words what speaks against it."""
         if self.springs is not None:
             yield from elastic.doubts(self.springs)

@@ -72,8 +72,8 @@ def estimate_lenses(seen: T) -> T:
             with _naming(session, frame):
                 found = estimate_intrinsics(fitted, targets, look.resolution, look.table.model)
             lens = CameraResult(found.camera, estimated=True, covariance=found.covariance)
-            of = f"{frame}: " if len(session.cameras) > 1 else ""
-            seen = seen.noting(found.rejections, (f"{of}{it}" for it in found.warnings))
+            of = frame if len(session.cameras) > 1 else ""
+            seen = seen.noting(found.rejections, (it.of(of) for it in found.warnings))
         seen = seen.with_camera(frame, replace(look, lens=lens))
     return seen
 

@@ -20,11 +20,12 @@ from visioncal.calibration.stages.offset import (
     speed_words,
     stated_doubts,
     told_words,
-    turning_words,
+    turning_doubt,
     why_untold,
 )
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Mount, Rejection
+from visioncal.core.verdict import Finding
 from visioncal.estimation.clock import ClockFit, DelayedFit, clear_fit, fit_offset
 from visioncal.estimation.clock_correlation import Frames, Match, turning_matches
 from visioncal.estimation.corners import CornerStack
@@ -82,7 +83,7 @@ class Clocked:
     views: tuple[View, ...]
     rejections: tuple[Rejection, ...]
     spared: Mapping[int, str]
-    warnings: tuple[str, ...]
+    warnings: tuple[Finding, ...]
     notes: tuple[str, ...]
     poses: Mapping[int, ViewPoses] = field(default_factory=dict)
 
@@ -228,7 +229,7 @@ def _by_turning(sweep: Sweep, views: Sequence[View], match: Match) -> Clocked:
     clock = Clock(
         match.offset_s, match.sigma_s, "turning", sweep.stated_s, 0, match.correlation, speeds={}
     )
-    warnings = [turning_words(match), *stated_doubts(clock, views)]
+    warnings = [turning_doubt(match), *stated_doubts(clock, views)]
     return _placed(sweep, views, clock, warnings, [])
 
 
@@ -252,17 +253,19 @@ def _untold(
         )
         return _placed(sweep, views, clock, [], [note])
     if stated_s is not None:
-        warning = (
+        warning = Finding(
+            "clock",
             f"[clock] camera_minus_robot_s is taken as stated, {1e3 * stated_s:+.4g} ms, to "
-            f"{1e3 * _STATED_SIGMA_S:g} ms, although views were taken in motion: {why}."
+            f"{1e3 * _STATED_SIGMA_S:g} ms, although views were taken in motion: {why}.",
         )
         clock = replace(clock, method="stated", sigma_s=_STATED_SIGMA_S)
         return _placed(sweep, views, clock, [warning], [])
     if resting.sum() < FEWEST_VIEWS:
         raise no_offset(sweep.motion, views, resting, why)
-    warning = (
+    warning = Finding(
+        "clock",
         f"{int((~resting).sum())} views that were taken in motion are left out, as the offset "
-        f"between the clocks is not known: {why}."
+        f"between the clocks is not known: {why}.",
     )
     kept = [view for view, it in zip(views, resting, strict=True) if it]
     placed = _placed(sweep, kept, clock, [warning], [])
@@ -278,7 +281,7 @@ def _placed(
     sweep: Sweep,
     views: Sequence[View],
     clock: Clock,
-    warnings: Sequence[str],
+    warnings: Sequence[Finding],
     notes: Sequence[str],
 ) -> Clocked:
     """Gives views their poses at an offset, and chooses among very many."""

@@ -17,6 +17,7 @@ from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.offset import Clock
 from visioncal.core.errors import VisioncalError
 from visioncal.core.types import Rejection
+from visioncal.core.verdict import Finding, Step
 from visioncal.estimation.effects.clock import clock_effect
 from visioncal.estimation.parts import Effect
 from visioncal.robot import Robot
@@ -63,7 +64,7 @@ def _with_pair(seen: T, pair: Pair, rows: list[View]) -> T:
     document = session.robot_documents.get(pair.robot)
     # An only pair needs no name, and there is nothing to go on with where it has no clock.
     is_only = max(len(session.cameras), len(session.robots)) < 2
-    of = "" if is_only else f"{pair.words}: "
+    of = "" if is_only else pair.words
     on_flange = session.frames[pair.camera] == frame_name("flange", pair.robot)
     try:
         motion = motion_of(
@@ -84,16 +85,17 @@ def _with_pair(seen: T, pair: Pair, rows: list[View]) -> T:
         if is_only:
             raise
         lost = [Rejection(it.number, f"no pose: {error.message}") for it in rows]
-        return seen.noting(lost, (f"{of}{error.message} {error.next_step}".strip(),))
+        found = Finding("clock", error.message, Step(error.next_step) if error.next_step else None)
+        return seen.noting(lost, (found.of(of),))
     named = {"robot": pair.robot} if pair.robot else {}
     views = tuple(replace(it, text={**it.text, **named}) for it in clocked.views)
     seen = replace(
         seen,
         clocks={**seen.clocks, pair: replace(clocked, views=views)},
         poses={**seen.poses, **clocked.poses},
-        notes=(*seen.notes, *(f"{of}{it}" for it in clocked.notes)),
+        notes=(*seen.notes, *(f"{of}: {it}" if of else it for it in clocked.notes)),
     )
-    return seen.noting(clocked.rejections, (f"{of}{it}" for it in clocked.warnings))
+    return seen.noting(clocked.rejections, (it.of(of) for it in clocked.warnings))
 
 
 def _stated_s(session: Session, camera: str) -> float | None:

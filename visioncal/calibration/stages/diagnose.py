@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visioncal.core.verdict import PLAN, Finding, Step
 from visioncal.estimation.arm import LEVER_M, SIGNIFICANT, ArmErrors, stops_of
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.residual_tests import Drift, Neighbours, drift, neighbours
@@ -42,8 +43,8 @@ def misfits(problem: Problem, fit: Solution) -> dict[str, ResidualTest]:
     return found
 
 
-def misfit_words(found: ResidualTest, arm: ArmErrors | None, *, calibrated: bool) -> Iterator[str]:
-    """Words what of a robot's residuals is no noise, and what it probably is."""
+def doubts(found: ResidualTest, arm: ArmErrors | None, *, calibrated: bool) -> Iterator[Finding]:
+    """Finds what of a robot's residuals is no noise, and what it probably is."""
     alike, moved = found.alike, found.moved
     if arm is not None and arm.is_significant and not calibrated:
         size = f"{1e3 * LEVER_M * arm.sigma:.2g} mm and {np.rad2deg(arm.sigma):.2g} deg"
@@ -52,21 +53,41 @@ def misfit_words(found: ResidualTest, arm: ArmErrors | None, *, calibrated: bool
             if arm.of_links
             else "without joint angles and a known [robot] model they cannot be estimated along"
         )
-        yield (
+        yield Finding(
+            "arm_errors",
             f"Residuals follow the arm's posture (likelihood ratio {arm.gain:.0f}, noise stays "
             f"under {SIGNIFICANT:.0f}): its links are off from the model by typically {size}; "
             f"{told}. What of them looks the same in all views is in no residual, and counts in "
-            "the covariance: a kinematic calibration of the arm would take it out."
+            "the covariance.",
+            _of_arm(arm),
+            until_mm=0.0,
+            mahalanobis_sq=arm.gain,
         )
     if moved is not None:
-        yield (
+        yield Finding(
+            "moved_slowly",
             f"Residuals drift with time: from the first stop to the last, base or target moved by "
-            f"{1e3 * moved.moved_m:.2g} mm and {np.rad2deg(moved.moved_rad):.2g} deg. Fasten them, "
-            "let the arm warm up, and record again."
+            f"{1e3 * moved.moved_m:.2g} mm and {np.rad2deg(moved.moved_rad):.2g} deg.",
+            Step("Fasten base and target, let the arm warm up, and record again."),
         )
     if alike.is_significant:
-        yield (
+        yield Finding(
+            "correlated_errors",
             f"Neighbouring stops err alike: leaving them out in blocks moves the answer "
             f"{np.sqrt(alike.factor):.2g} times farther than independent noise would. The robot's "
-            "share of the sigmas was multiplied by as much."
+            "share of the sigmas was multiplied by as much.",
+            Step("Record again, with the stops in an order of chance."),
         )
+
+
+def _of_arm(arm: ArmErrors) -> Step:
+    """What lets the arm's errors be estimated."""
+    if arm.of_links:
+        return Step(
+            "Add stops all over the workspace, so that the arm can be calibrated along.",
+            f"{PLAN} --for kinematics",
+        )
+    return Step(
+        "Record joint angles with the poses, and name the arm as [robot] model in session.toml: "
+        "calibrate then estimates the arm, too."
+    )

@@ -9,6 +9,7 @@ import numpy as np
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray, Mask
+from visioncal.core.verdict import Finding, Step
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.armmodel import COMPLIANCE, WEIGHT, ArmModel
 from visioncal.estimation.armpair import ArmData
@@ -215,16 +216,18 @@ def remarks(elastic: Elastic) -> Iterator[str]:
         )
 
 
-def doubts(elastic: Elastic) -> Iterator[str]:
+def doubts(elastic: Elastic) -> Iterator[Finding]:
     """Says where payload and bend do not fit together."""
     factor = elastic.payload
     if factor is not None and elastic.weighs and factor.is_off:
         more = "heavier or hangs farther out" if factor.value > 1.0 else "lighter or hangs nearer"
-        yield (
+        yield Finding(
+            "load",
             f"Load and bend do not fit: the stops with a load bend {factor.value:.2f} +- "
             f"{factor.sigma:.1g} times as far as the load times its reach asks of joints that "
             f"yield to the arm's own weight as they do. The load is {more} than stated "
-            "(payload_kg, payload_x_m ...), or the masses of the arm's links are off."
+            "(payload_kg, payload_x_m ...), or the masses of the arm's links are off.",
+            Step("Weigh the load, and correct payload_kg and its centre in views.csv."),
         )
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from visioncal.core.number_format import figure
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import FloatArray, IntArray, Target
+from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Step
 from visioncal.estimation.appearance import MOST_LOOSE
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.joint import (
@@ -23,10 +24,15 @@ from visioncal.estimation.solve import held_shift
 
 # A rig that is as stated seems not to be in one session of ten thousand.
 _FALSE_ALARM = 1e-4
+_NEW_LENS = Step(
+    "Leave matrix and distortion out of session.toml, so that they are estimated, or calibrate "
+    "the camera anew.",
+    CALIBRATE,
+)
 
 
-def found_of_looks(side: Side, fitted: Fitted) -> Iterator[tuple[str, bool]]:
-    """Says what a joint fit found of lenses and boards, and whether each is a reason for doubt.
+def found_of_looks(side: Side, fitted: Fitted) -> Iterator[Finding]:
+    """Says what a joint fit found of lenses and boards; what is no reason for doubt is a note.
 
     Args:
         side: The frames' side of the fit.
@@ -36,57 +42,51 @@ def found_of_looks(side: Side, fitted: Fitted) -> Iterator[tuple[str, bool]]:
     cameras = zip(looks.problems.items(), fitted.seen.compressed, strict=True)
     for (camera, problem), it in cameras:
         moving = np.flatnonzero(np.isin(looks.places(camera), fitted.moving))
-        found = noise_words(problem.stack, it.residuals, problem.unknowns(it, moving))
-        for words, is_doubt in (found, *_lens_words(fitted, camera)):
-            if words:
-                yield _of(camera, words), is_doubt
+        scattered = noise_found(problem.stack, it.residuals, problem.unknowns(it, moving))
+        of = "" if camera == ONLY_CAMERA else camera
+        yield from (it.of(of) for it in (*scattered, *_lens_found(fitted, camera)))
     scene = next(iter(looks.problems.values())).scene
     for board, target in enumerate(scene.targets):
         if board not in looks.printed:
-            yield from ((it, True) for it in points_words(target, looks.moved_points(board)))
+            yield from points_found(target, looks.moved_points(board))
             continue
         called = f"board {scene.names[board]}".strip()
         if _moves(fitted, looks.scale_of(board)):
-            yield scale_words(called, target.square_m, measured_scale(side, fitted, board))
+            yield scale_found(called, target.square_m, measured_scale(side, fitted, board))
         if _moved(fitted, looks.shape_of(board)):
-            yield bend_words(called, 1e3 * float(np.ptp(looks.corners[board][:, 2]))), True
+            yield bend_found(called, 1e3 * float(np.ptp(looks.corners[board][:, 2])))
 
 
-def _of(camera: str, words: str) -> str:
-    """Names the camera, where it is not the only one."""
-    return words if camera == ONLY_CAMERA else f"{camera}: {words[0].lower()}{words[1:]}"
-
-
-def noise_words(stack: CornerStack, residuals: FloatArray, unknowns: int) -> tuple[str, bool]:
-    """Whether corners scatter otherwise than corners.csv states, in words; empty where not.
+def noise_found(stack: CornerStack, residuals: FloatArray, unknowns: int) -> Iterator[Finding]:
+    """Finds whether corners scatter otherwise than corners.csv states; less is no doubt.
 
     Args:
         stack: The corners.
         residuals: (n, 2) by their weights [px].
         unknowns: How many were fitted to them.
-
-    Returns:
-        The words, and whether it is a reason for doubt: less scatter than is stated is none.
     """
     stated, shown = stack.stated_px, stack.shown_px(residuals, unknowns)
     if stated is None or not stack.contradicts(residuals, unknowns):
-        return "", False
+        return
     more = shown > stated
-    advice = (
-        "by the scatter. Look for errors of the detector, the lens or the target that sigma_px "
-        "leaves out."
+    by, advice = (
+        (
+            "by the scatter.",
+            "Look for errors of the detector, the lens or the target that sigma_px leaves out.",
+        )
         if more
-        else "by what is stated. State what the detector errs by, or leave sigma_px out."
+        else ("by what is stated.", "State what the detector errs by, or leave sigma_px out.")
     )
-    return (
+    yield Finding(
+        "corner_noise" if more else NOTE,
         f"The corners scatter by {figure(shown)} px, and corners.csv states {figure(stated)} px "
-        f"(sigma_px of a typical corner). The result goes {advice}",
-        more,
+        f"(sigma_px of a typical corner). The result goes {by}",
+        Step(advice),
     )
 
 
-def scale_words(board: str, square_m: float, measured: MeasuredScale) -> tuple[str, bool]:
-    """Words another size than the file states, and whether it is a reason for doubt.
+def scale_found(board: str, square_m: float, measured: MeasuredScale) -> Finding:
+    """Words another size than the file states; a note where that allows it.
 
     Args:
         board: What the board is called.
@@ -103,25 +103,31 @@ def scale_words(board: str, square_m: float, measured: MeasuredScale) -> tuple[s
     )
     if not measured.contradicts:
         allowed = f"{sized}, which what is stated allows (to within {share})."
-        return f"{allowed} The result goes by both.", False
-    return (
-        f"{sized}, which is not what is stated (to within {share}). The result goes by the robot. "
-        "Measure over many squares and mend square_m and square_sigma_m; if the board is right, "
-        "the arm's model is off by as much.",
-        True,
+        return Finding(NOTE, f"{allowed} The result goes by both.")
+    return Finding(
+        "board_size",
+        f"{sized}, which is not what is stated (to within {share}). The result goes by the robot; "
+        "if the board is right, the arm's model is off by as much.",
+        Step(
+            "Measure the board over many squares, correct square_m and square_sigma_m in its "
+            "file, and calibrate again.",
+            CALIBRATE,
+        ),
+        mahalanobis_sq=measured.scale**2 / (measured.sigma**2 + measured.stated_sigma**2),
     )
 
 
-def bend_words(board: str, bend_mm: float) -> str:
+def bend_found(board: str, bend_mm: float) -> Finding:
     """Words a board that is not flat; `bend_mm` is the depth of its corners [mm]."""
-    return (
+    return Finding(
+        "board_shape",
         f"The {board} is not flat: its corners lie within {bend_mm:.2g} mm of "
-        "depth. Its shape was estimated with the rest; a board on a stiff, flat plate makes a "
-        "better result."
+        "depth. Its shape was estimated with the rest.",
+        Step("Put the board on a stiff, flat plate, and record again."),
     )
 
 
-def points_words(target: Target, moved_m: FloatArray) -> Iterator[str]:
+def points_found(target: Target, moved_m: FloatArray) -> Iterator[Finding]:
     """Whether a rig's points lie farther from where its table has them than it says.
 
     Args:
@@ -131,65 +137,66 @@ def points_words(target: Target, moved_m: FloatArray) -> Iterator[str]:
     if not target.point_sigmas_m:
         return
     if not len(moved_m):
-        yield (
+        yield Finding(
+            "remark",
             f"The {len(target.points_m)} points of target {target.name} were taken for exact: "
-            f"their sigma_m counts for up to {MOST_LOOSE}."
+            f"their sigma_m counts for up to {MOST_LOOSE}.",
         )
         return
     sigmas = np.array(target.point_sigmas_m)
     away = np.linalg.norm(moved_m.reshape(-1, 3), axis=1)
     worst = int(np.argmax(away / sigmas))
     if (away[worst] / sigmas[worst]) ** 2 > chi2_limit(_FALSE_ALARM / len(sigmas), 3):
-        yield (
+        yield Finding(
+            "board_shape",
             f"Point {target.point_numbers[worst]} of target {target.name} lies "
             f"{figure(1e3 * float(away[worst]))} mm from where its table has it, which is stated "
-            f"to {figure(1e3 * float(sigmas[worst]))} mm (sigma_m). The result goes by both: "
-            "measure the point again."
+            f"to {figure(1e3 * float(sigmas[worst]))} mm (sigma_m). The result goes by both.",
+            Step("Measure the point again."),
         )
 
 
-def _lens_words(fitted: Fitted, camera: str) -> Iterator[tuple[str, bool]]:
+def _lens_found(fitted: Fitted, camera: str) -> Iterator[Finding]:
     looks = fitted.looks
     problem, lens = looks.problems[camera], looks.lens_of(camera)
     if problem.scene.mode == "refine" and not problem.has_spare_corners:
         words = (
             f'intrinsics = "refine" was not done: {len(problem.stack.px)} corners in '
-            f"{len(problem.stack.views)} views leave too little to judge by. Show a board with "
-            "more corners, or more views."
+            f"{len(problem.stack.views)} views leave too little to judge by."
         )
-        yield words, True
+        yield Finding("remark", words, Step("Show a board with more corners, or more views."))
     if not problem.scene.estimated and _moved(fitted, lens):
         is_exact = problem.scene.matrix_sigma_px is None
         steps = (looks.values - looks.stated)[lens[:4]]
-        yield lens_words(steps, is_doubtful=is_exact or contradicted_lens(fitted, camera))
+        yield lens_found(steps, is_doubtful=is_exact or contradicted_lens(fitted, camera))
     if problem.contested:
         shift = held_shift(fitted.problem, fitted.fit)[fitted.columns]
         moves = shift[np.searchsorted(fitted.seen.free, lens[:4])]
-        yield contest_words(problem.scene, moves), True
+        yield contest_found(problem.scene, moves)
 
 
-def lens_words(steps_px: FloatArray, *, is_doubtful: bool) -> tuple[str, bool]:
-    """Words given intrinsics that were refined, and whether it is a reason for doubt.
+def lens_found(steps_px: FloatArray, *, is_doubtful: bool) -> Finding:
+    """Words given intrinsics that were refined; a note where they are no reason for doubt.
 
     Args:
         steps_px: (4,) by how much fx, fy, cx, cy moved [px].
         is_doubtful: Whether they were taken for exact, or for better than they are.
     """
     if is_doubtful:
-        return (
+        return Finding(
+            "lens",
             "The given intrinsics do not fit these images and were refined: fx, fy, cx, cy moved "
-            f"by {_px(steps_px)} px. Calibrate the camera anew, or hold them with "
-            'intrinsics = "hold".',
-            True,
+            f"by {_px(steps_px)} px.",
+            _NEW_LENS,
         )
-    return (
+    return Finding(
+        NOTE,
         "The given intrinsics were refined within what is stated: fx, fy, cx, cy moved by "
         f"{_px(steps_px)} px.",
-        False,
     )
 
 
-def contest_words(scene: Scene, moves_px: FloatArray) -> str:
+def contest_found(scene: Scene, moves_px: FloatArray) -> Finding:
     """Words intrinsics that stay although the corners speak against them.
 
     Args:
@@ -201,10 +208,11 @@ def contest_words(scene: Scene, moves_px: FloatArray) -> str:
         if scene.mode == "hold"
         else "they were kept, because views left out are predicted no better with others"
     )
-    return (
+    return Finding(
+        "lens",
         "The given intrinsics do not fit these images: free, fx, fy, cx, cy would move by "
-        f"{_px(moves_px)} px. But {why}; what this does to the result counts in its sigmas. "
-        "Calibrate the camera anew."
+        f"{_px(moves_px)} px. But {why}; what this does to the result counts in its sigmas.",
+        _NEW_LENS,
     )
 
 

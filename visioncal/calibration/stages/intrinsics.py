@@ -10,6 +10,7 @@ import numpy as np
 from visioncal.core.errors import ConvergenceError, DataError, DegenerateError
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, CameraKind, Corners, FloatArray, Rejection, Target
+from visioncal.core.verdict import Finding, Step
 from visioncal.estimation.bundle import BundleFit, fit_bundle
 from visioncal.estimation.corners import CornerStack, mean_square_by_view
 from visioncal.estimation.gating import gate
@@ -54,14 +55,14 @@ class Intrinsics:
         covariance: (4 + k, 4 + k) of fx, fy, cx, cy and the distortion.
         sigma_px: Standard deviation of a corner's coordinate, stated or by the residuals [px].
         rejections: Views whose residual is no noise.
-        warnings: What the views do not determine, in words.
+        warnings: What the views do not determine.
     """
 
     camera: Camera
     covariance: FloatArray
     sigma_px: float
     rejections: tuple[Rejection, ...]
-    warnings: tuple[str, ...]
+    warnings: tuple[Finding, ...]
 
 
 def estimate_intrinsics(
@@ -210,39 +211,50 @@ def _check(fit: BundleFit) -> None:
         )
 
 
-def _warnings(stack: CornerStack, fit: BundleFit) -> Iterator[str]:
+def _warnings(stack: CornerStack, fit: BundleFit) -> Iterator[Finding]:
     """Says what the views do not determine, and what about the views is the cause."""
     sigma = np.sqrt(np.diag(fit.covariance))
     focal, centre = (sigma[:2] / fit.camera.matrix[:2]).max(), sigma[2:4].max()
     causes = list(_causes(fit)) if _is_flat(stack) else []
-    advice = f" {' '.join(causes)}" if causes else " Add views, tilted and near the image's edges."
-    if focal > _FOCAL_LIMIT:
-        yield f"The corners alone tell the focal length to {100 * focal:.1f} % only.{advice}"
-    if centre > _CENTRE_LIMIT_PX:
-        yield f"The corners alone tell the image centre to {centre:.1f} px only.{advice}"
-    if focal <= _FOCAL_LIMIT and centre <= _CENTRE_LIMIT_PX:
+    why = "".join(f" {it.words}" for it in causes)
+    step = causes[0].do if causes else Step("Add views, tilted and near the image's edges.")
+    weak = [f"the focal length to {100 * focal:.1f} %"] * bool(focal > _FOCAL_LIMIT)
+    weak += [f"the image centre to {centre:.1f} px"] * bool(centre > _CENTRE_LIMIT_PX)
+    if weak:
+        words = f"The corners alone determine {' and '.join(weak)} only.{why}"
+        yield Finding("weak_lens", words, step, until_mm=0.0)
+    else:
         yield from causes
     empty = _unvisited(stack, fit.camera.resolution)
     if empty:
-        yield (
+        yield Finding(
+            "empty_image",
             f"No corner was ever seen in the {' and '.join(empty)} of the image, so the lens is "
-            "extrapolated there. Move the target there in some views."
+            "extrapolated there.",
+            Step("Move the target there in some views."),
         )
 
 
-def _causes(fit: BundleFit) -> Iterator[str]:
+def _causes(fit: BundleFit) -> Iterator[Finding]:
     poses = fit.cam_from_target
     axis = poses[:, :3, 2]
     tilt = np.rad2deg(np.arccos(np.clip(np.abs(axis[:, 2]), 0.0, 1.0)))
     if tilt.max() < _TILT_SPREAD_DEG:
-        yield (
-            f"All views are frontal (tilted by at most {tilt.max():.0f} degrees): add views tilted "
-            "by 30 to 45 degrees."
+        yield Finding(
+            "weak_lens",
+            f"All views are frontal (tilted by at most {tilt.max():.0f} degrees).",
+            Step("Add views tilted by 30 to 45 degrees."),
+            until_mm=0.0,
         )
     distance = np.linalg.norm(poses[:, :3, 3], axis=1)
     covariance = distance.max() / distance.min()
     if covariance < _DISTANCE_SPREAD and tilt.max() < 2 * _TILT_SPREAD_DEG:
-        yield f"All views are from one distance (within {100 * (covariance - 1):.0f} %): vary it."
+        yield Finding(
+            "weak_lens",
+            f"All views are from one distance (within {100 * (covariance - 1):.0f} %).",
+            Step("Vary the distance of the views."),
+            until_mm=0.0,
+        )
 
 
 def _unvisited(stack: CornerStack, resolution: tuple[int, int]) -> list[str]:

@@ -16,6 +16,7 @@ from visioncal.calibration.stages.joints import Matched, zero_taken
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Mount, Rejection
+from visioncal.core.verdict import Finding, Step
 from visioncal.robot import Robot
 
 
@@ -90,8 +91,12 @@ def misread_joints(guess: JointGuess, robot: Robot, *, has_poses: bool) -> DataE
     )
 
 
-def lost_zero(guess: JointGuess, zero: JointReading, *, taken: bool) -> str:
+def lost_zero(guess: JointGuess, zero: JointReading, *, taken: bool) -> Finding:
     """Says which joint's zero is lost, and what becomes of it."""
-    what = zero_taken(zero) if taken else zero.fix
-    told = f"The joint angles do not belong to {zero.robot.name} as they are told."
-    return f"{told} {guess.sentence('what the camera sees')} {what}"
+    words = (
+        f"The joint angles do not belong to {zero.robot.name} as they are declared. "
+        f"{guess.sentence('what the camera sees')}"
+    )
+    if taken:
+        return Finding("misread_joints", f"{words} {zero_taken(zero)}")
+    return Finding("misread_joints", words, Step(zero.fix))

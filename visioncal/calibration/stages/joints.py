@@ -14,6 +14,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import invert, mean_transform, pose_difference
 from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.core.verdict import CALIBRATE, GUESS, Finding, Step
 from visioncal.robot import Robot, placed_at, with_zeros
 from visioncal.session import View
 
@@ -48,7 +49,7 @@ class Matched:
         zero: The joint whose zero is elsewhere, as the poses tell; None for none.
         misread: What is wrong with the angles or the model, and the fix; empty where nothing is.
         contradicting: What is wrong with the angles, if it is not the pose, by view.
-        warnings: What to mend, in words.
+        warnings: What to mend.
         notes: What is good to know.
     """
 
@@ -58,7 +59,7 @@ class Matched:
     zero: JointReading | None = None
     misread: str = ""
     contradicting: Mapping[int, str] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Finding, ...] = ()
     notes: tuple[str, ...] = ()
 
     @property
@@ -133,8 +134,14 @@ def match_joints(rows: Sequence[View], robot: Robot) -> Matched:
     }
     counts = {len(it) for it in joints.values()} - {robot.joint_count}
     if counts:
-        told = f"there are {min(counts)} a row, and {robot.name} has {robot.joint_count} joints."
-        return Matched(robot, warnings=(f"Joint angles were not used: {told}",) if poses else ())
+        words = (
+            f"Joint angles were not used: there are {min(counts)} a row, and {robot.name} has "
+            f"{robot.joint_count} joints."
+        )
+        step = Step(
+            "Correct [robot] model in session.toml, or the columns q1_rad ... of views.csv."
+        )
+        return Matched(robot, warnings=(Finding("misread_joints", words, step),) if poses else ())
     if not poses:
         return Matched(robot, joints)
     views, q = tuple(poses), np.array([joints[view] for view in poses])
@@ -146,16 +153,19 @@ def _compared(matched: Matched, views: Sequence[int], q: FloatArray, poses: Floa
     if len(q) >= FEWEST_JOINT_ROWS:
         guess = guess_joints(robot, q, poses)
     if guess is not None and guess.stands_out and guess.zero is None:
-        sentence = f"{guess.sentence('the reported poses')} {guess.fix}"
+        sentence = guess.sentence("the reported poses")
         words = f"The joint angles were not used: they are misread. {sentence}"
-        return Matched(
-            robot, misread=f"The angles of this session are misread. {sentence}", warnings=(words,)
-        )
+        misread = f"The angles of this session are misread. {sentence} {guess.fix}"
+        doubt = Finding("misread_joints", words, Step(guess.fix))
+        return Matched(robot, misread=misread, warnings=(doubt,))
     zero = None if guess is None else guess.zero
     if zero is not None and guess is not None:
-        told = "The joint angles do not belong to the reported poses as they are told."
-        words = f"{told} {guess.sentence('the reported poses')} {zero_taken(zero)} {zero.fix}"
-        matched = replace(matched, zero=zero, warnings=(words,))
+        words = (
+            "The joint angles do not belong to the reported poses as they are declared. "
+            f"{guess.sentence('the reported poses')} {zero_taken(zero)}"
+        )
+        lost = Finding("misread_joints", words, Step(zero.fix))
+        matched = replace(matched, zero=zero, warnings=(lost,))
     model = matched.arm.base_from_flange(q)
     found = _constants(model, poses, guess)
     typical_m, typical_rad = found.typical
@@ -200,7 +210,8 @@ def _rows_out(
     if not len(out):
         return matched
     swapped = _exchanged(found, out, sides)
-    reasons, words = {}, []
+    reasons: dict[int, str] = {}
+    warnings = list(matched.warnings)
     for row in out.tolist():
         away = f"{figure(1e3 * found.fit.shift[row])} mm and {_deg(found.fit.angle[row])} deg"
         reasons[views[row]] = f"its joint angles lead {away} away from its pose"
@@ -209,20 +220,28 @@ def _rows_out(
             reasons[views[row]] = f"its joint angles are those of view {mate}"
     if swapped:
         first, second = (views[row] for row in swapped)
-        words.append(
+        words = (
             f"The joint angles of views {first} and {second} are exchanged, or their poses are: "
-            "each view's angles lead to the other's pose. The hand-eye result uses the poses. "
-            "Exchange q1_rad ... of both rows in views.csv, or x_m to qw where these are wrong."
+            "each view's angles lead to the other's pose. The hand-eye result uses the poses."
         )
+        step = Step(
+            "Exchange q1_rad ... of both rows in views.csv, or x_m to qw where these are wrong, "
+            "and calibrate again.",
+            CALIBRATE,
+        )
+        warnings.append(Finding("exchanged_joints", words, step, (first, second)))
     rest = [row for row in out.tolist() if row not in swapped]
     if rest:
         shift, angle = found.fit.shift[rest].max(), found.fit.angle[rest].max()
-        words.append(
+        words = (
             f"Pose and joint angles disagree in {', '.join(f'view {views[it]}' for it in rest)}, "
             f"by up to {figure(1e3 * shift)} mm and {_deg(angle)} deg; in the other views they "
-            "agree. The hand-eye result uses the poses. Correct what is wrong there."
+            "agree. The hand-eye result uses the poses."
         )
-    return replace(matched, contradicting=reasons, warnings=(*matched.warnings, *words))
+        step = Step("Correct what is wrong there in views.csv.")
+        named = tuple(views[it] for it in rest)
+        warnings.append(Finding("contradicting_joints", words, step, named))
+    return replace(matched, contradicting=reasons, warnings=tuple(warnings))
 
 
 def _exchanged(
@@ -249,11 +268,14 @@ def _based(matched: Matched, found: _Constants) -> Matched:
         words = (
             f"base_link was taken for base: the reported poses are in a frame that is turned by "
             f"180 deg about z from the base of {name}, as ROS's base_link is from the controller's "
-            "base. The results are in the frame of the poses, and so is the arm. To have them in "
-            "the controller's base, report poses in it (visioncal convert SESSION FIXED --guess "
-            "turns these); to keep base_link, name a model that has it for its root."
+            "base. The results are in the frame of the poses, and so is the arm."
         )
-        return replace(matched, warnings=(*matched.warnings, words))
+        step = Step(
+            "To have them in the controller's base, write a copy of the session whose poses are "
+            "turned; to keep base_link, name a model that has it for its root.",
+            GUESS,
+        )
+        return replace(matched, warnings=(*matched.warnings, Finding("base_link", words, step)))
     x, y, z = 1e3 * base[:3, 3]
     turn = pose_difference(np.eye(4), base)[1]
     words = (
@@ -281,22 +303,25 @@ def _told(matched: Matched, found: _Constants) -> Matched:
             )
     offset_mm, turn_deg = pose_difference(np.eye(4), tool)
     if offset_mm > 1e3 * _AGREE_M + shift * 1e3 or turn_deg > np.rad2deg(_AGREE_RAD + angle):
-        warnings.append(
+        words = (
             f"The reported poses are of a tool frame, {offset_mm:.1f} mm and {turn_deg:.1f} deg "
             f"from the flange of {robot.name}: the camera's transform is to that frame."
         )
+        warnings.append(Finding("tool_frame", words))
     return replace(matched, warnings=tuple(warnings), notes=tuple(notes))
 
 
-def _of_another_arm(robot: Robot, found: _Constants) -> str:
-    return f"{_disagree(robot, found.figures)} The joint angles were not used."
+def _of_another_arm(robot: Robot, found: _Constants) -> Finding:
+    disagree = _disagree(robot, found.figures)
+    return replace(disagree, words=f"{disagree.words} The joint angles were not used.")
 
 
-def _disagree(robot: Robot, figures: str) -> str:
-    return (
+def _disagree(robot: Robot, figures: str) -> Finding:
+    return Finding(
+        "other_arm",
         f"Poses and joint angles disagree: through the model of {robot.name} the joints give poses "
-        f"that differ by up to {figures}. The hand-eye result uses the poses. Check [robot] model "
-        "and tip, and whether the base frame is the controller's."
+        f"that differ by up to {figures}. The hand-eye result uses the poses.",
+        Step("Check [robot] model and tip, and whether the base frame is the controller's."),
     )
 
 

@@ -1,17 +1,28 @@
 """Whether a result can be trusted, in plain sentences: of one camera and robot, or of many."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.calibration.stages.causes import Doubt, ranked, warned
+from visioncal.calibration.stages.causes import TRY_READINGS, adding, ranked
 from visioncal.calibration.stages.need import CHECK, GOOD, Picks, need_met
-from visioncal.calibration.stages.next_views_hint import with_proposal
 from visioncal.core.number_format import figure, percent
 from visioncal.core.types import Mount, Need, Rejection
+from visioncal.core.verdict import (
+    AGREEMENT,
+    GOOD_FOR,
+    GUESS,
+    NEED,
+    NOTE,
+    Finding,
+    Step,
+    Verdict,
+    VerdictStatus,
+    remarks,
+)
 from visioncal.estimation.observability import Direction
-from visioncal.results import NeedMet, Rms, Verdict, VerdictStatus, ViewResult
+from visioncal.results import NeedMet, Rms, ViewResult
 
 # Scatters under a nanometre and a micro-degree are rounding, and their ratios say nothing.
 _ROUNDING = 1e-6
@@ -169,11 +180,17 @@ class Findings:
     arms: Sequence[Arm]
     worst: Sequence[Direction]
     places: Sequence[Place]
-    warnings: Sequence[str] = ()
+    warnings: Sequence[Finding] = ()
     notes: Sequence[str] = ()
     mount: Mount = "eye-in-hand"
     need: Need | None = None
     picks: Sequence[Picks] = ()
+
+    @property
+    def plannable(self) -> bool:
+        """Whether views can be proposed: of cameras, by arms whose models are known."""
+        has_images = any(it.pixel_px is not None for it in self.sensors)
+        return has_images and all(it.modelled for it in self.arms)
 
     @property
     def rms(self) -> Rms:
@@ -229,7 +246,7 @@ def judge(findings: Findings, limits: Limits | None = None) -> Verdict:
         *(doubt for it in sensors for doubt in _lost_doubts(it, limits)),
         *(doubt for it in sensors for doubt in _noise_doubts(it, limits)),
         *([] if scatter else _robot_doubts(findings, limits)),
-        *(warned(it, _agreeing(findings)) for it in findings.warnings),
+        *(_warned(it, findings) for it in findings.warnings),
     ]
     good_for_mm = _good_for_mm(findings.picks, doubts)
     met = need_met(findings.need, findings.picks)
@@ -241,25 +258,29 @@ def judge(findings: Findings, limits: Limits | None = None) -> Verdict:
         status = "check" if doubts else "good"
     else:
         status = "check" if met.probability >= CHECK else "bad"
-    ordered = sorted(doubts, key=lambda doubt: not doubt.is_fatal)
-    sentences = [doubt.sentence for doubt in ordered] if doubts else [_praise(findings)]
-    if met is not None:
-        sentences.insert(len(ordered) * (met.probability >= GOOD), met_words(findings, met))
-    elif good_for_mm is not None:
-        sentences[0] += f" {_good_for_words(findings.picks, good_for_mm)}"
-    told = tuple(sentences)
-    if doubts and any(it.pixel_px is not None for it in sensors):
-        told = with_proposal(told, modelled=all(it.modelled for it in findings.arms))
-    causes = () if status == "good" else ranked(doubts, findings.picks, met)
-    return Verdict(status, (*told, *findings.notes), good_for_mm, causes)
+    ordered: Sequence[Finding] = sorted(doubts, key=lambda doubt: not doubt.is_fatal)
+    if status != "good":
+        ordered = ranked(ordered, findings.picks, met, modelled=findings.plannable)
+    said = list(ordered)
+    if met is None:
+        said += _good_for(findings, good_for_mm)
+    else:
+        said.insert(len(said) * (met.probability >= GOOD), Finding(NEED, met_words(findings, met)))
+    said += [] if doubts else [_praise(findings)]
+    return Verdict(status, (*said, *remarks(findings.notes, NOTE)), good_for_mm)
 
 
-def _agreeing(findings: Findings) -> str:
-    """How well views agree that are not left out."""
-    return f"Without them, views that are left out in turn agree to {_both(findings.held_out)}."
+def _warned(found: Finding, findings: Findings) -> Finding:
+    """A stage's warning, with what the result is without the views that it has left out."""
+    left_out = found.kind in ("exchanged_views", "wrong_pose", "something_moved")
+    return replace(found, without_it=_without_them(findings.held_out)) if left_out else found
 
 
-def _good_for_mm(picks: Sequence[Picks], doubts: Sequence[Doubt]) -> float | None:
+def _without_them(held_out: Rms) -> str:
+    return f"Without them, views that are left out in turn agree to {_both(held_out)}."
+
+
+def _good_for_mm(picks: Sequence[Picks], doubts: Sequence[Finding]) -> float | None:
     """The least need that would be met by all pairs; None where none would, or none is known."""
     least = max((it.until_mm for it in doubts), default=0.0)
     if not picks or np.isinf(least):
@@ -267,12 +288,15 @@ def _good_for_mm(picks: Sequence[Picks], doubts: Sequence[Doubt]) -> float | Non
     return max(least, *(it.good_for_mm for it in picks))
 
 
-def _good_for_words(picks: Sequence[Picks], good_for_mm: float) -> str:
-    worst = max(picks, key=lambda it: it.good_for_mm)
-    return (
+def _good_for(findings: Findings, good_for_mm: float | None) -> tuple[Finding, ...]:
+    if good_for_mm is None:
+        return ()
+    worst = max(findings.picks, key=lambda it: it.good_for_mm)
+    words = (
         f"It is good for tasks of {figure(good_for_mm)} mm and more at "
         f"{figure(worst.distance_m)} m from the camera."
     )
+    return (Finding(GOOD_FOR, words),)
 
 
 def met_words(findings: Findings, met: NeedMet) -> str:
@@ -292,18 +316,18 @@ def is_scattered(findings: Findings, limits: Limits | None = None) -> bool:
     return any(_scatter_doubts(findings, limits or Limits()))
 
 
-def _named(name: str, sentence: str) -> str:
-    """A sentence with whom it is of, where there are several."""
-    return f"{name}: {sentence[0].lower()}{sentence[1:]}" if name else sentence
-
-
-def _praise(findings: Findings) -> str:
+def _praise(findings: Findings) -> Finding:
     used = sum(view.used for it in findings.pairs for view in it.views)
     worst = findings.worst[0]
-    return (
+    return Finding(
+        AGREEMENT,
         f"All {used} used views agree: left out of the fit, they are predicted to "
         f"{_both(findings.held_out)} (rms), and "
-        f"{worst.words}, its worst direction, is known to {figure(1e3 * worst.sigma)} mm."
+        f"{worst.words}, its worst direction, is known to {figure(1e3 * worst.sigma)} mm.",
+        Step(
+            "Use the result with its covariance, and keep it: visioncal verify and visioncal diff "
+            "compare later stops with it."
+        ),
     )
 
 
@@ -320,7 +344,7 @@ def _pairs(one: Rms, other: Rms) -> list[tuple[float, float]]:
     return pairs
 
 
-def _scatter_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
+def _scatter_doubts(findings: Findings, limits: Limits) -> Iterator[Finding]:
     yield from _pair_doubts(findings, limits)
     ratios = [
         outside / within
@@ -329,15 +353,22 @@ def _scatter_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
     ]
     ratio = max(ratios, default=0.0)
     if ratio > limits.optimism[0]:
-        yield Doubt(
+        yield Finding(
+            "optimism",
             f"Views left out fit {ratio:.1f} times worse than views in the fit: there are too few "
-            "views for their noise. Add 5 or more, tilted about different axes.",
-            ratio > limits.optimism[1],
+            "views for their noise.",
+            _tilted(findings),
+            is_fatal=ratio > limits.optimism[1],
             until_mm=0.0,
         )
 
 
-def _pair_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
+def _tilted(findings: Findings) -> Step:
+    words = "Add 5 views or more, tilted by 20 to 40 degrees about different axes."
+    return adding(words, modelled=findings.plannable)
+
+
+def _pair_doubts(findings: Findings, limits: Limits) -> Iterator[Finding]:
     words, views, is_fatal = [], list[ViewResult](), False
     for pair in findings.pairs:
         held = pair.held_out
@@ -357,38 +388,46 @@ def _pair_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
             views += pair.views
             is_fatal |= any(it for _, it in beyond)
     if words:
-        yield Doubt(
+        worst = _worst_views(views)
+        named = ", ".join(f"view {view.view} ({_residual(view)})" for view in worst)
+        yield Finding(
+            "unexplained",
             f"Left out of the fit, views disagree with the others by "
-            f"{', '.join(words)}, rms; the worst are "
-            f"{_worst_views(views)}. Possible causes: {_CAUSES[findings.mount]}, or an "
-            "arm with large model errors.",
-            is_fatal,
+            f"{', '.join(words)}, rms; the worst are {named}. Possible causes: "
+            f"{_CAUSES[findings.mount]}, or an arm with large model errors.",
+            TRY_READINGS,
+            tuple(it.view for it in worst),
+            is_fatal=is_fatal,
             until_mm=0.0,
-            cause="unexplained",
         )
 
 
-def _worst_views(views: Sequence[ViewResult]) -> str:
+def _worst_views(views: Sequence[ViewResult]) -> list[ViewResult]:
     measured = [view for view in views if view.used and view.residual_mm is not None]
-    measured.sort(key=lambda view: -(view.residual_mm or 0.0))
-    return ", ".join(f"view {view.view} ({_residual(view)})" for view in measured[:_LISTED_VIEWS])
+    return sorted(measured, key=lambda view: -(view.residual_mm or 0.0))[:_LISTED_VIEWS]
 
 
-def _disagreement_doubts(pair: Pair) -> Iterator[Doubt]:
+def _disagreement_doubts(pair: Pair) -> Iterator[Finding]:
     """Names the views that were left out because they contradict the others."""
     out = pair.disagreeing
-    without_it = f"Without them, views that are left out in turn agree to {_both(pair.held_out)}."
     if not out:
         return
+    views, run = tuple(it.view for it in out), _run(pair)
     if len(out) == 1:
-        sentence = f"View {out[0].view} was left out: it {out[0].reason}."
-        yield Doubt(_named(pair.name, sentence), cause="wrong_views", without_it=without_it)
-        return
-    named, first = ", ".join(str(it.view) for it in out), out[0].view
-    run = _run(pair)
-    sentence = f"Views {named} were left out; view {first} {out[0].reason}.{run}"
-    cause = "something_moved" if run else "wrong_views"
-    yield Doubt(_named(pair.name, sentence), cause=cause, without_it=without_it)
+        words = f"View {views[0]} was left out: it {out[0].reason}."
+    else:
+        named = ", ".join(map(str, views))
+        words = f"Views {named} were left out; view {views[0]} {out[0].reason}.{run}"
+    step = (
+        Step("Fasten what moved, and calibrate the views before and after it apart.")
+        if run
+        else Step(
+            "Look at the images and poses of these views: repeat them, or take them out of "
+            "views.csv."
+        )
+    )
+    kind, without_it = "something_moved" if run else "wrong_views", _without_them(pair.held_out)
+    yield Finding(kind, words, step, views, without_it=without_it).of(pair.name)
 
 
 def _run(pair: Pair) -> str:
@@ -405,7 +444,7 @@ def _run(pair: Pair) -> str:
     return f" They follow each other: {when}, something had moved."
 
 
-def _outlier_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
+def _outlier_doubts(findings: Findings, limits: Limits) -> Iterator[Finding]:
     """Names single views whose residual stands out from the others'.
 
     Where the corners tell how well each view sees the board, the consensus has judged them better.
@@ -414,13 +453,15 @@ def _outlier_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
         return
     for pair in findings.pairs:
         for view, ratio in outlying_views(pair.views, limits.outlier):
-            sentence = (
+            words = (
                 f"View {view.view} stands out: it places the target {_residual(view, ' and ')} "
                 f"from the others, {ratio:.0f} times what is typical. It is in the fit and pulls "
-                "at it: look at its image and its pose, and take it out of views.csv if one of "
-                "them is wrong."
+                "at it."
             )
-            yield Doubt(_named(pair.name, sentence), cause="wrong_views")
+            step = Step(
+                "Look at its image and its pose, and take it out of views.csv if one is wrong."
+            )
+            yield Finding("wrong_views", words, step, (view.view,)).of(pair.name)
 
 
 def outlying_views(
@@ -440,7 +481,7 @@ def _residual(view: ViewResult, between: str = ", ") -> str:
     return f"{figure(view.residual_mm or 0.0)} mm{turned}"
 
 
-def _holdout_doubts(pair: Pair, mount: Mount, limits: Limits) -> Iterator[Doubt]:
+def _holdout_doubts(pair: Pair, mount: Mount, limits: Limits) -> Iterator[Finding]:
     holdout, held = pair.holdout, pair.held_out
     if holdout is None:
         return
@@ -448,15 +489,16 @@ def _holdout_doubts(pair: Pair, mount: Mount, limits: Limits) -> Iterator[Doubt]
     ratio = max(back / max(left, _ROUNDING) for back, left in pairs)
     if ratio > limits.holdout and max(back for back, _ in pairs) > _ROUNDING:
         observed = "readings" if mount == "instrument" else "images"
-        sentence = (
+        words = (
             f"The views that the session holds back are missed by {_both(holdout)}, {ratio:.0f} "
             "times worse than views left out in turn. They lie where the result does not hold, or "
             f"their poses or {observed} are wrong."
         )
-        yield Doubt(_named(pair.name, sentence), cause="holdout")
+        step = Step("Record views where the result is to hold, with role = fit.")
+        yield Finding("holdout", words, step).of(pair.name)
 
 
-def _worth_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
+def _worth_doubts(findings: Findings, limits: Limits) -> Iterator[Finding]:
     """Judges the answer where it counts.
 
     Edges are known in the arm's own frames. Those of a calibrated arm are as open as the errors of
@@ -469,20 +511,25 @@ def _worth_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
         if it.workspace_mm is not None and it.workspace_mm > limits.sigma_mm[0]:
             seen = any(sensor.pixel_px is not None for sensor in findings.sensors)
             board = (
-                "The board's size counts in it, as no view can tell an arm and a board that are "
-                "both too large: measure its squares, and state square_sigma_m. "
+                " The board's size counts in it, as no view can tell an arm and a board that are "
+                "both too large: measure its squares, and state square_sigma_m."
             )
-            sentence = (
+            words = (
                 "All over the workspace the calibrated arm places its tool to "
                 f"{figure(it.workspace_mm)} mm (sigma, in the median; doubt begins at "
-                f"{limits.sigma_mm[0]:g}). {board if seen else ''}Add views in "
-                "which the arm stands otherwise, all over the workspace."
+                f"{limits.sigma_mm[0]:g}).{board if seen else ''}"
+            )
+            step = adding(
+                "Add views with other postures of the arm, all over the workspace.",
+                modelled=findings.plannable,
+                purpose=" --for kinematics",
             )
             is_fatal = it.workspace_mm > limits.sigma_mm[1]
-            yield Doubt(_named(_robot(it), sentence), is_fatal, until_mm=0.0)
+            found = Finding("workspace", words, step, is_fatal=is_fatal, until_mm=0.0)
+            yield found.of(_robot(it))
 
 
-def _sigma_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
+def _sigma_doubts(findings: Findings, limits: Limits) -> Iterator[Finding]:
     weak, is_fatal = [], False
     for direction in findings.worst:
         scale, unit, (check, bad) = (
@@ -495,16 +542,17 @@ def _sigma_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
             weak.append(f"{direction.words} ({figure(sigma)} {unit})")
             is_fatal |= bool(sigma > bad)
     if weak:
-        yield Doubt(
+        yield Finding(
+            "weak_motion",
             f"Weakly determined by the motion, with their sigmas: {', '.join(weak)}; doubt begins "
-            f"at {limits.sigma_mm[0]:g} mm and {limits.sigma_deg[0]:g} deg. Add views tilted by "
-            "20 to 40 degrees about axes across these directions.",
-            is_fatal,
+            f"at {limits.sigma_mm[0]:g} mm and {limits.sigma_deg[0]:g} deg.",
+            _tilted(findings),
+            is_fatal=is_fatal,
             until_mm=0.0,
         )
 
 
-def _budget_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
+def _budget_doubts(findings: Findings, limits: Limits) -> Iterator[Finding]:
     """Says what makes the result uncertain where it is to be used."""
     beyond = [it for it in findings.places if it.budget_mm["total"] > limits.sigma_mm[0]]
     if not beyond:
@@ -515,31 +563,34 @@ def _budget_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
     others = [
         f"{it.words} ({figure(it.budget_mm['total'])} mm)" for it in beyond if it is not worst
     ]
-    yield Doubt(
+    yield Finding(
+        "place",
         f"{worst.words} is placed to {figure(budget['total'])} mm (sigma; 95 % "
         f"within {figure(worst.radius95_mm)} mm): "
         + ", ".join(f"{figure(mm)} mm from the {name}" for name, mm in parts[:_LISTED_PARTS])
         + "."
         + (f" Over {limits.sigma_mm[0]:g} mm are also {', '.join(others)}." if others else ""),
-        budget["total"] > limits.sigma_mm[1],
+        is_fatal=budget["total"] > limits.sigma_mm[1],
         until_mm=0.0,
     )
 
 
-def _stop_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
+def _stop_doubts(findings: Findings, limits: Limits) -> Iterator[Finding]:
     used = sum(view.used for it in findings.pairs for view in it.views)
     check, bad = limits.stops
     for it in findings.arms:
         if it.stops < check:
             counted = f"{used} views" if it.stops == used else f"{it.stops} stops"
-            sentence = (
+            words = (
                 f"Only {counted} are used; {check} or more give the result something to be checked "
                 "with."
             )
-            yield Doubt(_named(_robot(it), sentence), it.stops < bad, until_mm=0.0)
+            step = _tilted(findings)
+            found = Finding("few_stops", words, step, is_fatal=it.stops < bad, until_mm=0.0)
+            yield found.of(_robot(it))
 
 
-def _lost_doubts(sensor: Sensor, limits: Limits) -> Iterator[Doubt]:
+def _lost_doubts(sensor: Sensor, limits: Limits) -> Iterator[Finding]:
     lost, used = sensor.lost, sensor.used
     share = len(lost) / max(used + len(lost), 1)
     if share > limits.lost_share[0]:
@@ -551,36 +602,39 @@ def _lost_doubts(sensor: Sensor, limits: Limits) -> Iterator[Doubt]:
         if others:
             told += f"; the first{' but for these' if disagree else ''}: view {others[0].view}, "
             told += others[0].reason
-        sentence = f"{len(lost)} of {used + len(lost)} views are not used{told}."
-        yield Doubt(_named(sensor.name, sentence), share > limits.lost_share[1], cause="lost_views")
+        words = f"{len(lost)} of {used + len(lost)} views are not used{told}."
+        step = Step("Look at the first of them, and repeat what is missing.") if others else None
+        views, is_fatal = tuple(it.view for it in lost), share > limits.lost_share[1]
+        yield Finding("lost_views", words, step, views, is_fatal=is_fatal).of(sensor.name)
 
 
-def _noise_doubts(sensor: Sensor, limits: Limits) -> Iterator[Doubt]:
+def _noise_doubts(sensor: Sensor, limits: Limits) -> Iterator[Finding]:
     check, bad = limits.pixel_px
     noise = sensor.pixel_px
     if noise is None:
         return
     if noise > check:
-        sentence = (
+        words = (
             f"Corners deviate by {figure(noise)} px from any pose of a flat board (doubt begins at "
             f"{check:g}): the intrinsics do not fit this camera, the board is not flat, or images "
             "are blurred."
         )
-        yield Doubt(_named(sensor.name, sentence), noise > bad, cause="corner_noise")
+        step = Step("Look for blur, glare, and a lens or a board that is not as stated.")
+        yield Finding("corner_noise", words, step, is_fatal=noise > bad).of(sensor.name)
     if sensor.level > limits.level:
-        sentence = (
+        words = (
             f"Its poses scatter {figure(sensor.level)} times as much as its corners say: squares "
-            "of few pixels, blur, or a lens that is not as stated. Go nearer, or show it larger "
-            "squares."
+            "of few pixels, blur, or a lens that is not as stated."
         )
-        yield Doubt(_named(sensor.name, sentence), cause="corner_noise")
+        step = Step("Go nearer, or show it larger squares.")
+        yield Finding("corner_noise", words, step).of(sensor.name)
 
 
 def _robot(arm: Arm) -> str:
     return f"Robot {arm.name}" if arm.name else ""
 
 
-def _robot_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
+def _robot_doubts(findings: Findings, limits: Limits) -> Iterator[Finding]:
     """An arm is a good instrument: what looks like its error is often something else's.
 
     A task that needs ten times as much has an arm that is as good as it has to be.
@@ -590,18 +644,26 @@ def _robot_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
             continue
         beyond = max(it.away_mm / limits.robot_mm, it.away_deg / limits.robot_deg)
         if beyond > 1.0:
-            cause = (
-                "the instrument reads worse than is stated of it, was moved, or the arm's model is "
-                "off by as much. Read a few stops twice to see how well readings repeat."
+            cause, step = (
+                (
+                    "the instrument reads worse than is stated of it, was moved, or the arm's "
+                    "model is off by as much.",
+                    Step("Read a few stops twice to see how well readings repeat."),
+                )
                 if findings.mount == "instrument"
-                else "the board is of another size than stated, or warped, the intrinsics are not "
-                "this camera's, or the arm's model is off by as much. Measure the board's squares "
-                "first."
+                else (
+                    "the board is of another size than stated, or warped, the intrinsics are not "
+                    "this camera's, or the arm's model is off by as much.",
+                    Step(
+                        "Measure the board over many squares first, then try other conventions.",
+                        GUESS,
+                    ),
+                )
             )
-            sentence = (
+            words = (
                 f"To explain what is seen, the flange would have to be off by {figure(it.away_mm)} "
                 f"mm and {figure(it.away_deg)} deg from stop to stop; arms repeat to 0.1 mm. More "
                 f"likely {cause}"
             )
             until_mm = 10.0 * beyond * limits.robot_mm
-            yield Doubt(_named(_robot(it), sentence), until_mm=until_mm, cause="unexplained")
+            yield Finding("unexplained", words, step, until_mm=until_mm).of(_robot(it))

@@ -10,6 +10,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, Mask
+from visioncal.core.verdict import CALIBRATE, Finding, Step
 from visioncal.estimation.arm import SIGNIFICANT, ArmErrors
 from visioncal.estimation.kinematics import LEVELS, ArmTrials, LevelFit, fit_level, resized
 from visioncal.estimation.parts import Noise, State
@@ -245,15 +246,17 @@ def check_asked(asked: str, *, can: bool, misread: str = "") -> None:
         )
 
 
-def doubts(kinematics: Kinematics) -> Iterator[str]:
+def doubts(kinematics: Kinematics) -> Iterator[Finding]:
     """Says where another level explains the views far better than the one that was asked for."""
     best = _best(kinematics.levels)
     chosen = next(it for it in kinematics.levels if it.name == kinematics.level)
     if best.likelihood_ratio - chosen.likelihood_ratio > SIGNIFICANT:
-        yield (
+        yield Finding(
+            "level",
             f"The views speak for more than the arm's {chosen.name}: with its {best.name} stops "
             f"left out are predicted to {figure(best.left_out.mm)} mm instead of "
-            f"{figure(chosen.left_out.mm)} mm. Leave --level out."
+            f"{figure(chosen.left_out.mm)} mm.",
+            Step("Leave --level out.", CALIBRATE),
         )
 
 

@@ -13,6 +13,7 @@ from visioncal.calibration.stages.reported_poses import Reported
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.types import Corners, FloatArray, Progress, Rejection
+from visioncal.core.verdict import Finding
 from visioncal.estimation.scene import Scene
 from visioncal.results import HELD_BACK, CameraResult
 from visioncal.robot import Robot
@@ -55,7 +56,7 @@ class Observed:
         reasons: Why a view cannot be used, by view.
         robots: What its rows report of each robot, by the name that rows give it.
         clocks: How the clocks of cameras and robots go together, where robots' streams are used.
-        warnings: What the user should know, in sentences.
+        warnings: What the user should know.
         notes: What is good to know and no reason for doubt.
         dense: How corners are fitted by all pixels around them; None for the template's.
     """
@@ -67,11 +68,11 @@ class Observed:
     reasons: Mapping[int, str] = field(default_factory=dict)
     robots: Mapping[str, Reported] = field(default_factory=dict)
     clocks: Mapping[Pair, Clocked] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Finding, ...] = ()
     notes: tuple[str, ...] = ()
     dense: Dense | None = None
 
-    def noting(self, rejections: Iterable[Rejection], warnings: Iterable[str] = ()) -> Self:
+    def noting(self, rejections: Iterable[Rejection], warnings: Iterable[Finding] = ()) -> Self:
         """Adds rejected views, of which the first reason counts, and warnings."""
         reasons = {it.view: it.reason for it in rejections} | dict(self.reasons)
         return replace(self, reasons=reasons, warnings=(*self.warnings, *warnings))

@@ -11,6 +11,7 @@ from visioncal.calibration.stages.motion import Motion
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray, Mask
+from visioncal.core.verdict import GUESS, Finding, Step
 from visioncal.estimation.clock import ClockFit
 from visioncal.estimation.clock_correlation import Match
 from visioncal.session import View
@@ -94,28 +95,31 @@ def told_words(fit: ClockFit, match: Match, stream: str) -> str:
     )
 
 
-def turning_words(match: Match) -> str:
+def turning_doubt(match: Match) -> Finding:
     """Says what the turning alone tells."""
-    return (
+    return Finding(
+        "clock",
         f"The camera's clock is {1e3 * match.offset_s:+.1f} ms ahead of the robot's (sigma "
         f"{1e3 * match.sigma_s:.2g} ms), as the turning of both tells (correlation "
-        f"{match.correlation:.2f}). It tells no better, because the chain of frames does not close "
-        "over the motion: check how the poses are to be read."
+        f"{match.correlation:.2f}). It is known no better, because the chain of frames does not "
+        "close over the motion.",
+        Step("Try other conventions of the poses.", GUESS),
     )
 
 
-def stated_doubts(clock: Clock, views: Sequence[View]) -> Iterator[str]:
+def stated_doubts(clock: Clock, views: Sequence[View]) -> Iterator[Finding]:
     """Says so where what the session states is not what the motion tells."""
     if clock.stated_s is None:
         return
     away_s = abs(clock.stated_s - clock.camera_minus_robot_s)
     frame_s = float(np.median(np.diff([view.stamp_s or 0.0 for view in views])))
     if away_s > max(_STATED_SIGMAS * clock.sigma_s, _STATED_SHARE * frame_s):
-        yield (
+        yield Finding(
+            "clock",
             f"[clock] camera_minus_robot_s is stated as {1e3 * clock.stated_s:+.2f} ms, but the "
             f"motion tells {1e3 * clock.camera_minus_robot_s:+.2f} ms (sigma "
-            f"{1e3 * clock.sigma_s:.2g} ms), which was taken. Correct session.toml, or look at how "
-            "the stamps are made."
+            f"{1e3 * clock.sigma_s:.2g} ms), which was taken.",
+            Step("Correct [clock] in session.toml, or look at how the stamps are made."),
         )
 
 

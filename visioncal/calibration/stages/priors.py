@@ -6,6 +6,7 @@ from visioncal.calibration.stages.measured import components, prior_of
 from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean
 from visioncal.core.types import FloatArray
+from visioncal.core.verdict import NOTE, Finding, remarks
 from visioncal.estimation.parts import FramePrior, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.tree import Tree
@@ -68,8 +69,8 @@ def most_contradicted(problem: Problem, state: State, covariance: FloatArray) ->
 
 def prior_words(
     problem: Problem, state: State, covariance: FloatArray, stated: Iterable[FramePrior]
-) -> Iterator[tuple[str, bool]]:
-    """Says what became of priors, and whether that is a reason for doubt.
+) -> Iterator[Finding]:
+    """Says what became of priors; what contradicts none is a note.
 
     Args:
         problem: The observations in the fit, with the priors that these do not contradict.
@@ -81,6 +82,6 @@ def prior_words(
     for prior in stated:
         found = components(problem, state, covariance, [prior])
         if prior.name in used:
-            yield from ((it.remark, False) for it in found)
+            yield from remarks((it.remark for it in found), NOTE)
         elif found:
-            yield max(found, key=lambda it: it.contradiction).doubt, True
+            yield Finding("prior", max(found, key=lambda it: it.contradiction).doubt)

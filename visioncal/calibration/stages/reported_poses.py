@@ -13,6 +13,7 @@ from visioncal.calibration.stages.joints import Matched, match_joints
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, pose_difference
 from visioncal.core.types import FloatArray, Rejection
+from visioncal.core.verdict import Finding
 from visioncal.robot import Robot
 from visioncal.session import Session
 
@@ -33,14 +34,14 @@ class Reported:
     Attributes:
         base_from_flange: (4, 4) by view.
         rejections: Views without a pose.
-        warnings: What does not fit together, in words.
+        warnings: What does not fit together.
         notes: What is good to know of it.
         matched: The joints beside the poses; None without a model.
     """
 
     base_from_flange: Mapping[int, FloatArray]
     rejections: tuple[Rejection, ...] = ()
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Finding, ...] = ()
     notes: tuple[str, ...] = ()
     matched: Matched | None = None
 

@@ -18,6 +18,7 @@ from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.reported_poses import Reported, reported_poses
 from visioncal.core.types import Mount, Rejection
+from visioncal.core.verdict import remarks
 from visioncal.robot import Robot
 from visioncal.session import Observation, Session, frame_name
 from visioncal.session.kinds import is_seen, name_of
@@ -44,9 +45,9 @@ def read_robots(seen: T) -> T:
         model = None if document is None else Robot.from_document(document)
         reported = reported_poses(replace(session, views=mine), model)
         found[name] = _with_stops(session, name, reported)
-        seen = seen.noting((), _of_robot(session, name, reported.warnings))
-        notes = (*seen.notes, *_of_robot(session, name, reported.notes))
-        seen = replace(seen, notes=notes)
+        seen = seen.noting((), (it.of(_called(session, name)) for it in reported.warnings))
+        notes = (it.of(_called(session, name)).words for it in remarks(reported.notes))
+        seen = replace(seen, notes=(*seen.notes, *notes))
     rows = [it for it in session.observations if it.view.number not in seen.spared]
     return replace(seen, robots=found).noting(_lost(session, rows, found))
 
@@ -81,11 +82,9 @@ def _lost(
             yield Rejection(row.view.number, f"{why}{of}")
 
 
-def _of_robot(session: Session, robot: str, told: tuple[str, ...]) -> Iterator[str]:
-    """Names, of several robots, the one that sentences are of."""
-    for words in told:
-        several = len(session.robots) > 1
-        yield f"Robot {robot}: {words[0].lower()}{words[1:]}" if several else words
+def _called(session: Session, robot: str) -> str:
+    """Names, of several robots, the one that findings are of."""
+    return f"Robot {robot}" if len(session.robots) > 1 else ""
 
 
 def check_joints(seen: T, *, drops: bool, takes: bool) -> T:
@@ -132,8 +131,7 @@ def _checked(seen: T, name: str, reported: Reported, matched: Matched, how: tupl
         error = misread_joints(guess, matched.robot, has_poses=has_poses)
         raise error.within(f"robot {name}") if len(session.robots) > 1 else error
     taken = takes and matched.zero is None
-    words = (lost_zero(guess, zero, taken=taken),)
-    seen = seen.noting((), _of_robot(session, name, words))
+    seen = seen.noting((), (lost_zero(guess, zero, taken=taken).of(_called(session, name)),))
     return seen.with_robot(name, reported.with_zero(zero)) if taken else seen
 
 

@@ -330,7 +330,7 @@ def _check_robot(session: Session, stated: Robot, known: Robot) -> None:
 
 def _warnings(known: ObservedPoses, prior_calibration: CalibrationPrior) -> Iterator[str]:
     """What is odd about the session."""
-    yield from dict.fromkeys(known.warnings)
+    yield from dict.fromkeys(it.reason for it in known.warnings)
     if "thermal" in prior_calibration.calibration.stages:
         cold_c = float(prior_calibration.calibration.drift.reference_c.mean())
         yield (

@@ -3,15 +3,21 @@
 from collections.abc import Sequence
 
 from visioncal.core.number_format import significant
-from visioncal.present.recording.notes import HEADLINES, edge_line, plain
+from visioncal.present.recording.notes import (
+    edge_line,
+    further_lines,
+    plain,
+    step_lines,
+    verdict_lines,
+)
 from visioncal.results import Alignment, Sight
 from visioncal.session import View
 
 
 def verdict_markdown(found: Alignment) -> str:
     """The verdict with its reasons, the transforms, and the observations that were left out."""
-    lines = [f"# {HEADLINES[found.verdict.status]}", ""]
-    lines += [f"- {plain(it)}" for it in found.verdict.lines]
+    verdict = found.verdict
+    lines = [*verdict_lines(verdict), *step_lines(verdict.next_steps), *further_lines(verdict)]
     lines += ["", plain(found.weakest), ""]
     lines += [f"- {plain(it.frame)} is not tied. {plain(it.remedy)}" for it in found.untied]
     lines += [f"The frame of the cell is that of {plain(found.reference)}.", ""]

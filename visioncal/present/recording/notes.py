@@ -2,17 +2,17 @@
 
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import rerun as rr
 
 from visioncal.core.transforms import pose_difference
+from visioncal.core.verdict import Step, Verdict
 from visioncal.present.recording import colours, paths
 from visioncal.present.recording.findings import SOURCES, Arm, Board, Findings, Uncertainty
 from visioncal.present.recording.kinematics import Kinematics
 from visioncal.results import Calibration, Edge, Rms, ViewResult
 
-HEADLINES = {"good": "Good", "check": "Check before use", "bad": "Bad: do not use"}
 _PLOTS = {
     paths.POSITION_MM: "residual_mm",
     paths.ORIENTATION_DEG: "residual_deg",
@@ -79,13 +79,13 @@ def log_view(stream: rr.RecordingStream, view: ViewResult, ends: Mapping[str, fl
 def verdict_markdown(calibration: Calibration) -> str:
     """The verdict with its reasons, the transforms, and the views that were left out."""
     verdict = calibration.verdict
-    lines = [f"# {HEADLINES[verdict.status]}", ""]
-    lines += [f"- {plain(reason)}" for reason in verdict.lines]
+    lines = [*verdict_lines(verdict), *step_lines(calibration.next_steps)]
     lines += [
-        f"- {plain(name)}: {HEADLINES[it.verdict.status]}, see Tools and fixtures."
+        f"- {plain(name)}: {it.verdict.headline}, see Tools and fixtures."
         for name, it in calibration.frames.items()
         if it.verdict.status != "good"
     ]
+    lines += further_lines(verdict)
     lines += [
         "",
         "| transform | x, y, z [mm] | rotation vector [deg] | sigma |",
@@ -107,6 +107,27 @@ def verdict_markdown(calibration: Calibration) -> str:
     lines += ["", f"{used} of {len(calibration.views)} views used."]
     lines += [f"- View {view.view}: {plain(view.reason)}" for view in rejected]
     return "\n".join(lines)
+
+
+def verdict_lines(verdict: Verdict) -> Iterator[str]:
+    """The verdict in a few words, and what is read first."""
+    yield from (f"# {verdict.headline}", "")
+    yield from (f"- {plain(it)}" for it in verdict.top)
+
+
+def step_lines(steps: Sequence[Step]) -> Iterator[str]:
+    """What to do next, commands as they are typed."""
+    if steps:
+        yield from ("", "## What to do next", "")
+    for at, it in enumerate(steps, 1):
+        yield f"{at}. {plain(it.words)}" + (f" `{it.command}`" if it.command else "")
+
+
+def further_lines(verdict: Verdict) -> Iterator[str]:
+    """What else was found."""
+    if verdict.rest:
+        yield from ("", "## What else was found", "")
+    yield from (f"- {plain(it)}" for it in verdict.rest)
 
 
 def edge_line(edge: Edge, *, oriented: bool = True) -> str:

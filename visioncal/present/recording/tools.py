@@ -6,7 +6,7 @@ import rerun as rr
 
 from visioncal.present.recording import paths
 from visioncal.present.recording.details import details
-from visioncal.present.recording.notes import HEADLINES, edge_line, plain
+from visioncal.present.recording.notes import edge_line, plain
 from visioncal.results import Calibration, Frame, Observation
 
 
@@ -23,7 +23,7 @@ def markdown(calibration: Calibration) -> str:
 
 
 def _frame(name: str, frame: Frame) -> Iterator[str]:
-    yield from (f"# {plain(name)}: {HEADLINES[frame.verdict.status]}", "")
+    yield from (f"# {plain(name)}: {frame.verdict.headline}", "")
     for reason in frame.verdict.reasons:
         yield f"- {plain(reason)}"
     yield from ("", "| x, y, z [mm] | rotation vector [deg] | sigma |", "|---|---|---|")

@@ -1,7 +1,6 @@
-"""Which views to look at, and what to do next."""
+"""Which views to look at."""
 
-import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,10 +11,6 @@ from visioncal.results import Calibration, ViewResult
 
 # Views whose residual is this many times the median are named, as by the verdict.
 _STANDS_OUT = Limits.outlier
-# Sentences of a verdict that start so say what to do.
-_IMPERATIVE = re.compile("(Add|Check|Compare|Let|Look|Measure|Move|Print|Record|Take|Use) ")
-# And one that starts so is about views that disagree.
-_CAUSES = "Possible causes: "
 # So begins the reason of a view that was left out because pose and image do not go together.
 _CONTRADICTS = "disagrees with the other views"
 
@@ -87,72 +82,6 @@ def _outlying(views: Sequence[ViewResult]) -> dict[int, str]:
                     f"{significant(value)} {unit} (median {significant(median)})"
                 )
     return {view: f"off by {' and '.join(it)}" for view, it in words.items()}
-
-
-def next_steps(calibration: Calibration, found: Sequence[Suspects]) -> tuple[str, ...]:
-    """What to do next: the verdict's own advice, and the views that it is about by number.
-
-    Args:
-        calibration: The result.
-        found: Its suspects.
-
-    Returns:
-        Sentences, the most pressing first.
-    """
-    of_frames = [
-        f"Settle what is said of {name} under Tools and fixtures before it is used."
-        for name, frame in calibration.frames.items()
-        if frame.verdict.status != "good"
-    ]
-    if calibration.verdict.status == "good":
-        return (*_when_good(calibration), *of_frames)
-    outlying = outlying_views(found)
-    advice = list(
-        dict.fromkeys(
-            sentence
-            for sentence in _sentences(calibration.verdict.lines)
-            if _IMPERATIVE.match(sentence)
-        )
-    )
-    causes = [
-        sentence.removeprefix(_CAUSES)
-        for sentence in _sentences(calibration.verdict.reasons)
-        if sentence.startswith(_CAUSES)
-    ]
-    if outlying:
-        advice.insert(
-            0,
-            f"Look at {listed(outlying)}: does the pose belong to the image, and did anything "
-            "move? Repeat wrong views or take them out of views.csv, and calibrate again.",
-        )
-    elif causes:
-        advice.insert(0, f"No view stands out, so look for what all of them share: {causes[0]}")
-    contradicting = [view.view for view in calibration.views if contradicts(view)]
-    if contradicting:
-        advice.insert(
-            0,
-            f"Find out what went wrong with {listed(contradicting)}, which the result does not "
-            "use: does the pose belong to the image, and did anything move? Repeat them where the "
-            "others leave gaps.",
-        )
-    return (*(advice or ["Settle the points above, and calibrate again."]), *of_frames)
-
-
-def _when_good(calibration: Calibration) -> Iterator[str]:
-    wanted = next(iter(calibration.edges))
-    arm = ", and the poses of the calibrated arm" if calibration.arm_is_calibrated else ""
-    is_read = calibration.mount == "instrument"
-    moved = "instrument from a moved probe" if is_read else "camera from a moved board"
-    yield f"Use {wanted} as it stands in calibration.json, with its covariance{arm}."
-    yield (
-        "Keep calibration.json: visioncal diff tells a later calibration's change from noise, and "
-        f"a moved {moved}."
-    )
-
-
-def _sentences(reasons: Sequence[str]) -> Iterator[str]:
-    for reason in reasons:
-        yield from re.split(r"(?<=[.!?])\s+(?=[A-Z])", reason)
 
 
 def listed(views: Sequence[int]) -> str:

@@ -80,7 +80,6 @@ def render_cell(found: Alignment) -> str:
     ]
     return environment.get_template("cell.html.j2").render(
         found=found,
-        headline=content.headline(found.verdict),
         created=content.readable_time(found.created),
         kinds=_kinds(found),
         key_figures=_key_figures(found),

@@ -36,11 +36,6 @@ _MOUNTS = {
     "eye-to-hand": "the camera stands still and the robot carries the target",
     "instrument": "a measuring instrument stands still and reads what the robot carries",
 }
-HEADLINES = {
-    "good": "Good: ready to use",
-    "check": "Check: usable once the points below are settled",
-    "bad": "Bad: do not use this result",
-}
 
 
 @dataclass(frozen=True)
@@ -110,11 +105,6 @@ class ResidualRow:
     mm: str
     deg: str
     px: str
-
-
-def headline(verdict: Verdict) -> str:
-    """The verdict in a few words."""
-    return HEADLINES[verdict.status]
 
 
 def readable_time(created: str) -> str:

@@ -11,6 +11,7 @@ from markupsafe import Markup
 from visioncal.core.files import write_atomically
 from visioncal.core.number_format import matched, significant
 from visioncal.core.types import FloatArray
+from visioncal.core.verdict import Verdict
 from visioncal.core.version import __version__
 from visioncal.dynamics import Identified, Prediction, Run, judge, stribeck_rows
 from visioncal.present.report import content, torqueplots
@@ -91,7 +92,7 @@ def render_dynamics(run: Run) -> str:
         sha256=source.get("sha256", ""),
         created=content.readable_time(str(identified.facts.get("created", ""))),
         judged=judged,
-        headline=content.HEADLINES[judged.status],
+        headline=Verdict(judged.status).headline,
         key_figures=tuple(_key_figures(identified)),
         notes=tuple(note for it in identified.streams for note in it.notes),
         torques=tuple(_torque_rows(identified)),

@@ -89,9 +89,7 @@ def render(
 def _words(calibration: Calibration) -> dict[str, object]:
     found = advice.suspects(calibration)
     return {
-        "headline": content.headline(calibration.verdict),
         "created": content.readable_time(calibration.created),
-        "next_steps": advice.next_steps(calibration, found),
         "suspects": [(advice.listed(it.views), it) for it in found],
         "has_outliers": any(it.used for it in found),
         "has_contradicting": any(it.contradict for it in found),

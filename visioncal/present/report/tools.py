@@ -8,7 +8,7 @@ from visioncal.core.number_format import significant
 from visioncal.present.recording.details import details
 from visioncal.present.report import bars, svg
 from visioncal.present.report.bars import Bar
-from visioncal.present.report.content import EdgeCard, Fact, edge_card, headline, readable_time
+from visioncal.present.report.content import EdgeCard, Fact, edge_card, readable_time
 from visioncal.results import Calibration, Frame, Observation
 
 _WIDTH_IN, _HEIGHT_IN = 5.0, 1.7
@@ -67,7 +67,7 @@ def _card(name: str, frame: Frame) -> FrameCard:
     return FrameCard(
         edge_card(name, frame.edge, oriented=frame.oriented),
         frame.verdict.status,
-        headline(frame.verdict),
+        frame.verdict.headline,
         frame.verdict.reasons,
         _facts(frame),
         _plot(name, frame),

@@ -1,0 +1,197 @@
+"""Verdicts: what was found, how likely it is the cause, what it costs, and what to do about it."""
+
+import re
+import shlex
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal, Self, TypeAlias
+
+import numpy as np
+
+from visioncal.core.number_format import percent
+
+VerdictStatus: TypeAlias = Literal["good", "check", "bad"]
+
+# So many findings are shown first, and so many steps; causes as likely as this are among them.
+_SHOWN, _LEAST_LIKELY = 3, 0.05
+# Kinds of findings that are no doubts.
+AGREEMENT, NEED, GOOD_FOR, NOTE = "agreement", "need", "good_for", "note"
+# What says how large errors are, the most telling first.
+_SIZES = (NEED, GOOD_FOR, "unexplained", "optimism", "weak_motion", "place", "workspace")
+
+
+_HEADLINES = {
+    "good": "Good: ready to use",
+    "check": "Check before use",
+    "bad": "Bad: do not use",
+}
+# Commands of steps.
+CALIBRATE, PLAN = "visioncal calibrate SESSION -o OUT", "visioncal plan SESSION --add 5"
+GUESS = "visioncal convert SESSION FIXED --guess"
+_PATH = re.compile(r"\b(SESSION|FIXED|OUT)\b")
+
+
+@dataclass(frozen=True)
+class Step:
+    """What to do about a finding.
+
+    Attributes:
+        words: A sentence in the imperative.
+        command: A command line that does it or leads on; empty where there is none. SESSION, FIXED
+            (a corrected copy of the session) and OUT stand for paths that `with_paths` fills in.
+    """
+
+    words: str
+    command: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.words} Run: {self.command}" if self.command else self.words
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was found, worded once.
+
+    Attributes:
+        kind: What it is, as a short name that stays.
+        words: The same in sentences, with its figures.
+        do: What to do about it; None where that is nothing.
+        views: The views that it is about.
+        probability: How likely it is the cause of what is wrong; 0 for what is no cause.
+        without_it: What the result would be without it, in a sentence.
+        is_fatal: Whether it alone makes a result bad.
+        until_mm: The need of a task from which on it is no doubt [mm]: zero where it says how large
+            errors are, which any need says better than a limit; infinite where something is
+            unexplained.
+        mahalanobis_sq: The evidence for it, as the square of a standard normal variable; zero where
+            the limit of the test that found it has to do.
+    """
+
+    kind: str
+    words: str
+    do: Step | None = None
+    views: tuple[int, ...] = ()
+    probability: float = 0.0
+    without_it: str = ""
+    is_fatal: bool = field(default=False, compare=False)
+    until_mm: float = field(default=np.inf, compare=False)
+    mahalanobis_sq: float = field(default=0.0, compare=False)
+
+    def of(self, name: str) -> Self:
+        """The same finding with whom it is of, where there are several; empty names nobody."""
+        if not name:
+            return self
+        return replace(self, words=f"{name}: {self.words[0].lower()}{self.words[1:]}")
+
+    @property
+    def reason(self) -> str:
+        """What it is, and what to do about it."""
+        return self.words if self.do is None else f"{self.words} {self.do}"
+
+
+def remarks(sentences: Iterable[str], kind: str = "remark") -> tuple[Finding, ...]:
+    """Findings that no test is behind."""
+    return tuple(Finding(kind, it) for it in sentences)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether a result can be trusted.
+
+    Attributes:
+        status: In one word.
+        findings: Why: doubts, those that settle it first, what is needed and met, then notes.
+        good_for_mm: The least need that it would be good for [mm]; None where something is
+            unexplained, and it is good for none.
+    """
+
+    status: VerdictStatus
+    findings: tuple[Finding, ...] = ()
+    good_for_mm: float | None = None
+
+    @classmethod
+    def of(cls, status: VerdictStatus, *sentences: str) -> Self:
+        """A verdict with sentences that no test is behind."""
+        return cls(status, remarks(sentences))
+
+    @classmethod
+    def by(cls, doubts: Sequence[Finding], praise: Finding) -> Self:
+        """`bad` with a doubt that settles it, `check` with others, else `good` with its praise."""
+        if not doubts:
+            return cls("good", (praise,))
+        status: VerdictStatus = "bad" if any(it.is_fatal for it in doubts) else "check"
+        return cls(status, tuple(sorted(doubts, key=lambda it: not it.is_fatal)))
+
+    def noting(self, sentences: Iterable[str]) -> Self:
+        """The same verdict with notes."""
+        return replace(self, findings=(*self.findings, *remarks(sentences, NOTE)))
+
+    @property
+    def headline(self) -> str:
+        """The verdict in a few words."""
+        return _HEADLINES[self.status]
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """All findings in sentences, with what to do about them."""
+        return tuple(it.reason for it in self.findings)
+
+    @property
+    def causes(self) -> tuple[Finding, ...]:
+        """What may be why it is not good, likeliest first."""
+        found = (it for it in self.findings if it.probability)
+        return tuple(sorted(found, key=lambda it: -it.probability))
+
+    @property
+    def ranked(self) -> tuple[Finding, ...]:
+        """All findings as people read them: the likeliest cause, what it costs, then the rest."""
+        causes = [it for it in self.causes if it.probability >= _LEAST_LIKELY]
+        costs = [it for kind in _SIZES for it in self.findings if it.kind == kind]
+        ordered = [*causes[:1], *costs[:1], *causes[1:], *self.findings]
+        return tuple({id(it): it for it in ordered}.values())
+
+    @property
+    def top(self) -> tuple[str, ...]:
+        """What is read first, in sentences."""
+        return tuple(map(self._line, self.ranked[:_SHOWN]))
+
+    @property
+    def rest(self) -> tuple[str, ...]:
+        """All else, in sentences."""
+        return tuple(map(self._line, self.ranked[_SHOWN:]))
+
+    def _line(self, finding: Finding) -> str:
+        likely = f"({percent(finding.probability)})"
+        how = "Most likely" if finding in self.causes[:1] else "Possibly"
+        begin = f"{how} {likely}: " if finding.probability >= _LEAST_LIKELY else ""
+        return f"{begin}{finding.words} {finding.without_it}".strip()
+
+    @property
+    def next_steps(self) -> tuple[Step, ...]:
+        """What to do about the findings, in their order; each once."""
+        steps = (it.do for it in self.ranked if it.do is not None)
+        return tuple(dict.fromkeys(steps))[:_SHOWN]
+
+    def with_paths(self, session: Path | str, out: Path | str = "") -> Self:
+        """Fills the paths of a run into the commands of its steps.
+
+        Args:
+            session: The session's folder or recording.
+            out: The folder of its result; empty leaves it open.
+        """
+
+        def filled(it: Finding) -> Finding:
+            if it.do is None:
+                return it
+            return replace(it, do=replace(it.do, command=with_paths(it.do.command, session, out)))
+
+        return replace(self, findings=tuple(map(filled, self.findings)))
+
+
+def with_paths(command: str, session: Path | str, out: Path | str = "") -> str:
+    """Fills the paths of a run into a command; see `Verdict.with_paths`."""
+    folder = Path(session)
+    fixed = f"{folder.with_suffix('') if folder.is_file() else folder}-fixed"
+    paths = {"SESSION": str(session), "FIXED": fixed, "OUT": str(out) or "OUT"}
+    return _PATH.sub(lambda found: shlex.quote(paths[found[0]]), command)
