@@ -100,7 +100,7 @@ def _of_calibration(result) -> Answer:
     words = {
         "unused": [it.view for it in result.views if not it.used],
         "status": result.verdict.status,
-        "doubts": len(result.verdict.reasons),
+        "findings": sorted(it.kind for it in result.verdict.findings),
         "level": stages.get("kinematics", {}).get("level", ""),
         "stages": sorted(stages),
     }

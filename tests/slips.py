@@ -83,11 +83,14 @@ class Identifiability:
             known = self.seen()
         except VisioncalError as error:
             return f"error: {error}"
-        return " ".join((*known.warnings, *known.notes, *known.reasons.values()))
+        return " ".join(
+            (*(it.reason for it in known.warnings), *known.notes, *known.reasons.values())
+        )
 
     def hinted(self) -> str:
         """What the guess says of the poses that the joints lead to."""
-        return reading_hint(self.seen())
+        hint = reading_hint(self.seen())
+        return hint.reason if hint else ""
 
 
 Plant = Callable[[Identifiability, np.random.Generator], Identifiability]

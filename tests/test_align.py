@@ -544,7 +544,7 @@ def test_joints_of_one_robot_are_held_against_what_the_cameras_see(clean):
     moved = with_elbow_of_b(session, lambda it: it | {"q3_rad": it["q3_rad"] + 0.2})
     found = align(moved, corners=corners)
     (words,) = [it for it in found.verdict.reasons if "elbow_joint" in it]
-    assert words.startswith("Robot b: the joint angles do not belong to ur5e as they are told.")
+    assert words.startswith("Robot b: the joint angles do not belong to ur5e as they are declared.")
     assert "moved by -11.4" in words
     _, squared = off(cell, found, "base_a", "base_b")
     # Chi-square of 6 beyond 22 is 0.1 %.

@@ -118,7 +118,7 @@ def test_a_bent_board_is_noticed_and_costs_nothing(given):
         for seed in range(4):
             options = replace(FINE, state_intrinsics=given, seed=seed, board_bow_m=bow_m)
             known = calibrated(simulate(options))
-            assert any("not flat" in it for it in known.warnings) == (bow_m > 0.0)
+            assert any("not flat" in it.reason for it in known.warnings) == (bow_m > 0.0)
             kept.append(error_of(simulate(options), known)[:6])
     flat, bent = (np.sqrt(np.mean(np.square(it), axis=0)) for it in errors.values())
     lengths = [np.linalg.norm(it[part]) for it in (flat, bent) for part in (slice(3), slice(3, 6))]
@@ -227,7 +227,7 @@ def test_given_intrinsics_that_do_not_fit_are_refined_or_held_as_asked():
     wrong = replace(cell.options.camera, matrix=cell.options.camera.matrix + off)
     told = replace(cell, stated_camera=wrong)
     known = calibrated(told)
-    assert any("given intrinsics do not fit" in it for it in known.warnings)
+    assert any("given intrinsics do not fit" in it.reason for it in known.warnings)
     refined = known.fitted.looks.camera("cam")
     lens = known.fitted.columns_of(known.fitted.looks.lens_of("cam"))
     sigma = np.sqrt(np.diag(known.solved.covariance))[lens[:4]]
@@ -249,4 +249,6 @@ def test_too_few_corners_leave_the_lens_alone():
     session = replace(known_of(cell).session, document=document | {"camera": camera})
     known = calibrated(cell, session=session)
     assert not lens_is_free(known)
-    assert any('"refine" was not done: 60 corners in 15 views' in it for it in known.warnings)
+    assert any(
+        '"refine" was not done: 60 corners in 15 views' in it.reason for it in known.warnings
+    )

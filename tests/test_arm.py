@@ -57,7 +57,7 @@ def test_a_wrong_arm_is_noticed_and_counts_in_the_covariance(mount, joints):
         # A scale of thirty to fifty random effects: its own sigma is some 15 %, and another basis
         # than the arm's own makes it another number.
         assert 4e-4 < known.robot_arm.errors.sigma < 3e-3
-        told = known.notes if joints else known.warnings
+        told = known.notes if joints else [it.words for it in known.warnings]
         assert any(("was calibrated" if joints else "arm's posture") in it for it in told)
         error, covariance = error_of(cell, known), known.solved.covariance[:12, :12]
         surprises.append(error @ np.linalg.solve(covariance, error) / 12)

@@ -231,7 +231,7 @@ def test_views_in_motion_are_left_out_where_nothing_tells_the_offset():
     assert sorted(it.view for it in clocked.rejections) == list(range(14, 20))
     assert all("taken in motion" in it.reason for it in clocked.rejections)
     assert [view.number for view in clocked.views] == list(range(14))
-    assert "6 views that were taken in motion are left out" in clocked.warnings[0]
+    assert "6 views that were taken in motion are left out" in clocked.warnings[0].words
 
 
 def screwed(noise: float = 1e-4) -> Session:
@@ -301,7 +301,7 @@ def test_a_stated_offset_stands_where_motion_does_not_tell_it():
     even = stating(screwed(), 0.02)
     clocked = clocked_of(even)
     assert (clocked.clock.method, clocked.clock.sigma_s) == ("stated", 1e-3)
-    assert "is taken as stated, +20 ms, to 1 ms" in clocked.warnings[0]
+    assert "is taken as stated, +20 ms, to 1 ms" in clocked.warnings[0].words
     view = clocked.views[0]
     way = np.array([0.05, 0.1, 0.2, 0.01, 0.02, 0.005])
     there = exp((view.stamp_s - 0.02) * way)

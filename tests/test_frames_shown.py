@@ -70,7 +70,7 @@ def of_tool(page: Page) -> str:
 
 def test_frames_have_their_verdict_pose_and_origin(page):
     words = of_tool(page)
-    assert re.search(r"flange_from_tool \S+ Check: usable once", words)
+    assert re.search(r"flange_from_tool \S+ Check before use", words)
     assert f"Touch {WRONG_TOUCH} is not used: {WRONG_REASON}. Repeat it." in words
     assert "The pose of the tool in the frame of the flange." in words
     for value in FLANGE_FROM_TOOL.as_matrix().ravel():

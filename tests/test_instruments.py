@@ -214,7 +214,7 @@ def test_an_instrument_that_sinks_is_told(options):
         sunk[2, 3] -= 5e-4 * stop / 29
         rows.append((stop, point, sunk))
     known = known_of(session_of(replace(shop, rows=tuple(rows))), level="hand-eye")
-    told = [it for it in known.warnings if "drift with time" in it]
+    told = [it.words for it in known.warnings if it.kind == "moved_slowly"]
     assert len(told) == 1
     moved = float(told[0].split("moved by ")[1].split(" mm")[0])
     # Told to some 15 %: the arm repeats to 0.03 mm.
@@ -249,7 +249,7 @@ def test_measured_poses_of_a_target_come_before_readings():
     known = known_of(both)
     assert both.mount == "eye-to-hand"
     assert known.readings is None
-    assert any("30 rows have an instrument's readings" in it for it in known.warnings)
+    assert any("30 rows have an instrument's readings" in it.reason for it in known.warnings)
 
 
 def edited(session: Session, column: str, change) -> Session:

@@ -57,7 +57,7 @@ def test_a_creeping_base_is_noticed_and_its_way_told(mount):
         found = of_fit(drift, result)
         # A turn of the base by its sigma of some 0.1 mrad moves the place of work by 0.1 mm.
         assert found.moved_m == pytest.approx(3e-4, abs=2.5e-4)
-        assert any("drift with time" in it for it in known.warnings)
+        assert any("drift with time" in it.reason for it in known.warnings)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
@@ -110,7 +110,7 @@ def test_stops_that_err_in_groups_are_noticed():
     stated = result_of(known).stages["uncertainty"]["inflation"]
     assert stated == pytest.approx(found.factor, rel=1e-9)
     assert found.factor > 1.5
-    assert any("Neighbouring stops err alike" in it for it in known.warnings)
+    assert any("Neighbouring stops err alike" in it.reason for it in known.warnings)
 
 
 @pytest.mark.slow

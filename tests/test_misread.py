@@ -179,7 +179,7 @@ def test_zeros_that_differ_between_poses_and_joints_are_named():
     matched = match_joints(session.views, load_robot("ur5e"))
     assert matched.zero.zeros == pytest.approx(off, abs=1e-4)  # the search stops at 1e-6 rad
     assert matched.arm.base_from_flange(told.joints - off) == pytest.approx(told.poses, abs=1e-4)
-    assert "moved by 10.00 deg" in matched.warnings[0]
+    assert "moved by 10.00 deg" in matched.warnings[0].reason
 
 
 def test_one_row_of_wrong_joints_costs_its_view_alone():

@@ -66,16 +66,16 @@ def test_rows_of_one_stop_may_be_read_anew():
 def test_one_row_whose_pose_and_joints_disagree_is_named():
     poses = CELL.base_from_flange.copy()
     poses[5] = poses[5] @ exp(0.3 * SIDEWAYS)
-    (sentence,) = reported_poses(session(poses, CELL.joints), ROBOT).warnings
-    assert sentence.startswith(
+    (found,) = reported_poses(session(poses, CELL.joints), ROBOT).warnings
+    assert found.views == (5,)
+    assert found.words.startswith(
         "Pose and joint angles disagree in view 5, by up to 300 mm and under 0.001 deg"
     )
 
 
 def test_joints_of_another_robot_are_noticed_whatever_single_rows_say():
-    (sentence,) = reported_poses(
-        session(CELL.base_from_flange, CELL.joints), load_robot("ur5e")
-    ).warnings
+    stated = session(CELL.base_from_flange, CELL.joints)
+    (sentence,) = (it.reason for it in reported_poses(stated, load_robot("ur5e")).warnings)
     assert sentence.startswith("The joint angles were not used: they are misread.")
     assert "With the arm a ur10e and not a ur5e" in sentence
     assert 'Write [robot] model = "ur10e" into session.toml.' in sentence

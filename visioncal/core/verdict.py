@@ -28,7 +28,8 @@ _HEADLINES = {
 }
 # Commands of steps.
 CALIBRATE, PLAN = "visioncal calibrate SESSION -o OUT", "visioncal plan SESSION --add 5"
-GUESS = "visioncal convert SESSION FIXED --guess"
+GUESS = "visioncal convert SESSION FIXED --guess --yes"
+REVIEW = "visioncal review OUT"
 _PATH = re.compile(r"\b(SESSION|FIXED|OUT)\b")
 
 

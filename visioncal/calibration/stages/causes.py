@@ -20,7 +20,7 @@ from scipy.special import chdtrc
 
 from visioncal.calibration.stages.need import GOOD, Picks
 from visioncal.core.number_format import figure, percent
-from visioncal.core.verdict import GUESS, PLAN, Finding, Step, Verdict
+from visioncal.core.verdict import CALIBRATE, GUESS, PLAN, REVIEW, Finding, Step, Verdict
 from visioncal.results import NeedMet
 
 # The limits of tests that are passed by chance: none is behind the first, the last is a fact.
@@ -63,7 +63,9 @@ EVIDENCE: Mapping[str, Evidence] = {
     "misread_joints": Evidence(1e-3),
     "unexplained": Evidence(_REMARK, _CHAIN),
 }
-TRY_READINGS = Step("Try other conventions of the poses, then look at the worst views.", GUESS)
+LOOK = Step(
+    "Look at the worst views: does each pose belong to its image, did anything move?", REVIEW
+)
 
 
 def adding(words: str, *, modelled: bool, purpose: str = "") -> Step:
@@ -86,7 +88,10 @@ def read_otherwise(sentence: str) -> Finding:
     Args:
         sentence: How they are better read.
     """
-    step = Step("Write a copy of the session that is read so, and calibrate it.", GUESS)
+    again = CALIBRATE.replace("SESSION", "FIXED")
+    step = Step(
+        "Write a copy of the session that is read so, and calibrate it.", f"{GUESS} && {again}"
+    )
     return Finding("misread_poses", sentence, step)
 
 
@@ -191,7 +196,7 @@ _SOURCES: Mapping[str, tuple[str, str, Step | None]] = {
     "left out": (
         "unexplained",
         "what left-out views err by beyond what is predicted",
-        TRY_READINGS,
+        LOOK,
     ),
 }
 

@@ -5,14 +5,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.calibration.stages.causes import TRY_READINGS, adding, ranked
+from visioncal.calibration.stages.causes import LOOK, adding, ranked
 from visioncal.calibration.stages.need import CHECK, GOOD, Picks, need_met
 from visioncal.core.number_format import figure, percent
 from visioncal.core.types import Mount, Need, Rejection
 from visioncal.core.verdict import (
     AGREEMENT,
     GOOD_FOR,
-    GUESS,
     NEED,
     NOTE,
     Finding,
@@ -395,7 +394,7 @@ def _pair_doubts(findings: Findings, limits: Limits) -> Iterator[Finding]:
             f"Left out of the fit, views disagree with the others by "
             f"{', '.join(words)}, rms; the worst are {named}. Possible causes: "
             f"{_CAUSES[findings.mount]}, or an arm with large model errors.",
-            TRY_READINGS,
+            LOOK,
             tuple(it.view for it in worst),
             is_fatal=is_fatal,
             until_mm=0.0,
@@ -655,8 +654,7 @@ def _robot_doubts(findings: Findings, limits: Limits) -> Iterator[Finding]:
                     "the board is of another size than stated, or warped, the intrinsics are not "
                     "this camera's, or the arm's model is off by as much.",
                     Step(
-                        "Measure the board over many squares first, then try other conventions.",
-                        GUESS,
+                        "Measure the board over many squares; check the lens and the arm's model."
                     ),
                 )
             )
