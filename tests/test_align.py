@@ -231,8 +231,9 @@ def test_a_lens_that_is_stated_wrong_is_refined_or_kept_as_asked(clean, mode):
     assert budget["held_values"] > 0.9 * budget["total"]
 
 
-def test_lenses_that_the_views_do_not_determine_are_refused():
-    cell = simulate_network(NetworkOptions(stops=6, pixel_sigma_px=1.0))
+@pytest.mark.parametrize("pixel_px", [0.1, 1.0])
+def test_noise_of_corners_refuses_no_lens(pixel_px):
+    cell = simulate_network(NetworkOptions(stops=6, pixel_sigma_px=pixel_px))
     session = network_session(cell, "cell", seen="names")
     given = ("matrix", "distortion", "matrix_sigma_px")
     cameras = {
@@ -240,9 +241,9 @@ def test_lenses_that_the_views_do_not_determine_are_refused():
         for name, table in session.document["cameras"].items()
     }
     session = replace(session, document={**session.document, "cameras": cameras})
-    with pytest.raises(DegenerateError, match="do not determine lens and board") as refused:
-        align(session, corners={it.view: it for it in cell.corners})
-    assert refused.value.next_step.startswith("Give matrix and distortion")
+    found = align(session, corners={it.view: it for it in cell.corners})
+    # The same stops: at 1 px a camera's place is open by 7 mm, which nobody can use.
+    assert (found.verdict.status == "bad") == (pixel_px == 1.0)
 
 
 def test_cameras_in_the_hand_and_poses_that_are_given():

@@ -183,11 +183,13 @@ def test_one_view_places_a_board():
     assert np.isfinite(known.findings.held_out.mm)
 
 
-def test_a_board_that_is_told_too_badly_is_refused():
+def test_noise_that_the_data_show_refuses_no_board():
     cell = simulate(replace(TWO, pixel_sigma_px=0.5, robot_sigma_m=7e-3, seed=7))
     further = np.flatnonzero(cell.shown.boards == 1)
-    with pytest.raises(DegenerateError, match=r"target second.* has a predicted sigma"):
-        calibrated(without(cell, set(further[1:].tolist())), joints=False)
+    known = calibrated(without(cell, set(further[1:].tolist())), joints=False)
+    # One view by a flange that errs by 7 mm an axis; the geometry is that of an ordinary cell.
+    assert result_of(known).edges["base_from_target_second"].sigma_mm > 10.0
+    assert known.verdict.status == "bad"
 
 
 def test_a_board_that_is_never_seen_is_told():

@@ -297,6 +297,28 @@ def test_healthy_motion_is_never_refused_small_tilts_included():
         assert np.all(np.abs(log(invert(x) @ result.state.edges[0])) < 5.5 * sigma[:6])
 
 
+def test_noise_that_the_data_show_refuses_nothing():
+    # Rows that are exchanged, another convention, wrong images: what disagrees is looked for and
+    # named, and judged; the stops themselves are sound.
+    for seed in range(20):
+        x, z = some_edges(seed)
+        motion = some_motion(12, seed, np.deg2rad(5.0))
+        result = solved(made_up(motion, x, z, Noise.of_robot(np.deg2rad(3.0), 2e-2), seed=seed))
+        assert max(it.sigma / it.limit for it in result.worst) > 2.0
+
+
+def test_small_tilts_are_refused_at_a_typical_noise():
+    # Of 0.05 deg an axis and tilts of 0.1 deg over 12 stops, the offset along the axis hangs on a
+    # lever of some hundred millimetres: centimetres.
+    for seed in range(20):
+        x, z = some_edges(seed)
+        data = made_up(
+            one_axis(12, seed, np.deg2rad(0.1)), x, z, Noise.of_robot(np.deg2rad(0.05), 1e-4)
+        )
+        with pytest.raises(DegenerateError, match=r"predicted sigma of .* at a typical noise"):
+            solved(data)
+
+
 def test_weak_motion_is_answered_and_its_direction_told():
     x, z = some_edges(3)
     # Turns mostly about one axis: the offset along it hangs on tilts of two degrees.

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,8 +19,11 @@ from visioncal.estimation.solve import fisher_information
 
 # Under this scaled eigenvalue ratio a direction is not determined by the motion at all.
 _NULL_RATIO = 1e-8
-# Over these predicted sigmas a result is of no use to anybody.
+# Over these predicted sigmas at a typical noise, stops are too poor to calibrate with.
 SIGMA_LIMIT_M, SIGMA_LIMIT_RAD = 5e-3, float(np.deg2rad(0.5))
+# Of most robots and corners, per axis. What data show beyond is no fault of the motion: exchanged
+# rows, another convention, wrong images. It is looked for, named, and judged by the verdict.
+TYPICAL_NOISE, TYPICAL_PX = Noise.of_robot(float(np.deg2rad(0.05)), 1e-4), 0.2
 # A direction this close to an axis is called by the axis.
 _NEARLY_AXIS = 0.95
 FEWEST_VIEWS = 3
@@ -69,25 +73,30 @@ def title(mount: Mount) -> str:
 
 
 def check_observability(
-    problem: Problem, state: State, noise: Noise, mount: Mount, *, looks: bool = False
+    problem: Problem,
+    state: State,
+    noise: Noise,
+    mount: Mount,
+    pixel_px: Mapping[str, float] = MappingProxyType({}),
+    *,
+    looks: bool = False,
 ) -> None:
     """Refuses motion that leaves a direction open.
 
-    Views that disagree wildly are no fault of the motion: poses in other units, of other images or
-    through a wrong lens leave residuals that no motion could average out. The motion is judged by a
-    noise of at most the limits themselves; what is beyond is the verdict's business.
+    The motion is judged by its geometry, at a noise of at most `TYPICAL_NOISE` and `TYPICAL_PX`.
 
     Args:
         problem: What the used views measured.
         state: The answer.
         noise: Of the residuals.
         mount: Where the camera is.
+        pixel_px: By camera, the noise of a corner's coordinate that its poses are known to [px].
         looks: Whether the first effect has to be determined, too: lens and board, or points.
 
     Raises:
         DegenerateError: A direction is numerically null, or its predicted sigma is over the limit.
     """
-    check_determined(problem, state, noise, _scene(problem, mount), looks=looks)
+    check_determined(problem, state, noise, _scene(problem, mount), pixel_px, looks=looks)
 
 
 @dataclass(frozen=True)
@@ -111,7 +120,13 @@ class Scene:
 
 
 def check_determined(
-    problem: Problem, state: State, noise: Noise, scene: Scene, *, looks: bool = False
+    problem: Problem,
+    state: State,
+    noise: Noise,
+    scene: Scene,
+    pixel_px: Mapping[str, float] = MappingProxyType({}),
+    *,
+    looks: bool = False,
 ) -> None:
     """Refuses motion that leaves a direction of an unknown frame open.
 
@@ -120,11 +135,13 @@ def check_determined(
         state: The answer.
         noise: Of the residuals; see `check_observability`.
         scene: The words.
+        pixel_px: As there.
         looks: Whether the first effect has to be determined, too.
 
     Raises:
         DegenerateError: A direction is numerically null, or its predicted sigma is over the limit.
     """
+    problem, noise = _at_typical_noise(problem, noise, pixel_px)
     _refuse_open(problem.with_effects(()), State(state.edges, np.zeros(0)), noise, scene)
     if looks and problem.effects:
         cause, advice = scene.untold
@@ -134,6 +151,25 @@ def check_determined(
             noise,
             replace(scene, motion=lambda _: cause, advice=lambda *_: advice),
         )
+
+
+def _at_typical_noise(
+    problem: Problem, noise: Noise, pixel_px: Mapping[str, float]
+) -> tuple[Problem, Noise]:
+    """The same observations at a noise that is typical, where these data show a larger one."""
+    shares = {name: min(1.0, TYPICAL_PX / px) for name, px in pixel_px.items()}
+    seen, least = problem.observations, min(shares.values(), default=1.0)
+    by_row = np.array([shares.get(it, 1.0) for it in seen.observers])[:, None, None]
+    typical = replace(
+        problem,
+        observations=replace(seen, covariance=by_row**2 * seen.covariance),
+        effects=tuple(
+            replace(it, known=replace(it.known, information=it.known.information / least**2))
+            for it in problem.effects
+        ),
+    )
+    robots = np.minimum(noise.robots, TYPICAL_NOISE.robots)
+    return typical, Noise(robots, np.minimum(noise.sensors, 1.0))
 
 
 def _refuse_open(problem: Problem, state: State, noise: Noise, scene: Scene) -> None:
@@ -156,9 +192,7 @@ def _refuse_open(problem: Problem, state: State, noise: Noise, scene: Scene) -> 
 
 def _refuse_vague(problem: Problem, state: State, noise: Noise, scene: Scene) -> None:
     """Refuses frames whose predicted sigmas are over the limit."""
-    most = np.array([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M])
-    plausible = replace(noise, robots=np.minimum(noise.robots, most))
-    covariance = covariance_among(fisher_information(problem, state, plausible), problem.counted)
+    covariance = covariance_among(fisher_information(problem, state, noise), problem.counted)
     beyond = [
         (frame, it)
         for frame in problem.unknown
@@ -168,7 +202,8 @@ def _refuse_vague(problem: Problem, state: State, noise: Noise, scene: Scene) ->
     if beyond:
         frame, worst = beyond[0]
         raise DegenerateError(
-            f"{scene.title}: {worst.words} has a predicted sigma of {worst.figure}: "
+            f"{scene.title}: {worst.words} has a predicted sigma of {worst.figure} at a typical "
+            f"noise: "
             f"{scene.motion(frame)}.",
             culprits=[it.words for _, it in beyond],
             next_step=scene.advice(frame, ""),

@@ -29,7 +29,7 @@ _ROUNDS, _SETTLED = 20, 1e-10
 # Noise levels that change by less have settled, far below what is known of them.
 _LEVELS_SETTLED = 1e-3
 # Arms and cameras err by some 0.6 mm for each mrad, give or take a factor of five.
-RATIO_PRIOR = RatioPrior(ratio=0.6, covariance=1.5)
+RATIO_PRIOR = RatioPrior(ratio=0.6, log_sigma=1.5)
 # Robots' noise levels are started from above: at least here [rad and m].
 _START_SIGMA = 5e-4
 # Where they are sought again, it is from so much above where they were.

@@ -56,12 +56,12 @@ class RatioPrior:
 
     Attributes:
         ratio: The second over the first, typically.
-        covariance: Standard deviation of the ratio's logarithm.
+        log_sigma: Standard deviation of the ratio's logarithm.
         places: Which two sigmas these are; of several pairs, all of them.
     """
 
     ratio: float
-    covariance: float
+    log_sigma: float
     places: tuple[tuple[int, int], ...] = ((0, 1),)
 
 
@@ -219,8 +219,8 @@ def _likelihood(
         return _Likelihood(value, slope, curvature)
     lean = np.zeros((len(prior.places), len(logs)))
     for row, (first, second) in zip(lean, prior.places, strict=True):
-        row[first], row[second] = -1.0 / prior.covariance, 1.0 / prior.covariance
-    offset = lean @ logs - np.log(prior.ratio) / prior.covariance
+        row[first], row[second] = -1.0 / prior.log_sigma, 1.0 / prior.log_sigma
+    offset = lean @ logs - np.log(prior.ratio) / prior.log_sigma
     return _Likelihood(
         value + 0.5 * float(offset @ offset), slope + offset @ lean, curvature + lean.T @ lean
     )

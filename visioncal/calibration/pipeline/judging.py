@@ -225,9 +225,11 @@ def check_answer(known: RunState) -> None:
     """
     agreed, cell = known.fitted.agreed, known.fitted.cell
     part, fit = known.fitted.part, agreed.fit
-    looks = known.fitted.seen is not None and any(it.estimated for it in known.scenes.values())
+    seen = known.fitted.seen
+    looks = seen is not None and any(it.estimated for it in known.scenes.values())
+    pixel_px = {} if seen is None else dict(zip(seen.looks.problems, seen.sigmas_px, strict=True))
     if known.mount is not None:
-        check_observability(part, fit.state, fit.noise, known.mount, looks=looks)
+        check_observability(part, fit.state, fit.noise, known.mount, pixel_px, looks=looks)
         return
     names = {it: _names(part.tree, it) for it in part.unknown}
     lost = agreed.problem.subset(~agreed.used)
@@ -246,7 +248,7 @@ def check_answer(known: RunState) -> None:
         )
 
     scene = Scene("align", names, motion, advice)
-    check_determined(part, fit.state, fit.noise, scene, looks=looks)
+    check_determined(part, fit.state, fit.noise, scene, pixel_px, looks=looks)
 
 
 def _names(tree: Tree, frame: str) -> tuple[str, str]:
