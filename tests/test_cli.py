@@ -95,12 +95,41 @@ def test_a_message_leaves_out_the_middle_of_what_nobody_reads():
 def test_an_error_as_json_has_its_parts(poor, tmp_path):
     done = visioncal("calibrate", poor, "-o", tmp_path / "out", "--json")
     assert done.status == 2
-    error = json.loads(done.out)["error"]
-    assert set(error) == {"class", "message", "culprits", "next"}
+    error = json.loads(done.err)["error"]
     assert error["class"] == "DegenerateError"
     assert error["culprits"]
     assert "Add 3 or more views" in error["next"]
     assert not (tmp_path / "out").exists()
+
+
+# Options that each command with --json needs before it can look for its input.
+NEEDED = {
+    "correct": ["-c", "nowhere"],
+    "diff": ["nowhere"],
+    "dynamics gains": ["--loaded", "nowhere", "--mass-kg", 1, "--com-mm", "0,0,0"],
+    "dynamics payload": ["--against", "nowhere"],
+    "dynamics validate": ["--against", "nowhere"],
+    "locate": ["-c", "nowhere"],
+    "record": ["-o", "new", "--arm", "manual", "--camera", "folder:nowhere", "--target", "no"],
+    "verify": ["--against", "nowhere"],
+}
+
+
+def test_errors_as_json_have_one_form_and_leave_stdout_to_results(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with_json = [name for name, it in every_command() if "as_json" in {p.name for p in it.params}]
+    # It looks at its libraries first, which may not be there.
+    assert len(with_json) == 17
+    for name in with_json:
+        if name == "rehearse":
+            continue
+        source = [] if name == "record" else ["nowhere"]
+        done = visioncal(*name.split(), *source, *NEEDED.get(name, ()), "--json")
+        assert (done.status, done.out) == (2, ""), name
+        error = json.loads(done.err)["error"]
+        assert set(error) == {"class", "message", "culprits", "next"}
+        assert "no" in error["message"]
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
