@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 from cells import calibrated, known_of
-from test_kinematics import WRONG_LINKS, target_in_camera
+from wrong_arms import WRONG_LINKS, target_in_camera
 
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState

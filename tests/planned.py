@@ -7,13 +7,16 @@ from cells import known_of
 
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.core.errors import DegenerateError
-from visioncal.core.transforms import exp
+from visioncal.core.transforms import exp, invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.parts import Noise
-from visioncal.live.planning.cell import PlanCell
+from visioncal.live.planning.cell import Limits, PlanCell
 from visioncal.live.planning.recorded import SoFar
 from visioncal.robot import load_robot
 from visioncal.simulation import Cell, CellOptions, simulate
+from visioncal.simulation.arms import forward, ur_arm
+from visioncal.simulation.boards import Sheet, outline_m
+from visioncal.simulation.optics import sees
 
 
 def plan_cell(options: CellOptions, sigma_rad: float = 0.0, sigma_m: float = 0.0) -> PlanCell:
@@ -58,3 +61,39 @@ def so_far_of(cell: Cell, **changes) -> SoFar:
         except DegenerateError as error:
             return SoFar(known, error.message)
     return SoFar(known)
+
+
+def cell_of(options: CellOptions, **changes) -> PlanCell:
+    """The cell as it is; a floor so low that the board lies on it."""
+    x, z = simulate(replace(options, views=2)).transforms.values()
+    floor_m = min(0.0, z[2, 3] - 0.02) if options.mount == "eye-in-hand" else 0.0
+    cell = PlanCell(
+        mount=options.mount,
+        robot=load_robot(options.robot),
+        camera=options.camera,
+        target=options.target,
+        x=x,
+        z=z,
+        sigma_rad=0.005,
+        sigma_m=0.002,
+        noise=Noise.of_robot(5e-5, 3e-5),
+        pixel_px=0.05,
+        limits=Limits(floor_m=floor_m),
+    )
+    return replace(cell, **changes)
+
+
+def views(cell: PlanCell, q: FloatArray) -> FloatArray:
+    """`cam_from_target` by the simulation's kinematics."""
+    flange = forward(ur_arm(cell.robot.name), q)
+    if cell.mount == "eye-in-hand":
+        return invert(flange @ cell.x) @ cell.z
+    return invert(cell.x) @ flange @ cell.z
+
+
+def whole(cell: PlanCell, q: FloatArray, edge_px: float) -> FloatArray:
+    """Whether the simulation's camera sees the whole print."""
+    outline = outline_m(Sheet(cell.target, 1.0, 0.0), 0.0)
+    seen = views(cell, q)
+    points = outline @ np.swapaxes(seen[:, :3, :3], 1, 2) + seen[:, None, :3, 3]
+    return sees(cell.camera, points, edge_px).all(axis=1)

@@ -12,7 +12,7 @@ from commands import visioncal
 from placed import alone, tool
 from readers import ARM_FORMATS, rx, ry, rz, transform
 from samples import made_up
-from test_robot_models import URDF, of_urdf, some_changes, some_joints
+from urdf_arm import URDF, of_urdf, some_changes, some_joints
 
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp

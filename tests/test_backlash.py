@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cells import calibrated
-from test_elastic import COBOT, SAGGING
-from test_kinematics import GOOD
+from wrong_arms import COBOT, GOOD, SAGGING
 
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.simulation import simulate

@@ -9,7 +9,7 @@ import pytest
 from cells import calibrated
 from commands import visioncal as run
 from commands import write_poses
-from test_kinematics import WRONG_LINKS
+from wrong_arms import WRONG_LINKS
 
 import visioncal
 from visioncal.calibration.pipeline.result import result_of

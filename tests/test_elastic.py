@@ -8,7 +8,7 @@ from bound import compliance_bound
 from cells import calibrated
 from loaded import COMPLIANCE, HUNG, STIFFNESS, STRETCHED, deflection_m, loaded, predicted_m
 from planned import postures_in_view, true_cell
-from test_kinematics import GOOD, WRONG_LINKS, error_m
+from wrong_arms import CARRIED, COBOT, GOOD, SAGGING, WRONG_LINKS, error_m
 
 import visioncal
 from visioncal.calibration.pipeline.result import result_of
@@ -23,19 +23,6 @@ from visioncal.live.planning.purposes import PURPOSES
 from visioncal.results.compensation.correction import correct
 from visioncal.robot import Loads, load_robot
 from visioncal.simulation import CellOptions, Payload, simulate
-
-# A cobot's joints, from the base to the wrist [N m/rad].
-COBOT = np.array([2e4, 1.6e4, 1.2e4, 8e3, 7e3, 6e3])
-SAGGING = replace(
-    WRONG_LINKS,
-    robot="ur10e",
-    views=40,
-    branches=True,
-    roll_rad=np.pi,
-    compliance_rad_per_nm=tuple(1.0 / COBOT),
-    target=replace(WRONG_LINKS.target, square_sigma_m=3e-7),
-)
-CARRIED = (Payload(), Payload(5.0, (0.0, 0.0, 0.1)), Payload(10.0, (0.02, 0.0, 0.1)))
 
 
 @pytest.fixture(scope="module")

@@ -7,53 +7,20 @@ import pytest
 from bound import workspace_bound_m
 from cells import calibrated, error_of, known_of
 from scipy.spatial.transform import Rotation
+from wrong_arms import GOOD, WRONG_LINKS, error_m, target_in_camera
 
 import visioncal
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert, log
+from visioncal.core.types import MOUNTS
 from visioncal.estimation.armpair import ArmPair
 from visioncal.estimation.parts import ROBOT, State
 from visioncal.estimation.workspace import postures
 from visioncal.frames.tcp import touched_tool
 from visioncal.frames.touches import TouchRows
-from visioncal.simulation import CellOptions, fine_camera, forward, simulate
+from visioncal.simulation import forward, simulate
 from visioncal.simulation.arms import inverse
-from visioncal.simulation.boards import centre_m, corners_m
-
-GOOD = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1, robot="ur5e", views=30)
-WRONG_LINKS = replace(GOOD, dh_sigma_m=5e-4, dh_sigma_rad=1e-3)
-MOUNTS = ("eye-in-hand", "eye-to-hand")
-
-
-def target_in_camera(mount, x, z, flange):
-    """(m, 4, 4) where the camera has the target."""
-    return invert(flange @ x) @ z if mount == "eye-in-hand" else invert(x) @ flange @ z
-
-
-def told_frame(sheet):
-    """(4, 4) the frame of a bent sheet as it is told: of the plane that fits its corners best."""
-    x, y, z = corners_m(sheet).T
-    (depth, by_x, by_y), *_ = np.linalg.lstsq(np.column_stack([np.ones_like(x), x, y]), z)
-    return exp(np.array([by_y, -by_x, 0.0, 0.0, 0.0, depth]))
-
-
-def error_m(cell, known, robot):
-    """Root mean square error of what the arm carries, all over the workspace [m].
-
-    Seen from what stands still: the camera's place seen from the target, or that of the target's
-    middle seen from the camera. `robot` may be an `ArmModel`, which bends under its own weight.
-    """
-    q = postures(getattr(robot, "nominal", robot))
-    mount, edges = cell.options.mount, known.solved.state.edges
-    true = target_in_camera(mount, *cell.transforms.values(), cell.flange_at(q))
-    true = true @ told_frame(cell.sheet)
-    ours = target_in_camera(mount, *edges, robot.base_from_flange(q))
-    if mount == "eye-in-hand":
-        away = (invert(true) - invert(ours))[:, :3, 3]
-    else:
-        away = (true - ours)[:, :3] @ [*centre_m(cell.sheet), 1.0]
-    return float(np.sqrt(np.mean(np.sum(away**2, axis=1))))
 
 
 @pytest.mark.slow

@@ -134,7 +134,8 @@ def test_an_interval_is_about_the_level_that_was_found():
         return 2.0 * min((logarithm - np.log(1e-4)) ** 2, (logarithm - np.log(1e-2)) ** 2 - 5.0)
 
     low, high = profile_interval(profile, 1e-4, -10.0)
-    assert low < 1e-4 < high < 1e-3
+    # Chi-square of one is under 3.84 in 95 %: 0.98 in logarithms either way, sought to 0.02.
+    assert np.log([low, high]) == pytest.approx(np.log(1e-4) + np.array([-0.98, 0.98]), abs=0.03)
 
 
 def test_the_size_of_an_arms_errors_is_known_as_well_as_these_are_told():

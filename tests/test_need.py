@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cells import calibrated
-from test_verdict import SOUND, changed, directions
+from sound_findings import SOUND, changed, directions
 
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.stages.judge import judge

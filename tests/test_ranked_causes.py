@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.special import chdtrc
-from test_need import NEED
-from test_verdict import SOUND, changed, directions, left_out
+from sound_findings import SOUND, changed, directions, left_out
 
 from visioncal.calibration.stages.causes import read_otherwise, with_misread
 from visioncal.calibration.stages.fit_messages import scale_found
 from visioncal.calibration.stages.judge import judge
 from visioncal.calibration.stages.need import Picks
+from visioncal.core.types import Need
 from visioncal.core.verdict import CALIBRATE, GUESS, PLAN, Finding, Step, Verdict, with_paths
 from visioncal.estimation.joint import MeasuredScale
 from visioncal.results import Rms
@@ -87,7 +87,7 @@ def test_views_that_are_left_out_are_a_cause(views, cause: str) -> None:
     assert ids(judge(left_out(views)))[0] == cause
 
 
-@pytest.mark.parametrize("need", [None, NEED])
+@pytest.mark.parametrize("need", [None, Need(0.5)])
 def test_errors_that_are_too_large_come_from_their_sources(need) -> None:
     large, small = (np.diag(np.repeat([1e-6, it], 3) ** 2)[None] for it in (4e-4, 3e-4))
     picks = (Picks("cam", "robot", {"calibration": small, "look": large}, np.inf, 0.5),)

@@ -8,7 +8,7 @@ import pytest
 from arms import ERROR_RAD, NOISE, TOOL, arm_data, erring, problem_of
 from cells import calibrated
 from edges import solved
-from test_kinematics import MOUNTS, WRONG_LINKS
+from wrong_arms import WRONG_LINKS
 
 import visioncal
 from visioncal.calibration.pipeline.result import result_of
@@ -16,6 +16,7 @@ from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.arm_identifiability import tell
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert, log
+from visioncal.core.types import MOUNTS
 from visioncal.estimation.indices import Indices
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.parameters import free_parameters, parameter_moves

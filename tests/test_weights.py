@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cells import calibrated
-from test_elastic import CARRIED, COBOT, SAGGING
-from test_kinematics import error_m
+from wrong_arms import CARRIED, COBOT, SAGGING, error_m
 
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.estimation.workspace import postures

@@ -16,7 +16,7 @@ import numpy as np
 import pinocchio as pin
 from cells import calibrated
 from results import few, first, wished, write_section
-from test_kinematics import WRONG_LINKS, target_in_camera
+from wrong_arms import WRONG_LINKS, target_in_camera
 
 import visioncal
 from visioncal.calibration.pipeline.result import result_of

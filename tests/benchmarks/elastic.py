@@ -16,7 +16,7 @@ from bound import compliance_bound, workspace_bound_m
 from cells import calibrated
 from loaded import COMPLIANCE, HUNG, STIFFNESS, STRETCHED, deflection_m, loaded, predicted_m
 from results import WORDS, few, first, wished, write_section
-from test_kinematics import WRONG_LINKS, error_m
+from wrong_arms import WRONG_LINKS, error_m
 
 from visioncal.calibration.stages.elastic import deflection_words
 from visioncal.estimation.workspace import postures

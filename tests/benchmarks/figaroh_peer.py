@@ -17,7 +17,7 @@ from typing import TypeAlias
 import numpy as np
 from cells import calibrated
 from results import few, first, need, wished, write_section
-from test_kinematics import WRONG_LINKS, target_in_camera
+from wrong_arms import WRONG_LINKS, target_in_camera
 
 import visioncal
 from visioncal.core.threads import one_blas_thread

@@ -17,7 +17,7 @@ import numpy as np
 from bound import workspace_bound_m
 from cells import calibrated, known_of
 from results import first, wished, write_section
-from test_kinematics import WRONG_LINKS, error_m
+from wrong_arms import WRONG_LINKS, error_m
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES

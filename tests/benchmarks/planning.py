@@ -13,10 +13,9 @@ from multiprocessing import Pool
 
 import numpy as np
 from cells import calibrated, error_of
-from planned import plan_cell, so_far_of, true_cell
+from planned import cell_of, plan_cell, so_far_of, true_cell, whole
 from results import few, first, wished, write_section
-from test_candidates import cell_of, whole
-from test_kinematics import WRONG_LINKS, error_m
+from wrong_arms import WRONG_LINKS, error_m
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.errors import DataError

@@ -1,0 +1,53 @@
+"""What a verdict is made of, with nothing to doubt, and changes of it."""
+
+from dataclasses import replace
+
+from visioncal.calibration.stages.judge import Arm, Findings, Pair, Place, Sensor
+from visioncal.core.types import Rejection
+from visioncal.estimation.observability import Direction
+from visioncal.results import Rms, ViewResult
+
+
+def directions(*sigmas):
+    return tuple(
+        Direction(f"the direction {at}", sigma, 5e-3, is_rotation=bool(at % 2))
+        for at, sigma in enumerate(sigmas)
+    )
+
+
+def views(count=20, **odd):
+    """Views with like residuals, but for view 7 where `odd` says so."""
+    plain = [ViewResult(at, True, "", 40, 0.1, 0.1, 0.01) for at in range(count)]
+    return tuple(replace(view, **odd) if view.view == 7 else view for view in plain)
+
+
+PAIR = Pair(views(), Rms(0.1, 0.01, 0.1), Rms(0.11, 0.011, 0.12))
+SENSOR = Sensor(20, pixel_px=0.05)
+ARM = Arm(20, 0.1, 0.0057)
+SOUND = Findings(
+    (PAIR,),
+    (SENSOR,),
+    (ARM,),
+    directions(1e-4, 1e-4, 1e-4, 1e-4),
+    (Place("Where the views look, a point", {"pixels": 0.05, "robot": 0.03, "total": 0.06}, 0.1),),
+)
+PARTS = {"pairs": PAIR, "sensors": SENSOR, "arms": ARM}
+
+
+def changed(findings, **changes):
+    """Findings with other values of their only pair, sensor and arm, or of their own."""
+    for name, part in PARTS.items():
+        mine = {it: changes.pop(it) for it in list(changes) if hasattr(part, it)}
+        if mine:
+            (now,) = getattr(findings, name)
+            changes[name] = (replace(now, **mine),)
+    return replace(findings, **changes)
+
+
+def left_out(numbers, count=20):
+    """Findings of views of which some disagree with the others."""
+    seen = [replace(it, used=it.view not in numbers) for it in views(count)]
+    out = [Rejection(at, f"disagrees with the other views: view {at}'s figures") for at in numbers]
+    pair = replace(PAIR, views=seen, disagreeing=out)
+    sensor = replace(SENSOR, used=count - len(out), lost=out, disagreeing=[*numbers])
+    return replace(SOUND, pairs=(pair,), sensors=(sensor,))
