@@ -377,8 +377,8 @@ def main(seeds: int, few: int) -> None:
 cameras of 2448 x 2048 (5 MP) and 1280 x 800 (1.0 MP). A good robot errs by 0.03 mm and 0.05 mrad a
 stop, a coarse one by 0.3 mm and 0.5 mrad. Errors are of the camera's transform, root mean square;
 the bound is Cramer and Rao's with the board as stated. The squared error over the stated covariance
-of both edges, per degree of freedom, is 1 where the covariance tells the truth; the board's scale
-is exact here and counts as known to 0.1 %, which makes it 11/12. OpenCV's best is the best of seven
+of both edges, per degree of freedom, is 1 where the covariance is right; the board's scale is exact
+here and counts as known to 0.1 %, which makes it 11/12. OpenCV's best is the best of seven
 methods for each figure, from poses by solvePnP or calibrateCamera.
 
 {seeds} seeds a row:

@@ -170,7 +170,7 @@ def report(cells: Sequence[Clean], faults: Sequence[Faulty], four_s: float) -> s
         [
             f"{len(cells)} cells of two robots, two fixed cameras and three boards, {STOPS} stops;",
             "base b in base a, root mean square error over the bound, and the error over its own",
-            "covariance (1 where that is honest).",
+            "covariance (1 where that is right).",
             "",
             "| place | rotation | NEES of base b | NEES of all frames |",
             "| ---: | ---: | ---: | ---: |",
