@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from cells import calibrated, session_of
 from commands import visioncal
+from marks import slow
 
 from visioncal.calibration.pipeline import align, calibrate
 from visioncal.core.errors import DataError, DegenerateError
@@ -200,7 +201,7 @@ def test_lenses_come_from_images_of_their_own():
     assert len(found.sights) == len(cell.sights) - 24
 
 
-@pytest.mark.parametrize("mode", ["auto", pytest.param("hold", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("mode", ["auto", slow("hold")])
 def test_a_lens_that_is_stated_wrong_is_refined_or_kept_as_asked(clean, mode):
     cell, right = clean
     session = network_session(cell, "cell", seen="names")

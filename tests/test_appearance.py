@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cells import calibrated, error_of, known_of
+from marks import slow
 from scipy.stats import chi2
 
 from visioncal.core.transforms import invert, log
@@ -96,7 +97,7 @@ def test_the_corners_alone_do_not_tell_the_size():
 
 @pytest.mark.parametrize(
     "given",
-    [True, pytest.param(False, marks=pytest.mark.slow)],
+    [True, slow(False)],
     ids=["lens given", "lens estimated"],
 )
 def test_a_flat_board_of_the_stated_size_stays_so(given):
@@ -109,7 +110,7 @@ def test_a_flat_board_of_the_stated_size_stays_so(given):
 
 @pytest.mark.parametrize(
     "given",
-    [True, pytest.param(False, marks=pytest.mark.slow)],
+    [True, slow(False)],
     ids=["lens given", "lens estimated"],
 )
 def test_a_bent_board_is_noticed_and_costs_nothing(given):

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from boards import any_page, aprilgrid, printed
+from marks import slow
 from rendered import Shot, photograph
 
 from visioncal.calibration.pipeline import run
@@ -117,9 +118,7 @@ def test_a_photograph_names_it(target):
     assert replace(found, square_sigma_m=target.square_sigma_m) == target
 
 
-@pytest.mark.parametrize(
-    "mount", ["eye-in-hand", pytest.param("eye-to-hand", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("mount", ["eye-in-hand", slow("eye-to-hand")])
 def test_a_cell_is_calibrated_with_it(tmp_path, mount):
     cell = simulate(CellOptions(target=aprilgrid_target(), views=12, mount=mount, seed=4))
     write_session(cell, tmp_path / "s")

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cells import calibrated, error_of
+from marks import slow
 
 import visioncal
 from visioncal.core.transforms import compose, exp, invert, log
@@ -43,10 +44,8 @@ def test_base_and_flange_move_the_flange_as_their_basis_says():
         np.testing.assert_allclose(basis[0, :, axis], twist / step, atol=1e-12)
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
-@pytest.mark.parametrize(
-    "joints", [pytest.param(True, marks=pytest.mark.slow), False], ids=["joints", "poses only"]
-)
+@pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
+@pytest.mark.parametrize("joints", [slow(True), False], ids=["joints", "poses only"])
 def test_a_wrong_arm_is_noticed_and_counts_in_the_covariance(mount, joints):
     surprises = []
     for seed in range(6):
@@ -74,8 +73,8 @@ def test_measured_poses_alone_tell_a_wrong_arm_too(dh, tmp_path):
         assert ("arm_errors" in result.stages) == (dh > 0.0)
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
-@pytest.mark.parametrize("sigma", [5e-5, pytest.param(5e-4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
+@pytest.mark.parametrize("sigma", [5e-5, slow(5e-4)])
 def test_white_noise_is_not_taken_for_a_wrong_arm(mount, sigma):
     for seed in range(5):
         options = CellOptions(

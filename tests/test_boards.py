@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cells import calibrated, error_of
+from marks import slow
 from rerun.chunk import RrdReader
 from scipy.stats import chi2
 
@@ -114,9 +115,7 @@ def test_two_boards_tell_more_of_an_arm_than_one():
     assert np.median(ratios) < 0.8
 
 
-@pytest.mark.parametrize(
-    "mount", ["eye-in-hand", pytest.param("eye-to-hand", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("mount", ["eye-in-hand", slow("eye-to-hand")])
 def test_each_board_adds_six_values_that_are_told(mount):
     """Everett and Hsu (1988): 4 a revolute joint, 6 for the frames, and 6 a further board."""
     cell = simulate(replace(TWO, **WRONG_LINKS, mount=mount, views=24, seed=1))

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from boards import circles
+from marks import slow
 from rendered import Shot, photograph
 
 from visioncal.calibration.pipeline import run
@@ -123,8 +124,8 @@ def test_a_photograph_names_it(target):
     [
         (circles_target(), "eye-to-hand"),
         (symmetric_circles_target(), "eye-in-hand"),
-        pytest.param(circles_target(), "eye-in-hand", marks=pytest.mark.slow),
-        pytest.param(symmetric_circles_target(), "eye-to-hand", marks=pytest.mark.slow),
+        slow(circles_target(), "eye-in-hand"),
+        slow(symmetric_circles_target(), "eye-to-hand"),
     ],
 )
 def test_a_cell_is_calibrated_with_it(tmp_path, mount, target):

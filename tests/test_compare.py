@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import visioncal
+from marks import slow
 from pairs import (
     calibrated_cell,
     halves,
@@ -59,7 +60,7 @@ def test_noise_is_no_change(mount: Mount) -> None:
     assert abs(np.mean(p_values < 0.5) - 0.5) < 0.36
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize("mount", ["eye-in-hand", slow("eye-to-hand")])
 def test_a_camera_moved_by_five_sigma_is_found(mount: Mount) -> None:
     for seed in range(2):
         reference, second = pair(mount, seed)[0], cells(mount, seed)[1]

@@ -7,6 +7,7 @@ import numpy as np
 import placed as made
 import pytest
 from commands import turned_poses, visioncal, write_poses, write_table
+from marks import slow
 from parts import away, placed, some_frame
 from samples import made_up
 from scipy.spatial.transform import Rotation
@@ -114,7 +115,7 @@ def test_the_tips_error_is_a_pure_offset_where_all_touches_stand_alike(features)
     assert np.abs(more[:3]).max() < 1e-12
 
 
-@pytest.mark.parametrize("features", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.parametrize("features", [slow(False), True])
 def test_the_error_over_its_sigma_is_as_it_should_be(features):
     squares = []
     noise = Noise.of_robot(1e-4, 3e-5)
@@ -178,7 +179,7 @@ def test_features_that_were_touched_once_are_named():
 
 @pytest.mark.parametrize(
     "chosen",
-    [[0, 1, 3, 4], pytest.param([0, 1, 3, 4, 6, 6], marks=pytest.mark.slow)],
+    [[0, 1, 3, 4], slow([0, 1, 3, 4, 6, 6])],
     ids=["four", "six"],
 )
 def test_few_touches_that_agree_by_chance_are_not_believed(chosen):

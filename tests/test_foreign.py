@@ -25,6 +25,7 @@ from foreign_samples import (
     views_json,
     visp,
 )
+from marks import slow
 
 import visioncal
 from visioncal.core.conventions import Reading
@@ -258,9 +259,7 @@ def test_what_the_user_says_of_poses_is_applied_in_every_form(make, tmp_path):
             np.testing.assert_array_equal(after.positions, before.positions)
 
 
-@pytest.mark.parametrize(
-    "ahead_s", [0.337, *(pytest.param(it, marks=pytest.mark.slow) for it in (0.0, -1.25))]
-)
+@pytest.mark.parametrize("ahead_s", [0.337, *(slow(it) for it in (0.0, -1.25))])
 def test_the_offset_of_two_clocks_is_found(tmp_path, ahead_s):
     robot_s, camera_s = np.arange(0, 12, 0.01), np.arange(0.5, 11.5, 1 / 30)
     columns = "t,x,y,z,qx,qy,qz,qw"
@@ -353,7 +352,7 @@ def test_intrinsics_of_numpy_and_of_a_fisheye(tmp_path):
         read_intrinsics(tmp_path / "omni.yaml")
 
 
-@pytest.mark.parametrize("count", [170, pytest.param(510, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [170, slow(510)])
 def test_damaged_recordings_end_in_a_clear_message_or_a_session(tmp_path, count):
     """In bounded memory; `foreign_damage.py` lists the kinds of damage."""
     script = Path(__file__).with_name("foreign_damage.py")

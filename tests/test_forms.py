@@ -29,6 +29,7 @@ def calibrated(tmp_path_factory) -> str:
         (("rms", "mm"), 10**400, "rms.mm is inf; a number that a cell has"),
         (("rms", "mm"), None, "rms.mm is None"),
         (("rms",), {}, "rms.mm is missing"),
+        (("verdict", "status"), "perfect", "verdict.status is 'perfect'"),
         (("verdict", "reasons"), "none", "verdict.reasons is 'none'; a list is needed"),
         (("solvers", "park", "rms_mm"), True, "solvers.park.rms_mm is True; a number"),
         (("frames", "flange_from_tool", "created"), [], "flange_from_tool.created is"),

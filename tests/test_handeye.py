@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from cells import calibrated, error_of
 from edges import solved
+from marks import slow
 from scipy.spatial.transform import Rotation
 
 from visioncal.calibration.pipeline.result import result_of
@@ -154,12 +155,10 @@ def test_the_fit_is_the_least_squares_solution_from_far_starts_too():
 @pytest.mark.parametrize("mount", MOUNTS)
 @pytest.mark.parametrize(
     "given",
-    [True, pytest.param(False, marks=pytest.mark.slow)],
+    [True, slow(False)],
     ids=["lens given", "lens estimated"],
 )
-@pytest.mark.parametrize(
-    "coarse", [1.0, pytest.param(10.0, marks=pytest.mark.slow)], ids=["fine robot", "coarse robot"]
-)
+@pytest.mark.parametrize("coarse", [1.0, slow(10.0)], ids=["fine robot", "coarse robot"])
 def test_the_whole_chain_states_its_errors_honestly(mount, given, coarse):
     seeds, robot_m, robot_rad = 8, coarse * 3e-5, coarse * 5e-5
     surprises, noises = [], []

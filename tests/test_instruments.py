@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from commands import visioncal as command
+from marks import slow
 from tracked import (
     errors_of,
     information,
@@ -30,7 +31,7 @@ PROBE, POINT, POINTS = Tracked(poses=True), Tracked(), Tracked(points=THREE)
 KINDS = pytest.mark.parametrize("options", [PROBE, POINT, POINTS], ids=["probe", "point", "three"])
 PROBE_FIRST = pytest.mark.parametrize(
     "options",
-    [PROBE, *(pytest.param(it, marks=pytest.mark.slow) for it in (POINT, POINTS))],
+    [PROBE, *(slow(it) for it in (POINT, POINTS))],
     ids=["probe", "point", "three"],
 )
 WRONG = {"dh_sigma_m": 5e-4, "dh_sigma_rad": 1e-3}
@@ -109,7 +110,7 @@ def test_an_arm_off_by_millimetres_is_calibrated_all_over_its_workspace(options)
 
 @pytest.mark.parametrize(
     ("options", "rank"),
-    [(PROBE, 30), (POINT, 27), pytest.param(POINTS, 33, marks=pytest.mark.slow)],
+    [(PROBE, 30), (POINT, 27), slow(POINTS, 33)],
     ids=["probe", "point", "three"],
 )
 def test_so_many_values_are_told_of_a_six_axis_arm(options, rank):

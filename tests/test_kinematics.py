@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from bound import workspace_bound_m
 from cells import calibrated, error_of, known_of
+from marks import slow
 from scipy.spatial.transform import Rotation
 from wrong_arms import GOOD, WRONG_LINKS, error_m, target_in_camera
 
@@ -136,7 +137,7 @@ def test_without_joints_no_level_can_be_asked_for():
         calibrated(cell, joints=False, level="kinematics")
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
 def test_predictions_move_as_their_derivatives_say(mount):
     known = calibrated(simulate(replace(WRONG_LINKS, mount=mount, seed=4)))
     arm, edges = known.robot_arm.at(np.arange(3)), known.solved.state.edges

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cells import session_of
+from marks import slow
 from picks import (
     before_camera,
     calibration_of,
@@ -220,9 +221,8 @@ def test_exact_sights_give_exact_places(exact_cell):
     "options",
     [
         CellOptions(views=10, robot_sigma_m=3e-4, robot_sigma_rad=5e-4, pixel_sigma_px=0.1),
-        pytest.param(
-            CellOptions(views=10, mount="eye-to-hand", pixel_sigma_px=0.1, state_intrinsics=False),
-            marks=pytest.mark.slow,
+        slow(
+            CellOptions(views=10, mount="eye-to-hand", pixel_sigma_px=0.1, state_intrinsics=False)
         ),
     ],
     ids=MOUNTS,

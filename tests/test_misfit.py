@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cells import calibrated, error_of
+from marks import slow
 from problems import observed, world
 
 from visioncal.calibration.pipeline.result import result_of
@@ -46,7 +47,7 @@ def of_fit(test, result):
     return test(*told(result), ROBOT)
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
 def test_a_creeping_base_is_noticed_and_its_way_told(mount):
     for seed in range(4):
         cell = simulate(replace(FINE, mount=mount, seed=seed))

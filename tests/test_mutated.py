@@ -1,6 +1,7 @@
 """Broken inputs, a few of the thousands that `benchmarks/mutated.py` draws."""
 
 import pytest
+from marks import slow
 from mutants import READINGS, missing_commands, unknown_inputs, walk
 
 # Inputs that are made within a second, and commands that end soon on them.
@@ -18,7 +19,7 @@ def test_every_command_that_reads_is_called():
     assert not unknown_inputs()
 
 
-@pytest.mark.parametrize("count", [12, pytest.param(40, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [12, slow(40)])
 def test_broken_inputs_end_in_a_result_or_a_clear_refusal(tmp_path, count):
     ended = list(walk(range(-SOUND, count), tmp_path, readings=READ))
     assert len(ended) == SOUND + count

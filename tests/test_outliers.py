@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cells import calibrated, error_of
+from marks import slow
 
 from visioncal.core.errors import DegenerateError
 from visioncal.core.transforms import exp
@@ -23,7 +24,7 @@ WORLDS = {
 
 
 @pytest.mark.parametrize("world", WORLDS)
-@pytest.mark.parametrize("wrong", [0, pytest.param(2, marks=pytest.mark.slow), 6])
+@pytest.mark.parametrize("wrong", [0, slow(2), 6])
 def test_just_the_wrong_views_are_left_out(world, wrong):
     for seed in range(4):
         cell = simulate(replace(WORLDS[world], wrong_views=wrong, seed=seed))

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cells import calibrated, error_of, known_of, session_of
+from marks import slow
 
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.pipeline.view_evidence import view_evidence
@@ -61,7 +62,7 @@ def test_intrinsics_are_refined_where_they_are_asked_to_be():
     assert np.mean(surprises) == pytest.approx(1.0, abs=0.8)
 
 
-@pytest.mark.parametrize("mode", ["hold", "auto"])
+@pytest.mark.parametrize("mode", [slow("hold"), "auto"])
 def test_a_matrix_known_to_a_pixel_is_counted_as_such(mode):
     rng = np.random.default_rng(1)
     surprises = []
@@ -76,7 +77,7 @@ def test_a_matrix_known_to_a_pixel_is_counted_as_such(mode):
     assert 0.4 < np.mean(surprises) < 1.8
 
 
-@pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens estimated"])
+@pytest.mark.parametrize("given", [slow(True), False], ids=["lens given", "lens estimated"])
 def test_a_fisheye_camera_goes_the_whole_way(given):
     surprises = []
     for seed in range(4):
@@ -131,7 +132,7 @@ def test_a_view_left_out_as_ambiguous_is_shown_by_its_best_pose(given):
     assert all(shown[view].predicted_px is not None for view in known.used)
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
 def test_a_lens_stated_for_images_twice_as_large_is_refined(mount):
     matrix, bent = np.array([520.0, 519, 320, 190]), np.array([-0.37, 0.1, 0.001, 0.0, 0.03])
     camera = Camera("brown", (640, 360), matrix, bent)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from marks import slow
 from scipy.spatial.transform import Rotation
 from touched import (
     EXACT,
@@ -107,10 +108,7 @@ def test_the_robots_noise_is_carried_to_the_touched_point():
     "job",
     [
         Job(tips=6, axes=2),
-        *(
-            pytest.param(it, marks=pytest.mark.slow)
-            for it in (Job(noise=ROBOT), Job(tips=4, points=3))
-        ),
+        *(slow(it) for it in (Job(noise=ROBOT), Job(tips=4, points=3))),
     ],
 )
 def test_error_and_covariance_agree_with_each_other_and_with_the_bound(job):

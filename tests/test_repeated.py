@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from marks import slow
 from whole_cells import misfit
 
 from visioncal import calibrate
@@ -141,7 +142,7 @@ def test_a_lens_is_not_doubted_for_what_images_of_a_stop_have_wrong_alike():
     assert misfit(edge.matrix, edge.covariance, cell.transforms[name]) < 22.5
 
 
-@pytest.mark.parametrize(("seed", "images"), [(0, 10), (2, 3)])
+@pytest.mark.parametrize(("seed", "images"), [slow(0, 10), (2, 3)])
 def test_still_boards_seen_often_outvote_no_robot(seed, images):
     """Most rows are of still cameras and a still board, and agree best of all."""
     cell, session = of_a_cell(images, stops=True, seed=seed)

@@ -17,6 +17,7 @@ from urllib.parse import urlsplit
 import browser
 import numpy as np
 import pytest
+from commands import visioncal
 from samples import made_up
 
 from visioncal.present.recording import write_recording
@@ -102,16 +103,15 @@ def test_what_cannot_be_reviewed_is_refused_with_the_next_step(tmp_path):
         (other, "first bytes"),
         (tmp_path / "nowhere.rrd", "does not exist"),
     ):
-        done = review(path)
-        assert done.returncode == 2
-        assert words in done.stderr
-        assert "Traceback" not in done.stderr
+        done = visioncal("review", path)
+        assert done.status == 2
+        assert words in done.err
 
 
 def test_options_of_the_server_belong_to_it(out):
-    done = review(out, "--port", "8080")
-    assert done.returncode == 2
-    assert "--web" in done.stderr
+    done = visioncal("review", out, "--port", "8080")
+    assert done.status == 2
+    assert "--web" in done.err
 
 
 def test_a_port_that_is_taken_is_named(out):
@@ -119,10 +119,10 @@ def test_a_port_that_is_taken_is_named(out):
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        done = review(out, "--web", "--no-open", "--port", port)
-    assert done.returncode == 2
-    assert f"port {port}" in done.stderr
-    assert done.stdout == ""
+        done = visioncal("review", out, "--web", "--no-open", "--port", port)
+    assert done.status == 2
+    assert f"port {port}" in done.err
+    assert done.out == ""
 
 
 def test_the_server_hands_out_the_page_the_viewer_and_the_recording(out):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cells import calibrated_sweep
+from marks import slow
 from swept_cells import HOW, cell_of, swept_session
 
 from visioncal.calibration.pipeline import align, calibrate
@@ -103,9 +104,9 @@ def test_the_simulation_takes_every_row_at_its_own_time():
     ("seed", "mount"),
     [
         (1, "eye-in-hand"),
-        pytest.param(1, "eye-to-hand", marks=pytest.mark.slow),
-        pytest.param(2, "eye-in-hand", marks=pytest.mark.slow),
-        pytest.param(2, "eye-to-hand", marks=pytest.mark.slow),
+        slow(1, "eye-to-hand"),
+        slow(2, "eye-in-hand"),
+        slow(2, "eye-to-hand"),
     ],
 )
 def test_the_readout_is_found_and_the_camera_is_where_it_is(seed, mount, monkeypatch):
@@ -129,7 +130,7 @@ def test_the_readout_is_found_and_the_camera_is_where_it_is(seed, mount, monkeyp
     assert np.linalg.norm(away) > 5.0 * np.sqrt(np.trace(covariance[3:, 3:]))
 
 
-@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [3, slow(4)])
 def test_a_global_shutter_is_not_mistaken(seed):
     known = calibrated_sweep(swept(seed, replace(HURRIED, readout_s=0.0)))
     (found,) = known.clock.delays

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from boards import any_page, printed
+from marks import slow
 
 from visioncal.calibration.pipeline import run
 from visioncal.calibration.stages.detect import look_for
@@ -139,7 +140,7 @@ def test_they_are_printed_where_the_table_has_them():
         any_page(lifted)
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize("mount", ["eye-in-hand", slow("eye-to-hand")])
 def test_a_cell_is_calibrated_with_them(tmp_path, mount):
     cell = simulate(CellOptions(target=TAGS, views=12, mount=mount, seed=4))
     write_session(cell, tmp_path / "s")

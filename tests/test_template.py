@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from boards import charuco, checkerboard
+from marks import slow
 from rendered import Shot, photograph
 
 from visioncal.vision.finders import Seen, blur_of, board, find_target
@@ -40,10 +41,7 @@ def rms(errors):
         (CHECKERBOARD, replace(SMALL, uneven=0.5), 0.015),
         (CHECKERBOARD, replace(SMALL, bayer=True), 0.02),
         (CHECKERBOARD, replace(SMALL, tilt_deg=60, square_px=30), 0.015),
-        pytest.param(
-            *(CHECKERBOARD, replace(SMALL, square_px=60, bend=0.15, noise=1), 0.006),
-            marks=pytest.mark.slow,
-        ),
+        slow(CHECKERBOARD, replace(SMALL, square_px=60, bend=0.15, noise=1), 0.006),
         (CHECKERBOARD, replace(SMALL, levels=(0, 330)), 0.015),
         (CHARUCO, replace(SMALL, square_px=36), 0.01),
         (CHARUCO, replace(SMALL, square_px=36, jpeg=75, uneven=0.5), 0.015),

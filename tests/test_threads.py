@@ -10,6 +10,7 @@ import cv2
 import matplotlib as mpl
 import pytest
 from kept import assert_same_evidence
+from marks import slow
 from threadpoolctl import threadpool_info
 
 from visioncal.calibration.pipeline import run
@@ -27,7 +28,7 @@ def settings():
     return cv2.getNumThreads(), blas, dict(mpl.rcParams)
 
 
-@pytest.mark.parametrize("threads", [2, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("threads", [2, slow(4)])
 def test_threads_write_what_one_alone_writes(tmp_path, threads):
     write_session(simulate(CellOptions(views=6, seed=2)), tmp_path / "cell")
     session = Session.load(tmp_path / "cell")

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from marks import slow
 from scipy.spatial.transform import Rotation
 from varied_arms import built_in, built_in_names, placed, table_arm, urdf_arm
 from varied_cells import cell, write
@@ -19,9 +20,7 @@ OTHERS = (13, 19, 21, 34, 36, 37, 38, 40, 43, 48, 54, 56, 59, 62, 64)
 SURPRISING = 5.0
 
 
-@pytest.mark.parametrize(
-    "seed", [*FIRST, *(pytest.param(it, marks=pytest.mark.slow) for it in OTHERS)]
-)
+@pytest.mark.parametrize("seed", [*FIRST, *(slow(it) for it in OTHERS)])
 def test_an_ordinary_cell_goes_through_all_commands(seed, tmp_path):
     done = walk(seed, tmp_path, whole=False)
     assert not [it.trace for it in done.steps if it.status == 1]

@@ -9,6 +9,7 @@ import pytest
 from cells import calibrated, known_of, session_of
 from commands import visioncal
 from later import ANYHOW, FITTED, Change, again, knock, known_again, part, usual
+from marks import slow
 from pages import Page
 
 from visioncal import calibrate, verify
@@ -191,7 +192,7 @@ def test_an_arm_off_by_its_posture_raises_no_alarm_near_the_calibration():
         assert check(seen_by(known, prior_calibration), prior_calibration).passed
 
 
-@pytest.mark.parametrize("weighed", [True, False])
+@pytest.mark.parametrize("weighed", [True, slow(False)])
 def test_a_bent_arm_under_its_loads_is_no_change(weighed):
     """Springs and loads are in what is predicted, whether or not the arm's masses are known."""
     loads = (Payload(), Payload(8.0, (0.0, 0.0, 0.1)))
