@@ -173,6 +173,11 @@ def test_every_command_and_option_is_on_a_page():
             ), f"no page has {flags} of visioncal {name}"
 
 
+def test_the_architecture_has_every_package():
+    (order,) = [it for it in code_of(ROOT / "visioncal" / "README.md") if it.split()[0] == "core"]
+    assert sorted(order.split()) == [it.name for it in PACKAGES]
+
+
 def test_the_front_page_is_short():
     assert len(text_of(FRONT).splitlines()) <= 260
 
