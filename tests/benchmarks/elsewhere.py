@@ -1,0 +1,430 @@
+"""Cells that visioncal has not made: error over the stated covariance, world by world.
+
+    PYTHONPATH=tests python tests/benchmarks/elsewhere.py [SEEDS] [WORLD ...]
+
+The generator is numpy and OpenCV alone; corners travel through `corners.csv`, poses through
+`views.csv`. For each world, mount, and lens (given or estimated): squared error over the stated
+covariance per degree of freedom, of the camera's place (X) and of picks (a point of the table that
+`visioncal.locate` finds by one pixel), the median errors, those picks by Park's X and the lens that
+Park had (OpenCV), the share of each verdict, and refusals.
+"""
+
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+import visioncal
+
+SEEDS = 40
+SIZE = (1280, 1024)
+MATRIX = np.array([[1150.0, 0.0, 644.0], [0.0, 1152.0, 508.0], [0.0, 0.0, 1.0]])
+DISTORTION = np.array([-0.11, 0.09, 0.0004, -0.0006, -0.01])
+COLUMNS, ROWS, SQUARE_M = 11, 8, 0.02
+WINDOW_M = np.array([0.22, 0.16])
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """What is wrong with a cell, beside noise.
+
+    Attributes:
+        views: How many stops.
+        pixel_px: Noise of a corner's coordinate, an axis [px].
+        robot_m: Noise of the flange's place, an axis [m].
+        robot_rad: And of its rotation [rad].
+        shift: (n, 2) pixels to (n, 2) displacements, drawn by a seed: a lens beyond its model.
+        focus: By distance over the mean one, and by view: factors of the focal length.
+        board: (c, 3) corners to where they really are, drawn by a seed.
+        robot: (m, 4, 4) poses to what is reported of them, drawn by a seed, before noise.
+    """
+
+    views: int = 22
+    pixel_px: float = 0.05
+    robot_m: float = 5e-5
+    robot_rad: float = 1e-4
+    shift: Callable[[np.random.Generator], Callable[[np.ndarray], np.ndarray]] | None = None
+    focus: Callable[[np.ndarray, np.random.Generator], np.ndarray] | None = None
+    board: Callable[[np.ndarray, np.random.Generator], np.ndarray] | None = None
+    robot: Callable[[np.ndarray, np.random.Generator], np.ndarray] | None = None
+    noise: Callable[[tuple[int, int], np.random.Generator], np.ndarray] = field(
+        default=lambda shape, rng: rng.normal(size=shape)
+    )
+
+
+def lens_field(sigma_px: float, length: float = 0.2):
+    """A smooth field over the image: a Gaussian process of this size, `length` of the width."""
+
+    def drawn(rng):
+        # Random Fourier features of a squared exponential (Rahimi and Recht 2007).
+        waves = rng.normal(size=(2, 400, 2)) / (length * SIZE[0])
+        phases = rng.uniform(0, 2 * np.pi, (2, 400))
+        weights = rng.normal(size=(2, 400)) * np.sqrt(2 / 400) * sigma_px
+
+        def at(px):
+            return np.stack(
+                [np.cos(px @ waves[k].T + phases[k]) @ weights[k] for k in (0, 1)], axis=1
+            )
+
+        return at
+
+    return drawn
+
+
+def thin_prism(size: float):
+    """Displacement of Brown's thin prism of this size, in units of the focal length."""
+
+    def drawn(rng):
+        turn = rng.uniform(0, 2 * np.pi)
+        along = np.array([np.cos(turn), np.sin(turn)])
+
+        def at(px):
+            away = (px - MATRIX[:2, 2]) / MATRIX[0, 0]
+            return MATRIX[0, 0] * size * np.sum(away**2, axis=1)[:, None] * along
+
+        return at
+
+    return drawn
+
+
+def correlated(share: float):
+    """Noise of stop after stop that remembers its last value by a share."""
+
+    def drawn(shape, rng):
+        found = rng.normal(size=shape)
+        for at in range(1, shape[0]):
+            found[at] = share * found[at - 1] + np.sqrt(1 - share**2) * found[at]
+        return found
+
+    return drawn
+
+
+def bent(height_m: float):
+    def drawn(corners, rng):
+        half = (corners - corners.mean(axis=0)) / (np.ptp(corners, axis=0).max() / 2)
+        turn = rng.uniform(0, np.pi)
+        bow = height_m * (half[:, 0] * np.cos(turn) + half[:, 1] * np.sin(turn)) ** 2
+        return corners + np.stack([0 * bow, 0 * bow, bow], axis=1)
+
+    return drawn
+
+
+def stretched(x: float, y: float):
+    return lambda corners, _: corners * np.array([x, y, 1.0])
+
+
+def breathing(share: float):
+    """The focal length follows the distance, over the mean one."""
+    return lambda far, _: 1 + share * (far - 1)
+
+
+def lifted(by_m):
+    """The robot's base rises over the session, from 0 to 1."""
+
+    def moved(poses, _):
+        found = poses.copy()
+        found[:, 2, 3] += by_m(np.linspace(0, 1, len(poses)))
+        return found
+
+    return moved
+
+
+WORLDS = {
+    "clean": World(),
+    "clean, 6 views": World(views=6),
+    "clean, 200 views": World(views=200),
+    "heavy tails (t, 3)": World(
+        noise=lambda shape, rng: rng.standard_t(3, size=shape) / np.sqrt(3.0)
+    ),
+    "correlated 0.9": World(noise=correlated(0.9)),
+    "correlated 0.97": World(noise=correlated(0.97)),
+    "field 0.03 px": World(shift=lens_field(0.03)),
+    "field 0.1 px": World(shift=lens_field(0.1)),
+    "field 0.2 px": World(shift=lens_field(0.2)),
+    "thin prism": World(shift=thin_prism(0.002)),
+    "breathing 0.1 %": World(focus=breathing(0.001)),
+    "breathing 0.3 %": World(focus=breathing(0.003)),
+    "breathing 1 %": World(focus=breathing(0.01)),
+    "focus jitter 0.1 %": World(focus=lambda far, rng: 1 + 0.001 * rng.normal(size=len(far))),
+    "board bent 0.5 mm": World(board=bent(5e-4)),
+    "board 0.2 % too large": World(board=stretched(1.002, 1.002)),
+    "board 0.1 % longer one way": World(board=stretched(1.0005, 0.9995)),
+    "drift 0.5 mm": World(robot=lifted(lambda share: 5e-4 * share)),
+    "camera bumped 1 mm": World(robot=lifted(lambda share: 1e-3 * (share > 0.5))),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One cell, as it truly is."""
+
+    world: World
+    mount: str
+    x: np.ndarray
+    z: np.ndarray
+    robot: np.ndarray
+    shift: Callable[[np.ndarray], np.ndarray]
+    corners: np.ndarray
+    pixels: np.ndarray
+
+
+def pose(turn, place):
+    found = np.eye(4)
+    found[:3, :3], found[:3, 3] = Rotation.from_rotvec(turn).as_matrix(), place
+    return found
+
+
+def seen(camera_from_points, shift, focal=1.0):
+    """Pixels of (n, 3) points in the camera's frame."""
+    matrix = MATRIX.copy()
+    matrix[[0, 1], [0, 1]] *= focal
+    px = cv2.projectPoints(
+        camera_from_points.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), matrix, DISTORTION
+    )[0].reshape(-1, 2)
+    return px + shift(px)
+
+
+def views_of(count, rng) -> Iterator[np.ndarray]:
+    """cam_from_target: the board in the image, tilted by up to 40 degrees about any axis."""
+    corner = np.array([[0, 0, 0], [WINDOW_M[0], 0, 0], [0, WINDOW_M[1], 0], [*WINDOW_M, 0]])
+    while count:
+        tilt = np.deg2rad(rng.uniform(5, 40)) * np.array([*_unit(rng), 0.0])
+        turn = Rotation.from_rotvec(tilt) * Rotation.from_rotvec([0, 0, rng.uniform(-1, 1)])
+        far = rng.uniform(0.3, 0.7)
+        at = np.array([*(rng.uniform(-0.28, 0.28, 2) * far), far])
+        found = np.eye(4)
+        found[:3, :3] = turn.as_matrix()
+        found[:3, 3] = at - found[:3, :3] @ np.array([*(WINDOW_M / 2), 0])
+        px = seen(corner @ found[:3, :3].T + found[:3, 3], np.zeros_like)
+        if np.all((px > 25) & (px < np.array(SIZE) - 25)):
+            count -= 1
+            yield found
+
+
+def _unit(rng):
+    turn = rng.uniform(0, 2 * np.pi)
+    return np.cos(turn), np.sin(turn)
+
+
+def cell(world: World, mount: str, given: bool, seed: int, folder: Path) -> Case:
+    rng = np.random.default_rng([seed, 41])
+    shift = world.shift(rng) if world.shift else np.zeros_like
+    grid = np.stack(np.meshgrid(np.arange(COLUMNS), np.arange(ROWS)), axis=-1).reshape(-1, 2)
+    corners = np.column_stack([SQUARE_M * grid, np.zeros(len(grid))])
+    real = world.board(corners, rng) if world.board else corners
+    boards = np.array([*views_of(world.views, rng)])
+    if mount == "eye-in-hand":
+        x = pose(rng.normal(0, 0.1, 3), [0.03, -0.05, 0.09])
+        z = pose([0.02, -0.01, 0.4], [0.55, -0.1, 0.02])
+        z[:3, :3] = z[:3, :3] @ np.diag([1.0, -1.0, -1.0])
+        robot = z @ np.linalg.inv(boards) @ np.linalg.inv(x)
+    else:
+        x = pose(np.array([0.1, 2.9, 0.2]), [0.9, 0.1, 0.7])
+        z = pose(rng.normal(0, 0.2, 3), [-0.1, -0.08, 0.05])
+        robot = x @ boards @ np.linalg.inv(z)
+    far = boards[:, 2, 3] / boards[:, 2, 3].mean()
+    focal = world.focus(far, rng) if world.focus else np.ones(len(far))
+    pixels = np.array(
+        [
+            seen(real @ it[:3, :3].T + it[:3, 3], shift, zoom)
+            for it, zoom in zip(boards, focal, strict=True)
+        ]
+    )
+    pixels = pixels + world.pixel_px * rng.normal(size=pixels.shape)
+    reported = world.robot(robot, rng) if world.robot else robot
+    errors = world.noise((len(robot), 6), rng)
+    steps = np.array([pose(world.robot_rad * it[:3], world.robot_m * it[3:]) for it in errors])
+    reported = reported @ steps
+    write(folder, mount, given, reported, pixels)
+    return Case(world, mount, x, z, reported, shift, corners, pixels)
+
+
+def write(folder, mount, given, reported, pixels):
+    folder.mkdir(parents=True)
+    lens = (
+        f"matrix = {MATRIX[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()}\n"
+        f"distortion = {DISTORTION.tolist()}\n"
+        if given
+        else ""
+    )
+    (folder / "board.toml").write_text(
+        f'kind = "checkerboard"\ncolumns = {COLUMNS}\nrows = {ROWS}\nsquare_m = {SQUARE_M}\n'
+        "square_sigma_m = 0.000002\n"
+    )
+    (folder / "session.toml").write_text(
+        f'schema = 1\nname = "elsewhere"\nmount = "{mount}"\ntarget = "board.toml"\n[camera]\n'
+        f"resolution = {list(SIZE)}\n{lens}"
+    )
+    rows = ["view,x_m,y_m,z_m,qx,qy,qz,qw"]
+    for view, it in enumerate(reported):
+        q = Rotation.from_matrix(it[:3, :3]).as_quat()
+        rows.append(",".join([str(view), *(f"{v:.9f}" for v in (*it[:3, 3], *q))]))
+    (folder / "views.csv").write_text("\n".join(rows) + "\n")
+    lines = ["view,point,u_px,v_px"]
+    for view, px in enumerate(pixels):
+        lines += [f"{view},{at},{u:.5f},{v:.5f}" for at, (u, v) in enumerate(px)]
+    (folder / "corners.csv").write_text("\n".join(lines) + "\n")
+
+
+def park(case: Case, given: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """OpenCV's calibrateCamera and Park: X, and the lens."""
+    points = np.tile(case.corners.astype(np.float32), (len(case.pixels), 1, 1))
+    px = case.pixels.astype(np.float32)
+    if given:
+        matrix, distortion = MATRIX, DISTORTION
+        turns, places = [], []
+        for at in range(len(px)):
+            _, turn, place = cv2.solvePnP(points[at], px[at], matrix, distortion)
+            turns.append(turn)
+            places.append(place)
+    else:
+        _, matrix, distortion, turns, places = cv2.calibrateCamera(
+            [*points], [*px], SIZE, None, None
+        )
+    robot = case.robot if case.mount == "eye-in-hand" else np.linalg.inv(case.robot)
+    turn, place = cv2.calibrateHandEye(
+        [*robot[:, :3, :3]],
+        [*robot[:, :3, 3]],
+        [cv2.Rodrigues(it)[0] for it in turns],
+        [*places],
+        method=cv2.CALIB_HAND_EYE_PARK,
+    )
+    x = np.eye(4)
+    x[:3, :3], x[:3, 3] = turn, place.ravel()
+    return x, matrix, distortion
+
+
+def trial(world: World, mount: str, given: bool, seed: int, folder: Path) -> dict:
+    case = cell(world, mount, given, seed, folder)
+    name = "flange_from_cam" if mount == "eye-in-hand" else "base_from_cam"
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            result = visioncal.calibrate(visioncal.Session.load(folder))
+    except visioncal.VisioncalError as error:
+        return {"refused": str(error)}
+    found, covariance = result.transforms[name].as_matrix(), result.covariance(name)
+    turned = Rotation.from_matrix(case.x[:3, :3].T @ found[:3, :3]).as_rotvec()
+    shifted = case.x[:3, :3].T @ (found[:3, 3] - case.x[:3, 3])
+    error = np.concatenate([turned, shifted])
+    looks = [*looks_of(case, seed)]
+    picks = [pick(case, result, it) for it in looks]
+    theirs = [pick_by(case, *park(case, given), it) for it in looks]
+    x = park(case, given)[0]
+    return {
+        "x": float(shifted @ np.linalg.solve(covariance[3:, 3:], shifted) / 3),
+        "pose": float(error @ np.linalg.solve(covariance, error) / 6),
+        "x_mm": 1e3 * float(np.linalg.norm(shifted)),
+        "pick": float(np.mean([it[0] for it in picks])),
+        "pick_mm": float(np.median([it[1] for it in picks])),
+        "park_mm": float(np.median(theirs)),
+        "park_x_mm": 1e3 * float(np.linalg.norm(x[:3, 3] - case.x[:3, 3])),
+        "status": result.verdict.status,
+        "cause": [it.cause for it in result.verdict.causes][:1],
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """One more image, of a point that is to be picked.
+
+    Attributes:
+        px: (2,) its pixel.
+        point: (3,) where it is in the base.
+        normal: (3,) of the plane that it lies in: across the camera's axis.
+        reported: (4, 4) where the robot says that it was.
+    """
+
+    px: np.ndarray
+    point: np.ndarray
+    normal: np.ndarray
+    reported: np.ndarray
+
+
+def looks_of(case: Case, seed: int, count: int = 4) -> Iterator[Look]:
+    rng, world = np.random.default_rng([seed, 43]), case.world
+    for board in views_of(count, rng):
+        there = board @ np.array([*(WINDOW_M / 2), 0.0, 1.0])
+        noise = rng.normal(size=6)
+        error = pose(world.robot_rad * noise[:3], world.robot_m * noise[3:])
+        robot = case.z @ np.linalg.inv(board) @ np.linalg.inv(case.x)
+        camera = robot @ case.x if case.mount == "eye-in-hand" else case.x
+        px = seen(there[None, :3], case.shift)[0] + world.pixel_px * rng.normal(size=2)
+        yield Look(px, (camera @ there)[:3], camera[:3, 2], robot @ error)
+
+
+def pick(case: Case, result: visioncal.Calibration, look: Look) -> tuple[float, float]:
+    """Squared error over covariance per degree of freedom, and the error [mm], in the plane."""
+    (located,) = visioncal.locate(
+        result,
+        look.px,
+        visioncal.Plane.through(look.normal, look.point),
+        RigidTransform.from_matrix(look.reported) if case.mount == "eye-in-hand" else None,
+    )
+    axes = np.linalg.svd(look.normal[None])[2][1:]
+    error = axes @ (located.p_base - look.point)
+    among = axes @ located.covariance @ axes.T
+    return float(error @ np.linalg.solve(among, error) / 2), 1e3 * float(np.linalg.norm(error))
+
+
+def pick_by(case: Case, x: np.ndarray, matrix, distortion, look: Look) -> float:
+    """The error [mm] of the same pick by another X and lens."""
+    camera = look.reported @ x if case.mount == "eye-in-hand" else x
+    ray = camera[:3, :3] @ np.append(
+        cv2.undistortPoints(look.px.reshape(1, 1, 2), matrix, distortion).ravel(), 1.0
+    )
+    along = look.normal @ (look.point - camera[:3, 3]) / (look.normal @ ray)
+    return 1e3 * float(np.linalg.norm(camera[:3, 3] + along * ray - look.point))
+
+
+def row(name: str, mount: str, given: bool, seeds: int) -> str:
+    with tempfile.TemporaryDirectory() as folder:
+        found = [
+            trial(WORLDS[name], mount, given, seed, Path(folder) / str(seed))
+            for seed in range(seeds)
+        ]
+    done = [it for it in found if "refused" not in it]
+    if not done:
+        return f"| {name} | {mount} | {'given' if given else 'estimated'} | all refused |"
+
+    def mean(key):
+        return np.mean([it[key] for it in done])
+
+    def middle(key):
+        return np.median([it[key] for it in done])
+
+    verdicts = "/".join(
+        str(sum(it["status"] == word for it in done)) for word in ("good", "check", "bad")
+    )
+    return (
+        f"| {name} | {mount} | {'given' if given else 'estimated'} | {mean('x'):.2f} "
+        f"| {mean('pick'):.2f} | {middle('x_mm'):.3f}, {middle('park_x_mm'):.3f} "
+        f"| {middle('pick_mm'):.3f}, {middle('park_mm'):.3f} "
+        f"| {verdicts} | {len(found) - len(done)} |"
+    )
+
+
+def main() -> None:
+    words = [it for it in sys.argv[1:] if not it.startswith("-")]
+    quick = "--quick" in sys.argv
+    seeds = int(words[0]) if words and words[0].isdigit() else 1 if quick else SEEDS
+    names = [it for it in words if it in WORLDS] or list(WORLDS)[: 2 if quick else None]
+    print(
+        "| world | mount | lens | X | pick | X [mm], Park's | pick [mm], Park's "
+        "| good/check/bad | refused |"
+    )
+    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+    for name in names:
+        for mount in ("eye-in-hand", "eye-to-hand"):
+            for given in (True, False):
+                print(row(name, mount, given, seeds), flush=True)
+
+
+if __name__ == "__main__":
+    main()
