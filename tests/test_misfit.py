@@ -14,7 +14,7 @@ from visioncal.estimation.arm import ArmErrors, covariance_of_size
 from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance, radius95
 from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.parts import ROBOT
-from visioncal.estimation.residual_tests import drift, neighbours
+from visioncal.estimation.residual_tests import drift, lens_field, neighbours
 from visioncal.estimation.solve import covariance_of
 from visioncal.estimation.variance import profile_interval
 from visioncal.simulation import CellOptions, fine_camera, simulate
@@ -213,3 +213,63 @@ def test_errors_follow_the_stated_covariance_with_the_misfit_tests_on():
         surprises.append(error @ np.linalg.solve(result.covariance[:12, :12], error) / 12)
     # Mean of 12 chi-square of 12: 0.12; the board's scale, held at the truth, takes one of them.
     assert np.mean(surprises) == pytest.approx(0.95, abs=0.35)
+
+
+def through_a_wavy_lens(cell, sigma_px, rng):
+    """The cell with corners displaced by a smooth field, which no lens model has."""
+    waves = rng.normal(size=(2, 200, 2)) / (0.2 * cell.stated_camera.resolution[0])
+    phases = rng.uniform(0.0, 2.0 * np.pi, (2, 200))
+    weights = rng.normal(size=(2, 200)) * np.sqrt(2 / 200) * sigma_px
+
+    def moved(px):
+        return px + np.stack(
+            [np.cos(px @ waves[it].T + phases[it]) @ weights[it] for it in (0, 1)], axis=1
+        )
+
+    return replace(cell, corners=tuple(replace(it, px=moved(it.px)) for it in cell.corners))
+
+
+def test_noise_of_corners_is_no_field_of_the_lens():
+    rng = np.random.default_rng(6)
+    px = rng.uniform(0, [1280, 800], (800, 2))
+    found = [lens_field(px, rng.normal(0, 0.1, (800, 2)), (1280, 800)) for _ in range(300)]
+    # One of ten thousand by chance.
+    assert not any(it.is_significant for it in found)
+    # 60 of 72 directions count, so that F lies about 1.2, 0.2 wide, before a fit takes some out.
+    assert np.mean([it.factor for it in found]) == pytest.approx(1.2, abs=0.03)
+
+
+def test_a_field_of_the_lens_is_found_with_its_size():
+    rng = np.random.default_rng(7)
+    px = rng.uniform(0, [1280, 800], (800, 2))
+    wave = 0.08 * np.sqrt(2) * np.sin(2 * np.pi * px[:, ::-1] / 600)
+    found = lens_field(px, wave + rng.normal(0, 0.1, (800, 2)), (1280, 800))
+    assert found.is_significant
+    # A cell's mean loses part of a wave of 600 px over cells of 213 x 133.
+    assert 0.06 < found.sigma_px < 0.09
+
+
+def test_few_corners_say_nothing_of_a_field():
+    found = lens_field(np.zeros((8, 2)), np.ones((8, 2)), (1280, 800))
+    assert (found.factor, found.is_significant) == (1.0, False)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_a_lens_beyond_its_model_is_counted_and_named(mount):
+    squared, before, named = [], [], 0
+    for seed in range(6):
+        cell = simulate(replace(FINE, mount=mount, seed=seed, robot_sigma_m=1e-5))
+        cell = through_a_wavy_lens(cell, 0.25, np.random.default_rng(seed))
+        known = calibrated(cell, joints=False)
+        answer = known.solved
+        away, field = error_of(cell, known)[3:6], answer.beside["lens_field"][3:6, 3:6]
+        covariance = answer.covariance[3:6, 3:6]
+        squared.append(away @ np.linalg.solve(covariance, away) / 3)
+        before.append(away @ np.linalg.solve(covariance - field, away) / 3)
+        named += any(it.kind == "lens_field" for it in known.findings.warnings)
+    # 18 components: a mean squared error over the covariance of 2.5 is one in a thousand. What the
+    # field adds is a fifth of the variance at least, or this tests nothing.
+    assert np.mean(squared) < 2.5
+    assert np.mean(before) > 1.2 * np.mean(squared)
+    # A field of 2.5 times the noise; a board that fills a part of the image shows a part of it.
+    assert named >= 4

@@ -55,7 +55,7 @@ def covariance_by_source(
     """
     fitted = covariance_among(fisher_information(problem, state, noise), problem.counted)
     linear, own = problem.linear(state, ideal=True), problem.covariance(noise)
-    gain = _weighted(problem, linear, own, noise) @ fitted[:, : 6 * len(problem.unknown)]
+    gain = weighted_jacobian(problem, linear, own, noise) @ fitted[:, : 6 * len(problem.unknown)]
     found: dict[str, FloatArray] = defaultdict(lambda: np.zeros((gain.shape[2],) * 2))
     for frame in dict.fromkeys(problem.observations.observers):
         mine = np.array([it == frame for it in problem.observations.observers])
@@ -79,8 +79,20 @@ def covariance_by_source(
     return dict(found)
 
 
-def _weighted(problem: Problem, linear: Linear, own: FloatArray, noise: Noise) -> FloatArray:
-    """(n, 6, p) the inverse covariance of all residuals times their derivatives."""
+def weighted_jacobian(
+    problem: Problem, linear: Linear, own: FloatArray, noise: Noise
+) -> FloatArray:
+    """The inverse covariance of all residuals times their Jacobian.
+
+    Args:
+        problem: The observations.
+        linear: Their residuals and Jacobian.
+        own: (n, 6, 6) covariances of the observations' own noise.
+        noise: The levels.
+
+    Returns:
+        (n, 6, p).
+    """
     found, alone, (of, _) = linear.jacobian, problem.alone, problem.units
     total = problem.total_covariance(linear, noise)
     found[alone] = np.linalg.solve(total[alone], found[alone])

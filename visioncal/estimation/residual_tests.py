@@ -1,14 +1,15 @@
-"""Whether the residuals are noise: tests of drift, and of neighbours that err alike."""
+"""Whether the residuals are noise: tests of drift, of neighbours that err alike, of the lens."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.core.quantiles import chi2_limit
+from visioncal.core.quantiles import chi2_limit, f_limit
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import rows_of, stops_of
-from visioncal.estimation.linalg import covariance_among
+from visioncal.estimation.budget import weighted_jacobian
+from visioncal.estimation.linalg import covariance_among, gram
 from visioncal.estimation.parts import Effect, Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import fisher_information, normal_equations
@@ -17,6 +18,10 @@ from visioncal.estimation.variance import Knowledge
 # Noise looks like a misfit in one session of ten thousand.
 _FALSE_ALARM = 1e-4
 _BLOCKS = 10
+# Cells of the image whose mean residuals are compared, an axis; corners that a cell has at least.
+_CELLS, _FEWEST_CORNERS = 6, 4
+# What a lens's own parameters and a plane's pose take out of the cells' means.
+_ABSORBED = 12
 
 
 @dataclass(frozen=True)
@@ -45,6 +50,78 @@ class Drift:
 
     moved_m: float
     moved_rad: float
+
+
+@dataclass(frozen=True)
+class LensField:
+    """How much more corners of one part of the image err alike than noise lets them.
+
+    Attributes:
+        factor: Variance of the cells' mean residuals over that of noise; at least one.
+        sigma_px: Size of the displacements that the lens's model leaves, an axis [px].
+        is_significant: Whether chance does not explain it.
+    """
+
+    factor: float
+    sigma_px: float
+    is_significant: bool
+
+
+def lens_field(px: FloatArray, residuals: FloatArray, resolution: tuple[int, int]) -> LensField:
+    """Compares the mean residuals of the image's cells with the scatter within them (F test).
+
+    A lens beyond its model displaces all corners of a region alike, in all views: no number of
+    views averages that out, and residuals of single corners hardly grow.
+
+    Args:
+        px: (n, 2) corners of all views of one camera [px].
+        residuals: (n, 2) of the fit [px].
+        resolution: Width and height of the image [px].
+    """
+    place = np.clip((_CELLS * px / np.array(resolution)).astype(np.int64), 0, _CELLS - 1)
+    cell = place[:, 0] + _CELLS * place[:, 1]
+    counts = np.bincount(cell, minlength=_CELLS**2)
+    rows = counts[cell] >= _FEWEST_CORNERS
+    many, used = counts[counts >= _FEWEST_CORNERS], int(rows.sum())
+    between, within = 2 * len(many) - _ABSORBED, 2 * (used - len(many))
+    if between < 1:
+        return LensField(1.0, 0.0, is_significant=False)
+    sums = np.stack(
+        [np.bincount(cell[rows], residuals[rows, it], _CELLS**2) for it in (0, 1)], axis=1
+    )
+    among = float(np.sum(sums[counts >= _FEWEST_CORNERS] ** 2 / many[:, None]))
+    noise = (float(np.sum(residuals[rows] ** 2)) - among) / within
+    factor = among / between / noise if noise > 0.0 else 1.0
+    return LensField(
+        max(factor, 1.0),
+        float(np.sqrt(max(factor - 1.0, 0.0) * noise / np.mean(many))),
+        bool(factor > f_limit(_FALSE_ALARM, between, within)),
+    )
+
+
+def lens_inflation(
+    problem: Problem,
+    state: State,
+    noise: Noise,
+    camera: str,
+    corners: FloatArray,
+    factor: float,
+) -> FloatArray:
+    """What is to be added to a covariance (p, p) where corners err alike by parts of the image.
+
+    Args:
+        problem: The observations.
+        state: The answer.
+        noise: Its levels.
+        camera: The frame that observed.
+        corners: (p, p) what its corners say of lens and boards, as information on the unknowns.
+        factor: By how much more its corners contribute than independent noise lets them.
+    """
+    fitted = covariance_among(fisher_information(problem, state, noise), problem.counted)
+    mine = np.array([it == camera for it in problem.observations.observers])
+    linear, own = problem.linear(state, ideal=True), problem.covariance(noise)
+    gain = weighted_jacobian(problem, linear, own, noise)[mine] @ fitted
+    return np.asarray((factor - 1.0) * (gram(gain, own[mine] @ gain) + fitted @ corners @ fitted))
 
 
 def neighbours(problem: Problem, state: State, noise: Noise, robot: str) -> Neighbours:

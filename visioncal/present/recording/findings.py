@@ -27,6 +27,7 @@ SOURCES = {
     "temperature": "what is open about the arm's drift with temperature",
     "priors": "what was measured by hand",
     "held_values": "values that are held",
+    "lens_field": "the lens beyond its model",
     "misfit": "neighbouring stops that err alike",
 }
 
