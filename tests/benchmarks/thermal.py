@@ -51,7 +51,7 @@ def main() -> None:
             "100 to the fifth hour. *Share* is what is left over the drift, *surprise* what is "
             "left over its predicted sigma.",
             "",
-            "| arm | told | drift [mm] | left [mm] | share | worst | surprise | s |",
+            "| arm | measured | drift [mm] | left [mm] | share | worst | surprise | s |",
             "| --- | --- | --- | --- | --- | --- | --- | --- |",
             *rows,
         ]
