@@ -1,11 +1,14 @@
 """What a calibration says of a calibrated arm, for tests of the report and the recording."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from visioncal.core.types import FloatArray
-from visioncal.robot import load_robot
+from visioncal.results.arm import ArmResult
+from visioncal.results.codec import read
+from visioncal.robot import Robot, load_robot
 
 # What the parameters' changes are, with their sigmas: one sure, one chance, one held.
 SURE, CHANCE = (1.2e-3, 1e-4), (-2e-4, 1.5e-4)
@@ -25,6 +28,12 @@ def levels() -> list[dict[str, Any]]:
     names = ("level", "unknowns", "rms_mm", "rms_deg")
     names += ("held_out_mm", "held_out_deg", "likelihood_ratio")
     return [dict(zip(names, it, strict=True)) for it in figures]
+
+
+def arm_of(robot: Robot, **changes: Any) -> ArmResult:
+    """An arm that was calibrated, with other values of some fields."""
+    found = read(ArmResult, {"level": "geometry", "levels": levels()}, "kinematics")
+    return replace(found, robot=robot, **changes)
 
 
 def stays_stated() -> dict[str, Any]:

@@ -7,6 +7,8 @@ from samples import Sample
 
 from visioncal.estimation.appearance import BOARD_NAMES
 from visioncal.results import Calibration
+from visioncal.results.codec import read_fields
+from visioncal.results.sections import CalibrationSections
 
 # So begins the reason of a view that contradicts the others; test_report checks it on a real one.
 CONTRADICTS = "disagrees with the other views: it places the target 36 mm and 1.5 deg away"
@@ -52,7 +54,7 @@ def sick() -> dict[str, dict[str, Any]]:
 
 def with_findings(sample: Sample, documents: dict[str, dict[str, Any]]) -> Calibration:
     """The sample's calibration with what else was found."""
-    return replace(sample.calibration, stages=documents)
+    return replace(sample.calibration, **read_fields(CalibrationSections, documents, ""))
 
 
 def with_contradiction(sample: Sample) -> Calibration:

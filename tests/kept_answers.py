@@ -18,6 +18,8 @@ from visioncal.calibration.pipeline import align, calibrate
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.core.errors import VisioncalError
 from visioncal.core.transforms import invert, log
+from visioncal.results.codec import write
+from visioncal.results.sections import CalibrationSections
 from visioncal.session import Session
 from visioncal.simulation import (
     CellOptions,
@@ -96,13 +98,12 @@ def _flat(noise: Mapping[str, Any], prefix: str = "") -> dict[str, float]:
 
 
 def _of_calibration(result) -> Answer:
-    stages = result.stages
     words = {
         "unused": [it.view for it in result.views if not it.used],
         "status": result.verdict.status,
         "findings": sorted(it.kind for it in result.verdict.findings),
-        "level": stages.get("kinematics", {}).get("level", ""),
-        "stages": sorted(stages),
+        "level": "" if result.arm is None else result.arm.level,
+        "stages": sorted(write(CalibrationSections, result)),
     }
     edges = {name: (it.matrix, it.covariance) for name, it in result.edges.items()}
     return Answer(words, edges, _flat(result.noise))
@@ -115,8 +116,7 @@ def _of_alignment(result) -> Answer:
         "untied": sorted(it.frame for it in result.untied),
         "status": result.verdict.status,
         "levels": {
-            name: it.stages.get("kinematics", {}).get("level", "")
-            for name, it in result.arms.items()
+            name: "" if it.arm is None else it.arm.level for name, it in result.arms.items()
         },
     }
     edges = {name: (it.matrix, it.covariance) for name, it in result.edges.items()}

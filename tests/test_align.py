@@ -15,7 +15,7 @@ from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import Target
 from visioncal.interchange.exports import Selection, document
 from visioncal.results import Alignment, Calibration, to_document
-from visioncal.robot import Robot, load_robot
+from visioncal.robot import load_robot
 from visioncal.session import Session
 from visioncal.session.columns import POSE
 from visioncal.simulation import CellOptions, simulate
@@ -228,7 +228,7 @@ def test_a_lens_that_is_stated_wrong_is_refined_or_kept_as_asked(clean, mode):
     away, squared = off(cell, found, "base_a", "cam_left")
     assert np.linalg.norm(away[3:]) > 5e-3
     assert squared < 22.0
-    budget = found.stages["uncertainty"]["budget_mm"]["cell_from_cam_left"]
+    budget = found.uncertainty.budget_mm["cell_from_cam_left"]
     assert budget["held_values"] > 0.9 * budget["total"]
 
 
@@ -327,25 +327,25 @@ def test_arms_that_err_are_named_and_their_offsets_found_where_that_is_asked_for
     found = align(session, corners=corners)
     assert found.verdict.status == "good"
     for robot in ("a", "b"):
-        kinematics = found.arms[robot].stages["kinematics"]
-        assert kinematics["level"] == "offsets"
+        kinematics = found.arms[robot].arm
+        assert kinematics.level == "offsets"
         true = cell.true_arms[robot].offset - cell.arms[robot].offset
-        arm = Robot.from_document(kinematics["robot"])
+        arm = kinematics.robot
         told = arm.chain.functions[:, 0] - load_robot("ur5e").chain.functions[:, 0]
         # What the first joint and the last take may be the base's and the flange's: they stay about
         # as stated. Others are known to some 0.05 mrad by this many stops.
         assert told[[0, -1]] == pytest.approx(0.0, abs=1e-6)
         assert told[1:-1] == pytest.approx(true[1:-1], abs=2.5e-4)
-        zeros = [it for it in kinematics["parameters"] if it["name"] == "theta_rad"]
-        surprises = ([it["change"] for it in zeros] - true) / [it["sigma"] for it in zeros]
+        zeros = [it for it in kinematics.parameters if it.name == "theta_rad"]
+        surprises = ([it.change for it in zeros] - true) / [it.sigma for it in zeros]
         assert np.abs(surprises).max() < 4.5  # one of twelve in ten thousand sessions
         seen = {it.view for it in found.sights if it.seen == f"target_plate_{robot}" and it.used}
-        rows = kinematics["left_out"]
-        assert {it["view"] for it in rows} == seen
+        rows = kinematics.left_out
+        assert {it.view for it in rows} == seen
         before, after = (
-            np.sqrt(np.mean([it[of] ** 2 for it in rows])) for of in ("nominal_mm", "mm")
+            np.sqrt(np.mean([getattr(it, of) ** 2 for it in rows])) for of in ("nominal_mm", "mm")
         )
-        held_out = {it["level"]: it["held_out_mm"] for it in kinematics["levels"]}
+        held_out = {it.level: it.held_out_mm for it in kinematics.levels}
         # The same residuals, written twice.
         assert before == pytest.approx(held_out["nominal"], rel=1e-9)
         assert after == pytest.approx(held_out["offsets"], rel=1e-9)
@@ -599,20 +599,20 @@ def test_an_arm_that_bends_is_as_elastic_in_a_cell_as_by_itself(tmp_path):
     pairs_session(simulate(bending), "pairs").save(tmp_path / "pairs")
     session = Session.load(tmp_path / "pairs")
     alone, cell = calibrate(session), Calibration.whole(align(session)).of()
-    assert cell.stages["kinematics"]["level"] == "elastic"
-    assert alone.stages["kinematics"]["level"] == "elastic"
-    rows = zip(*(it.stages["elastic"]["joints"] for it in (alone, cell)), springs, strict=True)
+    assert cell.arm.level == "elastic"
+    assert alone.arm.level == "elastic"
+    rows = zip(*(it.elastic.joints for it in (alone, cell)), springs, strict=True)
     for one, other, true in rows:
-        sigma = other["sigma_rad_per_nm"]
+        sigma = other.sigma_rad_per_nm
         # Of the same views, but for what a frame beside the arm takes up: within a sigma or so.
-        assert other["compliance_rad_per_nm"] == pytest.approx(
-            one["compliance_rad_per_nm"], abs=1.5 * sigma
+        assert other.compliance_rad_per_nm == pytest.approx(
+            one.compliance_rad_per_nm, abs=1.5 * sigma
         )
-        if other["told"]:
-            assert other["compliance_rad_per_nm"] == pytest.approx(true, abs=4.5 * sigma)
-    assert sum(other["told"] for other in cell.stages["elastic"]["joints"]) >= 2
+        if other.told:
+            assert other.compliance_rad_per_nm == pytest.approx(true, abs=4.5 * sigma)
+    assert sum(other.told for other in cell.elastic.joints) >= 2
     np.testing.assert_allclose(
-        cell.compliance, [it["compliance_rad_per_nm"] for it in cell.stages["elastic"]["joints"]]
+        cell.compliance, [it.compliance_rad_per_nm for it in cell.elastic.joints]
     )
 
 
@@ -653,12 +653,12 @@ def test_a_board_of_another_size_is_found_beside_arms_that_err():
     cameras = (replace(LEFT, camera=fine_camera()), RIGHT, CameraAt("hand", "b"))
     options = NetworkOptions(robots, cameras, boards, stops=2 * STOPS)
     found = aligned(simulate_network(options))
-    floor = found.stages["boards"]["floor"]
+    floor = found.boards["floor"]
     # Four of its sigmas: one run in fifteen thousand.
-    assert abs(floor["shape"]["scale"] - 0.002) < 4 * floor["sigma"]["scale"] < 4e-4
-    assert set(found.stages["boards"]["plate_a"]["sigma"]) == {"scale"}
+    assert abs(floor.shape["scale"] - 0.002) < 4 * floor.sigma["scale"] < 4e-4
+    assert set(found.boards["plate_a"].sigma) == {"scale"}
     assert not found.moved
-    assert {found.arms[it].stages["kinematics"]["level"] for it in "ab"} == {"offsets"}
+    assert {found.arms[it].arm.level for it in "ab"} == {"offsets"}
 
 
 @pytest.mark.slow
@@ -670,7 +670,7 @@ def test_boards_of_three_sizes_are_found_beside_arms_that_err():
     found = aligned(
         simulate_network(NetworkOptions(tuple(robots), boards=tuple(boards), stops=STOPS, seed=5))
     )
-    shapes = {name: found.stages["boards"][name]["shape"]["scale"] for name in scales}
+    shapes = {name: found.boards[name].shape["scale"] for name in scales}
     # Against each other they are known to some hundred-thousandths.
     assert shapes["floor"] - shapes["plate_a"] == pytest.approx(0.003, abs=1e-4)
     assert shapes["floor"] - shapes["plate_b"] == pytest.approx(0.001, abs=1e-4)

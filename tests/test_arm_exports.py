@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from arm_documents import arm_of
 from commands import visioncal
 from placed import alone, tool
 from readers import ARM_FORMATS, rx, ry, rz, transform
@@ -19,11 +20,12 @@ from visioncal.core.transforms import exp
 from visioncal.interchange.exports import Selection, document, export
 from visioncal.interchange.exports.arm import omission_mm
 from visioncal.interchange.result_files import load_placed
+from visioncal.results.arm import ArmResult, WorkspaceSigma
 from visioncal.robot import CONVENTIONS, Robot, load_robot
 from visioncal.session import Session
 
 SAMPLE = made_up(5).calibration
-SIGMA = {"median": 0.123, "p95": 0.345}
+SIGMA = WorkspaceSigma(0.123, 0.345)
 
 
 def calibrated(nominal, *, waves=False, **changes):
@@ -32,8 +34,8 @@ def calibrated(nominal, *, waves=False, **changes):
     if not waves:
         functions[:, 1:] = 0.0
     arm = nominal.corrected(placements, functions)
-    found = {"level": "geometry", "robot": dict(arm.document), "workspace_sigma_mm": SIGMA}
-    return replace(SAMPLE, robot=nominal, stages={"kinematics": found}, **changes)
+    found = arm_of(arm, workspace_sigma_mm=SIGMA)
+    return replace(SAMPLE, robot=nominal, arm=found, **changes)
 
 
 def poses(calibration):
@@ -158,7 +160,7 @@ def test_json_holds_all_that_was_found(tmp_path, nominal):
     again = read_back(tmp_path, "arm.json", found.text)
     # Every number is written in full.
     q = some_joints(nominal)
-    expected = Robot.from_document(result.stages["kinematics"]["robot"]).base_from_flange(q)
+    expected = result.arm.robot.base_from_flange(q)
     assert np.array_equal(again.base_from_flange(q), expected)
 
 
@@ -171,7 +173,7 @@ def test_what_a_file_cannot_hold_is_said_with_its_price(name):
     price_mm = float(said[0].rpartition("up to ")[2].split()[0])
     assert said[0].rstrip(".") in found.text.replace("- -", "--")
     # Against other postures: the arm without them is off by as much, and hardly by more.
-    arm = Robot.from_document(result.stages["kinematics"]["robot"])
+    arm = result.arm.robot
     functions = np.tile([0.0, 1.0, 0.0, 0.0], (6, 1)) - arm.chain.functions
     functions[:, 0] = 0.0
     q = np.random.default_rng(9).uniform(-np.pi, np.pi, (2000, 6))
@@ -201,7 +203,7 @@ def test_the_file_says_where_it_comes_from(name):
     ("source", "words"),
     [
         (SAMPLE, "Record q1_rad"),
-        (replace(SAMPLE, stages={"kinematics": {"level": "nominal"}}), "kept the nominal one"),
+        (replace(SAMPLE, arm=ArmResult(level="nominal", levels=())), "kept the nominal one"),
         (alone(tool()), "Name the calibration"),
     ],
     ids=["none", "nominal", "frames"],

@@ -1,20 +1,19 @@
 """The calibrated arm in the report and in the recording."""
 
 import re
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from arm_documents import NOT_TOLD, WORTH, calibrated, stays_stated, with_holdout
 from drawn import column
+from findings import with_findings
 from pages import Page, section
 from rerun.chunk import RrdReader
 from samples import Sample, made_up
 
 from visioncal.core.errors import DataError
 from visioncal.present.recording import armtext, notes, paths, read_calibration, write_recording
-from visioncal.present.recording.kinematics import Kinematics
 from visioncal.present.recording.workspace import ArmPicture
 from visioncal.present.report.arm import arm_card
 from visioncal.present.report.page import render
@@ -28,7 +27,7 @@ def sample() -> Sample:
 
 
 def with_arm(sample: Sample, document: dict[str, Any]) -> Calibration:
-    return replace(sample.calibration, stages={"kinematics": document})
+    return with_findings(sample, {"kinematics": document})
 
 
 def page_of(sample: Sample, document: dict[str, Any]) -> Page:
@@ -146,19 +145,24 @@ def test_a_session_without_joints_has_no_arm(sample):
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"levels": []}, {"level": "elastic"}, {"parameters": [{"joint": "a"}]}, ["no table"]]
+    ("wrong", "words"),
+    [
+        ({"levels": []}, "kinematics: level 'geometry' is not among the levels"),
+        ({"level": "elastic"}, "kinematics: level 'elastic' is not among the levels"),
+        ({"parameters": [{"joint": "a"}]}, r"kinematics.parameters\[0\].name is missing"),
+        (["no table"], r"kinematics is \['no table'\]; a table is needed"),
+    ],
 )
-def test_an_arm_that_cannot_be_read_is_named(sample, wrong):
+def test_an_arm_that_cannot_be_read_is_named(sample, wrong, words):
     document = calibrated() | wrong if isinstance(wrong, dict) else wrong
-    with pytest.raises(DataError, match="kinematics cannot be read"):
-        Kinematics.of(with_arm(sample, document))
+    with pytest.raises(DataError, match=words):
+        with_arm(sample, document)
 
 
 def test_five_stops_have_no_least_one(sample):
     document = calibrated()
     document["stops"] = document["stops"][:5]
-    found = Kinematics.of(with_arm(sample, document))
-    assert found is not None
+    found = with_arm(sample, document).arm
     card = arm_card(found)
     assert (len(card.most_worth), card.least_worth) == (5, ())
 
@@ -220,8 +224,7 @@ def test_the_arm_is_drawn_as_calibrated_and_the_stated_one_off_it(sample, tmp_pa
 
 
 def test_the_note_names_what_is_sure_and_what_is_not_told(sample):
-    found = Kinematics.of(with_arm(sample, calibrated()))
-    assert found is not None
+    found = with_arm(sample, calibrated()).arm
     text = armtext.markdown(found)
     assert "| **geometry of the links** | 36 | 0.073 |" in text
     assert "| shoulder pan joint | a | 0 | 1.20 | **+1.20** |" in text

@@ -28,14 +28,17 @@ def test_play_is_told_and_is_no_stiffness(worn):
         assert abs(play.deadband_rad - true) < 3.5 * play.sigma_rad
     springs = worn.arm_found.springs.springs
     for at in (1, 2):
-        assert abs(springs[at].compliance - 1.0 / COBOT[at]) < 3.5 * springs[at].sigma
+        assert (
+            abs(springs[at].compliance_rad_per_nm - 1.0 / COBOT[at])
+            < 3.5 * springs[at].sigma_rad_per_nm
+        )
     assert any("Joints have play: shoulder_pan_joint" in it for it in worn.verdict.reasons)
 
 
 def test_play_is_in_the_result(worn):
-    rows = result_of(worn).stages["kinematics"]["backlash"]
-    assert [row["joint"] for row in rows] == list(worn.robot.joint_names)
-    assert rows[1]["deadband_rad"] == pytest.approx(PLAY[1], rel=0.2)
+    rows = result_of(worn).arm.backlash
+    assert [row.joint for row in rows] == list(worn.robot.joint_names)
+    assert rows[1].deadband_rad == pytest.approx(PLAY[1], rel=0.2)
 
 
 def test_an_arm_that_is_right_but_for_its_play():

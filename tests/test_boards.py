@@ -89,7 +89,7 @@ def test_boards_have_names_and_a_common_covariance(mount):
     # The boards hang together by the camera's edge.
     assert np.abs(result.joint_covariance[6:12, 12:]).max() > 0.0
     assert np.linalg.eigvalsh(result.joint_covariance).min() > 0.0
-    assert set(result.stages["boards"]) == {"first", "second"}
+    assert set(result.boards) == {"first", "second"}
     for solver in result.solvers.values():
         assert list(solver.matrices) == list(cell.transforms)
     park = result.solvers["park"].matrices
@@ -159,10 +159,10 @@ def test_a_board_of_another_size_is_named():
     told = [it for it in known.verdict.reasons if "By the robot's motion" in it]
     assert len(told) == 1
     assert "the board second is 1 % larger than stated" in told[0]
-    shapes = result_of(known).stages["boards"]
+    shapes = result_of(known).boards
     # The robot measures a size to some hundredths of a percent.
-    assert shapes["second"]["shape"]["scale"] == pytest.approx(0.01, abs=1e-3)
-    assert shapes["first"]["shape"]["scale"] == 0.0
+    assert shapes["second"].shape["scale"] == pytest.approx(0.01, abs=1e-3)
+    assert shapes["first"].shape["scale"] == 0.0
 
 
 def test_one_view_places_a_board():

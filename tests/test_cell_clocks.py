@@ -29,20 +29,20 @@ def found(swept):
 
 
 def test_the_offset_of_one_camera_is_found_by_the_motion(found):
-    clock = found.details["clocks"][CLOCK]
-    assert clock["method"] == "motion"
-    assert clock["sigma_s"] < 1e-4
+    clock = found.details.clocks[CLOCK]
+    assert clock.method == "motion"
+    assert clock.sigma_s < 1e-4
     # Three sigma: one run in 370. What the motion tells of the arm as stated is off by more.
-    assert abs(clock["camera_minus_robot_s"] - AHEAD_S) < 3 * clock["sigma_s"]
-    ahead_ms = 1e3 * clock["camera_minus_robot_s"]
+    assert abs(clock.camera_minus_robot_s - AHEAD_S) < 3 * clock.sigma_s
+    ahead_ms = 1e3 * clock.camera_minus_robot_s
     said = f"{CLOCK}: the fit of the whole cell has the camera's clock {ahead_ms:+.2f} ms ahead"
     assert any(it.startswith(said) for it in found.verdict.reasons)
 
 
 def test_the_clock_of_one_camera_and_robot_goes_with_them(found):
     whole = Calibration.whole(found)
-    assert whole.of("side", "b").stages["clock"] == found.details["clocks"][CLOCK]
-    assert "clock" not in whole.of("left", "b").stages
+    assert whole.of("side", "b").clock == found.details.clocks[CLOCK]
+    assert whole.of("left", "b").clock is None
 
 
 def test_a_camera_that_saw_nothing_else_is_placed_as_its_covariance_says(swept, found):
@@ -64,7 +64,7 @@ def test_what_is_stated_of_one_camera_is_contradicted_by_name(swept):
     found = align(replace(session, document=document), corners=corners)
     (doubt,) = [it for it in found.verdict.reasons if "is stated as +20.00 ms" in it]
     assert doubt.startswith(CLOCK)
-    assert found.details["clocks"][CLOCK]["stated_s"] == 0.02
+    assert found.details.clocks[CLOCK].stated_s == 0.02
     assert found.verdict.status == "check"
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from arm_documents import arm_of
 from commands import turned_poses, visioncal, write_poses
 from whole_cells import LATER, OPTIONS, misfit, part, recorded, saved, simulated, truth
 
@@ -233,8 +234,7 @@ def test_targets_are_corrected_for_the_robot_that_is_named(place, tmp_path):
     whole = Calibration.load(place / "out")
     arm = whole.cell.arms["b"]
     bent = arm.model.corrected(1e-3 * np.ones((7, 6)))
-    stages = {"kinematics": {"level": "kinematics", "robot": dict(bent.document)}}
-    arms = {**whole.cell.arms, "b": RobotResult(arm.model, stages)}
+    arms = {**whole.cell.arms, "b": RobotResult(arm.model, arm=arm_of(bent))}
     Calibration.whole(replace(whole.cell, arms=arms)).save(tmp_path / "calibration.json")
     q = np.array([[0.2, -1.2, 1.4, -1.6, -1.5, 0.3], [0.5, -1.0, 1.2, -1.4, -1.3, 0.1]])
     wanted = bent.base_from_flange(q)

@@ -77,17 +77,17 @@ def test_coefficients_are_within_their_sigmas(found, tmp_path):
         [drift.growth_per_k - heat.growth_per_k, drift.drift_rad_per_k - heat.drift_rad_per_k]
     )
     assert off @ np.linalg.solve(drift.covariance[:12, :12], off) < OF_TWELVE
-    thermal = found.arms["a"].stages["thermal"]
-    assert thermal["residual_mm"]["with"] < 0.7 * thermal["residual_mm"]["without"]
-    assert len(thermal["views"]) > 30
+    thermal = found.arms["a"].thermal
+    assert thermal.residual_mm.with_drift < 0.7 * thermal.residual_mm.without
+    assert len(thermal.views) > 30
 
 
 def test_a_robot_without_temperatures_stays_and_is_named(found):
-    assert "thermal" not in found.arms["b"].stages
+    assert found.arms["b"].thermal is None
     reasons = found.verdict.reasons
     assert any(it.startswith("Robot a: the arm drifts with its temp") for it in reasons)
     assert any(it.startswith("Robot b: nothing tells how it drifts") for it in reasons)
-    budget = found.stages["uncertainty"]["budget_mm"]["flange_a_from_target_plate_a"]
+    budget = found.uncertainty.budget_mm["flange_a_from_target_plate_a"]
     assert 0.0 < budget["temperature of a"] < budget["total"]
 
 

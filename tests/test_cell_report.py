@@ -10,6 +10,7 @@ from visioncal.core.number_format import significant
 from visioncal.present.recording.cellmap import pairs, weakest_frame
 from visioncal.present.report.cells import pair_table, render_cell, write_cell_report
 from visioncal.results import Moved, RobotResult, Sight, Untied
+from visioncal.results.arm import ArmLevel, ArmResult
 
 CELL = made_up_cell(5)
 
@@ -55,11 +56,11 @@ def test_the_table_has_any_frame_in_any_other():
 
 
 def test_errors_of_robots_are_told_where_they_were_estimated():
-    levels = [
-        {"level": name, "unknowns": 6, "rms_mm": mm, "held_out_mm": mm, "likelihood_ratio": 0.0}
+    levels = tuple(
+        ArmLevel(level=name, unknowns=6, rms_mm=mm, held_out_mm=mm, likelihood_ratio=0.0)
         for name, mm in (("nominal", 0.31), ("offsets", 0.17))
-    ]
-    arm = RobotResult(stages={"kinematics": {"level": "offsets", "levels": levels}})
+    )
+    arm = RobotResult(arm=ArmResult(level="offsets", levels=levels))
     words = text_of(render_cell(replace(CELL, arms={"a": arm})))
     assert "robot a offsets stops left out: 0.17 mm, as stated 0.31 mm" in words
     assert "The robots themselves" not in render_cell(CELL)

@@ -87,14 +87,14 @@ def x_error(cell, result) -> tuple[np.ndarray, np.ndarray]:
 def test_the_offset_is_told_by_a_sweep(seed, mount, ahead_s):
     it = swept(seed, mount, replace(SHORT, camera_minus_robot_s=ahead_s))
     result = calibrate(sweep_session(it, "swept"))
-    clock = result.stages["clock"]
-    error_s = clock["camera_minus_robot_s"] - ahead_s
-    assert clock["method"] == "motion"
+    clock = result.clock
+    error_s = clock.camera_minus_robot_s - ahead_s
+    assert clock.method == "motion"
     # A hundredth of what is asked for (2 ms), as told by some 200 frames; no error is beyond four
     # of its sigmas, and none of these is so small that this were easy.
     assert abs(error_s) < 2e-4
-    assert abs(error_s) < 4 * clock["sigma_s"]
-    assert clock["sigma_s"] < 1e-4
+    assert abs(error_s) < 4 * clock.sigma_s
+    assert clock.sigma_s < 1e-4
     error, covariance = x_error(it.cell, result)
     # Six degrees of freedom: one in ten thousand is beyond.
     assert error @ np.linalg.solve(covariance, error) < 27.9
@@ -121,7 +121,7 @@ def test_stamps_that_jitter_are_told_worse(moved):
 
 def test_images_are_placed_in_time_by_their_corners(moved):
     result = result_of(calibrated_sweep(moved))
-    assert abs(result.stages["clock"]["camera_minus_robot_s"] - AHEAD_S) < 1e-4
+    assert abs(result.clock.camera_minus_robot_s - AHEAD_S) < 1e-4
     assert result.noise["pixel_px"] == pytest.approx(0.1, rel=0.05)
     error, covariance = x_error(moved.cell, result)
     assert error @ np.linalg.solve(covariance, error) < 27.9
@@ -133,8 +133,8 @@ def test_joints_are_placed_in_time_too(moved, session):
     robot = load_robot("ur10e").document
     joints = replace(session, robot_document=robot).with_streams({"arm": Stream(columns, values)})
     result = calibrate(joints, level="offsets")
-    assert abs(result.stages["clock"]["camera_minus_robot_s"] - AHEAD_S) < 1e-4
-    assert result.stages["kinematics"]["level"] in ("nominal", "offsets")
+    assert abs(result.clock.camera_minus_robot_s - AHEAD_S) < 1e-4
+    assert result.arm.level in ("nominal", "offsets")
     assert "streams/arm.csv" in " ".join(result.verdict.reasons)
 
 
@@ -143,7 +143,7 @@ def test_a_folder_and_its_recording_give_the_same(session, tmp_path):
     write_recording(tmp_path / "session.rrd", session, None, (), None)
     one, other = (calibrate(tmp_path / it) for it in ("folder", "session.rrd"))
     assert one.session_sha256 == other.session_sha256
-    assert one.stages["clock"] == other.stages["clock"]
+    assert one.clock == other.clock
     for name, edge in one.edges.items():
         np.testing.assert_array_equal(edge.matrix, other.edges[name].matrix)
     (fact,) = [it for it in method_facts(one) if it.label == "camera's clock"]
@@ -168,15 +168,15 @@ def test_a_stated_offset_is_compared(session):
     assert not any("is stated as" in it for it in right.verdict.reasons)
     assert any(told in it for it in wrong.verdict.reasons)
     assert wrong.verdict.status == "check"
-    assert wrong.stages["clock"]["stated_s"] == 0.0
-    assert abs(wrong.stages["clock"]["camera_minus_robot_s"] - AHEAD_S) < 1e-4
+    assert wrong.clock.stated_s == 0.0
+    assert abs(wrong.clock.camera_minus_robot_s - AHEAD_S) < 1e-4
 
 
 def test_what_the_stream_does_not_cover_is_left_out_by_name(session):
     gapped = cut(session, lambda it: ((it < 3.0) | (it > 3.4)) & (it < 6.3))
     result = calibrate(gapped)
     reasons = [view.reason for view in result.views]
-    assert abs(result.stages["clock"]["camera_minus_robot_s"] - AHEAD_S) < 1e-4
+    assert abs(result.clock.camera_minus_robot_s - AHEAD_S) < 1e-4
     # 12 frames in the gap of 0.4 s, give or take those at its ends.
     assert sum("samples of its stream are missing" in it for it in reasons) in (11, 12, 13, 14)
     assert sum("before or after the robot's stream" in it for it in reasons) > 8
@@ -216,8 +216,8 @@ def quaternions(poses: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("ahead_s", [0.0, 0.2])
 def test_at_rest_the_clocks_do_not_matter(ahead_s):
     result = calibrate(dwelling(ahead_s))
-    assert result.stages["clock"]["method"] == "rest"
-    assert "sigma_s" not in result.stages["clock"]
+    assert result.clock.method == "rest"
+    assert result.clock.sigma_s is None
     assert any("taken at rest, where this does not count" in it for it in result.verdict.reasons)
     assert result.verdict.status == "good"
     assert sum(view.used for view in result.views) == 20
@@ -320,7 +320,7 @@ def test_what_is_open_about_the_clocks_counts(session):
         later = replace(known, clocks=clocks)
         for stage in STAGES[[it.name for it in STAGES].index("clock") + 1 :]:
             later = stage.run(later)
-        budget = result_of(later).stages["uncertainty"]["budget_mm"]
+        budget = result_of(later).uncertainty.budget_mm
         spreads.append((budget["clock"], budget["total"]))
     assert spreads[0][0] < 1e-3
     # The used views themselves tell the offset to better than 5 ms, but not for nothing.
@@ -345,5 +345,5 @@ def test_views_with_poses_of_their_own_ask_no_stream(moved, session):
         for view, row in zip(session.views, rows, strict=True)
     )
     result = calibrate(replace(session, views=posed[::8]))
-    assert "clock" not in result.stages
+    assert result.clock is None
     assert all(view.used for view in result.views)

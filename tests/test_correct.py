@@ -16,6 +16,14 @@ from visioncal.calibration.pipeline.result import result_of
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert
 from visioncal.results import Calibration
+from visioncal.results.arm import (
+    ArmResult,
+    ElasticResult,
+    JointSpring,
+    Sag,
+    WorkspacePlace,
+    WorkspaceSigma,
+)
 from visioncal.results.compensation.arms import predicted_sigma_mm
 from visioncal.robot import Robot
 from visioncal.robot.inverse import Inverse
@@ -52,8 +60,7 @@ def exact(cell, result) -> Calibration:
     robot = Robot.from_document(
         {"schema": 1, "name": "true", "tip": nominal.tip, "convention": "hayati", "joint": named}
     )
-    kinematics = {**result.stages["kinematics"], "robot": robot.corrected().document}
-    return replace(result, stages={**result.stages, "kinematics": kinematics})
+    return replace(result, arm=replace(result.arm, robot=robot.corrected()))
 
 
 def joints_near(count: int, seed: int = 1, size: float = 0.5) -> np.ndarray:
@@ -98,7 +105,7 @@ def test_the_true_arm_brings_the_camera_to_where_it_is_wanted(cell, result, by_p
     # Forty views leave 4 to 10 % of the nominal arm's error.
     assert after < 0.1 * before
     # The stated sigma counts the board's size, which is exact here.
-    assert after < 2.0 * result.stages["kinematics"]["workspace_sigma_mm"]["median"]
+    assert after < 2.0 * result.arm.workspace_sigma_mm.median
 
 
 def test_a_model_that_is_the_truth_is_inverted_exactly(cell, exact):
@@ -192,27 +199,24 @@ def test_what_is_no_target_or_no_seed_is_refused(result, targets, seed, said):
 def test_without_a_calibrated_arm_there_is_nothing_to_correct(result, by_poses):
     with pytest.raises(DataError, match="no joint angles"):
         visioncal.correct(by_poses, np.eye(4))
-    stages = {**result.stages, "kinematics": {"level": "nominal", "levels": []}}
+    nominal = ArmResult(level="nominal", levels=())
     with pytest.raises(DataError, match="level nominal"):
-        visioncal.correct(replace(result, stages=stages), np.eye(4))
+        visioncal.correct(replace(result, arm=nominal), np.eye(4))
 
 
 def test_sigmas_come_from_the_map_or_else_from_the_median(result):
     places = np.array([[0.4, 0.0, 0.2], [0.41, 0.0, 0.2]])
-    plain = {**result.stages["kinematics"], "workspace_sigma_mm": {"median": 0.3, "p95": 0.5}}
-    plain.pop("workspace_map", None)
-    rows = [
-        {"x_m": x, "y_m": 0.0, "z_m": 0.2, "sigma_mm": sigma}
-        for x, sigma in ((0.4, 0.1), (0.45, 0.2), (0.6, 0.9))
-    ]
-    for kinematics, sigmas in (
+    plain = replace(result.arm, workspace_sigma_mm=WorkspaceSigma(0.3, 0.5), workspace_map=())
+    rows = tuple(
+        WorkspacePlace(x, 0.0, 0.2, sigma) for x, sigma in ((0.4, 0.1), (0.45, 0.2), (0.6, 0.9))
+    )
+    for arm, sigmas in (
         (plain, (0.3, 0.3)),
         # On a place of the map, and between two of them, nearer to the first.
-        (plain | {"workspace_map": rows}, (0.1, 0.11)),
-        ({"robot": plain["robot"]}, (np.nan, np.nan)),
+        (replace(plain, workspace_map=rows), (0.1, 0.11)),
+        (replace(plain, workspace_sigma_mm=None), (np.nan, np.nan)),
     ):
-        known = replace(result, stages={"kinematics": kinematics})
-        found = predicted_sigma_mm(known, places)
+        found = predicted_sigma_mm(replace(result, arm=arm), places)
         assert found == pytest.approx(np.array(sigmas), abs=0.01, nan_ok=True)
 
 
@@ -381,8 +385,13 @@ def test_what_is_no_table_of_targets_is_named(stored, result):
 
 
 def test_a_payload_is_counted_where_joints_bend(stored, result):
-    springs = [{"compliance_rad_per_nm": 1e-4} for _ in range(6)]
-    bending = replace(result, stages={**result.stages, "elastic": {"joints": springs}})
+    spring = {"compliance_rad_per_nm": 1e-4, "sigma_rad_per_nm": 1e-6, "told": True}
+    springs = tuple(
+        JointSpring(joint=it, torque_nm=(0.0, 9.0), **spring) for it in result.robot.joint_names
+    )
+    sagging = {"not_told": (), "weight": "unknown", "payload_kg": (0.0, 0.0), "stops": ()}
+    elastic = ElasticResult(joints=springs, sag_mm=Sag(0.1, 0.2), **sagging)
+    bending = replace(result, elastic=elastic)
     poses = targets_near(2, result)
     table = write_poses(stored / "t.csv", poses)
     load = ("--payload-kg", "3", "--payload-m", "0,0,0.1", "--seed-joints", SEED)

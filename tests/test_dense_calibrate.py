@@ -15,6 +15,7 @@ from visioncal.calibration.pipeline import run, run_dense
 from visioncal.calibration.stages import dense as stage
 from visioncal.calibration.stages.detect import detect
 from visioncal.core.errors import DataError
+from visioncal.results.sections import CornerResiduals
 from visioncal.session.single import is_whole_cell
 from visioncal.simulation import (
     CellOptions,
@@ -77,11 +78,11 @@ def test_dense_corners_are_nearer_to_the_truth_and_both_predictions_are_told(cel
     # The template's blur has two widths; a line has one direction.
     assert off_px(cell, found) < 0.8 * off_px(cell, plain)
     assert found.calibration.noise["pixel_px"] < 0.8 * plain.calibration.noise["pixel_px"]
-    document = found.calibration.stages["dense"]
-    assert document["kept"]
+    document = found.calibration.dense
+    assert document.kept
     held = found.calibration.validation.held_out
-    assert document["held_out"]["dense"] == {"mm": held.mm, "px": held.px}
-    assert document["held_out"]["template"]["px"] == plain.calibration.validation.held_out.px
+    assert document.held_out["dense"] == CornerResiduals(mm=held.mm, px=held.px)
+    assert document.held_out["template"].px == plain.calibration.validation.held_out.px
     (told,) = [it for it in found.calibration.verdict.reasons if it.startswith("Dense corners")]
     assert told.startswith("Dense corners are kept: with them, views that were left out are")
     assert told.count(" px and ") == told.count(" mm") == 2
@@ -91,7 +92,7 @@ def test_blur_is_told_with_its_cause(both):
     found = both[1].calibration
     (told,) = [it for it in found.verdict.reasons if "Motion smears" in it]
     assert told.startswith("Motion smears 10 of 10 images, by up to 6.")
-    lengths = [it["motion_px"] for it in found.stages["dense"]["images"]]
+    lengths = [it.motion_px for it in found.dense.images]
     np.testing.assert_allclose(lengths, 6.0, atol=0.5)
 
 
@@ -112,7 +113,7 @@ def test_a_result_with_dense_corners_can_be_written_and_read(both, tmp_path):
     found = both[1].calibration
     found.save(tmp_path / "calibration.json")
     again = package.Calibration.load(tmp_path)
-    assert again.stages["dense"] == found.stages["dense"]
+    assert again.dense == found.dense
 
 
 def test_dense_corners_that_predict_worse_are_not_kept(session, both, monkeypatch):
@@ -129,7 +130,7 @@ def test_dense_corners_that_predict_worse_are_not_kept(session, both, monkeypatc
     assert found.edges["flange_from_cam"].transform.translation == pytest.approx(
         plain.edges["flange_from_cam"].transform.translation, abs=1e-12
     )
-    assert not found.stages["dense"]["kept"]
+    assert not found.dense.kept
     assert any(it.startswith("Dense corners are not kept") for it in found.verdict.reasons)
 
 

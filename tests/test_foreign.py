@@ -280,7 +280,7 @@ def test_the_offset_of_two_clocks_is_found(tmp_path, ahead_s):
     assert not session.declaration.clock.model_fields_set
     result = visioncal.calibrate(session)
     # What cubics between samples of 100 Hz leave.
-    assert result.stages["clock"]["camera_minus_robot_s"] == pytest.approx(ahead_s, abs=1e-6)
+    assert result.clock.camera_minus_robot_s == pytest.approx(ahead_s, abs=1e-6)
     away = pose_difference(result.edges["flange_from_cam"].matrix, invert(FLANGE_FROM_CAM_BACK))
     assert max(away) < 1e-4
 

@@ -188,9 +188,9 @@ def test_two_streams_with_clocks_of_their_own(real_data, calibrated):
     # A frame lasts 33 ms and the robot's samples 20; the angular speeds alone give +20 ms to half
     # a sample.
     assert "clock is about +16 ms" in said
-    clock = result.stages["clock"]
-    assert clock["camera_minus_robot_s"] == pytest.approx(0.0170, abs=1e-3)
-    assert 2e-4 < clock["sigma_s"] < 2e-3
+    clock = result.clock
+    assert clock.camera_minus_robot_s == pytest.approx(0.0170, abs=1e-3)
+    assert 2e-4 < clock.sigma_s < 2e-3
     used = [it for it in result.views if it.used]
     # 3.2 mm and 0.36 deg in the median over 174 samples that stand close to each other; these lie
     # all over the motion.
@@ -211,9 +211,9 @@ def test_streams_read_the_wrong_way_round_do_not_close(real_data, calibrated):
     assert result.verdict.status == "bad"
     assert "With the camera's poses inverse, the chain closes" in result.verdict.reasons[0]
     # How the poses are read does not matter to how both turn: a frame's fraction, as above.
-    clock = result.stages["clock"]
-    assert clock["method"] == "turning"
-    assert clock["camera_minus_robot_s"] == pytest.approx(0.0170, abs=3e-3)
+    clock = result.clock
+    assert clock.method == "turning"
+    assert clock.camera_minus_robot_s == pytest.approx(0.0170, abs=3e-3)
 
 
 def test_a_positioner_from_its_joints(real_data, calibrated, tmp_path):
@@ -240,10 +240,10 @@ def test_a_calibrated_positioner_predicts_views_that_no_fit_has_seen(real_data, 
     result = visioncal.calibrate(replace(session, views=views))
     assert result.arm_is_calibrated
     # Ten folds leave 0.36 mm in the mean over all, and a fit of both axes alone 0.38 mm in sample.
-    away = result.stages["kinematics"]["holdout"]
+    away = result.arm.holdout
     assert len(away) == 21
-    assert np.mean([it["mm"] for it in away]) < 1.2 * 0.38
-    assert np.mean([it["deg"] for it in away]) < 1.2 * 0.046
+    assert np.mean([it.mm for it in away]) < 1.2 * 0.38
+    assert np.mean([it.deg for it in away]) < 1.2 * 0.046
 
 
 def test_a_ur10_from_its_joints(real_data, calibrated):

@@ -34,7 +34,7 @@ def calibrated(tmp_path_factory) -> str:
         (("solvers", "park", "rms_mm"), True, "solvers.park.rms_mm is True; a number"),
         (("frames", "flange_from_tool", "created"), [], "flange_from_tool.created is"),
         (("kinematics",), "nominal", "kinematics is 'nominal'; a table is needed"),
-        (("uncertainty",), {"budget_mm": {}}, "uncertainty.noise_95 is missing"),
+        (("uncertainty",), {"budget_mm": {}}, "uncertainty.point_cam_m is missing"),
         (("joint_covariance", "matrix", 2, 2), -1e-8, "matrix is no covariance"),
         (("joint_covariance", "matrix", 2, 3), 1.0, "matrix is no covariance"),
         (("transforms", "flange_from_cam", "matrix", 3, 0), 1.0, "not a rigid transform"),
@@ -44,7 +44,7 @@ def calibrated(tmp_path_factory) -> str:
             "1e\\+300; a number that a cell has",
         ),
         (("elastic",), {"joints": [{"compliance_rad_per_nm": {}}]}, r"joints\[0\].compliance"),
-        (("elastic",), {"weight_moments": [[1], [1, 2]]}, "inhomogeneous"),
+        (("elastic",), {"weight_moments": [[1], [1, 2]]}, "an array of n x n numbers"),
         (("kinematics",), {"level": "offsets", "robot": {"joint": 1}}, "robot: name is missing"),
     ],
 )

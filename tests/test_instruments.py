@@ -140,12 +140,12 @@ def test_without_a_model_poses_give_the_frames_alone(tmp_path):
     session_of(shop, joints=False, poses=True).save(tmp_path / "shop")
     result = visioncal.calibrate(tmp_path / "shop")
     assert list(result.transforms) == ["base_from_instrument", "flange_from_probe"]
-    assert "kinematics" not in result.stages
-    places = np.array([[it["x_m"], it["y_m"], it["z_m"]] for it in result.stages["points"]])
+    assert result.arm is None
+    places = np.array([[it.x_m, it.y_m, it.z_m] for it in result.points])
     # Known to 0.012 mm each, by what the result says of them.
     assert places == pytest.approx(np.array(THREE), abs=5e-5)
-    assert [it["point"] for it in result.stages["points"]] == ["a", "b", "c"]
-    assert all(it["sigma_mm"] < 0.02 for it in result.stages["points"])
+    assert [it.point for it in result.points] == ["a", "b", "c"]
+    assert all(it.sigma_mm < 0.02 for it in result.points)
 
 
 @PROBE_FIRST

@@ -186,18 +186,18 @@ def test_the_result_holds_the_calibrated_arm(tmp_path):
     file = tmp_path / "calibration.json"
     result_of(known).save(file)
     result = visioncal.Calibration.load(file)
-    found = result.stages["kinematics"]
+    found = result.arm
     q = postures(known.robot)[:5]
     calibrated_poses = known.robot_arm.model.robot.base_from_flange(q)
     # RigidTransform makes rotations orthonormal anew, to the last digits.
     assert result.base_from_flange(q).as_matrix() == pytest.approx(calibrated_poses, abs=1e-14)
-    assert found["level"] == "geometry"
-    assert found["levels"][0]["level"] == "nominal"
-    changes = {(it["joint"], it["name"]): it["change"] for it in found["parameters"]}
+    assert found.level == "geometry"
+    assert found.levels[0].level == "nominal"
+    changes = {(it.joint, it.name): it.change for it in found.parameters}
     # A UR's second and third axes are parallel, and so get Hayati's beta.
     assert ("shoulder_lift_joint", "beta_rad") in changes
     assert 1e-5 < max(map(abs, changes.values())) < 0.02
-    assert found["observability"]["identifiable"] == 30
+    assert found.observability.identifiable == 30
     # The nominal model stays what it was.
     assert np.array_equal(result.robot.base_from_flange(q), known.robot.base_from_flange(q))
 

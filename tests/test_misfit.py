@@ -108,7 +108,7 @@ def test_stops_that_err_in_groups_are_noticed():
     result, known = answered(together)
     found = of_fit(neighbours, result)
     assert found.is_significant
-    stated = result_of(known).stages["uncertainty"]["inflation"]
+    stated = result_of(known).uncertainty.inflation
     assert stated == pytest.approx(found.factor, rel=1e-9)
     assert found.factor > 1.5
     assert any("Neighbouring stops err alike" in it.reason for it in known.warnings)

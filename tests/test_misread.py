@@ -46,8 +46,8 @@ def finished(told, **changes):
 
 
 def parameters(known):
-    """The arm's parameters as calibration.json has them."""
-    return result_of(known).stages["kinematics"]["parameters"]
+    """The arm's parameters, as the result has them."""
+    return result_of(known).arm.parameters
 
 
 def planted(name, *, with_poses, seed=0):
@@ -160,10 +160,10 @@ def test_a_lost_encoder_is_found_and_not_thrown_away(with_poses):
     nominal, *others = known.robot_arm.kinematics.levels
     assert nominal.left_out.mm > 10.0
     assert others[-1].left_out.mm < 0.5
-    theta = {it["joint"]: it for it in parameters(known) if it["name"] == "theta_rad"}
+    theta = {it.joint: it for it in parameters(known) if it.name == "theta_rad"}
     # Errors of the arm's other parameters are up to a few milliradians.
-    assert theta["elbow_joint"]["nominal"] == pytest.approx(0.0, abs=1e-9)
-    assert theta["elbow_joint"]["change"] == pytest.approx(np.deg2rad(10.0), abs=5e-3)
+    assert theta["elbow_joint"].nominal == pytest.approx(0.0, abs=1e-9)
+    assert theta["elbow_joint"].change == pytest.approx(np.deg2rad(10.0), abs=5e-3)
     # What is seen of the target hardly depends on whose errors the last tenths of a degree are.
     found = known.robot_arm.model.robot.base_from_flange(joints)
     true = IN_HAND.true_base_from_flange

@@ -106,14 +106,14 @@ def test_points_that_are_not_where_the_table_has_them_are_named(tmp_path):
     (sentence,) = (it for it in result.verdict.reasons if "table has it" in it)
     assert sentence.startswith(f"Point {number} of target target lies 0.")
     # The views have it where it was, to within four sigmas of what the table says of it.
-    assert result.stages["rig"]["shape"][4][0] == pytest.approx(-5e-4, abs=2e-4)
+    assert result.rig.shape[4][0] == pytest.approx(-5e-4, abs=2e-4)
     again = Calibration.from_json(json.dumps(to_document(result)), "again")
     write_rig(tmp_path / "fresh", replace(rig, views=6))
     (folder / "target.csv").replace(tmp_path / "fresh" / "target.csv")
     fresh = Session.load(tmp_path / "fresh")
     free = CalibrationPrior.of(again).free
     moved = free.corners_after(np.zeros(len(free.columns)))[4] - free.positions[4]
-    assert moved == pytest.approx(result.stages["rig"]["shape"][4])
+    assert moved == pytest.approx(result.rig.shape[4])
     assert see_again(fresh, CalibrationPrior.of(again)).known.pixel_px == pytest.approx(
         NOISE_PX, rel=0.15
     )

@@ -12,7 +12,6 @@ from samples import TARGET, Sample, made_up
 
 from visioncal.core.errors import DataError
 from visioncal.present.recording import notes, paths, write_recording
-from visioncal.present.recording.findings import Findings
 from visioncal.present.recording.overlays import Overlay
 from visioncal.present.viewer import blueprint
 from visioncal.vision.targets import corner_positions, load_target
@@ -60,23 +59,28 @@ def test_older_calibrations_have_no_findings(sample: Sample) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "document"),
+    ("name", "document", "words"),
     [
-        ("board", {"shape": {}, "sigma": {}, "estimated": [], "bend_mm": 0.0}),
-        ("arm_errors", {"sigma_mm": "much"}),
-        ("uncertainty", healthy()["uncertainty"] | {"budget_mm": {"total": 0.1}}),
-        ("uncertainty", ["no table"]),
+        ("board", healthy()["board"] | {"shape": {}}, "board: shape.scale is missing"),
+        ("arm_errors", {"sigma_mm": "much"}, "arm_errors.sigma_mm is 'much'; a number is needed"),
+        (
+            "uncertainty",
+            healthy()["uncertainty"] | {"budget_mm": {"total": 0.1}},
+            "uncertainty: budget_mm has no total, or no source",
+        ),
+        ("uncertainty", ["no table"], r"uncertainty is \['no table'\]; a table is needed"),
     ],
 )
-def test_findings_that_cannot_be_read_are_named(sample: Sample, name: str, document: dict) -> None:
-    calibration = replace(sample.calibration, stages={name: document})
-    with pytest.raises(DataError, match=f"{name} cannot be read"):
-        Findings.of(calibration)
+def test_findings_that_cannot_be_read_are_named(
+    sample: Sample, name: str, document: dict, words: str
+) -> None:
+    with pytest.raises(DataError, match=words):
+        with_findings(sample, {name: document})
 
 
 def test_the_board_is_as_large_and_as_deep_as_its_corners(sample: Sample) -> None:
     target, _ = load_target(TARGET, None)
-    board = Findings.of(with_findings(sample, sick())).boards[""]
+    board = with_findings(sample, sick()).board
     flat, bent = corner_positions(target), board.corners(target)
     stretched = np.ptp(bent, axis=0)[:2] / np.ptp(flat, axis=0)[:2]
     # The shape is linear in its values.

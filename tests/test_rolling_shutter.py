@@ -135,43 +135,43 @@ def test_a_global_shutter_is_not_mistaken(seed):
     known = calibrated_sweep(swept(seed, replace(HURRIED, readout_s=0.0)))
     (found,) = known.clock.delays
     assert not found.is_clear
-    shutter = known.clock.document()["shutter"]
-    assert shutter["kind"] == "global"
-    assert abs(shutter["readout_s"]) < 4.0 * shutter["readout_sigma_s"]
+    shutter = known.clock.result().shutter
+    assert shutter.kind == "global"
+    assert abs(shutter.readout_s) < 4.0 * shutter.readout_sigma_s
     assert not any("rolling" in it for it in known.notes)
 
 
 def test_it_is_said_and_written(tmp_path):
     folder = write_sweep(swept(5), tmp_path / "swept")
     result = calibrate(folder)
-    shutter = result.stages["clock"]["shutter"]
-    assert shutter["kind"] == "rolling"
+    shutter = result.clock.shutter
+    assert shutter.kind == "rolling"
     # A line's time is that of the whole over the 799 steps between 800 rows.
-    assert shutter["line_s"] == pytest.approx(shutter["readout_s"] / 799)
+    assert shutter.line_s == pytest.approx(shutter.readout_s / 799)
     (said,) = [it for it in result.verdict.reasons if "rolling shutter" in it]
-    readout_ms = 1e3 * shutter["readout_s"]
+    readout_ms = 1e3 * shutter.readout_s
     assert f"the image's last line is taken {readout_ms:.2f} ms after the first" in said
     (fact,) = [it for it in method_facts(result) if it.label == "rolling shutter"]
     # It is rounded by its sigma, to some hundredths of a millisecond.
     assert float(fact.value.split()[0]) == pytest.approx(readout_ms, abs=0.01)
     # A recording has what was seen, not what was set straight.
     write_recording(tmp_path / "it.rrd", Session.load(folder), None, (), None)
-    assert calibrate(tmp_path / "it.rrd").stages["clock"] == result.stages["clock"]
+    assert calibrate(tmp_path / "it.rrd").clock == result.clock
 
 
 def test_poses_that_others_measured_say_nothing_of_rows():
     session = sweep_session(swept(6, replace(HURRIED, readout_s=0.0, stops=5)), "swept")
-    assert "shutter" not in calibrate(session).stages["clock"]
+    assert calibrate(session).clock.shutter is None
 
 
 def test_a_camera_of_a_whole_cell_has_its_own():
     cell = cell_of(NetworkOptions(stops=16, seed=1), replace(HOW, readout_s=READOUT_S))
     session, corners = swept_session(cell)
     found = align(session, corners=corners)
-    (told,) = found.details["clocks"].values()
-    shutter = told["shutter"]
-    assert shutter["kind"] == "rolling"
-    assert abs(shutter["readout_s"] - READOUT_S) < 4.0 * shutter["readout_sigma_s"]
+    (told,) = found.details.clocks.values()
+    shutter = told.shutter
+    assert shutter.kind == "rolling"
+    assert abs(shutter.readout_s - READOUT_S) < 4.0 * shutter.readout_sigma_s
     edge = found.between("base_a", "cam_side")
     away = log(invert(cell.between("base_a", "cam_side")) @ edge.matrix)
     # Chi-square of 6 beyond 22 is 0.1 %.

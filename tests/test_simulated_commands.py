@@ -133,7 +133,7 @@ def test_readings_of_a_tracker_are_calibrated(read, place):
     done("simulate", folder, "--instrument", read, *errs, "--views", 24)
     done("calibrate", folder, "-o", out)
     found, (_, edges) = Calibration.load(out), truth_of(folder)
-    assert ("robot" in found.stages["kinematics"]) == bool(errs)
+    assert found.arm_is_calibrated == bool(errs)
     assert misfit(found.edges["base_from_instrument"], edges["base_from_instrument"]) < MOST
     probe = found.edges["flange_from_probe"]
     among = slice(None) if read == "probe" else slice(3, 6)
@@ -302,10 +302,10 @@ def test_a_sweep_of_a_cell_tells_the_clock_of_its_camera(place):
     timed = [it for it in session.views if it.stamp_s is not None]
     assert all(it.base_from_flange() is None for it in timed)
     done("calibrate", folder, "-o", place / "swept-cell-out")
-    clocks = Alignment.load(place / "swept-cell-out").details["clocks"]
+    clocks = Alignment.load(place / "swept-cell-out").details.clocks
     clock = clocks["cam_top and robot a"]
     # Four sigma: one run in fifteen thousand.
-    assert abs(clock["camera_minus_robot_s"] - 0.04) < 4.0 * clock["sigma_s"] < 4e-3
+    assert abs(clock.camera_minus_robot_s - 0.04) < 4.0 * clock.sigma_s < 4e-3
 
 
 def test_a_sweep_comes_after_what_was_pushed(place):

@@ -25,6 +25,7 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import fisher_information
 from visioncal.estimation.variance import Knowledge
 from visioncal.estimation.workspace import postures
+from visioncal.results import to_document
 from visioncal.robot import CONVENTIONS, Robot, convert_table, load_robot, robot_names, table_of
 from visioncal.robot.slopes import number_jacobian, table_moves
 from visioncal.robot.tables import table_document, table_from_document
@@ -336,7 +337,7 @@ def test_the_result_is_in_the_convention_that_is_asked_for(calibrated_cell, conv
     asked = replace(known, convention=convention)
     (examine_again,) = (it for it in STAGES if it.name == "examine")
     known = examine_again.run(asked)
-    found = json.loads(json.dumps(result_of(known).stages["kinematics"], allow_nan=False))
+    found = json.loads(json.dumps(to_document(result_of(known)), allow_nan=False))["kinematics"]
     assert found["convention"] == convention
     changes = {(it["joint"], it["name"]): it for it in found["parameters"]}
     assert (("elbow_joint", "beta_rad") in changes) == (convention == "hayati")

@@ -83,12 +83,12 @@ def test_coefficients_are_within_their_sigmas(learnt):
 
 
 def test_what_is_not_told_stays_at_its_prior_and_is_named(learnt):
-    thermal = learnt["temperatures"].calibration.stages["thermal"]
+    thermal = learnt["temperatures"].calibration.thermal
     # The last link is a tenth of a metre: it grows by a micrometre for a kelvin.
-    assert "growth of wrist_3_joint" in thermal["not_told"]
-    assert thermal["joints"][5]["growth_per_k"] == pytest.approx(17.5e-6, abs=5.5e-6)
-    assert "drift of shoulder_lift_joint" not in thermal["not_told"]
-    assert thermal["residual_mm"]["with"] < 0.85 * thermal["residual_mm"]["without"]
+    assert "growth of wrist_3_joint" in thermal.not_told
+    assert thermal.joints[5].growth_per_k == pytest.approx(17.5e-6, abs=5.5e-6)
+    assert "drift of shoulder_lift_joint" not in thermal.not_told
+    assert thermal.residual_mm.with_drift < 0.85 * thermal.residual_mm.without
 
 
 def test_what_is_open_about_the_drift_counts_in_the_edges_covariance(learnt):
@@ -98,7 +98,7 @@ def test_what_is_open_about_the_drift_counts_in_the_edges_covariance(learnt):
     # Chi-square of 12 degrees of freedom is below 32.9 but for one in a thousand; a drift taken for
     # known makes it 36 here, and 53 on average over six worlds.
     assert error @ np.linalg.solve(known.joint_covariance, error) < 32.9
-    budget = known.stages["uncertainty"]["budget_mm"]
+    budget = known.uncertainty.budget_mm
     assert 0.0 < budget["temperature"] < budget["total"]
     # A check has no use for what the drift's parameters are: the edges' covariance has them.
     prior_calibration = CalibrationPrior.of(known)
@@ -119,7 +119,7 @@ def test_a_check_says_that_it_takes_the_arm_for_cold(learnt):
 @pytest.mark.slow
 def test_an_arm_that_is_off_is_calibrated_beside_its_drift():
     found = warmed(replace(CELL, mount="eye-to-hand", dh_sigma_m=3e-4, dh_sigma_rad=5e-4, seed=2))
-    assert found.calibration.stages["kinematics"]["level"] == "geometry"
+    assert found.calibration.arm.level == "geometry"
     assert drift_of(found).share < 0.2
     # A file of the arm has no place for the drift, and says so to whoever reads it.
     for form in ("robot-dh", "robot-urdf", "robot-json"):
@@ -282,7 +282,7 @@ def test_a_session_at_one_temperature_is_refused():
         calibrate(session, level="thermal")
     assert "cold robot" in refused.value.next_step
     known = calibrate(session)
-    assert "thermal" not in known.stages
+    assert known.thermal is None
 
 
 def test_currents_that_warm_nothing_yet_are_refused():
@@ -350,16 +350,16 @@ def test_report_and_recording_show_the_drift(learnt, tmp_path):
     assert "Drift with temperature" in page.text
     assert "Steel grows by 12, aluminium by 23" in page.text
     assert "seen by the stops" in page.text
-    seen = found.calibration.stages["thermal"]["seen"]
+    seen = found.calibration.thermal.seen
     # Of the six views that are looked at again every five minutes, one is in the posture drawn.
-    assert [it["stamp_s"] // 300.0 for it in seen] == list(range(20))
-    course = found.calibration.stages["thermal"]["course"]
+    assert [it.stamp_s // 300.0 for it in seen] == list(range(20))
+    course = found.calibration.thermal.course
     told = np.interp(
-        [it["stamp_s"] for it in seen],
-        [it["stamp_s"] for it in course],
-        [it["drift_mm"] for it in course],
+        [it.stamp_s for it in seen],
+        [it.stamp_s for it in course],
+        [it.drift_mm for it in course],
     )
-    off = np.array([it["drift_mm"] for it in seen]) - told
+    off = np.array([it.drift_mm for it in seen]) - told
     # Poses that are measured to about 0.05 mm along one direction, of twenty stops.
     assert abs(off.mean()) < 0.04
     assert 0.01 < off.std() < 0.1
@@ -367,9 +367,9 @@ def test_report_and_recording_show_the_drift(learnt, tmp_path):
     layout = blueprint(found.session, found.calibration)
     write_recording(path, found.session, found.calibration, (), layout)
     drifts = [it[0] for it in column(path, paths.DRIFT_MM, "Scalars:scalars").values()]
-    views = found.calibration.stages["thermal"]["views"]
+    views = found.calibration.thermal.views
     assert len(views) == len(found.session.views)
-    assert sorted(drifts) == pytest.approx(sorted(it["drift_mm"] for it in views))
+    assert sorted(drifts) == pytest.approx(sorted(it.drift_mm for it in views))
 
 
 def test_correct_goes_by_the_temperatures(learnt, tmp_path):

@@ -45,28 +45,28 @@ def known(cell: Cell) -> RunState:
 
 
 def rms(rows, name):
-    return float(np.sqrt(np.mean([it[name] ** 2 for it in rows])))
+    return float(np.sqrt(np.mean([getattr(it, name) ** 2 for it in rows])))
 
 
 def test_views_left_out_add_up_to_the_levels_figures(known):
-    found = result_of(known).stages["kinematics"]
-    by_name = {it["level"]: it for it in found["levels"]}
-    nominal, chosen = by_name["nominal"], by_name[found["level"]]
-    assert [it["view"] for it in found["left_out"]] == list(known.used)
+    found = result_of(known).arm
+    by_name = {it.level: it for it in found.levels}
+    nominal, chosen = by_name["nominal"], by_name[found.level]
+    assert [it.view for it in found.left_out] == list(known.used)
     for unit in ("mm", "deg"):
         # The same residuals, written twice.
-        before, after = rms(found["left_out"], f"nominal_{unit}"), rms(found["left_out"], unit)
-        assert before == pytest.approx(nominal[f"held_out_{unit}"], rel=1e-9)
-        assert after == pytest.approx(chosen[f"held_out_{unit}"], rel=1e-9)
+        before, after = rms(found.left_out, f"nominal_{unit}"), rms(found.left_out, unit)
+        assert before == pytest.approx(getattr(nominal, f"held_out_{unit}"), rel=1e-9)
+        assert after == pytest.approx(getattr(chosen, f"held_out_{unit}"), rel=1e-9)
 
 
 def test_views_held_back_are_predicted_by_both_arms(known):
-    rows = result_of(known).stages["kinematics"]["holdout"]
-    assert tuple(it["view"] for it in rows) == HELD
+    rows = result_of(known).arm.holdout
+    assert tuple(it.view for it in rows) == HELD
     shown = {it.view: it for it in known.solved.sights}
     for it in rows:
         # Against the target's estimated place here, against the views' mean there: some 0.01 mm.
-        assert it["mm"] == pytest.approx(shown[it["view"]].residual_mm, abs=0.03)
+        assert it.mm == pytest.approx(shown[it.view].residual_mm, abs=0.03)
     # Links off by half a millimetre and a milliradian, against noise of 0.03 mm.
     assert rms(rows, "nominal_mm") > 3 * rms(rows, "mm")
 
@@ -76,7 +76,7 @@ def test_without_a_calibrated_arm_there_is_nothing_to_compare(cell):
     for stage in STAGES:
         if stage.name not in ("robot", "detect"):
             known = stage.run(known)
-    assert "kinematics" not in result_of(known).stages
+    assert result_of(known).arm is None
     reported = [it.base_from_flange for it in view_evidence(known)]
     assert np.array_equal(reported, cell.base_from_flange)
 

@@ -200,7 +200,7 @@ def test_a_bent_arm_under_its_loads_is_no_change(weighed):
     cell = simulate(replace(ANYHOW, robot="ur10e", views=FITTED + 20, seed=2, **springs))
     robot = load_robot("ur10e") if weighed else replace(load_robot("ur10e"), masses=None)
     lot = result_of(calibrated(part(cell, range(FITTED)), robot=robot))
-    assert lot.stages["kinematics"]["level"] == "elastic"
+    assert lot.arm.level == "elastic"
     rng, prior_calibration = np.random.default_rng(4), CalibrationPrior.of(lot)
     found = check(
         seen_by(known_of(again(cell, rng), robot=robot), prior_calibration), prior_calibration
@@ -303,20 +303,19 @@ def test_other_cells_are_refused_by_what_differs():
     look = known.cameras["cam"]
     with pytest.raises(DataError, match="640 x 480"):
         seen_by(known.with_camera("cam", replace(look, resolution=(640, 480))), prior_calibration)
-    older = dict(place.calibration.stages)
-    del older["joint_fit"]
     with pytest.raises(DataError, match="an older version"):
-        CalibrationPrior.of(replace(place.calibration, stages=older))
-    spoilt = {**place.calibration.stages, "joint_fit": {"boards": [""], "covariance": [[1.0]]}}
+        CalibrationPrior.of(replace(place.calibration, joint_fit=None))
+    spoilt = replace(place.calibration.joint_fit, covariance=np.eye(1))
     with pytest.raises(DataError, match="joint_fit cannot be read"):
-        CalibrationPrior.of(replace(place.calibration, stages=spoilt))
+        CalibrationPrior.of(replace(place.calibration, joint_fit=spoilt))
 
 
 def test_triggers_fire_by_their_limits_and_say_what_is_not_known(tmp_path):
     place = usual("eye-in-hand")
-    stages = {**place.calibration.stages, "conditions": {"ambient_c": 21.0}}
     created = datetime(2026, 1, 1, tzinfo=UTC)
-    calibration = replace(place.calibration, stages=stages, created=created.isoformat())
+    calibration = replace(
+        place.calibration, conditions={"ambient_c": 21.0}, created=created.isoformat()
+    )
     session = session_of(part(place.cell, range(5)))
     warm = tuple(replace(it, numbers={"ambient_c": 33.0}) for it in session.views)
     facts = facts_of(
@@ -364,7 +363,7 @@ def pairs(tmp_path_factory):
 
 def test_the_command_says_pass_or_fail_by_its_status(pairs, tmp_path):
     out = pairs / "out"
-    assert Calibration.load(out).stages["conditions"] == {"ambient_c": 20.0}
+    assert Calibration.load(out).conditions == {"ambient_c": 20.0}
     done = visioncal("verify", pairs / "later", "--against", out, "-o", tmp_path / "check")
     assert done.status == 0
     assert done.err.startswith("pass")

@@ -24,6 +24,7 @@ from visioncal.present.viewer import blueprint
 from visioncal.present.viewer.process import viewer_process
 from visioncal.results import Edge
 from visioncal.results.evidence import ExplainedImage, ViewEvidence
+from visioncal.results.sections import DenseResult
 from visioncal.vision.finders import find_target
 from visioncal.vision.targets import corner_positions, target_from_document
 
@@ -55,10 +56,8 @@ def with_explained(sample: Sample) -> Sample:
         it if it.view == 1 else replace(it, explained=ExplainedImage(grey, grey, "**Sharp.**"))
         for it in sample.evidence
     )
-    stages = {**sample.calibration.stages, "dense": {"kept": True}}
-    return replace(
-        sample, calibration=replace(sample.calibration, stages=stages), evidence=evidence
-    )
+    dense = DenseResult(kept=True, held_out={}, images=())
+    return replace(sample, calibration=replace(sample.calibration, dense=dense), evidence=evidence)
 
 
 @pytest.fixture(scope="module")

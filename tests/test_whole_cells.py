@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from arm_documents import arm_of
 from commands import visioncal
 from whole_cells import FLOOR, LATER, OPTIONS, misfit, part, recorded, saved, simulated, truth
 
@@ -97,7 +98,7 @@ def test_the_file_says_how_well_the_noise_of_each_robot_is_known(folder, found):
             assert 0.0 < low < written["noise"][robot][name] < high
     # Two levels of 20 stops, some directions of which the frames have taken: not known exactly.
     part = found.of("left", "b", "plate_b")
-    assert part.stages["uncertainty"]["noise_95"].keys() < part.noise.keys()
+    assert part.uncertainty.noise_95.keys() < part.noise.keys()
     assert 20.0 < part.noise_dof < 120.0
     low = written["uncertainty"]["noise_95"]["b"]["translation_mm"][0]
     assert f"(95 %: {significant(low)} to" in (folder / "out" / "report.html").read_text()
@@ -283,8 +284,7 @@ def test_a_pair_calibrated_by_itself_agrees_with_the_whole_cell(found, folder):
 def test_further_stages_of_a_robot_stand_in_its_section(found, tmp_path):
     arm = found.cell.arms["b"]
     bent = arm.model.corrected(1e-3 * np.ones((7, 6)))
-    stages = {"kinematics": {"level": "kinematics", "robot": dict(bent.document)}}
-    arms = {**found.cell.arms, "b": RobotResult(arm.model, stages)}
+    arms = {**found.cell.arms, "b": RobotResult(arm.model, arm=arm_of(bent))}
     Calibration.whole(replace(found.cell, arms=arms)).save(tmp_path / "calibration.json")
     again = Calibration.load(tmp_path)
     assert not again.of("left", "a").arm_is_calibrated
@@ -297,7 +297,7 @@ def test_further_stages_of_a_robot_stand_in_its_section(found, tmp_path):
 
 
 def test_errors_of_the_arms_are_said_where_a_part_does_not_have_them(found):
-    fitted = replace(found.cell, details={**found.cell.details, "arms": {"a": {}}})
+    fitted = replace(found.cell, details=replace(found.cell.details, further={"arms": {"a": {}}}))
     verdict = Calibration.whole(fitted).of("left", "a").verdict
     assert verdict.status == "check"
     assert "errors of its arms" in verdict.reasons[0]

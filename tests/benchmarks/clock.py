@@ -65,12 +65,12 @@ def of_one_sweep(task: tuple[World, int]) -> Outcome | None:
         result = calibrate(sweep_session(moved, "sweep"))
     except VisioncalError:
         return None
-    clock, name = result.stages["clock"], next(iter(moved.cell.transforms))
+    clock, name = result.clock, next(iter(moved.cell.transforms))
     edge = result.edges[name]
     error = log(invert(moved.cell.transforms[name]) @ edge.matrix)
     return Outcome(
-        clock["camera_minus_robot_s"] - ahead_s,
-        clock["sigma_s"],
+        clock.camera_minus_robot_s - ahead_s,
+        clock.sigma_s,
         1e3 * float(np.linalg.norm(error[3:])),
         float(error @ np.linalg.solve(edge.covariance, error)),
     )

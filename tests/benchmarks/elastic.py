@@ -76,9 +76,9 @@ def world(options: CellOptions) -> tuple[tuple[float, ...], list[tuple[float, fl
     elif ours.arm_found.springs is not None:
         bound = compliance_bound(cell)
         for at, it in enumerate(ours.arm_found.springs.springs):
-            if it.is_told:
-                off = it.compliance - options.compliance_rad_per_nm[at]
-                springs.append((it.sigma / bound[at], off / it.sigma))
+            if it.told:
+                off = it.compliance_rad_per_nm - options.compliance_rad_per_nm[at]
+                springs.append((it.sigma_rad_per_nm / bound[at], off / it.sigma_rad_per_nm))
     return tuple(1e3 * it for it in errors), springs
 
 
@@ -98,13 +98,12 @@ def weighed(seed: int) -> tuple[float, ...]:
     if known.arm_found.springs is None:
         return (np.nan,) * 5
     springs = [known.arm_found.springs.springs[it] for it in (1, 2)]
-    off = [
-        (it.compliance - true) / it.sigma for it, true in zip(springs, COMPLIANCE[1:3], strict=True)
-    ]
+    pairs = zip(springs, COMPLIANCE[1:3], strict=True)
+    off = [(it.compliance_rad_per_nm - true) / it.sigma_rad_per_nm for it, true in pairs]
     q = np.vstack([STRETCHED, shop.joints[::4]])
     before = deflection_m(shop, q, HUNG[-1])
     after = before - predicted_m(known, q, HUNG[-1])
-    shares = [it.sigma / true for it, true in zip(springs, COMPLIANCE[1:3], strict=True)]
+    shares = [it.sigma_rad_per_nm / true for it, true in zip(springs, COMPLIANCE[1:3], strict=True)]
     return (*off, *shares, float(np.linalg.norm(after) / np.linalg.norm(before)))
 
 

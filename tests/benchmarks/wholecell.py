@@ -127,14 +127,14 @@ def outcome(seed: int) -> Outcome:
         ]
     )
     offsets = [_zeros(found, it.cell, robot) for robot in ("a", "b")]
-    (clock,) = found.details["clocks"].values()
-    floor = found.stages["boards"]["floor"]
+    (clock,) = found.details.clocks.values()
+    floor = found.boards["floor"]
     return Outcome(
         float(error @ np.linalg.solve(covariance, error)) / len(error),
         1e3 * float(np.sqrt(np.mean(error.reshape(-1, 6)[:, 3:] ** 2))),
         np.concatenate(offsets),
-        (clock["camera_minus_robot_s"] - AHEAD_S) / clock["sigma_s"],
-        (floor["shape"]["scale"] - (SCALE - 1.0)) / floor["sigma"]["scale"],
+        (clock.camera_minus_robot_s - AHEAD_S) / clock.sigma_s,
+        (floor.shape["scale"] - (SCALE - 1.0)) / floor.sigma["scale"],
         not any("contradicted" in reason for reason in found.verdict.reasons),
         len(found.moved),
         found.verdict.status,
@@ -143,10 +143,10 @@ def outcome(seed: int) -> Outcome:
 
 def _zeros(found: Alignment, cell: Network, robot: str) -> FloatArray:
     """(k,) errors over their sigmas of the joints' zeros."""
-    rows = found.arms[robot].stages["kinematics"]["parameters"]
-    zeros = [it for it in rows if it["name"] == "theta_rad"]
-    away = [it["change"] for it in zeros] - cell.true_arms[robot].offset
-    return np.asarray(away / [it["sigma"] for it in zeros])
+    rows = found.arms[robot].arm.parameters
+    zeros = [it for it in rows if it.name == "theta_rad"]
+    away = [it.change for it in zeros] - cell.true_arms[robot].offset
+    return np.asarray(away / [it.sigma for it in zeros])
 
 
 def _true(cell: Network, name: str, reference: str) -> FloatArray:

@@ -262,8 +262,8 @@ def _calibrated(calibration: Calibration, session: Session | None, words: CellWo
         target = _target(words.target)
     elif session is not None and session.target is not None:
         target = session.target
-    elif known := calibration.stages.get("joint_fit", {}).get("targets", {}).get(""):
-        target = target_from_document(known, "target")
+    elif calibration.joint_fit is not None and "" in calibration.joint_fit.targets:
+        target = target_from_document(calibration.joint_fit.targets[""], "target")
     else:
         raise DataError(
             f"calibration {calibration.session_name!r} does not say which board it was made with, "

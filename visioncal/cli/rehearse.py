@@ -29,6 +29,7 @@ from visioncal.live.rehearsal.compared import Explained, edge_errors, explained
 from visioncal.live.rehearsal.fault_injection import Faults
 from visioncal.live.rehearsal.witness import Pace, Witness, pace_of
 from visioncal.results import Calibration
+from visioncal.results.arm import NOMINAL
 
 # A check said no: the result is there, and it is farther from the truth than it says.
 EXIT_WRONG = 3
@@ -156,7 +157,7 @@ class _Rehearsal:
             "errors": {
                 name: asdict(it) for name, it in edge_errors(self.calibration, truth).items()
             },
-            "arm_level": self.calibration.stages.get("kinematics", {}).get("level", "nominal"),
+            "arm_level": NOMINAL if self.calibration.arm is None else self.calibration.arm.level,
             "noise": dict(self.calibration.noise),
             "verdict": self.calibration.verdict.status,
             "views": len(self.away_mm),

@@ -8,7 +8,6 @@ covariance is the price of an uncalibrated arm.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -67,15 +66,6 @@ class ArmErrors:
     def is_estimated(self) -> bool:
         """Whether they are unknowns of the fit; others only count in the covariance."""
         return self.of_links and self.is_significant
-
-    def document(self) -> dict[str, Any]:
-        """Their size as calibration.json has it."""
-        return {
-            "sigma_mm": 1e3 * LEVER_M * self.sigma,
-            "sigma_deg": float(np.rad2deg(self.sigma)),
-            "likelihood_ratio": self.gain,
-            "estimated": self.is_estimated,
-        }
 
     def effect(self, robot: str, name: str = "arm", values: FloatArray | None = None) -> Effect:
         """Puts the effects as unknowns of a robot's flange, at their (p,) present values."""

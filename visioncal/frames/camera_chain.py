@@ -246,5 +246,5 @@ def _flange_sigmas(calibration: Calibration) -> FloatArray:
 
 
 def _arm_sigma(calibration: Calibration) -> float:
-    found = calibration.stages.get("arm_errors", {})
-    return float(np.deg2rad(found.get("sigma_deg", 0.0)))
+    found = calibration.arm_errors
+    return 0.0 if found is None else float(np.deg2rad(found.sigma_deg))

@@ -17,11 +17,13 @@ from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Verdict
 from visioncal.core.version import __version__
 from visioncal.estimation.tree import Branch, Step, Tree
+from visioncal.results.codec import read, write
 from visioncal.results.edge import Edge, edge_document, read_covariance, read_edge
 from visioncal.results.forms import CAMERA, MOVED, SCHEMA, UNTIED, VERDICT, VIEW, Form, check
 from visioncal.results.frame import Frame, present
 from visioncal.results.lens import camera_document, read_camera
 from visioncal.results.parts import CameraResult, NeedMet, RobotResult
+from visioncal.results.sections import CellDetails, CellSections
 from visioncal.results.verdicts import (
     need_document,
     read_need,
@@ -115,8 +117,8 @@ class Untied:
 
 
 @dataclass(frozen=True, eq=False)
-class Alignment:
-    """A whole cell in one frame; `save` writes it as alignment.json.
+class Alignment(CellSections):
+    """A whole cell in one frame; `save` writes it as alignment.json. See also `CellSections`.
 
     Attributes:
         session_name: The session's name.
@@ -135,12 +137,10 @@ class Alignment:
         untied: Frames that nothing ties to the rest.
         weakest: The weakest link, in words.
         verdict: Whether to trust it.
-        details: Further figures, as they stand on disk.
+        details: Further figures.
         arms: The robots by name; one that has no name goes by `robot`.
         targets: What was printed, by name as it is described.
         placed: Tools and fixtures by the transform that places them, as `flange_a_from_tool`.
-        stages: Further sections of calibration.json by name: `boards`, `rigs`, `joint_fit`,
-            `uncertainty`.
         left_out: How observations were left out of fits in turn, in words; empty where none was.
         need: What the task needs, and how likely picks meet it; None where that is not said.
     """
@@ -160,11 +160,10 @@ class Alignment:
     untied: tuple[Untied, ...]
     weakest: str
     verdict: Verdict
-    details: Mapping[str, Any] = field(default_factory=dict)
+    details: CellDetails = field(default_factory=CellDetails)
     arms: Mapping[str, RobotResult] = field(default_factory=dict)
     targets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     placed: Mapping[str, Frame] = field(default_factory=dict)
-    stages: Mapping[str, Any] = field(default_factory=dict)
     left_out: str = ""
     need: NeedMet | None = None
 
@@ -265,7 +264,7 @@ class Alignment:
             "weakest": self.weakest,
             "verdict": verdict_document(self.verdict),
             **need_document(self.need),
-            "details": dict(self.details),
+            "details": write(CellDetails, self.details),
         }
 
     def save(self, path: Path | str) -> None:
@@ -352,5 +351,5 @@ def _fields(document: Mapping[str, Any]) -> dict[str, Any]:
         "weakest": document["weakest"],
         "verdict": read_verdict(document["verdict"]),
         "need": read_need(document),
-        "details": dict(document["details"]),
+        "details": read(CellDetails, document["details"], "details"),
     }

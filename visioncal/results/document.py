@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, get_args
 from visioncal.core.documents import Kinds, shown
 from visioncal.core.types import Mount
 from visioncal.core.version import __version__
+from visioncal.results.codec import read_fields, write
 from visioncal.results.edge import (
     edge_document,
     pose_document,
@@ -24,6 +25,7 @@ from visioncal.results.parts import (
     Validation,
     ViewResult,
 )
+from visioncal.results.sections import CalibrationSections
 from visioncal.results.verdicts import (
     need_document,
     read_need,
@@ -81,7 +83,7 @@ def to_document(calibration: "Calibration") -> dict[str, Any]:
     }
     if calibration.frames:
         document["frames"] = frames_document(calibration.frames)
-    return document | dict(calibration.stages)
+    return document | write(CalibrationSections, calibration)
 
 
 def _solver_document(result: SolverResult) -> dict[str, Any]:
@@ -138,7 +140,9 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
         "camera": None if camera is None else read_camera(camera),
         "robot": None if robot is None else Robot.from_document(robot),
         "frames": read_frames(document.get("frames", {})),
-        "stages": {name: value for name, value in document.items() if name not in _OWN_KEYS},
+        **read_fields(
+            CalibrationSections, {k: v for k, v in document.items() if k not in _OWN_KEYS}, ""
+        ),
     }
 
 

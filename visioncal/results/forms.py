@@ -51,7 +51,6 @@ FRAME: Form = {
     "details": {},
 }
 CAMERA: Form = {"resolution": [int], "model": str, "estimated": bool}
-_BOARD: Form = {"shape": {"": float}, "sigma": {"": float}, "estimated": [str], "bend_mm": float}
 VIEW: Mapping[str, Any] = {
     "view": int,
     "used": bool,
@@ -61,7 +60,6 @@ VIEW: Mapping[str, Any] = {
     "residual_mm?": float,
     "residual_deg?": float,
 }
-# Of the further stages, what is read without more ado.
 CALIBRATION: Form = MappingProxyType(
     {
         "created": str,
@@ -76,20 +74,6 @@ CALIBRATION: Form = MappingProxyType(
         "verdict": VERDICT,
         "need?": _NEED,
         "frames?": {"": FRAME},
-        "board?": _BOARD,
-        "boards?": {"": _BOARD},
-        "arm_errors?": {"sigma_mm": float, "sigma_deg": float},
-        "uncertainty?": {"noise_95": {"": [float]}, "budget_mm?": {"": float}},
-        "conditions?": {"": float},
-        "joint_fit?": {"targets": {"": {}}, "looks": [int], "boards": [str]},
-        "kinematics?": {
-            "level": str,
-            "robot?": {},
-            "workspace_map?": [{"x_m": float, "y_m": float, "z_m": float, "sigma_mm": float}],
-            "workspace_sigma_mm?": {"": float},
-        },
-        "elastic?": {"joints?": [{"compliance_rad_per_nm": float}], "weight_moments?": [[float]]},
-        "thermal?": {"joints": [{}]},
     }
 )
 MOVED: Form = {
@@ -128,11 +112,7 @@ WHOLE: Form = MappingProxyType(
         "verdict": VERDICT,
         "need?": _NEED,
         "frames?": {"": FRAME},
-        "details": {},
-        "boards?": {"": _BOARD},
         "validation?": {"method": str, "held_out": _RMS, "holdout?": _RMS, "pairs": [_RMS]},
-        "uncertainty?": {"budget_mm": {"": {"": float}}, "noise_95?": {"": {"": [float]}}},
-        "joint_fit?": {"cameras": {"": [int]}, "targets": {"": [int]}, "covariance": [[float]]},
     }
 )
 

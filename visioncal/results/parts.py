@@ -1,12 +1,12 @@
 """What a calibration is made of, beside its transforms."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 from scipy.spatial.transform import RigidTransform
 
 from visioncal.core.types import Camera, FloatArray, Need
+from visioncal.results.arm import ArmSections
 from visioncal.robot import Robot
 
 # Why a view is in no fit although nothing is wrong with it.
@@ -53,16 +53,14 @@ class CameraResult:
 
 
 @dataclass(frozen=True, eq=False)
-class RobotResult:
-    """A robot of a whole cell.
+class RobotResult(ArmSections):
+    """A robot of a whole cell, with what was found of its arm.
 
     Attributes:
         model: Its nominal model, where that is known.
-        stages: One document for each further stage that ran on it, by name, as `kinematics`.
     """
 
     model: Robot | None = None
-    stages: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -18,6 +18,7 @@ from visioncal.core.verdict import Step, Verdict
 from visioncal.estimation.intervals import freedom_of
 from visioncal.results.alignment import FILE as ALIGNMENT
 from visioncal.results.alignment import Alignment, is_alignment
+from visioncal.results.arm import NOMINAL, ArmResult
 from visioncal.results.document import KINDS, fields_from_document, to_document
 from visioncal.results.edge import Edge
 from visioncal.results.frame import Frame
@@ -29,6 +30,7 @@ from visioncal.results.parts import (
     Validation,
     ViewResult,
 )
+from visioncal.results.sections import CalibrationSections
 from visioncal.results.selecting import selected_fields, whole_fields
 from visioncal.results.whole import is_whole, read_whole
 from visioncal.robot import Loads, Robot, bent_joints
@@ -37,8 +39,10 @@ from visioncal.session.choosing import PARTS, Choice, Part
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration:
+class Calibration(CalibrationSections):
     """The result of calibrating one session; `save` writes it as calibration.json.
+
+    See also `CalibrationSections` and `ArmSections`, of which it has all attributes.
 
     Attributes:
         session_name: The session's name.
@@ -56,7 +60,6 @@ class Calibration:
         camera: The camera, where the session has one.
         robot: The nominal robot model, where the session names a known one.
         frames: Tools and fixtures by the transform that places them, as `flange_from_tool`.
-        stages: One document for each further stage that ran, by name.
         cell: The whole cell that it stands for, whose frames `edges` places; None for one camera,
             one robot and their targets. What is of one camera or robot, `of` takes out of it.
         need: What the task needs, and how likely picks meet it; None where that is not said.
@@ -77,7 +80,6 @@ class Calibration:
     camera: CameraResult | None = None
     robot: Robot | None = None
     frames: Mapping[str, Frame] = field(default_factory=dict)
-    stages: Mapping[str, Any] = field(default_factory=dict)
     cell: Alignment | None = None
     need: NeedMet | None = None
 
@@ -145,7 +147,7 @@ class Calibration:
     @property
     def noise_dof(self) -> float:
         """Degrees of freedom of the noise's levels; see `estimation.intervals.freedom_of`."""
-        intervals = self.stages.get("uncertainty", {}).get("noise_95", {})
+        intervals = {} if self.uncertainty is None else self.uncertainty.noise_95
         return freedom_of(intervals.values()) if intervals else np.inf
 
     def covariance(self, name: str) -> FloatArray:
@@ -220,13 +222,12 @@ class Calibration:
             bent_joints(arm, q, self.compliance, loads, self.weight_moments)
         )
 
-    @cached_property
+    @property
     def compliance(self) -> FloatArray:
         """(n,) what each joint yields to a torque [rad/(N m)]; zero where that is not known."""
-        rows = self.stages.get("elastic", {}).get("joints", ())
-        if not rows:
+        if self.elastic is None:
             return np.zeros(0 if self.robot is None else self.robot.joint_count)
-        return np.array([float(row["compliance_rad_per_nm"]) for row in rows])
+        return self.elastic.compliance
 
     @cached_property
     def drift(self) -> ThermalModel:
@@ -235,8 +236,8 @@ class Calibration:
         Raises:
             DataError: That was not calibrated.
         """
-        arm, found = self.calibrated_robot, self.stages.get("thermal")
-        if arm is None or found is None:
+        arm = self.calibrated_robot
+        if arm is None or self.thermal is None:
             raise DataError(
                 f"calibration {self.session_name!r} does not tell how its arm drifts with "
                 "temperature.",
@@ -244,7 +245,7 @@ class Calibration:
                 next_step="Record reference views while the arm warms up, with temp1_c ... or "
                 "current1_a ..., and calibrate with --level thermal.",
             )
-        return ThermalModel.from_document(found, arm)
+        return self.thermal.model(arm)
 
     def at_temperatures(self, temperatures_c: FloatArray) -> Self:
         """Returns the calibration of the arm as it is with its links at (n,) temperatures [deg C].
@@ -252,29 +253,28 @@ class Calibration:
         Raises:
             DataError: It does not tell how the arm drifts, or has another number of joints.
         """
-        warm = dict(self.drift.robot_at(np.asarray(temperatures_c, dtype=float)).document)
-        kinematics = {**self.stages.get("kinematics", {}), "robot": warm}
-        return replace(self, stages={**self.stages, "kinematics": kinematics})
+        warm = self.drift.robot_at(np.asarray(temperatures_c, dtype=float))
+        return replace(
+            self, arm=replace(self.arm or ArmResult(level=NOMINAL, levels=()), robot=warm)
+        )
 
     @property
     def arm_is_calibrated(self) -> bool:
         """Whether the transforms go with a calibrated arm, and not with the controller's."""
-        return "robot" in self.stages.get("kinematics", {})
+        return self.arm is not None and self.arm.robot is not None
 
-    @cached_property
+    @property
     def calibrated_robot(self) -> Robot | None:
         """The arm as it was calibrated, or else its nominal model, where there is one."""
-        found = self.stages.get("kinematics", {})
-        return Robot.from_document(found["robot"]) if "robot" in found else self.robot
+        return self.robot if self.arm is None or self.arm.robot is None else self.arm.robot
 
-    @cached_property
+    @property
     def weight_moments(self) -> FloatArray | None:
         """(n, 4 n) compliance times unknown masses and first moments; None where none were found.
 
         What `bent_joints` takes of an arm whose model does not tell the masses of its links.
         """
-        rows = self.stages.get("elastic", {}).get("weight_moments")
-        return None if rows is None else np.array(rows, dtype=float)
+        return None if self.elastic is None else self.elastic.weight_moments
 
     def save(self, path: Path | str) -> None:
         """Writes calibration.json, whole or not at all."""
@@ -314,9 +314,7 @@ class Calibration:
                 return cls.whole(read_whole(document))
             if is_alignment(document):
                 return cls.whole(Alignment.from_document(document))
-            read = cls(**fields_from_document(parse_stored(text, label, KINDS)))
-            # What is read of further stages when it is asked for: here, errors are the file's.
-            _ = read.calibrated_robot, read.compliance, read.weight_moments
+            return cls(**fields_from_document(parse_stored(text, label, KINDS)))
         except DataError as error:
             raise error.within(label) from error
         except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
@@ -325,4 +323,3 @@ class Calibration:
                 culprits=[label],
                 next_step="Calibrate the session again.",
             ) from error
-        return read

@@ -11,9 +11,12 @@ from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Finding, Verdict
 from visioncal.results.alignment import Alignment, Sight
+from visioncal.results.arm import ArmSections
+from visioncal.results.codec import entries
 from visioncal.results.edge import Edge
 from visioncal.results.frame import Frame
 from visioncal.results.parts import CameraResult, Rms, RobotResult, Validation
+from visioncal.results.sections import ClockResult, JointFit, NoiseIntervals
 from visioncal.results.whole import holdout_rms, left_out_rms, rms_of, view_results
 from visioncal.session.choosing import PARTS, Choice, Chosen, Part, choose
 from visioncal.session.frames import CELL, frames_of_kind, robots_between, thing_name
@@ -62,7 +65,7 @@ def selected_fields(cell: Alignment, choice: Choice, needs: Collection[Part]) ->
         for it in cell.sights
         if chosen.camera in ("", it.seer) and chosen.target in ("", it.seen)
     ]
-    rms = rms_of(sights)
+    rms, target = rms_of(sights), thing_name(chosen.target, "target")
     return whole_fields(cell) | {
         "mount": chosen.mount,
         "edges": {
@@ -78,13 +81,12 @@ def selected_fields(cell: Alignment, choice: Choice, needs: Collection[Part]) ->
         "camera": _camera(cell.cameras.get(chosen.camera), jacobian),
         "robot": arm.model,
         "frames": _placed(cell, chosen),
-        "stages": {
-            **arm.stages,
-            **_clock(cell, chosen),
-            **_intervals(cell, chosen),
-            **_shapes(cell, chosen),
-            **_joint_fit(cell, chosen, jacobian),
-        },
+        **{it.name: getattr(arm, it.name) for it in entries(ArmSections)},
+        "clock": _clock(cell, chosen),
+        "uncertainty": _intervals(cell, chosen),
+        "board": cell.boards.get(target),
+        "rig": cell.rigs.get(target),
+        "joint_fit": _joint_fit(cell, chosen, jacobian),
         "cell": None,
         "need": None if cell.need is None else cell.need.of(*_pair(chosen)),
     }
@@ -172,7 +174,7 @@ def _camera(result: CameraResult | None, jacobian: FloatArray) -> CameraResult |
 
 
 def _verdict(cell: Alignment) -> Verdict:
-    if "arms" not in cell.details:
+    if "arms" not in cell.details.further:
         return cell.verdict
     found = Finding(
         "arm_left_out",
@@ -206,32 +208,24 @@ def _placed(cell: Alignment, chosen: Chosen) -> dict[str, Frame]:
     return found
 
 
-def _clock(cell: Alignment, chosen: Chosen) -> dict[str, Any]:
+def _clock(cell: Alignment, chosen: Chosen) -> ClockResult | None:
     """How far the camera's clock is ahead of the robot's."""
-    found = cell.details.get("clocks", {})
-    pair = f"{chosen.camera} and robot {chosen.robot or 'robot'}"
-    return {"clock": found[pair]} if pair in found else {}
+    return cell.details.clocks.get(f"{chosen.camera} and robot {chosen.robot or 'robot'}")
 
 
-def _intervals(cell: Alignment, chosen: Chosen) -> dict[str, Any]:
+def _intervals(cell: Alignment, chosen: Chosen) -> NoiseIntervals | None:
     """How well the robot's noise is known."""
-    found = cell.stages.get("uncertainty", {}).get("noise_95", {}).get(chosen.robot or "robot", {})
+    known = {} if cell.uncertainty is None else cell.uncertainty.noise_95
+    found = known.get(chosen.robot or "robot", {})
     named = {f"robot_{name}": it for name, it in found.items()}
-    return {"uncertainty": {"noise_95": named}} if named else {}
+    return NoiseIntervals(noise_95=named) if named else None
 
 
-def _shapes(cell: Alignment, chosen: Chosen) -> dict[str, Any]:
-    """What the target was found to be like."""
-    name, stages = thing_name(chosen.target, "target"), cell.stages
-    parts = {"board": stages.get("boards", {}), "rig": stages.get("rigs", {})}
-    return {kind: it[name] for kind, it in parts.items() if name in it}
-
-
-def _joint_fit(cell: Alignment, chosen: Chosen, jacobian: FloatArray) -> dict[str, Any]:
+def _joint_fit(cell: Alignment, chosen: Chosen, jacobian: FloatArray) -> JointFit | None:
     """What `verify` predicts with: both edges, and lens and board as far as they are free."""
-    fit = cell.stages.get("joint_fit")
+    fit = cell.joint_fit
     if fit is None or not (chosen.camera and chosen.target):
-        return {}
+        return None
     target = thing_name(chosen.target, "target")
     camera = thing_name(chosen.camera, "camera")
     lens_count = 0
@@ -240,19 +234,16 @@ def _joint_fit(cell: Alignment, chosen: Chosen, jacobian: FloatArray) -> dict[st
     looks: list[int] = []
     columns: list[int] = []
     at = jacobian.shape[1]
-    for part, name, first in (("cameras", camera, 0), ("targets", target, lens_count)):
-        for it, places in fit[part].items():
+    for part, name, first in ((fit.cameras, camera, 0), (fit.targets, target, lens_count)):
+        for it, places in part.items():
             if it == name:
                 looks += [first + place for place in places]
                 columns += range(at, at + len(places))
             at += len(places)
-    full = np.array(fit["covariance"], dtype=float)
     carried = block_diag(jacobian, np.eye(at)[columns][:, jacobian.shape[1] :])
-    return {
-        "joint_fit": {
-            "targets": {"": cell.targets[target]} if target in cell.targets else {},
-            "looks": looks,
-            "boards": [""],
-            "covariance": (carried @ full @ carried.T).tolist(),
-        }
-    }
+    return JointFit(
+        targets={"": cell.targets[target]} if target in cell.targets else {},
+        boards=("",),
+        looks=tuple(looks),
+        covariance=carried @ fit.covariance @ carried.T,
+    )

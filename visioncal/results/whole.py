@@ -18,6 +18,8 @@ from visioncal.results.alignment import (
     moved_document,
     read_moved,
 )
+from visioncal.results.arm import ArmSections
+from visioncal.results.codec import entries, read, read_fields, write
 from visioncal.results.edge import edge_document, read_covariance, read_edge
 from visioncal.results.forms import SCHEMA, WHOLE, check
 from visioncal.results.frame import frames_document, present, read_frames
@@ -28,6 +30,7 @@ from visioncal.results.parts import (
     RobotResult,
     ViewResult,
 )
+from visioncal.results.sections import CellDetails, CellSections
 from visioncal.results.verdicts import (
     need_document,
     read_need,
@@ -38,8 +41,6 @@ from visioncal.robot import Robot
 from visioncal.session import frame_name
 from visioncal.session.frames import frames_of_kind, robots_between, thing_name
 
-# Further stages of one robot, which stand in its section.
-_OF_ROBOTS = ("kinematics", "elastic", "thermal", "arm_errors")
 _OWN_KEYS = frozenset(
     {"schema", "visioncal", "created", "session", "reference", "tree", "transforms", "noise"}
     | {"validation"}
@@ -80,13 +81,13 @@ def whole_document(cell: Alignment) -> dict[str, Any]:
         "weakest": cell.weakest,
         "verdict": verdict_document(cell.verdict),
         **need_document(cell.need),
-        "details": dict(cell.details),
+        "details": write(CellDetails, cell.details),
     }
     if cell.left_out:
         document["validation"] = _validation_document(cell)
     if cell.placed:
         document["frames"] = frames_document(cell.placed)
-    return document | dict(cell.stages)
+    return document | write(CellSections, cell)
 
 
 def read_whole(document: Mapping[str, Any]) -> Alignment:
@@ -119,12 +120,12 @@ def read_whole(document: Mapping[str, Any]) -> Alignment:
         weakest=document["weakest"],
         verdict=read_verdict(document["verdict"]),
         need=read_need(document),
-        details=dict(document["details"]),
-        arms={name: _arm(it) for name, it in document["robots"].items()},
+        details=read(CellDetails, document["details"], "details"),
+        arms={name: _arm(it, name) for name, it in document["robots"].items()},
         targets={name: dict(it) for name, it in document["targets"].items()},
         placed=read_frames(document.get("frames", {})),
-        stages={name: value for name, value in document.items() if name not in _OWN_KEYS},
         left_out=document.get("validation", {}).get("method", ""),
+        **read_fields(CellSections, {k: v for k, v in document.items() if k not in _OWN_KEYS}, ""),
     )
 
 
@@ -209,13 +210,16 @@ def _frame(tree: Mapping[str, str], kind: str, name: str) -> str:
 
 def _arm_document(arm: RobotResult) -> dict[str, Any]:
     model = {} if arm.model is None else dict(arm.model.document)
-    return model | dict(arm.stages)
+    return model | write(ArmSections, arm)
 
 
-def _arm(document: Mapping[str, Any]) -> RobotResult:
-    model = {name: it for name, it in document.items() if name not in _OF_ROBOTS}
-    stages = {name: it for name, it in document.items() if name in _OF_ROBOTS}
-    return RobotResult(Robot.from_document(model) if model else None, stages)
+def _arm(document: Mapping[str, Any], name: str) -> RobotResult:
+    ours = {it.key for it in entries(ArmSections)}
+    model = {key: it for key, it in document.items() if key not in ours}
+    return RobotResult(
+        Robot.from_document(model) if model else None,
+        **read_fields(ArmSections, document, f"robots.{name}"),
+    )
 
 
 def _view_document(cell: Alignment, sight: Sight) -> dict[str, Any]:

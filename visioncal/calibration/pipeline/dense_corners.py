@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.number_format import figure
 from visioncal.core.types import Progress, SolverName
 from visioncal.results import Calibration, Rms
+from visioncal.results.sections import CornerResiduals, DenseResult, ImageBlur
 from visioncal.robot import Convention
 from visioncal.session import Session
 from visioncal.vision.dense.library import chosen_device
@@ -97,44 +97,43 @@ def run_dense(
     try:
         found = calibrated(Dense(on))
     except VisioncalError as error:
-        return _telling(plain, {}, [f"Dense corners are not kept: {error.message}"])
+        return _telling(plain, None, [f"Dense corners are not kept: {error.message}"])
     if found.dense is None or not found.dense.fits:
-        return _telling(plain, {}, ["Dense corners are not kept: no image could be fitted."])
+        return _telling(plain, None, ["Dense corners are not kept: no image could be fitted."])
     both = [it.calibration.validation.held_out for it in (plain, found)]
     kept = not _is_worse(plain, found)
-    document = {
-        "kept": kept,
-        "held_out": {
-            name: {"mm": it.mm, "px": it.px}
+    result = DenseResult(
+        kept=kept,
+        held_out={
+            name: CornerResiduals(mm=it.mm, px=it.px)
             for name, it in zip(("template", "dense"), both, strict=True)
         },
-        "images": list(_images(found.dense)),
-    }
+        images=tuple(_images(found.dense)),
+    )
     words = [_words(*both, kept=kept), *found.dense.notes()]
     chosen = found if kept else plain
     if chosen.calibration.camera is not None:
         camera = chosen.calibration.camera.camera
         evidence = explained(session, chosen.evidence, found.dense, camera)
         chosen = replace(chosen, evidence=evidence)
-    return _telling(chosen, document, words)
+    return _telling(chosen, result, words)
 
 
-def _images(dense: Dense) -> Iterator[dict[str, Any]]:
+def _images(dense: Dense) -> Iterator[ImageBlur]:
     for view, it in dense.fits.items():
-        yield {
-            "view": view,
-            "sigma_px": it.blur.sigma_px,
-            "disc_px": it.blur.disc_px,
-            "motion_px": it.blur.length_px,
-            "motion_deg": it.blur.direction_deg,
-            "tone": it.tone,
-            "pixel_noise": it.noise,
-        }
+        yield ImageBlur(
+            view=view,
+            sigma_px=it.blur.sigma_px,
+            disc_px=it.blur.disc_px,
+            motion_px=it.blur.length_px,
+            motion_deg=it.blur.direction_deg,
+            tone=it.tone,
+            pixel_noise=it.noise,
+        )
 
 
-def _telling(found: Run, document: dict[str, Any], words: list[str]) -> Run:
+def _telling(found: Run, result: DenseResult | None, words: list[str]) -> Run:
     """The result with what is said of dense corners."""
     calibration: Calibration = found.calibration
     verdict = calibration.verdict.noting(words)
-    stages = {**calibration.stages, **({"dense": document} if document else {})}
-    return replace(found, calibration=replace(calibration, verdict=verdict, stages=stages))
+    return replace(found, calibration=replace(calibration, verdict=verdict, dense=result))

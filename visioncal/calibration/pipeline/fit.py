@@ -1,6 +1,4 @@
-"""What a later look at the same cell has to know of the joint fit, as calibration.json has it."""
-
-from typing import Any
+"""What a later look at the same cell has to know of the joint fit."""
 
 import numpy as np
 
@@ -8,8 +6,8 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import misfit_jacobian
-from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.effects.lenses import LENSES
+from visioncal.results.sections import FittedArm, JointFit
 from visioncal.session import frame_name
 from visioncal.vision.targets import target_document
 
@@ -17,8 +15,8 @@ from visioncal.vision.targets import target_document
 CONDITIONS = ("ambient_c", "payload_kg")
 
 
-def fit_document(known: RunState) -> dict[str, Any] | None:
-    """Writes all unknowns of the fit with their covariance; None where an instrument read them.
+def joint_fit_of(known: RunState) -> JointFit | None:
+    """All unknowns of the fit with their covariance; None where an instrument read them.
 
     The unknowns are, in this order: both edges of the chain, lens and board as far as something is
     open about them, where further boards lie from the first, and the arm's errors. What is open
@@ -29,17 +27,16 @@ def fit_document(known: RunState) -> dict[str, Any] | None:
     boards, seen = known.session.boards, known.fitted.seen
     placed = known.solved.problem.unknown
     names = [it for it in boards if len(boards) < 2 or frame_name("target", it) in placed]
-    arm = _arm(known)
-    return {
-        "targets": {name: target_document(it) for name, it in boards.items()},
-        "boards": names or [""],
-        "looks": [] if seen is None else seen.free.tolist(),
-        **({} if arm is None else {"arm": arm}),
-        "covariance": _covariance(known).tolist(),
-    }
+    return JointFit(
+        targets={name: target_document(it) for name, it in boards.items()},
+        boards=tuple(names) or ("",),
+        looks=() if seen is None else tuple(seen.free.tolist()),
+        arm=_arm(known),
+        covariance=_covariance(known),
+    )
 
 
-def conditions_document(known: RunState) -> dict[str, float]:
+def conditions_of(known: RunState) -> dict[str, float]:
     """The mean conditions of the used views; those that a used view does not say are left out."""
     views = [it for it in known.session.views if it.number in known.used]
     return {
@@ -49,7 +46,7 @@ def conditions_document(known: RunState) -> dict[str, float]:
     }
 
 
-def _arm(known: RunState) -> dict[str, Any] | None:
+def _arm(known: RunState) -> FittedArm | None:
     """What the arm's errors are of, and what they were found to be beside the arm that is told."""
     arm = known.robot_arm
     model, errors = arm.model, arm.errors
@@ -62,30 +59,20 @@ def _arm(known: RunState) -> dict[str, Any] | None:
     values = problem.values_of(name, known.solved.state) - problem.values_of(name, linearised)
     values = values if errors.is_estimated else np.zeros(count)
     if model is None:
-        of = "links" if arm.is_modelled else "poses"
-        return {"of": of, "values": values.tolist()}
-    return {
-        "of": "model",
-        "values": values.tolist(),
-        "weights": dict(model.weights),
-        "flange_from_reported": model.flange_from_reported.tolist(),
-        **_by_stop(model),
-    }
-
-
-def _by_stop(model: ArmModel) -> dict[str, Any]:
-    """What of the arm's errors is not in its geometry, as it goes by the loads of a stop."""
-    if not model.values_by_stop.any():
-        return {}
-    document: dict[str, Any] = {
-        "by_stop": model.values_by_stop.tolist(),
-        "torque_nm": model.torque_nm,
-    }
-    if model.yielding is not None:
-        document["yielding"] = model.yielding.tolist()
-    if model.functions is not None:
-        document["weight_functions"] = [it.tolist() for it in model.functions.parts]
-    return document
+        return FittedArm(of="links" if arm.is_modelled else "poses", values=values)
+    # What of its errors is not in its geometry goes by the loads of a stop.
+    loaded = bool(model.values_by_stop.any())
+    functions = model.functions if loaded else None
+    return FittedArm(
+        of="model",
+        values=values,
+        weights=model.weights,
+        flange_from_reported=model.flange_from_reported,
+        by_stop=model.values_by_stop if loaded else None,
+        torque_nm=model.torque_nm if loaded else None,
+        yielding=model.yielding if loaded else None,
+        weight_functions=None if functions is None else functions.parts,
+    )
 
 
 def _covariance(known: RunState) -> FloatArray:

@@ -2,14 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from visioncal.calibration.pipeline.solving import Solved, problem_of, targets_of
 from visioncal.calibration.stages.cell import Row
 from visioncal.calibration.stages.clocks import clock_effects
-from visioncal.calibration.stages.kinematics import unseen_rows
+from visioncal.calibration.stages.kinematics import unseen_views
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.pose_ambiguity import choose_by, chosen
@@ -19,6 +18,7 @@ from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.poses import fit_poses
 from visioncal.estimation.problem import Problem
 from visioncal.results import HELD_BACK, Sight
+from visioncal.results.arm import UnseenView
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,11 +91,11 @@ def held_sights(solved: Solved, looked: Observed) -> dict[int, Sight]:
     return found
 
 
-def held_by_both_arms(solved: Solved, looked: Observed, robot: str) -> list[dict[str, Any]]:
+def held_by_both_arms(solved: Solved, looked: Observed, robot: str) -> tuple[UnseenView, ...]:
     """How far what is held back is off by a robot's nominal arm with its own fit, and by ours."""
     arm, held = solved.arms[robot], held_back(solved, looked)
     if held is None or arm.kinematics is None:
-        return []
+        return ()
     stated = arm.without_errors(held.problem)
     stated = arm.stated(stated) or stated
     was, now = (
@@ -106,7 +106,7 @@ def held_by_both_arms(solved: Solved, looked: Observed, robot: str) -> list[dict
         )
     )
     views = [it.view for it in held.rows]
-    return list(unseen_rows(views, was, now, np.isfinite(now[:, 0])))
+    return unseen_views(views, was, now, np.isfinite(now[:, 0]))
 
 
 def _problem(solved: Solved, looked: Observed, views: Sequence[ViewPoses]) -> Problem:

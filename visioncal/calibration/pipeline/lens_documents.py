@@ -1,13 +1,15 @@
 """What is written of lenses and targets beside the frames."""
 
-from typing import Any
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.core.types import IntArray
+from visioncal.core.types import FloatArray, IntArray, TargetKind
 from visioncal.estimation.appearance import BOARD_NAMES, shape_slices
 from visioncal.results import CameraResult
+from visioncal.results.sections import BoardResult, CellJointFit, RigResult
 from visioncal.session import frame_name
 from visioncal.session.frames import thing_name
 
@@ -44,59 +46,78 @@ def cameras_of(known: RunState) -> dict[str, CameraResult]:
     return found
 
 
-def fit_section(known: RunState) -> dict[str, Any]:
-    """`joint_fit` of a whole cell.
-
-    That is which values of each camera's lens and each target's shape are among the unknowns,
-    cameras first, and the covariance of transforms and these.
-    """
+def fit_section(known: RunState) -> CellJointFit:
+    """The unknowns of the fit of a whole cell, with their covariance."""
     solved, covariance, edges = known.fitted, known.solved.covariance, 6 * len(known.solved.edges)
     seen, looks = solved.seen, solved.looks
     if seen is None or looks is None:
-        return {"cameras": {}, "targets": {}, "covariance": covariance[:edges, :edges].tolist()}
+        return CellJointFit(cameras={}, targets={}, covariance=covariance[:edges, :edges])
     columns = [*range(edges), *solved.columns_of(seen.free).tolist()]
-    return {
-        "cameras": {
+    return CellJointFit(
+        cameras={
             thing_name(it, "camera"): _among(seen.free, at) for it, at in looks.lenses.items()
         },
-        "targets": {name: _among(seen.free, it) for name, it in _shapes(known).items()},
-        "covariance": covariance[np.ix_(columns, columns)].tolist(),
+        targets={name: _among(seen.free, it) for name, it in _shapes(known).items()},
+        covariance=covariance[np.ix_(columns, columns)],
+    )
+
+
+def boards_of(known: RunState) -> dict[str, BoardResult]:
+    """The boards as they were found to be, by name."""
+    return {
+        it.name: BoardResult(
+            shape=dict(zip(BOARD_NAMES, it.values.tolist(), strict=True)),
+            sigma={BOARD_NAMES[at]: float(it.sigmas[at]) for at in it.free},
+            estimated=tuple(BOARD_NAMES[at] for at in it.moving),
+            bend_mm=1e3 * float(np.ptp(it.corners[:, 2])),
+        )
+        for it in _found_shapes(known)
+        if it.kind != "points"
     }
 
 
-def shape_sections(known: RunState) -> dict[str, Any]:
-    """`boards` and `rigs`: the targets as they were found to be; of rigs those that are not exact.
+def rigs_of(known: RunState) -> dict[str, RigResult]:
+    """The rigs as they were found to be, by name; those that are exact are left out."""
+    return {
+        it.name: RigResult(shape=it.values.reshape(-1, 3), sigma=it.sigmas.reshape(-1, 3))
+        for it in _found_shapes(known)
+        if it.kind == "points" and it.free
+    }
 
-    Where there is one target without a name they are `board` or `rig`, without another key.
-    """
+
+@dataclass(frozen=True, eq=False)
+class _FoundShape:
+    """A target's shape: its values with their sigmas, and which of them are free and moved."""
+
+    name: str
+    kind: TargetKind
+    values: FloatArray
+    sigmas: FloatArray
+    free: tuple[int, ...]
+    moving: tuple[int, ...]
+    corners: FloatArray
+
+
+def _found_shapes(known: RunState) -> Iterator[_FoundShape]:
+    """The shapes of the targets that were placed."""
     solved, covariance = known.fitted, known.solved.covariance
     seen, looks = solved.seen, solved.looks
     if seen is None or looks is None:
-        return {}
+        return
     sigmas = np.zeros(len(looks.values))
     sigmas[seen.free] = np.sqrt(np.diag(covariance))[solved.columns_of(seen.free)]
-    found: dict[str, dict[str, Any]] = {"boards": {}, "rigs": {}}
-    boards, placed = known.session.boards, solved.part.tree.branches
-    shapes = zip(_shapes(known).items(), boards.items(), strict=True)
-    for at, ((name, mine), (plate, target)) in enumerate(shapes):
-        if frame_name("target", plate) not in placed:
-            continue
-        values, known_to, free = looks.values[mine], sigmas[mine], _among(seen.free, mine)
-        if target.kind == "points" and free:
-            found["rigs"][name] = {
-                "shape": values.reshape(-1, 3).tolist(),
-                "sigma": known_to.reshape(-1, 3).tolist(),
-            }
-        elif target.kind != "points":
-            found["boards"][name] = {
-                "shape": dict(zip(BOARD_NAMES, values.tolist(), strict=True)),
-                "sigma": {BOARD_NAMES[it]: float(known_to[it]) for it in free},
-                "estimated": [BOARD_NAMES[it] for it in _among(seen.moving, mine)],
-                "bend_mm": 1e3 * float(np.ptp(looks.corners[at][:, 2])),
-            }
-    if known.mount is not None and not known.session.targets:
-        return {kind[:-1]: it for kind, of in found.items() for it in of.values()}
-    return {kind: it for kind, it in found.items() if it}
+    shapes = zip(_shapes(known).items(), known.session.boards.items(), looks.corners, strict=True)
+    for (name, mine), (plate, target), corners in shapes:
+        if frame_name("target", plate) in solved.part.tree.branches:
+            yield _FoundShape(
+                name,
+                target.kind,
+                looks.values[mine],
+                sigmas[mine],
+                _among(seen.free, mine),
+                _among(seen.moving, mine),
+                corners,
+            )
 
 
 def _shapes(known: RunState) -> dict[str, slice]:
@@ -109,7 +130,7 @@ def _shapes(known: RunState) -> dict[str, slice]:
     return dict(zip(names, shape_slices(targets, looks.boards.start), strict=True))
 
 
-def _among(places: IntArray, mine: slice) -> list[int]:
+def _among(places: IntArray, mine: slice) -> tuple[int, ...]:
     """Which values of a lens or a target are among some, from its own first on."""
     free = places[(places >= mine.start) & (places < mine.stop)]
-    return [int(it) for it in free - mine.start]
+    return tuple(int(it) for it in free - mine.start)

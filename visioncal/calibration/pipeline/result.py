@@ -1,21 +1,28 @@
 """What is known when all steps have run, put together as a Calibration."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
-from typing import Any
 
 import numpy as np
 
-from visioncal.calibration.pipeline.fit import conditions_document, fit_document
+from visioncal.calibration.pipeline.fit import conditions_of, joint_fit_of
 from visioncal.calibration.pipeline.holdout import held_by_both_arms
-from visioncal.calibration.pipeline.lens_documents import cameras_of, shape_sections
+from visioncal.calibration.pipeline.lens_documents import boards_of, cameras_of, rigs_of
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.pipeline.whole import alignment_of, arm_documents
+from visioncal.calibration.pipeline.whole import alignment_of, arm_sections, pair_of
 from visioncal.calibration.stages.handeye import compare_solvers
 from visioncal.calibration.stages.need import need_met
 from visioncal.calibration.stages.readings import Readings
 from visioncal.estimation.chain import edge_names
 from visioncal.results import HELD_BACK, Calibration, SolverResult, Validation, ViewResult
+from visioncal.results.arm import ArmSections
+from visioncal.results.sections import (
+    CalibrationSections,
+    InstrumentResult,
+    PointResult,
+    UncertaintyResult,
+)
 from visioncal.results.whole import holdout_rms, view_results
 from visioncal.session import View
 from visioncal.session.frames import thing_name
@@ -57,8 +64,8 @@ def result_of(known: RunState) -> Calibration:
         verdict=verdict,
         camera=next(iter(cameras_of(known).values()), None),
         robot=known.robot,
-        stages=_further(known),
         need=need_met(findings.need, findings.picks),
+        **vars(_sections(known)),
     )
 
 
@@ -104,74 +111,74 @@ def _reason(known: RunState, row: View) -> str:
     return known.reasons.get(row.number) or (HELD_BACK if row.holdout else _NO_POSE)
 
 
-def _further(known: RunState) -> dict[str, Any]:
+def _sections(known: RunState) -> CalibrationSections:
     """What was refined beside the edges, and where the uncertainty comes from."""
-    documents: dict[str, Any] = {}
-    for it in known.clocks.values():
-        documents["clock"] = it.clock.document()
-    if known.readings is not None:
-        documents |= _instrument(known, known.readings)
-    documents |= shape_sections(known) | _arm(known)
-    documents["uncertainty"] = _uncertainty(known)
-    conditions, fit = conditions_document(known), fit_document(known)
-    if conditions:
-        documents["conditions"] = conditions
-    if fit is not None:
-        documents["joint_fit"] = fit
-    return documents
+    boards, rigs = boards_of(known), rigs_of(known)
+    # Of one target without a name there is one section.
+    alone = not known.session.targets
+    return CalibrationSections(
+        **vars(_arm(known)),
+        clock=next((it.clock.result() for it in known.clocks.values()), None),
+        instrument=None if known.readings is None else _instrument(known.readings),
+        points=tuple(_points(known)),
+        board=next(iter(boards.values()), None) if alone else None,
+        boards={} if alone else boards,
+        rig=next(iter(rigs.values()), None) if alone else None,
+        rigs={} if alone else rigs,
+        uncertainty=_uncertainty(known),
+        conditions=conditions_of(known),
+        joint_fit=joint_fit_of(known),
+    )
 
 
-def _arm(known: RunState) -> dict[str, Any]:
+def _arm(known: RunState) -> ArmSections:
     """What was found of the arm."""
     arm = known.robot_arm
-    documents = arm_documents(known, arm.robot)
-    if "kinematics" in documents and arm.model is not None:
-        rows = held_by_both_arms(known.fitted, known, arm.robot)
-        if rows:
-            documents["kinematics"]["holdout"] = rows
-    return documents
+    sections = arm_sections(known, arm.robot)
+    if sections.arm is None or arm.model is None:
+        return sections
+    held = held_by_both_arms(known.fitted, known, arm.robot)
+    return replace(sections, arm=replace(sections.arm, holdout=held))
 
 
-def _instrument(known: RunState, readings: Readings) -> dict[str, Any]:
-    """The instrument as it was taken, and the places of the points that it read on the flange."""
+def _instrument(readings: Readings) -> InstrumentResult:
+    """The instrument as it was taken."""
     instrument = readings.instrument
-    stated = {
-        "words": instrument.words,
-        "reads": "poses" if readings.are_poses else "places",
-        "sigma_m": instrument.sigma_m,
-        "sigma_per_m": instrument.sigma_per_m,
-        "sigma_rad": instrument.sigma_rad if readings.are_poses else None,
-    }
-    document: dict[str, Any] = {"instrument": {k: v for k, v in stated.items() if v is not None}}
-    if not readings.are_poses:
-        places = {it: at for it, at in known.solved.edges.items() if it.startswith("point")}
-        document["points"] = [
-            {
-                "point": thing_name(frame, "probe"),
-                **dict(zip(("x_m", "y_m", "z_m"), edge.matrix[:3, 3].tolist(), strict=True)),
-                "sigma_mm": edge.sigma_mm,
-            }
-            for frame, edge in places.items()
-        ]
-    return document
+    return InstrumentResult(
+        words=instrument.words,
+        reads="poses" if readings.are_poses else "places",
+        sigma_m=instrument.sigma_m,
+        sigma_per_m=instrument.sigma_per_m,
+        sigma_rad=instrument.sigma_rad if readings.are_poses else None,
+    )
 
 
-def _uncertainty(known: RunState) -> dict[str, Any]:
+def _points(known: RunState) -> Iterator[PointResult]:
+    """The places of the points that an instrument read on the flange."""
+    if known.readings is not None and not known.readings.are_poses:
+        for frame, edge in known.solved.edges.items():
+            if frame.startswith("point"):
+                x_m, y_m, z_m = edge.matrix[:3, 3].tolist()
+                name = thing_name(frame, "probe")
+                yield PointResult(point=name, x_m=x_m, y_m=y_m, z_m=z_m, sigma_mm=edge.sigma_mm)
+
+
+def _uncertainty(known: RunState) -> UncertaintyResult:
     work, answer = known.work, known.solved
     of = "combined" if answer.problem.is_combined else "robot"
     (turn_rad, shift_m) = answer.intervals[0]
     alike = [it.alike.factor for it in answer.misfits.values() if it.alike.is_significant]
-    return {
-        "point_cam_m": work.point_cam.tolist(),
-        "budget_mm": dict(work.budget_mm),
-        "radius95_mm": work.radius95_mm,
-        "noise_95": {
-            f"{of}_translation_mm": (1e3 * shift_m).tolist(),
-            f"{of}_rotation_deg": np.rad2deg(turn_rad).tolist(),
+    return UncertaintyResult(
+        point_cam_m=work.point_cam,
+        budget_mm=work.budget_mm,
+        radius95_mm=work.radius95_mm,
+        noise_95={
+            f"{of}_translation_mm": pair_of(1e3 * shift_m),
+            f"{of}_rotation_deg": pair_of(np.rad2deg(turn_rad)),
         },
-        "spectrum": work.spectrum.tolist(),
-        "inflation": max(alike, default=1.0),
-    }
+        spectrum=work.spectrum,
+        inflation=max(alike, default=1.0),
+    )
 
 
 def _noise(known: RunState) -> dict[str, float]:

@@ -1,18 +1,25 @@
 """The result of a whole cell: its frames, each with respect to all others."""
 
 from datetime import UTC, datetime
-from typing import Any
 
 import numpy as np
 
 from visioncal.calibration.pipeline.judging import weakest_link
-from visioncal.calibration.pipeline.lens_documents import cameras_of, fit_section, shape_sections
+from visioncal.calibration.pipeline.lens_documents import (
+    boards_of,
+    cameras_of,
+    fit_section,
+    rigs_of,
+)
 from visioncal.calibration.pipeline.network_ties import untied_words
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell import robot_key
 from visioncal.calibration.stages.need import need_met
+from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import stops_of
 from visioncal.results import Alignment, RobotResult, Untied
+from visioncal.results.arm import ArmSections
+from visioncal.results.sections import CellDetails, CellUncertainty, Intervals
 from visioncal.robot import Robot
 from visioncal.vision.targets import target_document
 
@@ -54,16 +61,13 @@ def alignment_of(known: RunState) -> Alignment:
         details=_details(known),
         arms=_arms(known),
         targets={name or "target": target_document(it) for name, it in session.plates.items()},
-        stages={
-            **shape_sections(known),
-            "joint_fit": fit_section(known),
-            "uncertainty": {
-                "budget_mm": {
-                    f"{parents[it]}_from_{it}": mm for it, mm in answer.budget_mm.items()
-                },
-                "noise_95": _intervals(known),
-            },
-        },
+        boards=boards_of(known),
+        rigs=rigs_of(known),
+        joint_fit=fit_section(known),
+        uncertainty=CellUncertainty(
+            budget_mm={f"{parents[it]}_from_{it}": mm for it, mm in answer.budget_mm.items()},
+            noise_95=_intervals(known),
+        ),
         need=need_met(known.findings.need, known.findings.picks, whole=True),
     )
 
@@ -76,33 +80,38 @@ def _arms(known: RunState) -> dict[str, RobotResult]:
         for name in session.robots
     }
     for name in solved.arms:
-        found[name] = RobotResult(found[name].model, arm_documents(known, name))
+        found[name] = RobotResult(found[name].model, **vars(arm_sections(known, name)))
     return found
 
 
-def arm_documents(known: RunState, robot: str) -> dict[str, Any]:
-    """What was found of a robot's arm, as calibration.json has it: one section a stage."""
+def arm_sections(known: RunState, robot: str) -> ArmSections:
+    """What was found of a robot's arm."""
     solved, answer, first = known.fitted, known.solved, dict[int, int]()
     for row in solved.cell.rows:
         first.setdefault(row.station, row.view)
     stops = stops_of(answer.problem, robot)
     found = answer.arms[robot]
-    return solved.arms[robot].at(stops).documents(found, [first[it] for it in stops.tolist()])
+    return solved.arms[robot].at(stops).result(found, [first[it] for it in stops.tolist()])
 
 
-def _details(known: RunState) -> dict[str, Any]:
+def _details(known: RunState) -> CellDetails:
     """What was found of clocks."""
-    clocks = known.solved.clocks(known)
-    return {"clocks": {it.words: at.document() for it, at in clocks.items()}} if clocks else {}
+    return CellDetails({it.words: at.result() for it, at in known.solved.clocks(known).items()})
 
 
-def _intervals(known: RunState) -> dict[str, dict[str, list[float]]]:
+def _intervals(known: RunState) -> dict[str, Intervals]:
     """95 % intervals of the levels of robots, as the noise names them."""
     pairs = zip(known.solved.problem.robots, known.solved.intervals, strict=True)
     return {
         robot: {
-            "translation_mm": (1e3 * shift_m).tolist(),
-            "rotation_deg": np.rad2deg(turn_rad).tolist(),
+            "translation_mm": pair_of(1e3 * shift_m),
+            "rotation_deg": pair_of(np.rad2deg(turn_rad)),
         }
         for robot, (turn_rad, shift_m) in pairs
     }
+
+
+def pair_of(interval: FloatArray) -> tuple[float, float]:
+    """The ends of an interval."""
+    low, high = interval.tolist()
+    return low, high

@@ -1,8 +1,7 @@
 """Stage 7: what the stops tell of a calibrated arm, and what it is worth all over its workspace."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,6 +36,14 @@ from visioncal.estimation.parameters import (
 from visioncal.estimation.solve import whitened
 from visioncal.estimation.stop_influence import stop_worth
 from visioncal.estimation.workspace import postures
+from visioncal.results.arm import (
+    ArmParameter,
+    ArmResult,
+    Observability,
+    StopInfluence,
+    WorkspacePlace,
+    WorkspaceSigma,
+)
 from visioncal.robot import (
     Convention,
     DHTable,
@@ -96,67 +103,57 @@ class Telling:
     places: FloatArray
     sigmas_m: FloatArray
 
-    def document(
-        self, robot: Robot, views: Sequence[int], lost: JointReading | None = None
-    ) -> dict[str, Any]:
-        """It as calibration.json has it.
+    def told_of(
+        self, result: ArmResult, robot: Robot, views: Sequence[int], lost: JointReading | None
+    ) -> ArmResult:
+        """A section of a calibration, with this in it.
 
         Args:
+            result: The section.
             robot: The nominal arm.
             views: (m,) by which views the stops go.
             lost: A joint whose zero was found far from where it was stated.
         """
         ordered = sorted(zip(self.worth.tolist(), views, strict=True), key=lambda it: -it[0])
-        return {
-            "convention": self.convention,
-            "parameters": [_number(it, robot, lost) for it in self.estimates],
-            "workspace_sigma_mm": {
-                "median": 1e3 * float(np.median(self.sigmas_m)),
-                "p95": 1e3 * float(np.quantile(self.sigmas_m, 0.95)),
-            },
-            "workspace_map": [
-                dict(zip(("x_m", "y_m", "z_m"), place, strict=True)) | {"sigma_mm": 1e3 * sigma}
-                for place, sigma in list(
-                    zip(self.places.tolist(), self.sigmas_m.tolist(), strict=True)
-                )[:_PLACES]
-            ],
-            "observability": self._observability(),
-            "not_told": list(self.not_told),
-            "stops": [{"view": view, "worth": worth} for worth, view in ordered],
-        }
+        rows = np.column_stack([self.places, 1e3 * self.sigmas_m])[:_PLACES]
+        return replace(
+            result,
+            convention=self.convention,
+            parameters=tuple(_number(it, robot, lost) for it in self.estimates),
+            workspace_sigma_mm=WorkspaceSigma(
+                1e3 * float(np.median(self.sigmas_m)),
+                1e3 * float(np.quantile(self.sigmas_m, 0.95)),
+            ),
+            workspace_map=tuple(WorkspacePlace(*row) for row in rows.tolist()),
+            observability=self._observability(),
+            not_told=self.not_told,
+            stops=tuple(StopInfluence(view, worth) for worth, view in ordered),
+        )
 
-    def _observability(self) -> dict[str, Any]:
-        told, indices = self.told, self.indices
-        counted = {
-            "columns": told.columns,
-            "identifiable": told.identifiable,
-            "told": told.told,
-        }
-        if indices is None:
-            return counted
-        return counted | {
-            "condition": indices.condition,
-            "o1": indices.o1,
-            "o2": indices.o2,
-            "o3": indices.o3,
-            "o4": indices.o4,
-            "o5": indices.o5,
-        }
+    def _observability(self) -> Observability:
+        indices = self.indices
+        figures = {} if indices is None else {"condition": indices.condition, **vars(indices)}
+        return Observability(
+            columns=self.told.columns,
+            identifiable=self.told.identifiable,
+            told=self.told.told,
+            **figures,
+        )
 
 
-def _number(estimate: Estimate, robot: Robot, lost: JointReading | None) -> dict[str, Any]:
+def _number(estimate: Estimate, robot: Robot, lost: JointReading | None) -> ArmParameter:
     joint, nominal = estimate.parameter.joint, estimate.nominal
     if lost is not None and estimate.parameter.name == "theta_rad":
         # The fit starts where the zero was found; what is told starts where it was stated.
         nominal -= float(robot.chain.functions[joint, 1] * lost.zeros[joint])
-    return {
-        "joint": robot.joint_names[joint],
-        "name": estimate.parameter.name,
-        "nominal": nominal,
-        "identified": estimate.identified,
-        "change": estimate.identified - nominal,
-        "sigma": estimate.sigma,
-    }
+    return ArmParameter(
+        joint=robot.joint_names[joint],
+        name=estimate.parameter.name,
+        nominal=nominal,
+        identified=estimate.identified,
+        change=estimate.identified - nominal,
+        sigma=estimate.sigma,
+    )
 
 
 def tell(arm: ArmData, convention: Convention | None = None) -> Telling:

@@ -2,13 +2,13 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
 from visioncal.calibration.stages import backlash, elastic, thermal
 from visioncal.calibration.stages.arm_identifiability import Telling, tell
-from visioncal.calibration.stages.backlash import Play, plays_of
+from visioncal.calibration.stages.backlash import plays_of
 from visioncal.calibration.stages.elastic import Elastic, springs_of
 from visioncal.calibration.stages.joints import Matched
 from visioncal.calibration.stages.kinematics import Kinematics, choose_level
@@ -16,8 +16,7 @@ from visioncal.calibration.stages.loads import check_elastic, check_poses
 from visioncal.calibration.stages.reported_poses import moved_arm
 from visioncal.calibration.stages.thermal import (
     Heat,
-    drift_by_view,
-    drift_document,
+    drift_result,
     find_drift,
     heating,
 )
@@ -26,6 +25,7 @@ from visioncal.core.transforms import distances, invert, mean_transform
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.core.verdict import Finding
 from visioncal.estimation.arm import (
+    LEVER_M,
     ArmErrors,
     find_arm_errors,
     link_basis,
@@ -38,6 +38,7 @@ from visioncal.estimation.armpair import ArmData, ArmPair
 from visioncal.estimation.parts import Effect, Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import Solution
+from visioncal.results.arm import ArmErrorsResult, ArmSections, JointBacklash, ThermalResult
 from visioncal.robot import Convention, Loads
 from visioncal.session import Session, View
 from visioncal.session.loads import loads_of
@@ -54,13 +55,13 @@ class ArmFound:
         telling: Of its numbers; None where it stands as stated.
         springs: Of its joints as springs; None for a rigid one.
         plays: Of the play in its joints; empty where stops did not come from both sides.
-        drift: Its drift with temperature, as calibration.json has it; None for none.
+        drift: Its drift with temperature; None for none.
     """
 
     telling: Telling | None = None
     springs: Elastic | None = None
-    plays: tuple[Play, ...] = ()
-    drift: Mapping[str, Any] | None = None
+    plays: tuple[JointBacklash, ...] = ()
+    drift: ThermalResult | None = None
 
     def notes(self) -> Iterator[str]:
         """Words what is no reason for doubt."""
@@ -337,7 +338,7 @@ class RobotArm:
             seen = self.at(stops_of(problem, self.robot))
             stops = replace(seen.warming, places=stops_of(problem, self.robot))
             views = [] if seen.heat is None else seen.heat.views.tolist()
-            drift = drift_document(self.drift, stops, views, problem, fit)
+            drift = drift_result(self.drift, stops, views, problem, fit)
         data = self._seen(problem, fit, covariance, middles)
         if data is None or self.kinematics is None:
             return ArmFound(drift=drift)
@@ -350,34 +351,27 @@ class RobotArm:
             drift,
         )
 
-    def documents(self, found: ArmFound, views: Sequence[int]) -> dict[str, Any]:
-        """What was found of it, as calibration.json has it: one section a stage.
+    def result(self, found: ArmFound, views: Sequence[int]) -> ArmSections:
+        """What was found of it, as sections of a calibration.
 
         Args:
             found: What the stops tell of it.
             views: By which views these stops go.
         """
-        stages: dict[str, Any] = {}
-        if self.errors is not None:
-            stages["arm_errors"] = self.errors.document()
-        if found.drift is not None and self.drift is not None and self.heat is not None:
-            rows = drift_by_view(self.drift, self.warming, self.heat.views.tolist())
-            stages["thermal"] = {**found.drift, "views": rows}
-        if self.kinematics is None:
-            return stages
-        stages["kinematics"] = self.kinematics.document()
-        if self.model is None:
-            return stages
-        stages["kinematics"]["robot"] = dict(self.model.robot.document)
-        if found.plays:
-            stages["kinematics"]["backlash"] = [it.document() for it in found.plays]
+        sections = ArmSections(
+            arm_errors=None if self.errors is None else _size_of(self.errors),
+            thermal=found.drift,
+            arm=None if self.kinematics is None else self.kinematics.result(),
+        )
+        if sections.arm is None or self.kinematics is None or self.model is None:
+            return sections
+        arm = replace(sections.arm, robot=self.model.robot, backlash=found.plays)
         if found.telling is not None:
             zero = None if self.matched is None else self.matched.zero
-            stages["kinematics"] |= found.telling.document(self.model.nominal, views, zero)
-            stages["kinematics"]["left_out"] = self.kinematics.left_out()
-        if found.springs is not None:
-            stages["elastic"] = found.springs.document(views)
-        return stages
+            arm = found.telling.told_of(arm, self.model.nominal, views, zero)
+            arm = replace(arm, left_out=self.kinematics.left_out())
+        springs = None if found.springs is None else found.springs.result(views)
+        return replace(sections, arm=arm, elastic=springs)
 
     @property
     def basis(self) -> FloatArray:
@@ -460,6 +454,16 @@ class RobotArm:
         found = np.zeros((len(self.stood), *columns.shape[1:]))
         found[self.stood] = columns
         return found
+
+
+def _size_of(errors: ArmErrors) -> ArmErrorsResult:
+    """The size of errors, as a section of a calibration."""
+    return ArmErrorsResult(
+        sigma_mm=1e3 * LEVER_M * errors.sigma,
+        sigma_deg=float(np.rad2deg(errors.sigma)),
+        likelihood_ratio=errors.gain,
+        estimated=errors.is_estimated,
+    )
 
 
 def effects_of(arms: Mapping[str, RobotArm], *, freely: bool = False) -> Iterator[Effect]:

@@ -1,49 +1,16 @@
 """What stops that were approached from both sides say of the play in the joints."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray
 from visioncal.estimation.armmodel import BACKLASH, ArmModel
-
-# A dead-band of fewer standard deviations may be chance.
-_SURE = 3.0
+from visioncal.results.arm import JointBacklash
 
 
-@dataclass(frozen=True)
-class Play:
-    """The play of a joint.
-
-    Attributes:
-        joint: Its name.
-        deadband_rad: How far apart the joint stands when it is approached from its two sides, where
-            its encoder tells the same [rad]. Negative where it overshoots.
-        sigma_rad: Its standard deviation [rad].
-    """
-
-    joint: str
-    deadband_rad: float
-    sigma_rad: float
-
-    def document(self) -> dict[str, Any]:
-        """It as calibration.json has it."""
-        return {
-            "joint": self.joint,
-            "deadband_rad": self.deadband_rad,
-            "sigma_rad": self.sigma_rad,
-        }
-
-    @property
-    def is_sure(self) -> bool:
-        """Whether it is beyond chance."""
-        return abs(self.deadband_rad) > _SURE * self.sigma_rad
-
-
-def plays_of(model: ArmModel, covariance: FloatArray) -> tuple[Play, ...]:
+def plays_of(model: ArmModel, covariance: FloatArray) -> tuple[JointBacklash, ...]:
     """Tells the play of each joint; nothing where stops did not come from both sides.
 
     Args:
@@ -56,10 +23,10 @@ def plays_of(model: ArmModel, covariance: FloatArray) -> tuple[Play, ...]:
     sigmas = model.weights[BACKLASH] * np.sqrt(np.diag(covariance)[place])
     names = model.nominal.joint_names
     columns = zip(names, model.backlash.tolist(), sigmas.tolist(), strict=True)
-    return tuple(Play(name, band, sigma) for name, band, sigma in columns)
+    return tuple(JointBacklash(name, band, sigma) for name, band, sigma in columns)
 
 
-def remarks(plays: Sequence[Play]) -> Iterator[str]:
+def remarks(plays: Sequence[JointBacklash]) -> Iterator[str]:
     """Says which joints have play, for the verdict."""
     sure = [it for it in plays if it.is_sure]
     if not sure:

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from visioncal.estimation.bending import (
     flange_bends,
     payload_factor,
 )
+from visioncal.results.arm import ElasticResult, JointSpring, LoadedStop, Sag
 from visioncal.robot import Loads, Robot
 
 # A joint is told where the stops leave less than this share of what was open about it.
@@ -27,59 +27,6 @@ _TOLD = 0.5
 # Torque on a joint from which on it counts as loaded [N m].
 _LOADED_NM = 0.05
 _SURE = 2.0
-
-
-@dataclass(frozen=True)
-class Spring:
-    """A joint as a spring.
-
-    Attributes:
-        joint: Its name.
-        compliance: What it yields to a torque, zero or more [rad/(N m)].
-        sigma: Its standard deviation; where the stops do not tell it, that of springs at large.
-        is_told: Whether the stops tell it; others stay rigid.
-        torque_nm: Least and greatest torque on it at the stops [N m].
-    """
-
-    joint: str
-    compliance: float
-    sigma: float
-    is_told: bool
-    torque_nm: tuple[float, float]
-
-    @property
-    def stiffness(self) -> float | None:
-        """[N m/rad]; None where the joint is not told, or as good as rigid."""
-        if not self.is_told or self.compliance < _SURE * self.sigma:
-            return None
-        return 1.0 / self.compliance
-
-    @property
-    def words(self) -> str:
-        """Its stiffness with its sigma, in words; empty where it has none."""
-        stiffness, sigma = self.stiffness, self.stiffness_sigma
-        if stiffness is None or sigma is None:
-            return ""
-        return f"{1e-3 * stiffness:.4g} +- {figure(1e-3 * sigma)} kN m/rad"
-
-    def document(self) -> dict[str, Any]:
-        """It as calibration.json has it."""
-        row: dict[str, Any] = {
-            "joint": self.joint,
-            "compliance_rad_per_nm": self.compliance,
-            "sigma_rad_per_nm": self.sigma,
-            "told": self.is_told,
-            "torque_nm": list(self.torque_nm),
-        }
-        if self.stiffness is not None:
-            row["stiffness_nm_per_rad"] = self.stiffness
-            row["stiffness_sigma_nm_per_rad"] = self.stiffness_sigma
-        return row
-
-    @property
-    def stiffness_sigma(self) -> float | None:
-        """Standard deviation of the stiffness, to first order [N m/rad]."""
-        return None if self.stiffness is None else self.sigma * self.stiffness**2
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +46,7 @@ class Elastic:
             known (see `bent_joints`); None where they are, or where they hardly yield.
     """
 
-    springs: tuple[Spring, ...]
+    springs: tuple[JointSpring, ...]
     torques_nm: FloatArray
     bends_rad: FloatArray
     sag_mm: FloatArray
@@ -111,45 +58,36 @@ class Elastic:
     @property
     def untold(self) -> tuple[str, ...]:
         """The joints that the loads do not tell."""
-        return tuple(it.joint for it in self.springs if not it.is_told)
+        return tuple(it.joint for it in self.springs if not it.told)
 
-    def document(self, views: Sequence[int]) -> dict[str, Any]:
-        """It as calibration.json has it.
+    def result(self, views: Sequence[int]) -> ElasticResult:
+        """It as a section of a calibration.
 
         Args:
             views: (m,) by which views the stops go.
         """
-        document: dict[str, Any] = {
-            "joints": [it.document() for it in self.springs],
-            "not_told": list(self.untold),
-            "weight": "of the model's masses" if self.weighs else "unknown",
-            "payload_kg": [float(self.payload_kg.min()), float(self.payload_kg.max())],
-            "sag_mm": {
-                "median": float(np.median(self.sag_mm)),
-                "most": float(self.sag_mm.max()),
-            },
-            "stops": [self._stop(at, view) for at, view in enumerate(views)],
-        }
-        if self.weight_moments is not None:
-            document["weight_moments"] = self.weight_moments.tolist()
-        if self.payload is not None:
-            document["payload_factor"] = {
-                "value": self.payload.value,
-                "sigma": self.payload.sigma,
-            }
-        return document
+        return ElasticResult(
+            joints=self.springs,
+            not_told=self.untold,
+            weight="of the model's masses" if self.weighs else "unknown",
+            payload_kg=(float(self.payload_kg.min()), float(self.payload_kg.max())),
+            sag_mm=Sag(float(np.median(self.sag_mm)), float(self.sag_mm.max())),
+            stops=tuple(self._stop(at, view) for at, view in enumerate(views)),
+            weight_moments=self.weight_moments,
+            payload_factor=self.payload,
+        )
 
-    def _stop(self, at: int, view: int) -> dict[str, Any]:
+    def _stop(self, at: int, view: int) -> LoadedStop:
         """Torques and bends of a stop; a bend that is not told is left out."""
         joints = (it.joint for it in self.springs)
         bends = zip(joints, self.bends_rad[at].tolist(), strict=True)
-        return {
-            "view": view,
-            "payload_kg": float(self.payload_kg[at]),
-            "sag_mm": float(self.sag_mm[at]),
-            "torque_nm": self.torques_nm[at].tolist(),
-            "bend_mrad": {name: 1e3 * bend for name, bend in bends if np.isfinite(bend)},
-        }
+        return LoadedStop(
+            view=view,
+            payload_kg=float(self.payload_kg[at]),
+            sag_mm=float(self.sag_mm[at]),
+            torque_nm=tuple(self.torques_nm[at].tolist()),
+            bend_mrad={name: 1e3 * bend for name, bend in bends if np.isfinite(bend)},
+        )
 
 
 def springs_of(arm: ArmData, errors: Mapping[str, ArmErrors]) -> Elastic | None:
@@ -185,18 +123,33 @@ def springs_of(arm: ArmData, errors: Mapping[str, ArmErrors]) -> Elastic | None:
 
 def _springs(
     model: ArmModel, sigmas: FloatArray, told: Mask, torques: FloatArray
-) -> Iterator[Spring]:
-    for at, name in enumerate(model.nominal.joint_names):
-        low, high = float(torques[:, at].min()), float(torques[:, at].max())
-        compliance = float(model.compliance[at])
-        yield Spring(name, compliance, float(sigmas[at]), bool(told[at]), (low, high))
+) -> Iterator[JointSpring]:
+    columns = (model.nominal.joint_names, model.compliance.tolist(), sigmas.tolist(), told.tolist())
+    for at, (name, compliance, sigma, is_told) in enumerate(zip(*columns, strict=True)):
+        stiff = 1.0 / compliance if is_told and compliance >= _SURE * sigma else None
+        yield JointSpring(
+            joint=name,
+            compliance_rad_per_nm=compliance,
+            sigma_rad_per_nm=sigma,
+            told=is_told,
+            torque_nm=(float(torques[:, at].min()), float(torques[:, at].max())),
+            stiffness_nm_per_rad=stiff,
+            stiffness_sigma_nm_per_rad=None if stiff is None else sigma * stiff**2,
+        )
+
+
+def _stiffness_words(spring: JointSpring) -> str:
+    """The stiffness of a joint with its sigma; empty where it has none."""
+    stiffness, sigma = spring.stiffness_nm_per_rad, spring.stiffness_sigma_nm_per_rad
+    if stiffness is None or sigma is None:
+        return ""
+    return f"{spring.joint} {1e-3 * stiffness:.4g} +- {figure(1e-3 * sigma)} kN m/rad"
 
 
 def remarks(elastic: Elastic) -> Iterator[str]:
     """Says what was found of the springs, for the verdict."""
-    stiff = [it for it in elastic.springs if it.stiffness is not None]
-    if stiff:
-        words = ", ".join(f"{it.joint} {it.words}" for it in stiff)
+    words = ", ".join(filter(None, map(_stiffness_words, elastic.springs)))
+    if words:
         yield (
             f"The joints bend under load: their stiffness is {words}. At these stops that moves "
             f"the flange by up to {figure(float(elastic.sag_mm.max()))} mm."

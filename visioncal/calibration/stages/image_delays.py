@@ -6,6 +6,7 @@ how much, they are set straight: to where they would have been at the stamp.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -56,9 +57,9 @@ class FoundDelay:
         known = Knowledge(np.array([[self.sigma_s**-2.0]]), np.zeros(1))
         return Effect.free(name or self.of.name, known, jacobian)
 
-    def document(self) -> dict[str, object]:
-        """What calibration.json says of it."""
-        return self.of.document(self.time_s, self.sigma_s, self.is_clear, self.resolution)
+    def result(self) -> dict[str, Any]:
+        """Fields of `results.ClockResult`."""
+        return self.of.result(self.time_s, self.sigma_s, self.is_clear, self.resolution)
 
     @property
     def words(self) -> str:

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -17,8 +16,8 @@ from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import robot_levels, starting_noise
 from visioncal.results import Rms
+from visioncal.results.arm import NOMINAL, ArmLevel, ArmResult, UnseenView
 
-NOMINAL = "nominal"
 # What a zero that was found from the target's poses is still off by, before the corners are asked,
 # and the zeros of the other joints with it [rad].
 _ZERO_SIGMA_RAD = 5e-4
@@ -54,18 +53,17 @@ class Level:
     likelihood_ratio: float
     sizes: int
 
-    def document(self) -> dict[str, Any]:
-        """Its figures as calibration.json has them."""
-        figures = {
-            "level": self.name,
-            "unknowns": self.unknowns,
-            "rms_mm": self.inside.mm,
-            "rms_deg": self.inside.deg,
-            "held_out_mm": self.left_out.mm,
-            "held_out_deg": self.left_out.deg,
-            "likelihood_ratio": self.likelihood_ratio,
-        }
-        return {name: it for name, it in figures.items() if it is not None}
+    def result(self) -> ArmLevel:
+        """It as a calibration has it."""
+        return ArmLevel(
+            level=self.name,
+            unknowns=self.unknowns,
+            rms_mm=self.inside.mm,
+            rms_deg=self.inside.deg,
+            held_out_mm=self.left_out.mm,
+            held_out_deg=self.left_out.deg,
+            likelihood_ratio=self.likelihood_ratio,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,20 +86,20 @@ class Kinematics:
     fits: tuple[LevelFit, LevelFit]
     views: tuple[int, ...] = ()
 
-    def left_out(self) -> list[dict[str, Any]]:
+    def left_out(self) -> tuple[UnseenView, ...]:
         """How far stops that are left out in turn are off by both arms, by view."""
         before, after = (np.linalg.norm(it.left_out.reshape(-1, 2, 3), axis=2) for it in self.fits)
-        return list(unseen_rows(self.views, before, after, self.fits[0].has_rotation))
+        return unseen_views(self.views, before, after, self.fits[0].has_rotation)
 
-    def document(self) -> dict[str, Any]:
-        """The levels that were compared, as calibration.json has them."""
-        return {"level": self.level, "levels": [it.document() for it in self.levels]}
+    def result(self) -> ArmResult:
+        """The levels that were compared, as a section of a calibration."""
+        return ArmResult(level=self.level, levels=tuple(it.result() for it in self.levels))
 
 
-def unseen_rows(
+def unseen_views(
     views: Sequence[int], before: FloatArray, after: FloatArray, turned: Mask
-) -> Iterator[dict[str, Any]]:
-    """Writes how far views that no fit has seen are off by the nominal arm and by the calibrated.
+) -> tuple[UnseenView, ...]:
+    """How far views that no fit has seen are off by the nominal arm and by the calibrated.
 
     Args:
         views: (m,) the views.
@@ -110,11 +108,16 @@ def unseen_rows(
         turned: (m,) whether a rotation was measured.
     """
     columns = zip(views, before.tolist(), after.tolist(), turned.tolist(), strict=True)
-    for view, (was_rad, was_m), (now_rad, now_m), has_rotation in columns:
-        row = {"view": view, "nominal_mm": 1e3 * was_m, "mm": 1e3 * now_m}
-        if has_rotation:
-            row |= {"nominal_deg": np.rad2deg(was_rad).item(), "deg": np.rad2deg(now_rad).item()}
-        yield row
+    return tuple(
+        UnseenView(
+            view=view,
+            nominal_mm=1e3 * was_m,
+            mm=1e3 * now_m,
+            nominal_deg=np.rad2deg(was_rad).item() if has_rotation else None,
+            deg=np.rad2deg(now_rad).item() if has_rotation else None,
+        )
+        for view, (was_rad, was_m), (now_rad, now_m), has_rotation in columns
+    )
 
 
 def choose_level(

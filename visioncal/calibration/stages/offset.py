@@ -14,6 +14,7 @@ from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import GUESS, Finding, Step
 from visioncal.estimation.clock import ClockFit
 from visioncal.estimation.clock_correlation import Match
+from visioncal.results.sections import ClockResult
 from visioncal.session import View
 
 # Angles that go along by less are of other motions; a larger sigma [s] is no answer.
@@ -66,23 +67,17 @@ class Clock:
         share = 0.0 if erring else max(0.0, 1.0 - len(self.speeds) / self.frames)
         return 1.0 / max(1.0 / LARGEST_SIGMA_S, float(np.sqrt(share)) / self.sigma_s)
 
-    def document(self) -> dict[str, object]:
-        """What calibration.json says of it."""
-        known: dict[str, object] = {
-            "camera_minus_robot_s": self.camera_minus_robot_s,
-            "method": self.method,
-        }
-        if self.method != "rest":
-            known["sigma_s"] = self.sigma_s
-        if self.stated_s is not None:
-            known["stated_s"] = self.stated_s
-        if self.frames:
-            known["frames"] = self.frames
-        if self.correlation is not None:
-            known["correlation"] = self.correlation
-        for it in self.delays:
-            known |= it.document()
-        return known
+    def result(self) -> ClockResult:
+        """It as a section of a calibration."""
+        return ClockResult(
+            camera_minus_robot_s=self.camera_minus_robot_s,
+            method=self.method,
+            sigma_s=None if self.method == "rest" else self.sigma_s,
+            stated_s=self.stated_s,
+            frames=self.frames or None,
+            correlation=self.correlation,
+            **{name: it for delay in self.delays for name, it in delay.result().items()},
+        )
 
 
 def told_words(fit: ClockFit, match: Match, stream: str) -> str:

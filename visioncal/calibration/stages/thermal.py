@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -19,8 +19,16 @@ from visioncal.estimation.armpair import ArmPair
 from visioncal.estimation.parts import State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import Solution, starting_noise
+from visioncal.results.arm import (
+    DriftPoint,
+    DriftResidual,
+    JointDrift,
+    ObservedDrift,
+    ThermalResult,
+    ViewDrift,
+)
 from visioncal.robot import Robot
-from visioncal.robot.thermal import Inputs
+from visioncal.robot.thermal import Inputs, ThermalModel
 from visioncal.session import Session
 
 LEVEL = "thermal"
@@ -177,10 +185,10 @@ def findings(fit: ThermalFit) -> Iterator[str]:
         )
 
 
-def drift_document(
+def drift_result(
     fit: ThermalFit, stops: Stops, views: Sequence[int], problem: Problem, solved: Solution
-) -> dict[str, Any]:
-    """Writes a drift's coefficients and its course, as calibration.json has it.
+) -> ThermalResult:
+    """A drift's coefficients and its course, as a section of a calibration.
 
     Args:
         fit: The drift.
@@ -189,28 +197,52 @@ def drift_document(
         problem: The observations that agree.
         solved: Their fit.
     """
-    return fit.model.document() | {
-        "not_told": list(fit.not_told),
-        "residual_mm": {"without": 1e3 * fit.before_m, "with": 1e3 * fit.after_m},
-        "likelihood_ratio": fit.gain,
-        "rises_k": fit.rises_k.tolist(),
-        "trained_s": float(np.ptp(stops.stamps_s)),
-        "course": _course(fit, _typical(stops.q)),
-        "seen": _seen(fit, stops, views, problem, solved.state),
+    model = fit.model
+    return ThermalResult(
+        heated_by=model.heating.kind,
+        joints=_joints(model),
+        covariance=model.covariance,
+        lengths_m=model.lengths,
+        not_told=tuple(fit.not_told),
+        residual_mm=DriftResidual(without=1e3 * fit.before_m, with_drift=1e3 * fit.after_m),
+        likelihood_ratio=fit.gain,
+        rises_k=tuple(fit.rises_k.tolist()),
+        trained_s=float(np.ptp(stops.stamps_s)),
+        course=_course(fit, _typical(stops.q)),
+        seen=_seen(fit, stops, views, problem, solved.state),
+        views=_by_view(fit, stops, views),
+    )
+
+
+def _joints(model: ThermalModel) -> tuple[JointDrift, ...]:
+    """The coefficients joint by joint; sigmas of tau and gain are relative."""
+    columns = {
+        "reference_c": model.reference_c,
+        "growth_per_k": model.growth_per_k,
+        "drift_rad_per_k": model.drift_rad_per_k,
+        "tau_s": model.heating.tau_s,
     }
+    sigmas = np.sqrt(np.diag(model.covariance)).reshape(-1, model.joint_count)
+    names = ["growth_sigma_per_k", "drift_sigma_rad_per_k", "tau_sigma"]
+    if model.heating.kind == "currents":
+        columns["gain_k_per_a2"] = model.heating.gain_k_per_a2
+        names.append("gain_sigma")
+    columns |= dict(zip(names, sigmas, strict=True))
+    return tuple(
+        JointDrift(joint=joint, **{name: float(it[at]) for name, it in columns.items()})
+        for at, joint in enumerate(model.robot.joint_names)
+    )
 
 
-def drift_by_view(fit: ThermalFit, stops: Stops, views: Sequence[int]) -> list[dict[str, float]]:
+def _by_view(fit: ThermalFit, stops: Stops, views: Sequence[int]) -> tuple[ViewDrift, ...]:
     """How far the flange had drifted at (m,) views, and the largest rise of a link."""
     moved = np.linalg.norm(fit.motion(stops)[:, :3, 3], axis=1)
     rises = fit.model.rises(fit.links_c(stops)).max(axis=1)
-    return [
-        {"view": view, "drift_mm": 1e3 * drift, "rise_k": rise}
-        for view, drift, rise in zip(views, moved.tolist(), rises.tolist(), strict=True)
-    ]
+    rows = zip(views, (1e3 * moved).tolist(), rises.tolist(), strict=True)
+    return tuple(ViewDrift(*row) for row in rows)
 
 
-def _course(fit: ThermalFit, q: FloatArray) -> list[dict[str, float]]:
+def _course(fit: ThermalFit, q: FloatArray) -> tuple[DriftPoint, ...]:
     """How far the flange has drifted at (n,) joint angles, and how surely that is known."""
     model, inputs = fit.model, fit.inputs
     at_s = np.linspace(inputs.stamps_s[0], inputs.stamps_s[-1], _DRAWN)
@@ -219,17 +251,13 @@ def _course(fit: ThermalFit, q: FloatArray) -> list[dict[str, float]]:
     moved = np.linalg.norm(model.motion(rows, links)[:, :3, 3], axis=1)
     sigma = model.sigma_m(rows, links, model.heating.jacobian(inputs, at_s))
     rises = model.rises(links).max(axis=1)
-    return [
-        {"stamp_s": at, "drift_mm": 1e3 * drift, "sigma_mm": 1e3 * covariance, "rise_k": rise}
-        for at, drift, covariance, rise in zip(
-            at_s.tolist(), moved.tolist(), sigma.tolist(), rises.tolist(), strict=True
-        )
-    ]
+    columns = (at_s, 1e3 * moved, 1e3 * sigma, rises)
+    return tuple(DriftPoint(*row) for row in np.stack(columns, axis=1).tolist())
 
 
 def _seen(
     fit: ThermalFit, stops: Stops, views: Sequence[int], problem: Problem, state: State
-) -> list[dict[str, float]]:
+) -> tuple[ObservedDrift, ...]:
     """How far the stops in the typical posture see the flange to have moved, by their first view.
 
     What is left of a stop is taken for its flange's, and counted along the drift's direction: its
@@ -243,7 +271,7 @@ def _seen(
     alike = np.abs(stops.q - _typical(stops.q)).max(axis=1) < _SAME_RAD
     _, chosen, among = np.intersect1d(np.where(alike, stops.places, -1), where, return_indices=True)
     if not len(chosen):
-        return []
+        return ()
     rows, slots = pair.rows[first[among]], slots[first[among]]
     errors = linear.by_errors[rows].reshape(len(rows), 6, -1, 6)[np.arange(len(rows)), :, slots]
     left = -np.linalg.solve(errors, linear.residuals[rows, :, None])[:, 3:, 0]
@@ -252,10 +280,10 @@ def _seen(
     lengths = np.linalg.norm(moved, axis=1)
     far = moved[int(np.argmax(lengths))] / max(float(lengths.max()), 1e-9)
     seen = lengths + left @ far
-    return [
-        {"view": views[at], "stamp_s": float(stops.stamps_s[at]), "drift_mm": 1e3 * drift}
+    return tuple(
+        ObservedDrift(views[at], float(stops.stamps_s[at]), 1e3 * drift)
         for at, drift in zip(chosen.tolist(), seen.tolist(), strict=True)
-    ]
+    )
 
 
 def _typical(q: FloatArray) -> FloatArray:

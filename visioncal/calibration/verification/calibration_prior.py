@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -10,7 +10,6 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import adjoint, invert, log
 from visioncal.core.types import FloatArray, Target
 from visioncal.estimation.appearance import (
-    BOARD_NAMES,
     Appearance,
     LensBoardParameters,
     board_prior,
@@ -20,7 +19,7 @@ from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.chain import edge_names
 from visioncal.estimation.parts import Noise, State
 from visioncal.results import Calibration
-from visioncal.results.edge import read_covariance
+from visioncal.results.sections import BoardResult, FittedArm, JointFit, RigResult
 from visioncal.robot import Robot, WeightFunctions
 from visioncal.vision.targets import numbered_positions, target_from_document
 
@@ -70,8 +69,8 @@ class CalibrationPrior:
                 "only one with a camera can be verified.",
                 next_step="Calibrate the new readings, and compare both with visioncal diff.",
             )
-        document = calibration.stages.get("joint_fit")
-        if document is None:
+        fit = calibration.joint_fit
+        if fit is None:
             raise DataError(
                 f"calibration {calibration.session_name!r} does not hold the covariance of its "
                 "fit (joint_fit): an older version made it.",
@@ -79,8 +78,8 @@ class CalibrationPrior:
                 "FOLDER.",
             )
         try:
-            return _read(calibration, document)
-        except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            return _read(calibration, fit)
+        except (LookupError, TypeError, ValueError) as error:
             raise DataError(
                 f"calibration {calibration.session_name!r}: joint_fit cannot be read: {error!r}.",
                 culprits=["joint_fit"],
@@ -109,14 +108,14 @@ class CalibrationPrior:
 
         A level that the calibration knows badly is taken for what its 95 % interval allows.
         """
-        stated, stages = self.calibration.noise, self.calibration.stages
+        stated, known = self.calibration.noise, self.calibration.uncertainty
         of = "robot" if from_corners else "combined"
         if f"{of}_rotation_deg" not in stated:
             # Poses of another origin than the calibration's: as they scattered there in all.
             rms = self.calibration.rms
             deg, mm = (rms.deg or 0.0) / np.sqrt(3), rms.mm / np.sqrt(3)
             return Noise.of_robot(float(np.deg2rad(deg)), 1e-3 * mm)
-        intervals = stages.get("uncertainty", {}).get("noise_95", {})
+        intervals = {} if known is None else known.noise_95
         deg, mm = (
             max(stated[name], 0.5 * intervals.get(name, (0.0, 0.0))[1])
             for name in (f"{of}_rotation_deg", f"{of}_translation_mm")
@@ -142,32 +141,28 @@ class CalibrationPrior:
         return replace(self, state=moved, covariance=covariance)
 
 
-def _read(calibration: Calibration, document: Mapping[str, Any]) -> CalibrationPrior:
-    names = document["boards"]
+def _read(calibration: Calibration, fit: JointFit) -> CalibrationPrior:
+    names = fit.boards
     x_name, z_name = edge_names(calibration.mount)
     placed = [calibration.edges[f"{z_name}_{it}" if it else z_name].matrix for it in names]
-    targets = {
-        name: target_from_document(it, name or "target") for name, it in document["targets"].items()
-    }
-    covariance, looks = read_covariance(document, "covariance", (-1, -1)), tuple(document["looks"])
-    arm = document.get("arm", {"of": "none", "values": []})
-    size = len(arm["values"])
-    jacobian = _jacobian(np.array(placed), len(looks), size)
-    if covariance.shape != (jacobian.shape[1],) * 2:
-        raise ValueError(f"covariance has the shape {covariance.shape}")
+    targets = {name: target_from_document(it, name or "target") for name, it in fit.targets.items()}
+    values = np.zeros(0) if fit.arm is None else fit.arm.values
+    jacobian = _jacobian(np.array(placed), len(fit.looks), len(values))
+    if fit.covariance.shape != (jacobian.shape[1],) * 2:
+        raise ValueError(f"covariance has the shape {fit.covariance.shape}")
     return CalibrationPrior(
         calibration,
         targets,
         tuple(list(targets).index(it) for it in names) if targets else (0,),
         State(
             np.stack([calibration.edges[x_name].matrix, *placed]),
-            np.concatenate([np.zeros(len(looks)), np.array(arm["values"], dtype=float)]),
+            np.concatenate([np.zeros(len(fit.looks)), values]),
         ),
-        jacobian @ covariance @ jacobian.T,
-        looks,
-        arm["of"],
-        size,
-        _model(calibration.calibrated_robot, arm),
+        jacobian @ fit.covariance @ jacobian.T,
+        fit.looks,
+        "none" if fit.arm is None else fit.arm.of,
+        len(values),
+        _model(calibration.calibrated_robot, fit.arm),
     )
 
 
@@ -194,42 +189,37 @@ def _jacobian(placed: FloatArray, looks: int, arm: int) -> FloatArray:
     return jacobian
 
 
-def _model(arm: Robot | None, document: Mapping[str, Any]) -> ArmModel | None:
+def _model(arm: Robot | None, fitted: FittedArm | None) -> ArmModel | None:
     """The arm's model at what was found, so that no errors are left to be added.
 
     Its geometry is in the arm; what goes by the loads of a stop is in the values.
     """
-    if document["of"] != "model" or arm is None:
+    if fitted is None or fitted.of != "model" or arm is None:
         return None
-    reported = np.array(document["flange_from_reported"], dtype=float)
+    reported, weights = fitted.flange_from_reported, fitted.weights
+    if reported is None or weights is None:
+        raise ValueError("arm.flange_from_reported or arm.weights is missing")
     mounted = np.zeros((arm.joint_count + 1, 6))
     mounted[-1] = log(invert(reported))
-    count = len(document["values"])
-    yielding, parts = document.get("yielding"), document.get("weight_functions")
-    shape = (4 * arm.joint_count, -1)
+    parts, shape = fitted.weight_functions, (4 * arm.joint_count, -1)
     return ArmModel(
         arm.corrected(mounted),
         reported,
-        document["weights"],
-        np.array(document.get("by_stop", np.zeros(count)), dtype=float),
-        float(document.get("torque_nm", 1.0)),
-        None if yielding is None else np.array(yielding, dtype=bool),
-        None
-        if parts is None
-        else WeightFunctions(tuple(np.array(it, dtype=float).reshape(shape) for it in parts)),
+        weights,
+        np.zeros(len(fitted.values)) if fitted.by_stop is None else fitted.by_stop,
+        1.0 if fitted.torque_nm is None else fitted.torque_nm,
+        fitted.yielding,
+        None if parts is None else WeightFunctions(tuple(it.reshape(shape) for it in parts)),
     )
 
 
 def _shape(calibration: Calibration, targets: Mapping[str, Target]) -> FloatArray:
     """(s,) what the targets were found to be like; those that were not looked at are as stated."""
-    stages = calibration.stages
-    found = {**stages.get("boards", {}), **stages.get("rigs", {})}
-    found[""] = stages.get("board", stages.get("rig", {}))
-    shapes: list[FloatArray] = []
-    for name, target in targets.items():
-        stated = np.zeros(len(board_prior(target)))
-        shape = found.get(name, {}).get("shape")
-        if isinstance(shape, Mapping):
-            shape = [shape[it] for it in BOARD_NAMES]
-        shapes.append(stated if shape is None else stated + np.ravel(shape))
-    return np.concatenate(shapes)
+    found: dict[str, BoardResult | RigResult] = {**calibration.boards, **calibration.rigs}
+    only = calibration.board or calibration.rig
+    if only is not None:
+        found[""] = only
+    stated = {name: np.zeros(len(board_prior(it))) for name, it in targets.items()}
+    return np.concatenate(
+        [it + found[name].values if name in found else it for name, it in stated.items()]
+    )

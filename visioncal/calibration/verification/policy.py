@@ -125,7 +125,7 @@ def facts_of(
         now: The time; that of the clock where None.
     """
     values, unknown = {}, {}
-    before = calibration.stages.get("conditions", {})
+    before = calibration.conditions
     for quantity, column in _COLUMNS.items():
         here = [it.numbers[column] for it in session.views if column in it.numbers]
         if column not in before:
@@ -133,7 +133,7 @@ def facts_of(
         elif not here:
             unknown[quantity] = f"the check's views have no {column}"
         else:
-            values[quantity] = abs(float(np.mean(here)) - float(before[column]))
+            values[quantity] = abs(float(np.mean(here)) - before[column])
     age_days = _age_days(calibration.created, now or datetime.now(UTC))
     if age_days is None:
         unknown["age_days"] = f"the calibration's time is {calibration.created!r}"

@@ -331,7 +331,7 @@ def _check_robot(session: Session, stated: Robot, known: Robot) -> None:
 def _warnings(known: ObservedPoses, prior_calibration: CalibrationPrior) -> Iterator[str]:
     """What is odd about the session."""
     yield from dict.fromkeys(it.reason for it in known.warnings)
-    if "thermal" in prior_calibration.calibration.stages:
+    if prior_calibration.calibration.thermal is not None:
         cold_c = float(prior_calibration.calibration.drift.reference_c.mean())
         yield (
             "The calibrated arm drifts with its temperature, and a check takes it for as warm as "

@@ -7,6 +7,7 @@ twist a second at which the target moves in the camera's view, on its right.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -24,15 +25,15 @@ class Delay:
         name: What it is called.
         sigma_s: What the time is known to without any view, about zero [s].
         shares: Of (n, 2) corners [px] in an image of some resolution, the (n,) shares.
-        document: What calibration.json says of a time, its sigma [s], whether it is beyond chance,
-            and the image's resolution.
+        result: Fields of `results.ClockResult`, from a time, its sigma [s], whether it is beyond
+            chance, and the image's resolution.
         words: The same in a sentence, of a time and its sigma [s] that are beyond chance.
     """
 
     name: str
     sigma_s: float
     shares: Callable[[FloatArray, tuple[int, int]], FloatArray]
-    document: Callable[[float, float, bool, tuple[int, int]], dict[str, object]]
+    result: Callable[[float, float, bool, tuple[int, int]], dict[str, Any]]
     words: Callable[[float, float], str]
 
 

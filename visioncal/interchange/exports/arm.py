@@ -1,8 +1,7 @@
 """What there is to export of a calibrated arm, and what a file of others cannot hold of it."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from visioncal.interchange.exports.content import Selection
 from visioncal.interchange.exports.format import Takes
 from visioncal.interchange.exports.sources import Source
 from visioncal.results import Calibration, Verdict
+from visioncal.results.arm import WorkspaceSigma
 from visioncal.robot import (
     CONVENTIONS,
     Convention,
@@ -38,8 +38,8 @@ class ArmContent:
         robot: The arm as it was calibrated.
         origin: Where the result comes from, in one line.
         verdict: Whether it can be trusted.
-        sigma_mm: Predicted standard deviation of a tool's place over the workspace, as
-            calibration.json has it; empty where it has none.
+        sigma_mm: Predicted standard deviation of a tool's place over the workspace;
+            None where that is not known.
         convention: In which form joints are tabulated, where that was said.
         calibration_hash: What marks the arm for its driver, where that was said.
         sag_mm: How far the flange of an arm whose joints bend stands off at the most under its own
@@ -52,7 +52,7 @@ class ArmContent:
     robot: Robot
     origin: str
     verdict: Verdict
-    sigma_mm: Mapping[str, float]
+    sigma_mm: WorkspaceSigma | None
     convention: Convention | None = None
     calibration_hash: str | None = None
     sag_mm: float = 0.0
@@ -92,8 +92,8 @@ class ArmContent:
     def notes(self) -> list[str]:
         """Lines for a comment: where it comes from, its worth, and what it goes with."""
         worth = f"verdict {self.verdict.status}"
-        if self.sigma_mm:
-            median, high = self.sigma_mm["median"], self.sigma_mm["p95"]
+        if self.sigma_mm is not None:
+            median, high = self.sigma_mm.median, self.sigma_mm.p95
             worth += f"; sigma over the workspace {median:.2g} mm, at 95 % of it under {high:.2g}"
         return [
             self.origin,
@@ -163,16 +163,15 @@ def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmCont
     """
     check_said(selection, form)
     nominal = source.robot if isinstance(source, Calibration) else None
-    calibrated = isinstance(source, Calibration) and source.arm_is_calibrated
-    if not isinstance(source, Calibration) or nominal is None or not calibrated:
+    arm = source.arm if isinstance(source, Calibration) else None
+    if not isinstance(source, Calibration) or nominal is None or arm is None or arm.robot is None:
         raise _without_arm(source, form)
-    found: Mapping[str, Any] = source.stages["kinematics"]
     return ArmContent(
         nominal,
-        Robot.from_document(found["robot"]),
+        arm.robot,
         f"calibrated by visioncal from {source.session_name!r}, {source.created}",
         source.verdict,
-        found.get("workspace_sigma_mm", {}),
+        arm.workspace_sigma_mm,
         None if selection.convention is None else _convention(selection.convention),
         selection.calibration_hash,
         _sag_mm(source),
@@ -183,7 +182,7 @@ def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmCont
 def _sag_mm(calibration: Calibration) -> float:
     """How far the flange stands off under its own weight at worst, over the workspace [mm]."""
     arm = calibration.calibrated_robot
-    if arm is None or "elastic" not in calibration.stages:
+    if arm is None or calibration.elastic is None:
         return 0.0
     q = postures(arm)
     away = calibration.standing(q)[:, :3, 3] - arm.base_from_flange(q)[:, :3, 3]
@@ -192,12 +191,11 @@ def _sag_mm(calibration: Calibration) -> float:
 
 def _drift(calibration: Calibration) -> tuple[tuple[float, float] | None, float]:
     """Temperatures of the links to which the arm belongs, and how far it drifted from that [mm]."""
-    if "thermal" not in calibration.stages:
+    if calibration.thermal is None:
         return None, 0.0
     model = calibration.drift
-    course = calibration.stages["thermal"]["course"]
     cold_c = float(model.reference_c.min()), float(model.reference_c.max())
-    return cold_c, max(float(it["drift_mm"]) for it in course)
+    return cold_c, max(it.drift_mm for it in calibration.thermal.course)
 
 
 def omission_mm(robot: Robot) -> float:
@@ -253,7 +251,7 @@ def _without_arm(source: Source, form: ArmFormat) -> DataError:
     """Says why there is no calibrated arm, and how to get one."""
     if not isinstance(source, Calibration):
         why, step = "a file of frames has none", "Name the calibration instead"
-    elif "kinematics" in source.stages:
+    elif source.arm is not None:
         why = "this calibration kept the nominal one: no level of the arm's errors explained more"
         step = (
             "The nominal arm is what its own file says. For more than that, add stops all over the "

@@ -7,10 +7,16 @@ import rerun as rr
 
 from visioncal.core.number_format import decimals_for, fixed, signed, significant
 from visioncal.present.recording import paths
-from visioncal.present.recording.elastic import Elastic
-from visioncal.present.recording.kinematics import Kinematics, Level, Parameter, joint_words
 from visioncal.present.recording.notes import plain
+from visioncal.present.recording.words import (
+    by_joint,
+    joint_words,
+    level_reason,
+    level_words,
+    parameter_words,
+)
 from visioncal.results import Calibration
+from visioncal.results.arm import ArmLevel, ArmParameter, ArmResult, ElasticResult, JointSpring
 
 _MOST_WORTH = 5
 # Without a sigma: about a hundredth of what an arm repeats to.
@@ -32,20 +38,20 @@ class ParameterRow:
 
 def log_static(stream: rr.RecordingStream, calibration: Calibration) -> None:
     """Logs what is to be said of the arm, where levels of it were tried."""
-    found, springs = Kinematics.of(calibration), Elastic.of(calibration)
+    found, springs = calibration.arm, calibration.elastic
     if found is not None:
         words = markdown(found) + ("" if springs is None else "\n".join(_springs(springs)))
         text = rr.TextDocument(words, media_type=rr.MediaType.MARKDOWN)
         stream.log(paths.ARM_NOTE, text, static=True)
 
 
-def markdown(found: Kinematics) -> str:
+def markdown(found: ArmResult) -> str:
     """Which level was taken and why, and what is known of the arm then."""
     return "\n".join(
         [
             "# The arm",
             "",
-            plain(found.reason),
+            plain(level_reason(found)),
             "",
             *_levels(found),
             *_worth_over_workspace(found),
@@ -56,11 +62,11 @@ def markdown(found: Kinematics) -> str:
     )
 
 
-def _levels(found: Kinematics) -> Iterator[str]:
+def _levels(found: ArmResult) -> Iterator[str]:
     yield "| what is free | values | fit mm | fit deg | left out mm | left out deg | ratio |"
     yield "|---|---:|---:|---:|---:|---:|---:|"
     for it in found.levels:
-        yield _level(it, taken=it.name == found.level)
+        yield _level(it, taken=it.level == found.level)
     yield ""
     yield "Ratio: twice the gain in log-likelihood over the arm as stated."
     if found.left_out:
@@ -73,60 +79,70 @@ def _levels(found: Kinematics) -> Iterator[str]:
         )
 
 
-def _level(level: Level, *, taken: bool) -> str:
-    words = f"**{plain(level.words)}**" if taken else plain(level.words)
+def _level(level: ArmLevel, *, taken: bool) -> str:
+    words = plain(level_words(level.level))
+    words = f"**{words}**" if taken else words
     figures = (level.rms_mm, level.rms_deg, level.held_out_mm, level.held_out_deg)
     cells = [words, str(level.unknowns), *("" if it is None else f"{it:.2g}" for it in figures)]
     return f"| {' | '.join([*cells, f'{level.likelihood_ratio:.0f}'])} |"
 
 
-def _springs(found: Elastic) -> Iterator[str]:
+def _springs(found: ElasticResult) -> Iterator[str]:
     yield from ("", "", "## Joints that bend", "")
     yield "| joint | stiffness kN m/rad | sigma | torque N m |"
     yield "|---|---:|---:|---:|"
-    for it in found.springs:
-        told = it.stiffness is not None and it.stiffness_sigma is not None
-        stiffness = f"{1e-3 * it.stiffness:.4g}" if it.stiffness is not None else "taken for rigid"
-        sigma = significant(1e-3 * it.stiffness_sigma) if told and it.stiffness_sigma else ""
-        low, high = (f"{round(torque, 1) + 0.0:g}" for torque in it.torque_nm)
-        yield f"| {plain(joint_words(it.joint))} | {stiffness} | {sigma} | {low} to {high} |"
-    median, most = map(significant, found.sag_mm)
+    for it in found.joints:
+        yield f"| {plain(joint_words(it.joint))} | {' | '.join(spring_words(it))} |"
+    median, most = significant(found.sag_mm.median), significant(found.sag_mm.most)
     yield ""
     yield f"The loads of the stops move the flange by {median} mm in the median, {most} mm at most."
 
 
-def _worth_over_workspace(found: Kinematics) -> Iterator[str]:
-    if found.workspace_mm is not None:
-        median, p95 = found.workspace_mm
+def spring_words(spring: JointSpring) -> tuple[str, str, str]:
+    """Writes a joint's stiffness and its sigma [kN m/rad], and the torques on it [N m]."""
+    stiffness, sigma = spring.stiffness_nm_per_rad, spring.stiffness_sigma_nm_per_rad
+    low, high = (f"{round(it, 1) + 0.0:g}" for it in spring.torque_nm)
+    return (
+        "taken for rigid" if stiffness is None else f"{1e-3 * stiffness:.4g}",
+        "" if sigma is None else significant(1e-3 * sigma),
+        f"{low} to {high}",
+    )
+
+
+def _worth_over_workspace(found: ArmResult) -> Iterator[str]:
+    sigma = found.workspace_sigma_mm
+    if sigma is not None:
         yield ""
         yield (
-            f"All over the workspace a tool's place is predicted with a sigma of {median:.2g} mm "
-            f"(median; 95 % of the places: under {p95:.2g} mm)."
+            f"All over the workspace a tool's place is predicted with a sigma of {sigma.median:.2g}"
+            f" mm (median; 95 % of the places: under {sigma.p95:.2g} mm)."
         )
 
 
-def _parameters(found: Kinematics) -> Iterator[str]:
+def _parameters(found: ArmResult) -> Iterator[str]:
     if found.parameters:
         yield from ("", "## Parameters", "")
         yield "| joint | | nominal | identified | change | sigma | |"
         yield "|---|---|---:|---:|---:|---:|---|"
-    for joint, rows in found.grouped().items():
+    for joint, rows in by_joint(found).items():
         for place, it in enumerate(rows):
             name = "" if place else plain(joint_words(joint))
             yield _parameter_line(name, parameter_row(it))
 
 
-def parameter_row(it: Parameter) -> ParameterRow:
+def parameter_row(it: ArmParameter) -> ParameterRow:
     """Writes a number of the arm's model with as many digits as its change is known to."""
-    decimals = decimals_for(it.sigma) if it.sigma else _DECIMALS.get(it.unit, 5)
+    symbol, unit, scale = parameter_words(it.name)
+    sigma = None if it.sigma is None else scale * it.sigma
+    decimals = decimals_for(sigma) if sigma else _DECIMALS.get(unit, 5)
     return ParameterRow(
-        it.symbol,
-        it.unit,
+        symbol,
+        unit,
         # As stated, whatever is known of it now.
-        f"{it.nominal + 0.0:.7g}",
-        fixed(it.identified, decimals),
-        signed(it.change, decimals),
-        f"\N{PLUS-MINUS SIGN} {significant(it.sigma)}" if it.sigma else "",
+        f"{scale * it.nominal + 0.0:.7g}",
+        fixed(scale * it.identified, decimals),
+        signed(scale * it.change, decimals),
+        f"\N{PLUS-MINUS SIGN} {significant(sigma)}" if sigma else "",
         it.is_sure,
     )
 
@@ -137,20 +153,19 @@ def _parameter_line(joint: str, row: ParameterRow) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def _told(found: Kinematics) -> Iterator[str]:
+def _told(found: ArmResult) -> Iterator[str]:
     known = found.observability
-    if "told" in known:
-        most = int(known.get("identifiable", known["told"]))
+    if known is not None:
         yield from ("", "## What the stops tell", "")
-        yield f"{int(known['told'])} of {most} directions that any stops could tell."
-    for it in found.not_told:
+        yield f"{known.told} of {known.identifiable} directions that any stops could tell."
+    for it in found.not_told or ():
         yield f"- {plain(it)}"
 
 
-def _stops(found: Kinematics) -> Iterator[str]:
-    if found.worth:
+def _stops(found: ArmResult) -> Iterator[str]:
+    if found.stops:
         yield from ("", "## What each stop is worth", "")
         yield "By how much the mean variance over the workspace would grow without it:"
         yield ""
-    for view, share in (*found.worth[:_MOST_WORTH], *found.worth[_MOST_WORTH:][-1:]):
-        yield f"- view {view}: {100 * share:.2g} %"
+    for it in (*found.stops[:_MOST_WORTH], *found.stops[_MOST_WORTH:][-1:]):
+        yield f"- view {it.view}: {100 * it.worth:.2g} %"

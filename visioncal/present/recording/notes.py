@@ -9,9 +9,10 @@ import rerun as rr
 from visioncal.core.transforms import pose_difference
 from visioncal.core.verdict import Step, Verdict
 from visioncal.present.recording import colours, paths
-from visioncal.present.recording.findings import SOURCES, Arm, Board, Findings, Uncertainty
-from visioncal.present.recording.kinematics import Kinematics
+from visioncal.present.recording.words import SOURCES, level_reason
 from visioncal.results import Calibration, Edge, Rms, ViewResult
+from visioncal.results.arm import ArmErrorsResult
+from visioncal.results.sections import BoardResult, UncertaintyResult
 
 _PLOTS = {
     paths.POSITION_MM: "residual_mm",
@@ -99,7 +100,7 @@ def verdict_markdown(calibration: Calibration) -> str:
         f"| {plain(name)} {edge_line(it.edge, oriented=it.oriented)}"
         for name, it in calibration.frames.items()
     ]
-    known = Findings.of(calibration).uncertainty
+    known = calibration.budget
     if known is not None:
         lines += ["", _work_line(known)]
     rejected = [view for view in calibration.views if not view.used]
@@ -144,7 +145,7 @@ def edge_line(edge: Edge, *, oriented: bool = True) -> str:
     return f"| {position} | {turn} | {edge.sigma_mm:.2g} mm, {edge.sigma_deg:.2g} deg |"
 
 
-def _work_line(known: Uncertainty) -> str:
+def _work_line(known: UncertaintyResult) -> str:
     largest = plain(next(iter(known.parts_mm)))
     return (
         f"Where the views look, a point is placed to {known.total_mm:.2g} mm (sigma; 95 % within "
@@ -155,25 +156,25 @@ def _work_line(known: Uncertainty) -> str:
 
 def figures_markdown(calibration: Calibration) -> str:
     """The residuals of the fit and of what it had not seen, the noise, and what else was found."""
-    found = Findings.of(calibration)
     lines = ["# Residuals, rms", "", "| views | mm | deg | px |", "|---|---:|---:|---:|"]
     validation = calibration.validation
     lines.append(_rms_line("used, as fitted", calibration.rms))
     lines.append(_rms_line(f"left out in turn ({plain(validation.method)})", validation.held_out))
     if validation.holdout is not None:
         lines.append(_rms_line("declared hold-out", validation.holdout))
-    intervals = {} if found.uncertainty is None else found.uncertainty.noise_95
+    known = calibration.uncertainty
+    intervals = {} if known is None else known.noise_95
     lines += ["", "# Noise, per axis", "", "| standard deviation | | 95 % |", "|---|---:|---:|"]
     for name, value in calibration.noise.items():
         low_high = " to ".join(f"{it:.2g}" for it in intervals.get(name, ()))
         lines.append(f"| {_noise_label(name)} | {value:.2g} | {low_high} |")
-    kinematics = Kinematics.of(calibration)
-    level = [] if kinematics is None else ["", "# Level of the arm", "", plain(kinematics.reason)]
-    return "\n".join([*lines, *_findings_lines(found), *level])
+    arm = calibration.arm
+    level = [] if arm is None else ["", "# Level of the arm", "", plain(level_reason(arm))]
+    return "\n".join([*lines, *_findings_lines(calibration), *level])
 
 
-def _findings_lines(found: Findings) -> Iterator[str]:
-    known = found.uncertainty
+def _findings_lines(found: Calibration) -> Iterator[str]:
+    known = found.budget
     if known is not None:
         yield from ("", "# Where the uncertainty comes from", "", _work_line(known), "")
         yield from ("| source | sigma mm | of the variance |", "|---|---:|---:|")
@@ -181,14 +182,14 @@ def _findings_lines(found: Findings) -> Iterator[str]:
             label = plain(SOURCES.get(name, name))
             yield f"| {label} | {value:.2g} | {known.percent(name)} |"
         yield f"| total | {known.total_mm:.2g} | |"
-    for name, board in found.boards.items():
+    for name, board in found.named_boards.items():
         if board.sigma:
             yield from ("", f"# Board {plain(name)}".strip(), "", _board_line(board))
-    if found.arm is not None:
-        yield from ("", "# Arm", "", _arm_line(found.arm))
+    if found.arm_errors is not None:
+        yield from ("", "# Arm", "", _arm_line(found.arm_errors))
 
 
-def _board_line(board: Board) -> str:
+def _board_line(board: BoardResult) -> str:
     scale = "as stated"
     if "scale" in board.estimated:
         sigma = board.sigma["scale"]
@@ -200,7 +201,7 @@ def _board_line(board: Board) -> str:
     return f"Size: {scale}. Bend: {bend}."
 
 
-def _arm_line(arm: Arm) -> str:
+def _arm_line(arm: ArmErrorsResult) -> str:
     treated = "were estimated along" if arm.estimated else "could not be estimated along"
     return (
         f"Residuals follow the arm's posture: its links are typically off by {arm.sigma_mm:.2g} mm "

@@ -20,13 +20,20 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import named_errors, sha256
 from visioncal.core.temporary_files import aside_file
 from visioncal.core.types import Corners, FloatArray
-from visioncal.present.recording import armtext, explained, notes, overlays, paths, tools
+from visioncal.present.recording import (
+    armtext,
+    explained,
+    notes,
+    overlays,
+    paths,
+    thermal,
+    tools,
+)
 from visioncal.present.recording.frames import Frame, append, read_payload, scan
 from visioncal.present.recording.messages import recording_id
 from visioncal.present.recording.reader import chunks, read_session
 from visioncal.present.recording.recorder import Recorder
 from visioncal.present.recording.scene import Scene
-from visioncal.present.recording.thermal import Drift
 from visioncal.results import Calibration, to_document
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
@@ -159,7 +166,8 @@ def _draw(
         armtext.log_static(stream, calibration)
     results = {} if calibration is None else {it.view: it for it in calibration.views}
     ends = {} if calibration is None else notes.scales(calibration)
-    drift = None if calibration is None else Drift.of(calibration)
+    warming = None if calibration is None else calibration.thermal
+    drifts = {} if warming is None else {it.view: it for it in warming.views}
     for row, view in enumerate(session.views):
         recorder.at(row)
         seen = evidence.get(view.number, ViewEvidence(view.number))
@@ -169,8 +177,8 @@ def _draw(
             explained.log_view(stream, seen)
         if view.number in results:
             notes.log_view(stream, results[view.number], ends)
-        if drift is not None:
-            drift.log_view(stream, view.number)
+        if view.number in drifts:
+            thermal.log_view(stream, drifts[view.number])
     recorder.keep()
 
 

@@ -10,7 +10,7 @@ from visioncal.core.types import Camera, FloatArray, Target
 from visioncal.present.recording import board, colours, paths
 from visioncal.present.recording.arm import log_arm
 from visioncal.present.recording.charts import Charts
-from visioncal.present.recording.findings import target_frames
+from visioncal.present.recording.target_frames import target_frames
 from visioncal.present.recording.uncertainty import Uncertainty
 from visioncal.present.recording.workspace import ArmPicture
 from visioncal.results import Calibration

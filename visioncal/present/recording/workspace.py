@@ -8,9 +8,9 @@ import rerun as rr
 
 from visioncal.core.types import FloatArray
 from visioncal.present.recording import colours, paths
-from visioncal.present.recording.kinematics import Kinematics, Unseen
 from visioncal.present.recording.uncertainty import round_factor
 from visioncal.results import Calibration
+from visioncal.results.arm import ArmResult, UnseenView
 from visioncal.robot import Robot
 from visioncal.session import Session, View
 
@@ -39,7 +39,7 @@ class ArmPicture:
         size_m: The cell's size [m].
     """
 
-    found: Kinematics
+    found: ArmResult
     robot: Robot
     off_m: Mapping[int, tuple[FloatArray, FloatArray]]
     factor: int
@@ -50,10 +50,10 @@ class ArmPicture:
         cls, session: Session, calibration: Calibration | None, size_m: float
     ) -> "ArmPicture | None":
         """Collects what there is to draw; None where the arm stays as stated."""
-        if calibration is None or not calibration.arm_is_calibrated:
+        if calibration is None:
             return None
-        found = Kinematics.of(calibration)
-        robot, nominal = calibration.calibrated_robot, calibration.robot
+        found, nominal = calibration.arm, calibration.robot
+        robot = None if found is None else found.robot
         if found is None or robot is None:
             return None
         off_m = {
@@ -70,9 +70,8 @@ class ArmPicture:
         """Draws the map with its legend, and how the plots look."""
         frame = rr.CoordinateFrame(paths.BASE_FRAME)
         stream.log(paths.magnified_arm(self.factor), frame, static=True)
-        if self.found.workspace is not None:
-            found = self.found.workspace
-            log_map(stream, found.places_m, found.sigma_mm, self.size_m)
+        if self.found.workspace_map:
+            log_map(stream, self.found.map_places_m, self.found.map_sigmas_mm, self.size_m)
         for plot in (paths.UNSEEN_MM, paths.UNSEEN_DEG):
             for held in (False, True):
                 for name, label, colour in (
@@ -133,7 +132,7 @@ def log_map(
     stream.log(f"{paths.WORKSPACE}/legend", frame, legend, static=True)
 
 
-def _log_unseen(stream: rr.RecordingStream, seen: Unseen, *, held: bool) -> None:
+def _log_unseen(stream: rr.RecordingStream, seen: UnseenView, *, held: bool) -> None:
     for plot, before, after in (
         (paths.UNSEEN_MM, seen.nominal_mm, seen.mm),
         (paths.UNSEEN_DEG, seen.nominal_deg, seen.deg),

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 from visioncal.core.number_format import significant
 from visioncal.estimation.arm import SIGNIFICANT
 from visioncal.present.recording.armtext import ParameterRow, parameter_row
-from visioncal.present.recording.kinematics import NOMINAL, Kinematics, Level, joint_words
+from visioncal.present.recording.words import by_joint, joint_words, level_reason, level_words
 from visioncal.present.report.content import Fact
+from visioncal.results.arm import NOMINAL, ArmLevel, ArmResult
 
 _COLUMNS = 2
 _MOST_WORTH = 5
@@ -77,88 +78,88 @@ class ArmCard:
     least_worth: tuple[WorthRow, ...]
 
 
-def arm_card(found: Kinematics) -> ArmCard:
+def arm_card(found: ArmResult) -> ArmCard:
     """Writes what was found of the arm as text."""
-    sentences = [found.reason]
-    if found.workspace_mm is not None:
-        median, p95 = map(significant, found.workspace_mm)
+    sentences, sigma = [level_reason(found)], found.workspace_sigma_mm
+    if sigma is not None:
+        median, p95 = significant(sigma.median), significant(sigma.p95)
         sentences.append(
             f"All over the workspace, a tool's place is predicted with a sigma of {median} mm "
             f"(median; 95 % of the places: under {p95} mm)."
         )
-    worth = [WorthRow(f"view {view}", _percent(share)) for view, share in found.worth]
+    worth = [WorthRow(f"view {it.view}", _percent(it.worth)) for it in found.stops]
     return ArmCard(
         tuple(sentences),
-        tuple(_level(it, it.name == found.level) for it in found.levels[: _tried(found)]),
+        tuple(_level(it, it.level == found.level) for it in found.levels[: _tried(found)]),
         f"{SIGNIFICANT:.0f}",
-        _CONVENTIONS.get(found.convention, ""),
+        _CONVENTIONS.get(found.convention or "", ""),
         _sure(found),
         _columns(found),
         _told(found),
         tuple(_details(found)),
-        found.not_told,
+        found.not_told or (),
         tuple(worth[:_MOST_WORTH]),
         tuple(worth[_MOST_WORTH:][-1:]),
     )
 
 
-def _tried(found: Kinematics) -> int:
+def _tried(found: ArmResult) -> int:
     return len(found.levels) if len(found.levels) > 1 else 0
 
 
-def _level(level: Level, taken: bool) -> LevelRow:
+def _level(level: ArmLevel, taken: bool) -> LevelRow:
     return LevelRow(
-        level.words,
+        level_words(level.level),
         taken,
         str(level.unknowns),
         significant(level.rms_mm),
         significant(level.rms_deg),
         significant(level.held_out_mm),
         significant(level.held_out_deg),
-        significant(None) if level.name == NOMINAL else f"{level.likelihood_ratio:.0f}",
+        significant(None) if level.level == NOMINAL else f"{level.likelihood_ratio:.0f}",
     )
 
 
-def _sure(found: Kinematics) -> str:
+def _sure(found: ArmResult) -> str:
     known = [it for it in found.parameters if it.sigma is not None]
     sure = sum(it.is_sure for it in known)
     return f"{sure} of {len(found.parameters)}" if known else ""
 
 
 def _columns(
-    found: Kinematics,
+    found: ArmResult,
 ) -> tuple[tuple[tuple[str, tuple[ParameterRow, ...]], ...], ...]:
     """Joints with their parameters, half of them in each column."""
     joints = [
         (joint_words(name), tuple(parameter_row(it) for it in them))
-        for name, them in found.grouped().items()
+        for name, them in by_joint(found).items()
     ]
     height = max(-(-len(joints) // _COLUMNS), 1)
     return tuple(tuple(joints[start : start + height]) for start in range(0, len(joints), height))
 
 
-def _told(found: Kinematics) -> tuple[Fact, ...]:
+def _told(found: ArmResult) -> tuple[Fact, ...]:
     known = found.observability
-    if "told" not in known:
+    if known is None:
         return ()
-    told, most = int(known["told"]), int(known.get("identifiable", known["told"]))
-    facts = [Fact("directions told", f"{told} of {most}", "that any stops could tell")]
-    if "condition" in known:
-        facts.append(
-            Fact("condition", significant(known["condition"]), "best over worst told, scaled")
-        )
+    told = f"{known.told} of {known.identifiable}"
+    facts = [Fact("directions told", told, "that any stops could tell")]
+    if known.condition is not None:
+        note = "best over worst told, scaled"
+        facts.append(Fact("condition", significant(known.condition), note))
     return tuple(facts)
 
 
-def _details(found: Kinematics) -> list[Fact]:
+def _details(found: ArmResult) -> list[Fact]:
     known = found.observability
-    facts = []
-    if "columns" in known:
-        note = "both transforms' and the arm's, redundant ones among them"
-        facts.append(Fact("values carried", str(int(known["columns"])), note))
-    facts += [
-        Fact(label, f"{known[name]:.3g}", note) for name, label, note in _INDICES if name in known
-    ]
+    if known is None:
+        return []
+    note = "both transforms' and the arm's, redundant ones among them"
+    facts = [Fact("values carried", str(known.columns), note)]
+    for name, label, note in _INDICES:
+        value = getattr(known, name)
+        if value is not None:
+            facts.append(Fact(label, f"{value:.3g}", note))
     return facts
 
 

@@ -9,8 +9,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 
 from visioncal.core.number_format import significant
 from visioncal.core.types import FloatArray
-from visioncal.present.recording.kinematics import Kinematics, Unseen, WorkspaceMap
 from visioncal.present.report import svg
+from visioncal.results.arm import ArmResult, UnseenView
 
 _WIDE_IN, _MAP_IN = 9.2, 5.0
 # Places left free between the views that were left out in turn and those that are held back.
@@ -26,10 +26,10 @@ _TALLEST = 1.0
 
 _BEFORE, _AFTER = svg.CHECK, svg.ACCENT
 
-_Pair = Callable[[Unseen], tuple[float | None, float | None]]
+_Pair = Callable[[UnseenView], tuple[float | None, float | None]]
 
 
-def before_and_after(found: Kinematics) -> Markup:
+def before_and_after(found: ArmResult) -> Markup:
     """Residuals of views that the fit had not seen, by the arm as stated and as calibrated.
 
     Returns:
@@ -104,25 +104,27 @@ def _name_sets(axes: Axes, first_held: float) -> None:
         )  # fmt: skip
 
 
-def side_map(found: WorkspaceMap, stops_m: FloatArray) -> Markup:
+def side_map(found: ArmResult, stops_m: FloatArray) -> Markup:
     """The map seen from the side: height over the distance from the base's axis.
 
     Args:
-        found: The map.
+        found: The arm, with a map of its workspace.
         stops_m: (m, 3) where the flange was when the arm was measured; may be empty [m].
     """
     return _map(
         found,
-        _from_the_side(found.places_m),
+        _from_the_side(found.map_places_m),
         _from_the_side(stops_m),
         ("distance from the base's axis [m]", "base z [m]"),
         "side",
     )
 
 
-def top_map(found: WorkspaceMap, stops_m: FloatArray) -> Markup:
+def top_map(found: ArmResult, stops_m: FloatArray) -> Markup:
     """The map seen from above; see `side_map`."""
-    return _map(found, found.places_m[:, :2], stops_m[:, :2], ("base x [m]", "base y [m]"), "top")
+    return _map(
+        found, found.map_places_m[:, :2], stops_m[:, :2], ("base x [m]", "base y [m]"), "top"
+    )
 
 
 def _from_the_side(places_m: FloatArray) -> FloatArray:
@@ -130,15 +132,15 @@ def _from_the_side(places_m: FloatArray) -> FloatArray:
 
 
 def _map(
-    found: WorkspaceMap,
+    found: ArmResult,
     places_m: FloatArray,
     stops_m: FloatArray,
     labels: tuple[str, str],
     name: str,
 ) -> Markup:
     """Draws (k, 2) places, the worst ones on top, and the stops as crosses."""
-    order = np.argsort(found.sigma_mm)
-    low, high = np.percentile(found.sigma_mm, [_LOW_PERCENT, _HIGH_PERCENT])
+    order = np.argsort(found.map_sigmas_mm)
+    low, high = np.percentile(found.map_sigmas_mm, [_LOW_PERCENT, _HIGH_PERCENT])
     ends = np.vstack([places_m, stops_m, np.zeros((1, 2))])
     width, height = np.ptp(ends, axis=0)
     share = min(height / max(width, 1e-9), _TALLEST)
@@ -146,7 +148,7 @@ def _map(
         figure = svg.new_figure(_MAP_IN, 0.7 + 0.72 * _MAP_IN * share)
         axes = figure.subplots()
         coloured = axes.scatter(
-            places_m[order, 0], places_m[order, 1], c=found.sigma_mm[order], cmap="plasma",
+            places_m[order, 0], places_m[order, 1], c=found.map_sigmas_mm[order], cmap="plasma",
             vmin=low, vmax=high, s=26, linewidths=0,
         )  # fmt: skip
         axes.plot(*stops_m.T, "x", color=svg.INK, markersize=4.5, markeredgewidth=0.9)

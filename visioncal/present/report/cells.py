@@ -1,7 +1,7 @@
 """The report of an aligned cell: one HTML file that says how well its frames are tied."""
 
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -178,11 +178,9 @@ def source_table(found: Alignment) -> PairTable | None:
 
     A source that counts for less than a hundredth of every frame's variance is left out.
     """
-    budgets: Mapping[str, Mapping[str, float]] = found.stages.get("uncertainty", {}).get(
-        "budget_mm", {}
-    )
-    if not budgets:
+    if found.uncertainty is None or not found.uncertainty.budget_mm:
         return None
+    budgets = found.uncertainty.budget_mm
     names = dict.fromkeys(name for it in budgets.values() for name in it)
     shown = [
         name
@@ -198,7 +196,7 @@ def source_table(found: Alignment) -> PairTable | None:
 
 def _noise_facts(found: Alignment) -> list[Fact]:
     units = {"mm": "mm", "deg": _DEG, "px": "px", "level": "times what is said of it"}
-    intervals = found.stages.get("uncertainty", {}).get("noise_95", {})
+    intervals = {} if found.uncertainty is None else found.uncertainty.noise_95
     facts = []
     for name, levels in found.noise.items():
         words = []
@@ -216,13 +214,11 @@ def _arm_facts(found: Alignment) -> list[Fact]:
     """How far each arm is calibrated, where that was asked."""
     facts = []
     for name, arm in found.arms.items():
-        if "kinematics" in arm.stages:
-            kinematics = arm.stages["kinematics"]
-            left_out = {it["level"]: it["held_out_mm"] for it in kinematics["levels"]}
-            level = kinematics["level"]
-            now, stated = (f"{significant(left_out[it])} mm" for it in (level, "nominal"))
-            more = "" if level == "nominal" else f", as stated {stated}"
-            facts.append(Fact(f"robot {name}", level, f"stops left out: {now}{more}"))
+        if arm.arm is not None:
+            both = (arm.arm.chosen, arm.arm.nominal)
+            now, stated = (f"{significant(it.held_out_mm)} mm" for it in both)
+            more = f", as stated {stated}" if arm.arm.is_calibrated else ""
+            facts.append(Fact(f"robot {name}", arm.arm.level, f"stops left out: {now}{more}"))
     return facts
 
 

@@ -1,18 +1,15 @@
 """What the report says: rows of ready text, made from a calibration."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from importlib import metadata
-from typing import Any
 
 import numpy as np
 
 from visioncal.core.number_format import decimals_for, fixed, matched, percent, significant
 from visioncal.core.transforms import pose_difference
 from visioncal.core.types import FloatArray
-from visioncal.present.recording.findings import read_stage
-from visioncal.present.recording.kinematics import Kinematics
 from visioncal.present.report.advice import Suspects, contradicts, outlying_views
 from visioncal.results import (
     Calibration,
@@ -24,6 +21,7 @@ from visioncal.results import (
     ViewResult,
 )
 from visioncal.results.compare import intrinsics_names
+from visioncal.results.sections import ClockResult, PointResult
 from visioncal.vision.camera import intrinsics
 
 PLUS_MINUS = "\N{PLUS-MINUS SIGN}"
@@ -253,9 +251,9 @@ def key_figures(calibration: Calibration) -> tuple[Fact, ...]:
     ]
     if calibration.rms.px is not None:
         facts.insert(3, Fact("reprojection, rms", f"{significant(calibration.rms.px)} px"))
-    arm = Kinematics.of(calibration)
-    if arm is not None and arm.workspace_mm is not None:
-        sigma = f"{significant(arm.workspace_mm[0])} mm"
+    arm = calibration.arm
+    if arm is not None and arm.workspace_sigma_mm is not None:
+        sigma = f"{significant(arm.workspace_sigma_mm.median)} mm"
         facts.insert(2, Fact("all over the workspace, sigma", sigma))
     return (*need_facts(calibration.need, calibration.verdict), *facts)
 
@@ -295,46 +293,37 @@ def method_facts(calibration: Calibration) -> tuple[Fact, ...]:
         camera = calibration.camera.camera
         width, height = camera.resolution
         facts.append(Fact("camera", f"{camera.model}, {width} \N{MULTIPLICATION SIGN} {height} px"))
-    clock = read_stage(calibration, "clock", _clock_facts)
-    return (*facts, *_instrument_facts(calibration), *(clock or ()))
+    if calibration.instrument is not None:
+        read = f"it read {calibration.instrument.reads}"
+        facts.append(Fact("instrument", calibration.instrument.words, read))
+        facts += [_point_fact(it) for it in calibration.points]
+    if calibration.clock is not None:
+        facts += _clock_facts(calibration.clock)
+    return tuple(facts)
 
 
-def _clock_facts(clock: Mapping[str, Any]) -> tuple[Fact, ...]:
+def _clock_facts(clock: ClockResult) -> Iterator[Fact]:
     """How far the camera's clock is ahead of the robot's, and when an image's rows are taken."""
-    shutter = clock.get("shutter")
-    if shutter is None:
-        return (_clock_fact(clock),)
-    sigma_ms = 1e3 * float(shutter["readout_sigma_s"])
-    late = f"{matched(1e3 * float(shutter['readout_s']), sigma_ms)} ms"
-    note = f"{PLUS_MINUS} {significant(sigma_ms)}, from an image's first row to its last"
-    return _clock_fact(clock), Fact(f"{shutter['kind']} shutter", late, note)
+    ahead_ms = 1e3 * clock.camera_minus_robot_s
+    if clock.sigma_s is None:
+        yield Fact("camera's clock", f"{ahead_ms:+.4g} ms", "taken so: views at rest")
+    else:
+        sigma_ms = 1e3 * clock.sigma_s
+        note = f"{PLUS_MINUS} {significant(sigma_ms)}, ahead of the robot's, by {clock.method}"
+        yield Fact("camera's clock", f"{matched(ahead_ms, sigma_ms)} ms", note)
+    shutter = clock.shutter
+    if shutter is not None:
+        sigma_ms = 1e3 * shutter.readout_sigma_s
+        late = f"{matched(1e3 * shutter.readout_s, sigma_ms)} ms"
+        note = f"{PLUS_MINUS} {significant(sigma_ms)}, from an image's first row to its last"
+        yield Fact(f"{shutter.kind} shutter", late, note)
 
 
-def _clock_fact(clock: Mapping[str, Any]) -> Fact:
-    ahead_ms, method = 1e3 * float(clock["camera_minus_robot_s"]), str(clock["method"])
-    if "sigma_s" not in clock:
-        return Fact("camera's clock", f"{ahead_ms:+.4g} ms", "taken so: views at rest")
-    sigma_ms = 1e3 * float(clock["sigma_s"])
-    note = f"{PLUS_MINUS} {significant(sigma_ms)}, ahead of the robot's, by {method}"
-    return Fact("camera's clock", f"{matched(ahead_ms, sigma_ms)} ms", note)
-
-
-def _instrument_facts(calibration: Calibration) -> tuple[Fact, ...]:
-    """What an instrument read, and where the points sit on the flange; empty without one."""
-    stated = read_stage(calibration, "instrument", lambda it: (str(it["words"]), str(it["reads"])))
-    points = read_stage(calibration, "points", lambda rows: [_point_fact(it) for it in rows])
-    if stated is None:
-        return ()
-    words, reads = stated
-    return (Fact("instrument", words, f"it read {reads}"), *(points or ()))
-
-
-def _point_fact(point: Mapping[str, Any]) -> Fact:
-    sigma_mm = float(point["sigma_mm"])
-    axis_mm = sigma_mm / np.sqrt(3.0)
-    place = ", ".join(matched(1e3 * float(point[name]), axis_mm) for name in ("x_m", "y_m", "z_m"))
-    note = f"{PLUS_MINUS} {significant(sigma_mm)}, on the flange"
-    return Fact(f"point {point['point']}", f"[{place}] mm", note)
+def _point_fact(point: PointResult) -> Fact:
+    axis_mm = point.sigma_mm / np.sqrt(3.0)
+    place = ", ".join(matched(1e3 * it, axis_mm) for it in (point.x_m, point.y_m, point.z_m))
+    note = f"{PLUS_MINUS} {significant(point.sigma_mm)}, on the flange"
+    return Fact(f"point {point.point}", f"[{place}] mm", note)
 
 
 def lens_facts(calibration: Calibration) -> tuple[Fact, ...]:

@@ -12,10 +12,6 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import write_atomically
 from visioncal.core.types import Target
 from visioncal.core.version import __version__
-from visioncal.present.recording.elastic import Elastic
-from visioncal.present.recording.findings import Findings
-from visioncal.present.recording.kinematics import Kinematics
-from visioncal.present.recording.thermal import Drift
 from visioncal.present.report import (
     advice,
     arm,
@@ -108,12 +104,11 @@ def _words(calibration: Calibration) -> dict[str, object]:
 
 
 def _uncertainty(calibration: Calibration, session: Session | None) -> dict[str, object]:
-    found = Findings.of(calibration)
-    arm, known = found.arm, found.uncertainty
-    boards = _board_cards(calibration, found, {} if session is None else session.boards)
+    arm, known = calibration.arm_errors, calibration.budget
+    boards = _board_cards(calibration, {} if session is None else session.boards)
     return {
         "uncertainty": () if known is None else uncertainty.summary(calibration, known),
-        "noise": uncertainty.noise_facts(calibration, known),
+        "noise": uncertainty.noise_facts(calibration),
         "boards": tuple(boards),
         "arm": () if arm is None else uncertainty.arm_facts(arm),
         "arm_is_estimated": arm is not None and arm.estimated,
@@ -129,11 +124,9 @@ class _BoardCard:
     plot: str
 
 
-def _board_cards(
-    calibration: Calibration, found: Findings, targets: Mapping[str, Target]
-) -> Iterator[_BoardCard]:
+def _board_cards(calibration: Calibration, targets: Mapping[str, Target]) -> Iterator[_BoardCard]:
     """What was found of each board; nothing of one of which nothing was looked for."""
-    for name, board in found.boards.items():
+    for name, board in calibration.named_boards.items():
         target = targets.get(name)
         facts = uncertainty.board_facts(calibration, board, target)
         if facts:
@@ -142,16 +135,16 @@ def _board_cards(
 
 
 def _arm(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> dict[str, object]:
-    found = Kinematics.of(calibration)
-    workspace = None if found is None else found.workspace
+    found = calibration.arm
+    mapped = found is not None and bool(found.workspace_map)
     used = {it.view for it in calibration.views if it.used}
     poses = [it.base_from_flange for it in evidence if it.view in used]
     stops_m = np.reshape([it[:3, 3] for it in poses if it is not None], (-1, 3))
     return {
         "arm_card": None if found is None else arm.arm_card(found),
         "unseen_plot": "" if found is None else armplots.before_and_after(found),
-        "side_plot": "" if workspace is None else armplots.side_map(workspace, stops_m),
-        "top_plot": "" if workspace is None else armplots.top_map(workspace, stops_m),
+        "side_plot": armplots.side_map(found, stops_m) if found and mapped else "",
+        "top_plot": armplots.top_map(found, stops_m) if found and mapped else "",
         "has_stops": len(stops_m) > 0,
         **_springs(calibration),
         **_drift(calibration),
@@ -159,7 +152,7 @@ def _arm(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> dict[str
 
 
 def _springs(calibration: Calibration) -> dict[str, object]:
-    found = Elastic.of(calibration)
+    found = calibration.elastic
     if found is None:
         return {"springs": (), "spring_facts": (), "spring_plot": ""}
     return {
@@ -170,7 +163,7 @@ def _springs(calibration: Calibration) -> dict[str, object]:
 
 
 def _drift(calibration: Calibration) -> dict[str, object]:
-    found = Drift.of(calibration)
+    found = calibration.thermal
     if found is None:
         return {"drift_card": None, "drift_plot": ""}
     return {"drift_card": thermal.drift_card(found), "drift_plot": thermal.course(found)}

@@ -7,8 +7,9 @@ from matplotlib.tri import Triangulation, UniformTriRefiner
 
 from visioncal.core.number_format import significant
 from visioncal.core.types import Target
-from visioncal.present.recording.findings import SOURCES, Board, Uncertainty
+from visioncal.present.recording.words import SOURCES
 from visioncal.present.report import svg
+from visioncal.results.sections import BoardResult, UncertaintyResult
 
 _WIDTH_IN = 5.0
 _LEVELS, _FINER = 13, 3
@@ -18,7 +19,7 @@ _TALLEST = 0.8
 _LEAST_DEPTH_MM = 1e-6
 
 
-def budget(found: Uncertainty) -> Markup:
+def budget(found: UncertaintyResult) -> Markup:
     """Bars of the standard deviation that each source contributes where the views look."""
     names = [*found.parts_mm, "total"]
     values = [*found.parts_mm.values(), found.total_mm]
@@ -46,7 +47,7 @@ def budget(found: Uncertainty) -> Markup:
         return svg.inline(figure, "budget", "Bars: standard deviation by source")
 
 
-def directions(found: Uncertainty) -> Markup:
+def directions(found: UncertaintyResult) -> Markup:
     """Standard deviations of both edges along their principal directions, against the limit."""
     values = found.spectrum[found.spectrum > 0.0]
     if not len(values):
@@ -77,7 +78,7 @@ def directions(found: Uncertainty) -> Markup:
         )
 
 
-def board_shape(board: Board, target: Target, name: str = "") -> Markup:
+def board_shape(board: BoardResult, target: Target, name: str = "") -> Markup:
     """How far each place of a board lies behind its mean plane; empty for a flat one."""
     x_mm, y_mm, depth_mm = 1e3 * board.corners(target).T
     reach = float(np.abs(depth_mm).max())

@@ -7,10 +7,11 @@ import numpy as np
 from markupsafe import Markup
 
 from visioncal.core.number_format import significant
-from visioncal.present.recording.elastic import Elastic, Spring
-from visioncal.present.recording.kinematics import joint_words
+from visioncal.present.recording.armtext import spring_words
+from visioncal.present.recording.words import joint_words
 from visioncal.present.report import svg
 from visioncal.present.report.content import Fact
+from visioncal.results.arm import ElasticResult
 
 _COLUMNS, _WIDE_IN, _HIGH_IN = 3, 9.2, 2.3
 
@@ -25,57 +26,51 @@ class SpringRow:
     torque: str
 
 
-def spring_rows(elastic: Elastic) -> tuple[SpringRow, ...]:
+def spring_rows(elastic: ElasticResult) -> tuple[SpringRow, ...]:
     """The table of the joints."""
-    return tuple(_row(it) for it in elastic.springs)
+    return tuple(SpringRow(joint_words(it.joint), *spring_words(it)) for it in elastic.joints)
 
 
-def _row(spring: Spring) -> SpringRow:
-    low, high = (f"{round(it, 1) + 0.0:g}" for it in spring.torque_nm)
-    stiffness, sigma = spring.stiffness, spring.stiffness_sigma
-    told = stiffness is not None and sigma is not None
-    return SpringRow(
-        joint_words(spring.joint),
-        f"{1e-3 * stiffness:.4g}" if stiffness is not None else "taken for rigid",
-        significant(1e-3 * sigma) if told and sigma is not None else "",
-        f"{low} to {high}",
-    )
-
-
-def spring_facts(elastic: Elastic) -> tuple[Fact, ...]:
+def spring_facts(elastic: ElasticResult) -> tuple[Fact, ...]:
     """What the loads of the stops do."""
     return tuple(_facts(elastic))
 
 
-def _facts(elastic: Elastic) -> Iterator[Fact]:
-    median, most = map(significant, elastic.sag_mm)
+def _facts(elastic: ElasticResult) -> Iterator[Fact]:
+    median, most = significant(elastic.sag_mm.median), significant(elastic.sag_mm.most)
     yield Fact("the flange gives way by", f"{median} mm", f"median; at most {most} mm")
     low, high = map(significant, elastic.payload_kg)
     if elastic.payload_kg[1] > 0.0:
         yield Fact("payload", f"{low} to {high} kg")
     if elastic.payload_factor is not None:
-        value, sigma = elastic.payload_factor
-        note = f"\N{PLUS-MINUS SIGN} {significant(sigma)}; 1 where load and bend fit"
-        yield Fact("load as stated, times", f"{value:.2f}", note)
+        factor = elastic.payload_factor
+        note = f"\N{PLUS-MINUS SIGN} {significant(factor.sigma)}; 1 where load and bend fit"
+        yield Fact("load as stated, times", f"{factor.value:.2f}", note)
 
 
-def deflection_against_load(elastic: Elastic) -> Markup:
+def deflection_against_load(elastic: ElasticResult) -> Markup:
     """How far each stop sees each told joint bend, over the torque on it.
 
     Returns:
         The figure; empty where no joint is told.
     """
-    told = [it for it in elastic.springs if it.stiffness is not None and len(it.bends_mrad)]
+    told = {
+        spring: np.array(seen)
+        for at, spring in enumerate(elastic.joints)
+        if spring.stiffness_nm_per_rad is not None and (seen := elastic.bends(at))
+    }
     if not told:
         return Markup("")
     rows = -(-len(told) // _COLUMNS)
     with svg.style():
         figure = svg.new_figure(_WIDE_IN, _HIGH_IN * rows)
         panels = figure.subplots(rows, _COLUMNS, squeeze=False).ravel()
-        for axes, spring in zip(panels, told, strict=False):
-            ends = np.array([min(spring.torques_nm.min(), 0.0), max(spring.torques_nm.max(), 0.0)])
-            axes.plot(ends, 1e3 * spring.compliance * ends, color=svg.LINE, linewidth=1.6)
-            axes.plot(spring.torques_nm, spring.bends_mrad, "o", color=svg.ACCENT, markersize=3.0)
+        for axes, (spring, points) in zip(panels, told.items(), strict=False):
+            torques_nm, bends_mrad = points.T
+            ends = np.array([min(torques_nm.min(), 0.0), max(torques_nm.max(), 0.0)])
+            slope = 1e3 * spring.compliance_rad_per_nm
+            axes.plot(ends, slope * ends, color=svg.LINE, linewidth=1.6)
+            axes.plot(torques_nm, bends_mrad, "o", color=svg.ACCENT, markersize=3.0)
             axes.set_title(joint_words(spring.joint), fontsize=9)
             axes.set_xlabel("torque [N m]")
             axes.set_ylabel("bend [mrad]")

@@ -1,12 +1,14 @@
 """How the arm drifts with its temperature: a table and a plot."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 from markupsafe import Markup
 
 from visioncal.core.number_format import significant
-from visioncal.present.recording.thermal import Drift
 from visioncal.present.report import svg
+from visioncal.results.arm import JointDrift, ThermalResult
 
 _WIDE_IN, _HIGH_IN = 9.2, 2.6
 # The band holds 95 % of cases.
@@ -32,41 +34,57 @@ class DriftCard:
     rows: tuple[JointRow, ...]
 
 
-def drift_card(found: Drift) -> DriftCard:
+def drift_card(found: ThermalResult) -> DriftCard:
     """Writes what was found."""
     told = "measured temperatures" if found.heated_by == "temperatures" else "motor currents"
+    last, residual = found.course[-1], found.residual_mm
     return DriftCard(
-        f"By {told}, the flange had moved by {significant(float(found.drift_mm[-1]))} mm at the "
-        f"end, {significant(float(found.hours[-1]))} h after the start. Counted with, it takes the "
-        f"views' residuals from {significant(found.before_mm)} to {significant(found.after_mm)} "
-        "mm.",
-        tuple(
-            JointRow(
-                it.name,
-                _with_sigma(*it.growth_um),
-                _with_sigma(*it.drift_urad),
-                significant(it.tau_min),
-                "growth as known before" if it.not_told else "",
-            )
-            for it in found.joints
-        ),
+        f"By {told}, the flange had moved by {significant(last.drift_mm)} mm at the end, "
+        f"{significant(_hours(found, last.stamp_s))} h after the start. Counted with, it takes the "
+        f"views' residuals from {significant(residual.without)} to "
+        f"{significant(residual.with_drift)} mm.",
+        tuple(_row(it, found.not_told) for it in found.joints),
     )
 
 
-def course(found: Drift) -> Markup:
+def _row(it: JointDrift, not_told: Sequence[str]) -> JointRow:
+    return JointRow(
+        it.joint,
+        _with_sigma(1e6 * it.growth_per_k, 1e6 * it.growth_sigma_per_k),
+        _with_sigma(1e6 * it.drift_rad_per_k, 1e6 * it.drift_sigma_rad_per_k),
+        significant(it.tau_s / 60.0),
+        "growth as known before" if f"growth of {it.joint}" in not_told else "",
+    )
+
+
+def _hours(found: ThermalResult, stamp_s: float) -> float:
+    """Since the start of the course."""
+    return (stamp_s - found.course[0].stamp_s) / 3600.0
+
+
+def course(found: ThermalResult) -> Markup:
     """The drift over time, with the band in which it is predicted to lie."""
-    low = found.drift_mm - _BAND * found.sigma_mm
-    high = found.drift_mm + _BAND * found.sigma_mm
+    hours = [_hours(found, it.stamp_s) for it in found.course]
+    drift_mm = np.array([it.drift_mm for it in found.course])
+    band_mm = _BAND * np.array([it.sigma_mm for it in found.course])
+    low, high = drift_mm - band_mm, drift_mm + band_mm
+    seen = [(_hours(found, it.stamp_s), it.drift_mm) for it in found.seen or ()]
     with svg.style():
         figure = svg.new_figure(_WIDE_IN, _HIGH_IN)
         axes = figure.subplots()
-        axes.fill_between(found.hours, low, high, color=svg.ACCENT, alpha=0.2, linewidth=0.0)
-        axes.plot(found.hours, found.drift_mm, color=svg.ACCENT, linewidth=1.6, label="the model")
-        if len(found.seen):
-            axes.plot(*found.seen.T, "o", color=svg.INK, markersize=3.5, label="seen by the stops")
+        axes.fill_between(hours, low, high, color=svg.ACCENT, alpha=0.2, linewidth=0.0)
+        axes.plot(hours, drift_mm, color=svg.ACCENT, linewidth=1.6, label="the model")
+        if seen:
+            axes.plot(
+                *np.transpose(seen),
+                "o",
+                color=svg.INK,
+                markersize=3.5,
+                label="seen by the stops",
+            )
             axes.legend(loc="lower right")
-        axes.set_xlim(float(found.hours[0]), float(found.hours[-1]))
-        least = min(0.0, float(low.min()), float(found.seen[:, 1].min(initial=0.0)))
+        axes.set_xlim(hours[0], hours[-1])
+        least = min(0.0, float(low.min()), *(mm for _, mm in seen))
         axes.set_ylim(bottom=1.1 * least)
         axes.set_xlabel("time since the start [h]")
         axes.set_ylabel("drift of the flange [mm]")

@@ -9,7 +9,7 @@ from matplotlib.ticker import MaxNLocator
 
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import FloatArray
-from visioncal.present.recording.findings import target_frames
+from visioncal.present.recording.target_frames import target_frames
 from visioncal.present.report import svg
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence

@@ -2,9 +2,10 @@
 
 from visioncal.core.number_format import decimals_for, matched, significant
 from visioncal.core.types import Target
-from visioncal.present.recording.findings import Arm, Board, Uncertainty
 from visioncal.present.report.content import PLUS_MINUS, Fact, answering_solver, frame_words
 from visioncal.results import Calibration
+from visioncal.results.arm import ArmErrorsResult
+from visioncal.results.sections import BoardResult, UncertaintyResult
 
 _UNITS = {"_px": "px", "_mm": "mm", "_deg": "deg"}
 # What would lower each source's part.
@@ -25,7 +26,7 @@ _REMEDIES = {
 }
 
 
-def summary(calibration: Calibration, found: Uncertainty) -> tuple[str, ...]:
+def summary(calibration: Calibration, found: UncertaintyResult) -> tuple[str, ...]:
     """Sentences: how well a point is placed where the views look, and what limits it."""
     parent, _, sensor = next(iter(calibration.edges)).partition("_from_")
     where = "the views look" if calibration.camera is not None else "it was measured"
@@ -45,9 +46,10 @@ def summary(calibration: Calibration, found: Uncertainty) -> tuple[str, ...]:
     return tuple(sentences)
 
 
-def noise_facts(calibration: Calibration, found: Uncertainty | None) -> tuple[Fact, ...]:
+def noise_facts(calibration: Calibration) -> tuple[Fact, ...]:
     """The noise's levels, with the intervals that they lie in with 95 % where these are known."""
-    intervals = {} if found is None else found.noise_95
+    known = calibration.uncertainty
+    intervals = {} if known is None else known.noise_95
     return tuple(
         _noise_fact(name, value, intervals.get(name)) for name, value in calibration.noise.items()
     )
@@ -65,7 +67,9 @@ def _noise_fact(name: str, value: float, interval: tuple[float, float] | None) -
     return Fact(stem.replace("_", " "), f"{significant(value)} {unit}".strip(), note)
 
 
-def board_facts(calibration: Calibration, board: Board, target: Target | None) -> tuple[Fact, ...]:
+def board_facts(
+    calibration: Calibration, board: BoardResult, target: Target | None
+) -> tuple[Fact, ...]:
     """The board's size and shape, stated and found; empty where nothing was looked for."""
     if not board.sigma:
         return ()
@@ -79,7 +83,7 @@ def board_facts(calibration: Calibration, board: Board, target: Target | None) -
     return tuple(facts)
 
 
-def _size_facts(board: Board, target: Target) -> tuple[Fact, ...]:
+def _size_facts(board: BoardResult, target: Target) -> tuple[Fact, ...]:
     sigma_mm = 1e3 * target.square_sigma_m
     stated = Fact(
         "squares, stated",
@@ -99,7 +103,7 @@ def _size_facts(board: Board, target: Target) -> tuple[Fact, ...]:
     return (stated, Fact("squares, found", found, note))
 
 
-def arm_facts(arm: Arm) -> tuple[Fact, ...]:
+def arm_facts(arm: ArmErrorsResult) -> tuple[Fact, ...]:
     """The size of the errors that follow the arm's posture."""
     treated = (
         ("estimated along with the result", "what looks the same in all views is left, see above")

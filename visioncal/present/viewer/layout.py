@@ -9,9 +9,8 @@ import rerun.blueprint as rrb
 from visioncal.core.types import FloatArray
 from visioncal.present.recording import paths
 from visioncal.present.recording.coverage import AXES_RINGS_DEG, DIRECTIONS_RINGS_DEG
-from visioncal.present.recording.kinematics import Kinematics
-from visioncal.present.recording.thermal import Drift
 from visioncal.results import Calibration
+from visioncal.results.arm import ArmResult
 from visioncal.session import Session
 
 # Distance of the eye from the cell's centre, in extents of all that the cell holds.
@@ -56,12 +55,12 @@ def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.B
         session.mount != "instrument",
     )
     eye = _eye(session, calibration)
-    arm = None if calibration is None else Kinematics.of(calibration)
+    arm = None if calibration is None else calibration.arm
     tabs = rrb.Tabs(
         _overview(contents, eye),
         *([] if arm is None or not arm.is_calibrated else [_arm(arm, eye)]),
-        *([] if calibration is None or Drift.of(calibration) is None else [_warming()]),
-        *([_explained()] if calibration is not None and "dense" in calibration.stages else []),
+        *([] if calibration is None or calibration.thermal is None else [_warming()]),
+        *([_explained()] if calibration is not None and calibration.dense is not None else []),
         _residuals(contents),
         _coverage(contents),
         rrb.Horizontal(
@@ -131,10 +130,10 @@ def _warming() -> rrb.Container:
     )
 
 
-def _arm(found: Kinematics, eye: rrb.EyeControls3D | None) -> rrb.Container:
+def _arm(found: ArmResult, eye: rrb.EyeControls3D | None) -> rrb.Container:
     """What the calibrated arm is worth, how views left out speak for it, and its parameters."""
     # The places are all around the base, farther out than the views.
-    wider = eye if found.workspace is None else eye_on(found.workspace.places_m, MAP_DISTANCE)
+    wider = eye_on(found.map_places_m, MAP_DISTANCE) if found.workspace_map else eye
     cell = rrb.Spatial3DView(
         name="Sigma of a tool's place over the workspace",
         origin="/",

@@ -86,8 +86,7 @@ class CalibratedArm:
 
 def _without_arm(calibration: Calibration) -> DataError:
     name = calibration.session_name
-    found = calibration.stages.get("kinematics")
-    if found is None:
+    if calibration.arm is None:
         return DataError(
             f"calibration {name!r} has no calibrated arm: its session had no joint angles of every "
             "view or no known robot model, or it was made with --level hand-eye.",
@@ -95,7 +94,7 @@ def _without_arm(calibration: Calibration) -> DataError:
             "calibrate with --level auto or kinematics.",
         )
     return DataError(
-        f"calibration {name!r} has no calibrated arm (level {found.get('level', 'unknown')}): its "
+        f"calibration {name!r} has no calibrated arm (level {calibration.arm.level}): its "
         "views do not tell the arm from its nominal model, so there is nothing to correct.",
         next_step="Send the targets as they are; or calibrate with more views, all over the "
         "workspace.",
@@ -113,13 +112,11 @@ def predicted_sigma_mm(calibration: Calibration, p_base: FloatArray) -> FloatArr
         (m,) root of the trace of a place's covariance [mm]: of the map of the workspace around each
         place, or else the median over the workspace; NaN where the calibration says neither.
     """
-    found = calibration.stages.get("kinematics", {})
-    rows = found.get("workspace_map", ())
-    if not rows:
-        median = found.get("workspace_sigma_mm", {}).get("median", np.nan)
-        return np.full(len(p_base), float(median))
-    places = np.array([[row["x_m"], row["y_m"], row["z_m"]] for row in rows])
-    sigmas = np.array([row["sigma_mm"] for row in rows])
+    arm = calibration.arm
+    if arm is None or not arm.workspace_map:
+        known = None if arm is None else arm.workspace_sigma_mm
+        return np.full(len(p_base), np.nan if known is None else known.median)
+    places, sigmas = arm.map_places_m, arm.map_sigmas_mm
     away = np.linalg.norm(p_base[:, None] - places, axis=2)
     near = np.argsort(away, axis=1)[:, :_AROUND]
     # A place of the map itself would have all the weight there is.

@@ -1,9 +1,7 @@
 """An arm that grows and drifts with the temperatures of its links."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Self
 
 import numpy as np
 
@@ -11,7 +9,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp
 from visioncal.core.types import FloatArray
 from visioncal.robot import Robot
-from visioncal.robot.thermal.heating import Heating, Kind
+from visioncal.robot.thermal.heating import Heating
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,55 +36,6 @@ class ThermalModel:
     drift_rad_per_k: FloatArray
     covariance: FloatArray
     lengths: FloatArray
-
-    @classmethod
-    def from_document(cls, document: Mapping[str, Any], robot: Robot) -> Self:
-        """Reads what `document` wrote, for the arm at the reference.
-
-        Raises:
-            LookupError, ValueError: It is none.
-        """
-        kind: Kind = "currents" if document["heated_by"] == "currents" else "temperatures"
-        rows = document["joints"]
-
-        def column(name: str) -> FloatArray:
-            return np.array([float(row[name]) for row in rows])
-
-        warm = kind == "temperatures"
-        gain = np.ones(len(rows)) if warm else column("gain_k_per_a2")
-        return cls(
-            robot,
-            Heating(kind, column("tau_s"), gain),
-            column("reference_c"),
-            column("growth_per_k"),
-            column("drift_rad_per_k"),
-            np.array(document["covariance"], dtype=float),
-            np.array(document["lengths_m"], dtype=float),
-        )
-
-    def document(self) -> dict[str, Any]:
-        """Writes all but the arm; sigmas of tau and gain are relative."""
-        columns = {
-            "reference_c": self.reference_c,
-            "growth_per_k": self.growth_per_k,
-            "drift_rad_per_k": self.drift_rad_per_k,
-            "tau_s": self.heating.tau_s,
-        }
-        sigmas = np.sqrt(np.diag(self.covariance)).reshape(-1, self.joint_count)
-        names = ["growth_sigma_per_k", "drift_sigma_rad_per_k", "tau_sigma"]
-        if self.heating.kind == "currents":
-            columns["gain_k_per_a2"] = self.heating.gain_k_per_a2
-            names.append("gain_sigma")
-        columns |= dict(zip(names, sigmas, strict=True))
-        return {
-            "heated_by": self.heating.kind,
-            "joints": [
-                {"joint": joint} | {name: float(it[at]) for name, it in columns.items()}
-                for at, joint in enumerate(self.robot.joint_names)
-            ],
-            "covariance": self.covariance.tolist(),
-            "lengths_m": self.lengths.tolist(),
-        }
 
     @property
     def joint_count(self) -> int:

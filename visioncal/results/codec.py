@@ -1,0 +1,278 @@
+"""Frozen dataclasses as JSON: written, read with checks, by the types of their fields.
+
+A field is a key of its own name, or of the one that `Key` gives. What is None is absent on disk, as
+is an empty default. Keys that a class does not know are kept in its field `further`, where it has
+one. An error names the path of the value, as `kinematics.levels[2].rms_mm`.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from functools import cache
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from visioncal.core.errors import DataError
+from visioncal.core.types import FloatArray
+
+_T = TypeVar("_T")
+_WORDS = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
+_FURTHER = "further"
+
+
+@dataclass(frozen=True)
+class Key:
+    """The key of a field that is not of its own name."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class Array:
+    """The shape of an array: sizes, of which those that are negative may be any."""
+
+    shape: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Written:
+    """How a value is written that is no dataclass of ours.
+
+    Attributes:
+        write: Makes JSON of it.
+        read: Reads that.
+        schema: Describes it as JSON Schema does.
+    """
+
+    write: Callable[[Any], Any]
+    read: Callable[[Any], Any]
+    schema: Mapping[str, Any] = field(default_factory=lambda: {"type": "object"})
+
+
+Vector = Annotated[FloatArray, Array((-1,))]
+Matrix = Annotated[FloatArray, Array((-1, -1))]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Section:
+    """A part of a result.
+
+    Attributes:
+        further: What a file has of it that this version does not know, as it is there.
+    """
+
+    further: Mapping[str, Any] = field(default_factory=dict, repr=False)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A field as it is on disk: its name, key and type, and whether it has to be there."""
+
+    name: str
+    key: str
+    kind: Any
+    required: bool
+
+
+@cache
+def entries(cls: type) -> tuple[Entry, ...]:
+    """The fields of a dataclass in their order, `further` left out."""
+    hints = get_type_hints(cls, include_extras=True)
+    found = []
+    for it in fields(cls):
+        if it.name != _FURTHER:
+            kind = hints[it.name]
+            keys = [mark.name for mark in get_args(kind)[1:] if isinstance(mark, Key)]
+            required = it.default is MISSING and it.default_factory is MISSING
+            found.append(Entry(it.name, keys[0] if keys else it.name, kind, required))
+    return tuple(found)
+
+
+def write(cls: type, value: object) -> dict[str, Any]:
+    """Writes the fields that a dataclass has.
+
+    Args:
+        cls: The dataclass.
+        value: One of it, or of a class that has its fields.
+    """
+    document = {}
+    for it in entries(cls):
+        mine = getattr(value, it.name)
+        if mine is not None and (it.required or not _is_empty(mine)):
+            document[it.key] = _written(it.kind, mine)
+    return document | dict(getattr(value, _FURTHER, {}))
+
+
+def _is_empty(value: object) -> bool:
+    return isinstance(value, tuple | Mapping) and not value
+
+
+def _written(kind: Any, value: Any) -> Any:  # noqa: ANN401 - what JSON may hold
+    kind = _fitting(_alternatives(kind), value)
+    if get_origin(kind) is Annotated:
+        inner, *marks = get_args(kind)
+        ours = [it for it in marks if isinstance(it, Written)]
+        return ours[0].write(value) if ours else _written(inner, value)
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if is_dataclass(value):
+        return write(type(value), value)
+    if kind is not Any and isinstance(value, Mapping):
+        return {name: _written(get_args(kind)[1], it) for name, it in value.items()}
+    if isinstance(value, tuple):
+        return [_written(get_args(kind)[0], it) for it in value]
+    return value
+
+
+def read(cls: type[_T], document: object, path: str) -> _T:
+    """Reads what `write` wrote.
+
+    Args:
+        cls: The dataclass.
+        document: The JSON.
+        path: Its place in the file, for messages.
+
+    Raises:
+        DataError: Something in it is missing or of another kind; the message names its place.
+    """
+    found = read_fields(cls, document, path)
+    try:
+        return cls(**found)
+    except ValueError as error:
+        raise DataError(f"{path}: {error}.", culprits=[path]) from error
+
+
+def read_fields(cls: type, document: object, path: str) -> dict[str, Any]:
+    """Reads the fields of a dataclass by name; its errors are those of `read`."""
+    table, known = _table(document, path), entries(cls)
+    found = {
+        it.name: _read(it.kind, table[it.key], _joined(path, it.key))
+        for it in known
+        if it.key in table
+    }
+    for it in known:
+        if it.required and it.name not in found:
+            place = _joined(path, it.key)
+            raise DataError(f"{place} is missing.", culprits=[place])
+    further = {name: it for name, it in table.items() if name not in {it.key for it in known}}
+    if further and any(it.name == _FURTHER for it in fields(cls)):
+        found[_FURTHER] = further
+    return found
+
+
+def _read(kind: Any, value: Any, path: str) -> Any:  # noqa: ANN401 - what JSON may hold
+    origin, args = get_origin(kind), get_args(kind)
+    if kind is Any:
+        return value
+    if origin is Annotated:
+        return _read_marked(args, value, path)
+    if origin in (Union, UnionType):
+        return _read(_fitting(_alternatives(kind), value), value, path)
+    if origin is Literal:
+        if value not in args:
+            raise other(value, f"one of {', '.join(map(repr, args))}", path)
+        return value
+    if origin is tuple:
+        return _read_tuple(args, value, path)
+    if origin is not None and issubclass(origin, Mapping):
+        table = _table(value, path)
+        return {name: _read(args[1], it, _joined(path, name)) for name, it in table.items()}
+    if is_dataclass(kind):
+        return read(kind, value, path)  # type: ignore[arg-type] # no instance, but a class
+    return plain(kind, value, path)
+
+
+def _read_marked(args: tuple[Any, ...], value: Any, path: str) -> Any:  # noqa: ANN401 - see `_read`
+    inner, *marks = args
+    for it in marks:
+        if isinstance(it, Array):
+            return _array(inner, it.shape, value, path)
+        if isinstance(it, Written):
+            try:
+                return it.read(value)
+            except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
+                raise DataError(
+                    f"{path} cannot be read: {error or type(error).__name__}.", culprits=[path]
+                ) from error
+    return _read(inner, value, path)
+
+
+def _alternatives(kind: Any) -> list[Any]:  # noqa: ANN401 - a type
+    """What a type that may be None may be beside it."""
+    if get_origin(kind) in (Union, UnionType):
+        return [it for it in get_args(kind) if it is not NoneType]
+    return [kind]
+
+
+def _fitting(kinds: list[Any], value: object) -> Any:  # noqa: ANN401 - a type
+    """Of several dataclasses, the one of whose keys a table has most, and lacks fewest."""
+    if len(kinds) == 1 or not isinstance(value, Mapping):
+        return kinds[0]
+
+    def fit(kind: type) -> tuple[int, int]:
+        there = sum(it.key in value for it in entries(kind))
+        return there, there - len(entries(kind))
+
+    return max(kinds, key=fit)
+
+
+def _read_tuple(args: tuple[Any, ...], value: object, path: str) -> tuple[Any, ...]:
+    if not isinstance(value, list):
+        raise other(value, "a list", path)
+    if args[-1] is Ellipsis:
+        args = (args[0],) * len(value)
+    if len(value) != len(args):
+        raise other(value, f"a list of {len(args)}", path)
+    return tuple(
+        _read(kind, it, f"{path}[{at}]")
+        for at, (kind, it) in enumerate(zip(args, value, strict=True))
+    )
+
+
+def _array(kind: Any, shape: tuple[int, ...], value: object, path: str) -> Any:  # noqa: ANN401
+    """An array of a type, as `npt.NDArray[np.float64]`, and a shape."""
+    (wanted,) = get_args(get_args(kind)[1])
+    sizes = " x ".join("n" if it < 0 else str(it) for it in shape)
+    needed = other(value, f"an array of {sizes} numbers", path)
+    try:
+        found = np.asarray(value)
+    except ValueError as error:
+        raise needed from error
+    held = "b" if wanted is np.bool_ else "iuf"
+    if not found.size:
+        found = np.zeros((*found.shape, *(0,) * len(shape))[: len(shape)])
+    elif found.dtype.kind not in held:
+        raise needed
+    alike = [mine == its or its < 0 for mine, its in zip(found.shape, shape, strict=False)]
+    if found.ndim != len(shape) or not all(alike):
+        raise needed
+    return found.astype(wanted)
+
+
+def plain(kind: type[_T], value: Any, path: str) -> _T:  # noqa: ANN401 - what JSON may hold
+    """Checks a value that is a number, a text, or true or false.
+
+    Raises:
+        DataError: It is something else.
+    """
+    kinds = (int, float) if kind is float else (kind,)
+    if not isinstance(value, kinds) or (isinstance(value, bool) and kind is not bool):
+        raise other(value, _WORDS[kind], path)
+    return kind(value)  # type: ignore[call-arg] # float of an int, or what it is
+
+
+def other(value: object, needed: str, path: str) -> DataError:
+    """Says what is there, and what is needed."""
+    place = path or "the document"
+    return DataError(f"{place} is {value!r:.60}; {needed} is needed.", culprits=[place])
+
+
+def _table(value: object, path: str) -> Mapping[str, Any]:
+    if not isinstance(value, Mapping):
+        raise other(value, "a table", path)
+    return value
+
+
+def _joined(path: str, key: str) -> str:
+    return f"{path}.{key}".lstrip(".")
