@@ -13,8 +13,9 @@ from visioncal.core.number_format import percent
 
 VerdictStatus: TypeAlias = Literal["good", "check", "bad"]
 
-# So many findings are shown first, and so many steps; causes as likely as this are among them.
-_SHOWN, _LEAST_LIKELY = 3, 0.05
+# So many findings are shown first, and so many steps; causes as likely as this are among them, and
+# steps against causes as likely as the other.
+_SHOWN, _LEAST_LIKELY, _LIKELY = 3, 0.05, 0.2
 # Kinds of findings that are no doubts.
 AGREEMENT, NEED, GOOD_FOR, NOTE = "agreement", "need", "good_for", "note"
 # What says how large errors are, the most telling first.
@@ -171,7 +172,8 @@ class Verdict:
     @property
     def next_steps(self) -> tuple[Step, ...]:
         """What to do about the findings, in their order; each once."""
-        steps = (it.do for it in self.ranked if it.do is not None)
+        unlikely = [it for it in self.causes[1:] if it.probability < _LIKELY]
+        steps = (it.do for it in self.ranked if it.do is not None and it not in unlikely)
         return tuple(dict.fromkeys(steps))[:_SHOWN]
 
     def with_paths(self, session: Path | str, out: Path | str = "") -> Self:

@@ -137,9 +137,10 @@ def _with_hint(error: VisioncalError, seen: RunState | None) -> VisioncalError:
         return error
     hint = reading_hint(seen)
     (planned,) = with_proposal([error.next_step], modelled=seen.robot is not None)
+    if hint is not None:
+        message = f"{hint.words} As declared: {error.message}"
+        return type(error)(message, culprits=error.culprits, next_step=str(hint.do))
     next_step = planned if seen.scenes else error.next_step
-    if hint:
-        next_step = hint.reason
     return type(error)(error.message, culprits=error.culprits, next_step=next_step)
 
 

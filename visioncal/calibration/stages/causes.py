@@ -20,7 +20,7 @@ from scipy.special import chdtrc
 
 from visioncal.calibration.stages.need import GOOD, Picks
 from visioncal.core.number_format import figure, percent
-from visioncal.core.verdict import CALIBRATE, GUESS, PLAN, REVIEW, Finding, Step, Verdict
+from visioncal.core.verdict import CALIBRATE, GOOD_FOR, GUESS, PLAN, REVIEW, Finding, Step, Verdict
 from visioncal.results import NeedMet
 
 # The limits of tests that are passed by chance: none is behind the first, the last is a fact.
@@ -51,6 +51,7 @@ EVIDENCE: Mapping[str, Evidence] = {
     "holdout": Evidence(1e-3),
     "lost_views": Evidence(_REMARK),
     "untied": Evidence(_FACT),
+    "too_few_stops": Evidence(_FACT),
     "board_size": Evidence(2.7e-3, _CHAIN),
     "board_shape": Evidence(1e-4, _CHAIN),
     "lens": Evidence(1e-4, _CHAIN),
@@ -102,8 +103,16 @@ def with_misread(verdict: Verdict, found: Finding) -> Verdict:
         verdict: On the poses as they are declared.
         found: That they are misread.
     """
+    if verdict.causes and verdict.causes[0].kind == "exchanged_views":
+        # The same, found by the views themselves; the command exchanges the rows.
+        said = (replace(it, do=found.do) if it.do else it for it in verdict.findings)
+        return replace(verdict, findings=tuple(said))
     odds = _odds(EVIDENCE[found.kind].chance)
-    rest = (replace(it, probability=it.probability / (1.0 + odds)) for it in verdict.findings)
+    rest = (
+        replace(it, probability=it.probability / (1.0 + odds), do=None)
+        for it in verdict.findings
+        if it.kind not in _SIZES_OF_PICKS
+    )
     return replace(verdict, findings=(replace(found, probability=odds / (1.0 + odds)), *rest))
 
 
@@ -168,6 +177,8 @@ def _odds(chance: float) -> float:
     return float(-1.0 / (np.e * chance * np.log(chance)))
 
 
+# What is said of picks by a result that nobody will use.
+_SIZES_OF_PICKS = (GOOD_FOR, "calibration", "robot_noise", "robot_noise_of_pick")
 # What picks are limited by: as a kind, in words, and what helps.
 _SOURCES: Mapping[str, tuple[str, str, Step | None]] = {
     "calibration": (

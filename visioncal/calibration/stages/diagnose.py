@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visioncal.core.number_format import figure
 from visioncal.core.verdict import PLAN, Finding, Step
 from visioncal.estimation.arm import LEVER_M, SIGNIFICANT, ArmErrors, stops_of
 from visioncal.estimation.problem import Problem
@@ -47,7 +48,9 @@ def doubts(found: ResidualTest, arm: ArmErrors | None, *, calibrated: bool) -> I
     """Finds what of a robot's residuals is no noise, and what it probably is."""
     alike, moved = found.alike, found.moved
     if arm is not None and arm.is_significant and not calibrated:
-        size = f"{1e3 * LEVER_M * arm.sigma:.2g} mm and {np.rad2deg(arm.sigma):.2g} deg"
+        size = (
+            f"{figure(1e3 * LEVER_M * arm.sigma)} mm and {figure(float(np.rad2deg(arm.sigma)))} deg"
+        )
         told = (
             "they were estimated along"
             if arm.of_links
@@ -67,7 +70,7 @@ def doubts(found: ResidualTest, arm: ArmErrors | None, *, calibrated: bool) -> I
         yield Finding(
             "moved_slowly",
             f"Residuals drift with time: from the first stop to the last, base or target moved by "
-            f"{1e3 * moved.moved_m:.2g} mm and {np.rad2deg(moved.moved_rad):.2g} deg.",
+            f"{_size(moved.moved_m, moved.moved_rad)}.",
             Step("Fasten base and target, let the arm warm up, and record again."),
         )
     if alike.is_significant:
@@ -78,6 +81,10 @@ def doubts(found: ResidualTest, arm: ArmErrors | None, *, calibrated: bool) -> I
             "share of the sigmas was multiplied by as much.",
             Step("Record again, with the stops in an order of chance."),
         )
+
+
+def _size(shift_m: float, turn_rad: float) -> str:
+    return f"{figure(1e3 * shift_m)} mm and {figure(float(np.rad2deg(turn_rad)))} deg"
 
 
 def _of_arm(arm: ArmErrors) -> Step:

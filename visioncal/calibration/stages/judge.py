@@ -584,8 +584,9 @@ def _stop_doubts(findings: Findings, limits: Limits) -> Iterator[Finding]:
                 f"Only {counted} are used; {check} or more give the result something to be checked "
                 "with."
             )
-            step = _tilted(findings)
-            found = Finding("few_stops", words, step, is_fatal=it.stops < bad, until_mm=0.0)
+            step, is_fatal = _tilted(findings), it.stops < bad
+            kind = "too_few_stops" if is_fatal else "few_stops"
+            found = Finding(kind, words, step, is_fatal=is_fatal, until_mm=0.0)
             yield found.of(_robot(it))
 
 
@@ -604,7 +605,9 @@ def _lost_doubts(sensor: Sensor, limits: Limits) -> Iterator[Finding]:
         words = f"{len(lost)} of {used + len(lost)} views are not used{told}."
         step = Step("Look at the first of them, and repeat what is missing.") if others else None
         views, is_fatal = tuple(it.view for it in lost), share > limits.lost_share[1]
-        yield Finding("lost_views", words, step, views, is_fatal=is_fatal).of(sensor.name)
+        # Those that disagree have a finding of their own.
+        kind = "lost_views" if others else "left_out"
+        yield Finding(kind, words, step, views, is_fatal=is_fatal).of(sensor.name)
 
 
 def _noise_doubts(sensor: Sensor, limits: Limits) -> Iterator[Finding]:

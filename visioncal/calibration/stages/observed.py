@@ -1,5 +1,6 @@
 """What was observed in a session, by one camera and one robot or by many."""
 
+import shlex
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -18,6 +19,7 @@ from visioncal.estimation.scene import Scene
 from visioncal.results import HELD_BACK, CameraResult
 from visioncal.robot import Robot
 from visioncal.session import Session
+from visioncal.session.images import FolderImages
 from visioncal.session.tables import CameraTable
 
 # So many views of one reason are named.
@@ -216,5 +218,12 @@ def nothing_seen(seen: Observed) -> DataError:
     return DataError(
         f"session {seen.session.name!r}: no view shows the target.",
         next_step="Look at an image: is the board in it, and is it the one that the session "
-        "declares?",
+        f"declares?{_named_by(seen)}",
     )
+
+
+def _named_by(seen: Observed) -> str:
+    """The command that names the board in an image, where images are files."""
+    image = next((it.image for it in seen.session.views if it.image), "")
+    has_files = image and isinstance(seen.session.images, FolderImages)
+    return f" Run: visioncal target check SESSION/{shlex.quote(image)}" if has_files else ""
