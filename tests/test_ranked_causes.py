@@ -162,7 +162,7 @@ def test_verdicts_of_earlier_files_say_the_same() -> None:
     assert [it.kind for it in old.causes] == ["lens", "calibration"]
     assert old.top == (
         "Most likely (90 %): It is another. Hold it.",
-        "Possibly (40 %): Much comes from it.",
+        "Much comes from it.",
         "Views disagree.",
     )
     assert old.next_steps == (Step("Measure it."),)

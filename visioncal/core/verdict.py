@@ -27,6 +27,8 @@ _HEADLINES = {
     "check": "Check before use",
     "bad": "Bad: do not use",
 }
+# Kinds of findings about the sources of errors: how likely they are is their share, in their words.
+SOURCES = ("calibration", "robot_noise", "robot_noise_of_pick")
 # Commands of steps.
 CALIBRATE, PLAN = "visioncal calibrate SESSION -o OUT", "visioncal plan SESSION --add 5"
 GUESS = "visioncal convert SESSION FIXED --guess --yes"
@@ -166,15 +168,19 @@ class Verdict:
     def _line(self, finding: Finding) -> str:
         likely = f"({percent(finding.probability)})"
         how = "Most likely" if finding in self.causes[:1] else "Possibly"
-        begin = f"{how} {likely}: " if finding.probability >= _LEAST_LIKELY else ""
+        is_likely = finding.probability >= _LEAST_LIKELY and finding.kind not in SOURCES
+        begin = f"{how} {likely}: " if is_likely else ""
         return f"{begin}{finding.words} {finding.without_it}".strip()
 
     @property
     def next_steps(self) -> tuple[Step, ...]:
         """What to do about the findings, in their order; each once."""
         unlikely = [it for it in self.causes[1:] if it.probability < _LIKELY]
-        steps = (it.do for it in self.ranked if it.do is not None and it not in unlikely)
-        return tuple(dict.fromkeys(steps))[:_SHOWN]
+        steps: dict[str, Step] = {}
+        for it in self.ranked:
+            if it.do is not None and it not in unlikely:
+                steps.setdefault(it.do.command or it.do.words, it.do)
+        return tuple(steps.values())[:_SHOWN]
 
     def with_paths(self, session: Path | str, out: Path | str = "") -> Self:
         """Fills the paths of a run into the commands of its steps.

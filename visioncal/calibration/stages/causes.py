@@ -20,7 +20,17 @@ from scipy.special import chdtrc
 
 from visioncal.calibration.stages.need import GOOD, Picks
 from visioncal.core.number_format import figure, percent
-from visioncal.core.verdict import CALIBRATE, GOOD_FOR, GUESS, PLAN, REVIEW, Finding, Step, Verdict
+from visioncal.core.verdict import (
+    CALIBRATE,
+    GOOD_FOR,
+    GUESS,
+    PLAN,
+    REVIEW,
+    SOURCES,
+    Finding,
+    Step,
+    Verdict,
+)
 from visioncal.results import NeedMet
 
 # The limits of tests that are passed by chance: none is behind the first, the last is a fact.
@@ -105,13 +115,15 @@ def with_misread(verdict: Verdict, found: Finding) -> Verdict:
     """
     if verdict.causes and verdict.causes[0].kind == "exchanged_views":
         # The same, found by the views themselves; the command exchanges the rows.
-        said = (replace(it, do=found.do) if it.do else it for it in verdict.findings)
+        words = "Write a copy of the session with these rows exchanged, and calibrate it."
+        step = found.do and replace(found.do, words=words)
+        said = (replace(it, do=step) if it.do else it for it in verdict.findings)
         return replace(verdict, findings=tuple(said))
     odds = _odds(EVIDENCE[found.kind].chance)
     rest = (
         replace(it, probability=it.probability / (1.0 + odds), do=None)
         for it in verdict.findings
-        if it.kind not in _SIZES_OF_PICKS
+        if it.kind not in (GOOD_FOR, *SOURCES)
     )
     return replace(verdict, findings=(replace(found, probability=odds / (1.0 + odds)), *rest))
 
@@ -177,8 +189,6 @@ def _odds(chance: float) -> float:
     return float(-1.0 / (np.e * chance * np.log(chance)))
 
 
-# What is said of picks by a result that nobody will use.
-_SIZES_OF_PICKS = (GOOD_FOR, "calibration", "robot_noise", "robot_noise_of_pick")
 # What picks are limited by: as a kind, in words, and what helps.
 _SOURCES: Mapping[str, tuple[str, str, Step | None]] = {
     "calibration": (
