@@ -95,7 +95,7 @@ def test_a_message_leaves_out_the_middle_of_what_nobody_reads():
 def test_an_error_as_json_has_its_parts(poor, tmp_path):
     done = visioncal("calibrate", poor, "-o", tmp_path / "out", "--json")
     assert done.status == 2
-    error = json.loads(done.err)["error"]
+    error = json.loads(done.out)["error"]
     assert error["class"] == "DegenerateError"
     assert error["culprits"]
     assert "Add 3 or more views" in error["next"]
@@ -115,7 +115,7 @@ NEEDED = {
 }
 
 
-def test_errors_as_json_have_one_form_and_leave_stdout_to_results(tmp_path, monkeypatch):
+def test_errors_as_json_have_one_form(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with_json = [name for name, it in every_command() if "as_json" in {p.name for p in it.params}]
     # It looks at its libraries first, which may not be there.
@@ -125,8 +125,8 @@ def test_errors_as_json_have_one_form_and_leave_stdout_to_results(tmp_path, monk
             continue
         source = [] if name == "record" else ["nowhere"]
         done = visioncal(*name.split(), *source, *NEEDED.get(name, ()), "--json")
-        assert (done.status, done.out) == (2, ""), name
-        error = json.loads(done.err)["error"]
+        assert (done.status, done.err) == (2, ""), name
+        error = json.loads(done.out)["error"]
         assert set(error) == {"class", "message", "culprits", "next"}
         assert "no" in error["message"]
     assert not list(tmp_path.iterdir())

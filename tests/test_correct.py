@@ -314,7 +314,7 @@ def test_targets_out_of_reach_are_named_and_nothing_is_written(stored, result):
     assert len(rows_of(out.read_text())) == 2
     done = run("correct", table, "-c", stored, "--json")
     assert done.status == 2
-    assert json.loads(done.err)["error"]["culprits"] == ["t.csv, line 3"]
+    assert json.loads(done.out)["error"]["culprits"] == ["t.csv, line 3"]
     poses[:, :3, 3] = [1.5, 0.0, 0.3]
     done = run("correct", write_poses(table, poses), "-c", stored, "--skip-unreachable")
     assert done.status == 2

@@ -25,7 +25,7 @@ def messages() -> Console:
 
 
 def report_error(error: VisioncalError, *, as_json: bool) -> None:
-    """Prints an error to stderr: one message, or a JSON object."""
+    """Prints an error: one message to stderr, or a JSON object to stdout."""
     if as_json:
         document = {
             "class": type(error).__name__,
@@ -33,7 +33,7 @@ def report_error(error: VisioncalError, *, as_json: bool) -> None:
             "culprits": list(error.culprits),
             "next": error.next_step,
         }
-        typer.echo(json.dumps({"error": document}, indent=2), err=True)
+        typer.echo(json.dumps({"error": document}, indent=2))
         return
     console = messages()
     console.print(f"[bold red]error:[/] {escape(error.message)}")
