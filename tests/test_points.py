@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from commands import visioncal
+from edited import changed
 from rigs import (
     BOARD_FROM_CUBE,
     LENS,
@@ -46,13 +47,6 @@ def x_of(calibration: Calibration) -> tuple[np.ndarray, np.ndarray]:
     name = next(iter(calibration.edges))
     edge, mount = calibration.edges[name], calibration.mount
     return log(invert(edge.matrix) @ truth(mount)[0].as_matrix()), edge.covariance
-
-
-def changed(folder: Path, name: str, old: str, new: str) -> Path:
-    text = (folder / name).read_text()
-    assert old in text
-    (folder / name).write_text(text.replace(old, new, 1))
-    return folder
 
 
 def with_line(folder: Path, line: str) -> Path:

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from edited import changed
 
 from visioncal.core.errors import DataError
 from visioncal.present.recording import write_recording
@@ -45,13 +46,6 @@ def folder(tmp_path: Path) -> Path:
     for name in ("a.png", "b.png"):
         (session / name).write_bytes(b"\x89PNG " + name.encode())
     return session
-
-
-def changed(folder: Path, name: str, old: str, new: str) -> Path:
-    text = (folder / name).read_text()
-    assert old in text
-    (folder / name).write_text(text.replace(old, new))
-    return folder
 
 
 def test_rows_say_which_board_they_show(folder):

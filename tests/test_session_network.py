@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from edited import changed
 
 from visioncal.core.errors import DataError
 from visioncal.frames.touches import touches_of
@@ -69,13 +70,6 @@ def folder(tmp_path: Path) -> Path:
     for name in "abcd":
         (session / f"{name}.png").write_bytes(b"\x89PNG " + name.encode())
     return session
-
-
-def changed(folder: Path, name: str, old: str, new: str) -> Path:
-    text = (folder / name).read_text()
-    assert old in text
-    (folder / name).write_text(text.replace(old, new))
-    return folder
 
 
 def test_every_frame_hangs_on_another(folder):
