@@ -4,6 +4,7 @@ import csv
 import re
 import shlex
 import shutil
+from dataclasses import fields
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -171,6 +172,11 @@ def test_every_command_and_option_is_on_a_page():
             assert flags == [it.name] or any(
                 re.search(rf"(?<![\w-]){flag}(?![\w-])", text) for flag in flags
             ), f"no page has {flags} of visioncal {name}"
+
+
+def test_every_field_of_a_result_is_on_its_page():
+    words = set(re.findall(r"\w+", text_of(ROOT / "visioncal" / "results" / "README.md")))
+    assert {it.name for it in fields(visioncal.Calibration)} <= words
 
 
 def test_the_architecture_has_every_package():
