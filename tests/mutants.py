@@ -417,9 +417,10 @@ def _unclear(
         yield f"a message of {len(str(error))} letters: {str(error)[:200]}"
     if not error.culprits:
         yield f"no culprit: {error}"
-    if as_json and not message.startswith('{\n  "error": {'):
-        yield f"--json printed {message[:100]}"
-    if out:
+    if as_json:
+        if json.loads(out).keys() != {"error"}:
+            yield f"--json printed {out[:100]}"
+    elif out:
         yield f"a refusal with a result: {out[:100]}"
 
 

@@ -73,7 +73,7 @@ def test_a_reader_that_has_gone_ends_the_command_quietly(pairs, tmp_path):
     assert names(tmp_path) == FILES
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["export", "--list"]])
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["calibrate", "none", "--json"]])
 def test_every_command_ends_so(arguments):
     err = io.StringIO()
     with full() as out:

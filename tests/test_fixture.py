@@ -579,8 +579,8 @@ def test_positions_of_the_tip_itself_are_enough(tmp_path, tool_file):
         # Eight points of 0.1 mm over 0.3 m.
         assert np.abs(np.array(found["matrix"]) - FRAME).max() < 5e-4
     assert "are in no unit that is named" in run(("X", "Y", "Z"), *none).out
-    assert "these look like millimetres" in run(("x_m", "y_m", "z_m"), *none).err
-    assert "say --tool none" in run(("x_mm", "y_mm", "z_mm"), "--tool", tool_file).err
+    assert "these look like millimetres" in run(("x_m", "y_m", "z_m"), *none).out
+    assert "say --tool none" in run(("x_mm", "y_mm", "z_mm"), "--tool", tool_file).out
     write_table(touches, ("q1_rad", "q2_rad"), [[0.1, 0.2]] * 8, {"point": NAMES})
     done = visioncal("fixture", touches, "--cad", cad, *none)
     assert done.status == 2
