@@ -110,8 +110,7 @@ def main(sweeps: int) -> None:
 next (5 postures in 7 s), without a rest; 30 frames a second whose poses have the noise of corners
 of 0.1 px, and the robot's poses at 125 Hz. The clocks differ by up to a second, drawn anew each
 time. Errors are of `clock.camera_minus_robot_s` against the truth; its sigma is a median. The
-camera's place is that of its transform (median), and chi2 / 6 is 1 where its covariance tells its
-errors.
+camera's place is that of its transform (median), and chi2 / 6 is 1 where its covariance is right.
 
 {table}
 """
