@@ -35,7 +35,7 @@ def _finding_document(found: Finding) -> dict[str, Any]:
     document = {
         "kind": found.kind,
         "words": found.words,
-        "do": step and {"words": step.words, "command": step.command},
+        "do": step and {name: it for name, it in vars(step).items() if it},
         "views": list(found.views),
         "probability": found.probability,
         "without_it": found.without_it,
