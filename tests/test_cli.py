@@ -1,7 +1,11 @@
 """The commands as a user runs them: exit status, messages, and the files that appear."""
 
+import io
 import json
+import os
 import re
+import time
+from contextlib import redirect_stderr
 from pathlib import Path
 from typing import get_args
 
@@ -9,7 +13,11 @@ import pytest
 from commands import every_command, started, visioncal
 from typer.main import get_command
 
+import visioncal as visioncal_package
+from visioncal.calibration.pipeline import STAGES
 from visioncal.calibration.stages.kinematics import ASKED
+from visioncal.cli import progress
+from visioncal.cli import simulate as simulate_module
 from visioncal.cli.app import app
 from visioncal.cli.lazy import LazyGroup
 from visioncal.core.conventions import POSE_FORMS, UNITS_M
@@ -44,7 +52,7 @@ def test_calibrate_writes_three_files_and_says_how_good_it_is(rendered, tmp_path
         "recording.rrd",
     }
     assert done.out == ""
-    assert done.err.startswith("good")
+    assert "\ngood" in f"\n{done.err}"
     assert "flange_from_cam" in done.err
     assert "daniilidis" in done.err
 
@@ -201,6 +209,52 @@ def test_demo_compares_itself_with_the_truth(tmp_path, monkeypatch):
 def test_help_and_version_name_the_program():
     assert "calibrate" in started("--help").out
     assert visioncal("--version").out.strip().count(".") == 2
+
+
+def test_steps_are_said_in_words_and_counted_by_what_they_go_through():
+    steps = progress.Steps()
+    said = []
+    for report in (("detect", 2, 10), ("detect", 1, 40), ("detect", 40, 40), ("solve", 7, 10)):
+        steps.report(*report)
+        said.append(steps.line)
+    board = "detect the board"
+    assert said == [board, f"{board}: 1 of 40", f"{board}: 40 of 40", "solve for all frames"]
+
+
+def test_every_step_has_words():
+    sources = Path(visioncal_package.__file__).parent.rglob("*.py")
+    called = r"""(?:progress|told)\(\s*"(\w+)","""
+    named = {it for path in sources for it in re.findall(called, path.read_text("utf-8"))}
+    assert {"detect", "render", "excitation", "path"} <= named
+    assert progress.WORDS.keys() == named | {it.name for it in STAGES}
+
+
+def test_without_a_terminal_the_step_at_work_is_a_line(monkeypatch):
+    err = io.StringIO()
+    monkeypatch.setattr(progress, "PAUSE_S", 0.001)
+    with redirect_stderr(err), progress.shown_progress(quiet=False) as report:
+        report("detect", 2, 10)
+        report("detect", 12, 57)
+        while "12 of 57" not in err.getvalue():
+            time.sleep(0.001)
+    assert err.getvalue().splitlines()[-1] == "detect the board: 12 of 57 (0 s)"
+
+
+@pytest.mark.parametrize("keeps", [False, True])
+def test_ctrl_c_is_status_130_and_says_what_is_left_behind(tmp_path, monkeypatch, keeps):
+    (tmp_path / "earlier.csv").touch()
+    os.utime(tmp_path / "earlier.csv", (0, 0))
+
+    def interrupted(_, folder, *__, **___):
+        if keeps:
+            (folder / "views.csv").write_text("view\n")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(simulate_module, "write_session", interrupted)
+    done = visioncal("simulate", tmp_path, "--views", 3)
+    assert (done.status, done.out) == (130, "")
+    left = f"written so far: {tmp_path / 'views.csv'}" if keeps else "nothing was written"
+    assert done.err == f"stopped by Ctrl-C; {left}\n"
 
 
 @pytest.mark.parametrize("path", [(), ("dynamics",)])

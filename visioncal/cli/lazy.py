@@ -1,13 +1,20 @@
 """Commands with help in plain text, and groups that import one when it is asked for."""
 
+import time
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib import import_module
+from pathlib import Path
 from typing import Any, ClassVar
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command, get_group
+
+from visioncal.core.files import some_of
+
+# As a shell reports a program that SIGINT ended.
+_EXIT_CTRL_C = 128 + 2
 
 
 class PlainCommand(TyperCommand):
@@ -16,6 +23,18 @@ class PlainCommand(TyperCommand):
     It knows no markup, which takes `[mm]` for a style, and no columns beside each other, for which
     a terminal of 80 columns has no room.
     """
+
+    def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 - typer's own types
+        """Runs it; where Ctrl-C ends it, says which files it leaves behind."""
+        begun = time.time()
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            given = [it for it in ctx.params.values() if isinstance(it, Path)]
+            left = sorted(str(it) for path in given for it in _written_since(path, begun))
+            words = f"written so far: {some_of(left)}" if left else "nothing was written"
+            typer.echo(f"stopped by Ctrl-C; {words}", err=True)
+            raise typer.Exit(_EXIT_CTRL_C) from None
 
     def format_options(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401 - typer's own types
         """Writes them."""
@@ -27,6 +46,14 @@ class PlainCommand(TyperCommand):
         for name, records in panels.items():
             with formatter.section(name):
                 formatter.write_dl(records)
+
+
+def _written_since(path: Path, begun: float) -> Iterator[Path]:
+    """The files of a path that were written since some time [s]."""
+    for it in (path, *path.rglob("*")):
+        # File systems keep times as coarse as this.
+        if it.is_file() and it.stat().st_mtime > begun - 0.01:
+            yield it
 
 
 class LazyGroup(TyperGroup):

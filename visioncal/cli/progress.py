@@ -1,29 +1,110 @@
 """What a command is at, while it works."""
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from threading import Event, Thread
 
 from visioncal.cli.console import messages
+
+# What is done in a step, for people; other names are words already.
+WORDS = {
+    "robot": "read the robot",
+    "readings": "read the instruments",
+    "detect": "detect the board",
+    "dense": "refine corners by all pixels",
+    "intrinsics": "estimate the lens",
+    "pnp": "locate the board in each view",
+    "clock": "compare the clocks",
+    "joints": "check the joint angles",
+    "solve": "solve for all frames",
+    "examine": "leave views out and predict them",
+    "judge": "judge the result",
+    "write": "write the result, report and recording",
+    "render": "render the images",
+    "candidates": "collect possible stops",
+    "information": "compute the information of each stop",
+    "choice": "choose the stops",
+    "path": "find a clear path",
+    "excitation": "search for the motion",
+}
+# Without a terminal, so often a line at most [s].
+PAUSE_S = 2.0
+
+
+class Steps:
+    """The step at work, in words.
+
+    The first report of a step has its place among all steps, or nothing done yet; those after it
+    count what the step goes through.
+    """
+
+    def __init__(self) -> None:
+        self.words = ""
+        self.count: tuple[int, int] | None = None
+        self._name = ""
+
+    def report(self, name: str, done: int, total: int) -> None:
+        """Takes a report of progress."""
+        self.count = (done, total) if name == self._name and total else None
+        self._name, self.words = name, WORDS.get(name, name)
+
+    @property
+    def line(self) -> str:
+        """The step, and how much of it is done."""
+        counted = "" if self.count is None else f": {self.count[0]} of {self.count[1]}"
+        return f"{self.words}{counted}"
 
 
 @contextmanager
 def shown_progress(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
-    """Shows a bar of the stage at work, where somebody looks at a terminal."""
-    columns = (
-        TextColumn("{task.description:<12}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-    )
-    console = messages()
-    with Progress(
-        *columns, console=console, transient=True, disable=quiet or not console.is_terminal
-    ) as bar:
-        task = bar.add_task("", total=None)
+    """Shows the step at work: as a bar on a terminal, else as a line now and then.
 
-        def told(stage: str, done: int, total: int) -> None:
-            bar.update(task, description=stage, completed=done, total=total)
+    Args:
+        quiet: Whether to show nothing.
+    """
+    steps = Steps()
+    if quiet:
+        yield steps.report
+        return
+    shown = _bar if messages().is_terminal else _lines
+    with shown(steps) as report:
+        yield report
 
-        yield told
+
+@contextmanager
+def _bar(steps: Steps) -> Iterator[Callable[[str, int, int], None]]:
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    with Progress(*columns, TimeElapsedColumn(), console=messages(), transient=True) as bar:
+        task = bar.add_task("begin", total=None)
+
+        def report(name: str, done: int, total: int) -> None:
+            steps.report(name, done, total)
+            counted = steps.count or (0, None)
+            if steps.count is None:
+                bar.reset(task, total=None, description=steps.words)
+            bar.update(task, description=steps.words, completed=counted[0], total=counted[1])
+
+        yield report
+
+
+@contextmanager
+def _lines(steps: Steps) -> Iterator[Callable[[str, int, int], None]]:
+    begun, over = time.monotonic(), Event()
+
+    def say() -> None:
+        last = ""
+        while not over.wait(PAUSE_S):
+            if steps.line != last:
+                last = steps.line
+                messages().print(f"{last} ({time.monotonic() - begun:.0f} s)", markup=False)
+
+    teller = Thread(target=say, daemon=True)
+    teller.start()
+    try:
+        yield steps.report
+    finally:
+        over.set()
+        teller.join()
