@@ -64,6 +64,7 @@ def test_sections_have_types_and_none_where_nothing_was_computed():
     ("place", "value", "words"),
     [
         (("joints", 2, "tau_s"), "x", r"thermal\.joints\[2\]\.tau_s is 'x'; a number is needed"),
+        (("joints", 2, "tau_s"), True, r"thermal\.joints\[2\]\.tau_s is True; a number is needed"),
         (("joints", 2, "tau_s"), None, r"thermal\.joints\[2\]\.tau_s is None; a number"),
         (("covariance",), [[1.0], [2.0, 3.0]], r"thermal\.covariance is \[\[1.0\].*n x n numbers"),
         (("rises_k", 1), "1", r"thermal\.rises_k\[1\] is '1'; a number is needed"),
