@@ -18,8 +18,8 @@ from visioncal.calibration.verification import (
     facts_of,
     load_policy,
     outcomes,
-    sentences,
     to_document,
+    verdict_of,
 )
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.calibration.verification.check import check
@@ -84,7 +84,7 @@ def test_a_bumped_camera_is_told_with_its_size_and_direction(place):
     assert error @ np.linalg.solve(covariance, error) < 22.5
     told = to_document(found, ())["changes"][0]
     assert told["moved_mm"] == pytest.approx(1.0, abs=4 * told["sigma_mm"])
-    assert "The camera moved by" in sentences(found)[0]
+    assert "The camera moved by" in verdict_of(found).reasons[0]
 
 
 def test_a_turned_camera_a_moved_board_and_a_slip_are_told_apart(place):
@@ -95,7 +95,7 @@ def test_a_turned_camera_a_moved_board_and_a_slip_are_told_apart(place):
     assert names(found) == ["joint 3"]
     told = to_document(found, ())["changes"][0]
     assert told["offset_deg"] == pytest.approx(-0.05, abs=4 * told["sigma_deg"])
-    assert "Joint 3 (elbow_joint) off by -0.0" in sentences(found)[0]
+    assert "Joint 3 (elbow_joint) off by -0.0" in verdict_of(found).reasons[0]
 
 
 def test_what_no_stops_can_tell_apart_is_named_together(place):
@@ -106,7 +106,7 @@ def test_what_no_stops_can_tell_apart_is_named_together(place):
     # A slip of the first joint turns all that stands in the base; of the last, what is carried.
     first = checked(place, rng, slip(1, 0.05))
     assert set(names(first)) == {"joint 1", stands}
-    assert "No stops can tell that from" in sentences(first)[1]
+    assert "No stops can tell that from" in verdict_of(first).reasons[1]
     assert set(names(checked(place, rng, slip(6, 0.05)))) == {"joint 6", carried}
 
 
@@ -144,7 +144,7 @@ def test_two_changes_more_noise_and_a_wrong_view_are_told(place):
         seen_by(known_of(replace(cell, joints=wrong)), prior_calibration), prior_calibration
     )
     assert names(found) == ["view 2"]
-    assert "View 2 alone contradicts" in sentences(found)[0]
+    assert "View 2 alone contradicts" in verdict_of(found).reasons[0]
 
 
 def test_the_page_shows_what_is_left_with_the_change_undone(place):
@@ -158,16 +158,16 @@ def test_the_page_shows_what_is_left_with_the_change_undone(place):
         load_policy(),
         facts_of(found.seen.known.session, place.calibration, failed=True, collision=True),
     )
-    page = Page(render_check(page_of(found, policy)))
+    page = Page(render_check(page_of(found, policy, verdict_of(found))))
     assert "does not hold any more" in page.words
     assert "with the likeliest change undone: the camera moved by" in page.words
     assert [f"{1e3 * it:.3f}" in page.words for it in (*before, *after)] == [True] * 10
     assert "now a collision" in page.words
     passed = checked(place, np.random.default_rng(0))
     assert (passed.left == passed.away).all()
-    assert "undone" not in Page(render_check(page_of(passed, ()))).words
+    assert "undone" not in Page(render_check(page_of(passed, (), verdict_of(passed)))).words
     more = checked(place, np.random.default_rng(6), Change(noise_factor=8.0))
-    assert "undone" not in Page(render_check(page_of(more, ()))).words
+    assert "undone" not in Page(render_check(page_of(more, (), verdict_of(more)))).words
 
 
 def test_two_slips_are_more_than_one_change_explains():
@@ -232,7 +232,11 @@ def test_one_of_two_boards_that_moved_is_named():
     found = check(replace(moved, problem=pushed), prior_calibration)
     assert names(found) == [f"board {tuple(prior_calibration.targets)[1]}"]
     axes = prior_calibration.state.edges[1 + prior_calibration.boards.index(1), :3, :3]
-    assert sentences(found)[0].endswith(f"along the base's {_signed_axis(axes[:, 1])}.")
+    assert (
+        verdict_of(found)
+        .findings[0]
+        .words.endswith(f"along the base's {_signed_axis(axes[:, 1])}.")
+    )
     with pytest.raises(DataError, match="several boards") as refused:
         check(moved, prior_calibration, board_placed_anew=True)
     assert "the one that moved is named" in refused.value.next_step

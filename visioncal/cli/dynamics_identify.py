@@ -27,7 +27,6 @@ from visioncal.dynamics.identify import SLOW_RAD_S, Options
 from visioncal.dynamics.judge import judge
 from visioncal.dynamics.run import Request, identify_session
 from visioncal.interchange.outputs import write_dynamics
-from visioncal.results import Verdict
 from visioncal.session import Session
 
 _FRICTION = ("coulomb", "viscous", "offset")
@@ -113,10 +112,8 @@ def _terms(words: str) -> FrictionTerms:
 
 
 def _tell(identified: Identified) -> None:
-    console, judged = messages(), judge(identified)
-    print_verdict(
-        Verdict.of(judged.status, *judged.reasons), f"dynamics of {identified.robot.name}"
-    )
+    console = messages()
+    print_verdict(judge(identified), f"dynamics of {identified.robot.name}")
     for stream in identified.streams:
         left = f", {stream.left_out} torques left out" if stream.left_out else ""
         console.print(

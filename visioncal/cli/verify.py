@@ -14,14 +14,16 @@ from visioncal.calibration.verification import (
     facts_of,
     load_policy,
     outcomes,
-    sentences,
     to_document,
+    verdict_of,
     verify,
 )
 from visioncal.cli.choosing import CameraName, RobotName, TargetName
 from visioncal.cli.console import messages, tell_written
 from visioncal.cli.progress import shown_progress
+from visioncal.cli.summary import print_steps
 from visioncal.core.errors import DataError
+from visioncal.core.verdict import Verdict
 from visioncal.interchange.outputs import REPORT, VERIFY, Written, refuse_calibration, write_check
 from visioncal.interchange.result_files import load_result
 from visioncal.results import picked
@@ -83,22 +85,26 @@ def verify_command(
         check = verify(loaded, calibration, board_placed_anew=board_moved, progress=progress)
     facts = facts_of(loaded, calibration, failed=not check.passed, collision=collision)
     fired = outcomes(triggers, facts)
-    document = json.dumps(to_document(check, fired), indent=2, allow_nan=False) + "\n"
-    written = Written(()) if output is None else write_check(output, check, fired, document)
+    verdict = verdict_of(check).with_paths(session, against)
+    document = json.dumps(to_document(check, fired, verdict), indent=2, allow_nan=False) + "\n"
+    written = (
+        Written(()) if output is None else write_check(output, check, fired, verdict, document)
+    )
     if as_json:
         typer.echo(document, nl=False)
     else:
-        _tell(check, fired)
+        _tell(check, fired, verdict)
     tell_written(written, quiet=True, status=0 if check.passed else _EXIT_FAILED)
 
 
-def _tell(check: Check, triggers: Sequence[Outcome]) -> None:
+def _tell(check: Check, triggers: Sequence[Outcome], verdict: Verdict) -> None:
     console = messages()
     word, colour = ("pass", "green") if check.passed else ("fail", "red")
     name = escape(check.seen.known.session.name)
     console.print(f"[bold {colour}]{word}[/]  {name} against {escape(_named(check))}")
-    for sentence in (*sentences(check), *check.seen.warnings):
-        console.print(f"  - {escape(sentence)}")
+    for line in (*verdict.top, *verdict.rest, *check.seen.warnings):
+        console.print(f"  - {escape(line)}")
+    print_steps(verdict.next_steps)
     for view, reason in sorted(check.seen.known.reasons.items()):
         console.print(f"  view {view} was not used: {escape(reason)}")
     for state, begin in _TRIGGERED.items():

@@ -32,7 +32,7 @@ SOURCES = ("calibration", "robot_noise", "robot_noise_of_pick")
 # Commands of steps.
 CALIBRATE, PLAN = "visioncal calibrate SESSION -o OUT", "visioncal plan SESSION --add 5"
 GUESS = "visioncal convert SESSION FIXED --guess --yes"
-REVIEW = "visioncal review OUT"
+REVIEW, VERIFY = "visioncal review OUT", "visioncal verify SESSION --against OUT"
 _PATH = re.compile(r"\b(SESSION|FIXED|OUT)\b")
 
 

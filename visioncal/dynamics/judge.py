@@ -1,18 +1,15 @@
 """Whether identified dynamics can be trusted, in sentences with their figures."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Literal, TypeAlias
 
 import numpy as np
 
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray, Mask
+from visioncal.core.verdict import NOTE, Finding, Step, Verdict, VerdictStatus
 from visioncal.dynamics.base import random_motion
 from visioncal.dynamics.identified import NOT_TOLD, Identified, Validation
-
-Status: TypeAlias = Literal["good", "check", "bad"]
 
 # Other torques may be predicted so many times worse than those that were fitted, and bodies so many
 # times worse than base parameters.
@@ -25,47 +22,47 @@ _POOR, _USELESS = 0.2, 0.6
 _STRANGE = 0.5
 # So many of the base parameters may be noise: those of the wrist weigh little.
 _UNTOLD = 0.5
-_PLAN = "Record the motion that visioncal dynamics plan writes, and fit it together with this one."
+_PLAN = Step("Record the motion that visioncal dynamics plan writes, and fit it with this one.")
 
 
-@dataclass(frozen=True)
-class Judged:
-    """Whether to trust a result: a status and the reasons in plain sentences."""
-
-    status: Status
-    reasons: tuple[str, ...]
-
-
-def judge(identified: Identified) -> Judged:
-    """Judges a result by what it predicts, and by what the motion told."""
+def judge(identified: Identified) -> Verdict:
+    """Judges a result by what it predicts, and by what the motion determined."""
     found = [
         *_of_prediction(identified),
         *_of_range(identified),
         *_of_parameters(identified),
     ]
     statuses = {status for status, _ in found}
-    worst: Status = "bad" if "bad" in statuses else "check" if "check" in statuses else "good"
-    return Judged(worst, tuple(words for _, words in found))
+    worst: VerdictStatus = (
+        "bad" if "bad" in statuses else "check" if "check" in statuses else "good"
+    )
+    return Verdict(worst, tuple(it for _, it in found))
 
 
-def _of_prediction(identified: Identified) -> Iterator[tuple[Status, str]]:
+def _of_prediction(identified: Identified) -> Iterator[tuple[VerdictStatus, Finding]]:
     validation = identified.validation
     if validation is None:
         yield (
             "check",
-            "Nothing was left to predict: the torques that were fitted are no proof. Record a "
-            "second motion, and name it with --validate-on.",
+            Finding(
+                "unchecked",
+                "Nothing was left to predict: the torques that were fitted are no proof.",
+                Step("Record a second motion, and name it with --validate-on."),
+            ),
         )
         return
     shares = validation.shares
     worst = int(np.argmax(shares))
-    status: Status = "good"
+    status: VerdictStatus = "good"
     if shares[worst] > _POOR:
         status = "bad" if shares.min() > _USELESS else "check"
     yield (
         status,
-        f"The torques of {validation.label} are predicted to {_percents(shares)} of their range "
-        f"(joints 1 to {len(shares)}).",
+        Finding(
+            "prediction",
+            f"The torques of {validation.label} are predicted to {_percents(shares)} of their "
+            f"range (joints 1 to {len(shares)}).",
+        ),
     )
     fitted = identified.fitted_rms_nm
     surprised = validation.rms_nm > _WORSE * np.maximum(fitted, validation.noise_nm)
@@ -73,50 +70,72 @@ def _of_prediction(identified: Identified) -> Iterator[tuple[Status, str]]:
     if surprised.any():
         yield (
             "check",
-            f"{_joints(surprised)}: torques are predicted "
-            f"{figure(float((validation.rms_nm / fitted)[surprised].max()))} times worse than they "
-            f"were fitted: the motion told too little, or something changed. {_PLAN}",
+            Finding(
+                "optimism",
+                f"{_joints(surprised)}: torques are predicted "
+                f"{figure(float((validation.rms_nm / fitted)[surprised].max()))} times worse than "
+                "they were fitted: the motion says too little, or something changed.",
+                _PLAN,
+            ),
         )
     yield from _of_known(identified, validation)
 
 
-def _of_known(identified: Identified, validation: Validation) -> Iterator[tuple[Status, str]]:
+def _of_known(
+    identified: Identified, validation: Validation
+) -> Iterator[tuple[VerdictStatus, Finding]]:
     known, bodies = validation.known_rms_nm, validation.consistent_rms_nm
     if known is not None:
         lost = validation.rms_nm > known
         if lost.any():
             yield (
                 "check",
-                f"{_joints(lost)}: the inertias that {identified.robot.name} comes with predict "
-                f"torques better than the identified ones. {_PLAN}",
+                Finding(
+                    "worse_than_known",
+                    f"{_joints(lost)}: the inertias that {identified.robot.name} comes with "
+                    "predict torques better than the identified ones.",
+                    _PLAN,
+                ),
             )
         else:
             times = float(np.median(known / np.maximum(validation.rms_nm, 1e-12)))
             yield (
                 "good",
-                f"That is {figure(times)} times nearer than by the inertias that "
-                f"{identified.robot.name} comes with, in the median of the joints.",
+                Finding(
+                    NOTE,
+                    f"That is {figure(times)} times nearer than by the inertias that "
+                    f"{identified.robot.name} comes with, in the median of the joints.",
+                ),
             )
         strange = known > _STRANGE * validation.torque_nm
         if strange.any():
             yield (
                 "check",
-                f"{_joints(strange)}: by the inertias that {identified.robot.name} comes with, "
-                f"{figure(100.0 * float((known / validation.torque_nm).max()))} % of the torques' "
-                "range stays unexplained. Is it the robot that was recorded, does it stand upright "
-                "([robot] gravity_m_s2), and what is on its flange?",
+                Finding(
+                    "other_robot",
+                    f"{_joints(strange)}: by the inertias that {identified.robot.name} comes with, "
+                    f"{figure(100.0 * float((known / validation.torque_nm).max()))} % of the "
+                    "torques' range stays unexplained.",
+                    Step(
+                        "Check whether it is the robot that was recorded, whether it stands "
+                        "upright ([robot] gravity_m_s2), and what is on its flange."
+                    ),
+                ),
             )
     if bodies is not None:
         worse = bodies > _BODIES_WORSE * validation.rms_nm
         if worse.any():
             yield (
                 "check",
-                f"{_joints(worse)}: no bodies near the known ones explain the torques as well; "
-                "friction may be of another kind, or a load is on the flange.",
+                Finding(
+                    "bodies",
+                    f"{_joints(worse)}: no bodies near the known ones explain the torques as "
+                    "well; friction may be of another kind, or a load is on the flange.",
+                ),
             )
 
 
-def _of_range(identified: Identified) -> Iterator[tuple[Status, str]]:
+def _of_range(identified: Identified) -> Iterator[tuple[VerdictStatus, Finding]]:
     """Whether the motion told what fast motions all around take."""
     base = identified.base
     motion = random_motion(base.model, np.random.default_rng(0))
@@ -127,21 +146,29 @@ def _of_range(identified: Identified) -> Iterator[tuple[Status, str]]:
     if share.max() > _POOR:
         yield (
             "check",
-            f"{_joints(share > _POOR)}: what fast motions take (up to "
-            f"{np.abs(motion.dq).max():.0f} rad/s and {np.abs(motion.ddq).max():.0f} rad/s^2) is "
-            f"told to {figure(100.0 * float(share.max()))} % only: this motion was too slow, too "
-            f"small or too short. {_PLAN}",
+            Finding(
+                "weak_motion",
+                f"{_joints(share > _POOR)}: what fast motions take (up to "
+                f"{np.abs(motion.dq).max():.0f} rad/s and {np.abs(motion.ddq).max():.0f} rad/s^2) "
+                f"is known to {figure(100.0 * float(share.max()))} % only: this motion was too "
+                "slow, too small or too short.",
+                _PLAN,
+            ),
         )
 
 
-def _of_parameters(identified: Identified) -> Iterator[tuple[Status, str]]:
+def _of_parameters(identified: Identified) -> Iterator[tuple[VerdictStatus, Finding]]:
     told = np.array([it == NOT_TOLD for it in identified.determined])
     if told.mean() > _UNTOLD:
         names = [it for it, lost in zip(identified.base.names, told, strict=True) if lost]
         yield (
             "check",
-            f"{told.sum()} of {len(told)} base parameters are not told by this motion, among them "
-            f"{some_of(names, 3)}. {_PLAN}",
+            Finding(
+                "undetermined",
+                f"{told.sum()} of {len(told)} base parameters are not determined by this motion, "
+                f"among them {some_of(names, 3)}.",
+                _PLAN,
+            ),
         )
 
 

@@ -2,6 +2,7 @@
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
+from visioncal.core.verdict import Finding
 from visioncal.estimation.features import FEATURE_KINDS
 from visioncal.frames.drawing_points import NominalPoints
 from visioncal.frames.fixture_fit import FixtureOptions, Setting
@@ -9,7 +10,6 @@ from visioncal.frames.fixture_from_drawing import drawn_fixture
 from visioncal.frames.fixture_from_features import featured_fixture
 from visioncal.frames.measured import Tool, touched_points
 from visioncal.frames.touches import TouchRows, robot_noise
-from visioncal.frames.verdicts import Doubt
 from visioncal.results import Calibration, Frame
 from visioncal.robot import Robot
 
@@ -74,14 +74,15 @@ def _check_named(rows: TouchRows) -> None:
         )
 
 
-def _doubts(tool: Tool | None) -> list[Doubt]:
+def _doubts(tool: Tool | None) -> list[Finding]:
     if tool is None or tool.verdict.status == "good":
         return []
     return [
-        Doubt(
+        Finding(
+            "tool",
             f"The tool, {tool.name}, is in doubt itself ({tool.verdict.status}): "
             f"{tool.verdict.reasons[0] if tool.verdict.reasons else 'no reason is kept.'}",
-            tool.verdict.status == "bad",
+            is_fatal=tool.verdict.status == "bad",
         )
     ]
 

@@ -9,20 +9,13 @@ import numpy as np
 
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray, Mask
+from visioncal.core.verdict import AGREEMENT, Finding, Verdict
 from visioncal.estimation.group_outliers import Agreement
 from visioncal.estimation.groups import State
 from visioncal.estimation.observability import Direction
 from visioncal.estimation.placing import worst_of
 from visioncal.frames.measured import MeasuredPoints
-from visioncal.frames.verdicts import (
-    Doubt,
-    disputed,
-    noisy,
-    off_words,
-    placed_name,
-    verdict_of,
-    weak_directions,
-)
+from visioncal.frames.verdicts import disputed, noisy, off_words, placed_name, weak_directions
 from visioncal.results import Edge, Frame, Observation
 
 
@@ -81,7 +74,7 @@ class Setting:
     """
 
     touch_noise_m: float | None = None
-    doubts: tuple[Doubt, ...] = ()
+    doubts: tuple[Finding, ...] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
     options: FixtureOptions = field(default_factory=FixtureOptions)
     words: Words = field(default_factory=Words)
@@ -162,7 +155,7 @@ def fixture_frame(
     fitted: Fitted,
     kinds: Sequence[str],
     method: str,
-    more: Sequence[Doubt],
+    more: Sequence[Finding],
     details: Mapping[str, Any],
     setting: Setting,
 ) -> Frame:
@@ -189,7 +182,7 @@ def fixture_frame(
         1e3 * float(np.sqrt(np.mean(used**2))),
         1e3 * fitted.noise_m,
         _observations(fitted, kinds),
-        verdict_of(doubts, fitted.praise(setting.words.things)),
+        Verdict.by(doubts, Finding(AGREEMENT, fitted.praise(setting.words.things))),
         {
             **({"noise_95_mm": noise_95} if np.isfinite(noise_95).all() else {}),
             "worst": {
@@ -217,7 +210,7 @@ def _observations(fitted: Fitted, kinds: Sequence[str]) -> tuple[Observation, ..
     )
 
 
-def _doubts(fitted: Fitted, setting: Setting) -> list[Doubt]:
+def _doubts(fitted: Fitted, setting: Setting) -> list[Finding]:
     names = [
         placed_name(name, place)
         for name, place in zip(fitted.names, fitted.measured.places, strict=True)

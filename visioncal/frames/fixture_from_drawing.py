@@ -7,12 +7,12 @@ import numpy as np
 
 from visioncal.core.number_format import figure
 from visioncal.core.types import Mask
+from visioncal.core.verdict import Finding, Step
 from visioncal.estimation.pointfit import PointFit, fit_points
 from visioncal.estimation.pointpairs import PointPairs
 from visioncal.frames.drawing_points import NominalPoints
 from visioncal.frames.fixture_fit import Fitted, Setting, fixture_frame, reasons_of
 from visioncal.frames.measured import MeasuredPoints
-from visioncal.frames.verdicts import Doubt
 from visioncal.results import Frame
 
 # A warm part or a long arm is off by less than this; a drawing of another issue by more.
@@ -95,22 +95,28 @@ def _causes(fit: PointFit, pairs: PointPairs) -> list[str]:
     return [causes[it] for it in pairs.labels]
 
 
-def _doubts(fit: PointFit, fitted: Fitted, pairs: PointPairs, setting: Setting) -> Iterator[Doubt]:
+def _doubts(
+    fit: PointFit, fitted: Fitted, pairs: PointPairs, setting: Setting
+) -> Iterator[Finding]:
     yield from _scaled(fit, pairs)
     if not fit.hand_known:
         yield from _mirrored(fitted, pairs, setting.words.side)
     if not fit.numbering.is_unique:
-        yield Doubt(
+        yield Finding(
+            "symmetric",
             f"The pattern of the points is symmetric: they fit the drawing in "
-            f"{fit.numbering.equally_good} orders alike, and exchanged names would not be noticed. "
-            f"Check that {pairs.labels[0]} is where the drawing has it, or measure one more point "
-            "that breaks the symmetry."
+            f"{fit.numbering.equally_good} orders alike, and exchanged names would not be noticed.",
+            Step(
+                f"Check that {pairs.labels[0]} is where the drawing has it, or measure one more "
+                "point that breaks the symmetry."
+            ),
         )
     used = len(_names_used(pairs, fitted.agrees))
     if used < setting.options.points:
-        yield Doubt(
+        yield Finding(
+            "few_points",
             f"Only {used} points are used: with {setting.options.points} or more a wrong one can "
-            "be told."
+            "be told.",
         )
 
 
@@ -118,7 +124,7 @@ def _names_used(pairs: PointPairs, agrees: Mask) -> set[str]:
     return {name for name, ok in zip(pairs.labels, agrees.tolist(), strict=True) if ok}
 
 
-def _scaled(fit: PointFit, pairs: PointPairs) -> Iterator[Doubt]:
+def _scaled(fit: PointFit, pairs: PointPairs) -> Iterator[Finding]:
     """Doubts a part that is not as large as drawn; the frame does not take that in."""
     if not fit.scale.differs:
         return
@@ -130,15 +136,16 @@ def _scaled(fit: PointFit, pairs: PointPairs) -> Iterator[Doubt]:
         if off < _WARM
         else "is it the drawing of this part, in this issue and at full scale?"
     )
-    yield Doubt(
+    yield Finding(
+        "scale",
         f"The part is {fit.scale.value:.5f} times as large as drawn (sigma {fit.scale.sigma:.5f}), "
         f"{figure(1e3 * off * reach)} mm over its {figure(1e3 * reach)} mm, which the frame does "
         f"not take in: {cause}",
-        off > _WARM * 10,
+        is_fatal=off > _WARM * 10,
     )
 
 
-def _mirrored(fitted: Fitted, pairs: PointPairs, seen_from: str) -> Iterator[Doubt]:
+def _mirrored(fitted: Fitted, pairs: PointPairs, seen_from: str) -> Iterator[Finding]:
     """Doubts points in a plane, unless the side that they were touched from tells their hand."""
     drawn = pairs.nominal[fitted.agrees]
     normal = np.linalg.svd(drawn - drawn.mean(axis=0))[2][2]
@@ -147,16 +154,18 @@ def _mirrored(fitted: Fitted, pairs: PointPairs, seen_from: str) -> Iterator[Dou
     if side > _ASIDE:
         return
     if side < -_ASIDE:
-        yield Doubt(
+        yield Finding(
+            "mirrored",
             "The points lie in one plane, and the fixture's z axis points away from the side that "
-            f"{seen_from}: a mirrored drawing looks like this. Check that z of the drawing points "
-            "into the part."
+            f"{seen_from}: a mirrored drawing looks like this.",
+            Step("Check that z of the drawing points into the part."),
         )
         return
-    yield Doubt(
+    yield Finding(
+        "mirrored",
         "The points lie in one plane, and a mirrored drawing would fit them as well, turned to the "
-        "other side. Check to which side the fixture's axes point, or measure a point beside "
-        "the plane."
+        "other side.",
+        Step("Check to which side the fixture's axes point, or measure a point beside the plane."),
     )
 
 

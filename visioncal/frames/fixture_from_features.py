@@ -6,6 +6,7 @@ from typing import cast
 import numpy as np
 
 from visioncal.core.types import Mask
+from visioncal.core.verdict import Finding, Step
 from visioncal.estimation.features import (
     FEATURE_KINDS,
     FeatureFit,
@@ -16,7 +17,6 @@ from visioncal.estimation.features import (
 from visioncal.estimation.placing import TOUCH_NOISE_M
 from visioncal.frames.fixture_fit import Fitted, Setting, fixture_frame, reasons_of
 from visioncal.frames.measured import MeasuredPoints
-from visioncal.frames.verdicts import Doubt
 from visioncal.results import Frame
 
 # Touches of each feature twice leave so many numbers to spare. Fewer agree too well by chance to
@@ -82,7 +82,7 @@ def _fitted(fit: FeatureFit, measured: MeasuredPoints, setting: Setting) -> Fitt
     )
 
 
-def _doubts(fitted: Fitted, kinds: Sequence[str], setting: Setting) -> Iterator[Doubt]:
+def _doubts(fitted: Fitted, kinds: Sequence[str], setting: Setting) -> Iterator[Finding]:
     once = [_THINGS[kind] for kind in FEATURE_KINDS if _count(kinds, kind, fitted.agrees) == 1]
     assumed = (
         f" Its sigma is that of touches that repeat to {1e3 * TOUCH_NOISE_M:g} mm, which is "
@@ -91,15 +91,18 @@ def _doubts(fitted: Fitted, kinds: Sequence[str], setting: Setting) -> Iterator[
         else ""
     )
     if len(once) == len(FEATURE_KINDS):
-        yield Doubt(
-            "Three touches leave nothing to check the fixture with. Touch each feature once more, "
-            f"elsewhere.{assumed}"
+        yield Finding(
+            "unchecked",
+            f"Three touches leave nothing to check the fixture with.{assumed}",
+            Step("Touch each feature once more, elsewhere."),
         )
     elif once:
         verb = "was" if len(once) == 1 else "were"
-        yield Doubt(
-            f"{' and '.join(once).capitalize()} {verb} touched once only, which nothing checks. "
-            f"Touch again, elsewhere.{assumed}"
+        yield Finding(
+            "unchecked",
+            f"{' and '.join(once).capitalize()} {verb} touched once only, which nothing checks."
+            f"{assumed}",
+            Step("Touch again, elsewhere."),
         )
 
 

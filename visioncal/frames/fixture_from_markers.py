@@ -1,6 +1,7 @@
 """A fixture from markers on it, whose places a drawing has."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,7 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.types import Corners, FloatArray, Target
+from visioncal.core.verdict import remarks
 from visioncal.estimation.pointpairs import FEWEST_POINTS
 from visioncal.frames.camera_chain import Eye
 from visioncal.frames.drawing_points import NominalPoints
@@ -18,7 +20,6 @@ from visioncal.frames.marker_points import SeenPoints, seen_markers
 from visioncal.frames.measured import MeasuredPoints
 from visioncal.frames.session_observations import Sighting, for_fits, pictured
 from visioncal.frames.single_view import Sight
-from visioncal.frames.verdicts import Doubt
 from visioncal.results import Calibration, Frame
 from visioncal.session import Session
 from visioncal.vision.finders.marker import marker_ids
@@ -90,9 +91,9 @@ def marked_fixture(
     )
     trusted = Eye.of(calibration).warnings
     doubts = (
-        *(Doubt(it, is_fatal=it in trusted) for it in found.warnings),
+        *(replace(it, is_fatal=it.words in trusted) for it in remarks(found.warnings)),
         *view_doubts(session, shown.lost),
-        *map(Doubt, shown.warnings),
+        *remarks(shown.warnings),
     )
     setting = Setting(
         doubts=doubts,

@@ -1,7 +1,7 @@
 """A tool or a fixture from a session's images: the frame, the words for it, whether to trust it."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Any
 
@@ -11,6 +11,7 @@ from visioncal.calibration.stages.observed import by_reason
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray, Progress
+from visioncal.core.verdict import AGREEMENT, Finding, Verdict, remarks
 from visioncal.estimation.observability import Direction
 from visioncal.estimation.placing import worst_of
 from visioncal.frames.camera_chain import Eye, checked_point
@@ -26,7 +27,7 @@ from visioncal.frames.session_observations import (
 from visioncal.frames.single_view import Sight, needs_robot
 from visioncal.frames.target_in_image import SeenTarget, see
 from visioncal.frames.target_pose import Seen, place_looks
-from visioncal.frames.verdicts import Doubt, verdict_of, weak_directions
+from visioncal.frames.verdicts import weak_directions
 from visioncal.results import HELD_BACK, Calibration, Frame, Observation, picked
 from visioncal.session import Session, View
 from visioncal.session.choosing import EYE, Choice
@@ -130,10 +131,10 @@ def seen_frame(
     placed = _Placed(kind, shown, seen, worst, views, lost)
     _check_still(eye, placed, sights, looks)
     doubts = [
-        *(Doubt(it, is_fatal=it in eye.warnings) for it in seen.warnings),
+        *(replace(it, is_fatal=it.words in eye.warnings) for it in remarks(seen.warnings)),
         *weak_directions(worst, options.sigma_mm, options.sigma_deg, _advice(seen)),
         *view_doubts(session, lost),
-        *map(Doubt, shown.warnings),
+        *remarks(shown.warnings),
     ]
     return Frame(
         seen.edge,
@@ -144,7 +145,7 @@ def seen_frame(
         seen.rms_mm,
         _noise_mm(seen),
         tuple(_observations(session, placed)),
-        verdict_of(doubts, _praise(placed)),
+        Verdict.by(doubts, Finding(AGREEMENT, _praise(placed))),
         _details(placed, point, calibration),
     )
 
@@ -202,13 +203,15 @@ def _advice(seen: Seen) -> str:
     )
 
 
-def view_doubts(session: Session, lost: Mapping[int, str]) -> Iterator[Doubt]:
+def view_doubts(session: Session, lost: Mapping[int, str]) -> Iterator[Finding]:
     """Doubts a session many of whose views were not used."""
     missing = {view: why for view, why in lost.items() if why != HELD_BACK}
     if len(missing) > _LOST_SHARE * len(session.views):
-        yield Doubt(
+        yield Finding(
+            "lost_views",
             f"{len(missing)} of {len(session.views)} views were not used: "
-            f"{'; '.join(by_reason(missing)[:_LISTED])}."
+            f"{'; '.join(by_reason(missing)[:_LISTED])}.",
+            views=tuple(missing),
         )
 
 

@@ -11,6 +11,7 @@ from visioncal.core.errors import DataError, DegenerateError, VisioncalError
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray
+from visioncal.core.verdict import AGREEMENT, Finding, Step, Verdict
 from visioncal.estimation.pivot import PivotFit, fit_pivot
 from visioncal.estimation.readings import readings_that_close
 from visioncal.estimation.touching import Touches, TouchKind
@@ -22,15 +23,7 @@ from visioncal.frames.touches import (
     refuse_copies,
     robot_noise,
 )
-from visioncal.frames.verdicts import (
-    Doubt,
-    disputed,
-    noisy,
-    off_words,
-    placed_name,
-    verdict_of,
-    weak_directions,
-)
+from visioncal.frames.verdicts import disputed, noisy, off_words, placed_name, weak_directions
 from visioncal.results import Calibration, Edge, Frame, Observation
 from visioncal.robot import Robot
 
@@ -98,7 +91,7 @@ def touched_tool(
         1e3 * fit.rms_m,
         1e3 * fit.sigma_m,
         tuple(_observations(fit, touches)),
-        verdict_of(doubts, _praise(fit, touches)),
+        Verdict.by(doubts, Finding(AGREEMENT, _praise(fit, touches))),
         _details(fit, touches),
     )
 
@@ -174,7 +167,7 @@ def _wrong(fit: PivotFit, touches: Touches, at: int) -> str:
 
 def _doubts(
     fit: PivotFit, touches: Touches, places: Sequence[str], options: TcpOptions
-) -> Iterator[Doubt]:
+) -> Iterator[Finding]:
     rows = range(len(touches))
     yield from disputed(
         [placed_name(f"Touch {touches.labels[it]}", places[it]) for it in rows],
@@ -192,10 +185,11 @@ def _doubts(
         explained=fit.explained,
     )
     if fit.looks_inverse:
-        yield Doubt(
+        yield Finding(
+            "inverse_poses",
             "The tip would be farther from the flange than the point from the base: poses read the "
-            "other way round look like this. If the columns hold flange_from_base, say "
-            "--robot-inverse."
+            "other way round look like this.",
+            Step("If the columns hold flange_from_base, say --robot-inverse."),
         )
     yield from weak_directions(
         fit.worst,
@@ -205,9 +199,11 @@ def _doubts(
     )
     used = int(np.sum(fit.agrees & touches.are("point")))
     if used < options.touches:
-        yield Doubt(
+        yield Finding(
+            "few_touches",
             f"Only {used} touches of a point are used: {options.touches} or more give the result "
-            "something to be checked with."
+            "something to be checked with.",
+            Step("Touch the point from more directions."),
         )
 
 

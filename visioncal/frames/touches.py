@@ -9,8 +9,8 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean, some_of
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, Mask
+from visioncal.core.verdict import Finding, Step
 from visioncal.estimation.parts import Noise
-from visioncal.frames.verdicts import Doubt
 from visioncal.results import Calibration
 from visioncal.robot import Robot
 from visioncal.session import Session
@@ -150,15 +150,17 @@ def flange_poses(
     return np.where(first[:, None, None], poses, rows.base_from_flange)
 
 
-def nominal_poses(rows: TouchRows, calibration: Calibration | None) -> Iterator[Doubt]:
+def nominal_poses(rows: TouchRows, calibration: Calibration | None) -> Iterator[Finding]:
     """Says where a calibrated arm's touches come with the nominal arm's poses."""
     if calibration is None or not calibration.arm_is_calibrated:
         return
     joints = rows.joints_rad
     if joints is None or not np.isfinite(joints).all():
-        yield Doubt(
+        yield Finding(
+            "nominal_poses",
             "The calibration is of a calibrated arm, but touches come without joint angles: their "
-            "poses are the nominal arm's, off by as much as its errors. Write down q1_rad ... too."
+            "poses are the nominal arm's, off by as much as its errors.",
+            Step("Write down q1_rad ... too."),
         )
 
 

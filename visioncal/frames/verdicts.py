@@ -1,31 +1,14 @@
 """Whether a tool's or a fixture's frame can be trusted, in plain sentences."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
 from visioncal.core.types import Mask
-from visioncal.core.verdict import AGREEMENT, Finding, Verdict
+from visioncal.core.verdict import Finding, Step
 from visioncal.estimation.observability import Direction
-
-
-@dataclass(frozen=True)
-class Doubt:
-    """A reason not to trust a frame, and whether it settles the matter."""
-
-    sentence: str
-    is_fatal: bool = False
-
-
-def verdict_of(doubts: Sequence[Doubt], praise: str) -> Verdict:
-    """Makes a verdict: `bad` with a reason that settles it, `check` with doubts, else `good`."""
-    if not doubts:
-        return Verdict("good", (Finding(AGREEMENT, praise),))
-    findings = [Finding("remark", it.sentence, is_fatal=it.is_fatal) for it in doubts]
-    return Verdict.by(findings, Finding(AGREEMENT, praise))
 
 
 def weak_directions(
@@ -33,7 +16,7 @@ def weak_directions(
     sigma_mm: tuple[float, float],
     sigma_deg: tuple[float, float],
     advice: str,
-) -> Iterator[Doubt]:
+) -> Iterator[Finding]:
     """Doubts the directions that are known worst.
 
     Args:
@@ -46,16 +29,18 @@ def weak_directions(
         scale, unit = (np.rad2deg(1.0), "deg") if it.is_rotation else (1e3, "mm")
         check, bad = sigma_deg if it.is_rotation else sigma_mm
         if it.sigma * scale > check:
-            yield Doubt(
+            yield Finding(
+                "weak_motion",
                 f"{it.words[0].upper()}{it.words[1:]} is known to {figure(it.sigma * scale)} "
-                f"{unit} only (doubt begins at {check:g}). {advice}",
-                it.sigma * scale > bad,
+                f"{unit} only (doubt begins at {check:g}).",
+                Step(advice),
+                is_fatal=it.sigma * scale > bad,
             )
 
 
 def disputed(
     names: Sequence[str], reasons: Sequence[str], agrees: Mask, doubtful: Mask, again: str
-) -> Iterator[Doubt]:
+) -> Iterator[Finding]:
     """Doubts for what was left out, and for what stayed although it contradicts.
 
     Args:
@@ -67,12 +52,11 @@ def disputed(
     """
     for at in np.flatnonzero(~agrees).tolist():
         end = "" if reasons[at].endswith("?") else "."
-        yield Doubt(f"{names[at]} was left out: {reasons[at]}{end}")
+        yield Finding("left_out", f"{names[at]} was left out: {reasons[at]}{end}")
     if doubtful.any():
         some = some_of([names[at] for at in np.flatnonzero(doubtful).tolist()])
-        yield Doubt(
-            f"{some} contradict each other, and nothing tells which is wrong: all are used. {again}"
-        )
+        words = f"{some} contradict each other, and nothing tells which is wrong: all are used."
+        yield Finding("contradicting", words, Step(again))
 
 
 def noisy(
@@ -82,7 +66,7 @@ def noisy(
     *,
     explained: bool,
     things: str = "touches",
-) -> Iterator[Doubt]:
+) -> Iterator[Finding]:
     """Doubts for touches that agree badly, or worse than they are stated to.
 
     Args:
@@ -94,15 +78,19 @@ def noisy(
     """
     check, bad = limits_mm
     if noise_mm > check:
-        yield Doubt(
+        yield Finding(
+            "noise",
             f"The {things} agree to {figure(noise_mm)} mm only (per axis; doubt begins at "
-            f"{check:g}). {cause}",
-            noise_mm > bad,
+            f"{check:g}).",
+            Step(cause),
+            is_fatal=noise_mm > bad,
         )
     elif not explained:
-        yield Doubt(
+        yield Finding(
+            "noise",
             f"The {things} scatter by more than they are stated to, without one that stands out: "
-            f"{figure(noise_mm)} mm per axis. Repeat them, or state the noise as it is."
+            f"{figure(noise_mm)} mm per axis.",
+            Step("Repeat them, or state the noise as it is."),
         )
 
 

@@ -15,6 +15,7 @@ from visioncal.core.output_generations import write_generation
 if TYPE_CHECKING:
     from visioncal.calibration.pipeline import Run as Calibrated
     from visioncal.calibration.verification import Check, Outcome
+    from visioncal.core.verdict import Verdict
     from visioncal.dynamics import Run
     from visioncal.dynamics.planned import MotionPlan
     from visioncal.live.planning.plan import Plan
@@ -97,7 +98,11 @@ def write_outputs(
 
 
 def write_check(
-    folder: Path, check: "Check", triggers: "Sequence[Outcome]", document: str
+    folder: Path,
+    check: "Check",
+    triggers: "Sequence[Outcome]",
+    verdict: "Verdict",
+    document: str,
 ) -> Written:
     """Writes a check's page and JSON into a folder, all at once.
 
@@ -105,6 +110,7 @@ def write_check(
         folder: Where to; it is made where there is none.
         check: The check.
         triggers: What became of the policy's triggers.
+        verdict: What it found.
         document: The content of verify.json.
 
     Returns:
@@ -118,7 +124,7 @@ def write_check(
         from visioncal.present.report.check import write_check as write_page
         from visioncal.present.report.check_page import page_of
 
-        write_page(path, page_of(check, triggers))
+        write_page(path, page_of(check, triggers, verdict))
 
     return _write(folder, {VERIFY: _text(document)}, {REPORT: page})
 

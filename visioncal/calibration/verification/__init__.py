@@ -2,7 +2,7 @@
 
 from visioncal.calibration.verification.check import Check, Suspect, verify
 from visioncal.calibration.verification.document import to_document
-from visioncal.calibration.verification.messages import sentences
+from visioncal.calibration.verification.messages import verdict_of
 from visioncal.calibration.verification.policy import (
     Outcome,
     Trigger,
@@ -19,7 +19,7 @@ __all__ = [
     "facts_of",
     "load_policy",
     "outcomes",
-    "sentences",
     "to_document",
+    "verdict_of",
     "verify",
 ]

@@ -6,17 +6,26 @@ from typing import Any
 import numpy as np
 
 from visioncal.calibration.verification.check import Check, Suspect
-from visioncal.calibration.verification.messages import described, sentences
+from visioncal.calibration.verification.messages import described, verdict_of
 from visioncal.calibration.verification.policy import Outcome
+from visioncal.core.verdict import Verdict
 
 SCHEMA = 1
 # Changes that are less likely than this share are not worth a line.
 _LISTED_SHARE = 1e-3
 
 
-def to_document(check: Check, triggers: Sequence[Outcome]) -> dict[str, Any]:
-    """Writes a check as JSON has it; what is not known is absent."""
-    calibration, known = check.calibration, check.seen.known
+def to_document(
+    check: Check, triggers: Sequence[Outcome], verdict: Verdict | None = None
+) -> dict[str, Any]:
+    """Writes a check as JSON has it; what is not known is absent.
+
+    Args:
+        check: The check.
+        triggers: What became of the policy's triggers.
+        verdict: What it found, with the paths of the run; without them where None.
+    """
+    calibration, known, verdict = check.calibration, check.seen.known, verdict or verdict_of(check)
     return {
         "schema": SCHEMA,
         "passed": check.passed,
@@ -26,7 +35,8 @@ def to_document(check: Check, triggers: Sequence[Outcome]) -> dict[str, Any]:
             "created": calibration.created,
         },
         "session": {"name": known.session.name, "sha256": known.session.digest()},
-        "sentences": list(sentences(check)),
+        "sentences": list(verdict.reasons),
+        "next": [vars(it) for it in verdict.next_steps],
         "changes": [_change(check, it) for it in check.named],
         "others": [_change(check, it) for it in listed_suspects(check) if it not in check.named],
         "explained": check.explained,

@@ -1,6 +1,6 @@
 """What a check found, in plain sentences."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +19,7 @@ from visioncal.calibration.verification.check import FEW_STOPS, Check, Suspect
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import exp, inverse_right_jacobian, skew
 from visioncal.core.types import FloatArray
+from visioncal.core.verdict import AGREEMENT, VERIFY, Finding, Step, Verdict
 from visioncal.estimation.null_space import joint_words, listed
 from visioncal.estimation.observability import axis_words
 from visioncal.vision.targets import corner_positions
@@ -29,17 +30,26 @@ _WORTH_A_WORD = 3.0
 _SURE = 6.0
 _ALUMINIUM, _STEEL = 23e-6, 12e-6
 _NEXT = {
-    CAMERA: "Fasten the camera, and calibrate again.",
-    BOARD: "Put the board back, or, if it was moved on purpose, verify with --board-moved.",
-    BOTH: "Fasten both, and calibrate again.",
-    JOINT: "Look whether the joint keeps its zero (a coupling that slips does so again), then "
-    "calibrate again.",
-    LENGTH: "Let the arm come to the temperature at which it was calibrated, or calibrate it at "
-    "the one at which it works.",
-    NOISE: "Look for play in mounts and joints, and whether the robot stood still at each image; "
-    "then verify again.",
+    CAMERA: Step("Fasten the camera, and calibrate again."),
+    BOARD: Step(
+        "Put the board back; if it was moved on purpose, verify without its place.",
+        f"{VERIFY} --board-moved",
+    ),
+    BOTH: Step("Fasten both, and calibrate again."),
+    JOINT: Step(
+        "Look whether the joint keeps its zero (a coupling that slips does so again), then "
+        "calibrate again."
+    ),
+    LENGTH: Step(
+        "Let the arm come to the temperature at which it was calibrated, or calibrate it at the "
+        "one at which it works."
+    ),
+    NOISE: Step(
+        "Look for play in mounts and joints, and whether the robot stood still at each image; "
+        "then verify again."
+    ),
 }
-_WRONG_VIEW = "Take that stop again: its image and its pose do not belong together."
+_WRONG_VIEW = Step("Take that stop again: its image and its pose do not belong together.")
 
 
 @dataclass(frozen=True)
@@ -78,37 +88,37 @@ class Motion:
         return " and ".join(told) or f"moved {shift}"
 
 
-def sentences(check: Check) -> tuple[str, ...]:
+def verdict_of(check: Check) -> Verdict:
     """What the check found: whether the calibration holds, what changed, and what to do."""
+    doubts = tuple(_doubts(check))
     if check.passed:
-        return (_agreement(check), *_doubts(check))
+        found = (Finding(AGREEMENT, _agreement(check)), *doubts)
+        return Verdict("check" if doubts else "good", found)
     best, *others = check.named
-    told = [_changed(check, best)]
+    changed = Finding(
+        kind_of(best.name),
+        _changed(check, best),
+        _NEXT.get(kind_of(best.name), _WRONG_VIEW),
+        probability=best.probability,
+    )
+    told = [changed]
     if others:
         told.append(_rivals(check, best, others))
     if not check.explained:
-        told.append(
-            "Alone it does not explain the stops: something else has changed too. Calibrate again."
-        )
-    return (*told, next_step(best.name), *(_doubts(check) if others else ()))
+        words = "Alone it does not explain the stops: something else has changed too."
+        told.append(Finding("unexplained", words, Step("Calibrate again.")))
+    return Verdict("bad", (*told, *(doubts if others else ())))
 
 
-def _rivals(check: Check, best: Suspect, others: Sequence[Suspect]) -> str:
+def _rivals(check: Check, best: Suspect, others: Sequence[Suspect]) -> Finding:
     """What the likeliest change cannot be told from."""
     named = listed([thing(check, it) for it in others])
     robot = check.calibration.calibrated_robot
     if robot is not None and best.name in (f"{JOINT} 1", f"{JOINT} {robot.joint_count}"):
         # A base that turns about the first axis, or a tool about the last, looks the same anywhere.
-        return f"No stops can tell that from {named}: look at both."
-    return (
-        f"These {_stops(check)} cannot tell that from {named}: verify with stops all over the "
-        "workspace."
-    )
-
-
-def next_step(cause: str) -> str:
-    """What to do about a change."""
-    return _NEXT.get(kind_of(cause), _WRONG_VIEW)
+        return Finding("rivals", f"No stops can tell that from {named}.", Step("Look at both."))
+    words = f"These {_stops(check)} cannot tell that from {named}."
+    return Finding("rivals", words, Step("Verify with stops all over the workspace."))
 
 
 def described(check: Check, suspect: Suspect) -> dict[str, Any]:
@@ -279,12 +289,10 @@ def _agreement(check: Check) -> str:
     )
 
 
-def _doubts(check: Check) -> tuple[str, ...]:
-    if check.seen.stops >= FEW_STOPS:
-        return ()
-    return (
-        f"{_capital(_stops(check))} hardly tell one change from another: take {FEW_STOPS} or more.",
-    )
+def _doubts(check: Check) -> Iterator[Finding]:
+    if check.seen.stops < FEW_STOPS:
+        words = f"{_capital(_stops(check))} hardly tell one change from another."
+        yield Finding("few_stops", words, Step(f"Take {FEW_STOPS} stops or more."))
 
 
 def _stops(check: Check) -> str:

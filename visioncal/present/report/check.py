@@ -11,6 +11,7 @@ from matplotlib.ticker import MaxNLocator
 
 from visioncal.core.files import write_atomically
 from visioncal.core.types import FloatArray
+from visioncal.core.verdict import Verdict
 from visioncal.core.version import __version__
 from visioncal.present.report import svg
 from visioncal.present.report.templating import template
@@ -45,7 +46,7 @@ class CheckPage:
         session: Name of the check's session.
         against: Name and time of the calibration.
         passed: Whether it still holds.
-        sentences: What was found and what to do, the most important first.
+        verdict: What was found and what to do, the most important first.
         changes: What may have changed, the likeliest first.
         undone: What the likeliest change is, where one was found; else empty.
         stops: Names of the m stops, by their views.
@@ -60,7 +61,7 @@ class CheckPage:
     session: str
     against: str
     passed: bool
-    sentences: Sequence[str]
+    verdict: Verdict
     changes: Sequence[ChangeRow]
     undone: str
     stops: Sequence[str]

@@ -7,18 +7,20 @@ import numpy as np
 from visioncal.calibration.verification.causes import NOISE
 from visioncal.calibration.verification.check import Check, Suspect
 from visioncal.calibration.verification.document import listed_suspects
-from visioncal.calibration.verification.messages import sentences, thing
+from visioncal.calibration.verification.messages import thing
 from visioncal.calibration.verification.policy import Outcome
 from visioncal.core.types import FloatArray
+from visioncal.core.verdict import Verdict
 from visioncal.present.report.check import ChangeRow, CheckPage, TriggerRow
 
 
-def page_of(check: Check, triggers: Sequence[Outcome]) -> CheckPage:
+def page_of(check: Check, triggers: Sequence[Outcome], verdict: Verdict) -> CheckPage:
     """Puts together what the page of a check says.
 
     Args:
         check: The check.
         triggers: What became of the policy's triggers.
+        verdict: What it found.
     """
     known, calibration = check.seen.known, check.calibration
     order = {"fired": 0, "unknown": 1, "quiet": 2}
@@ -26,7 +28,7 @@ def page_of(check: Check, triggers: Sequence[Outcome]) -> CheckPage:
         known.session.name,
         f"{calibration.session_name}, {calibration.created}",
         check.passed,
-        sentences(check),
+        verdict,
         [] if check.passed else [_change(check, it) for it in listed_suspects(check)],
         _undone(check),
         [", ".join(map(str, views)) for views in check.seen.views],

@@ -11,7 +11,6 @@ from markupsafe import Markup
 from visioncal.core.files import write_atomically
 from visioncal.core.number_format import matched, significant
 from visioncal.core.types import FloatArray
-from visioncal.core.verdict import Verdict
 from visioncal.core.version import __version__
 from visioncal.dynamics import Identified, Prediction, Run, judge, stribeck_rows
 from visioncal.present.report import content, torqueplots
@@ -83,7 +82,6 @@ def render_dynamics(run: Run) -> str:
     """Renders the report as HTML text; see `write_dynamics_report`."""
     identified = run.identified
     source = identified.facts.get("session", {})
-    judged = judge(identified)
     shown = [] if run.predicted is None else [(run.predicted, "not fitted")]
     shown += [(it, "fitted") for it in run.fitted[:_MOST_FITTED]]
     return template("dynamics.html.j2").render(
@@ -91,8 +89,7 @@ def render_dynamics(run: Run) -> str:
         session=source.get("name", ""),
         sha256=source.get("sha256", ""),
         created=content.readable_time(str(identified.facts.get("created", ""))),
-        judged=judged,
-        headline=Verdict(judged.status).headline,
+        judged=judge(identified),
         key_figures=tuple(_key_figures(identified)),
         notes=tuple(note for it in identified.streams for note in it.notes),
         torques=tuple(_torque_rows(identified)),
