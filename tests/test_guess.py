@@ -1,13 +1,16 @@
 """Which reading of the poses is right: planted mistakes are named, sound poses are not accused."""
 
 import json
+import shlex
 import tracemalloc
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from commands import visioncal as visioncal_command
 from mistakes import MISTAKES, OTHER, guessed, is_named, measured, numbers, seen_in, sound
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -24,6 +27,7 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import compose, exp, invert, nearest_rotation
 from visioncal.core.types import MOUNTS, Corners, Target
 from visioncal.estimation.closed_form import SOLVERS
+from visioncal.results import Calibration
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE
 from visioncal.simulation import CellOptions, simulate
@@ -283,10 +287,22 @@ def test_a_poor_calibration_says_how_the_poses_should_be_read(name):
     assert "visioncal convert SESSION FIXED --guess" in verdict.reasons[0]
 
 
-def test_a_refused_calibration_says_so_too():
-    planted = MISTAKES["board's size in mm"](cell_poses("eye-in-hand"), np.random.default_rng(0))
-    with pytest.raises(DegenerateError, match=r"positions in mm.*--guess"):
-        visioncal.calibrate(pairs_session(planted))
+@pytest.mark.parametrize("name", ["board's size in mm", "two rows exchanged"])
+def test_what_is_advised_runs_as_it_is_printed_and_mends_it(name, tmp_path, monkeypatch):
+    planted = MISTAKES[name](cell_poses("eye-in-hand"), np.random.default_rng(0))
+    monkeypatch.chdir(tmp_path)
+    pairs_session(planted).save(Path("my cell"))
+    done = visioncal_command("calibrate", "my cell", "-o", "out")
+    assert done.status == 0, done.err
+    first = done.err.split("What to do next:")[1].splitlines()[2].strip()
+    assert first == (
+        "visioncal convert 'my cell' 'my cell-fixed' --guess --yes"
+        " && visioncal calibrate 'my cell-fixed' -o out"
+    )
+    for command in first.split(" && "):
+        again = visioncal_command(*shlex.split(command)[1:])
+        assert again.status == 0, again.err
+    assert Calibration.load(Path("out/calibration.json")).verdict.status == "good"
 
 
 def test_a_sound_calibration_is_not_troubled_by_it():
