@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
+from result_schema import faults_below
 
 from visioncal.live.drivers import ur, ur_net, ur_primary, ur_watch
 from visioncal.simulation import CellOptions, simulate, write_session
@@ -37,6 +38,13 @@ def rendered(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("rendered sessions, größer") / "cell"
     options = replace(CellOptions(), views=12, state_intrinsics=False, seed=11)
     return write_session(simulate(options), folder)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def calibrations_are_as_their_schema_says(tmp_path_factory):
+    """Checks the files that tests wrote, when the last of them has run."""
+    yield
+    assert faults_below(tmp_path_factory.getbasetemp()) == []
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from visioncal.core.types import Need
 from visioncal.core.verdict import remarks
 from visioncal.estimation.tolerance_probability import chance_within, radius_within
 from visioncal.results import Calibration, NeedMet, Picker, Rms, to_document
-from visioncal.results.verdicts import need_document, read_need
+from visioncal.results.codec import read, write
 from visioncal.simulation import CellOptions, simulate
 
 
@@ -162,9 +162,8 @@ def test_the_worst_pair_counts_and_is_named() -> None:
     ],
 )
 def test_it_is_kept(met: NeedMet) -> None:
-    document = json.loads(json.dumps(need_document(met)))
-    assert read_need(document) == met
-    assert read_need(need_document(None)) is None
+    document = json.loads(json.dumps(write(NeedMet, met)))
+    assert read(NeedMet, document, "need") == met
 
 
 def test_a_result_tells_what_it_is_good_for() -> None:

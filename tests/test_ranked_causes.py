@@ -1,5 +1,6 @@
 """Causes of doubts: how likely each is, what competes, and what stands on top."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,8 @@ from visioncal.core.types import Need
 from visioncal.core.verdict import CALIBRATE, GUESS, PLAN, Finding, Step, Verdict, with_paths
 from visioncal.estimation.joint import MeasuredScale
 from visioncal.results import Rms
-from visioncal.results.verdicts import read_verdict, verdict_document
+from visioncal.results.codec import read, write
+from visioncal.results.verdicts import VerdictForm
 
 EXCHANGED = Finding(
     "exchanged_views",
@@ -140,7 +142,8 @@ def test_the_cause_its_cost_and_what_to_do_come_first() -> None:
 
 def test_findings_are_kept_and_name_the_session(tmp_path: Path) -> None:
     verdict = judge(changed(SOUND, warnings=(EXCHANGED,), stops=8))
-    assert read_verdict(verdict_document(verdict)) == verdict
+    document = json.loads(json.dumps(write(VerdictForm, VerdictForm.of(verdict))))
+    assert read(VerdictForm, document, "verdict").verdict("verdict") == verdict
     named = verdict.with_paths(tmp_path / "my cell", "out")
     command = f"visioncal calibrate '{tmp_path}/my cell' -o out"
     assert named.next_steps[0].command == command
@@ -158,7 +161,8 @@ def test_verdicts_of_earlier_files_say_the_same() -> None:
         {"cause": "calibration", "probability": 0.4, "sentence": "Much comes from it."},
     ]
     reasons = ["Views disagree.", "It is another. Hold it."]
-    old = read_verdict({"status": "bad", "reasons": reasons, "causes": causes})
+    old = read(VerdictForm, {"status": "bad", "reasons": reasons, "causes": causes}, "verdict")
+    old = old.verdict("verdict")
     assert [it.kind for it in old.causes] == ["lens", "calibration"]
     assert old.top == (
         "Most likely (90 %): It is another. Hold it.",

@@ -5,9 +5,9 @@ from visioncal.results.alignment import Alignment, Moved, Sight, Untied
 from visioncal.results.document import to_document
 from visioncal.results.edge import Edge
 from visioncal.results.frame import Frame, FrameFile, Observation
+from visioncal.results.lens import CameraResult
 from visioncal.results.parts import (
     HELD_BACK,
-    CameraResult,
     NeedMet,
     Picker,
     Rms,

@@ -1,10 +1,10 @@
 """The result of aligning a whole cell: every frame of it, with respect to every other."""
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -17,37 +17,15 @@ from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Verdict
 from visioncal.core.version import __version__
 from visioncal.estimation.tree import Branch, Step, Tree
-from visioncal.results.codec import read, write
-from visioncal.results.edge import Edge, edge_document, read_covariance, read_edge
-from visioncal.results.forms import CAMERA, MOVED, SCHEMA, UNTIED, VERDICT, VIEW, Form, check
-from visioncal.results.frame import Frame, present
-from visioncal.results.lens import camera_document, read_camera
-from visioncal.results.parts import CameraResult, NeedMet, RobotResult
+from visioncal.results.codec import KEPT, read, write
+from visioncal.results.edge import Edge, JointCovariance, StoredEdge
+from visioncal.results.frame import Frame
+from visioncal.results.lens import CameraResult, StoredCamera
+from visioncal.results.parts import SCHEMA, NeedMet, RobotResult, SessionForm, check_schema
 from visioncal.results.sections import CellDetails, CellSections
-from visioncal.results.verdicts import (
-    need_document,
-    read_need,
-    read_verdict,
-    verdict_document,
-)
+from visioncal.results.verdicts import StoredVerdict
 
 FILE = "alignment.json"
-_FORM: Form = {
-    "created": str,
-    "session": {"name": str, "sha256": str},
-    "reference": str,
-    "frames": {"": str},
-    "robots": {"": str},
-    "transforms": {"": {}},
-    "cameras": {"": CAMERA},
-    "noise": {"": {"": float}},
-    "observations": [{"stop": int, "seer": str, "seen": str, **VIEW}],
-    "moved": [MOVED],
-    "untied": [UNTIED],
-    "weakest": str,
-    "verdict": VERDICT,
-    "details": {},
-}
 
 
 @dataclass(frozen=True)
@@ -75,7 +53,7 @@ class Sight:
     seer: str
     seen: str
     used: bool
-    reason: str = ""
+    reason: Annotated[str, KEPT] = ""
     residual_mm: float | None = None
     residual_deg: float | None = None
     corners: int | None = None
@@ -105,7 +83,7 @@ class Moved:
     first_stop: int
     shift_mm: float
     turn_deg: float
-    rivals: tuple[str, ...] = ()
+    rivals: Annotated[tuple[str, ...], KEPT] = ()
 
 
 @dataclass(frozen=True)
@@ -243,29 +221,15 @@ class Alignment(CellSections):
 
     def document(self) -> dict[str, Any]:
         """Builds the content of alignment.json; what was not computed is absent."""
-        return {
-            "schema": SCHEMA,
-            "visioncal": __version__,
-            "created": self.created,
-            "session": {"name": self.session_name, "sha256": self.session_sha256},
-            "reference": self.reference,
-            "frames": dict(self.frames),
-            "robots": dict(self.robots),
-            "transforms": {name: edge_document(edge) for name, edge in self.edges.items()},
-            "joint_covariance": {
-                "order": list(self.edges),
-                "matrix": self.joint_covariance.tolist(),
-            },
-            "cameras": {name: camera_document(it) for name, it in self.cameras.items()},
-            "noise": {name: dict(it) for name, it in self.noise.items()},
-            "observations": [present(vars(it)) for it in self.sights],
-            "moved": moved_document(self.moved),
-            "untied": [vars(it) for it in self.untied],
-            "weakest": self.weakest,
-            "verdict": verdict_document(self.verdict),
-            **need_document(self.need),
-            "details": write(CellDetails, self.details),
-        }
+        form = AlignmentForm(
+            schema=SCHEMA,
+            session=SessionForm(self.session_name, self.session_sha256),
+            transforms=self.edges,
+            joint_covariance=JointCovariance.of(self.edges, self.joint_covariance),
+            observations=self.sights,
+            **{name: getattr(self, name) for name in _SAME},
+        )
+        return write(AlignmentForm, form)
 
     def save(self, path: Path | str) -> None:
         """Writes alignment.json, whole or not at all."""
@@ -310,46 +274,62 @@ class Alignment(CellSections):
         """Reads what `document` built.
 
         Raises:
-            LookupError, TypeError, ValueError, AttributeError: It is another.
+            ValueError: It is of another schema.
+        DataError: It is another; the message names the place.
         """
-        return cls(**_fields(document))
+        check_schema(document)
+        form = read(AlignmentForm, document, "")
+        return cls(
+            session_name=form.session.name,
+            session_sha256=form.session.sha256,
+            edges=form.transforms,
+            joint_covariance=form.joint_covariance.matrix,
+            sights=form.observations,
+            **{name: getattr(form, name) for name in _SAME},
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AlignmentForm:
+    """alignment.json; its fields are those of `Alignment`, but for what `CalibrationForm` has."""
+
+    schema: Literal[1]
+    visioncal: str = __version__
+    created: str
+    session: SessionForm
+    reference: str
+    frames: Mapping[str, str]
+    robots: Mapping[str, str]
+    transforms: Mapping[str, StoredEdge]
+    joint_covariance: JointCovariance
+    cameras: Mapping[str, StoredCamera]
+    noise: Mapping[str, Mapping[str, float]]
+    observations: tuple[Sight, ...]
+    moved: tuple[Moved, ...]
+    untied: tuple[Untied, ...]
+    weakest: str
+    verdict: StoredVerdict
+    need: NeedMet | None = None
+    details: CellDetails
+
+
+# Fields that an alignment has under the same names.
+_SAME = (
+    "created",
+    "reference",
+    "frames",
+    "robots",
+    "cameras",
+    "noise",
+    "moved",
+    "untied",
+    "weakest",
+    "verdict",
+    "need",
+    "details",
+)
 
 
 def is_alignment(document: Mapping[str, Any]) -> bool:
     """Tells an alignment by its content: the calibration of one camera has no reference."""
     return {"reference", "transforms"} <= document.keys()
-
-
-def moved_document(moved: Iterable[Moved]) -> list[dict[str, Any]]:
-    """Writes what moved."""
-    return [{**vars(it), "rivals": list(it.rivals)} for it in moved]
-
-
-def read_moved(document: Iterable[Mapping[str, Any]]) -> tuple[Moved, ...]:
-    """Reads what `moved_document` wrote."""
-    return tuple(Moved(**{**it, "rivals": tuple(it["rivals"])}) for it in document)
-
-
-def _fields(document: Mapping[str, Any]) -> dict[str, Any]:
-    if document.get("schema") != SCHEMA:
-        raise ValueError(f"schema is {document.get('schema')!r}, this version reads {SCHEMA}")
-    check(document, _FORM)
-    return {
-        "session_name": document["session"]["name"],
-        "session_sha256": document["session"]["sha256"],
-        "created": document["created"],
-        "reference": document["reference"],
-        "frames": dict(document["frames"]),
-        "robots": dict(document["robots"]),
-        "edges": {name: read_edge(edge, name) for name, edge in document["transforms"].items()},
-        "joint_covariance": read_covariance(document["joint_covariance"], "matrix", (-1, -1)),
-        "cameras": {name: read_camera(it) for name, it in document["cameras"].items()},
-        "noise": {name: dict(it) for name, it in document["noise"].items()},
-        "sights": tuple(Sight(**it) for it in document["observations"]),
-        "moved": read_moved(document["moved"]),
-        "untied": tuple(Untied(**it) for it in document["untied"]),
-        "weakest": document["weakest"],
-        "verdict": read_verdict(document["verdict"]),
-        "need": read_need(document),
-        "details": read(CellDetails, document["details"], "details"),
-    }

@@ -10,6 +10,7 @@ import numpy as np
 from visioncal.core.types import FloatArray
 from visioncal.estimation.bending import Factor
 from visioncal.results.codec import Array, Key, Matrix, Section, Written
+from visioncal.results.edge import Covariance
 from visioncal.robot import Convention, Robot
 from visioncal.robot.thermal import Heating, Kind, ThermalModel
 
@@ -17,7 +18,9 @@ NOMINAL = "nominal"
 # Departures of fewer standard deviations may be chance.
 _SURE = 3.0
 
-StoredRobot = Annotated[Robot, Written(lambda it: dict(it.document), Robot.from_document)]
+StoredRobot = Annotated[
+    Robot, Written(lambda it: dict(it.document), lambda it, _: Robot.from_document(it))
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -434,7 +437,7 @@ class ThermalResult(Section):
 
     heated_by: Kind
     joints: tuple[JointDrift, ...]
-    covariance: Matrix
+    covariance: Covariance
     lengths_m: Annotated[FloatArray, Array((-1, 3))]
     not_told: tuple[str, ...]
     residual_mm: DriftResidual

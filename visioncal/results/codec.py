@@ -1,8 +1,8 @@
 """Frozen dataclasses as JSON: written, read with checks, by the types of their fields.
 
 A field is a key of its own name, or of the one that `Key` gives. What is None is absent on disk, as
-is an empty default. Keys that a class does not know are kept in its field `further`, where it has
-one. An error names the path of the value, as `kinematics.levels[2].rms_mm`.
+is an empty default. Keys that a class does not know are left out, or kept in its field of the kind
+`REST`. An error names the path of the value, as `kinematics.levels[2].rms_mm`.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,7 +18,6 @@ from visioncal.core.types import FloatArray
 
 _T = TypeVar("_T")
 _WORDS = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
-_FURTHER = "further"
 
 
 @dataclass(frozen=True)
@@ -30,26 +29,36 @@ class Key:
 
 @dataclass(frozen=True)
 class Array:
-    """The shape of an array: sizes, of which those that are negative may be any."""
+    """The shape of an array.
+
+    Attributes:
+        shape: Its sizes, of which those that are negative may be any.
+        fault: Says what else is wrong with one; empty for nothing.
+    """
 
     shape: tuple[int, ...]
+    fault: Callable[[FloatArray], str] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Written:
-    """How a value is written that is no dataclass of ours.
+    """How a value is written that is no dataclass of ours, or has another form on disk.
 
     Attributes:
-        write: Makes JSON of it.
-        read: Reads that.
-        schema: Describes it as JSON Schema does.
+        write: Makes JSON of it, or its form.
+        read: Reads that; its path is for messages.
+        form: The dataclass that it is on disk; None for JSON of any kind.
     """
 
     write: Callable[[Any], Any]
-    read: Callable[[Any], Any]
-    schema: Mapping[str, Any] = field(default_factory=lambda: {"type": "object"})
+    read: Callable[[Any, str], Any]
+    form: type | None = None
 
 
+# Fields whose keys stand beside those of their owner, and one that has all keys of no other.
+INLINE, REST = object(), object()
+# A field that is on disk though it is empty, and a text that is not.
+KEPT, DROPPED = object(), object()
 Vector = Annotated[FloatArray, Array((-1,))]
 Matrix = Annotated[FloatArray, Array((-1, -1))]
 
@@ -62,10 +71,10 @@ class Section:
         further: What a file has of it that this version does not know, as it is there.
     """
 
-    further: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    further: Annotated[Mapping[str, Any], REST] = field(default_factory=dict, repr=False)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Entry:
     """A field as it is on disk: its name, key and type, and whether it has to be there."""
 
@@ -73,20 +82,37 @@ class Entry:
     key: str
     kind: Any
     required: bool
+    marks: tuple[Any, ...]
+
+    @property
+    def keys(self) -> set[str]:
+        """The keys that it has."""
+        if INLINE in self.marks:
+            forms = [it.form for it in self.marks if isinstance(it, Written)]
+            (inner,) = _alternatives(get_args(self.kind)[0])
+            return set().union(*(it.keys for it in entries(forms[0] if forms else inner)))
+        return set() if REST in self.marks else {self.key}
+
+    def is_absent(self, value: object) -> bool:
+        """Whether a value is not written."""
+        is_empty = isinstance(value, tuple | Mapping) or DROPPED in self.marks
+        can_be = not self.required and KEPT not in self.marks
+        return value is None or (can_be and is_empty and not value)
 
 
 @cache
 def entries(cls: type) -> tuple[Entry, ...]:
-    """The fields of a dataclass in their order, `further` left out."""
+    """The fields of a dataclass in their order."""
     hints = get_type_hints(cls, include_extras=True)
     found = []
     for it in fields(cls):
-        if it.name != _FURTHER:
-            kind = hints[it.name]
-            keys = [mark.name for mark in get_args(kind)[1:] if isinstance(mark, Key)]
-            required = it.default is MISSING and it.default_factory is MISSING
-            found.append(Entry(it.name, keys[0] if keys else it.name, kind, required))
-    return tuple(found)
+        kind = hints[it.name]
+        marks = get_args(kind)[1:] if get_origin(kind) is Annotated else ()
+        keys = [mark.name for mark in marks if isinstance(mark, Key)]
+        required = it.default is MISSING and it.default_factory is MISSING
+        found.append(Entry(it.name, keys[0] if keys else it.name, kind, required, marks))
+    # What is of other things stands first.
+    return tuple(sorted(found, key=lambda it: REST not in it.marks))
 
 
 def write(cls: type, value: object) -> dict[str, Any]:
@@ -96,24 +122,24 @@ def write(cls: type, value: object) -> dict[str, Any]:
         cls: The dataclass.
         value: One of it, or of a class that has its fields.
     """
-    document = {}
+    document: dict[str, Any] = {}
     for it in entries(cls):
         mine = getattr(value, it.name)
-        if mine is not None and (it.required or not _is_empty(mine)):
-            document[it.key] = _written(it.kind, mine)
-    return document | dict(getattr(value, _FURTHER, {}))
-
-
-def _is_empty(value: object) -> bool:
-    return isinstance(value, tuple | Mapping) and not value
+        if not it.is_absent(mine):
+            written = _written(it.kind, mine)
+            beside = INLINE in it.marks or REST in it.marks
+            document |= written if beside else {it.key: written}
+    return document
 
 
 def _written(kind: Any, value: Any) -> Any:  # noqa: ANN401 - what JSON may hold
     kind = _fitting(_alternatives(kind), value)
     if get_origin(kind) is Annotated:
         inner, *marks = get_args(kind)
-        ours = [it for it in marks if isinstance(it, Written)]
-        return ours[0].write(value) if ours else _written(inner, value)
+        for it in marks:
+            if isinstance(it, Written):
+                return it.write(value) if it.form is None else write(it.form, it.write(value))
+        return _written(inner, value)
     if isinstance(value, np.ndarray):
         return value.tolist()
     if is_dataclass(value):
@@ -140,24 +166,28 @@ def read(cls: type[_T], document: object, path: str) -> _T:
     try:
         return cls(**found)
     except ValueError as error:
-        raise DataError(f"{path}: {error}.", culprits=[path]) from error
+        place = path or "the document"
+        raise DataError(f"{place}: {error}.", culprits=[place]) from error
 
 
 def read_fields(cls: type, document: object, path: str) -> dict[str, Any]:
     """Reads the fields of a dataclass by name; its errors are those of `read`."""
     table, known = _table(document, path), entries(cls)
-    found = {
-        it.name: _read(it.kind, table[it.key], _joined(path, it.key))
-        for it in known
-        if it.key in table
-    }
+    ours = set().union(*(it.keys for it in known))
+    found = {}
+    for it in known:
+        if REST in it.marks:
+            rest = {key: value for key, value in table.items() if key not in ours}
+            found[it.name] = _read(it.kind, rest, path)
+        elif INLINE in it.marks:
+            if it.required or it.keys & table.keys():
+                found[it.name] = _read(it.kind, table, path)
+        elif it.key in table:
+            found[it.name] = _read(it.kind, table[it.key], _joined(path, it.key))
     for it in known:
         if it.required and it.name not in found:
             place = _joined(path, it.key)
             raise DataError(f"{place} is missing.", culprits=[place])
-    further = {name: it for name, it in table.items() if name not in {it.key for it in known}}
-    if further and any(it.name == _FURTHER for it in fields(cls)):
-        found[_FURTHER] = further
     return found
 
 
@@ -171,7 +201,8 @@ def _read(kind: Any, value: Any, path: str) -> Any:  # noqa: ANN401 - what JSON 
         return _read(_fitting(_alternatives(kind), value), value, path)
     if origin is Literal:
         if value not in args:
-            raise other(value, f"one of {', '.join(map(repr, args))}", path)
+            words = ", ".join(map(repr, args))
+            raise other(value, f"one of {words}" if len(args) > 1 else words, path)
         return value
     if origin is tuple:
         return _read_tuple(args, value, path)
@@ -187,14 +218,14 @@ def _read_marked(args: tuple[Any, ...], value: Any, path: str) -> Any:  # noqa: 
     inner, *marks = args
     for it in marks:
         if isinstance(it, Array):
-            return _array(inner, it.shape, value, path)
+            return _array(inner, it, value, path)
         if isinstance(it, Written):
+            known = value if it.form is None else read(it.form, value, path)
             try:
-                return it.read(value)
+                return it.read(known, path)
             except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
-                raise DataError(
-                    f"{path} cannot be read: {error or type(error).__name__}.", culprits=[path]
-                ) from error
+                why = str(error) or type(error).__name__
+                raise DataError(f"{path}: {why}.", culprits=[path]) from error
     return _read(inner, value, path)
 
 
@@ -206,9 +237,12 @@ def _alternatives(kind: Any) -> list[Any]:  # noqa: ANN401 - a type
 
 
 def _fitting(kinds: list[Any], value: object) -> Any:  # noqa: ANN401 - a type
-    """Of several dataclasses, the one of whose keys a table has most, and lacks fewest."""
-    if len(kinds) == 1 or not isinstance(value, Mapping):
+    """The type that a value is of: of dataclasses, that of whose keys it has most, lacking few."""
+    if len(kinds) == 1:
         return kinds[0]
+    if not isinstance(value, Mapping):
+        is_row = isinstance(value, list | tuple)
+        return next((it for it in kinds if (get_origin(it) is tuple) == is_row), kinds[0])
 
     def fit(kind: type) -> tuple[int, int]:
         there = sum(it.key in value for it in entries(kind))
@@ -230,23 +264,25 @@ def _read_tuple(args: tuple[Any, ...], value: object, path: str) -> tuple[Any, .
     )
 
 
-def _array(kind: Any, shape: tuple[int, ...], value: object, path: str) -> Any:  # noqa: ANN401
-    """An array of a type, as `npt.NDArray[np.float64]`, and a shape."""
+def _array(kind: Any, form: Array, value: object, path: str) -> Any:  # noqa: ANN401
+    """An array of a type, as `npt.NDArray[np.float64]`."""
     (wanted,) = get_args(get_args(kind)[1])
-    sizes = " x ".join("n" if it < 0 else str(it) for it in shape)
+    sizes = " x ".join("n" if it < 0 else str(it) for it in form.shape)
     needed = other(value, f"an array of {sizes} numbers", path)
     try:
         found = np.asarray(value)
     except ValueError as error:
         raise needed from error
-    held = "b" if wanted is np.bool_ else "iuf"
     if not found.size:
-        found = np.zeros((*found.shape, *(0,) * len(shape))[: len(shape)])
-    elif found.dtype.kind not in held:
+        found = np.zeros((*found.shape, *(0,) * len(form.shape))[: len(form.shape)])
+    elif found.dtype.kind not in ("b" if wanted is np.bool_ else "iuf"):
         raise needed
-    alike = [mine == its or its < 0 for mine, its in zip(found.shape, shape, strict=False)]
-    if found.ndim != len(shape) or not all(alike):
+    pairs = zip(found.shape, form.shape, strict=False)
+    if found.ndim != len(form.shape) or not all(mine == its or its < 0 for mine, its in pairs):
         raise needed
+    fault = form.fault(found) if form.fault else ""
+    if fault:
+        raise DataError(f"{path} {fault}.", culprits=[path])
     return found.astype(wanted)
 
 

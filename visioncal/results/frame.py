@@ -4,16 +4,15 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 from visioncal.core.documents import parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, write_atomically
-from visioncal.core.verdict import Verdict
 from visioncal.core.version import __version__
-from visioncal.results.edge import Edge, edge_document, read_edge
-from visioncal.results.forms import FRAME, check
-from visioncal.results.verdicts import read_verdict, verdict_document
+from visioncal.results.codec import INLINE, KEPT, read, write
+from visioncal.results.edge import StoredEdge
+from visioncal.results.verdicts import StoredVerdict
 
 _SCHEMA = 1
 
@@ -32,8 +31,8 @@ class Observation:
 
     name: str
     used: bool
-    reason: str = ""
-    kind: str = ""
+    reason: Annotated[str, KEPT] = ""
+    kind: Annotated[str, KEPT] = ""
     residual_mm: float | None = None
 
 
@@ -55,7 +54,7 @@ class Frame:
         details: Further figures of the method, as they stand on disk.
     """
 
-    edge: Edge
+    edge: Annotated[StoredEdge, INLINE]
     oriented: bool
     method: str
     source: str
@@ -63,8 +62,8 @@ class Frame:
     rms_mm: float
     noise_mm: float
     observations: tuple[Observation, ...]
-    verdict: Verdict
-    details: Mapping[str, Any] = field(default_factory=dict)
+    verdict: StoredVerdict
+    details: Annotated[Mapping[str, Any], KEPT] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,35 +107,7 @@ class FrameFile:
 
 def frames_document(frames: Mapping[str, Frame]) -> dict[str, Any]:
     """Writes frames as JSON has them."""
-    return {name: _frame_document(frame) for name, frame in frames.items()}
-
-
-def _frame_document(frame: Frame) -> dict[str, Any]:
-    return edge_document(frame.edge) | {
-        "oriented": frame.oriented,
-        "method": frame.method,
-        "source": frame.source,
-        "created": frame.created,
-        "rms_mm": frame.rms_mm,
-        "noise_mm": frame.noise_mm,
-        "observations": [present(vars(it)) for it in frame.observations],
-        "verdict": verdict_document(frame.verdict),
-        "details": dict(frame.details),
-    }
-
-
-def present(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Drops what was not computed: on disk it is absent."""
-    return {name: value for name, value in values.items() if value is not None}
-
-
-def read_frames(document: Mapping[str, Any]) -> dict[str, Frame]:
-    """Reads what `frames_document` wrote.
-
-    Raises:
-        LookupError, TypeError, ValueError: The document is another.
-    """
-    return {name: _read_frame(it, name) for name, it in document.items()}
+    return write(FrameFile, FrameFile(frames))["frames"]  # type: ignore[no-any-return]
 
 
 def _read_file(document: Mapping[str, Any]) -> dict[str, Frame]:
@@ -144,20 +115,4 @@ def _read_file(document: Mapping[str, Any]) -> dict[str, Frame]:
         raise ValueError("it is a calibration, whose folder is named with -c")
     if document.get("schema") != _SCHEMA:
         raise ValueError(f"schema is {document.get('schema')!r}, this version reads {_SCHEMA}")
-    return read_frames(document["frames"])
-
-
-def _read_frame(document: Mapping[str, Any], name: str) -> Frame:
-    check(document, FRAME)
-    return Frame(
-        read_edge(document, name),
-        document["oriented"],
-        document["method"],
-        document["source"],
-        document["created"],
-        document["rms_mm"],
-        document["noise_mm"],
-        tuple(Observation(**it) for it in document["observations"]),
-        read_verdict(document["verdict"]),
-        dict(document["details"]),
-    )
+    return dict(read(FrameFile, document, "").frames)

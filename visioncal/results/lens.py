@@ -1,57 +1,78 @@
 """A camera in a result, and how it stands on disk."""
 
-from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated
 
-import numpy as np
-
-from visioncal.core.types import Camera, FloatArray
-from visioncal.results.edge import read_array, read_covariance
-from visioncal.results.frame import present
-from visioncal.results.parts import CameraResult
+from visioncal.core.types import Camera, CameraKind, FloatArray
+from visioncal.results.codec import Array, Matrix, Vector, Written
+from visioncal.results.edge import Covariance
 
 
-def camera_document(result: CameraResult) -> dict[str, Any]:
-    """Writes a camera's intrinsics."""
-    camera = result.camera
-    return present(
-        {
-            "model": camera.model,
-            "resolution": list(camera.resolution),
-            "matrix": camera.matrix.tolist(),
-            "distortion": camera.distortion.tolist(),
-            "estimated": result.estimated,
-            "covariance": None if result.covariance is None else result.covariance.tolist(),
-            "edge_covariance": (
-                None if result.edge_covariance is None else result.edge_covariance.tolist()
-            ),
-        }
-    )
+@dataclass(frozen=True, eq=False)
+class CameraResult:
+    """The camera that the result was obtained with.
 
-
-def read_camera(document: Mapping[str, Any]) -> CameraResult:
-    """Reads what `camera_document` wrote.
-
-    Raises:
-        LookupError, TypeError, ValueError: The document is another.
+    Attributes:
+        camera: The intrinsics.
+        estimated: Whether they were estimated from this session's images.
+        covariance: (k, k) of fx, fy, cx, cy and the distortion, where estimated.
+        edge_covariance: (k, 6 e) of these with the calibration's edges in the order of its
+            `joint_covariance`, where both were estimated together.
     """
-    width, height = document["resolution"]
-    return CameraResult(
-        Camera(
-            document["model"],
-            (int(width), int(height)),
-            read_array(document, "matrix", (4,)),
-            read_array(document, "distortion", (-1,)),
-        ),
-        document["estimated"],
-        read_covariance(document, "covariance", (-1, -1)) if "covariance" in document else None,
-        _edge_covariance(document),
-    )
+
+    camera: Camera
+    estimated: bool
+    covariance: FloatArray | None = None
+    edge_covariance: FloatArray | None = None
 
 
-def _edge_covariance(document: Mapping[str, Any]) -> FloatArray | None:
-    if "edge_covariance" not in document:
-        return None
-    rows = np.asarray(document["edge_covariance"], dtype=float)
-    unknowns = 4 + len(document["distortion"])
-    return read_array(document, "edge_covariance", (unknowns, rows.shape[-1]))
+@dataclass(frozen=True, eq=False)
+class CameraForm:
+    """A camera.
+
+    Attributes:
+        model: `brown` or `fisheye`.
+        resolution: Width and height [px].
+        matrix: fx, fy, cx, cy [px].
+        distortion: The coefficients in OpenCV's order.
+        estimated: Whether it was estimated from this session's images.
+        covariance: (k, k) of matrix and distortion, where estimated.
+        edge_covariance: (k, 6 e) of these with the transforms, in the order of `joint_covariance`.
+    """
+
+    model: CameraKind
+    resolution: tuple[int, int]
+    matrix: Annotated[FloatArray, Array((4,))]
+    distortion: Vector
+    estimated: bool
+    covariance: Covariance | None = None
+    edge_covariance: Matrix | None = None
+
+    @classmethod
+    def of(cls, result: CameraResult) -> "CameraForm":
+        """Writes a camera."""
+        camera, both = result.camera, (result.covariance, result.edge_covariance)
+        return cls(
+            camera.model,
+            camera.resolution,
+            camera.matrix,
+            camera.distortion,
+            result.estimated,
+            *both,
+        )
+
+    def result(self, _: str) -> CameraResult:
+        """Reads it.
+
+        Raises:
+            ValueError: The covariances are not of its intrinsics.
+        """
+        size = len(self.matrix) + len(self.distortion)
+        for it in (self.covariance, self.edge_covariance):
+            if it is not None and len(it) != size:
+                raise ValueError(f"a covariance has {len(it)} rows; {size} are needed")
+        camera = Camera(self.model, self.resolution, self.matrix, self.distortion)
+        return CameraResult(camera, self.estimated, self.covariance, self.edge_covariance)
+
+
+StoredCamera = Annotated[CameraResult, Written(CameraForm.of, CameraForm.result, CameraForm)]

@@ -2,15 +2,43 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated, Any, Literal
 
 from scipy.spatial.transform import RigidTransform
 
-from visioncal.core.types import Camera, FloatArray, Need
+from visioncal.core.types import Need
 from visioncal.results.arm import ArmSections
+from visioncal.results.codec import INLINE, KEPT, REST, Written
+from visioncal.results.edge import StoredPose
 from visioncal.robot import Robot
 
+# Of all results of a calibration.
+SCHEMA: Literal[1] = 1
 # Why a view is in no fit although nothing is wrong with it.
 HELD_BACK = "held out of the fit by the session (role = holdout)"
+
+
+_OF_ROBOT = Written(
+    lambda it: dict(it.document), lambda it, _: Robot.from_document(it) if it else None
+)
+
+
+def check_schema(document: Mapping[str, Any]) -> None:
+    """Checks that a result is of the schema that this version reads.
+
+    Raises:
+        ValueError: It is of another.
+    """
+    if document.get("schema") != SCHEMA:
+        raise ValueError(f"schema is {document.get('schema')!r}, this version reads {SCHEMA}")
+
+
+@dataclass(frozen=True)
+class SessionForm:
+    """The session that a result is of: its name, and the sha256 of its canonical content."""
+
+    name: str
+    sha256: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +52,7 @@ class SolverResult:
             alone were read.
     """
 
-    matrices: Mapping[str, FloatArray]
+    matrices: Annotated[Mapping[str, StoredPose], REST]
     rms_mm: float
     rms_deg: float | None = None
 
@@ -35,24 +63,6 @@ class SolverResult:
 
 
 @dataclass(frozen=True, eq=False)
-class CameraResult:
-    """The camera that the result was obtained with.
-
-    Attributes:
-        camera: The intrinsics.
-        estimated: Whether they were estimated from this session's images.
-        covariance: (k, k) of fx, fy, cx, cy and the distortion, where estimated.
-        edge_covariance: (k, 6 e) of these with the calibration's edges in the order of its
-            `joint_covariance`, where both were estimated together.
-    """
-
-    camera: Camera
-    estimated: bool
-    covariance: FloatArray | None = None
-    edge_covariance: FloatArray | None = None
-
-
-@dataclass(frozen=True, eq=False)
 class RobotResult(ArmSections):
     """A robot of a whole cell, with what was found of its arm.
 
@@ -60,7 +70,7 @@ class RobotResult(ArmSections):
         model: Its nominal model, where that is known.
     """
 
-    model: Robot | None = None
+    model: Annotated[Robot | None, _OF_ROBOT, REST] = None
 
 
 @dataclass(frozen=True)
@@ -79,7 +89,7 @@ class ViewResult:
 
     view: int
     used: bool
-    reason: str = ""
+    reason: Annotated[str, KEPT] = ""
     corners: int | None = None
     rms_px: float | None = None
     residual_mm: float | None = None
@@ -132,7 +142,7 @@ class NeedMet:
         pairs: Each camera and robot of a whole cell that pick together; empty elsewhere.
     """
 
-    need: Need
+    need: Annotated[Need, INLINE]
     probability: float
     pairs: tuple[Picker, ...] = ()
 

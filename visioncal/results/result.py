@@ -19,11 +19,11 @@ from visioncal.estimation.intervals import freedom_of
 from visioncal.results.alignment import FILE as ALIGNMENT
 from visioncal.results.alignment import Alignment, is_alignment
 from visioncal.results.arm import NOMINAL, ArmResult
-from visioncal.results.document import KINDS, fields_from_document, to_document
+from visioncal.results.document import fields_from_document, to_document
 from visioncal.results.edge import Edge
 from visioncal.results.frame import Frame
+from visioncal.results.lens import CameraResult
 from visioncal.results.parts import (
-    CameraResult,
     NeedMet,
     Rms,
     SolverResult,
@@ -314,7 +314,7 @@ class Calibration(CalibrationSections):
                 return cls.whole(read_whole(document))
             if is_alignment(document):
                 return cls.whole(Alignment.from_document(document))
-            return cls(**fields_from_document(parse_stored(text, label, KINDS)))
+            return cls(**fields_from_document(document))
         except DataError as error:
             raise error.within(label) from error
         except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:

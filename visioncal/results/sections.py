@@ -10,7 +10,8 @@ from visioncal.core.types import FloatArray, Mask, Target
 from visioncal.estimation.appearance import BOARD_NAMES, board_basis
 from visioncal.estimation.effects.rolling_shutter import Shutter
 from visioncal.results.arm import ArmSections
-from visioncal.results.codec import Array, Matrix, Section, Vector
+from visioncal.results.codec import REST, Array, Matrix, Section, Vector
+from visioncal.results.edge import Covariance
 from visioncal.vision.targets import corner_positions
 
 _BEND = "bow_"
@@ -259,7 +260,7 @@ class JointFit(Section):
     boards: tuple[str, ...]
     looks: tuple[int, ...]
     arm: FittedArm | None = None
-    covariance: Matrix
+    covariance: Covariance
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -274,7 +275,7 @@ class CellJointFit(Section):
 
     cameras: Mapping[str, tuple[int, ...]]
     targets: Mapping[str, tuple[int, ...]]
-    covariance: Matrix
+    covariance: Covariance
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -353,7 +354,7 @@ class CalibrationSections(ArmSections):
     conditions: Mapping[str, float] = field(default_factory=dict)
     joint_fit: JointFit | None = None
     dense: DenseResult | None = None
-    further: Mapping[str, Any] = field(default_factory=dict)
+    further: Annotated[Mapping[str, Any], REST] = field(default_factory=dict)
 
     @property
     def budget(self) -> UncertaintyResult | None:
@@ -382,7 +383,7 @@ class CellSections:
     rigs: Mapping[str, RigResult] = field(default_factory=dict)
     joint_fit: CellJointFit | None = None
     uncertainty: CellUncertainty | None = None
-    further: Mapping[str, Any] = field(default_factory=dict)
+    further: Annotated[Mapping[str, Any], REST] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

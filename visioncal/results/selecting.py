@@ -15,7 +15,8 @@ from visioncal.results.arm import ArmSections
 from visioncal.results.codec import entries
 from visioncal.results.edge import Edge
 from visioncal.results.frame import Frame
-from visioncal.results.parts import CameraResult, Rms, RobotResult, Validation
+from visioncal.results.lens import CameraResult
+from visioncal.results.parts import Rms, RobotResult, Validation
 from visioncal.results.sections import ClockResult, JointFit, NoiseIntervals
 from visioncal.results.whole import holdout_rms, left_out_rms, rms_of, view_results
 from visioncal.session.choosing import PARTS, Choice, Chosen, Part, choose

@@ -1,123 +1,142 @@
-"""The verdict and the need in calibration.json."""
+"""A verdict in calibration.json."""
 
-from collections.abc import Iterator, Mapping
-from typing import Any, get_args
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Annotated
 
-from visioncal.core.types import Need
 from visioncal.core.verdict import Finding, Step, Verdict, VerdictStatus
-from visioncal.results.parts import NeedMet, Picker
+from visioncal.results.codec import DROPPED, Written
 
 
-def verdict_document(verdict: Verdict) -> dict[str, Any]:
-    """Writes a verdict; what was not computed is absent."""
-    document: dict[str, Any] = {"status": verdict.status, "reasons": list(verdict.reasons)}
-    if verdict.good_for_mm is not None:
-        document["good_for_mm"] = verdict.good_for_mm
-    if verdict.causes:
-        document["causes"] = [_cause_document(it) for it in verdict.causes]
-    document["findings"] = [_finding_document(it) for it in verdict.findings]
-    return document
+@dataclass(frozen=True, kw_only=True)
+class CauseForm:
+    """What may be why a result is not good.
 
-
-def _cause_document(found: Finding) -> dict[str, Any]:
-    document = {
-        "cause": found.kind,
-        "probability": found.probability,
-        "sentence": found.words,
-        "without_it": found.without_it,
-        "do": "" if found.do is None else str(found.do),
-    }
-    return {name: it for name, it in document.items() if it != ""}
-
-
-def _finding_document(found: Finding) -> dict[str, Any]:
-    step = found.do
-    document = {
-        "kind": found.kind,
-        "words": found.words,
-        "do": step and {name: it for name, it in vars(step).items() if it},
-        "views": list(found.views),
-        "probability": found.probability,
-        "without_it": found.without_it,
-    }
-    return {name: it for name, it in document.items() if it}
-
-
-def read_verdict(document: Mapping[str, Any]) -> Verdict:
-    """Reads what `verdict_document` wrote, or what was written before findings were.
-
-    Raises:
-        ValueError: The status is none.
+    Attributes:
+        cause: What it is, as a short name that stays.
+        probability: How likely it is.
+        sentence: What it is, with its figures.
+        without_it: What the result would be without it, in a sentence; absent where not computed.
+        do: What to do about it, with a command where one does it.
     """
-    if document["status"] not in get_args(VerdictStatus):
-        raise ValueError(f"verdict.status is {document['status']!r}")
-    written = document.get("findings")
-    findings = _earlier(document) if written is None else map(_read_finding, written)
-    return Verdict(document["status"], tuple(findings), document.get("good_for_mm"))
+
+    cause: str
+    probability: float
+    sentence: str
+    without_it: Annotated[str, DROPPED] = ""
+    do: Annotated[str, DROPPED] = ""
+
+    @classmethod
+    def of(cls, found: Finding) -> "CauseForm":
+        """Writes a finding that may be the cause."""
+        return cls(
+            cause=found.kind,
+            probability=found.probability,
+            sentence=found.words,
+            without_it=found.without_it,
+            do="" if found.do is None else str(found.do),
+        )
+
+    def finding(self, words: str) -> Finding:
+        """Reads it, with the words of a reason that begins with its sentence."""
+        step = Step(self.do) if self.do else None
+        return Finding(
+            self.cause, words, step, probability=self.probability, without_it=self.without_it
+        )
 
 
-def _read_finding(document: Mapping[str, Any]) -> Finding:
-    step = document.get("do")
-    return Finding(
-        document["kind"],
-        document["words"],
-        None if step is None else Step(step["words"], step.get("command", "")),
-        tuple(document.get("views", ())),
-        document.get("probability", 0.0),
-        document.get("without_it", ""),
-    )
+@dataclass(frozen=True, kw_only=True)
+class StepForm:
+    """What to do about a finding: a sentence, and a command line that does it or leads on."""
+
+    words: str
+    command: Annotated[str, DROPPED] = ""
 
 
-def _earlier(document: Mapping[str, Any]) -> Iterator[Finding]:
-    """Findings of reasons and causes, of which a reason may begin with a cause's sentence."""
-    causes = {it["sentence"]: it for it in document.get("causes", ())}
-    for reason in document["reasons"]:
-        begun = next((it for it in causes if reason.startswith(it)), None)
-        if begun is None:
-            yield Finding("remark", reason)
-        else:
-            yield _of_cause(causes.pop(begun), reason)
-    yield from (_of_cause(it, sentence) for sentence, it in causes.items())
+@dataclass(frozen=True, kw_only=True)
+class FindingForm:
+    """One thing that was found; see `core.verdict.Finding`.
 
-
-def _of_cause(cause: Mapping[str, Any], words: str) -> Finding:
-    step = Step(cause["do"]) if cause.get("do") else None
-    without_it = cause.get("without_it", "")
-    return Finding(
-        cause["cause"], words, step, probability=cause["probability"], without_it=without_it
-    )
-
-
-def need_document(met: NeedMet | None) -> dict[str, Any]:
-    """Writes what the task needs as `need`; nothing where that is not said."""
-    if met is None:
-        return {}
-    need = met.need
-    at = need.at if need.at == "views" else list(need.at)
-    document: dict[str, Any] = {
-        "mm": need.mm,
-        "deg": need.deg,
-        "at": at,
-        "probability": met.probability,
-    }
-    if met.pairs:
-        document["pairs"] = [vars(it) for it in met.pairs]
-    return {"need": {name: it for name, it in document.items() if it is not None}}
-
-
-def read_need(document: Mapping[str, Any]) -> NeedMet | None:
-    """Reads what `need_document` added to a document.
-
-    Raises:
-        ValueError: It names no place.
+    Attributes:
+        kind: What it is, as a short name that stays.
+        words: The same in sentences, with its figures.
+        do: What to do about it.
+        views: The views that it is about.
+        probability: How likely it is the cause of what is wrong; absent for what is no cause.
+        without_it: What the result would be without it, in a sentence.
     """
-    found = document.get("need")
-    if found is None:
-        return None
-    at = found["at"]
-    if at != "views":
-        x, y, z = map(float, at)
-        at = (x, y, z)
-    need = Need(found.get("mm"), found.get("deg"), at)
-    pairs = tuple(Picker(**it) for it in found.get("pairs", ()))
-    return NeedMet(need, found["probability"], pairs)
+
+    kind: str
+    words: str
+    do: StepForm | None = None
+    views: tuple[int, ...] = ()
+    probability: Annotated[float, DROPPED] = 0.0
+    without_it: Annotated[str, DROPPED] = ""
+
+    @classmethod
+    def of(cls, found: Finding) -> "FindingForm":
+        """Writes a finding."""
+        step = found.do
+        return cls(
+            kind=found.kind,
+            words=found.words,
+            do=None if step is None else StepForm(words=step.words, command=step.command),
+            views=found.views,
+            probability=found.probability,
+            without_it=found.without_it,
+        )
+
+    def finding(self) -> Finding:
+        """Reads it."""
+        step = None if self.do is None else Step(self.do.words, self.do.command)
+        return Finding(self.kind, self.words, step, self.views, self.probability, self.without_it)
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerdictForm:
+    """Whether a result can be trusted.
+
+    Attributes:
+        status: In one word.
+        reasons: Why, in plain sentences.
+        good_for_mm: The least need that it would be good for [mm]; absent where it is good for
+            none.
+        causes: What may be why it is not good, likeliest first.
+        findings: The reasons one by one; absent in files of earlier versions.
+    """
+
+    status: VerdictStatus
+    reasons: tuple[str, ...]
+    good_for_mm: float | None = None
+    causes: tuple[CauseForm, ...] = ()
+    findings: tuple[FindingForm, ...] | None = None
+
+    @classmethod
+    def of(cls, verdict: Verdict) -> "VerdictForm":
+        """Writes a verdict."""
+        return cls(
+            status=verdict.status,
+            reasons=verdict.reasons,
+            good_for_mm=verdict.good_for_mm,
+            causes=tuple(map(CauseForm.of, verdict.causes)),
+            findings=tuple(map(FindingForm.of, verdict.findings)),
+        )
+
+    def verdict(self, _: str) -> Verdict:
+        """Reads it."""
+        found = self._earlier() if self.findings is None else (it.finding() for it in self.findings)
+        return Verdict(self.status, tuple(found), self.good_for_mm)
+
+    def _earlier(self) -> Iterator[Finding]:
+        """Findings of reasons and causes, of which a reason may begin with a cause's sentence."""
+        causes = {it.sentence: it for it in self.causes}
+        for reason in self.reasons:
+            begun = next((it for it in causes if reason.startswith(it)), None)
+            if begun is None:
+                yield Finding("remark", reason)
+            else:
+                yield causes.pop(begun).finding(reason)
+        yield from (it.finding(sentence) for sentence, it in causes.items())
+
+
+StoredVerdict = Annotated[Verdict, Written(VerdictForm.of, VerdictForm.verdict, VerdictForm)]

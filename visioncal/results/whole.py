@@ -5,47 +5,197 @@ What differs: `tree` says what each frame hangs on, `reference` which frame the 
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, field, fields, replace
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from visioncal.core.version import __version__
-from visioncal.results.alignment import (
-    Alignment,
-    Sight,
-    Untied,
-    moved_document,
-    read_moved,
-)
-from visioncal.results.arm import ArmSections
-from visioncal.results.codec import entries, read, read_fields, write
-from visioncal.results.edge import edge_document, read_covariance, read_edge
-from visioncal.results.forms import SCHEMA, WHOLE, check
-from visioncal.results.frame import frames_document, present, read_frames
-from visioncal.results.lens import camera_document, read_camera
+from visioncal.results.alignment import Alignment, Moved, Sight, Untied
+from visioncal.results.codec import INLINE, KEPT, read, read_fields, write
+from visioncal.results.edge import JointCovariance, StoredEdge
+from visioncal.results.frame import Frame
+from visioncal.results.lens import StoredCamera
 from visioncal.results.parts import (
     HELD_BACK,
+    SCHEMA,
+    NeedMet,
     Rms,
     RobotResult,
+    SessionForm,
     ViewResult,
+    check_schema,
 )
 from visioncal.results.sections import CellDetails, CellSections
-from visioncal.results.verdicts import (
-    need_document,
-    read_need,
-    read_verdict,
-    verdict_document,
-)
-from visioncal.robot import Robot
+from visioncal.results.verdicts import StoredVerdict
 from visioncal.session import frame_name
 from visioncal.session.frames import frames_of_kind, robots_between, thing_name
 
-_OWN_KEYS = frozenset(
-    {"schema", "visioncal", "created", "session", "reference", "tree", "transforms", "noise"}
-    | {"validation"}
-    | {"joint_covariance", "cameras", "robots", "targets", "views", "rms", "moved", "untied"}
-    | {"weakest", "verdict", "need", "frames", "details"}
+
+@dataclass(frozen=True, kw_only=True)
+class CellView:
+    """What became of one observation of a whole cell.
+
+    Attributes:
+        view: The number of its row.
+        stop: Its stop, or the view's number where the session has none.
+        camera: The camera that saw it; or else an instrument did.
+        instrument: The instrument that read it.
+        target: The target that was seen; or else a point was.
+        point: The point that was read.
+        robots: The robots that move both before each other.
+        used: Whether the fit used it.
+        reason: Why it was not used, in words; empty for a used one.
+        residual_mm: How far it is from what the rest of the cell predicts [mm].
+        residual_deg: The same in rotation [deg].
+        corners: How many corners were found in its image.
+        rms_px: Reprojection error through the whole chain of frames [px].
+        left_out_mm: How far it is from what a fit predicts that was made without its stop [mm].
+        left_out_deg: The same in rotation [deg].
+        left_out_px: Reprojection error by such a fit [px].
+    """
+
+    view: int
+    stop: int
+    camera: str | None = None
+    instrument: str | None = None
+    target: str | None = None
+    point: str | None = None
+    robots: Annotated[tuple[str, ...], KEPT] = ()
+    used: bool
+    reason: Annotated[str, KEPT] = ""
+    residual_mm: float | None = None
+    residual_deg: float | None = None
+    corners: int | None = None
+    rms_px: float | None = None
+    left_out_mm: float | None = None
+    left_out_deg: float | None = None
+    left_out_px: float | None = None
+
+    def __post_init__(self) -> None:
+        """Checks that something was seen by something.
+
+        Raises:
+            ValueError: It was not.
+        """
+        if (self.camera or self.instrument) is None or (self.target or self.point) is None:
+            raise ValueError("camera or instrument, or target or point, is missing")
+
+    @classmethod
+    def of(cls, cell: Alignment, sight: Sight) -> "CellView":
+        """Writes an observation."""
+        both = {sight.seer, sight.seen} <= cell.frames.keys()
+        robots = robots_between(cell.frames, sight.seer, sight.seen) if both else ()
+        figures = {name: it for name, it in vars(sight).items() if name not in ("seer", "seen")}
+        between = tuple(it or "robot" for it in robots)
+        return cls(robots=between, **_seer_and_seen(sight), **figures)
+
+    def sight(self, tree: Mapping[str, str]) -> Sight:
+        """Reads it."""
+        names = ("camera", "instrument", "target", "point")
+        there = {it: name for it in names if (name := getattr(self, it)) is not None}
+        seer, seen = (
+            next(_frame(tree, kind, there[kind]) for kind in kinds if kind in there)
+            for kinds in (names[:2], names[2:])
+        )
+        figures = {name: it for name, it in vars(self).items() if name not in (*names, "robots")}
+        return Sight(seer=seer, seen=seen, **figures)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairResiduals:
+    """Residuals of views of a target by a camera that were left out [mm, deg, px]."""
+
+    camera: str | None = None
+    instrument: str | None = None
+    target: str | None = None
+    point: str | None = None
+    views: int
+    rms: Annotated[Rms, INLINE]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellValidation:
+    """Residuals of what was left out of fits in turn: of all, and by camera and target.
+
+    Attributes:
+        method: How observations were left out, in words.
+        held_out: Their residuals.
+        holdout: Residuals of those that the session declares as `holdout`.
+        pairs: Residuals by camera and target.
+    """
+
+    method: str
+    held_out: Rms
+    holdout: Rms | None = None
+    pairs: Annotated[tuple[PairResiduals, ...], KEPT] = ()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CellForm:
+    """calibration.json of a whole cell, but for its further sections.
+
+    Attributes:
+        schema: The version of this form.
+        visioncal: The version of the program.
+        created: When, in ISO 8601.
+        session: The session.
+        reference: The frame that stands for the cell.
+        tree: What each frame hangs on.
+        transforms: The estimated transforms by name.
+        joint_covariance: Their covariance together.
+        cameras: The cameras by name.
+        robots: The robots by name: the nominal model, and what was found of the arm.
+        targets: What was printed, by name and as it is described.
+        noise: Estimated standard deviations, by frame or robot and by name.
+        views: One entry for each observation.
+        rms: Residuals over the used ones.
+        moved: What moved while the session was taken.
+        untied: Frames that nothing ties to the rest.
+        weakest: The weakest link, in words.
+        verdict: Whether to trust it.
+        need: What the task needs, and how likely picks meet it.
+        details: Further figures.
+        validation: Residuals of what was left out.
+        frames: Tools and fixtures by the transform that places them.
+    """
+
+    schema: Literal[1]
+    visioncal: str = __version__
+    created: str
+    session: SessionForm
+    reference: str
+    tree: Mapping[str, str]
+    transforms: Mapping[str, StoredEdge]
+    joint_covariance: JointCovariance
+    cameras: Mapping[str, StoredCamera]
+    robots: Mapping[str, RobotResult]
+    targets: Mapping[str, Mapping[str, Any]]
+    noise: Mapping[str, Mapping[str, float]]
+    views: tuple[CellView, ...]
+    rms: Rms
+    moved: tuple[Moved, ...]
+    untied: tuple[Untied, ...]
+    weakest: str
+    verdict: StoredVerdict
+    need: NeedMet | None = None
+    details: CellDetails
+    validation: CellValidation | None = None
+    frames: Mapping[str, Frame] = field(default_factory=dict)
+
+
+# Fields that a cell has under the same names.
+_SAME = (
+    "created",
+    "reference",
+    "targets",
+    "noise",
+    "moved",
+    "untied",
+    "weakest",
+    "verdict",
+    "need",
+    "details",
 )
 
 
@@ -56,102 +206,70 @@ def is_whole(document: Mapping[str, Any]) -> bool:
 
 def whole_document(cell: Alignment) -> dict[str, Any]:
     """Builds the content of calibration.json; what was not computed is absent."""
-    document: dict[str, Any] = {
-        "schema": SCHEMA,
-        "visioncal": __version__,
-        "created": cell.created,
-        "session": {"name": cell.session_name, "sha256": cell.session_sha256},
-        "reference": cell.reference,
-        "tree": dict(cell.frames),
-        "transforms": {name: edge_document(edge) for name, edge in cell.edges.items()},
-        "joint_covariance": {
-            "order": list(cell.edges),
-            "matrix": cell.joint_covariance.tolist(),
-        },
-        "cameras": {
-            thing_name(frame, "camera"): camera_document(it) for frame, it in cell.cameras.items()
-        },
-        "robots": {name: _arm_document(it) for name, it in cell.arms.items()},
-        "targets": {name: dict(it) for name, it in cell.targets.items()},
-        "noise": {name: dict(it) for name, it in cell.noise.items()},
-        "views": [_view_document(cell, it) for it in cell.sights],
-        "rms": present(vars(rms_of(cell.sights))),
-        "moved": moved_document(cell.moved),
-        "untied": [vars(it) for it in cell.untied],
-        "weakest": cell.weakest,
-        "verdict": verdict_document(cell.verdict),
-        **need_document(cell.need),
-        "details": write(CellDetails, cell.details),
-    }
-    if cell.left_out:
-        document["validation"] = _validation_document(cell)
-    if cell.placed:
-        document["frames"] = frames_document(cell.placed)
-    return document | write(CellSections, cell)
+    form = CellForm(
+        schema=SCHEMA,
+        session=SessionForm(cell.session_name, cell.session_sha256),
+        tree=cell.frames,
+        transforms=cell.edges,
+        joint_covariance=JointCovariance.of(cell.edges, cell.joint_covariance),
+        cameras={thing_name(frame, "camera"): it for frame, it in cell.cameras.items()},
+        robots=cell.arms,
+        views=tuple(CellView.of(cell, it) for it in cell.sights),
+        rms=rms_of(cell.sights),
+        validation=_validation(cell) if cell.left_out else None,
+        frames=cell.placed,
+        **{name: getattr(cell, name) for name in _SAME},
+    )
+    return write(CellForm, form) | write(CellSections, cell)
 
 
 def read_whole(document: Mapping[str, Any]) -> Alignment:
     """Reads what `whole_document` built.
 
     Raises:
-        LookupError, TypeError, ValueError, AttributeError: It is no whole cell of this schema.
+        ValueError: It is of another schema.
+        DataError: It is no whole cell; the message names the place.
     """
-    if document.get("schema") != SCHEMA:
-        raise ValueError(f"schema is {document.get('schema')!r}, this version reads {SCHEMA}")
-    check(document, WHOLE)
-    tree = dict(document["tree"])
+    check_schema(document)
+    form = read(CellForm, document, "")
+    own = {it.name for it in fields(CellForm)}
+    rest = {key: it for key, it in document.items() if key not in own}
+    tree = form.tree
     return Alignment(
-        session_name=document["session"]["name"],
-        session_sha256=document["session"]["sha256"],
-        created=document["created"],
-        reference=document["reference"],
+        session_name=form.session.name,
+        session_sha256=form.session.sha256,
         frames=tree,
         robots={it: thing_name(it, "robot") for it in frames_of_kind(tree, "flange")},
-        edges={name: read_edge(edge, name) for name, edge in document["transforms"].items()},
-        joint_covariance=read_covariance(document["joint_covariance"], "matrix", (-1, -1)),
-        cameras={
-            _frame(tree, "camera", name): read_camera(it)
-            for name, it in document["cameras"].items()
-        },
-        noise={name: dict(it) for name, it in document["noise"].items()},
-        sights=tuple(_sight(tree, it) for it in document["views"]),
-        moved=read_moved(document["moved"]),
-        untied=tuple(Untied(**it) for it in document["untied"]),
-        weakest=document["weakest"],
-        verdict=read_verdict(document["verdict"]),
-        need=read_need(document),
-        details=read(CellDetails, document["details"], "details"),
-        arms={name: _arm(it, name) for name, it in document["robots"].items()},
-        targets={name: dict(it) for name, it in document["targets"].items()},
-        placed=read_frames(document.get("frames", {})),
-        left_out=document.get("validation", {}).get("method", ""),
-        **read_fields(CellSections, {k: v for k, v in document.items() if k not in _OWN_KEYS}, ""),
+        edges=form.transforms,
+        joint_covariance=form.joint_covariance.matrix,
+        cameras={_frame(tree, "camera", name): it for name, it in form.cameras.items()},
+        sights=tuple(it.sight(tree) for it in form.views),
+        arms=form.robots,
+        placed=form.frames,
+        left_out="" if form.validation is None else form.validation.method,
+        **{name: getattr(form, name) for name in _SAME},
+        **read_fields(CellSections, rest, ""),
     )
 
 
-def _validation_document(cell: Alignment) -> dict[str, Any]:
+def _validation(cell: Alignment) -> CellValidation:
     """Residuals of what was left out of fits in turn: of all, and by camera and target."""
     pairs: dict[tuple[str, str], list[Sight]] = {}
     for it in cell.sights:
         if it.left_out_mm is not None:
             pairs.setdefault((it.seer, it.seen), []).append(it)
-    holdout = holdout_rms(cell.sights)
-    return {
-        "method": cell.left_out,
-        "held_out": present(vars(left_out_rms(cell.sights))),
-        **({} if holdout is None else {"holdout": present(vars(holdout))}),
-        "pairs": [
-            {
-                **_seer_and_seen(mine[0]),
-                "views": len(mine),
-                **present(vars(left_out_rms(mine))),
-            }
+    return CellValidation(
+        method=cell.left_out,
+        held_out=left_out_rms(cell.sights),
+        holdout=holdout_rms(cell.sights),
+        pairs=tuple(
+            PairResiduals(views=len(mine), rms=left_out_rms(mine), **_seer_and_seen(mine[0]))
             for mine in pairs.values()
-        ],
-    }
+        ),
+    )
 
 
-def _seer_and_seen(sight: Sight) -> dict[str, str]:
+def _seer_and_seen(sight: Sight) -> dict[str, Any]:
     """What saw, and what was seen, by their kinds."""
     seer = "camera" if sight.seer in frames_of_kind([sight.seer], "camera") else "instrument"
     seen = "target" if sight.seen in frames_of_kind([sight.seen], "target") else "point"
@@ -206,36 +324,3 @@ def _frame(tree: Mapping[str, str], kind: str, name: str) -> str:
     """The frame of what is called so."""
     frame = frame_name(kind, name)
     return frame if frame in tree or name != kind else frame_name(kind, "")
-
-
-def _arm_document(arm: RobotResult) -> dict[str, Any]:
-    model = {} if arm.model is None else dict(arm.model.document)
-    return model | write(ArmSections, arm)
-
-
-def _arm(document: Mapping[str, Any], name: str) -> RobotResult:
-    ours = {it.key for it in entries(ArmSections)}
-    model = {key: it for key, it in document.items() if key not in ours}
-    return RobotResult(
-        Robot.from_document(model) if model else None,
-        **read_fields(ArmSections, document, f"robots.{name}"),
-    )
-
-
-def _view_document(cell: Alignment, sight: Sight) -> dict[str, Any]:
-    """One observation: its thing that sees, what is seen, and the robots that part them."""
-    both = {sight.seer, sight.seen} <= cell.frames.keys()
-    robots = robots_between(cell.frames, sight.seer, sight.seen) if both else ()
-    figures = {name: it for name, it in vars(sight).items() if name not in ("seer", "seen")}
-    of = {"view": sight.view, "stop": sight.stop, **_seer_and_seen(sight)}
-    return present(of | {"robots": [it or "robot" for it in robots]} | figures)
-
-
-def _sight(tree: Mapping[str, str], document: Mapping[str, Any]) -> Sight:
-    figures = dict(document)
-    figures.pop("robots", None)
-    seer, seen = (
-        next(_frame(tree, kind, figures.pop(kind)) for kind in kinds if kind in figures)
-        for kinds in (("camera", "instrument"), ("target", "point"))
-    )
-    return Sight(seer=seer, seen=seen, **figures)

@@ -7,7 +7,7 @@ what is needed.
 from visioncal.core.documents.arrays import read_npy, read_npz
 from visioncal.core.documents.jsons import read_json
 from visioncal.core.documents.opencv import read_opencv
-from visioncal.core.documents.stored import Kinds, parse_stored
+from visioncal.core.documents.stored import parse_stored
 from visioncal.core.documents.tables import TextTable, is_number, read_table
 from visioncal.core.documents.values import as_numbers, mapping, number, shown
 from visioncal.core.documents.xmls import Element, read_xml
@@ -15,7 +15,6 @@ from visioncal.core.documents.yamls import read_yaml
 
 __all__ = [
     "Element",
-    "Kinds",
     "TextTable",
     "as_numbers",
     "is_number",

@@ -1,7 +1,6 @@
 """JSON that visioncal wrote, as it may come back from others: every error names its field."""
 
 import re
-from dataclasses import dataclass
 from typing import Any
 
 from visioncal.core.documents.jsons import parse_json
@@ -18,21 +17,8 @@ _NUMBERS = re.compile(
 )
 # Tables whose fields users name.
 _NAMED = ("frames", "robots", "tree")
-_NOTHING = re.compile(r"(?!)")
 # Squares and products of larger numbers leave what floats hold.
 _LARGEST = 1e60
-
-
-@dataclass(frozen=True)
-class Kinds:
-    """What fields of a document hold, by their names: patterns of those with texts and so on."""
-
-    texts: re.Pattern[str] = _NOTHING
-    tables: re.Pattern[str] = _NOTHING
-    rows: re.Pattern[str] = _NOTHING
-
-
-_NO_KINDS = Kinds()
 
 
 class StoredTable(dict[str, Any]):
@@ -47,13 +33,12 @@ class StoredTable(dict[str, Any]):
         raise DataError(f"{self.path}{key} is missing.", culprits=[f"{self.path}{key}"])
 
 
-def parse_stored(text: bytes | str, label: str, kinds: Kinds = _NO_KINDS) -> StoredTable:
+def parse_stored(text: bytes | str, label: str) -> StoredTable:
     """Parses a document that visioncal wrote.
 
     Args:
         text: The document.
         label: Its origin, for messages.
-        kinds: What its fields hold beside numbers.
 
     Returns:
         Its content; a field that is asked for and missing raises DataError.
@@ -63,41 +48,35 @@ def parse_stored(text: bytes | str, label: str, kinds: Kinds = _NO_KINDS) -> Sto
             it holds, as `rms_mm` does, holds something else; the message has its path.
     """
     text = decode_text(text, label) if isinstance(text, bytes) else text
-    found = _checked(parse_json(text, label), f"{label}: ", "", kinds)
+    found = _checked(parse_json(text, label), f"{label}: ", "")
     if not isinstance(found, StoredTable):
         raise DataError(f"{label} is {shown(found)}; a table is needed.", culprits=[label])
     return found
 
 
-def _checked(value: Any, path: str, key: str, kinds: Kinds) -> Any:  # noqa: ANN401 - what JSON may hold
-    needed = _needed(value, key, kinds)
+def _checked(value: Any, path: str, key: str) -> Any:  # noqa: ANN401 - what JSON may hold
+    needed = _needed(value, key)
     if needed:
         place = path.rstrip(".")
         raise DataError(f"{place} is {shown(value)}; {needed} is needed.", culprits=[place])
     if isinstance(value, dict):
         return StoredTable(
             {
-                name: _checked(it, f"{path}{name}.", "" if key in _NAMED else name, kinds)
+                name: _checked(it, f"{path}{name}.", "" if key in _NAMED else name)
                 for name, it in value.items()
             },
             path,
         )
     if isinstance(value, list):
         stem = path.rstrip(".")
-        return [_checked(it, f"{stem}[{at}].", key, kinds) for at, it in enumerate(value)]
+        return [_checked(it, f"{stem}[{at}].", key) for at, it in enumerate(value)]
     return value
 
 
-def _needed(value: object, key: str, kinds: Kinds) -> str:
+def _needed(value: object, key: str) -> str:
     """What a field must hold by its name and does not; empty where it does."""
-    if isinstance(value, list):
-        return "a table" if kinds.tables.fullmatch(key) else ""
     if _NUMBERS.fullmatch(key) and isinstance(value, str | bool):
         return "a number"
     if isinstance(value, float) and not abs(value) <= _LARGEST:
         return "a number that a cell has"
-    if kinds.texts.fullmatch(key) and isinstance(value, int | float):
-        return "a text"
-    if (kinds.tables.fullmatch(key) or kinds.rows.fullmatch(key)) and not isinstance(value, dict):
-        return "a table"
     return ""
