@@ -278,7 +278,9 @@ def pairs_session(poses):
     return Session.assemble(document, columns, rows, MemoryImages({}))
 
 
-@pytest.mark.parametrize("name", ["inverse poses", "two rows exchanged", "the other mount"])
+@pytest.mark.parametrize(
+    "name", ["inverse poses", "two rows exchanged", "the other mount", "board's size in mm"]
+)
 def test_a_poor_calibration_says_how_the_poses_should_be_read(name):
     planted = MISTAKES[name](cell_poses("eye-in-hand"), np.random.default_rng(0))
     verdict = visioncal.calibrate(pairs_session(planted)).verdict
@@ -303,6 +305,13 @@ def test_what_is_advised_runs_as_it_is_printed_and_mends_it(name, tmp_path, monk
         again = visioncal_command(*shlex.split(command)[1:])
         assert again.status == 0, again.err
     assert Calibration.load(Path("out/calibration.json")).verdict.status == "good"
+
+
+def test_a_refused_calibration_says_so_too():
+    turning = CellOptions(views=14, motion="one_axis", pixel_sigma_px=0.1, seed=4)
+    planted = MISTAKES["two rows exchanged"](seen_in(simulate(turning)), np.random.default_rng(0))
+    with pytest.raises(DegenerateError, match=r"view 8 and view 11 exchanged.*--guess"):
+        visioncal.calibrate(pairs_session(planted))
 
 
 def test_a_sound_calibration_is_not_troubled_by_it():
