@@ -138,7 +138,7 @@ def test_limits_give_way_to_the_need_and_what_is_unexplained_does_not(changes, g
         assert judge(replace(found, need=Need(1e3))).status == "check"
         return
     assert plain.good_for_mm == pytest.approx(max(good_from_mm, 0.28), rel=0.01)
-    assert f"It is good for tasks of {good_from_mm:g}" in plain.reasons[-1] or not good_from_mm
+    assert f"good for tasks of {good_from_mm:g}" in plain.reasons[-1] or not good_from_mm
     assert judge(replace(found, need=Need(plain.good_for_mm))).status == "good"
     assert judge(replace(found, need=Need(0.9 * plain.good_for_mm))).status == "check"
 

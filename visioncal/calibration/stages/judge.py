@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.calibration.stages.causes import LOOK, adding, ranked
+from visioncal.calibration.stages.causes import adding, ranked
 from visioncal.calibration.stages.need import CHECK, GOOD, Picks, need_met
 from visioncal.core.number_format import figure, percent
 from visioncal.core.types import Mount, Need, Rejection
@@ -14,6 +14,7 @@ from visioncal.core.verdict import (
     GOOD_FOR,
     NEED,
     NOTE,
+    REVIEW,
     Finding,
     Step,
     Verdict,
@@ -262,7 +263,7 @@ def judge(findings: Findings, limits: Limits | None = None) -> Verdict:
         ordered = ranked(ordered, findings.picks, met, modelled=findings.plannable)
     said = list(ordered)
     if met is None:
-        said += _good_for(findings, good_for_mm)
+        said += _good_for(findings, good_for_mm, status)
     else:
         said.insert(len(said) * (met.probability >= GOOD), Finding(NEED, met_words(findings, met)))
     said += [] if doubts else [_praise(findings)]
@@ -287,12 +288,15 @@ def _good_for_mm(picks: Sequence[Picks], doubts: Sequence[Finding]) -> float | N
     return max(least, *(it.good_for_mm for it in picks))
 
 
-def _good_for(findings: Findings, good_for_mm: float | None) -> tuple[Finding, ...]:
+def _good_for(
+    findings: Findings, good_for_mm: float | None, status: VerdictStatus
+) -> tuple[Finding, ...]:
     if good_for_mm is None:
         return ()
+    verb = "would be" if status == "bad" else "is"
     worst = max(findings.picks, key=lambda it: it.good_for_mm)
     words = (
-        f"It is good for tasks of {figure(good_for_mm)} mm and more at "
+        f"It {verb} good for tasks of {figure(good_for_mm)} mm and more at "
         f"{figure(worst.distance_m)} m from the camera."
     )
     return (Finding(GOOD_FOR, words),)
@@ -392,9 +396,12 @@ def _pair_doubts(findings: Findings, limits: Limits) -> Iterator[Finding]:
         yield Finding(
             "unexplained",
             f"Left out of the fit, views disagree with the others by "
-            f"{', '.join(words)}, rms; the worst are {named}. Possible causes: "
-            f"{_CAUSES[findings.mount]}, or an arm with large model errors.",
-            LOOK,
+            f"{', '.join(words)}, rms; the worst are {named}.",
+            Step(
+                f"Look at the worst views for possible causes: {_CAUSES[findings.mount]}, or an "
+                "arm with large model errors.",
+                REVIEW,
+            ),
             tuple(it.view for it in worst),
             is_fatal=is_fatal,
             until_mm=0.0,
