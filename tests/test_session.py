@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from visioncal.core.errors import DataError
 from visioncal.core.types import Need
 from visioncal.session import FolderImages, MemoryImages, Session
-from visioncal.session.table import parse_csv
+from visioncal.session.table import parse_csv, read_views
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "sessions"
 
@@ -575,3 +575,36 @@ def test_a_table_of_samples_is_no_table_of_views() -> None:
 def test_a_stamp_beyond_all_time_is_refused(folder: Path) -> None:
     edit(folder, "views.csv", ",0.10,", ",1e308,")
     assert "1e+308 s is no time of a recording" in str(refusal(folder))
+
+
+NUMBERS = np.random.default_rng(3).uniform(0.5, 1.5, (4, 3))
+
+
+@pytest.mark.parametrize(
+    ("names", "rotations", "words"),
+    [
+        ("rx,ry,rz", NUMBERS, "the rotations are in rx,ry,rz.*--robot-form rotation-vector or"),
+        ("A,B,C", 90.0 * NUMBERS, "the rotations are in A,B,C.*--robot-form euler-ZYX-deg"),
+        ("qx,qy,qz,qw", np.pad(2.0 * NUMBERS, ((0, 0), (0, 1))), "line 2.*as it seems, rotation v"),
+        ("qx,qy,qz,qw", np.pad(90.0 * NUMBERS, ((0, 0), (0, 1))), "3 more.*Euler angles in degr"),
+    ],
+)
+def test_rotations_of_another_form_are_named(names, rotations, words):
+    rows = [
+        ",".join(map(str, (at, 0.5, 0.1, 0.3, *it))) for at, it in enumerate(rotations.tolist())
+    ]
+    text = "\n".join([f"view,x_m,y_m,z_m,{names}", *rows])
+    with pytest.raises(DataError) as caught:
+        read_views(*parse_csv(text, "views.csv"), "views.csv", with_corners=True)
+    assert re.match(f".*{words}", f"{caught.value}")
+    assert len(caught.value.culprits) == 1
+
+
+@pytest.mark.parametrize("name", ["cam", "Camera", "webcamera"])
+def test_a_table_of_another_name_is_named(name):
+    document = {"schema": 1, "name": "cell", "mount": "eye-in-hand"}
+    document |= {"target": "charuco_9x6_30mm", name: {}}
+    with pytest.raises(DataError, match=f"{name} is no known name; camera is needed. Rename"):
+        Session.assemble(
+            document, ("view", "image"), [["0", "0.png"]], MemoryImages({"0.png": b""})
+        )

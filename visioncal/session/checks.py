@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from visioncal.core.errors import DataError
+from visioncal.core.files import did_you_mean
 from visioncal.session import columns as known
 from visioncal.session.document import Declaration
 from visioncal.session.table import View
@@ -29,6 +30,13 @@ def check_images_can_be_used(declaration: Declaration, views: Sequence[View]) ->
         ("camera", declaration.camera or declaration.cameras or None, "[camera]"),
     ):
         if with_image and value is None:
+            for key in declaration.model_extra or {}:
+                if key.lower()[:3] == field[:3] or did_you_mean(key, (field,)):
+                    raise DataError(
+                        f"session.toml: {key} is no known name; {field} is needed.",
+                        culprits=[f"session.toml: {key}"],
+                        next_step=f"Rename {key} to {field}.",
+                    )
             raise DataError(
                 f"session.toml: {field} is missing, but view {with_image[0].number} has "
                 f"{'an image' if with_image[0].image else 'rows in corners.csv'}.",

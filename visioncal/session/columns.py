@@ -26,6 +26,13 @@ LOAD = (
     *(f"payload_{axis}_m" for axis in "xyz"),
     *(f"force_{axis}_n" for axis in "xyz"),
 )
+# Columns of rotations that are no quaternions, and the forms that they usually have.
+_ROTATIONS: Mapping[tuple[str, str, str], tuple[str, ...]] = {
+    ("rx", "ry", "rz"): ("rotation-vector", "euler-xyz-deg"),
+    ("a", "b", "c"): ("euler-ZYX-deg",),
+    ("w", "p", "r"): ("euler-xyz-deg",),
+    ("roll", "pitch", "yaw"): ("euler-xyz-rad", "euler-xyz-deg"),
+}
 _PLAIN_NUMBERS = frozenset(
     {
         "stamp_s",
@@ -114,6 +121,16 @@ def check_header(columns: Sequence[str], where: str) -> None:
     problems = list(_header_problems(columns))
     if not problems:
         return
+    spelt = {name.lower(): name for name in columns}
+    turned = next((it for it in _ROTATIONS if spelt.keys() >= set(it)), None)
+    if turned is not None and not set(QUATERNION) & set(columns):
+        names = ",".join(spelt[it] for it in turned)
+        raise DataError(
+            f"{where}: the rotations are in {names}, and quaternions qx, qy, qz, qw are needed.",
+            culprits=[where],
+            next_step="Let visioncal convert write them: --from table --robot-columns "
+            f"x_m,y_m,z_m,{names} --robot-form {' or '.join(_ROTATIONS[turned])}.",
+        )
     others = [
         name
         for mark, name in ((";", "semicolons"), ("\t", "tabs"))

@@ -22,6 +22,9 @@ from visioncal.session.loads import SIDES, load_problems
 _MOST_VIEWS, _MOST_COLUMNS = 20_000, 1_000
 # Rounding to four digits leaves a unit quaternion's norm within this of 1.
 _NORM_TOLERANCE = 1e-3
+# So many rows that are no quaternions are another form of rotation: not one that was rounded, and
+# of a norm that angles in radians do not have, in degrees.
+_FEWEST_ALIKE, _FAR_FROM_UNIT, _ANGLES_RAD = 3, 1.5, 7.0
 _SHOWN_PROBLEMS = 10
 # Stricter than float(), which also takes 1_000, nan, and the digits of other scripts.
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
@@ -124,6 +127,7 @@ class Problem:
 
     place: str
     words: str
+    norm: float | None = None  # of what should be a unit quaternion
 
 
 def parse_csv(text: str, label: str) -> tuple[tuple[str, ...], tuple[Row, ...]]:
@@ -219,6 +223,17 @@ def read_views(
 
 def problems_error(problems: Sequence[Problem]) -> DataError:
     """Words the first ten problems of a table."""
+    norms = [it.norm for it in problems if it.norm is not None]
+    if len(norms) == len(problems) >= _FEWEST_ALIKE and max(norms) > _FAR_FROM_UNIT:
+        degrees = max(norms) > _ANGLES_RAD
+        return DataError(
+            f"{problems[0].place} and {len(norms) - 1} more: these are no quaternions but, as it "
+            f"seems, {'Euler angles in degrees' if degrees else 'rotation vectors or Euler angles'}"
+            f": their norms are {min(norms):.3g} to {max(norms):.3g}, and 1 is needed.",
+            culprits=[problems[0].place],
+            next_step="Write quaternions x, y, z, w; or name the columns as they are meant, as rx, "
+            "ry, rz, and let visioncal convert read them.",
+        )
     shown = problems[:_SHOWN_PROBLEMS]
     more = len(problems) - len(shown)
     lines = [f"{problem.place}: {problem.words}." for problem in shown]
@@ -236,9 +251,9 @@ class _RowReader:
     problems: list[Problem]
     with_corners: bool
 
-    def report(self, column: str, words: str) -> None:
+    def report(self, column: str, words: str, norm: float | None = None) -> None:
         place = f"{self.row.where}, column {column}" if column else self.row.where
-        self.problems.append(Problem(place, words))
+        self.problems.append(Problem(place, words, norm))
 
     def view(self) -> View | None:
         """Reads the row; None where it is so wrong that its problems are all there is."""
@@ -343,6 +358,7 @@ class _RowReader:
                         f"{group[0]} ... {group[-1]}",
                         f"the quaternion's norm is {norm:.6g}, but must be 1 to within "
                         f"{_NORM_TOLERANCE:g}",
+                        norm,
                     )
 
 
