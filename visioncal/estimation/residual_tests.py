@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import chdtri, fdtrc
 
 from visioncal.core.quantiles import chi2_limit, f_limit
 from visioncal.core.transforms import adjoint, invert
@@ -22,6 +23,8 @@ _BLOCKS = 10
 _CELLS, _FEWEST_CORNERS = 6, 4
 # What a lens's own parameters and a plane's pose take out of the cells' means.
 _ABSORBED = 12
+# Of smaller chances there is no telling.
+_LEAST_CHANCE = 1e-300
 
 
 @dataclass(frozen=True)
@@ -59,11 +62,13 @@ class LensField:
     Attributes:
         factor: Variance of the cells' mean residuals over that of noise; at least one.
         sigma_px: Size of the displacements that the lens's model leaves, an axis [px].
+        mahalanobis_sq: The evidence for it, as the square of a standard normal variable.
         is_significant: Whether chance does not explain it.
     """
 
     factor: float
     sigma_px: float
+    mahalanobis_sq: float
     is_significant: bool
 
 
@@ -85,7 +90,7 @@ def lens_field(px: FloatArray, residuals: FloatArray, resolution: tuple[int, int
     many, used = counts[counts >= _FEWEST_CORNERS], int(rows.sum())
     between, within = 2 * len(many) - _ABSORBED, 2 * (used - len(many))
     if between < 1:
-        return LensField(1.0, 0.0, is_significant=False)
+        return LensField(1.0, 0.0, 0.0, is_significant=False)
     sums = np.stack(
         [np.bincount(cell[rows], residuals[rows, it], _CELLS**2) for it in (0, 1)], axis=1
     )
@@ -95,6 +100,7 @@ def lens_field(px: FloatArray, residuals: FloatArray, resolution: tuple[int, int
     return LensField(
         max(factor, 1.0),
         float(np.sqrt(max(factor - 1.0, 0.0) * noise / np.mean(many))),
+        float(chdtri(1.0, max(fdtrc(between, within, factor), _LEAST_CHANCE))),
         bool(factor > f_limit(_FALSE_ALARM, between, within)),
     )
 

@@ -55,4 +55,5 @@ def fields_found(fields: Mapping[str, LensField]) -> Iterator[Finding]:
                     "Fix the focus, give matrix and distortion of a model that fits the lens, or "
                     "keep the work in the middle of the image."
                 ),
+                mahalanobis_sq=it.mahalanobis_sq,
             )

@@ -65,6 +65,7 @@ EVIDENCE: Mapping[str, Evidence] = {
     "board_size": Evidence(2.7e-3, _CHAIN),
     "board_shape": Evidence(1e-4, _CHAIN),
     "lens": Evidence(1e-4, _CHAIN),
+    "lens_field": Evidence(1e-4, _CHAIN),
     "corner_noise": Evidence(1e-4, "corners"),
     "moved_slowly": Evidence(1e-4, _CHAIN),
     "correlated_errors": Evidence(1e-4, _CHAIN),
