@@ -82,10 +82,9 @@ def _bar(steps: Steps) -> Iterator[Callable[[str, int, int], None]]:
 
         def report(name: str, done: int, total: int) -> None:
             steps.report(name, done, total)
-            counted = steps.count or (0, None)
-            if steps.count is None:
-                bar.reset(task, total=None, description=steps.words)
-            bar.update(task, description=steps.words, completed=counted[0], total=counted[1])
+            # An update to no total keeps the one before.
+            completed, bar.tasks[0].total = steps.count or (0, None)
+            bar.update(task, description=steps.words, completed=completed)
 
         yield report
 
