@@ -133,7 +133,7 @@ def test_slow_motions_are_told_to_tell_nothing_of_fast_ones(folder, tmp_path):
 def test_another_robot_is_doubted(folder, tmp_path):
     done = told_of(tmp_path, "ur10e", Session.load(folder).streams["excite"])
     assert done.status == 0
-    assert "Is it the robot that was recorded" in done.err
+    assert "Check whether it is the robot that was recorded" in done.err
 
 
 def test_a_robot_without_inertias_gets_base_parameters(folder, tmp_path):

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from visioncal.core.limits import TOUCH_NOISE_MM, TOUCHED_MM
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import AGREEMENT, Finding, Verdict
@@ -30,9 +31,9 @@ class FixtureOptions:
         points: Points of a drawing in the fit; with fewer none could be told wrong.
     """
 
-    sigma_mm: tuple[float, float] = (0.5, 2.0)
+    sigma_mm: tuple[float, float] = TOUCHED_MM
     sigma_deg: tuple[float, float] = (0.1, 0.4)
-    noise_mm: tuple[float, float] = (0.5, 3.0)
+    noise_mm: tuple[float, float] = TOUCH_NOISE_MM
     points: int = 4
 
 

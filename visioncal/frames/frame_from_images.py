@@ -9,6 +9,7 @@ import numpy as np
 
 from visioncal.calibration.stages.observed import by_reason
 from visioncal.core.errors import DataError
+from visioncal.core.limits import PLACE_MM, SMALL_TURN_DEG
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray, Progress
 from visioncal.core.verdict import AGREEMENT, Finding, Verdict, remarks
@@ -57,8 +58,8 @@ class SeenOptions:
         sigma_deg: The same of the rotation [deg].
     """
 
-    sigma_mm: tuple[float, float] = (1.0, 3.0)
-    sigma_deg: tuple[float, float] = (0.3, 1.0)
+    sigma_mm: tuple[float, float] = PLACE_MM
+    sigma_deg: tuple[float, float] = SMALL_TURN_DEG
 
 
 @dataclass(frozen=True, eq=False)

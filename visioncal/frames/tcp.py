@@ -8,6 +8,7 @@ from typing import Any, cast
 import numpy as np
 
 from visioncal.core.errors import DataError, DegenerateError, VisioncalError
+from visioncal.core.limits import SMALL_TURN_DEG, TOUCH_NOISE_MM, TOUCHED_MM
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray
@@ -41,9 +42,9 @@ class TcpOptions:
         touches: Touches in the fit; fewer leave too little to check it with.
     """
 
-    sigma_mm: tuple[float, float] = (0.5, 2.0)
-    sigma_deg: tuple[float, float] = (0.3, 1.0)
-    noise_mm: tuple[float, float] = (0.5, 3.0)
+    sigma_mm: tuple[float, float] = TOUCHED_MM
+    sigma_deg: tuple[float, float] = SMALL_TURN_DEG
+    noise_mm: tuple[float, float] = TOUCH_NOISE_MM
     touches: int = 5
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from visioncal.calibration.stages.causes import adding, ranked
 from visioncal.calibration.stages.need import CHECK, GOOD, Picks, need_met
+from visioncal.core.limits import PLACE_MM, TURN_DEG
 from visioncal.core.number_format import figure, percent
 from visioncal.core.types import Mount, Need, Rejection
 from visioncal.core.verdict import (
@@ -64,8 +65,8 @@ class Limits:
 
     scatter_mm: tuple[float, float] = (2.0, 10.0)
     scatter_deg: tuple[float, float] = (0.3, 2.0)
-    sigma_mm: tuple[float, float] = (1.0, 3.0)
-    sigma_deg: tuple[float, float] = (0.1, 0.3)
+    sigma_mm: tuple[float, float] = PLACE_MM
+    sigma_deg: tuple[float, float] = TURN_DEG
     pixel_px: tuple[float, float] = (0.7, 3.0)
     level: float = 2.0
     robot_mm: float = 0.2
