@@ -39,6 +39,7 @@ def session_of(cell: Cell) -> Session:
     ]
     if len(cell.sheets) == 1:
         columns = ("view", "image")
+        document["target"] = options.target.name
         return Session(document, columns, tuple(views), options.target, None, MemoryImages({}))
     targets = {name: it.target for name, it in zip(BOARDS, cell.sheets, strict=True)}
     document["targets"] = {name: it.name for name, it in targets.items()}
