@@ -15,7 +15,7 @@ from visioncal.core.transforms import invert, log
 from visioncal.interchange.formats.boards import described_target
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, aprilgrid_target, simulate, write_session
-from visioncal.vision.finders import NotFound, Seen, find_target
+from visioncal.vision.finders import DetectedCorners, NotFound, find_target
 from visioncal.vision.finders.identify import identify
 from visioncal.vision.targets import corner_positions, target_document, target_from_document
 
@@ -83,7 +83,7 @@ def test_a_wrong_field_is_named(change, words):
 def test_corners_are_as_exact_as_the_image(shot, most_px):
     image, truth = photograph(GRID, shot, 1)
     seen = find_target(image, GRID)
-    assert isinstance(seen, Seen), seen
+    assert isinstance(seen, DetectedCorners), seen
     assert len(seen.ids) > 50
     error = seen.px - truth[seen.ids]
     assert np.sqrt(np.mean(error**2)) < most_px

@@ -17,7 +17,7 @@ from visioncal.calibration.verification.calibration_prior import CalibrationPrio
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import exp, invert, log
 from visioncal.estimation.workspace import postures
-from visioncal.frames.session_observations import sighting
+from visioncal.frames.session_observations import session_looks
 from visioncal.interchange.outputs import write_outputs
 from visioncal.session import Session
 from visioncal.simulation import (
@@ -278,7 +278,7 @@ def test_every_output_shows_all_boards(tmp_path):
         assert f"/targets/{name}/sheet" in logged
         assert any(it.startswith(f"/targets/{name}/") for it in placements)
     with pytest.raises(DataError, match=r"several targets \(first, second\)"):
-        sighting(session, written.calibration, "base")
+        session_looks(session, written.calibration, "base")
 
 
 @pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens estimated"])

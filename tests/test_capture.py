@@ -14,7 +14,7 @@ from visioncal.core.transforms import compose
 from visioncal.live.capture.approach import Ways
 from visioncal.live.capture.core import missed
 from visioncal.live.capture.drive import travel_s
-from visioncal.live.capture.joint_pose_check import Agreement
+from visioncal.live.capture.joint_pose_check import JointPoseCheck
 from visioncal.live.capture.live import LiveCell
 from visioncal.live.capture.options import CaptureOptions, Stillness
 from visioncal.live.capture.record import departure
@@ -212,7 +212,7 @@ def test_joints_and_poses_of_other_moments_disagree(plan):
     for stop in plan.stops[:3]:
         arm.q0 = stop.q
         states.append(arm.state())
-    told = Agreement(plan.cell.robot)
+    told = JointPoseCheck(plan.cell.robot)
     assert told.why_not(states[0]) == ""
     assert told.why_not(states[1]) == ""
     stale = replace(states[2], q=states[1].q)
@@ -220,7 +220,7 @@ def test_joints_and_poses_of_other_moments_disagree(plan):
     stale = replace(states[2], base_from_flange=states[1].base_from_flange)
     assert "so the pose is stale" in told.why_not(stale)
     # Another base than the model's, and a tool on its flange, are no disagreement.
-    for other in (Agreement(plan.cell.robot), Agreement(plan.cell.robot)):
+    for other in (JointPoseCheck(plan.cell.robot), JointPoseCheck(plan.cell.robot)):
         offset = compose(np.diag([-1.0, -1.0, 1.0]), np.array([0.1, 0.0, 0.2]))
         for state in states:
             moved = offset @ state.base_from_flange

@@ -10,7 +10,7 @@ from visioncal.core.types import Corners
 from visioncal.live.capture.coach import Coach
 from visioncal.live.capture.core import Capture, Step
 from visioncal.live.capture.follow import ask_and_take, follow
-from visioncal.live.capture.joint_pose_check import Agreement
+from visioncal.live.capture.joint_pose_check import JointPoseCheck
 from visioncal.live.capture.journal import Journal
 from visioncal.live.capture.live import LiveCell
 from visioncal.live.capture.take import Taken
@@ -130,7 +130,7 @@ def _capture(folder, plan: PlanFile, arm: FakeArm, camera: FakeCamera) -> Captur
         plan.cell.target,
         journal,
         QUICK,
-        Agreement(plan.cell.robot),
+        JointPoseCheck(plan.cell.robot),
         Coach(plan.cell.target, camera.resolution, camera.lens),
         None,
     )

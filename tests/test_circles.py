@@ -19,7 +19,7 @@ from visioncal.simulation import (
     symmetric_circles_target,
     write_session,
 )
-from visioncal.vision.finders import NotFound, Seen, find_target
+from visioncal.vision.finders import DetectedCorners, NotFound, find_target
 from visioncal.vision.finders.identify import identify
 from visioncal.vision.targets import (
     corner_positions,
@@ -76,7 +76,7 @@ def test_circles_that_touch_are_refused():
 def test_centres_are_as_exact_as_the_image(target, shot, most_px):
     image, truth = photograph(target, shot, 1)
     seen = find_target(image, target)
-    assert isinstance(seen, Seen), seen
+    assert isinstance(seen, DetectedCorners), seen
     assert len(seen.ids) == len(truth)
     error = numbered(seen, truth) - truth
     assert np.sqrt(np.mean(error**2)) < most_px

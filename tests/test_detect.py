@@ -23,7 +23,7 @@ from visioncal.simulation import (
     render,
     simulate,
 )
-from visioncal.vision.finders import NotFound, Seen, find_target
+from visioncal.vision.finders import DetectedCorners, NotFound, find_target
 from visioncal.vision.finders.headers import claimed_size
 from visioncal.vision.finders.imaging import blur_at_corners, decode_image
 from visioncal.vision.targets import charuco_board, corner_positions
@@ -93,7 +93,7 @@ def test_steep_views_keep_their_corners():
     ours, opencvs = [], []
     for image in images:
         seen, ids = find_target(image, cell.options.target), checked.detectBoard(image)[1]
-        ours.append(len(seen.ids) if isinstance(seen, Seen) else 0)
+        ours.append(len(seen.ids) if isinstance(seen, DetectedCorners) else 0)
         opencvs.append(0 if ids is None else len(ids))
     assert all(mine >= other for mine, other in zip(ours, opencvs, strict=True))
     # With its own check of the markers OpenCV drops the first of these boards altogether.

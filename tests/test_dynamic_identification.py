@@ -17,7 +17,7 @@ from visioncal.dynamics.identify import SLOW_RAD_S, Options, block_of, identify
 from visioncal.dynamics.judge import judge
 from visioncal.dynamics.limits import Share, allowed_motion
 from visioncal.dynamics.model import DynamicModel
-from visioncal.dynamics.null_space import untold
+from visioncal.dynamics.null_space import null_space
 from visioncal.dynamics.reading import Recorded, read_recorded
 from visioncal.dynamics.sweeps import SweepRequest, plan_sweeps
 from visioncal.dynamics.validate import friction_of_known, predict, validate
@@ -191,7 +191,7 @@ def test_motion_about_one_line_is_named():
         values[:, 1:] = values[:, :1] * np.array([1e-6, 0.0, 0.0, 0.0, 0.0])
     base = BaseModel.reduce(DynamicModel(known_arm(), TERMS))
     stream = recorded(real_dynamics("ur5e", rng), done, rng, Senses(q_rad=0.0))
-    lost = [base.names[it] for it in untold(base, [block_of(base, stream)])]
+    lost = [base.names[it] for it in null_space(base, [block_of(base, stream)])]
     assert "Fc4" in lost
     assert len(lost) > 20
 

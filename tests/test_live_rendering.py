@@ -11,7 +11,7 @@ from visioncal.live.rehearsal.camera import Clock, Pace, RehearsalCamera
 from visioncal.simulation import CellOptions, Second, prepare_scene, render, simulate
 from visioncal.simulation.live import LiveView
 from visioncal.vision.finders.charuco import find_charuco
-from visioncal.vision.finders.result import Seen
+from visioncal.vision.finders.result import DetectedCorners
 
 TARGET = CellOptions().target
 # How each joint shares in a motion, in no special direction.
@@ -27,7 +27,7 @@ def a_cell(**options):
 
 def errors_px(image, exact):
     found = find_charuco(image, TARGET)
-    assert isinstance(found, Seen)
+    assert isinstance(found, DetectedCorners)
     ids, mine, theirs = np.intersect1d(found.ids, exact.ids, return_indices=True)
     assert len(ids) > 0.8 * len(exact.ids)
     return found.px[mine] - exact.px[theirs]
@@ -69,7 +69,9 @@ def test_a_fast_motion_leaves_no_board_to_be_found():
     swept = cell.joints[0] + np.linspace(-0.5, 0.5, 5)[:, None] * 0.02 * SWAY
     image = LiveView(cell).picture(swept)
     found = find_charuco(image, TARGET)
-    assert not isinstance(found, Seen) or len(found.ids) < 0.8 * len(cell.exact_corners[0].ids)
+    assert not isinstance(found, DetectedCorners) or len(found.ids) < 0.8 * len(
+        cell.exact_corners[0].ids
+    )
 
 
 def test_an_arm_that_looks_elsewhere_sees_no_board():
@@ -77,7 +79,7 @@ def test_an_arm_that_looks_elsewhere_sees_no_board():
     live = LiveView(cell)
     for turn in (1.5, 2.5, -2.5):
         away = cell.joints[0] + np.array([0.0, 0.0, 0.0, turn, 0.0, 0.0])
-        assert not isinstance(find_charuco(live.picture(away[None]), TARGET), Seen)
+        assert not isinstance(find_charuco(live.picture(away[None]), TARGET), DetectedCorners)
 
 
 def test_two_boards_are_refused():

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from visioncal.calibration.stages.init_frames import place
+from visioncal.calibration.stages.init_frames import init_frames
 from visioncal.calibration.stages.pnp import estimate_poses
 from visioncal.calibration.stages.pose_ambiguity import chosen
 from visioncal.core.transforms import exp, invert, log
@@ -36,7 +36,7 @@ def chosen_of(result, cell):
     """The views with the one pose that the robot's motion leaves to each."""
     first = np.array([it.cam_from_target[0] for it in result.views])
     problem = chain("eye-in-hand", cell.base_from_flange, first)
-    return place(problem, result.views, {"target": cell.options.target})
+    return init_frames(problem, result.views, {"target": cell.options.target})
 
 
 def test_poses_follow_their_stated_covariance():

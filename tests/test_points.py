@@ -27,7 +27,7 @@ from visioncal import align, calibrate
 from visioncal.calibration.pipeline import run
 from visioncal.calibration.stages.detect import detect
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
-from visioncal.calibration.verification.prediction import see_again
+from visioncal.calibration.verification.prediction import predict_stops
 from visioncal.core.errors import DataError
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import invert, log
@@ -108,7 +108,7 @@ def test_points_that_are_not_where_the_table_has_them_are_named(tmp_path):
     free = CalibrationPrior.of(again).free
     moved = free.corners_after(np.zeros(len(free.columns)))[4] - free.positions[4]
     assert moved == pytest.approx(result.rig.shape[4])
-    assert see_again(fresh, CalibrationPrior.of(again)).known.pixel_px == pytest.approx(
+    assert predict_stops(fresh, CalibrationPrior.of(again)).known.pixel_px == pytest.approx(
         NOISE_PX, rel=0.15
     )
 

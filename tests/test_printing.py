@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from visioncal.cli.target import target_app
 from visioncal.core.errors import DataError
 from visioncal.core.types import Target
-from visioncal.vision.finders import Seen, find_target
+from visioncal.vision.finders import DetectedCorners, find_target
 from visioncal.vision.printing import Request, arrange, draw_pattern, pages_named, requested_target
 from visioncal.vision.printing.drawing import to_pdf, to_png, to_svg
 from visioncal.vision.printing.page import EDGE_MM
@@ -41,7 +41,7 @@ BOARDS = {name: load_target(name, None)[0] for name in target_names()} | ODD
 def scales(image, target, size_mm) -> tuple[int, np.ndarray]:
     """How many corners are found, and their scale along x and y over the page's."""
     seen = find_target(image, target)
-    assert isinstance(seen, Seen), seen
+    assert isinstance(seen, DetectedCorners), seen
     # A renderer rounds the page to whole pixels, and stretches what is on it as much.
     px_per_mm = np.array(image.shape[::-1]) / np.array(size_mm)
     places_mm = 1e3 * corner_positions(target)[seen.ids, :2]

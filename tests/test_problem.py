@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from problems import ROBOT_SIGMAS, away, moved, observed, pose, true_state, world
 
-from visioncal.calibration.stages.init_network import tie
+from visioncal.calibration.stages.init_network import init_network
 from visioncal.calibration.stages.pair_observations import Sighted
 from visioncal.calibration.stages.pairwise import Candidates
 from visioncal.estimation.outliers import agree, settle
@@ -50,7 +50,7 @@ def sighted(problem, **turned):
 
 
 def started(problem):
-    tied = tie(problem.tree, problem.poses, sighted(problem))
+    tied = init_network(problem.tree, problem.poses, sighted(problem))
     assert not tied.untied
     return State(np.array([tied.edges[it] for it in problem.unknown]), np.zeros(0))
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.special import chdtrc
 from sound_findings import SOUND, changed, directions, left_out
 
-from visioncal.calibration.stages.causes import read_otherwise, with_misread
+from visioncal.calibration.stages.cause_ranking import read_otherwise, with_misread
 from visioncal.calibration.stages.fit_messages import scale_found
 from visioncal.calibration.stages.judge import judge
 from visioncal.calibration.stages.need import Picks

@@ -13,7 +13,7 @@ from wrong_arms import WRONG_LINKS
 import visioncal
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.steps import STAGES
-from visioncal.calibration.stages.arm_identifiability import tell
+from visioncal.calibration.stages.arm_identifiability import identify_arm
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import MOUNTS
@@ -27,7 +27,7 @@ from visioncal.estimation.variance import Knowledge
 from visioncal.estimation.workspace import postures
 from visioncal.results import to_document
 from visioncal.robot import CONVENTIONS, Robot, convert_table, load_robot, robot_names, table_of
-from visioncal.robot.slopes import number_jacobian, table_moves
+from visioncal.robot.jacobians import number_jacobian, table_moves
 from visioncal.robot.tables import table_document, table_from_document
 from visioncal.simulation import simulate
 
@@ -125,7 +125,7 @@ def test_ranks_are_those_of_theory(name, mount):
     robot = robot_of(name)
     rails = int(robot.chain.prismatic.sum())
     turning = robot.joint_count - rails
-    told = tell(arm_data(robot, postures(robot)[:40], mount)).told
+    told = identify_arm(arm_data(robot, postures(robot)[:40], mount)).told
     expected = 4 * turning + 2 * rails + 6
     assert told.columns == 12 + 6 * robot.joint_count
     assert (told.identifiable, told.told, told.missing.shape[1]) == (expected, expected, 0)
@@ -138,7 +138,10 @@ def test_readings_of_one_point_tell_three_values_less(name):
     """A point of the tool has a place and no direction."""
     robot = load_robot(name)
     arm = arm_data(robot, postures(robot)[:60], "eye-to-hand")
-    whole, point = tell(arm).told, tell(replace(arm, measured=np.arange(6) > 2)).told
+    whole, point = (
+        identify_arm(arm).told,
+        identify_arm(replace(arm, measured=np.arange(6) > 2)).told,
+    )
     assert (point.identifiable, point.told) == (whole.identifiable - 3, whole.told - 3)
 
 
@@ -152,17 +155,19 @@ def test_a_second_board_adds_six_values(mount):
     state = replace(arm.state, values=problem.start_values)
     covariance = covariance_from(fisher_information(problem, state, arm.noise))
     further = {"frames": np.arange(18), "columns": 6 + arm.columns}
-    telling = tell(replace(arm, problem=problem, state=state, covariance=covariance, **further))
+    telling = identify_arm(
+        replace(arm, problem=problem, state=state, covariance=covariance, **further)
+    )
     told = telling.told
     assert (told.columns, told.identifiable, told.told) == (54, 36, 36)
     # Half of the stops have a board of their own to place: they tell less of the arm.
-    assert np.median(telling.sigmas_m) > np.median(tell(arm).sigmas_m)
+    assert np.median(telling.sigmas_m) > np.median(identify_arm(arm).sigmas_m)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_offsets_of_the_first_and_the_last_joint_are_never_told(mount):
     robot = load_robot("ur5e")
-    telling = tell(arm_data(robot, postures(robot)[:40], mount, ("offsets",)))
+    telling = identify_arm(arm_data(robot, postures(robot)[:40], mount, ("offsets",)))
     assert (telling.told.identifiable, telling.told.told) == (16, 16)
     assert telling.not_told == (
         "the offset of joint 1 (shoulder_pan_joint) cannot be told from the base frame",
@@ -170,7 +175,7 @@ def test_offsets_of_the_first_and_the_last_joint_are_never_told(mount):
     )
     assert telling.advice == ""
     # Both sines of each encoder are told, however the arm is mounted.
-    both = tell(arm_data(robot, postures(robot)[:60], mount, ("links", "eccentricity")))
+    both = identify_arm(arm_data(robot, postures(robot)[:60], mount, ("links", "eccentricity")))
     assert (both.told.identifiable, both.told.told) == (42, 42)
 
 
@@ -178,7 +183,7 @@ def test_offsets_of_the_first_and_the_last_joint_are_never_told(mount):
 def test_beta_is_chosen_for_parallel_axes(name):
     robot = load_robot(name)
     data = arm_data(robot, postures(robot)[:40])
-    by_default, standard = tell(data), tell(data, "standard")
+    by_default, standard = identify_arm(data), identify_arm(data, "standard")
     assert (by_default.convention, standard.convention) == ("hayati", "standard")
     betas = [it.parameter.joint for it in by_default.estimates if it.parameter.kind == "beta"]
     assert betas == [1, 2]
@@ -193,7 +198,7 @@ def test_beta_is_chosen_for_parallel_axes(name):
 def test_what_hides_in_the_frames_depends_on_the_convention():
     robot = load_robot("panda")
     data = arm_data(robot, postures(robot)[:40])
-    lost = {it: tell(data, it).not_told for it in CONVENTIONS}
+    lost = {it: identify_arm(data, it).not_told for it in CONVENTIONS}
     # Craig's first row lies before the first axis; Denavit and Hartenberg's last behind the last.
     assert any(it.startswith("the twist alpha of joint 1 ") for it in lost["modified"])
     assert any(it.startswith("the twist alpha of joint 7 ") for it in lost["standard"])
@@ -204,7 +209,7 @@ def test_a_joint_that_hardly_moved_is_named():
     robot = load_robot("ur5e")
     q = postures(robot)[:40].copy()
     q[:, 4] = 1.2 + np.deg2rad(np.linspace(-1.0, 1.0, len(q)))
-    telling = tell(arm_data(robot, q))
+    telling = identify_arm(arm_data(robot, q))
     assert telling.told.identifiable == 30
     assert 26 <= telling.told.told < 30
     assert len(telling.not_told) == 7
@@ -214,14 +219,14 @@ def test_a_joint_that_hardly_moved_is_named():
     # Done as advised, all is told.
     wanted = float(telling.advice.split("joint 5 by ")[1].split(" deg")[0])
     q[:, 4] += np.deg2rad(np.random.default_rng(1).uniform(-0.5, 0.5, len(q)) * wanted)
-    assert tell(arm_data(robot, q)).told.told == 30
+    assert identify_arm(arm_data(robot, q)).told.told == 30
 
 
 def test_two_joints_that_stood_still_are_named():
     robot = load_robot("irb120")
     q = postures(robot)[:40].copy()
     q[:, [2, 3]] = [0.2, 0.4]
-    telling = tell(arm_data(robot, q))
+    telling = identify_arm(arm_data(robot, q))
     assert telling.told.told < 30
     named = {"joint 3 (joint_3)", "joint 4 (joint_4)"}
     assert {it for it in named if it in telling.not_told[-1]} == named
@@ -233,7 +238,7 @@ def test_a_rail_that_stood_still_is_named_in_millimetres():
     robot = robot_of("crane")
     q = postures(robot)[:40].copy()
     q[:, 2] = 0.1
-    telling = tell(arm_data(robot, q))
+    telling = identify_arm(arm_data(robot, q))
     assert telling.told.told < telling.told.identifiable
     assert "joint 3 (joint_3) moved by 0 mm only" in telling.not_told[-1]
     assert "mm or more" in telling.advice
@@ -252,7 +257,7 @@ def test_better_stops_have_better_indices():
     q = postures(robot)[:60]
     # Near one posture all slopes look alike.
     near = q.mean(axis=0) + 0.3 * (q - q.mean(axis=0))
-    wide, narrow = (tell(arm_data(robot, it)).indices for it in (q, near))
+    wide, narrow = (identify_arm(arm_data(robot, it)).indices for it in (q, near))
     for name in ("o1", "o2", "o3", "o4", "o5"):
         assert getattr(wide, name) > 1.5 * getattr(narrow, name)
 
@@ -261,7 +266,7 @@ def test_better_stops_have_better_indices():
 def test_the_worth_of_a_stop_is_that_of_a_fit_without_it(mount):
     robot = load_robot("ur5e")
     arm = arm_data(robot, postures(robot)[:15], mount)
-    telling = tell(arm)
+    telling = identify_arm(arm)
     anywhere = postures(arm.model.robot)
     flange = arm.model.base_from_flange(anywhere)
     poses, jacobian = arm.pair.jacobian(flange, arm.basis(anywhere))
@@ -303,7 +308,7 @@ def test_sigmas_hold_the_errors_of_the_numbers(name, convention):
             covariance=result.covariance,
             model=found,
         )
-        telling = tell(arm, convention)
+        telling = identify_arm(arm, convention)
         like = convert_table(table_from_document(robot.document), convention)
         wanted = table_of(true.bare, convention, like=like)
         # What the frames hide keeps what was stated, which says nothing of the sigma.
@@ -360,7 +365,7 @@ def test_the_result_is_in_the_convention_that_is_asked_for(calibrated_cell, conv
 def test_a_tool_on_the_flange_is_no_change_of_the_arm():
     model = erring(load_robot("ur5e"))
     assert np.abs(TOOL - np.eye(4)).max() > 0.05
-    telling = tell(arm_data(model.nominal, postures(model.nominal)[:40]))
+    telling = identify_arm(arm_data(model.nominal, postures(model.nominal)[:40]))
     assert max(abs(it.identified - it.nominal) for it in telling.estimates) < 1e-12
 
 

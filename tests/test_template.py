@@ -9,7 +9,7 @@ from boards import charuco, checkerboard
 from marks import slow
 from rendered import Shot, photograph
 
-from visioncal.vision.finders import Seen, blur_of, board, find_target
+from visioncal.vision.finders import DetectedCorners, blur_of, board, find_target
 from visioncal.vision.finders.charuco import find_charuco
 from visioncal.vision.finders.checkerboard import find_checkerboard
 from visioncal.vision.finders.template import refine
@@ -138,14 +138,14 @@ def test_a_corner_unlike_the_print_is_left_out_of_a_view():
     u, v = np.rint(truth[14]).astype(int)
     cv2.circle(image, (int(u) + 5, int(v) - 4), 6, 250, -1)
     seen = find_target(image, CHECKERBOARD)
-    assert isinstance(seen, Seen)
+    assert isinstance(seen, DetectedCorners)
     assert seen.ids.tolist() == [*range(14), *range(15, 30)]
     assert np.abs(seen.px - truth[seen.ids]).max() < 0.03
 
 
 def test_where_few_corners_are_like_the_print_the_detector_serves(monkeypatch):
     image, truth = photograph(CHECKERBOARD, replace(SMALL, square_px=40), 1)
-    seen = Seen(np.arange(30), truth + 0.1)
+    seen = DetectedCorners(np.arange(30), truth + 0.1)
     monkeypatch.setitem(board.FINDERS, "checkerboard", lambda *_: seen)
     for covered, fits in ((0.3, True), (0.7, False), (1.0, False)):
         blank = image.copy()

@@ -14,7 +14,7 @@ from marks import slow
 from threadpoolctl import threadpool_info
 
 from visioncal.calibration.pipeline import run
-from visioncal.core.threads import Shared
+from visioncal.core.threads import SharedSetting
 from visioncal.interchange.outputs import write_outputs
 from visioncal.present.recording import read_evidence
 from visioncal.session import Session
@@ -63,7 +63,7 @@ def test_a_shared_setting_is_made_by_the_first_and_undone_by_the_last():
         yield
         log.append("undone")
 
-    shared = Shared(setting)
+    shared = SharedSetting(setting)
     first, second = shared.held(), shared.held()
     first.__enter__()
     second.__enter__()

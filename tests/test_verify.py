@@ -24,7 +24,7 @@ from visioncal.calibration.verification import (
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.calibration.verification.check import check
 from visioncal.calibration.verification.messages import _signed_axis
-from visioncal.calibration.verification.prediction import known_before, see_again, seen_by
+from visioncal.calibration.verification.prediction import known_before, predict_stops, seen_by
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.present.report.check import render_check
@@ -267,26 +267,26 @@ def test_boards_are_those_of_the_same_name_or_print_however_many_a_session_has(t
     prior_calibration = CalibrationPrior.of(calibrate(two))
     named = dict(reversed(two.targets.items()))
     turned = replace(two, targets=named)
-    assert check(see_again(turned, prior_calibration), prior_calibration).passed
+    assert check(predict_stops(turned, prior_calibration), prior_calibration).passed
     for name, board in two.targets.items():
         shown = tuple(it for it in two.views if it.text["target"] == name)
         alone = {key: it for key, it in two.document.items() if key != "targets"}
         one = replace(two, document=alone, target=board, targets={}, views=shown)
-        found = check(see_again(one, prior_calibration), prior_calibration)
+        found = check(predict_stops(one, prior_calibration), prior_calibration)
         assert found.passed
         assert found.seen.stops == len(shown)
         with pytest.raises(DataError, match="which of the targets"):
-            see_again(replace(one, target=None), prior_calibration)
+            predict_stops(replace(one, target=None), prior_calibration)
         with pytest.raises(DataError, match="columns = 11"):
-            see_again(
+            predict_stops(
                 replace(turned, targets={**named, name: replace(board, columns=11)}),
                 prior_calibration,
             )
         with pytest.raises(DataError, match="is none of those") as refused:
-            see_again(two, CalibrationPrior.of(calibrate(one)))
+            predict_stops(two, CalibrationPrior.of(calibrate(one)))
         assert "that target alone" in refused.value.next_step
         with pytest.raises(DataError, match="is none of those"):
-            see_again(replace(one, target=replace(board, columns=11)), prior_calibration)
+            predict_stops(replace(one, target=replace(board, columns=11)), prior_calibration)
 
 
 def test_other_cells_are_refused_by_what_differs():

@@ -23,7 +23,7 @@ from results import few, write_section
 
 from visioncal.core.types import FloatArray, Image, Target
 from visioncal.vision.finders.board import FINDERS, find_board
-from visioncal.vision.finders.result import Seen
+from visioncal.vision.finders.result import DetectedCorners
 from visioncal.vision.finders.template import refine
 
 PICTURES, REPEATS = few((2, 7), (1, 1))
@@ -128,14 +128,14 @@ def compared(target: Target, words: str, shot: Shot) -> Row | None:
     )
 
 
-def detected(image: Image, target: Target) -> Seen | None:
+def detected(image: Image, target: Target) -> DetectedCorners | None:
     """What OpenCV's detector gives."""
     seen = FINDERS[target.kind](image, target)
-    return seen if isinstance(seen, Seen) else None
+    return seen if isinstance(seen, DetectedCorners) else None
 
 
 def peers(
-    image: Image, target: Target, seen: Seen, side_px: float
+    image: Image, target: Target, seen: DetectedCorners, side_px: float
 ) -> Iterator[tuple[str, FloatArray]]:
     """What else is made of the detected corners."""
     yield "detector", seen.px

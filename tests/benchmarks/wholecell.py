@@ -25,9 +25,9 @@ from visioncal.session import Session
 from visioncal.simulation.layout import BoardAt, CameraAt, NetworkOptions, RobotAt, Swept
 from visioncal.simulation.network import simulate_network
 from visioncal.simulation.network_records import network_session
+from visioncal.simulation.observed_points import Network
 from visioncal.simulation.optics import fine_camera
 from visioncal.simulation.options import checkerboard_target
-from visioncal.simulation.seen import Network
 
 CELLS = 50
 STOPS = 40

@@ -29,7 +29,7 @@ from visioncal.cli.framing import (
     touch_wishes,
 )
 from visioncal.cli.refusing import refuse_given
-from visioncal.cli.seeing import (
+from visioncal.cli.target_in_images import (
     PointOption,
     frame_by_images,
     image_session,

@@ -15,7 +15,7 @@ from visioncal.live.capture.coach import Coach
 from visioncal.live.capture.core import Capture, Step, Watcher
 from visioncal.live.capture.facts import Facts
 from visioncal.live.capture.follow import ask_and_take, follow
-from visioncal.live.capture.joint_pose_check import Agreement
+from visioncal.live.capture.joint_pose_check import JointPoseCheck
 from visioncal.live.capture.journal import Journal
 from visioncal.live.capture.live import LiveCell
 from visioncal.live.capture.options import CaptureOptions
@@ -162,7 +162,7 @@ def guided(
         scene.target,
         journal,
         taking,
-        Agreement(scene.robot),
+        JointPoseCheck(scene.robot),
         Coach(scene.target, cell.camera.resolution, lens),
         prediction,
         watchers,

@@ -15,7 +15,7 @@ from threadpoolctl import ThreadpoolController
 DRAWING = RLock()
 
 
-class Shared:
+class SharedSetting:
     """A setting that holds while any thread is within."""
 
     def __init__(self, setting: Callable[[], AbstractContextManager[object]]) -> None:
@@ -56,4 +56,4 @@ def _thread_pools() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-_ONE_BLAS_THREAD = Shared(lambda: _thread_pools().limit(limits=1))
+_ONE_BLAS_THREAD = SharedSetting(lambda: _thread_pools().limit(limits=1))

@@ -13,7 +13,7 @@ from scipy.linalg import cholesky, solve_triangular
 
 from visioncal.core.types import FloatArray, Mask
 from visioncal.dynamics.base import BaseModel
-from visioncal.estimation.levenberg_marquardt import Linearised, descend
+from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
 from visioncal.estimation.linalg import covariance_from, damped_step
 from visioncal.robot import Inertias, LogCholesky
 
@@ -65,7 +65,7 @@ def fit_consistent(
     positive = np.array([it.startswith(_POSITIVE) for it in names], dtype=bool)
     problem = _Problem(base, values, _Whitened.of(covariance), LogCholesky.around(known), held)
     for _ in range(len(names) + 1):
-        state, _ = descend(problem.start(), problem.linearised, _SETTLED)
+        state, _ = levenberg_marquardt(problem.start(), problem.linearised, _SETTLED)
         wrong = positive & (state.own < 0.0) & ~problem.held
         if not wrong.any():
             break

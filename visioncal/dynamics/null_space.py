@@ -60,7 +60,7 @@ def check_told(base: BaseModel, blocks: Sequence[Block]) -> None:
     Raises:
         DegenerateError: There is one; its main parameters are named.
     """
-    lost = untold(base, blocks)
+    lost = null_space(base, blocks)
     if lost:
         names = base.names
         raise DegenerateError(
@@ -71,7 +71,7 @@ def check_told(base: BaseModel, blocks: Sequence[Block]) -> None:
         )
 
 
-def untold(base: BaseModel, blocks: Sequence[Block]) -> list[int]:
+def null_space(base: BaseModel, blocks: Sequence[Block]) -> list[int]:
     """The base parameters in directions about which a motion says nothing."""
     information = np.zeros((base.rank, base.rank))
     rows = 0

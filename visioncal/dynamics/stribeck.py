@@ -17,7 +17,7 @@ from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.friction import sign
 from visioncal.dynamics.motion import Motion
 from visioncal.dynamics.regression import Block, Regression, regress
-from visioncal.estimation.levenberg_marquardt import Linearised, descend
+from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
 from visioncal.estimation.linalg import covariance_from, damped_step, gram
 
 # Where the search begins, and what it stays within [rad/s].
@@ -130,7 +130,7 @@ def _descended(whole: "_Weighted", start: Stribeck) -> "_Look":
 
         return Linearised(logs, look.cost, step)
 
-    logs, _ = descend(np.log(start.speed_rad_s), linearise, _SETTLED)
+    logs, _ = levenberg_marquardt(np.log(start.speed_rad_s), linearise, _SETTLED)
     return whole.look(replace(start, speed_rad_s=np.exp(logs)))
 
 

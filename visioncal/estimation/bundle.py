@@ -12,7 +12,7 @@ import numpy as np
 from visioncal.core.transforms import exp
 from visioncal.core.types import Camera, FloatArray
 from visioncal.estimation.corners import CornerStack, Reprojection, reproject
-from visioncal.estimation.levenberg_marquardt import Linearised, descend
+from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
 from visioncal.estimation.linalg import covariance_from, damped_step
 from visioncal.vision.camera import intrinsics, with_intrinsics
 
@@ -104,7 +104,7 @@ def fit_bundle(
 
         return Linearised(at, float(np.sum(now.residuals**2) + weight @ offset**2), step)
 
-    (values, poses), settled = descend((start, cam_from_target), linearise, _SETTLED)
+    (values, poses), settled = levenberg_marquardt((start, cam_from_target), linearise, _SETTLED)
     fitted = with_intrinsics(camera, values)
     return _finished(stack, fitted, poses, reproject(stack, fitted, poses), settled=settled)
 

@@ -17,7 +17,7 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.files import some_of
 from visioncal.core.transforms import compose, exp, skew
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.estimation.group_outliers import Agreement, agreeing_groups
+from visioncal.estimation.group_outliers import GroupInliers, agreeing_groups
 from visioncal.estimation.groups import GroupFit, Groups
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.observability import SIGMA_LIMIT_M, Direction
@@ -83,7 +83,7 @@ class FeatureFit:
             they are those of a careful touch.
     """
 
-    agreement: Agreement[FloatArray]
+    agreement: GroupInliers[FloatArray]
     noise_m: float | None
     worst: tuple[Direction, Direction]
 

@@ -21,7 +21,7 @@ _ODDS = 100.0
 
 
 @dataclass(frozen=True, eq=False)
-class Agreement(Generic[State]):
+class GroupInliers(Generic[State]):
     """The groups that agree, and their fit.
 
     Attributes:
@@ -48,7 +48,7 @@ def agreeing_groups(
     problem: GroupProblem[State],
     expected_sigma: float | None = None,
     start: tuple[Mask, State] | None = None,
-) -> Agreement[State]:
+) -> GroupInliers[State]:
     """Finds the groups that agree with each other, and fits the unknowns to them.
 
     Args:
@@ -79,7 +79,7 @@ def agreeing_groups(
     explained = not doubtful.any() and (
         expected_sigma is None or _is_explained(fit, expected_sigma)
     )
-    return Agreement(fit, fit.used, away.squares / per, away.limit / per, doubtful, explained)
+    return GroupInliers(fit, fit.used, away.squares / per, away.limit / per, doubtful, explained)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 from visioncal.core.types import FloatArray, Mask
-from visioncal.estimation.levenberg_marquardt import Linearised, descend
+from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
 from visioncal.estimation.linalg import covariance_from, damped_step, gram, spectrum
 from visioncal.estimation.variance import (
     LEAST_SIGMA,
@@ -234,4 +234,4 @@ def descended(
             lambda damping: problem.move(at, damped_step(information, gradient, damping)),
         )
 
-    return descend(start, linearise, _SETTLED)
+    return levenberg_marquardt(start, linearise, _SETTLED)

@@ -16,7 +16,7 @@ from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.corners import floored_sigma_px
-from visioncal.estimation.effects.lenses import CameraParameters, Seen
+from visioncal.estimation.effects.lenses import CameraParameters, LinearisedCorners
 from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
@@ -63,7 +63,7 @@ class Side(Protocol):
     def has_errors(self) -> bool:
         """Whether errors of an arm are free at all."""
 
-    def problem(self, seen: Seen) -> Problem:
+    def problem(self, seen: LinearisedCorners) -> Problem:
         """The problem of what the fit uses, with lenses and boards as its first effect."""
 
     def with_errors(self, fitted: "Fitted") -> Self:
@@ -77,7 +77,7 @@ class Side(Protocol):
 class Fitted:
     """The fit at rest: the linearisation, the problem of all frames, and what came out."""
 
-    seen: Seen
+    seen: LinearisedCorners
     problem: Problem
     fit: Solution
 
@@ -168,7 +168,7 @@ def _settled(side: Side, fitted: Fitted) -> Fitted:
     return fitted
 
 
-def _stepped(fitted: Fitted) -> Seen:
+def _stepped(fitted: Fitted) -> LinearisedCorners:
     """Linearises where the fit came to rest, or on the way there as far as the corners follow.
 
     Far from the answer, as where a lens was stated for images of another size, the whole step
@@ -185,7 +185,7 @@ def _stepped(fitted: Fitted) -> Seen:
 
 
 def _fitted(
-    side: Side, seen: Seen, frames: Mapping[str, FloatArray], others: FloatArray | None
+    side: Side, seen: LinearisedCorners, frames: Mapping[str, FloatArray], others: FloatArray | None
 ) -> Fitted:
     problem = side.problem(seen)
     start = problem.start(frames)
@@ -307,7 +307,7 @@ class Scores:
         return score_gain(self.information, self.gradient, among)
 
 
-def _at(side: Side, fitted: Fitted, seen: Seen) -> tuple[Problem, State]:
+def _at(side: Side, fitted: Fitted, seen: LinearisedCorners) -> tuple[Problem, State]:
     """The problem with other values free, and a fit's state in it."""
     values = fitted.looks.values[seen.free]
     state = State(fitted.fit.state.edges, np.concatenate([values, fitted.others]))

@@ -20,7 +20,7 @@ class Linearised(Generic[State]):
     step: Callable[[float], State]
 
 
-def descend(
+def levenberg_marquardt(
     start: State, linearise: Callable[[State], Linearised[State]], settled: float
 ) -> tuple[State, bool]:
     """Minimises a sum of squares (Levenberg 1944; Marquardt 1963).

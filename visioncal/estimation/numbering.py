@@ -16,7 +16,7 @@ from scipy.optimize import linear_sum_assignment
 from visioncal.core.quantiles import f_limit
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.placing import LEAST_NOISE_M
-from visioncal.estimation.procrustes import align, apply, misfit
+from visioncal.estimation.procrustes import align, apply, procrustes_residual
 
 # So many orders are all tried: seven points of seven.
 _EXHAUSTIVE = 5040
@@ -111,7 +111,7 @@ def find_numbering(
     count = len(measured)
     stated = np.arange(count)
     orders = np.unique(np.vstack([stated, _orders(measured, nominal)]), axis=0)
-    squares = misfit(measured[None], nominal[orders])
+    squares = procrustes_residual(measured[None], nominal[orders])
     freedom = 3.0 * count - 6.0
     # What noise that is known beforehand leaves in any order counts as no difference.
     floor = freedom * max(noise_m, LEAST_NOISE_M) ** 2

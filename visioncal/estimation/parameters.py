@@ -10,7 +10,7 @@ from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.robot import FUNCTION_NAMES, DHTable
-from visioncal.robot.slopes import ROW_NAMES, number_jacobian, table_moves
+from visioncal.robot.jacobians import ROW_NAMES, number_jacobian, table_moves
 
 _LENGTHS = ("d", "a")
 _ROW = len(ROW_NAMES)

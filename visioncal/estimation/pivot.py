@@ -13,7 +13,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.quantiles import f_limit
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, Mask
-from visioncal.estimation.group_outliers import Agreement, agreeing_groups
+from visioncal.estimation.group_outliers import GroupInliers, agreeing_groups
 from visioncal.estimation.groups import GroupFit, fit_groups
 from visioncal.estimation.observability import Direction
 from visioncal.estimation.parts import Noise
@@ -38,7 +38,7 @@ class PivotFit:
         points_covariance: (k, 3, 3) of them [m^2].
         agrees: (n,) touches that the answer was made from.
         doubtful: (n,) touches of which some are wrong, while nothing tells which: all are used.
-        explained: Whether noise explains the used touches (see `group_outliers.Agreement`).
+        explained: Whether noise explains the used touches (see `group_outliers.GroupInliers`).
         mahalanobis_sq: (n,) squared Mahalanobis distance of each touch from what the others
             predict, one on average where it is noise.
         limit: (n,) what it may be; infinite where the others do not predict the touch.
@@ -125,7 +125,7 @@ def _fitted(touches: Touches, noise: Noise, expected: float | None) -> PivotFit:
     return _result(problem, found, worst)
 
 
-def _check_doubt(problem: TouchProblem, found: Agreement[Placed]) -> None:
+def _check_doubt(problem: TouchProblem, found: GroupInliers[Placed]) -> None:
     """Refuses touches that contradict each other grossly where nothing tells which is wrong."""
     if not found.doubtful.any() or found.fit.sigma < CARELESS_M:
         return
@@ -146,7 +146,7 @@ def _check_doubt(problem: TouchProblem, found: Agreement[Placed]) -> None:
     )
 
 
-def _check_sides(touches: Touches, found: Agreement[Placed]) -> None:
+def _check_sides(touches: Touches, found: GroupInliers[Placed]) -> None:
     seen = in_tool(touches, found.fit.state)
     for kind, along in (("z", seen[:, 2]), ("xz", seen[:, 0])):
         these = found.agrees & np.array([it == kind for it in touches.kinds])
@@ -164,7 +164,7 @@ def _check_sides(touches: Touches, found: Agreement[Placed]) -> None:
 
 
 def _result(
-    problem: TouchProblem, found: Agreement[Placed], worst: tuple[Direction, ...]
+    problem: TouchProblem, found: GroupInliers[Placed], worst: tuple[Direction, ...]
 ) -> PivotFit:
     fit, edge = found.fit, 6 if problem.oriented else 3
     covariance = np.zeros((6, 6))
@@ -191,7 +191,7 @@ def _result(
     )
 
 
-def _belonging(problem: TouchProblem, found: Agreement[Placed]) -> tuple[int | None, ...]:
+def _belonging(problem: TouchProblem, found: GroupInliers[Placed]) -> tuple[int | None, ...]:
     """The other point that each disagreeing touch fits, as the touches beyond doubt have it."""
     suspects = ~found.agrees | found.doubtful
     fit = found.fit

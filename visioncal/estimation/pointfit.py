@@ -13,7 +13,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.quantiles import t_chance
 from visioncal.core.transforms import exp, skew
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.group_outliers import Agreement, agreeing_groups
+from visioncal.estimation.group_outliers import GroupInliers, agreeing_groups
 from visioncal.estimation.groups import GroupFit, Groups, fit_groups
 from visioncal.estimation.numbering import Numbering, find_numbering
 from visioncal.estimation.observability import SIGMA_LIMIT_M, Direction
@@ -26,7 +26,13 @@ from visioncal.estimation.pointpairs import (
     line_words,
     tells_hand,
 )
-from visioncal.estimation.procrustes import align, apply, misfit, scale_between, spreads
+from visioncal.estimation.procrustes import (
+    align,
+    apply,
+    procrustes_residual,
+    scale_between,
+    spreads,
+)
 from visioncal.estimation.robust import small_sets
 
 # A scale is called different from one in one sound set of a thousand.
@@ -73,7 +79,7 @@ class PointFit:
         worst: The worst known offset, amid the points, and the worst known rotation.
     """
 
-    agreement: Agreement[Placed]
+    agreement: GroupInliers[Placed]
     scale: Scale
     numbering: Numbering
     hand_known: bool
@@ -191,7 +197,9 @@ def fit_points(pairs: PointPairs, expected_noise_m: float | None = None) -> Poin
     return PointFit(agreement, scale, numbering, hand_known, worst)
 
 
-def _agreeing(pairs: PointPairs, expected_noise_m: float | None) -> tuple[Agreement[Placed], Scale]:
+def _agreeing(
+    pairs: PointPairs, expected_noise_m: float | None
+) -> tuple[GroupInliers[Placed], Scale]:
     """Finds the points that agree, without accusing those that only a scale sets apart."""
     rigid = agreeing_groups(PointProblem(pairs, scaled=False), expected_noise_m)
     if not _sound(rigid).all():
@@ -203,13 +211,13 @@ def _agreeing(pairs: PointPairs, expected_noise_m: float | None) -> tuple[Agreem
     return rigid, _scale_of(fit_groups(PointProblem(pairs, scaled=True), rigid.agrees))
 
 
-def _sound(agreement: Agreement[Placed]) -> Mask:
+def _sound(agreement: GroupInliers[Placed]) -> Mask:
     return agreement.agrees & ~agreement.doubtful
 
 
-def _as_scaled(scaled: Agreement[Placed], fit: GroupFit[Placed]) -> Agreement[Placed]:
+def _as_scaled(scaled: GroupInliers[Placed], fit: GroupFit[Placed]) -> GroupInliers[Placed]:
     """What agrees behind a scale, with the fit that has none: noise does not explain that one."""
-    return Agreement(
+    return GroupInliers(
         fit, fit.used, scaled.mahalanobis_sq, scaled.limit, scaled.doubtful, explained=False
     )
 
@@ -243,7 +251,7 @@ def _no_fit(pairs: PointPairs, fit: GroupFit[Placed], scale: Scale) -> DataError
     off = np.linalg.norm(fit.groups.residuals, axis=1)
     rms_mm, worst = 1e3 * np.sqrt(np.mean(off**2)), int(np.argmax(off))
     scaled = pairs.nominal[fit.used] * scale.value
-    left = np.sqrt(misfit(pairs.measured[fit.used], scaled) / fit.used.sum())
+    left = np.sqrt(procrustes_residual(pairs.measured[fit.used], scaled) / fit.used.sum())
     hint = f" A drawing {scale.value:.4g} times as large would fit to {1e3 * left:.2g} mm."
     return DataError(
         f"fixture: the points do not fit the drawing: they are {rms_mm:.3g} mm off (root mean "

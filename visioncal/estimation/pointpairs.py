@@ -17,7 +17,7 @@ from visioncal.core.types import FloatArray
 from visioncal.estimation.numbering import Numbering
 from visioncal.estimation.observability import axis_words
 from visioncal.estimation.placing import LEAST_NOISE_M, LEAST_RATIO
-from visioncal.estimation.procrustes import mirrored, misfit, spreads
+from visioncal.estimation.procrustes import mirrored, procrustes_residual, spreads
 
 FEWEST_POINTS = 3
 # A ratio of lengths this near to that of two units is no chance: no part is off by so much.
@@ -155,7 +155,7 @@ def check_hand(pairs: PointPairs, numbering: Numbering, noise_m: float) -> None:
         DataError: Mirrored, the points fit so much better that noise does not explain it.
     """
     as_drawn, flipped, limit = _hands(pairs.measured, pairs.nominal, noise_m)
-    reordered = float(misfit(pairs.measured, pairs.drawn[numbering.assignment]))
+    reordered = float(procrustes_residual(pairs.measured, pairs.drawn[numbering.assignment]))
     if as_drawn <= limit * flipped or flipped > limit * (reordered + _floor(len(pairs), noise_m)):
         return
     rms_mm = 1e3 * np.sqrt(np.array([as_drawn, flipped]) / len(pairs))
@@ -176,8 +176,8 @@ def _hands(measured: FloatArray, nominal: FloatArray, noise_m: float) -> tuple[f
     """Squared misfits of the drawing and of its mirror image [m^2], and how far they may differ."""
     freedom, floor = 3.0 * len(measured) - 6.0, _floor(len(measured), noise_m)
     return (
-        float(misfit(measured, nominal)) + floor,
-        float(misfit(measured, mirrored(nominal))) + floor,
+        float(procrustes_residual(measured, nominal)) + floor,
+        float(procrustes_residual(measured, mirrored(nominal))) + floor,
         float(f_limit(_FALSE_ALARM, freedom, freedom)),
     )
 

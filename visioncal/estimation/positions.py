@@ -13,7 +13,7 @@ import numpy as np
 
 from visioncal.core.transforms import exp, invert, skew
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.levenberg_marquardt import Linearised, descend
+from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
 from visioncal.estimation.linalg import damped_step
 from visioncal.estimation.procrustes import align
 from visioncal.estimation.robust import half_of, small_sets, trimmed_start
@@ -135,7 +135,7 @@ def fit_mounting(places: Places, start: Mounting | None, count: int) -> Mounting
 
         return Linearised(at, float(np.sum(off**2)), step)
 
-    return descend(start, linearise, _SETTLED)[0]
+    return levenberg_marquardt(start, linearise, _SETTLED)[0]
 
 
 def residuals(places: Places, at: Mounting) -> FloatArray:

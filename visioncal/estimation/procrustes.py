@@ -34,7 +34,7 @@ def apply(matrices: FloatArray, points: FloatArray) -> FloatArray:
     return np.asarray(turned + matrices[..., None, :3, 3])
 
 
-def misfit(measured: FloatArray, nominal: FloatArray) -> FloatArray:
+def procrustes_residual(measured: FloatArray, nominal: FloatArray) -> FloatArray:
     """Sums (...,) the squared distances [m^2] that the best rigid transform leaves."""
     left = measured - apply(align(measured, nominal), nominal)
     return np.asarray(np.sum(left**2, axis=(-1, -2)))

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from visioncal.core.types import FloatArray, Mask
-from visioncal.estimation.levenberg_marquardt import Linearised, descend
+from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
 from visioncal.estimation.linalg import (
     covariance_among,
     covariance_from,
@@ -126,7 +126,7 @@ def solve_problem(problem: Problem, state: State, noise: Noise) -> tuple[State, 
 
         return Linearised(at, cost, step)
 
-    return descend(state, linearise, _SETTLED)
+    return levenberg_marquardt(state, linearise, _SETTLED)
 
 
 def reduce(problem: Problem, state: State, linear: Linear, covariance: FloatArray) -> Reduced:

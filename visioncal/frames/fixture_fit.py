@@ -11,7 +11,7 @@ from visioncal.core.limits import TOUCH_NOISE_MM, TOUCHED_MM
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import AGREEMENT, Finding, Verdict
-from visioncal.estimation.group_outliers import Agreement
+from visioncal.estimation.group_outliers import GroupInliers
 from visioncal.estimation.groups import State
 from visioncal.estimation.observability import Direction
 from visioncal.estimation.placing import worst_of
@@ -131,7 +131,7 @@ class Fitted:
 
 
 def reasons_of(
-    agreement: Agreement[State], residuals_m: FloatArray, causes: Sequence[str]
+    agreement: GroupInliers[State], residuals_m: FloatArray, causes: Sequence[str]
 ) -> list[str]:
     """Says what is wrong with each of n points; empty where nothing is.
 

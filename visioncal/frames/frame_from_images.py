@@ -22,12 +22,12 @@ from visioncal.frames.session_observations import (
     for_fits,
     held_back,
     nothing_fits,
-    sighting,
+    session_looks,
     without_label,
 )
 from visioncal.frames.single_view import Sight, needs_robot
 from visioncal.frames.target_in_image import SeenTarget, see
-from visioncal.frames.target_pose import Seen, place_looks
+from visioncal.frames.target_pose import TargetPose, place_looks
 from visioncal.frames.verdicts import weak_directions
 from visioncal.results import HELD_BACK, Calibration, Frame, Observation, picked
 from visioncal.session import Session, View
@@ -77,7 +77,7 @@ class _Placed:
 
     kind: FrameKind
     shown: Sighting
-    seen: Seen
+    seen: TargetPose
     worst: tuple[Direction, Direction]
     views: tuple[View, ...]
     lost: Mapping[int, str]
@@ -123,7 +123,7 @@ def seen_frame(
     options = options or SeenOptions()
     point = checked_point(point_target_m, "point_target_m")
     eye, parent = Eye.of(calibration), PARENTS[kind]
-    shown = sighting(session, calibration, parent, among=for_fits(session), progress=progress)
+    shown = session_looks(session, calibration, parent, among=for_fits(session), progress=progress)
     views, looks, lost = _looks(eye, shown)
     lost |= held_back(session)
     sights = [it for it, view in zip(shown.sights, shown.views, strict=True) if view in views]
@@ -194,7 +194,7 @@ def _check_still(
         )
 
 
-def _advice(seen: Seen) -> str:
+def _advice(seen: TargetPose) -> str:
     own, common = (float(np.trace(it[3:, 3:])) for it in (seen.independent, seen.common))
     if own > common:
         return "Take more images, from nearer and from other sides."
@@ -236,7 +236,7 @@ def _method(placed: _Placed, point: FloatArray) -> str:
     return f"{told}; its point ({', '.join(f'{it:.6g}' for it in 1e3 * point)}) mm"
 
 
-def _noise_mm(seen: Seen) -> float:
+def _noise_mm(seen: TargetPose) -> float:
     """Of one image, per axis: by how they scatter, or as predicted where there is only one."""
     count = int(seen.agrees.sum())
     if count > 1:

@@ -74,7 +74,7 @@ class Mean:
 
 
 @dataclass(frozen=True, eq=False)
-class Agreement:
+class ImageInliers:
     """The images that agree, and their mean.
 
     Attributes:
@@ -99,7 +99,7 @@ class Agreement:
     rival: FloatArray | None
 
 
-def agreeing(sights: CandidateViews) -> Agreement:
+def agreeing(sights: CandidateViews) -> ImageInliers:
     """Finds the images that put the target in one place.
 
     Where no more than half agree, nothing tells which are right: all stay.
@@ -119,10 +119,10 @@ class _Search:
     sights: CandidateViews
     picks: IntArray
 
-    def fit(self, used: Mask, _: Agreement) -> Agreement:
+    def fit(self, used: Mask, _: ImageInliers) -> ImageInliers:
         return _judged(self.sights, self.picks, used)
 
-    def distances(self, _: Mask, fit: Agreement) -> Distances:
+    def distances(self, _: Mask, fit: ImageInliers) -> Distances:
         six = np.full(len(self.picks), 6.0)
         return Distances(fit.mahalanobis_sq, six, fit.variance * fit.limit * np.ones_like(six))
 
@@ -157,7 +157,7 @@ def _nearest(sights: CandidateViews, seed: Place) -> tuple[FloatArray, IntArray]
     return np.array([it[0] for it in found]), np.array([it[1] for it in found], dtype=np.int64)
 
 
-def _judged(sights: CandidateViews, picks: IntArray, agrees: Mask) -> Agreement:
+def _judged(sights: CandidateViews, picks: IntArray, agrees: Mask) -> ImageInliers:
     """The mean of some images, and how far all of them are from it."""
     chosen = [view[at] for view, at in zip(sights.views, picks, strict=True)]
     mean = _mean(sights, chosen, agrees)
@@ -174,7 +174,7 @@ def _judged(sights: CandidateViews, picks: IntArray, agrees: Mask) -> Agreement:
     mahalanobis_sq = (
         squared_lengths(away, left, own)[0] if others else np.where(agrees, 0.0, squared)
     )
-    return Agreement(
+    return ImageInliers(
         mean,
         picks,
         agrees,

@@ -10,7 +10,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.types import Corners, FloatArray, Image, Target
 from visioncal.frames.camera_chain import Eye
-from visioncal.frames.image_outliers import Agreement, CandidateViews, agreeing
+from visioncal.frames.image_outliers import CandidateViews, ImageInliers, agreeing
 from visioncal.frames.single_view import (
     Place,
     Sight,
@@ -161,7 +161,7 @@ def _corners(eye: Eye, sight: Sight, target: Target) -> Corners | None:
 
 
 def _warnings(
-    eye: Eye, marker: _Marker, found: Agreement, sights: Sequence[Sight]
+    eye: Eye, marker: _Marker, found: ImageInliers, sights: Sequence[Sight]
 ) -> Iterator[str]:
     """What is odd. One image is not: the other markers check it."""
     for look in marker.looks:
@@ -173,7 +173,9 @@ def _warnings(
         yield from doubts(found, labels, marker.looks, stops, f"marker {marker.name}")
 
 
-def _shares(found: Agreement, views: Sequence[Sequence[Place]]) -> list[tuple[Place, FloatArray]]:
+def _shares(
+    found: ImageInliers, views: Sequence[Sequence[Place]]
+) -> list[tuple[Place, FloatArray]]:
     """Each image's place, and the (3, 6) slope by which it moves the mean's centre."""
     mean = np.concatenate([np.zeros((3, 3)), found.mean.matrix[:3, :3]], axis=1)
     return [
@@ -182,7 +184,7 @@ def _shares(found: Agreement, views: Sequence[Sequence[Place]]) -> list[tuple[Pl
     ]
 
 
-def _own(marker: _Marker, found: Agreement) -> FloatArray:
+def _own(marker: _Marker, found: ImageInliers) -> FloatArray:
     """(3, 3) covariance of a centre by the pixels of its images."""
     covariance = np.sum(
         [slope @ it.pixels @ slope.T for it, slope in _shares(found, marker.views)], axis=0
@@ -193,7 +195,7 @@ def _own(marker: _Marker, found: Agreement) -> FloatArray:
 def _shared(
     eye: Eye,
     markers: Sequence[_Marker],
-    found: Sequence[Agreement],
+    found: Sequence[ImageInliers],
     common: FloatArray,
     images: int,
 ) -> FloatArray:

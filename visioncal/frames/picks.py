@@ -7,7 +7,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, Progress
 from visioncal.frames.locate import locate_target
 from visioncal.frames.located import Located
-from visioncal.frames.session_observations import nothing_fits, sighting, without_label
+from visioncal.frames.session_observations import nothing_fits, session_looks, without_label
 from visioncal.results import Calibration, picked
 from visioncal.session import Session, View
 from visioncal.session.choosing import EYE, Choice
@@ -63,7 +63,7 @@ def locate_views(
     """
     choice = Choice(camera, robot, target)
     session, calibration = picked(session, calibration, choice, EYE, parted=False)
-    shown = sighting(session, calibration, "base", among=among, progress=progress)
+    shown = session_looks(session, calibration, "base", among=among, progress=progress)
     found: dict[int, Located] = {}
     lost = dict(shown.lost)
     for view, sight in zip(shown.views, shown.sights, strict=True):

@@ -45,7 +45,7 @@ class Sighting:
     warnings: tuple[str, ...]
 
 
-def sighting(
+def session_looks(
     session: Session,
     calibration: Calibration,
     parent: Parent,
@@ -91,7 +91,7 @@ def pictured(
     """Reads a session's images as they are: of several markers, to be placed in the base.
 
     Args:
-        session: As for `sighting`; its target is one of the markers.
+        session: As for `session_looks`; its target is one of the markers.
         calibration: The camera's.
         among: Those of its views to look at; all where None.
 

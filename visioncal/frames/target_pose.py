@@ -10,7 +10,7 @@ from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import adjoint, compose, invert, pose_difference
 from visioncal.core.types import FloatArray, Mask, Target
 from visioncal.frames.camera_chain import Eye
-from visioncal.frames.image_outliers import Agreement, CandidateViews, agreeing
+from visioncal.frames.image_outliers import CandidateViews, ImageInliers, agreeing
 from visioncal.frames.single_view import (
     Parent,
     Sight,
@@ -27,7 +27,7 @@ _FALSE_ALARM = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class TargetPose:
     """Where images put a target on a tool or a fixture.
 
     Attributes:
@@ -98,7 +98,7 @@ def place_seen(
     parent: Parent,
     *,
     sigma_px: float | None = None,
-) -> Seen:
+) -> TargetPose:
     """Places a target on a fixture in the base, or on a tool on the flange.
 
     The images are averaged with the weights of what is each one's own, and those that disagree are
@@ -123,14 +123,14 @@ def place_seen(
 
 def place_looks(
     eye: Eye, sights: Sequence[Sight], looks: Sequence[SeenTarget], parent: Parent
-) -> Seen:
+) -> TargetPose:
     """Places a target by what was seen of it in each of the images; see `place_seen`."""
     views = all_places(eye, sights, looks, parent)
     common = common_covariance(eye, looks[0].scale_sigma)
     stops = len({it.stop_key for it in sights}) if needs_robot(eye, parent) else None
     found = agreeing(CandidateViews(views, eye.flange_noise, common, eye.freedom))
     labels = tuple(it.label for it in sights)
-    return Seen(
+    return TargetPose(
         found.mean.matrix,
         found.variance * found.mean.own,
         found.mean.by_common @ common @ found.mean.by_common.T,
@@ -148,7 +148,7 @@ def place_looks(
 
 
 def doubts(
-    found: Agreement,
+    found: ImageInliers,
     labels: Sequence[str],
     looks: Sequence[SeenTarget],
     stops: int | None,
@@ -195,20 +195,20 @@ def doubts(
         yield _rival_words(found, looks, thing)
 
 
-def _is_torn(found: Agreement) -> bool:
+def _is_torn(found: ImageInliers) -> bool:
     """Whether images stayed in although they contradict each other."""
     return bool(np.any((found.mahalanobis_sq > found.limit)[found.agrees])) and bool(
         found.agrees.all()
     )
 
 
-def _distance(found: Agreement, at: int) -> str:
+def _distance(found: ImageInliers, at: int) -> str:
     away = found.away[at]
     millimetres, degrees = 1e3 * np.linalg.norm(away[3:]), np.rad2deg(np.linalg.norm(away[:3]))
     return f"{millimetres:.2g} mm and {degrees:.2g} deg"
 
 
-def _rival_words(found: Agreement, looks: Sequence[SeenTarget], thing: str) -> str:
+def _rival_words(found: ImageInliers, looks: Sequence[SeenTarget], thing: str) -> str:
     rival = np.eye(4) if found.rival is None else found.rival
     millimetres, degrees = pose_difference(found.mean.matrix, rival)
     away = f"{millimetres:.2g} mm and {degrees:.2g} deg away"

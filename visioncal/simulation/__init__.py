@@ -19,6 +19,7 @@ from visioncal.simulation.layout import (
 )
 from visioncal.simulation.network import simulate_network
 from visioncal.simulation.network_records import network_session, write_network
+from visioncal.simulation.observed_points import Network, Sight
 from visioncal.simulation.optics import (
     CAMERAS,
     fine_camera,
@@ -50,7 +51,6 @@ from visioncal.simulation.records import (
 )
 from visioncal.simulation.render import Scene, prepare_scene, render, render_view
 from visioncal.simulation.sag import Payload
-from visioncal.simulation.seen import Network, Sight
 from visioncal.simulation.sweep import Sweep, SweepOptions, sweep
 from visioncal.simulation.touching import touch, touch_network, write_touches
 from visioncal.simulation.warmup import (

@@ -13,11 +13,7 @@ from visioncal.session import frame_name
 from visioncal.simulation.arms import ArmErrors, arm_named, disturb, forward
 from visioncal.simulation.boards import Sheet, corners_m
 from visioncal.simulation.layout import Moved, NetworkOptions
-from visioncal.simulation.optics import project, sees
-from visioncal.simulation.options import CellOptions
-from visioncal.simulation.poses import draw_views
-from visioncal.simulation.second import looks_at
-from visioncal.simulation.seen import (
+from visioncal.simulation.observed_points import (
     Network,
     Reading,
     Sight,
@@ -25,6 +21,10 @@ from visioncal.simulation.seen import (
     sheet_named,
     with_faults,
 )
+from visioncal.simulation.optics import project, sees
+from visioncal.simulation.options import CellOptions
+from visioncal.simulation.poses import draw_views
+from visioncal.simulation.second import looks_at
 from visioncal.simulation.standing import Stream, mounted, parents_of, postures, sheet_of, stream
 from visioncal.simulation.swept import sweep_network
 from visioncal.simulation.warmup import Heat, heated_poses, warm_up

@@ -15,6 +15,13 @@ from visioncal.simulation.cell import Cell
 from visioncal.simulation.exercise import Exercised
 from visioncal.simulation.layout import CameraAt
 from visioncal.simulation.network import first_pushed
+from visioncal.simulation.observed_points import (
+    Network,
+    Sight,
+    board_named,
+    camera_named,
+    sheet_named,
+)
 from visioncal.simulation.options import CellOptions
 from visioncal.simulation.records import (
     POSE,
@@ -26,7 +33,6 @@ from visioncal.simulation.records import (
 )
 from visioncal.simulation.render import Scene, encode, prepare_scene, render
 from visioncal.simulation.second import Shown
-from visioncal.simulation.seen import Network, Sight, board_named, camera_named, sheet_named
 from visioncal.simulation.standing import Stream, stream
 from visioncal.simulation.touching import Touching, write_touches
 

@@ -13,8 +13,8 @@ from visioncal.session import frame_name
 from visioncal.simulation.arms import forward
 from visioncal.simulation.boards import corners_m, found_in_part
 from visioncal.simulation.layout import CELL, Swept
+from visioncal.simulation.observed_points import Network, Sight, camera_named, sheet_named
 from visioncal.simulation.optics import project, sees
-from visioncal.simulation.seen import Network, Sight, camera_named, sheet_named
 from visioncal.simulation.standing import Stream, stream
 from visioncal.simulation.sweep import SweepOptions, in_turn, recorded
 

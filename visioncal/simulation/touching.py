@@ -25,9 +25,9 @@ from visioncal.simulation.cell import (
     lowest_m,
     stream,
 )
+from visioncal.simulation.observed_points import Network
 from visioncal.simulation.options import CellOptions
 from visioncal.simulation.records import pose_row
-from visioncal.simulation.seen import Network
 
 # How far off a contact is, per axis [m], and how far the flange tilts from straight down [rad].
 _CONTACT_M, _CONE_RAD = 5e-5, 0.75

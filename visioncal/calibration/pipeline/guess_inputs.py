@@ -10,9 +10,9 @@ from scipy.spatial.transform import RigidTransform
 from visioncal.calibration.guess import Guess, guess_reading
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
-from visioncal.calibration.stages.causes import read_otherwise
+from visioncal.calibration.stages.cause_ranking import read_otherwise
 from visioncal.calibration.stages.clocks import waits_for_clock
-from visioncal.calibration.stages.init_frames import place
+from visioncal.calibration.stages.init_frames import init_frames
 from visioncal.calibration.stages.judge import is_scattered
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.errors import VisioncalError
@@ -195,7 +195,7 @@ def _chosen(seen: RunState, robot: PoseNumbers) -> RunState:
     )
     boards = [*seen.session.boards.values()]
     targets = {it: boards[both[0].board] for it in problem.observations.observed if boards}
-    found = place(problem, both, targets)
+    found = init_frames(problem, both, targets)
     return replace(seen, poses={it.view: it for it in found.views})
 
 

@@ -9,7 +9,7 @@ from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.pipeline.view_evidence import view_evidence
-from visioncal.calibration.stages.causes import with_misread
+from visioncal.calibration.stages.cause_ranking import with_misread
 from visioncal.calibration.stages.dense import Dense
 from visioncal.calibration.stages.handeye import SOLVER_NAMES
 from visioncal.calibration.stages.kinematics import check_level

@@ -12,7 +12,7 @@ from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.clocks import clock_effects
 from visioncal.calibration.stages.fit_messages import found_of_looks
 from visioncal.calibration.stages.handeye import closed_form_state
-from visioncal.calibration.stages.init_frames import place
+from visioncal.calibration.stages.init_frames import init_frames
 from visioncal.calibration.stages.kinematics import check_asked
 from visioncal.calibration.stages.observed import Observed, nothing_seen
 from visioncal.calibration.stages.pnp import ViewPoses
@@ -24,7 +24,7 @@ from visioncal.core.errors import DegenerateError
 from visioncal.core.types import FloatArray, IntArray, Mask, SolverName, Target
 from visioncal.core.verdict import Finding
 from visioncal.estimation.arm import rows_of
-from visioncal.estimation.effects.lenses import LENSES, CameraParameters, Seen
+from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
 from visioncal.estimation.joint import Fitted
 from visioncal.estimation.joint import settle as settle_looks
 from visioncal.estimation.observability import FEWEST_VIEWS, refuse_too_few
@@ -64,7 +64,7 @@ class Solved:
 
     cell: Cell
     agreed: Agreed
-    seen: Seen | None
+    seen: LinearisedCorners | None
     poses: tuple[ViewPoses, ...]
     untied: tuple[str, ...]
     arms: Mapping[str, RobotArm]
@@ -213,7 +213,7 @@ def _agreeing_looks(
     agreed: Agreed,
     arms: Mapping[str, RobotArm],
     late: Sequence[Effect],
-) -> tuple[Agreed, Seen | None, Mapping[str, RobotArm]]:
+) -> tuple[Agreed, LinearisedCorners | None, Mapping[str, RobotArm]]:
     """Fits lenses, boards and frames, until the same observations agree under them.
 
     In a whole cell, what moved must not be taken for a wrong view: there it is left to the end,
@@ -236,7 +236,7 @@ def _with_looks(
     agreed: Agreed,
     arms: Mapping[str, RobotArm],
     late: Sequence[Effect],
-) -> tuple[Agreed, Seen | None, Mapping[str, RobotArm]]:
+) -> tuple[Agreed, LinearisedCorners | None, Mapping[str, RobotArm]]:
     """Fits lenses, boards and frames, with errors of the arms sought anew beside their drift."""
     arms = {name: it.erring(None) for name, it in arms.items()}
     poses = {**agreed.problem.poses, **{name: it.poses for name, it in arms.items()}}
@@ -270,10 +270,10 @@ def _levels(
 def _at_rest(
     cell: Cell,
     agreed: Agreed,
-    seen: Seen | None,
+    seen: LinearisedCorners | None,
     arms: Mapping[str, RobotArm],
     late: Sequence[Effect],
-) -> tuple[Agreed, Seen | None, Mapping[str, RobotArm]]:
+) -> tuple[Agreed, LinearisedCorners | None, Mapping[str, RobotArm]]:
     """Fits with calibrated arms that are linearised anew until they stay."""
     for _ in range(_ROUNDS if any(it.model is not None for it in arms.values()) else 0):
         poses = {**agreed.problem.poses, **{name: it.poses for name, it in arms.items()}}
@@ -426,7 +426,7 @@ def _started(
     if cell.mount is not None:
         refuse_too_few(problem_of(cell, views), cell.mount, len(cell.rows))
         _refuse_few_of_each(cell)
-    placed = place(problem_of(cell, views), views, targets_of(cell))
+    placed = init_frames(problem_of(cell, views), views, targets_of(cell))
     tied, clear = placed.tied, {it.view: it for it in placed.views}
     if tied.untied:
         untied_robots(cell, tied.untied, seen=True)
@@ -469,7 +469,11 @@ def problem_of(cell: Cell, views: Sequence[ViewPoses]) -> Problem:
     covariance = np.array([it.covariance[0] for it in views])
     places = np.array([it.is_place for it in cell.rows], dtype=bool)
     covariance[given] = _NOMINAL
-    turned = {row.seen for row, place in zip(cell.rows, places.tolist(), strict=True) if not place}
+    turned = {
+        row.seen
+        for row, init_frames in zip(cell.rows, places.tolist(), strict=True)
+        if not init_frames
+    }
     # What one camera measured with one robot, without a word of its noise, has that of both as one.
     is_combined = cell.mount is not None and cell.mount != "instrument" and bool(given.any())
     if is_combined:

@@ -77,7 +77,7 @@ class Estimate:
 
 
 @dataclass(frozen=True, eq=False)
-class Telling:
+class ArmIdentifiability:
     """What the stops tell of the arm.
 
     Attributes:
@@ -156,7 +156,7 @@ def _number(estimate: Estimate, robot: Robot, lost: JointReading | None) -> ArmP
     )
 
 
-def tell(arm: ArmData, convention: Convention | None = None) -> Telling:
+def identify_arm(arm: ArmData, convention: Convention | None = None) -> ArmIdentifiability:
     """Says what the stops tell of an arm, and what it is worth.
 
     Args:
@@ -181,7 +181,7 @@ def tell(arm: ArmData, convention: Convention | None = None) -> Telling:
         fitted = (arm.problem, arm.state, arm.noise)
         worth = stop_worth(*fitted, arm.stops, place, arm.chain)
     nominal = arm.model.nominal
-    return Telling(
+    return ArmIdentifiability(
         convention=numbers.before.convention,
         estimates=tuple(_estimates(arm, numbers)),
         told=told,

@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 
 from visioncal.calibration.stages import backlash, elastic, thermal
-from visioncal.calibration.stages.arm_identifiability import Telling, tell
+from visioncal.calibration.stages.arm_identifiability import ArmIdentifiability, identify_arm
 from visioncal.calibration.stages.backlash import plays_of
 from visioncal.calibration.stages.elastic import Elastic, springs_of
 from visioncal.calibration.stages.joints import Matched
@@ -58,7 +58,7 @@ class ArmFound:
         drift: Its drift with temperature; None for none.
     """
 
-    telling: Telling | None = None
+    telling: ArmIdentifiability | None = None
     springs: Elastic | None = None
     plays: tuple[JointBacklash, ...] = ()
     drift: ThermalResult | None = None
@@ -345,7 +345,7 @@ class RobotArm:
         # With nothing but play and springs its numbers are as stated.
         erring = data.model.weights.keys() & set(RIGID)
         return ArmFound(
-            tell(data, convention) if erring else None,
+            identify_arm(data, convention) if erring else None,
             springs_of(data, self.kinematics.errors),
             plays_of(data.model, data.arm_covariance),
             drift,

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.threads import Shared
+from visioncal.core.threads import SharedSetting
 from visioncal.core.types import Corners, Image, IntArray, Progress, Rejection, Target
 from visioncal.estimation.planar import determines_pose
 from visioncal.session import Session, View
@@ -154,7 +154,7 @@ def _one_opencv_thread() -> Iterator[None]:
 
 
 # OpenCV's threads inside ours slow both down.
-_ONE_OPENCV_THREAD = Shared(_one_opencv_thread)
+_ONE_OPENCV_THREAD = SharedSetting(_one_opencv_thread)
 
 
 def image_of(session: Session, view: View) -> Image | Rejection:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.calibration.stages.init_network import Tied, tie
+from visioncal.calibration.stages.init_network import Tied, init_network
 from visioncal.calibration.stages.pair_observations import Sighted
 from visioncal.calibration.stages.pairwise import FEWEST, Candidates
 from visioncal.calibration.stages.pnp import ViewPoses
@@ -37,7 +37,9 @@ class Placed:
     rejections: tuple[Rejection, ...]
 
 
-def place(problem: Problem, views: Sequence[ViewPoses], targets: Mapping[str, Target]) -> Placed:
+def init_frames(
+    problem: Problem, views: Sequence[ViewPoses], targets: Mapping[str, Target]
+) -> Placed:
     """Finds where the frames are, and which pose of each view goes with that.
 
     Args:
@@ -60,7 +62,7 @@ def place(problem: Problem, views: Sequence[ViewPoses], targets: Mapping[str, Ta
         turned,
         ~seen.has_rotation,
     )
-    tied = tie(problem.tree, problem.poses, sighted, problem.priors)
+    tied = init_network(problem.tree, problem.poses, sighted, problem.priors)
     away = _distances(problem, candidates, tied)
     unclear = _unclear(problem, candidates, tied, away)
     tied, picks = _numbered_as_first(problem, tied, away.argmin(axis=1), turned)

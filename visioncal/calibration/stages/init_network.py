@@ -12,9 +12,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.calibration.stages.init_instruments import mounted_points
-from visioncal.calibration.stages.init_spanning_tree import grow
+from visioncal.calibration.stages.init_spanning_tree import spanning_tree
 from visioncal.calibration.stages.pair_observations import Growth, Pair, Relation, Sighted
-from visioncal.calibration.stages.pairwise import FEWEST, Candidates, consensus, hand_eye, trimmed
+from visioncal.calibration.stages.pairwise import (
+    FEWEST,
+    Candidates,
+    common_transform,
+    hand_eye,
+    trimmed,
+)
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray, Mount
 from visioncal.estimation.parts import FramePrior
@@ -37,7 +43,7 @@ class Tied:
     ambiguous: tuple[str, ...]
 
 
-def tie(
+def init_network(
     tree: Tree,
     poses: Mapping[str, FloatArray],
     sighted: Sighted,
@@ -60,11 +66,11 @@ def tie(
             relations.append(relation)
     for pair in growth.oriented:
         relations += _solved(tree, poses, sighted, pair)
-    placed, ambiguous = grow(replace(growth, relations=relations))
+    placed, ambiguous = spanning_tree(replace(growth, relations=relations))
     if not placed.keys() & {*tree.unknown}:
         # What the motion leaves open is for those to say who know how far it does.
         relations += _loose(growth)
-        placed, ambiguous = grow(replace(growth, relations=relations))
+        placed, ambiguous = spanning_tree(replace(growth, relations=relations))
     edges = {
         name: invert(placed[tree.branches[name].parent]) @ placed[name]
         for name in tree.unknown
@@ -92,7 +98,7 @@ def _solved(
     """What one pair says by itself."""
     rows = sighted.early(pair.rows)
     if not pair.robots:
-        matrix, _, sigma_m = consensus(sighted.candidates.take(rows))
+        matrix, _, sigma_m = common_transform(sighted.candidates.take(rows))
         yield Relation(pair.seer, pair.seen, matrix, sigma_m, sighted.turns_of(pair.seen))
     if len(pair.robots) != 1:
         return

@@ -15,7 +15,7 @@ import numpy as np
 from visioncal.calibration.stages.init_instruments import placed_by_points
 from visioncal.calibration.stages.init_two_arms import between_arms
 from visioncal.calibration.stages.pair_observations import Factor, Growth, factors_of, product_of
-from visioncal.calibration.stages.pairwise import FEWEST, consensus, hand_eye
+from visioncal.calibration.stages.pairwise import FEWEST, common_transform, hand_eye
 from visioncal.calibration.stages.pose_ambiguity import CLEAR_RATIO
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray
@@ -35,7 +35,7 @@ class _Grown:
     counts: tuple[int, ...]
 
 
-def grow(growth: Growth) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
+def spanning_tree(growth: Growth) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
     """Places all frames in their bodies.
 
     Returns:
@@ -120,7 +120,7 @@ def _implied(
             there = replace(there, poses=invert(there.poses))
         # A board's own frame may be either way round: that of its first view is taken.
         ways = range(1 if it.frame == pair.seen else len(growth.sighted.turns_of(pair.seen)))
-        found = [consensus(there, way) for way in ways]
+        found = [common_transform(there, way) for way in ways]
         yield it.frame, np.array([matrix for matrix, *_ in found]), found[0][2]
 
 

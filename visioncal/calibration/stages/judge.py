@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.calibration.stages.causes import adding, ranked
+from visioncal.calibration.stages.cause_ranking import adding, ranked
 from visioncal.calibration.stages.need import CHECK, GOOD, Picks, need_met
 from visioncal.core.limits import PLACE_MM, TURN_DEG
 from visioncal.core.number_format import figure, percent

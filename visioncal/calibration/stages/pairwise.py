@@ -126,7 +126,7 @@ def trimmed(robot: FloatArray, candidates: Candidates) -> tuple[Mask, Parted]:
     )
 
 
-def consensus(candidates: Candidates, turn: int = 0) -> tuple[FloatArray, float, float]:
+def common_transform(candidates: Candidates, turn: int = 0) -> tuple[FloatArray, float, float]:
     """The transform that most views agree on.
 
     Args:

@@ -16,7 +16,7 @@ from visioncal.estimation.appearance import (
     compress,
 )
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
-from visioncal.estimation.effects.lenses import CameraParameters, Seen
+from visioncal.estimation.effects.lenses import CameraParameters, LinearisedCorners
 from visioncal.estimation.joint import (
     Fitted,
     MeasuredScale,
@@ -35,7 +35,7 @@ from visioncal.estimation.parts import State
 from visioncal.estimation.solve import covariance_of, left_out_residuals
 
 
-def free_of(seen: Seen) -> LensBoardParameters:
+def free_of(seen: LinearisedCorners) -> LensBoardParameters:
     """Lens and boards of the only camera, and what is open about them."""
     looks, known = seen.looks, seen.known
     ((name, problem),) = looks.problems.items()

@@ -10,7 +10,7 @@ from visioncal.calibration.stages.arms import RobotArm, effects_of
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.types import Corners, Mask
 from visioncal.estimation.arm import ArmErrors
-from visioncal.estimation.effects.lenses import CameraParameters, Seen
+from visioncal.estimation.effects.lenses import CameraParameters, LinearisedCorners
 from visioncal.estimation.joint import Fitted
 from visioncal.estimation.parts import Effect, Noise
 from visioncal.estimation.problem import Problem
@@ -54,11 +54,11 @@ class FramesSide:
         """Whether those of an arm's own links are."""
         return self.has_errors and any(it.of_links for it in self.errors)
 
-    def problem(self, seen: Seen) -> Problem:
+    def problem(self, seen: LinearisedCorners) -> Problem:
         """The problem of the observations that agree, repeated ones sharing an error."""
         return replace(self.whole(seen), with_repeats=True).subset(self.used)
 
-    def whole(self, seen: Seen) -> Problem:
+    def whole(self, seen: LinearisedCorners) -> Problem:
         """The problem of all observations, with poses as lenses and boards make them."""
         places, problem = {view: at for at, view in enumerate(seen.views)}, self.observed
         rows = np.array([places.get(it, -1) for it in self.views], dtype=np.int64)

@@ -14,7 +14,7 @@ import numpy as np
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.arm import rows_of
-from visioncal.estimation.levenberg_marquardt import Linearised, descend
+from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
 from visioncal.estimation.linalg import covariance_among, damped_step
 from visioncal.estimation.parts import Effect, Noise, State
 from visioncal.estimation.problem import Problem
@@ -180,7 +180,7 @@ def fit_thermal(
 def _descended(warming: "_Warming", state: "_Warm", noise: Noise) -> tuple["_Warm", Noise]:
     """Minimises under the noise that the residuals show, until that stays the same."""
     for _ in range(_ROUNDS):
-        state, _ = descend(state, partial(warming.linearised, noise=noise), _SETTLED)
+        state, _ = levenberg_marquardt(state, partial(warming.linearised, noise=noise), _SETTLED)
         problem, at, last = warming.problem(state.values), warming.at(state), noise
         noise = estimate_noise(problem, at, noise, from_above=True)
         if np.allclose(last.robots, noise.robots, rtol=1e-3):

@@ -7,8 +7,18 @@ import numpy as np
 from scipy.special import fdtrc
 
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
-from visioncal.calibration.verification.causes import BOTH, CAMERA, NOISE, causes_of, kind_of
-from visioncal.calibration.verification.prediction import Seen, asked_of_boards, see_again
+from visioncal.calibration.verification.change_hypotheses import (
+    BOTH,
+    CAMERA,
+    NOISE,
+    causes_of,
+    kind_of,
+)
+from visioncal.calibration.verification.prediction import (
+    PredictedStops,
+    asked_of_boards,
+    predict_stops,
+)
 from visioncal.core.errors import DataError
 from visioncal.core.quantiles import f_limit
 from visioncal.core.threads import one_blas_thread
@@ -79,7 +89,7 @@ class Check:
     """
 
     calibration: Calibration
-    seen: Seen
+    seen: PredictedStops
     prior_calibration: CalibrationPrior
     away: FloatArray
     left: FloatArray
@@ -130,12 +140,12 @@ def verify(
     # What the calibration has left out contradicts it now as it did then.
     without = {it.view: it.reason for it in calibration.views if is_its_own and not it.used}
     prior_calibration = CalibrationPrior.of(calibration)
-    seen = see_again(session, prior_calibration, progress, without)
+    seen = predict_stops(session, prior_calibration, progress, without)
     return check(seen, prior_calibration, board_placed_anew=board_placed_anew)
 
 
 def check(
-    seen: Seen, prior_calibration: CalibrationPrior, *, board_placed_anew: bool = False
+    seen: PredictedStops, prior_calibration: CalibrationPrior, *, board_placed_anew: bool = False
 ) -> Check:
     """Compares what may have changed by stops that have been looked at; see `verify`."""
     if board_placed_anew:
@@ -187,7 +197,7 @@ def check(
     )
 
 
-def _left(seen: Seen, belief: Belief, cause: Cause, explained: Explained) -> FloatArray:
+def _left(seen: PredictedStops, belief: Belief, cause: Cause, explained: Explained) -> FloatArray:
     """(m, 6) where each sight places its board with a change undone, from where it was."""
     before = undone(seen.problem, cause, explained.values)
     return log(asked_of_boards(before, with_change(belief.state, cause)))

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.calibration.verification.causes import (
+from visioncal.calibration.verification.change_hypotheses import (
     BOARD,
     BOTH,
     CAMERA,
@@ -53,7 +53,7 @@ _WRONG_VIEW = Step("Take that stop again: its image and its pose do not belong t
 
 
 @dataclass(frozen=True)
-class Motion:
+class MeasuredMove:
     """How far something moved: lengths, their standard deviations, and directions in words.
 
     Attributes:
@@ -136,7 +136,7 @@ def described(check: Check, suspect: Suspect) -> dict[str, Any]:
     return documents if kind == BOTH else documents[suspect.name]
 
 
-def _motion_document(moved: Motion) -> dict[str, Any]:
+def _motion_document(moved: MeasuredMove) -> dict[str, Any]:
     return {
         "moved_mm": moved.mm,
         "sigma_mm": moved.sigma_mm,
@@ -147,7 +147,7 @@ def _motion_document(moved: Motion) -> dict[str, Any]:
     }
 
 
-def motions(check: Check, suspect: Suspect) -> dict[str, Motion]:
+def motions(check: Check, suspect: Suspect) -> dict[str, MeasuredMove]:
     """How far the camera, a board, or the board of one view moved, by their names."""
     names = (CAMERA, BOARD) if kind_of(suspect.name) == BOTH else (suspect.name,)
     values, covariance = suspect.explained.values, suspect.explained.covariance
@@ -158,7 +158,7 @@ def motions(check: Check, suspect: Suspect) -> dict[str, Motion]:
     }
 
 
-def _motion(check: Check, name: str, twist: FloatArray, covariance: FloatArray) -> Motion:
+def _motion(check: Check, name: str, twist: FloatArray, covariance: FloatArray) -> MeasuredMove:
     x, *boards = check.prior_calibration.state.edges
     hand = check.calibration.mount == "eye-in-hand"
     if name == CAMERA:
@@ -174,7 +174,7 @@ def _motion(check: Check, name: str, twist: FloatArray, covariance: FloatArray) 
     slope = moved[:3, :3] @ np.concatenate([-skew(point), np.eye(3)], axis=1) @ onward
     mm, sigma_mm = _length(shift, slope @ covariance @ slope.T)
     turn, sigma = _length(twist[:3], covariance[:3, :3])
-    return Motion(
+    return MeasuredMove(
         1e3 * mm,
         1e3 * sigma_mm,
         f"the {parent}'s {_signed_axis(rotation @ shift)}",
@@ -261,7 +261,7 @@ def thing(check: Check, suspect: Suspect) -> str:
     return f"{suspect.name} alone being wrong"
 
 
-def _short(moved: Motion) -> str:
+def _short(moved: MeasuredMove) -> str:
     return f"{figure(moved.mm)} mm and {figure(moved.deg)} deg"
 
 

@@ -35,7 +35,7 @@ _WORTH_A_WORD = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class PredictedStops:
     """The stops of a session as a calibration sees them.
 
     Attributes:
@@ -75,12 +75,12 @@ class Seen:
         return not self.problem.is_combined
 
 
-def see_again(
+def predict_stops(
     session: Session,
     prior_calibration: CalibrationPrior,
     progress: Progress | None = None,
     without: Mapping[int, str] | None = None,
-) -> Seen:
+) -> PredictedStops:
     """Looks at a session with what a calibration rests on, and estimates nothing anew.
 
     Args:
@@ -119,8 +119,8 @@ def known_before(
     return RunState(session, progress)
 
 
-def seen_by(known: RunState, prior_calibration: CalibrationPrior) -> Seen:
-    """Carries on where targets have been detected; see `see_again`."""
+def seen_by(known: RunState, prior_calibration: CalibrationPrior) -> PredictedStops:
+    """Carries on where targets have been detected; see `predict_stops`."""
     calibration = prior_calibration.calibration
     for frame, look in known.cameras.items():
         if look.resolution is None:
@@ -139,7 +139,7 @@ def seen_by(known: RunState, prior_calibration: CalibrationPrior) -> Seen:
     looked = _posed(_with_arm(ObservedPoses.of(known), prior_calibration), prior_calibration)
     problem = looked.problem(looked.used)
     sights = problem.of_one_stop
-    return Seen(
+    return PredictedStops(
         looked,
         problem.merged(),
         tuple(

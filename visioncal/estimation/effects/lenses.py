@@ -163,7 +163,7 @@ class CameraParameters:
         }
         return replace(self, problems=problems)
 
-    def weighed(self, seen: "Seen") -> "CameraParameters":
+    def weighed(self, seen: "LinearisedCorners") -> "CameraParameters":
         """The same, views weighing as the residuals of all corners ask for."""
         problems = {
             name: replace(it, stack=it.stack.weighed(own.residuals))
@@ -181,7 +181,7 @@ class CameraParameters:
         values[free] = found
         return replace(self, values=values)
 
-    def seen(self, moving: IntArray) -> "Seen":
+    def seen(self, moving: IntArray) -> "LinearisedCorners":
         """Compresses all corners, (f,) values being free."""
         found, sigmas = [], []
         information = np.zeros((len(self.values), len(self.values)))
@@ -209,7 +209,7 @@ class CameraParameters:
         poses = np.concatenate([it.cam_from_target for it in found])
         corners = Knowledge(information, gradient)
         looks = replace(self, poses=poses)
-        return Seen(looks, np.sort(moving), tuple(found), tuple(sigmas), corners)
+        return LinearisedCorners(looks, np.sort(moving), tuple(found), tuple(sigmas), corners)
 
     def places(self, name: str) -> IntArray:
         """Places of what one camera's corners tell of: its lens and all boards."""
@@ -220,7 +220,7 @@ class CameraParameters:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class LinearisedCorners:
     """What all corners say of poses, lenses and boards, where they were linearised.
 
     Attributes:
@@ -257,7 +257,7 @@ class Seen:
             self.corners.gradient[free] + prior * (looks.values - looks.stated)[free],
         )
 
-    def freed(self, moving: IntArray, looks: CameraParameters | None = None) -> "Seen":
+    def freed(self, moving: IntArray, looks: CameraParameters | None = None) -> "LinearisedCorners":
         """The same with other values moving, or with other priors."""
         return replace(self, moving=np.sort(moving), looks=looks or self.looks)
 

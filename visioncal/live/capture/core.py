@@ -10,7 +10,7 @@ from visioncal.core.number_format import figure
 from visioncal.core.types import Corners, Target
 from visioncal.live.capture.coach import Coach
 from visioncal.live.capture.facts import state_of
-from visioncal.live.capture.joint_pose_check import Agreement
+from visioncal.live.capture.joint_pose_check import JointPoseCheck
 from visioncal.live.capture.journal import Journal
 from visioncal.live.capture.live import LiveCell
 from visioncal.live.capture.options import CaptureOptions
@@ -81,7 +81,7 @@ class Capture:
     target: Target
     journal: Journal
     options: CaptureOptions
-    agreement: Agreement
+    agreement: JointPoseCheck
     coach: Coach
     prediction: Prediction | None
     watchers: Sequence[Watcher] = ()

@@ -17,7 +17,7 @@ _STOOD_RAD, _STOOD_M = 1e-4, 1e-4
 
 
 @dataclass(eq=False)
-class Agreement:
+class JointPoseCheck:
     """Compares poses with the robot's model, up to a base or a tool that stays the same.
 
     Of the states so far it keeps those that agreed with one another.

@@ -15,7 +15,7 @@ from visioncal.live.capture.approach import Ways
 from visioncal.live.capture.coach import Coach
 from visioncal.live.capture.core import Capture, Step, Watcher
 from visioncal.live.capture.drive import drive, joints_of, travel_s
-from visioncal.live.capture.joint_pose_check import Agreement
+from visioncal.live.capture.joint_pose_check import JointPoseCheck
 from visioncal.live.capture.journal import Journal
 from visioncal.live.capture.live import LiveCell
 from visioncal.live.capture.options import CaptureOptions
@@ -120,7 +120,7 @@ def record(
         plan.cell.target,
         journal,
         options,
-        Agreement(plan.cell.robot),
+        JointPoseCheck(plan.cell.robot),
         Coach(plan.cell.target, cell.camera.resolution, lens or plan.cell.camera),
         PlannedAccuracy.of(plan),
         watchers,

@@ -52,7 +52,7 @@ class Settled:
     last: Look
 
 
-def look(cell: LiveCell) -> Look:
+def take_look(cell: LiveCell) -> Look:
     """Takes a frame, with the states of the arm around its exposure.
 
     Raises:
@@ -80,11 +80,11 @@ def settle(cell: LiveCell, options: CaptureOptions) -> Settled | Missed:
     """
     still = options.still
     begun = cell.clock.now()
-    first = look(cell)
+    first = take_look(cell)
     if options.single:
         return Settled(first, first)
     while True:
-        then = look(cell)
+        then = take_look(cell)
         why = why_moving(first, then, options)[0]
         if why:
             first = then
@@ -139,7 +139,7 @@ def _frames(
     """Frames of one rest, the reason why they are none, and how far the image moved [px]."""
     looks, moved = [settled.last], 0.0
     while len(looks) < (1 if options.single else options.frames):
-        then = look(cell)
+        then = take_look(cell)
         why, moved = why_moving(settled.first, then, options)
         if why:
             return [], why, moved

@@ -24,7 +24,7 @@ from visioncal.live.planning.losses import (
 )
 from visioncal.live.planning.obstacles import collisions_of
 from visioncal.live.planning.shade import Shade
-from visioncal.live.planning.sight import sight_of
+from visioncal.live.planning.visibility import sight_of
 from visioncal.robot import Robot
 from visioncal.robot.atlas import Atlas
 from visioncal.robot.collision import Collisions

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from visioncal.calibration.verification.causes import NOISE
+from visioncal.calibration.verification.change_hypotheses import NOISE
 from visioncal.calibration.verification.check import Check, Suspect
 from visioncal.calibration.verification.document import listed_suspects
 from visioncal.calibration.verification.messages import thing

@@ -6,7 +6,7 @@ from importlib import import_module
 from typing import Any
 
 from visioncal.core.errors import DataError
-from visioncal.core.threads import Shared
+from visioncal.core.threads import SharedSetting
 
 DEVICES = ("auto", "cpu", "cuda")
 
@@ -62,4 +62,4 @@ def _one_thread() -> Iterator[None]:
 
 
 # Images are worked on side by side; torch's threads inside ours wait for one another.
-ONE_TORCH_THREAD = Shared(_one_thread)
+ONE_TORCH_THREAD = SharedSetting(_one_thread)

@@ -7,14 +7,14 @@ from visioncal.vision.finders.board import FINDERS, find_board
 from visioncal.vision.finders.charuco import fitting_layouts
 from visioncal.vision.finders.imaging import blur_at_corners
 from visioncal.vision.finders.marker import find_marker
-from visioncal.vision.finders.result import NotFound, Seen
+from visioncal.vision.finders.result import DetectedCorners, NotFound
 from visioncal.vision.finders.tags import find_tags
 from visioncal.vision.finders.template import refine
 
-__all__ = ["NotFound", "Seen", "blur_of", "find_target", "fitting_layouts"]
+__all__ = ["DetectedCorners", "NotFound", "blur_of", "find_target", "fitting_layouts"]
 
 
-def find_target(image: Image, target: Target) -> Seen | NotFound:
+def find_target(image: Image, target: Target) -> DetectedCorners | NotFound:
     """Finds a target's corners to sub-pixel accuracy.
 
     Args:

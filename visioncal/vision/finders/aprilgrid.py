@@ -8,7 +8,7 @@ import numpy as np
 
 from visioncal.core.types import FloatArray, Image, IntArray, Mask, Target
 from visioncal.vision.finders.layout import LAYOUT_MISFIT, layout_misfit
-from visioncal.vision.finders.result import NotFound, Seen
+from visioncal.vision.finders.result import DetectedCorners, NotFound
 from visioncal.vision.targets import aruco_dictionary
 
 # The squares at a tag's corners touch it, and OpenCV sees a tag only where white surrounds it.
@@ -37,7 +37,7 @@ _MOST_OF, _NEAR_LINES = 0.8, 2
 _SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
 
 
-def find_aprilgrid(image: Image, target: Target) -> Seen | NotFound:
+def find_aprilgrid(image: Image, target: Target) -> DetectedCorners | NotFound:
     """Finds the corners of an AprilGrid's tags.
 
     Args:
@@ -88,7 +88,7 @@ def find_aprilgrid(image: Image, target: Target) -> Seen | NotFound:
             f"{target.spacing:g}",
             misfit=True,
         )
-    return Seen((4 * numbers[:, None] + np.arange(4)).ravel(), px.reshape(-1, 2))
+    return DetectedCorners((4 * numbers[:, None] + np.arange(4)).ravel(), px.reshape(-1, 2))
 
 
 def grid_tags(

@@ -11,7 +11,7 @@ from visioncal.vision.finders.aprilgrid import find_aprilgrid
 from visioncal.vision.finders.charuco import find_charuco
 from visioncal.vision.finders.checkerboard import find_checkerboard
 from visioncal.vision.finders.circles import find_circles
-from visioncal.vision.finders.result import NotFound, Seen
+from visioncal.vision.finders.result import DetectedCorners, NotFound
 from visioncal.vision.finders.template import refine
 from visioncal.vision.targets import corner_positions
 
@@ -23,7 +23,7 @@ _LONG_SIDE_PX = 2000
 # weight: so much less exact they are in the median of what was measured.
 _FEWEST_FITTED, _LEAST_FITTED, _DETECTED_WEIGHT = 6, 0.5, 0.1
 
-FINDERS: dict[TargetKind, Callable[[Image, Target], Seen | NotFound]] = {
+FINDERS: dict[TargetKind, Callable[[Image, Target], DetectedCorners | NotFound]] = {
     "charuco": find_charuco,
     "checkerboard": find_checkerboard,
     "aprilgrid": find_aprilgrid,
@@ -31,7 +31,7 @@ FINDERS: dict[TargetKind, Callable[[Image, Target], Seen | NotFound]] = {
 }
 
 
-def find_board(image: Image, target: Target) -> Seen | NotFound:
+def find_board(image: Image, target: Target) -> DetectedCorners | NotFound:
     """Finds the corners of a board whose corners the template fits.
 
     OpenCV finds them, in a small copy where an image is large and shows the whole board there;
@@ -50,19 +50,21 @@ def find_board(image: Image, target: Target) -> Seen | NotFound:
             continue
         small = _shrunk(image, by)
         seen = find(small, target)
-        if isinstance(seen, Seen) and _is_whole(seen, small, target):
+        if isinstance(seen, DetectedCorners) and _is_whole(seen, small, target):
             # Where a pixel of the small image has its centre in the large one.
-            return _refined(image, target, Seen(seen.ids, by * seen.px + (by - 1) / 2))
+            return _refined(image, target, DetectedCorners(seen.ids, by * seen.px + (by - 1) / 2))
     seen = find(image, target)
     return seen if isinstance(seen, NotFound) else _refined(image, target, seen)
 
 
-def _refined(image: Image, target: Target, seen: Seen) -> Seen:
+def _refined(image: Image, target: Target, seen: DetectedCorners) -> DetectedCorners:
     refined = refine(image, target, seen.ids, seen.px)
     fitted = np.array([not it for it in refined.reasons])
     if fitted.sum() < max(min(_FEWEST_FITTED, len(fitted)), _LEAST_FITTED * len(fitted)):
         return replace(seen, weights=np.full(len(fitted), _DETECTED_WEIGHT))
-    return Seen(seen.ids[fitted], refined.px[fitted], blur_px=float(refined.blur_px.max()))
+    return DetectedCorners(
+        seen.ids[fitted], refined.px[fitted], blur_px=float(refined.blur_px.max())
+    )
 
 
 def _shrunk(image: Image, by: int) -> Image:
@@ -72,7 +74,7 @@ def _shrunk(image: Image, by: int) -> Image:
     return np.asarray(small, np.uint8)
 
 
-def _is_whole(seen: Seen, image: Image, target: Target) -> bool:
+def _is_whole(seen: DetectedCorners, image: Image, target: Target) -> bool:
     """Whether no corner that the image should show is missing."""
     places: FloatArray = corner_positions(target)[:, :2] / target.square_m
     missing = np.setdiff1d(np.arange(len(places)), seen.ids)

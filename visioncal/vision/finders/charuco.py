@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from visioncal.core.types import FloatArray, Image, Target
 from visioncal.vision.finders.layout import LAYOUT_MISFIT, layout_misfit
-from visioncal.vision.finders.result import NotFound, Seen
+from visioncal.vision.finders.result import DetectedCorners, NotFound
 from visioncal.vision.targets import charuco_board
 
 # A homography has eight unknowns and a marker gives eight equations: three markers check it.
@@ -29,7 +29,7 @@ _ENDS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-3)
 _Markers: TypeAlias = Mapping[int, FloatArray]
 
 
-def find_charuco(image: Image, target: Target) -> Seen | NotFound:
+def find_charuco(image: Image, target: Target) -> DetectedCorners | NotFound:
     """Finds the chessboard corners of a ChArUco board (Garrido-Jurado et al. 2014; OpenCV).
 
     OpenCV's check of interpolated corners against neighbouring markers is off, because it drops
@@ -55,7 +55,7 @@ def find_charuco(image: Image, target: Target) -> Seen | NotFound:
         return NotFound(f"no board: {len(marker_px)} markers are seen, but no corner")
     order = np.argsort(ids.ravel())
     rough = px.reshape(-1, 2)[order].astype(np.float64)
-    return Seen(ids.ravel()[order].astype(np.int64), _refined(image, rough, marker_px))
+    return DetectedCorners(ids.ravel()[order].astype(np.int64), _refined(image, rough, marker_px))
 
 
 def _refined(image: Image, px: FloatArray, marker_px: Sequence[Any]) -> FloatArray:

@@ -4,13 +4,13 @@ import cv2
 import numpy as np
 
 from visioncal.core.types import FloatArray, Image, Target
-from visioncal.vision.finders.result import NotFound, Seen
+from visioncal.vision.finders.result import DetectedCorners, NotFound
 
 # OpenCV's search takes 170 bytes and a microsecond a pixel, and fails beyond such sides.
 MOST_PIXELS, _MOST_SIDES = 48_000_000, 23_000
 
 
-def find_checkerboard(image: Image, target: Target) -> Seen | NotFound:
+def find_checkerboard(image: Image, target: Target) -> DetectedCorners | NotFound:
     """Finds the inner corners of a checkerboard (Duda and Frese 2018, through OpenCV).
 
     Corner 0 becomes the one whose outward diagonal square is dark. Where the board looks the same
@@ -40,7 +40,7 @@ def find_checkerboard(image: Image, target: Target) -> Seen | NotFound:
         )
     grid = px.reshape(target.rows, target.columns, 2).astype(np.float64)
     grid = _dark_corner_first(image, _right_handed(grid))
-    return Seen(np.arange(target.columns * target.rows), grid.reshape(-1, 2))
+    return DetectedCorners(np.arange(target.columns * target.rows), grid.reshape(-1, 2))
 
 
 def _right_handed(grid: FloatArray) -> FloatArray:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from visioncal.core.types import FloatArray, Image, IntArray, Target
-from visioncal.vision.finders.result import NotFound, Seen
+from visioncal.vision.finders.result import DetectedCorners, NotFound
 from visioncal.vision.targets import circle_places
 
 # Dark is darker than its surroundings, so wide as a share of the image's shorter side, by so many
@@ -58,7 +58,7 @@ class Circles:
     diameter_px: float
 
 
-def find_circles(image: Image, target: Target) -> Seen | NotFound:
+def find_circles(image: Image, target: Target) -> DetectedCorners | NotFound:
     """Finds the centres of a grid of circles, to a pixel or so.
 
     Where the grid looks the same after a turn, the one that turns least against the image is taken.
@@ -84,7 +84,7 @@ def find_circles(image: Image, target: Target) -> Seen | NotFound:
                     f"{share:.2f}",
                     misfit=True,
                 )
-            return Seen(np.arange(len(it.px)), it.px)
+            return DetectedCorners(np.arange(len(it.px)), it.px)
     wanted = f"{_layout(target.asymmetric)} grid of {target.columns} x {target.rows} circles"
     if not seen:
         return NotFound(f"no board: no {wanted} is seen")

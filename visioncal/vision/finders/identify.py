@@ -15,7 +15,7 @@ from visioncal.vision.finders.identify_charuco import LEAST_MARKERS, Lattice, fi
 from visioncal.vision.finders.identify_checkerboard import find_squares
 from visioncal.vision.finders.identify_markers import Marker, decode_markers, genuine, holding
 from visioncal.vision.finders.imaging import why_hard_to_see
-from visioncal.vision.finders.result import Seen
+from visioncal.vision.finders.result import DetectedCorners
 from visioncal.vision.targets import DEFAULT_RELATIVE_SIGMA
 
 # Edges wider than this hide the bits of small markers [px].
@@ -212,7 +212,7 @@ def _charuco(image: Image, family: str, lattice: Lattice) -> Identity | None:
         notes=tuple(_charuco_notes(lattice, names)),
     )
     seen = find_charuco(image, identity.target("board", 1.0))
-    if isinstance(seen, Seen):
+    if isinstance(seen, DetectedCorners):
         return replace(identity, corners_seen=len(seen.ids))
     if len(lattice.markers) < _SURE_MARKERS:
         return None

@@ -18,7 +18,7 @@ from visioncal.vision.finders.aprilgrid import (
     seen_spacing,
 )
 from visioncal.vision.finders.layout import LAYOUT_MISFIT
-from visioncal.vision.finders.result import Seen
+from visioncal.vision.finders.result import DetectedCorners
 from visioncal.vision.targets import APRILGRID_DICTIONARY, DEFAULT_RELATIVE_SIGMA
 
 # Fewer tags are single ones; no printable grid has more columns.
@@ -65,7 +65,7 @@ def find_grid(image: Image) -> Grid | None:
         target = replace(target, rows=rows + first // columns, marker_id=first % columns)
     whole = lacks_a_line(image, *_one_more(target, ids - target.marker_id, below=False), quads)
     seen = find_aprilgrid(image, target)
-    return Grid(target, whole, ids, len(seen.ids)) if isinstance(seen, Seen) else None
+    return Grid(target, whole, ids, len(seen.ids)) if isinstance(seen, DetectedCorners) else None
 
 
 def _columns(ids: IntArray, px: FloatArray, border: int) -> tuple[int, int]:

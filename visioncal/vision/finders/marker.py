@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 
 from visioncal.core.types import FloatArray, Image, Target
-from visioncal.vision.finders.result import NotFound, Seen
+from visioncal.vision.finders.result import DetectedCorners, NotFound
 from visioncal.vision.targets import aruco_dictionary
 
 
-def find_marker(image: Image, target: Target) -> Seen | NotFound:
+def find_marker(image: Image, target: Target) -> DetectedCorners | NotFound:
     """Finds the four corners of one marker, in OpenCV's order (Garrido-Jurado et al. 2014).
 
     Args:
@@ -29,7 +29,7 @@ def find_marker(image: Image, target: Target) -> Seen | NotFound:
     if found.count(target.marker_id) > 1:
         return NotFound(f"marker {target.marker_id} is seen {found.count(target.marker_id)} times")
     corners = px[found.index(target.marker_id)].reshape(4, 2)
-    return Seen(np.arange(4), corners)
+    return DetectedCorners(np.arange(4), corners)
 
 
 def marker_ids(image: Image, dictionary: str) -> tuple[int, ...]:

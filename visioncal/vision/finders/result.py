@@ -6,7 +6,7 @@ from visioncal.core.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class DetectedCorners:
     """Corners that were found.
 
     Attributes:

@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.core.types import FloatArray, Image, Target
 from visioncal.vision.finders.layout import LAYOUT_MISFIT, layout_misfit
-from visioncal.vision.finders.result import NotFound, Seen
+from visioncal.vision.finders.result import DetectedCorners, NotFound
 from visioncal.vision.finders.template import refine_tags
 from visioncal.vision.targets import aruco_dictionary, corner_positions, tag_corners
 
@@ -16,7 +16,7 @@ _LEAST_TAGS = 2
 _SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
 
 
-def find_tags(image: Image, target: Target) -> Seen | NotFound:
+def find_tags(image: Image, target: Target) -> DetectedCorners | NotFound:
     """Finds the corners of a rig's tags.
 
     Args:
@@ -60,7 +60,7 @@ def find_tags(image: Image, target: Target) -> Seen | NotFound:
     px = np.concatenate([it.px for it in parts])[fitted]
     order = np.argsort(points[fitted])
     blur_px = float(np.nanmedian([it.blur_px.max() for it in parts]))
-    return Seen(points[fitted][order], px[order], blur_px=blur_px)
+    return DetectedCorners(points[fitted][order], px[order], blur_px=blur_px)
 
 
 def _in_plane(target: Target, quads: Mapping[int, FloatArray]) -> FloatArray | None:

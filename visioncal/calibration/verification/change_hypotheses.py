@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
-from visioncal.calibration.verification.prediction import Seen
+from visioncal.calibration.verification.prediction import PredictedStops
 from visioncal.core.transforms import adjoint, invert, log
 from visioncal.core.types import FloatArray
 from visioncal.estimation.armmodel import ArmModel
@@ -29,7 +29,7 @@ _KNOCK = np.repeat([TURN_PER_M, 1.0], 3)
 
 
 def causes_of(
-    seen: Seen, prior_calibration: CalibrationPrior, *, board_placed_anew: bool
+    seen: PredictedStops, prior_calibration: CalibrationPrior, *, board_placed_anew: bool
 ) -> tuple[Cause, ...]:
     """The single causes that a check of these stops compares.
 
@@ -55,13 +55,13 @@ def kind_of(cause: str) -> str:
     return cause.partition(" ")[0]
 
 
-def _camera(seen: Seen) -> Cause:
+def _camera(seen: PredictedStops) -> Cause:
     """The camera's edge: a twist on its right, seen from the target's side."""
     moved = adjoint(invert(seen.problem.observations.measured))
     return _cause(CAMERA, seen, _KNOCK, by_sensor=moved)
 
 
-def _boards(seen: Seen, prior_calibration: CalibrationPrior) -> Iterator[Cause]:
+def _boards(seen: PredictedStops, prior_calibration: CalibrationPrior) -> Iterator[Cause]:
     """Each board's edge: a twist on its right."""
     names, away = tuple(prior_calibration.targets) or ("",), log(seen.away(prior_calibration))
     for at, board in enumerate(prior_calibration.boards):
@@ -72,7 +72,7 @@ def _boards(seen: Seen, prior_calibration: CalibrationPrior) -> Iterator[Cause]:
         yield _cause(f"{BOARD} {names[board]}".strip(), seen, _KNOCK, by_sensor, start=start)
 
 
-def _tell_both(seen: Seen, prior_calibration: CalibrationPrior) -> bool:
+def _tell_both(seen: PredictedStops, prior_calibration: CalibrationPrior) -> bool:
     """Whether camera and board at once are worth a thought: they fit any two stops."""
     return len(prior_calibration.boards) == 1 and len(seen.problem) >= FEWEST_VIEWS
 
@@ -88,7 +88,7 @@ def _both(camera: Cause, board: Cause) -> Cause:
     )
 
 
-def _joints(seen: Seen, prior_calibration: CalibrationPrior) -> Iterator[Cause]:
+def _joints(seen: PredictedStops, prior_calibration: CalibrationPrior) -> Iterator[Cause]:
     """One offset a joint, and one stretch of all lengths."""
     model, q = _arm(seen, prior_calibration), seen.joints_rad
     if model is None or q is None:
@@ -101,7 +101,7 @@ def _joints(seen: Seen, prior_calibration: CalibrationPrior) -> Iterator[Cause]:
     yield _cause(LENGTH, seen, np.ones(1), flange_jacobian=_stretch(robot, q)[:, :, None])
 
 
-def _arm(seen: Seen, prior_calibration: CalibrationPrior) -> ArmModel | None:
+def _arm(seen: PredictedStops, prior_calibration: CalibrationPrior) -> ArmModel | None:
     """The arm that offsets are of; the nominal one where none was calibrated."""
     robot, matched = prior_calibration.calibration.calibrated_robot, seen.known.reported.matched
     if prior_calibration.model is not None or robot is None:
@@ -119,11 +119,11 @@ def _stretch(robot: Robot, q: FloatArray) -> FloatArray:
     return np.asarray(robot.placement_jacobian(q) @ twists.reshape(-1))
 
 
-def _noise(seen: Seen) -> Cause:
+def _noise(seen: PredictedStops) -> Cause:
     return replace(_cause(NOISE, seen, np.zeros(0)), noise_factors=_FACTORS)
 
 
-def _views(seen: Seen, prior_calibration: CalibrationPrior) -> Iterator[Cause]:
+def _views(seen: PredictedStops, prior_calibration: CalibrationPrior) -> Iterator[Cause]:
     """Each stop by itself: its image belongs to another pose, or something slipped meanwhile."""
     if seen.stops < 2:
         return
@@ -139,7 +139,7 @@ def _views(seen: Seen, prior_calibration: CalibrationPrior) -> Iterator[Cause]:
 
 def _cause(
     name: str,
-    seen: Seen,
+    seen: PredictedStops,
     units: FloatArray,
     by_sensor: FloatArray | None = None,
     flange_jacobian: FloatArray | None = None,
