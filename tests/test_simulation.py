@@ -1,14 +1,11 @@
 """The simulated cell: is its truth true, and do its pictures show it where it says?"""
 
-import ast
 import dataclasses
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-import visioncal.simulation
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log, rotation_angle
 from visioncal.core.types import Camera, Target
@@ -462,16 +459,3 @@ def test_other_files_are_no_truth(tmp_path):
     truth_path(tmp_path / "cell").write_text('{"schema": 1}', encoding="utf-8")
     with pytest.raises(DataError, match="not the truth"):
         read_truth(tmp_path / "cell")
-
-
-def test_simulation_shares_no_model_with_the_application():
-    allowed = ("errors", "types", "transforms", "files", "threads", "session", "simulation")
-    folder = Path(visioncal.simulation.__file__).parent
-    imported = {
-        node.module
-        for path in folder.glob("*.py")
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("visioncal")
-    }
-    assert len(imported) > 5
-    assert {name.split(".")[1] for name in imported} <= set(allowed)
