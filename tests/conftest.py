@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
-from result_schema import faults_below
+from support.result_schema import faults_below
 
 from visioncal.live.drivers import ur, ur_net, ur_primary, ur_watch
 from visioncal.simulation import CellOptions, simulate, write_session

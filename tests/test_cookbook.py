@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from recipes import FOLDER, match, run, run_example
+from support.recipes import FOLDER, match, run, run_example
 
 PACKAGES = Path(__file__).parents[1] / "visioncal"
 # Blocks of a package's page that begin with a simulation.

@@ -1,7 +1,7 @@
 """The estimator's answers to sixty cells stay what they are."""
 
 import pytest
-from kept_answers import answer_of, away_in_sigmas, cases, kept, levels_apart, sigmas_apart
+from support.kept_answers import answer_of, away_in_sigmas, cases, kept, levels_apart, sigmas_apart
 
 # Another processor's rounding moves a minimum by far less; what is known of any value is its sigma.
 EDGE_SIGMAS = 1e-3

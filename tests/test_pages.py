@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 import typer
-from commands import every_command
-from recipes import BLOCK, FOLDER
+from support.commands import every_command
+from support.recipes import BLOCK, FOLDER
 
 import visioncal
 from visioncal import dynamics

@@ -9,8 +9,8 @@ from threading import Barrier
 import cv2
 import matplotlib as mpl
 import pytest
-from kept import assert_same_evidence
-from marks import slow
+from support.kept import assert_same_evidence
+from support.marks import slow
 from threadpoolctl import threadpool_info
 
 from visioncal.calibration.pipeline import run

@@ -13,7 +13,7 @@ from multiprocessing import Pool
 from pathlib import Path
 from typing import Any
 
-from kept_answers import (
+from support.kept_answers import (
     KEPT,
     Answer,
     answer_of,

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from killed import kill_and_resume
-from planned import true_cell
 from results import few, first, need, write_section
+from support.killed import kill_and_resume
+from support.planned import true_cell
 
 from visioncal.core.errors import VisioncalError
 from visioncal.live.capture.core import Step, Watcher

@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 TESTS = Path(__file__).parents[1]
 sys.path[:0] = [str(TESTS), str(TESTS.parent)]
 
-from worlds import (  # noqa: E402
+from support.worlds import (  # noqa: E402
     BOTH_AT_ONCE,
     COARSE,
     NOISY_WORLDS,

@@ -19,7 +19,7 @@ from results import few, first, write_section
 TESTS = Path(__file__).parents[1]
 sys.path[:0] = [str(TESTS), str(TESTS.parent)]
 
-from pairs import calibrated_cell, halves, with_moved_result  # noqa: E402
+from support.pairs import calibrated_cell, halves, with_moved_result  # noqa: E402
 
 from visioncal.core.types import FloatArray, Mount  # noqa: E402
 from visioncal.results.compare import EdgeChange, compare  # noqa: E402

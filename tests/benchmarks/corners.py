@@ -17,9 +17,9 @@ from itertools import product
 
 import cv2
 import numpy as np
-from boards import aprilgrid, charuco, checkerboard, circles
-from rendered import Shot, photograph
 from results import few, write_section
+from support.boards import aprilgrid, charuco, checkerboard, circles
+from support.rendered import Shot, photograph
 
 from visioncal.core.types import FloatArray, Image, Target
 from visioncal.vision.finders.board import FINDERS, find_board

@@ -14,9 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
-from cells import calibrated
 from results import few, first, wished, write_section
-from wrong_arms import WRONG_LINKS, target_in_camera
+from support.cells import calibrated
+from support.wrong_arms import WRONG_LINKS, target_in_camera
 
 import visioncal
 from visioncal.calibration.pipeline.result import result_of

@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from boards import charuco
-from cells import calibrated, error_of, session_of
 from corners import CHARUCO, CHECKERBOARD, detected, peers, rms, shots
-from rendered import Shot, photograph
 from results import few, first, need, wished, write_section
-from smeared import smeared
+from support.boards import charuco
+from support.cells import calibrated, error_of, session_of
+from support.rendered import Shot, photograph
+from support.smeared import smeared
 
 from visioncal.calibration.stages.dense import Dense, fit_densely
 from visioncal.calibration.stages.detect import image_of, look_for

@@ -14,8 +14,8 @@ from pathlib import Path
 from time import process_time
 
 import numpy as np
-from moved_arms import recorded, robot_with_bodies, true_base
 from results import few, wished, write_section
+from support.moved_arms import recorded, robot_with_bodies, true_base
 
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray

@@ -12,11 +12,11 @@ from dataclasses import replace
 from multiprocessing import Pool
 
 import numpy as np
-from bound import compliance_bound, workspace_bound_m
-from cells import calibrated
-from loaded import COMPLIANCE, HUNG, STIFFNESS, STRETCHED, deflection_m, loaded, predicted_m
 from results import WORDS, few, first, wished, write_section
-from wrong_arms import WRONG_LINKS, error_m
+from support.bound import compliance_bound, workspace_bound_m
+from support.cells import calibrated
+from support.loaded import COMPLIANCE, HUNG, STIFFNESS, STRETCHED, deflection_m, loaded, predicted_m
+from support.wrong_arms import WRONG_LINKS, error_m
 
 from visioncal.calibration.stages.elastic import deflection_words
 from visioncal.estimation.workspace import postures

@@ -15,9 +15,9 @@ from time import process_time
 from typing import TypeAlias
 
 import numpy as np
-from cells import calibrated
 from results import few, first, need, wished, write_section
-from wrong_arms import WRONG_LINKS, target_in_camera
+from support.cells import calibrated
+from support.wrong_arms import WRONG_LINKS, target_in_camera
 
 import visioncal
 from visioncal.core.threads import one_blas_thread

@@ -12,7 +12,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from parts import (
+from results import few, write_section
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+from scipy.stats import f as f_distribution
+from support.parts import (
     away,
     even,
     feature_bound,
@@ -25,10 +29,6 @@ from parts import (
     some_touches,
     uneven,
 )
-from results import few, write_section
-from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
-from scipy.stats import f as f_distribution
 
 from visioncal.core.errors import DataError
 from visioncal.core.threads import one_blas_thread

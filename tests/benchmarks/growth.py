@@ -15,8 +15,8 @@ from dataclasses import replace
 from multiprocessing import get_context
 
 import numpy as np
-from cells import known_of
 from results import write_section
+from support.cells import known_of
 
 from visioncal.calibration.pipeline import align
 from visioncal.calibration.pipeline.steps import STAGES

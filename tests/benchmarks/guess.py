@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from mistakes import MISTAKES, Poses, guessed, is_named, seen_in
 from results import few, write_section
+from support.mistakes import MISTAKES, Poses, guessed, is_named, seen_in
 
 from visioncal.core.types import MOUNTS
 from visioncal.simulation import CellOptions, simulate

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from bound import edge_bound
-from cells import calibrated, error_of
 from results import few, first, wished, write_section
-from worlds import BOTH_AT_ONCE, Problem, opencv
+from support.bound import edge_bound
+from support.cells import calibrated, error_of
+from support.worlds import BOTH_AT_ONCE, Problem, opencv
 
 from visioncal.core.errors import VisioncalError
 from visioncal.core.transforms import invert, log

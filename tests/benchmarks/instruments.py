@@ -10,9 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import thirdparty
 from results import first, wished, write_section
-from tracked import (
+from support import thirdparty
+from support.tracked import (
     errors_of,
     information,
     known_of,

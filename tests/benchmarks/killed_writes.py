@@ -33,7 +33,7 @@ PADDING = 1_000_000 * "."
 def write_drawn(folder: Path, number: int) -> None:
     """Writes what a calibration writes; the number is in its time."""
     # A second to load, which the other kind need not wait for.
-    from samples import made_up
+    from support.samples import made_up
 
     from visioncal.calibration.pipeline import Run
     from visioncal.interchange.outputs import write_outputs

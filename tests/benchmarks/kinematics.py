@@ -14,10 +14,10 @@ from dataclasses import replace
 from multiprocessing import Pool
 
 import numpy as np
-from bound import workspace_bound_m
-from cells import calibrated, known_of
 from results import first, wished, write_section
-from wrong_arms import WRONG_LINKS, error_m
+from support.bound import workspace_bound_m
+from support.cells import calibrated, known_of
+from support.wrong_arms import WRONG_LINKS, error_m
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES

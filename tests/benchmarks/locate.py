@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from multiprocessing import Pool
 
 import numpy as np
-from picks import Pick, calibration_of, pick_by_plane, pick_by_target
 from results import first, wished, write_section
+from support.picks import Pick, calibration_of, pick_by_plane, pick_by_target
 
 from visioncal.core.errors import VisioncalError
 from visioncal.core.types import Target

@@ -15,9 +15,9 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from mutants import LONGEST_S, MOST_BYTES, READINGS, Ended, walk
-from mutators import KINDS
 from results import write_section
+from support.mutants import LONGEST_S, MOST_BYTES, READINGS, Ended, walk
+from support.mutators import KINDS
 
 MUTANTS = 2000
 # With --quick one reading of so many is broken once: nineteen of the 21 commands.

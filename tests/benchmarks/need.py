@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 from multiprocessing import Pool
 
 import numpy as np
-from cells import calibrated
-from picks import seen_corners
 from results import wished, write_section
 from scipy.spatial.transform import RigidTransform
+from support.cells import calibrated
+from support.picks import seen_corners
 
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from multiprocessing import Pool
 
 import numpy as np
-from networkbound import network_bound
 from results import few, wished, write_section
+from support.networkbound import network_bound
 
 from visioncal.calibration.pipeline import align
 from visioncal.core.transforms import invert, log

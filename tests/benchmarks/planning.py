@@ -12,10 +12,10 @@ from functools import partial
 from multiprocessing import Pool
 
 import numpy as np
-from cells import calibrated, error_of
-from planned import cell_of, plan_cell, so_far_of, true_cell, whole
 from results import few, first, wished, write_section
-from wrong_arms import WRONG_LINKS, error_m
+from support.cells import calibrated, error_of
+from support.planned import cell_of, plan_cell, so_far_of, true_cell, whole
+from support.wrong_arms import WRONG_LINKS, error_m
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.errors import DataError

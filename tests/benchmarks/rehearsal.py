@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import get_args
 
 import numpy as np
-from killed import kill_and_resume
 from results import WORDS, few, first, need, write_section
+from support.killed import kill_and_resume
 
 from visioncal.cli.recorded_cell import Scene, facts_of, scene_of
 from visioncal.cli.rehearsed import TAKING, planned, recorded

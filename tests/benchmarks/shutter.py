@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from multiprocessing import Pool
 
 import numpy as np
-from cells import calibrated_sweep
 from results import few, first, wished, write_section
+from support.cells import calibrated_sweep
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages import clock

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from results import few, write_section
-from touched import TURN, Job, Made, bound, error_of, slipped, touched, turned
+from support.touched import TURN, Job, Made, bound, error_of, slipped, touched, turned
 
 from visioncal.core.transforms import compose
 from visioncal.estimation.parts import Noise

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 from results import first, wished, write_section
-from warmed import CELL, drift_of, warmed
+from support.warmed import CELL, drift_of, warmed
 
 WORLDS = 8
 ARMS = {

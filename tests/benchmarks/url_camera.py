@@ -13,8 +13,8 @@ from contextlib import closing
 
 import cv2
 import numpy as np
-from mjpeg import NetworkCamera, number_of, served
 from results import write_section
+from support.mjpeg import NetworkCamera, number_of, served
 
 from visioncal.live.drivers.protocols import Frame
 from visioncal.live.drivers.uvc import UvcCamera

@@ -14,8 +14,8 @@ from multiprocessing import Pool
 from types import MappingProxyType
 
 import numpy as np
-from later import ANYHOW, Change, Lot, knock, known_again, lot
 from results import few, first, wished, write_section
+from support.later import ANYHOW, Change, Lot, knock, known_again, lot
 
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.calibration.verification.check import check

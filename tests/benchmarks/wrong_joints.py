@@ -14,7 +14,7 @@ from multiprocessing import Pool
 
 import numpy as np
 from results import wished, write_section
-from slips import (
+from support.slips import (
     SLIPS,
     Identifiability,
     alarms,

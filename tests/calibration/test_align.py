@@ -1,0 +1,692 @@
+"""Whole cells from sessions: frames, faults, symmetric boards, lenses, and what is refused."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.cells import calibrated, session_of
+from support.commands import visioncal
+from support.marks import slow
+
+from visioncal.calibration.pipeline import align, calibrate
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.transforms import exp, invert, log
+from visioncal.core.types import Target
+from visioncal.interchange.exports import Selection, document
+from visioncal.results import Alignment, Calibration, to_document
+from visioncal.robot import load_robot
+from visioncal.session import Session
+from visioncal.session.columns import POSE
+from visioncal.simulation import CellOptions, simulate
+from visioncal.simulation.layout import (
+    BoardAt,
+    CameraAt,
+    InstrumentAt,
+    Moved,
+    NetworkOptions,
+    PointAt,
+    RobotAt,
+)
+from visioncal.simulation.network import simulate_network
+from visioncal.simulation.network_records import network_session
+from visioncal.simulation.optics import fine_camera
+from visioncal.simulation.records import pairs_session, pose_row
+from visioncal.simulation.sag import Payload
+
+STOPS = 20
+# Looks the same after half a turn: both counts are even.
+ALIKE = Target("checkerboard_8x6_25mm", "checkerboard", 8, 6, 0.025, 2.5e-5)
+FLOOR = BoardAt("floor", place_m=(0.0, 0.0, 0.05))
+LEFT = CameraAt("left", place_m=(0.0, -1.0, 1.1))
+RIGHT = CameraAt("right", place_m=(0.15, 0.95, 1.25), camera=fine_camera())
+
+
+def aligned(cell):
+    session = network_session(cell, "cell", seen="names")
+    return align(session, corners={it.view: it for it in cell.corners})
+
+
+@pytest.fixture(scope="module")
+def clean():
+    cell = simulate_network(NetworkOptions(stops=STOPS))
+    return cell, aligned(cell)
+
+
+def off(cell, found, first, second):
+    """(6,) by which a frame is off from another's, and its squared length in sigmas."""
+    edge = found.between(first, second)
+    away = log(invert(cell.between(first, second)) @ edge.matrix)
+    return away, float(away @ np.linalg.solve(edge.covariance, away))
+
+
+def test_bases_are_as_near_as_their_covariance_says(clean):
+    cell, found = clean
+    away, squared = off(cell, found, "base_a", "base_b")
+    # 2e-4 m: four sigma of what twenty stops tell at a metre; chi-square of 6 beyond 22 is 0.1 %.
+    assert np.linalg.norm(away[3:]) < 2e-4
+    assert squared < 22.0
+    assert found.edge_of("base_b").sigma_mm < 0.1
+    assert found.verdict.status == "good"
+    assert all(it.used for it in found.sights)
+    assert not found.moved
+    assert found.reference == "base_a"
+
+
+def test_noise_is_told_apart_by_robot_and_camera(clean):
+    cell, found = clean
+    assert found.noise["cam_left"]["pixel_px"] == pytest.approx(
+        cell.options.pixel_sigma_px, rel=0.1
+    )
+    # Twenty stops tell a robot's to some 15 %.
+    assert found.noise["a"]["translation_mm"] == pytest.approx(0.03, rel=0.5)
+    assert found.noise["b"]["translation_mm"] == pytest.approx(0.03, rel=0.5)
+
+
+def test_any_frame_is_placed_in_any_other(clean):
+    cell, found = clean
+    _, squared = off(cell, found, "cam_left", "cam_right")
+    assert squared < 22.0
+    there, back = found.between("cam_left", "base_b"), found.between("base_b", "cam_left")
+    np.testing.assert_allclose(there.matrix @ back.matrix, np.eye(4), atol=1e-12)
+    direct = found.between("base_a", "base_b")
+    np.testing.assert_allclose(direct.covariance, found.edge_of("base_b").covariance)
+    assert not found.between("base_a", "base_a").covariance.any()
+
+
+def test_the_covariance_of_a_chain_is_that_of_its_edges(clean):
+    _, found = clean
+    edges = list(found.edges)
+    flange = exp(np.array([0.3, -0.2, 0.5, 0.4, 0.1, 0.6]))
+    poses = {"b": flange}
+    chain = found.between("cam_left", "target_plate_b", poses)
+    step, jacobian = 1e-6, np.zeros((6, 6 * len(edges)))
+    for at in range(6 * len(edges)):
+        twist = np.zeros(6)
+        twist[at % 6] = step
+        name = edges[at // 6]
+        moved = replace(found.edges[name], matrix=found.edges[name].matrix @ exp(twist))
+        other = replace(found, edges={**found.edges, name: moved})
+        there = other.between("cam_left", "target_plate_b", poses).matrix
+        jacobian[:, at] = log(invert(chain.matrix) @ there) / step
+    expected = jacobian @ found.joint_covariance @ jacobian.T
+    # Forward differences of 1e-6 are exact to 1e-6 of themselves.
+    np.testing.assert_allclose(chain.covariance, expected, rtol=1e-4, atol=1e-13)
+
+
+def test_a_frame_that_moves_with_a_robot_asks_for_its_pose(clean):
+    _, found = clean
+    with pytest.raises(DataError, match="moves with robot 'b': its pose is needed"):
+        found.between("cam_left", "target_plate_b")
+    with pytest.raises(DataError, match="no frame 'cam_lft'"):
+        found.between("cam_lft", "base_a")
+
+
+def test_it_is_the_same_after_it_was_saved(clean, tmp_path):
+    _, found = clean
+    found.save(tmp_path / "alignment.json")
+    again = Alignment.load(tmp_path)
+    assert again.document() == found.document()
+    (tmp_path / "alignment.json").write_text(json.dumps({"schema": 9}))
+    with pytest.raises(DataError, match="not an alignment that this version can read"):
+        Alignment.load(tmp_path)
+
+
+def test_the_weakest_link_is_the_frame_that_is_known_worst(clean):
+    _, found = clean
+    worst = max(found.edges, key=lambda it: found.edges[it].sigma_mm).partition("_from_")[2]
+    assert found.weakest.startswith(f"The weakest link is {worst}: sigma ")
+
+
+def test_all_that_is_wrong_is_named_and_the_answer_is_that_of_a_sound_cell():
+    pushes = (Moved("target_floor", 9), Moved("cam_right", 12))
+    options = NetworkOptions(stops=STOPS, moved=pushes, swapped_rows=1, stray_images=3, seed=3)
+    cell = simulate_network(options)
+    found = aligned(cell)
+    assert [(it.frame, it.first_stop) for it in found.moved] == [
+        ("target_floor", 9),
+        ("cam_right", 12),
+    ]
+    for it in found.moved:
+        # A pushed frame's own place is known to 0.1 mm.
+        assert it.shift_mm == pytest.approx(5.0, abs=0.4)
+    reasons = {it.view: it.reason for it in found.sights if not it.used}
+    assert sorted(reasons) == list(cell.wrong_views)
+    assert sum("exchanged" in it for it in reasons.values()) == 2
+    assert sum("its image is of stop" in it for it in reasons.values()) == 3
+    assert found.verdict.status == "check"
+    assert any("cam_right was bumped between stops 11 and 12" in it for it in found.verdict.reasons)
+    away, squared = off(cell, found, "base_a", "base_b")
+    assert squared < 22.0
+    assert np.linalg.norm(away[3:]) < 2.5e-4
+
+
+def test_a_robot_that_was_pushed_is_named_and_counts_as_it_stood_before():
+    cell = simulate_network(NetworkOptions(stops=STOPS, moved=(Moved("base_b", 10),)))
+    found = aligned(cell)
+    (words,) = [it for it in found.verdict.reasons if "pushed" in it]
+    assert "by way of flange_b from stop 10 on" in words
+    assert "as if base_b had been pushed by 5" in words
+    assert not found.moved
+    assert off(cell, found, "base_a", "base_b")[1] < 22.0
+
+
+def test_boards_that_look_alike_from_both_ends_are_told_apart_across_cameras():
+    boards = (
+        replace(FLOOR, target=ALIKE),
+        BoardAt("plate_a", "a", target=ALIKE),
+        BoardAt("plate_b", "b", target=ALIKE),
+    )
+    cell = simulate_network(NetworkOptions(boards=boards, stops=STOPS))
+    found = aligned(cell)
+    assert all(it.used for it in found.sights)
+    for frames in (("base_a", "base_b"), ("cam_left", "cam_right")):
+        assert off(cell, found, *frames)[1] < 22.0
+
+
+def test_lenses_come_from_images_of_their_own():
+    cameras = (replace(LEFT, state_intrinsics=False), replace(RIGHT, state_intrinsics=False))
+    cell = simulate_network(NetworkOptions(cameras=cameras, lens_views=12, stops=STOPS))
+    assert LEFT.camera.resolution != RIGHT.camera.resolution
+    found = aligned(cell)
+    assert off(cell, found, "base_a", "base_b")[1] < 22.0
+    for camera in cameras:
+        got = found.cameras[f"cam_{camera.name}"]
+        assert got.estimated
+        assert got.camera.resolution == camera.camera.resolution
+        sigma = np.sqrt(np.diag(got.covariance))[:4]
+        # Five sigma of each: the distortion's own errors go with them.
+        assert np.all(np.abs(got.camera.matrix - camera.camera.matrix) < 5 * sigma)
+    # Images of the lens alone are no observations of the cell.
+    assert len(found.sights) == len(cell.sights) - 24
+
+
+@pytest.mark.parametrize("mode", ["auto", slow("hold")])
+def test_a_lens_that_is_stated_wrong_is_refined_or_kept_as_asked(clean, mode):
+    cell, right = clean
+    session = network_session(cell, "cell", seen="names")
+    stated = session.document["cameras"]["left"]
+    wrong = np.add(stated["matrix"], [8.0, 8.0, -3.0, 4.0])
+    left = {**stated, "matrix": wrong.tolist(), "intrinsics": mode}
+    document = {**session.document, "cameras": {**session.document["cameras"], "left": left}}
+    found = align(replace(session, document=document), corners={it.view: it for it in cell.corners})
+    got = found.cameras["cam_left"]
+    (said,) = [it for it in found.verdict.reasons if "the given intrinsics do not fit" in it]
+    assert said.startswith("cam_left: ")
+    if mode == "auto":
+        sigma = np.sqrt(np.diag(got.covariance))[:4]
+        assert np.all(np.abs(got.camera.matrix - LEFT.camera.matrix) < 5 * sigma)
+        assert off(cell, found, "base_a", "base_b")[1] < 22.0
+        assert "were refined" in said
+        return
+    np.testing.assert_array_equal(got.camera.matrix, wrong)
+    assert 'intrinsics = "hold" keeps them' in said
+    # What is open about it counts where that camera is.
+    edges = found.edges["cell_from_cam_left"], right.edges["cell_from_cam_left"]
+    assert edges[0].sigma_mm > 2.0 * edges[1].sigma_mm
+    # Corners pull at it: the camera is a centimetre away, which is within what that counts for.
+    away, squared = off(cell, found, "base_a", "cam_left")
+    assert np.linalg.norm(away[3:]) > 5e-3
+    assert squared < 22.0
+    budget = found.uncertainty.budget_mm["cell_from_cam_left"]
+    assert budget["held_values"] > 0.9 * budget["total"]
+
+
+@pytest.mark.parametrize("pixel_px", [0.1, 1.0])
+def test_noise_of_corners_refuses_no_lens(pixel_px):
+    cell = simulate_network(NetworkOptions(stops=6, pixel_sigma_px=pixel_px))
+    session = network_session(cell, "cell", seen="names")
+    given = ("matrix", "distortion", "matrix_sigma_px")
+    cameras = {
+        name: {key: it for key, it in table.items() if key not in given}
+        for name, table in session.document["cameras"].items()
+    }
+    session = replace(session, document={**session.document, "cameras": cameras})
+    found = align(session, corners={it.view: it for it in cell.corners})
+    # The same stops: at 1 px a camera's place is open by 7 mm, which nobody can use.
+    assert (found.verdict.status == "bad") == (pixel_px == 1.0)
+
+
+def test_cameras_in_the_hand_and_poses_that_are_given():
+    cameras = (CameraAt("left", "a"), CameraAt("right", "b"))
+    cell = simulate_network(NetworkOptions(cameras=cameras, boards=(FLOOR,), stops=STOPS))
+    found = align(network_session(cell, "cell", seen="poses"))
+    away, squared = off(cell, found, "base_a", "base_b")
+    assert np.linalg.norm(away[3:]) < 1e-3
+    # The noise of the given poses is estimated, too: fewer are told than they are.
+    assert squared < 40.0
+
+
+POINTS = (
+    PointAt("n1", "cell", (0.2, 0.3, 0.1)),
+    PointAt("n2", "cell", (-0.2, 0.35, 0.2)),
+    PointAt("n3", "cell", (0.1, -0.4, 0.15)),
+    PointAt("fa", "a", (0.05, 0.02, 0.08)),
+    PointAt("fb", "b", (0.03, -0.04, 0.09)),
+)
+TRACKERS = (InstrumentAt("t1", (0.0, -3.0, 1.2)), InstrumentAt("t2", (0.5, 3.0, 1.2), 2.5))
+
+
+def test_instruments_and_the_points_that_they_share_tie_robots_without_a_camera():
+    cell = simulate_network(
+        NetworkOptions(cameras=(), instruments=TRACKERS, points=POINTS, stops=12)
+    )
+    # The second stands alone but for the points in the cell.
+    kept = [it for it in cell.readings if it.instrument == "t1" or it.point.startswith("n")]
+    found = aligned(replace(cell, readings=tuple(kept)))
+    for frames in (("base_a", "base_b"), ("instrument_t1", "instrument_t2")):
+        assert off(cell, found, *frames)[1] < 22.0
+    # Places alone were read: a point's axes are its parent's by choice.
+    assert not found.edge_of("point_n1").oriented
+    assert all(it.residual_deg is None for it in found.sights)
+    # Some 250 coordinates tell what a tracker's noise is of what is said of it, to 5 %.
+    assert found.noise["instrument_t1"]["level"] == pytest.approx(1.0, rel=0.25)
+
+
+def test_readings_of_one_instrument_in_millimetres_are_refused_in_a_cell():
+    cell = simulate_network(NetworkOptions(instruments=TRACKERS, points=POINTS, stops=4))
+    session = network_session(cell, "cell", seen="names")
+    views = tuple(
+        replace(
+            it,
+            numbers={
+                name: 1e3 * at if name.startswith("meas_") else at
+                for name, at in it.numbers.items()
+            },
+        )
+        if it.text.get("instrument") == "t2"
+        else it
+        for it in session.views
+    )
+    with pytest.raises(DataError, match="looks like millimetres"):
+        align(replace(session, views=views))
+
+
+def test_an_instrument_that_reads_nothing_in_common_is_reported_with_what_would_tie_it():
+    cell = simulate_network(
+        NetworkOptions(instruments=TRACKERS[:1], points=POINTS[:3], stops=STOPS)
+    )
+    found = aligned(cell)
+    (remedy,) = {it.remedy for it in found.untied if it.frame == "instrument_t1"}
+    assert "read points on a robot's flange" in remedy
+
+
+ERRING = (
+    RobotAt("a", (-0.6, 0.0, 0.0), offset_sigma_rad=1e-3),
+    RobotAt("b", (0.6, 0.05, 0.02), offset_sigma_rad=1e-3),
+)
+
+
+@pytest.mark.slow
+def test_arms_that_err_are_named_and_their_offsets_found_where_that_is_asked_for():
+    cell = simulate_network(NetworkOptions(robots=ERRING, stops=STOPS))
+    session = network_session(cell, "cell", seen="names")
+    corners = {it.view: it for it in cell.corners}
+    reported = align(session, corners=corners, level="hand-eye")
+    assert sum("follow the arm's posture" in it for it in reported.verdict.reasons) == 2
+    found = align(session, corners=corners)
+    assert found.verdict.status == "good"
+    for robot in ("a", "b"):
+        kinematics = found.arms[robot].arm
+        assert kinematics.level == "offsets"
+        true = cell.true_arms[robot].offset - cell.arms[robot].offset
+        arm = kinematics.robot
+        told = arm.chain.functions[:, 0] - load_robot("ur5e").chain.functions[:, 0]
+        # What the first joint and the last take may be the base's and the flange's: they stay about
+        # as stated. Others are known to some 0.05 mrad by this many stops.
+        assert told[[0, -1]] == pytest.approx(0.0, abs=1e-6)
+        assert told[1:-1] == pytest.approx(true[1:-1], abs=2.5e-4)
+        zeros = [it for it in kinematics.parameters if it.name == "theta_rad"]
+        surprises = ([it.change for it in zeros] - true) / [it.sigma for it in zeros]
+        assert np.abs(surprises).max() < 4.5  # one of twelve in ten thousand sessions
+        seen = {it.view for it in found.sights if it.seen == f"target_plate_{robot}" and it.used}
+        rows = kinematics.left_out
+        assert {it.view for it in rows} == seen
+        before, after = (
+            np.sqrt(np.mean([getattr(it, of) ** 2 for it in rows])) for of in ("nominal_mm", "mm")
+        )
+        held_out = {it.level: it.held_out_mm for it in kinematics.levels}
+        # The same residuals, written twice.
+        assert before == pytest.approx(held_out["nominal"], rel=1e-9)
+        assert after == pytest.approx(held_out["offsets"], rel=1e-9)
+        one = Calibration.whole(found).of("cam_left", robot, f"target_plate_{robot}")
+        np.testing.assert_allclose(
+            one.standing(cell.joints[robot]), arm.base_from_flange(cell.joints[robot]), atol=1e-12
+        )
+        written = document(Calibration.whole(found), "robot-dh", Selection(robot=robot))
+        assert f"theta_offset_rad = {told[1]:.6f}"[:-2] in written.text
+    assert off(cell, found, "cam_left", "cam_right")[1] < 22.0
+    after, before = (it.between("cam_left", "cam_right").sigma_mm for it in (found, reported))
+    assert after < 0.4 * before
+
+
+def test_a_robot_without_joints_stays_as_it_reports_itself(clean):
+    cell, _ = clean
+    session = network_session(cell, "cell", seen="names")
+    columns = [it for it in session.columns if not it.startswith("q")]
+    columns += ["qx", "qy", "qz", "qw"]
+    bare = Session.assemble(
+        session.document,
+        columns,
+        [[view.cell(it) for it in columns] for view in session.views],
+        session.images,
+        target_document=session.target_document,
+        robot_document=session.robot_document,
+    )
+    found = align(bare, corners={it.view: it for it in cell.corners}, level="offsets")
+    assert sum("stays as it reports itself" in it for it in found.verdict.reasons) == 2
+    with pytest.raises(DataError, match="level 'all'"):
+        align(bare, level="all")
+
+
+def test_a_robot_that_nothing_ties_is_refused_with_what_would_tie_it():
+    boards = (FLOOR, BoardAt("plate_a", "a"))
+    cell = simulate_network(NetworkOptions(boards=boards, stops=8))
+    with pytest.raises(DegenerateError, match="nothing ties base_b to base_a") as caught:
+        aligned(cell)
+    assert "put a board on flange_b and let cam_left, cam_right see it" in caught.value.next_step
+
+
+def test_few_stops_are_said_to_be_few():
+    cell = simulate_network(NetworkOptions(stops=6))
+    found = aligned(cell)
+    assert found.verdict.status == "check"
+    assert "Robot a: only 6 stops are used; 10 or more give" in found.verdict.reasons[0]
+    with pytest.raises(DegenerateError, match=r"too few, .* all 2 stops of robot b"):
+        aligned(simulate_network(NetworkOptions(stops=2)))
+
+
+def one_camera(cell):
+    return pairs_session(cell, "cell")
+
+
+def two_cameras(cell):
+    """What two fixed cameras say of the board on a robot's flange, one of them a metre beside."""
+    session = pairs_session(cell, "cell")
+    columns, rows = ("camera", "stop", *session.columns), []
+    beside = exp(np.array([[0.0, 0.3, 0.0, 1.0, 0.0, 0.0]]))[0]
+    for view in session.views:
+        seen = view.cam_from_target().as_matrix()
+        for camera, pose in (("left", seen), ("right", beside @ seen)):
+            row = view.numbers | {f"cft_{it}": value for it, value in pose_row(pose).items()}
+            row |= {"view": len(rows), "camera": camera, "stop": view.number}
+            rows.append([str(row[it]) for it in columns])
+    cameras = {name: {"resolution": [640, 480]} for name in ("left", "right")}
+    document = {"schema": 1, "name": "cell", "mount": "eye-to-hand", "cameras": cameras}
+    return Session.assemble(document, columns, rows, session.images)
+
+
+@pytest.mark.parametrize(
+    ("motion", "words", "left_open"),
+    [
+        ("one_axis", r"all \d+ (stops|used views) .*turn about .*'s", "offset along"),
+        ("translation", r"the \d+ (stops|used views) .*differ in position", "offset from"),
+    ],
+)
+@pytest.mark.parametrize(
+    ("mount", "seen"),
+    [("eye-in-hand", one_camera), ("eye-to-hand", one_camera), ("eye-to-hand", two_cameras)],
+)
+def test_motion_that_leaves_an_offset_from_an_only_robot_open_is_named(
+    motion, words, left_open, mount, seen
+):
+    with pytest.raises(DegenerateError, match=words) as caught:
+        align(seen(simulate(CellOptions(mount=mount, motion=motion))))
+    culprit, frame = caught.value.culprits[0], "the cell"
+    if seen is one_camera:
+        frame = "the tool" if mount == "eye-in-hand" else "the base"
+    assert "cam" in culprit
+    assert f"'s {left_open} {frame}" in culprit
+
+
+def test_a_view_of_a_whole_cell_that_allows_two_poses_is_left_out():
+    # A small board far away: in frontal views perspective hardly tells the tilt's sign.
+    small = Target("small", "checkerboard", 5, 4, 0.025, 2.5e-5)
+    cell = simulate(
+        CellOptions(
+            target=small, pixel_sigma_px=0.3, distance_m=(1.0, 1.5), tilt_rad=(0.0, 0.5), seed=3
+        )
+    )
+    found = align(session_of(cell), corners=dict(enumerate(cell.corners)))
+    reasons = calibrated(cell, joints=False).reasons
+    assert reasons[4] == "ambiguous: two poses of the target fit image and motion alike"
+    assert {it.view: it.reason for it in found.sights}[4] == reasons[4]
+
+
+def test_two_stops_of_an_only_robot_are_too_few():
+    cell = simulate(CellOptions(mount="eye-to-hand", views=2))
+    with pytest.raises(DegenerateError, match="2 usable stops of the robot, at least 3"):
+        align(one_camera(cell))
+    with pytest.raises(DegenerateError, match=r"too few, .* all 2 stops of the robot turn") as it:
+        align(two_cameras(cell))
+    assert "see target at 5 stops or more" in it.value.next_step
+
+
+def test_a_camera_that_sees_nothing_but_its_own_board_is_reported():
+    wall = BoardAt("wall", place_m=(3.0, 0.0, 0.05))
+    apart = CameraAt("apart", place_m=(3.0, -1.0, 1.1), looks_at_m=(3.0, 0.0, 0.05))
+    boards = (FLOOR, BoardAt("plate_a", "a"), BoardAt("plate_b", "b"), wall)
+    cell = simulate_network(NetworkOptions(cameras=(LEFT, RIGHT, apart), boards=boards, stops=12))
+    found = aligned(cell)
+    assert {it.frame for it in found.untied} == {"cam_apart", "target_wall"}
+    assert found.verdict.status == "check"
+    assert all(not it.used for it in found.sights if it.seer == "cam_apart")
+    (reason,) = {it.reason for it in found.sights if it.seer == "cam_apart"}
+    assert reason == "nothing ties cam_apart to the rest of the cell"
+
+
+def test_a_camera_that_a_board_ties_either_way_round_is_refused():
+    beside = CameraAt("right", place_m=(0.15, 0.95, 1.25), looks_at_m=(0.0, 0.0, 0.05))
+    boards = (replace(FLOOR, target=ALIKE), BoardAt("plate_a", "a"))
+    cell = simulate_network(
+        NetworkOptions(
+            robots=(RobotAt("a", (-0.6, 0.0, 0.0)),),
+            cameras=(LEFT, beside),
+            boards=boards,
+            stops=12,
+        )
+    )
+    kept = [it for it in cell.sights if not (it.camera == "right" and it.board == "plate_a")]
+    cell = replace(cell, sights=tuple(kept))
+    with pytest.raises(DegenerateError, match="cam_right may be in two places: target_floor looks"):
+        aligned(cell)
+
+
+@pytest.mark.slow
+def test_rows_held_back_have_no_part_in_frames_lenses_and_noise(clean):
+    cell, _ = clean
+    session = network_session(cell, "cell", seen="names")
+    corners = {it.view: it for it in cell.corners}
+    held = set(list(corners)[::7])
+    views = [replace(it, holdout=it.number in held) for it in session.views]
+    rng = np.random.default_rng(0)
+    spoilt = {
+        view: replace(it, px=it.px + rng.normal(0.0, 3.0, it.px.shape)) if view in held else it
+        for view, it in corners.items()
+    }
+    kept, without = (
+        align(replace(session, views=tuple(views)), corners=it)
+        for it in (spoilt, {view: it for view, it in corners.items() if view not in held})
+    )
+    assert {it.view for it in kept.sights if not it.used} == held
+    assert kept.noise == without.noise
+    for name, edge in without.edges.items():
+        np.testing.assert_array_equal(kept.edges[name].matrix, edge.matrix)
+        np.testing.assert_array_equal(kept.edges[name].covariance, edge.covariance)
+    # Their residuals are told all the same: three pixels in each coordinate.
+    px = [it.rms_px for it in kept.sights if not it.used]
+    assert np.sqrt(np.mean(np.square(px))) == pytest.approx(3.0 * np.sqrt(2.0), rel=0.1)
+    sound = align(replace(session, views=tuple(views)), corners=corners)
+    found = Calibration.whole(sound)
+    written = to_document(found)["validation"]
+    # Left out once or in turn is the same to chance, of so many views; in its pair, of some.
+    assert written["holdout"]["px"] == pytest.approx(written["held_out"]["px"], rel=0.3)
+    assert written["holdout"]["mm"] == pytest.approx(written["held_out"]["mm"], rel=0.5)
+    assert found.of("left", "b").validation.holdout is not None
+    assert sound.verdict.status == "good"
+    assert kept.verdict.status == "check"
+    assert any("that the session holds back are missed by" in it for it in kept.verdict.reasons)
+
+
+def with_elbow_of_b(session, change):
+    """The session with no more than joints of one robot, the third of them changed."""
+    views = [
+        replace(view, numbers=change({k: it for k, it in view.numbers.items() if k not in POSE}))
+        if view.text.get("robot") == "b"
+        else view
+        for view in session.views
+    ]
+    return replace(session, views=tuple(views))
+
+
+@pytest.mark.slow
+def test_joints_of_one_robot_are_held_against_what_the_cameras_see(clean):
+    cell, _ = clean
+    session, corners = network_session(cell, "cell", seen="names"), dict(enumerate(cell.corners))
+    moved = with_elbow_of_b(session, lambda it: it | {"q3_rad": it["q3_rad"] + 0.2})
+    found = align(moved, corners=corners)
+    (words,) = [it for it in found.verdict.reasons if "elbow_joint" in it]
+    assert words.startswith("Robot b: the joint angles do not belong to ur5e as they are declared.")
+    assert "moved by -11.4" in words
+    _, squared = off(cell, found, "base_a", "base_b")
+    # Chi-square of 6 beyond 22 is 0.1 %.
+    assert squared < 22.0
+    turned = with_elbow_of_b(session, lambda it: it | {"q3_rad": -it["q3_rad"]})
+    with pytest.raises(DataError, match=r"^robot b: .* not those of ur5e .* of the opposite sign"):
+        align(turned, corners=corners)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.005])
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_one_camera_on_one_robot_gives_what_calibrate_gives(mount, scale):
+    cell = simulate(CellOptions(mount=mount, views=15, board_scale=scale))
+    found = align(session_of(cell), corners=dict(enumerate(cell.corners)))
+    edges = calibrated(cell, joints=False).solved.state.edges
+    names = {
+        "eye-in-hand": ("flange_from_cam", "cell_from_target"),
+        "eye-to-hand": ("cell_from_cam", "flange_from_target"),
+    }[mount]
+    for name, matrix in zip(names, edges, strict=True):
+        away = log(invert(matrix) @ found.edges[name].matrix)
+        # The same but for how levels of noise are estimated: a tenth of a sigma.
+        assert np.all(np.abs(away) < 0.1 * np.sqrt(np.diag(found.edges[name].covariance)))
+
+
+def test_one_robot_with_two_fixed_cameras_is_calibrated_by_the_same_way(tmp_path):
+    options = NetworkOptions(
+        robots=(RobotAt("a", (-0.6, 0.0, 0.0)),), boards=(BoardAt("plate_a", "a"),), stops=STOPS
+    )
+    session = network_session(simulate_network(options), "cell", seen="poses")
+    session.save(tmp_path / "session")
+    out = tmp_path / "out"
+    done = visioncal("calibrate", tmp_path / "session", "-o", out, "--json")
+    assert done.status == 0
+    written = json.loads((out / "calibration.json").read_text())
+    assert written == json.loads(done.out)
+    aligned = json.loads((out / "alignment.json").read_text())
+    assert aligned["transforms"] == written["transforms"]
+    assert set(written["transforms"]) == {
+        "cell_from_cam_left",
+        "cell_from_cam_right",
+        "flange_a_from_target_plate_a",
+    }
+
+
+def test_an_arm_that_bends_is_as_elastic_in_a_cell_as_by_itself(tmp_path):
+    springs = (1e-4, 1e-4, 8e-5, 2e-5, 2e-5, 1e-5)
+    loads = (Payload(0.0, (0.0, 0.0, 0.0)), Payload(8.0, (0.0, 0.0, 0.08)))
+    bending = CellOptions(compliance_rad_per_nm=springs, payloads=loads, branches=True, views=30)
+    pairs_session(simulate(bending), "pairs").save(tmp_path / "pairs")
+    session = Session.load(tmp_path / "pairs")
+    alone, cell = calibrate(session), Calibration.whole(align(session)).of()
+    assert cell.arm.level == "elastic"
+    assert alone.arm.level == "elastic"
+    rows = zip(*(it.elastic.joints for it in (alone, cell)), springs, strict=True)
+    for one, other, true in rows:
+        sigma = other.sigma_rad_per_nm
+        # Of the same views, but for what a frame beside the arm takes up: within a sigma or so.
+        assert other.compliance_rad_per_nm == pytest.approx(
+            one.compliance_rad_per_nm, abs=1.5 * sigma
+        )
+        if other.told:
+            assert other.compliance_rad_per_nm == pytest.approx(true, abs=4.5 * sigma)
+    assert sum(other.told for other in cell.elastic.joints) >= 2
+    np.testing.assert_allclose(
+        cell.compliance, [it.compliance_rad_per_nm for it in cell.elastic.joints]
+    )
+
+
+def reported(cell, robot, poses):
+    """A session in which one robot reports other poses, and what was seen in its images."""
+    told = {**cell.base_from_flange, robot: poses}
+    session = network_session(replace(cell, base_from_flange=told), "cell", seen="names")
+    return session, {it.view: it for it in cell.corners}
+
+
+@pytest.mark.slow
+def test_what_is_no_noise_of_a_robot_is_said_of_that_robot():
+    cell = simulate_network(NetworkOptions(stops=40))
+    share = np.linspace(-0.5, 0.5, 40)[:, None]
+    crept = exp(share * np.array([0, 0, 0, 0, 6e-4, 0])) @ cell.base_from_flange["a"]
+    session, corners = reported(cell, "a", crept)
+    (said,) = [it for it in align(session, corners=corners).verdict.reasons if "drift" in it]
+    assert said.startswith("Robot a: residuals drift with time")
+    # Forty stops that repeat to 0.03 mm leave some 0.03 mm of what crept by 0.6 mm.
+    assert float(said.split("moved by ")[1].split(" mm")[0]) == pytest.approx(0.6, abs=0.1)
+    rng = np.random.default_rng(1)
+    alike = np.repeat(rng.standard_normal((10, 6)) * np.repeat([4e-4, 2e-4], 3), 4, axis=0)
+    session, corners = reported(cell, "b", cell.base_from_flange["b"] @ exp(alike))
+    found = align(session, corners=corners)
+    assert any(it.startswith("Robot b: neighbouring stops") for it in found.verdict.reasons)
+    assert not any(it.startswith("Robot a:") for it in found.verdict.reasons)
+    _, squared = off(cell, found, "base_a", "base_b")
+    assert squared < 22.0
+
+
+@pytest.mark.slow
+def test_a_board_of_another_size_is_found_beside_arms_that_err():
+    robots = (
+        RobotAt("a", (-0.6, 0.0, 0.0), offset_sigma_rad=1e-3),
+        RobotAt("b", (0.6, 0.05, 0.02), offset_sigma_rad=1e-3),
+    )
+    boards = (replace(FLOOR, scale=1.002), BoardAt("plate_a", "a"), BoardAt("plate_b", "b"))
+    cameras = (replace(LEFT, camera=fine_camera()), RIGHT, CameraAt("hand", "b"))
+    options = NetworkOptions(robots, cameras, boards, stops=2 * STOPS)
+    found = aligned(simulate_network(options))
+    floor = found.boards["floor"]
+    # Four of its sigmas: one run in fifteen thousand.
+    assert abs(floor.shape["scale"] - 0.002) < 4 * floor.sigma["scale"] < 4e-4
+    assert set(found.boards["plate_a"].sigma) == {"scale"}
+    assert not found.moved
+    assert {found.arms[it].arm.level for it in "ab"} == {"offsets"}
+
+
+@pytest.mark.slow
+def test_boards_of_three_sizes_are_found_beside_arms_that_err():
+    """What all three have in common the arms' links may have, too: free together none is clear."""
+    robots = (replace(it, offset_sigma_rad=1e-3) for it in NetworkOptions().robots)
+    scales = {"floor": 1.002, "plate_a": 0.999, "plate_b": 1.001}
+    boards = (replace(it, scale=scales[it.name]) for it in NetworkOptions().boards)
+    found = aligned(
+        simulate_network(NetworkOptions(tuple(robots), boards=tuple(boards), stops=STOPS, seed=5))
+    )
+    shapes = {name: found.boards[name].shape["scale"] for name in scales}
+    # Against each other they are known to some hundred-thousandths.
+    assert shapes["floor"] - shapes["plate_a"] == pytest.approx(0.003, abs=1e-4)
+    assert shapes["floor"] - shapes["plate_b"] == pytest.approx(0.001, abs=1e-4)
+    # 0.03 mm is planted: sizes that stay wrong count as ten times that.
+    assert max(found.noise[it]["translation_mm"] for it in "ab") < 0.06
+
+
+@pytest.mark.slow
+def test_errors_of_an_arm_that_are_free_on_the_way_may_be_no_unknowns_at_the_end():
+    """Boards of slightly other sizes look like errors of both arms, until they are free."""
+    scales = 1.0 + 1e-3 * np.random.default_rng([47, 41]).standard_normal(3)
+    boards = [
+        replace(it, scale=float(scale))
+        for it, scale in zip(NetworkOptions().boards, scales, strict=True)
+    ]
+    cell = simulate_network(NetworkOptions(boards=tuple(boards), stops=30, seed=47))
+    found = aligned(cell)
+    # The worst of fifty such cells; chi-square of 6 beyond 28 is 0.01 %.
+    assert off(cell, found, "base_a", "base_b")[1] < 28.0

@@ -1,0 +1,84 @@
+"""A whole cell from its pictures: `visioncal align` on a folder, and on its recording."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.commands import visioncal
+
+from visioncal.core.transforms import log
+from visioncal.results import Alignment
+from visioncal.session import Session
+from visioncal.simulation import (
+    BoardAt,
+    CameraAt,
+    NetworkOptions,
+    RobotAt,
+    charuco_target,
+    checkerboard_target,
+    simulate_network,
+    wide_camera,
+    write_network,
+)
+
+SMALL = replace(wide_camera(), resolution=(640, 480), matrix=np.array([560.0, 559.0, 321.0, 238.0]))
+LARGE = replace(wide_camera(), resolution=(800, 600), matrix=np.array([760.0, 761.0, 398.0, 301.0]))
+PLAIN = replace(checkerboard_target(), name="6x5", columns=6, rows=5)
+OPTIONS = NetworkOptions(
+    robots=(RobotAt("a", (-0.6, 0.0, 0.0)), RobotAt("b", (0.6, 0.05, 0.02))),
+    cameras=(
+        CameraAt("left", place_m=(0.0, -0.5, 0.9), camera=LARGE),
+        CameraAt("right", place_m=(0.1, 0.45, 0.95), camera=SMALL, state_intrinsics=False),
+    ),
+    boards=(
+        BoardAt(
+            "plate_a", "a", target=replace(checkerboard_target(), name="6x5", columns=6, rows=5)
+        ),
+        BoardAt("plate_b", "b", target=replace(charuco_target(), name="5x4", columns=5, rows=4)),
+    ),
+    stops=8,
+    lens_views=6,
+    swapped_rows=1,
+)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    return write_network(simulate_network(OPTIONS), tmp_path_factory.mktemp("cell") / "cell")
+
+
+@pytest.fixture(scope="module")
+def out(folder, tmp_path_factory) -> Path:
+    found = tmp_path_factory.mktemp("out")
+    assert visioncal("align", folder, "-o", found).status == 0
+    return found
+
+
+def test_pictures_of_several_cameras_are_one_cell(out):
+    cell, found = simulate_network(OPTIONS), Alignment.load(out)
+    for frame in ("base_b", "cam_left", "cam_right"):
+        edge = found.between("base_a", frame)
+        off = log((np.linalg.inv(edge.matrix) @ cell.between("base_a", frame))[None])[0]
+        # Six squared sigmas are exceeded once in 4e5; pictures of small boards are not ideal.
+        assert off @ np.linalg.solve(edge.covariance, off) < 60.0, frame
+    # Both rows whose pictures were exchanged are left out.
+    left_out = {it.view: it.reason for it in found.sights if not it.used}
+    for view in cell.wrong_views:
+        assert "disagrees" in left_out[view]
+    assert found.cameras["cam_right"].estimated
+    assert not found.cameras["cam_left"].estimated
+
+
+@pytest.mark.slow
+def test_the_recording_is_the_session_and_holds_the_result(folder, out, tmp_path):
+    recording = out / "recording.rrd"
+    assert Session.load(recording).digest() == Session.load(folder).digest()
+    assert visioncal("align", recording, "-o", tmp_path / "again").status == 0
+    one, other = (
+        json.loads((it / "alignment.json").read_text()) for it in (out, tmp_path / "again")
+    )
+    assert one | {"created": ""} == other | {"created": ""}
+    assert visioncal("report", recording, "-o", tmp_path / "report.html").status == 0
+    assert (tmp_path / "report.html").read_text() == (out / "report.html").read_text()

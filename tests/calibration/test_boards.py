@@ -1,0 +1,296 @@
+"""Several boards in one chain: where they are, what they tell together, and what is wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+from scipy.stats import chi2
+from support.cells import calibrated, error_of
+from support.marks import slow
+
+from visioncal.calibration.pipeline import run
+from visioncal.calibration.pipeline.guess_inputs import guess_session
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.stages.detect import detect
+from visioncal.calibration.verification.calibration_prior import CalibrationPrior
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.transforms import exp, invert, log
+from visioncal.estimation.workspace import postures
+from visioncal.frames.session_observations import session_looks
+from visioncal.interchange.outputs import write_outputs
+from visioncal.session import Session
+from visioncal.simulation import (
+    CellOptions,
+    Second,
+    charuco_target,
+    checkerboard_target,
+    fine_camera,
+    forward,
+    simulate,
+    wide_camera,
+    write_session,
+)
+from visioncal.simulation.boards import corners_m
+from visioncal.simulation.optics import project
+
+# The second board is out of sight from where the first is looked at, unless it is turned less.
+NEAR = Second(turn_rad=0.6, tilt_rad=0.2)
+TWO = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1, robot="ur5e", views=16, second=Second())
+WRONG_LINKS = {"dh_sigma_m": 5e-4, "dh_sigma_rad": 1e-3}
+MOUNTS = ("eye-in-hand", "eye-to-hand")
+
+
+def without(cell, views):
+    """A cell that lacks some views."""
+    kept = np.array([at for at in range(len(cell.corners)) if at not in views])
+    shown = replace(cell.shown, stops=cell.shown.stops[kept], boards=cell.shown.boards[kept])
+    corners = tuple(replace(cell.corners[at], view=now) for now, at in enumerate(kept))
+    return replace(
+        cell,
+        corners=corners,
+        shown=shown,
+        joints=cell.joints[kept],
+        base_from_flange=cell.base_from_flange[kept],
+    )
+
+
+@pytest.mark.slow
+def test_all_boards_are_placed_as_well_as_their_sigmas_say():
+    """Ten cells, each with boards whose sizes are off by what their files allow."""
+    squares, count = 0.0, 0
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        first, further = 1.0 + 1e-3 * rng.standard_normal(2)
+        second = replace(NEAR if seed % 4 < 2 else Second(), scale=further)
+        cell = simulate(
+            replace(TWO, mount=MOUNTS[seed % 2], board_scale=first, second=second, seed=seed)
+        )
+        known = calibrated(cell, joints=False)
+        assert len(known.used) == len(cell.corners)
+        error, covariance = error_of(cell, known), result_of(known).joint_covariance
+        assert error.shape == (18,)
+        squares += float(error @ np.linalg.solve(covariance, error))
+        count += len(error)
+    # Both tails at one in ten thousand.
+    assert chi2.ppf(1e-4, count) < squares < chi2.ppf(1.0 - 1e-4, count)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_boards_have_names_and_a_common_covariance(mount):
+    cell = simulate(replace(TWO, mount=mount, seed=3))
+    known = calibrated(cell)
+    result = result_of(known)
+    assert list(result.edges) == list(cell.transforms)
+    assert result.joint_covariance.shape == (18, 18)
+    for at, edge in enumerate(result.edges.values()):
+        rows = slice(6 * at, 6 * at + 6)
+        assert np.array_equal(edge.covariance, result.joint_covariance[rows, rows])
+    # The boards hang together by the camera's edge.
+    assert np.abs(result.joint_covariance[6:12, 12:]).max() > 0.0
+    assert np.linalg.eigvalsh(result.joint_covariance).min() > 0.0
+    assert set(result.boards) == {"first", "second"}
+    for solver in result.solvers.values():
+        assert list(solver.matrices) == list(cell.transforms)
+    park = result.solvers["park"].matrices
+    for name, true in cell.transforms.items():
+        # Closed forms are off by a few tenths of a millimetre.
+        assert np.linalg.norm((invert(true) @ park[name])[:3, 3]) < 2e-3
+
+
+@pytest.mark.slow
+def test_two_boards_tell_more_of_an_arm_than_one():
+    """The same number of views, and the tool's place all over the workspace."""
+    ratios = []
+    for seed in range(3):
+        options = replace(TWO, **WRONG_LINKS, mount="eye-to-hand", views=24, seed=seed)
+        errors = []
+        for second in (None, Second(target=charuco_target())):
+            cell = simulate(replace(options, second=second))
+            known = calibrated(cell)
+            assert known.robot_arm.kinematics.level == "geometry"
+            errors.append(error_m(cell, known))
+        ratios.append(errors[1] / errors[0])
+    # Both boards are seen by most stops: 0.55 in the median of five cells.
+    assert np.median(ratios) < 0.8
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", slow("eye-to-hand")])
+def test_each_board_adds_six_values_that_are_told(mount):
+    """Everett and Hsu (1988): 4 a revolute joint, 6 for the frames, and 6 a further board."""
+    cell = simulate(replace(TWO, **WRONG_LINKS, mount=mount, views=24, seed=1))
+    known = calibrated(cell)
+    told = known.arm_found.telling.told
+    assert known.robot_arm.kinematics.level == "geometry"
+    assert (told.columns, told.identifiable, told.told) == (54, 36, 36)
+    # The first board alone tells thirty.
+    one = calibrated(without(cell, set(np.flatnonzero(cell.shown.boards == 1).tolist())))
+    assert (one.arm_found.telling.told.columns, one.arm_found.telling.told.identifiable) == (48, 30)
+
+
+def error_m(cell, known):
+    """Root mean square error of the first board's place, seen from the camera [m]."""
+    robot = known.robot_arm.model.robot
+    q = postures(robot)
+    x, z, *_ = cell.transforms.values()
+    board = known.solved.state.edges[1]
+    true = invert(x) @ forward(cell.true_arm, q) @ z
+    ours = invert(known.solved.state.edges[0]) @ robot.base_from_flange(q) @ board
+    return float(np.sqrt(np.mean(np.sum((true - ours)[:, :3, 3] ** 2, axis=1))))
+
+
+def test_a_wrong_view_of_one_board_is_named():
+    cell = simulate(replace(TWO, seed=4))
+    corners = list(cell.corners)
+    # One view of the second board shows it shifted by two squares.
+    slipped = next(at for at in np.flatnonzero(cell.shown.boards == 1) if len(corners[at].ids) > 40)
+    pose = cell.cam_from_target[slipped] @ exp(np.array([0, 0, 0.02, 0.03, 0.0, 0.0]))
+    turned = replace(cell.exact_corners[slipped], view=int(slipped))
+    points = corners_m(cell.sheets[1])[turned.ids] @ pose[:3, :3].T + pose[:3, 3]
+    corners[slipped] = replace(turned, px=project(cell.options.camera, points))
+    known = calibrated(replace(cell, corners=tuple(corners)))
+    assert set(range(len(corners))) - set(known.used) == {slipped}
+    assert "disagrees with the other views" in known.reasons[slipped]
+    assert any(f"View {slipped} was left out" in it for it in known.verdict.reasons)
+
+
+def test_a_board_of_another_size_is_named():
+    known = calibrated(simulate(replace(TWO, second=Second(scale=1.01), seed=5)))
+    told = [it for it in known.verdict.reasons if "By the robot's motion" in it]
+    assert len(told) == 1
+    assert "the board second is 1 % larger than stated" in told[0]
+    shapes = result_of(known).boards
+    # The robot measures a size to some hundredths of a percent.
+    assert shapes["second"].shape["scale"] == pytest.approx(0.01, abs=1e-3)
+    assert shapes["first"].shape["scale"] == 0.0
+
+
+def test_one_view_places_a_board():
+    cell = simulate(replace(TWO, second=replace(Second(), target=charuco_target()), seed=6))
+    further = np.flatnonzero(cell.shown.boards == 1)
+    known = calibrated(without(cell, set(further[1:].tolist())))
+    result = result_of(known)
+    edges = result.edges
+    assert edges["base_from_target_second"].sigma_mm > edges["base_from_target_first"].sigma_mm
+    true = cell.transforms["base_from_target_second"]
+    away = log(invert(true) @ edges["base_from_target_second"].matrix)
+    covariance = edges["base_from_target_second"].covariance
+    # One draw of chi-square with six degrees of freedom, at one in ten thousand.
+    assert away @ np.linalg.solve(covariance, away) < chi2.ppf(1.0 - 1e-4, 6)
+    # Without that view nothing places the board: it has no part in what is held out.
+    assert np.isnan(known.solved.held_out.away_m).sum() == 1
+    assert np.isfinite(known.findings.held_out.mm)
+
+
+def test_noise_that_the_data_show_refuses_no_board():
+    cell = simulate(replace(TWO, pixel_sigma_px=0.5, robot_sigma_m=7e-3, seed=7))
+    further = np.flatnonzero(cell.shown.boards == 1)
+    known = calibrated(without(cell, set(further[1:].tolist())), joints=False)
+    # One view by a flange that errs by 7 mm an axis; the geometry is that of an ordinary cell.
+    assert result_of(known).edges["base_from_target_second"].sigma_mm > 10.0
+    assert known.verdict.status == "bad"
+
+
+def test_a_board_that_is_never_seen_is_told():
+    cell = simulate(replace(TWO, seed=8))
+    further = set(np.flatnonzero(cell.shown.boards == 1).tolist())
+    known = calibrated(without(cell, further))
+    assert list(result_of(known).edges) == ["flange_from_cam", "base_from_target_first"]
+    assert any("No usable view shows target second" in it for it in known.verdict.reasons)
+
+
+def test_too_few_views_of_any_board_are_refused():
+    cell = simulate(replace(TWO, seed=9))
+    kept = {
+        *np.flatnonzero(cell.shown.boards == 0)[:2],
+        *np.flatnonzero(cell.shown.boards == 1)[:2],
+    }
+    with pytest.raises(DegenerateError, match="first in 2, second in 2"):
+        calibrated(without(cell, set(range(len(cell.corners))) - kept))
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_measured_poses_of_two_boards_will_do(tmp_path, mount):
+    cell = simulate(replace(TWO, mount=mount, second=NEAR, seed=10))
+    session = Session.load(write_session(cell, tmp_path / "pairs", images=False))
+    result = run(session).calibration
+    assert list(result.edges) == list(cell.transforms)
+    for name, true in cell.transforms.items():
+        away = log(invert(true) @ result.edges[name].matrix)
+        covariance = result.edges[name].covariance
+        # Chi-square with six degrees of freedom at one in ten thousand; the noise is estimated.
+        assert away @ np.linalg.solve(covariance, away) < 1.5 * chi2.ppf(1.0 - 1e-4, 6)
+
+
+def test_each_image_is_searched_for_its_own_board(tmp_path):
+    cell = simulate(replace(TWO, camera=wide_camera(), views=4, seed=11))
+    session = Session.load(write_session(cell, tmp_path / "session"))
+    found = detect(session)
+    assert sorted(found.corners) == [0, 1, 2, 3]
+    views = list(session.views)
+    views[1] = replace(views[1], text={"target": "first"})
+    wrong = detect(replace(session, views=tuple(views)))
+    assert sorted(wrong.corners) == [0, 2, 3]
+    (lost,) = wrong.rejections
+    assert (lost.view, lost.reason.endswith("(looked for target first)")) == (1, True)
+
+
+def test_the_turn_of_a_symmetric_board_is_told_by_its_other_views():
+    """Eight by six corners look the same after half a turn."""
+    even = replace(checkerboard_target(), name="even", columns=8)
+    cell = simulate(replace(TWO, second=Second(target=even), seed=13))
+    known = calibrated(cell)
+    assert len(known.used) == len(cell.corners)
+    away = error_of(cell, known)[12:]
+    # The board's frame is that of the first view's numbering, which need not be ours.
+    turned = np.linalg.norm(away[:3]) > 1.0
+    assert np.linalg.norm(away[3:]) < (0.5 if turned else 2e-4)
+    assert known.findings.held_out.mm < 0.5
+
+
+def test_inverse_poses_are_told_by_the_views_of_one_board(tmp_path):
+    cell = simulate(replace(TWO, seed=14))
+    inverse = replace(cell, base_from_flange=invert(cell.base_from_flange))
+    session = Session.load(write_session(inverse, tmp_path / "pairs", images=False))
+    guess = guess_session(session)
+    assert not guess.declared.closes
+    assert guess.stands_out
+    assert guess.best.closes
+
+
+def test_every_output_shows_all_boards(tmp_path):
+    cell = simulate(replace(TWO, seed=10))
+    session = Session.load(write_session(cell, tmp_path / "pairs", images=False))
+    written = run(session)
+    write_outputs(tmp_path / "out", session, written)
+    file = tmp_path / "out" / "recording.rrd"
+    assert Session.load(file).digest() == session.digest()
+    again = run(Session.load(file)).calibration
+    for name, edge in written.calibration.edges.items():
+        assert np.array_equal(again.edges[name].matrix, edge.matrix)
+        assert np.array_equal(again.edges[name].covariance, edge.covariance)
+    report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "base_from_target_first" in report
+    assert "base_from_target_second" in report
+    logged = {str(it.entity_path) for it in RrdReader(file).stream()}
+    placements = [it for it in logged if "placements_magnified" in it and it.endswith("/used")]
+    for name in ("first", "second"):
+        assert f"/targets/{name}/sheet" in logged
+        assert any(it.startswith(f"/targets/{name}/") for it in placements)
+    with pytest.raises(DataError, match=r"several targets \(first, second\)"):
+        session_looks(session, written.calibration, "base")
+
+
+@pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens estimated"])
+def test_what_is_written_of_the_fit_is_read_back(given):
+    """Further boards are written relative to the first."""
+    known = calibrated(simulate(replace(TWO, seed=2, state_intrinsics=given, **WRONG_LINKS)))
+    assert known.robot_arm.model is not None
+    prior_calibration, solved = CalibrationPrior.of(result_of(known)), known.solved
+    np.testing.assert_allclose(prior_calibration.state.edges, solved.state.edges, atol=1e-12)
+    sigmas = np.sqrt(np.diag(solved.covariance))
+    # Slopes there and back undo each other up to rounding.
+    scale = np.outer(sigmas, sigmas)
+    np.testing.assert_allclose(
+        prior_calibration.covariance / scale, solved.covariance / scale, atol=1e-6
+    )

@@ -1,0 +1,89 @@
+"""Streams and clocks of whole cells: a camera that sees a moving robot by a clock of its own."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.swept_cells import AHEAD_S, cell_of, swept_session
+
+from visioncal.calibration.pipeline import align
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import invert, log
+from visioncal.results import Calibration
+from visioncal.simulation.layout import NetworkOptions
+
+CLOCK = "cam_side and robot b"
+
+
+@pytest.fixture(scope="module")
+def swept():
+    arms = (replace(it, offset_sigma_rad=1e-3) for it in NetworkOptions().robots)
+    cell = cell_of(NetworkOptions(tuple(arms), stops=16, seed=4))
+    return cell, *swept_session(cell)
+
+
+@pytest.fixture(scope="module")
+def found(swept):
+    _, session, corners = swept
+    return align(session, corners=corners)
+
+
+def test_the_offset_of_one_camera_is_found_by_the_motion(found):
+    clock = found.details.clocks[CLOCK]
+    assert clock.method == "motion"
+    assert clock.sigma_s < 1e-4
+    # Three sigma: one run in 370. What the motion tells of the arm as stated is off by more.
+    assert abs(clock.camera_minus_robot_s - AHEAD_S) < 3 * clock.sigma_s
+    ahead_ms = 1e3 * clock.camera_minus_robot_s
+    said = f"{CLOCK}: the fit of the whole cell has the camera's clock {ahead_ms:+.2f} ms ahead"
+    assert any(it.startswith(said) for it in found.verdict.reasons)
+
+
+def test_the_clock_of_one_camera_and_robot_goes_with_them(found):
+    whole = Calibration.whole(found)
+    assert whole.of("side", "b").clock == found.details.clocks[CLOCK]
+    assert whole.of("left", "b").clock is None
+
+
+def test_a_camera_that_saw_nothing_else_is_placed_as_its_covariance_says(swept, found):
+    cell, session, _ = swept
+    edge = found.between("cam_left", "cam_side")
+    away = log(invert(cell.between("cam_left", "cam_side")) @ edge.matrix)
+    # Chi-square of 6 beyond 22 is 0.1 %.
+    assert away @ np.linalg.solve(edge.covariance, away) < 22.0
+    assert edge.sigma_mm < 0.2
+    used = [it for it in found.sights if it.seer == "cam_side" and it.used]
+    assert len(used) > 30
+    assert found.session_sha256 == session.digest()
+
+
+@pytest.mark.slow
+def test_what_is_stated_of_one_camera_is_contradicted_by_name(swept):
+    _, session, corners = swept
+    document = {**session.document, "clocks": {"side": {"camera_minus_robot_s": 0.02}}}
+    found = align(replace(session, document=document), corners=corners)
+    (doubt,) = [it for it in found.verdict.reasons if "is stated as +20.00 ms" in it]
+    assert doubt.startswith(CLOCK)
+    assert found.details.clocks[CLOCK].stated_s == 0.02
+    assert found.verdict.status == "check"
+
+
+def test_a_clock_of_no_camera_is_refused(swept):
+    _, session, corners = swept
+    document = {**session.document, "clocks": {"sied": {"camera_minus_robot_s": 0.02}}}
+    with pytest.raises(DataError, match=r"clocks\.sied is of no camera"):
+        align(replace(session, document=document), corners=corners)
+
+
+@pytest.mark.slow
+def test_rows_whose_motion_tells_no_offset_are_left_out_and_say_so(swept):
+    """Some frames of the sweep: too few to say when."""
+    _, session, corners = swept
+    timed = [it for it in session.views if it.stamp_s is not None]
+    views = tuple(it for it in session.views if it.stamp_s is None or it in timed[:5])
+    found = align(replace(session, views=views), corners=corners)
+    lost = [it for it in found.sights if it.seer == "cam_side"]
+    assert len(lost) == 5
+    assert all(not it.used and "clock" in it.reason for it in lost)
+    assert "cam_side" in {it.frame for it in found.untied}
+    assert any(it.startswith(CLOCK) for it in found.verdict.reasons)

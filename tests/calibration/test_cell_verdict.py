@@ -1,0 +1,244 @@
+"""The verdict on a whole cell names what is wrong: a camera, a pose, a board, the motion."""
+
+from copy import deepcopy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.problems import observed, pose, world
+from support.whole_cells import FLOOR, OPTIONS, PLATE, part, recorded
+
+from visioncal.calibration.pipeline import align
+from visioncal.core.errors import DegenerateError
+from visioncal.session import MemoryImages, Session
+from visioncal.simulation import (
+    BoardAt,
+    CameraAt,
+    checkerboard_target,
+    fine_camera,
+    simulate_network,
+)
+from visioncal.simulation.records import POSE, pose_row
+
+# Three cameras, so that two or more see by way of a robot at most stops.
+CELL = replace(
+    OPTIONS,
+    cameras=(
+        *OPTIONS.cameras,
+        CameraAt("right", place_m=(0.3, -1.0, 1.2), camera=fine_camera()),
+    ),
+    boards=(
+        BoardAt("floor", place_m=(0.0, 0.0, 0.05), target=FLOOR),
+        BoardAt("plate_a", on="a", target=FLOOR),
+        BoardAt("plate_b", on="b", target=PLATE),
+    ),
+    stops=16,
+)
+
+
+@pytest.fixture(scope="module")
+def session():
+    return recorded(simulate_network(CELL))
+
+
+def rewritten(session, change, document=None):
+    """The session with its rows as `change` makes them: a function of the view and its texts."""
+    rows = []
+    for view in session.views:
+        row = {it: view.cell(it) for it in session.columns}
+        change(view, row)
+        rows.append(list(row.values()))
+    return Session.assemble(
+        document or session.document,
+        session.columns,
+        rows,
+        session.images,
+        target_document=session.target_document,
+        robot_document=session.robot_document,
+        corners=session.corner_table,
+    )
+
+
+def of_plate(session, plate, stop):
+    """The views of a plate at a stop, one of which has the pose of its robot."""
+    return [it.number for it in session.views if it.stop == stop and it.text["target"] == plate]
+
+
+def seen_often(session, plate):
+    """The stops at which several cameras see a plate, after the first ones."""
+    return [it for it in range(3, CELL.stops) if len(of_plate(session, plate, it)) > 1]
+
+
+def poses(session, robot):
+    """The rows that have a robot's pose by stop, without its joints: they go with the pose."""
+    rows = {}
+    for view in session.views:
+        if view.text.get("robot") == robot and view.cell("x_m"):
+            row = {it: view.cell(it) for it in session.columns[5:]}
+            rows[view.stop] = row | {it: "" for it in row if it.endswith("_rad")}
+    return rows
+
+
+def test_a_sound_cell_is_good_and_says_how_good(session):
+    found = align(session)
+    assert found.verdict.status == "good"
+    good_for, reason = found.verdict.reasons
+    assert good_for.startswith("It is good for tasks of ")
+    used = sum(it.used for it in found.sights)
+    assert reason.startswith(
+        f"All {used} used views agree: left out of the fit, they are predicted"
+    )
+    assert "offset along the cell's" in reason
+
+
+def test_one_wrong_pose_of_a_robot_is_named(session):
+    stop = seen_often(session, "plate_b")[0]
+    mine, pose = of_plate(session, "plate_b", stop), poses(session, "b")[stop]
+
+    def push(view, row):
+        if view.stop == stop and view.text.get("robot") == "b" and view.cell("x_m"):
+            row.update(pose | {"x_m": repr(float(pose["x_m"]) + 0.02)})
+
+    found = align(rewritten(session, push))
+    (reason,) = [it for it in found.verdict.reasons if "Robot b did not stand" in it]
+    assert f"at stop {stop} where its pose says: all {len(mine)} views" in reason
+    assert "moved by 20 mm" in reason
+    assert all(str(it) in reason for it in mine)
+    assert found.verdict.status == "check"
+    # What a fault explains is not said once more of each camera.
+    assert not any("were left out; view" in it for it in found.verdict.reasons)
+    why = {it.view: it.reason for it in found.sights if not it.used}
+    assert sorted(why) == mine
+    assert all(f"the pose of robot b at stop {stop} is wrong" in it for it in why.values())
+
+
+def test_poses_of_a_robot_that_are_exchanged_are_named(session):
+    first, second = seen_often(session, "plate_b")[:2]
+    told = poses(session, "b")
+
+    def exchange(view, row):
+        other = {first: second, second: first}.get(view.stop)
+        if other is not None and view.text.get("robot") == "b" and view.cell("x_m"):
+            row.update(told[other])
+
+    found = align(rewritten(session, exchange))
+    words = f"The poses of robot b at stops {first} and {second} are exchanged: views"
+    assert any(it.startswith(words) for it in found.verdict.reasons)
+    out = [it.view for it in found.sights if not it.used]
+    assert out == [*of_plate(session, "plate_b", first), *of_plate(session, "plate_b", second)]
+
+
+def test_a_camera_whose_corners_are_bad_is_named(session):
+    table = session.corner_table
+    mine = {it.number for it in session.views if it.text.get("camera") == "right"}
+    noise = np.random.default_rng(0).normal(0.0, 1.5, table.px.shape)
+    blurred = np.where(np.isin(table.views, list(mine))[:, None], table.px + noise, table.px)
+    verdict = align(replace(session, corner_table=replace(table, px=blurred))).verdict
+    assert verdict.status == "check"
+    (reason,) = [it for it in verdict.reasons if "corners deviate" in it]
+    assert reason.startswith("cam_right: corners deviate by 1.5 px")
+    assert not any(it.startswith(("cam_left: ", "cam_hand: ")) for it in verdict.reasons)
+
+
+@pytest.mark.slow
+def test_a_board_of_another_size_is_named():
+    boards = (*CELL.boards[:2], replace(CELL.boards[2], target=checkerboard_target(), scale=1.004))
+    verdict = align(recorded(simulate_network(replace(CELL, boards=boards)))).verdict
+    assert verdict.status == "check"
+    (reason,) = [it for it in verdict.reasons if "larger than stated" in it]
+    assert reason.startswith("By the robot's motion the board plate_b is 0.4 % larger than stated")
+    assert "squares of 25.1 mm, not of 25 mm" in reason
+
+
+def test_a_board_that_is_bent_is_named():
+    boards = (*CELL.boards[:2], replace(CELL.boards[2], bow_m=1e-3))
+    verdict = align(recorded(simulate_network(replace(CELL, boards=boards)))).verdict
+    assert any(it.startswith("The board plate_b is not flat") for it in verdict.reasons)
+    assert sum("not flat" in it for it in verdict.reasons) == 1
+
+
+@pytest.mark.slow
+def test_a_lens_that_is_not_as_stated_is_named(session):
+    document = deepcopy(dict(session.document))
+    matrix = document["cameras"]["right"]["matrix"]
+    document["cameras"]["right"]["matrix"] = [1.005 * matrix[0], 1.005 * matrix[1], *matrix[2:]]
+    verdict = align(rewritten(session, lambda *_: None, document)).verdict
+    words = "cam_right: the given intrinsics do not fit these images and were refined: fx, fy"
+    assert any(it.startswith(words) for it in verdict.reasons)
+    assert sum("given intrinsics" in it for it in verdict.reasons) == 1
+
+
+def test_few_stops_are_told_by_robot(session):
+    verdict = align(part(session, 0, 8)).verdict
+    assert verdict.status == "check"
+    for robot in ("a", "b"):
+        assert any(it.startswith(f"Robot {robot}: only 8 stops are used") for it in verdict.reasons)
+
+
+def turned(tilt_deg, stops=14, noise=1.0):
+    """A session of measured poses in which robot b is tilted by so much, and turned about z."""
+    rng = np.random.default_rng(3)
+    cell = world(rng, stops, seen=1.0)
+    angles = rng.uniform(-1.0, 1.0, (stops, 3)) * [tilt_deg, tilt_deg, 35.0]
+    places = np.array([0.9, 0.1, 0.45]) + rng.uniform(-0.2, 0.2, (stops, 3))
+    flanges = [pose(*it) for it in zip(angles, places, strict=True)]
+    cell.flanges["b"] = np.linalg.inv(cell.truth["base_b"]) @ np.array(flanges)
+    problem = observed(cell, rng, noise=noise)
+    seen, rows, told = problem.observations, [], set()
+    for at, (camera, target, stop) in enumerate(cell.pairs):
+        row = {"view": at, "stop": stop, "camera": camera[4:], "target": target[7:]}
+        # Each robot's pose stands once a stop.
+        robot = {"target_a": "a", "target_b": "b"}.get(target)
+        fresh = robot is not None and (robot, stop) not in told
+        told.add((robot, stop))
+        row["robot"] = robot if fresh else ""
+        row |= pose_row(problem.poses[robot][stop]) if fresh else dict.fromkeys(POSE, "")
+        row |= {f"cft_{it}": value for it, value in pose_row(seen.measured[at]).items()}
+        rows.append(row)
+    document = {
+        "schema": 1,
+        "name": "turned",
+        "cameras": {"left": {}, "right": {}},
+        "robots": {"a": {}, "b": {}},
+        "targets": {it: {"target": "charuco_9x6_30mm"} for it in ("floor", "a", "b")},
+        "frames": {
+            **dict.fromkeys(("cam_left", "cam_right", "target_floor"), "cell"),
+            "target_a": "flange_a",
+            "target_b": "flange_b",
+        },
+    }
+    cells = [[str(value) for value in row.values()] for row in rows]
+    return Session.assemble(document, list(rows[0]), cells, MemoryImages({}))
+
+
+def test_motion_about_one_axis_is_refused_with_what_it_leaves_open():
+    with pytest.raises(
+        DegenerateError, match="all 14 stops of robot b turn about base_b's z"
+    ) as it:
+        align(turned(0.0))
+    assert it.value.culprits == ("base_b's offset along base_b's z",)
+    assert "Add 3 or more stops in which flange_b is tilted" in it.value.next_step
+
+
+def test_poor_motion_is_refused_with_the_direction_that_it_leaves_open():
+    with pytest.raises(DegenerateError, match="offset along the cell's z has a predicted") as it:
+        align(turned(0.3))
+    assert "base_b's offset along the cell's z" in it.value.culprits
+    assert "all 14 stops of robot b turn about base_b's z to within 0." in it.value.message
+
+
+def test_noise_refuses_nothing():
+    # Thirty times a usual camera's and robot's.
+    verdict = align(turned(35.0, noise=30.0)).verdict
+    assert verdict.status == "bad"
+    assert any("Weakly determined by the motion" in it for it in verdict.reasons)
+    assert sum("Left out of the fit, views disagree" in it for it in verdict.reasons) == 1
+
+
+@pytest.mark.slow
+def test_a_robot_all_of_whose_views_disagree_is_named():
+    boards = (*CELL.boards[:2], replace(CELL.boards[2], target=checkerboard_target(), scale=1.01))
+    session = recorded(simulate_network(replace(CELL, boards=boards, stops=24)))
+    with pytest.raises(DegenerateError, match=r"base_b's .* at all .*: all \d+ observations") as it:
+        align(session)
+    assert "has the stated size" in it.value.next_step

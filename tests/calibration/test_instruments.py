@@ -1,0 +1,330 @@
+"""Calibration by a measuring instrument: recovery, sigmas, rank, wrong rows and refusals."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.commands import visioncal as command
+from support.marks import slow
+from support.tracked import (
+    errors_of,
+    information,
+    known_of,
+    mounting_bound,
+    reads,
+    solved_of,
+)
+
+import visioncal
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.transforms import exp, invert
+from visioncal.estimation.positions import Mounting, Places, fit_mounting
+from visioncal.estimation.workspace import postures
+from visioncal.session import MemoryImages, Session
+from visioncal.session.instruments import instrument_names, known_instrument, stated_instrument
+from visioncal.simulation.arms import forward
+from visioncal.simulation.records import POSE
+from visioncal.simulation.tracked import THREE, Tracked, session_of, tracked
+
+PROBE, POINT, POINTS = Tracked(poses=True), Tracked(), Tracked(points=THREE)
+KINDS = pytest.mark.parametrize("options", [PROBE, POINT, POINTS], ids=["probe", "point", "three"])
+PROBE_FIRST = pytest.mark.parametrize(
+    "options",
+    [PROBE, *(slow(it) for it in (POINT, POINTS))],
+    ids=["probe", "point", "three"],
+)
+WRONG = {"dh_sigma_m": 5e-4, "dh_sigma_rad": 1e-3}
+
+
+def test_known_instruments_grow_noisy_with_distance():
+    assert len(instrument_names()) == 15
+    tracker = known_instrument("leica-at960")
+    places = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 4.0]])
+    # 20 um at 5 m is what is commonly said of it.
+    assert tracker.sigmas_m(places) == pytest.approx([17.5e-6, 20e-6])
+    assert tracker.sigma_rad == pytest.approx(9e-5)
+    assert known_instrument("zeiss-contura").sigma_per_m == 0.0
+
+
+def test_what_is_stated_comes_before_the_table():
+    stated = stated_instrument("leica-at960", 5e-5, None, None)
+    assert (stated.sigma_m, stated.sigma_per_m, stated.sigma_rad) == (5e-5, 0.5e-6, 9e-5)
+    assert stated_instrument("ours", 1e-4, 1e-6, None).sigma_per_m == 1e-6
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("leica-at96", None, None, None), "not in the table .* Did you mean leica-at960"),
+        (("ours", None, 1e-6, None), "noise is not stated. State sigma_m .*zeiss-contura"),
+        (("renishaw-xl80", 1e-6, None, None), "measures lengths along its beam; readings of pl"),
+        (("ours", 0.0, None, None), "instrument.sigma_m is 0; no instrument is exact"),
+    ],
+)
+def test_an_unknown_instrument_is_refused(arguments, words):
+    with pytest.raises(DataError, match=words):
+        stated_instrument(*arguments)
+
+
+@PROBE_FIRST
+def test_errors_follow_their_covariance_and_reach_their_bound(options):
+    kept = np.arange(12) if options.poses else np.r_[:6, 9:12]
+    by_sigma, by_bound = [], []
+    for seed in range(20):
+        shop = tracked(replace(options, seed=seed))
+        known = solved_of(session_of(shop))
+        error, covariance = (
+            errors_of(shop, known)[kept],
+            known.solved.covariance[np.ix_(kept, kept)],
+        )
+        by_sigma.append(error @ np.linalg.solve(covariance, error) / len(kept))
+        by_bound.append(error @ np.linalg.solve(mounting_bound(shop), error) / len(kept))
+    # The mean of 20 chi-squares of 9 or 12 degrees of freedom over these has a sigma of 0.1.
+    assert np.mean(by_sigma) == pytest.approx(1.0, abs=0.3)
+    assert np.sqrt(np.mean(by_bound)) < 1.1
+
+
+@KINDS
+def test_an_arm_off_by_millimetres_is_calibrated_all_over_its_workspace(options):
+    shop = tracked(replace(options, **WRONG, stops=40))
+    known = known_of(session_of(shop))
+    assert known.robot_arm.kinematics.level == "geometry"
+    assert known.verdict.status == "good"
+    q = postures(known.robot)
+    (x, z), size = known.solved.state.edges[:2], len(known.robot_arm.model.values)
+
+    def place(robot):
+        return (invert(x) @ robot.base_from_flange(q) @ z)[:, :3, 3]
+
+    true = invert(shop.base_from_instrument) @ forward(shop.true_arm, q) @ shop.flange_from_probe
+    away = 1e3 * np.linalg.norm(place(known.robot_arm.model.robot) - true[:, :3, 3], axis=1)
+    nominal = known.robot_arm.kinematics.levels[0].inside.mm
+    assert nominal > 1.0
+    # 40 readings of 20 um by an arm that repeats to 30 um; seen 0.03 mm.
+    assert np.median(away) < 0.06
+    # What the fit says of its own worth holds.
+    assert 0.3 < np.median(away) / known.findings.arms[0].workspace_mm < 1.5
+    assert size == 36
+
+
+@pytest.mark.parametrize(
+    ("options", "rank"),
+    [(PROBE, 30), (POINT, 27), slow(POINTS, 33)],
+    ids=["probe", "point", "three"],
+)
+def test_so_many_values_are_told_of_a_six_axis_arm(options, rank):
+    """Everett and Hsu (1988): 4 for each axis and 6 for the tool; 3 where it is a point.
+
+    Three points have six values more than one, of their places.
+    """
+    shop = tracked(replace(options, **WRONG))
+    seen = known_of(session_of(shop)).arm_found.telling.told
+    assert (seen.identifiable, seen.told) == (rank, rank)
+    whole = information(shop, arm_columns=True)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(whole), 1e-30))
+    values = np.linalg.eigvalsh(whole * np.outer(scale, scale))
+    assert int(np.sum(values > 1e-10 * values[-1])) == rank
+
+
+def test_twenty_three_values_are_told_by_one_point_with_base_and_tool_known():
+    shop = tracked(replace(POINT, stops=60))
+    steps = 1e-5 * np.eye(48)[12:]
+    jacobian = [(reads(shop, step) - reads(shop, -step)).ravel() / 2e-5 for step in steps]
+    values = np.linalg.svd(np.array(jacobian), compute_uv=False)
+    assert int(np.sum(values > 1e-7 * values[0])) == 23
+
+
+def test_without_a_model_poses_give_the_frames_alone(tmp_path):
+    shop = tracked(POINTS)
+    session_of(shop, joints=False, poses=True).save(tmp_path / "shop")
+    result = visioncal.calibrate(tmp_path / "shop")
+    assert list(result.transforms) == ["base_from_instrument", "flange_from_probe"]
+    assert result.arm is None
+    places = np.array([[it.x_m, it.y_m, it.z_m] for it in result.points])
+    # Known to 0.012 mm each, by what the result says of them.
+    assert places == pytest.approx(np.array(THREE), abs=5e-5)
+    assert [it.point for it in result.points] == ["a", "b", "c"]
+    assert all(it.sigma_mm < 0.02 for it in result.points)
+
+
+@PROBE_FIRST
+def test_outputs_are_whole_and_the_recording_gives_them_again(options, tmp_path):
+    session_of(tracked(replace(options, **WRONG))).save(tmp_path / "shop")
+    out = tmp_path / "out"
+    done = command("calibrate", tmp_path / "shop", "-o", out)
+    assert done.status == 0, done.err
+    document = json.loads((out / "calibration.json").read_text())
+    assert "null" not in (out / "calibration.json").read_text()
+    assert document["mount"] == "instrument"
+    assert document["noise"]["instrument_mm"] == pytest.approx(0.02)
+    # The arm's 0.03 mm is told from the instrument's 0.02 mm, to some 15 %.
+    assert document["noise"]["robot_translation_mm"] == pytest.approx(0.03, rel=0.5)
+    assert ("deg" in document["rms"]) == options.poses
+    found = document["kinematics"]
+    assert ("held_out_deg" in found["levels"][0]) == options.poses
+    assert ("deg" in found["left_out"][0]) == options.poses
+    rotation = np.array(document["transforms"]["flange_from_probe"]["covariance"])[:3, :3]
+    assert rotation.any() == options.poses
+    again = visioncal.calibrate(visioncal.Session.load(out / "recording.rrd"))
+    again.save(tmp_path / "again.json")
+    repeated = json.loads((tmp_path / "again.json").read_text())
+    assert repeated | {"created": ""} == document | {"created": ""}
+    assert "child_frame_id: instrument" in command("export", out, "--to", "ros").out
+    assert "holds the camera, and" in command("export", out, "--to", "easy-handeye2").err
+    report = (out / "report.html").read_text()
+    assert "the instrument" in report
+    assert "optical axis" not in report
+    assert "Where the camera looked" not in report
+
+
+def test_wrong_rows_are_named_and_left_out():
+    shop = tracked(replace(POINT, **WRONG))
+    rows = list(shop.rows)
+    rows[4], rows[9] = (rows[4][0], 0, rows[9][2]), (rows[9][0], 0, rows[4][2])
+    moved = rows[20][2].copy()
+    # Ten times the noise, and a third of what the nominal arm is off by.
+    moved[:3, 3] += [0.0, 1e-3, 0.0]
+    rows[20] = (20, 0, moved)
+    known = known_of(session_of(replace(shop, rows=tuple(rows))))
+    assert set(known.reasons) >= {4, 9}
+    assert "places the point" in known.reasons[4]
+    assert (
+        "it fits stop 9, and view 9 fits stop 4: these two rows are exchanged" in known.reasons[4]
+    )
+    assert known.robot_arm.kinematics.level == "geometry"
+
+
+@pytest.mark.slow
+def test_exchanged_points_are_named():
+    shop = tracked(replace(POINTS, **WRONG))
+    rows = list(shop.rows)
+    rows[12], rows[14] = (4, 0, rows[14][2]), (4, 2, rows[12][2])
+    known = known_of(session_of(replace(shop, rows=tuple(rows))))
+    assert sorted(known.reasons) == [12, 14]
+    assert "the points a and c are exchanged at this stop" in known.reasons[12]
+    assert known.robot_arm.kinematics.level == "geometry"
+
+
+@pytest.mark.parametrize("options", [PROBE, POINT], ids=["probe", "point"])
+def test_an_instrument_that_sinks_is_told(options):
+    shop = tracked(options)
+    rows = []
+    for stop, point, read in shop.rows:
+        sunk = read.copy()
+        sunk[2, 3] -= 5e-4 * stop / 29
+        rows.append((stop, point, sunk))
+    known = known_of(session_of(replace(shop, rows=tuple(rows))), level="hand-eye")
+    told = [it.words for it in known.warnings if it.kind == "moved_slowly"]
+    assert len(told) == 1
+    moved = float(told[0].split("moved by ")[1].split(" mm")[0])
+    # Told to some 15 %: the arm repeats to 0.03 mm.
+    assert moved == pytest.approx(0.5, rel=0.5)
+
+
+@pytest.mark.slow
+def test_views_that_are_held_back_are_predicted():
+    shop = tracked(replace(POINTS, **WRONG, stops=36))
+    session = session_of(shop)
+    views = tuple(replace(it, holdout=it.stop % 6 == 0) for it in session.views)
+    known = known_of(replace(session, views=views))
+    assert len(known.used) == 90
+    # Left out in turn, stops are predicted to 0.07 mm.
+    assert known.findings.pairs[0].holdout.mm < 0.12
+    assert known.findings.pairs[0].holdout.deg is None
+
+
+def test_measured_poses_of_a_target_come_before_readings():
+    session = session_of(tracked(PROBE))
+    views = tuple(
+        replace(
+            it,
+            numbers=it.numbers
+            | {f"cft_{name[5:]}": it.numbers[name] for name in it.numbers if "meas_" in name},
+        )
+        for it in session.views
+    )
+    document = {**session.document, "mount": "eye-to-hand"}
+    columns = (*session.columns, *(f"cft_{it}" for it in POSE))
+    both = replace(session, columns=columns, views=views, document=document)
+    known = known_of(both)
+    assert both.mount == "eye-to-hand"
+    assert known.readings is None
+    assert any("30 rows have an instrument's readings" in it.reason for it in known.warnings)
+
+
+def edited(session: Session, column: str, change) -> Session:
+    """The session with a column's cells changed, by row."""
+    place = session.columns.index(column)
+    rows = [[view.cell(it) for it in session.columns] for view in session.views]
+    for at, row in enumerate(rows):
+        row[place] = change(at, row[place])
+    return Session.assemble(session.document, session.columns, rows, MemoryImages({}))
+
+
+def test_what_cannot_be_calibrated_is_refused_by_name():
+    point, probe, points = (session_of(tracked(it)) for it in (POINT, PROBE, POINTS))
+    for session, words in (
+        (edited(point, "meas_x_m", lambda _, cell: str(1e3 * float(cell))), "millimetres"),
+        (edited(points, "point", lambda at, cell: "" if at == 7 else cell), "of view 7 do not"),
+        (edited(probe, "point", lambda at, _: "ab"[at % 2]), "poses of 2 probes"),
+    ):
+        with pytest.raises(DataError, match=words):
+            known_of(session)
+
+
+def test_a_misspelt_point_is_named():
+    named = edited(session_of(tracked(POINTS)), "point", lambda _, cell: f"nest_{cell}")
+    wrong = edited(named, "point", lambda at, cell: "nset_a" if at == 6 else cell)
+    with pytest.raises(DataError, match=r"'nset_a' that no other row names.*Did you mean nest_a"):
+        known_of(wrong)
+    odd = edited(named, "point", lambda at, cell: "tooling ball" if at == 6 else cell)
+    assert "was read once" in known_of(odd).reasons[6]
+
+
+def test_a_session_that_does_not_say_how_good_its_readings_are_is_refused():
+    session = session_of(tracked(POINT))
+    document = {it: value for it, value in session.document.items() if it != "instrument"}
+    rows = [[view.cell(it) for it in session.columns] for view in session.views]
+    silent = Session.assemble(
+        document | {"mount": "eye-to-hand"}, session.columns, rows, MemoryImages({})
+    )
+    with pytest.raises(DataError, match=r"nothing says how good they are.*leica-at960"):
+        known_of(silent)
+    probe = session_of(tracked(PROBE))
+    named = replace(probe, document={**probe.document, "instrument": {"name": "v-stars"}})
+    with pytest.raises(DataError, match=r"State sigma_rad in .instrument., or leave the columns"):
+        known_of(replace(named))
+
+
+def test_motion_that_tells_too_little_is_refused():
+    shop = tracked(POINT)
+    with pytest.raises(DegenerateError, match="3 usable stops of the robot; at least 4"):
+        known_of(session_of(tracked(replace(POINT, stops=3))))
+    still = tracked(POINT, joints=np.repeat(shop.joints[:1], 12, axis=0))
+    with pytest.raises(DegenerateError, match="12 used views are all from one pose of the robot"):
+        known_of(session_of(still, joints=False, poses=True))
+    # Joint 1 alone: the point goes round in a circle.
+    turning = np.repeat(shop.joints[:1], 12, axis=0)
+    turning[:, 0] = np.linspace(-1.5, 1.5, 12)
+    with pytest.raises(DegenerateError, match=r"are not determined at all.*about the base's z"):
+        known_of(session_of(tracked(POINT, joints=turning)))
+    with pytest.raises(DataError, match="needs poses, and the instrument reads places alone"):
+        known_of(session_of(shop), solver="tsai")
+
+
+def test_a_mounting_is_found_from_a_rough_start():
+    rng = np.random.default_rng(0)
+    flange = exp(rng.normal(size=(8, 6)))
+    mounting = Mounting(exp(rng.normal(size=(1, 6)))[0], rng.normal(size=(2, 3)))
+    points = np.arange(8) % 2
+    on_flange = mounting.on_flange[points][:, :, None]
+    in_base = (flange[:, :3, :3] @ on_flange)[:, :, 0] + flange[:, :3, 3]
+    x = invert(mounting.base_from_instrument)
+    read = in_base @ x[:3, :3].T + x[:3, 3]
+    places = Places(flange, read, points, np.arange(8) // 2, np.full(8, 1e-4))
+    off = Mounting(
+        mounting.base_from_instrument @ exp(np.full((1, 6), 0.05))[0], 0.8 * mounting.on_flange
+    )
+    found = fit_mounting(places, off, 2)
+    assert found.on_flange == pytest.approx(mounting.on_flange, abs=1e-5)

@@ -1,0 +1,234 @@
+"""The arm's own errors: which of them are told, and what the calibrated arm is worth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.bound import workspace_bound_m
+from support.cells import calibrated, error_of, known_of
+from support.marks import slow
+from support.wrong_arms import GOOD, WRONG_LINKS, error_m, target_in_camera
+
+import visioncal
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import compose, exp, invert, log
+from visioncal.core.types import MOUNTS
+from visioncal.estimation.armpair import ArmPair
+from visioncal.estimation.parts import ROBOT, State
+from visioncal.estimation.workspace import postures
+from visioncal.frames.tcp import touched_tool
+from visioncal.frames.touches import TouchRows
+from visioncal.simulation import forward, simulate
+from visioncal.simulation.arms import inverse
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_an_arm_off_by_a_millimetre_is_calibrated_all_over_its_workspace(mount):
+    shares = []
+    for seed in range(4):
+        cell = simulate(replace(WRONG_LINKS, mount=mount, seed=seed, branches=True))
+        known, nominal = calibrated(cell), calibrated(cell, joints=False)
+        assert known.robot_arm.kinematics.level == "geometry"
+        assert nominal.robot_arm.model is None
+        assert known.verdict.status in ("good", "check")
+        after = error_m(cell, known, known.robot_arm.model.robot)
+        shares.append(after / error_m(cell, nominal, known.robot))
+    # Thirty views leave 5 % of what a fit of the edges alone leaves; four worlds scatter by half.
+    assert np.median(shares) < 0.08
+
+
+def test_offsets_alone_are_told_from_wrong_links():
+    cell = simulate(replace(GOOD, offset_sigma_rad=1e-3, seed=1))
+    known = calibrated(cell)
+    assert known.robot_arm.kinematics.level == "offsets"
+    by_name = {it.name: it for it in known.robot_arm.kinematics.levels}
+    assert by_name["offsets"].left_out.mm < 0.3 * by_name["nominal"].left_out.mm
+    assert by_name["offsets"].left_out.mm < 1.05 * by_name["geometry"].left_out.mm
+    # Those of the first and the last joint hide in base and tool; the others are told to 0.1 mrad.
+    found = known.robot_arm.model.robot.chain.functions[1:5, 0]
+    true = (cell.true_arm.offset - cell.arm.offset)[1:5]
+    assert found == pytest.approx(true, abs=3e-4)
+
+
+@pytest.mark.slow
+def test_links_that_are_off_by_little_count_in_the_covariance():
+    # Off by hardly more than the arm repeats to, in all parameters alike: offsets of the joints
+    # explain most of what twelve views show, and leave the first and the last link for exact.
+    little = replace(GOOD, views=12, dh_sigma_m=5e-5, dh_sigma_rad=5e-5)
+    squares = 0.0
+    for seed in (1, 9, 13):
+        cell = simulate(replace(little, seed=seed))
+        known = calibrated(cell)
+        assert known.robot_arm.kinematics.level == "geometry"
+        error = error_of(cell, known)
+        squares += error @ np.linalg.solve(known.solved.covariance[:12, :12], error)
+    # Chi-square of 36 degrees of freedom but for one in a thousand; under offsets it is 118.
+    assert squares < 68.0
+
+
+@pytest.mark.slow
+def test_an_eccentric_gear_is_told():
+    cell = simulate(replace(WRONG_LINKS, seed=2, views=40))
+    # The encoders of joints 2 and 3 tell what their axes do but for a wave of 1 mrad.
+    reported = cell.joints.copy()
+    reported[:, 1:3] -= 1e-3 * np.sin(cell.joints[:, 1:3])
+    robot = known_of(cell).robot
+    wavy = replace(cell, joints=reported, base_from_flange=robot.base_from_flange(reported))
+    known = calibrated(wavy)
+    assert known.robot_arm.kinematics.level == "eccentricity"
+    # Told to a few tenths of a milliradian beside errors of all links.
+    assert known.robot_arm.model.robot.chain.functions[1:3, 2] == pytest.approx(1e-3, abs=5e-4)
+
+
+@pytest.mark.slow
+def test_a_wrong_gear_ratio_is_told():
+    cell = simulate(replace(WRONG_LINKS, seed=2, views=40, branches=True))
+    reported = cell.joints.copy()
+    reported[:, 1:4] *= 1.0 - 1e-3
+    robot = known_of(cell).robot
+    geared = replace(cell, joints=reported, base_from_flange=robot.base_from_flange(reported))
+    known = calibrated(geared)
+    assert known.robot_arm.kinematics.level == "eccentricity"
+    assert "ratios" in known.robot_arm.kinematics.errors
+    # Told to a tenth beside errors of all links.
+    assert known.robot_arm.model.robot.chain.functions[1:4, 1] == pytest.approx(1.001, abs=2e-4)
+
+
+@pytest.mark.slow
+def test_a_dirty_cell_is_calibrated_all_over_its_workspace():
+    """Bent board, lens a little off, eccentric and rippling joints, size known to 0.02 %."""
+    target = replace(WRONG_LINKS.target, square_sigma_m=2e-4 * WRONG_LINKS.target.square_m)
+    wrong = replace(WRONG_LINKS, views=60, branches=True, target=target, board_scale=1.0001)
+    worn = replace(wrong, eccentricity_sigma_rad=1.5e-4, ripple_sigma_rad=3e-5)
+    cell = simulate(replace(worn, board_bow_m=3e-4, lens_mismatch_px=0.1, seed=1))
+    known, nominal = calibrated(cell), calibrated(cell, joints=False)
+    assert known.robot_arm.kinematics.level == "eccentricity"
+    share = error_m(cell, known, known.robot_arm.model.robot) / error_m(cell, nominal, known.robot)
+    # A median of 6 % over many worlds, of which nine in ten lie under twice that.
+    assert share < 0.12
+
+
+def test_an_arm_with_long_links_is_not_taken_for_a_small_board():
+    sure = replace(WRONG_LINKS.target, square_sigma_m=1e-6 * WRONG_LINKS.target.square_m)
+    cell = simulate(replace(WRONG_LINKS, seed=3, target=sure))
+    known = calibrated(cell)
+    # As if nothing but errors of one size could be, this arm makes the board 0.16 % smaller, at
+    # three sigma; what was measured to a millionth is kept.
+    assert known.fitted.seen.free.tolist() == [9]
+    assert known.fitted.seen.held.all()
+    sigma = float(np.sqrt(np.mean(known.arm_found.telling.sigmas_m**2)))
+    assert error_m(cell, known, known.robot_arm.model.robot) < 2.0 * sigma
+
+
+def test_a_right_arm_stays_nominal():
+    known = calibrated(simulate(replace(GOOD, seed=3)))
+    assert known.robot_arm.kinematics.level == "nominal"
+    assert known.robot_arm.model is None
+    assert [it.name for it in known.robot_arm.kinematics.levels] == ["nominal"]
+
+
+def test_without_joints_no_level_can_be_asked_for():
+    cell = simulate(replace(WRONG_LINKS, views=12))
+    assert calibrated(cell, joints=False).robot_arm.kinematics is None
+    with pytest.raises(DataError, match="needs the joint angles of every view"):
+        calibrated(cell, joints=False, level="kinematics")
+
+
+@pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
+def test_predictions_move_as_their_derivatives_say(mount):
+    known = calibrated(simulate(replace(WRONG_LINKS, mount=mount, seed=4)))
+    arm, edges = known.robot_arm.at(np.arange(3)), known.solved.state.edges
+    model, q = arm.model, arm.joints_rad
+    size, step = 12 + len(model.values), 1e-6
+    middle = target_in_camera(mount, *edges, model.robot.base_from_flange(q))
+    problem = known.solved.problem.with_effects([])
+    pair = ArmPair.of(problem, State(edges, np.zeros(0)), ROBOT)
+    jacobian = pair.jacobian(model.base_from_flange(q), model.basis(q))[1]
+    for at in range(size):
+        change = np.zeros(size)
+        change[at] = step
+        ends = [
+            log(
+                invert(middle)
+                @ target_in_camera(
+                    mount,
+                    *(edges @ exp(it[:12].reshape(2, 6))),
+                    model.moved(it[12:]).robot.base_from_flange(q),
+                )
+            )
+            for it in (change, -change)
+        ]
+        # Steps are composed with values of some mrad, whose product is left out.
+        assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(jacobian[:, :, at], abs=5e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_the_workspace_sigma_is_the_bound_and_holds_the_error(mount):
+    sure = replace(WRONG_LINKS.target, square_sigma_m=1e-5 * WRONG_LINKS.target.square_m)
+    cell = simulate(replace(WRONG_LINKS, seed=6, mount=mount, target=sure))
+    known = calibrated(cell)
+    sigma = float(np.sqrt(np.mean(known.arm_found.telling.sigmas_m**2)))
+    bound = workspace_bound_m(cell, postures(known.robot)[::20])
+    # The bound knows the size of each error; the fit estimates one size and the noise's levels from
+    # 30 views, which tell them to a tenth. Twenty postures stand for all to about as much.
+    assert sigma == pytest.approx(bound, rel=0.3)
+    # One world's error along the weakest direction, at three sigma.
+    assert error_m(cell, known, known.robot_arm.model.robot) < 3.0 * sigma
+
+
+def test_the_result_holds_the_calibrated_arm(tmp_path):
+    cell = simulate(replace(WRONG_LINKS, seed=7))
+    known = calibrated(cell)
+    file = tmp_path / "calibration.json"
+    result_of(known).save(file)
+    result = visioncal.Calibration.load(file)
+    found = result.arm
+    q = postures(known.robot)[:5]
+    calibrated_poses = known.robot_arm.model.robot.base_from_flange(q)
+    # RigidTransform makes rotations orthonormal anew, to the last digits.
+    assert result.base_from_flange(q).as_matrix() == pytest.approx(calibrated_poses, abs=1e-14)
+    assert found.level == "geometry"
+    assert found.levels[0].level == "nominal"
+    changes = {(it.joint, it.name): it.change for it in found.parameters}
+    # A UR's second and third axes are parallel, and so get Hayati's beta.
+    assert ("shoulder_lift_joint", "beta_rad") in changes
+    assert 1e-5 < max(map(abs, changes.values())) < 0.02
+    assert found.observability.identifiable == 30
+    # The nominal model stays what it was.
+    assert np.array_equal(result.robot.base_from_flange(q), known.robot.base_from_flange(q))
+
+
+@pytest.mark.slow
+def test_touches_close_on_the_calibrated_arm():
+    cell = simulate(replace(WRONG_LINKS, seed=5, views=40))
+    result = result_of(calibrated(cell))
+    rng, tip, point = np.random.default_rng(0), np.array([0.034, 0.001, 0.16]), [0.45, 0.1, 0.1]
+    turns = Rotation.from_euler("xyz", rng.uniform(-0.6, 0.6, (12, 3))).as_matrix()
+    turns = forward(cell.true_arm, cell.joints[:1])[0, :3, :3] @ turns
+    poses = compose(turns, np.array(point) - turns @ tip)
+    reach = inverse(cell.true_arm, poses, np.tile(cell.joints[0], (12, 1)))
+    q, names = reach.joints[reach.solved], tuple(map(str, range(int(reach.solved.sum()))))
+    nothing = ("",) * len(q)
+    rows = TouchRows("t", names, names, result.robot.base_from_flange(q), q, nothing, nothing)
+    with_arm, without = touched_tool(rows, result), touched_tool(rows)
+    assert with_arm.verdict.status == "good"
+    # Exact touches: what is left is what the calibration leaves of the arm's errors nearby.
+    assert with_arm.rms_mm < 0.15 * without.rms_mm
+    # Controllers' poses are the nominal arm's.
+    told = touched_tool(replace(rows, joints_rad=None), result)
+    assert any("without joint angles" in it for it in told.verdict.reasons)
+
+
+def test_a_level_that_explains_too_little_is_told():
+    cell = simulate(replace(WRONG_LINKS, seed=1))
+    known = calibrated(cell, level="offsets")
+    assert known.robot_arm.kinematics.level == "offsets"
+    assert any("speak for more than the arm's offsets" in it for it in known.verdict.reasons)
+    assert known.verdict.status != "good"
+    right = calibrated(simulate(replace(GOOD, seed=3)), level="kinematics")
+    assert right.robot_arm.kinematics.level == "nominal"
+    assert any("The arm stays as stated" in it for it in right.verdict.reasons)

@@ -1,0 +1,183 @@
+"""Measured components of an edge, for motion that leaves it open as a SCARA's does."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.cells import calibrated, error_of, known_of
+
+from visioncal.calibration.pipeline import calibrate
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.stages.cell import read_cell
+from visioncal.core.errors import DegenerateError
+from visioncal.core.transforms import compose, exp, invert, log
+from visioncal.live.planning.information import worlds_of
+from visioncal.live.planning.purposes import PURPOSES
+from visioncal.live.planning.recorded import SoFar, begin
+from visioncal.results import Calibration
+from visioncal.session import MemoryImages, Session
+from visioncal.simulation import Cell, CellOptions, Second, simulate
+
+SIGMA_M = 5e-4
+X = exp(np.array([0.02, -0.03, 0.4, 0.06, -0.02, 0.081]))
+Z = compose(np.diag([1.0, -1.0, -1.0]), np.array([0.4, 0.1, -0.25]))
+# Of the target's poses, as a camera measures them [rad and m].
+NOISE = np.repeat([2e-4, 1e-4], 3)
+POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+
+
+def scara(seed: int, prior: dict[str, dict[str, float]], views: int = 12) -> Session:
+    """A session of four axes: the tool turns about z alone, and exactly so."""
+    rng = np.random.default_rng(seed)
+    rows = []
+    for view in range(views):
+        turn = Rotation.from_rotvec([0.0, 0.0, rng.uniform(-2.5, 2.5)]).as_matrix()
+        flange = compose(turn, np.array([0.4, 0.1, 0.1]) + rng.uniform(-0.1, 0.1, 3))
+        seen = invert(flange @ X) @ Z @ exp(NOISE * rng.standard_normal(6))
+        numbers = [
+            [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()] for pose in (flange, seen)
+        ]
+        rows.append([str(view), *(repr(float(it)) for it in np.concatenate(numbers))])
+    document = {"schema": 1, "name": "scara", "mount": "eye-in-hand", "prior": prior}
+    columns = ["view", *POSE, *(f"cft_{it}" for it in POSE)]
+    return Session.assemble(document, columns, rows, MemoryImages({}))
+
+
+def away(found: Calibration) -> np.ndarray:
+    """(6,) right perturbation from the true `flange_from_cam` to the one that was found."""
+    return log(invert(X) @ found.transforms["flange_from_cam"].as_matrix())
+
+
+def run(cell: Cell, prior: dict[str, dict[str, float]]) -> RunState:
+    """Calibrates a cell whose session knows something beforehand."""
+    known = known_of(cell, level="hand-eye")
+    document = {**known.session.document, "prior": prior}
+    known = replace(known, session=replace(known.session, document=document))
+    for stage in STAGES:
+        if stage.name not in ("robot", "detect"):
+            known = stage.run(known)
+    return known
+
+
+def test_four_axes_give_a_result_with_a_measured_height_and_none_without():
+    with pytest.raises(DegenerateError, match="the tool's z is not determined at all") as refused:
+        calibrate(scara(0, {}))
+    assert "measure that offset for [prior.flange_from_cam]" in refused.value.next_step
+    squares = []
+    for seed in range(10):
+        wrong = SIGMA_M * np.random.default_rng(100 + seed).standard_normal()
+        prior = {"z_m": float(X[2, 3] + wrong), "sigma_m": SIGMA_M}
+        found = calibrate(scara(seed, {"flange_from_cam": prior}))
+        assert found.verdict.status == "good"
+        assert any(
+            it.startswith(f"The measured z_m of flange_from_cam = {1e3 * prior['z_m']:g} mm was")
+            and it.endswith("the views alone leave it open.")
+            for it in found.verdict.reasons
+        )
+        covariance, off = found.covariance("flange_from_cam"), away(found)
+        # What was measured is all that is known of the height.
+        height = X[2, :3] @ covariance[3:, 3:] @ X[2, :3]
+        assert np.sqrt(height) == pytest.approx(SIGMA_M, rel=0.05)
+        squares.append(off @ np.linalg.solve(covariance, off))
+    # Sixty squares: a mean of 1 to within 0.18; the noise is itself estimated from each session.
+    assert 0.6 < np.mean(squares) / 6.0 < 1.6
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_what_was_measured_of_the_target_helps_as_well(mount):
+    cell = simulate(CellOptions(robot="ur5e", mount=mount, motion="one_axis", views=12, seed=2))
+    _, name = cell.transforms
+    place = cell.transforms[name][:3, 3]
+    prior = dict(zip(("x_m", "y_m", "z_m"), place.tolist(), strict=True)) | {"sigma_m": SIGMA_M}
+    known = run(cell, {name: prior})
+    sigmas = np.sqrt(np.diag(known.solved.covariance)[:12])
+    # Four sigma, for twelve numbers.
+    assert np.all(np.abs(error_of(cell, known)) < 4.0 * sigmas)
+    assert sum("was used" in it for it in known.notes) == 3
+
+
+def test_a_board_of_several_may_be_known_whole():
+    options = CellOptions(robot="ur5e", motion="one_axis", views=12, second=Second(), seed=2)
+    cell = simulate(options)
+    name = "base_from_target_second"
+    edge = cell.transforms[name]
+    turn = Rotation.from_matrix(edge[:3, :3]).as_quat().tolist()
+    prior = dict(zip(("x_m", "y_m", "z_m"), edge[:3, 3].tolist(), strict=True))
+    prior |= {"sigma_m": SIGMA_M, "quaternion_xyzw": turn, "sigma_rad": 1e-5}
+    known = run(cell, {name: prior})
+    sigmas = np.sqrt(np.diag(known.solved.covariance)[:18])
+    # Four sigma, for eighteen numbers.
+    assert np.all(np.abs(error_of(cell, known)) < 4.0 * sigmas)
+    # The board is turned no farther than that is known.
+    assert sigmas[12:15].max() < 1.001e-5
+    assert sum("was used" in it and name in it for it in known.notes) == 3
+
+
+def test_a_measurement_that_good_data_contradict_is_told_and_left_out():
+    cell = simulate(CellOptions(robot="ur5e", views=20, seed=3))
+    true = float(cell.transforms["flange_from_cam"][2, 3])
+    free = calibrated(cell, level="hand-eye")
+    wrong = run(cell, {"flange_from_cam": {"z_m": true + 0.005, "sigma_m": SIGMA_M}})
+    (told,) = (it.words for it in wrong.warnings if it.kind == "prior")
+    assert "is contradicted by the views" in told
+    assert f"{1e3 * true + 5.0:g} mm" in told
+    assert "it is not used" in told
+    # The same views once more, from where they were with it.
+    sigmas = np.sqrt(np.diag(free.solved.covariance))
+    off = log(invert(free.solved.state.edges) @ wrong.solved.state.edges).ravel()
+    assert np.all(np.abs(off) < 0.02 * sigmas[: len(off)])
+    assert wrong.used == free.used
+    right = run(cell, {"flange_from_cam": {"z_m": true + 2e-4, "sigma_m": SIGMA_M}})
+    assert not any(it.kind == "prior" for it in right.warnings)
+    (note,) = (it for it in right.notes if "was used" in it)
+    assert "the views alone tell it to" in note
+
+
+def test_what_cannot_be_used_is_said():
+    prior = {"z_m": 0.1, "sigma_m": SIGMA_M}
+    cell = simulate(CellOptions(robot="ur5e", views=12, seed=1))
+    session = known_of(cell).session
+    document = {**session.document, "prior": {"base_from_cam": prior}}
+    elsewhere = known_of(cell, session=replace(session, document=document))
+    assert read_cell(elsewhere).priors == ()
+    other = calibrate(scara_with_tilt({"base_from_cam": prior}))
+    assert any(
+        "[prior.base_from_cam] was not used: what is unknown of this session is flange_from_cam "
+        "and base_from_target" in it
+        for it in other.verdict.reasons
+    )
+    closed = calibrate(scara_with_tilt({"flange_from_cam": prior}), solver="park")
+    assert any("was not used: the closed form park cannot" in it for it in closed.verdict.reasons)
+
+
+def scara_with_tilt(prior: dict[str, dict[str, float]]) -> Session:
+    """The same session, its first views tilted about other axes."""
+    session = scara(5, prior, views=14)
+    rows = [[view.cell(it) for it in session.columns] for view in session.views]
+    rng = np.random.default_rng(6)
+    for row in rows[:8]:
+        flange = compose(
+            Rotation.from_rotvec(rng.uniform(-0.5, 0.5, 3)).as_matrix(),
+            np.array([float(it) for it in row[1:4]]),
+        )
+        seen = invert(flange @ X) @ Z @ exp(NOISE * rng.standard_normal(6))
+        numbers = [
+            [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()] for pose in (flange, seen)
+        ]
+        row[1:] = [repr(float(it)) for it in np.concatenate(numbers)]
+    return Session.assemble(session.document, session.columns, rows, MemoryImages({}))
+
+
+def test_a_plan_counts_what_was_measured():
+    cell = simulate(CellOptions(robot="ur5e", motion="one_axis", views=8, seed=4))
+    place = cell.transforms["flange_from_cam"][:3, 3].tolist()
+    prior = dict(zip(("x_m", "y_m", "z_m"), place, strict=True)) | {"sigma_m": SIGMA_M}
+    begun = begin(SoFar(run(cell, {"flange_from_cam": prior})))
+    (world,) = worlds_of(
+        [begun.cell], PURPOSES["hand-eye"], cell.joints[:1], recorded=begun.recorded
+    )
+    covariance = world.covariance(np.arange(0))
+    # Without a further stop: the three lengths are known to what they were measured to, or better.
+    assert np.sqrt(np.diag(covariance)[3:6]).max() < 1.05 * SIGMA_M

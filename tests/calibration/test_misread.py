@@ -1,0 +1,238 @@
+"""Joint angles and models of robots that are mistaken: named, and sound ones left alone."""
+
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.slips import (
+    SLIPS,
+    Identifiability,
+    alarms,
+    as_built,
+    in_the_world,
+    is_named,
+    with_stray_offset,
+    with_tool,
+)
+
+from visioncal.calibration.guess.misread import guess_joints
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.stages.joints import match_joints
+from visioncal.calibration.stages.reported_poses import reported_poses
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import exp, invert
+from visioncal.robot import load_robot, other_convention, placed_at, table_document, with_zeros
+from visioncal.robot.conversion import table_of
+from visioncal.simulation import CellOptions, fine_camera, simulate
+
+OPTIONS = CellOptions(
+    camera=fine_camera(),
+    pixel_sigma_px=0.1,
+    robot="ur5e",
+    views=16,
+    dh_sigma_m=5e-4,
+    dh_sigma_rad=1e-3,
+    seed=4,
+)
+CELLS = {it: simulate(replace(OPTIONS, mount=it)) for it in ("eye-in-hand", "eye-to-hand")}
+IN_HAND = CELLS["eye-in-hand"]
+TURN = np.array([0.2, -0.1, 0.4, 0.3, 0.1, -0.2])
+
+
+def finished(told, **changes):
+    """What is known at the end of the way."""
+    return deque(told.known(**changes), maxlen=1).pop()
+
+
+def parameters(known):
+    """The arm's parameters, as the result has them."""
+    return result_of(known).arm.parameters
+
+
+def planted(name, *, with_poses, seed=0):
+    told = Identifiability.of(IN_HAND, with_poses=with_poses)
+    return SLIPS[name](told, np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize("with_poses", [True, False])
+@pytest.mark.parametrize("name", SLIPS)
+def test_slips_are_named(name, with_poses):
+    if name == "base_link for base" and not with_poses:
+        pytest.skip("the target may stand anywhere: no camera tells how the base is turned")
+    for seed, cell in enumerate(CELLS.values()):
+        told = SLIPS[name](
+            Identifiability.of(cell, with_poses=with_poses), np.random.default_rng(seed)
+        )
+        assert is_named(told, name), told.said()
+
+
+@pytest.mark.parametrize("change", [as_built, in_the_world, with_stray_offset, with_tool])
+def test_sound_sessions_raise_no_alarm(change):
+    for seed, cell in enumerate(CELLS.values()):
+        told = change(Identifiability.of(cell, with_poses=True), np.random.default_rng(seed))
+        assert not alarms(told), told.said()
+
+
+def test_joints_alone_that_are_misread_are_refused_with_the_fix():
+    with pytest.raises(DataError, match="opposite sign, they fit") as caught:
+        finished(planted("a joint's sign", with_poses=False))
+    error = caught.value
+    assert "not those of ur5e" in error.message
+    (column,) = error.culprits
+    assert column.startswith("views.csv: q")
+    assert error.next_step.startswith(f"Negate {column.removeprefix('views.csv: ')}")
+
+
+def test_with_poses_the_hand_eye_goes_on_without_misread_joints():
+    told = planted("joints in degrees", with_poses=True)
+    known = finished(told)
+    assert known.reported.joints_rad is None
+    assert known.robot_arm.kinematics is None
+    assert known.verdict.status != "good"
+    assert any("--joint-unit deg" in it for it in known.verdict.reasons)
+    alone = finished(replace(told, robot=None))
+    # What is done with the poses is what would be done if there were no joints.
+    assert np.array_equal(known.solved.state.edges[0], alone.solved.state.edges[0])
+
+
+def test_an_arm_asked_for_is_refused_where_its_joints_are_misread():
+    with pytest.raises(DataError, match="needs the joint angles") as caught:
+        finished(planted("joints in degrees", with_poses=True), level="kinematics")
+    assert "Multiply q1_rad to q6_rad by pi / 180" in caught.value.next_step
+
+
+def test_rows_without_poses_are_not_taken_by_misread_joints():
+    session = planted("joints in degrees", with_poses=True).session
+    views = list(session.views)
+    joints = {name: it for name, it in views[3].numbers.items() if name.endswith("_rad")}
+    views[3] = replace(views[3], numbers=joints)
+    reported = reported_poses(replace(session, views=tuple(views)), load_robot("ur5e"))
+    (rejection,) = reported.rejections
+    assert rejection.view == 3
+    assert "joint angles are misread" in rejection.reason
+
+
+def test_degrees_are_known_by_their_fit_and_not_by_their_size():
+    # A table whose zeros are where the arm works: all angles are within a few degrees.
+    middle = IN_HAND.joints.mean(axis=0)
+    robot = with_zeros(load_robot("ur5e"), middle)
+    near = 0.1 * (IN_HAND.joints - middle)
+    poses = robot.base_from_flange(near)
+    assert np.abs(np.rad2deg(near)).max() < 13.0
+    assert not guess_joints(robot, near, poses).stands_out
+    guess = guess_joints(robot, np.rad2deg(near), poses)
+    assert guess.best.reading.words == "the angles in degrees"
+
+
+def test_two_turns_are_no_degrees():
+    # Joints of many arms turn by two turns either way.
+    robot = load_robot("ur5e")
+    q = IN_HAND.joints + 2.0 * np.pi * np.where(IN_HAND.joints > 0.0, -1.0, 1.0)
+    assert not guess_joints(robot, q, robot.base_from_flange(q)).stands_out
+
+
+def test_poses_that_turn_about_one_axis_accuse_nobody():
+    robot = load_robot("ur5e")
+    q = np.tile(IN_HAND.joints[0], (12, 1))
+    q[:, 5] += np.linspace(-1.0, 1.0, 12)
+    assert not guess_joints(robot, q * [1, 1, -1, 1, 1, -1], robot.base_from_flange(q)).stands_out
+
+
+def test_readings_that_no_row_tells_apart_are_all_named():
+    robot = load_robot("ur5e")
+    q = IN_HAND.joints.copy()
+    # These two never move, and stand alike: exchanged with a third they are the same.
+    q[:, 1] = q[:, 4] = -1.2
+    guess = guess_joints(robot, q[:, [0, 2, 1, 3, 4, 5]], robot.base_from_flange(q))
+    assert guess.stands_out
+    assert "q2_rad and q3_rad exchanged" in guess.sentence("the reported poses")
+
+
+@pytest.mark.parametrize("with_poses", [True, False])
+def test_a_lost_encoder_is_found_and_not_thrown_away(with_poses):
+    told = Identifiability.of(IN_HAND, with_poses=with_poses)
+    zeros = np.deg2rad([0.0, 0.0, 10.0, 0.0, 0.0, 0.0])
+    joints = told.joints - zeros
+    poses = load_robot("ur5e").base_from_flange(joints) if with_poses else None
+    known = finished(replace(told, joints=joints, poses=poses))
+    assert known.robot_arm.kinematics.level != "nominal"
+    nominal, *others = known.robot_arm.kinematics.levels
+    assert nominal.left_out.mm > 10.0
+    assert others[-1].left_out.mm < 0.5
+    theta = {it.joint: it for it in parameters(known) if it.name == "theta_rad"}
+    # Errors of the arm's other parameters are up to a few milliradians.
+    assert theta["elbow_joint"].nominal == pytest.approx(0.0, abs=1e-9)
+    assert theta["elbow_joint"].change == pytest.approx(np.deg2rad(10.0), abs=5e-3)
+    # What is seen of the target hardly depends on whose errors the last tenths of a degree are.
+    found = known.robot_arm.model.robot.base_from_flange(joints)
+    true = IN_HAND.true_base_from_flange
+    moved, moves = invert(found[:-1]) @ found[1:], invert(true[:-1]) @ true[1:]
+    away = np.linalg.norm((moved - moves)[:, :3, 3], axis=1)
+    assert np.median(away) < 1e-3
+
+
+def test_zeros_that_differ_between_poses_and_joints_are_named():
+    told = Identifiability.of(IN_HAND, with_poses=True)
+    off = np.deg2rad([0.0, 0.0, 10.0, 0.0, 0.0, 0.0])
+    session = replace(told, joints=told.joints - off).session
+    matched = match_joints(session.views, load_robot("ur5e"))
+    assert matched.zero.zeros == pytest.approx(off, abs=1e-4)  # the search stops at 1e-6 rad
+    assert matched.arm.base_from_flange(told.joints - off) == pytest.approx(told.poses, abs=1e-4)
+    assert "moved by 10.00 deg" in matched.warnings[0].reason
+
+
+def test_one_row_of_wrong_joints_costs_its_view_alone():
+    told = Identifiability.of(IN_HAND, with_poses=True)
+    joints = told.joints.copy()
+    joints[5, 1] += 0.3
+    known = finished(replace(told, joints=joints))
+    assert known.reported.joints_rad.keys() == set(range(16)) - {5}
+    assert known.robot_arm.kinematics.level == "geometry"
+    assert known.reasons[5].endswith("with which the camera agrees")
+
+
+def test_one_row_of_a_wrong_pose_is_left_to_the_consensus():
+    told = Identifiability.of(IN_HAND, with_poses=True)
+    poses = told.poses.copy()
+    poses[5] = poses[5] @ exp(np.array([0.0, 0.0, 0.0, 0.03, 0.0, 0.0]))
+    known = finished(replace(told, poses=poses))
+    assert known.reasons[5].startswith("disagrees with the other views")
+    assert known.robot_arm.kinematics.level == "geometry"
+
+
+def test_an_arm_in_the_world_is_calibrated_where_it_stands():
+    told = in_the_world(Identifiability.of(IN_HAND, with_poses=True), np.random.default_rng(0))
+    known = finished(told)
+    assert known.robot_arm.kinematics.level == "geometry"
+    found = known.robot_arm.model.robot.base_from_flange(told.joints)
+    away_m = np.linalg.norm((found - told.poses)[:, :3, 3], axis=1)
+    # The poses are of the nominal arm: in the world the calibrated one is off by its errors alone.
+    assert 1e-4 < np.median(away_m) < 0.01
+
+
+@pytest.mark.parametrize("as_chain", [False, True])
+def test_arms_move_with_their_base_and_their_zeros(as_chain):
+    robot = load_robot("ur5e")
+    if as_chain:
+        robot = robot.corrected()
+    base = exp(TURN)
+    q = IN_HAND.joints
+    assert placed_at(robot, base).base_from_flange(q) == pytest.approx(
+        base @ robot.base_from_flange(q), abs=1e-12
+    )
+    zeros = 0.1 * TURN
+    assert with_zeros(robot, zeros).base_from_flange(q) == pytest.approx(
+        robot.base_from_flange(q + zeros), abs=1e-12
+    )
+    assert ("convention" in with_zeros(robot, zeros).document) != as_chain
+
+
+def test_the_other_convention_of_a_table_is_the_arm_that_was_meant():
+    # A modified table that is declared standard: read as modified it is the right arm again.
+    robot = load_robot("ur5e")
+    document = table_document(table_of(robot, "modified")) | {"convention": "standard"}
+    other, convention = other_convention(type(robot).from_document(document))
+    assert convention == "modified"
+    guess = guess_joints(other, IN_HAND.joints, robot.base_from_flange(IN_HAND.joints))
+    assert guess.declared.score < 1e-3

@@ -1,0 +1,180 @@
+"""What a task needs: the chance that picks land within it, and the verdict about that."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.cells import calibrated
+from support.sound_findings import SOUND, changed, directions
+
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.stages.judge import judge
+from visioncal.calibration.stages.need import Picks, need_met
+from visioncal.core.quantiles import chi2_limit
+from visioncal.core.transforms import exp
+from visioncal.core.types import Need
+from visioncal.core.verdict import remarks
+from visioncal.estimation.tolerance_probability import chance_within, radius_within
+from visioncal.results import Calibration, NeedMet, Picker, Rms, to_document
+from visioncal.results.codec import read, write
+from visioncal.simulation import CellOptions, simulate
+
+
+@pytest.mark.parametrize("freedom", [np.inf, 15.0])
+@pytest.mark.parametrize("places", [1, 7])
+@pytest.mark.parametrize("flat", [1.0, 0.03])
+def test_the_chance_is_that_of_drawn_errors(freedom: float, places: int, flat: float) -> None:
+    rng, count = np.random.default_rng(places), 200_000
+    sizes = 1e-3 * np.geomspace(flat, 1.0, 6)[rng.permutation(6)]
+    roots = sizes[:, None] * rng.standard_normal((places, 6, 6))
+    spreads = roots @ np.swapaxes(roots, 1, 2)
+    away = np.einsum(
+        "nij,nj->ni", roots[np.arange(count) % places], rng.standard_normal((count, 6))
+    )
+    if np.isfinite(freedom):
+        away /= np.sqrt(rng.chisquare(freedom, count) / freedom)[:, None]
+    turned, shifted = (np.linalg.norm(it, axis=1) for it in (away[:, :3], away[:, 3:]))
+    # 4,096 even points leave 0.007 at most, as 200,000 drawn ones leave three times 0.001.
+    for share in (0.3, 0.7, 0.95):
+        turn, shift = np.quantile(turned, share), np.quantile(shifted, share)
+        both = np.mean((turned < turn) & (shifted < shift))
+        assert chance_within(spreads, turn, shift, freedom) == pytest.approx(both, abs=0.01)
+        assert chance_within(spreads, np.inf, shift, freedom) == pytest.approx(share, abs=0.01)
+        assert chance_within(spreads, turn, np.inf, freedom) == pytest.approx(share, abs=0.01)
+    radius = radius_within(spreads, 0.95, freedom)
+    assert chance_within(spreads, np.inf, radius, freedom) == pytest.approx(0.95, abs=1e-6)
+
+
+def test_round_errors_have_the_closed_form() -> None:
+    covariance = 1e-8 * np.eye(6)[None]
+    radius = 1e-4 * np.sqrt(chi2_limit(0.05, 3))
+    assert radius_within(covariance, 0.95) == pytest.approx(radius, rel=2e-3)
+    assert chance_within(covariance, np.inf, np.inf) == 1.0
+    assert chance_within(np.zeros((1, 6, 6)), 1e-3, 1e-3) == 1.0
+    assert radius_within(np.zeros((1, 6, 6)), 0.95) == 0.0
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_picks_err_as_the_chain_does(mount: str) -> None:
+    """Against errors that are drawn and put through the chain, by no slope of ours."""
+    cell = simulate(CellOptions(mount=mount, views=12))
+    known = calibrated(cell, joints=False)
+    (picks,) = known.findings.picks
+    rng, count = np.random.default_rng(0), 20_000
+    result = known.solved
+    covariance = np.linalg.cholesky(result.covariance[:6, :6])
+    views = rng.integers(len(known.used), size=count)
+    problem = known.solved.problem
+    flange = known.robot_arm.poses[problem.observations.stops][views]
+    middle = np.array([0.135, 0.09, 0.0, 1.0])
+    seen = (problem.measured(result.state)[views] @ middle)[:, :, None]
+    sigmas = np.repeat(result.noise.robots[0], 3)
+
+    def noise():
+        return exp(sigmas * rng.standard_normal((count, 6)))
+
+    off = exp(rng.standard_normal((count, 6)) @ covariance.T)
+    camera = result.state.edges[0]
+    if mount == "eye-in-hand":
+        away = flange @ (noise() @ camera @ off - camera) @ seen
+    else:
+        away = (camera @ off - camera) @ seen
+    away = away[:, :3, 0] + sigmas[3:] * rng.standard_normal((count, 3))
+    parts = {name: it for name, it in picks.budget_mm.items() if name != "left out"}
+    total = np.sqrt(sum(it**2 for name, it in parts.items() if name != "total"))
+    # Of the lens, which is given and refined within what it is stated to, little is left.
+    assert total == pytest.approx(1e3 * np.sqrt(np.mean(np.sum(away**2, axis=1))), rel=0.05)
+    looks = {"look"} if mount == "eye-in-hand" else set()
+    assert set(parts) == {"calibration", "pick", "total"} | looks
+
+
+def of_size(sigma_mm: float, camera: str = "cam", robot: str = "robot") -> Picks:
+    """Picks that err alike along all axes."""
+    covariance = np.diag(np.repeat([1e-4, 1e-3 * sigma_mm], 3) ** 2)[None]
+    return Picks(camera, robot, {"calibration": covariance}, np.inf, 0.5)
+
+
+NEED = Need(0.5)
+
+
+@pytest.mark.parametrize(
+    ("sigma_mm", "status"), [(0.1, "good"), (0.17, "good"), (0.2, "check"), (0.4, "bad")]
+)
+def test_the_verdict_is_about_the_need(sigma_mm: float, status: str) -> None:
+    verdict = judge(replace(SOUND, need=NEED, picks=(of_size(sigma_mm),)))
+    assert verdict.status == status
+    assert "where the views looked lands within 0.5 mm with a probability of" in verdict.reasons[0]
+    assert verdict.good_for_mm == pytest.approx(sigma_mm * np.sqrt(7.815), rel=5e-3)
+    causes = [] if status == "good" else ["calibration"]
+    assert [it.kind for it in verdict.causes] == causes
+
+
+def test_both_have_to_hold() -> None:
+    sound = replace(SOUND, picks=(of_size(0.1),))
+    assert judge(replace(sound, need=Need(0.5, 0.05))).status == "good"
+    assert judge(replace(sound, need=Need(0.5, 0.005))).status == "bad"
+    assert judge(replace(sound, need=Need(None, 0.05))).status == "good"
+
+
+@pytest.mark.parametrize(
+    ("changes", "good_from_mm"),
+    [
+        ({"held_out": Rms(30.0, 5.0), "rms": Rms(29.0, 4.8)}, 0.0),
+        ({"worst": directions(4e-3, 0, 0, 0)}, 0.0),
+        ({"stops": 8}, 0.0),
+        ({"away_mm": 1.0}, 10.0),
+        ({"away_deg": 0.1}, 10.0),
+        ({"warnings": remarks(["It is upside down."])}, np.inf),
+        ({"pixel_px": 4.0}, np.inf),
+    ],
+)
+def test_limits_give_way_to_the_need_and_what_is_unexplained_does_not(changes, good_from_mm):
+    found = replace(changed(SOUND, **changes), picks=(of_size(0.1),))
+    plain = judge(found)
+    assert plain.status != "good"
+    if np.isinf(good_from_mm):
+        assert plain.good_for_mm is None
+        assert judge(replace(found, need=Need(1e3))).status == "check"
+        return
+    assert plain.good_for_mm == pytest.approx(max(good_from_mm, 0.28), rel=0.01)
+    assert f"good for tasks of {good_from_mm:g}" in plain.reasons[-1] or not good_from_mm
+    assert judge(replace(found, need=Need(plain.good_for_mm))).status == "good"
+    assert judge(replace(found, need=Need(0.9 * plain.good_for_mm))).status == "check"
+
+
+def test_the_worst_pair_counts_and_is_named() -> None:
+    picks = (of_size(0.1, "cam_left", "a"), of_size(0.3, "cam_right", "b"))
+    verdict = judge(replace(SOUND, need=NEED, picks=picks))
+    assert "A pick by robot b of what cam_right sees where" in verdict.reasons[0]
+    met = need_met(NEED, picks, whole=True)
+    assert [it.camera for it in met.pairs] == ["left", "right"]
+    assert met.probability == min(it.probability for it in met.pairs)
+    assert met.of("left", "a").probability == met.pairs[0].probability
+    assert need_met(None, picks) is None
+
+
+@pytest.mark.parametrize(
+    "met",
+    [
+        NeedMet(Need(0.5), 0.97),
+        NeedMet(Need(None, 0.1, (0.4, 0.0, 0.2)), 0.5, (Picker("left", "a", 0.5),)),
+    ],
+)
+def test_it_is_kept(met: NeedMet) -> None:
+    document = json.loads(json.dumps(write(NeedMet, met)))
+    assert read(NeedMet, document, "need") == met
+
+
+def test_a_result_tells_what_it_is_good_for() -> None:
+    known = calibrated(simulate(CellOptions(views=12)))
+    plain = result_of(known)
+    assert plain.need is None
+    assert plain.verdict.good_for_mm == pytest.approx(0.2, abs=0.1)
+    need = {"mm": plain.verdict.good_for_mm, "at": [0.5, 0.1, 0.0]}
+    session = replace(known.session, document={**known.session.document, "need": need})
+    asked = result_of(calibrated(simulate(CellOptions(views=12)), session=session))
+    # The camera looks at a declared place as it looked at the board.
+    assert asked.need.probability == pytest.approx(0.95, abs=1e-3)
+    again = Calibration.from_json(json.dumps(to_document(asked)), "again")
+    assert (again.need, again.verdict) == (asked.need, asked.verdict)

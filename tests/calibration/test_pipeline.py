@@ -1,0 +1,168 @@
+"""The whole way on simulated corners, by ways that few sessions take."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.cells import calibrated, error_of, known_of, session_of
+from support.marks import slow
+
+from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.pipeline.view_evidence import view_evidence
+from visioncal.calibration.stages.observed import nothing_seen
+from visioncal.core.errors import DataError
+from visioncal.core.types import MOUNTS, Camera, Target
+from visioncal.estimation.closed_form import SOLVERS
+from visioncal.simulation import (
+    CellOptions,
+    fine_camera,
+    fisheye_camera,
+    simulate,
+    wide_camera,
+)
+
+FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
+# Its corners look the same after half a turn, and at small tilts its mirrored pose fits as well.
+AMBIGUOUS = replace(
+    FINE,
+    target=Target("sym", "checkerboard", 8, 6, 0.025, 2.5e-5),
+    camera=wide_camera(),
+    pixel_sigma_px=0.3,
+    tilt_rad=(0.0, 0.3),
+    seed=1,
+)
+
+
+def with_camera(cell, off_px=(0, 0, 0, 0), **table):
+    """What the session says of the camera: a matrix that is off, and more fields."""
+    stated = replace(cell.options.camera, matrix=cell.options.camera.matrix + off_px)
+    told = session_of(replace(cell, stated_camera=stated))
+    return replace(told, document=told.document | {"camera": told.document["camera"] | table})
+
+
+def mahalanobis_sq(cell, known):
+    """Squared error of both edges over the covariance, divided by their twelve numbers."""
+    error, covariance = error_of(cell, known), known.solved.covariance[:12, :12]
+    return error @ np.linalg.solve(covariance, error) / 12
+
+
+def test_intrinsics_are_refined_where_they_are_asked_to_be():
+    off = np.array([4.0, 4.0, -3.0, 2.0])
+    surprises = []
+    for seed in range(4):
+        cell = simulate(replace(FINE, seed=seed))
+        known = calibrated(cell, session=with_camera(cell, off, intrinsics="refine"))
+        assert np.isin(known.fitted.looks.lens_of("cam")[:4], known.fitted.seen.moving).all()
+        refined = known.fitted.looks.camera("cam")
+        sigma = np.sqrt(np.diag(known.solved.covariance)[12:16])
+        # Chi-square of four under 23.5 in all but one case of ten thousand, were they independent.
+        assert np.all(np.abs(refined.matrix - cell.options.camera.matrix) < 4.5 * sigma)
+        surprises.append(mahalanobis_sq(cell, known))
+    # Mean of 4 chi-square of 12 over 12: sigma 0.2.
+    assert np.mean(surprises) == pytest.approx(1.0, abs=0.8)
+
+
+@pytest.mark.parametrize("mode", [slow("hold"), "auto"])
+def test_a_matrix_known_to_a_pixel_is_counted_as_such(mode):
+    rng = np.random.default_rng(1)
+    surprises = []
+    for seed in range(8):
+        cell = simulate(replace(FINE, seed=seed))
+        off = 0.5 * rng.standard_normal(4)
+        told = with_camera(cell, off, matrix_sigma_px=0.5, intrinsics=mode)
+        known = calibrated(cell, session=told)
+        assert known.work.budget_mm["intrinsics"] > 0.0
+        surprises.append(mahalanobis_sq(cell, known))
+    # Mean of 8 chi-square of 12 over 12: sigma 0.14; four sigma, and held values err a bit more.
+    assert 0.4 < np.mean(surprises) < 1.8
+
+
+@pytest.mark.parametrize("given", [slow(True), False], ids=["lens given", "lens estimated"])
+def test_a_fisheye_camera_goes_the_whole_way(given):
+    surprises = []
+    for seed in range(4):
+        options = CellOptions(camera=fisheye_camera(), state_intrinsics=given, seed=seed)
+        known = calibrated(cell := simulate(options))
+        assert known.used == tuple(range(20))
+        assert len(known.fitted.looks.lens_of("cam")) == 8
+        surprises.append(mahalanobis_sq(cell, known))
+    # Mean of 4 chi-square of 12 over 12: sigma 0.2.
+    assert np.mean(surprises) == pytest.approx(1.0, abs=0.8)
+
+
+def test_a_closed_form_is_diagnosed_too():
+    cell = simulate(replace(FINE, seed=2))
+    joint, park = (calibrated(cell, solver=it).work for it in ("joint", "park"))
+    assert {"pixels", "robot", "total"} < set(park.budget_mm)
+    # The closed form leaves larger residuals, so its budget is wider, but of the same order; what
+    # is held pulls at a fit that is at rest only.
+    assert "held_values" not in park.budget_mm
+    noise = [np.hypot(it.budget_mm["pixels"], it.budget_mm["robot"]) for it in (joint, park)]
+    assert noise[0] < noise[1] < 10 * noise[0]
+
+
+@pytest.mark.parametrize("solver", ["joint", *SOLVERS])
+def test_views_held_back_may_be_ambiguous(solver):
+    cell = simulate(AMBIGUOUS)
+    told = session_of(cell)
+    views = tuple(replace(it, holdout=it.number % 4 == 0) for it in told.views)
+    plain = known_of(cell, session=replace(told, views=views), solver=solver)
+    for stage in (it for it in STAGES if it.name in ("intrinsics", "pnp")):
+        plain = stage.run(plain)
+    held = range(0, 20, 4)
+    assert any(len(plain.poses[it].cam_from_target) > 1 for it in held)
+    known = calibrated(cell, session=replace(told, views=views), solver=solver)
+    assert known.used == tuple(it for it in range(20) if it % 4)
+    # Of the order of the used views': half a turn of the board would be metres.
+    assert known.findings.pairs[0].holdout.mm < 5 * known.findings.held_out.mm
+
+
+@pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens estimated"])
+def test_a_view_left_out_as_ambiguous_is_shown_by_its_best_pose(given):
+    # A small board far away: in frontal views perspective hardly tells the tilt's sign.
+    small = Target("small", "checkerboard", 5, 4, 0.025, 2.5e-5)
+    far = CellOptions(
+        target=small, pixel_sigma_px=0.3, distance_m=(1.0, 1.5), tilt_rad=(0.0, 0.5), seed=3
+    )
+    known = calibrated(simulate(replace(far, state_intrinsics=given)))
+    assert known.reasons[4].startswith("ambiguous")
+    shown = {it.view: it for it in view_evidence(known)}
+    np.testing.assert_array_equal(shown[4].cam_from_target, known.poses[4].cam_from_target[0])
+    assert shown[4].predicted_px is None
+    assert all(shown[view].predicted_px is not None for view in known.used)
+
+
+@pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
+def test_a_lens_stated_for_images_twice_as_large_is_refined(mount):
+    matrix, bent = np.array([520.0, 519, 320, 190]), np.array([-0.37, 0.1, 0.001, 0.0, 0.03])
+    camera = Camera("brown", (640, 360), matrix, bent)
+    told = CellOptions(robot="ur3e", mount=mount, views=24, camera=camera, pixel_sigma_px=0.03)
+    cell = simulate(replace(told, robot_sigma_m=1e-4))
+    known = calibrated(cell, session=with_camera(cell, matrix))
+    refined = known.fitted.looks.camera("cam")
+    sigma = np.sqrt(np.diag(known.solved.covariance)[12:16])
+    # Chi-square of four under 23.5 in all but one case of ten thousand, were they independent.
+    assert np.all(np.abs(refined.matrix - matrix) < 4.5 * sigma)
+
+
+@pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens estimated"])
+def test_a_session_that_holds_all_views_back_is_told_so(given):
+    cell = simulate(replace(FINE, views=8, state_intrinsics=given))
+    told = session_of(cell)
+    held = replace(told, views=tuple(replace(it, holdout=True) for it in told.views))
+    with pytest.raises(DataError, match="are held back") as caught:
+        calibrated(cell, session=held)
+    assert "Clear role" in caught.value.next_step
+
+
+@pytest.mark.parametrize(
+    ("reason", "words"),
+    [
+        ("too few corners: 4 of 4, needs 6", "shows enough of the target"),
+        ("no board: no marker of DICT_5X5_100 is seen", "shows the target"),
+    ],
+)
+def test_a_board_with_too_few_corners_is_told_from_one_that_is_not_seen(reason, words):
+    known = known_of(simulate(FINE))
+    unseen = replace(known, cameras={}, reasons=dict.fromkeys(known.corners, reason))
+    assert words in nothing_seen(unseen).message

@@ -1,0 +1,417 @@
+"""Points from elsewhere: corners that another detector found, and rigs of known points."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from support.commands import visioncal
+from support.edited import changed
+from support.rigs import (
+    BOARD_FROM_CUBE,
+    LENS,
+    NOISE_PX,
+    PLACES,
+    Rig,
+    numbers_of,
+    truth,
+    write_rig,
+    write_target,
+    write_two_cameras,
+    write_two_targets,
+)
+
+from visioncal import align, calibrate
+from visioncal.calibration.pipeline import run
+from visioncal.calibration.stages.detect import detect
+from visioncal.calibration.verification.calibration_prior import CalibrationPrior
+from visioncal.calibration.verification.prediction import predict_stops
+from visioncal.core.errors import DataError
+from visioncal.core.quantiles import chi2_limit
+from visioncal.core.transforms import invert, log
+from visioncal.present.recording import board, write_recording
+from visioncal.present.report import write_report
+from visioncal.results import Calibration, to_document
+from visioncal.session import Session, corners
+from visioncal.vision.targets import load_target, target_document, target_from_document
+
+IN_HAND, TO_HAND = "eye-in-hand", "eye-to-hand"
+REFINED, AUTO = f'{LENS}intrinsics = "refine"\n', LENS
+SEEDS = 4
+
+
+def x_of(calibration: Calibration) -> tuple[np.ndarray, np.ndarray]:
+    """The error (6,) of the camera's edge, and its covariance."""
+    name = next(iter(calibration.edges))
+    edge, mount = calibration.edges[name], calibration.mount
+    return log(invert(edge.matrix) @ truth(mount)[0].as_matrix()), edge.covariance
+
+
+def with_line(folder: Path, line: str) -> Path:
+    with (folder / "corners.csv").open("a") as file:
+        file.write(f"{line}\n")
+    return folder
+
+
+@pytest.fixture
+def cube(tmp_path: Path) -> Path:
+    return write_rig(tmp_path / "cube", Rig("cube"))
+
+
+RIGS = (
+    Rig("charuco", IN_HAND, uneven=5.0, stated=1.0),
+    Rig("checkerboard", TO_HAND, lens=REFINED),
+    Rig("marker", TO_HAND, stated=1.0),
+    Rig("flat", IN_HAND, lens=""),
+    Rig("plate", TO_HAND),
+    Rig("cube", IN_HAND, lens=AUTO),
+    Rig("cube", TO_HAND, lens="", uneven=5.0, stated=1.0),
+    # Taken for exact, points as loose as these put the camera 1.5 sigma off.
+    Rig("flat", IN_HAND, sigma_m=2e-4),
+)
+
+
+@pytest.mark.slow
+def test_the_camera_is_where_it_is_within_its_sigmas(tmp_path):
+    squares = np.zeros((len(RIGS), SEEDS))
+    for at, rig in enumerate(RIGS):
+        for seed in range(SEEDS):
+            folder = write_rig(tmp_path / f"{at}_{seed}", replace(rig, seed=seed))
+            error, covariance = x_of(calibrate(folder))
+            squares[at, seed] = error @ np.linalg.solve(covariance, error)
+    # Sums are chi-square of as many numbers, which chance leaves in one of a thousand cases; the
+    # noise of the robot is known to 10 % from so few stops, and its square to 20 %.
+    for sums, freedom in ((squares.sum(axis=1), 6 * SEEDS), (squares.sum(), 6 * squares.size)):
+        low, high = chi2_limit(np.array([0.9995, 0.0005]), freedom)
+        assert np.all((low / 1.2 < sums) & (sums < 1.2 * high))
+
+
+def test_points_that_are_not_where_the_table_has_them_are_named(tmp_path):
+    rig = Rig("cube", sigma_m=5e-5)
+    folder = write_rig(tmp_path / "cell", rig)
+    lines = (folder / "target.csv").read_text().splitlines()
+    number, x_m, *rest = lines[5].split(",")
+    lines[5] = ",".join([number, repr(float(x_m) + 5e-4), *rest])
+    (folder / "target.csv").write_text("\n".join(lines) + "\n")
+    result = calibrate(folder)
+    assert result.verdict.status == "check"
+    (sentence,) = (it for it in result.verdict.reasons if "table has it" in it)
+    assert sentence.startswith(f"Point {number} of target target lies 0.")
+    # The views have it where it was, to within four sigmas of what the table says of it.
+    assert result.rig.shape[4][0] == pytest.approx(-5e-4, abs=2e-4)
+    again = Calibration.from_json(json.dumps(to_document(result)), "again")
+    write_rig(tmp_path / "fresh", replace(rig, views=6))
+    (folder / "target.csv").replace(tmp_path / "fresh" / "target.csv")
+    fresh = Session.load(tmp_path / "fresh")
+    free = CalibrationPrior.of(again).free
+    moved = free.corners_after(np.zeros(len(free.columns)))[4] - free.positions[4]
+    assert moved == pytest.approx(result.rig.shape[4])
+    assert predict_stops(fresh, CalibrationPrior.of(again)).known.pixel_px == pytest.approx(
+        NOISE_PX, rel=0.15
+    )
+
+
+def test_sigmas_weigh_the_corners(tmp_path):
+    rig = Rig("charuco", uneven=5.0)
+    plain, weighed = (
+        calibrate(write_rig(tmp_path / str(stated), replace(rig, stated=stated)))
+        for stated in (None, 1.0)
+    )
+    # Half of the corners are five times as good as the rest: alone, they have a 13th of the mean
+    # variance at half the number.
+    assert np.trace(x_of(weighed)[1]) < 0.4 * np.trace(x_of(plain)[1])
+
+
+@pytest.mark.parametrize(
+    ("stated", "status", "said", "level"),
+    [
+        (1.0, "good", "", NOISE_PX),
+        (1.1, "good", "", 1.1 * NOISE_PX),
+        (0.4, "check", "corners.csv states 0.08 px", NOISE_PX),
+        (2.5, "good", "corners.csv states 0.5 px", 2.5 * NOISE_PX),
+    ],
+)
+def test_the_verdict_says_where_the_corners_contradict_what_is_stated(
+    stated, status, said, level, tmp_path
+):
+    result = calibrate(write_rig(tmp_path / "cell", Rig("charuco", stated=stated)))
+    assert result.verdict.status == status
+    sentences = " ".join(result.verdict.reasons)
+    assert said in sentences
+    assert ("corners.csv states" in sentences) is bool(said)
+    # The scatter of 1200 coordinates shows the noise to 2 %.
+    assert result.noise["pixel_px"] == pytest.approx(level, rel=0.06)
+
+
+@pytest.mark.parametrize("kind", ["charuco", "cube"])
+def test_every_storage_of_it_is_the_same_session(kind, tmp_path):
+    folder = write_rig(tmp_path / "cell", Rig(kind, stated=1.0))
+    session = Session.load(folder)
+    write_recording(tmp_path / "cell.rrd", session, None, (), None)
+    recorded = Session.load(tmp_path / "cell.rrd")
+    recorded.save(tmp_path / "back")
+    ours, result = session.corner_table, to_document(calibrate(session))
+    for again in (recorded, Session.load(tmp_path / "back")):
+        theirs = again.corner_table
+        assert again.digest() == session.digest()
+        assert again.boards == {"": replace(session.boards[""], name=again.boards[""].name)}
+        for name in ("views", "points", "px", "sigmas_px"):
+            np.testing.assert_array_equal(getattr(theirs, name), getattr(ours, name))
+        assert to_document(calibrate(again)) | {"created": ""} == result | {"created": ""}
+
+
+def test_what_was_measured_counts_in_the_digest(cube):
+    digest = Session.load(cube).digest()
+    text = (cube / "corners.csv").read_text()
+    for name, old, new in (
+        ("corners.csv", text.split("\n")[1], text.split("\n")[1].replace(".", ".5", 1)),
+        ("target.csv", "-0.08,-0.08,-0.08", "-0.08,-0.08,-0.081"),
+    ):
+        before = (cube / name).read_text()
+        assert Session.load(changed(cube, name, old, new)).digest() != digest
+        (cube / name).write_text(before)
+    # Spelling counts for nothing.
+    (cube / "corners.csv").write_text(text.replace(",", " , "))
+    assert Session.load(cube).digest() == digest
+
+
+def test_an_image_with_corners_is_not_searched(cube):
+    rows = (cube / "views.csv").read_text().splitlines()
+    told = [f"{rows[0]},image", f"{rows[1]},broken.png", *(f"{it}," for it in rows[2:])]
+    (cube / "views.csv").write_text("\n".join(told) + "\n")
+    (cube / "broken.png").write_bytes(b"no image")
+    result = calibrate(cube)
+    assert all(view.used for view in result.views)
+    assert result.views[0].corners == len(PLACES["cube"])
+
+
+def test_views_that_do_not_serve_are_left_out_by_name(cube):
+    lines = (cube / "corners.csv").read_text().splitlines()
+    of = {view: [it for it in lines if it.startswith(f"{view},")] for view in range(5)}
+    # View 1 has three points, view 2 none, view 3 four of a row, view 4 one far outside.
+    row = [str(it) for it in numbers_of("cube")[:4]]
+    in_row = [it for it in of[3] if it.split(",")[1] in row]
+    view, point, u_px, _ = of[4][0].split(",")
+    rest = [it for it in lines if it.split(",")[0] not in ("1", "2", "3", "4")]
+    kept = [*rest, *of[1][:3], *in_row, f"{view},{point},{u_px},4000.0", *of[4][1:]]
+    (cube / "corners.csv").write_text("\n".join(kept) + "\n")
+    reasons = {it.view: it.reason for it in calibrate(cube).views if not it.used}
+    assert reasons.keys() == {1, 2, 3, 4}
+    assert "has 3 of 37, needs 4" in reasons[1]
+    assert "neither image nor rows in corners.csv" in reasons[2]
+    assert "on one line" in reasons[3]
+    assert f"point {point} at ({float(u_px):g}, 4000) px lies far outside" in reasons[4]
+
+
+def test_a_rig_is_not_looked_for_in_images(cube):
+    changed(cube, "views.csv", "view,", "image,view,")
+    text = (cube / "views.csv").read_text().splitlines()
+    rows = [text[0], *(f"{'a.png' if at == 1 else ''},{it}" for at, it in enumerate(text[1:]))]
+    (cube / "views.csv").write_text("\n".join(rows) + "\n")
+    image = np.full((960, 1280), 200, dtype=np.uint8)
+    cv2.imwrite(str(cube / "a.png"), image)
+    lines = (cube / "corners.csv").read_text().splitlines()
+    kept = [it for it in lines if not it.startswith("1,")]
+    (cube / "corners.csv").write_text("\n".join(kept) + "\n")
+    (view,) = (it for it in calibrate(cube).views if not it.used)
+    assert view.view == 1
+    assert "rig of points, which no image is searched for" in view.reason
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("99,700,10,10", "column view: views.csv has no view 99"),
+        ("0,5,10,10", "has no point 5; its 37 points have the numbers 592 to 700"),
+        ("0,700,10,10", "point 700 of view 0 is there twice, first in line"),
+        ("0,x,10,10", "column point: 'x' is no whole number"),
+        ("0,700,nan,10", "column u_px: 'nan' is no finite number"),
+        ("0,700,10", "it has 3 fields, but the header has 4 columns"),
+    ],
+)
+def test_wrong_rows_are_named(line, said, cube):
+    with pytest.raises(DataError, match=r"corners\.csv, line 557") as error:
+        Session.load(with_line(cube, line))
+    assert said in error.value.message
+
+
+@pytest.mark.parametrize(
+    ("header", "cells", "said"),
+    [
+        ("view,point,u_px,v_px,sigma_px", ",0", "column sigma_px: 0 px is no standard deviation"),
+        ("view,point,u_px,v_px,sigma_px", ",-0.1", "-0.1 px is no standard deviation"),
+        ("view,point,u_px,v_px,score", ",1", "others are not read"),
+        ("view,point,u_px,sigma_px", "", "view, point, u_px, v_px are needed"),
+    ],
+)
+def test_wrong_columns_are_named(header, cells, said, cube):
+    _, *rows = (cube / "corners.csv").read_text().splitlines()
+    (cube / "corners.csv").write_text("\n".join([header, *(f"{it}{cells}" for it in rows)]))
+    with pytest.raises(DataError, match=r"corners\.csv") as error:
+        Session.load(cube)
+    assert said in error.value.message
+
+
+def test_sigmas_are_stated_of_all_rows_or_none(tmp_path):
+    folder = write_rig(tmp_path / "cell", Rig(stated=1.0))
+    with pytest.raises(DataError, match="it is empty; all rows state it, or none"):
+        Session.load(with_line(folder, "0,700,10,10,"))
+
+
+def test_corners_without_images_need_a_resolution(cube):
+    changed(cube, "session.toml", "resolution = [1280, 960]\n", "")
+    changed(cube, "session.toml", LENS, "")
+    with pytest.raises(DataError, match="the camera's resolution is missing"):
+        calibrate(cube)
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        ("point,x_m,y_m,z_m\n0,0,0,0\n1,1,0,0\n2,0,1,0\n", "four points or more"),
+        ("point,x_m,y_m,z_m\n0,0,0,0\n1,1,0,0\n2,0,1,0\n2,0,1,1\n", "point 2 twice"),
+        ("point,x_m,y_m,z_m\n0,0,0,0\n1,100,0,0\n2,0,100,0\n3,0,0,80\n", "in metres"),
+        ("point,x_m,y_m,z_m\n0,0,0,0\n1,1,0,0\n2,0,1,0\n3,0,nan,1\n", "a finite number"),
+        ("point,x_m,y_m,z_m\n0,0,0,0\n1,1,0,0\n2,0,1,0\n3,0,b,1\n", "'b' is no number"),
+        ("point,x_m,y_m\n0,0,0\n1,1,0\n2,0,1\n3,0,1\n", "point, x_m, y_m, z_m"),
+        ("point,x_m,y_m,z_m,sigma_m\n0,0,0,0,1\n1,1,0,0,1\n2,0,1,0,1\n3,0,1,1,0\n", "above 0"),
+    ],
+)
+def test_wrong_rigs_are_refused(table, said, tmp_path):
+    name = write_target(tmp_path, "cube", "rig")
+    (tmp_path / "rig.csv").write_text(table)
+    with pytest.raises(DataError) as error:
+        load_target(name, tmp_path)
+    assert said in error.value.message
+
+
+def test_a_rig_is_described_by_its_document(tmp_path):
+    target, document = load_target(write_target(tmp_path, "cube", "rig", 1e-4), tmp_path)
+    assert target_document(target) == document
+    assert target_from_document(document, "rig") == target
+    assert target.point_numbers == tuple(numbers_of("cube"))
+
+
+def test_one_image_of_two_targets_is_two_views(tmp_path):
+    session = Session.load(write_two_targets(tmp_path / "cell"))
+    # Fourteen images show the rig, and twelve of them the board, too.
+    assert len(session.views) == 26
+    result = calibrate(session)
+    assert all(view.used for view in result.views)
+    places = [result.edges[f"base_from_target_{it}"] for it in ("board", "rig")]
+    between = log(invert(places[0].matrix) @ places[1].matrix @ BOARD_FROM_CUBE.inv().as_matrix())
+    # Four standard deviations of both places, as if they were independent.
+    sigmas = np.sqrt(sum(np.diag(it.covariance) for it in places))
+    assert np.all(np.abs(between[3:]) < 4.0 * np.linalg.norm(sigmas[3:]))
+    session.save(tmp_path / "copy")
+    assert Session.load(tmp_path / "copy").digest() == session.digest()
+
+
+def test_targets_of_rows_are_those_of_their_views(tmp_path):
+    folder = write_two_targets(tmp_path / "cell")
+    cases = {
+        "wall": "'wall' is not declared; session.toml declares board, rig",
+        "": "it is empty, and so is view 0's",
+    }
+    for name, said in cases.items():
+        with pytest.raises(DataError) as error:
+            Session.load(changed(folder, "corners.csv", ",board\n", f",{name}\n"))
+        assert said in error.value.message
+        changed(folder, "corners.csv", f",{name}\n", ",board\n")
+    rows = (folder / "views.csv").read_text().splitlines()
+    told = [f"target,{rows[0]}", *(f"rig,{it}" for it in rows[1:])]
+    (folder / "views.csv").write_text("\n".join(told) + "\n")
+    with pytest.raises(DataError, match=r"views\.csv says that view 0 shows 'rig'"):
+        Session.load(folder)
+
+
+def test_a_cell_of_two_cameras_is_aligned(tmp_path):
+    found = align(write_two_cameras(tmp_path / "cell"))
+    x, z = truth(IN_HAND)
+    for name, true in {
+        "flange_from_cam_left": x,
+        "cell_from_target_floor": z,
+        "cell_from_cam_right": z,
+        "flange_from_target_held": x,
+    }.items():
+        edge = found.edges[name]
+        error = log(invert(edge.matrix) @ true.as_matrix())
+        # Chi-square of six exceeds this in one case of 100,000.
+        assert error @ np.linalg.solve(edge.covariance, error) < 33.0
+    assert found.noise["cam_left"]["pixel_px"] == 0.1
+    assert found.noise["cam_right"]["pixel_px"] == 0.4
+
+
+def test_report_and_recording_draw_what_no_image_shows(cube, tmp_path):
+    session = Session.load(cube)
+    done = run(session)
+    write_report(tmp_path / "report.html", done.calibration, session, done.evidence)
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("Best used view") == 1
+    drawn = board.sheet(session.boards[""])
+    assert len(drawn.positions) == len(PLACES["cube"])
+    box = board.closed_outline(session.boards[""])
+    assert len(np.unique(box, axis=0)) == 8
+    assert np.ptp(box, axis=0) == pytest.approx([0.16] * 3)
+
+
+def test_commands_take_a_rig_or_say_why_not(cube, tmp_path):
+    out = tmp_path / "out"
+    assert visioncal("calibrate", cube, "-o", out).status == 0
+    fresh = write_rig(tmp_path / "fresh", Rig("cube", seed=9, views=6))
+    assert visioncal("verify", fresh, "--against", out).status == 0
+    located = visioncal("locate", fresh, "-c", out)
+    assert located.out.count("view ") == 6
+    fixture = visioncal("fixture", fresh, "-c", out, "-o", tmp_path / "fixture.json")
+    assert "rig target seen in 6 images" in fixture.out + fixture.err
+    other = visioncal("locate", fresh, "-c", out, "--target", "charuco_9x6_30mm")
+    assert other.status == 2
+    assert "corners of its own target" in other.err
+    changed(cube, "session.toml", "[camera]", '[robot]\nmodel = "ur10e"\n[camera]')
+    planned = visioncal("plan", cube, "--add", 2, "-o", tmp_path / "plan")
+    assert planned.status == 2
+    assert "rig of points outside the plane z = 0" in planned.err
+
+
+def test_corners_of_images_give_what_the_images_give(rendered, tmp_path):
+    session = Session.load(rendered)
+    found = detect(session)
+    session.save(tmp_path / "cell")
+    for image in (tmp_path / "cell").rglob("*.png"):
+        image.unlink()
+    rows = [
+        f"{view},{point},{u_px!r},{v_px!r}"
+        for view, it in found.corners.items()
+        for point, (u_px, v_px) in zip(it.ids.tolist(), it.px.tolist(), strict=True)
+    ]
+    (tmp_path / "cell" / "corners.csv").write_text("\n".join(["view,point,u_px,v_px", *rows]))
+    ours, theirs = (to_document(calibrate(it)) for it in (tmp_path / "cell", session))
+    for name in ("transforms", "noise", "views", "rms", "verdict"):
+        assert ours[name] == theirs[name]
+
+
+def test_more_corners_than_a_session_holds_are_refused(monkeypatch):
+    monkeypatch.setattr(corners, "_MOST_CORNERS", 2)
+    rows = "".join(f"1,{at},10.0,20.0\n" for at in range(3))
+    with pytest.raises(DataError, match="more than 2 rows"):
+        corners.parse_corners("view,point,u_px,v_px\n" + rows)
+
+
+def test_a_rig_lies_beside_its_description(tmp_path):
+    (tmp_path / "inside").mkdir()
+    (tmp_path / "points.csv").write_text("point,x_m,y_m,z_m\n", encoding="utf-8")
+    target = tmp_path / "inside" / "rig.toml"
+    target.write_text('kind = "points"\npoints = "../points.csv"\n', encoding="utf-8")
+    with pytest.raises(DataError, match="leads out of the folder"):
+        load_target("rig.toml", target.parent)
+
+
+def test_corners_outside_of_the_folder_are_not_read(tmp_path):
+    elsewhere = tmp_path / "elsewhere.csv"
+    elsewhere.write_text("view,point,u_px,v_px\n", encoding="utf-8")
+    (tmp_path / "session").mkdir()
+    (tmp_path / "session" / "corners.csv").symlink_to(elsewhere)
+    with pytest.raises(DataError, match="leads out of its folder"):
+        corners.read_corners(tmp_path / "session")

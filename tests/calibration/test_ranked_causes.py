@@ -1,0 +1,180 @@
+"""Causes of doubts: how likely each is, what competes, and what stands on top."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.special import chdtrc
+from support.sound_findings import SOUND, changed, directions, left_out
+
+from visioncal.calibration.stages.cause_ranking import read_otherwise, with_misread
+from visioncal.calibration.stages.fit_messages import scale_found
+from visioncal.calibration.stages.judge import judge
+from visioncal.calibration.stages.need import Picks
+from visioncal.core.types import Need
+from visioncal.core.verdict import CALIBRATE, GUESS, PLAN, Finding, Step, Verdict, with_paths
+from visioncal.estimation.joint import MeasuredScale
+from visioncal.results import Rms
+from visioncal.results.codec import read, write
+from visioncal.results.verdicts import VerdictForm
+
+EXCHANGED = Finding(
+    "exchanged_views",
+    "Views 3 and 4 are exchanged: the image of each fits the pose in the other's row.",
+    Step("Exchange them.", CALIBRATE),
+    (3, 4),
+)
+POSTURE = Finding("arm_errors", "Residuals follow the arm's posture.", mahalanobis_sq=45.0)
+DRIFT = Finding("moved_slowly", "Residuals drift with time.")
+SIZE = scale_found("board", 0.03, MeasuredScale(0, 4.7e-3, 6e-4, 8e-4))
+
+
+def chi2_chance(square: float) -> float:
+    return float(chdtrc(1.0, square))
+
+
+def ids(verdict: Verdict) -> list[str]:
+    return [it.kind for it in verdict.causes]
+
+
+def test_a_good_result_has_no_causes() -> None:
+    assert judge(SOUND).causes == ()
+
+
+def test_exchanged_rows_come_first_with_what_is_left_without_them() -> None:
+    verdict = judge(changed(SOUND, warnings=(DRIFT, EXCHANGED), stops=8))
+    assert ids(verdict)[0] == "exchanged_views"
+    first = verdict.causes[0]
+    assert first.probability > 0.9999
+    assert first.without_it == (
+        "Without them, views that are left out in turn agree to 0.11 mm and 0.011 deg."
+    )
+    assert first.do == EXCHANGED.do
+    assert verdict.causes == tuple(sorted(verdict.causes, key=lambda it: -it.probability))
+
+
+@pytest.mark.parametrize(
+    ("warnings", "chances"),
+    [
+        ((DRIFT,), (1e-4,)),
+        # Those that give figures are weighed by them: twice a gain of 45, and 4.7 sigmas.
+        ((POSTURE, DRIFT), (chi2_chance(45.0), 1e-4)),
+        ((SIZE, DRIFT), (chi2_chance(22.09), 1e-4)),
+    ],
+)
+def test_explanations_of_one_misfit_share_it(warnings, chances) -> None:
+    """By the bound of Sellke, Bayarri and Berger on what a chance says, none of them among them."""
+    verdict = judge(changed(SOUND, warnings=warnings, away_mm=1.0))
+    odds = {text: -1.0 / (np.e * p * np.log(p)) for text, p in zip(warnings, chances, strict=True)}
+    found = {it.words: it.probability for it in verdict.causes}
+    for text in warnings:
+        assert found[text.words] == pytest.approx(odds[text] / (1.0 + sum(odds.values())))
+    (unexplained,) = (it for it in verdict.causes if it.kind == "unexplained")
+    assert unexplained.probability == pytest.approx(1.0 / (1.0 + sum(odds.values())))
+    assert sum(it.probability for it in verdict.causes) == pytest.approx(1.0)
+
+
+def test_what_nothing_explains_is_the_cause_itself() -> None:
+    (only,) = judge(changed(SOUND, away_mm=1.0)).causes
+    assert (only.kind, only.probability) == ("unexplained", 1.0)
+    assert "Measure the board" in only.do.words
+
+
+@pytest.mark.parametrize(
+    ("views", "cause"), [(range(12, 20), "something_moved"), ((6, 9), "wrong_views")]
+)
+def test_views_that_are_left_out_are_a_cause(views, cause: str) -> None:
+    assert ids(judge(left_out(views)))[0] == cause
+
+
+@pytest.mark.parametrize("need", [None, Need(0.5)])
+def test_errors_that_are_too_large_come_from_their_sources(need) -> None:
+    large, small = (np.diag(np.repeat([1e-6, it], 3) ** 2)[None] for it in (4e-4, 3e-4))
+    picks = (Picks("cam", "robot", {"calibration": small, "look": large}, np.inf, 0.5),)
+    found = replace(SOUND, need=need, picks=picks, worst=directions(2e-3, 0, 0, 0))
+    verdict = judge(found)
+    assert ids(verdict) == ["robot_noise", "calibration"]
+    assert [it.probability for it in verdict.causes] == pytest.approx([0.64, 0.36])
+    without = f"Without it 95 % of picks land within {0.3 * np.sqrt(7.815):.2f} mm"
+    assert verdict.causes[0].without_it.startswith(without)
+    assert ("within what is needed" in verdict.causes[0].without_it) == (need is not None)
+    # No command proposes views of an arm whose model nobody knows.
+    assert "visioncal plan proposes them" in verdict.causes[1].do.words
+    assert not verdict.causes[1].do.command
+    (arm,) = found.arms
+    known = judge(replace(found, arms=(replace(arm, modelled=True),)))
+    assert known.causes[1].do.command == PLAN
+    # What can be had without them is no cause of a doubt about something else.
+    met = replace(found, need=None, worst=directions(1e-4), warnings=(DRIFT,))
+    assert ids(judge(met)) == ["moved_slowly"]
+
+
+def test_poses_that_are_misread_explain_the_rest() -> None:
+    before = judge(changed(SOUND, warnings=(DRIFT,)))
+    after = with_misread(before, read_otherwise("The quaternions are w, x, y, z."))
+    assert ids(after) == ["misread_poses", "moved_slowly"]
+    assert sum(it.probability for it in after.causes) <= 1.0
+    assert after.top[0].startswith("Most likely (98 %): The quaternions are w, x, y, z.")
+    assert after.reasons[1:] == before.reasons
+
+
+def test_the_cause_its_cost_and_what_to_do_come_first() -> None:
+    found = (
+        Finding("place", "A point is placed to 4 mm.", Step("Add views."), is_fatal=True),
+        Finding("something_odd", "It is odd."),
+        Finding("lens", "The lens is another.", Step("Leave it out."), probability=0.2),
+        DRIFT,
+        replace(EXCHANGED, probability=0.7, without_it="Without them all is well."),
+        Finding("holdout", "Held back.", Step("Add views."), probability=0.01),
+    )
+    verdict = Verdict("bad", found)
+    assert verdict.top == (
+        f"Most likely (70 %): {EXCHANGED.words} Without them all is well.",
+        "A point is placed to 4 mm.",
+        "Possibly (20 %): The lens is another.",
+    )
+    assert verdict.rest == ("It is odd.", DRIFT.words, "Held back.")
+    assert verdict.next_steps == (EXCHANGED.do, Step("Add views."), Step("Leave it out."))
+    assert Verdict.of("good", "Fine.").top == ("Fine.",)
+
+
+def test_findings_are_kept_and_name_the_session(tmp_path: Path) -> None:
+    verdict = judge(changed(SOUND, warnings=(EXCHANGED,), stops=8))
+    document = json.loads(json.dumps(write(VerdictForm, VerdictForm.of(verdict))))
+    assert read(VerdictForm, document, "verdict").verdict("verdict") == verdict
+    named = verdict.with_paths(tmp_path / "my cell", "out")
+    command = f"visioncal calibrate '{tmp_path}/my cell' -o out"
+    assert named.next_steps[0].command == command
+    assert command in named.reasons[-1]
+    folder = tmp_path / "cell"
+    assert with_paths(GUESS, folder) == f"visioncal convert {folder} {folder}-fixed --guess --yes"
+    recording = tmp_path / "cell.rrd"
+    recording.touch()
+    assert with_paths(GUESS, recording).endswith(f"cell.rrd {folder}-fixed --guess --yes")
+
+
+def test_verdicts_of_earlier_files_say_the_same() -> None:
+    causes = [
+        {"cause": "lens", "probability": 0.9, "sentence": "It is another.", "do": "Measure it."},
+        {"cause": "calibration", "probability": 0.4, "sentence": "Much comes from it."},
+    ]
+    reasons = ["Views disagree.", "It is another. Hold it."]
+    old = read(VerdictForm, {"status": "bad", "reasons": reasons, "causes": causes}, "verdict")
+    old = old.verdict("verdict")
+    assert [it.kind for it in old.causes] == ["lens", "calibration"]
+    assert old.top == (
+        "Most likely (90 %): It is another. Hold it.",
+        "Much comes from it.",
+        "Views disagree.",
+    )
+    assert old.next_steps == (Step("Measure it."),)
+
+
+def _scattered() -> Verdict:
+    return judge(changed(SOUND, held_out=Rms(30.0, 0.011), rms=Rms(29.0, 0.01)))
+
+
+def test_scatter_without_any_finding_is_unexplained() -> None:
+    assert ids(_scattered()) == ["unexplained"]

@@ -1,0 +1,176 @@
+"""Several images of one stop share the robot's error: they are not as good as so many stops."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.marks import slow
+from support.whole_cells import misfit
+
+from visioncal import calibrate
+from visioncal.core.transforms import exp, invert
+from visioncal.session import MemoryImages, Session
+from visioncal.session.corners import CornerTable
+from visioncal.simulation import (
+    CellOptions,
+    charuco_target,
+    network_session,
+    read_cell,
+    simulate,
+    simulate_network,
+)
+from visioncal.simulation.records import pose_row, target_document
+
+SIGMA_PX = 0.05
+# The size of the board is known: else it is most of what transforms are uncertain by.
+BOARD = replace(charuco_target(), square_sigma_m=1e-7)
+
+
+def table(shown, rng):
+    """Corners of views, each with noise of its own."""
+    counts = [len(exact.ids) for _, exact in shown]
+    px = np.concatenate([exact.px for _, exact in shown])
+    return CornerTable(
+        np.repeat([view for view, _ in shown], counts),
+        np.concatenate([exact.ids for _, exact in shown]),
+        px + SIGMA_PX * rng.standard_normal(px.shape),
+        ("",) * len(px),
+    )
+
+
+def of_one_camera(images, *, stops, trembling_m=0.0, bias_px=0.0):
+    """A session with so many images a stop, whose poses are read anew for each of them.
+
+    All images of a stop have the same bias, as a detector has it.
+    """
+    cell = simulate(CellOptions(views=12, cut_views=0.0, seed=3))
+    rng = np.random.default_rng(8)
+    rows, shown = [], []
+    for stop, pose in enumerate(cell.base_from_flange):
+        exact = cell.exact_corners[stop]
+        exact = bent(exact, bias_px) if bias_px else exact
+        for _ in range(images):
+            shown.append((len(rows), exact))
+            # Radians count as metres here: both tremble alike.
+            read = pose @ exp(trembling_m * rng.standard_normal(6))
+            named = {"stop": stop} if stops else {}
+            rows.append({"view": len(rows), **named, **pose_row(read)})
+    optics = cell.options.camera
+    camera = {"resolution": list(optics.resolution), "model": optics.model, "intrinsics": "hold"}
+    camera |= {"matrix": optics.matrix.tolist(), "distortion": optics.distortion.tolist()}
+    document = {"schema": 1, "name": "repeated", "mount": "eye-in-hand", "target": "board.toml"}
+    session = Session.assemble(
+        document | {"camera": camera},
+        list(rows[0]),
+        [[str(it) for it in row.values()] for row in rows],
+        MemoryImages({}),
+        target_document=target_document(BOARD),
+        corners=table(shown, rng),
+    )
+    return cell, session
+
+
+def of_a_cell(images, *, stops, seed, bias_px=0.0):
+    """A session of two fixed cameras, one arm and a board on the floor, likewise.
+
+    All views of the board on the floor by one camera have the same bias, as a detector has it.
+    """
+    options = read_cell("two-cameras")
+    boards = tuple(
+        replace(it, target=replace(it.target, square_sigma_m=1e-7)) for it in options.boards
+    )
+    # Beside such a robot, corners are nearly exact.
+    robots = tuple(replace(it, sigma_m=1e-4) for it in options.robots)
+    cell = simulate_network(replace(options, stops=14, boards=boards, robots=robots, seed=seed))
+    told = network_session(cell, "repeated", seen="names")
+    columns = [it for it in told.columns if it != "image" and (stops or it != "stop")]
+    exact = {it.view: it.exact for it in cell.sights}
+    for it in cell.sights:
+        if bias_px and it.board == "floor":
+            exact[it.view] = bent(it.exact, bias_px)
+    rows, shown = [], []
+    for view in sorted(told.views, key=lambda it: it.stop):
+        for _ in range(images):
+            if view.number in exact:
+                shown.append((len(rows), exact[view.number]))
+            rows.append([str(len(rows)), *(view.cell(it) for it in columns[1:])])
+    return cell, Session.assemble(
+        told.document,
+        columns,
+        rows,
+        told.images,
+        target_document=told.target_document,
+        corners=table(shown, np.random.default_rng([8, seed])),
+    )
+
+
+def bent(corners, bias_px):
+    """Corners that are off by a cubic of their places, which their places in the image choose."""
+    rng = np.random.default_rng(np.round(1e3 * corners.px[0]).astype(int))
+    u = 2.0 * (corners.px - corners.px.mean(axis=0)) / np.ptp(corners.px, axis=0)
+    terms = np.column_stack([u**2, u[:, 0] * u[:, 1], u**3])
+    return replace(corners, px=corners.px + bias_px * terms @ rng.standard_normal((5, 2)))
+
+
+def off(cell, found, name):
+    edge, truth = found.edges[name], cell.transforms[name.partition("_from_")[2]]
+    if name.startswith("cell"):
+        truth = invert(cell.transforms["base_a"]) @ truth
+    return misfit(edge.matrix, edge.covariance, truth)
+
+
+@pytest.mark.parametrize(
+    ("stops", "trembling_m"), [(True, 2e-6), (False, 0.0), (False, 2e-6), (False, 1e-5)]
+)
+def test_images_of_a_stop_share_the_robots_error(stops, trembling_m):
+    cell, session = of_one_camera(6, stops=stops, trembling_m=trembling_m)
+    found = calibrate(session)
+    once = calibrate(of_one_camera(1, stops=True)[1])
+    edge, name = found.edges["flange_from_cam"], "flange_from_cam"
+    # Six independent views for each would give 0.41; corners alone get better.
+    assert 0.55 < edge.sigma_mm / once.edges[name].sigma_mm < 1.05
+    assert found.verdict.status == "good", found.verdict.reasons
+    # Chi-square of six exceeds this in one case of a thousand.
+    assert misfit(edge.matrix, edge.covariance, cell.transforms[name]) < 22.5
+
+
+def test_a_lens_is_not_doubted_for_what_images_of_a_stop_have_wrong_alike():
+    cell, session = of_one_camera(8, stops=True, bias_px=0.6 * SIGMA_PX)
+    found = calibrate(session)
+    assert found.verdict.status == "good", found.verdict.reasons
+    (name, edge), *_ = found.edges.items()
+    assert misfit(edge.matrix, edge.covariance, cell.transforms[name]) < 22.5
+
+
+@pytest.mark.parametrize(("seed", "images"), [slow(0, 10), (2, 3)])
+def test_still_boards_seen_often_outvote_no_robot(seed, images):
+    """Most rows are of still cameras and a still board, and agree best of all."""
+    cell, session = of_a_cell(images, stops=True, seed=seed)
+    found, once = calibrate(session), calibrate(of_a_cell(1, stops=True, seed=seed)[1])
+    assert sum(not it.used for it in found.cell.sights) <= 0.01 * len(found.cell.sights)
+    for name, edge in found.edges.items():
+        assert edge.sigma_mm > 0.6 * once.edges[name].sigma_mm, name
+        assert off(cell, found, name) < 22.5, name
+
+
+def test_rows_of_a_cell_in_which_the_robot_stands_still_are_of_one_stop():
+    _, session = of_a_cell(3, stops=True, seed=1)
+    _, unnamed = of_a_cell(3, stops=False, seed=1)
+    stations = [it.station for it in session.observations]
+    assert len(set(stations)) == 14
+    # Without stops, rows that tell no robot's pose stand alone.
+    told = [it.station for it in unnamed.observations if it.robots]
+    assert len(set(told)) == 14
+    named, other = calibrate(session), calibrate(unnamed)
+    for name, edge in named.edges.items():
+        assert other.edges[name].sigma_mm == pytest.approx(edge.sigma_mm, rel=1e-3), name
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_lens_is_not_moved_by_what_repeated_views_have_wrong_alike(seed):
+    """The bias is within the noise of one view, and clear in fourteen that count as one."""
+    cell, session = of_a_cell(1, stops=True, seed=seed, bias_px=SIGMA_PX)
+    found = calibrate(session)
+    assert found.cell.joint_fit.cameras == {"left": (), "right": ()}
+    for name in found.edges:
+        assert off(cell, found, name) < 22.5, name

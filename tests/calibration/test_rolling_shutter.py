@@ -1,0 +1,178 @@
+"""Rolling shutters: rows of an image that are taken one after the other, seen by a moving robot."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.cells import calibrated_sweep
+from support.marks import slow
+from support.swept_cells import HOW, cell_of, swept_session
+
+from visioncal.calibration.pipeline import align, calibrate
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.stages import clock
+from visioncal.core.transforms import exp, invert, log
+from visioncal.core.types import MOUNTS
+from visioncal.estimation.corners import CornerStack
+from visioncal.estimation.effects import EFFECTS
+from visioncal.estimation.effects.delays import (
+    delayed_points,
+    shares_of,
+    target_twists,
+)
+from visioncal.present.recording import write_recording
+from visioncal.present.report.content import method_facts
+from visioncal.session import Session
+from visioncal.simulation import CellOptions, Sweep, SweepOptions, sweep, sweep_session, write_sweep
+from visioncal.simulation.layout import NetworkOptions
+from visioncal.vision.targets import numbered_positions
+
+READOUT_S = 0.0124
+# 12 s at 30 Hz, at up to 0.2 m/s and 0.5 rad/s.
+HURRIED = SweepOptions(stops=8, camera_minus_robot_s=0.037, readout_s=READOUT_S)
+MOUNTED = pytest.mark.parametrize("mount", MOUNTS)
+
+
+def swept(seed: int, how: SweepOptions = HURRIED, **options) -> Sweep:
+    return sweep(CellOptions(seed=seed, pixel_sigma_px=0.1, **options), how)
+
+
+def x_error(moved: Sweep, known: RunState) -> np.ndarray:
+    """(6,) right perturbation of the camera's edge, true to estimated."""
+    return log(invert(next(iter(moved.cell.transforms.values()))) @ known.solved.state.edges[0])
+
+
+def distance(error: np.ndarray, covariance: np.ndarray) -> float:
+    """Squared, in units of its covariance."""
+    return float(error @ np.linalg.solve(covariance, error))
+
+
+@MOUNTED
+def test_a_target_moves_in_front_of_the_camera_as_finite_motion_has_it(mount):
+    rng, step_s = np.random.default_rng(0), 1e-4
+    x, z = (exp(rng.normal(size=6) * [0.3, 0.3, 0.3, 0.1, 0.1, 0.1]) for _ in range(2))
+    flange, speeds = exp(rng.normal(size=(4, 6))), rng.normal(size=(4, 6))
+
+    def seen(at_s):
+        chain = flange @ exp(speeds * at_s)
+        return invert(chain @ x) @ z if mount == "eye-in-hand" else invert(x) @ chain @ z
+
+    twists = target_twists(mount, flange, x, seen(0.0), speeds)
+    moved = log(invert(seen(-step_s)) @ seen(step_s)) / (2.0 * step_s)
+    # Central differences of a screw motion are exact but for rounding.
+    np.testing.assert_allclose(twists, moved, atol=1e-9)
+
+
+def test_corners_move_with_the_readout_as_differences_say():
+    moved = swept(0, replace(HURRIED, stops=3))
+    camera, target = moved.cell.options.camera, moved.cell.options.target
+    stack = CornerStack.of({it.view: it for it in moved.cell.corners}, numbered_positions([target]))
+    shares = shares_of(EFFECTS, stack, camera)
+    # Rows from the first to the last.
+    assert -0.5 <= shares.min() < -0.3
+    assert 0.3 < shares.max() <= 0.5
+    twists = np.random.default_rng(1).normal(size=(len(stack.views), 6))
+    step_s = 1e-6
+    _, jacobian = delayed_points(stack, shares, twists, np.array([READOUT_S]))
+    ahead, behind = (
+        delayed_points(stack, shares, twists, np.array([READOUT_S + it]))[0]
+        for it in (step_s, -step_s)
+    )
+    # Places of 0.3 m at rounding over the step.
+    np.testing.assert_allclose(jacobian[:, :, 0], (ahead - behind) / (2 * step_s), atol=1e-8)
+
+
+def test_the_simulation_takes_every_row_at_its_own_time():
+    moved, still = swept(1), swept(1, replace(HURRIED, readout_s=0.0))
+    cell, camera = moved.cell, moved.cell.options.camera
+    away_px = []
+    for at, (late, stamped) in enumerate(
+        zip(cell.exact_corners, still.cell.exact_corners, strict=True)
+    ):
+        both, here, there = np.intersect1d(late.ids, stamped.ids, return_indices=True)
+        off = late.px[here] - stamped.px[there]
+        rows = late.px[here, 1] / (camera.resolution[1] - 1) - 0.5
+        away_px.append(np.abs(off).max())
+        # In the middle row nothing moves; elsewhere the more, the farther from it.
+        near = np.abs(rows) < 0.02
+        assert np.all(np.abs(off[near]) < 0.3), at
+        assert len(both) > 4
+    assert max(away_px) > 2.0
+
+
+@MOUNTED
+@pytest.mark.parametrize("seed", [1, slow(2)])
+def test_the_readout_is_found_and_the_camera_is_where_it_is(seed, mount):
+    moved = swept(seed, mount=mount)
+    known = calibrated_sweep(moved)
+    (found,) = known.clock.delays
+    assert found.is_clear
+    # Four sigma, of which none is so large that this were easy: a hundredth of the readout.
+    assert abs(found.time_s - READOUT_S) < 4.0 * found.sigma_s
+    assert found.sigma_s < 0.01 * READOUT_S
+    error, covariance = x_error(moved, known), known.solved.covariance[:6, :6]
+    # Six degrees of freedom: one in ten thousand is beyond.
+    assert distance(error, covariance) < 27.9
+    assert known.pixel_px == pytest.approx(0.1, rel=0.05)
+    assert known.verdict.status == "good"
+
+
+@pytest.mark.slow
+def test_a_readout_that_is_ignored_moves_the_camera(monkeypatch):
+    moved = swept(1)
+    covariance = calibrated_sweep(moved).solved.covariance[:6, :6]
+    monkeypatch.setattr(clock, "find_delays", lambda *_: (None, ()))
+    away = x_error(moved, calibrated_sweep(moved))[3:]
+    # Five sigma of what is possible.
+    assert np.linalg.norm(away) > 5.0 * np.sqrt(np.trace(covariance[3:, 3:]))
+
+
+@pytest.mark.parametrize("seed", [3, slow(4)])
+def test_a_global_shutter_is_not_mistaken(seed):
+    known = calibrated_sweep(swept(seed, replace(HURRIED, readout_s=0.0)))
+    (found,) = known.clock.delays
+    assert not found.is_clear
+    shutter = known.clock.result().shutter
+    assert shutter.kind == "global"
+    assert abs(shutter.readout_s) < 4.0 * shutter.readout_sigma_s
+    assert not any("rolling" in it for it in known.notes)
+
+
+def test_it_is_said_and_written(tmp_path):
+    folder = write_sweep(swept(5), tmp_path / "swept")
+    result = calibrate(folder)
+    shutter = result.clock.shutter
+    assert shutter.kind == "rolling"
+    # A line's time is that of the whole over the 799 steps between 800 rows.
+    assert shutter.line_s == pytest.approx(shutter.readout_s / 799)
+    (said,) = [it for it in result.verdict.reasons if "rolling shutter" in it]
+    readout_ms = 1e3 * shutter.readout_s
+    assert f"the image's last line is taken {readout_ms:.2f} ms after the first" in said
+    (fact,) = [it for it in method_facts(result) if it.label == "rolling shutter"]
+    # It is rounded by its sigma, to some hundredths of a millisecond.
+    assert float(fact.value.split()[0]) == pytest.approx(readout_ms, abs=0.01)
+    # A recording has what was seen, not what was set straight.
+    write_recording(tmp_path / "it.rrd", Session.load(folder), None, (), None)
+    assert calibrate(tmp_path / "it.rrd").clock == result.clock
+
+
+def test_poses_that_others_measured_say_nothing_of_rows():
+    session = sweep_session(swept(6, replace(HURRIED, readout_s=0.0, stops=5)), "swept")
+    assert calibrate(session).clock.shutter is None
+
+
+def test_a_camera_of_a_whole_cell_has_its_own():
+    cell = cell_of(NetworkOptions(stops=16, seed=1), replace(HOW, readout_s=READOUT_S))
+    session, corners = swept_session(cell)
+    found = align(session, corners=corners)
+    (told,) = found.details.clocks.values()
+    shutter = told.shutter
+    assert shutter.kind == "rolling"
+    assert abs(shutter.readout_s - READOUT_S) < 4.0 * shutter.readout_sigma_s
+    edge = found.between("base_a", "cam_side")
+    away = log(invert(cell.between("base_a", "cam_side")) @ edge.matrix)
+    # Chi-square of 6 beyond 22 is 0.1 %.
+    assert distance(away, edge.covariance) < 22.0
+    assert any(
+        "cam_side and robot b: The camera has a rolling" in it for it in found.verdict.reasons
+    )

@@ -1,0 +1,386 @@
+"""What stops tell of an arm: ranks, names of what they do not, indices, sigmas, and worth."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.arms import ERROR_RAD, NOISE, TOOL, arm_data, erring, problem_of
+from support.cells import calibrated
+from support.edges import solved
+from support.wrong_arms import WRONG_LINKS
+
+import visioncal
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.stages.arm_identifiability import identify_arm
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import exp, invert, log
+from visioncal.core.types import MOUNTS
+from visioncal.estimation.indices import Indices
+from visioncal.estimation.linalg import covariance_from
+from visioncal.estimation.parameters import free_parameters, parameter_moves
+from visioncal.estimation.parts import Effect
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.solve import fisher_information
+from visioncal.estimation.variance import Knowledge
+from visioncal.estimation.workspace import postures
+from visioncal.results import to_document
+from visioncal.robot import CONVENTIONS, Robot, convert_table, load_robot, robot_names, table_of
+from visioncal.robot.jacobians import number_jacobian, table_moves
+from visioncal.robot.tables import table_document, table_from_document
+from visioncal.simulation import simulate
+
+# Three axes and a wrist, with rails among them.
+CRANE = {
+    "schema": 1,
+    "name": "crane",
+    "convention": "standard",
+    "joint": [
+        {"type": "prismatic", "a_m": 0.1, "alpha_rad": -1.2, "d_m": 0.5},
+        {"a_m": 0.4, "alpha_rad": 0.7, "d_m": 0.1},
+        {"type": "prismatic", "a_m": 0.2, "alpha_rad": 1.3, "d_m": 0.3},
+        {"a_m": 0.1, "alpha_rad": -1.1, "d_m": 0.2},
+        {"a_m": 0.05, "alpha_rad": 1.4, "d_m": 0.1},
+        {"a_m": 0.0, "alpha_rad": 0.0, "d_m": 0.1},
+    ],
+}
+for row in CRANE["joint"]:
+    if "type" in row:
+        row |= {"lower_m": -0.4, "upper_m": 0.4}
+
+
+def robot_of(name):
+    return Robot.from_document(CRANE) if name == "crane" else load_robot(name)
+
+
+def wrong(robot, rng):
+    """An arm whose every link, and every revolute joint's function, is off by a milliradian."""
+    functions = 1e-3 * rng.normal(size=(robot.joint_count, 4)) * [1.0, 0.0, 1.0, 1.0]
+    functions[robot.chain.prismatic, 2:] = 0.0
+    return robot.corrected(1e-3 * rng.normal(size=(robot.joint_count + 1, 6)), functions)
+
+
+def rows_of(table):
+    """(n, 5) theta, d, a, alpha and beta of each Z_i X_i."""
+    n = len(table)
+    names = ("theta_rad", "d_m", "a_m", "alpha_rad", "beta_rad")
+    return np.stack([getattr(table, it)[-n:] for it in names], axis=1)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("name", [*robot_names(), "crane"])
+def test_a_table_moves_as_its_derivatives_say(name, convention):
+    robot, rng = robot_of(name), np.random.default_rng(0)
+    like = convert_table(table_from_document(robot.document), convention)
+    arm = wrong(robot, rng)
+    table = table_of(arm, convention, like=like)
+    twists = rng.normal(size=(3, len(table) + 1, 6))
+    functions = rng.normal(size=(3, len(table), 4)) * [1.0, 0.0, 0.0, 0.0]
+    # Common normals of nearly parallel axes run away with the inverse square of the angle.
+    step = 1e-7 if convention == "hayati" else 1e-9
+    for by, turn, way in zip(
+        table_moves(arm, table, twists, functions), twists, functions, strict=True
+    ):
+        ends = [
+            rows_of(table_of(arm.corrected(it * turn, it * way), convention, like=like))
+            for it in (step, -step)
+        ]
+        # Base and flange are tilted by some mrad, whose product with a step is left out.
+        assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(by, rel=0.01, abs=0.01)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("name", ["ur5e", "panda", "crane"])
+def test_the_flange_moves_with_a_table_as_its_derivatives_say(name, convention):
+    robot, step = robot_of(name), 1e-6
+    table = convert_table(table_from_document(robot.document), convention)
+    q = postures(robot)[:2]
+    middle = robot.base_from_flange(q)
+    numbers, _ = number_jacobian(table, q)
+    for place, column in enumerate(("theta_rad", "d_m", "a_m", "alpha_rad", "beta_rad")):
+        values = getattr(table, column)
+        for row in range(len(values)):
+            if column == "beta_rad" and not table.parallel[row]:
+                continue
+            # X_0 stands in a row of its own in Craig's form alone.
+            if len(values) > len(table) and row == 0 and convention != "modified":
+                continue
+            link = row if len(values) > len(table) else row + 1
+            ends = []
+            for way in (step, -step):
+                moved = values.copy()
+                moved[row] += way
+                document = table_document(replace(table, **{column: moved}))
+                ends.append(Robot.from_document(document).base_from_flange(q))
+            slope = (log(invert(middle) @ ends[0]) - log(invert(middle) @ ends[1])) / (2 * step)
+            # Central differences of a step of 1e-6 are exact to 1e-9.
+            assert slope == pytest.approx(numbers[:, :, link, place], abs=1e-7)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("name", [*robot_names(), "crane"])
+def test_ranks_are_those_of_theory(name, mount):
+    """Everett and Hsu (1988): 4 a revolute joint, 2 a prismatic one, and 6 for the frames."""
+    robot = robot_of(name)
+    rails = int(robot.chain.prismatic.sum())
+    turning = robot.joint_count - rails
+    told = identify_arm(arm_data(robot, postures(robot)[:40], mount)).told
+    expected = 4 * turning + 2 * rails + 6
+    assert told.columns == 12 + 6 * robot.joint_count
+    assert (told.identifiable, told.told, told.missing.shape[1]) == (expected, expected, 0)
+    # Forty stops all over the workspace tell all of it well.
+    assert len(told.values) == expected - 12
+
+
+@pytest.mark.parametrize("name", ["ur5e", "irb120", "panda"])
+def test_readings_of_one_point_tell_three_values_less(name):
+    """A point of the tool has a place and no direction."""
+    robot = load_robot(name)
+    arm = arm_data(robot, postures(robot)[:60], "eye-to-hand")
+    whole, point = (
+        identify_arm(arm).told,
+        identify_arm(replace(arm, measured=np.arange(6) > 2)).told,
+    )
+    assert (point.identifiable, point.told) == (whole.identifiable - 3, whole.told - 3)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_a_second_board_adds_six_values(mount):
+    robot = load_robot("ur5e")
+    arm = arm_data(robot, postures(robot)[:40], mount)
+    seen = np.where(np.arange(40)[:, None, None] % 2 == 1, np.eye(6), 0.0)
+    place = Effect.free("board", Knowledge(np.zeros((6, 6)), np.zeros(6)), seen)
+    problem = arm.problem.with_effects([place, *arm.problem.effects])
+    state = replace(arm.state, values=problem.start_values)
+    covariance = covariance_from(fisher_information(problem, state, arm.noise))
+    further = {"frames": np.arange(18), "columns": 6 + arm.columns}
+    telling = identify_arm(
+        replace(arm, problem=problem, state=state, covariance=covariance, **further)
+    )
+    told = telling.told
+    assert (told.columns, told.identifiable, told.told) == (54, 36, 36)
+    # Half of the stops have a board of their own to place: they tell less of the arm.
+    assert np.median(telling.sigmas_m) > np.median(identify_arm(arm).sigmas_m)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_offsets_of_the_first_and_the_last_joint_are_never_told(mount):
+    robot = load_robot("ur5e")
+    telling = identify_arm(arm_data(robot, postures(robot)[:40], mount, ("offsets",)))
+    assert (telling.told.identifiable, telling.told.told) == (16, 16)
+    assert telling.not_told == (
+        "the offset of joint 1 (shoulder_pan_joint) cannot be told from the base frame",
+        "the offset of joint 6 (wrist_3_joint) cannot be told from the tool frame",
+    )
+    assert telling.advice == ""
+    # Both sines of each encoder are told, however the arm is mounted.
+    both = identify_arm(arm_data(robot, postures(robot)[:60], mount, ("links", "eccentricity")))
+    assert (both.told.identifiable, both.told.told) == (42, 42)
+
+
+@pytest.mark.parametrize("name", ["ur3e", "ur5", "ur5e", "ur10", "ur10e", "ur16e"])
+def test_beta_is_chosen_for_parallel_axes(name):
+    robot = load_robot(name)
+    data = arm_data(robot, postures(robot)[:40])
+    by_default, standard = identify_arm(data), identify_arm(data, "standard")
+    assert (by_default.convention, standard.convention) == ("hayati", "standard")
+    betas = [it.parameter.joint for it in by_default.estimates if it.parameter.kind == "beta"]
+    assert betas == [1, 2]
+    # Four numbers a joint, six of which hide in the frames at both ends.
+    assert len(by_default.estimates) == 24
+    assert len(by_default.not_told) == 6
+    summed = "the lengths d of joints 2, 3, 4 (parallel axes): only their sum is told"
+    assert summed in standard.not_told
+    assert summed not in by_default.not_told
+
+
+def test_what_hides_in_the_frames_depends_on_the_convention():
+    robot = load_robot("panda")
+    data = arm_data(robot, postures(robot)[:40])
+    lost = {it: identify_arm(data, it).not_told for it in CONVENTIONS}
+    # Craig's first row lies before the first axis; Denavit and Hartenberg's last behind the last.
+    assert any(it.startswith("the twist alpha of joint 1 ") for it in lost["modified"])
+    assert any(it.startswith("the twist alpha of joint 7 ") for it in lost["standard"])
+    assert all(len(it) == 6 for it in lost.values())
+
+
+def test_a_joint_that_hardly_moved_is_named():
+    robot = load_robot("ur5e")
+    q = postures(robot)[:40].copy()
+    q[:, 4] = 1.2 + np.deg2rad(np.linspace(-1.0, 1.0, len(q)))
+    telling = identify_arm(arm_data(robot, q))
+    assert telling.told.identifiable == 30
+    assert 26 <= telling.told.told < 30
+    assert len(telling.not_told) == 7
+    assert "joint 5 (wrist_2_joint) moved by 2 deg only" in telling.not_told[-1]
+    assert "joint 5 by" in telling.advice
+    assert f"tell {telling.told.told} of the 30" in telling.advice
+    # Done as advised, all is told.
+    wanted = float(telling.advice.split("joint 5 by ")[1].split(" deg")[0])
+    q[:, 4] += np.deg2rad(np.random.default_rng(1).uniform(-0.5, 0.5, len(q)) * wanted)
+    assert identify_arm(arm_data(robot, q)).told.told == 30
+
+
+def test_two_joints_that_stood_still_are_named():
+    robot = load_robot("irb120")
+    q = postures(robot)[:40].copy()
+    q[:, [2, 3]] = [0.2, 0.4]
+    telling = identify_arm(arm_data(robot, q))
+    assert telling.told.told < 30
+    named = {"joint 3 (joint_3)", "joint 4 (joint_4)"}
+    assert {it for it in named if it in telling.not_told[-1]} == named
+    assert telling.not_told[-1].count("by 0 deg") == 2
+    assert telling.not_told[-1].endswith(" and others")
+
+
+def test_a_rail_that_stood_still_is_named_in_millimetres():
+    robot = robot_of("crane")
+    q = postures(robot)[:40].copy()
+    q[:, 2] = 0.1
+    telling = identify_arm(arm_data(robot, q))
+    assert telling.told.told < telling.told.identifiable
+    assert "joint 3 (joint_3) moved by 0 mm only" in telling.not_told[-1]
+    assert "mm or more" in telling.advice
+
+
+def test_the_indices_are_as_published():
+    found = Indices.of(np.array([8.0, 4.0, 2.0]), 4)
+    assert found.o1 == pytest.approx(4.0 / 2.0)
+    assert (found.o2, found.condition, found.o3) == pytest.approx((0.25, 4.0, 2.0))
+    assert found.o4 == pytest.approx(0.5)
+    assert found.o5 == pytest.approx(1.0 / (1 / 8 + 1 / 4 + 1 / 2))
+
+
+def test_better_stops_have_better_indices():
+    robot = load_robot("ur5e")
+    q = postures(robot)[:60]
+    # Near one posture all slopes look alike.
+    near = q.mean(axis=0) + 0.3 * (q - q.mean(axis=0))
+    wide, narrow = (identify_arm(arm_data(robot, it)).indices for it in (q, near))
+    for name in ("o1", "o2", "o3", "o4", "o5"):
+        assert getattr(wide, name) > 1.5 * getattr(narrow, name)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_the_worth_of_a_stop_is_that_of_a_fit_without_it(mount):
+    robot = load_robot("ur5e")
+    arm = arm_data(robot, postures(robot)[:15], mount)
+    telling = identify_arm(arm)
+    anywhere = postures(arm.model.robot)
+    flange = arm.model.base_from_flange(anywhere)
+    poses, jacobian = arm.pair.jacobian(flange, arm.basis(anywhere))
+    place = arm.pair.place_jacobian(poses, jacobian, arm.at)
+
+    def variance(problem: Problem) -> float:
+        fitted = covariance_from(fisher_information(problem, arm.state, arm.noise))
+        return float(np.mean(np.einsum("mij,jk,mik->m", place, fitted, place)))
+
+    whole = variance(arm.problem)
+    for stop in range(15):
+        rest = arm.problem.subset(np.arange(15) != stop)
+        # Exact but for rounding.
+        assert telling.worth[stop] == pytest.approx(variance(rest) / whole - 1.0, rel=1e-6)
+    assert telling.worth.min() > 0.0
+    assert telling.sigmas_m == pytest.approx(
+        np.sqrt(np.einsum("mij,jk,mik->m", place, arm.covariance, place))
+    )
+
+
+@pytest.mark.parametrize(("name", "convention"), [("ur5e", "hayati"), ("panda", "modified")])
+def test_sigmas_hold_the_errors_of_the_numbers(name, convention):
+    """Twenty arms drawn from what is known of them beforehand, and measured with noise."""
+    robot = load_robot(name)
+    rng, surprises = np.random.default_rng(3), []
+    for _ in range(20):
+        model = erring(robot)
+        q = postures(robot, 200)[rng.permutation(60)[:25]]
+        true = model.moved(ERROR_RAD * rng.normal(size=len(model.values)))
+        noise = exp(rng.normal(size=(2, 25, 6)) * np.repeat(NOISE.robots[0], 3))
+        flange = true.robot.base_from_flange(q) @ noise[0]
+        result = solved(problem_of(model, "eye-in-hand", q, flange, noise[1]))
+        found = model.moved(result.state.values)
+        arm = replace(
+            arm_data(robot, q),
+            problem=problem_of(found, "eye-in-hand", q, flange, noise[1]),
+            state=result.state,
+            noise=result.noise,
+            covariance=result.covariance,
+            model=found,
+        )
+        telling = identify_arm(arm, convention)
+        like = convert_table(table_from_document(robot.document), convention)
+        wanted = table_of(true.bare, convention, like=like)
+        # What the frames hide keeps what was stated, which says nothing of the sigma.
+        told = [it for it in telling.estimates if it.sigma < 0.4 * ERROR_RAD * it.parameter.unit]
+        surprises += [(it.identified - it.parameter.value(wanted)) / it.sigma for it in told]
+    assert len(surprises) > 20 * 14
+    # Some four hundred squares, of which a few numbers of each arm hang together: 10 % each.
+    assert np.mean(np.square(surprises)) == pytest.approx(1.0, abs=0.25)
+
+
+def test_parameters_of_the_level_alone_are_told():
+    model = erring(load_robot("ur5e"), ("offsets", "eccentricity"))
+    table = convert_table(table_from_document(model.nominal.document), "hayati")
+    kinds = {it.kind for it in free_parameters(model, table)}
+    assert kinds == {"theta", "sine", "cosine"}
+    moves = parameter_moves(model, table, free_parameters(model, table))
+    # Each value is one number of the table.
+    assert np.abs(moves).sum(axis=0) == pytest.approx(np.ones(len(model.values)))
+
+
+@pytest.fixture(scope="module")
+def calibrated_cell():
+    cell = simulate(replace(WRONG_LINKS, seed=7))
+    return cell, calibrated(cell)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_the_result_is_in_the_convention_that_is_asked_for(calibrated_cell, convention):
+    cell, known = calibrated_cell
+    assert known.arm_found.telling.convention == "hayati"
+    asked = replace(known, convention=convention)
+    (examine_again,) = (it for it in STAGES if it.name == "examine")
+    known = examine_again.run(asked)
+    found = json.loads(json.dumps(to_document(result_of(known)), allow_nan=False))["kinematics"]
+    assert found["convention"] == convention
+    changes = {(it["joint"], it["name"]): it for it in found["parameters"]}
+    assert (("elbow_joint", "beta_rad") in changes) == (convention == "hayati")
+    # Across from the first axis to the second, which every convention tells to 0.1 mrad.
+    row = "shoulder_lift_joint" if convention == "modified" else "shoulder_pan_joint"
+    alpha = changes[row, "alpha_rad"]
+    assert alpha["sigma"] < 1e-4
+    assert alpha["identified"] == pytest.approx(cell.true_arm.alpha[0], abs=4 * alpha["sigma"])
+    places = found["workspace_map"]
+    assert 150 < len(places) <= 200
+    assert all(0.0 < it["sigma_mm"] < 5.0 and it["z_m"] > 0.0 for it in places)
+    worths = [it["worth"] for it in found["stops"]]
+    assert worths == sorted(worths, reverse=True)
+    assert {it["view"] for it in found["stops"]} == set(known.used)
+    told = found["observability"]
+    assert (told["columns"], told["identifiable"], told["told"]) == (48, 30, 30)
+    assert told["condition"] == pytest.approx(1.0 / told["o2"])
+
+
+def test_a_tool_on_the_flange_is_no_change_of_the_arm():
+    model = erring(load_robot("ur5e"))
+    assert np.abs(TOOL - np.eye(4)).max() > 0.05
+    telling = identify_arm(arm_data(model.nominal, postures(model.nominal)[:40]))
+    assert max(abs(it.identified - it.nominal) for it in telling.estimates) < 1e-12
+
+
+def test_a_missing_direction_is_in_the_verdict():
+    """Looking straight at a board leaves the fifth joint of a UR almost where it is."""
+    options = replace(WRONG_LINKS, seed=9, tilt_rad=(0.0, 0.03), roll_rad=0.4, views=40)
+    known = calibrated(simulate(options))
+    assert known.arm_found.telling.told.told < 30
+    assert known.arm_found.telling.advice in known.verdict.reasons
+    assert "joint 5 (wrist_2_joint) moved by 3.9 deg only" in known.arm_found.telling.advice
+    rich = calibrated(simulate(replace(WRONG_LINKS, seed=9, views=40)))
+    assert rich.arm_found.telling.told.told == 30
+    assert not any("that can be told of this arm" in it for it in rich.verdict.reasons)
+
+
+def test_an_unknown_convention_is_refused(rendered):
+    with pytest.raises(DataError, match="'craig' is not one of standard, modified, hayati"):
+        visioncal.calibrate(rendered, convention="craig")

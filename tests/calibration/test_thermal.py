@@ -1,0 +1,402 @@
+"""Drift with temperature: learnt while an arm warms up, predicted, followed, and refused."""
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from support.commands import visioncal as run
+from support.drawn import column
+from support.pages import Page
+from support.warmed import CELL, drift_of, warmed
+
+from visioncal import Session
+from visioncal.calibration.pipeline import calibrate
+from visioncal.calibration.stages.thermal_inputs import inputs_of
+from visioncal.calibration.verification import verify
+from visioncal.calibration.verification.calibration_prior import CalibrationPrior
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.transforms import invert, log
+from visioncal.interchange.exports import document
+from visioncal.present.recording import paths, write_recording
+from visioncal.present.report.page import render
+from visioncal.present.viewer import blueprint
+from visioncal.results import Calibration
+from visioncal.robot import load_robot
+from visioncal.robot.thermal import Heating, Inputs, OnlineCompensator, ThermalModel
+from visioncal.session.streams import Stream
+from visioncal.simulation import Heat, Round, WarmUpOptions, simulate_warm_up
+
+ROBOT = load_robot("ur5e")
+GROWTH, DRIFT = np.full(6, 2e-5), np.array([3.0, -2.0, 4.0, -1.0, 2.0, 0.0]) * 1e-6
+Q = np.random.default_rng(3).uniform(-2.0, 2.0, (7, 6))
+
+
+def model(kind="currents", tau_s=1800.0, gain=2.0):
+    heating = Heating(kind, np.full(6, tau_s), np.full(6, gain))
+    return ThermalModel(
+        ROBOT,
+        heating,
+        np.full(6, 20.0),
+        GROWTH,
+        DRIFT,
+        1e-12 * np.eye(12 + heating.size),
+        ROBOT.chain.placements[:, :3, 3],
+    )
+
+
+def inputs(kind="currents", hours=2.0, seed=0):
+    stamps = np.arange(0.0, 3600.0 * hours, 40.0)
+    told = np.random.default_rng(seed).uniform(2.0, 9.0, (len(stamps), 6))
+    return Inputs(kind, stamps, told, 21.0 + np.sin(stamps / 3000.0))
+
+
+@pytest.fixture(scope="module")
+def learnt():
+    return {
+        told: warmed(temperatures=told == "temperatures") for told in ("temperatures", "currents")
+    }
+
+
+# Over 8 worlds the median share was 0.10 and 0.18, the worst of each 0.14 and 0.34; this world is
+# not the worst. The limits are those that are promised of the median.
+@pytest.mark.parametrize(("told", "limit"), [("temperatures", 0.2), ("currents", 0.25)])
+def test_a_hundred_minutes_predict_five_hours(learnt, told, limit):
+    found = drift_of(learnt[told])
+    assert np.median(found.true) > 2e-4
+    assert found.share < limit
+    # Root mean squares of 60 places that share 18 or 24 parameters.
+    assert 0.4 < found.mahalanobis_sq < 1.8
+
+
+def test_coefficients_are_within_their_sigmas(learnt):
+    found, heat = learnt["temperatures"].calibration.drift, learnt["temperatures"].truth.heat
+    sigmas = np.sqrt(np.diag(found.covariance))
+    off = np.concatenate(
+        [found.growth_per_k - heat.growth_per_k, found.drift_rad_per_k - heat.drift_rad_per_k]
+    )
+    # Chi-square of 12 degrees of freedom is below 32.9 but for one in a thousand; growth was not
+    # drawn from its prior but from a narrower range, which only makes it smaller.
+    assert np.sum((off / sigmas[:12]) ** 2) < 32.9
+
+
+def test_what_is_not_told_stays_at_its_prior_and_is_named(learnt):
+    thermal = learnt["temperatures"].calibration.thermal
+    # The last link is a tenth of a metre: it grows by a micrometre for a kelvin.
+    assert "growth of wrist_3_joint" in thermal.not_told
+    assert thermal.joints[5].growth_per_k == pytest.approx(17.5e-6, abs=5.5e-6)
+    assert "drift of shoulder_lift_joint" not in thermal.not_told
+    assert thermal.residual_mm.with_drift < 0.85 * thermal.residual_mm.without
+
+
+def test_what_is_open_about_the_drift_counts_in_the_edges_covariance(learnt):
+    known, truth = learnt["currents"].calibration, learnt["currents"].truth.cell.transforms
+    away = [log(invert(true) @ known.edges[name].matrix) for name, true in truth.items()]
+    error = np.concatenate(away)
+    # Chi-square of 12 degrees of freedom is below 32.9 but for one in a thousand; a drift taken for
+    # known makes it 36 here, and 53 on average over six worlds.
+    assert error @ np.linalg.solve(known.joint_covariance, error) < 32.9
+    budget = known.uncertainty.budget_mm
+    assert 0.0 < budget["temperature"] < budget["total"]
+    # A check has no use for what the drift's parameters are: the edges' covariance has them.
+    prior_calibration = CalibrationPrior.of(known)
+    assert prior_calibration.covariance[:12, :12] == pytest.approx(known.joint_covariance, rel=1e-9)
+
+
+def test_a_check_says_that_it_takes_the_arm_for_cold(learnt):
+    found = learnt["temperatures"]
+    cold, warm = found.session.views[:24:4], found.session.views[-6:]
+    passed = verify(replace(found.session, views=cold), found.calibration)
+    assert passed.passed
+    assert "as warm as it was at the start (about 21 deg C)" in passed.seen.warnings[-1]
+    # Half a millimetre is no noise, and the reason for it may be what the warning says.
+    failed = verify(replace(found.session, views=warm), found.calibration)
+    assert not failed.passed
+
+
+@pytest.mark.slow
+def test_an_arm_that_is_off_is_calibrated_beside_its_drift():
+    found = warmed(replace(CELL, mount="eye-to-hand", dh_sigma_m=3e-4, dh_sigma_rad=5e-4, seed=2))
+    assert found.calibration.arm.level == "geometry"
+    assert drift_of(found).share < 0.2
+    # A file of the arm has no place for the drift, and says so to whoever reads it.
+    for form in ("robot-dh", "robot-urdf", "robot-json"):
+        written = document(found.calibration, form)
+        assert any("drifts with its temperature" in it for it in written.warnings)
+        assert "the arm with links at 21 deg C" in written.text
+
+
+def test_the_calibration_tells_the_arm_at_any_temperature(learnt, tmp_path):
+    known = learnt["temperatures"].calibration
+    known.save(tmp_path / "calibration.json")
+    again = Calibration.load(tmp_path / "calibration.json")
+    warm = known.drift.reference_c + 15.0
+    at = again.base_from_flange(Q, temperatures_c=warm)
+    cold = again.base_from_flange(Q)
+    assert np.linalg.norm(at.translation - cold.translation, axis=1).min() > 1e-5
+    built = again.at_temperatures(warm).base_from_flange(Q)
+    # The motion is linear in the rise; second order of 0.2 mrad is below 0.1 um at a metre.
+    assert at.translation == pytest.approx(built.translation, abs=2e-7)
+    with pytest.raises(DataError, match=r"shape \(5,\).*6 joints"):
+        known.base_from_flange(Q, temperatures_c=np.zeros(5))
+
+
+def test_motion_is_that_of_the_arm_with_its_links_grown():
+    drifting, links = model(), 20.0 + np.array([12.0, 3.0, 8.0, -4.0, 15.0, 9.0])
+    built = drifting.robot_at(links).base_from_flange(Q)
+    # Second order: growth of 3e-4 times turns of 6e-5 at a metre.
+    assert log(invert(built) @ drifting.base_from_flange(Q, links)) == pytest.approx(0.0, abs=1e-7)
+
+
+@pytest.mark.parametrize("kind", ["temperatures", "currents"])
+def test_links_follow_the_differential_equation(kind):
+    heating, heat = Heating(kind, np.full(6, 900.0), np.full(6, 2.0)), inputs(kind)
+    rest = heating.rest(heat.told, heat.ambient_c)
+    held = 0.5 * (rest[:-1] + rest[1:])
+
+    def slope(t, s):
+        at = min(int(t // 40.0), len(held) - 1)
+        return (held[at] - s) / 900.0
+
+    start = heating.cold(heat.told, heat.ambient_c)
+    end_s = heat.stamps_s[-1]
+    exact = solve_ivp(slope, (0.0, end_s), start, max_step=10.0, rtol=1e-8).y[:, -1]
+    # The integration steps across the jumps of the input; its own error is about a millikelvin.
+    assert heating.links_c(heat, np.array([end_s]))[0] == pytest.approx(exact, abs=0.02)
+
+
+@pytest.mark.parametrize("kind", ["temperatures", "currents"])
+def test_jacobian_are_those_of_small_changes(kind):
+    heating, heat = Heating(kind, np.linspace(300.0, 3000.0, 6), np.linspace(1, 2, 6)), inputs(kind)
+    at_s, step = np.linspace(100.0, 7000.0, 9), 1e-5
+    jacobian = heating.jacobian(heat, at_s)
+    for which in range(heating.size // 6):
+        change = np.zeros(heating.size)
+        change[6 * which : 6 * which + 6] = step
+        ahead, behind = (heating.changed(it).links_c(heat, at_s) for it in (change, -change))
+        # Central differences of steps of 1e-5 are good to about 1e-9 of the rise.
+        assert jacobian[:, :, which] == pytest.approx((ahead - behind) / (2 * step), abs=1e-6)
+
+
+def test_the_flange_moves_with_the_parameters_as_it_is_told():
+    heat, at_s, step = inputs(), np.linspace(100.0, 7000.0, 7), 1e-4
+    before = model()
+    links = before.heating.links_c(heat, at_s)
+    basis = before.basis(Q, links, before.heating.jacobian(heat, at_s))
+    scales = np.repeat([1e-5, 1e-6, 1.0, 1.0], 6)
+    for at in range(24):
+        poses = []
+        for sign in (1.0, -1.0):
+            change = sign * step * scales * (np.arange(24) == at)
+            other = replace(
+                before,
+                growth_per_k=GROWTH + change[:6],
+                drift_rad_per_k=DRIFT + change[6:12],
+                heating=before.heating.changed(change[12:]),
+            )
+            poses.append(other.base_from_flange(Q, other.heating.links_c(heat, at_s)))
+        seen = log(invert(poses[1]) @ poses[0]) / (2.0 * step)
+        # Columns are of first order in a motion of half a milliradian.
+        assert scales[at] * basis[:, :, at] == pytest.approx(seen, abs=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["temperatures", "currents"])
+def test_the_compensator_follows_what_the_fit_computes(kind):
+    heat, drifting = inputs(kind), model(kind)
+    following = OnlineCompensator(drifting)
+    given = heat.told if kind == "temperatures" else np.sqrt(heat.told)
+    name = "temperatures_c" if kind == "temperatures" else "currents_a"
+    for stamp_s, row, air in zip(heat.stamps_s, given, heat.ambient_c, strict=True):
+        following.feed(stamp_s, **{name: row}, ambient_c=air)
+    links = drifting.heating.links_c(heat, heat.stamps_s[-1:])[0]
+    assert following.links_c == pytest.approx(links, abs=1e-9)
+    assert following.base_from_flange(Q) == pytest.approx(drifting.base_from_flange(Q, links))
+    assert following.robot.base_from_flange(Q) == pytest.approx(
+        following.base_from_flange(Q), abs=2e-7
+    )
+    # What is open about time constants and gains is followed along.
+    heated = np.tile(drifting.heating.jacobian(heat, heat.stamps_s[-1:]), (len(Q), 1, 1))
+    sigma_m = drifting.sigma_m(Q, links, heated)
+    assert following.sigma_m(Q) == pytest.approx(sigma_m, rel=1e-9)
+    assert (sigma_m > drifting.sigma_m(Q, links)).all()
+
+
+def test_advice_says_when_the_arm_is_warm():
+    following, drifting = OnlineCompensator(model()), model()
+    for minute in range(10):
+        following.feed(60.0 * minute, currents_a=np.full(6, 3.0), ambient_c=20.0)
+    advice = following.advice(Q[0], 0.2)
+    assert advice.rate_um_min > 0.2
+    assert "go on warming up" in advice.words
+    stamp_s = 540.0 + advice.wait_s
+    following.feed(stamp_s, currents_a=np.full(6, 3.0), ambient_c=20.0)
+    assert following.advice(Q[0], 0.2).wait_s == 0.0
+    # The rate is really that: the flange a minute apart.
+    places = []
+    for later in (0.0, 60.0):
+        if later:
+            following.feed(stamp_s + later, currents_a=np.full(6, 3.0), ambient_c=20.0)
+        places.append(drifting.base_from_flange(Q[:1], following.links_c)[0, :3, 3])
+    rate = 1e6 * float(np.linalg.norm(places[1] - places[0]))
+    # Over a minute of a time constant of thirty the rate falls by a thirtieth.
+    assert rate == pytest.approx(0.2, rel=0.05)
+
+
+def test_advice_by_temperatures_comes_from_how_they_level_out():
+    following = OnlineCompensator(model("temperatures", tau_s=120.0))
+    assert following.advice(Q[0], 0.5).rate_um_min is None
+    for stamp_s in np.arange(0.0, 3000.0, 20.0):
+        rise = 20.0 * (1.0 - np.exp(-stamp_s / 1800.0))
+        following.feed(stamp_s, temperatures_c=20.0 + rise * np.ones(6))
+    advice = following.advice(Q[0], 0.2)
+    wait_s = 1800.0 * np.log(advice.rate_um_min / 0.2)
+    # The rate is an average over ten minutes, and so is how it falls.
+    assert advice.wait_s == pytest.approx(wait_s, rel=0.1)
+
+
+def test_the_compensator_refuses_what_does_not_fit():
+    following = OnlineCompensator(model())
+    with pytest.raises(DataError, match="no sample"):
+        _ = following.robot
+    with pytest.raises(DataError, match="fitted to currents"):
+        following.feed(0.0, temperatures_c=np.full(6, 30.0))
+    following.feed(0.0, currents_a=np.ones(6))
+    with pytest.raises(DataError, match="does not come after"):
+        following.feed(0.0, currents_a=np.ones(6))
+    with pytest.raises(DataError, match="not above zero"):
+        following.advice(Q[0], 0.0)
+
+
+def still(**changes):
+    """A session at a constant temperature."""
+    heat = replace(Heat.drawn(0), k_per_a2=np.zeros(6), ambient_swing_k=0.0)
+    short = Round(minutes=30.0)
+    return simulate_warm_up(WarmUpOptions(CELL, heat, short, hours=0.6)).session("still", **changes)
+
+
+def test_a_session_at_one_temperature_is_refused():
+    session = still()
+    with pytest.raises(DegenerateError, match=r"change by at most .* K in the 0\.42 h") as refused:
+        calibrate(session, level="thermal")
+    assert "cold robot" in refused.value.next_step
+    known = calibrate(session)
+    assert known.thermal is None
+
+
+def test_currents_that_warm_nothing_yet_are_refused():
+    with pytest.raises(DegenerateError, match="% of the way"):
+        calibrate(
+            simulate_warm_up(
+                WarmUpOptions(CELL, round=Round(minutes=4.0, every_s=120.0), hours=0.1)
+            ).session("short", temperatures=False),
+            level="thermal",
+        )
+
+
+def test_a_session_without_temperatures_is_refused_by_the_columns_that_lack(learnt):
+    session = learnt["temperatures"].session
+    heat = session.streams["heat"]
+    with pytest.raises(DataError, match=r"temp1_c \.\.\. temp6_c or current1_a"):
+        calibrate(replace(session, streams={}), level="thermal")
+    five = [at for at, it in enumerate(heat.columns) if it != "temp6_c"]
+    fewer = Stream(tuple(heat.columns[at] for at in five), heat.values[:, five])
+    with pytest.raises(DataError, match="temp6_c of temp1_c"):
+        calibrate(session.with_streams({"heat": fewer}), level="thermal")
+    soon = Stream(heat.columns, heat.values[heat.stamps_s < 3000.0])
+    with pytest.raises(
+        DataError, match=r"from 0 to 2990 s, and views were taken from 0 to 57\d\d s"
+    ):
+        calibrate(session.with_streams({"heat": soon}), level="thermal")
+
+
+def test_kelvin_is_no_celsius(learnt, tmp_path):
+    session = learnt["temperatures"].session
+    session.save(tmp_path / "warm")
+    path = tmp_path / "warm" / "streams" / "heat.csv"
+    head, *rows = path.read_text(encoding="utf-8").splitlines()
+    kelvin = [",".join([it.split(",")[0], *[repr(float(n) + 273.15) for n in it.split(",")[1:]]])
+              for it in rows]  # fmt: skip
+    path.write_text("\n".join([head, *kelvin]) + "\n", encoding="utf-8")
+    with pytest.raises(DataError, match=r"heat\.csv, column temp1_c: .*looks like kelvin"):
+        Session.load(tmp_path / "warm")
+
+
+def test_a_view_in_kelvin_is_named(learnt):
+    session = learnt["temperatures"].session
+    columns = (*session.columns, "ambient_c")
+    cells = [[*(it.cell(name) for name in session.columns), "21.5"] for it in session.views]
+    cells[4][-1] = "294.65"
+    with pytest.raises(DataError, match=re.escape("row 5, column ambient_c: 294.65")):
+        Session.assemble(session.document, columns, cells, session.images)
+
+
+def test_samples_that_are_many_are_averaged():
+    stamps = np.arange(0.0, 2000.0, 0.1)
+    values = np.column_stack([stamps, np.tile([2.0], (len(stamps), 6))])
+    names = ("stamp_s", *(f"current{it}_a" for it in range(1, 7)))
+    session = still().with_streams({"fast": Stream(names, values)})
+    session = replace(session, streams={"fast": session.streams["fast"]})
+    found, _ = inputs_of(session, 6)
+    assert found.kind == "currents"
+    assert len(found.stamps_s) <= 8192
+    assert found.told == pytest.approx(4.0)
+
+
+def test_report_and_recording_show_the_drift(learnt, tmp_path):
+    found = learnt["temperatures"]
+    page = Page(render(found.calibration, found.session, ()))
+    assert "Drift with temperature" in page.text
+    assert "Steel grows by 12, aluminium by 23" in page.text
+    assert "seen by the stops" in page.text
+    seen = found.calibration.thermal.seen
+    # Of the six views that are looked at again every five minutes, one is in the posture drawn.
+    assert [it.stamp_s // 300.0 for it in seen] == list(range(20))
+    course = found.calibration.thermal.course
+    told = np.interp(
+        [it.stamp_s for it in seen],
+        [it.stamp_s for it in course],
+        [it.drift_mm for it in course],
+    )
+    off = np.array([it.drift_mm for it in seen]) - told
+    # Poses that are measured to about 0.05 mm along one direction, of twenty stops.
+    assert abs(off.mean()) < 0.04
+    assert 0.01 < off.std() < 0.1
+    path = tmp_path / "drift.rrd"
+    layout = blueprint(found.session, found.calibration)
+    write_recording(path, found.session, found.calibration, (), layout)
+    drifts = [it[0] for it in column(path, paths.DRIFT_MM, "Scalars:scalars").values()]
+    views = found.calibration.thermal.views
+    assert len(views) == len(found.session.views)
+    assert sorted(drifts) == pytest.approx(sorted(it.drift_mm for it in views))
+
+
+def test_correct_goes_by_the_temperatures(learnt, tmp_path):
+    known = learnt["temperatures"].calibration
+    known.save(tmp_path / "calibration.json")
+    q = np.array([[0.4, -1.3, 1.5, -1.75, -1.57, 0.3]])
+    warm = known.drift.reference_c + 15.0
+    pose = known.base_from_flange(q, temperatures_c=warm)
+    numbers = [*pose.translation[0], *pose.rotation.as_quat()[0], *q[0]]
+    names = ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", *(f"q{it}_rad" for it in range(1, 7))]
+    table = tmp_path / "targets.csv"
+    rows = [",".join(names), ",".join(map(repr, map(float, numbers)))]
+    table.write_text("\n".join(rows) + "\n", encoding="utf-8")
+    told = ",".join(f"{it:.9f}" for it in warm)
+    done = run("correct", table, "--against", tmp_path, "--temperatures", told, "--json")
+    sent = json.loads(done.out)["targets"][0]
+    # The warm arm is at the target with the joints that the target was made of.
+    assert [sent[f"q{it}_rad"] for it in range(1, 7)] == pytest.approx(q[0], abs=1e-6)
+    kelvin = ",".join(["300"] * 6)
+    refused = run("correct", table, "--against", tmp_path, "--temperatures", kelvin)
+    assert refused.status == 2
+    assert "looks like kelvin" in refused.err
+
+
+def test_a_posture_that_is_come_back_to_is_another_stop(learnt):
+    found = learnt["temperatures"]
+    # 24 views and then six again, every five minutes; the poses that are told are the same ones.
+    assert len(np.unique(found.truth.cell.base_from_flange, axis=0)) == 24
+    stations = {it.station for it in found.session.observations}
+    assert len(stations) == len(found.session.views)

@@ -1,0 +1,88 @@
+"""Views that no fit has seen: what the arm as stated and the calibrated one make of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.cells import known_of
+
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.pipeline.view_evidence import view_evidence
+from visioncal.simulation import Cell, CellOptions, fine_camera, simulate
+
+HELD = (3, 8, 21, 30)
+
+
+@pytest.fixture(scope="module")
+def cell() -> Cell:
+    return simulate(
+        CellOptions(
+            camera=fine_camera(),
+            pixel_sigma_px=0.1,
+            robot="ur5e",
+            views=34,
+            dh_sigma_m=5e-4,
+            dh_sigma_rad=1e-3,
+            seed=2,
+        )
+    )
+
+
+@pytest.fixture(scope="module")
+def known(cell: Cell) -> RunState:
+    """A session with a bad arm, four of whose views are held back."""
+    known = known_of(cell)
+    views = tuple(
+        replace(it, holdout=True) if it.number in HELD else it for it in known.session.views
+    )
+    known = replace(known, session=replace(known.session, views=views))
+    for stage in STAGES:
+        if stage.name not in ("robot", "detect"):
+            known = stage.run(known)
+    return known
+
+
+def rms(rows, name):
+    return float(np.sqrt(np.mean([getattr(it, name) ** 2 for it in rows])))
+
+
+def test_views_left_out_add_up_to_the_levels_figures(known):
+    found = result_of(known).arm
+    by_name = {it.level: it for it in found.levels}
+    nominal, chosen = by_name["nominal"], by_name[found.level]
+    assert [it.view for it in found.left_out] == list(known.used)
+    for unit in ("mm", "deg"):
+        # The same residuals, written twice.
+        before, after = rms(found.left_out, f"nominal_{unit}"), rms(found.left_out, unit)
+        assert before == pytest.approx(getattr(nominal, f"held_out_{unit}"), rel=1e-9)
+        assert after == pytest.approx(getattr(chosen, f"held_out_{unit}"), rel=1e-9)
+
+
+def test_views_held_back_are_predicted_by_both_arms(known):
+    rows = result_of(known).arm.holdout
+    assert tuple(it.view for it in rows) == HELD
+    shown = {it.view: it for it in known.solved.sights}
+    for it in rows:
+        # Against the target's estimated place here, against the views' mean there: some 0.01 mm.
+        assert it.mm == pytest.approx(shown[it.view].residual_mm, abs=0.03)
+    # Links off by half a millimetre and a milliradian, against noise of 0.03 mm.
+    assert rms(rows, "nominal_mm") > 3 * rms(rows, "mm")
+
+
+def test_without_a_calibrated_arm_there_is_nothing_to_compare(cell):
+    known = known_of(cell, level="hand-eye")
+    for stage in STAGES:
+        if stage.name not in ("robot", "detect"):
+            known = stage.run(known)
+    assert result_of(known).arm is None
+    reported = [it.base_from_flange for it in view_evidence(known)]
+    assert np.array_equal(reported, cell.base_from_flange)
+
+
+def test_evidence_has_the_calibrated_arm_s_poses(cell, known):
+    ours = np.stack([it.base_from_flange for it in view_evidence(known)])
+    expected = known.robot_arm.model.robot.base_from_flange(cell.joints)
+    assert np.array_equal(ours, expected)
+    assert not np.allclose(ours, cell.base_from_flange, atol=1e-4)

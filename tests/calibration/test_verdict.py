@@ -1,0 +1,170 @@
+"""The verdict: each doubt by itself, with the sentence that tells of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.sound_findings import PAIR, SOUND, changed, directions, left_out, views
+
+from visioncal.calibration.stages.judge import judge
+from visioncal.core.number_format import figure
+from visioncal.core.types import Rejection
+from visioncal.core.verdict import remarks
+from visioncal.results import Rms
+
+LOST = [Rejection(at, "blurred: very") for at in range(30, 40)]
+
+
+def test_sound_findings_are_good_and_say_how_good():
+    verdict = judge(SOUND)
+    assert verdict.status == "good"
+    assert len(verdict.reasons) == 1
+    assert "All 20 used views agree" in verdict.reasons[0]
+    assert "0.11 mm" in verdict.reasons[0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "status", "words"),
+    [
+        ({"held_out": Rms(3.0, 0.011), "rms": Rms(2.9, 0.01)}, "check", "by 3 mm (doubt begins"),
+        ({"held_out": Rms(30.0, 0.011), "rms": Rms(29.0, 0.01)}, "bad", "by 30 mm"),
+        ({"held_out": Rms(0.11, 0.5), "rms": Rms(0.1, 0.45)}, "check", "by 0.5 deg"),
+        ({"held_out": Rms(0.11, 3.0), "rms": Rms(0.1, 2.9)}, "bad", "by 3 deg"),
+        ({"held_out": Rms(0.2, 0.011)}, "check", "fit 2.0 times worse than views in the fit"),
+        ({"held_out": Rms(0.5, 0.011)}, "bad", "fit 5.0 times worse"),
+        ({"held_out": Rms(0.11, 0.02)}, "check", "fit 2.0 times worse"),
+        (
+            {"views": views(residual_mm=0.9), "away_mm": None},
+            "check",
+            "View 7 stands out: it places the target 0.9",
+        ),
+        (
+            {"away_mm": None, "views": views(residual_deg=0.2)},
+            "check",
+            "0.2 deg from the others, 20 times",
+        ),
+        ({"holdout": Rms(2.0, 0.01)}, "check", "holds back are missed by 2 mm"),
+        ({"holdout": Rms(0.1, 0.4)}, "check", "0.4 deg, 36 times worse"),
+        (
+            {"worst": directions(2e-3, 0, 0, 0)},
+            "check",
+            "the direction 0 (2 mm)",
+        ),
+        ({"worst": directions(4e-3, 0, 0, 0)}, "bad", "the direction 0 (4 mm)"),
+        (
+            {"worst": directions(0, 3e-3, 0, 0)},
+            "check",
+            "the direction 1 (0.17 deg)",
+        ),
+        (
+            {"worst": directions(0, 0, 2e-3, 0)},
+            "check",
+            "the direction 2 (2 mm)",
+        ),
+        ({"away_mm": 1.0}, "check", "have to be off by 1 mm and 0.0057 deg"),
+        ({"away_deg": 0.029}, "check", "0.029 deg from stop to stop"),
+        ({"stops": 8}, "check", "Only 8 stops are used"),
+        ({"stops": 4, "views": views(4)}, "bad", "Only 4 views are used"),
+        ({"lost": LOST}, "check", "10 of 30 views are not used; the first: view 30, blurred"),
+        ({"lost": LOST * 4}, "bad", "40 of 60 views"),
+        ({"pixel_px": 1.0}, "check", "Corners deviate by 1 px"),
+        ({"pixel_px": 4.0}, "bad", "Corners deviate by 4 px"),
+        (
+            {"warnings": remarks(("The board is upside down.",))},
+            "check",
+            "The board is upside down.",
+        ),
+    ],
+)
+def test_each_doubt_has_its_sentence(changes, status, words):
+    verdict = judge(changed(SOUND, **changes))
+    assert verdict.status == status
+    assert len(verdict.reasons) == 1
+    assert words in verdict.reasons[0]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"holdout": Rms(0.2, 0.02)},
+        {"views": views(residual_mm=0.5)},
+        {"lost": LOST[:3]},
+        {"pixel_px": None},
+        {"away_mm": None},
+        # Exact data: held-out and in-sample scatter are both rounding.
+        {"rms": Rms(1e-10, 1e-11), "held_out": Rms(9e-10, 9e-11)},
+    ],
+)
+def test_what_is_ordinary_raises_no_doubt(changes):
+    assert judge(changed(SOUND, **changes)).status == "good"
+
+
+@pytest.mark.parametrize(
+    ("numbers", "words"),
+    [
+        (range(12, 20), "They follow each other: from view 12 on, something had moved."),
+        (range(5), "They follow each other: before view 5, something had moved."),
+        ((6, 7, 8), "They follow each other: from view 6 to view 8, something had moved."),
+        ((6, 7, 9), None),
+        ((12, 13), None),
+    ],
+)
+def test_a_run_of_wrong_views_is_told(numbers, words):
+    reason = judge(left_out(numbers)).reasons[0]
+    assert "were left out" in reason
+    assert (words in reason) if words else "follow each other" not in reason
+
+
+def test_a_pair_of_which_all_views_are_left_out_is_told():
+    """As of one camera of several, which by itself has no view that the others could precede."""
+    found = left_out(range(20))
+    several = (replace(PAIR, name="left of floor"), replace(found.pairs[0], name="right of floor"))
+    reasons = judge(replace(found, pairs=several)).reasons
+    assert any(it.startswith("right of floor: views 0, 1, 2") for it in reasons)
+    assert not any("follow each other" in it for it in reasons)
+
+
+def test_a_reason_is_told_once():
+    found = left_out(range(12, 20))
+    reasons = judge(found).reasons
+    assert sum("view 12's figures" in it for it in reasons) == 1
+    assert "8 of 20 views are not used; all of them disagree with the others." in reasons
+    more = judge(changed(found, lost=[*found.sensors[0].lost, *LOST[:1]])).reasons
+    assert any("; the first but for these: view 30, blurred: very." in it for it in more)
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        (0.0, "0"),
+        (2.1e-13, "under 0.001"),
+        (-1e-9, "under 0.001"),
+        (0.0214, "0.021"),
+        (0.0996, "0.1"),
+        (2.96, "3"),
+        (1234.6, "1235"),
+        (-273.4, "-273"),
+        (np.inf, "inf"),
+    ],
+)
+def test_figures_have_no_exponents(value, words):
+    assert figure(value) == words
+
+
+def test_a_scatter_that_settles_it_is_not_blamed_on_the_motion():
+    wild = changed(
+        SOUND,
+        held_out=Rms(80.0, 5.0),
+        rms=Rms(75.0, 4.8),
+        worst=directions(0.02, 0.02, 0.02, 0.02),
+    )
+    verdict = judge(wild)
+    assert verdict.status == "bad"
+    assert not any("weakly determined" in it for it in verdict.reasons)
+    assert "units or conventions" in verdict.reasons[0]
+
+
+def test_what_settles_it_comes_first():
+    verdict = judge(changed(SOUND, pixel_px=4.0, warnings=remarks(("Something.",)), stops=8))
+    assert verdict.reasons[0].startswith("Corners deviate")
+    assert len(verdict.reasons) == 3

@@ -1,0 +1,398 @@
+"""Whether a calibration still holds: what a few fresh stops say of a change, and of none."""
+
+import json
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+
+import numpy as np
+import pytest
+from support.cells import calibrated, known_of, session_of
+from support.commands import visioncal
+from support.later import ANYHOW, FITTED, Change, again, knock, known_again, part, usual
+from support.marks import slow
+from support.pages import Page
+
+from visioncal import calibrate, verify
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.verification import (
+    facts_of,
+    load_policy,
+    outcomes,
+    to_document,
+    verdict_of,
+)
+from visioncal.calibration.verification.calibration_prior import CalibrationPrior
+from visioncal.calibration.verification.check import check
+from visioncal.calibration.verification.messages import _signed_axis
+from visioncal.calibration.verification.prediction import known_before, predict_stops, seen_by
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import compose, exp, invert, log
+from visioncal.present.report.check import render_check
+from visioncal.present.report.check_page import page_of
+from visioncal.results import Calibration
+from visioncal.robot import load_robot
+from visioncal.session import Session
+from visioncal.simulation import CellOptions, Payload, simulate, write_session
+from visioncal.simulation.boards import centre_m
+from visioncal.simulation.second import Second
+
+MOUNTS = ("eye-in-hand", "eye-to-hand")
+
+
+def checked(place, rng, change=None, **options):
+    prior_calibration = CalibrationPrior.of(place.calibration)
+    return check(
+        seen_by(known_again(place.cell, rng, change), prior_calibration),
+        prior_calibration,
+        **options,
+    )
+
+
+def names(found):
+    return [it.name for it in found.named]
+
+
+def slip(joint, deg):
+    offsets = np.zeros(6)
+    offsets[joint - 1] = np.deg2rad(deg)
+    return Change(joints_rad=offsets)
+
+
+@pytest.fixture(params=MOUNTS)
+def place(request):
+    return usual(request.param)
+
+
+def test_an_unchanged_cell_passes_as_often_as_it_should(place):
+    rng = np.random.default_rng(0)
+    found = [checked(place, rng) for _ in range(8)]
+    assert all(it.passed and not it.named for it in found)
+    # Chi-square of thirty directions; the mean of eight is known to 2.7, and the noise's scale to
+    # a tenth, which is three more.
+    assert np.mean([it.misfit for it in found]) == pytest.approx(30.0, abs=12.0)
+
+
+def test_a_bumped_camera_is_told_with_its_size_and_direction(place):
+    bump = np.array([0.0, 0.0, 0.0, 1e-3, 0.0, 0.0])
+    found = checked(place, np.random.default_rng(1), Change(camera=bump))
+    assert names(found) == ["camera"]
+    assert not found.passed
+    assert found.explained
+    values, covariance = found.named[0].explained.values, found.named[0].explained.covariance
+    error = values - bump
+    # Chi-square of six exceeds 22.5 in one case of a thousand.
+    assert error @ np.linalg.solve(covariance, error) < 22.5
+    told = to_document(found, ())["changes"][0]
+    assert told["moved_mm"] == pytest.approx(1.0, abs=4 * told["sigma_mm"])
+    assert "The camera moved by" in verdict_of(found).reasons[0]
+
+
+def test_a_turned_camera_a_moved_board_and_a_slip_are_told_apart(place):
+    rng = np.random.default_rng(2)
+    assert names(checked(place, rng, Change(camera=knock(rng, 0.0, 0.2)))) == ["camera"]
+    assert names(checked(place, rng, Change(board=knock(rng, 1.0, 0.0)))) == ["board"]
+    found = checked(place, rng, slip(3, -0.05))
+    assert names(found) == ["joint 3"]
+    told = to_document(found, ())["changes"][0]
+    assert told["offset_deg"] == pytest.approx(-0.05, abs=4 * told["sigma_deg"])
+    assert "Joint 3 (elbow_joint) off by -0.0" in verdict_of(found).reasons[0]
+
+
+def test_what_no_stops_can_tell_apart_is_named_together(place):
+    rng = np.random.default_rng(3)
+    stands, carried = "board", "camera"
+    if place.cell.options.mount == "eye-to-hand":
+        stands, carried = carried, stands
+    # A slip of the first joint turns all that stands in the base; of the last, what is carried.
+    first = checked(place, rng, slip(1, 0.05))
+    assert set(names(first)) == {"joint 1", stands}
+    assert "No stops can tell that from" in verdict_of(first).reasons[1]
+    assert set(names(checked(place, rng, slip(6, 0.05)))) == {"joint 6", carried}
+
+
+def test_a_board_that_was_turned_by_much_is_told(place):
+    middle = compose(np.eye(3), centre_m(place.cell.sheet))
+    turn = exp(np.array([0.02, -0.05, 2.5, 0.0, 0.02, 0.0]))
+    moved = log(middle @ turn @ invert(middle))
+    found = checked(place, np.random.default_rng(4), Change(board=moved))
+    assert names(found) == ["board"]
+    assert found.explained
+    # Known to some hundredths of a millimetre and of a degree.
+    assert found.named[0].explained.values == pytest.approx(moved, abs=1e-3)
+
+
+def test_a_board_that_was_placed_anew_is_no_fault(place):
+    rng = np.random.default_rng(5)
+    anew = Change(board=np.array([0.0, 0.0, 0.3, 0.02, 0.01, 0.0]))
+    assert checked(place, rng, anew, board_placed_anew=True).passed
+    slipped = replace(anew, joints_rad=slip(3, 0.1).joints_rad)
+    assert names(checked(place, rng, slipped, board_placed_anew=True)) == ["joint 3"]
+
+
+def test_two_changes_more_noise_and_a_wrong_view_are_told(place):
+    rng = np.random.default_rng(6)
+    both = Change(camera=knock(rng, 2.0, 0.3), board=knock(rng, 2.0, 0.3))
+    found = checked(place, rng, both)
+    assert names(found) == ["camera_and_board"]
+    assert set(to_document(found, ())["changes"][0]) >= {"camera", "board"}
+    assert names(checked(place, rng, Change(noise_factor=8.0))) == ["robot_noise"]
+    prior_calibration, cell = CalibrationPrior.of(place.calibration), again(place.cell, rng)
+    # The third image was taken at another pose than is written beside it.
+    wrong = cell.joints.copy()
+    wrong[2] = wrong[2] + 0.02
+    found = check(
+        seen_by(known_of(replace(cell, joints=wrong)), prior_calibration), prior_calibration
+    )
+    assert names(found) == ["view 2"]
+    assert "View 2 alone contradicts" in verdict_of(found).reasons[0]
+
+
+def test_the_page_shows_what_is_left_with_the_change_undone(place):
+    found = checked(
+        place, np.random.default_rng(9), Change(camera=knock(np.random.default_rng(9), 2.0, 0.2))
+    )
+    before, after = (np.linalg.norm(it[:, 3:], axis=1) for it in (found.away, found.left))
+    # Two millimetres and 0.2 deg at half a metre become the noise of stops, some tenths of that.
+    assert np.sqrt(np.mean(after**2)) < 0.3 * np.sqrt(np.mean(before**2))
+    policy = outcomes(
+        load_policy(),
+        facts_of(found.seen.known.session, place.calibration, failed=True, collision=True),
+    )
+    page = Page(render_check(page_of(found, policy, verdict_of(found))))
+    assert "does not hold any more" in page.words
+    assert "with the likeliest change undone: the camera moved by" in page.words
+    assert [f"{1e3 * it:.3f}" in page.words for it in (*before, *after)] == [True] * 10
+    assert "now a collision" in page.words
+    passed = checked(place, np.random.default_rng(0))
+    assert (passed.left == passed.away).all()
+    assert "undone" not in Page(render_check(page_of(passed, (), verdict_of(passed)))).words
+    more = checked(place, np.random.default_rng(6), Change(noise_factor=8.0))
+    assert "undone" not in Page(render_check(page_of(more, (), verdict_of(more)))).words
+
+
+def test_two_slips_are_more_than_one_change_explains():
+    place = usual("eye-in-hand")
+    change = Change(joints_rad=np.deg2rad([0.0, 0.3, 0.0, 0.3, 0.0, 0.0]))
+    found = checked(place, np.random.default_rng(7), change)
+    assert not found.passed
+    assert not found.explained or names(found)[0] == "robot_noise"
+
+
+def test_an_arm_off_by_its_posture_raises_no_alarm_near_the_calibration():
+    options = CellOptions(dh_sigma_m=5e-4, dh_sigma_rad=1e-3, seed=3)
+    cell = simulate(replace(options, views=FITTED + 20))
+    calibration = result_of(calibrated(part(cell, range(FITTED)), joints=False))
+    prior_calibration = CalibrationPrior.of(calibration)
+    assert prior_calibration.arm == "poses"
+    # What the fit has in common with errors that only count in it leaves a covariance one.
+    assert np.linalg.eigvalsh(prior_calibration.covariance)[0] > -1e-12
+    rng = np.random.default_rng(8)
+    for _ in range(4):
+        known = known_of(again(cell, rng), joints=False)
+        assert check(seen_by(known, prior_calibration), prior_calibration).passed
+
+
+@pytest.mark.parametrize("weighed", [True, slow(False)])
+def test_a_bent_arm_under_its_loads_is_no_change(weighed):
+    """Springs and loads are in what is predicted, whether or not the arm's masses are known."""
+    loads = (Payload(), Payload(8.0, (0.0, 0.0, 0.1)))
+    springs = {"compliance_rad_per_nm": (6e-5,) * 6, "payloads": loads}
+    cell = simulate(replace(ANYHOW, robot="ur10e", views=FITTED + 20, seed=2, **springs))
+    robot = load_robot("ur10e") if weighed else replace(load_robot("ur10e"), masses=None)
+    lot = result_of(calibrated(part(cell, range(FITTED)), robot=robot))
+    assert lot.arm.level == "elastic"
+    rng, prior_calibration = np.random.default_rng(4), CalibrationPrior.of(lot)
+    found = check(
+        seen_by(known_of(again(cell, rng), robot=robot), prior_calibration), prior_calibration
+    )
+    assert found.passed, found.misfit
+    bumped = again(cell, rng, Change(camera=knock(rng, 2.0, 0.0)))
+    assert not check(
+        seen_by(known_of(bumped, robot=robot), prior_calibration), prior_calibration
+    ).passed
+
+
+def test_one_of_two_boards_that_moved_is_named():
+    cell = simulate(replace(ANYHOW, second=Second(turn_rad=0.6, tilt_rad=0.2), views=40, seed=2))
+    calibration = result_of(calibrated(cell))
+    prior_calibration = CalibrationPrior.of(calibration)
+    assert len(prior_calibration.boards) == 2
+    known = known_of(cell)
+    shown = cell.shown.boards
+    pushed = np.array([0.0, 0.0, 0.0, 0.0, 3e-3, 0.0])
+    assert check(seen_by(known, prior_calibration), prior_calibration).passed
+    assert shown.max() == 1
+    moved = seen_by(known, prior_calibration)
+    # Some stops show both.
+    assert len(moved.problem) > moved.stops == 40
+    mine = np.array([shown[views[0]] for views in moved.views]) == 1
+    seen = moved.problem.observations
+    measured = np.where(mine[:, None, None], seen.measured @ exp(pushed), seen.measured)
+    pushed = replace(moved.problem, observations=replace(seen, measured=measured))
+    found = check(replace(moved, problem=pushed), prior_calibration)
+    assert names(found) == [f"board {tuple(prior_calibration.targets)[1]}"]
+    axes = prior_calibration.state.edges[1 + prior_calibration.boards.index(1), :3, :3]
+    assert (
+        verdict_of(found)
+        .findings[0]
+        .words.endswith(f"along the base's {_signed_axis(axes[:, 1])}.")
+    )
+    with pytest.raises(DataError, match="several boards") as refused:
+        check(moved, prior_calibration, board_placed_anew=True)
+    assert "the one that moved is named" in refused.value.next_step
+
+
+def test_a_calibration_holds_by_its_own_session_of_which_it_left_views_out(tmp_path):
+    cell = simulate(CellOptions(views=24, seed=3))
+    flange = cell.base_from_flange.copy()
+    # Two images of one stop stand in the rows of another.
+    flange[[4, 9]] = flange[[9, 4]]
+    wrong = replace(cell, base_from_flange=flange)
+    session = Session.load(write_session(wrong, tmp_path / "cell", images=False))
+    calibration = calibrate(session)
+    assert [it.view for it in calibration.views if not it.used] == [4, 9]
+    found = verify(session, calibration)
+    assert found.passed
+    assert found.seen.stops == 22
+    assert [it["view"] for it in to_document(found, ())["not_used"]] == [4, 9]
+    # Of another session nothing is known beforehand.
+    assert not verify(
+        replace(session, document={**session.document, "name": "b"}), calibration
+    ).passed
+
+
+def test_boards_are_those_of_the_same_name_or_print_however_many_a_session_has(tmp_path):
+    cell = simulate(CellOptions(views=24, second=Second(), seed=3))
+    two = Session.load(write_session(cell, tmp_path / "two", images=False))
+    prior_calibration = CalibrationPrior.of(calibrate(two))
+    named = dict(reversed(two.targets.items()))
+    turned = replace(two, targets=named)
+    assert check(predict_stops(turned, prior_calibration), prior_calibration).passed
+    for name, board in two.targets.items():
+        shown = tuple(it for it in two.views if it.text["target"] == name)
+        alone = {key: it for key, it in two.document.items() if key != "targets"}
+        one = replace(two, document=alone, target=board, targets={}, views=shown)
+        found = check(predict_stops(one, prior_calibration), prior_calibration)
+        assert found.passed
+        assert found.seen.stops == len(shown)
+        with pytest.raises(DataError, match="which of the targets"):
+            predict_stops(replace(one, target=None), prior_calibration)
+        with pytest.raises(DataError, match="columns = 11"):
+            predict_stops(
+                replace(turned, targets={**named, name: replace(board, columns=11)}),
+                prior_calibration,
+            )
+        with pytest.raises(DataError, match="is none of those") as refused:
+            predict_stops(two, CalibrationPrior.of(calibrate(one)))
+        assert "that target alone" in refused.value.next_step
+        with pytest.raises(DataError, match="is none of those"):
+            predict_stops(replace(one, target=replace(board, columns=11)), prior_calibration)
+
+
+def test_other_cells_are_refused_by_what_differs():
+    place = usual("eye-in-hand")
+    prior_calibration = CalibrationPrior.of(place.calibration)
+    session = session_of(place.cell)
+    other = replace(session.target, columns=11)
+    for wrong, words in (
+        (replace(session, document={**session.document, "mount": "eye-to-hand"}), "eye-to-hand"),
+        (replace(session, target=other), "columns = 11"),
+        (replace(session, robot_document=load_robot("ur10e").document), "another robot"),
+    ):
+        with pytest.raises(DataError, match=words):
+            known_before(wrong, prior_calibration)
+    known = known_again(place.cell, np.random.default_rng(9))
+    with pytest.raises(DataError, match="no joint angles"):
+        seen_by(known.with_robot("", replace(known.reported, matched=None)), prior_calibration)
+    look = known.cameras["cam"]
+    with pytest.raises(DataError, match="640 x 480"):
+        seen_by(known.with_camera("cam", replace(look, resolution=(640, 480))), prior_calibration)
+    with pytest.raises(DataError, match="an older version"):
+        CalibrationPrior.of(replace(place.calibration, joint_fit=None))
+    spoilt = replace(place.calibration.joint_fit, covariance=np.eye(1))
+    with pytest.raises(DataError, match="joint_fit cannot be read"):
+        CalibrationPrior.of(replace(place.calibration, joint_fit=spoilt))
+
+
+def test_triggers_fire_by_their_limits_and_say_what_is_not_known(tmp_path):
+    place = usual("eye-in-hand")
+    created = datetime(2026, 1, 1, tzinfo=UTC)
+    calibration = replace(
+        place.calibration, conditions={"ambient_c": 21.0}, created=created.isoformat()
+    )
+    session = session_of(part(place.cell, range(5)))
+    warm = tuple(replace(it, numbers={"ambient_c": 33.0}) for it in session.views)
+    facts = facts_of(
+        replace(session, views=warm),
+        calibration,
+        failed=False,
+        collision=True,
+        now=created + timedelta(days=200),
+    )
+    told = {it.trigger.quantity: it for it in outcomes(load_policy(), facts)}
+    assert {name: it.state for name, it in told.items()} == {
+        "failed_check": "quiet",
+        "collision": "fired",
+        "ambient_change_k": "fired",
+        "payload_change_kg": "unknown",
+        "age_days": "quiet",
+    }
+    assert "12 K (limit 10)" in told["ambient_change_k"].words
+    assert told["age_days"].value == 200.0
+    strict = tmp_path / "strict.toml"
+    strict.write_text('[[trigger]]\nquantity = "age_days"\nlimit = 30\n')
+    (only,) = outcomes(load_policy(strict), facts)
+    assert only.state == "fired"
+    strict.write_text('[[trigger]]\nquantity = "age"\nlimit = 30\n')
+    with pytest.raises(DataError, match="trigger 1: quantity is 'age'"):
+        load_policy(strict)
+    strict.write_text("limit = 30\n")
+    with pytest.raises(DataError, match="holds no"):
+        load_policy(strict)
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory):
+    """A calibrated session of pose pairs, and five later ones of the same cell."""
+    folder = tmp_path_factory.mktemp("pairs")
+    whole = write_session(simulate(CellOptions(views=25, seed=5)), folder / "all", images=False)
+    session = Session.load(whole)
+    cold = [replace(it, numbers={**it.numbers, "ambient_c": 20.0}) for it in session.views]
+    columns = (*session.columns, "ambient_c")
+    for name, views in (("fit", cold[:20]), ("later", cold[20:])):
+        replace(session, columns=columns, views=tuple(views)).save(folder / name)
+    assert visioncal("calibrate", folder / "fit", "-o", folder / "out").status == 0
+    return folder
+
+
+def test_the_command_says_pass_or_fail_by_its_status(pairs, tmp_path):
+    out = pairs / "out"
+    assert Calibration.load(out).conditions == {"ambient_c": 20.0}
+    done = visioncal("verify", pairs / "later", "--against", out, "-o", tmp_path / "check")
+    assert done.status == 0
+    assert done.err.startswith("pass")
+    assert "the ambient temperature's change, 0 K (limit 10)" in done.err
+    written = json.loads((tmp_path / "check/verify.json").read_text())
+    assert written["passed"]
+    assert not written["recalibrate"]
+    page = Page((tmp_path / "check/report.html").read_text(encoding="utf-8"))
+    assert "The calibration still holds" in page.words
+    assert not [it for it in page.references if not it.startswith(("#", "data:"))]
+    # A check has no business with the files of a calibration.
+    refused = visioncal("verify", pairs / "later", "--against", out, "-o", out)
+    assert refused.status == 2
+    assert "holds a calibration" in refused.err
+    session = Session.load(pairs / "later")
+    # The camera's poses as if it had been knocked by 20 mm along its own x.
+    pushed = tuple(
+        replace(it, numbers={**it.numbers, "cft_x_m": it.numbers["cft_x_m"] - 0.02})
+        for it in session.views
+    )
+    replace(session, views=pushed).save(tmp_path / "knocked")
+    done = visioncal("verify", tmp_path / "knocked", "--against", out, "--json")
+    assert done.status == 3
+    document = json.loads(done.out)
+    assert document["changes"][0]["cause"] == "camera"
+    assert document["changes"][0]["moved_mm"] == pytest.approx(20.0, rel=0.1)
+    assert document["recalibrate"]
+    assert visioncal("verify", pairs / "later").status == 2

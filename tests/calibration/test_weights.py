@@ -1,0 +1,62 @@
+"""Arms whose model does not tell the masses of their links: what can be told of their springs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.cells import calibrated
+from support.wrong_arms import CARRIED, COBOT, SAGGING, error_m
+
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.estimation.workspace import postures
+from visioncal.robot import Robot, WeightFunctions, load_robot
+from visioncal.simulation import simulate
+
+
+@pytest.fixture(scope="module")
+def bare():
+    """A UR10e of which nobody knows what it weighs."""
+    document = dict(load_robot("ur10e").document)
+    document["joint"] = [
+        {key: it for key, it in row.items() if key not in ("mass_kg", "com_m")}
+        for row in document["joint"]
+    ]
+    return Robot.from_document(document)
+
+
+def test_weight_is_among_the_functions(bare):
+    functions, q = WeightFunctions.of(bare), postures(bare)[:60]
+    # An upright axis bears nothing.
+    assert functions.parts[0].shape[1] == 0
+    torques = load_robot("ur10e").load_torques(q)
+    values = functions.bends(bare, q).reshape(-1, functions.size)
+    shares, *_ = np.linalg.lstsq(values, torques.ravel(), rcond=None)
+    assert values @ shares == pytest.approx(torques.ravel(), abs=1e-6)
+    again = np.einsum("mjk,jk->mj", bare.weight_jacobian(q), functions.moments(shares))
+    assert again == pytest.approx(torques, abs=1e-6)
+
+
+def test_an_arm_of_unknown_weight_is_calibrated_with_its_sag(bare):
+    cell = simulate(replace(SAGGING, views=60, seed=4))
+    known = calibrated(cell, robot=bare)
+    assert known.robot_arm.kinematics.level == "elastic"
+    assert all(it.stiffness_nm_per_rad is None for it in known.arm_found.springs.springs)
+    assert any("of which its model tells nothing" in it for it in known.verdict.reasons)
+    before = error_m(cell, calibrated(cell, joints=False), bare)
+    assert error_m(cell, known, known.robot_arm.model) < 0.06 * before
+    q = postures(bare)[:20]
+    result = result_of(known)
+    ours = known.robot_arm.model.base_from_flange(q)
+    # RigidTransform makes rotations orthonormal anew.
+    assert result.base_from_flange(q).as_matrix() == pytest.approx(ours, abs=1e-12)
+
+
+@pytest.mark.slow
+def test_payloads_tell_its_stiffness(bare):
+    known = calibrated(simulate(replace(SAGGING, views=60, payloads=CARRIED, seed=5)), robot=bare)
+    for at in (1, 2):
+        spring = known.arm_found.springs.springs[at]
+        assert spring.told
+        # One draw, at three and a half sigma.
+        assert abs(spring.compliance_rad_per_nm - 1.0 / COBOT[at]) < 3.5 * spring.sigma_rad_per_nm
+        assert spring.sigma_rad_per_nm < 0.1 / COBOT[at]

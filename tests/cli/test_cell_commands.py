@@ -1,0 +1,248 @@
+"""Commands on a whole cell: any of its cameras, robots and targets, against the truth."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.arm_documents import arm_of
+from support.commands import turned_poses, visioncal, write_poses
+from support.whole_cells import LATER, OPTIONS, misfit, part, recorded, saved, simulated, truth
+
+from visioncal.cli.summary import unused_words
+from visioncal.frames.frame_from_images import seen_frame
+from visioncal.frames.locate import locate
+from visioncal.frames.plane import Plane
+from visioncal.results import Calibration, RobotResult
+from visioncal.results.compare import compare
+from visioncal.results.compensation import correct
+from visioncal.session import Session
+from visioncal.simulation import Moved, simulate_network
+
+# Chi-square of six and of three exceed these in one case of a thousand.
+MOST, MOST_OF_THREE = 22.5, 16.3
+
+
+def done(*arguments):
+    it = visioncal(*arguments)
+    assert it.status == 0, it.err
+    return it.out
+
+
+@pytest.fixture(scope="module")
+def cell():
+    return simulated()
+
+
+@pytest.fixture(scope="module")
+def place(cell, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("cell")
+    session, _ = saved(folder, cell)
+    done("calibrate", session, "-o", folder / "out")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def bumped(place):
+    """The same cell, whose fixed camera was pushed before the later stops."""
+    shift = Moved("cam_left", LATER, shift_m=0.002)
+    cell = simulate_network(replace(OPTIONS, moved=(shift,)))
+    part(recorded(cell), LATER, OPTIONS.stops).save(place / "bumped")
+    return place / "bumped"
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("--camera", "left", "--robot", "b"),
+        ("--camera", "left", "--target", "plate_a"),
+        ("--camera", "hand", "--target", "floor"),
+    ],
+)
+def test_every_pair_of_the_cell_still_holds(place, names):
+    checked = done("verify", place / "later", "--against", place / "out", *names, "--json")
+    assert json.loads(checked)["passed"]
+
+
+def test_a_camera_that_was_pushed_is_named_by_its_own_pair_alone(place, bumped):
+    against = ("--against", place / "out")
+    seen = visioncal("verify", bumped, *against, "--camera", "left", "--robot", "a")
+    assert seen.status == 3
+    assert "The camera moved by" in seen.err
+    done("verify", bumped, *against, "--camera", "hand", "--target", "floor")
+
+
+@pytest.mark.parametrize(("camera", "robot"), [("left", "a"), ("left", "b"), ("hand", "a")])
+def test_a_board_is_located_in_the_base_of_any_robot(cell, place, camera, robot):
+    names = ("--camera", camera, "--robot", robot, "--target", "floor")
+    found = json.loads(done("locate", place / "later", "-c", place / "out", *names, "--json"))
+    at = truth(cell, f"base_{robot}", "target_floor")[:3, 3]
+    assert len(found) >= 3
+    for it in found:
+        error = np.array(it["p_base_m"]) - at
+        assert error @ np.linalg.solve(it["covariance"], error) < MOST_OF_THREE
+
+
+def test_a_pixel_is_located_in_the_base_of_any_robot(place):
+    whole, plane = Calibration.load(place / "out"), Plane.horizontal(0.02)
+    px = np.array([[1200.0, 1000.0]])
+    words = ("--pixel", "1200,1000", "--plane", "z=20")
+    for robot in ("a", "b"):
+        names = ("--camera", "left", "--robot", robot)
+        (told,) = json.loads(done("locate", "-c", place / "out", *words, *names, "--json"))
+        (found,) = locate(whole, px, plane, camera="left", robot=robot)
+        np.testing.assert_allclose(told["p_base_m"], found.p_base)
+    # In the plane of a board that stands still, it is on that board.
+    board = ("--pixel", "1200,1000", "--plane", "floor")
+    names = ("--camera", "left", "--robot", "b")
+    (told,) = json.loads(done("locate", "-c", place / "out", *board, *names, "--json"))
+    floor = whole.cell.between("base_b", "target_floor").matrix
+    height = (np.array(told["p_base_m"]) - floor[:3, 3]) @ floor[:3, 2]
+    assert abs(height) < 1e-9
+    ambiguous = visioncal("locate", "-c", place / "out", *words, "--camera", "left")
+    assert ambiguous.status == 2
+    assert "several robots (a, b)" in ambiguous.err
+
+
+def test_a_tool_is_found_by_touches_of_either_robot_and_joins_the_cell(place, tmp_path):
+    rng = np.random.default_rng(3)
+    tip, point = np.array([0.01, -0.02, 0.15]), np.array([0.4, 0.1, 0.05])
+    poses = turned_poses(rng, np.tile(point, (12, 1)), tip, np.eye(3))
+    poses[:, :3, 3] += rng.normal(0.0, 5e-5, (12, 3))
+    touches = write_poses(tmp_path / "touches.csv", poses)
+    unnamed = visioncal("tcp", touches, "-c", place / "out", "--name", "pin")
+    assert "several robots (a, b)" in unnamed.err
+    done("tcp", touches, "-c", place / "out", "--robot", "b", "--name", "pin")
+    whole = Calibration.load(place / "out")
+    edge = whole.frames["flange_b_from_pin"].edge
+    error = edge.matrix[:3, 3] - tip
+    assert error @ np.linalg.solve(edge.covariance[3:, 3:], error) < MOST_OF_THREE
+    assert "flange_from_pin" in whole.of("left", "b").frames
+    assert "flange_from_pin" not in whole.of("left", "a").frames
+    # It stays when the cell is calibrated again into the same folder.
+    again = visioncal("calibrate", place / "session", "-o", place / "out")
+    assert "flange_b_from_pin" in again.err
+    assert "flange_b_from_pin" in (place / "out" / "frames.json").read_text()
+
+
+@pytest.mark.parametrize(
+    ("command", "target", "names", "ends"),
+    [
+        ("tcp", "plate_b", ("left", "b"), ("flange_b", "target_plate_b")),
+        ("fixture", "floor", ("hand", "a"), ("base_a", "target_floor")),
+        ("fixture", "floor", ("left", "b"), ("base_b", "target_floor")),
+    ],
+)
+def test_a_target_is_placed_on_any_flange_and_in_any_base(
+    cell, place, tmp_path, command, target, names, ends
+):
+    chosen = ("--camera", names[0], "--robot", names[1], "--target", target)
+    into = ("--name", "thing", "-o", tmp_path / "frames.json")
+    done(command, place / "later", "-c", place / "out", *chosen, *into)
+    content = json.loads((tmp_path / "frames.json").read_text())["frames"]
+    found = content[f"{ends[0]}_from_thing"]
+    matrix, covariance = np.array(found["matrix"]), np.array(found["covariance"])
+    assert misfit(matrix, covariance, truth(cell, *ends)) < MOST
+
+
+def test_a_row_without_the_robots_pose_is_left_out_where_a_tool_is_placed(place):
+    session = Session.load(place / "later").of("left", "b", "plate_b")
+    whole, (first, *others) = Calibration.load(place / "out"), session.views
+    open_row = replace(first, numbers={})
+    shown = replace(session, views=(open_row, *others))
+    frame = seen_frame(shown, whole, "tool", camera="left", robot="b")
+    (left,) = [it for it in frame.observations if not it.used]
+    assert "no pose of the robot" in left.reason
+
+
+def test_many_rows_that_are_left_out_for_one_reason_share_a_line(place):
+    sight = Calibration.load(place / "out").cell.sights[0]
+    lost = [replace(sight, view=it, used=False, reason="not needed") for it in range(30)]
+    of = f"({sight.seer} of {sight.seen})"
+    assert list(unused_words([*lost, sight])) == [
+        f"30 views (0, 1, 2 and 27 more) {of}: not needed"
+    ]
+    alone = replace(lost[5], reason="blurred")
+    assert f"view 5 {of}: blurred" in unused_words([*lost[:5], alone])
+
+
+def test_a_fixture_of_one_robot_is_known_in_the_base_of_the_other(cell, place, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    for name in ("calibration.json", "alignment.json"):
+        (out / name).write_text((place / "out" / name).read_text())
+    names = ("--camera", "hand", "--robot", "a", "--target", "floor", "--name", "jig")
+    done("fixture", place / "later", "-c", out, *names)
+    edge = Calibration.load(out).of("left", "b").frames["base_from_jig"].edge
+    assert misfit(edge.matrix, edge.covariance, truth(cell, "base_b", "target_floor")) < MOST
+    own = Calibration.load(out).of("left", "a").frames["base_from_jig"].edge
+    assert edge.sigma_mm > own.sigma_mm
+    assert "base_a_from_jig" in (out / "report.html").read_text()
+
+
+def test_stops_are_added_to_one_pair(place, tmp_path):
+    chosen = ("--camera", "left", "--target", "plate_b", "--candidates", 60)
+    out = tmp_path / "plan"
+    done("plan", place / "later", "--add", 2, *chosen, "-o", out)
+    assert len(json.loads((out / "plan.json").read_text())["stops"]) == 2
+    # The calibration itself says which board it was made with.
+    alone = place / "out" / "calibration.json"
+    (tmp_path / "calibration.json").write_text(alone.read_text())
+    chosen = ("--camera", "hand", "--target", "floor", "--candidates", 60)
+    done("plan", tmp_path, "--stops", 3, *chosen, "-o", out)
+    assert json.loads((out / "plan.json").read_text())["cell"]["mount"] == "eye-in-hand"
+
+
+def test_two_whole_cells_are_compared_by_all_frames_or_by_a_pair(place, tmp_path):
+    whole = Calibration.load(place / "out")
+    twist = np.eye(4)
+    twist[0, 3] = 2e-3
+    edges = dict(whole.edges)
+    edges["cell_from_cam_left"] = replace(
+        edges["cell_from_cam_left"], matrix=edges["cell_from_cam_left"].matrix @ twist
+    )
+    moved = Calibration.whole(replace(whole.cell, edges=edges))
+    moved.save(tmp_path / "calibration.json")
+    told = json.loads(done("diff", place / "out", tmp_path, "--json"))
+    assert [name for name, it in told["transforms"].items() if it["is_change"]] == [
+        "cell_from_cam_left"
+    ]
+    assert "cam_left moved" in told["findings"][1]
+    assert told["mounts"] == ["whole cell"] * 2
+    pair = json.loads(
+        done("diff", place / "out", tmp_path, "--camera", "left", "--robot", "b", "--json")
+    )
+    assert pair["transforms"]["base_from_cam"]["is_change"]
+    assert not compare(whole, moved, camera="hand").is_change
+
+
+def test_transforms_of_one_robot_are_exported(place):
+    whole = Calibration.load(place / "out")
+    text = done("export", place / "out", "--to", "text", "--camera", "left", "--robot", "b")
+    rows = [it for it in text.splitlines() if it and not it.startswith("#")]
+    written = np.array([it.split() for it in rows], dtype=float)
+    np.testing.assert_allclose(written, whole.cell.between("base_b", "cam_left").matrix)
+    named = ("--edge", "flange_from_target", "--robot", "b", "--camera", "left")
+    done("export", place / "out", "--to", "text", *named, "--target", "plate_b")
+    refused = visioncal("export", place / "out", "--to", "robot-dh")
+    assert "several robots (a, b)" in refused.err
+    refused = visioncal("export", place / "out", "--to", "robot-dh", "--robot", "b")
+    assert "writes the calibrated arm, and this calibration kept the nominal one" in refused.err
+
+
+def test_targets_are_corrected_for_the_robot_that_is_named(place, tmp_path):
+    whole = Calibration.load(place / "out")
+    arm = whole.cell.arms["b"]
+    bent = arm.model.corrected(1e-3 * np.ones((7, 6)))
+    arms = {**whole.cell.arms, "b": RobotResult(arm.model, arm=arm_of(bent))}
+    Calibration.whole(replace(whole.cell, arms=arms)).save(tmp_path / "calibration.json")
+    q = np.array([[0.2, -1.2, 1.4, -1.6, -1.5, 0.3], [0.5, -1.0, 1.2, -1.4, -1.3, 0.1]])
+    wanted = bent.base_from_flange(q)
+    found = correct(Calibration.load(tmp_path), wanted, q[0], robot="b")
+    np.testing.assert_allclose(found.q, q, atol=1e-6)
+    table = write_poses(tmp_path / "targets.csv", wanted)
+    told = json.loads(done("correct", table, "--against", tmp_path, "--robot", "b", "--json"))
+    assert len(told["targets"]) == 2
+    refused = visioncal("correct", table, "--against", tmp_path, "--robot", "a")
+    assert refused.status == 2
+    assert "no calibrated arm" in refused.err

@@ -1,0 +1,306 @@
+"""The commands as a user runs them: exit status, messages, and the files that appear."""
+
+import io
+import json
+import os
+import re
+import time
+from contextlib import redirect_stderr
+from pathlib import Path
+from typing import get_args
+
+import pytest
+from support.commands import every_command, started, visioncal
+from typer.main import get_command
+
+import visioncal as visioncal_package
+from visioncal.calibration.pipeline import STAGES
+from visioncal.calibration.stages.kinematics import ASKED
+from visioncal.cli import progress
+from visioncal.cli import simulate as simulate_module
+from visioncal.cli.app import app
+from visioncal.cli.lazy import LazyGroup
+from visioncal.core.conventions import POSE_FORMS, UNITS_M
+from visioncal.core.errors import DataError
+from visioncal.core.types import Mount, SolverName
+from visioncal.interchange.exports import EXPORT_FORMATS
+from visioncal.interchange.formats import FOREIGN_FORMATS
+from visioncal.live.capture.options import Keep
+from visioncal.live.planning.purposes import PURPOSES
+from visioncal.live.planning.selection import Criterion
+from visioncal.robot import Convention, robot_names
+from visioncal.session import Session
+from visioncal.simulation import ARMS, CellOptions, read_truth, simulate, truth_path, write_session
+from visioncal.vision.dense.library import DEVICES
+from visioncal.vision.targets import target_names
+
+
+@pytest.fixture(scope="module")
+def poor(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("poor") / "one axis"
+    options = CellOptions(views=6, motion="one_axis", seed=1)
+    return write_session(simulate(options), folder, images=False)
+
+
+def test_calibrate_writes_three_files_and_says_how_good_it_is(rendered, tmp_path):
+    out = tmp_path / "out put, größer"
+    done = started("calibrate", rendered, "-o", out, "-v")
+    assert done.status == 0, done.err
+    assert {path.name for path in out.iterdir()} == {
+        "calibration.json",
+        "report.html",
+        "recording.rrd",
+    }
+    assert done.out == ""
+    assert "\ngood" in f"\n{done.err}"
+    assert "flange_from_cam" in done.err
+    assert "daniilidis" in done.err
+
+
+def test_json_goes_to_stdout_and_is_the_file(rendered, tmp_path):
+    done = visioncal("calibrate", rendered, "-o", tmp_path / "out", "--json")
+    assert done.status == 0, done.err
+    assert json.loads(done.out) == json.loads((tmp_path / "out/calibration.json").read_text())
+
+
+@pytest.mark.slow
+def test_calibrating_the_recording_gives_the_same_numbers(rendered, tmp_path):
+    done = visioncal("calibrate", rendered, "-o", tmp_path / "a", "--need-mm", "0.5")
+    assert done.status == 0
+    again = visioncal("calibrate", tmp_path / "a/recording.rrd", "-o", tmp_path / "b")
+    assert again.status == 0, again.err
+    first, second = (
+        json.loads((tmp_path / name / "calibration.json").read_text()) for name in "ab"
+    )
+    assert first | {"created": ""} == second | {"created": ""}
+    assert first["need"]["mm"] == 0.5
+
+
+def test_no_result_is_status_2_with_one_message_and_leaves_the_folder_alone(poor, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "calibration.json").write_text("an earlier result")
+    done = started("calibrate", poor, "-o", out)
+    assert done.status == 2
+    assert done.out == ""
+    assert "the camera's offset along the tool's" in done.err
+    assert "Traceback" not in done.err
+    assert [path.name for path in out.iterdir()] == ["calibration.json"]
+    assert (out / "calibration.json").read_text() == "an earlier result"
+
+
+def test_a_message_leaves_out_the_middle_of_what_nobody_reads():
+    error = DataError(
+        f"model is {'x' * 100_000}; a name is needed.\nLine 2.", culprits=["y" * 9000]
+    )
+    assert len(error.message) < 2100
+    assert error.message.startswith("model is xxx")
+    assert error.message.endswith("xxx; a name is needed.\nLine 2.")
+    assert len(error.culprits[0]) < 400
+    assert len(DataError("\n".join(["y" * 9000] * 10)).message) < 3200
+
+
+def test_an_error_as_json_has_its_parts(poor, tmp_path):
+    done = visioncal("calibrate", poor, "-o", tmp_path / "out", "--json")
+    assert done.status == 2
+    error = json.loads(done.out)["error"]
+    assert error["class"] == "DegenerateError"
+    assert error["culprits"]
+    assert "Add 3 or more views" in error["next"]
+    assert not (tmp_path / "out").exists()
+
+
+# Options that each command with --json needs before it can look for its input.
+NEEDED = {
+    "correct": ["-c", "nowhere"],
+    "diff": ["nowhere"],
+    "dynamics gains": ["--loaded", "nowhere", "--mass-kg", 1, "--com-mm", "0,0,0"],
+    "dynamics payload": ["--against", "nowhere"],
+    "dynamics validate": ["--against", "nowhere"],
+    "locate": ["-c", "nowhere"],
+    "record": ["-o", "new", "--arm", "manual", "--camera", "folder:nowhere", "--target", "no"],
+    "verify": ["--against", "nowhere"],
+}
+
+
+def test_errors_as_json_have_one_form(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with_json = [name for name, it in every_command() if "as_json" in {p.name for p in it.params}]
+    # It looks at its libraries first, which may not be there.
+    assert len(with_json) == 17
+    for name in with_json:
+        if name == "rehearse":
+            continue
+        source = [] if name == "record" else ["nowhere"]
+        done = visioncal(*name.split(), *source, *NEEDED.get(name, ()), "--json")
+        assert (done.status, done.err) == (2, ""), name
+        error = json.loads(done.out)["error"]
+        assert set(error) == {"class", "message", "culprits", "next"}
+        assert "no" in error["message"]
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["calibrate", "nowhere"], "nowhere"),
+        (["calibrate", "nowhere.rrd"], "nowhere.rrd"),
+        (["calibrate"], "Missing argument"),
+        (["calibrate", "x", "--solver", "best"], "best"),
+        (["fly"], "No such command"),
+    ],
+)
+def test_mistakes_at_the_command_line_are_status_2(arguments, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    done = visioncal(*arguments)
+    assert done.status == 2
+    assert words in done.err
+    assert "Traceback" not in done.err
+
+
+def test_a_folder_that_cannot_be_written_is_named(rendered, tmp_path):
+    (tmp_path / "taken").write_text("a file where the folder should be")
+    done = visioncal("calibrate", rendered, "-o", tmp_path / "taken")
+    assert done.status == 2
+    assert "taken" in done.err
+    assert "Traceback" not in done.err
+
+
+def test_simulate_writes_arms_that_warm_up_and_arms_that_bend(tmp_path):
+    warm = visioncal("simulate", tmp_path / "warm", "--warm-up", "--currents", "--views", 12)
+    assert warm.status == 0, warm.err
+    session = Session.load(tmp_path / "warm")
+    # Twelve views of a cold arm, and then six of them again every five minutes for 100 minutes.
+    assert len(session.views) == 12 + 19 * 6
+    assert {"current6_a", "ambient_c"} < set(session.streams["heat"].columns)
+    heat = json.loads((tmp_path / "warm.truth.json").read_text())["heat"]
+    assert len(heat["growth_per_k"]) == 6
+    loads = ("--payload-kg", 0, "--payload-kg", 5)
+    bending = ("--stiffness-knm", 10, "--no-images", "--views", 4)
+    assert visioncal("simulate", tmp_path / "bent", *bending, *loads).status == 0
+    carried = [it.numbers["payload_kg"] for it in Session.load(tmp_path / "bent").views]
+    assert carried == [0.0, 5.0, 0.0, 5.0]
+    truth = read_truth(tmp_path / "bent")
+    assert truth.options["compliance_rad_per_nm"] == [1e-4] * 6
+
+
+def test_simulate_writes_a_session_and_its_truth_beside_it(tmp_path):
+    folder = tmp_path / "cell"
+    done = visioncal("simulate", folder, "--views", 4, "--mount", "eye-to-hand", "--no-images")
+    assert done.status == 0, done.err
+    assert truth_path(folder).exists()
+    assert not any("truth" in path.name for path in folder.rglob("*"))
+    assert set(read_truth(folder).transforms) == {"base_from_cam", "flange_from_target"}
+    again = visioncal("simulate", folder, "--views", 4, "--no-images")
+    assert again.status == 2
+    assert "cell" in again.err
+
+
+@pytest.mark.slow
+def test_demo_compares_itself_with_the_truth(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for _ in range(2):  # a second run replaces the first
+        done = visioncal("demo", "--views", 8)
+        assert done.status == 0, done.err
+    assert "against the truth" in done.err
+    assert (tmp_path / "demo/result/report.html").stat().st_size > 10_000
+
+
+def test_help_and_version_name_the_program():
+    assert "calibrate" in started("--help").out
+    assert visioncal("--version").out.strip().count(".") == 2
+
+
+def test_steps_are_said_in_words_and_counted_by_what_they_go_through():
+    steps = progress.Steps()
+    said = []
+    for report in (("detect", 2, 10), ("detect", 1, 40), ("detect", 40, 40), ("solve", 7, 10)):
+        steps.report(*report)
+        said.append(steps.line)
+    board = "detect the board"
+    assert said == [board, f"{board}: 1 of 40", f"{board}: 40 of 40", "solve for all frames"]
+
+
+def test_every_step_has_words():
+    sources = Path(visioncal_package.__file__).parent.rglob("*.py")
+    called = r"""(?:progress|told)\(\s*"(\w+)","""
+    named = {it for path in sources for it in re.findall(called, path.read_text("utf-8"))}
+    assert {"detect", "render", "excitation", "path"} <= named
+    assert progress.WORDS.keys() == named | {it.name for it in STAGES}
+
+
+def test_without_a_terminal_the_step_at_work_is_a_line(monkeypatch):
+    err = io.StringIO()
+    monkeypatch.setattr(progress, "PAUSE_S", 0.001)
+    with redirect_stderr(err), progress.shown_progress(quiet=False) as report:
+        report("detect", 2, 10)
+        report("detect", 12, 57)
+        while "12 of 57" not in err.getvalue():
+            time.sleep(0.001)
+    assert err.getvalue().splitlines()[-1] == "detect the board: 12 of 57 (0 s)"
+
+
+@pytest.mark.parametrize("keeps", [False, True])
+def test_ctrl_c_is_status_130_and_says_what_is_left_behind(tmp_path, monkeypatch, keeps):
+    (tmp_path / "earlier.csv").touch()
+    os.utime(tmp_path / "earlier.csv", (0, 0))
+
+    def interrupted(_, folder, *__, **___):
+        if keeps:
+            (folder / "views.csv").write_text("view\n")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(simulate_module, "write_session", interrupted)
+    done = visioncal("simulate", tmp_path, "--views", 3)
+    assert (done.status, done.out) == (130, "")
+    left = f"written so far: {tmp_path / 'views.csv'}" if keeps else "nothing was written"
+    assert done.err == f"stopped by Ctrl-C; {left}\n"
+
+
+@pytest.mark.parametrize("path", [(), ("dynamics",)])
+def test_the_listing_has_the_first_words_of_each_command_s_own_help(path):
+    group = get_command(app)
+    for name in path:
+        group = group.imported(name)
+    assert isinstance(group, LazyGroup)
+    own = {it: group.imported(it).help.split("\n\n")[0] for it in group.listed}
+    assert group.listed == {it: " ".join(words.split()) for it, words in own.items()}
+
+
+@pytest.mark.parametrize("columns", [80, 200])
+def test_help_has_every_word_within_the_terminal(columns):
+    """Markup takes `[mm]` for a style, and columns beside each other cut names and words off."""
+    for name, command in every_command():
+        shown = visioncal(*name.split(), "--help", columns=columns).out
+        assert max(map(len, shown.splitlines())) <= columns
+        for it in (command, *command.params):
+            for words in (getattr(it, "help", None) or "", *getattr(it, "opts", ())):
+                assert "".join(words.split()) in "".join(shown.split()), (name, it.name)
+
+
+CHOICES = {
+    "calibrate": {"level": (*ASKED, "hand-eye"), "solver": get_args(SolverName), "device": DEVICES},
+    "align": {"level": (*(it for it in ASKED if it != "thermal"), "hand-eye")},
+    "plan": {"purpose": PURPOSES, "criterion": get_args(Criterion), "mount": get_args(Mount)},
+    "record": {"pose_form": ("ours", *POSE_FORMS), "keep": get_args(Keep)},
+    "simulate": {"robot": ARMS},
+    "export": {"to": [it.name for it in EXPORT_FORMATS], "convention": get_args(Convention)},
+    "convert": {"form": [it.name for it in FOREIGN_FORMATS], "robot_unit": UNITS_M},
+    "fixture": {"cad_unit": UNITS_M},
+}
+
+
+@pytest.mark.parametrize("name", CHOICES)
+def test_help_lists_what_can_be_chosen(name):
+    command = get_command(app).imported(name)
+    context = command.make_context(name, [], resilient_parsing=True)
+    params = {it.name: it for it in command.params}
+    for option, choices in CHOICES[name].items():
+        words = set(re.split(r"[^\w-]+", " ".join(params[option].get_help_record(context))))
+        assert set(choices) <= words, option
+
+
+def test_boards_and_robots_are_found_from_any_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = {*target_names(), *robot_names()}
+    assert {"charuco_9x6_30mm", "checkerboard_9x6_25mm", "ur10e", "panda"} <= names

@@ -1,0 +1,170 @@
+"""The files of an output folder change together, whenever the program is killed."""
+
+import json
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from support.commands import visioncal
+from support.killed_calls import ALL, LESS, NAMES, expect_no_leftovers, visible, written
+from support.samples import made_up, with_frames
+
+from visioncal.calibration.pipeline import Run
+from visioncal.core.errors import DataError
+from visioncal.core.files import write_atomically
+from visioncal.core.output_generations import write_generation
+from visioncal.interchange.merge_results import rewrite
+from visioncal.interchange.outputs import write_outputs
+from visioncal.present import recording, report
+from visioncal.results import Calibration
+from visioncal.simulation import CellOptions, simulate, write_session
+
+posix = pytest.mark.skipif(sys.platform == "win32", reason="links and locks are POSIX's")
+
+
+@posix
+def test_killed_at_any_call_one_generation_is_whole(tmp_path):
+    program = Path(__file__).parents[1] / "support" / "killed_calls.py"
+    done = subprocess.run(
+        [sys.executable, str(program), str(tmp_path)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    # A writer whose calls are not seen is never killed.
+    assert all(int(calls) > 5 for calls in done.stdout.split())
+
+
+@posix
+def test_what_a_living_writer_has_aside_is_left_alone(tmp_path):
+    def write(aside):
+        # Another one comes and goes meanwhile.
+        written(tmp_path, LESS)
+        write_atomically(tmp_path / "single.txt", "another")
+        for name in NAMES:
+            (aside / name).write_text(ALL[name])
+
+    write_generation(tmp_path, NAMES, write)
+    assert visible(tmp_path) == ALL | {"single.txt": "another"}
+    expect_no_leftovers(tmp_path, visible(tmp_path))
+
+
+def test_writers_at_once_leave_the_files_of_one(tmp_path):
+    contents = [{name: f"{number} {name}" for name in NAMES} for number in range(4)]
+    with ThreadPoolExecutor(len(contents)) as pool:
+        for _ in range(5):
+            list(pool.map(lambda it: written(tmp_path, it), contents))
+            assert visible(tmp_path) in contents
+    expect_no_leftovers(tmp_path, contents[0])
+
+
+@pytest.mark.parametrize("refused", ["link", "symlink", "flock"])
+def test_without_links_or_locks_the_files_are_renamed(tmp_path, monkeypatch, refused):
+    def unsupported(*_: object, **__: object) -> None:
+        raise OSError(95, "Operation not supported")
+
+    written(tmp_path, ALL)
+    monkeypatch.setattr("fcntl.flock" if refused == "flock" else f"os.{refused}", unsupported)
+    written(tmp_path, LESS)
+    assert visible(tmp_path) == LESS
+    expect_no_leftovers(tmp_path, LESS)
+
+
+@posix
+def test_a_link_of_the_users_is_replaced_and_what_it_leads_to_stays(tmp_path):
+    (tmp_path / "else").mkdir()
+    (tmp_path / "else" / "there.txt").write_text("theirs")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "report.html").symlink_to("../else/there.txt")
+    written(tmp_path / "out", ALL)
+    assert visible(tmp_path / "out") == ALL
+    expect_no_leftovers(tmp_path / "out", ALL)
+    assert (tmp_path / "else" / "there.txt").read_text() == "theirs"
+
+
+@posix
+@pytest.mark.parametrize("at", ["before", "after"])
+def test_an_error_within_the_switch_leaves_one_generation(tmp_path, monkeypatch, at):
+    written(tmp_path, ALL)
+    rename, calls = os.replace, []
+
+    def fails(self, target):
+        # Of the public names the second cannot be replaced, by a link or by the file itself.
+        calls.append(Path(target).name in NAMES and Path(target).parent == tmp_path)
+        if calls[-1] and sum(calls) == (2 if at == "before" else len(NAMES) + 2):
+            raise OSError(5, "Input/output error")
+        rename(self, target)
+
+    with monkeypatch.context() as broken:
+        broken.setattr(Path, "replace", fails)
+        with pytest.raises(DataError, match="Input/output error"):
+            written(tmp_path, LESS)
+    assert visible(tmp_path) == (ALL if at == "before" else LESS)
+    written(tmp_path, LESS)
+    expect_no_leftovers(tmp_path, LESS)
+
+
+def test_an_error_names_the_file_as_it_would_be_called(tmp_path):
+    def write(aside):
+        (aside / "report.html").mkdir()
+        write_atomically(aside / "report.html", "text")
+
+    with pytest.raises(DataError, match=r"report\.html cannot be written") as caught:
+        write_generation(tmp_path, NAMES, write)
+    assert caught.value.culprits == (str(tmp_path / "report.html"),)
+    assert ".tmp" not in caught.value.message
+    assert not list(tmp_path.iterdir())
+
+
+def breaking(*_: object, **__: object) -> None:
+    raise ValueError("18 mm of 25 mm")
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "file"),
+    [
+        (report, "write_report", "report.html"),
+        (recording, "write_recording", "recording.rrd"),
+    ],
+)
+def test_a_result_outlives_a_drawing_that_fails(tmp_path, monkeypatch, module, name, file):
+    sample = made_up()
+    before = write_outputs(tmp_path, sample.session, Run(sample.calibration, sample.evidence))
+    later = replace(sample.calibration, created="2026-11-22T00:00:00+00:00")
+    monkeypatch.setattr(module, name, breaking)
+    done = write_outputs(tmp_path, sample.session, Run(later, sample.evidence))
+    assert Calibration.load(tmp_path).created == later.created
+    # The earlier drawing does not stand beside the new result as if it were its own.
+    assert sorted(it.name for it in tmp_path.iterdir()) == sorted(it.name for it in done.files)
+    assert {it.name for it in before.files} - {it.name for it in done.files} == {file}
+    (missing,) = done.undrawn
+    assert missing.file == tmp_path / file
+    assert "ValueError at test_generations.py" in missing.cause
+    assert "18 mm of 25 mm" in missing.cause
+
+
+def test_frames_join_a_result_whose_report_cannot_be_drawn(tmp_path, monkeypatch):
+    sample = made_up()
+    write_outputs(tmp_path, sample.session, Run(sample.calibration, sample.evidence))
+    monkeypatch.setattr(report, "write_report", breaking)
+    joined = with_frames(sample).calibration
+    assert len(rewrite(tmp_path, joined).undrawn) == 1
+    assert Calibration.load(tmp_path).frames.keys() == joined.frames.keys()
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_calibrate_ends_with_1_and_the_result_where_a_drawing_fails(tmp_path, monkeypatch, as_json):
+    cell = write_session(simulate(CellOptions(views=12, seed=1)), tmp_path / "p", images=False)
+    monkeypatch.setattr(report, "write_report", breaking)
+    out = tmp_path / "out"
+    done = visioncal("calibrate", cell, "-o", out, *(["--json"] if as_json else []))
+    assert done.status == 1
+    assert f"{out / 'report.html'} could not be drawn (ValueError" in done.err
+    assert f"The result is safe in {out / 'calibration.json'}" in done.err
+    assert sorted(it.name for it in out.iterdir()) == ["calibration.json", "recording.rrd"]
+    if as_json:
+        assert json.loads(done.out) == json.loads((out / "calibration.json").read_bytes())
+    else:
+        assert "views used" in done.err

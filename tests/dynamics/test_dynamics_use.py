@@ -1,0 +1,313 @@
+"""What identified dynamics are good for: payloads, drive gains, reports, and other programs."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.commands import visioncal
+from support.drawn import column
+
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.dynamics import (
+    ArmDynamics,
+    BaseModel,
+    DynamicModel,
+    FrictionTerms,
+    Identified,
+    Measured,
+    Motion,
+    drive_gains,
+    estimate_payload,
+    external_torques,
+    friction_at,
+)
+from visioncal.dynamics.conditioning import condition
+from visioncal.dynamics.identify import Options
+from visioncal.dynamics.reading import read_recorded
+from visioncal.dynamics.run import Request, conditioned_streams, identify_session
+from visioncal.interchange.outputs import write_dynamics
+from visioncal.present.recording.paths import MOTION_TIMELINE
+from visioncal.robot import Inertias, Loads, Robot, load_robot, small_urdf
+from visioncal.session import Session
+from visioncal.simulation.dynamics import Body, drive_torques, real_dynamics
+from visioncal.simulation.exercise import (
+    Senses,
+    exercise_session,
+    multi_sine,
+    record,
+    slow_sweep,
+)
+
+# The rotors of the simulated arm are not among what the maker tells.
+TERMS = FrictionTerms(motor_inertia=True, slow_rad_s=3e-4)
+LOAD = Body(2.8, np.array([0.02, -0.03, 0.08]), np.diag([0.012, 0.01, 0.008]))
+
+
+class World:
+    """A simulated UR10e that moved without and with a load."""
+
+    def __init__(self, seed=0, load=LOAD, senses=None, stribeck=False):
+        rng = np.random.default_rng(seed)
+        self.built = real_dynamics("ur10e", rng, stribeck=stribeck)
+        self.loaded = self.built.carrying(load)
+        done = {"exercise": multi_sine(6, rng), "check": multi_sine(6, rng, seconds=8.0)}
+        if stribeck:
+            done["sweep"] = slow_sweep(6, rng, seconds=20.0)
+        runs = {name: record(self.built, it, rng, senses) for name, it in done.items()}
+        self.done, self.empty = done, exercise_session("ur10e", runs)
+        carried = record(self.loaded, done["exercise"], rng, senses)
+        self.full = exercise_session("ur10e", {"loaded": carried})
+
+
+@pytest.fixture(scope="module")
+def world():
+    return World(stribeck=True)
+
+
+@pytest.fixture(scope="module")
+def run(world):
+    request = Request(validate_on="check", options=Options(terms=TERMS, checked=False))
+    return identify_session(world.empty, request)
+
+
+def body_of(load):
+    mass, centre = np.array([load.kg]), load.centre_m[None]
+    return Inertias.of_bodies(mass, centre, load.inertia_kg_m2[None]).values[0]
+
+
+def loaded_streams(identified, session):
+    return conditioned_streams(session, identified, Request())
+
+
+def test_the_simulations_torques_are_the_models(world):
+    """Two recursions that share nothing: links as bodies, and the drives' own part."""
+    robot, built, done = load_robot("ur10e"), world.built, world.done["check"]
+    still = np.zeros(6)
+    gears = replace(built.gears, coulomb=still, viscous=still, offset=still, stribeck=still)
+    bare = replace(built, gears=replace(gears, motor_inertia=still))
+    document = dict(robot.document)
+    document["joint"] = [
+        row
+        | {
+            "mass_kg": body.kg,
+            "com_m": body.centre_m.tolist(),
+            "inertia_kg_m2": body.inertia_kg_m2[np.triu_indices(3)][[0, 1, 3, 2, 4, 5]].tolist(),
+        }
+        for row, body in zip(document["joint"], built.bodies, strict=True)
+    ]
+    links = Robot.from_document(document).inertias
+    from visioncal.robot import joint_torques
+
+    wanted = drive_torques(bare, done.q, done.dq, done.ddq)
+    # Sums of some hundred products about 1 to 100 N m; the arms' tables agree to the last digit.
+    assert joint_torques(robot, links, done.q, done.dq, done.ddq) == pytest.approx(wanted, abs=1e-9)
+
+
+def test_torques_are_fed_forward(world, run):
+    arm, done = ArmDynamics.of(run.identified), world.done["check"]
+    wanted = drive_torques(world.built, done.q, done.dq, done.ddq)
+    away = arm.torques(done.q, done.dq, done.ddq) - wanted
+    known = ArmDynamics(arm.robot, arm.robot.inertias, arm.friction)
+    before = known.torques(done.q, done.dq, done.ddq) - wanted
+    share = np.sqrt(np.mean(away**2, axis=0) / np.var(wanted, axis=0))
+    # 3 % of noise in 3000 torques a joint tell each of 60 parameters to some thousandths.
+    assert share.max() < 0.02
+    # Links weigh 20 % otherwise than the maker says.
+    assert np.sqrt(np.mean(before[:, 1] ** 2)) > 10.0 * np.sqrt(np.mean(away[:, 1] ** 2))
+
+
+def test_a_collision_is_felt(world, run):
+    """Someone leans on the flange from the third second on."""
+    done, robot = world.done["check"], run.identified.robot
+    push = np.array([0.0, 30.0, -40.0])
+    frames = robot.base_from_flange(done.q)
+    local = np.einsum("mji,j->mi", frames[:, :3, :3], push)
+    jacobian = robot.axis_jacobian(done.q)[:, 3:]
+    external = np.einsum("mij,mi->mj", jacobian, local) * (done.times_s > 3.0)[:, None]
+    given = drive_torques(world.built, done.q, done.dq, done.ddq) - external
+    measured = Measured(Motion(done.times_s, done.q, done.dq, done.ddq), given)
+    found = external_torques(ArmDynamics.of(run.identified), measured, 50.0)
+    quiet, leaning = done.times_s < 2.99, done.times_s > 3.2
+    # Behind the filter of 20 ms; joints turn over within 3 mrad/s, where friction leaps by 20 N m.
+    assert np.abs(np.median(np.abs(found[quiet]), axis=0)).max() < 1.0
+    felt = found[leaning] - external[leaning]
+    assert np.median(np.abs(felt), axis=0).max() < 2.0
+    assert np.median(np.abs(external[leaning, :3]), axis=0).max() > 15.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_payload_is_weighed(seed):
+    world = World(seed)
+    request = Request(options=Options(terms=TERMS, stribeck=False, checked=False))
+    identified = identify_session(world.empty, request).identified
+    found = estimate_payload(identified, loaded_streams(identified, world.full))
+    assert found.mass_kg == pytest.approx(2.8, abs=0.05)
+    assert found.centre_m == pytest.approx(LOAD.centre_m, abs=0.005)
+    # Within four of its own sigmas: chance exceeds them once in some ten thousand.
+    assert abs(found.mass_kg - 2.8) < 4.0 * found.mass_sigma_kg < 0.05
+    assert (np.abs(found.centre_m - LOAD.centre_m) < 4.0 * found.centre_sigma_m).all()
+    assert found.consistent
+    assert found.document()["inertia_kg_m2"][0] == pytest.approx(0.012, rel=0.3)
+    # The arm that carries it holds it.
+    q = world.done["check"].q[::500]
+    more = ArmDynamics.of(identified).carrying(found.body).gravity(q)
+    more -= ArmDynamics.of(identified).gravity(q)
+    held = identified.robot.load_torques(
+        q, Loads.alike(len(q), found.mass_kg, found.centre_m, (0.0, 0.0, 0.0))
+    ) - identified.robot.load_torques(q)
+    assert more == pytest.approx(-held, abs=1e-9)
+
+
+def test_no_payload_is_none(world, run):
+    same = exercise_session("ur10e", {"again": world.empty.streams["check"]})
+    with pytest.raises(DegenerateError, match="cannot be told from none"):
+        estimate_payload(run.identified, loaded_streams(run.identified, same))
+
+
+def test_a_known_payload_tells_the_drives_gains():
+    gains = np.array([20.0, 21.0, 16.0, 9.0, 9.5, 8.7])
+    load = Body(8.0, np.array([0.08, -0.03, 0.08]), LOAD.inertia_kg_m2)
+    world = World(4, load, Senses(gains_nm_a=tuple(gains)))
+    base = BaseModel.reduce(DynamicModel(load_robot("ur10e"), TERMS))
+
+    def currents(session, name):
+        return [condition(read_recorded(session.streams[name], name, 6, np.ones(6)))]
+
+    empty, full = currents(world.empty, "exercise"), currents(world.full, "loaded")
+    found = drive_gains(base, empty, full, body_of(load))
+    assert found.told.all()
+    # Four sigmas, and half a percent at the most.
+    assert (np.abs(found.nm_per_a - gains) < 4.0 * found.sigma).all()
+    assert found.nm_per_a == pytest.approx(gains, rel=0.02)
+    with pytest.raises(DegenerateError, match="stand out at no joint"):
+        drive_gains(base, empty, empty, 1e-6 * body_of(load))
+
+
+def test_friction_is_that_of_the_drives(world, run):
+    speeds = np.repeat(np.array([[-1.0], [0.2], [1.5]]), 6, axis=1)
+    gears = world.built.gears
+    wanted = gears.torques(speeds, np.zeros_like(speeds))
+    found = friction_at(run.identified, speeds)
+    # An offset and an unbalanced link are told apart to some hundredths of the friction.
+    assert found == pytest.approx(wanted, rel=0.05, abs=0.3)
+
+
+@pytest.fixture(scope="module")
+def written(run, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("dynamics")
+    assert [it.name for it in write_dynamics(folder, run).files] == [
+        "dynamics.json",
+        "report.html",
+        "recording.rrd",
+    ]
+    return folder
+
+
+def test_the_report_says_what_was_found(written, run):
+    page = (written / "report.html").read_text(encoding="utf-8")
+    identified = run.identified
+    for text in ("shoulder_pan_joint", "Fc1", "kg m", "Base parameters", "m6*cx6"):
+        assert text in page
+    # One row a parameter, a plot a motion and one of friction.
+    assert page.count('class="combination"') == identified.base.rank
+    assert page.count("<svg role") == len(run.predictions) + 1
+    assert "http://" not in page.replace("http://www.w3.org", "")
+
+
+def test_the_recording_has_torques_over_time(written, run):
+    path = written / "recording.rrd"
+    samples = sum(len(it.times_s) for it in run.predictions)
+    for name in ("measured", "predicted", "known_before"):
+        # One more a motion ends its line.
+        entity = f"/dynamics/torques_nm/joint_3/{name}"
+        count = len(column(path, entity, "Scalars:scalars", MOTION_TIMELINE))
+        assert count == samples + len(run.predictions)
+    # It is the session as well, which can be identified again.
+    assert Session.load(path).digest() == run.session.digest()
+
+
+@pytest.mark.parametrize("form", ["robot-urdf", "robot-json"])
+def test_identified_inertias_are_exported(written, run, form, tmp_path):
+    suffix = {"robot-urdf": ".urdf", "robot-json": ".json"}[form]
+    path = tmp_path / f"arm{suffix}"
+    assert visioncal("export", written, "--to", form, "-o", path).status == 0
+    again = load_robot(str(path), tip="tool0")
+    assert again.inertias.values == pytest.approx(run.identified.inertias.values, abs=1e-9)
+    assert again.torque_nm.tolist() == run.identified.robot.torque_nm.tolist()
+    refused = visioncal("export", written, "--to", "ros")
+    assert (refused.status, "robot-urdf and robot-json" in refused.err) == (2, True)
+
+
+def test_a_urdf_keeps_its_form(run):
+    robot = load_robot("ur10e")
+    given = {"schema": 1, "name": "mine", "tip": "tool0", "urdf": small_urdf(robot)}
+    identified = replace(run.identified, robot=Robot.from_document(given))
+    from visioncal.interchange.exports import document
+
+    text = document(identified, "robot-urdf").text
+    assert 'robot name="ur10e"' in text
+    again = Robot.from_document(given | {"urdf": text})
+    assert again.inertias.values == pytest.approx(run.identified.inertias.values, abs=1e-9)
+
+
+def test_without_known_inertias_there_are_no_bodies(run):
+    with pytest.raises(DataError, match="no links that are bodies"):
+        ArmDynamics.of(replace(run.identified, consistent=None))
+
+
+def test_the_command_weighs(written, world, tmp_path):
+    world.full.save(tmp_path / "loaded")
+    arguments = ("dynamics", "payload", tmp_path / "loaded", "--against", written)
+    told = json.loads(visioncal(*arguments, "--json").out)
+    assert told["mass_kg"] == pytest.approx(2.8, abs=0.05)
+    assert "on a UR: set_target_payload(2." in visioncal(*arguments).out
+    assert Identified.load(written).base.rank == 58
+
+
+def test_the_command_finds_gains(tmp_path):
+    gains = (20.0, 21.0, 16.0, 9.0, 9.5, 8.7)
+    load = Body(8.0, np.array([0.08, -0.03, 0.08]), LOAD.inertia_kg_m2)
+    world = World(4, load, Senses(gains_nm_a=gains))
+    world.empty.save(tmp_path / "empty")
+    world.full.save(tmp_path / "loaded")
+    known = ("--mass-kg", 8.0, "--com-mm", "80,-30,80", "--inertia", "0.012,0,0.01,0,0,0.008")
+    arguments = ("dynamics", "gains", tmp_path / "empty", "--loaded", tmp_path / "loaded", *known)
+    rows = json.loads(visioncal(*arguments, "--json").out)
+    assert [it["nm_per_a"] for it in rows] == pytest.approx(gains, rel=0.02)
+    assert visioncal(*arguments).out.startswith("--gains ")
+    wrong = visioncal(*arguments, "--inertia", "0.1,0,0.01,0,0,0.01")
+    assert (wrong.status, "are those of no body" in wrong.err) == (2, True)
+
+
+def test_gains_need_currents(world, tmp_path):
+    world.full.save(tmp_path / "loaded")
+    known = ("--mass-kg", 8.0, "--com-mm", "80,-30,80")
+    path = tmp_path / "loaded"
+    done = visioncal("dynamics", "gains", path, "--loaded", path, *known)
+    assert (done.status, "tells torques and no currents" in done.err) == (2, True)
+
+
+def test_base_parameters_are_read_as_they_were_kept(run, tmp_path):
+    """Another machine may have kept other columns of the same model."""
+    identified = run.identified
+    other = BaseModel.reduce(identified.base.model, np.random.default_rng(5))
+    assert other.independent.tolist() != identified.base.independent.tolist()
+    turn = other.dependence[:, identified.base.independent]
+    humps = np.eye(len(identified.covariance) - other.rank)
+    across = np.block(
+        [
+            [turn, np.zeros((other.rank, len(humps)))],
+            [np.zeros((len(humps), other.rank)), humps],
+        ]
+    )
+    covariance = across @ identified.covariance @ across.T
+    written = replace(
+        identified, base=other, values=turn @ identified.values, covariance=covariance
+    )
+    written.save(tmp_path / "dynamics.json")
+    again = Identified.load(tmp_path)
+    assert again.base.independent.tolist() == other.independent.tolist()
+    found = run.identification.streams[0].pieces[0].measured.motion.chosen(slice(0, 50))
+    # Both are the same torques, to rounding of sums of some 60 products.
+    assert again.torques(found) == pytest.approx(identified.torques(found), abs=1e-7)

@@ -1,0 +1,255 @@
+"""Lens and board as unknowns of all views: derivatives, and what is set free when."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from support.cells import calibrated, error_of, known_of
+from support.marks import slow
+
+from visioncal.core.transforms import invert, log
+from visioncal.core.types import Target
+from visioncal.estimation.appearance import BOARD_NAMES, SCALE, Appearance, board_basis, compress
+from visioncal.estimation.corners import CornerStack
+from visioncal.estimation.poses import reproject
+from visioncal.simulation import CellOptions, fine_camera, simulate
+from visioncal.vision.camera import intrinsics
+from visioncal.vision.targets import corner_positions
+
+FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
+MOUNTS = ("eye-in-hand", "eye-to-hand")
+
+
+def compressed(cell, change=None):
+    """The cell's corners under its true lens and a flat board, both changed by a vector."""
+    positions = corner_positions(cell.options.target)
+    stack = CornerStack.of({it.view: it for it in cell.corners}, positions)
+    appearance = Appearance(cell.options.camera, np.zeros(len(BOARD_NAMES)))
+    if change is not None:
+        appearance = appearance.moved(change)
+    scales = np.array([9 + SCALE])
+    return compress(stack, board_basis(positions), appearance, cell.cam_from_target, scales)
+
+
+def test_poses_and_cost_follow_lens_and_board_as_their_derivatives_say():
+    cell = simulate(replace(FINE, views=6, seed=1, pixel_sigma_px=0.02))
+    middle = compressed(cell)
+    size = len(intrinsics(cell.options.camera)) + len(BOARD_NAMES)
+    # Steps that move corners by about a tenth of a pixel.
+    steps = np.concatenate([np.full(4, 0.1), np.full(5, 1e-3), np.full(2, 1e-5), np.full(7, 1e-5)])
+    for at in range(size):
+        shift = np.zeros(size)
+        shift[at] = steps[at]
+        ahead, behind = compressed(cell, shift), compressed(cell, -shift)
+        centre = invert(middle.cam_from_target)
+        slope = (log(centre @ ahead.cam_from_target) - log(centre @ behind.cam_from_target)) / (
+            2 * steps[at]
+        )
+        # Gauss-Newton's derivative leaves out residual times curvature: 0.02 px of residual over
+        # hundreds of pixels of board, and the steps' own curvature: a percent of the largest.
+        limit = 0.01 * np.abs(slope).max()
+        np.testing.assert_allclose(middle.by_shared[:, :, at], slope, atol=limit)
+        cost = np.sum(ahead.residuals**2) - np.sum(behind.residuals**2)
+        gradient, curvature = (
+            4 * steps[at] * middle.shared_gradient[at],
+            middle.shared_information[at, at],
+        )
+        if at != 9 + SCALE:
+            # Of a symmetric difference the third order is left: small beside the second.
+            assert cost == pytest.approx(gradient, abs=0.02 * 2 * curvature * steps[at] ** 2)
+
+
+def test_the_poses_take_their_share_of_the_information_and_no_more():
+    cell = simulate(replace(FINE, views=6, seed=0))
+    found = compressed(cell)
+    positions = corner_positions(cell.options.target)
+    stack = CornerStack.of({it.view: it for it in cell.corners}, positions)
+    now = reproject(stack, cell.options.camera, found.cam_from_target)
+    by_board = now.by_pose[:, :, 3:] @ board_basis(positions)[stack.ids]
+    by_shared = np.concatenate([now.by_intrinsics, by_board], axis=2)
+    left = 0.0
+    for view in range(6):
+        mine = stack.view_of == view
+        span = np.linalg.qr(np.concatenate(now.by_pose[mine]))[0]
+        rows = np.concatenate(by_shared[mine])
+        rows -= span @ (span.T @ rows)
+        left += rows.T @ rows
+    open_ones = np.flatnonzero(np.arange(len(left)) != 9 + SCALE)
+    among = np.ix_(open_ones, open_ones)
+    scale = np.sqrt(np.diag(left)[open_ones])
+    scale = scale[:, None] * scale
+    # The poses are at rest to 1e-8, and what they take is a million times what they leave.
+    np.testing.assert_allclose(
+        np.linalg.eigvalsh(found.shared_information[among] / scale),
+        np.linalg.eigvalsh(left[among] / scale),
+        rtol=1e-4,
+    )
+
+
+def test_the_corners_alone_do_not_tell_the_size():
+    middle = compressed(simulate(replace(FINE, views=6, seed=1)))
+    grown = compressed(simulate(replace(FINE, views=6, seed=1)), np.eye(18)[9 + SCALE] * 0.01)
+    assert np.all(middle.shared_information[9 + SCALE] == 0.0)
+    # Fits to the same pixels settle to 1e-8 m, which is a millionth of a pixel.
+    np.testing.assert_allclose(grown.residuals, middle.residuals, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [True, slow(False)],
+    ids=["lens given", "lens estimated"],
+)
+def test_a_flat_board_of_the_stated_size_stays_so(given):
+    for seed in range(4):
+        known = calibrated(simulate(replace(FINE, state_intrinsics=given, seed=seed)))
+        looks = known.fitted.looks
+        assert len(known.fitted.seen.moving) == (0 if given else 9)
+        assert np.all(looks.values[looks.boards] == 0.0)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [True, slow(False)],
+    ids=["lens given", "lens estimated"],
+)
+def test_a_bent_board_is_noticed_and_costs_nothing(given):
+    errors = {0.0: [], 3e-4: []}
+    for bow_m, kept in errors.items():
+        for seed in range(4):
+            options = replace(FINE, state_intrinsics=given, seed=seed, board_bow_m=bow_m)
+            known = calibrated(simulate(options))
+            assert any("not flat" in it.reason for it in known.warnings) == (bow_m > 0.0)
+            kept.append(error_of(simulate(options), known)[:6])
+    flat, bent = (np.sqrt(np.mean(np.square(it), axis=0)) for it in errors.values())
+    lengths = [np.linalg.norm(it[part]) for it in (flat, bent) for part in (slice(3), slice(3, 6))]
+    # The same noise in both: what differs is the price of seven more unknowns.
+    assert lengths[2] < 1.2 * lengths[0]
+    assert lengths[3] < 1.2 * lengths[1]
+
+
+def mahalanobis_sq(cell, known, size=12) -> float:
+    """Squared error of the edges in units of the stated covariance: chi-square if that is true."""
+    error = error_of(cell, known)[:size]
+    return float(error @ np.linalg.solve(known.solved.covariance[:size, :size], error))
+
+
+# A true covariance exceeds it in one run of a thousand.
+UNLIKELY = chi2.ppf(0.999, 12)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_a_board_within_what_is_stated_is_measured_and_not_accused(mount):
+    cell = simulate(replace(FINE, mount=mount, seed=3, board_scale=1.002))
+    known = calibrated(cell)
+    (sentence,) = [it for it in known.verdict.reasons if "robot's motion" in it]
+    assert "% larger than stated" in sentence
+    assert "which what is stated allows (to within 0.1 %)" in sentence
+    assert known.verdict.status == "good"
+    assert mahalanobis_sq(cell, known) < UNLIKELY
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("scale", [0.97, 1.01])
+@pytest.mark.parametrize("joints", [True, False])
+def test_a_size_that_is_contradicted_is_dropped_and_no_arm_is_blamed(mount, scale, joints):
+    """As after printing with `fit to page`: the robot's measure is all that is left."""
+    cell = simulate(replace(FINE, mount=mount, seed=3, board_scale=scale))
+    known = calibrated(cell, joints=joints)
+    assert any("which is not what is stated" in it for it in known.verdict.reasons)
+    assert known.verdict.status == "check"
+    assert known.robot_arm.errors is None or not known.robot_arm.errors.is_significant
+    assert mahalanobis_sq(cell, known) < UNLIKELY
+    # Left as stated, the camera would be off by 5 mm and more.
+    assert np.linalg.norm(error_of(cell, known)[3:6]) < 0.5e-3
+
+
+@pytest.mark.slow
+def test_a_size_that_is_held_counts_by_what_the_views_say_against_it():
+    """Sizes drawn as the file states them, an arm too coarse to measure them."""
+    rng = np.random.default_rng(1)
+    coarse = replace(FINE, robot_sigma_m=3e-4, robot_sigma_rad=5e-4)
+    seen = []
+    for seed in range(12):
+        scale = 1.0 + 1e-3 * rng.standard_normal()
+        cell = simulate(replace(coarse, seed=seed, board_scale=scale))
+        seen.append(mahalanobis_sq(cell, calibrated(cell)))
+    # Twelve chi-squares of twelve: 144 +- 17, and 199 in one of a thousand.
+    assert sum(seen) < chi2.ppf(0.999, 144)
+    assert sum(seen) > chi2.ppf(0.001, 144)
+
+
+def with_lens(cell, off, **table):
+    """What is known at the end where the session states a lens that is off by (4,) pixels."""
+    wrong = replace(cell.options.camera, matrix=cell.options.camera.matrix + off)
+    told = replace(cell, stated_camera=wrong)
+    session = known_of(told).session
+    camera = session.document["camera"] | table
+    return calibrated(
+        told, session=replace(session, document=session.document | {"camera": camera})
+    )
+
+
+def lens_is_free(known):
+    """Whether the fit moves the intrinsics."""
+    return np.isin(known.fitted.looks.lens_of("cam"), known.fitted.seen.moving).any()
+
+
+def test_intrinsics_that_are_held_against_the_images_are_named_and_counted():
+    cell = simulate(replace(FINE, seed=5))
+    known = with_lens(cell, np.array([0.0, 0.0, 3.0, 0.0]), intrinsics="hold")
+    (sentence,) = [it for it in known.verdict.reasons if "do not fit these images" in it]
+    assert 'intrinsics = "hold" keeps them' in sentence
+    assert known.verdict.status != "good"
+    assert not lens_is_free(known)
+    assert mahalanobis_sq(cell, known) < UNLIKELY
+
+
+@pytest.mark.parametrize("options", [FINE, replace(FINE, seed=11)])
+def test_right_intrinsics_and_a_flat_board_are_refined_without_a_doubt(options):
+    cell = simulate(options)
+    known = with_lens(cell, np.zeros(4), intrinsics="refine")
+    assert lens_is_free(known)
+    assert known.verdict.status == "good"
+    assert mahalanobis_sq(cell, known) < UNLIKELY
+
+
+def test_intrinsics_within_their_stated_sigma_are_refined_without_a_doubt():
+    cell = simulate(replace(FINE, seed=2))
+    known = with_lens(cell, np.array([2.0, 2.0, -1.5, 1.0]), matrix_sigma_px=2.0)
+    assert known.verdict.status == "good"
+    assert any("refined within what is stated" in it for it in known.verdict.reasons)
+    assert mahalanobis_sq(cell, known) < UNLIKELY
+
+
+def test_given_intrinsics_that_do_not_fit_are_refined_or_held_as_asked():
+    cell = simulate(replace(FINE, seed=5, views=15))
+    off = np.array([6.0, 6.0, -8.0, 5.0])
+    wrong = replace(cell.options.camera, matrix=cell.options.camera.matrix + off)
+    told = replace(cell, stated_camera=wrong)
+    known = calibrated(told)
+    assert any("given intrinsics do not fit" in it.reason for it in known.warnings)
+    refined = known.fitted.looks.camera("cam")
+    lens = known.fitted.columns_of(known.fitted.looks.lens_of("cam"))
+    sigma = np.sqrt(np.diag(known.solved.covariance))[lens[:4]]
+    assert np.all(np.abs(refined.matrix - cell.options.camera.matrix) < 4.0 * sigma)
+    table = {"intrinsics": "hold"}
+    document = known_of(told).session.document
+    session = replace(
+        known_of(told).session, document=document | {"camera": document["camera"] | table}
+    )
+    held = calibrated(told, session=session)
+    assert held.fitted.looks.camera("cam").matrix == pytest.approx(wrong.matrix)
+
+
+def test_too_few_corners_leave_the_lens_alone():
+    marker = Target("tag", "marker", 1, 1, 0.12, 1e-4, dictionary="DICT_4X4_50", marker_id=0)
+    cell = simulate(replace(FINE, seed=2, views=15, target=marker))
+    document = known_of(cell).session.document
+    camera = document["camera"] | {"intrinsics": "refine"}
+    session = replace(known_of(cell).session, document=document | {"camera": camera})
+    known = calibrated(cell, session=session)
+    assert not lens_is_free(known)
+    assert any(
+        '"refine" was not done: 60 corners in 15 views' in it.reason for it in known.warnings
+    )

@@ -1,0 +1,275 @@
+"""Whether residuals are noise, how sure the noise's levels are, and the error budget."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.cells import calibrated, error_of
+from support.marks import slow
+from support.problems import observed, world
+
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.core.transforms import exp
+from visioncal.estimation.arm import ArmErrors, covariance_of_size
+from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance, radius95
+from visioncal.estimation.intervals import noise_intervals
+from visioncal.estimation.parts import ROBOT
+from visioncal.estimation.residual_tests import drift, lens_field, neighbours
+from visioncal.estimation.solve import covariance_of
+from visioncal.estimation.variance import profile_interval
+from visioncal.simulation import CellOptions, fine_camera, simulate
+
+FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
+MOUNTS = ("eye-in-hand", "eye-to-hand")
+
+
+def with_moving_base(cell, twist):
+    """The cell with its base creeping by a twist from the first view to the last."""
+    share = np.linspace(-0.5, 0.5, len(cell.base_from_flange))[:, None]
+    return replace(cell, base_from_flange=exp(share * twist) @ cell.base_from_flange)
+
+
+def answered(cell):
+    known = calibrated(cell, joints=False)
+    return known.solved, known
+
+
+def told(result):
+    return result.problem, result.state, result.noise
+
+
+def sources(**shared):
+    columns = {name: 12 + places for name, places in shared.items()}
+    return Sources({"cam": "pixels"}, {ROBOT: "robot"}, columns)
+
+
+def of_fit(test, result):
+    return test(*told(result), ROBOT)
+
+
+@pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
+def test_a_creeping_base_is_noticed_and_its_way_told(mount):
+    for seed in range(4):
+        cell = simulate(replace(FINE, mount=mount, seed=seed))
+        result, _ = answered(cell)
+        assert of_fit(drift, result) is None
+        moved = with_moving_base(cell, np.array([0, 0, 0, 0.0, 3e-4, 0]))
+        result, known = answered(moved)
+        found = of_fit(drift, result)
+        # A turn of the base by its sigma of some 0.1 mrad moves the place of work by 0.1 mm.
+        assert found.moved_m == pytest.approx(3e-4, abs=2.5e-4)
+        assert any("drift with time" in it.reason for it in known.warnings)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_a_turning_base_moves_the_target_by_its_distance(mount):
+    cell = simulate(replace(FINE, mount=mount, seed=0))
+    turn = np.array([2e-3, 0, 0, 0, 0, 0.0])
+    result, _ = answered(with_moving_base(cell, turn))
+    z = cell.transforms["base_from_target" if mount == "eye-in-hand" else "flange_from_target"]
+    target = z if mount == "eye-in-hand" else (cell.base_from_flange @ z).mean(axis=0)
+    found = of_fit(drift, result)
+    moved = np.linalg.norm(np.cross(turn[:3], target[:3, 3]))
+    # Where the target is, noise leaves some 0.03 mm; the flange moves by 0.2 mm more or less.
+    assert found.moved_m == pytest.approx(moved, abs=8e-5)
+    # Its turn is known to some 0.1 mrad.
+    assert found.moved_rad == pytest.approx(2e-3, abs=3e-4)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"tilt_rad": (0.0, 0.3)}, {"state_intrinsics": False}], ids=str
+)
+def test_a_closed_form_is_not_taken_for_a_misfit(changes):
+    for seed in range(4):
+        known = calibrated(simulate(replace(FINE, seed=seed, **changes)), solver="park")
+        (found,) = known.solved.misfits.values()
+        assert not found.alike.is_significant
+        assert found.moved is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_independent_noise_gives_neighbours_no_more_than_their_share(mount):
+    factors = []
+    for seed in range(12):
+        result, _ = answered(simulate(replace(FINE, mount=mount, seed=seed)))
+        found = of_fit(neighbours, result)
+        assert not found.is_significant
+        factors.append(found.factor)
+    # One on average; a single one scatters by 0.16.
+    assert np.mean(factors) == pytest.approx(1.0, abs=0.2)
+
+
+def test_stops_that_err_in_groups_are_noticed():
+    rng = np.random.default_rng(0)
+    cell = simulate(replace(FINE, views=30, seed=1))
+    group = np.repeat(rng.standard_normal((10, 6)) * np.repeat([4e-4, 2e-4], 3), 3, axis=0)
+    together = replace(cell, base_from_flange=cell.base_from_flange @ exp(group))
+    result, known = answered(together)
+    found = of_fit(neighbours, result)
+    assert found.is_significant
+    stated = result_of(known).uncertainty.inflation
+    assert stated == pytest.approx(found.factor, rel=1e-9)
+    assert found.factor > 1.5
+    assert any("Neighbouring stops err alike" in it.reason for it in known.warnings)
+
+
+@pytest.mark.slow
+def test_intervals_of_the_noise_hold_the_truth():
+    inside, count = np.zeros(2), 20
+    truth = np.array([5e-5, 3e-5])
+    for seed in range(count):
+        result, _ = answered(simulate(replace(FINE, seed=seed, views=12)))
+        low, high = noise_intervals(*told(result))[0].T
+        assert np.all(low <= result.noise.robots[0])
+        assert np.all(result.noise.robots[0] <= high)
+        inside += (low <= truth) & (truth <= high)
+    # 95 % of 20 are 19; under 16 comes in one run of four hundred.
+    assert np.all(inside >= 16)
+
+
+def test_an_interval_is_about_the_level_that_was_found():
+    """Also where another one, far away, is likelier."""
+
+    def profile(logarithm):
+        return 2.0 * min((logarithm - np.log(1e-4)) ** 2, (logarithm - np.log(1e-2)) ** 2 - 5.0)
+
+    low, high = profile_interval(profile, 1e-4, -10.0)
+    # Chi-square of one is under 3.84 in 95 %: 0.98 in logarithms either way, sought to 0.02.
+    assert np.log([low, high]) == pytest.approx(np.log(1e-4) + np.array([-0.98, 0.98]), abs=0.03)
+
+
+def test_the_size_of_an_arms_errors_is_known_as_well_as_these_are_told():
+    rng = np.random.default_rng(0)
+    problem = observed(world(rng, stops=8), rng)
+    # Six errors, of which four are told.
+    errors = ArmErrors(np.zeros((8, 6, 6)), 1e-3, 100.0, True)
+    erring = problem.with_effects([errors.effect("a")])
+    arm = erring.effect_columns["arm of a"]
+    covariance = np.zeros((erring.size, erring.size))
+    covariance[arm, arm] = np.diag([1e-6, 1e-6, 0.0, 0.0, 0.0, 0.0])
+    # The place of a frame makes up for one that is not told.
+    covariance[0, arm.start] = covariance[arm.start, 0] = -5e-7
+    covariance[0, 0] = 3e-7
+    more = covariance_of_size(erring, covariance, "a", errors)
+    # Student's t of four degrees has twice the variance of the normal.
+    np.testing.assert_allclose(np.diag(more[arm, arm]), [1e-6, 1e-6, 0.0, 0.0, 0.0, 0.0])
+    assert more[0, arm.start] == pytest.approx(-5e-7)
+    # Of the frame's variance, the part that the error makes up for.
+    assert more[0, 0] == pytest.approx(2.5e-7)
+
+
+@pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens estimated"])
+def test_the_budget_adds_up(given):
+    result, known = answered(simulate(replace(FINE, state_intrinsics=given, seed=2)))
+    rows = np.arange(len(result.state.values))
+    parts = covariance_by_source(*told(result), sources(shared=rows))
+    whole = covariance_of(result.problem, result.fit)[:12, :12]
+    # An identity; what is left is rounding of an inverse with a condition of 1e10.
+    np.testing.assert_allclose(sum(parts.values()), whole, rtol=1e-4, atol=1e-6 * whole.max())
+    budget, covariance = known.work.budget_mm, result.covariance[:6, :6]
+    at_work = point_covariance(result.state.edges[0], covariance, known.work.point_cam)
+    assert budget["total"] == pytest.approx(1e3 * np.sqrt(np.trace(at_work)), rel=1e-4)
+    assert ("intrinsics" in budget) == (not given)
+
+
+def test_sources_that_are_known_together_add_up_as_well():
+    bent = replace(FINE, state_intrinsics=False, board_bow_m=5e-4, seed=2)
+    result, known = answered(simulate(bent))
+    is_lens = known.fitted.seen.free < known.fitted.looks.boards.start
+    owners = {"intrinsics": np.flatnonzero(is_lens), "board": np.flatnonzero(~is_lens)}
+    parts = covariance_by_source(*told(result), sources(**owners))
+    whole = covariance_of(result.problem, result.fit)[:12, :12]
+    # An identity; what is left is rounding of an inverse with a condition of 1e10.
+    np.testing.assert_allclose(sum(parts.values()), whole, rtol=1e-4, atol=1e-6 * whole.max())
+
+
+def test_a_point_is_as_uncertain_as_its_scatter():
+    rng = np.random.default_rng(3)
+    edge, point = exp(rng.normal(size=6)), np.array([0.1, -0.2, 0.6])
+    root = rng.normal(size=(6, 6)) * 1e-4
+    steps = rng.standard_normal((20000, 6)) @ root.T
+    seen = (edge @ exp(steps))[:, :3, :3] @ point + (edge @ exp(steps))[:, :3, 3]
+    # 20000 draws tell a variance to 1 %.
+    expected = point_covariance(edge, root @ root.T, point)
+    np.testing.assert_allclose(np.cov(seen.T), expected, atol=0.04 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("variances", [(1, 1, 1), (1, 0.1, 0.01), (1, 0, 0)])
+def test_95_percent_lie_within_the_radius(variances):
+    draws = np.random.default_rng(0).standard_normal((200000, 3)) ** 2 @ np.array(variances, float)
+    radius = radius95(np.diag(np.array(variances, float)))
+    # Imhof's fit is good to 1 %; 200000 draws to 0.1 %.
+    assert np.mean(draws < radius**2) == pytest.approx(0.95, abs=0.004)
+
+
+@pytest.mark.slow
+def test_errors_follow_the_stated_covariance_with_the_misfit_tests_on():
+    surprises = []
+    for seed in range(12):
+        cell = simulate(replace(FINE, seed=seed, robot_sigma_m=3e-4, robot_sigma_rad=5e-4))
+        result, known = answered(cell)
+        error = error_of(cell, known)
+        surprises.append(error @ np.linalg.solve(result.covariance[:12, :12], error) / 12)
+    # Mean of 12 chi-square of 12: 0.12; the board's scale, held at the truth, takes one of them.
+    assert np.mean(surprises) == pytest.approx(0.95, abs=0.35)
+
+
+def through_a_wavy_lens(cell, sigma_px, rng):
+    """The cell with corners displaced by a smooth field, which no lens model has."""
+    waves = rng.normal(size=(2, 200, 2)) / (0.2 * cell.stated_camera.resolution[0])
+    phases = rng.uniform(0.0, 2.0 * np.pi, (2, 200))
+    weights = rng.normal(size=(2, 200)) * np.sqrt(2 / 200) * sigma_px
+
+    def moved(px):
+        return px + np.stack(
+            [np.cos(px @ waves[it].T + phases[it]) @ weights[it] for it in (0, 1)], axis=1
+        )
+
+    return replace(cell, corners=tuple(replace(it, px=moved(it.px)) for it in cell.corners))
+
+
+def test_noise_of_corners_is_no_field_of_the_lens():
+    rng = np.random.default_rng(6)
+    px = rng.uniform(0, [1280, 800], (800, 2))
+    found = [lens_field(px, rng.normal(0, 0.1, (800, 2)), (1280, 800)) for _ in range(300)]
+    # One of ten thousand by chance.
+    assert not any(it.is_significant for it in found)
+    # 60 of 72 directions count, so that F lies about 1.2, 0.2 wide, before a fit takes some out.
+    assert np.mean([it.factor for it in found]) == pytest.approx(1.2, abs=0.03)
+
+
+def test_a_field_of_the_lens_is_found_with_its_size():
+    rng = np.random.default_rng(7)
+    px = rng.uniform(0, [1280, 800], (800, 2))
+    wave = 0.08 * np.sqrt(2) * np.sin(2 * np.pi * px[:, ::-1] / 600)
+    found = lens_field(px, wave + rng.normal(0, 0.1, (800, 2)), (1280, 800))
+    assert found.is_significant
+    # A cell's mean loses part of a wave of 600 px over cells of 213 x 133.
+    assert 0.06 < found.sigma_px < 0.09
+
+
+def test_few_corners_say_nothing_of_a_field():
+    found = lens_field(np.zeros((8, 2)), np.ones((8, 2)), (1280, 800))
+    assert (found.factor, found.is_significant) == (1.0, False)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_a_lens_beyond_its_model_is_counted_and_named(mount):
+    squared, before, named = [], [], 0
+    for seed in range(6):
+        cell = simulate(replace(FINE, mount=mount, seed=seed, robot_sigma_m=1e-5))
+        cell = through_a_wavy_lens(cell, 0.25, np.random.default_rng(seed))
+        known = calibrated(cell, joints=False)
+        answer = known.solved
+        away, field = error_of(cell, known)[3:6], answer.beside["lens_field"][3:6, 3:6]
+        covariance = answer.covariance[3:6, 3:6]
+        squared.append(away @ np.linalg.solve(covariance, away) / 3)
+        before.append(away @ np.linalg.solve(covariance - field, away) / 3)
+        named += any(it.kind == "lens_field" for it in known.findings.warnings)
+    # 18 components: a mean squared error over the covariance of 2.5 is one in a thousand. What the
+    # field adds is a fifth of the variance at least, or this tests nothing.
+    assert np.mean(squared) < 2.5
+    assert np.mean(before) > 1.2 * np.mean(squared)
+    # A field of 2.5 times the noise; a board that fills a part of the image shows a part of it.
+    assert named >= 4

@@ -1,0 +1,147 @@
+"""Wrong views are found, named and left out; right ones are kept."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.cells import calibrated, error_of
+from support.marks import slow
+
+from visioncal.core.errors import DegenerateError
+from visioncal.core.transforms import exp
+from visioncal.estimation.chain import chain
+from visioncal.estimation.outliers import distances, inliers
+from visioncal.estimation.parts import ROBOT, State
+from visioncal.estimation.solve import Solution, fit_problem, solve_problem
+from visioncal.simulation import CellOptions, fine_camera, simulate, wide_camera
+
+WORLDS = {
+    "fine, given": CellOptions(camera=fine_camera(), pixel_sigma_px=0.1),
+    "wide, estimated": CellOptions(
+        camera=wide_camera(), pixel_sigma_px=0.1, state_intrinsics=False, mount="eye-to-hand"
+    ),
+}
+
+
+@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("wrong", [0, slow(2), 6])
+def test_just_the_wrong_views_are_left_out(world, wrong):
+    for seed in range(4):
+        cell = simulate(replace(WORLDS[world], wrong_views=wrong, seed=seed))
+        known = calibrated(cell)
+        assert set(range(20)) - set(known.used) == set(cell.wrong_views)
+        for view in cell.wrong_views:
+            assert "times the noise" in known.reasons[view]
+        error, covariance = error_of(cell, known), known.solved.covariance[:12, :12]
+        # Chi-square of 12 stays under 39 in all but one case of ten thousand.
+        assert error @ np.linalg.solve(covariance, error) < 39.0
+
+
+def test_of_hundreds_of_uneven_views_several_are_taken_in_by_one_fit(monkeypatch):
+    fits = []
+    monkeypatch.setattr(
+        "visioncal.estimation.outliers.fit_problem",
+        lambda problem, *start: fits.append(len(problem)) or fit_problem(problem, *start),
+    )
+    cell = simulate(replace(WORLDS["fine, given"], views=600, seed=3))
+    # Poses that others measured: no covariance, and some are many times worse than most.
+    noise = 3e-4 * np.random.default_rng(0).standard_t(3, (600, 6))
+    seen = cell.cam_from_target @ exp(noise)
+    found = inliers(chain("eye-in-hand", cell.base_from_flange, seen))
+    # All views but one or two belong to the noise, of which the search first left out fifty.
+    assert found.used.sum() >= 598
+    assert len(fits) < 25
+
+
+def test_two_exchanged_rows_are_found():
+    cell = simulate(replace(WORLDS["fine, given"], seed=2))
+    poses = cell.base_from_flange.copy()
+    poses[[4, 11]] = poses[[11, 4]]
+    known = calibrated(replace(cell, base_from_flange=poses), joints=False)
+    assert set(range(20)) - set(known.used) == {4, 11}
+
+
+@pytest.mark.slow
+def test_where_nothing_agrees_nothing_is_left_out():
+    known = calibrated(simulate(replace(WORLDS["fine, given"], seed=2)))
+    problem = known.solved.problem.with_effects([])
+    mixed = replace(problem, poses={ROBOT: np.roll(problem.poses[ROBOT], 1, axis=0)})
+    assert inliers(mixed).used.all()
+
+
+def test_a_stop_is_right_or_wrong_as_a_whole():
+    cell = simulate(replace(WORLDS["fine, given"], seed=1, wrong_views=1))
+    known = calibrated(cell)
+    (wrong,) = cell.wrong_views
+    problem = known.fitted.agreed.problem.with_effects([])
+    doubled = problem.observations.take(np.repeat(np.arange(20), 2))
+    found = inliers(replace(problem, observations=doubled))
+    assert np.flatnonzero(~found.used).tolist() == [2 * wrong, 2 * wrong + 1]
+
+
+def looked_at_again(problem, times=2, seed=5):
+    """Each stop looked at several times, with the camera's own noise each time."""
+    seen = problem.observations.take(np.repeat(np.arange(len(problem)), times))
+    noise = np.random.default_rng(seed).standard_normal((len(seen), 6))
+    moved = exp((np.linalg.cholesky(seen.covariance) @ noise[:, :, None])[:, :, 0])
+    return replace(problem, observations=replace(seen, measured=seen.measured @ moved))
+
+
+def with_measured(problem, measured):
+    return replace(problem, observations=replace(problem.observations, measured=measured))
+
+
+@pytest.mark.parametrize("times", [2, 3])
+@pytest.mark.parametrize("measured", [True, False], ids=["covariance unknown", "covariance known"])
+def test_a_wrong_image_does_not_take_a_sound_one_of_its_stop_with_it(times, measured):
+    known = calibrated(simulate(replace(WORLDS["fine, given"], seed=1)))
+    problem = looked_at_again(known.solved.problem.with_effects([]), times)
+    if measured:
+        unknown = np.zeros_like(problem.observations.covariance)
+        seen = replace(problem.observations, covariance=unknown)
+        problem = replace(problem, observations=seen, is_combined=True)
+    assert inliers(problem).used.all()
+    wrong = problem.observations.measured.copy()
+    wrong[4 * times + 1] = problem.observations.measured[11 * times]
+    found = inliers(with_measured(problem, wrong))
+    assert np.flatnonzero(~found.used).tolist() == [4 * times + 1]
+
+
+def test_one_pose_of_the_robot_is_refused_before_anything_is_counted():
+    cell = simulate(replace(WORLDS["fine, given"], seed=1))
+    still = np.repeat(cell.base_from_flange[:1], 20, axis=0)
+    with pytest.raises(DegenerateError, match="all 20 used views are from one pose") as caught:
+        calibrated(replace(cell, base_from_flange=still), joints=False)
+    assert caught.value.culprits == ("the camera's offset from the tool",)
+
+
+def test_a_square_is_the_distance_from_what_the_others_predict():
+    known = calibrated(simulate(replace(WORLDS["fine, given"], seed=3, views=12)))
+    problem = known.solved.problem.with_effects([])
+    state = State(known.solved.state.edges, np.zeros(0))
+    everything = np.ones(12, dtype=bool)
+    fit = fit_problem(problem, state)
+    inside = distances(problem, everything, fit)
+    for view in (0, 7):
+        others = everything.copy()
+        others[view] = False
+        # The same noise, so that the deletion identity holds to the fit's own curvature.
+        state, _ = solve_problem(problem.subset(others), fit.state, fit.noise)
+        without = distances(problem, others, Solution(state, fit.noise))
+        assert without.squares[view] == pytest.approx(inside.squares[view], rel=1e-3)
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_rows_that_are_exchanged_and_an_image_of_another_row_are_named(mount):
+    cell = simulate(CellOptions(mount=mount, seed=3))
+    poses = cell.base_from_flange.copy()
+    poses[[4, 9]] = poses[[9, 4]]
+    corners = [replace(cell.corners[2], view=7) if it.view == 7 else it for it in cell.corners]
+    known = calibrated(replace(cell, base_from_flange=poses, corners=tuple(corners)), joints=False)
+    verdict = known.verdict
+    assert verdict.status == "check"
+    (words,) = [it for it in verdict.reasons if "exchanged" in it]
+    assert words.startswith("Views 4 and 9 are exchanged: the image of each fits the pose in the")
+    (words,) = [it for it in verdict.reasons if it.startswith("View 7 was left out")]
+    assert "its image is of stop 2; its pose or its image is wrong" in words
+    assert set(known.reasons) == {4, 7, 9}

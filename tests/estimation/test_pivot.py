@@ -1,0 +1,315 @@
+"""The pivot: a tool's tip and rotation from touches, wrong touches, and poor motion."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.marks import slow
+from support.touched import (
+    EXACT,
+    POINTS,
+    TIP,
+    TURN,
+    Job,
+    bound,
+    error_of,
+    relabelled,
+    slipped,
+    touched,
+    turned,
+)
+
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.transforms import compose, exp, invert
+from visioncal.estimation.parts import Noise
+from visioncal.estimation.pivot import fit_pivot
+from visioncal.estimation.readings import readings_that_close
+from visioncal.estimation.touching import Placed, Touches, TouchProblem
+
+DATA = Path(__file__).parents[3] / "shared" / "data"
+ROBOT = Noise.of_robot(5e-5, 3e-5)
+WAY = np.array([0.48, -0.6, 0.64])
+
+
+def rejected(fit):
+    return np.flatnonzero(~fit.agrees).tolist()
+
+
+def with_poses(touches, rotations):
+    poses = touches.base_from_flange.copy()
+    poses[:, :3, :3] = rotations.as_matrix()
+    return replace(touches, base_from_flange=poses)
+
+
+@pytest.mark.parametrize("job", [Job(tips=3), Job(tips=2, points=2), Job(axes=1), Job(points=3)])
+def test_exact_touches_give_the_exact_tool(job):
+    made = touched(replace(job, contact_m=0.0), 1)
+    fit = fit_pivot(made.touches)
+    # Exact in double precision, at levers of a metre and the weakest of these geometries.
+    assert fit.flange_from_tool[:3, 3] == pytest.approx(TIP, abs=1e-11)
+    assert fit.points == pytest.approx(POINTS[: job.points], abs=1e-11)
+    turn = TURN.as_matrix() if job.axes else np.eye(3)
+    assert fit.flange_from_tool[:3, :3] == pytest.approx(turn, abs=1e-10)
+    assert fit.oriented == (job.axes > 0)
+    assert fit.agrees.all()
+    if not fit.oriented:
+        assert not fit.covariance[:3].any()
+
+
+@pytest.mark.parametrize("oriented", [False, True])
+def test_derivatives_are_those_of_the_residuals(oriented):
+    # Where the touches close: elsewhere the derivatives leave out what noise would add.
+    made = touched(Job(tips=3, points=2, axes=2, contact_m=0.0), 2)
+    problem = TouchProblem(made.touches, ROBOT, oriented)
+    state = Placed(compose(TURN.as_matrix(), TIP), POINTS[:2])
+    jacobian = problem.linearise(state).jacobian
+    for at, step in enumerate(1e-6 * np.eye(jacobian.shape[2])):
+        ahead, behind = (
+            problem.linearise(problem.move(state, it)).residuals for it in (step, -step)
+        )
+        # Central differences at 1e-6 err by their square and by rounding over the step.
+        assert jacobian[:, :, at] == pytest.approx((ahead - behind) / 2e-6, abs=1e-8)
+
+
+def test_the_gradient_is_exact_far_from_closing_too():
+    made = touched(Job(tips=3, points=2, axes=2), 2)
+    problem = TouchProblem(made.touches, EXACT, oriented=True)
+    twist = np.array([0.1, -0.2, 0.3, 0.01, 0.02, -0.01])
+    state = Placed(compose(TURN.as_matrix(), TIP) @ exp(twist), POINTS[:2] + 0.01)
+
+    def cost(step):
+        return np.sum(problem.linearise(problem.move(state, step)).residuals ** 2) / 2
+
+    groups = problem.linearise(state)
+    gradient = np.einsum("mij,mi->j", groups.jacobian, groups.residuals)
+    expected = [(cost(it) - cost(-it)) / 2e-6 for it in 1e-6 * np.eye(12)]
+    # Central differences of a cost of 0.01 are exact to rounding over the step.
+    assert gradient == pytest.approx(np.array(expected), abs=1e-10)
+
+
+def test_the_robots_noise_is_carried_to_the_touched_point():
+    made = touched(Job(tips=1, axes=1), 3)
+    problem = TouchProblem(made.touches, Noise.of_robot(1e-3, 2e-3), oriented=True)
+    tool, point = compose(TURN.as_matrix(), TIP), np.array([*POINTS[0], 1.0])
+    known = problem.linearise(Placed(tool, POINTS[:1])).known
+    for at, flange in enumerate(made.touches.base_from_flange):
+        jacobian = [
+            (invert(flange @ exp(step) @ tool) - invert(flange @ exp(-step) @ tool)) @ point / 2e-5
+            for step in 1e-5 * np.eye(6)
+        ]
+        slope = np.array(jacobian)[:, :3].T * np.repeat([1e-3, 2e-3], 3)
+        # The floor of a micrometre is 2.5e-7 of the level.
+        assert known[at] == pytest.approx(slope @ slope.T, rel=1e-5, abs=1e-11)
+
+
+@pytest.mark.parametrize(
+    "job",
+    [
+        Job(tips=6, axes=2),
+        *(slow(it) for it in (Job(noise=ROBOT), Job(tips=4, points=3))),
+    ],
+)
+def test_error_and_covariance_agree_with_each_other_and_with_the_bound(job):
+    squared, errors, least = [], [], []
+    for seed in range(60):
+        made = touched(job, seed)
+        fit = fit_pivot(made.touches, job.noise)
+        free = np.arange(0 if job.axes else 3, 6)
+        error = error_of(fit.flange_from_tool) if job.axes else np.zeros(6)
+        if not job.axes:
+            error[3:] = fit.flange_from_tool[:3, 3] - TIP
+        covariance = fit.covariance[np.ix_(free, free)]
+        squared.append(error[free] @ np.linalg.solve(covariance, error[free]))
+        errors.append(error[3:] @ error[3:])
+        least.append(np.trace(bound(made)[3:, 3:]))
+    size = len(free)
+    # An F distribution over 24 degrees of freedom or more: 9 % over its size on average, and its
+    # standard deviation is at most 1.2 sqrt(2 size); four standard errors of the mean.
+    assert abs(np.mean(squared) - 1.09 * size) < 4 * 1.2 * np.sqrt(2 * size / 60)
+    # The mean of 60 squared errors of three components: 11 % standard error, taken four times.
+    assert abs(np.mean(errors) / np.mean(least) - 1) < 0.45
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda it: slipped(it, 4, 1e-3 * WAY),
+        lambda it: slipped(it, 4, 5e-3 * WAY),
+        lambda it: turned(it, 4, np.deg2rad(2.0) * WAY),
+    ],
+    ids=["slip of 1 mm", "slip of 5 mm", "turn of 2 deg"],
+)
+def test_one_wrong_touch_in_ten_is_left_out(spoil, seed):
+    fit = fit_pivot(spoil(touched(Job(noise=ROBOT), seed).touches), ROBOT)
+    assert rejected(fit) == [4]
+    assert fit.belongs_to[4] is None
+    assert fit.mahalanobis_sq[4] > fit.limit[4]
+    # What is left errs as ten touches of 0.1 mm do: half of that, and six times it for certain.
+    assert np.linalg.norm(fit.flange_from_tool[:3, 3] - TIP) < 6e-4
+
+
+def test_how_far_a_touch_slipped_is_told():
+    fit = fit_pivot(slipped(touched(Job(), 1).touches, 4, 5e-3 * WAY))
+    # The slip, give or take the noise of the touch and of the prediction.
+    assert fit.residuals_m[4] == pytest.approx(5e-3, abs=6e-4)
+
+
+def test_a_wrong_touch_of_an_axis_is_left_out_where_others_tell():
+    made = touched(Job(axes=3), 5)
+    fit = fit_pivot(slipped(made.touches, 11, 5e-3 * made.truly[11].apply(TURN.apply([1, 0, 0]))))
+    assert rejected(fit) == [11]
+
+
+def test_a_lone_touch_of_an_axis_is_not_accused():
+    made = touched(Job(axes=1), 5)
+    aside = 5e-3 * made.truly[10].apply(TURN.apply([1, 0, 0]))
+    fit = fit_pivot(slipped(made.touches, 10, aside))
+    assert fit.agrees.all()
+    assert np.isinf(fit.limit[10:]).all()
+
+
+def test_exchanged_labels_are_recognised():
+    touches = touched(Job(tips=5, points=2), 3).touches
+    fit = fit_pivot(relabelled(relabelled(touches, 2, 1), 7, 0))
+    assert rejected(fit) == [2, 7]
+    assert (fit.belongs_to[2], fit.belongs_to[7]) == (0, 1)
+
+
+def test_of_two_touches_of_a_point_neither_is_accused():
+    touches = touched(Job(tips=5, points=2), 3).touches
+    # Of point B there are one touch of its own and one that was slipped.
+    few = touches.subset(np.array([True] * 5 + [True, True] + [False] * 3))
+    fit = fit_pivot(slipped(few, 5, 2e-3 * WAY))
+    assert fit.agrees.all()
+    assert np.flatnonzero(fit.doubtful).tolist() == [5, 6]
+    assert not fit.explained
+
+
+def test_two_touches_that_contradict_each_other_grossly_are_refused_by_name():
+    touches = touched(Job(tips=5, points=2), 3).touches
+    few = touches.subset(np.array([True] * 6 + [True] + [False] * 3))
+    with pytest.raises(DataError, match=r"touches 0, 6 contr.*touch 0 fits point 'A'") as caught:
+        fit_pivot(relabelled(few.subset(np.arange(7) != 5), 0, 1))
+    assert caught.value.culprits == ("0", "6")
+
+
+def test_sound_touches_are_kept():
+    lost = [seed for seed in range(40) if not fit_pivot(touched(Job(), seed).touches).agrees.all()]
+    # One in a thousand loses one by design: more than one of 40 has a probability of 8e-4.
+    assert len(lost) <= 1
+
+
+def test_touches_without_turns_are_refused():
+    made = touched(Job(cone_deg=0.0), 1).touches
+    still = with_poses(made, Rotation.from_matrix(np.tile(np.diag([1.0, -1, -1]), (10, 1, 1))))
+    with pytest.raises(DegenerateError, match=r"offset from the flange.*one orientation"):
+        fit_pivot(still)
+
+
+def test_turns_about_one_axis_are_refused_by_name():
+    made = touched(Job(cone_deg=0.0), 1).touches
+    with pytest.raises(DegenerateError, match=r"offset along the flange's z .*flange's z to wi"):
+        fit_pivot(made)
+
+
+def test_small_turns_are_refused_with_their_size():
+    rng = np.random.default_rng(4)
+    leans = np.deg2rad(0.6) * rng.standard_normal((10, 3))
+    rotations = Rotation.from_rotvec([np.pi, 0, 0]) * Rotation.from_rotvec(leans)
+    place = POINTS[0] - rotations.apply(TIP) + 5e-4 * rng.standard_normal((10, 3))
+    touches = replace(
+        touched(Job(), 1).touches, base_from_flange=compose(rotations.as_matrix(), place)
+    )
+    with pytest.raises(DegenerateError, match=r"sigma of .* mm \(limit 5\).*turn by at most"):
+        fit_pivot(touches)
+
+
+def test_touches_that_scatter_are_told_from_touches_that_do_not_turn():
+    touches = touched(Job(tips=4, contact_m=0.02, cone_deg=20.0), 1).touches
+    with pytest.raises(DegenerateError, match=r"scatter by .* mm"):
+        fit_pivot(touches)
+
+
+@pytest.mark.parametrize(
+    ("job", "keep", "match"),
+    [
+        (Job(tips=2), None, "2 touches of kind point"),
+        (Job(axes=1), slice(0, 11), "none of kind xz"),
+        (Job(axes=1), [*range(10), 11], "none of kind z:"),
+    ],
+)
+def test_missing_touches_are_named(job, keep, match):
+    touches = touched(job, 1).touches
+    chosen = np.zeros(len(touches), dtype=bool)
+    chosen[slice(None) if keep is None else keep] = True
+    with pytest.raises(DataError, match=match):
+        fit_pivot(touches.subset(chosen))
+
+
+def test_an_axis_touch_of_a_point_that_the_tip_never_met_is_refused():
+    touches = touched(Job(axes=1), 1).touches
+    other = replace(relabelled(touches, 10, 1), names=("A", "B"))
+    with pytest.raises(DataError, match="touch 10 of kind z is of point 'B'"):
+        fit_pivot(other)
+
+
+def test_axis_touches_too_near_to_the_tip_are_refused():
+    made = touched(Job(axes=1), 1)
+    poses = made.touches.base_from_flange.copy()
+    # The point stays on the axis, but 2 mm from the tip.
+    near = made.reached[10] - [0.0, 0.0, 2e-3]
+    poses[10, :3, 3] += made.truly[10].apply(TURN.apply(near))
+    with pytest.raises(DegenerateError, match="of kind z have their point at most 2"):
+        fit_pivot(replace(made.touches, base_from_flange=poses))
+
+
+def test_touches_on_opposite_sides_of_the_tip_are_refused_by_name():
+    made = touched(Job(axes=3), 1)
+    poses = made.touches.base_from_flange.copy()
+    poses[11, :3, 3] += 2 * made.truly[11].apply(TURN.apply(made.reached[11]))
+    with pytest.raises(DataError, match=r"kind z, 11 lie on the other side.*than 10, 12"):
+        fit_pivot(replace(made.touches, base_from_flange=poses))
+
+
+def test_a_wrong_order_of_the_quaternions_is_recognised():
+    touches = touched(Job(), 2).touches
+    assert readings_that_close(touches) == ()
+    numbers = Rotation.from_matrix(touches.base_from_flange[:, :3, :3]).as_quat()
+    # Written as w, x, y, z and read as x, y, z, w.
+    misread = with_poses(touches, Rotation.from_quat(np.roll(numbers, 1, axis=1)))
+    (reading,) = readings_that_close(misread)
+    assert "w, x, y, z" in reading.words
+    # The noise of ten touches of 0.1 mm per axis.
+    assert reading.rms_m == pytest.approx(1.6e-4, abs=5e-5)
+    assert reading.as_read_m > 20 * reading.rms_m
+
+
+def test_inverse_poses_are_recognised_by_several_points_or_by_a_far_tip():
+    one, two = touched(Job(), 2).touches, touched(Job(points=2), 2).touches
+    (reading,) = readings_that_close(replace(two, base_from_flange=invert(two.base_from_flange)))
+    assert "flange_from_base" in reading.words
+    assert fit_pivot(replace(one, base_from_flange=invert(one.base_from_flange))).looks_inverse
+    assert not fit_pivot(one).looks_inverse
+
+
+@pytest.mark.skipif(not DATA.exists(), reason="the third party's poses are not in the repository")
+def test_five_real_touches():
+    rows = np.loadtxt(DATA / "tcp_pivot_rvbust" / "poses.csv", delimiter=",", skiprows=1)
+    poses = compose(Rotation.from_quat(rows[:, 3:]).as_matrix(), rows[:, :3])
+    labels = tuple(map(str, range(5)))
+    fit = fit_pivot(Touches(poses, np.zeros(5, dtype=int), ("point",) * 5, labels, ("",)))
+    # Figures of a plain linear fit by others, as they round them.
+    assert 1e3 * fit.flange_from_tool[:3, 3] == pytest.approx([33.78, 0.97, 76.79], abs=0.006)
+    assert 1e3 * fit.points[0] == pytest.approx([789.9, 5.2, 133.5], abs=0.06)
+    # Root mean square of the distances in space; per axis it is 0.126.
+    assert 1e3 * fit.rms_m == pytest.approx(0.219, abs=0.001)
+    assert 1e3 * fit.residuals_m.max() == pytest.approx(0.301, abs=0.001)
+    assert fit.agrees.all()
+    # 15 residuals, 6 unknowns: the level is that of 9 degrees of freedom.
+    assert fit.sigma_m == pytest.approx(fit.rms_m * np.sqrt(5 / 9), rel=1e-3)
+    assert fit.sigma_95_m[0] < fit.sigma_m < fit.sigma_95_m[1]
+    # Of this geometry, at that level: about 0.1 mm in each direction.
+    assert 1e3 * np.sqrt(np.diag(fit.covariance)[3:]) == pytest.approx([0.1] * 3, abs=0.04)

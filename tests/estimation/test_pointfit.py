@@ -1,0 +1,320 @@
+"""A fixture's frame from the coordinates of its points: the fit, its sigma, and what is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import f as f_distribution
+from scipy.stats import kstest
+from support.parts import (
+    away,
+    even,
+    jacobian,
+    noise_of,
+    pairs_of,
+    placed,
+    point_bound,
+    some_drawing,
+    some_frame,
+    uneven,
+)
+
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.estimation.groups import fit_groups
+from visioncal.estimation.pointfit import Placed, PointProblem, fit_points
+from visioncal.estimation.procrustes import align
+
+NOISE_M = 1e-4
+# Three points in the xy plane, two of them on a line with the origin.
+LINE = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.3, 0.0, 0.0]])
+
+
+def measured_part(seed, count, noise_m=NOISE_M):
+    """A frame and the points of a part that lies there."""
+    rng = np.random.default_rng(seed)
+    frame, nominal = some_frame(rng), some_drawing(rng, count)
+    return frame, pairs_of(nominal, placed(frame, nominal) + noise_m * rng.normal(size=(count, 3)))
+
+
+@pytest.mark.parametrize("count", [3, 4, 12])
+def test_exact_points_give_the_exact_frame(count):
+    frame, pairs = measured_part(1, count, 0.0)
+    found = fit_points(pairs)
+    # Rounding of coordinates near a metre.
+    assert np.abs(found.base_from_fixture - frame).max() < 1e-13
+    assert found.scale.value == pytest.approx(1.0, abs=1e-13)
+    assert not found.scale.differs
+    assert found.agreement.agrees.all()
+    assert found.rms_m < 1e-13
+
+
+@pytest.mark.parametrize("scaled", [False, True])
+def test_derivatives_are_those_of_the_residuals(scaled):
+    rng = np.random.default_rng(2)
+    problem = PointProblem(pairs_of(some_drawing(rng, 5), rng.normal(size=(5, 3))), scaled)
+    state = Placed(some_frame(rng), 1.3 if scaled else 1.0)
+    found = jacobian(
+        lambda step: problem.linearise(problem.move(state, step)).residuals, 7 if scaled else 6
+    )
+    # Central differences of lengths near a metre are exact to some 1e-9.
+    assert np.abs(problem.linearise(state).jacobian - found).max() < 1e-8
+
+
+def test_the_error_over_its_sigma_is_distributed_as_it_should_be():
+    shares = []
+    for seed in range(240):
+        frame, pairs = measured_part(seed, 3 + seed % 6)
+        fit = fit_groups(PointProblem(pairs, scaled=False))
+        error = away(fit.state.base_from_fixture, frame)
+        square = error @ np.linalg.solve(fit.covariance, error) / 6
+        shares.append(f_distribution.cdf(square, 6, fit.freedom))
+    # With even noise of unknown level it is F, exactly but for the curvature of turns by 0.1 deg.
+    assert kstest(shares, "uniform").pvalue > 1e-2
+
+
+def test_known_and_unknown_noise_add_up():
+    squares, levels = [], []
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        frame, nominal, known = some_frame(rng), some_drawing(rng, 10), uneven(rng, 10)
+        noise = noise_of(known + even(10, 2 * NOISE_M), rng)
+        pairs = pairs_of(nominal, placed(frame, nominal) + noise, known)
+        fit = fit_groups(PointProblem(pairs, scaled=False))
+        error = away(fit.state.base_from_fixture, frame)
+        squares.append(error @ np.linalg.solve(fit.covariance, error))
+        levels.append(fit.sigma)
+    # Of a chi-square with six degrees, a little widened by some twenty residuals' noise level: the
+    # mean of F is 6 * 20 / 18 = 6.7, and 200 draws scatter by 0.3.
+    assert 5.6 < np.mean(squares) < 7.6
+    assert np.median(levels) == pytest.approx(2 * NOISE_M, rel=0.1)
+
+
+def test_weights_reach_the_bound():
+    errors, plain, bounds = [], [], []
+    for seed in range(120):
+        rng = np.random.default_rng(seed)
+        frame, nominal, known = some_frame(rng), some_drawing(rng, 6), uneven(rng, 6)
+        pairs = pairs_of(nominal, placed(frame, nominal) + noise_of(known, rng), known)
+        fit = fit_groups(PointProblem(pairs, scaled=False))
+        errors.append(away(frame, fit.state.base_from_fixture) ** 2)
+        plain.append(away(frame, align(pairs.measured, nominal)) ** 2)
+        bounds.append(np.diag(point_bound(frame, nominal, known)))
+    share = np.sqrt(np.mean(errors, axis=0) / np.mean(bounds, axis=0))
+    # A sum of 120 squares scatters by 6 % in its root, and the noise's level costs a little.
+    assert share.max() < 1.2
+    # Even weights ignore that each point is ten times better in two directions.
+    assert np.sqrt(np.mean(plain, axis=0) / np.mean(bounds, axis=0)).min() > 1.5
+
+
+def test_the_covariance_is_the_bound_where_the_noise_is_known():
+    rng = np.random.default_rng(4)
+    frame, nominal, known = some_frame(rng), some_drawing(rng, 8), uneven(rng, 8)
+    pairs = replace(
+        pairs_of(nominal, placed(frame, nominal), known), nominal_sigma_m=np.full(8, NOISE_M)
+    )
+    bound = point_bound(frame, nominal, known + even(8, NOISE_M))
+    # The points are exact, so that no noise is estimated; differences are exact to 1e-8.
+    assert np.allclose(fit_points(pairs).covariance, bound, rtol=1e-5, atol=1e-14)
+
+
+@pytest.mark.parametrize("wrong", [0, 4])
+def test_a_wrong_point_is_named(wrong):
+    for seed in range(10):
+        frame, pairs = measured_part(seed, 8)
+        slip = np.random.default_rng(seed).normal(size=3)
+        points = pairs.measured.copy()
+        points[wrong] += 2e-3 * slip / np.linalg.norm(slip)
+        found = fit_points(replace(pairs, measured=points))
+        assert np.flatnonzero(~found.agreement.agrees).tolist() == [wrong]
+        # The distance from where the others place it: the slip, give or take the noise.
+        assert np.linalg.norm(found.residuals[wrong]) == pytest.approx(2e-3, abs=6 * NOISE_M)
+        assert np.linalg.norm(away(frame, found.base_from_fixture)[3:]) < 1e-3
+
+
+def test_two_exchanged_points_among_many_are_named_and_left_out():
+    _, pairs = measured_part(5, 10)
+    points = pairs.measured.copy()
+    points[[2, 7]] = points[[7, 2]]
+    found = fit_points(replace(pairs, measured=points))
+    assert np.flatnonzero(~found.agreement.agrees).tolist() == [2, 7]
+    assert found.numbering.words(pairs.drawn_labels) == "P2 and P7 are exchanged"
+
+
+@pytest.mark.parametrize("count", [3, 4, 5])
+def test_two_exchanged_points_among_few_are_refused_by_name(count):
+    _, pairs = measured_part(6, count)
+    points = pairs.measured.copy()
+    points[[0, 2]] = points[[2, 0]]
+    with pytest.raises(DataError, match="P0 and P2 are exchanged") as caught:
+        fit_points(replace(pairs, measured=points))
+    assert caught.value.culprits == ("P0", "P2")
+
+
+def test_shifted_numbers_are_refused():
+    _, pairs = measured_part(6, 9)
+    with pytest.raises(DataError, match="all numbers are shifted by 1: P0 is P1"):
+        fit_points(replace(pairs, measured=np.roll(pairs.measured, -1, axis=0)))
+
+
+def test_a_point_of_the_drawing_that_was_not_measured_explains_a_wrong_name():
+    rng = np.random.default_rng(7)
+    frame, drawn = some_frame(rng), some_drawing(rng, 6)
+    # P4 was said, P5 was touched.
+    points = placed(frame, drawn[[0, 1, 2, 3, 5]])
+    pairs = replace(pairs_of(drawn[:5], points), spare_labels=("P5",), spare=drawn[5:])
+    found = fit_points(pairs)
+    assert found.numbering.words(pairs.drawn_labels) == "numbers are shifted by 1: P4 is P5"
+    assert np.flatnonzero(~found.agreement.agrees).tolist() == [4]
+
+
+@pytest.mark.parametrize("flip", [[-1, 1, 1], [1, 1, -1], [-1, -1, -1]])
+@pytest.mark.parametrize("count", [4, 8])
+def test_a_mirrored_drawing_is_refused(flip, count):
+    _, pairs = measured_part(8, count)
+    with pytest.raises(DataError, match="mirror image of the drawing"):
+        fit_points(replace(pairs, nominal=pairs.nominal * flip))
+
+
+def test_points_in_a_plane_have_no_hand():
+    rng = np.random.default_rng(9)
+    frame, flat = some_frame(rng), some_drawing(rng, 6) * [1.0, 1.0, 0.0]
+    pairs = pairs_of(flat, placed(frame, flat) + NOISE_M * rng.normal(size=(6, 3)))
+    assert not fit_points(pairs).hand_known
+    mirrored = fit_points(replace(pairs, nominal=flat * [-1, 1, 1]))
+    # The same points from behind: z and x point the other way, and everything fits.
+    turned = frame[:3, :3] @ np.diag([-1.0, 1.0, -1.0])
+    # A sigma of 0.1 mm on 0.2 m: some 0.5 mrad.
+    assert np.abs(mirrored.base_from_fixture[:3, :3] - turned).max() < 2e-3
+    assert mirrored.agreement.agrees.all()
+    assert fit_points(measured_part(9, 6)[1]).hand_known
+
+
+@pytest.mark.parametrize("count", [3, 4, 10])
+def test_points_on_a_line_are_refused(count):
+    frame = some_frame(np.random.default_rng(1))
+    nominal = np.resize(LINE, (count, 3)) + np.outer(np.arange(count), [0.01, 0.0, 0.0])
+    with pytest.raises(DegenerateError, match="rotation about the fixture's x is not determined"):
+        fit_points(pairs_of(nominal, placed(frame, nominal)))
+    with pytest.raises(DegenerateError, match="the measured points lie within 0 mm of a line"):
+        fit_points(pairs_of(some_drawing(np.random.default_rng(1), count), nominal))
+
+
+def test_points_nearly_on_a_line_are_refused_by_their_noise():
+    rng = np.random.default_rng(2)
+    frame, nominal = some_frame(rng), LINE.copy()
+    nominal[1, 1] = 2e-3
+    points = placed(frame, nominal)
+    found = fit_points(pairs_of(nominal, points))
+    # Exact points that are known to be exact do determine it, and it is known worst about x.
+    assert found.worst[1].words == "the fixture's rotation about its x"
+    with pytest.raises(
+        DegenerateError, match=r"rotation about its x has a predicted sigma of 3\.\d"
+    ):
+        # A sigma of 0.1 mm at 1.6 mm from the line that the other two draw: some 3.5 deg.
+        fit_points(pairs_of(nominal, points, even(3, NOISE_M)))
+
+
+def test_what_was_left_out_is_said_where_the_others_are_too_poor():
+    rng = np.random.default_rng(3)
+    frame, nominal = (
+        some_frame(rng),
+        np.vstack([np.outer(np.arange(6), [0.06, 0.0, 0.0]), LINE[:1]]),
+    )
+    nominal[:6, 1:] = 5e-4 * rng.normal(size=(6, 2))
+    nominal[6] = [0.1, 0.2, 0.0]
+    points = placed(frame, nominal) + NOISE_M * rng.normal(size=(7, 3))
+    # Off along the line: in no turn about it does P6 fit.
+    points[6] += 0.02 * frame[:3, 0]
+    with pytest.raises(DegenerateError, match="without P6, which does not agree with the others"):
+        fit_points(pairs_of(nominal, points))
+
+
+def test_points_in_one_place_are_refused():
+    points = np.tile([0.1, 0.2, 0.3], (4, 1))
+    with pytest.raises(DegenerateError, match="all in one place"):
+        fit_points(pairs_of(some_drawing(np.random.default_rng(1), 4), points))
+
+
+def test_two_points_are_too_few():
+    with pytest.raises(DataError, match=r"2 measured points .* at least 3 are needed"):
+        fit_points(pairs_of(LINE[:2], LINE[:2]))
+
+
+def test_a_scale_is_told_and_not_absorbed():
+    frame, pairs = measured_part(10, 10, 2e-5)
+    grown = replace(
+        pairs,
+        measured=placed(frame, 1.001 * pairs.nominal)
+        + (pairs.measured - placed(frame, pairs.nominal)),
+    )
+    found = fit_points(grown)
+    assert found.scale.differs
+    assert abs(found.scale.value - 1.001) < 4 * found.scale.sigma
+    # 0.1 % of some 0.2 m, which the frame without a scale leaves as residuals.
+    assert 5e-5 < found.agreement.fit.sigma < 3e-4
+    # The points that are far out are not to blame.
+    assert found.agreement.agrees.all()
+    assert not fit_points(pairs).scale.differs
+
+
+def test_a_grown_part_accuses_no_point():
+    rng = np.random.default_rng(0)
+    frame = some_frame(rng)
+    near, far = 0.02 * rng.normal(size=(8, 3)), np.array([[0.5, 0.0, 0.0]])
+    nominal = np.vstack([near, far, -far])
+    points = placed(frame, 1.002 * nominal) + 1e-5 * rng.normal(size=(10, 3))
+    found = fit_points(pairs_of(nominal, points))
+    assert found.scale.differs
+    assert found.agreement.agrees.all()
+    assert not found.agreement.explained
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"), [(1000, "in mm and were read as m"), (25.4, "in mm and were read as inch")]
+)
+@pytest.mark.parametrize("count", [3, 9])
+def test_another_unit_is_named(factor, words, count):
+    _, pairs = measured_part(11, count)
+    with pytest.raises(DataError, match=words):
+        fit_points(replace(pairs, measured=factor * pairs.measured))
+    with pytest.raises(DataError, match=words):
+        fit_points(replace(pairs, nominal=pairs.nominal / factor))
+
+
+def test_another_drawing_is_refused_with_the_scale_that_would_fit():
+    _, pairs = measured_part(12, 6)
+    with pytest.raises(DataError, match=r"do not fit the drawing.*1\.\d+ times as large would fit"):
+        fit_points(replace(pairs, nominal=pairs.nominal / 1.3))
+
+
+def test_the_expected_noise_is_compared_with_what_is_seen():
+    _, pairs = measured_part(13, 4, 1e-3)
+    assert fit_points(pairs).agreement.explained
+    assert not fit_points(pairs, expected_noise_m=NOISE_M).agreement.explained
+    assert fit_points(pairs, expected_noise_m=1e-3).agreement.explained
+
+
+def test_a_drawing_far_from_its_origin_is_no_worse():
+    rng = np.random.default_rng(14)
+    frame, nominal = some_frame(rng), some_drawing(rng, 6) + np.array([3.0, -2.0, 1.0])
+    pairs = pairs_of(nominal, placed(frame, nominal) + NOISE_M * rng.normal(size=(6, 3)))
+    found = fit_points(pairs)
+    error = away(found.base_from_fixture, frame)
+    # F of 6 and 12 degrees stays under 8.4 in all but one case of a thousand.
+    assert error @ np.linalg.solve(found.covariance, error) < 6 * 8.4
+    assert found.worst[0].sigma < 2 * NOISE_M
+
+
+def test_the_frame_moves_with_each_point_as_it_says():
+    frame, pairs = measured_part(5, 5, 0.0)
+    pairs = replace(pairs, covariances=uneven(np.random.default_rng(5), 5))
+    found = fit_points(pairs).by_points
+
+    def moved(step):
+        measured = pairs.measured + step.reshape(5, 3)
+        return away(frame, fit_points(replace(pairs, measured=measured)).base_from_fixture)
+
+    # Of exact points; the steps of a micrometre leave 1e-8 of a gain near one, and some of its
+    # slope: a frame turns by radians a metre over points of 0.1 m.
+    expected = np.moveaxis(jacobian(moved, 15).reshape(6, 5, 3), 0, 1)
+    assert np.abs(found - expected).max() < 1e-4

@@ -1,0 +1,138 @@
+"""Identities of the joint fit: views left out, stops merged, and the likelihood's slope."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.cells import calibrated
+
+from visioncal.core.errors import ConvergenceError
+from visioncal.estimation import joint
+from visioncal.estimation.parts import ROBOT, Effect
+from visioncal.estimation.solve import (
+    RATIO_PRIOR,
+    fit_problem,
+    left_out_residuals,
+    normal_equations,
+    robot_likelihood,
+    solve_problem,
+)
+from visioncal.estimation.variance import Components, Knowledge, _likelihood, estimate_sigmas
+from visioncal.simulation import CellOptions, fine_camera, simulate
+
+FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
+LENS = pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens estimated"])
+
+
+def answered(given, **changes):
+    known = calibrated(simulate(replace(FINE, state_intrinsics=given, **changes)))
+    problem = known.solved.problem
+    return problem, fit_problem(problem, known.solved.state)
+
+
+@LENS
+def test_residuals_of_views_left_out_are_those_of_fits_without_them(given):
+    problem, fit = answered(given, views=12, seed=3)
+    predicted = left_out_residuals(problem, fit.state, fit.noise)
+    covariance = problem.total_covariance(problem.linear(fit.state), fit.noise)
+    for view in range(12):
+        others = np.arange(12) != view
+        without, _ = solve_problem(problem.subset(others), fit.state, fit.noise)
+        refitted = problem.linear(without).residuals[view]
+        sigma = np.sqrt(np.diagonal(covariance[view]))
+        # To first order: what is left is the curvature over a step of the size of the noise.
+        np.testing.assert_allclose(predicted[view], refitted, atol=0.01 * sigma.max())
+
+
+def doubled(problem):
+    """Every view twice, as two that know half as much each."""
+    again = np.repeat(np.arange(len(problem)), 2)
+    seen = problem.observations.take(again)
+    return replace(
+        problem,
+        observations=replace(seen, covariance=2.0 * seen.covariance),
+        effects=tuple(it.take(again) for it in problem.effects),
+    )
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_a_stop_seen_twice_half_as_well_is_one_seen_once(mount):
+    problem, fit = answered(False, views=8, seed=2, mount=mount)
+    arm = 1e-3 * np.random.default_rng(0).standard_normal((8, 6, 2))
+    known = Knowledge(np.eye(2), np.zeros(2))
+    errors = Effect.free("arm", known, flange_jacobian={ROBOT: arm})
+    problem = problem.with_effects([*problem.effects, errors])
+    state = replace(fit.state, values=problem.start_values)
+    twice = doubled(problem)
+    assert len(twice.merged()) == 8
+    for other in (twice, twice.merged()):
+        for expected, seen in zip(
+            normal_equations(problem, state, fit.noise),
+            normal_equations(other, state, fit.noise),
+            strict=True,
+        ):
+            # The same sums in another order.
+            allowed = 1e-9 * np.abs(expected).max()
+            np.testing.assert_allclose(seen, expected, rtol=1e-6, atol=allowed)
+
+
+def test_views_of_a_stop_move_with_the_lens_by_their_information():
+    problem, _ = answered(False, views=8, seed=2)
+    twice = doubled(problem)
+    # The second view of each stop knows nothing to speak of, and says nonsense.
+    (effect,), seen = twice.effects, twice.observations
+    known, lens = seen.covariance.copy(), effect.by_sensor.copy()
+    known[1::2] *= 1e12
+    lens[1::2] *= -5.0
+    lopsided = replace(
+        twice,
+        observations=replace(seen, covariance=known),
+        effects=(replace(effect, by_sensor=lens),),
+    ).merged()
+    np.testing.assert_allclose(lopsided.by_sensor, problem.by_sensor, rtol=1e-6)
+    before = problem.observations.covariance
+    np.testing.assert_allclose(lopsided.observations.covariance, 2 * before, rtol=1e-6)
+
+
+@LENS
+def test_the_likelihood_jacobian_as_its_differences_say(given):
+    problem, fit = answered(given, views=10, seed=4)
+    state = fit.state.moved(np.full(problem.size, 1e-5))
+    found = robot_likelihood(problem, state, fit.noise)
+    errors, jacobian = found.reduced.errors, found.reduced.jacobian[:, :, found.moving]
+
+    def at(logs):
+        return _likelihood(errors, jacobian, found.components, found.known, logs, RATIO_PRIOR)
+
+    logs, step = np.log(2.0 * fit.noise.robots[0]), 1e-4
+    for level in range(2):
+        shift = step * np.eye(2)[level]
+        slope = (at(logs + shift).value - at(logs - shift).value) / (2 * step)
+        # The third order of a step of 1e-4 is left, and rounding of values of some thousands.
+        assert at(logs).slope[level] == pytest.approx(slope, rel=1e-4, abs=1e-4)
+
+
+def test_a_fit_that_runs_away_is_an_error_of_the_input(monkeypatch):
+    def runs_away(*_):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr(joint, "fit_problem", runs_away)
+    with pytest.raises(ConvergenceError, match="poses of other views than the images"):
+        calibrated(simulate(replace(FINE, views=6)))
+
+
+def test_a_noise_level_of_nothing_is_found_beside_a_large_one():
+    """Both coordinates err alike: what each has of its own is lost in the rounding."""
+    common = np.random.default_rng(2).normal(0.0, 1.0, (40, 1))
+    parts = np.tile([[[1.0, 1.0], [1.0, 1.0]], [[1.0, 0.0], [0.0, 1.0]]], (40, 1, 1, 1))
+    sigmas, value = estimate_sigmas(
+        np.hstack([common, common]),
+        np.ones((40, 2, 1)),
+        Components(np.zeros((40, 2, 2)), parts.swapaxes(0, 1)),
+        Knowledge(np.zeros((1, 1)), np.zeros(1)),
+        np.array([3.0, 3.0]),
+    )
+    assert np.isfinite(value)
+    # Forty of them tell a level to a ninth.
+    assert sigmas[0] == pytest.approx(1.0, rel=0.4)
+    assert sigmas[1] < 1e-5

@@ -1,0 +1,111 @@
+"""Exports of an aligned cell: any frame in any other, and all of them at once."""
+
+import io
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from support.aligned_cells import made_up_cell
+
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import invert
+from visioncal.interchange.exports import Selection, document, export
+from visioncal.interchange.result_files import load_calibration, load_exportable
+from visioncal.results import CameraResult
+from visioncal.session.choosing import Choice
+from visioncal.simulation import fisheye_camera, wide_camera
+
+CELL = made_up_cell(4)
+POSE = {"rotation": ("x", "y", "z", "w"), "translation": ("x", "y", "z")}
+
+
+def test_any_frame_is_written_in_any_other(tmp_path):
+    CELL.save(tmp_path / "alignment.json")
+    source = load_exportable(tmp_path)
+    text = export(source, "text", Selection("base_b_from_cam_top"))
+    expected = (
+        invert(CELL.edges["cell_from_base_b"].matrix) @ CELL.edges["cell_from_cam_top"].matrix
+    )
+    # Numbers are written so that they read back as they are; the way takes a few roundings.
+    assert np.allclose(np.loadtxt(io.StringIO(text)), expected, atol=1e-12)
+    assert "aligned by visioncal from 'made up'" in text
+    turned = export(source, "text", Selection("base_b_from_cam_top", inverse=True))
+    assert np.allclose(np.loadtxt(io.StringIO(turned)) @ expected, np.eye(4), atol=1e-12)
+
+
+def test_all_frames_are_one_tree():
+    found = list(yaml.safe_load_all(export(CELL, "ros", Selection("all"))))
+    hangs = {it["child_frame_id"]: it["header"]["frame_id"] for it in found}
+    assert hangs == {it: on for it, on in CELL.frames.items() if not it.startswith("flange")}
+    robot = ElementTree.fromstring(export(CELL, "urdf", Selection("all")))
+    links = [it.attrib["name"] for it in robot.findall("link")]
+    assert sorted(links) == sorted(["cell", *hangs])
+    joints = {
+        it.find("child").attrib["link"]: it.find("parent").attrib["link"]
+        for it in robot.findall("joint")
+    }
+    assert joints == hangs
+    launch = export(CELL, "ros-launch", Selection("all"))
+    assert launch.count("static_transform_publisher") == len(hangs)
+    compile(launch, "launch", "exec")
+    assert np.loadtxt(io.StringIO(export(CELL, "text", Selection("all")))).shape == (
+        4 * len(hangs),
+        4,
+    )
+
+
+def test_a_lens_is_that_of_the_camera_that_is_named():
+    cameras = {
+        "cam_top": CameraResult(wide_camera(), False),
+        "cam_hand": CameraResult(fisheye_camera(), False),
+    }
+    cell = replace(CELL, cameras=cameras)
+    for name, width in (("top", 1280), ("cam_hand", 1280)):
+        info = yaml.safe_load(export(cell, "camera-info", Selection(camera=name)))
+        assert info["image_width"] == width
+    focal = {
+        name: yaml.safe_load(export(cell, "camera-info", Selection(camera=name)))["camera_matrix"][
+            "data"
+        ][0]
+        for name in ("top", "hand")
+    }
+    assert focal == {"top": 914.2, "hand": 563.0}
+    with pytest.raises(DataError, match="holds one camera; this alignment has cam_top, cam_hand"):
+        export(cell, "camera-info")
+
+
+@pytest.mark.parametrize(
+    ("to", "selection", "words"),
+    [
+        ("ros", Selection(), r"which is meant is not said.*--edge base_a_from_\w+; or all"),
+        ("ros", Selection("base_a_from_target_plate"), "its pose is needed"),
+        ("ros", Selection("base_a_from_cam_tpo"), "Did you mean cam_top"),
+        ("ros", Selection("all", inverse=True), "--inverse, --parent and --child are of one"),
+        ("opencv", Selection("all"), "opencv holds one transform"),
+        ("camera-info", Selection(camera="tpo"), "no camera 'tpo'"),
+        ("easy-handeye2", Selection(), "holds the camera"),
+        ("robot-json", Selection(), "robot"),
+        ("abb-tooldata", Selection(), "has no tool"),
+    ],
+)
+def test_what_cannot_be_written_is_refused(to, selection, words):
+    with pytest.raises(DataError, match=words):
+        export(CELL, to, selection)
+
+
+def test_a_bad_verdict_is_warned_of():
+    bad = replace(CELL, verdict=replace(CELL.verdict, status="bad"))
+    assert document(bad, "ros", Selection("all")).warnings
+    assert not document(CELL, "ros", Selection("all")).warnings
+
+
+def test_what_needs_one_camera_takes_the_only_one_that_fits(tmp_path):
+    CELL.save(tmp_path / "alignment.json")
+    for path in (tmp_path, tmp_path / "alignment.json"):
+        found = load_calibration(path)
+        expected = CELL.between("base_b", "cam_top")
+        np.testing.assert_allclose(found.edges["base_from_cam"].matrix, expected.matrix)
+    with pytest.raises(DataError, match="robots a and b part them"):
+        load_calibration(tmp_path, Choice("hand"))

@@ -1,0 +1,416 @@
+"""Exports: what others read is the transform that was calibrated, whoever reads it."""
+
+import json
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from support import readers
+from support.commands import started, visioncal
+from support.placed import fixture, tool
+from support.readers import FIXTURE_READERS, READERS, TOOL_READERS
+from support.rotations import CASES
+from support.samples import made_up
+
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import compose, exp, invert, log
+from visioncal.core.types import Camera
+from visioncal.interchange.exports import EXPORT_FORMATS, Selection, export
+from visioncal.results import CameraResult, Edge, Verdict
+
+NAMES = [it.name for it in EXPORT_FORMATS]
+EDGE_NAMES = [it for it in NAMES if it not in readers.ARM_FORMATS]
+ANGLES = {"urdf", "kuka", "fanuc", "yaskawa", "staubli", "doosan"}
+LENSES = {"camera-info", "kalibr", "oak"}
+RNG = np.random.default_rng(3)
+SAMPLE = made_up(5).calibration
+
+
+def poses(kind):
+    rotations = np.array(CASES[kind])
+    return compose(rotations, RNG.uniform(-2, 2, (len(rotations), 3)))
+
+
+def calibration(matrix, mount="eye-in-hand", **changes):
+    name = "flange_from_cam" if mount == "eye-in-hand" else "base_from_cam"
+    other = "base_from_target" if mount == "eye-in-hand" else "flange_from_target"
+    edges = {
+        name: Edge(matrix, SAMPLE.edges["flange_from_cam"].covariance),
+        other: SAMPLE.edges["base_from_target"],
+    }
+    return replace(SAMPLE, mount=mount, edges=edges, **changes)
+
+
+def with_lens(model, distortion, estimated=False):
+    camera = Camera(model, (1280, 800), np.array([801.1, 802.2, 640.3, 1 / 3]), distortion)
+    return replace(SAMPLE, camera=CameraResult(camera, estimated=estimated))
+
+
+def off(document, name, matrix):
+    return float(np.abs(READERS[name](document) - matrix).max())
+
+
+@pytest.mark.parametrize("kind", CASES)
+@pytest.mark.parametrize("name", READERS)
+def test_what_is_read_back_is_the_transform(name, kind):
+    # A robot's form is written to the nanometre and to 1e-8 deg; other numbers to the last digit.
+    tolerance = 1e-9
+    if (kind == "near a pitch of 90" and name in ANGLES) or (kind, name) == ("tiny", "doosan"):
+        # Within 1e-7 rad of its singularity an Euler triple is taken to be singular: twice that.
+        tolerance = 2.1e-7
+    for at, matrix in enumerate(poses(kind)):
+        mount = ("eye-in-hand", "eye-to-hand")[at % 2]
+        assert off(export(calibration(matrix, mount), name), name, matrix) < tolerance
+
+
+@pytest.mark.parametrize("name", ["text", "opencv"])
+def test_a_matrix_in_metres_comes_back_bit_for_bit(name):
+    for matrix in poses("any"):
+        assert np.array_equal(READERS[name](export(calibration(matrix), name)), matrix)
+
+
+@pytest.mark.parametrize("name", sorted(set(READERS) - {"easy-handeye2"}))
+@pytest.mark.parametrize("edge", ["flange_from_cam", "base_from_target"])
+def test_any_edge_and_its_inverse(name, edge):
+    matrix = SAMPLE.edges[edge].matrix
+    # As above.
+    assert off(export(SAMPLE, name, Selection(edge)), name, matrix) < 1e-9
+    inverse = export(SAMPLE, name, Selection(edge, inverse=True))
+    assert off(inverse, name, invert(matrix)) < 1e-9
+
+
+def test_every_format_is_read_by_a_test_and_has_a_name_of_its_own():
+    known = set(READERS) | set(TOOL_READERS) | set(FIXTURE_READERS) | LENSES
+    assert set(NAMES) == known | set(readers.ARM_FORMATS)
+    assert len(set(NAMES)) == len(NAMES)
+
+
+def test_the_inverse_carries_the_covariance_along():
+    # Seen from the board, a rotation error of the board moves the base by the lever arm.
+    name = "base_from_target"
+    edge = SAMPLE.edges[name]
+    noise = RNG.multivariate_normal(np.zeros(6), edge.covariance, 20_000)
+    moved = log(edge.matrix @ invert(edge.matrix @ exp(noise)))
+    sampled_mm = 1e3 * np.sqrt(np.trace(np.cov(moved[:, 3:].T)))
+    worth = export(SAMPLE, "text", Selection(name, inverse=True)).splitlines()[1]
+    stated_mm = float(worth.partition("sigma ")[2].split()[0])
+    # 20,000 samples know a standard deviation to half a percent, and two digits are stated.
+    assert abs(stated_mm / sampled_mm - 1) < 0.05
+    assert abs(edge.sigma_mm / sampled_mm - 1) > 0.1
+
+
+@pytest.mark.parametrize("name", ["ros", "ros-launch", "moveit", "easy-handeye2", "urdf"])
+@pytest.mark.parametrize(("mount", "parent"), [("eye-in-hand", "tool0"), ("eye-to-hand", "base")])
+def test_ros_gets_its_own_names_and_is_told_what_they_mean(name, mount, parent):
+    text = export(calibration(np.eye(4), mount), name)
+    assert f"{parent}: the " in text
+    assert ("base_link may differ" in text) == (parent == "base")
+    assert "camera_optical_frame: the camera's optical frame: z forward" in text
+    assert "verdict check; sigma" in text
+
+
+def test_frames_stand_where_their_readers_look():
+    chosen = Selection(parent="arm/tool-1", child="cam.2")
+    transform = yaml.safe_load(export(SAMPLE, "ros", chosen))
+    assert transform["header"]["frame_id"] == "arm/tool-1"
+    assert transform["child_frame_id"] == "cam.2"
+    for name in ("ros-launch", "moveit"):
+        options = readers.launch_arguments(export(SAMPLE, name, chosen))
+        assert (options["--frame-id"], options["--child-frame-id"]) == ("arm/tool-1", "cam.2")
+    robot = ET.fromstring(export(SAMPLE, "urdf", chosen))
+    assert robot.find("link").get("name") == "cam.2"
+    joint = robot.find("joint")
+    assert joint.get("type") == "fixed"
+    assert (joint.find("parent").get("link"), joint.find("child").get("link")) == (
+        "arm/tool-1",
+        "cam.2",
+    )
+
+
+def test_the_inverse_exchanges_the_frames():
+    document = yaml.safe_load(export(SAMPLE, "ros", Selection(inverse=True)))
+    assert document["header"]["frame_id"] == "camera_optical_frame"
+    assert document["child_frame_id"] == "tool0"
+
+
+@pytest.mark.parametrize(
+    ("mount", "kind", "base", "effector"),
+    [
+        ("eye-in-hand", "eye_in_hand", "base", "mine"),
+        ("eye-to-hand", "eye_on_base", "mine", "tool0"),
+    ],
+)
+def test_easy_handeye2_has_all_fields_of_its_message(mount, kind, base, effector):
+    chosen = Selection(parent="mine", child="eye")
+    document = yaml.safe_load(export(calibration(np.eye(4), mount), "easy-handeye2", chosen))
+    assert document["parameters"] == {
+        "name": "visioncal",
+        "calibration_type": kind,
+        "robot_base_frame": base,
+        "robot_effector_frame": effector,
+        "tracking_base_frame": "eye",
+        "tracking_marker_frame": "target",
+        "freehand_robot_movement": True,
+        "move_group_namespace": "/",
+        "move_group": "manipulator",
+    }
+
+
+@pytest.mark.parametrize(
+    "chosen", [Selection("base_from_target"), Selection(inverse=True), Selection("base_from_cam")]
+)
+def test_easy_handeye2_takes_the_camera_only(chosen):
+    with pytest.raises(DataError):
+        export(SAMPLE, "easy-handeye2", chosen)
+
+
+BAD_NAMES = ['tool"0', "a b", "-x", "/world", "x\nimport os", "x'", "größe", "a<b", "${x}", "."]
+
+
+@pytest.mark.parametrize("bad", BAD_NAMES)
+def test_a_frame_name_that_could_end_its_quotes_is_refused(bad):
+    placed = replace(SAMPLE, frames=tool() | fixture())
+    for name in EDGE_NAMES:
+        with pytest.raises(DataError, match="frame's name"):
+            export(placed, name, Selection(child=bad))
+
+
+def test_frames_of_one_name_are_refused():
+    with pytest.raises(DataError, match="two frames"):
+        export(SAMPLE, "ros", Selection(parent="a", child="a"))
+
+
+@pytest.mark.parametrize("name", sorted(READERS))
+@pytest.mark.parametrize(
+    "hostile",
+    [
+        "x\nimport os\n--> ]]> <a/> --- \u2028 \x85",
+        'y """ coding: utf-7 +AAo-raise SystemExit',
+        "größer {#} */ ; ! -",
+    ],
+)
+def test_no_session_name_leaves_its_comment(name, hostile):
+    named = calibration(poses("any")[0], session_name=hostile)
+    plain = calibration(named.edges["flange_from_cam"].matrix)
+    # The same text is read whatever stands in the comments.
+    assert np.array_equal(READERS[name](export(named, name)), READERS[name](export(plain, name)))
+
+
+def test_a_launch_file_says_nothing_of_an_encoding():
+    named = replace(SAMPLE, session_name="coding: utf-7 +AAo-raise SystemExit")
+    for name in ("ros-launch", "moveit"):
+        text = export(named, name)
+        compile(text.encode(), name, "exec")
+        assert readers.ast.dump(readers.ast.parse(text.encode())) == readers.ast.dump(
+            readers.ast.parse(export(SAMPLE, name).encode())
+        )
+
+
+LENS_CASES = [
+    ("brown", np.array([0.1, -0.02, 1e-5, 1 / 3, 0.7]), "plumb_bob"),
+    ("brown", np.array([0.1, -0.02, 1e-5, -2e-3, 0.7, 0.01, 1e-17, 3.0]), "rational_polynomial"),
+    ("fisheye", np.array([0.1, -0.02, 1e-5, 1 / 7]), "equidistant"),
+]
+
+
+@pytest.mark.parametrize(("model", "distortion", "ros_model"), LENS_CASES)
+def test_camera_info_holds_the_lens(model, distortion, ros_model):
+    document = yaml.safe_load(export(with_lens(model, distortion), "camera-info"))
+
+    def array(key):
+        it = document[key]
+        return np.array(it["data"]).reshape(it["rows"], it["cols"])
+
+    k = np.array([[801.1, 0, 640.3], [0, 802.2, 1 / 3], [0, 0, 1]])
+    assert (document["image_width"], document["image_height"]) == (1280, 800)
+    assert document["camera_name"] == "camera"
+    assert document["distortion_model"] == ros_model
+    assert np.array_equal(array("camera_matrix"), k)
+    assert np.array_equal(array("distortion_coefficients"), distortion[None])
+    assert np.array_equal(array("rectification_matrix"), np.eye(3))
+    assert np.array_equal(array("projection_matrix"), np.hstack([k, np.zeros((3, 1))]))
+
+
+@pytest.mark.parametrize(
+    ("model", "distortion", "kalibr_model"),
+    [
+        ("brown", np.array([0.1, -0.02, 1e-5, 1 / 3, 0.0]), "radtan"),
+        ("brown", np.array([0.1, -0.02, 1e-5, 1 / 3, 0.0, 0.0, 0.0, 0.0]), "radtan"),
+        ("fisheye", np.array([0.1, -0.02, 1e-5, 1 / 7]), "equidistant"),
+    ],
+)
+def test_kalibr_holds_the_lens(model, distortion, kalibr_model):
+    text = export(with_lens(model, distortion), "kalibr", Selection(child="left"))
+    assert yaml.safe_load(text) == {
+        "cam0": {
+            "camera_model": "pinhole",
+            "intrinsics": [801.1, 802.2, 640.3, 1 / 3],
+            "distortion_model": kalibr_model,
+            "distortion_coeffs": distortion[:4].tolist(),
+            "resolution": [1280, 800],
+            "rostopic": "/left/image_raw",
+        }
+    }
+
+
+@pytest.mark.parametrize(
+    ("distortion", "words"),
+    [([0.1, 0, 0, 0, 1e-9], "1 more"), ([0.1, 0, 0, 0, 0, 0.2, 0.3, 0], "2 more")],
+)
+def test_kalibr_refuses_what_radtan_cannot_hold(distortion, words):
+    with pytest.raises(DataError, match=f"{words}.*camera-info"):
+        export(with_lens("brown", np.array(distortion, float)), "kalibr")
+
+
+@pytest.mark.parametrize(("model", "distortion"), [it[:2] for it in LENS_CASES])
+def test_opencv_holds_the_lens_beside_the_transform(model, distortion):
+    text = export(with_lens(model, distortion), "opencv")
+    storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    assert np.array_equal(storage.getNode("distortion_coefficients").mat(), distortion[None])
+    assert storage.getNode("camera_matrix").mat()[1, 2] == 1 / 3
+    assert storage.getNode("distortion_model").string() == model
+    assert storage.getNode("image_width").real() == 1280
+
+
+def test_a_lens_that_is_not_there_is_refused_and_the_transform_still_goes_out():
+    blind = replace(SAMPLE, camera=None)
+    for name in LENSES:
+        with pytest.raises(DataError, match="no camera"):
+            export(blind, name)
+    assert "camera_matrix" not in export(blind, "opencv")
+
+
+def test_a_lens_with_another_number_of_coefficients_is_refused():
+    for name in LENSES:
+        with pytest.raises(DataError, match="12 coefficients"):
+            export(with_lens("brown", np.zeros(12)), name)
+
+
+@pytest.mark.parametrize("name", sorted(LENSES))
+@pytest.mark.parametrize(
+    "chosen", [Selection("flange_from_cam"), Selection(inverse=True), Selection(parent="a")]
+)
+def test_a_format_of_lenses_says_that_it_holds_no_transform(name, chosen):
+    with pytest.raises(DataError, match="no transform"):
+        export(SAMPLE, name, chosen)
+
+
+@pytest.mark.parametrize(
+    ("name", "edge", "words"),
+    [
+        ("rso", "", "Did you mean ros"),
+        ("ros", "base_from_cam", "flange_from_cam, base_from_target"),
+        ("ros", "flange_from_cm", "Did you mean flange_from_cam"),
+        ("ros", "cam_from_flange", "--edge flange_from_cam --inverse"),
+    ],
+)
+def test_names_that_are_not_known_get_a_hint(name, edge, words):
+    with pytest.raises(DataError) as caught:
+        export(SAMPLE, name, Selection(edge))
+    assert words in str(caught.value)
+
+
+def exporting(*arguments):
+    return visioncal("export", *arguments)
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    """A folder with a calibration.json."""
+    folder = tmp_path_factory.mktemp("result, größer")
+    SAMPLE.save(folder / "calibration.json")
+    return folder
+
+
+def test_the_command_prints_the_document_and_nothing_else(saved):
+    done = started("export", saved, "--to", "ros")
+    assert (done.status, done.err) == (0, "")
+    assert done.out == export(SAMPLE, "ros")
+
+
+def test_the_command_writes_a_file_once(saved, tmp_path):
+    out = tmp_path / "camera.urdf"
+    chosen = ["--edge", "base_from_target", "--inverse", "--parent", "board", "--child", "world"]
+    done = exporting(saved / "calibration.json", "--to", "urdf", "-o", out, *chosen)
+    assert (done.status, done.out) == (0, ""), done.err
+    written = out.read_text(encoding="utf-8")
+    # Written with all digits.
+    assert off(written, "urdf", invert(SAMPLE.edges["base_from_target"].matrix)) < 1e-9
+    again = exporting(saved, "--to", "text", "-o", out)
+    assert again.status == 2
+    assert "--force" in again.err
+    assert out.read_text(encoding="utf-8") == written
+    assert exporting(saved, "--to", "text", "-o", out, "--force").status == 0
+    assert np.array_equal(readers.plain(out.read_text()), SAMPLE.edges["flange_from_cam"].matrix)
+
+
+def test_a_bad_verdict_is_exported_with_a_warning(tmp_path):
+    verdict = Verdict.of("bad", "The views disagree by 14 mm.")
+    replace(SAMPLE, verdict=verdict).save(tmp_path / "calibration.json")
+    done = exporting(tmp_path, "--to", "ur")
+    assert done.status == 0
+    assert "14 mm" in done.err
+    assert "# verdict bad; sigma" in done.out
+
+
+def test_the_command_lists_its_formats():
+    done = exporting("--list")
+    assert done.status == 0, done.err
+    assert [line.split()[0] for line in done.out.splitlines()] == NAMES
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--to", "kukka"], "Did you mean kuka"),
+        (["--to", "ros", "--child", 'a"b'], "frame's name"),
+        (["--to", "ros", "-o", "nowhere/here.yaml"], "nowhere/here.yaml"),
+        (["--to", "ros", "--parent", ""], "'' cannot be a frame's name"),
+        (["--to", "ros", "--edge", ""], "no transform ''"),
+        ([], "--to"),
+    ],
+)
+def test_mistakes_are_status_2_and_write_nothing(saved, arguments, words):
+    done = exporting(saved, *arguments)
+    assert (done.status, done.out) == (2, "")
+    assert words in done.err
+    assert "Traceback" not in done.err
+
+
+def test_a_dash_is_stdout(saved):
+    done = exporting(saved, "--to", "ros", "-o", "-")
+    assert (done.status, done.out) == (0, export(SAMPLE, "ros"))
+    assert not Path("-").exists()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+def test_a_full_disk_behind_stdout_is_told(saved):
+    with Path("/dev/full").open("w") as full:
+        done = started("export", saved, "--to", "ros", stdout=full)
+    assert done.status == 2
+    assert "stdout cannot be written" in done.err
+    assert "Traceback" not in done.err
+
+
+@pytest.mark.parametrize("name", ["", "session.toml"])
+def test_a_session_is_to_be_calibrated_first(tmp_path, name):
+    (tmp_path / "session.toml").write_text("schema = 1\n", encoding="utf-8")
+    done = exporting(tmp_path / name, "--to", "ur")
+    assert (done.status, done.out) == (2, "")
+    assert f"Run visioncal calibrate {tmp_path}" in done.err
+
+
+def test_frame_names_of_an_edited_calibration_are_checked_too(tmp_path):
+    path = tmp_path / "calibration.json"
+    SAMPLE.save(path)
+    document = json.loads(path.read_text(encoding="utf-8"))
+    name = 'x"\n_from_y'
+    document["transforms"] = {name: document["transforms"]["flange_from_cam"]}
+    path.write_text(json.dumps(document), encoding="utf-8")
+    done = exporting(path, "--to", "ros-launch", "--edge", name)
+    assert (done.status, done.out) == (2, "")
+    assert "frame's name" in done.err

@@ -1,0 +1,376 @@
+"""Recordings of others: each form gives the same poses, and what is missing is named."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.foreign_samples import (
+    BASE_FROM_FLANGE,
+    CAM_FROM_TARGET,
+    RECORDINGS,
+    easy_handeye,
+    images_and_table,
+    industrial,
+    keyed_json,
+    kinematics,
+    kuka_csv,
+    plain_table,
+    quaternions,
+    separate_lens,
+    views_json,
+    visp,
+)
+from support.marks import slow
+
+import visioncal
+from visioncal.core.conventions import Reading
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import exp, invert, pose_difference
+from visioncal.interchange.formats import ImportOptions, PoseImportOptions, convert, read_foreign
+from visioncal.interchange.formats.intrinsics import read_intrinsics
+from visioncal.session import Session
+from visioncal.session.columns import POSE
+
+
+def poses_of(session, name):
+    poses = [getattr(view, name)() for view in session.views]
+    return None if poses[0] is None else np.array([it.as_matrix() for it in poses])
+
+
+@pytest.mark.parametrize("make", RECORDINGS.values(), ids=RECORDINGS.keys())
+def test_every_form_gives_the_same_poses(make, tmp_path):
+    recording = make(tmp_path / "in")
+    convert(recording.source, tmp_path / "out", requested=recording.requested)
+    session = Session.load(tmp_path / "out")
+    robot, camera = poses_of(session, "base_from_flange"), poses_of(session, "cam_from_target")
+    assert robot is not None or camera is not None
+    assert camera is not None or all(view.image for view in session.views)
+    # Two roundings of a double: once through the writer's form, once through a quaternion.
+    if robot is not None:
+        np.testing.assert_allclose(robot, BASE_FROM_FLANGE, atol=1e-14)
+    if camera is not None:
+        np.testing.assert_allclose(camera, CAM_FROM_TARGET, atol=1e-14)
+
+
+def test_what_a_form_says_besides_poses_is_kept(tmp_path):
+    recording = industrial(tmp_path / "in")
+    session = convert(recording.source, tmp_path / "out", requested=recording.requested)
+    assert session.mount == "eye-in-hand"
+    assert (session.target.columns, session.target.rows) == (5, 7)
+    assert session.target.dictionary == "DICT_6X6_250"
+    assert session.resolution == (64, 48)  # from the images, which the source does not describe
+    assert any("no distortion" in it for it in session.warnings)
+    estimated = replace(recording.requested, intrinsics="estimate")
+    assert convert(recording.source, tmp_path / "free", requested=estimated).camera is None
+
+
+def test_visps_lens_and_note(tmp_path):
+    recording = visp(tmp_path / "in")
+    session = convert(recording.source, tmp_path / "out", requested=recording.requested)
+    np.testing.assert_array_equal(session.camera.matrix, [60.5, 60.25, 32.5, 24.5])
+    np.testing.assert_array_equal(session.camera.distortion, [-0.125, 0, 0, 0, 0])
+    assert session.target.square_m == 0.0236
+    assert [view.number for view in session.views] == list(range(1, 10))
+
+
+def test_joints_stand_where_there_are_no_poses(tmp_path):
+    recording = kinematics(tmp_path / "in")
+    session = convert(recording.source, tmp_path / "out", requested=recording.requested)
+    assert session.mount == "eye-to-hand"
+    assert session.views[3].base_from_flange() is None
+    assert session.views[3].joints_rad.tolist() == [0.1 * 3, 0.2 * 3]
+
+
+def test_the_samples_of_a_camera_on_the_base_are_inverted(tmp_path):
+    recording = easy_handeye(tmp_path / "in")
+    requested = replace(recording.requested, mount="eye-to-hand")
+    session = convert(recording.source, tmp_path / "out", requested=requested)
+    # One inversion in double precision.
+    np.testing.assert_allclose(
+        poses_of(session, "base_from_flange"), invert(BASE_FROM_FLANGE), atol=1e-14
+    )
+    as_is = replace(requested, robot=PoseImportOptions(inverse=False))
+    session = convert(recording.source, tmp_path / "as is", requested=as_is)
+    np.testing.assert_allclose(poses_of(session, "base_from_flange"), BASE_FROM_FLANGE, atol=1e-14)
+
+
+def test_numbers_in_our_own_form_stay_as_they_are_written(tmp_path):
+    recording = plain_table(tmp_path / "in")
+    session = convert(recording.source, tmp_path / "out", requested=recording.requested)
+    read = np.array([[view.numbers[name] for name in POSE] for view in session.views])
+    np.testing.assert_array_equal(read, quaternions(BASE_FROM_FLANGE))
+
+
+def test_other_columns_are_passed_through_as_text(tmp_path):
+    recording = kuka_csv(tmp_path / "in")
+    session = convert(recording.source, tmp_path / "out", requested=recording.requested)
+    assert {view.text["operator"] for view in session.views} == {"Ann"}
+    assert "X" not in session.columns
+
+
+def test_other_values_of_a_document_are_kept(tmp_path):
+    recording = keyed_json(tmp_path / "in")
+    document = json.loads(recording.source.read_text())
+    for at, row in enumerate(document["samples"]):
+        row |= {"lamp": {"on": True, "ampere": 0.25 * at}, "corners": [[0.0, 0.0]] * (at + 3)}
+    recording.source.write_text(json.dumps(document))
+    session = convert(recording.source, tmp_path / "out", requested=recording.requested)
+    assert session.views[3].text["lamp.ampere"] == "0.75"
+    assert session.views[3].text["lamp.on"] == "True"
+    assert not [it for it in session.columns if "corners" in it or "robot_pose" in it]
+
+
+def test_columns_that_only_sound_like_ours_get_another_name(tmp_path):
+    robot, camera = quaternions(BASE_FROM_FLANGE).tolist(), quaternions(CAM_FROM_TARGET).tolist()
+    own = ["a", "b", "c", "d", "e", "f", "g"]
+    extra = {"role": "tester", "stop": "emergency", "temp1_c": "warm", "camera": "", "q1_rad": "1"}
+    text = ",".join([*own, *(f"cft_{it}" for it in POSE), *extra, "group"]) + "\n"
+    for at, row in enumerate(np.hstack([robot, camera]).tolist()):
+        cells = [*map(repr, row), *(extra | {"camera": f"cam {at % 2}"}).values(), "warm-up"]
+        text += ",".join(cells) + "\n"
+    (tmp_path / "log.csv").write_text(text)
+    requested = ImportOptions(
+        mount="eye-in-hand", robot=PoseImportOptions(tuple(own), unit="m"), joints=("a",)
+    )
+    session = convert(tmp_path / "log.csv", tmp_path / "out", requested=requested)
+    assert {f"source_{it}" for it in extra} < set(session.columns)
+    assert session.views[0].text["group"] == "warm-up"
+    assert session.views[0].text["source_role"] == "tester"
+
+
+def test_images_are_copied_and_missing_ones_named(tmp_path):
+    recording = industrial(tmp_path / "in")
+    (recording.source / "images/4.png").unlink()
+    session = convert(recording.source, tmp_path / "out", requested=recording.requested)
+    assert any("images/4.png. --images names" in it for it in session.warnings)
+    kept = (tmp_path / "out/images/3.png").read_bytes()
+    assert kept == (recording.source / "images/3.png").read_bytes()
+    assert session.views[4].image == "images/4.png"
+
+
+def test_images_that_lie_elsewhere_are_found_by_number(tmp_path):
+    recording = industrial(tmp_path / "in")
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    for at in range(9):
+        (recording.source / f"images/{at}.png").rename(elsewhere / f"{at:02d}.png")
+    requested = replace(recording.requested, images=elsewhere)
+    session = convert(recording.source, tmp_path / "out", requested=requested)
+    assert [view.image for view in session.views] == [f"images/{at:02d}.png" for at in range(9)]
+    assert all(session.images.exists(view.image) for view in session.views)
+
+
+def test_a_lens_in_a_file_of_its_own(tmp_path):
+    recording = separate_lens(tmp_path / "in")
+    session = convert(recording.source, tmp_path / "out", requested=recording.requested)
+    assert session.camera.matrix.tolist() == [60, 60, 32, 24]
+    assert session.views[0].text["lamp"] == "on"
+
+
+def test_as_many_images_as_poses_are_needed(tmp_path):
+    recording = images_and_table(tmp_path / "in")
+    (recording.source / "shot5.png").unlink()
+    with pytest.raises(DataError, match=r"8 images \(shot0.png ... shot8.png\).* 9 poses"):
+        convert(recording.source, tmp_path / "out", requested=recording.requested)
+    assert not (tmp_path / "out").exists()
+
+
+def test_images_are_taken_in_natural_order(tmp_path):
+    recording = images_and_table(tmp_path / "in")
+    (recording.source / "shot1.png").rename(recording.source / "shot10.png")
+    session = convert(recording.source, tmp_path / "out", requested=recording.requested)
+    assert session.views[1].image == "images/shot2.png"
+    assert session.views[-1].image == "images/shot10.png"
+
+
+@pytest.mark.parametrize(
+    ("requested", "words"),
+    [
+        ({"robot": PoseImportOptions(("X", "Y", "Q"))}, "it has X, Y, Z, A, B, C"),
+        ({"robot": PoseImportOptions(("X", "Y"))}, "have 2 numbers; a pose has"),
+        ({"robot": PoseImportOptions(("X", "Y", "Z", "A", "B", "operator"))}, "holds 'Ann'"),
+        ({"robot": PoseImportOptions(("X", "Y", "Z", "A", "B", "C"), form="kuko")}, "kuka"),
+        ({"robot": PoseImportOptions(("X", "Y", "Z", "A", "B", "C"), form="abb")}, "has 3 numbers"),
+        ({"robot": PoseImportOptions(("X", "Y", "Z", "A", "B", "C"), unit="feet")}, "m, cm, mm"),
+        ({"mount": None}, "--mount"),
+        ({"target": "chekerboard_9x6_25mm"}, "checkerboard_9x6_23.6mm"),
+        ({"target": "charuco_5x7_30mm_40mm_DICT_6X6_250"}, "less than square_m"),
+        ({"joints": ("q",)}, "it has X"),
+        ({"tip": "tool0"}, "--robot-model"),
+        ({"robot_model": "ur11"}, "ur10"),
+        ({"intrinsics": "no such file.yaml"}, "does not exist"),
+        ({"images": Path("no such folder"), "target": "checkerboard_9x6_25mm"}, "no images"),
+    ],
+)
+def test_mistakes_are_answered_with_what_there_is(tmp_path, requested, words):
+    recording = kuka_csv(tmp_path / "in")
+    with pytest.raises(DataError) as caught:
+        convert(
+            recording.source, tmp_path / "out", requested=replace(recording.requested, **requested)
+        )
+    assert words in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_without_names_the_fields_are_listed(tmp_path):
+    (tmp_path / "log.csv").write_text("alpha,beta\n1,2\n3,4\n")
+    with pytest.raises(DataError, match="it has alpha, beta"):
+        convert(
+            tmp_path / "log.csv", tmp_path / "out", requested=ImportOptions(mount="eye-in-hand")
+        )
+
+
+def test_a_row_that_says_nothing_is_left_out_by_name(tmp_path):
+    recording = views_json(tmp_path / "in")
+    (recording.source / "pose_03.json").write_text(
+        json.dumps({"O_T_EE": BASE_FROM_FLANGE[3].reshape(-1).tolist(), "joint_pose": [0.0] * 7})
+    )
+    session = convert(recording.source, tmp_path / "out", requested=recording.requested)
+    assert [view.number for view in session.views] == [0, 1, 2, 4, 5, 6, 7, 8]
+    assert any("1 of 9 rows are left out" in it and "pose_03.json" in it for it in session.warnings)
+
+
+def test_a_path_that_leaves_the_folder_is_refused(tmp_path):
+    recording = industrial(tmp_path / "in")
+    file = recording.source / "cal_data.yaml"
+    file.write_text(file.read_text().replace("poses/0.yaml", "../secret.yaml"))
+    with pytest.raises(DataError, match="or leaves the folder"):
+        convert(recording.source, tmp_path / "out", requested=recording.requested)
+
+
+@pytest.mark.parametrize("make", RECORDINGS.values(), ids=RECORDINGS.keys())
+def test_what_the_user_says_of_poses_is_applied_in_every_form(make, tmp_path):
+    recording = make(tmp_path / "in")
+    plain = read_foreign(recording.source, recording.requested)
+    said = {
+        whose: replace(getattr(recording.requested, whose), unit="cm", inverse=whose == "robot")
+        for whose in ("robot", "camera")
+    }
+    read = read_foreign(recording.source, replace(recording.requested, **said))
+    for whose, requested in said.items():
+        before, after = getattr(plain, whose), getattr(read, whose)
+        if before is not None and before.there.any():
+            assert after.reading == Reading(before.reading.rotation, "cm", requested.inverse)
+            np.testing.assert_array_equal(after.positions, before.positions)
+
+
+@pytest.mark.parametrize("ahead_s", [0.337, *(slow(it) for it in (0.0, -1.25))])
+def test_the_offset_of_two_clocks_is_found(tmp_path, ahead_s):
+    robot_s, camera_s = np.arange(0, 12, 0.01), np.arange(0.5, 11.5, 1 / 30)
+    columns = "t,x,y,z,qx,qy,qz,qw"
+    world = {
+        "robot": (robot_s, swung(robot_s) @ FLANGE_FROM_CAM_BACK),
+        "camera": (camera_s + ahead_s, invert(swung(camera_s)) @ TARGET),
+    }
+    for name, (stamps, poses) in world.items():
+        rows = np.hstack([stamps[:, None], quaternions(poses)])
+        np.savetxt(
+            tmp_path / f"{name}.csv", rows, "%.17g", delimiter=",", header=columns, comments=""
+        )
+    requested = ImportOptions(mount="eye-in-hand", camera_file=tmp_path / "camera.csv")
+    session = convert(tmp_path / "robot.csv", tmp_path / "out", requested=requested)
+    # All of both streams is kept as it was, and nothing is stated of the clocks.
+    assert len(session.views) == len(camera_s)
+    np.testing.assert_array_equal(session.streams["robot"].stamps_s, robot_s)
+    assert not session.declaration.clock.model_fields_set
+    result = visioncal.calibrate(session)
+    # What cubics between samples of 100 Hz leave.
+    assert result.clock.camera_minus_robot_s == pytest.approx(ahead_s, abs=1e-6)
+    away = pose_difference(result.edges["flange_from_cam"].matrix, invert(FLANGE_FROM_CAM_BACK))
+    assert max(away) < 1e-4
+
+
+def test_streams_of_different_motions_are_refused(tmp_path):
+    stamps = np.arange(0, 30, 0.02)
+    for name, poses in (("robot", swung(stamps)), ("camera", swung(1.7 * stamps + 3))):
+        rows = np.hstack([stamps[:, None], quaternions(poses)])
+        np.savetxt(tmp_path / f"{name}.txt", rows, "%.17g")
+    requested = ImportOptions(mount="eye-in-hand", camera_file=tmp_path / "camera.txt")
+    with pytest.raises(DataError, match="of the same motion"):
+        convert(tmp_path / "robot.txt", tmp_path / "out", requested=requested)
+
+
+FLANGE_FROM_CAM_BACK = exp(np.array([0.1, -0.2, 1.5, 0.05, 0.01, 0.08]))
+TARGET = exp(np.array([0.3, 0.1, 0.2, 0.5, 0.1, 0.9]))
+
+
+def swung(times_s):
+    """A camera that swings about all axes, never twice alike within a minute: (n, 4, 4)."""
+    rates = np.array([0.31, 0.47, 0.73, 0.21, 0.37, 0.53])
+    sizes = np.array([0.4, 0.5, 0.7, 0.1, 0.1, 0.1])
+    return exp(np.sin(2 * np.pi * rates * times_s[:, None] + np.arange(6)) * sizes)
+
+
+LENSES = {
+    "ros.yaml": "image_width: 640\nimage_height: 480\ncamera_name: x\ndistortion_model: plumb_bob\n"
+    "camera_matrix: {rows: 3, cols: 3, data: [500.5, 0, 320, 0, 501, 240, 0, 0, 1]}\n"
+    "distortion_coefficients: {rows: 1, cols: 5, data: [-0.25, 0.125, 0, 0, 0.5]}\n",
+    "opencv.yml": "%YAML:1.0\n---\nimage_width: 640\nimage_height: 480\n"
+    "camera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
+    "   data: [ 500.5, 0., 320., 0., 501., 240., 0., 0., 1. ]\n"
+    "distortion_coefficients: !!opencv-matrix\n   rows: 5\n   cols: 1\n   dt: d\n"
+    "   data: [ -0.25, 0.125, 0., 0., 5.0e-1 ]\n",
+    "opencv.xml": '<?xml version="1.0"?><opencv_storage><width>640</width><height>480</height>'
+    '<camera_matrix type_id="opencv-matrix"><rows>3</rows><cols>3</cols><dt>d</dt><data>500.5 0. '
+    '320. 0. 501. 240. 0. 0. 1.</data></camera_matrix><dist type_id="opencv-matrix"><rows>1</rows>'
+    "<cols>5</cols><dt>f</dt><data>-0.25 0.125 0. 0. 0.5</data></dist></opencv_storage>",
+    "opencv.json": '{"width": 640, "height": 480, "K": {"type_id": "opencv-matrix", "rows": 3, '
+    '"cols": 3, "dt": "d", "data": [500.5, 0, 320, 0, 501, 240, 0, 0, 1]}, '
+    '"D": [[-0.25, 0.125, 0, 0, 0.5]]}',
+    "kalibr.yaml": "cam0:\n  camera_model: pinhole\n  intrinsics: [500.5, 501.0, 320.0, 240.0]\n"
+    "  distortion_model: radtan\n  distortion_coeffs: [-0.25, 0.125, 0.0, 0.0]\n"
+    "  resolution: [640, 480]\n",
+}
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_intrinsics_of_others(tmp_path, name):
+    (tmp_path / name).write_text(LENSES[name])
+    lens, notes = read_intrinsics(tmp_path / name)
+    assert not notes
+    assert lens["model"] == "brown"
+    assert lens["matrix"] == [500.5, 501, 320, 240]
+    assert lens["distortion"][:4] == [-0.25, 0.125, 0, 0]
+    assert lens["distortion"][4] == (0 if name == "kalibr.yaml" else 0.5)
+    assert lens["resolution"] == [640, 480]
+
+
+def test_intrinsics_of_numpy_and_of_a_fisheye(tmp_path):
+    matrix = [[500.5, 0, 320], [0, 501, 240], [0, 0, 1]]
+    np.savez(tmp_path / "lens.npz", cameraMatrix=matrix, distCoeffs=[[-0.25, 0.125, 0, 0, 0.5]])
+    assert read_intrinsics(tmp_path / "lens.npz")[0]["distortion"] == [-0.25, 0.125, 0, 0, 0.5]
+    text = LENSES["kalibr.yaml"].replace("radtan", "equidistant")
+    (tmp_path / "fisheye.yaml").write_text(text)
+    assert read_intrinsics(tmp_path / "fisheye.yaml")[0]["model"] == "fisheye"
+    (tmp_path / "omni.yaml").write_text(text.replace("pinhole", "omni"))
+    with pytest.raises(DataError, match="pinhole is needed"):
+        read_intrinsics(tmp_path / "omni.yaml")
+
+
+@pytest.mark.parametrize("count", [170, slow(510)])
+def test_damaged_recordings_end_in_a_clear_message_or_a_session(tmp_path, count):
+    """In bounded memory; `foreign_damage.py` lists the kinds of damage."""
+    script = Path(__file__).parents[1] / "support" / "foreign_damage.py"
+    done = subprocess.run(
+        [sys.executable, "-W", "error", script, tmp_path, str(count)],
+        check=False,
+        capture_output=True,
+        text=True,
+        encoding="utf-8",
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": f"{script.parents[2]}{os.pathsep}{script.parents[1]}"},
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    told = json.loads(done.stdout)
+    assert told["wrong"] == []
+    assert told["count"] == count
+    # Some damage leaves a whole recording behind, such as a digit that was replaced by others.
+    assert 0 < told["sessions"] < count / 2
+    assert not (tmp_path / "executed").exists()
+    # The limit of 50 MB a file, its text, and as much again for a million values: 112 MB were seen.
+    assert told["grown_mb"] < 300

@@ -1,0 +1,499 @@
+"""Exports of tools and fixtures: what a controller reads is the frame, as its maker writes it."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support import placed, readers
+from support.commands import visioncal
+from support.placed import BASE_FROM_FIXTURE, FIXTURE, FLANGE_FROM_TOOL, TOOL, fixture, tool
+from support.readers import FIXTURE_READERS, READERS, TOOL_READERS
+from support.rotations import CASES
+from support.samples import made_up
+
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import compose, invert
+from visioncal.interchange.exports import EXPORT_FORMATS, Load, Selection, document, export
+from visioncal.interchange.result_files import load_calibration, load_placed
+from visioncal.results import Calibration, FrameFile, Verdict
+
+RNG = np.random.default_rng(6)
+SAMPLE = replace(made_up(5).calibration, frames={})
+CELL = replace(SAMPLE, frames=tool() | fixture(source="points.csv"))
+ALONE = placed.alone(tool(), fixture())
+FRAME_READERS = TOOL_READERS | FIXTURE_READERS
+NUMBERED = {"fanuc-utool", "fanuc-uframe"}
+TAKES = {it.name: it.takes for it in EXPORT_FORMATS}
+
+
+def wanted(name, **changes):
+    """What to ask of a format; FANUC's want to know which frame they set."""
+    return Selection(number=7 if name in NUMBERED else None, **changes)
+
+
+def of(name):
+    """The transform that a format takes by itself."""
+    return (TOOL, FLANGE_FROM_TOOL) if name in TOOL_READERS else (FIXTURE, BASE_FROM_FIXTURE)
+
+
+def off(name, text, matrix):
+    return float(np.abs(FRAME_READERS[name](text) - matrix).max())
+
+
+@pytest.mark.parametrize("kind", CASES)
+@pytest.mark.parametrize("name", FRAME_READERS)
+def test_what_is_read_back_is_the_frame(name, kind):
+    # Written to the nanometre and to 1e-8 deg; FANUC's programs have 1e-6 deg, half of which may
+    # be cut from each of three angles.
+    tolerance = 3e-8 if name in NUMBERED else 1e-9
+    if kind == "near a pitch of 90" and not name.startswith(("ur", "abb")):
+        # Within 1e-7 rad of its singularity an Euler triple is taken to be singular: twice that.
+        tolerance = 2.1e-7 + tolerance
+    rotations = np.array(CASES[kind])
+    for matrix in compose(rotations, RNG.uniform(-2, 2, (len(rotations), 3))):
+        source = placed.alone(tool(matrix) if name in TOOL_READERS else fixture(matrix))
+        assert off(name, export(source, name, wanted(name)), matrix) < tolerance
+
+
+@pytest.mark.parametrize("name", sorted(set(READERS) - {"easy-handeye2"}))
+@pytest.mark.parametrize(
+    ("edge", "matrix"), [(TOOL, FLANGE_FROM_TOOL), (FIXTURE, BASE_FROM_FIXTURE)]
+)
+def test_a_frame_goes_out_as_any_transform(name, edge, matrix):
+    for source in (CELL, ALONE):
+        # As the tests of other transforms have it.
+        text = export(source, name, Selection(edge))
+        assert np.abs(READERS[name](text) - matrix).max() < 1e-9
+        text = export(source, name, Selection(edge, inverse=True))
+        assert np.abs(READERS[name](text) - invert(matrix)).max() < 1e-9
+
+
+# --- What the makers themselves have published.
+
+# ABB, RAPID reference manual, data types, tooldata and wobjdata: "Examples".
+GRIPPER = """PERS tooldata gripper := [ TRUE, [[97.4, 0, 223.1], [0.924, 0, 0.383 ,0]],
+[5, [23, 0, 75], [1, 0, 0, 0], 0, 0, 0]];"""
+WOBJ2 = """PERS wobjdata wobj2 :=[ FALSE, TRUE, "", [ [300, 600, 200], [1, 0, 0 ,0] ],
+[ [0, 200, 30], [1, 0, 0 ,0] ] ];"""
+# Universal Robots, script manual, `set_tcp` and `pose_trans`: "Example command".
+SET_TCP = "set_tcp(p[0.,.2,.3,0.,3.14,0.])"
+POSE = "p[.2,.5,.1,1.57,0,0]"
+# A KR 210 R2700-2's own $CONFIG.DAT (github.com/HugoDanielson/ChinaMilling, KRC/R1/System).
+TOOL_DATA = "TOOL_DATA[3]={X 409.434326,Y 3.01155138,Z 166.257782,A -90.0000,B 0.0,C 90.0000}"
+BASE_DATA = (
+    "BASE_DATA[1]={X 924.139893,Y 1099.00952,Z 527.833740,"
+    "A -89.7931595,B 0.238999218,C -0.0562113412}"
+)
+# Three frames in the form in which ROBOGUIDE prints a program; as an example of that form served
+# maketp/results/SETUP_FRAMES.printtp.LS of github.com/LeroyDu56/CrossArm.
+SETUP_FRAMES = """/PROG  SETUP_FRAMES
+/ATTR
+OWNER\t\t= MNEDITOR;
+COMMENT\t\t= "frames";
+PROG_SIZE\t= 875;
+CREATE\t\t= DATE 26-10-06  TIME 16:17:00;
+MODIFIED\t= DATE 26-10-06  TIME 16:17:00;
+FILE_NAME\t= ;
+VERSION\t\t= 0;
+LINE_COUNT\t= 7;
+MEMORY_SIZE\t= 1191;
+PROTECT\t\t= READ_WRITE;
+TCD:  STACK_SIZE\t= 0,
+      TASK_PRIORITY\t= 50,
+      TIME_SLICE\t= 0,
+      BUSY_LAMP_OFF\t= 0,
+      ABORT_REQUEST\t= 0,
+      PAUSE_REQUEST\t= 0;
+DEFAULT_GROUP\t= 1,*,*,*,*;
+CONTROL_CODE\t= 00000000 00000000;
+LOCAL_REGISTERS\t= 0,0,0;
+/MN
+   1:  !two tools and a fixture ;
+   2:  PR[100]=P[1]    ;
+   3:  UTOOL[1]=PR[100] ;
+   4:  PR[100]=P[2]    ;
+   5:  UTOOL[2]=PR[100] ;
+   6:  PR[100]=P[3]    ;
+   7:  UFRAME[1]=PR[100] ;
+/POS
+P[1]{
+   GP1:
+\tUF : 0, UT : 1,\t\tCONFIG : 'N U T, 0, 0, 0',
+\tX =     0.000  mm,\tY =     0.000  mm,\tZ =     0.000  mm,
+\tW =     0.000 deg,\tP =     0.000 deg,\tR =     0.000 deg
+};
+P[2]{
+   GP1:
+\tUF : 0, UT : 1,\t\tCONFIG : 'N U T, 0, 0, 0',
+\tX =     0.000  mm,\tY =     0.000  mm,\tZ =   150.000  mm,
+\tW =     0.000 deg,\tP =     0.000 deg,\tR =     0.000 deg
+};
+P[3]{
+   GP1:
+\tUF : 0, UT : 1,\t\tCONFIG : 'N U T, 0, 0, 0',
+\tX =   900.000  mm,\tY =     0.000  mm,\tZ =   400.000  mm,
+\tW =     0.000 deg,\tP =     0.000 deg,\tR =     0.000 deg
+};
+/END
+"""
+
+
+def rounded(text, mark):
+    """A document without comments and spaces, its numbers with three decimals alike."""
+    plain = re.sub(r"\s", "", readers.code(text, mark))
+    return re.sub(r"-?(\d+\.?\d*|\.\d+)", lambda it: f"{float(it[0]):.3f}", plain)
+
+
+def test_abb_gripper_of_the_manual():
+    # In the manual's words: turned by 45 deg, 223.1 mm straight out and 97.4 mm along x, 5 kg.
+    matrix = readers.transform(readers.ry(np.pi / 4), [0.0974, 0, 0.2231])
+    # The manual's quaternion has three digits, by which a matrix is off by up to four times that.
+    assert np.abs(readers.abb_tooldata(GRIPPER) - matrix).max() < 2e-3
+    ours = export(
+        placed.alone(tool(matrix)),
+        "abb-tooldata",
+        Selection(child="gripper", load=Load(5.0, (23.0, 0.0, 75.0))),
+    )
+    kind, name, (held, (position, quaternion), load) = readers.rapid(ours)
+    assert (kind, name) == readers.rapid(GRIPPER)[:2]
+    theirs = readers.rapid(GRIPPER)[2]
+    assert [held, position, load] == [theirs[0], theirs[1][0], theirs[2]]
+    # Their three digits.
+    assert np.abs(np.subtract(quaternion, theirs[1][1])).max() < 5e-4
+
+
+def test_abb_work_object_of_the_manual():
+    matrix = readers.transform(np.eye(3), [0.3, 0.8, 0.23])
+    # Rounding of doubles.
+    assert np.abs(readers.abb_wobjdata(WOBJ2) - matrix).max() < 1e-12
+    user = readers.transform(np.eye(3), [0.3, 0.6, 0.2])
+    ours = export(placed.alone(fixture(user)), "abb-wobjdata", Selection(child="wobj2"))
+    kind, name, value = readers.rapid(WOBJ2)
+    # All of the fixture goes into the user frame; the object's own is left where it is.
+    assert readers.rapid(ours) == (kind, name, [*value[:4], [[0, 0, 0], [1, 0, 0, 0]]])
+
+
+def test_ur_tool_and_pose_of_the_script_manual():
+    matrix = readers.transform(readers.of_rotation_vector(0, 3.14, 0), [0, 0.2, 0.3])
+    # Rounding of doubles.
+    assert np.abs(readers.ur_tcp(SET_TCP) - matrix).max() < 1e-12
+    assert rounded(export(placed.alone(tool(matrix)), "ur-tcp"), "#") == rounded(SET_TCP, "#")
+    pose = readers.transform(readers.rx(1.57), [0.2, 0.5, 0.1])
+    # As above.
+    assert np.abs(readers.urscript_pose(POSE) - pose).max() < 1e-12
+    ours = export(placed.alone(fixture(pose)), "ur-feature", Selection(child="p_from"))
+    assert rounded(ours, "#") == rounded(f"globalp_from={POSE}", "#")
+
+
+@pytest.mark.parametrize(
+    ("name", "theirs", "number"), [("kuka-tool", TOOL_DATA, 3), ("kuka-base", BASE_DATA, 1)]
+)
+def test_kuka_frames_of_a_controllers_own_file(name, theirs, number):
+    matrix = FRAME_READERS[name](theirs)
+    frames = tool(matrix) if name == "kuka-tool" else fixture(matrix)
+    ours = export(placed.alone(frames), name, Selection(number=number))
+    assert rounded(ours, ";") == rounded(theirs, ";")
+    active = export(placed.alone(frames), name)
+    assert readers.kuka_named(active)[0] == ("$TOOL" if name == "kuka-tool" else "$BASE")
+
+
+def test_fanuc_frames_of_a_program_that_a_controller_printed():
+    theirs = readers.fanuc_program(SETUP_FRAMES)
+    assert {name: it[:3, 3].tolist() for name, it in theirs.items()} == {
+        "UTOOL[1]": [0, 0, 0],
+        "UTOOL[2]": [0, 0, 0.15],
+        "UFRAME[1]": [0.9, 0, 0.4],
+    }
+    for name, frames, number, title in (
+        ("fanuc-utool", tool(theirs["UTOOL[2]"]), 2, "SET_UT2"),
+        ("fanuc-uframe", fixture(theirs["UFRAME[1]"]), 1, "SET_UF1"),
+    ):
+        text = export(placed.alone(frames), name, Selection(number=number))
+        ours = readers.fanuc_program(text)
+        assert all(np.array_equal(theirs[key], it) for key, it in ours.items())
+        assert text.startswith(f"/PROG  {title}\r\n")
+        # Every line but the remarks, the names and the sizes stands in theirs as well.
+        kept = {trimmed(it) for it in SETUP_FRAMES.splitlines()}
+        others = [it for it in text.splitlines() if trimmed(it) not in kept and "!" not in it]
+        assert [it.split()[0] for it in others] == [
+            "/PROG",
+            "COMMENT",
+            "PROG_SIZE",
+            "LINE_COUNT",
+            "MEMORY_SIZE",
+        ]
+
+
+def trimmed(line):
+    """A line without its number and the digits that a controller does not print."""
+    return re.sub(r" +", " ", re.sub(r"^ *\d+:", "", line).replace(".000000", ".000"))
+
+
+def test_fanuc_remarks_fit_and_say_what_is_lost():
+    long = {"flange_from_a_tool_with_a_very_long_name": placed.frame(np.eye(4), oriented=False)}
+    text = export(placed.alone(long), "fanuc-utool", Selection(number=12))
+    remarks = re.findall(r"^ *\d+:  (!.*) ;\r?$", text, re.M)
+    # A remark has 32 characters, its mark among them.
+    assert max(map(len, remarks)) == 32
+    assert "!PR[100] is overwritten" in remarks
+    assert "!rotation not measured" in remarks
+
+
+# --- What is taken, and what is refused.
+
+
+@pytest.mark.parametrize("name", FRAME_READERS)
+def test_the_only_frame_of_its_kind_is_taken(name):
+    edge, matrix = of(name)
+    for source in (CELL, ALONE):
+        chosen = export(source, name, wanted(name))
+        assert chosen == export(source, name, wanted(name, edge=edge))
+        # As above.
+        assert off(name, chosen, matrix) < 3e-8
+
+
+@pytest.mark.parametrize("name", FRAME_READERS)
+def test_of_several_frames_one_is_to_be_named(name):
+    edge, _ = of(name)
+    frames = CELL.frames | {f"{edge}_2": CELL.frames[edge]}
+    for source in (replace(SAMPLE, frames=frames), FrameFile(frames)):
+        with pytest.raises(DataError, match=f"2 .*{edge}, {edge}_2.*--edge") as caught:
+            export(source, name, wanted(name))
+        assert set(caught.value.culprits) == {edge, f"{edge}_2"}
+        assert export(source, name, wanted(name, edge=f"{edge}_2"))
+
+
+@pytest.mark.parametrize("name", FRAME_READERS)
+def test_a_calibration_without_frames_says_how_to_get_one(name):
+    command = "tcp" if name in TOOL_READERS else "fixture"
+    with pytest.raises(DataError, match=f"has no .*visioncal {command}"):
+        export(SAMPLE, name, wanted(name))
+
+
+@pytest.mark.parametrize(
+    ("name", "edge"), [("ur-tcp", "flange_from_cam"), ("kuka-base", "base_from_target")]
+)
+def test_the_camera_or_the_board_can_be_a_frame_where_it_is_named(name, edge):
+    # As above.
+    assert off(name, export(SAMPLE, name, Selection(edge)), SAMPLE.edges[edge].matrix) < 1e-9
+
+
+@pytest.mark.parametrize("name", FRAME_READERS)
+def test_the_wrong_kind_is_refused_with_the_format_for_it(name):
+    wrong = FIXTURE if name in TOOL_READERS else TOOL
+    with pytest.raises(DataError, match=f"{name} writes .*{wrong} is a .*--to ") as caught:
+        export(CELL, name, wanted(name, edge=wrong))
+    counterpart = caught.value.next_step.split()[-1].strip(".")
+    assert export(CELL, counterpart, wanted(counterpart, edge=wrong))
+    assert counterpart.split("-")[0] == name.split("-")[0]
+
+
+@pytest.mark.parametrize("name", FRAME_READERS)
+def test_an_inverse_is_no_tool_and_no_fixture(name):
+    with pytest.raises(DataError, match=r"the inverse of .*--inverse"):
+        export(CELL, name, wanted(name, inverse=True))
+
+
+def test_a_frame_of_another_parent_is_neither():
+    frames = {"cam_from_tool": placed.frame(FLANGE_FROM_TOOL)}
+    for name in FRAME_READERS:
+        with pytest.raises(DataError, match="parent in cam"):
+            export(FrameFile(frames), name, wanted(name, edge="cam_from_tool"))
+
+
+def test_a_suffix_of_the_parent_is_no_other_kind():
+    frames = {"flange_left_from_tool": placed.frame(FLANGE_FROM_TOOL)}
+    # As above.
+    assert off("ur-tcp", export(FrameFile(frames), "ur-tcp"), FLANGE_FROM_TOOL) < 1e-9
+
+
+@pytest.mark.parametrize("name", ["camera-info", "kalibr", "easy-handeye2"])
+def test_frames_alone_have_no_camera(name):
+    with pytest.raises(DataError, match=r"holds the camera.*has none"):
+        export(ALONE, name)
+
+
+def test_frames_alone_are_taken_without_a_name_where_there_is_one():
+    assert "flange_from_tool" in export(placed.alone(tool()), "text")
+    with pytest.raises(DataError, match=r"flange_from_tool, base_from_fixture.*--edge"):
+        export(ALONE, "text")
+    with pytest.raises(DataError, match="no frames"):
+        export(FrameFile({}), "text")
+
+
+def test_a_wrong_name_lists_the_frames_as_well():
+    for source in (CELL, ALONE):
+        with pytest.raises(DataError) as caught:
+            export(source, "ros", Selection("flange_from_tol"))
+        assert "flange_from_tool, base_from_fixture" in caught.value.message
+        assert "Did you mean flange_from_tool" in caught.value.next_step
+        with pytest.raises(DataError, match="--edge base_from_fixture --inverse"):
+            export(source, "ros", Selection("fixture_from_base"))
+
+
+@pytest.mark.parametrize("name", sorted(TAKES))
+def test_what_a_format_has_no_place_for_is_refused(name):
+    given = {"number": {"number": 2}, "load": {"load": Load(1.0, (0.0, 0.0, 1.0))}}
+    for what, chosen in given.items():
+        if what not in TAKES[name]:
+            with pytest.raises(DataError, match="no place for"):
+                export(CELL, name, Selection(**chosen))
+
+
+@pytest.mark.parametrize("number", [0, -3])
+def test_controllers_count_from_one(number):
+    with pytest.raises(DataError, match="from 1"):
+        export(CELL, "kuka-tool", Selection(number=number))
+
+
+@pytest.mark.parametrize("name", sorted(NUMBERED))
+def test_fanuc_wants_to_know_which_frame_is_overwritten(name):
+    with pytest.raises(DataError, match="--number"):
+        export(CELL, name)
+
+
+@pytest.mark.parametrize(
+    "load",
+    [Load(0.0, (0, 0, 1)), Load(-1.0, (0, 0, 1)), Load(np.nan, (0, 0, 1)), Load(1, (0, np.inf, 0))],
+)
+def test_a_load_that_is_none_is_refused(load):
+    with pytest.raises(DataError, match="mass above 0"):
+        export(CELL, "abb-tooldata", Selection(load=load))
+
+
+def test_a_tool_without_a_load_is_marked_and_warned_of():
+    written = document(CELL, "abb-tooldata")
+    assert readers.rapid(written.text)[2][2] == [-1, [0, 0, 0], [1, 0, 0, 0], 0, 0, 0]
+    assert ["--mass-kg" in it for it in written.warnings] == [True]
+    loaded = document(CELL, "abb-tooldata", Selection(load=Load(1.25, (0.0, -1.5, 60.0))))
+    assert readers.rapid(loaded.text)[2][2][:2] == [1.25, [0, -1.5, 60]]
+    assert loaded.warnings == ()
+
+
+@pytest.mark.parametrize("name", ["abb-tooldata", "abb-wobjdata"])
+@pytest.mark.parametrize(
+    "bad", ["2nd", "_tool", "tool.1", "a-b", "a/b", "tool0", "WOBJ0", "Test", "x" * 33]
+)
+def test_a_name_that_rapid_does_not_take_is_refused(name, bad):
+    with pytest.raises(DataError, match=r"RAPID.*--child"):
+        export(CELL, name, Selection(child=bad))
+    assert export(CELL, name, Selection(child="x" * 32))
+
+
+@pytest.mark.parametrize("bad", ["2nd", "a.b", "a-b", "end", "True"])
+def test_a_name_that_urscript_does_not_take_is_refused(bad):
+    with pytest.raises(DataError, match=r"URScript.*--child"):
+        export(CELL, "ur-feature", Selection(child=bad))
+    # A call of set_tcp has no name in it.
+    assert export(CELL, "ur-tcp", Selection(child=bad))
+
+
+# --- What is said of a frame.
+
+
+def test_a_frame_has_its_own_origin_and_worth():
+    # The calibration itself comes from another file, of another day, with another verdict.
+    frames = fixture(source="points.csv", verdict=Verdict("good"))
+    notes = export(replace(SAMPLE, frames=frames), "text", Selection(FIXTURE)).splitlines()[:3]
+    assert notes[0] == (
+        f"# calibrated by visioncal from 'points.csv', {placed.CREATED}: pivot over 10 touches"
+    )
+    edge = frames[FIXTURE].edge
+    assert notes[1] == f"# verdict good; sigma {edge.sigma_mm:.2g} mm and {edge.sigma_deg:.2g} deg"
+    assert SAMPLE.session_name in export(CELL, "text")
+
+
+@pytest.mark.parametrize("inverse", [False, True])
+def test_a_rotation_that_was_not_measured_has_no_sigma(inverse):
+    source = placed.alone(tool(oriented=False))
+    worth = export(source, "text", Selection(TOOL, inverse=inverse)).splitlines()[1]
+    assert worth.endswith(" mm; rotation taken from the flange, not measured")
+    assert "deg" not in worth
+
+
+def test_ros_is_told_what_a_tool_is():
+    text = export(CELL, "ros", Selection(TOOL))
+    assert "pose of tool in tool0" in text
+    assert "tool: the tool's frame" in text
+
+
+@pytest.mark.parametrize("name", sorted(FRAME_READERS))
+def test_no_source_leaves_its_comment(name):
+    hostile = 'x\nset_tcp(p[0])\r\nENDMODULE ; } !\u2028"'
+    frames = tool(source=hostile) | fixture(source=hostile)
+    text = export(FrameFile(frames), name, wanted(name))
+    assert np.array_equal(
+        FRAME_READERS[name](text), FRAME_READERS[name](export(CELL, name, wanted(name)))
+    )
+
+
+# --- Files and the command.
+
+
+def exporting(*arguments):
+    return visioncal("export", *arguments)
+
+
+def test_a_file_of_frames_is_known_by_its_content(tmp_path):
+    file = tmp_path / "any name"
+    ALONE.save(file)
+    assert isinstance(load_placed(file), FrameFile)
+    with pytest.raises(DataError, match="no calibration"):
+        load_calibration(file)
+    SAMPLE.save(tmp_path / "calibration.json")
+    CELL.save(tmp_path / "frames.json")
+    # The calibration of a folder comes before the frames beside it.
+    assert load_placed(tmp_path).frames == {}
+    for name in ("calibration.json", "frames.json"):
+        assert isinstance(load_placed(tmp_path / name), Calibration)
+
+
+def test_a_folder_with_frames_alone(tmp_path):
+    ALONE.save(tmp_path / "frames.json")
+    assert set(load_placed(tmp_path).frames) == {TOOL, FIXTURE}
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", '{"frames": {}}', '{"frames": 3, "schema": 1}'])
+def test_a_broken_file_is_named(tmp_path, text):
+    file = tmp_path / "frames.json"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(DataError, match=re.escape(str(file))):
+        load_placed(file)
+
+
+def test_the_command_writes_what_the_library_does(tmp_path):
+    ALONE.save(tmp_path / "frames.json")
+    done = exporting(tmp_path, "--to", "kuka-tool", "--number", "4")
+    assert (done.status, done.err) == (0, "")
+    assert done.out == export(ALONE, "kuka-tool", Selection(number=4))
+    out = tmp_path / "SET_UF2.LS"
+    done = exporting(tmp_path, "--to", "fanuc-uframe", "--number", "2", "-o", out)
+    assert done.status == 0, done.err
+    # A controller's listing has its lines ended as on its own disk.
+    assert out.read_bytes().decode() == export(ALONE, "fanuc-uframe", Selection(number=2))
+    assert b"/END\r\n" in out.read_bytes()
+
+
+def test_the_command_takes_a_load_and_warns_without_one(tmp_path):
+    CELL.save(tmp_path / "calibration.json")
+    load = ["--mass-kg", "5", "--cog-mm", "23", "0", "-75.5"]
+    done = exporting(tmp_path, "--to", "abb-tooldata", *load)
+    assert (done.status, done.err) == (0, "")
+    assert readers.rapid(done.out)[2][2][:2] == [5, [23, 0, -75.5]]
+    done = exporting(tmp_path, "--to", "abb-tooldata")
+    assert done.status == 0
+    assert "warning:" in done.err
+    assert "LoadIdentify" in done.err
+    done = exporting(tmp_path, "--to", "abb-tooldata", "--mass-kg", "5")
+    assert (done.status, done.out) == (2, "")
+    assert "--cog-mm" in done.err
+
+
+def test_the_verdict_of_the_frame_is_what_is_warned_of():
+    bad = Verdict.of("bad", "Touch 4 is off by 7 mm.")
+    frames = tool(verdict=bad) | fixture()
+    cell = replace(SAMPLE, frames=frames, verdict=Verdict.of("bad", "The views disagree."))
+    assert any("7 mm" in it for it in document(cell, "ur-tcp").warnings)
+    assert document(cell, "ur-feature").warnings == ()
+    assert any("views disagree" in it for it in document(cell, "ros").warnings)

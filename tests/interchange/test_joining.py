@@ -1,0 +1,180 @@
+"""A result written anew with what has joined it."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.kept import assert_same, assert_same_evidence
+from support.samples import Sample, made_up, tool_frame, with_frames
+
+import visioncal.present.recording
+from visioncal.calibration.pipeline import Run, run
+from visioncal.cli.calibrate import calibrate_command
+from visioncal.core.errors import DataError
+from visioncal.frames.frame_from_images import SEEN_BY
+from visioncal.interchange.merge_results import leftover, rewrite
+from visioncal.interchange.outputs import write_outputs
+from visioncal.interchange.result_files import load_stored
+from visioncal.present.recording import read_calibration, read_evidence, read_session
+from visioncal.results import Calibration, FrameFile, to_document
+from visioncal.session import Session
+from visioncal.simulation import CellOptions, simulate, write_session
+
+
+@pytest.fixture(scope="module")
+def sample() -> Sample:
+    return made_up()
+
+
+@pytest.fixture(scope="module")
+def outputs(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a calibration writes."""
+    folder = tmp_path_factory.mktemp("written")
+    write_outputs(folder, sample.session, Run(sample.calibration, sample.evidence))
+    return folder
+
+
+@pytest.fixture
+def folder(outputs: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(outputs, tmp_path / "out"))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {it.name: it.read_bytes() for it in folder.iterdir()}
+
+
+def test_all_files_are_as_before_with_the_frames(sample, folder):
+    joined = with_frames(sample).calibration
+    files = rewrite(folder, joined).files
+    assert [it.name for it in files] == ["calibration.json", "report.html", "recording.rrd"]
+    assert sorted(contents(folder)) == sorted(it.name for it in files)
+    expected = to_document(sample.calibration) | {"frames": to_document(joined)["frames"]}
+    for calibration in (Calibration.load(folder), read_calibration(folder / "recording.rrd")):
+        assert to_document(calibration) == expected
+    assert_same(sample.session, read_session(folder / "recording.rrd"))
+    assert_same_evidence(sample.evidence, read_evidence(folder / "recording.rrd"))
+    assert load_stored(folder).note == ""
+    report = (folder / "report.html").read_text(encoding="utf-8")
+    assert "Tools and fixtures" in report
+    assert "data:image/jpeg" in report
+
+
+def test_frames_can_be_taken_out_again(sample, folder):
+    before = contents(folder)
+    rewrite(folder, with_frames(sample).calibration)
+    rewrite(folder, sample.calibration)
+    after = contents(folder)
+    # A recording bears an id and the time of its making.
+    for name in ("calibration.json", "report.html"):
+        assert after[name] == before[name]
+
+
+def test_the_new_recording_calibrates_to_the_same_numbers(sample, tmp_path):
+    write_session(simulate(CellOptions(views=12)), tmp_path / "cell", images=False)
+    session = Session.load(tmp_path / "cell")
+    first = run(session)
+    write_outputs(tmp_path / "out", session, first)
+    frames = with_frames(sample).calibration.frames
+    rewrite(tmp_path / "out", replace(first.calibration, frames=frames))
+    again = run(tmp_path / "out" / "recording.rrd").calibration
+    assert again.session_sha256 == first.calibration.session_sha256
+    for name, edge in first.calibration.edges.items():
+        assert np.array_equal(again.edges[name].matrix, edge.matrix)
+    assert np.array_equal(again.joint_covariance, first.calibration.joint_covariance)
+
+
+@pytest.mark.parametrize("part", ["write_recording", "replace"])
+def test_a_write_that_fails_leaves_the_old_files(sample, folder, monkeypatch, part):
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    before = contents(folder)
+    if part == "write_recording":
+        monkeypatch.setattr(visioncal.present.recording, "write_recording", fail)
+    else:
+        monkeypatch.setattr(Path, "replace", fail)
+    with pytest.raises(DataError, match="No space left on device"):
+        rewrite(folder, with_frames(sample).calibration)
+    monkeypatch.undo()
+    assert contents(folder) == before
+
+
+def test_a_result_without_its_recording_keeps_the_rest(sample, folder):
+    (folder / "recording.rrd").unlink()
+    files = rewrite(folder, with_frames(sample).calibration).files
+    assert [it.name for it in files] == ["calibration.json", "report.html"]
+    assert sorted(contents(folder)) == ["calibration.json", "report.html"]
+    assert Calibration.load(folder).frames.keys() == with_frames(sample).calibration.frames.keys()
+    assert "There is no recording.rrd beside" in (folder / "report.html").read_text("utf-8")
+
+
+def test_a_recording_of_another_result_is_left_alone(sample, folder):
+    other = replace(sample.calibration, created="2026-11-21T00:00:00+00:00")
+    other.save(folder / "calibration.json")
+    before = contents(folder)
+    rewrite(folder, replace(other, frames=with_frames(sample).calibration.frames))
+    assert contents(folder)["recording.rrd"] == before["recording.rrd"]
+    assert "holds another one" in (folder / "report.html").read_text("utf-8")
+
+
+def test_results_of_another_session_are_refused(sample, folder):
+    before = contents(folder)
+    other = replace(sample.calibration, session_sha256="0" * 64)
+    with pytest.raises(DataError, match="holds the result of another session"):
+        rewrite(folder, other)
+    with pytest.raises(DataError, match="does not exist"):
+        rewrite(folder / "absent", sample.calibration)
+    assert contents(folder) == before
+
+
+@pytest.fixture
+def pairs(tmp_path: Path) -> Path:
+    """A session of pose pairs, which are calibrated in no time."""
+    cell = simulate(CellOptions(views=12, seed=1))
+    return write_session(cell, tmp_path / "pairs", images=False)
+
+
+def test_frames_of_a_replaced_result_are_kept_beside_the_new_one(sample, pairs, tmp_path, capsys):
+    out = tmp_path / "out"
+    calibrate_command(pairs, out)
+    assert leftover(out) is None
+    assert not (out / "frames.json").exists()
+    # Of what had joined, the fixture was placed by the camera.
+    capsys.readouterr()
+    joined = with_frames(sample).calibration.frames
+    fixture = joined["base_from_fixture"]
+    seen = replace(fixture, details={**fixture.details, SEEN_BY: "yesterday"})
+    frames = {**joined, "base_from_fixture": seen}
+    replace(Calibration.load(out), frames=frames).save(out / "calibration.json")
+    FrameFile({"flange_from_old": tool_frame(), "flange_from_tool": tool_frame()}).save(
+        out / "frames.json"
+    )
+    calibrate_command(pairs, out)
+    assert not Calibration.load(out).frames
+    kept = FrameFile.load(out / "frames.json").frames
+    assert kept.keys() == {"flange_from_old", *frames}
+    assert kept["base_from_fixture"].details[SEEN_BY] == "yesterday"
+    told = capsys.readouterr().err
+    assert "flange_from_tool, base_from_fixture had joined the result that this one" in told
+    assert "It had another flange_from_tool of an earlier time." in told
+    assert "calibrated before: base_from_fixture." in told
+
+
+def test_frames_that_cannot_be_kept_stop_a_new_result(sample, pairs, tmp_path):
+    out = tmp_path / "out"
+    calibrate_command(pairs, out)
+    frames = with_frames(sample).calibration.frames
+    replace(Calibration.load(out), frames=frames).save(out / "calibration.json")
+    (out / "frames.json").write_text("not frames", encoding="utf-8")
+    before = contents(out)
+    with pytest.raises(DataError, match=r"frames\.json, line 1.* is no JSON"):
+        calibrate_command(pairs, out)
+    assert contents(out) == before
+
+
+def test_an_unreadable_result_has_nothing_to_lose(tmp_path):
+    (tmp_path / "calibration.json").write_text("an earlier result", encoding="utf-8")
+    assert leftover(tmp_path) is None
+    assert leftover(tmp_path / "nowhere") is None

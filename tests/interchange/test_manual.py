@@ -1,0 +1,216 @@
+"""Poses typed from a pendant: what each maker's form means, and what is asked back."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.rotations import CASES
+from support.samples import made_up
+
+from visioncal.core.documents.pendants import is_marked_pose, possible_forms, read_pose
+from visioncal.core.errors import DataError, DriverError
+from visioncal.core.transforms import compose
+from visioncal.interchange.exports import export
+from visioncal.interchange.formats import ImportOptions, PoseImportOptions
+from visioncal.interchange.formats.columns import foreign_from, read_fields
+from visioncal.live.drivers.manual import ManualArm
+from visioncal.live.drivers.protocols import Arm
+from visioncal.results import Edge
+
+SAMPLE = made_up(5).calibration
+SHIFT = np.array([0.4, -0.1, 0.3])
+
+
+def a_pose(rotation):
+    return compose(rotation.as_matrix(), SHIFT)
+
+
+# By the makers' own definitions, written with scipy's rotations alone.
+LINES = {
+    "p[0.4, -0.1, 0.3, 0.1, -0.2, 3.0]": Rotation.from_rotvec([0.1, -0.2, 3.0]),
+    "pose: p[.4,-1e-1,.3,0.1,-0.2,3.0] ": Rotation.from_rotvec([0.1, -0.2, 3.0]),
+    "X 400 mm Y -100 mm Z 300 mm RX 0.1 rad RY -0.2 rad RZ 3 rad": Rotation.from_rotvec(
+        [0.1, -0.2, 3.0]
+    ),
+    "{X 400.0, Y -100, Z 300.0, A 10, B -20, C 170}": Rotation.from_euler(
+        "ZYX", [10, -20, 170], degrees=True
+    ),
+    "{E6POS: X 400.0,Y -100,Z 300.0,A 10,B -20,C 170,S 6,T 50,E1 0.0,E2 0.0}": Rotation.from_euler(
+        "ZYX", [10, -20, 170], degrees=True
+    ),
+    "X = 400.000 mm, Y = -100 mm, Z = 300 mm,  W = 10 deg, P = -20 deg, R = 170 deg": (
+        Rotation.from_euler("xyz", [10, -20, 170], degrees=True)
+    ),
+    "X400.0 Y-100. Z300 W10 P-20 R170": Rotation.from_euler("xyz", [10, -20, 170], degrees=True),
+    "X: 400 Y: \N{MINUS SIGN}100 Z: 300 W: 10° P: \N{MINUS SIGN}20° R: 170°": Rotation.from_euler(
+        "xyz", [10, -20, 170], degrees=True
+    ),
+    "[[400,-100,300],[0.5,-0.5,0.5,0.5]]": Rotation.from_quat([-0.5, 0.5, 0.5, 0.5]),
+    "CONST robtarget p10:=[[400,-100,300],[0.5,-0.5,0.5,0.5],[0,-1,0,1],[9E9,9E9,9E9,9E9]];": (
+        Rotation.from_quat([-0.5, 0.5, 0.5, 0.5])
+    ),
+    "posx(400, -100, 300, 10, 20, 170)": Rotation.from_euler("ZYZ", [10, 20, 170], degrees=True),
+    "x_m 0.4 y_m -0.1 z_m 0.3 qx 0.5 qy -0.5 qz 0.5 qw 0.5": Rotation.from_quat(
+        [0.5, -0.5, 0.5, 0.5]
+    ),
+    "0.4, -0.1, 0.3, 0.5, -0.5, 0.5, 0.5": Rotation.from_quat([0.5, -0.5, 0.5, 0.5]),
+}
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_a_line_means_what_its_maker_says(line):
+    found = read_pose(line, "the line")
+    # To rounding.
+    assert np.abs(found.pose - a_pose(LINES[line])).max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("form", "rotation"),
+    [
+        ("ur", Rotation.from_rotvec([0.1, -0.2, 3.0])),
+        ("rpy", Rotation.from_euler("xyz", [0.1, -0.2, 3.0])),
+    ],
+)
+def test_bare_numbers_are_what_the_user_says(form, rotation):
+    found = read_pose("0.4 -0.1 0.3 0.1 -0.2 3.0", "the line", form)
+    assert np.abs(found.pose - a_pose(rotation)).max() < 1e-12
+
+
+@pytest.mark.parametrize("form", ["ur", "kuka", "fanuc", "abb", "doosan"])
+def test_what_is_exported_can_be_pasted_back(form):
+    for rotation in CASES["any"]:
+        matrix = compose(rotation, SHIFT)
+        edges = {**SAMPLE.edges, "flange_from_cam": Edge(matrix, np.eye(6))}
+        lines = export(replace(SAMPLE, edges=edges), form).splitlines()
+        pose = " ".join(it for it in lines if not it.startswith(("#", ";", "!")))
+        found = read_pose(pose, "the line")
+        assert found.form.name == form
+        # Exports are written to the nanometre and to 1e-8 deg.
+        assert np.abs(found.pose - matrix).max() < 2e-9
+
+
+@pytest.mark.parametrize(
+    ("line", "form", "words"),
+    [
+        ("1 2 3", None, "is no pose"),
+        ("hello", None, "is no pose"),
+        # Such a line must not take for ever.
+        (40 * "1" + "x", None, "is no pose"),
+        (2000 * "x1", None, "is no pose"),
+        ("X 1 mm Y 2 m Z 3 mm A 4 B 5 C 6", None, "is no pose"),
+        ("J1 10 deg J2 20 deg", None, "is no pose"),
+        ("1 2 3 4 5 6", None, "ur, kuka, fanuc, yaskawa, staubli, doosan"),
+        ("X 1 Y 2 Z 3 Rx 4 Ry 5 Rz 6", None, "ur, yaskawa, staubli"),
+        ("p[0.4, 0, 0, 0, 0, 0]", "kuka", "a pose of ur, not of 'kuka'"),
+        ("p[400, 0, 0, 0, 0, 0]", None, "400 m from the base"),
+        ("p[0.4, 0, 0, 0, 0, 170]", None, "too large for radians"),
+        ("[[400,0,0],[0.5,0.5,0.5,0.4]]", None, "not a quaternion w, x, y, z"),
+    ],
+)
+def test_what_cannot_be_or_may_be_several_things_is_refused(line, form, words):
+    with pytest.raises(DataError) as caught:
+        read_pose(line, "the line", form)
+    assert words in str(caught.value)
+
+
+def a_file(path, rotations, form="kuka", images=True):
+    """A pose a line, as a form of the exports writes it, with an image before it."""
+    lines = ["# poses of the morning"]
+    for at, rotation in enumerate(rotations):
+        edges = {**SAMPLE.edges, "flange_from_cam": Edge(compose(rotation, SHIFT), np.eye(6))}
+        text = export(replace(SAMPLE, edges=edges), form).splitlines()[-1]
+        lines.append(f'img{at}.png; "{text}"' if images else text)
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("form", ["ur", "kuka", "abb", "doosan"])
+def test_a_file_with_a_pose_a_line_says_itself_what_it_means(tmp_path, form):
+    rotations = CASES["any"][:4]
+    for images in (True, False):
+        fields = read_fields(a_file(tmp_path / "poses.txt", rotations, form, images))
+        foreign = foreign_from(fields, ImportOptions())
+        assert foreign.notes == ()
+        # Exports are written to the nanometre and to 1e-8 deg.
+        assert np.abs(foreign.robot.poses() - compose(np.array(rotations), SHIFT)).max() < 2e-9
+    assert read_fields(a_file(tmp_path / "b.txt", rotations)).texts["image"][3] == "img3.png"
+
+
+def test_a_file_of_poses_names_the_line_that_is_wrong(tmp_path):
+    path = a_file(tmp_path / "poses.txt", CASES["any"][:3])
+    path.write_text(path.read_text() + "img9.png; {X 1, Y 2}\n")
+    with pytest.raises(DataError, match=r"poses\.txt, line 5.*is no pose"):
+        read_fields(path)
+    path.write_text("{X 1,Y 2,Z 3,A 4,B 5,C 6}\np[0.1, 0.2, 0.3, 0, 0, 1]\n")
+    with pytest.raises(DataError, match="line 2: another maker's form than KUKA"):
+        read_fields(path)
+    path.write_text("p[0,0,0,0,0,1]\np[0,0,0,0,0,1] p[0.1,0,0,0,0,1]\n")
+    with pytest.raises(DataError, match=r"line 2.*is no pose"):
+        read_fields(path)
+
+
+def test_another_form_than_the_lines_have_is_refused(tmp_path):
+    fields = read_fields(a_file(tmp_path / "poses.txt", CASES["any"][:3]))
+    foreign_from(fields, ImportOptions(robot=PoseImportOptions(form="kuka")))
+    with pytest.raises(DataError, match="written as KUKA"):
+        foreign_from(fields, ImportOptions(robot=PoseImportOptions(form="fanuc")))
+
+
+def test_only_marks_and_names_make_a_pose_of_a_line():
+    assert is_marked_pose("{X 1, Y 2, Z 3, A 4, B 5, C 6}")
+    assert not is_marked_pose("1 2 3 4 5 6")
+    assert possible_forms("hello") == ()
+
+
+def asked(lines):
+    """What asks, and the questions that it asked."""
+    questions, left = [], iter(lines)
+
+    def ask(question):
+        questions.append(question)
+        line = next(left, None)
+        if line is None:
+            raise EOFError
+        return line
+
+    return ask, questions
+
+
+def test_a_pose_is_shown_back_and_taken_when_the_person_agrees():
+    ask, questions = asked(["{X 400, Y -100, Z 300, A 10, B -20, C 170}", ""])
+    arm: Arm = ManualArm(ask)
+    state = arm.state()
+    wanted = a_pose(Rotation.from_euler("ZYX", [10, -20, 170], degrees=True))
+    assert np.abs(state.base_from_flange - wanted).max() < 1e-12
+    assert "KUKA" in questions[1]
+    assert "x 400.00, y -100.00, z 300.00 mm" in questions[1]
+    with pytest.raises(DriverError, match="at their end"):
+        arm.state()
+
+
+def test_a_slip_can_be_corrected_before_it_counts():
+    ask, questions = asked(["p[0.4, 0.1", "p[0.5,0,0,0,0,0]", "p[0.4,0,0,0,0,0]", ""])
+    state = ManualArm(ask).state()
+    assert state.base_from_flange[0, 3] == 0.4
+    assert "is no pose" in questions[1]
+
+
+def test_bare_numbers_are_asked_for_once():
+    first, second = "400 -100 300 10 -20 170", "410 -100 300 10 -20 170"
+    ask, questions = asked([first, "kukka", "kuka", "", second, ""])
+    arm = ManualArm(ask)
+    wanted = a_pose(Rotation.from_euler("ZYX", [10, -20, 170], degrees=True))
+    assert np.abs(arm.state().base_from_flange - wanted).max() < 1e-12
+    assert arm.state().base_from_flange[0, 3] == pytest.approx(0.41)
+    assert sum("Which is it?" in it for it in questions) == 2
+
+
+def test_the_form_can_be_said_beforehand():
+    ask, questions = asked(["400 -100 300 10 -20 170", ""])
+    ManualArm(ask, "fanuc").state()
+    assert "FANUC" in questions[1]
+    ask, _ = asked(["0.4, -0.1, 0.3, 0.5, -0.5, 0.5, 0.5", ""])
+    ManualArm(ask, "ours").state()
+    with pytest.raises(DriverError, match="no form of poses 'kukka'"):
+        ManualArm(ask, "kukka")

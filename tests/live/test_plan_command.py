@@ -1,0 +1,291 @@
+"""`visioncal plan`, as a user runs it: what it proposes, what it writes, what it refuses."""
+
+import json
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun as rr
+from support.commands import Done, visioncal
+from support.drawn import column
+
+from visioncal.calibration.stages.next_views_hint import with_proposal
+from visioncal.cli.review import find_recording
+from visioncal.core.errors import DataError
+from visioncal.present.recording import paths
+from visioncal.results import Calibration
+from visioncal.robot import load_robot
+from visioncal.session import Session
+from visioncal.session.table import parse_csv, read_views
+from visioncal.simulation import CellOptions, simulate, write_session
+
+FILES = {"stops.csv", "plan.json", "plan.script", "plan.rrd"}
+CELL = {
+    "--target": "charuco_9x6_30mm",
+    "--camera": "1000,1000,640,400",
+    "--resolution": "1280,800",
+    "--cam": "0 -60 60 0 0 0",
+    "--board": "500 0 5 180 0 0",
+    "--guess-deg": "2",
+    "--candidates": "60",
+}
+
+ONE_AXIS = CellOptions(robot="ur5e", views=5, motion="one_axis", seed=1)
+
+
+@pytest.fixture(autouse=True)
+def strict_rerun():
+    """Turns rerun's warnings, which it prints and forgets, into errors."""
+    rr.set_strict_mode(True)
+    yield
+    rr.set_strict_mode(False)
+
+
+def plan(source: object, out: Path, *more: object, **cell: str) -> Done:
+    options = CELL | {f"--{name}": value for name, value in cell.items()}
+    return visioncal(
+        "plan", source, "-o", out, *more, *(it for two in options.items() for it in two)
+    )
+
+
+@pytest.fixture(scope="module")
+def planned(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("planned") / "größer"
+    done = plan("ur5e", folder, "--stops", 6, "--box", "post:400,600,300:100,100,600")
+    assert done.status == 0, done.err
+    return folder
+
+
+@pytest.fixture(scope="module")
+def document(planned) -> dict:
+    return json.loads((planned / "plan.json").read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="module")
+def one_axis(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("sessions") / "one axis"
+    return write_session(simulate(ONE_AXIS), folder)
+
+
+def test_a_plan_has_a_table_a_program_a_preview_and_all_of_it_as_json(planned, document):
+    assert {it.name for it in planned.iterdir()} == FILES
+    assert document["purpose"] == "hand-eye"
+    assert len(document["stops"]) == 6
+    assert sorted(it["rank"] for it in document["stops"]) == [1, 2, 3, 4, 5, 6]
+    assert document["cell"]["limits"]["clearance_m"] == 0.03
+    assert document["cell"]["boxes"][0]["name"] == "post"
+    assert re.fullmatch("[0-9a-f]{64}", document["inputs_sha256"])
+    # Six stops with the board filling the image know the camera's place to well under 1 mm.
+    assert 0.0 < document["predicted"]["after"]["sigma_mm"] < 1.0
+    by_rank = sorted(document["stops"], key=lambda it: it["rank"])
+    told = [it["after"]["sigma_mm"] for it in by_rank if "sigma_mm" in it["after"]]
+    assert told == sorted(told, reverse=True)
+
+
+def test_the_table_opens_as_views_with_the_models_poses(planned, document):
+    columns, rows = parse_csv((planned / "stops.csv").read_text(encoding="utf-8"), "stops.csv")
+    views = read_views(columns, rows, "stops.csv")
+    robot = load_robot("ur5e")
+    for view, stop in zip(views, document["stops"], strict=True):
+        assert view.number == stop["view"]
+        assert view.image == f"images/{view.number:03d}.png"
+        pose = robot.base_from_flange(view.joints_rad[None])[0]
+        # Nine decimals of joints of an arm of 1 m: a nanometre or two.
+        np.testing.assert_allclose(view.base_from_flange().as_matrix(), pose, atol=1e-8)
+        np.testing.assert_allclose(view.joints_rad, stop["q"], atol=1e-9)
+        assert view.text["why"] == stop["why"]
+
+
+def test_the_program_drives_to_each_stop_by_way_of_what_lies_between(planned, document):
+    text = (planned / "plan.script").read_text(encoding="ascii")
+    lines = [it for it in text.splitlines() if not it.startswith("#")]
+    assert lines[0] == "def visioncal_plan():"
+    # One function, closed before it is called; inside it nothing but assignments and calls.
+    assert [it for it in lines if it and not it.startswith("  ")] == [
+        "def visioncal_plan():",
+        "end",
+        "visioncal_plan()",
+    ]
+    inside = [it.strip() for it in lines if it.startswith("  ")]
+    call = r'(movej\(\[.*\], a=acceleration, v=speed\)|sleep\(settling\)|popup\(".*", title=".*", '
+    call += r"blocking=True\))"
+    assert all(re.match(rf"({call}|[a-z]+ = [0-9.]+)( *#.*)?$", it) for it in inside)
+    moves = [
+        json.loads(it.partition("(")[2].partition("]")[0] + "]") for it in inside if "movej" in it
+    ]
+    wanted = [q for it in document["stops"] for q in (*it.get("via_q", []), it["q"])]
+    # Six decimals.
+    np.testing.assert_allclose(moves, wanted, atol=1e-6)
+    assert sum("popup" in it and "take images/" in it for it in inside) == 6
+
+
+def test_the_preview_shows_stops_way_board_and_what_is_in_the_way(planned, document):
+    recording = find_recording(planned)
+    assert recording == planned / "plan.rrd"
+    # The board's 40 inner corners, whole in the image at every stop.
+    corners = column(recording, paths.PREDICTED, "Points2D:positions")
+    assert sorted(corners) == list(range(6))
+    for px in corners.values():
+        points = np.vstack(list(px))
+        assert points.shape == (40, 2)
+        assert np.all((points > 0) & (points < [1280, 800]))
+    labels = column(recording, f"{paths.STOPS}/{paths.USED}", "Points3D:labels")[0]
+    assert list(labels) == [str(it["view"]) for it in document["stops"]]
+    notes = column(recording, paths.STOP_NOTE, "TextDocument:text")
+    assert document["stops"][2]["why"] in str(notes[2][0])
+    for entity, component in (
+        (paths.WAY, "LineStrips3D:strips"),
+        (f"{paths.OBSTACLES}/floor", "Boxes3D:half_sizes"),
+        (f"{paths.OBSTACLES}/box_1", "Boxes3D:labels"),
+        (f"{paths.IMAGE_COVERAGE}/{paths.USED}", "Points2D:positions"),
+        (paths.PREDICTED_SIGMA, "BarChart:values"),
+    ):
+        assert len(column(recording, entity, component)[0]) > 0
+
+
+def test_the_same_seed_gives_the_same_plan(document, tmp_path):
+    done = plan(
+        "ur5e", tmp_path / "b", "--stops", 6, "--box", "post:400,600,300:100,100,600", "--json"
+    )
+    assert done.status == 0, done.err
+    assert json.loads(done.out) | {"created": ""} == document | {"created": ""}
+
+
+def test_a_poor_session_gets_its_missing_stops_and_gives_a_result(one_axis, tmp_path):
+    """Plan, record, calibrate anew: all through the command line, the recording simulated."""
+    done = visioncal("plan", one_axis, "--add", 5, "-o", tmp_path, "--candidates", 100)
+    assert done.status == 0, done.err
+    document = json.loads((tmp_path / "plan.json").read_text(encoding="utf-8"))
+    added = np.array([stop["q"] for stop in document["stops"]])
+    cell = simulate(ONE_AXIS)
+    both = np.concatenate([cell.joints, added])
+    whole = simulate(replace(ONE_AXIS, motion="free"), both)
+    session = write_session(whole, tmp_path / "whole")
+    planned = sorted(stop["view"] for stop in document["stops"])
+    assert planned == [it.number for it in Session.load(session).views][-5:]
+    solved = visioncal("calibrate", session, "-o", tmp_path / "out", "--level", "hand-eye")
+    assert solved.status == 0, solved.err
+    result = Calibration.load(tmp_path / "out")
+    assert result.verdict.status != "bad"
+    edge = result.edges["flange_from_cam"]
+    # The same noise makes the same sigma; with ten views it is itself known to a fifth or so, and
+    # what the plan took for noise is what five views showed.
+    assert 0.5 < edge.sigma_mm / document["predicted"]["after"]["sigma_mm"] < 2.0
+    away = whole.transforms["flange_from_cam"][:3, 3] - edge.transform.translation
+    # Three sigma of three numbers together.
+    assert 1e3 * np.linalg.norm(away) < 3.0 * edge.sigma_mm
+
+
+def test_a_session_about_one_axis_is_pointed_here_and_gets_its_missing_stops(one_axis, tmp_path):
+    refused = visioncal("calibrate", one_axis, "-o", tmp_path / "out")
+    assert refused.status == 2
+    assert f"Let visioncal plan '{one_axis}' --add 5 propose them." in refused.err
+    out = tmp_path / "plan"
+    done = visioncal("plan", one_axis, "--add", 2, "-o", out, "--candidates", 60)
+    assert done.status == 0, done.err
+    assert "not determined before" in done.err
+    found = json.loads((out / "plan.json").read_text())
+    assert found["predicted"]["before"] == {"open": True}
+    # The noise of a sound arm, by two stops that turn the camera otherwise.
+    assert found["predicted"]["after"]["sigma_mm"] < 0.5
+    assert "not determined at all" in found["refusal_before"]
+    numbers = [it.number for it in Session.load(one_axis).views]
+    assert [it["view"] for it in found["stops"]] == [max(numbers) + 1, max(numbers) + 2]
+    first = min(found["stops"], key=lambda it: it["rank"])
+    assert "determines what was open" in first["why"]
+
+
+@pytest.mark.parametrize(
+    ("source", "cell", "more", "words"),
+    [
+        ("ur55e", {}, (), "Did you mean ur5e"),
+        ("nowhere", {}, (), "no session and no calibration"),
+        ("ur5e", {"cam": "1 2 3"}, (), "--cam is '1,2,3'; x,y,z,rx,ry,rz is needed"),
+        ("ur5e", {"camera": "nofile.yaml"}, (), "nofile.yaml"),
+        ("ur5e", {"resolution": "1280"}, (), "--resolution"),
+        ("ur5e", {"board": "4000 0 5 180 0 0"}, (), "the arm's length"),
+        ("ur5e", {}, ("--box", "cage:500,0,400:900,900,700"), "Look whether the boxes are"),
+        ("ur5e", {}, ("--box", "cage:500,0,400"), "NAME:X,Y,Z:SX,SY,SZ"),
+        ("ur5e", {}, ("--for", "handeye"), "Did you mean hand-eye"),
+        ("ur5e", {}, ("--for", "tcp"), "--for is 'tcp'; stops can be planned for hand-eye"),
+        ("ur5e", {}, ("--add", "3"), "holds no recorded session"),
+        ("ur5e", {}, ("--start-joints", "1,2"), "--start-joints"),
+        ("ur5e", {}, ("--floor", "high"), "--floor"),
+        ("ur5e", {}, ("--wish-mm", "-1"), "above zero"),
+        ("ur5e", {}, ("--robot", "ur3"), "--robot has no use here"),
+    ],
+)
+def test_what_cannot_be_planned_is_refused_by_name(source, cell, more, words, tmp_path):
+    done = plan(source, tmp_path / "out", *more, **cell)
+    assert done.status == 2, done.err
+    assert words in done.err
+    assert "Traceback" not in done.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_cell_without_a_camera_says_all_that_is_missing(tmp_path):
+    done = visioncal("plan", "ur5e", "-o", tmp_path / "out")
+    assert done.status == 2
+    for option in ("--target", "--camera", "--cam", "--board"):
+        assert option in done.err
+
+
+@pytest.mark.parametrize(
+    ("option", "said"), [("--camera", "914,913"), ("--cam", "1 2 3"), ("--board", "low")]
+)
+def test_what_is_written_wrongly_is_told_before_what_is_missing(option, said, tmp_path):
+    done = visioncal("plan", "ur5e", option, said, "-o", tmp_path / "out")
+    assert done.status == 2
+    assert f"error: {option} is " in done.err
+
+
+def test_a_wish_beyond_the_candidates_is_told_and_the_plan_written(tmp_path):
+    out = tmp_path / "out"
+    done = plan("ur5e", out, "--stops", 4, "--wish-mm", "0.0001")
+    assert done.status == 0, done.err
+    assert "cannot be reached from these candidates" in done.err
+    assert json.loads((out / "plan.json").read_text())["wish_met"] is False
+
+
+def test_arms_that_no_ur_program_drives_get_none(tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "plan.script").write_text("of an earlier plan")
+    done = plan("panda", out, "--stops", 3, board="450 0 5 180 0 0")
+    assert done.status == 0, done.err
+    assert {it.name for it in out.iterdir()} == FILES - {"plan.script"}
+    header = (out / "stops.csv").read_text(encoding="utf-8").splitlines()[0].split(",")
+    assert header[:9] == ["view", "image", *(f"q{it}_rad" for it in range(1, 8))]
+
+
+def test_advice_to_add_views_names_the_command_once():
+    sentences = ("It is bent. Print it anew.", "Weak. Add views tilted.", "Few. Add 5 or more.")
+    first, second, third = with_proposal(sentences, modelled=True)
+    assert second == "Weak. Add views tilted. Let visioncal plan SESSION --add 5 propose them."
+    assert (first, third) == (sentences[0], sentences[2])
+    (arm,) = with_proposal(["Add stops that move joint 5 by 60 deg or more."], modelled=True)
+    assert arm.endswith("Let visioncal plan SESSION --add 5 --for kinematics propose them.")
+    assert with_proposal(["Measure the board."], modelled=True) == ("Measure the board.",)
+
+
+def test_advice_names_no_command_that_refuses_for_want_of_a_robot(one_axis, tmp_path):
+    bare = shutil.copytree(one_axis, tmp_path / "bare")
+    words = (bare / "session.toml").read_text(encoding="utf-8")
+    words, cut = re.subn(r"(?m)^\[robot\]\n(\w.*\n)+", "", words)
+    assert cut == 1
+    (bare / "session.toml").write_text(words, encoding="utf-8")
+    refused = visioncal("calibrate", bare, "-o", tmp_path / "out")
+    assert refused.status == 2
+    assert "Let visioncal plan" not in refused.err
+    assert "Once [robot] model in session.toml names the arm" in refused.err
+    planned = visioncal("plan", bare, "--add", 5, "-o", tmp_path / "plan")
+    assert planned.status == 2
+    assert "([robot] model), or by --robot" in planned.err
+
+
+def test_a_folder_without_any_recording_is_refused_by_review(tmp_path):
+    with pytest.raises(DataError, match=r"recording\.rrd"):
+        find_recording(tmp_path)

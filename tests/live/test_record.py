@@ -1,0 +1,361 @@
+"""`visioncal record`, as a user runs it: what it asks, says, writes and refuses."""
+
+import io
+import json
+import os
+import re
+import signal
+import sys
+from dataclasses import replace
+from unittest.mock import patch
+
+import cv2
+import numpy as np
+import pytest
+import rerun as rr
+from scipy.spatial.transform import Rotation
+from support.commands import Done, visioncal
+from support.drawn import column
+from support.live_cell import FakeArm, FakeCamera, fake_devices, fake_plan
+from support.mjpeg import NetworkCamera, number_of, served
+from support.recorded import REPEATABILITY_M
+
+from visioncal.cli import record as command
+from visioncal.core.errors import DataError, DriverError
+from visioncal.live.capture import devices
+from visioncal.live.capture.clock import HostClock
+from visioncal.live.planning.plan import Request, make_plan
+from visioncal.live.planning.purposes import purpose_of
+from visioncal.live.planning.read_back import PlanFile, read_plan
+from visioncal.live.planning.written import plan_document
+from visioncal.present.recording import paths
+from visioncal.present.recording.live import LiveCell, LiveDrawing, LiveView
+from visioncal.present.viewer import live as viewer
+from visioncal.session import Session
+
+ARM, CAMERA = ("--arm", "fake:here"), ("--camera", "fake")
+QUICK = ("--frames", 1, "--settle-s", 0.03)
+
+
+@pytest.fixture(scope="module")
+def planned(tmp_path_factory):
+    """A plan's file, and what is read back of it."""
+    found = fake_plan(3)
+    request = Request(purpose_of("hand-eye"), 4, candidates=30, start_q=found.start_q)
+    plan = make_plan(found.cell, request)
+    folder = tmp_path_factory.mktemp("plans") / "plan"
+    folder.mkdir()
+    document = plan_document(plan, {"kind": "robot ur5e"})
+    (folder / "plan.json").write_text(json.dumps(document), encoding="utf-8")
+    return folder, plan
+
+
+@pytest.fixture
+def cell(planned, monkeypatch):
+    """Devices in the place of real ones, with their own clock."""
+    plan = read_plan(planned[0])
+    arm, camera = fake_devices(plan)
+    _use(monkeypatch, arm, camera)
+    return arm, camera
+
+
+def _use(monkeypatch, arm: FakeArm, camera: FakeCamera) -> None:
+    monkeypatch.setattr(devices, "ARMS", {"fake": lambda _: arm, "manual": lambda _: arm})
+    monkeypatch.setattr(devices, "CAMERAS", {"fake": lambda *_: camera})
+    monkeypatch.setattr(command, "HostClock", lambda: arm.clock)
+
+
+def record(out, *more: object) -> Done:
+    return visioncal("record", "-o", out, *ARM, *CAMERA, *QUICK, *more)
+
+
+def test_a_plan_is_read_back_as_it_was_made(planned):
+    folder, plan = planned
+    for path in (folder, folder / "plan.json"):
+        read = read_plan(path)
+        assert [it.view for it in read.stops] == [it.view for it in plan.stops]
+        assert np.array_equal([it.q for it in read.stops], plan.q)
+        for mine, its in zip(read.stops, plan.stops, strict=True):
+            assert np.array_equal(mine.via, its.via)
+            assert mine.words == its.words
+        assert np.array_equal(read.start_q, plan.request.start_q)
+        assert read.cell.limits == plan.cell.limits
+        assert read.cell.target == plan.cell.target
+        assert np.array_equal(read.cell.x, plan.cell.x)
+        assert np.array_equal(read.cell.z, plan.cell.z)
+        assert np.array_equal(read.cell.noise.robots, plan.cell.noise.robots)
+        assert read.cell.robot.name == "ur5e"
+    document = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
+    assert read.digest == document["inputs_sha256"]
+
+
+def test_what_is_no_plan_is_named(tmp_path):
+    file = tmp_path / "plan.json"
+    with pytest.raises(DataError, match="does not exist"):
+        read_plan(tmp_path)
+    for text, words in (
+        ("{", "is no JSON"),
+        ("{}", "is no plan: it has no stops and cell"),
+        ('{"stops": [], "cell": {}, "schema": 1}', "is damaged"),
+        ('{"stops": [], "cell": {}, "schema": 7}', "schema is 7"),
+    ):
+        file.write_text(text)
+        with pytest.raises(DataError, match=words):
+            read_plan(file)
+
+
+def test_a_plan_is_driven_and_told_line_by_line(planned, cell, tmp_path):
+    done = record(tmp_path / "live", "--plan", planned[0], "--yes")
+    assert done.status == 0, done.err
+    assert "4 stops to drive at 0.4 rad/s, about" in done.err
+    assert "the way is clear of all that was declared" in done.err
+    lines = [it for it in done.err.splitlines() if it.startswith("[")]
+    assert [it[:5] for it in lines] == ["[1/4]", "[2/4]", "[3/4]", "[4/4]"]
+    assert "predicted sigma" in lines[-1]
+    assert re.search(r"-> next: view \d, for [0-9.]+ mm$", lines[-2])
+    assert "visioncal calibrate" in done.err
+    assert len(Session.load(tmp_path / "live").views) == 4
+    assert cell[0].halted == 0
+
+
+def test_json_sums_it_up(planned, cell, tmp_path):
+    done = record(tmp_path / "live", "--plan", planned[0], "--yes", "--json")
+    summary = json.loads(done.out)
+    assert summary["views"] == [it.view for it in planned[1].stops]
+    assert summary["predicted"]["sigma_mm"] > 0.0
+    assert {"view", "moved_s", "settled_s", "worked_s"} == summary["times_s"][0].keys()
+    assert cell[0].moves >= 4
+
+
+def test_nothing_moves_without_a_word(planned, cell, tmp_path):
+    arm = cell[0]
+    with patch.object(sys, "stdin", io.StringIO("y\n")):
+        done = record(tmp_path / "live", "--plan", planned[0])
+    assert done.status == 2
+    assert "stdin is no terminal" in done.err
+    assert "--yes" in done.err
+    assert arm.moves == 0
+    terminal = io.StringIO("n\n")
+    terminal.isatty = lambda: True
+    with patch.object(sys, "stdin", terminal):
+        done = record(tmp_path / "other", "--plan", planned[0])
+    assert done.status == 2
+    assert "nothing moved" in done.err
+    assert arm.moves == 0
+
+
+def test_a_dry_run_moves_nothing_and_writes_nothing(planned, cell, tmp_path):
+    done = record(tmp_path / "live", "--plan", planned[0], "--dry-run")
+    assert done.status == 0, done.err
+    assert "4 stops to drive" in done.err
+    assert "Nothing was moved" in done.err
+    assert cell[0].moves == 0
+    assert not (tmp_path / "live").exists()
+
+
+def test_a_recording_that_failed_is_resumed(planned, cell, tmp_path, monkeypatch):
+    arm, camera = cell
+    camera.unplugged_at = 4
+    done = record(tmp_path / "live", "--plan", planned[0], "--yes")
+    assert done.status == 2
+    assert "fake camera: no picture in" in done.err
+    assert "safe in" in done.err
+    assert "--resume" in done.err
+    some = len(Session.load(tmp_path / "live").views)
+    stops = read_plan(planned[0]).stops
+    arm, camera = fake_devices(read_plan(planned[0]))
+    arm.q0 = stops[some].q
+    _use(monkeypatch, arm, camera)
+    done = record(tmp_path / "live", "--plan", planned[0], "--yes", "--resume")
+    assert done.status == 0, done.err
+    assert f"{len(stops) - some} stop" in done.err
+    assert len(Session.load(tmp_path / "live").views) == 4
+    done = record(tmp_path / "live", "--plan", planned[0], "--yes", "--resume")
+    assert done.status == 0
+    assert "nothing is left to drive" in done.err
+
+
+def test_a_signal_ends_it_like_ctrl_c(planned, cell, tmp_path):
+    arm, camera = cell
+    frame = camera.frame
+
+    def signalled(**words):
+        if arm.moves == 3:
+            signal.raise_signal(signal.SIGTERM)
+        return frame(**words)
+
+    camera.frame = signalled
+    done = record(tmp_path / "live", "--plan", planned[0], "--yes")
+    assert done.status == 2
+    assert "stopped by Ctrl-C or a signal; the arm was halted" in done.err
+    assert arm.halted == 1
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
+def test_stops_without_a_view_end_in_status_2(planned, cell, tmp_path):
+    cell[1].hidden_at = (2,)
+    done = record(tmp_path / "live", "--plan", planned[0], "--yes")
+    assert done.status == 2
+    assert "1 of 4 stops gave no view" in done.err
+    assert "not taken:" in done.err
+    assert len(Session.load(tmp_path / "live").views) == 3
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ((), "--plan or --target is needed"),
+        (("--target", "charuco_9x6_30mm"), "an arm is driven by a plan"),
+        (("--plan", "PLAN", "--mount", "eye-to-hand"), "the plan says that already"),
+        (("--plan", "PLAN", "--speed", "9"), "up to 1.5 rad/s"),
+        (("--plan", "PLAN", "--follow", "--dry-run"), "a guided arm is not driven"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_a_device_is_asked(planned, tmp_path, more, words):
+    more = [planned[0] if it == "PLAN" else it for it in more]
+    done = record(tmp_path / "live", *more)
+    assert done.status == 2
+    assert words in " ".join(done.err.split())
+
+
+def test_devices_and_pictures_that_do_not_fit_are_named(planned, cell, tmp_path):
+    done = visioncal(
+        "record", "-o", tmp_path / "live", "--arm", "fak", *CAMERA, "--plan", planned[0]
+    )
+    assert done.status == 2
+    assert "'fak' is no kind of device; fake, manual are. Did you mean fake?" in " ".join(
+        done.err.split()
+    )
+    camera = cell[1]
+    camera.lens = replace(camera.lens, resolution=(320, 200))
+    done = record(tmp_path / "live", "--plan", planned[0], "--yes")
+    assert done.status == 2
+    assert "the plan is for pictures of 640 x 400 px, and the camera gives 320 x 200" in done.err
+
+
+def test_a_guided_arm_is_followed(planned, cell, tmp_path):
+    arm, stops = cell[0], iter(read_plan(planned[0]).stops)
+    state, rested = arm.state, [arm.clock.now()]
+
+    def led():
+        # Who leads the arm goes on some time after each rest, however long the way there was.
+        now = arm.clock.now()
+        if arm.moving():
+            rested[0] = now
+        if now - rested[0] > 2.0:
+            rested[0] = now
+            arm.start_move(next(stops).q, speed=2.0, acceleration=4.0)
+        return state()
+
+    arm.state = led
+    # One place at which nothing is seen is told, and the person goes elsewhere.
+    cell[1].hidden_at = (2,)
+    more = ("--follow", "--target", "charuco_9x6_30mm", "--robot", "ur5e", "--views", 3)
+    done = record(tmp_path / "live", *more)
+    assert done.status == 0, done.err
+    assert "[1/3] view 1:" in done.err
+    assert "not taken:" in done.err
+    assert "-> next:" in done.err
+    session = Session.load(tmp_path / "live")
+    assert len(session.views) == 3
+    assert session.robot_name == "ur5e"
+
+
+def test_each_view_of_a_network_camera_shows_where_the_arm_stood(planned, tmp_path, monkeypatch):
+    arm, camera = fake_devices(read_plan(planned[0]))
+    arm.clock = HostClock()
+    start_move = arm.start_move
+    arm.start_move = lambda q, **_: start_move(q, speed=20.0, acceleration=100.0)
+    monkeypatch.setattr(devices, "ARMS", {"fake": lambda _: arm})
+    sent = NetworkCamera(lambda: camera.frame().image)
+    with served(sent) as url:
+        words = ("--camera", f"uvc:{url}", "--plan", planned[0], "--yes", "--json")
+        done = visioncal("record", "-o", tmp_path / "live", *ARM, *QUICK, *words)
+    assert done.status == 0, done.err
+    session = Session.load(tmp_path / "live")
+    assert len(session.views) == 4
+    # One picture after the other was exposed, and the flange was there.
+    true_flanges = list(camera.exposures.values())
+    for view in session.views:
+        number = number_of(cv2.imread(str(tmp_path / "live" / view.image)))
+        off = view.base_from_flange().translation - true_flanges[number][:3, 3]
+        assert np.linalg.norm(off) < REPEATABILITY_M
+
+
+def test_typed_poses_and_pictures_in_a_folder_make_a_session(planned, tmp_path):
+    plan = read_plan(planned[0])
+    arm, camera = fake_devices(plan)
+    (tmp_path / "pictures").mkdir()
+    lines = []
+    for at, stop in enumerate(plan.stops):
+        arm.q0 = stop.q
+        cv2.imwrite(str(tmp_path / "pictures" / f"shot{at}.png"), camera.frame().image)
+        pose = arm.true_flange(0.0)
+        turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
+        numbers = ", ".join(f"{it:.6f}" for it in [*pose[:3, 3], *turn])
+        # Take it, its pose, and yes, that is what it means.
+        lines += ["", f"p[{numbers}]", ""]
+    answers = io.StringIO("\n".join([*lines, "q", ""]))
+    words = ["--arm", "manual", "--camera", f"folder:{tmp_path / 'pictures'}"]
+    words += ["--target", "charuco_9x6_30mm", "-o", tmp_path / "live"]
+    with patch.object(sys, "stdin", answers):
+        done = visioncal("record", *words)
+    assert done.status == 0, done.err
+    session = Session.load(tmp_path / "live")
+    assert len(session.views) == len(plan.stops)
+    for view, stop in zip(session.views, plan.stops, strict=True):
+        flange = plan.cell.robot.base_from_flange(stop.q[None])[0]
+        # Six digits of metres and radians.
+        assert np.allclose(view.base_from_flange().as_matrix(), flange, atol=5e-6)
+    with patch.object(sys, "stdin", io.StringIO("")):
+        done = visioncal("record", *words, "--resume")
+    assert done.status == 2
+    assert "begins with its first picture again" in done.err
+
+
+def test_a_recording_is_drawn(tmp_path):
+    plan: PlanFile = fake_plan(2)
+    arm, camera = fake_devices(plan)
+    rr.set_strict_mode(True)
+    file = tmp_path / "live.rrd"
+    stream = rr.RecordingStream(paths.APPLICATION)
+    stream.save(file)
+    scene = plan.cell
+    drawn = LiveCell(
+        scene.mount, scene.target, camera.resolution, scene.robot, camera.lens, scene.x, scene.z
+    )
+    drawing = LiveDrawing(stream, drawn)
+    drawing.begin()
+    px = np.array([[100.0, 50.0], [300.0, 200.0]])
+    for view, stop in enumerate(plan.stops, start=1):
+        arm.q0 = stop.q
+        state, image = arm.state(), camera.frame().image
+        shown = LiveView(view, image, px, state.base_from_flange, state.q, 0.1 * view, "note")
+        drawing.draw(shown)
+    stream.send_blueprint(viewer.live_blueprint())
+    stream.disconnect()
+    rr.set_strict_mode(False)
+    assert len(column(file, paths.LIVE_SIGMA, "Scalars:scalars")) == 2
+
+
+def test_without_a_display_the_recording_goes_on(planned, cell, tmp_path, monkeypatch):
+    def none(_: str):
+        raise DriverError("rerun's viewer cannot be shown here; is there a display?")
+
+    monkeypatch.setattr(viewer, "live_viewer", none)
+    done = record(tmp_path / "live", "--plan", planned[0], "--yes", "--view")
+    assert done.status == 0, done.err
+    assert "goes on without it" in done.err
+    assert cell[0].moves >= 4
+
+
+@pytest.mark.skipif(
+    any(os.environ.get(it) for it in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")),
+    reason="there is a display, on which a window would open",
+)
+def test_a_viewer_without_a_display_is_told():
+    with (
+        pytest.raises(DriverError, match="cannot be shown here"),
+        viewer.live_viewer("recording"),
+    ):
+        pass

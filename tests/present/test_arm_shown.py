@@ -1,0 +1,243 @@
+"""The calibrated arm in the report and in the recording."""
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+from support.arm_documents import NOT_TOLD, WORTH, calibrated, stays_stated, with_holdout
+from support.drawn import column
+from support.findings import with_findings
+from support.pages import Page, section
+from support.samples import Sample, made_up
+
+from visioncal.core.errors import DataError
+from visioncal.present.recording import armtext, notes, paths, read_calibration, write_recording
+from visioncal.present.recording.workspace import ArmPicture
+from visioncal.present.report.arm import arm_card
+from visioncal.present.report.page import render
+from visioncal.present.viewer import blueprint
+from visioncal.results import Calibration, to_document
+
+
+@pytest.fixture(scope="module")
+def sample() -> Sample:
+    return made_up()
+
+
+def with_arm(sample: Sample, document: dict[str, Any]) -> Calibration:
+    return with_findings(sample, {"kinematics": document})
+
+
+def page_of(sample: Sample, document: dict[str, Any]) -> Page:
+    return Page(render(with_arm(sample, document), sample.session, sample.evidence))
+
+
+@pytest.fixture(scope="module")
+def html(sample: Sample) -> str:
+    return render(with_arm(sample, calibrated()), sample.session, sample.evidence)
+
+
+@pytest.fixture(scope="module")
+def page(html: str) -> Page:
+    return Page(html)
+
+
+@pytest.fixture(scope="module")
+def rows(page: Page) -> list[str]:
+    return [" ".join(row.split()) for row in page.rows]
+
+
+def of_arm(page: Page) -> str:
+    return section(page, "The arm Taken", "Where the uncertainty comes from")
+
+
+def test_the_levels_are_compared_and_the_taken_one_says_why(page, rows):
+    words = of_arm(page)
+    assert (
+        "Taken: geometry of the links. It predicts stops that are left out of the fit to 0.085 mm "
+        "and 0.0055 deg, the arm as stated to 0.79 mm and 0.086 deg."
+    ) in words
+    assert "the arm as stated 0 0.76 0.083 0.79 0.086 \N{EN DASH}" in rows
+    assert "offsets of the joints 6 0.61 0.063 0.66 0.067 24" in rows
+    assert "geometry of the links (taken) 36 0.073 0.0049 0.085 0.0055 1027" in rows
+    assert "a sigma of 0.071 mm (median; 95 % of the places: under 0.14 mm)" in words
+
+
+def test_an_arm_that_stays_as_stated_takes_one_sentence(sample):
+    html = render(with_arm(sample, stays_stated()), sample.session, sample.evidence)
+    words = section(Page(html), "The arm No level", "Where the uncertainty comes from")
+    assert words.strip() == (
+        "The arm No level was taken: none predicts stops that are left out of the fit better than "
+        "the arm as stated does, beyond chance."
+    )
+
+
+def test_parameters_have_their_change_with_the_digits_of_its_sigma(page, html, rows):
+    assert "a 0 1.20 +1.20 \N{PLUS-MINUS SIGN} 0.10 mm" in rows
+    alpha = "\N{GREEK SMALL LETTER ALPHA} 90 89.9885 -0.0115 \N{PLUS-MINUS SIGN} 0.0086"
+    assert f"{alpha} \N{DEGREE SIGN}" in rows
+    # What is held has no sigma.
+    assert "d -572.3 -572.300 0 mm" in rows
+    assert "eccentricity, sine 0 0.0688 +0.0688 \N{PLUS-MINUS SIGN} 0.0057 \N{DEGREE SIGN}" in rows
+    assert "2 of 4 changes are beyond three sigma" in of_arm(page)
+    sure = re.findall(r'<tr class="sure">(.*?)</tr>', html)
+    assert len(sure) == 2
+    assert all("+" in row for row in sure)
+
+
+def test_no_key_of_the_document_stands_in_the_section(page):
+    said = of_arm(page).replace(" ".join(NOT_TOLD.split()), "")
+    assert re.findall(r"\w+_\w+", said) == []
+
+
+def test_what_the_stops_tell_and_what_not(page, rows):
+    words = of_arm(page)
+    assert "directions told 29 of 30" in words
+    assert "condition 54" in words
+    assert NOT_TOLD in words
+    assert "O4 6e-05" in words
+    shown = [row for row in rows if re.fullmatch(r"view \d.* %", row)]
+    most, least = list(WORTH)[:5], list(WORTH)[-1]
+    assert [int(re.findall(r"\d+", row)[0]) for row in shown] == [*most, least]
+    assert shown[0] == "view 5 31 %"
+    assert shown[-1] == f"view {least}, the least 0.30 %"
+
+
+def test_the_workspace_is_drawn_from_the_side_and_from_above(html):
+    for name in ("side", "top"):
+        assert f'aria-label="The workspace from the {name}, sigma 0.' in html
+    for label in ("base z [m]", "base x [m]", "sigma [mm]"):
+        assert label in html
+
+
+def test_views_held_back_stand_apart_from_those_left_out(sample, page):
+    held = page_of(sample, with_holdout())
+    assert "left out in turn held back by the session" in of_arm(held)
+    assert "held back by the session" not in of_arm(page)
+    # The residuals of those left out: 0.06 mm each, up to 0.85 mm with the arm as stated.
+    assert "rms 0.060" in of_arm(held)
+
+
+def test_the_pictures_have_words_for_those_who_do_not_see_them(html):
+    pictures = re.findall(r"<svg[^>]*>", html)
+    assert len(pictures) > 8
+    for it in pictures:
+        assert "aria-label=" in it or "aria-hidden" in it
+
+
+def test_results_without_what_later_versions_add_are_shown_with_what_they_have(sample):
+    document = calibrated()
+    for name in ("workspace_map", "not_told", "stops", "left_out", "convention"):
+        del document[name]
+    for it in document["parameters"]:
+        del it["sigma"]
+    words = of_arm(page_of(sample, document))
+    assert "Over the workspace" not in words
+    assert "beyond three sigma" not in words
+    assert "a 0 1.200 +1.200 mm" in words
+
+
+def test_a_session_without_joints_has_no_arm(sample):
+    words = Page(render(sample.calibration, sample.session, sample.evidence)).words
+    assert "The arm" not in words
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"levels": []}, "kinematics: level 'geometry' is not among the levels"),
+        ({"level": "elastic"}, "kinematics: level 'elastic' is not among the levels"),
+        ({"parameters": [{"joint": "a"}]}, r"kinematics.parameters\[0\].name is missing"),
+        (["no table"], r"kinematics is \['no table'\]; a table is needed"),
+    ],
+)
+def test_an_arm_that_cannot_be_read_is_named(sample, wrong, words):
+    document = calibrated() | wrong if isinstance(wrong, dict) else wrong
+    with pytest.raises(DataError, match=words):
+        with_arm(sample, document)
+
+
+def test_five_stops_have_no_least_one(sample):
+    document = calibrated()
+    document["stops"] = document["stops"][:5]
+    found = with_arm(sample, document).arm
+    card = arm_card(found)
+    assert (len(card.most_worth), card.least_worth) == (5, ())
+
+
+def test_a_recording_tells_and_draws_the_arm(sample, tmp_path):
+    calibration = with_arm(sample, with_holdout())
+    path = tmp_path / "recording.rrd"
+    layout = blueprint(sample.session, calibration)
+    write_recording(path, sample.session, calibration, sample.evidence, layout)
+    read = read_calibration(path)
+    assert read is not None
+    assert to_document(read) == to_document(calibration)
+    entities = {str(it.entity_path) for it in RrdReader(path).stream()}
+    wanted = (paths.ARM_NOTE, paths.WORKSPACE, paths.NOMINAL_ARM, paths.UNSEEN_MM)
+    for entity in wanted:
+        assert any(it.startswith(entity) for it in entities), entity
+    assert "Arm" in [tab.name for tab in layout.root_container.contents]
+    stated = column(path, f"{paths.UNSEEN_MM}/as_stated", "Scalars:scalars")
+    held = column(path, f"{paths.UNSEEN_MM}/as_stated_held_back", "Scalars:scalars")
+    assert (set(stated), set(held)) == ({0, 1, 2, 4, 5}, {7, 8})
+    assert held[8] == pytest.approx([1.0])
+
+
+def test_places_of_the_workspace_are_coloured_by_their_sigma(sample, tmp_path):
+    path = tmp_path / "recording.rrd"
+    document = calibrated()
+    write_recording(path, sample.session, with_arm(sample, document), sample.evidence, None)
+    entity = f"{paths.WORKSPACE}/sigma_of_a_tool_s_place"
+    places = column(path, entity, "Points3D:positions")[0]
+    given = [[it["x_m"], it["y_m"], it["z_m"]] for it in document["workspace_map"]]
+    # Single precision of places within 2 m.
+    np.testing.assert_allclose(places, given, atol=1e-6)
+    shades = column(path, entity, "Points3D:colors")[0] >> 16 & 255
+    greens = shades[np.argsort([it["sigma_mm"] for it in document["workspace_map"]])]
+    # From violet to yellow: the greens of the worst are the brightest.
+    assert greens[-5:].min() > greens[:20].max()
+    assert column(path, f"{paths.WORKSPACE}/legend", "Points3D:labels")[0][0].endswith(" mm")
+
+
+def test_the_arm_is_drawn_as_calibrated_and_the_stated_one_off_it(sample, tmp_path):
+    path = tmp_path / "recording.rrd"
+    calibration = with_arm(sample, calibrated())
+    write_recording(path, sample.session, calibration, sample.evidence, None)
+    q = sample.session.views[4].joints_rad
+    ours = calibration.calibrated_robot.link_frames(q)[:, :3, 3]
+    stated = calibration.robot.link_frames(q)[:, :3, 3]
+    drawn = column(path, f"{paths.ROBOT}/links", "Capsules3D:translations")[4]
+    np.testing.assert_allclose(drawn, [np.zeros(3), *ours[:-1]], atol=1e-6)
+    picture = ArmPicture.of(sample.session, calibration, 1.0)
+    assert picture is not None
+    assert picture.factor > 1
+    entities = {str(it.entity_path) for it in RrdReader(path).stream()}
+    (entity,) = (it for it in entities if it.startswith(paths.NOMINAL_ARM))
+    factor = int(re.findall(r"(\d+)x", entity)[0])
+    (strip,) = column(path, entity, "LineStrips3D:strips")[4]
+    expected = [np.zeros(3), *(ours + factor * (stated - ours))]
+    # Single precision; the sample's flange is the robot's own.
+    np.testing.assert_allclose(strip, expected, atol=1e-5)
+
+
+def test_the_note_names_what_is_sure_and_what_is_not_told(sample):
+    found = with_arm(sample, calibrated()).arm
+    text = armtext.markdown(found)
+    assert "| **geometry of the links** | 36 | 0.073 |" in text
+    assert "| shoulder pan joint | a | 0 | 1.20 | **+1.20** |" in text
+    assert "| elbow joint | d |" in text
+    assert "29 of 30 directions" in text
+    assert notes.plain(NOT_TOLD) in text
+    assert "- view 5: 31 %" in text
+    assert not re.findall(r"(?<!\\)_", text)
+
+
+def test_a_stated_arm_has_no_tab_but_a_word(sample):
+    calibration = with_arm(sample, stays_stated())
+    layout = blueprint(sample.session, calibration)
+    assert "Arm" not in [tab.name for tab in layout.root_container.contents]
+    assert "No level was taken" in notes.figures_markdown(calibration)
+    assert ArmPicture.of(sample.session, calibration, 1.0) is None

@@ -1,0 +1,91 @@
+"""The report of an aligned cell says what the result has."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+from support.aligned_cells import made_up_cell
+
+from visioncal.core.number_format import significant
+from visioncal.present.recording.cellmap import pairs, weakest_frame
+from visioncal.present.report.cells import pair_table, render_cell, write_cell_report
+from visioncal.results import Moved, RobotResult, Sight, Untied
+from visioncal.results.arm import ArmLevel, ArmResult
+
+CELL = made_up_cell(5)
+
+
+def text_of(html: str) -> str:
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", html))
+
+
+def test_the_graph_has_every_frame_with_its_sigma():
+    html = render_cell(CELL)
+    figure = re.search(r"<svg[^>]*The network of frames.*?</svg>", html, re.DOTALL)[0]
+    labels = re.findall(r"<text[^>]*>([^<]*)</text>", figure)
+    for frame in ("base_b", "cam_top", "cam_hand", "target_plate"):
+        edge = CELL.edge_of(frame)
+        assert frame in labels
+        worth = f"{significant(edge.sigma_mm)} mm, {significant(edge.sigma_deg)}°"
+        assert worth in [it.replace("&#176;", "°") for it in labels]
+    assert "the reference" in labels
+    assert {"robot a", "robot b"} <= set(labels)
+
+
+def test_observations_are_counted_by_who_saw_whom():
+    sights = (
+        Sight(0, 0, "cam_top", "target_plate", True, "", 3.0, 0.1),
+        Sight(1, 1, "cam_top", "target_plate", True, "", 4.0, 0.3),
+        Sight(2, 2, "cam_top", "target_plate", False, "disagrees", 90.0, 9.0),
+        Sight(3, 2, "cam_hand", "target_plate", False, "blurred"),
+    )
+    first, second = pairs(replace(CELL, sights=sights))
+    assert (first.used, first.left_out, first.rms_mm) == (2, 1, 12.5**0.5)
+    assert (second.used, second.rms_mm) == (0, None)
+    words = text_of(render_cell(replace(CELL, sights=sights)))
+    assert "2 (\N{MINUS SIGN}1)" in words
+    assert "2 cam_top of target_plate disagrees" in words
+
+
+def test_the_table_has_any_frame_in_any_other():
+    table = pair_table(CELL, "cell")
+    assert [it.name for it in table.rows] == ["base_a", "base_b", "cam_top"]
+    edge = CELL.between("cam_top", "base_b")
+    assert table.rows[2].cells[1].startswith(f"{significant(edge.sigma_mm)} mm")
+    assert table.rows[2].cells[2] == ""
+
+
+def test_errors_of_robots_are_told_where_they_were_estimated():
+    levels = tuple(
+        ArmLevel(level=name, unknowns=6, rms_mm=mm, held_out_mm=mm, likelihood_ratio=0.0)
+        for name, mm in (("nominal", 0.31), ("offsets", 0.17))
+    )
+    arm = RobotResult(arm=ArmResult(level="offsets", levels=levels))
+    words = text_of(render_cell(replace(CELL, arms={"a": arm})))
+    assert "robot a offsets stops left out: 0.17 mm, as stated 0.31 mm" in words
+    assert "The robots themselves" not in render_cell(CELL)
+
+
+def test_what_moved_and_what_is_untied_is_told(tmp_path):
+    frames = {**CELL.frames, "cam_top_until_stop_4": "cell"}
+    edges = {**CELL.edges, "cell_from_cam_top_until_stop_4": CELL.edge_of("cam_top")}
+    found = replace(
+        CELL,
+        frames=frames,
+        edges=edges,
+        joint_covariance=np.pad(CELL.joint_covariance, (0, 6)),
+        moved=(Moved("cam_top", "cam_top_until_stop_4", 4, 5, 0.58, 0.03, ("target_plate",)),),
+        untied=(Untied("cam_<far>", "Let it see target_plate."),),
+    )
+    write_cell_report(tmp_path / "report.html", found)
+    html = (tmp_path / "report.html").read_text(encoding="utf-8")
+    words = text_of(html)
+    assert "Between stops 4 and 5. cam_top is where it stood last" in words
+    assert "It may have been target_plate instead" in words
+    assert "Let it see target_plate." in words
+    # Names are text, never markup.
+    assert "<far>" not in html
+    # The network shows the cell as it is now.
+    graph = re.search(r"<svg[^>]*The network of frames.*?</svg>", html, re.DOTALL)[0]
+    assert "until_stop" not in graph
+    assert weakest_frame(found) == weakest_frame(CELL)

@@ -1,0 +1,245 @@
+"""Recordings: the session in them is the session that was written, to the last bit."""
+
+import datetime
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun as rr
+from rerun.chunk import OptimizationProfile, RrdReader
+from support.kept import KEPT, assert_same, kept_session, kept_streams
+from support.samples import Sample, made_up
+
+from visioncal.core.errors import DataError
+from visioncal.core.types import Corners
+from visioncal.present.recording import codec, notes, paths, read_session, write_recording
+from visioncal.present.viewer import blueprint
+from visioncal.results.evidence import ViewEvidence, magnification
+from visioncal.session import MemoryImages, Session, Stream
+
+DATA = Path(__file__).parents[3] / "shared" / "data" / "sessions"
+
+
+@pytest.fixture(autouse=True)
+def strict_rerun() -> Iterator[None]:
+    """Turns rerun's warnings, which it prints and forgets, into errors."""
+    rr.set_strict_mode(True)
+    yield
+    rr.set_strict_mode(False)
+
+
+@pytest.fixture(scope="module")
+def sample() -> Sample:
+    return made_up()
+
+
+@pytest.fixture(scope="module")
+def recorded(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("recording") / "recording.rrd"
+    write_recording(
+        path, sample.session, sample.calibration, sample.evidence, blueprint(sample.session)
+    )
+    return path
+
+
+def write_session(path: Path, session: Session) -> Path:
+    write_recording(path, session, None, (), None)
+    return path
+
+
+def test_recording_gives_the_session_back(sample: Sample, recorded: Path) -> None:
+    assert_same(sample.session, Session.load(recorded))
+
+
+def test_results_do_not_change_the_session(sample: Sample, tmp_path: Path) -> None:
+    alone = write_session(tmp_path / "session.rrd", sample.session)
+    assert_same(sample.session, read_session(alone))
+
+
+def test_folder_to_recording_to_folder(sample: Sample, recorded: Path, tmp_path: Path) -> None:
+    sample.session.save(tmp_path / "folder")
+    read_session(recorded).save(tmp_path / "again")
+    assert_same(Session.load(tmp_path / "folder"), Session.load(tmp_path / "again"))
+
+
+@pytest.mark.parametrize("name", ["ric_charuco_eye_to_hand", "visp_franka_eye_in_hand"])
+def test_real_session_round_trip(name: str, tmp_path: Path) -> None:
+    folder = DATA / name
+    if not folder.is_dir():
+        pytest.skip("the shared sessions are not beside this checkout")
+    session = Session.load(folder)
+    assert_same(session, read_session(write_session(tmp_path / "real.rrd", session)))
+
+
+def test_odd_facts_survive(tmp_path: Path) -> None:
+    document = {
+        "schema": 1,
+        "name": 'Prüf\n\t"1" \N{ROBOT FACE}',
+        "mount": "eye-in-hand",
+        "extra": {"list": [1, 1.0, -0.0], "day": datetime.date(2026, 11, 20)},
+    }
+    pose = ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]
+    columns = ["note", "view", "stamp_s", "tau1_nm", *(f"cft_{name}" for name in pose)]
+    cells = [
+        ['a,"b"\n', "7", "5e-324", "999999.9999999999", "-0.0", "0", "1", "0", "0", "0", "1"],
+        ["", "-3", "", "0.1", "0.30000000000000004", "0", "1", "0", "0", "0", "1"],
+    ]
+    session = Session.assemble(document, columns, cells, MemoryImages({}))
+    assert_same(session, read_session(write_session(tmp_path / "odd.rrd", session)))
+
+
+@pytest.mark.parametrize(("version", "streams"), [(1, {}), (2, {}), (3, kept_streams())])
+def test_recordings_of_all_formats_open(version: int, streams: dict[str, Stream]) -> None:
+    kept = kept_session().with_streams(streams)
+    again = read_session(KEPT / f"recording_format_{version}.rrd")
+    assert_same(kept, again)
+    assert again.warnings == kept.warnings
+
+
+def test_newer_format_names_the_version_that_it_needs(
+    sample: Sample, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as newer:
+        newer.setattr(codec, "FORMAT", codec.FORMAT + 1)
+        newer.setattr(codec, "__version__", "9.1")
+        path = write_session(tmp_path / "newer.rrd", sample.session)
+    with pytest.raises(DataError, match=f"format {codec.FORMAT + 1}") as error:
+        read_session(path)
+    assert "Install visioncal 9.1 or newer" in error.value.next_step
+
+
+def test_recording_that_rerun_saved_again_opens(
+    sample: Sample, recorded: Path, tmp_path: Path
+) -> None:
+    again = tmp_path / "again.rrd"
+    # Rerun joins small chunks and orders them anew.
+    RrdReader(recorded).stream().collect(optimize=OptimizationProfile()).write_rrd(
+        again, application_id="other", recording_id="other"
+    )
+    assert_same(sample.session, read_session(again))
+
+
+def test_images_stay_in_the_recording_until_they_are_read(sample: Sample, tmp_path: Path) -> None:
+    path = write_session(tmp_path / "session.rrd", sample.session)
+    session = read_session(path)
+    image = session.views[2].image
+    write_session(path, made_up(2).session)
+    with pytest.raises(DataError, match="replaced since"):
+        session.images.read(image)
+    with pytest.raises(DataError, match=r"no image none\.png"):
+        session.images.read("none.png")
+
+
+def test_missing_and_shared_images_stay_so(sample: Sample, tmp_path: Path) -> None:
+    first, second, third = sample.session.views[:3]
+    views = (first, replace(second, image=first.image), replace(third, image="images/none.png"))
+    session = replace(sample.session, views=views)
+    again = read_session(write_session(tmp_path / "few.rrd", session))
+    assert_same(session, again)
+    assert not again.images.exists("images/none.png")
+
+
+def test_what_is_no_recording_is_refused(recorded: Path, tmp_path: Path) -> None:
+    junk, cut, foreign = (tmp_path / f"{name}.rrd" for name in ("junk", "cut", "foreign"))
+    junk.write_bytes(b"no recording" * 100)
+    cut.write_bytes(recorded.read_bytes()[:500])
+    with rr.RecordingStream("other") as stream:
+        stream.save(foreign)
+        stream.log("points", rr.Points2D([[1.0, 2.0]]))
+        stream.disconnect()
+    for path in (junk, cut, foreign, tmp_path / "absent.rrd"):
+        with pytest.raises(DataError) as error:
+            Session.load(path)
+        assert path.name in error.value.message
+
+
+def test_failed_write_leaves_the_old_file(sample: Sample, tmp_path: Path) -> None:
+    class Broken(MemoryImages):
+        def read(self, path: str) -> bytes:
+            raise DataError(f"{path} cannot be read.")
+
+    path = tmp_path / "recording.rrd"
+    path.write_bytes(b"old")
+    broken = replace(sample.session, images=Broken({it.image: b"" for it in sample.session.views}))
+    with pytest.raises(DataError, match=r"000\.png"):
+        write_session(path, broken)
+    assert path.read_bytes() == b"old"
+    assert [it.name for it in tmp_path.iterdir()] == ["recording.rrd"]
+    shutil.rmtree(tmp_path)
+    with pytest.raises(DataError, match="cannot be written"):
+        write_session(path, sample.session)
+
+
+def test_full_disk_is_an_error(
+    sample: Sample, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=3_000_000))
+    with pytest.raises(DataError, match="cannot be written: 3 MB are free"):
+        write_session(tmp_path / "recording.rrd", sample.session)
+    assert list(tmp_path.iterdir()) == []
+
+
+def column(path: Path, entity: str, component: str) -> list[object]:
+    """Reads one component of one entity, in the order of the views."""
+    found: dict[int, object] = {}
+    for chunk in RrdReader(path).stream().filter(content=entity):
+        batch = chunk.to_record_batch()
+        if component in batch.schema.names:
+            keys = range(1) if chunk.is_static else batch.column(paths.TIMELINE).to_pylist()
+            found |= dict(zip(keys, batch.column(component).to_pylist(), strict=True))
+    return [found[key] for key in sorted(found)]
+
+
+def test_corners_are_drawn_where_the_viewer_has_the_pixels(sample: Sample, recorded: Path) -> None:
+    drawn = column(recorded, paths.DETECTED, "Points2D:positions")
+    # View 3 found no corners: an empty batch takes those of view 2 off the screen.
+    assert drawn[3] == []
+    corners = sample.evidence[4].corners
+    assert corners is not None
+    # Single precision holds 640 px to 3e-5.
+    np.testing.assert_allclose(drawn[4], corners.px + 0.5, atol=1e-4)
+
+
+def test_camera_is_drawn_at_the_end_of_the_chain(sample: Sample, recorded: Path) -> None:
+    drawn = column(recorded, paths.CAMERA, "Transform3D:translation")
+    edge = sample.calibration.transforms["flange_from_cam"].as_matrix()
+    for position, seen in zip(drawn, sample.evidence, strict=True):
+        assert seen.base_from_flange is not None
+        base_from_cam = seen.base_from_flange @ edge
+        # Single precision holds 1 m to 6e-8.
+        np.testing.assert_allclose(position[0], base_from_cam[:3, 3], atol=1e-6)
+
+
+def test_session_without_images_can_be_recorded(tmp_path: Path) -> None:
+    sample = made_up(images=False)
+    path = tmp_path / "poses.rrd"
+    write_recording(
+        path, sample.session, sample.calibration, sample.evidence, blueprint(sample.session)
+    )
+    assert_same(sample.session, read_session(path))
+    assert column(path, paths.DETECTED, "Points2D:positions") == []
+
+
+def test_notes_cannot_load_or_link_anything(sample: Sample) -> None:
+    view = sample.calibration.views[6]
+    assert "](http" not in notes.view_markdown(view)
+    assert r"\[it\]\(http://example\.org\)" in notes.view_markdown(view)
+    assert "| park | " in notes.solvers_markdown(sample.calibration)
+    assert "# Check before use" in notes.verdict_markdown(sample.calibration)
+
+
+def test_magnification_fits_the_residuals() -> None:
+    px = np.zeros((4, 2))
+
+    def shown(error_px: float) -> ViewEvidence:
+        return ViewEvidence(0, Corners(0, np.arange(4), px, 1.0), px + np.array([error_px, 0.0]))
+
+    # A fiftieth of 1000 px is 20 px: 0.1 px may grow 200 times, 30 px not at all.
+    assert magnification([shown(0.1)], 1000) == 200
+    assert magnification([shown(30.0)], 1000) == 1
+    assert magnification([shown(0.0)], 1000) == 1
+    assert magnification([], 1000) == 1

@@ -1,0 +1,157 @@
+"""What a recording tells of board, arm and uncertainty, and how it draws views left out."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+from support.drawn import column
+from support.findings import healthy, sick, with_findings
+from support.samples import TARGET, Sample, made_up
+
+from visioncal.core.errors import DataError
+from visioncal.present.recording import notes, paths, write_recording
+from visioncal.present.recording.overlays import Overlay
+from visioncal.present.viewer import blueprint
+from visioncal.vision.targets import corner_positions, load_target
+
+
+@pytest.fixture(scope="module")
+def sample() -> Sample:
+    return made_up()
+
+
+@pytest.fixture(scope="module")
+def recorded(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("recording") / "recording.rrd"
+    write_recording(path, sample.session, sample.calibration, sample.evidence, None)
+    return path
+
+
+def test_the_figures_tell_what_a_sick_cell_suffers_from(sample: Sample) -> None:
+    text = notes.figures_markdown(with_findings(sample, sick()))
+    assert r"| errors of the arm's links | 1.2 | 94 % |" in text
+    assert text.index("arm's links") < text.index("from stop to stop") < text.index("| total | 1.2")
+    assert "placed to 1.2 mm (sigma; 95 % within 0.16 mm)" in text
+    assert "| 0.051 | 0.041 to 0.062 |" in text
+    assert "Size: +0.2 % against the stated one (sigma 0.1 %)." in text
+    assert "its corners lie within 0.29 mm of depth" in text
+    assert "typically off by 0.46 mm and 0.053 deg (likelihood ratio 356" in text
+    assert "These errors were estimated along." in text
+
+
+def test_a_healthy_cell_has_a_flat_board_and_no_word_of_its_arm(sample: Sample) -> None:
+    calibration = with_findings(sample, healthy())
+    text = notes.figures_markdown(calibration)
+    assert "Size: as stated. Bend: none: flat within what is seen." in text
+    assert "# Arm" not in text
+    assert (
+        "placed to 0.1 mm (sigma; 95 % within 0.16 mm); the largest part comes from the robot."
+        in notes.verdict_markdown(calibration)
+    )
+
+
+def test_older_calibrations_have_no_findings(sample: Sample) -> None:
+    text = notes.figures_markdown(sample.calibration)
+    assert "| 0.051 |  |" in text
+    assert not {"# Where", "# Board", "# Arm"} & set(text.split("\n"))
+
+
+@pytest.mark.parametrize(
+    ("name", "document", "words"),
+    [
+        ("board", healthy()["board"] | {"shape": {}}, "board: shape.scale is missing"),
+        ("arm_errors", {"sigma_mm": "much"}, "arm_errors.sigma_mm is 'much'; a number is needed"),
+        (
+            "uncertainty",
+            healthy()["uncertainty"] | {"budget_mm": {"total": 0.1}},
+            "uncertainty: budget_mm has no total, or no source",
+        ),
+        ("uncertainty", ["no table"], r"uncertainty is \['no table'\]; a table is needed"),
+    ],
+)
+def test_findings_that_cannot_be_read_are_named(
+    sample: Sample, name: str, document: dict, words: str
+) -> None:
+    with pytest.raises(DataError, match=words):
+        with_findings(sample, {name: document})
+
+
+def test_the_board_is_as_large_and_as_deep_as_its_corners(sample: Sample) -> None:
+    target, _ = load_target(TARGET, None)
+    board = with_findings(sample, sick()).board
+    flat, bent = corner_positions(target), board.corners(target)
+    stretched = np.ptp(bent, axis=0)[:2] / np.ptp(flat, axis=0)[:2]
+    # The shape is linear in its values.
+    np.testing.assert_allclose(stretched, [1.0015, 1.0025], rtol=1e-12)
+    np.testing.assert_allclose(board.squares_m(target), stretched * target.square_m, rtol=1e-12)
+    # A parabola of 0.3 mm at the board's edge, less its mean plane.
+    assert 2.5e-4 < np.ptp(bent[:, 2]) <= 3e-4
+
+
+def test_residuals_of_views_left_out_end_at_the_scale_of_the_others(
+    sample: Sample, recorded: Path
+) -> None:
+    used = [it.residual_mm for it in sample.calibration.views if it.used]
+    beyond = column(recorded, f"{paths.POSITION_MM}/{paths.BEYOND}", "Scalars:scalars")
+    # View 6 is off by 14 mm, fifty times as far as the others; view 3 has no residual at all.
+    assert set(beyond) == {6}
+    assert max(used) < beyond[6][0] < 1.5 * max(used)
+    marks = column(recorded, f"{paths.POSITION_MM}/{paths.REJECTED}", "Scalars:scalars")
+    assert set(marks) == {3}
+    assert "14.2 mm" in notes.view_markdown(sample.calibration.views[6])
+
+
+def test_residuals_of_views_left_out_are_drawn_to_scale(sample: Sample, recorded: Path) -> None:
+    overlay = Overlay.of(
+        sample.session, sample.calibration, {it.view: it for it in sample.evidence}
+    )
+    magnified = column(recorded, paths.magnified_residuals(overlay.factor), "Arrows2D:vectors")
+    to_scale = column(recorded, paths.RESIDUALS_TO_SCALE, "Arrows2D:vectors")
+    assert overlay.factor > 1
+    for view, used in ((4, True), (6, False)):
+        seen = sample.evidence[view]
+        assert seen.corners is not None
+        assert seen.predicted_px is not None
+        residuals = seen.predicted_px - seen.corners.px
+        expected = (overlay.factor * residuals, []) if used else ([], residuals)
+        for found, wanted in zip((magnified[view], to_scale[view]), expected, strict=True):
+            # Single precision of arrows that are some ten pixels long.
+            np.testing.assert_allclose(found, wanted, atol=1e-4)
+
+
+def test_placements_far_out_are_drawn_at_arm_s_length(sample: Sample, tmp_path: Path) -> None:
+    away = np.eye(4)
+    away[:3, 3] = [0.3, 0.0, 0.4]
+    seen = sample.evidence[6]
+    assert seen.cam_from_target is not None
+    evidence = [*sample.evidence]
+    evidence[6] = replace(seen, cam_from_target=seen.cam_from_target @ away)
+    path = tmp_path / "recording.rrd"
+    write_recording(path, sample.session, sample.calibration, evidence, None)
+    entities = {str(it.entity_path) for it in RrdReader(path).stream()}
+    (beyond,) = (it for it in entities if it.endswith(paths.BEYOND) and "placements" in it)
+    (arrow,) = column(path, beyond, "Arrows3D:vectors")[0]
+    points = column(path, beyond.replace(paths.BEYOND, paths.REJECTED), "Points3D:positions")[0]
+    # It points where the view puts the target, and is as short as a fifth of the cell.
+    np.testing.assert_allclose(arrow / np.linalg.norm(arrow), [0.6, 0.0, 0.8], atol=1e-3)
+    assert 0.05 < np.linalg.norm(arrow) < 0.3
+    np.testing.assert_allclose(points, [arrow], atol=1e-6)
+
+
+def test_the_target_as_a_view_left_out_sees_it_is_marked(recorded: Path) -> None:
+    drawn = column(recorded, paths.SEEN_TARGET, "LineStrips3D:colors")
+    assert drawn[6] != drawn[5] == drawn[4]
+
+
+def test_plots_explain_marks_only_where_there_are_some(sample: Sample) -> None:
+    views = tuple(replace(view, used=True, reason="") for view in sample.calibration.views)
+    everything = replace(sample.calibration, views=views)
+    assert "red: not used" in str(blueprint_names(sample, sample.calibration))
+    assert "not used" not in str(blueprint_names(sample, everything))
+
+
+def blueprint_names(sample: Sample, calibration) -> list[str]:
+    tabs = blueprint(sample.session, calibration).root_container.contents
+    return [view.name for view in tabs[1].contents[0].contents]

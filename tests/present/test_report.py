@@ -1,0 +1,491 @@
+"""The report: complete, self-contained, and safe against what sessions may be called."""
+
+import base64
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from support.findings import CONTRADICTS, healthy, sick, with_contradiction, with_findings
+from support.pages import Page, section
+from support.samples import CAMERA, REJECTED, Sample, made_up
+
+from visioncal.calibration.pipeline import Run, run
+from visioncal.core.errors import DataError
+from visioncal.core.number_format import matched, significant
+from visioncal.core.types import Target
+from visioncal.interchange.outputs import write_outputs
+from visioncal.interchange.result_files import load_stored
+from visioncal.present.recording import write_recording
+from visioncal.present.report import write_report
+from visioncal.present.report.advice import listed, suspects
+from visioncal.present.report.page import render
+from visioncal.present.report.thumbnails import thumbnail
+from visioncal.present.report.trends import twist_of
+from visioncal.results import (
+    Calibration,
+    CameraResult,
+    Finding,
+    Rms,
+    Step,
+    Verdict,
+    VerdictStatus,
+)
+from visioncal.robot import load_robot
+from visioncal.session import MemoryImages
+from visioncal.simulation import CellOptions, simulate, write_session
+
+
+@pytest.fixture(scope="module")
+def sample() -> Sample:
+    return made_up()
+
+
+@pytest.fixture(scope="module")
+def html(sample: Sample) -> str:
+    return render(sample.calibration, sample.session, sample.evidence)
+
+
+def test_verdict_comes_first_with_its_reasons(sample: Sample, html: str) -> None:
+    words = Page(html).words
+    places = [words.index("Check before use")]
+    places += [words.index(reason) for reason in sample.calibration.verdict.reasons]
+    places += [words.index(heading) for heading in ("flange_from_cam", "base_from_target")]
+    places += [
+        words.index(heading)
+        for heading in ("How it was obtained", "Solvers compared", "All views", "Provenance")
+    ]
+    assert places == sorted(places)
+
+
+@pytest.mark.parametrize(
+    ("status", "word"), [("good", "Good:"), ("check", "Check before use"), ("bad", "Bad:")]
+)
+def test_verdict_is_told_by_word_and_colour(
+    sample: Sample, status: VerdictStatus, word: str
+) -> None:
+    verdict = Verdict.of(status, "One reason.")
+    html = render(replace(sample.calibration, verdict=verdict), None, ())
+    assert f'class="verdict {status}"' in html
+    assert word in Page(html).words
+
+
+def test_every_view_has_a_row_and_every_reason_too(sample: Sample, html: str) -> None:
+    rows = [" ".join(row.split()) for row in Page(html).rows]
+    for view in sample.calibration.views:
+        end = "yes" if view.used else "no"
+        assert sum(row.startswith(f"{view.view} ") and row.endswith(f" {end}") for row in rows) == 1
+        if not view.used:
+            assert f"view {view.view} not used {view.reason}" in rows
+
+
+def with_outliers(sample: Sample, status: VerdictStatus) -> Calibration:
+    """The sample's calibration with two used views far from the others."""
+    views = tuple(
+        replace(view, residual_mm=9.5) if view.view in (1, 4) else view
+        for view in sample.calibration.views
+    )
+    tilted = Step("Add views tilted by 20 degrees.", "visioncal plan SESSION --add 5")
+    found = (
+        Finding("weak_motion", "Its z is weakly determined.", tilted),
+        Finding("place", "Its y is weakly determined.", tilted),
+        Finding("wrong_views", "View 1 is wrong.", Step("Look at it."), (1,), 0.9),
+        Finding("lens", "The lens is another.", Step("Measure it."), probability=0.3),
+        Finding("note", "It was cold."),
+    )
+    return replace(sample.calibration, views=views, verdict=Verdict(status, found))
+
+
+def test_wrong_views_are_named_and_marked(sample: Sample) -> None:
+    html = render(with_outliers(sample, "bad"), sample.session, sample.evidence)
+    words, rows = Page(html).words, [" ".join(row.split()) for row in Page(html).rows]
+    steps = words[words.index("What to do next") : words.index("camera position, sigma")]
+    assert steps.count("Add views tilted by 20 degrees.") == 1
+    assert steps.index("Look at it.") < steps.index("Add views") < steps.index("Measure it.")
+    for view in (1, 4):
+        assert any(row.startswith(f"view {view} used off by 9.5 mm") for row in rows)
+        assert any(row.startswith(f"{view} ") and row.endswith(" look") for row in rows)
+
+
+def test_good_results_have_no_doubtful_views_and_say_what_they_are_for(sample: Sample) -> None:
+    words = Page(render(with_outliers(sample, "good"), None, ())).words
+    assert "to look at" not in words
+
+
+def test_three_findings_are_read_first_and_the_rest_is_folded(sample: Sample) -> None:
+    html = render(with_outliers(sample, "bad"), None, ())
+    first, folded = html.split("<details><summary>What else was found (2)")[:2]
+    assert "Most likely (90 %): View 1 is wrong." in first
+    assert "Possibly (30 %): The lens is another." in first
+    assert "Its z is weakly determined." in first
+    assert "It was cold." in folded.split("</details>")[0]
+
+
+def test_sources_of_uncertainty_are_told_with_their_shares(sample: Sample) -> None:
+    page = Page(render(with_findings(sample, sick()), sample.session, sample.evidence))
+    words = section(page, "Where the uncertainty comes from", "How it was obtained")
+    assert "0.50 m from the camera" in words
+    assert "in the frame of the flange with a sigma of 1.2 mm" in words
+    assert "right to within 0.16 mm" in words
+    assert "94 % of the variance, comes from the arm; what of it looks the same in all" in words
+    # The bars, the largest first.
+    labels = ["errors of the arm's links", "the robot, from stop to stop", "total"]
+    assert sorted(labels, key=words.index) == labels
+    assert "1.2 (94 %)" in words
+    assert "robot translation 0.051 mm 95 %: 0.041 to 0.062" in words
+    assert "sigma / largest accepted" in words
+
+
+def test_board_and_arm_are_told_where_something_is_wrong_with_them(sample: Sample) -> None:
+    page = Page(render(with_findings(sample, sick()), sample.session, sample.evidence))
+    words = section(page, "Where the uncertainty comes from", "How it was obtained")
+    assert f"squares, stated 30.000 mm {chr(177)} 0.030" in words
+    # 30 mm with 0.2 % more of scale and 0.1 % of aspect, half of it on each side.
+    assert f"squares, found 30.045 {chr(215)} 30.075 mm {chr(177)} 0.030, between" in words
+    assert "bend 0.29 mm of depth" in words
+    assert "depth [mm]" in words
+    assert "typically off by 0.46 mm, 0.053 deg" in words
+    assert "likelihood ratio 356 " in words
+    assert "estimated along with the result" in words
+    assert "The arm's errors that were estimated are still in here." in page.words
+
+
+def test_healthy_cells_look_calm(sample: Sample) -> None:
+    page = Page(render(with_findings(sample, healthy()), sample.session, sample.evidence))
+    words = section(page, "Where the uncertainty comes from", "How it was obtained")
+    assert "64 % of the variance, comes from the robot; more stops would lower it" in words
+    assert "squares, found as stated" in words
+    assert "bend none flat within what is seen" in words
+    assert "0.0010 (<1 %)" in words
+    for absent in ("depth [mm]", "Arm", "likelihood"):
+        assert absent not in words
+
+
+def test_closed_forms_look_for_no_other_board(sample: Sample) -> None:
+    park = sample.calibration.solvers["park"].matrices
+    edges = {
+        name: replace(edge, matrix=park[name]) for name, edge in sample.calibration.edges.items()
+    }
+    calibration = replace(with_findings(sample, healthy()), edges=edges)
+    words = Page(render(calibration, sample.session, ())).words
+    assert "size and shape as stated a closed form takes them as they are" in words
+
+
+def test_exact_cells_and_single_markers_have_a_report() -> None:
+    many = made_up(5, images=False)
+    documents = sick()
+    documents["uncertainty"]["budget_mm"] = {"poses": 0.0, "total": 0.0}
+    documents["uncertainty"]["spectrum"] = [0.0] * 12
+    documents["board"]["shape"]["bow_xy"] = 3e-4
+    marker = Target("marker", "marker", 1, 1, 0.1, 1e-4, dictionary="DICT_4X4_50", marker_id=7)
+    session = replace(many.session, target=marker)
+    words = Page(render(with_findings(many, documents), session, many.evidence)).words
+    assert "noise of the poses" in words
+    assert "depth [mm]" in words
+    assert "The largest part" not in words
+    assert "sigma / largest accepted" not in words
+
+
+def test_older_calibrations_still_tell_the_noise(html: str) -> None:
+    words = section(Page(html), "Where the uncertainty comes from", "How it was obtained")
+    assert "robot rotation 0.0042 deg" in words
+    assert "variance" not in words
+    assert "Board" not in words
+
+
+def test_views_that_contradict_the_others_are_set_apart(sample: Sample) -> None:
+    html = render(with_contradiction(sample), sample.session, sample.evidence)
+    page, rows = Page(html), [" ".join(row.split()) for row in Page(html).rows]
+    assert f"view 6 not used {CONTRADICTS}" in rows
+    assert any(row.startswith("6 ") and row.endswith(" left out") for row in rows)
+    assert any(row.startswith("3 ") and row.endswith(" no") for row in rows)
+    assert "Red: left out, since it contradicts the others." in page.words
+    # Its picture shows how far off it is.
+    assert html[html.index("View 6:") - 2000 : html.index("View 6:")].count("<path d=") > 10
+    # Residuals far beyond the others' are clipped, and say how far they reach.
+    assert " 14 " in section(page, "Residuals by view", "Residuals over joint angles")
+
+
+def test_real_contradictions_are_recognised(tmp_path: Path) -> None:
+    cell = simulate(CellOptions(views=15, wrong_views=1))
+    write_session(cell, tmp_path / "cell", images=False)
+    calibration = run(tmp_path / "cell").calibration
+    assert sum(it.contradict for it in suspects(calibration)) == 1
+    assert "the largest part" in Page(render(calibration, None, ())).words.lower()
+
+
+@pytest.mark.parametrize(
+    ("views", "words"),
+    [
+        ([3], "view 3"),
+        ([3, 6], "views 3 and 6"),
+        ([3, 6, 9], "views 3, 6 and 9"),
+    ],
+)
+def test_views_in_a_sentence(views: list[int], words: str) -> None:
+    assert listed(views) == words
+
+
+def test_views_that_share_a_reason_share_a_row(sample: Sample) -> None:
+    views = tuple(
+        replace(view, used=False, reason="blurred") if view.view in (0, 2, 5) else view
+        for view in sample.calibration.views
+    )
+    page = Page(render(replace(sample.calibration, views=views), None, ()))
+    assert "views 0, 2 and 5 not used blurred" in [" ".join(row.split()) for row in page.rows]
+    assert "Views not used" in page.words
+
+
+def test_joint_angles_get_a_plot_where_there_are_any(sample: Sample, html: str) -> None:
+    assert "q6 [deg]" in Page(html).text
+    views = tuple(
+        replace(view, numbers={name: it for name, it in view.numbers.items() if name[0] != "q"})
+        for view in sample.session.views
+    )
+    without = render(sample.calibration, replace(sample.session, views=views), sample.evidence)
+    assert "Residuals over joint angles" not in Page(without).words
+
+
+def test_an_error_of_one_joint_is_a_slope_in_its_column(sample: Sample) -> None:
+    # The joint's offset turns the arm's tip about the joint: the residual grows with the offset.
+    offset_rad = np.deg2rad(0.5)
+    q = np.array([view.joints_rad for view in sample.session.views])
+    wrong = load_robot("ur10e").base_from_flange(q + offset_rad * np.eye(6)[3])
+    residuals = [
+        twist_of(sample.calibration, replace(it, base_from_flange=pose))
+        for it, pose in zip(sample.evidence, wrong, strict=True)
+        if it.cam_from_target is not None
+    ]
+    # Without the error, rounding alone is left.
+    exact = [twist_of(sample.calibration, it) for it in sample.evidence if it.corners is not None]
+    np.testing.assert_allclose(exact, 0.0, atol=1e-9)
+    # Every residual turns by the joint's error, whatever the pose.
+    turned_rad = np.linalg.norm(np.array(residuals)[:, :3], axis=1)
+    np.testing.assert_allclose(turned_rad, offset_rad, rtol=1e-6)
+
+
+def test_the_lens_and_its_origin_are_told(sample: Sample, html: str) -> None:
+    words = Page(html).words
+    assert "Lens, estimated from this session" in words
+    assert f"fx 520.00 {chr(177)} 0.40 px" in words
+    given = CameraResult(CAMERA, estimated=False)
+    again = Page(render(replace(sample.calibration, camera=given), None, ())).words
+    assert "Lens, as given by the session" in again
+
+
+def test_the_solver_that_gave_the_result_is_named(sample: Sample, html: str) -> None:
+    assert "joint (result)" in Page(html).words
+    park = sample.calibration.solvers["park"].matrices
+    edges = {
+        name: replace(edge, matrix=park[name]) for name, edge in sample.calibration.edges.items()
+    }
+    words = Page(render(replace(sample.calibration, edges=edges), None, ())).words
+    assert "park (result)" in words
+    assert "solver park a closed form" in words
+
+
+def test_many_views_stand_in_three_columns() -> None:
+    many = made_up(40, images=False)
+    html = render(many.calibration, many.session, many.evidence)
+    table = html[html.index("All views") :]
+    assert table.count("<table>") == 3
+
+
+def test_a_note_is_shown_where_something_is_missing(sample: Sample, html: str) -> None:
+    assert 'class="note"' not in html
+    assert "Nothing <here>." in Page(render(sample.calibration, None, (), "Nothing <here>.")).words
+
+
+@pytest.fixture(scope="module")
+def outputs(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a calibration writes."""
+    folder = tmp_path_factory.mktemp("out put")
+    write_outputs(folder, sample.session, Run(sample.calibration, sample.evidence))
+    return folder
+
+
+@pytest.mark.parametrize("name", ["", "calibration.json", "recording.rrd"])
+def test_report_made_again_is_the_same(outputs: Path, tmp_path: Path, name: str) -> None:
+    stored = load_stored(outputs / name)
+    write_report(
+        tmp_path / "again.html", stored.calibration, stored.session, stored.evidence, stored.note
+    )
+    assert (tmp_path / "again.html").read_bytes() == (outputs / "report.html").read_bytes()
+
+
+def test_report_without_its_recording_says_so(outputs: Path, tmp_path: Path) -> None:
+    shutil.copy(outputs / "calibration.json", tmp_path)
+    stored = load_stored(tmp_path)
+    assert "no recording.rrd" in stored.note
+    (tmp_path / "recording.rrd").write_bytes(b"damaged")
+    assert str(tmp_path / "recording.rrd") in load_stored(tmp_path).note
+    page = Page(render(stored.calibration, stored.session, stored.evidence, stored.note))
+    assert stored.note in page.words
+    assert "position [mm]" in page.text
+    assert "Pictures" not in page.words.replace(stored.note, "")
+
+
+def test_recording_of_another_result_is_not_mixed_in(
+    sample: Sample, outputs: Path, tmp_path: Path
+) -> None:
+    shutil.copy(outputs / "recording.rrd", tmp_path)
+    replace(sample.calibration, created="2026-11-21T00:00:00+00:00").save(
+        tmp_path / "calibration.json"
+    )
+    stored = load_stored(tmp_path)
+    assert "holds another one" in stored.note
+    assert stored.session is None
+
+
+def test_session_alone_has_no_report(sample: Sample, tmp_path: Path) -> None:
+    write_recording(tmp_path / "session.rrd", sample.session, None, (), None)
+    with pytest.raises(DataError, match="without a result"):
+        load_stored(tmp_path / "session.rrd")
+
+
+def test_names_and_reasons_are_text(sample: Sample, html: str) -> None:
+    page = Page(html)
+    assert sample.session.name in page.words
+    assert REJECTED[6] in page.words
+    assert not {"b", "its", "1", "script"} & set(page.tags)
+    assert "<b>robot moved" not in html
+
+
+def test_nothing_is_loaded_from_elsewhere(html: str) -> None:
+    for reference in Page(html).references:
+        assert reference.startswith(("#", "data:image/")), reference
+    assert not re.search(r"url\((?!#)", html)
+    assert "@import" not in html
+
+
+def test_identifiers_of_figures_stay_apart(html: str) -> None:
+    identifiers = re.findall(r'\bid="([^"]+)"', html)
+    assert len(identifiers) == len(set(identifiers))
+    assert {it.removeprefix("#") for it in re.findall(r'xlink:href="(#[^"]+)"', html)} <= set(
+        identifiers
+    )
+
+
+def test_plots_are_named_with_units(html: str) -> None:
+    text = Page(html).text
+    for label in ("position [mm]", "orientation [deg]", "reprojection [px]", "image x [px]"):
+        assert label in text
+
+
+def test_pictures_show_the_best_the_worst_and_the_rejected(sample: Sample, html: str) -> None:
+    words = Page(html).words
+    used = [view for view in sample.calibration.views if view.used and view.rms_px is not None]
+    best, worst = min(used, key=lambda it: it.rms_px), max(used, key=lambda it: it.rms_px)
+    assert f"Best used view: {best.view}," in words
+    assert f"Worst used view: {worst.view}," in words
+    assert re.search(r"drawn \d+ times longer", words)
+    uris = re.findall(r'href="data:image/jpeg;base64,([^"]+)"', html)
+    assert len(uris) == 2 + len(REJECTED)
+    for uri in uris:
+        jpeg = np.frombuffer(base64.b64decode(uri), np.uint8)
+        assert cv2.imdecode(jpeg, cv2.IMREAD_COLOR) is not None
+
+
+def test_figures_are_those_of_the_calibration(sample: Sample, html: str) -> None:
+    words = Page(html).words
+    edge = sample.calibration.edges["flange_from_cam"]
+    for value in edge.matrix.ravel():
+        assert f"{value:.9f}" in words
+    assert sample.calibration.session_sha256 in words
+    assert f"{edge.sigma_mm:.2f} mm" in words
+
+
+def test_pose_pairs_leave_out_what_does_not_apply() -> None:
+    sample = made_up(images=False)
+    page = Page(render(sample.calibration, sample.session, sample.evidence))
+    for absent in ("Lens", "reprojection", "image x [px]", "Pictures", "data:image"):
+        assert absent not in page.text
+    assert "position [mm]" in page.text
+
+
+def test_spoilt_images_do_not_spoil_the_report(sample: Sample) -> None:
+    files = {view.image: b"no image" for view in sample.session.views[:5]}
+    files[sample.session.views[5].image] = b""
+    session = replace(sample.session, images=MemoryImages(files))
+    html = render(sample.calibration, session, sample.evidence)
+    assert "data:image/jpeg" not in html
+    assert REJECTED[3] in Page(html).words
+
+
+def test_pictures_lie_as_their_pixels_are_stored() -> None:
+    jpeg = cv2.imencode(".jpg", np.zeros((40, 64), np.uint8))[1].tobytes()
+    # Exif, big-endian: one entry, the orientation (0x0112), which says "turned by 90 degrees".
+    entry = bytes.fromhex("0112 0003 00000001 0006 0000")
+    exif = b"Exif\0\0MM\0*" + bytes.fromhex("00000008 0001") + entry + bytes(4)
+    turned = jpeg[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + jpeg[2:]
+    shown = cv2.imdecode(np.frombuffer(turned, np.uint8), cv2.IMREAD_COLOR)
+    assert shown is not None
+    assert shown.shape[:2] == (64, 40), "the tag is not read: this test tests nothing"
+    picture = thumbnail(turned, None, "", 0, 1)
+    assert picture is not None
+    assert (picture.width, picture.height) == (64, 40)
+
+
+def test_one_used_view_and_no_residuals_still_give_a_report(sample: Sample) -> None:
+    views = tuple(
+        replace(view, residual_mm=0.0, residual_deg=None, rms_px=None)
+        for view in sample.calibration.views[:1]
+    )
+    poor = replace(sample.calibration, views=views, rms=Rms(0.0, 0.0), solvers={})
+    page = Page(render(poor, sample.session, sample.evidence))
+    assert "1 of 1" in page.words
+    assert "Solvers compared" not in page.words
+
+
+def test_many_corners_become_a_bitmap() -> None:
+    many = made_up(90, images=True)
+    html = render(many.calibration, None, many.evidence)
+    # As vectors, 88 views of 40 corners would be 3520 uses of a mark.
+    assert html.count("<use") < 2500
+    # One bitmap of corners, one of the colour bar.
+    assert html.count('href="data:image/png') == 2
+
+
+def test_report_is_whole_or_absent(sample: Sample, tmp_path: Path) -> None:
+    path = tmp_path / "report.html"
+    write_report(path, sample.calibration, sample.session, sample.evidence)
+    assert path.read_text(encoding="utf-8").endswith("</html>")
+    assert [it.name for it in tmp_path.iterdir()] == ["report.html"]
+    with pytest.raises(DataError, match="cannot be written"):
+        write_report(tmp_path / "absent" / "report.html", sample.calibration, None, ())
+
+
+@pytest.mark.parametrize(
+    ("value", "sigma", "text"),
+    [
+        (12.3456, 0.1, "12.35"),
+        (12.3456, 0.0996, "12.35"),
+        (12.3456, 0.0094, "12.3456"),
+        (1234.5, 30.0, "1234"),
+        (-0.004, 1.0, "0.0"),
+        (1.0, 0.0, "1.000000"),
+        (1.0, float("nan"), "1.000000"),
+    ],
+)
+def test_value_has_the_digits_of_its_sigma(value: float, sigma: float, text: str) -> None:
+    assert matched(value, sigma) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0996, "0.10"),
+        (0.3349, "0.33"),
+        (96.4, "96"),
+        (1234.5, "1234"),
+        (0.0, "0"),
+        (2e-9, "<0.0001"),
+        (None, "\N{EN DASH}"),
+        (float("inf"), "inf"),
+    ],
+)
+def test_significant_digits(value: float | None, text: str) -> None:
+    assert significant(value) == text

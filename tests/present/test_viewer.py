@@ -1,0 +1,376 @@
+"""What a recording shows: its layout, the cell and the charts, and how the viewer draws them."""
+
+import re
+import socket
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rerun as rr
+import rerun.blueprint as rrb
+from rerun.chunk import RrdReader
+from rerun.experimental import ViewerClient
+from scipy.spatial.transform import RigidTransform, Rotation
+from support.samples import Sample, made_up, with_frames
+
+from visioncal.core.transforms import exp, invert
+from visioncal.present.recording import arm, board, coverage, paths, write_recording
+from visioncal.present.recording.uncertainty import SIGMAS_95, Uncertainty
+from visioncal.present.viewer import blueprint
+from visioncal.present.viewer.process import viewer_process
+from visioncal.results import Edge
+from visioncal.results.evidence import ExplainedImage, ViewEvidence
+from visioncal.results.sections import DenseResult
+from visioncal.vision.finders import find_target
+from visioncal.vision.targets import corner_positions, target_from_document
+
+RASTERISERS = list(Path("/usr/share/vulkan/icd.d").glob("lvp*"))
+
+
+@pytest.fixture(autouse=True)
+def strict_rerun() -> Iterator[None]:
+    """Turns rerun's warnings, which it prints and forgets, into errors."""
+    rr.set_strict_mode(True)
+    yield
+    rr.set_strict_mode(False)
+
+
+def without_joints(sample: Sample) -> Sample:
+    session = sample.session
+    views = tuple(
+        replace(it, numbers={key: n for key, n in it.numbers.items() if not key.endswith("_rad")})
+        for it in session.views
+    )
+    columns = tuple(it for it in session.columns if not it.endswith("_rad"))
+    return replace(sample, session=replace(session, views=views, columns=columns))
+
+
+def with_explained(sample: Sample) -> Sample:
+    """All images but the second were looked at as `calibrate --dense` does."""
+    grey = cv2.imencode(".jpg", np.full((4, 6), 128, np.uint8))[1].tobytes()
+    evidence = tuple(
+        it if it.view == 1 else replace(it, explained=ExplainedImage(grey, grey, "**Sharp.**"))
+        for it in sample.evidence
+    )
+    dense = DenseResult(kept=True, held_out={}, images=())
+    return replace(sample, calibration=replace(sample.calibration, dense=dense), evidence=evidence)
+
+
+@pytest.fixture(scope="module")
+def samples() -> dict[str, Sample]:
+    return {
+        "images and joints": made_up(),
+        "poses alone": made_up(images=False),
+        "no joints": without_joints(made_up()),
+        "tools and fixtures": with_frames(made_up()),
+        "images explained": with_explained(made_up()),
+    }
+
+
+@pytest.fixture(scope="module")
+def recordings(
+    samples: dict[str, Sample], tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("recordings")
+    files = {}
+    for name, it in samples.items():
+        files[name] = folder / f"{name}.rrd"
+        layout = blueprint(it.session, it.calibration)
+        write_recording(files[name], it.session, it.calibration, it.evidence, layout)
+    return files
+
+
+def views_of(container: rrb.Container | rrb.View) -> Iterator[rrb.View]:
+    if isinstance(container, rrb.View):
+        yield container
+        return
+    for it in container.contents:
+        yield from views_of(it)
+
+
+def tabs(sample: Sample) -> dict[str, list[str]]:
+    root = blueprint(sample.session, sample.calibration).root_container
+    return {tab.name: [view.name for view in views_of(tab)] for tab in root.contents}
+
+
+def column(path: Path, entity: str, component: str) -> dict[int, object]:
+    """Reads one component of one entity by the place of the view; static ones have the place 0."""
+    found: dict[int, object] = {}
+    for chunk in RrdReader(path).stream().filter(content=entity):
+        batch = chunk.to_record_batch()
+        if component in batch.schema.names:
+            keys = range(1) if chunk.is_static else batch.column(paths.TIMELINE).to_pylist()
+            found |= dict(zip(keys, batch.column(component).to_pylist(), strict=True))
+    return found
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["images and joints", "poses alone", "no joints", "tools and fixtures", "images explained"],
+)
+def test_every_panel_shows_something(name, samples, recordings):
+    layout = blueprint(samples[name].session, samples[name].calibration)
+    logged = {str(it.entity_path) for it in RrdReader(recordings[name]).stream()}
+    for view in views_of(layout.root_container):
+        below = f"{view.origin.rstrip('/')}/"
+        assert any(f"{entity}/".startswith(below) for entity in logged), view.name
+
+
+def test_panels_are_those_that_the_session_has_something_for(samples):
+    everything = tabs(samples["images and joints"])
+    first = next(iter(everything))
+    assert {"Cell", "Verdict", "This view"} < set(everything[first])
+    assert any(view.startswith("Image") for view in everything[first])
+    assert sum("over q" in view for view in everything["Residuals"]) == 6
+    poses = str(tabs(samples["poses alone"]))
+    assert "Image" not in poses
+    assert "px" not in poses
+    assert "in the image" not in poses
+    assert "over q1" in poses
+    assert "over q1" not in str(tabs(samples["no joints"]))
+    assert "Images explained" not in everything
+    assert len(tabs(samples["images explained"])["Images explained"]) == 4
+    assert "Tools and fixtures" not in str(everything)
+    assert "Tools and fixtures" in tabs(samples["tools and fixtures"])[first]
+
+
+def test_an_image_that_was_not_explained_takes_the_last_one_back(recordings):
+    for entity in (paths.DRAWN, paths.REST):
+        shown = column(recordings["images explained"], entity, "EncodedImage:blob")
+        cleared = column(recordings["images explained"], entity, "Clear:is_recursive")
+        assert {place for place, blob in shown.items() if blob} == {0, *range(2, 9)}
+        assert {place for place, it in cleared.items() if it is not None} == {1}
+        assert entity not in {
+            str(it.entity_path) for it in RrdReader(recordings["images and joints"]).stream()
+        }
+
+
+def test_views_that_were_not_used_are_marked_in_the_plots(samples, recordings):
+    rejected = {
+        place
+        for place, it in enumerate(samples["images and joints"].calibration.views)
+        if not it.used
+    }
+    for plot in (paths.POSITION_MM, paths.ORIENTATION_DEG, paths.REPROJECTION_PX):
+        marks = [
+            column(recordings["images and joints"], f"{plot}/{name}", "Scalars:scalars")
+            for name in (paths.REJECTED, paths.BEYOND)
+        ]
+        assert {place for it in marks for place in it} == rejected
+
+
+def test_a_view_without_target_takes_the_marks_of_the_last_off(recordings):
+    # View 3 of the sample found no corners.
+    file = recordings["images and joints"]
+    for entity, component in (
+        (paths.SEEN_TARGET, "LineStrips3D:strips"),
+        (f"{paths.IMAGE_COVERAGE}/{paths.THIS_VIEW}", "Points2D:positions"),
+        (f"{paths.DIRECTIONS}/{paths.THIS_VIEW}", "Points2D:positions"),
+    ):
+        drawn = column(file, entity, component)
+        assert drawn[2]
+        assert drawn[3] == []
+
+
+def test_ellipsoids_are_the_covariance_in_the_frame_of_the_edge(tmp_path):
+    sample = made_up(images=False)
+    root = np.random.default_rng(1).normal(size=(6, 6)) * 1e-4
+    edges = {
+        name: Edge(it.matrix, factor * root @ root.T)
+        for (name, it), factor in zip(sample.calibration.edges.items(), (1.0, 0.3), strict=True)
+    }
+    calibration = replace(sample.calibration, edges=edges)
+    evidence = {it.view: it for it in sample.evidence}
+    uncertainty = Uncertainty.of(calibration, evidence, size_m=1.0)
+    file = tmp_path / "cell.rrd"
+    write_recording(file, sample.session, calibration, sample.evidence, None)
+    found = {
+        str(it.entity_path)
+        for it in RrdReader(file).stream()
+        if re.search(r"95_percent_magnified_\d+x$", str(it.entity_path))
+    }
+    assert {it.split("/")[1] for it in found} == {"camera", "target"}
+    for entity in found:
+        name = re.match(r"/\w+/(\w+)_95_percent", entity)[1]
+        drawn_factor = int(re.search(r"_(\d+)x$", entity)[1])
+        (half,) = column(file, entity, "Ellipsoids3D:half_sizes")[0]
+        (quaternion,) = column(file, entity, "Ellipsoids3D:quaternions")[0]
+        axes = Rotation.from_quat(quaternion).as_matrix()
+        drawn = axes @ np.diag(np.square(half)) @ axes.T / (SIGMAS_95 * drawn_factor) ** 2
+        expected = edges[name].covariance[3:, 3:]
+        # The drawing has single precision.
+        np.testing.assert_allclose(drawn, expected, atol=1e-5 * np.trace(expected))
+    assert uncertainty.factor > 1
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_placements_are_where_the_views_put_the_target(mount):
+    rng = np.random.default_rng(3)
+    x, z = exp(0.5 * rng.normal(size=(2, 6)))
+    base_from_flange = exp(0.7 * rng.normal(size=(5, 6)))
+    moved_m = 1e-3 * rng.normal(size=(5, 3))
+    hand = base_from_flange if mount == "eye-in-hand" else invert(base_from_flange)
+    shifted = np.array([RigidTransform.from_translation(it).as_matrix() for it in moved_m])
+    cam_from_target = invert(hand @ x) @ z @ shifted
+    names = {
+        "eye-in-hand": ("flange_from_cam", "base_from_target"),
+        "eye-to-hand": ("base_from_cam", "flange_from_target"),
+    }[mount]
+    sample = made_up(views=5, images=False)
+    calibration = replace(
+        sample.calibration,
+        mount=mount,
+        edges={
+            name: Edge(edge, 1e-8 * np.eye(6)) for name, edge in zip(names, (x, z), strict=True)
+        },
+        views=tuple(replace(it, used=True) for it in sample.calibration.views),
+    )
+    evidence = {
+        view: ViewEvidence(view, None, None, base_from_flange[view], cam_from_target[view])
+        for view in range(5)
+    }
+    found = Uncertainty.of(calibration, evidence, size_m=1.0).scatter_m
+    expected = moved_m - moved_m.mean(axis=0)
+    # Rounding of poses of about 1 m.
+    np.testing.assert_allclose([found[view] for view in range(5)], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        {"kind": "charuco", "columns": 7, "rows": 5, "square_m": 0.03, "marker_m": 0.022}
+        | {"dictionary": "DICT_5X5_100"},
+        {"kind": "charuco", "columns": 6, "rows": 8, "square_m": 0.03, "marker_m": 0.022}
+        | {"dictionary": "DICT_5X5_100", "legacy": True},
+        {"kind": "checkerboard", "columns": 8, "rows": 5, "square_m": 0.02},
+        {"kind": "marker", "id": 7, "size_m": 0.1, "dictionary": "DICT_4X4_50"},
+    ],
+    ids=["charuco", "legacy charuco", "checkerboard", "marker"],
+)
+def test_the_sheet_shows_the_pattern_in_the_target_s_frame(document):
+    target = target_from_document(document, "board")
+    picture, margin = board.picture(target), 60
+    seen = find_target(
+        cv2.copyMakeBorder(picture, *[margin] * 4, cv2.BORDER_CONSTANT, value=255), target
+    )
+    low, _, high, _ = board.outline(target)
+    px_per_m = picture.shape[1] / (high - low)[0]
+    expected = (corner_positions(target)[seen.ids] - low)[:, :2] * px_per_m + margin - 0.5
+    assert len(seen.ids) == len(corner_positions(target))
+    # Corners of a sharp pattern are found to half a pixel; a square has 48.
+    np.testing.assert_allclose(seen.px, expected, atol=0.6)
+
+
+def test_the_arm_reaches_from_the_base_to_the_flange(tmp_path):
+    frames = np.tile(np.eye(4), (4, 1, 1))
+    # The third link hangs straight down, the fourth has no length.
+    frames[:, :3, 3] = [[0.0, 0.0, 0.4], [0.3, 0.1, 0.5], [0.3, 0.1, 0.2], [0.3, 0.1, 0.2]]
+    file = tmp_path / "arm.rrd"
+    with rr.RecordingStream("arm") as stream:
+        stream.save(file)
+        stream.set_time(paths.TIMELINE, sequence=0)
+        arm.log_arm(stream, frames)
+        stream.disconnect()
+    entity = f"{paths.ROBOT}/links"
+    starts = np.array(column(file, entity, "Capsules3D:translations")[0])
+    lengths = np.array(column(file, entity, "Capsules3D:lengths")[0])
+    turns = Rotation.from_quat(column(file, entity, "Capsules3D:quaternions")[0])
+    ends = starts + turns.apply(np.outer(lengths, [0.0, 0.0, 1.0]))
+    np.testing.assert_allclose(starts[0], 0.0)
+    # Single precision of lengths under 1 m.
+    np.testing.assert_allclose(ends, frames[:, :3, 3], atol=1e-6)
+
+
+def test_directions_lie_on_the_side_that_the_camera_is_on():
+    # 0.5 m above the board, moved 30 degrees towards the target's x and looking back at it.
+    tilt = Rotation.from_euler("y", -30, degrees=True)
+    target_from_cam = RigidTransform.from_components(tilt.apply([0.0, 0.0, -0.5]), tilt)
+    assert target_from_cam.translation[0] > 0.2
+    seen = ViewEvidence(4, cam_from_target=target_from_cam.inv().as_matrix())
+    chart = coverage.directions_chart({4: seen})
+    np.testing.assert_allclose(chart.points[4], [[30.0, 0.0]], atol=1e-9)
+
+
+def test_axes_of_rotation_and_their_reverse_are_one_point():
+    turns_deg = [[0, 0, 0], [20, 0, 0], [0, 0, 0], [0, 0, -50]]
+    poses = exp(np.pad(np.deg2rad(turns_deg), ((0, 0), (0, 3))))
+    seen = [ViewEvidence(view, base_from_flange=it) for view, it in enumerate(poses)]
+    points = coverage.rotation_axes_chart(seen).points
+    np.testing.assert_allclose(np.abs(points[1]), [[90.0, 0.0]], atol=1e-9)
+    np.testing.assert_allclose(np.abs(points[2]), [[90.0, 0.0]], atol=1e-9)
+    np.testing.assert_allclose(points[3], [[0.0, 0.0]], atol=1e-9)
+
+
+def free_port() -> int:
+    with socket.socket() as it:
+        it.bind(("127.0.0.1", 0))
+        return it.getsockname()[1]
+
+
+def part(picture: np.ndarray, left: float, top: float, right: float, bottom: float) -> np.ndarray:
+    height, width = picture.shape[:2]
+    return picture[
+        round(top * height) : round(bottom * height), round(left * width) : round(right * width)
+    ]
+
+
+def colours(picture: np.ndarray) -> int:
+    return len(np.unique(picture.reshape(-1, 3), axis=0))
+
+
+def greens(picture: np.ndarray) -> int:
+    """Counts the pixels in the colour of detected corners."""
+    blue, green, red = (picture[:, :, channel].astype(int) for channel in range(3))
+    return int(np.sum((green > red + 60) & (green > blue + 60)))
+
+
+def drawn_view(client: ViewerClient, place: int, file: Path, patience_s: float = 120) -> np.ndarray:
+    """Goes to a view and takes pictures until two in a row are alike and not blank."""
+    end, last = time.monotonic() + patience_s, np.zeros((1, 1, 3), np.uint8)
+    while time.monotonic() < end:
+        time.sleep(0.3)
+        try:
+            client.set_time(paths.TIMELINE, sequence=place)
+        except ConnectionError:  # the recording is still being loaded
+            continue
+        client.save_screenshot(str(file))
+        new = cv2.imread(str(file))
+        if colours(new) > 500 and np.array_equal(new, last):
+            break
+        last = new
+    return last
+
+
+# Where the parts of the first tab lie in the window, as shares: left, top, right, bottom.
+CELL = (0.0, 0.1, 0.54, 0.73)
+PLOTS = (0.0, 0.78, 0.54, 0.96)
+VERDICT = (0.55, 0.1, 1.0, 0.36)
+IMAGE = (0.55, 0.42, 1.0, 0.79)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not RASTERISERS, reason="no software rasteriser (mesa-vulkan-drivers) here")
+def test_the_native_viewer_draws_it(recordings, tmp_path):
+    port = free_port()
+    options = ("--headless", "--bind", "127.0.0.1", "--port", str(port))
+    file = str(recordings["images and joints"])
+    with viewer_process(*options, "--window-size", "1400x850", file) as process:
+        for line in process.stdout:
+            if "Listening" in line:
+                break
+        client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+
+        used, rejected = (drawn_view(client, place, tmp_path / "shot.png") for place in (2, 3))
+    for picture in (used, rejected):
+        # Empty panels have a background and little else; the robot is shaded.
+        assert colours(part(picture, *CELL)) > 1000
+        assert colours(part(picture, *VERDICT)) > 20
+        assert colours(part(picture, *PLOTS)) > 20
+        # The ground of the sample's images is grey 150.
+        assert np.mean(np.abs(part(picture, *IMAGE).astype(int) - 150) < 4) > 0.1
+    assert greens(part(used, *IMAGE)) > 100
+    assert greens(part(rejected, *IMAGE)) == 0

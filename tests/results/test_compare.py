@@ -1,0 +1,231 @@
+"""Two calibrations of one cell: noise stays noise, and what moved is found and named."""
+
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.commands import visioncal
+from support.marks import slow
+from support.pairs import (
+    calibrated_cell,
+    halves,
+    with_moved_board,
+    with_moved_camera,
+    with_moved_result,
+)
+from support.samples import made_up
+
+from visioncal.core.transforms import exp, invert, log
+from visioncal.core.types import Camera, Mount
+from visioncal.results import Calibration, CameraResult, Edge, ViewResult
+from visioncal.results.compare import FALSE_ALARMS, compare, to_document
+from visioncal.simulation import Cell, CellOptions, simulate
+
+PAIRS = 8
+SHIFT = np.array([0.0, 0.0, 0.0, 0.6, -0.64, 0.48])
+
+
+@cache
+def cells(mount: Mount, seed: int) -> tuple[Cell, Cell]:
+    """Two cells of one truth, with a lens that is to be estimated."""
+    options = CellOptions(mount=mount, views=40, seed=seed, state_intrinsics=False)
+    return halves(simulate(options))
+
+
+@cache
+def pair(mount: Mount, seed: int) -> tuple[Calibration, Calibration]:
+    first, second = cells(mount, seed)
+    return calibrated_cell(first), calibrated_cell(second)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_noise_is_no_change(mount: Mount) -> None:
+    compared = [compare(*pair(mount, seed)) for seed in range(PAIRS)]
+    # One in a hundred may be told apart: two of eight come once in four hundred such runs.
+    assert sum(it.is_change for it in compared) <= 1
+    p_values = np.array(
+        [
+            test.p_value
+            for it in compared
+            for edge in it.edges
+            for test in (edge.rotation, edge.translation)
+        ]
+    )
+    # Where the covariance is right half of the chances lie under one half; 32 of them scatter by
+    # 0.09, and by up to twice that as the two transforms of one pair share their noise.
+    assert abs(np.mean(p_values < 0.5) - 0.5) < 0.36
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", slow("eye-to-hand")])
+def test_a_camera_moved_by_five_sigma_is_found(mount: Mount) -> None:
+    for seed in range(2):
+        reference, second = pair(mount, seed)[0], cells(mount, seed)[1]
+        sigma_m = 1e-3 * compare(*pair(mount, seed)).edges[0].sigma_mm
+        moved = calibrated_cell(with_moved_camera(second, 5 * sigma_m * SHIFT))
+        comparison = compare(reference, moved)
+        camera, board = comparison.edges
+        assert camera.translation.is_change
+        assert not board.is_change
+        assert comparison.findings[0].startswith("The camera moved")
+        # The noise of the difference, one sigma to an axis or so, is added to the move.
+        assert 3.0 < camera.moved_mm / camera.sigma_mm < 7.0
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_a_moved_camera_moves_its_result_alike(mount: Mount) -> None:
+    """The benchmark moves results rather than calibrating again."""
+    twist, cell = 1e-3 * SHIFT, cells(mount, 0)[1]
+    again = calibrated_cell(with_moved_camera(cell, twist))
+    moved = with_moved_result(pair(mount, 0)[1], cell, twist)
+    for name, edge in again.edges.items():
+        sigmas = np.sqrt(np.diag(edge.covariance))
+        # The flange's error has a lever a millimetre longer: a hundredth of the camera's 100 mm.
+        away = log(invert(edge.matrix) @ moved.edges[name].matrix)
+        assert np.abs(away / sigmas).max() < 1e-2
+        covariance = (edge.covariance - moved.edges[name].covariance) / np.outer(sigmas, sigmas)
+        assert np.abs(covariance).max() < 1e-2
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_a_moved_board_is_no_moved_camera(mount: Mount) -> None:
+    moved = calibrated_cell(with_moved_board(cells(mount, 0)[1], 2e-3 * SHIFT))
+    comparison = compare(pair(mount, 0)[0], moved)
+    assert [edge.is_change for edge in comparison.edges] == [False, True]
+    assert comparison.findings[0].startswith("The board was moved")
+    assert "its calibration still holds" in comparison.findings[0]
+
+
+def test_a_turn_is_a_change_of_rotation() -> None:
+    first, second = pair("eye-in-hand", 1)
+    turned = calibrated_cell(with_moved_camera(cells("eye-in-hand", 1)[1], np.eye(6)[1] * 3e-3))
+    (edge, _) = compare(first, turned).edges
+    assert edge.rotation.is_change
+    assert edge.rotation.p_value < compare(first, second).edges[0].rotation.p_value
+    # 3 mrad, to within the noise of 0.6 mrad.
+    assert edge.moved_deg == pytest.approx(np.rad2deg(3e-3), abs=0.07)
+
+
+def test_a_change_of_the_lens_is_found() -> None:
+    first, second = pair("eye-in-hand", 0)
+    assert second.camera is not None
+    camera = second.camera.camera
+    longer = replace(camera, matrix=camera.matrix * [1.01, 1.01, 1.0, 1.0])
+    comparison = compare(first, replace(second, camera=replace(second.camera, camera=longer)))
+    assert comparison.lens is not None
+    assert comparison.lens.is_change
+    assert any("intrinsics differ" in it for it in comparison.findings)
+    same = compare(first, second).lens
+    assert same is not None
+    assert same.names == ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    assert not same.is_change
+
+
+def test_given_lenses_are_compared_as_they_stand() -> None:
+    calibration = replace(made_up(4).calibration)
+    assert calibration.camera is not None
+    camera = calibration.camera.camera
+    given = replace(calibration, camera=CameraResult(camera, estimated=False))
+    other = replace(camera, matrix=camera.matrix + 1e-9)
+    changed = replace(calibration, camera=CameraResult(other, estimated=False))
+    of_other_size = Camera("brown", (320, 200), camera.matrix, camera.distortion)
+    small = replace(calibration, camera=CameraResult(of_other_size, estimated=False))
+    assert not compare(given, given).is_change
+    assert compare(given, changed).is_change
+    assert compare(given, small).lens is None
+    assert any("model or resolution" in it for it in compare(given, small).findings)
+
+
+def test_covariances_are_added_in_one_tangent_space() -> None:
+    """Against sampling, where the two poses are a radian and a third of a metre apart."""
+    rng = np.random.default_rng(5)
+    spreads = []
+    for _ in range(2):
+        root = rng.normal(size=(6, 6)) * np.repeat([1e-3, 3e-4], 3)[:, None]
+        spreads.append(root @ root.T)
+    first = exp(np.array([0.3, -0.2, 1.1, 0.1, 0.2, 0.3]))
+    second = first @ exp(np.array([0.7, -0.6, 0.4, 0.2, -0.2, 0.15]))
+    noise = [
+        rng.multivariate_normal(np.zeros(6), covariance, size=40_000) for covariance in spreads
+    ]
+    sampled = log(invert(first @ exp(noise[0])) @ (second @ exp(noise[1])))
+    (edge, _) = compare(with_edge(first, spreads[0]), with_edge(second, spreads[1])).edges
+    # 40000 samples show a variance to 0.7 %; the nonlinear rest is a thousandth.
+    sigmas = np.sqrt(np.diag(edge.covariance))
+    away = (np.cov(sampled.T) - edge.covariance) / np.outer(sigmas, sigmas)
+    assert np.abs(away).max() < 0.03
+
+
+def with_edge(pose: np.ndarray, covariance: np.ndarray, views: int = 20) -> Calibration:
+    """The sample's calibration with another first edge and number of views."""
+    calibration = made_up(4).calibration
+    edge = Edge(pose, covariance)
+    edges = {**calibration.edges, "flange_from_cam": edge}
+    used = tuple(ViewResult(view, used=True) for view in range(views))
+    return replace(calibration, edges=edges, views=used)
+
+
+def test_few_views_make_the_same_difference_less_sure() -> None:
+    covariance = 1e-8 * np.eye(6)
+    away = exp(np.array([0.0, 0.0, 0.0, 5e-4, 0.0, 0.0]))
+    p_values = [
+        compare(with_edge(np.eye(4), covariance, views), with_edge(away, covariance, views))
+        .edges[0]
+        .translation.p_value
+        for views in (4, 10, 1000)
+    ]
+    assert p_values[0] > 2 * p_values[1]
+    assert p_values[1] > 1.5 * p_values[2]
+    # Very many views: chi-square of 12.5 with three degrees of freedom, by its table 0.00585.
+    assert p_values[2] == pytest.approx(0.00585, rel=0.02)
+
+
+def test_a_calibration_does_not_differ_from_itself() -> None:
+    calibration = made_up(4).calibration
+    comparison = compare(calibration, calibration)
+    assert comparison.same_session
+    assert not comparison.is_change
+    assert "share its noise" in comparison.findings[0]
+    # Exact data has no spread: rounding is no change either.
+    exact = with_edge(np.eye(4), np.zeros((6, 6)))
+    rounded = with_edge(exp(np.full(6, 1e-13)), np.zeros((6, 6)))
+    assert not compare(exact, rounded).is_change
+
+
+def test_different_mounts_have_nothing_in_common() -> None:
+    in_hand, to_hand = pair("eye-in-hand", 0)[0], pair("eye-to-hand", 0)[0]
+    comparison = compare(in_hand, to_hand)
+    assert comparison.edges == ()
+    assert comparison.only_in_a == ("flange_from_cam", "base_from_target")
+    assert comparison.only_in_b == ("base_from_cam", "flange_from_target")
+    assert "The mounts differ" in comparison.findings[0]
+
+
+def test_command_prints_to_stdout_and_ends_well_either_way(tmp_path: Path) -> None:
+    first, second = pair("eye-in-hand", 0)
+    first.save(tmp_path / "calibration.json")
+    moved = calibrated_cell(with_moved_camera(cells("eye-in-hand", 0)[1], 2e-3 * SHIFT))
+    moved.save(tmp_path / "moved.json")
+    second.save(tmp_path / "same.json")
+    for name, words in (("same", "No transform changed"), ("moved", "The camera moved")):
+        done = visioncal("diff", tmp_path, tmp_path / f"{name}.json")
+        assert done.status == 0, done.err
+        assert done.err == ""
+        assert words in done.out
+    printed = visioncal("diff", tmp_path, tmp_path / "moved.json", "--json").out
+    files = (Calibration.load(tmp_path), Calibration.load(tmp_path / "moved.json"))
+    assert json.loads(printed) == to_document(compare(*files))
+    assert "null" not in printed
+    assert json.loads(printed)["transforms"]["flange_from_cam"]["translation"]["limit"] == (
+        FALSE_ALARMS / 5
+    )
+
+
+def test_command_names_what_is_no_calibration(tmp_path: Path) -> None:
+    (tmp_path / "other.json").write_text("{}")
+    done = visioncal("diff", tmp_path / "other.json", tmp_path)
+    assert done.status == 2
+    assert "other.json" in done.err

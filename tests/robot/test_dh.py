@@ -1,0 +1,292 @@
+"""Joint tables: three conventions, from one to another, from any chain, and recognised by poses."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import exp
+from visioncal.robot import (
+    CONVENTIONS,
+    DHTable,
+    Robot,
+    convert_table,
+    load_robot,
+    parallel_axes,
+    recognised_convention,
+    robot_names,
+    small_urdf,
+    table_document,
+    table_from_document,
+    table_of,
+)
+
+DATA = Path(__file__).parents[3] / "shared" / "data"
+NUMBERS = ("theta_rad", "d_m", "a_m", "alpha_rad", "beta_rad", "parallel", "base", "flange")
+KEYS = ("a_m", "alpha_rad", "d_m", "theta_offset_rad")
+
+
+def table(name: str) -> DHTable:
+    return table_from_document(load_robot(name).document)
+
+
+def random_table(convention: str, seed: int = 1) -> DHTable:
+    """Rows in general position, one with all that a row can hold, a base and a flange."""
+    rng = np.random.default_rng(seed)
+    rows: list[dict[str, Any]] = [
+        dict(zip(KEYS, rng.normal(size=4).tolist(), strict=True)) for _ in range(5)
+    ]
+    rows[2] |= {"type": "prismatic", "lower_m": -0.5, "upper_m": 0.5}
+    rows[3] |= {"gear_ratio": 1.01, "sine_rad": 0.02, "cosine_rad": 0.03, "lower_deg": -np.inf}
+    if convention == "hayati":
+        rows[1] |= {"alpha_rad": 2e-3, "beta_rad": -1e-3, "d_m": 0.0}
+    pose = {"xyz_m": rng.normal(size=3).tolist(), "rpy_rad": rng.normal(size=3).tolist()}
+    flange = {"xyz_m": [0.1, 0.2, 0.3], "rpy_rad": [0.4, 0.5, 0.6]}
+    document = {"schema": 1, "name": "random", "convention": convention, "joint": rows}
+    return table_from_document(document | {"base": pose, "flange": flange})
+
+
+def disturbed(name: str, seed: int) -> Robot:
+    """An arm off by 0.5 mm and 1 mrad in everything."""
+    robot, rng = load_robot(name), np.random.default_rng(seed)
+    scale = np.repeat([1e-3, 5e-4], 3)
+    return robot.corrected(scale * rng.normal(size=(robot.joint_count + 1, 6)))
+
+
+def robot_of(it: DHTable) -> Robot:
+    return Robot.from_document(json.loads(json.dumps(table_document(it, "a test"))))
+
+
+def poses(it: DHTable | Robot, count: int = 20) -> np.ndarray:
+    robot = it if isinstance(it, Robot) else robot_of(it)
+    q = np.random.default_rng(7).uniform(-2, 2, (count, robot.joint_count))
+    return robot.base_from_flange(q)
+
+
+def assert_same_table(found: DHTable, expected: DHTable, atol: float) -> None:
+    assert (found.convention, found.joint_names) == (expected.convention, expected.joint_names)
+    for name in (*NUMBERS, "lower", "upper", "functions", "prismatic"):
+        np.testing.assert_allclose(
+            getattr(found, name), getattr(expected, name), rtol=0, atol=atol, err_msg=name
+        )
+
+
+def elementary(row: dict[str, float], order: str) -> np.ndarray:
+    """A row's product by its textbook: Z and z turn about and go along z, X and x, Y likewise."""
+    twists = {
+        "Z": [0, 0, row.get("theta_offset_rad", 0.0), 0, 0, 0],
+        "z": [0, 0, 0, 0, 0, row["d_m"]],
+        "x": [0, 0, 0, row["a_m"], 0, 0],
+        "X": [row["alpha_rad"], 0, 0, 0, 0, 0],
+        "Y": [0, row.get("beta_rad", 0.0), 0, 0, 0, 0],
+    }
+    product = np.eye(4)
+    for letter in order:
+        product = product @ exp(np.array(twists[letter], float))
+    return product
+
+
+def test_hayatis_rows_are_the_textbooks_product() -> None:
+    rng = np.random.default_rng(3)
+    rows = [dict(zip(KEYS, rng.normal(size=4).tolist(), strict=True)) for _ in range(4)]
+    rows[1] |= {"beta_rad": 0.3}
+    document = {"schema": 1, "name": "x", "convention": "hayati", "joint": rows}
+    expected = np.eye(4)
+    for row in rows:
+        expected = expected @ elementary(row, "ZzxXY")
+    # Products of twenty transforms with entries of a few metres.
+    found = Robot.from_document(document).base_from_flange(np.zeros((1, 4)))[0]
+    np.testing.assert_allclose(found, expected, atol=1e-14 * 100)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("name", robot_names())
+def test_conversions_keep_the_arm_and_come_back(name: str, convention: str) -> None:
+    start = table(name)
+    there = convert_table(start, convention)
+    assert there.convention == convention
+    # Rounding of some ten products; nothing is computed anew, so the way back is exact.
+    np.testing.assert_allclose(poses(there), poses(start), rtol=0, atol=1e-14)
+    assert_same_table(convert_table(there, start.convention), start, atol=0.0)
+
+
+@pytest.mark.parametrize("other", CONVENTIONS)
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_conversions_of_any_table_come_back(convention: str, other: str) -> None:
+    start = random_table(convention)
+    there = convert_table(start, other)
+    # d of some hundred metres where beta had been: 1e-16 of it, a few times over.
+    np.testing.assert_allclose(poses(there), poses(start), rtol=0, atol=1e-12)
+    assert_same_table(convert_table(there, convention), start, atol=1e-12)
+
+
+@pytest.mark.parametrize("other", ["standard", "modified"])
+@pytest.mark.parametrize("name", ["ur5e", "ur10e", "irb120", "generic-6r-1800"])
+def test_nearly_parallel_axes_come_back_too(name: str, other: str) -> None:
+    for seed in range(5):
+        robot = disturbed(name, seed)
+        hayati = table_of(robot, "hayati", like=table(name))
+        there = convert_table(hayati, other)
+        # What Hayati's form is for: the common normal is far away.
+        assert np.abs(there.d_m).max() > 5.0 > 2.0 > np.abs(hayati.d_m).max()
+        for it in (hayati, there):
+            np.testing.assert_allclose(poses(it), poses(robot), rtol=0, atol=2e-12)
+        assert_same_table(convert_table(there, "hayati"), hayati, atol=2e-12)
+
+
+def test_beta_is_chosen_for_the_axes_that_are_nearly_parallel() -> None:
+    for robot in (load_robot("ur5e"), disturbed("ur5e", 1)):
+        assert parallel_axes(robot).tolist() == [False, True, True, False, False]
+        assert table_of(robot, "hayati").parallel.tolist() == [0, 0, 1, 1, 0, 0, 0]
+        assert not table_of(robot, "hayati", parallel_rad=0.0).parallel.any()
+        assert not table_of(robot, "standard").parallel.any()
+    assert parallel_axes(load_robot("irb120")).tolist() == [False, True, False, False, False]
+    assert not parallel_axes(load_robot("panda")).any()
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("name", robot_names())
+def test_a_urdfs_table_is_the_published_one(name: str, convention: str) -> None:
+    nominal = table(name)
+    document = {"schema": 1, "name": name, "tip": nominal.tip, "urdf": small_urdf(load_robot(name))}
+    found = table_of(Robot.from_document(document), convention)
+    expected = convert_table(nominal, convention)
+    if name == "panda":
+        # Its flange is a way along the last axis, which goes into that axis' row.
+        d = np.append(expected.d_m[:-1], expected.flange[2, 3])
+        expected = replace(expected, d_m=d, flange=np.eye(4))
+    # Angles written as roll, pitch and yaw and read again.
+    assert_same_table(found, replace(expected, name=found.name), atol=1e-13)
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="real robots' descriptions are not in ../shared/data")
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize(
+    ("file", "tip"), [("talos.urdf", "gripper_left_base_link"), ("tiago_hey5.urdf", "arm_7_link")]
+)
+def test_any_urdf_has_a_table(file: str, tip: str, convention: str) -> None:
+    robot = load_robot(str(DATA / "figaroh_small" / file), tip)
+    found = table_of(robot, convention)
+    # Right angles written with 8 digits or so leave axes 1e-8 from parallel, or from meeting.
+    np.testing.assert_allclose(poses(found), poses(robot), rtol=0, atol=1e-7)
+    assert found.prismatic.tolist() == robot.chain.prismatic.tolist()
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_a_table_holds_what_a_corrected_arm_has(convention: str) -> None:
+    robot = random_table("standard")
+    rng = np.random.default_rng(2)
+    functions = 1e-2 * rng.normal(size=(5, 4))
+    functions[2, 2:] = 0.0
+    corrected = robot_of(robot).corrected(1e-2 * rng.normal(size=(6, 6)), functions)
+    for like in (None, robot):
+        found = table_of(corrected, convention, like=like)
+        np.testing.assert_allclose(poses(found), poses(corrected), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(found.functions[:, 1:], corrected.chain.functions[:, 1:])
+
+
+def test_a_corrected_table_stays_near_the_nominal_one() -> None:
+    nominal, robot = table("panda"), disturbed("panda", 4)
+    found = table_of(robot, "modified", like=nominal)
+    for name in NUMBERS:
+        # Some 5 sigma of 1 mrad, twice over where a row takes up what its neighbour leaves.
+        away = np.asarray(getattr(found, name), float) - getattr(nominal, name)
+        assert np.abs(away).max() < 1e-2, name
+
+
+def test_axes_in_one_line_have_a_table() -> None:
+    straight = {"a_m": 0.0, "alpha_rad": 0.0, "d_m": 0.2}
+    rows = [straight, straight | {"alpha_rad": np.pi}, straight]
+    document = {"schema": 1, "name": "x", "convention": "standard", "joint": rows}
+    robot = Robot.from_document(document)
+    for convention in CONVENTIONS:
+        found = table_of(robot, convention)
+        np.testing.assert_allclose(poses(found), poses(robot), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_a_table_is_written_and_read(convention: str) -> None:
+    start = random_table(convention)
+    again = table_from_document(json.loads(json.dumps(table_document(start, "a test"))))
+    # Poses as roll, pitch and yaw; limits in degrees.
+    assert_same_table(again, start, atol=1e-14)
+    assert again.lower[3] == -np.inf
+    panda = table_document(table("panda"))
+    assert panda["flange"]["d_m"] == 0.107
+    assert "base" not in panda
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"beta_rad": 0.1}, "beta_rad has no place in the convention 'standard'"),
+        ({"gear_ratio": 0.0}, "gear_ratio is 0.0; a number above 0"),
+        ({"type": "screw"}, "type is 'screw'"),
+        ({"upper_deg": -np.inf}, "upper_deg is -inf; a number is needed"),
+        ({"lower_deg": np.inf}, "lower_deg is inf"),
+        ({"type": "prismatic", "lower_m": 2.0, "upper_m": 1.0}, "less than upper_m = 1.0"),
+    ],
+)
+def test_a_wrong_row_is_refused_by_field(change: dict[str, Any], words: str) -> None:
+    document = json.loads(json.dumps(load_robot("ur5").document))
+    document["joint"][1] |= change
+    with pytest.raises(DataError, match=words) as caught:
+        Robot.from_document(document)
+    assert "shoulder_lift_joint" in str(caught.value)
+
+
+@pytest.mark.parametrize("place", ["base", "flange"])
+@pytest.mark.parametrize("content", [[1.0], {"xyz_m": [0, 0]}, {"xyz_m": [0, 0, 0]}])
+def test_a_wrong_constant_is_refused(place: str, content: Any) -> None:
+    with pytest.raises(DataError, match=place):
+        Robot.from_document({**load_robot("ur5").document, place: content})
+
+
+def reported(robot: Robot, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Joints and the poses that go with them, between two frames of the controller's own."""
+    rng = np.random.default_rng(seed)
+    q = rng.uniform(-1.5, 1.5, (count, robot.joint_count))
+    base, tool = exp(rng.normal(size=(2, 6)))
+    return q, base @ robot.base_from_flange(q) @ tool
+
+
+@pytest.mark.parametrize("name", robot_names())
+def test_the_convention_is_recognised_whatever_is_declared(name: str) -> None:
+    start = table(name)
+    for seed in range(5):
+        q, seen = reported(disturbed(name, seed), 12, seed)
+        for declared in (start, _misread(start)):
+            found = recognised_convention(declared, q, seen)
+            assert found.convention == start.convention
+            # The errors of 0.5 mm and 1 mrad a link, seen by a tool one or two metres long.
+            assert min(found.misfit_m.values()) < 2e-2
+
+
+def _misread(it: DHTable) -> DHTable:
+    """The same printed rows under the other convention."""
+    document = table_document(it)
+    other = "standard" if it.convention == "modified" else "modified"
+    return table_from_document(document | {"convention": other})
+
+
+def test_hayatis_reading_is_told_from_the_modified_one() -> None:
+    robot = disturbed("ur10e", 3)
+    found = recognised_convention(table_of(robot, "hayati"), *reported(robot, 12, 3))
+    assert found.convention == "hayati"
+    assert set(found.misfit_m) == {"hayati", "modified"}
+
+
+def test_a_convention_that_nothing_tells_is_left_open() -> None:
+    start = table("ur5e")
+    # Another arm fits in no convention.
+    assert recognised_convention(start, *reported(load_robot("irb120"), 12, 1)).convention is None
+    # One pose again and again fits in all.
+    q, seen = reported(load_robot("ur5e"), 1, 1)
+    again = recognised_convention(start, np.repeat(q, 8, axis=0), np.repeat(seen, 8, axis=0))
+    assert again.convention is None
+    with pytest.raises(DataError, match="at least 5 rows with 6 joint angles"):
+        recognised_convention(start, *reported(load_robot("ur5e"), 4, 1))

@@ -1,0 +1,308 @@
+"""Robots as calibrations need them: derivatives, corrected models, and the files they go into."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.urdf_arm import URDF, of_urdf, some_changes, some_joints
+
+from visioncal.core.documents import read_yaml
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import exp, invert, log
+from visioncal.robot import (
+    Robot,
+    corrected_urdf,
+    load_robot,
+    read_robot_document,
+    robot_file,
+    robot_names,
+    small_urdf,
+    table_from_document,
+    table_of,
+    table_toml,
+    unwritten,
+    ur_kinematics_yaml,
+)
+
+DATA = Path(__file__).parents[3] / "shared" / "data"
+
+
+def robots() -> list[Robot]:
+    return [*(load_robot(name) for name in robot_names()), of_urdf()]
+
+
+def other(robot: Robot) -> Robot:
+    return robot.corrected(*some_changes(robot))
+
+
+def slope(poses, size: int) -> np.ndarray:
+    """Central differences (m, 6, size) of poses(step), a function of (size,) changes."""
+    step, columns = 1e-5, []
+    middle = invert(poses(np.zeros(size)))
+    for at in range(size):
+        change = np.zeros(size)
+        change[at] = step
+        columns.append((log(middle @ poses(change)) - log(middle @ poses(-change))) / (2 * step))
+    return np.stack(columns, axis=-1)
+
+
+@pytest.mark.parametrize("robot", [*robots(), other(load_robot("ur5e")), other(of_urdf())])
+def test_jacobians_are_the_jacobian_of_the_forward_kinematics(robot: Robot) -> None:
+    q, count = some_joints(robot), robot.joint_count
+    turning = np.where(robot.chain.prismatic[:, None], [1, 1, 0, 0], 1).ravel()
+
+    def placed(change):
+        return robot.corrected(placements=change.reshape(-1, 6)).base_from_flange(q)
+
+    def functioning(change):
+        changes = (turning * change).reshape(-1, 4)
+        return robot.corrected(functions=changes).base_from_flange(q)
+
+    # The third order of a step of 1e-5, and rounding of 1e-16 over it: 1e-10 for metres.
+    tolerance = {"rtol": 0, "atol": 1e-9}
+    joints = slope(lambda change: robot.base_from_flange(q + change), count)
+    np.testing.assert_allclose(robot.joint_jacobian(q), joints, **tolerance)
+    links = slope(placed, 6 * (count + 1))
+    np.testing.assert_allclose(robot.placement_jacobian(q), links, **tolerance)
+    functions = slope(functioning, 4 * count)
+    np.testing.assert_allclose(robot.function_jacobian(q), functions, **tolerance)
+
+
+def test_corrections_are_what_they_say() -> None:
+    robot = load_robot("ur10e")
+    placements, functions = some_changes(robot)
+    corrected = robot.corrected(placements, functions)
+    expected = robot.chain.placements @ exp(placements)
+    assert np.array_equal(corrected.chain.placements, expected)
+    q = some_joints(robot)
+    offset, ratio, sine, cosine = functions.T
+    at = robot.corrected(placements).base_from_flange(
+        q + offset + ratio * q + sine * np.sin(q) + cosine * np.cos(q)
+    )
+    # The same angles, added in another order.
+    np.testing.assert_allclose(corrected.base_from_flange(q), at, atol=1e-14)
+    once_more = corrected.corrected(functions=-functions)
+    np.testing.assert_allclose(
+        once_more.base_from_flange(q), robot.corrected(placements).base_from_flange(q), atol=1e-14
+    )
+
+
+@pytest.mark.parametrize("robot", [load_robot("panda"), of_urdf()], ids=["panda", "urdf"])
+def test_a_corrected_robot_stands_alone(robot: Robot, tmp_path: Path) -> None:
+    corrected = other(robot)
+    again = Robot.from_document(json.loads(json.dumps(corrected.document)))
+    name, content = robot_file(corrected.document)
+    (tmp_path / name).write_text(content)
+    q = some_joints(robot)
+    for copy in (again, load_robot(name, folder=tmp_path)):
+        assert (copy.name, copy.tip, copy.joint_names) == (robot.name, robot.tip, robot.joint_names)
+        assert np.array_equal(copy.base_from_flange(q), corrected.base_from_flange(q))
+        assert np.array_equal(copy.lower_rad, robot.lower_rad)
+        assert np.array_equal(copy.upper_rad, robot.upper_rad)
+
+
+@pytest.mark.parametrize(
+    ("placements", "functions", "words"),
+    [
+        (np.zeros((3, 6)), None, r"placements of shape \(4, 6\)"),
+        (None, np.zeros((3, 3)), r"functions of shape \(3, 4\)"),
+        (None, np.full((3, 4), np.nan), "finite"),
+        (None, np.eye(3, 4, 2), "prismatic joint has no eccentricity"),
+        (None, -np.eye(3, 4, 1), "ratio is 0.0; a number above 0"),
+    ],
+)
+def test_impossible_corrections_are_refused(placements, functions, words: str) -> None:
+    with pytest.raises(DataError, match=words):
+        of_urdf().corrected(placements, functions)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "words"),
+    [
+        ("type", "ball", "type is 'ball'"),
+        ("axis", [0, 0, 2], "a vector of length 1"),
+        ("axis", "z", "a list of 3 numbers"),
+        ("placement", [[1, 0, 0, 0]] * 4, "no rigid transform"),
+        ("placement", np.diag([1, 1, -1, 1]).tolist(), "no rigid transform"),
+        ("placement", 7, "a list of 4 rows"),
+        ("lower", 9.0, r"lower is 9\.0; less than upper"),
+        ("ratio", -1.0, "ratio is -1.0"),
+    ],
+)
+def test_a_wrong_chain_is_refused_by_field(field: str, value, words: str) -> None:
+    document = json.loads(json.dumps(other(load_robot("ur5")).document))
+    document["joint"][1][field] = value
+    with pytest.raises(DataError, match=words) as caught:
+        Robot.from_document(document)
+    assert "shoulder_lift_joint" in str(caught.value)
+
+
+@pytest.mark.parametrize("robot", robots())
+def test_a_small_urdf_is_the_same_arm(robot: Robot) -> None:
+    placements, functions = some_changes(robot)
+    functions[:, 1:] = 0.0
+    corrected = robot.corrected(placements, functions)
+    document = {"schema": 1, "name": "x", "tip": robot.tip, "urdf": small_urdf(corrected)}
+    again, q = Robot.from_document(document), some_joints(robot)
+    assert (again.joint_names, again.tip) == (robot.joint_names, robot.tip)
+    np.testing.assert_allclose(again.lower_rad, robot.lower_rad)
+    # Angles of a rotation, written and read again, over some eight joints.
+    np.testing.assert_allclose(again.base_from_flange(q), corrected.base_from_flange(q), atol=1e-13)
+
+
+@pytest.mark.parametrize("tip", ["flange", "mount", "d", "bend"])
+def test_a_given_urdf_changes_in_its_origins_alone(tip: str) -> None:
+    robot = of_urdf(tip)
+    placements, functions = some_changes(robot)
+    functions[:, 1:] = 0.0
+    corrected = robot.corrected(placements, functions)
+    text = corrected_urdf(robot, corrected)
+    # A joint that moves cannot place the tip behind it.
+    held = tip if tip in ("flange", "mount") else f"{tip}_corrected"
+    again = Robot.from_document({"schema": 1, "name": "x", "tip": held, "urdf": text})
+    q = some_joints(robot)
+    np.testing.assert_allclose(again.base_from_flange(q), corrected.base_from_flange(q), atol=1e-13)
+    kept = [line for line in URDF.splitlines() if "<origin" not in line and "mount" not in line]
+    lines = iter(text.splitlines())
+    assert all(line in lines for line in kept)  # in their order
+    assert text.count("9 9 9") == text.count("kept: inside") == 1
+    assert corrected_urdf(robot, robot) == URDF
+
+
+def test_what_a_urdf_cannot_hold_is_said() -> None:
+    robot = of_urdf()
+    corrected = other(robot)
+    assert [it.partition(":")[0] for it in unwritten(corrected)] == list(robot.joint_names)
+    assert unwritten(robot) == ()
+    for text in (corrected_urdf(robot, corrected), small_urdf(corrected)):
+        assert "Not in this file" in text
+        assert "turn: ratio " in text
+        Robot.from_document({"schema": 1, "name": "x", "tip": "flange", "urdf": text})
+    with pytest.raises(DataError, match="a robot of a URDF"):
+        corrected_urdf(load_robot("ur5"), load_robot("ur5"))
+
+
+def test_a_table_is_written_with_all_that_was_found(tmp_path: Path) -> None:
+    robot = load_robot("ur5e")
+    corrected = other(robot)
+    nominal = table_from_document(robot.document)
+    table = table_of(corrected, "hayati", like=nominal)
+    (tmp_path / "mine.toml").write_text(table_toml(table, "a calibration"))
+    again, q = load_robot("mine.toml", folder=tmp_path), some_joints(robot)
+    # Lengths of a metre through some twenty products.
+    np.testing.assert_allclose(again.base_from_flange(q), corrected.base_from_flange(q), atol=1e-13)
+
+
+# What ur_description's config/ur5e/default_kinematics.yaml holds, pi / 2 in full.
+UR5E_KINEMATICS = {
+    "shoulder": (0, 0, 0.1625, 0, 0, 0),
+    "upper_arm": (0, 0, 0, np.pi / 2, 0, 0),
+    "forearm": (-0.425, 0, 0, 0, 0, 0),
+    "wrist_1": (-0.3922, 0, 0.1333, 0, 0, 0),
+    "wrist_2": (0, -0.0997, 0, np.pi / 2, 0, 0),
+    "wrist_3": (0, 0.0996, 0, -np.pi / 2, 0, 0),
+}
+
+
+@pytest.mark.parametrize("turned", [False, True], ids=["base", "base_link"])
+def test_the_kinematics_of_urs_driver_are_those_of_its_description(
+    tmp_path: Path, turned: bool
+) -> None:
+    robot = load_robot("ur5e")
+    if turned:
+        half = '<joint name="h" type="fixed"><parent link="base_link"/><child link="base"/>'
+        half += '<origin xyz="0 0 0" rpy="0 0 3.141592653589793"/></joint><link name="base_link"/>'
+        urdf = small_urdf(robot).replace("</robot>", half + "</robot>")
+        robot = Robot.from_document({"schema": 1, "name": "ur", "tip": "tool0", "urdf": urdf})
+    path = tmp_path / "kinematics.yaml"
+    path.write_text(ur_kinematics_yaml(robot, calibration_hash="calib_12788084448423163542"))
+    content = read_yaml(path)["kinematics"]
+    assert content.pop("hash") == "calib_12788084448423163542"
+    for link, numbers in UR5E_KINEMATICS.items():
+        found = [content[link][key] for key in ("x", "y", "z", "roll", "pitch", "yaw")]
+        np.testing.assert_allclose(found, numbers, atol=1e-12)  # rounding of half turns
+
+
+def test_the_kinematics_of_urs_driver_hold_a_corrected_arm(tmp_path: Path) -> None:
+    robot = load_robot("ur10e")
+    placements, functions = some_changes(robot)
+    functions[:, 1:] = 0.0
+    corrected = robot.corrected(placements, functions)
+    path = tmp_path / "kinematics.yaml"
+    text = ur_kinematics_yaml(corrected, calibration_hash="calib_1")
+    path.write_text(text)
+    content = read_yaml(path)["kinematics"]
+    chain, q = np.eye(4), some_joints(robot, 1)[0]
+    for link, angle in zip(UR5E_KINEMATICS, q, strict=True):
+        x, y, z, roll, pitch, yaw = (
+            content[link][key] for key in ("x", "y", "z", "roll", "pitch", "yaw")
+        )
+        about = [exp(np.array(it)) for it in ([0, 0, yaw + 0.0, 0, 0, 0], [0, pitch, 0, 0, 0, 0])]
+        roll_only = exp(np.array([roll, 0, 0, 0, 0, 0]))
+        origin = about[0] @ about[1] @ roll_only
+        origin[:3, 3] = x, y, z
+        # Near the nominal frames, not at the common normals hundreds of metres off.
+        assert np.linalg.norm(origin[:3, 3]) < 0.7
+        chain = chain @ origin @ exp(np.array([0, 0, angle, 0, 0, 0]))
+    left_over = invert(chain) @ corrected.base_from_flange(q[None])[0]
+    # Off by the corrections of 2 mm and 2 mrad alone; the comment has the rest.
+    assert np.abs(left_over - np.eye(4)).max() < 0.02
+    assert text.startswith("# flange in wrist_3: xyz ")
+    said = np.array(text.splitlines()[0].partition("xyz ")[2].replace("rpy ", "").split(), float)
+    np.testing.assert_allclose(said[:3], left_over[:3, 3], atol=1e-12)
+    with pytest.raises(DataError, match="six revolute joints"):
+        ur_kinematics_yaml(load_robot("panda"), calibration_hash="")
+
+
+def test_abbs_arm_is_the_one_of_its_published_urdf() -> None:
+    # ros-industrial/abb, irb120_3_58_macro.xacro: origins and axes of the joints, then tool0.
+    origins = [(0, 0, 0), (0, 0, 0.29), (0, 0, 0.27), (0, 0, 0.07), (0.302, 0, 0), (0.072, 0, 0)]
+    axes = np.eye(3)[[2, 1, 1, 0, 1, 0]]
+    robot = load_robot("irb120")
+    q = some_joints(robot)
+    for angles, pose in zip(q, robot.base_from_flange(q), strict=True):
+        chain = np.eye(4)
+        for origin, axis, angle in zip(origins, axes, angles, strict=True):
+            chain = (
+                chain
+                @ exp(np.array([0, 0, 0, *origin]))
+                @ exp(np.array([*(angle * axis), 0, 0, 0]))
+            )
+        chain = chain @ exp(np.array([0, np.pi / 2, 0, 0, 0, 0]))
+        np.testing.assert_allclose(pose, chain, atol=1e-14)
+
+
+def test_the_generic_arm_reaches_as_far_as_its_name() -> None:
+    robot = load_robot("generic-6r-1800")
+    # Upper arm level, and the forearm's offset turned so that its wrist lies as far out as it can.
+    elbow = np.arctan2(0.18, 0.8)
+    q = np.array([0.0, np.pi / 2, -np.pi / 2 + elbow, 0.0, 0.0, 0.0])
+    wrist = robot.link_frames(q)[4]
+    assert np.hypot(*wrist[:2, 3]) == pytest.approx(1.8, abs=1e-12)
+
+
+@pytest.mark.skipif(
+    not DATA.is_dir(), reason="the real robots' descriptions are not beside the repository"
+)
+@pytest.mark.parametrize(
+    ("file", "tip"), [("talos.urdf", "gripper_left_base_link"), ("tiago_hey5.urdf", "arm_7_link")]
+)
+def test_real_urdfs_are_corrected_in_place(file: str, tip: str) -> None:
+    robot = load_robot(str(DATA / "figaroh_small" / file), tip)
+    placements, functions = some_changes(robot)
+    functions[:, 1:] = 0.0
+    placements[-1] = 0.0
+    corrected = robot.corrected(placements, functions)
+    text = corrected_urdf(robot, corrected)
+    again = Robot.from_document(
+        read_robot_document(str(DATA / "figaroh_small" / file), tip=tip) | {"urdf": text}
+    )
+    q = some_joints(robot)
+    np.testing.assert_allclose(again.base_from_flange(q), corrected.base_from_flange(q), atol=1e-13)
+    changed = [
+        (a, b)
+        for a, b in zip(str(robot.document["urdf"]).splitlines(), text.splitlines(), strict=True)
+        if a != b
+    ]
+    assert len(changed) == robot.joint_count

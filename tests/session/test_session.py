@@ -1,0 +1,610 @@
+"""Sessions: read without loss, written whole, and refused by file, line and column."""
+
+import csv
+import io
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from visioncal.core.errors import DataError
+from visioncal.core.types import Need
+from visioncal.session import FolderImages, MemoryImages, Session
+from visioncal.session.table import parse_csv, read_views
+
+DATA = Path(__file__).parents[3] / "shared" / "data" / "sessions"
+
+TOML = """\
+schema = 1
+name = "bench"
+mount = "eye-in-hand"
+target = "board.toml"
+
+[camera]
+name = "oak"
+resolution = [1280, 800]
+matrix = [800, 801.5, 640, 400]
+distortion = [0.1, 0, 0, 0, 0]
+
+[robot]
+model = "ur10e"
+tip = "tool0"
+"""
+BOARD = 'kind = "checkerboard"\ncolumns = 9\nrows = 6\nsquare_m = 0.025\n'
+HEADER = "view,stop,role,image,stamp_s,x_m,y_m,z_m,qx,qy,qz,qw,note"
+ROWS = (
+    '7,1,,images/a.png,0.10,0.5,-0.1,.3,0,0,0,1,"first, ""dark"""',
+    "3,,holdout,images\\b 2.png,1e-1,0.6,0,0.3,0.6,0,0,0.8,",
+    "5,2,fit,images/missing.png,,,,,,,,,",
+)
+TABLE = "\n".join((HEADER, *ROWS)) + "\n"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    session = tmp_path / "Prüfstand 1"
+    (session / "images").mkdir(parents=True)
+    (session / "session.toml").write_text(TOML, encoding="utf-8")
+    (session / "views.csv").write_text(TABLE, encoding="utf-8")
+    (session / "board.toml").write_text(BOARD, encoding="utf-8")
+    (session / "images" / "a.png").write_bytes(b"\x89PNG a")
+    (session / "images" / "b 2.png").write_bytes(b"\x89PNG b")
+    return session
+
+
+def edit(folder: Path, name: str, old: str, new: str) -> None:
+    text = (folder / name).read_text(encoding="utf-8")
+    assert old in text
+    (folder / name).write_text(text.replace(old, new), encoding="utf-8")
+
+
+def refusal(folder: Path) -> DataError:
+    with pytest.raises(DataError) as caught:
+        Session.load(folder)
+    assert caught.value.culprits
+    return caught.value
+
+
+def test_what_the_folder_holds_is_what_the_session_says(folder: Path) -> None:
+    session = Session.load(folder)
+    assert (session.name, session.mount) == ("bench", "eye-in-hand")
+    assert session.camera is not None
+    assert (session.camera_name, session.camera.model) == ("oak", "brown")
+    assert session.resolution == (1280, 800)
+    assert session.camera.matrix.tolist() == [800, 801.5, 640, 400]
+    assert (session.robot_name, session.robot_tip) == ("ur10e", "tool0")
+    assert session.target is not None
+    assert session.target.columns == 9
+    assert session.columns == tuple(HEADER.split(","))
+    assert [view.number for view in session.views] == [7, 3, 5]
+    assert [view.holdout for view in session.views] == [False, True, False]
+    assert [view.stop for view in session.views] == [1, None, 2]
+    assert session.views[1].image == "images/b 2.png"
+    assert dict(session.views[0].text) == {"note": 'first, "dark"'}
+    assert session.views[0].numbers["z_m"] == 0.3
+    assert session.images.read("images/a.png") == b"\x89PNG a"
+    assert session.warnings == ()
+
+
+def test_transforms_come_from_the_rows(folder: Path) -> None:
+    first, second, third = Session.load(folder).views
+    pose = second.base_from_flange()
+    assert pose is not None
+    assert np.array_equal(pose.translation, [0.6, 0, 0.3])
+    expected = Rotation.from_rotvec([2 * np.arctan2(0.6, 0.8), 0, 0])
+    # The same rotation by two routes in double precision.
+    np.testing.assert_allclose(pose.rotation.as_matrix(), expected.as_matrix(), atol=1e-15)
+    assert third.base_from_flange() is None
+    assert (first.stamp_s, third.stamp_s) == (0.1, None)
+    assert first.cam_from_target() is None
+    assert first.joints_rad is None
+
+
+def test_a_quaternion_is_stored_as_read_and_normalised_in_the_transform(folder: Path) -> None:
+    edit(folder, "views.csv", "0.6,0,0,0.8", "0.6003,0,0,0.8")
+    view = Session.load(folder).views[1]
+    assert view.cell("qx") == "0.6003"
+    pose = view.base_from_flange()
+    assert pose is not None
+    determinant = np.linalg.det(pose.rotation.as_matrix())
+    assert determinant == pytest.approx(1.0, abs=1e-14)  # a product of a few rounded numbers
+
+
+def test_joints_come_in_order_beyond_nine() -> None:
+    columns = ("view", *(f"q{k}_rad" for k in (10, *range(1, 10))), "cft_x_m")
+    columns += tuple(f"cft_{name}" for name in ("y_m", "z_m", "qx", "qy", "qz", "qw"))
+    cells = ["1", "10", *map(str, range(1, 10)), "0", "0", "1", "0", "0", "0", "1"]
+    document = {"schema": 1, "name": "n", "mount": "eye-to-hand"}
+    session = Session.assemble(document, columns, [cells], MemoryImages({}))
+    joints = session.views[0].joints_rad
+    assert joints is not None
+    assert joints.tolist() == list(range(1, 11))
+    assert session.views[0].cam_from_target() is not None
+    assert session.target is None
+    assert session.camera is None
+
+
+def test_saving_keeps_everything(folder: Path, tmp_path: Path) -> None:
+    session = Session.load(folder)
+    copy = tmp_path / "elsewhere" / "copy"
+    session.save(copy)
+    again = Session.load(copy)
+    assert again.document == session.document
+    assert again.target_document == session.target_document
+    assert again.columns == session.columns
+    for one, other in zip(session.views, again.views, strict=True):
+        assert [one.cell(name) for name in session.columns] == [
+            other.cell(name) for name in session.columns
+        ]
+    assert again.images.read("images/b 2.png") == b"\x89PNG b"
+    assert not again.images.exists("images/missing.png")
+    assert again.digest() == session.digest()
+    assert [entry.name for entry in copy.parent.iterdir()] == ["copy"]
+
+
+def test_a_saved_session_needs_no_other_file(folder: Path, tmp_path: Path) -> None:
+    shutil.move(folder / "board.toml", tmp_path / "shared board.toml")
+    robot = 'schema=1\nconvention="standard"\n[[joint]]\na_m=0\nd_m=1\nalpha_rad=0.5\n'
+    (tmp_path / "arm.toml").write_text(robot)
+    edit(folder, "session.toml", '"board.toml"', '"../shared board.toml"')
+    edit(folder, "session.toml", '"ur10e"', '"../arm.toml"')
+    session = Session.load(folder)
+    assert [it.partition(" = ")[0] for it in session.warnings] == [
+        "session.toml: target",
+        "session.toml: model",
+    ]
+    copy = tmp_path / "copy"
+    session.save(copy)
+    (tmp_path / "shared board.toml").unlink()
+    (tmp_path / "arm.toml").unlink()
+    again = Session.load(copy)
+    assert again.document["target"] == "target.toml"
+    assert again.robot_document == session.robot_document
+    assert again.digest() == session.digest()
+
+
+@pytest.mark.parametrize(
+    ("field", "file", "content"),
+    [
+        ('"board.toml"', "board.toml", 'kind = "secret"\n'),
+        ('"board.toml"', "board.toml", "password: secret\n"),
+        ('"ur10e"', "arm.toml", '[[joint]]\nname = "secret"\n'),
+        ('"ur10e"', "arm.urdf", "<secret/>"),
+        ('"ur10e"', "arm.json", '{"kind": "secret"}'),
+    ],
+)
+def test_what_is_wrong_with_a_file_outside_is_said_without_its_content(
+    field: str, file: str, content: str, folder: Path, tmp_path: Path
+) -> None:
+    (tmp_path / file).write_text(content)
+    edit(folder, "session.toml", field, f'"../{file}"')
+    try:
+        said, session = "", Session.load(folder)
+    except DataError as error:
+        said, session = str(error), None
+    if session is not None:
+        said = "\n".join(session.warnings)
+        assert session.robot_document is None
+    assert f"{tmp_path / file}, outside of the session's folder, is no " in said
+    assert "secret" not in said
+
+
+def test_a_link_to_another_kind_of_file_is_no_board(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "passwords").write_text(BOARD)
+    (folder / "board.toml").unlink()
+    (folder / "board.toml").symlink_to(tmp_path / "passwords")
+    assert "passwords, outside of the session's folder, is no target" in str(refusal(folder))
+
+
+def test_links_out_of_the_folder_are_not_followed(folder: Path, tmp_path: Path) -> None:
+    shutil.move(folder / "images" / "a.png", tmp_path / "a.png")
+    (folder / "images" / "a.png").symlink_to(tmp_path / "a.png")
+    images = Session.load(folder).images
+    assert not images.exists("images/a.png")
+    assert "copy the images into the folder" in images.absence("images/a.png")
+    assert images.read("images/b 2.png") == b"\x89PNG b"
+    with pytest.raises(DataError, match="leads out"):
+        images.read("images/a.png")
+    Session.load(folder).save(tmp_path / "copy")
+    assert not (tmp_path / "copy" / "images" / "a.png").exists()
+    (tmp_path / "link").symlink_to(folder)
+    assert Session.load(tmp_path / "link").images.exists("images/b 2.png")
+    shutil.move(folder / "views.csv", tmp_path / "views.csv")
+    (folder / "views.csv").symlink_to(tmp_path / "views.csv")
+    assert "leads out of its folder" in str(refusal(folder))
+
+
+def test_a_name_that_no_file_has_leaves_its_view_alone(folder: Path) -> None:
+    edit(folder, "views.csv", "images/missing.png", f"images/{'a' * 300}.png")
+    images = Session.load(folder).images
+    assert "longer than 255 bytes" in images.absence(f"images/{'a' * 300}.png")
+
+
+def test_a_packaged_target_stays_a_name(folder: Path, tmp_path: Path) -> None:
+    edit(folder, "session.toml", "board.toml", "checkerboard_9x6_25mm")
+    Session.load(folder).save(tmp_path / "copy")
+    assert Session.load(tmp_path / "copy").document["target"] == "checkerboard_9x6_25mm"
+    assert not list((tmp_path / "copy").glob("*board*"))
+
+
+def test_nothing_is_overwritten_and_nothing_is_left_half_written(
+    folder: Path, tmp_path: Path
+) -> None:
+    session = Session.load(folder)
+    full = tmp_path / "full"
+    full.mkdir()
+    (full / "precious").touch()
+    with pytest.raises(DataError, match="exists and is not empty"):
+        session.save(full)
+    assert [entry.name for entry in full.iterdir()] == ["precious"]
+
+    class Broken(FolderImages):
+        def read(self, path: str) -> bytes:
+            raise DataError(f"{path} is on a disk that died.")
+
+    broken = Session(
+        session.document,
+        session.columns,
+        session.views,
+        session.target,
+        session.target_document,
+        Broken(folder),
+    )
+    with pytest.raises(DataError, match="died"):
+        broken.save(tmp_path / "new")
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == [folder.name, "full"]
+
+    (tmp_path / "empty").mkdir()
+    session.save(tmp_path / "empty")
+    assert Session.load(tmp_path / "empty").digest() == session.digest()
+
+
+def test_what_the_task_needs_is_read_and_can_be_asked_otherwise(
+    folder: Path, tmp_path: Path
+) -> None:
+    plain = Session.load(folder)
+    assert plain.need is None
+    edit(folder, "session.toml", "[robot]", "[need]\nmm = 0.5\nat = [0.4, 0, 0.1]\n[robot]")
+    session = Session.load(folder)
+    assert session.need == Need(0.5, None, (0.4, 0.0, 0.1))
+    asked = session.needing(deg=0.2)
+    assert asked.need == Need(0.5, 0.2, (0.4, 0.0, 0.1))
+    assert session.needing() is session
+    asked.save(tmp_path / "saved")
+    assert Session.load(tmp_path / "saved").need == asked.need
+    assert plain.needing(2).need == Need(2.0)
+    # The same was recorded, whatever it is to be good for.
+    assert plain.digest() == asked.digest()
+
+
+@pytest.mark.parametrize("mm", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_need_of_nothing_is_refused(folder: Path, mm: float) -> None:
+    with pytest.raises(DataError, match="a number above 0 is needed"):
+        Session.load(folder).needing(mm)
+
+
+def test_the_digest_sees_facts_and_not_their_spelling(folder: Path, tmp_path: Path) -> None:
+    digest = Session.load(folder).digest()
+    other = tmp_path / "other"
+    shutil.copytree(folder, other)
+    edit(other, "session.toml", "800, 801.5", "8e2, 801.50")
+    edit(other, "session.toml", "[camera]", "# a comment\n[camera]")
+    edit(other, "views.csv", "0.10,0.5", "+1.0e-1,00.5")
+    edit(other, "views.csv", "\n", "\r\n")
+    shutil.move(other / "board.toml", other / "print.toml")
+    edit(other, "session.toml", "board.toml", "./print.toml")
+    assert Session.load(other).digest() == digest
+    session = Session.load(folder)
+    held = MemoryImages({name: session.images.read(name) for name in ("images/a.png",)})
+    cells = [[view.cell(name) for name in session.columns] for view in session.views]
+    # As a recording keeps it: through JSON, images by path.
+    document = json.loads(json.dumps(session.document))
+    whole = Session.assemble(
+        document,
+        session.columns,
+        cells,
+        MemoryImages({**held.files, "images/b 2.png": b"\x89PNG b"}),
+        target_document=session.target_document,
+    )
+    assert whole.digest() == digest
+    changed = [
+        ("views.csv", "0.6,0,0.3", "0.6000000000000001,0,0.3"),
+        ("views.csv", "holdout", "fit"),
+        ("views.csv", "dark", "Dark"),
+        ("views.csv", "note", "remark"),
+        ("session.toml", "801.5", "801.6"),
+        ("session.toml", "eye-in-hand", "eye-to-hand"),
+        ("board.toml", "0.025", "0.026"),
+    ]
+    for place, (name, old, new) in enumerate(changed):
+        variant = tmp_path / f"variant {place}"
+        shutil.copytree(folder, variant)
+        edit(variant, name, old, new)
+        assert Session.load(variant).digest() != digest, new
+    (folder / "images" / "a.png").write_bytes(b"\x89PNG c")
+    assert Session.load(folder).digest() != digest
+
+
+@pytest.mark.parametrize("name", ["ric_charuco_eye_to_hand", "visp_franka_eye_in_hand"])
+def test_real_sessions_round_trip(name: str, tmp_path: Path) -> None:
+    if not (DATA / name).is_dir():
+        pytest.skip("the third-party sessions are not on this machine")
+    session = Session.load(DATA / name)
+    assert session.warnings == ()
+    session.save(tmp_path / "copy")
+    assert Session.load(tmp_path / "copy").digest() == session.digest()
+    original = list(csv.reader(io.StringIO((DATA / name / "views.csv").read_text())))
+    for view, row in zip(session.views, original[1:], strict=True):
+        for column, cell in zip(original[0], row, strict=True):
+            if column != "image":
+                assert float(view.cell(column)) == float(cell)
+
+
+TOML_REFUSALS = [
+    ("schema = 1", "schema = 2", "schema is 2; this version reads schema 1"),
+    ("schema = 1\n", "", r"schema is missing \(schema = 1\)"),
+    ('name = "bench"\n', "", "name is missing"),
+    ('"bench"', "7", 'name is 7, but must be a "text"'),
+    ('"eye-in-hand"', '"hand"', 'mount is \'hand\', but must be "eye-in-hand" or "eye-to-hand"'),
+    ("[camera]", "[camera", r"session\.toml is not valid TOML: .*line 6"),
+    ("1280, 800", "1280", r"camera\.resolution is \[1280\], but must be a list of 2"),
+    ("1280, 800", "1280, -800", r"camera\.resolution\[1\] is -800, but must be a number above 0"),
+    ("1280, 800", "1280, 800.0", r"camera\.resolution\[1\] is 800\.0, .* a whole number"),
+    ("800, 801.5", '800, "801.5"', r"camera\.matrix\[1\] is '801\.5', but must be a number"),
+    ("800, 801.5", "800, true", r"camera\.matrix\[1\] is True, but must be a number"),
+    ("800, 801.5", "nan, 801.5", r"camera\.matrix\[0\] is nan, but must be a finite number"),
+    ("800, 801.5", "-800, 801.5", r"camera\.matrix\[0\] is -800.*fx must be above 0"),
+    ("800, 801.5, 640", "800, 640", "camera.matrix is .*must be a list of 4"),
+    ("matrix =", "# matrix =", "camera.matrix is missing beside camera.distortion"),
+    ("distortion =", "# d =", "camera.distortion is missing beside camera.matrix"),
+    ("0.1, 0, 0, 0, 0", "0.1, 0, 0, 0", 'has 4 coefficients, but the "brown" model needs 5 or 8'),
+    ('name = "oak"', 'model = "fisheye"', 'has 5 .* "fisheye" model needs 4'),
+    ('name = "oak"', 'model = "pinhole"', 'model is \'pinhole\', .* "brown" or "fisheye"'),
+    ('name = "oak"', 'intrinsics = "fix"', "camera.intrinsics is 'fix'"),
+    ('name = "oak"', "matrix_sigma_px = 1e-300", r"is 1e-300, but .* of at least 0\.001"),
+    ('name = "oak"', "matrix_sigma_px = 1e300", r"is 1e\+300, but .* of at most 10000"),
+    ("resolution", "size", "camera.resolution is missing: camera.matrix holds for one"),
+    ('target = "board.toml"\n', "", r"target is missing, but view 7 has an image\. Add target"),
+    ("board.toml", "boad.toml", r"target file .*boad\.toml does not exist"),
+    ("board.toml", "charuco", "There is no target named 'charuco'"),
+    ("[robot]", "[clock]\ncamera_minus_robot_s = '0'\n[robot]", "clock.camera_minus_robot_s is"),
+    ("[robot]", "[prior.flange_from_cam]\nz_m = 1.0\n[robot]", "prior.flange_from_cam.sigma_m is"),
+    ("[robot]", "[prior.flange_from_cam]\nsigma_m = 1.0\n[robot]", "cam names no component"),
+    ("[robot]", "[instrument]\nsigma_m = -1\n[robot]", "instrument.sigma_m is -1, .*at least 0"),
+    ("[robot]\nmodel = ", "robot = ", "robot is 'ur10e', but must be a table"),
+    ("[robot]", "[need]\nmm = 0\n[robot]", "need.mm is 0, but must be a number above 0"),
+    ("[robot]", '[need]\nat = "views"\n[robot]', "need says neither mm nor deg: give how near"),
+    ("[robot]", '[need]\nmm = 1\nat = "table"\n[robot]', "need.at is 'table', but must be \"v"),
+    ("[robot]", "[need]\nmm = 1\nat = [1, 2]\n[robot]", r"need.at is \[1, 2\], but must be"),
+    ("[robot]", "[need]\nmm = 1\nat = [500, 0, 0]\n[robot]", "farther than any arm reaches: .* me"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "words"), TOML_REFUSALS)
+def test_a_wrong_session_toml_is_refused_by_field(
+    folder: Path, old: str, new: str, words: str
+) -> None:
+    if new.startswith("robot"):
+        # A bare key must stand before the tables.
+        edit(folder, "session.toml", '[robot]\nmodel = "ur10e"\ntip = "tool0"\n', "")
+        edit(folder, "session.toml", "[camera]", 'robot = "ur10e"\n[camera]')
+    else:
+        edit(folder, "session.toml", old, new)
+    error = refusal(folder)
+    assert re.search(words, str(error))
+
+
+def test_all_wrong_fields_are_named_at_once(folder: Path) -> None:
+    edit(folder, "session.toml", '"bench"', "7")
+    edit(folder, "session.toml", "1280, 800", "1280")
+    assert refusal(folder).culprits == ("session.toml: name", "session.toml: camera.resolution")
+
+
+CSV_REFUSALS = [
+    ("view,", "number,", "header: the column view, .*, is missing"),
+    (",note", ",role", r"column role is there twice \(columns 3 and 13\)"),
+    (",note", ",", "column 13 has no name"),
+    (",qw,", ",w,", "the columns x_m, .* lack qw"),
+    (",stamp_s,", ",q2_rad,", "the joint columns q2_rad lack q1_rad"),
+    ("3,,holdout", "3.5,,holdout", r"line 3, column view: '3\.5' is no whole number"),
+    ("3,,holdout", ",,holdout", "line 3, column view: it is empty; a whole number is needed"),
+    ("3,,holdout", "7,,holdout", r"line 3, column view: 7 is already the view of .*line 2"),
+    ("3,,holdout", "3,x,holdout", "line 3, column stop: 'x' is no whole number"),
+    ("holdout", "test", 'line 3, column role: \'test\' is no role; "fit", "holdout"'),
+    ("0.6,0,0.3", "0.6,zero,0.3", "line 3, column y_m: 'zero' is no finite number"),
+    ("0.6,0,0.3", '0.6,"0,1",0.3', "line 3, column y_m: '0,1' .*decimal sign is a point"),
+    ("0.6,0,0.3", "0.6,nan,0.3", "line 3, column y_m: 'nan' is no finite number"),
+    ("0.6,0,0.3", "0.6,1e999,0.3", "line 3, column y_m: '1e999' is no finite number"),
+    ("0.6,0,0.3", "0.6,1_0,0.3", "line 3, column y_m: '1_0' is no finite number"),
+    ("0.6,0,0.3", "0.6,,0.3", r"line 3, column y_m: it is empty while x_m is filled"),
+    ("0.6,0,0,0.8", "0.6,0,0,0.9", r"line 3, column qx \.\.\. qw: .*norm is 1\.08167, but must"),
+    ("0.6,0,0,0.8,", "0.6,0,0,0.8", "line 3: it has 12 fields, but the header has 13 columns"),
+    ("0.6,0,0,0.8,", "0.6,0,0,0.8,,", "line 3: it has 14 fields"),
+    ("images\\b 2.png", "..\\b.png", "line 3, column image: the path .* leaves the session"),
+    ("images\\b 2.png", "/b.png", "line 3, column image: the path .* leaves the session"),
+    ("images\\b 2.png", "C:b.png", "line 3, column image: the path .* leaves the session"),
+    ("images\\b 2.png", "", "line 3, column image: it is empty, and the row has neither"),
+    ('"first, ""dark"""', '"first', r"views\.csv, line 2"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "words"), CSV_REFUSALS)
+def test_a_wrong_views_csv_is_refused_by_line_and_column(
+    folder: Path, old: str, new: str, words: str
+) -> None:
+    edit(folder, "views.csv", old, new)
+    error = refusal(folder)
+    assert re.search(words, str(error))
+    assert "views.csv" in error.culprits[0]
+
+
+def test_an_angle_that_no_joint_turns_is_refused(folder: Path) -> None:
+    edit(folder, "views.csv", "stamp_s", "q1_rad")
+    edit(folder, "views.csv", "0.10", "1e200")
+    assert "q1_rad: 1e+200 rad is no angle of a joint" in refusal(folder).message
+
+
+def test_a_shared_column_that_names_two_cameras_is_refused(folder: Path) -> None:
+    edit(folder, "views.csv", "note", "camera")
+    edit(folder, "views.csv", "0.8,", "0.8,left")
+    assert "names first, " in refusal(folder).message
+
+
+def test_ten_wrong_rows_are_named_and_the_rest_counted(folder: Path) -> None:
+    rows = [f"{k},,,images/a.png,never,,,,,,,,\n" for k in range(14)]
+    (folder / "views.csv").write_text(HEADER + "\n" + "".join(rows))
+    error = refusal(folder)
+    assert len(error.culprits) == 10
+    assert "line 2, column stamp_s: 'never'" in error.message
+    assert error.message.endswith("And 4 more of the kind.")
+
+
+def test_lines_are_counted_through_quoted_line_breaks(folder: Path) -> None:
+    edit(folder, "views.csv", "first, ", "first\n\n")
+    edit(folder, "views.csv", "0.6,0,0.3", "0.6,x,0.3")
+    assert "line 5, column y_m" in refusal(folder).message
+
+
+@pytest.mark.parametrize("name", ["session.toml", "views.csv"])
+def test_a_missing_or_empty_file_is_named(folder: Path, name: str) -> None:
+    (folder / name).write_text("")
+    assert name in refusal(folder).message
+    (folder / name).unlink()
+    assert f"{name} does not exist" in refusal(folder).message
+
+
+def test_a_header_without_rows_and_other_separators_are_named(folder: Path) -> None:
+    (folder / "views.csv").write_text(HEADER + "\n,,,,,,,,,,,,\n")
+    assert "a header row and no views" in refusal(folder).message
+    (folder / "views.csv").write_text(TABLE.replace(",", ";"))
+    assert "commas, not semicolons" in refusal(folder).next_step
+    (folder / "views.csv").write_text(TABLE.replace(",", "\t"))
+    assert "commas, not tabs" in refusal(folder).next_step
+
+
+def test_what_is_no_session_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="is no session: a folder"):
+        Session.load(tmp_path / "nowhere")
+
+
+def test_a_byte_order_mark_and_other_line_ends_are_read(folder: Path) -> None:
+    digest = Session.load(folder).digest()
+    for name in ("session.toml", "views.csv"):
+        text = (folder / name).read_text(encoding="utf-8").replace("\n", "\r\n")
+        (folder / name).write_bytes(b"\xef\xbb\xbf" + text.encode())
+    assert Session.load(folder).digest() == digest
+
+
+WARNINGS = [
+    ("session.toml", "[camera]", 'targt = "x"\n[camera]', "targt is not a known .* mean target"),
+    ("session.toml", 'name = "oak"', "exposure = 3", "camera.exposure is not a known field"),
+    ("session.toml", "640, 400", "400, 6400", r"principal point at \(400, 6400\) px, outside"),
+    ("session.toml", "ur10e", "kuka", "robot.model: There is no robot named 'kuka'"),
+    ("session.toml", "[robot]", "[prior.flange_to_cam]\nz_m=1\nsigma_m=1\n[robot]", "flange_from"),
+    ("views.csv", "note", "stamps_s", "stamps_s .* kept as text. Did you mean stamp_s"),
+    ("views.csv", "images/missing.png", "images/a.png", "views 7 and 5 share images/a.png"),
+]
+
+
+@pytest.mark.parametrize(("name", "old", "new", "words"), WARNINGS)
+def test_the_suspicious_is_said_and_kept(
+    folder: Path, name: str, old: str, new: str, words: str
+) -> None:
+    edit(folder, name, old, new)
+    session = Session.load(folder)
+    assert len(session.warnings) == 1
+    assert re.search(words, session.warnings[0])
+    session.save(folder.parent / "copy")
+    assert Session.load(folder.parent / "copy").digest() == session.digest()
+
+
+def test_millimetres_and_degrees_are_noticed(folder: Path) -> None:
+    edit(folder, "views.csv", "0.5,-0.1,.3", "500,-100,300")
+    edit(folder, "views.csv", "0.6,0,0.3", "600,0,300")
+    edit(folder, "views.csv", "stamp_s", "q1_rad")
+    edit(folder, "views.csv", "1e-1", "-90")
+    edit(folder, "views.csv", "0.10", "45")
+    far, wide = Session.load(folder).warnings
+    assert "It looks like millimetres: multiply these columns by 0.001" in far
+    assert "It looks like degrees" in wide
+
+
+@pytest.mark.parametrize("extra", ["point", "meas_x_m,meas_y_m,meas_z_m"])
+def test_touches_and_readings_need_no_image(folder: Path, extra: str) -> None:
+    cells = "tip" if extra == "point" else "1,2,3"
+    (folder / "views.csv").write_text(f"view,{extra}\n1,{cells}\n")
+    edit(folder, "session.toml", 'target = "board.toml"\n', "")
+    assert Session.load(folder).target is None
+
+
+cells = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=12)
+finite = st.floats(-1e10, 1e10)
+
+
+@settings(deadline=None, max_examples=60)  # a busy disk takes its time to flush
+@given(rows=st.lists(st.tuples(cells, finite), min_size=1, max_size=5))
+def test_any_text_and_any_number_survive(
+    tmp_path_factory: pytest.TempPathFactory, rows: list[tuple[str, float]]
+) -> None:
+    columns = ("view", "note", "stamp_s", "point")
+    texts = [[str(k), note, repr(stamp), "p"] for k, (note, stamp) in enumerate(rows)]
+    document = {"schema": 1, "name": "n", "mount": "eye-to-hand"}
+    session = Session.assemble(document, columns, texts, MemoryImages({}))
+    copy = tmp_path_factory.mktemp("any") / "copy"
+    session.save(copy)
+    again = Session.load(copy)
+    for view, (note, stamp) in zip(again.views, rows, strict=True):
+        assert (view.cell("note"), view.stamp_s) == (note, stamp)
+    assert again.digest() == session.digest()
+
+
+def test_a_table_of_samples_is_no_table_of_views() -> None:
+    rows = "view,image\n" + "".join(f"{it},a.png\n" for it in range(20_001))
+    with pytest.raises(DataError, match=r"more than 20,000 rows.*streams/NAME\.csv"):
+        parse_csv(rows, "views.csv")
+    with pytest.raises(DataError, match="1,000 columns"):
+        parse_csv("a," * 1000 + "a\n1\n", "views.csv")
+
+
+def test_a_stamp_beyond_all_time_is_refused(folder: Path) -> None:
+    edit(folder, "views.csv", ",0.10,", ",1e308,")
+    assert "1e+308 s is no time of a recording" in str(refusal(folder))
+
+
+NUMBERS = np.random.default_rng(3).uniform(0.5, 1.5, (4, 3))
+
+
+@pytest.mark.parametrize(
+    ("names", "rotations", "words"),
+    [
+        ("rx,ry,rz", NUMBERS, "the rotations are in rx,ry,rz.*--robot-form rotation-vector or"),
+        ("A,B,C", 90.0 * NUMBERS, "the rotations are in A,B,C.*--robot-form euler-ZYX-deg"),
+        ("qx,qy,qz,qw", np.pad(2.0 * NUMBERS, ((0, 0), (0, 1))), "line 2.*as it seems, rotation v"),
+        ("qx,qy,qz,qw", np.pad(90.0 * NUMBERS, ((0, 0), (0, 1))), "3 more.*Euler angles in degr"),
+    ],
+)
+def test_rotations_of_another_form_are_named(names, rotations, words):
+    rows = [
+        ",".join(map(str, (at, 0.5, 0.1, 0.3, *it))) for at, it in enumerate(rotations.tolist())
+    ]
+    text = "\n".join([f"view,x_m,y_m,z_m,{names}", *rows])
+    with pytest.raises(DataError) as caught:
+        read_views(*parse_csv(text, "views.csv"), "views.csv", with_corners=True)
+    assert re.match(f".*{words}", f"{caught.value}")
+    assert len(caught.value.culprits) == 1
+
+
+@pytest.mark.parametrize("name", ["cam", "Camera", "webcamera"])
+def test_a_table_of_another_name_is_named(name):
+    document = {"schema": 1, "name": "cell", "mount": "eye-in-hand"}
+    document |= {"target": "charuco_9x6_30mm", name: {}}
+    with pytest.raises(DataError, match=f"{name} is no known name; camera is needed. Rename"):
+        Session.assemble(
+            document, ("view", "image"), [["0", "0.png"]], MemoryImages({"0.png": b""})
+        )

@@ -1,0 +1,214 @@
+"""Streams beside the views: read, checked, told, and kept in every storage of a session."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.kept import assert_same, kept_session, kept_streams
+
+from visioncal.core.errors import DataError
+from visioncal.core.types import FloatArray
+from visioncal.interchange.formats import convert
+from visioncal.present.recording import codec, read_session, write_recording
+from visioncal.session import Session, Stream
+from visioncal.session.streams import check_stream, parse_stream, read_streams, write_stream
+
+POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+
+
+def stream(**columns: FloatArray) -> Stream:
+    return Stream(tuple(columns), np.stack(list(columns.values()), axis=1))
+
+
+def parsed(*lines: str) -> Stream:
+    robot = parse_stream("\n".join(lines) + "\n", "streams/robot.csv")
+    check_stream("robot", robot)
+    return robot
+
+
+def test_columns_are_the_numbers_as_they_were_read() -> None:
+    robot = parsed("stamp_s,q1_rad, dq1_rad_s", "0.1,1e-3,-0.0", "0.3,.5,2", "")
+    assert robot.columns == ("stamp_s", "q1_rad", "dq1_rad_s")
+    np.testing.assert_array_equal(robot["q1_rad"], [1e-3, 0.5])
+    np.testing.assert_array_equal(robot.joints()[1], [[1e-3], [0.5]])
+    with pytest.raises(ValueError, match="read-only"):
+        robot.values[0, 0] = 1.0
+
+
+def test_rows_without_a_pose_are_no_poses() -> None:
+    robot = parsed(
+        "stamp_s," + ",".join(POSE) + ",temp1_c",
+        "0,0.4,0,0.5,0,0,0,1,",
+        "0.1,,,,,,,,31.5",
+        "0.2,0.5,0,0.5,0,0.6,0,0.8,",
+    )
+    stamps_s, poses = robot.poses()
+    np.testing.assert_array_equal(stamps_s, [0.0, 0.2])
+    np.testing.assert_array_equal(poses[:, 0, 3], [0.4, 0.5])
+    assert np.isnan(robot["temp1_c"]).tolist() == [True, False, True]
+
+
+def test_a_file_of_windows_is_read_alike() -> None:
+    text = 'stamp_s,"temp1_c"\n0,1.5\n1,\n'
+    one, other = (parse_stream(it, "s.csv") for it in (text, text.replace("\n", "\r\n")))
+    assert one.columns == other.columns
+    np.testing.assert_array_equal(one.values, other.values)
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        (["time,q1_rad", "0,1"], "the column stamp_s, the time of each row, is missing"),
+        (["stamp_s,q1_rad"], "no samples"),
+        (["stamp_s,q1_rad", "0,1", "0,2"], "does not ascend from the row before in sample 2"),
+        (["stamp_s,q1_rad", "0,1", ",2"], "stamp_s is empty in sample 2"),
+        (["stamp_s,q1_rad", "0,1", "1,2,3"], "line 3: it has 3 fields, but the header has 2"),
+        (["stamp_s,q1_rad", "0,1", "1,nan"], "line 3, column q1_rad: 'nan' is no finite number"),
+        (["stamp_s,q1_rad", "0,a\rb"], "line 2, column q1_rad: 'a' is no finite number"),
+        (["stamp_s,q1_rad", f"0,{'1' * 200_000}.x"], "line 2: field larger than field limit"),
+        ([f"stamp_s,{'q' * 200_000}", "0,1"], "line 1: field larger than field limit"),
+        (["stamp_s,mode", "0,auto"], "line 2, column mode: 'auto'.*numbers alone"),
+        (["stamp_s,q2_rad", "0,1"], "lack q1_rad"),
+        (["stamp_s,q1_rad,q1_rad", "0,1,1"], "q1_rad is there twice"),
+        (["stamp_s,x_m", "0,1"], "x_m lack y_m"),
+        (["stamp_s,q1_rad,q2_rad", "0,1,"], "filled in part in sample 1"),
+        (["stamp_s," + ",".join(POSE), "0,1,1,1,0,0,0,2"], "no unit quaternion in sample 1"),
+    ],
+)
+def test_what_is_wrong_is_named(lines: list[str], words: str) -> None:
+    with pytest.raises(DataError, match=words):
+        parsed(*lines)
+
+
+def test_rows_that_are_wrong_are_named_up_to_some() -> None:
+    with pytest.raises(DataError, match="line 11: it has 1 fields") as error:
+        parsed("stamp_s,q1_rad", *["1"] * 1000)
+    assert len(error.value.culprits) == 10
+
+
+def test_a_name_that_leaves_the_folder_is_refused() -> None:
+    with pytest.raises(DataError, match="name"):
+        kept_session().with_streams({"../robot": kept_streams()["robot"]})
+
+
+def test_gaps_are_told() -> None:
+    stamps_s = np.arange(1000) / 500
+    there = (stamps_s < 0.5) | (stamps_s > 0.9)
+    (told,) = kept_session().with_streams({"robot": stream(stamp_s=stamps_s[there])}).warnings[-1:]
+    assert "in 1 place" in told
+    assert "0.404 s, 0.498 s from the start" in told
+    assert not parsed("stamp_s", *map(repr, stamps_s.tolist())).gaps().size
+
+
+def test_folder_recording_and_copies_hold_the_same(tmp_path: Path) -> None:
+    # A file of a robot's orders its keys anew.
+    session = replace(kept_session(), robot_document=None)
+    cells = [[view.cell(it) for it in session.columns] for view in session.views]
+    # The kept one has a time and an angle that no folder of today may hold.
+    cells = [["1e10" if it == "1e+308" else it for it in row] for row in cells]
+    plain = Session.assemble(
+        session.document,
+        session.columns,
+        cells,
+        session.images,
+        target_document=session.target_document,
+    )
+    (robot,) = kept_streams().values()
+    values = np.where(robot.values == 1e300, 1e4, robot.values)
+    session = plain.with_streams({"robot": replace(robot, values=values)})
+    session.save(tmp_path / "folder")
+    write_recording(tmp_path / "session.rrd", session, None, (), None)
+    assert_same(session, Session.load(tmp_path / "folder"))
+    assert_same(session, Session.load(tmp_path / "session.rrd"))
+    convert(tmp_path / "folder", tmp_path / "again.rrd")
+    convert(tmp_path / "again.rrd", tmp_path / "again")
+    assert_same(session, Session.load(tmp_path / "again"))
+
+
+def test_the_digest_knows_streams_and_is_as_it_was_without() -> None:
+    session, (robot,) = kept_session(), kept_streams().values()
+    # As version 0.1.0 had it, before there were streams.
+    assert session.digest() == "e83c60275bbfdebda5c33cd9109102a770f3f6bec9646e9bd73d2b99b9de1ba6"
+    changed = robot.values.copy()
+    changed[1, 1] = 1e-300
+    spelt = np.where(robot.values == 0.0, 0.0, robot.values)
+    digests = [
+        session.with_streams(it).digest()
+        for it in (
+            {},
+            {"robot": robot},
+            {"robot": replace(robot, values=changed)},
+            {"gripper": robot},
+            {"robot": replace(robot, columns=("stamp_s", "q1_rad", "temp2_c"))},
+        )
+    ]
+    assert len(set(digests)) == len(digests)
+    # -0.0 is 0.0 spelt otherwise.
+    assert session.with_streams({"robot": replace(robot, values=spelt)}).digest() == digests[1]
+
+
+def test_a_stream_that_was_changed_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = kept_session().with_streams(kept_streams())
+    with monkeypatch.context() as other:
+        other.setattr(codec, "stream_seal", lambda _: "0" * 64)
+        write_recording(tmp_path / "session.rrd", session, None, (), None)
+    with pytest.raises(DataError, match="the stream robot cannot be read or was changed"):
+        read_session(tmp_path / "session.rrd")
+
+
+def test_a_long_stream_is_not_read_row_by_row() -> None:
+    # Seconds at 1 kHz of six joints with five figures each.
+    calls = [calls_of_reading(rows) for rows in (1000, 5000)]
+    assert calls[1] < calls[0] + 1000
+
+
+def calls_of_reading(rows: int) -> int:
+    """Counts Python's calls and returns, which a busy computer does not change."""
+    rng = np.random.default_rng(0)
+    names = [f"{it}" for joint in range(1, 7) for it in (
+        f"q{joint}_rad", f"dq{joint}_rad_s", f"tau{joint}_nm", f"current{joint}_a", f"temp{joint}_c"
+    )]  # fmt: skip
+    values = np.hstack([1e-3 * np.arange(rows)[:, None], rng.normal(size=(rows, len(names)))])
+    long = Stream(("stamp_s", *names), values)
+    text = write_stream(long)
+    calls = 0
+
+    def count(*_: object) -> None:
+        nonlocal calls
+        calls += 1
+
+    sys.setprofile(count)
+    again = parse_stream(text, "streams/robot.csv")
+    sys.setprofile(None)
+    np.testing.assert_array_equal(again.values, values)
+    return calls
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "words"),
+    [
+        ("stamp_s", "1e308", "no time of a recording; write seconds"),
+        ("stamp_s", "1.7e12", "no time of a recording"),
+        ("x_m", "-1e308", "no place in a robot cell"),
+        ("q1_rad", "1e300", "no angle of a joint"),
+        ("dq1_rad_s", "1e308", "no speed of a joint"),
+        ("tau1_nm", "1e308", "no torque"),
+        ("qx", "1e308", "no number that a cell has"),
+        ("note", "1e308", "no number that a cell has"),
+    ],
+)
+def test_a_number_that_no_cell_has_is_named_by_its_column(
+    column: str, value: str, words: str, tmp_path: Path
+) -> None:
+    names = ("stamp_s", *POSE, "q1_rad", "dq1_rad_s", "tau1_nm", "note")
+    cells = dict.fromkeys(names, "0") | {"qw": "1"}
+    first, second = cells, cells | {"stamp_s": "1"} | {column: value}
+    lines = [",".join(names), *(",".join(it.values()) for it in (first, second))]
+    (tmp_path / "streams").mkdir()
+    (tmp_path / "streams" / "robot.csv").write_text("\n".join(lines))
+    with pytest.raises(DataError, match=rf"column {column}: .*{words}"):
+        read_streams(tmp_path)

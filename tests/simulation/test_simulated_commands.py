@@ -1,0 +1,399 @@
+"""What `simulate` writes is what each command reads; its truth is what they find."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.commands import visioncal
+from support.moved_arms import true_base
+
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import invert, log
+from visioncal.dynamics.identified import Identified
+from visioncal.results import Alignment, Calibration
+from visioncal.session import Session
+from visioncal.simulation import (
+    cell_names,
+    network_session,
+    read_cell,
+    simulate_network,
+)
+from visioncal.simulation.dynamics import real_dynamics
+
+# Chi-square of six exceeds this in one case of a thousand.
+MOST = 22.5
+
+
+def done(*arguments):
+    """What a command printed to stdout, once it ended well."""
+    it = visioncal(*arguments)
+    assert it.status == 0, it.err
+    return it.out
+
+
+def truth_of(folder):
+    content = json.loads(folder.with_name(f"{folder.name}.truth.json").read_text())
+    edges = {name: np.array(it) for name, it in content.get("transforms", {}).items()}
+    return content, edges
+
+
+def misfit(edge, truth, among=slice(None)):
+    """The error over its covariance, of those of the six components that were measured."""
+    error = log(invert(truth) @ edge.transform.as_matrix())[among]
+    return error @ np.linalg.solve(edge.covariance[among, among], error)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    return tmp_path_factory.mktemp("simulated")
+
+
+@pytest.fixture(scope="module")
+def seen(place):
+    """A cell with images and touches, calibrated, and five stops of another recording of it."""
+    folder, out, fresh = place / "cell", place / "out", place / "fresh"
+    done("simulate", folder, "--views", 8, "--touches")
+    done("simulate", fresh, "--views", 4, "--recording", 1)
+    done("calibrate", folder, "-o", out)
+    return folder, out, fresh
+
+
+def test_tools_and_fixtures_are_found_by_simulated_touches(seen):
+    folder, out, _ = seen
+    done("tcp", folder / "touches.csv", "-c", out, "--name", "gripper")
+    done("fixture", folder / "points.csv", "--cad", folder / "cad.csv", "-c", out, "--name", "jig")
+    done("fixture", folder / "features.csv", "-c", out, "--name", "plate")
+    found, (_, edges) = Calibration.load(out).frames, truth_of(folder)
+    assert misfit(found["flange_from_gripper"].edge, edges["flange_from_tool"]) < MOST
+    assert misfit(found["base_from_jig"].edge, edges["base_from_fixture"]) < MOST
+    assert misfit(found["base_from_plate"].edge, edges["base_from_fixture"]) < MOST
+
+
+def test_another_recording_of_the_cell_is_verified_and_its_board_located(seen):
+    folder, out, fresh = seen
+    assert json.loads(done("verify", fresh, "--against", out, "--json"))["passed"]
+    (_, edges), (_, again) = truth_of(folder), truth_of(fresh)
+    assert all(np.array_equal(edges[name], again[name]) for name in again)
+    places = json.loads(done("locate", fresh, "-c", out, "--json"))
+    assert len(places) == 4
+    for it in places:
+        error = np.array(it["p_base_m"]) - edges["base_from_target"][:3, 3]
+        # Chi-square of three exceeds this in one case of ten thousand.
+        assert error @ np.linalg.solve(np.array(it["covariance"]), error) < 21.1
+
+
+def test_a_camera_that_was_knocked_fails_the_check(seen, place):
+    _, out, _ = seen
+    done("simulate", place / "later", "--views", 4, "--recording", 2, "--camera-moved-mm", 1)
+    checked = visioncal("verify", place / "later", "--against", out)
+    assert checked.status == 3
+    assert "The camera moved by" in checked.err
+
+
+def test_a_second_board_is_placed_along(place):
+    done("simulate", place / "two", "--second-board", "--no-images", "--views", 12)
+    done("calibrate", place / "two", "-o", place / "two-out")
+    found, (_, edges) = Calibration.load(place / "two-out"), truth_of(place / "two")
+    assert set(found.edges) == set(edges)
+    assert len(edges) == 3
+    for name, truth in edges.items():
+        assert misfit(found.edges[name], truth) < MOST, name
+    again = ("--second-board", "--no-images", "--views", 6, "--recording", 1)
+    done("simulate", place / "two-later", *again)
+    # Both boards are looked at, with no word on which is meant.
+    done("verify", place / "two-later", "--against", place / "two-out")
+    assert "without images" in visioncal("plan", place / "two", "--add", 2).err
+
+
+@pytest.mark.parametrize("name", cell_names())
+def test_cells_that_come_with_visioncal_are_calibrated(name, place):
+    folder, out = place / name, place / f"{name}-out"
+    done("simulate", folder, "--cell", name, "--no-images", "--views", 20)
+    assert len({it.stop for it in Session.load(folder).views}) == 20
+    done("calibrate", folder, "-o", out)
+    found, (content, edges) = Alignment.load(out), truth_of(folder)
+    bodies = [it for it in edges if it.startswith(("cam_", "target_", "instrument_", "point_"))]
+    assert set(bodies) <= {it.partition("_from_")[2] for it in found.edges}
+    for edge, it in found.edges.items():
+        parent, _, child = edge.partition("_from_")
+        truth = edges[child]
+        if parent == "cell":
+            assert content["parents"][child] == "cell"
+            truth = invert(edges[found.reference]) @ truth
+        among = slice(None) if it.oriented else slice(3, 6)
+        assert misfit(it, truth, among) < MOST, edge
+
+
+@pytest.mark.parametrize("read", ["point", "probe"])
+def test_readings_of_a_tracker_are_calibrated(read, place):
+    folder, out = place / read, place / f"{read}-out"
+    errs = ("--arm-sigma-mm", 0.3, "--arm-sigma-mrad", 0.3) if read == "point" else ()
+    done("simulate", folder, "--instrument", read, *errs, "--views", 24)
+    done("calibrate", folder, "-o", out)
+    found, (_, edges) = Calibration.load(out), truth_of(folder)
+    assert found.arm_is_calibrated == bool(errs)
+    assert misfit(found.edges["base_from_instrument"], edges["base_from_instrument"]) < MOST
+    probe = found.edges["flange_from_probe"]
+    among = slice(None) if read == "probe" else slice(3, 6)
+    assert misfit(probe, edges["flange_from_probe"], among) < MOST
+
+
+def test_torques_are_identified_and_a_load_is_weighed(place):
+    empty, loaded, out = place / "empty", place / "loaded", place / "dynamics"
+    done("simulate", empty, "--torques", "--robot", "ur5e")
+    done("simulate", loaded, "--torques", "--robot", "ur5e", "--payload-kg", 2)
+    done("dynamics", "identify", empty, "--validate-on", "fresh", "-o", out)
+    found, (content, _) = Identified.load(out), truth_of(empty)
+    built = real_dynamics("ur5e", np.random.default_rng([0, 0]), stribeck=True)
+    assert content["arm"]["bodies"] == json.loads(
+        json.dumps(asdict(built)["bodies"], default=np.ndarray.tolist)
+    )
+    sigma = np.sqrt(np.diag(found.covariance)[: len(found.values)])
+    # Of 58 numbers one is beyond four sigma in one case of 270.
+    assert np.abs((found.values - true_base(found.base, built)) / sigma).max() < 4.0
+    weighed = json.loads(done("dynamics", "payload", loaded, "--against", out, "--json"))
+    assert weighed["mass_kg"] == pytest.approx(2.0, abs=4.0 * weighed["mass_sigma_kg"])
+    centre = (np.array(weighed["com_m"]) - [0.0, 0.0, 0.1]) / weighed["com_sigma_m"]
+    assert np.abs(centre).max() < 4.0
+
+
+@pytest.fixture(scope="module")
+def cell(place):
+    """A whole cell with touches and torques, calibrated."""
+    folder, out = place / "whole", place / "whole-out"
+    done("simulate", folder, "--cell", "two-arms", "--no-images", "--touches", "--torques")
+    done("calibrate", folder, "-o", out)
+    return folder, out
+
+
+def test_tools_and_fixtures_of_every_robot_of_a_cell_are_found_by_touches(cell):
+    folder, out = cell
+    unnamed = visioncal("tcp", folder / "touches.csv", "-o", folder / "frames.json")
+    assert unnamed.status == 2
+    assert "touches of several robots (a, b)" in unnamed.err
+    drawing = ("--cad", folder / "cad.csv")
+    for robot in ("a", "b"):
+        into = ("-c", out, "--robot", robot, "--name")
+        done("tcp", folder / "touches.csv", *into, f"tool{robot}")
+        tool = ("--tool", f"tool{robot}")
+        done("fixture", folder / "points.csv", *drawing, *tool, *into, f"jig{robot}")
+        done("fixture", folder / "features.csv", *tool, *into, f"plate{robot}")
+        found, (_, edges) = Calibration.load(out).frames, truth_of(folder)
+        for name, truth in (
+            (f"flange_{robot}_from_tool{robot}", f"flange_{robot}_from_tool"),
+            (f"base_{robot}_from_jig{robot}", f"base_{robot}_from_fixture"),
+            (f"base_{robot}_from_plate{robot}", f"base_{robot}_from_fixture"),
+        ):
+            assert misfit(found[name].edge, edges[truth]) < MOST, name
+    # A tool needs no camera: which robot is enough.
+    assert "set_tcp" in done("export", out, "--to", "ur-tcp", "--robot", "b")
+
+
+def test_torques_of_one_robot_of_a_cell_are_identified(cell, place):
+    (folder, _), loaded, out = cell, place / "whole-loaded", place / "arm-b"
+    assert "several robots (a, b)" in visioncal("dynamics", "identify", folder).err
+    some = ("--cell", "two-arms", "--no-images", "--views", 2, "--torques", "--payload-kg", 2)
+    done("simulate", loaded, *some)
+    one = ("--robot", "b")
+    done("dynamics", "identify", folder, *one, "--validate-on", "b_fresh", "-o", out)
+    found, (content, _) = Identified.load(out), truth_of(folder)
+    assert [it.label for it in found.streams] == ["streams/b_excite.csv", "streams/b_sweeps.csv"]
+    assert content["dynamics"]["a"]["bodies"] != content["dynamics"]["b"]["bodies"]
+    weighed = json.loads(done("dynamics", "payload", loaded, "--against", out, *one, "--json"))
+    assert weighed["mass_kg"] == pytest.approx(2.0, abs=4.0 * weighed["mass_sigma_kg"])
+    # The arm of the other was built otherwise, which looks like a load.
+    other = ("--robot", "a", "--json")
+    mistaken = json.loads(done("dynamics", "payload", loaded, "--against", out, *other))
+    assert abs(mistaken["mass_kg"] - 2.0) > 4.0 * weighed["mass_sigma_kg"]
+
+
+def test_another_recording_of_a_whole_cell_is_that_of_a_cell_whose_camera_was_knocked(place):
+    first, again = place / "whole-1", place / "whole-2"
+    some = ("--cell", "two-arms", "--no-images", "--views", 5, "--arm-sigma-mm", 0.3)
+    done("simulate", first, *some)
+    done("simulate", again, *some, "--recording", 1, "--camera-moved-mm", 2)
+    (before, edges), (after, other) = truth_of(first), truth_of(again)
+    assert all(np.array_equal(edges[name], other[name]) for name in edges)
+    assert before["arms"] == after["arms"]
+    assert before["arms"]["a"]["a"] != before["arms"]["b"]["a"]
+    assert before["base_from_flange"] != after["base_from_flange"]
+    assert after["moved"] == [{"frame": "cam_left", "from_stop": 0}]
+
+
+@pytest.mark.parametrize("read", ["points", "probe"])
+def test_a_tracker_beside_a_cell_ties_its_robots(read, place):
+    folder, out = place / f"cell-{read}", place / f"cell-{read}-out"
+    done(
+        "simulate", folder, "--cell", "two-arms", "--no-images", "--views", 8, "--instrument", read
+    )
+    done("calibrate", folder, "-o", out)
+    found, (_, edges) = Alignment.load(out), truth_of(folder)
+    truth = invert(edges["base_a"]) @ edges["instrument_tracker"]
+    assert misfit(found.between("base_a", "instrument_tracker"), truth) < MOST
+    for robot in ("a", "b"):
+        edge = found.edges[f"flange_{robot}_from_point_{robot}1"]
+        among = slice(None) if read == "probe" else slice(3, 6)
+        assert misfit(edge, edges[f"point_{robot}1"], among) < MOST
+
+
+def test_currents_stand_for_torques_by_gains_that_the_truth_has(place):
+    done("simulate", place / "motors", "--torques", "--currents")
+    content, _ = truth_of(place / "motors")
+    columns = Session.load(place / "motors").streams["excite"].columns
+    assert "current6_a" in columns
+    assert "tau6_nm" not in columns
+    assert content["options"]["senses"]["gains_nm_a"] == [10.0, 10.0, 9.0, 7.0, 7.0, 7.0]
+
+
+def test_a_file_of_ones_own_says_what_a_cell_is_made_of(place):
+    (place / "own.toml").write_text(OWN + PUSHED)
+    cell = simulate_network(read_cell(str(place / "own.toml")))
+    assert [it.robot for it in cell.options.robots] == ["ur10e"]
+    assert cell.options.cameras[0].camera.resolution == (2448, 2048)
+    assert cell.options.boards[0].scale == 1.002
+    assert {it.point for it in cell.readings} == {"ball"}
+    assert cell.options.moved[0].from_stop == 4
+    assert network_session(cell, "own", seen="poses").cameras.keys() == {"top"}
+    done("simulate", place / "own", "--cell", place / "own.toml", "--no-images", "--seed", 3)
+    content, _ = truth_of(place / "own")
+    assert (content["options"]["seed"], content["options"]["stops"]) == (3, 6)
+    assert content["moved"] == [{"frame": "target_plate", "from_stop": 4}]
+
+
+OWN = """
+stops = 6
+[robots.a]
+robot = "ur10e"
+place_m = [-0.7, 0.0, 0.0]
+[cameras.top]
+camera = "fine"
+[targets.plate]
+on = "a"
+scale = 1.002
+[instruments.tracker]
+place_m = [2.0, 0.0, 0.3]
+[points.ball]
+on = "a"
+place_m = [0.0, 0.1, 0.1]
+"""
+SWEPT = """
+[[sweeps]]
+camera = "top"
+robot = "a"
+target = "plate"
+camera_minus_robot_s = 0.04
+stops = 5
+"""
+PUSHED = """
+[[moved]]
+frame = "target_plate"
+from_stop = 4
+"""
+
+
+def test_a_sweep_of_a_cell_tells_the_clock_of_its_camera(place):
+    (place / "swept.toml").write_text(OWN.replace("stops = 6", "stops = 12") + SWEPT)
+    folder = place / "swept-cell"
+    done("simulate", folder, "--cell", place / "swept.toml", "--no-images")
+    session = Session.load(folder)
+    assert "a" in session.streams
+    timed = [it for it in session.views if it.stamp_s is not None]
+    assert all(it.base_from_flange() is None for it in timed)
+    done("calibrate", folder, "-o", place / "swept-cell-out")
+    clocks = Alignment.load(place / "swept-cell-out").details.clocks
+    clock = clocks["cam_top and robot a"]
+    # Four sigma: one run in fifteen thousand.
+    assert abs(clock.camera_minus_robot_s - 0.04) < 4.0 * clock.sigma_s < 4e-3
+
+
+def test_a_sweep_comes_after_what_was_pushed(place):
+    (place / "later.toml").write_text(OWN + PUSHED + SWEPT)
+    cell = simulate_network(read_cell(str(place / "later.toml")))
+    (place / "before.toml").write_text(OWN + SWEPT)
+    still = simulate_network(read_cell(str(place / "before.toml")))
+    pushed, unmoved = (
+        {it.stamp_s: it.cam_from_target for it in its.sights if it.stamp_s is not None}
+        for its in (cell, still)
+    )
+    away = [
+        1e3 * np.linalg.norm((invert(unmoved[it]) @ pushed[it])[:3, 3])
+        for it in pushed.keys() & unmoved.keys()
+    ]
+    # By default a push is of 5 mm; the robot repeats to some hundredths.
+    np.testing.assert_allclose(away, 5.0, atol=0.3)
+    assert len(away) > 10
+
+
+def test_the_page_s_cell_can_be_made(tmp_path):
+    page = Path(__file__).parents[2].joinpath("visioncal/simulation/README.md")
+    (shown,) = [it for it in page.read_text("utf-8").split("```toml")[1:] if "[[moved]]" in it]
+    (tmp_path / "cell.toml").write_text(shown.partition("```")[0])
+    cell = simulate_network(read_cell(str(tmp_path / "cell.toml")))
+    assert cell.sights
+    assert cell.readings
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("[robots.a]", "[robot.a]", "robots is missing; a table [robots.NAME]"),
+        ("stops = 6", "stop = 6", "own.toml: stop is not known.*Did you mean stops?"),
+        ("stops = 6", "stops = 0", "own.toml: stops is 0; a whole number from 1"),
+        ('on = "a"\nscale', 'on = "b"\nscale', 'own.toml, targets.plate: on is .b.; "cell" or "a"'),
+        ("[robots.a]", '[robots."a b"]', "own.toml: robots.a b is no name: letters, digits"),
+        ("[robots.a]", "[robots.cell]", "own.toml: robots.cell is no name"),
+        ("scale = 1.002", "scale = 1e3", "own.toml, targets.plate: scale is 1000.0; a number from"),
+        (
+            "scale = 1.002",
+            "bow_m = 1",
+            "own.toml, targets.plate: bow_m is 1.0; a number from -0.05",
+        ),
+        ("[instruments.tracker]", "[cameras.b]", "own.toml: there are points and no instrument"),
+        ("scale = 1.002", "scale = -1", "own.toml, targets.plate: scale is -1; a number above 0"),
+        ("[0.0, 0.1, 0.1]", "[0.1]", "own.toml, points.ball: place_m is .0.1.; a list of 3"),
+        ("place_m = [2.0, 0.0, 0.3]", "", "own.toml, instruments.tracker: place_m is missing"),
+        ('"fine"', '"tele"', 'own.toml, cameras.top: camera is .tele.; "wide" or "fine"'),
+        ("from_stop = 4", "from_stop = 6", "target_plate is pushed before stop 6; of 6 stops"),
+        ('robot = "a"', 'robot = "b"', 'own.toml, sweeps 1: robot is .b.; "a" is needed'),
+        ('camera = "top"', 'camera = "left"', "a sweep is of camera 'left'; there are top"),
+        ("[[moved]]", "[moved]", r"own.toml: moved is .*; a table \[\[moved\]\] for each"),
+        ("stops = 6", "share_seen = 2", "own.toml: share_seen is 2.0; a share above 0"),
+        ('robot = "ur10e"', "sigma_m = -1e-5", "own.toml, robots.a: sigma_m is -1e-05; a number"),
+    ],
+)
+def test_a_description_with_a_mistake_is_refused_by_its_field(old, new, words, tmp_path):
+    assert old in OWN + PUSHED + SWEPT
+    (tmp_path / "own.toml").write_text((OWN + PUSHED + SWEPT).replace(old, new))
+    with pytest.raises(DataError, match=words.replace("[robots.NAME]", r"\[robots.NAME\]")):
+        simulate_network(read_cell(str(tmp_path / "own.toml")))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--cell", "two-arms", "--board", "charuco"), "--board goes with"),
+        (("--cell", "to-arms"), "Did you mean two-arms"),
+        (("--cell", "two-arms", "--sweep"), "and --cell: each makes a session of its own"),
+        (("--cell", "two-arms", "--payload-kg", 1), "--payload-kg goes with"),
+        (("--cell", "camera-and-tracker", "--instrument", "point"), "instruments or points"),
+        (("--sweep", "--touches"), "goes with a plain cell of one robot or --cell, not"),
+        (("--clock-offset-ms", 3), "--clock-offset-ms goes with --sweep"),
+        (("--torques", "--instrument", "probe"), "each makes a session of its own kind"),
+        (("--torques", "--payload-kg", 1, "--payload-kg", 2), "one load"),
+        (("--torques", "--robot", "ur3e"), "nothing is known of the dynamics of 'ur3e'"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused_by_name(arguments, words, tmp_path):
+    refused = visioncal("simulate", tmp_path / "cell", *arguments)
+    assert refused.status == 2
+    assert words in " ".join(refused.err.split())
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_cell_in_which_nothing_is_seen_is_refused(tmp_path):
+    (tmp_path / "blind.toml").write_text("[robots.a]\nplace_m = [0, 0, 0]\n")
+    refused = visioncal("simulate", tmp_path / "cell", "--cell", tmp_path / "blind.toml")
+    assert refused.status == 2
+    assert "nothing in this cell is seen or read" in refused.err

@@ -1,0 +1,82 @@
+"""Sessions with images of simulated cells, kept in memory, for a camera that is calibrated."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from support.picks import calibration_of
+
+from visioncal.core.types import FloatArray, Mount
+from visioncal.results import Calibration
+from visioncal.session import MemoryImages, Session
+from visioncal.simulation import Cell, CellOptions, prepare_scene, render, simulate
+from visioncal.simulation.render import encode
+from visioncal.vision.targets import target_document
+
+POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One row of a session: which of the cell's views is its picture, and where the flange was."""
+
+    picture: int
+    base_from_flange: FloatArray | None
+
+
+@lru_cache
+def calibrated_cell(mount: Mount, views: int = 14) -> tuple[Cell, Calibration]:
+    """A good cell, and what its corners give: no image is rendered for that."""
+    cell = simulate(CellOptions(mount=mount, views=views, seed=21, pixel_sigma_px=0.05))
+    return cell, calibration_of(cell)
+
+
+@lru_cache
+def picture(mount: Mount, index: int) -> bytes:
+    """A rendered view of the calibrated cell, as a file."""
+    return encode(render(_scene(mount), index), None)
+
+
+@lru_cache
+def _scene(mount: Mount):
+    return prepare_scene(calibrated_cell(mount)[0])
+
+
+def shots(cell: Cell, count: int) -> list[Shot]:
+    """The cell's first views as they were taken."""
+    return [Shot(at, cell.base_from_flange[at]) for at in range(count)]
+
+
+def session_of(cell: Cell, rows: Sequence[Shot], **more: Sequence[str]) -> Session:
+    """A session of such shots, numbered from 30; `more` are further columns by their names."""
+    mount, target, camera = cell.options.mount, cell.options.target, cell.options.camera
+    document = {
+        "schema": 1,
+        "name": "the part",
+        "mount": mount,
+        "target": f"{target.name}.toml",
+        "camera": {"resolution": list(camera.resolution)},
+    }
+    cells = [
+        [
+            str(30 + at),
+            f"{at}.png",
+            *_cells(row.base_from_flange),
+            *(it[at] for it in more.values()),
+        ]
+        for at, row in enumerate(rows)
+    ]
+    images = MemoryImages({f"{at}.png": picture(mount, row.picture) for at, row in enumerate(rows)})
+    columns = ("view", "image", *POSE, *more)
+    return Session.assemble(
+        document, columns, cells, images, target_document=target_document(target)
+    )
+
+
+def _cells(pose: FloatArray | None) -> list[str]:
+    if pose is None:
+        return [""] * len(POSE)
+    turn = Rotation.from_matrix(pose[:3, :3]).as_quat()
+    return [repr(float(it)) for it in np.concatenate([pose[:3, 3], turn])]

@@ -1,0 +1,110 @@
+"""Later looks at a simulated cell that was calibrated: fresh stops, after some change or none."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+
+import numpy as np
+from support.cells import calibrated, known_of
+from support.wrong_arms import WRONG_LINKS, target_in_camera
+
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.core.transforms import exp
+from visioncal.core.types import Corners, FloatArray, Mount
+from visioncal.results import Calibration
+from visioncal.simulation import Cell, CellOptions, project, simulate
+from visioncal.simulation.boards import corners_m
+
+# Arms that are off by 0.5 mm and 1 mrad in every parameter, moved through all of their branches.
+ANYHOW = replace(WRONG_LINKS, roll_rad=np.pi, branches=True)
+FITTED = 60
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """What has changed: twists (6,) on the right of x and z, offsets of the joints, the noise."""
+
+    camera: FloatArray = field(default_factory=lambda: np.zeros(6))
+    board: FloatArray = field(default_factory=lambda: np.zeros(6))
+    joints_rad: FloatArray = field(default_factory=lambda: np.zeros(6))
+    noise_factor: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Lot:
+    """A cell of many views, the first of which its calibration rests on."""
+
+    cell: Cell
+    calibration: Calibration
+
+
+@lru_cache
+def usual(mount: Mount) -> Lot:
+    """The lot that tests share."""
+    return lot(replace(ANYHOW, mount=mount))
+
+
+def lot(options: CellOptions = ANYHOW, further: int = 60) -> Lot:
+    """A calibrated cell, and as many further postures from which the board is in view."""
+    cell = simulate(replace(options, views=FITTED + further))
+    return Lot(cell, result_of(calibrated(part(cell, range(FITTED)))))
+
+
+def part(cell: Cell, views: Sequence[int]) -> Cell:
+    """Some views of a cell with one board, numbered anew."""
+    rows = list(views)
+    return replace(
+        cell,
+        joints=cell.joints[rows],
+        base_from_flange=cell.base_from_flange[rows],
+        true_base_from_flange=cell.true_base_from_flange[rows],
+        cam_from_target=cell.cam_from_target[rows],
+        corners=tuple(replace(cell.corners[it], view=at) for at, it in enumerate(rows)),
+        payloads=tuple(cell.payloads[it] for it in rows if cell.payloads),
+    )
+
+
+def again(
+    cell: Cell, rng: np.random.Generator, change: Change | None = None, stops: int = 5
+) -> Cell:
+    """Fresh stops of a cell at postures that its calibration has not seen, with noise of their own.
+
+    Args:
+        cell: With `FITTED` views and more.
+        rng: Which postures, and the noise.
+        change: What has changed since; nothing where None.
+        stops: How many.
+    """
+    change = change or Change()
+    rows = FITTED + rng.choice(len(cell.joints) - FITTED, stops, replace=False)
+    fresh, options = part(cell, rows.tolist()), cell.options
+    sigma = np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3)
+    jitter = exp(change.noise_factor * sigma * rng.standard_normal((stops, 6)))
+    flange = cell.flange_at(fresh.joints + change.joints_rad, fresh.payloads) @ jitter
+    x, z = cell.transforms.values()
+    moved = x @ exp(change.camera), z @ exp(change.board)
+    poses = target_in_camera(options.mount, *moved, flange)
+    corners = tuple(_detected(cell, at, pose, rng) for at, pose in enumerate(poses))
+    return replace(fresh, true_base_from_flange=flange, corners=corners)
+
+
+def _detected(cell: Cell, view: int, pose: FloatArray, rng: np.random.Generator) -> Corners:
+    """The board as it was printed, as a detector reports it."""
+    camera = cell.options.camera
+    px = project(camera, corners_m(cell.sheet) @ pose[:3, :3].T + pose[:3, 3])
+    ids = np.flatnonzero(np.all((px > 0) & (px < np.array(camera.resolution) - 1), axis=1))
+    noise = cell.options.pixel_sigma_px * rng.standard_normal((len(ids), 2))
+    return Corners(view, ids, px[ids] + noise, cell.options.blur_px)
+
+
+def known_again(cell: Cell, rng: np.random.Generator, change: Change | None = None) -> RunState:
+    """What is known of such stops after detection."""
+    return known_of(again(cell, rng, change))
+
+
+def knock(rng: np.random.Generator, mm: float, deg: float) -> FloatArray:
+    """A twist (6,) of so much, about and along some direction each."""
+    directions = rng.standard_normal((2, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return np.concatenate([np.deg2rad(deg) * directions[0], 1e-3 * mm * directions[1]])

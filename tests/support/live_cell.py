@@ -1,0 +1,269 @@
+"""A live cell in memory: an arm on trapezoids, a camera that warps the board, a clock of its own.
+
+Nothing waits: the clock is moved on by whoever sleeps, exposes or talks to a device.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+from support.planned import true_cell
+
+from visioncal.core.errors import DriverError
+from visioncal.core.types import Camera, CameraMount, FloatArray
+from visioncal.live.drivers.protocols import ArmState, Frame, Safety
+from visioncal.live.planning.cell import Limits, PlanCell
+from visioncal.live.planning.purposes import purpose_of
+from visioncal.live.planning.read_back import PlanFile, Stop
+from visioncal.robot import Robot, load_robot
+from visioncal.simulation import CellOptions, simulate
+from visioncal.vision.camera import matrix_3x3
+from visioncal.vision.targets import charuco_board
+
+# Of the fakes: a controller's cycle, a camera's frame period and exposure [s].
+CYCLE_S, PERIOD_S, EXPOSURE_S = 0.002, 1.0 / 30.0, 0.01
+# A small image is enough for corners to a tenth of a pixel, and quick to make.
+LENS = Camera("brown", (640, 400), np.array([500.0, 500.0, 320.0, 200.0]), np.zeros(5))
+_PX_A_SQUARE = 40
+# A camera beside the robot stands farther off.
+FAR_LENS = replace(LENS, matrix=np.array([1000.0, 1000.0, 320.0, 200.0]))
+
+
+@dataclass
+class FakeClock:
+    """Time that passes only when somebody lets it."""
+
+    seconds: float = 1000.0
+
+    def now(self) -> float:
+        """The time [s]."""
+        return self.seconds
+
+    def sleep(self, seconds: float) -> None:
+        """Lets time pass."""
+        self.seconds += seconds
+
+    def unix_offset_s(self) -> float:
+        """What makes the time a UNIX time [s]."""
+        return 1.7e9
+
+
+@dataclass
+class FakeArm:
+    """An arm whose joints go straight to their goal by trapezoids, and what may befall it.
+
+    For `trembling_s` after each motion it swings by `tremble_rad`, unseen by its own encoders if
+    `hidden`. `fails_at` seconds after a motion began, `failure` happens: `gone`, or a stop by its
+    name. `stale` names what it tells as it was at the beginning: `joints`.
+    """
+
+    cell: PlanCell
+    clock: FakeClock
+    q0: FloatArray
+    name: str = "fake ur5e"
+    trembling_s: float = 0.0
+    tremble_rad: float = 0.0
+    hidden: bool = False
+    failure: str = ""
+    fails_at: float = 0.1
+    halted: int = 0
+    moves: int = 0
+    stale: str = ""
+    goal: FloatArray | None = None
+    begun: float = 0.0
+    pace: tuple[float, float] = (1.0, 1.0)
+    _stuck: FloatArray | None = None
+
+    def true_q(self, at: float) -> FloatArray:
+        """Where the joints really are [rad]."""
+        q, since = self._smooth(at)
+        if since is not None and since < self.trembling_s:
+            share = 1.0 - since / self.trembling_s
+            q = q + self.tremble_rad * share * np.sin(2 * np.pi * 11.0 * since)
+        return q
+
+    def true_flange(self, at: float) -> FloatArray:
+        """Where the flange really is."""
+        return self.cell.robot.base_from_flange(self.true_q(at)[None])[0]
+
+    def _smooth(self, at: float) -> tuple[FloatArray, float | None]:
+        """The joints of the trapezoid, and for how long they have been at its end."""
+        if self.goal is None:
+            return self.q0, None
+        way = self.goal - self.q0
+        far = float(np.abs(way).max())
+        if far == 0.0:
+            return self.goal, at - self.begun
+        v, a = self.pace
+        v = min(v, np.sqrt(far * a))
+        total = far / v + v / a
+        t = float(np.clip(at - self.begun, 0.0, total))
+        gone = min(0.5 * a * t * t, 0.5 * v * v / a)
+        gone += v * max(0.0, min(t, total - v / a) - v / a)
+        left = max(0.0, t - (total - v / a))
+        gone += v * left - 0.5 * a * left * left
+        since = at - self.begun - total
+        return self.q0 + way * (gone / far), since if since >= 0.0 else None
+
+    def state(self) -> ArmState:
+        """What its encoders say."""
+        self.clock.sleep(CYCLE_S)
+        now = self.clock.now()
+        fails = self.failure and self.goal is not None and now - self.begun > self.fails_at
+        if fails and self.failure == "gone":
+            raise DriverError("fake ur5e: the link is lost.", next_step="Check the cable.")
+        safety: Safety = "normal"
+        if fails and self.failure in ("protective-stop", "emergency-stop"):
+            safety = self.failure
+            self._freeze(now)
+        q = self._smooth(now)[0] if self.hidden else self.true_q(now)
+        if self._stuck is not None:
+            q = self._stuck
+        dq = np.zeros(6) if self._stuck is not None else self._speed(now)
+        pose = self.cell.robot.base_from_flange(q[None])[0]
+        if self.stale == "joints":
+            q = self.q0
+        return ArmState(
+            now,
+            pose,
+            q.copy(),
+            dq,
+            np.eye(4),
+            1.25,
+            np.array([0.0, 0.0, 0.04]),
+            np.full(6, 0.5),
+            np.full(6, 31.0),
+            safety,
+        )
+
+    def _speed(self, now: float) -> FloatArray:
+        step = 1e-3
+        pose = self._smooth if self.hidden else lambda at: (self.true_q(at), None)
+        return (pose(now)[0] - pose(now - step)[0]) / step
+
+    def _freeze(self, now: float) -> None:
+        if self._stuck is None:
+            self._stuck = self._smooth(now)[0]
+
+    def start_move(self, q: FloatArray, *, speed: float, acceleration: float) -> None:
+        """Begins a trapezoid."""
+        now = self.clock.now()
+        self.q0 = self._smooth(now)[0]
+        self.goal, self.begun, self.pace = np.array(q), now, (speed, acceleration)
+        self.moves += 1
+
+    def moving(self) -> bool:
+        """Whether the trapezoid has not ended."""
+        self.clock.sleep(CYCLE_S)
+        if self._stuck is not None:
+            return False
+        return self.goal is not None and self._smooth(self.clock.now())[1] is None
+
+    def halt(self) -> None:
+        """Stands still from now on."""
+        self.halted += 1
+        self._freeze(self.clock.now())
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+@dataclass
+class FakeCamera:
+    """A camera that sees the board where the true arm has it, blurred while that moves."""
+
+    arm: FakeArm
+    lens: Camera = LENS
+    name: str = "fake camera"
+    hidden_at: tuple[int, ...] = ()
+    unplugged_at: int = 10**9
+    factory: Camera | None = None
+    settings: dict[str, str | float] = field(default_factory=lambda: {"exposure_us": 10000.0})
+    frames: int = 0
+    noise: float = 1.0
+    exposures: dict[float, FloatArray] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        target = self.arm.cell.target
+        board = charuco_board(target)
+        size = (target.columns * _PX_A_SQUARE, target.rows * _PX_A_SQUARE)
+        self._print = cv2.copyMakeBorder(
+            board.generateImage(size), *(_PX_A_SQUARE // 2,) * 4, cv2.BORDER_CONSTANT, value=255
+        )
+        width, height = self.lens.resolution
+        # Fresh noise is a part of a larger picture of it, which is quicker than drawing it anew.
+        self._rng = np.random.default_rng(3)
+        self._noise = self._rng.standard_normal((height + 50, width + 50)).astype(np.float32)
+
+    @property
+    def resolution(self) -> tuple[int, int]:
+        """Of the lens."""
+        return self.lens.resolution
+
+    def frame(self, *, timeout_s: float = 1.0) -> Frame:
+        """A picture of the true arm's view, smeared where that moves."""
+        if self.arm.moves >= self.unplugged_at:
+            self.arm.clock.sleep(timeout_s)
+            raise DriverError(
+                f"fake camera: no picture in {timeout_s:g} s.", next_step="Check its cable."
+            )
+        self.frames += 1
+        begun = self.arm.clock.now()
+        middle = begun + 0.5 * EXPOSURE_S
+        self.arm.clock.sleep(PERIOD_S)
+        self.exposures[middle] = self.arm.true_flange(middle)
+        moments = begun + EXPOSURE_S * np.array([0.1, 0.5, 0.9])
+        poses = [self.arm.true_flange(it) for it in moments]
+        if np.allclose(poses[0], poses[2], atol=1e-7):
+            poses = poses[1:2]
+        image = np.mean([self._seen(it) for it in poses], axis=0)
+        if self.arm.moves in self.hidden_at:
+            image = np.full_like(image, 110.0)
+        top, left = self._rng.integers(0, 50, 2)
+        height, width = image.shape
+        noisy = image + self.noise * self._noise[top : top + height, left : left + width]
+        return Frame(np.clip(np.rint(noisy), 0, 255).astype(np.uint8), middle, EXPOSURE_S)
+
+    def _seen(self, base_from_flange: FloatArray) -> FloatArray:
+        cell = self.arm.cell
+        pose = cell.seen_from(base_from_flange[None])[0]
+        scale = cell.target.square_m / _PX_A_SQUARE
+        edge = 0.5 * cell.target.square_m
+        board_from_px = np.array([[scale, 0, -edge], [0, scale, -edge], [0, 0, 1.0]])
+        board_from_px[:2, 2] += 0.5 * scale
+        warp = matrix_3x3(self.lens) @ pose[:3, [0, 1, 3]] @ board_from_px
+        flags = cv2.INTER_AREA
+        seen = cv2.warpPerspective(
+            self._print, warp, self.lens.resolution, flags=flags, borderValue=120
+        )
+        return cv2.GaussianBlur(seen, (0, 0), 0.7).astype(np.float32)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def fake_plan(stops: int = 5, seed: int = 2, mount: CameraMount = "eye-in-hand") -> PlanFile:
+    """A plan whose stops all see the board; its ways are not looked at."""
+    lens = LENS if mount == "eye-in-hand" else FAR_LENS
+    options = CellOptions(
+        robot="ur5e", mount=mount, camera=lens, views=stops, seed=seed, cut_views=0.0
+    )
+    # The simulated camera sits close to the wrist: the links are thin, so that nothing is near.
+    limits = Limits(clearance_m=0.0, floor_m=None)
+    cell = replace(true_cell(options), limits=limits, robot=_thin(load_robot("ur5e")))
+    q = simulate(options).joints
+    none = np.zeros((0, 6))
+    planned = tuple(Stop(at + 1, it, none, f"words of stop {at + 1}") for at, it in enumerate(q))
+    return PlanFile(cell, purpose_of("hand-eye"), planned, q[0] + 0.002, "0" * 64)
+
+
+def _thin(robot: Robot) -> Robot:
+    joints = [{**it, "body_radius_m": 0.01} for it in robot.document["joint"]]
+    return Robot.from_document({**robot.document, "joint": joints})
+
+
+def fake_devices(plan: PlanFile, **changes) -> tuple[FakeArm, FakeCamera]:
+    """An arm that stands at the plan's start, and a camera."""
+    start = plan.stops[0].q if plan.start_q is None else plan.start_q
+    arm = FakeArm(plan.cell, FakeClock(), start, **changes)
+    return arm, FakeCamera(arm, plan.cell.camera)

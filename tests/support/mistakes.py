@@ -1,0 +1,196 @@
+"""Mistakes that people make with poses, planted into sound ones."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from support.cells import known_of
+
+from visioncal.calibration.guess import Guess, guess_reading
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.core.conventions import ROTATION_FORMS, UNITS_M, PoseNumbers, Reading
+from visioncal.core.transforms import invert
+from visioncal.core.types import FloatArray, Mount
+from visioncal.simulation import Cell
+
+OTHER: Mapping[Mount, Mount] = {"eye-in-hand": "eye-to-hand", "eye-to-hand": "eye-in-hand"}
+HALF_TURNS = [np.diag([*it, 1.0]) for it in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))]
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Poses of a cell as they are told, and as they are.
+
+    Attributes:
+        robot: The robot's numbers, as told.
+        camera: The camera's.
+        mount: The mount, as told.
+        true_robot: (n, 4, 4) `base_from_flange`, NaN in rows that no reading can give back.
+        true_mount: The mount.
+        true_scale: What the board's size is to be multiplied with.
+        chain: (n, 4, 4) the poses through the robot's model, where the session has joints.
+        is_measured: Whether the camera's poses come from images.
+    """
+
+    robot: PoseNumbers
+    camera: PoseNumbers
+    mount: Mount
+    true_robot: FloatArray
+    true_mount: Mount
+    true_scale: float = 1.0
+    chain: FloatArray | None = None
+    is_measured: bool = True
+
+
+Plant = Callable[[Poses, np.random.Generator], Poses]
+
+
+def numbers(poses: FloatArray, rotation: str = "quaternion-xyzw", unit: str = "m") -> PoseNumbers:
+    """Poses as numbers in some form, declared as what they are."""
+    return PoseNumbers(
+        poses[:, :3, 3] / UNITS_M[unit],
+        ROTATION_FORMS[rotation].write(poses[:, :3, :3]),
+        Reading(rotation, unit),
+        tuple(f"view {at}" for at in range(len(poses))),
+    )
+
+
+def sound(robot: FloatArray, camera: FloatArray, mount: Mount, **more) -> Poses:
+    """Poses that are told as they are."""
+    return Poses(numbers(robot), numbers(camera), mount, robot, mount, **more)
+
+
+def measured(cell: Cell) -> RunState:
+    """What is known of a cell once the target's poses are."""
+    known = known_of(cell)
+    for stage in STAGES:
+        if stage.name in ("intrinsics", "pnp"):
+            known = stage.run(known)
+    return known
+
+
+def seen_in(cell: Cell) -> Poses:
+    """The poses of a simulated cell: the camera's are measured from corners, lens included."""
+    known = measured(cell)
+    views = sorted(known.poses)
+    camera = np.array([known.poses[view].cam_from_target[0] for view in views])
+    return sound(cell.base_from_flange[views], camera, cell.options.mount)
+
+
+def guessed(poses: Poses) -> Guess:
+    """What the guess makes of the poses."""
+    return guess_reading(
+        poses.robot,
+        poses.camera,
+        poses.mount,
+        chain=poses.chain,
+        is_measured=poses.is_measured,
+    )
+
+
+def is_named(guess: Guess, poses: Poses) -> bool:
+    """Whether the right reading is named: it stands out and gives the true poses back.
+
+    They may differ by half turns of both frames where an axis was mirrored: no view tells which.
+    """
+    best = guess.best
+    if not guess.stands_out or best.hypothesis.mount != poses.true_mount:
+        return False
+    if not np.isclose(best.board_scale, poses.true_scale):
+        return False
+    found, true = best.hypothesis.robot_numbers(poses.robot).poses(), poses.true_robot
+    there = np.isfinite(true).all(axis=(1, 2))
+    turns = HALF_TURNS if best.hypothesis.robot.signs == "mirror" else HALF_TURNS[:1]
+    # Numbers are rewritten without loss, but for the rounding of a few conversions.
+    return any(
+        np.allclose(a @ found[there] @ b, true[there], atol=1e-7) for a in turns for b in turns
+    )
+
+
+def _told(poses: Poses, rotation: str, unit: str, reading: Reading) -> Poses:
+    return replace(poses, robot=numbers(poses.true_robot, rotation, unit).read_as(reading))
+
+
+def _unit(poses: Poses, rng: np.random.Generator) -> Poses:
+    unit = ("mm", "cm", "inch")[rng.integers(3)]
+    return _told(poses, "quaternion-xyzw", unit, Reading())
+
+
+def _inverse(poses: Poses, _: np.random.Generator) -> Poses:
+    return replace(poses, robot=numbers(invert(poses.true_robot)))
+
+
+def _wxyz(poses: Poses, _: np.random.Generator) -> Poses:
+    return _told(poses, "quaternion-wxyz", "m", Reading())
+
+
+def _order(poses: Poses, rng: np.random.Generator) -> Poses:
+    """Angles about Z, Y, X that are taken for X, Y, Z: as they stand, or made into quaternions."""
+    told = _told(poses, "euler-ZYX-deg", "m", Reading("euler-XYZ-deg"))
+    return told if rng.integers(2) else replace(told, robot=numbers(told.robot.poses()))
+
+
+def _degrees(poses: Poses, rng: np.random.Generator) -> Poses:
+    """Degrees taken for radians; or radians for degrees, which were made into quaternions."""
+    if rng.integers(2):
+        return _told(poses, "euler-xyz-deg", "m", Reading("euler-xyz-rad"))
+    told = _told(poses, "euler-xyz-rad", "m", Reading("euler-xyz-deg"))
+    return replace(told, robot=numbers(told.robot.poses()))
+
+
+def _mount(poses: Poses, _: np.random.Generator) -> Poses:
+    return replace(poses, mount=OTHER[poses.mount])
+
+
+def _shifted(poses: Poses, rng: np.random.Generator) -> Poses:
+    """One robot pose too many at one end and one too few at the other."""
+    by = (-1, 1)[rng.integers(2)]
+    true = poses.true_robot.copy()
+    told = np.roll(true, by, axis=0)
+    true[-1 if by > 0 else 0] = np.nan
+    return replace(poses, robot=numbers(told), true_robot=true)
+
+
+def _swapped(poses: Poses, rng: np.random.Generator) -> Poses:
+    first, second = rng.choice(len(poses.robot), 2, replace=False)
+    told = poses.true_robot.copy()
+    told[[first, second]] = told[[second, first]]
+    return replace(poses, robot=numbers(told))
+
+
+def _transposed(poses: Poses, _: np.random.Generator) -> Poses:
+    return _told(poses, "matrix-transposed", "m", Reading("matrix"))
+
+
+def _left_handed(poses: Poses, rng: np.random.Generator) -> Poses:
+    mirror = np.ones(4)
+    mirror[rng.integers(3)] = -1.0
+    return replace(poses, robot=numbers(poses.true_robot * np.outer(mirror, mirror)))
+
+
+def _base_link(poses: Poses, _: np.random.Generator) -> Poses:
+    """Needs the joints: the chain is what the controller's poses would be."""
+    told = np.diag([-1.0, -1.0, 1.0, 1.0]) @ poses.true_robot
+    return replace(poses, robot=numbers(told), chain=poses.true_robot)
+
+
+def _board_mm(poses: Poses, _: np.random.Generator) -> Poses:
+    camera = replace(poses.camera, positions=1e3 * poses.camera.positions)
+    return replace(poses, camera=camera, true_scale=1e-3)
+
+
+MISTAKES: Mapping[str, Plant] = {
+    "another unit": _unit,
+    "inverse poses": _inverse,
+    "quaternion w, x, y, z": _wxyz,
+    "Euler ZYX taken for XYZ": _order,
+    "degrees and radians": _degrees,
+    "the other mount": _mount,
+    "rows shifted by one": _shifted,
+    "two rows exchanged": _swapped,
+    "matrices transposed": _transposed,
+    "one axis left-handed": _left_handed,
+    "base_link for base": _base_link,
+    "board's size in mm": _board_mm,
+}

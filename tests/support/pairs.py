@@ -1,0 +1,108 @@
+"""Pairs of calibrations of one simulated cell, with poses and noise of their own."""
+
+from dataclasses import replace
+
+import numpy as np
+from support.cells import calibrated
+
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.core.transforms import exp, invert
+from visioncal.estimation.chain import edge_names
+from visioncal.results import Calibration, Edge, Rms, Validation, Verdict, ViewResult
+from visioncal.simulation import Cell
+
+
+def halves(cell: Cell) -> tuple[Cell, Cell]:
+    """Two cells with the same mountings: the first half of the views, and the second."""
+    middle = len(cell.corners) // 2
+    return _part(cell, slice(0, middle)), _part(cell, slice(middle, 2 * middle))
+
+
+def _part(cell: Cell, views: slice) -> Cell:
+    return replace(
+        cell,
+        base_from_flange=cell.base_from_flange[views],
+        corners=tuple(replace(it, view=at) for at, it in enumerate(cell.corners[views])),
+    )
+
+
+def with_moved_camera(cell: Cell, twist: np.ndarray) -> Cell:
+    """The cell with its camera's edge moved on the right, its images as they were.
+
+    The robot stands where the moved camera sees what the camera saw before.
+    """
+    x, z = cell.transforms.values()
+    moved = x @ exp(twist)
+    if cell.options.mount == "eye-in-hand":
+        flanges = cell.base_from_flange @ x @ invert(moved)
+    else:
+        flanges = moved @ invert(x) @ cell.base_from_flange
+    names = edge_names(cell.options.mount)
+    edges = dict(zip(names, (moved, z), strict=True))
+    return replace(cell, transforms=edges, base_from_flange=flanges)
+
+
+def with_moved_board(cell: Cell, twist: np.ndarray) -> Cell:
+    """The cell with its target's edge moved on the right, its images as they were."""
+    x, z = cell.transforms.values()
+    moved = z @ exp(twist)
+    if cell.options.mount == "eye-in-hand":
+        flanges = moved @ invert(z) @ cell.base_from_flange
+    else:
+        flanges = cell.base_from_flange @ z @ invert(moved)
+    names = edge_names(cell.options.mount)
+    edges = dict(zip(names, (x, moved), strict=True))
+    return replace(cell, transforms=edges, base_from_flange=flanges)
+
+
+def with_moved_result(calibration: Calibration, cell: Cell, twist: np.ndarray) -> Calibration:
+    """What calibrating `with_moved_camera(cell, twist)` gives, without calibrating again.
+
+    The chain closes with the moved camera at the moved stops exactly as it did before: each
+    estimate of the camera's edge moves as the truth does, and keeps its covariance.
+    """
+    name = next(iter(calibration.edges))
+    x, edge = cell.transforms[name], calibration.edges[name]
+    moved = x @ exp(twist) @ invert(x) @ edge.matrix
+    return replace(
+        calibration,
+        edges={
+            **calibration.edges,
+            name: replace(edge, matrix=moved),
+        },
+    )
+
+
+def calibration_of(known: RunState, name: str = "cell") -> Calibration:
+    """A calibration with what a comparison looks at."""
+    result = known.solved
+    covariance = result.covariance
+    names = edge_names(known.session.mount)
+    return Calibration(
+        session_name=name,
+        session_sha256=f"{known.base_from_flange[0].tobytes().hex()}",
+        created="2026-11-20T10:11:12+00:00",
+        mount=known.session.mount,
+        edges={
+            edge: Edge(pose, covariance[part, part])
+            for edge, pose, part in zip(
+                names,
+                result.state.edges,
+                (slice(0, 6), slice(6, 12)),
+                strict=True,
+            )
+        },
+        joint_covariance=covariance[:12, :12],
+        solvers={},
+        noise={"pixel_px": known.pixel_px or 0.0},
+        views=tuple(ViewResult(view, view in known.used) for view in known.base_from_flange),
+        rms=Rms(0.1, 0.01),
+        validation=Validation("none", Rms(0.1, 0.01)),
+        verdict=Verdict("good"),
+        camera=known.camera,
+    )
+
+
+def calibrated_cell(cell: Cell) -> Calibration:
+    """The calibration of a cell."""
+    return calibration_of(calibrated(cell))

@@ -1,0 +1,140 @@
+"""Simulated picks: a calibrated cell looks at a point whose true place is known.
+
+The robot stands, once more, not quite where it reports to; the pixels are noisy once more. What is
+seen comes from the simulation's own camera.
+"""
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from support.cells import calibrated
+
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.core.transforms import compose, exp, invert
+from visioncal.core.types import Corners, FloatArray, Target
+from visioncal.frames.locate import locate, locate_target
+from visioncal.frames.located import Located
+from visioncal.frames.plane import Plane
+from visioncal.results import Calibration
+from visioncal.simulation import Cell, project, rays
+from visioncal.simulation.boards import Sheet, corners_m
+from visioncal.vision.targets import corner_positions
+
+
+@dataclass(frozen=True, eq=False)
+class Stand:
+    """Where the flange is reported to stand (None for a fixed camera), and the true camera."""
+
+    base_from_flange: FloatArray | None
+    base_from_cam: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Pick:
+    """The true place (3,) in the true base, what was found, and how long that took [s]."""
+
+    truth: FloatArray
+    located: Located
+    taken_s: float
+
+
+def calibration_of(cell: Cell, **changes) -> Calibration:
+    """The result that the session of a simulated cell gives."""
+    return result_of(calibrated(cell, **changes))
+
+
+def pick_by_plane(cell: Cell, calibration: Calibration, rng: np.random.Generator) -> Pick:
+    """A point of a plane that is declared, in half of the cases to 0.2 mm only."""
+    at = stand(cell, rng)
+    place, px = seen_point(cell, at, rng)
+    normal = -at.base_from_cam[:3, 2] + 0.4 * rng.standard_normal(3)
+    normal = normal / np.linalg.norm(normal)
+    sigma_m = float(rng.choice([0.0, 2e-4]))
+    declared = Plane.through(normal, place + sigma_m * rng.standard_normal() * normal, sigma_m)
+    started = time.perf_counter()
+    (found,) = locate(calibration, px, declared, at.base_from_flange)
+    return Pick(place, found, time.perf_counter() - started)
+
+
+def pick_by_target(
+    cell: Cell, calibration: Calibration, target: Target, rng: np.random.Generator
+) -> Pick:
+    """A point beside a target's middle, by the target's corners."""
+    at = stand(cell, rng)
+    cam_from_target = before_camera(cell, target, rng)
+    # What was printed differs from what is stated by as much as that is known to.
+    scale = 1.0 + target.square_sigma_m / target.square_m * rng.standard_normal()
+    corners = seen_corners(cell, cam_from_target, target, rng, scale)
+    point = corner_positions(target).mean(axis=0) + np.array([0.01, -0.02, 0.005])
+    started = time.perf_counter()
+    found = locate_target(calibration, corners, target, at.base_from_flange, point)
+    taken = time.perf_counter() - started
+    base_from_target = at.base_from_cam @ cam_from_target
+    return Pick(base_from_target[:3, :3] @ point + base_from_target[:3, 3], found, taken)
+
+
+def stand(cell: Cell, rng: np.random.Generator) -> Stand:
+    """A new stop near one of the calibration's own."""
+    edge = next(iter(cell.transforms.values()))
+    if cell.options.mount == "eye-to-hand":
+        return Stand(None, edge)
+    near = cell.base_from_flange[rng.integers(len(cell.base_from_flange))]
+    reported = near @ exp(rng.normal(0.0, np.repeat([0.1, 0.03], 3)))
+    return Stand(reported, really(cell, reported, rng) @ edge)
+
+
+def really(cell: Cell, reported: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Where the flange really stands, (4, 4), when it reports a pose."""
+    sigma = np.repeat([cell.options.robot_sigma_rad, cell.options.robot_sigma_m], 3)
+    return reported @ exp(sigma * rng.standard_normal(6))
+
+
+def seen_point(cell: Cell, at: Stand, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """A point at a working distance: (3,) in the base, and (1, 2) where it is seen."""
+    camera = cell.options.camera
+    aim = np.array(camera.resolution) * rng.uniform(0.2, 0.8, 2)
+    point_cam = rays(camera, aim) * rng.uniform(*_distances(cell))
+    place = at.base_from_cam[:3, :3] @ point_cam + at.base_from_cam[:3, 3]
+    noise = cell.options.pixel_sigma_px * rng.standard_normal((1, 2))
+    return place, project(camera, point_cam[None]) + noise
+
+
+def before_camera(cell: Cell, target: Target, rng: np.random.Generator) -> FloatArray:
+    """A target well tilted, near the image's middle: (4, 4) `cam_from_target`."""
+    camera, middle = cell.options.camera, corner_positions(target).mean(axis=0)
+    direction = rng.standard_normal(2)
+    tilt = rng.uniform(0.4, 0.7) * direction / np.linalg.norm(direction)
+    turn = exp(np.array([*tilt, 0, 0, 0, 0])) @ exp(np.array([0, 0, rng.uniform(-1, 1), 0, 0, 0]))
+    aim = np.array(camera.resolution) * rng.uniform(0.4, 0.6, 2)
+    centre = rays(camera, aim) * rng.uniform(*_distances(cell))
+    return compose(turn[:3, :3], centre - turn[:3, :3] @ middle)
+
+
+def seen_corners(
+    cell: Cell,
+    cam_from_target: FloatArray,
+    target: Target,
+    rng: np.random.Generator,
+    scale: float = 1.0,
+) -> Corners:
+    """The noisy corners, in the image, of a target that is printed so many times too large."""
+    camera = cell.options.camera
+    stated = corner_positions(target)
+    real = scale * stated if target.kind == "marker" else corners_m(Sheet(target, scale, 0.0))
+    px = project(camera, real @ cam_from_target[:3, :3].T + cam_from_target[:3, 3])
+    ids = np.flatnonzero(np.all((px > 0) & (px < np.array(camera.resolution) - 1), axis=1))
+    px = px[ids] + cell.options.pixel_sigma_px * rng.standard_normal((len(ids), 2))
+    return Corners(0, ids, px, cell.options.blur_px)
+
+
+def corners_at(
+    cell: Cell, at: Stand, base_from_target: FloatArray, target: Target, rng: np.random.Generator
+) -> Corners:
+    """The noisy corners of a target that stands in the base."""
+    return seen_corners(cell, invert(at.base_from_cam) @ base_from_target, target, rng)
+
+
+def _distances(cell: Cell) -> tuple[float, float]:
+    distance = np.linalg.norm(cell.cam_from_target[:, :3, 3], axis=1)
+    return float(distance.min()), float(distance.max())

@@ -1,0 +1,87 @@
+"""Records fake cells; as a program, one that can be killed: `python recorded.py FOLDER STOPS`."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from support.live_cell import FakeArm, FakeCamera, fake_devices, fake_plan
+
+from visioncal.live.capture.core import Step, Watcher
+from visioncal.live.capture.facts import Facts
+from visioncal.live.capture.journal import Journal
+from visioncal.live.capture.live import LiveCell
+from visioncal.live.capture.options import CaptureOptions, Stillness
+from visioncal.live.capture.record import record
+from visioncal.live.capture.take import Taken
+from visioncal.live.planning.read_back import PlanFile
+from visioncal.session import Session
+
+# A UR repeats to 0.03 to 0.05 mm; what stands within is where it was told to be.
+REPEATABILITY_M = 5e-5
+# The shortest rest that counts: fewer pictures have to be made.
+QUICK = CaptureOptions(frames=1, still=Stillness(quiet_s=0.03))
+
+
+def facts_of(plan: PlanFile, arm: FakeArm, camera: FakeCamera, name: str = "live") -> Facts:
+    """What is written of a fake cell."""
+    return Facts(
+        name,
+        plan.cell.mount,
+        plan.cell.target,
+        plan.cell.robot,
+        arm.name,
+        camera.name,
+        camera.resolution,
+        camera.factory,
+        camera.settings,
+        plan.digest,
+    )
+
+
+def recorded(
+    folder: Path,
+    plan: PlanFile,
+    arm: FakeArm,
+    camera: FakeCamera,
+    options: CaptureOptions = QUICK,
+    watchers: tuple[Watcher, ...] = (),
+    *,
+    resume: bool = False,
+) -> list[Step]:
+    """Records the stops of a plan that have no view yet."""
+    begin = Journal.resume if resume else Journal.begin
+    facts = facts_of(plan, arm, camera)
+    journal = begin(folder, facts, arm.clock.unix_offset_s(), len(plan.stops))
+    cell = LiveCell(arm, camera, arm.clock)
+    return record(cell, plan, journal, options, watchers)
+
+
+def errors_m(session: Session, camera: FakeCamera) -> list[float]:
+    """How far each view's pose is from where the flange was at its exposure [m]."""
+    found = []
+    for view in session.views:
+        stamp = view.stamp_s - camera.arm.clock.unix_offset_s()
+        at = min(camera.exposures, key=lambda it: abs(it - stamp))
+        # Stamps are written to the microsecond.
+        assert abs(at - stamp) < 2e-6
+        away = camera.exposures[at][:3, 3] - view.base_from_flange().as_matrix()[:3, 3]
+        found.append(float(np.linalg.norm(away)))
+    return found
+
+
+class _Acknowledged:
+    """Prints the number of each view that is on the disk."""
+
+    def stepped(self, step: Step) -> None:
+        """Prints it."""
+        if isinstance(step.found, Taken):
+            print(step.view, flush=True)
+
+
+if __name__ == "__main__":
+    planned = fake_plan(int(sys.argv[2]))
+    print("begun", flush=True)
+    recorded(
+        Path(sys.argv[1]), planned, *fake_devices(planned), watchers=(_Acknowledged(),), resume=True
+    )
+    print("done", flush=True)

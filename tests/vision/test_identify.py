@@ -1,0 +1,290 @@
+"""Naming a board in a photograph: on paper, in renders, cut off, and in real images."""
+
+import json
+import tomllib
+from collections import Counter
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import pytest
+from support.boards import charuco, checkerboard, printed
+from typer.testing import CliRunner
+
+from visioncal.cli.target import target_app
+from visioncal.core.errors import DataError
+from visioncal.simulation import (
+    CellOptions,
+    fisheye_camera,
+    prepare_scene,
+    render,
+    simulate,
+)
+from visioncal.vision.finders.identify import identify
+from visioncal.vision.finders.identify_text import to_toml
+from visioncal.vision.finders.imaging import decode_image
+from visioncal.vision.targets import load_target, target_from_document, target_names
+
+SHIPPED = {name: load_target(name, None)[0] for name in target_names()}
+ODD = {
+    "legacy": charuco(9, 6, legacy=True),
+    "legacy, tags": charuco(8, 6, "DICT_APRILTAG_36h11", legacy=True),
+    "least": charuco(3, 3),
+    "short codes": charuco(7, 5, "DICT_APRILTAG_16h5"),
+    "original": charuco(9, 7, "DICT_ARUCO_ORIGINAL"),
+    "upright": charuco(5, 8, "DICT_7X7_100"),
+    "symmetric": checkerboard(7, 7),
+    "small": checkerboard(4, 3, 0.04),
+}
+
+
+@lru_cache(maxsize=64)
+def print_named(target):
+    """The identity of a print at 4 pixels a millimetre."""
+    return identify(printed(target, 100))
+
+
+def assert_named(identity, target):
+    assert identity.kind == target.kind
+    assert identity.whole
+    if target.kind == "marker":
+        assert identity.marker_ids == (target.marker_id,)
+    elif target.kind == "checkerboard":
+        # Which side is along x cannot be seen.
+        assert {identity.columns, identity.rows} == {target.columns, target.rows}
+    else:
+        assert (identity.columns, identity.rows) == (target.columns, target.rows)
+        # With an odd number of rows there is one layout.
+        assert identity.legacy == (target.legacy and target.rows % 2 == 0)
+    if target.dictionary:
+        assert target.dictionary in (identity.dictionary, *identity.larger)
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        pytest.param(it, marks=pytest.mark.slow if name == "legacy, tags" else (), id=name)
+        for name, it in (SHIPPED | ODD).items()
+    ],
+)
+def test_a_print_is_named(target):
+    identity = print_named(target)
+    assert_named(identity, target)
+    assert identity.corners_seen == identity.corners
+    if target.kind == "charuco":
+        share = target.marker_m / target.square_m
+        # A tenth of a pixel on squares of a hundred.
+        assert identity.marker_share == pytest.approx(share, abs=2e-3)
+
+
+@pytest.mark.parametrize("tilt_rad", [(0.05, 0.3), (0.6, 0.8), (0.9, 1.05)], ids=str)
+@pytest.mark.parametrize("name", ["charuco_9x6_30mm", "legacy", "least", "checkerboard_9x6_25mm"])
+def test_a_tilted_board_is_named(name, tilt_rad):
+    target = (SHIPPED | ODD)[name]
+    options = CellOptions(target=target, views=2, tilt_rad=tilt_rad, cut_views=0.0, seed=3)
+    scene = prepare_scene(simulate(options))
+    for view in range(2):
+        identity = identify(render(scene, view))
+        # The steepest rows of the checkerboard are out of the finder's reach.
+        if target.kind == "charuco" or tilt_rad[1] < 1.0:
+            assert_named(identity, target)
+        if target.kind == "charuco":
+            share = target.marker_m / target.square_m
+            # Tilted, an edge of a marker is known to a fifth of a pixel, squares have 30.
+            assert identity.marker_share == pytest.approx(share, abs=0.007)
+
+
+@pytest.mark.parametrize("name", ["charuco_14x9_20mm", "checkerboard_12x7_30mm"])
+def test_a_lens_that_bends_lines_does_not_change_the_count(name):
+    target = SHIPPED[name]
+    options = CellOptions(
+        target=target, camera=fisheye_camera(), views=2, tilt_rad=(0.1, 0.5), cut_views=0.0, seed=3
+    )
+    scene = prepare_scene(simulate(options))
+    for view in range(2):
+        assert_named(identify(render(scene, view)), target)
+
+
+def test_a_board_that_the_image_cuts_is_at_least_so_large():
+    page = printed(SHIPPED["charuco_9x6_30mm"], 100)
+    # Rows are 30 mm, 118 pixels, and start below 14 mm: two and a half of six are left.
+    identity = identify(page[: 55 + 3 * 118 - 59])
+    assert (identity.columns, identity.whole) == (9, False)
+    assert 2 <= identity.rows <= 3
+    assert any("may go on" in note for note in identity.notes)
+    sideways = identify(page[:, :-300])
+    # Columns follow from the ids, the last ones unseen too.
+    assert (sideways.columns, sideways.rows, sideways.whole) == (9, 6, True)
+    assert sideways.corners_seen < sideways.corners
+
+
+def test_two_rows_of_markers_do_not_tell_an_odd_number_of_columns_from_an_even_one():
+    page = printed(SHIPPED["charuco_9x6_30mm"], 100)
+    # Ids count along rows: 0 to 3 and 4 to 7 lie alike on boards of 8 and of 9 columns.
+    identity = identify(page[: 55 + 2 * 118 + 20, : 55 + 8 * 118])
+    assert not identity.whole
+    assert identity.columns in (8, 9)
+    assert any("show more of the board" in note for note in identity.notes)
+
+
+def test_a_marker_beside_a_board_is_told_of():
+    page = printed(SHIPPED["charuco_7x5_36mm"], 100)
+    tag = printed(SHIPPED["apriltag_36h11_id0_120mm"], 50)
+    identity = identify(np.vstack([np.pad(tag, ((0, 0), (0, page.shape[1] - tag.shape[1]))), page]))
+    assert_named(identity, SHIPPED["charuco_7x5_36mm"])
+    assert any("marker 0 of DICT_APRILTAG_36h11" in note for note in identity.notes)
+
+
+def test_a_cut_checkerboard_is_at_least_so_large():
+    page = printed(SHIPPED["checkerboard_9x6_25mm"], 100)
+    identity = identify(page[: page.shape[0] // 2])
+    assert identity.columns == 9
+    assert identity.rows < 6
+    assert not identity.whole
+
+
+@pytest.mark.parametrize(("columns", "rows", "side_mm"), [(8, 5, 28), (4, 3, 50)])
+def test_a_checkerboard_with_little_white_around_is_whole(columns, rows, side_mm):
+    target = checkerboard(columns, rows, 1e-3 * side_mm)
+    page = printed(target, 100)
+    # Only squares darken that much of a row or a column.
+    rows_px, columns_px = (np.flatnonzero((page < 128).mean(axis=axis) > 0.2) for axis in (1, 0))
+    white_px = round(8 * 100 / 25.4)
+    top, left = (max(it[0] - white_px, 0) for it in (rows_px, columns_px))
+    assert_named(
+        identify(page[top : rows_px[-1] + white_px, left : columns_px[-1] + white_px]), target
+    )
+
+
+@pytest.mark.parametrize("sigma_px", [7.0, 8.0, 10.0])
+def test_a_blurred_charuco_board_is_doubted_to_be_a_checkerboard(sigma_px):
+    page = printed(SHIPPED["charuco_9x6_30mm"], 100)
+    identity = identify(cv2.GaussianBlur(page, (0, 0), sigma_px))
+    assert identity.kind != "charuco"
+    assert any("rather a ChArUco board" in note for note in identity.notes)
+
+
+@pytest.mark.parametrize("sigma_px", [4.0, 8.0, 16.0])
+def test_a_blurred_checkerboard_is_not_doubted(sigma_px):
+    page = printed(SHIPPED["checkerboard_9x6_25mm"], 100)
+    identity = identify(cv2.GaussianBlur(page, (0, 0), sigma_px))
+    assert_named(identity, SHIPPED["checkerboard_9x6_25mm"])
+    assert not any("ChArUco" in note for note in identity.notes)
+
+
+@pytest.mark.slow
+def test_a_large_picture_is_searched_reduced_too():
+    page = cv2.GaussianBlur(printed(SHIPPED["charuco_9x6_30mm"], 320), (0, 0), 3.0)
+    noise = 120.0 * np.random.default_rng(1).normal(size=page.shape)
+    identity = identify(np.clip(40 + 0.7 * page + noise, 0, 255).astype(np.uint8))
+    assert_named(identity, SHIPPED["charuco_9x6_30mm"])
+    assert "reduced to" in identity.notes[0]
+
+
+@pytest.mark.parametrize("sigma_px", [0.0, 3.0, 12.0])
+def test_an_image_without_a_board_is_refused(sigma_px):
+    noise = np.random.default_rng(1).normal(0.0, 1.0, (1000, 1400))
+    if sigma_px:
+        noise = cv2.GaussianBlur(noise, (0, 0), sigma_px)
+    image = np.clip(128 + 60 * noise / noise.std(), 0, 255).astype(np.uint8)
+    with pytest.raises(DataError, match="Looked for were ChArUco boards"):
+        identify(image)
+
+
+def test_a_uniform_image_is_called_so():
+    with pytest.raises(DataError, match="almost uniform"):
+        identify(np.full((600, 800), 90, dtype=np.uint8))
+
+
+@pytest.mark.parametrize("name", target_names())
+def test_a_description_loads_once_the_size_is_known(name):
+    target = SHIPPED[name]
+    identity = print_named(target)
+    document = tomllib.loads(to_toml(identity, target.square_m, "photo.png"))
+    described = target_from_document(document, name)
+    assert (described.kind, described.square_m) == (target.kind, target.square_m)
+    # As far as a print at 4 pixels a millimetre tells.
+    assert described.marker_m == pytest.approx(target.marker_m, abs=1e-4)
+    unknown = tomllib.loads(to_toml(identity, None, "photo.png"))
+    with pytest.raises(DataError, match=r"(square_m|size_m) is missing"):
+        target_from_document(unknown, name)
+
+
+# Kind, columns, rows, dictionary, and a marker's side over a square's.
+REAL = {
+    "sessions/ric_charuco_eye_to_hand/images/*.png": (
+        ("charuco", 5, 7, "DICT_6X6_250"),
+        18.256 / 36.195,
+    ),
+    "doosan_a0509_charuco/intrinsics_images/*.jpg": (("charuco", 7, 5, "DICT_4X4_50"), 22 / 30),
+    "sessions/visp_franka_eye_in_hand/images/*.png": (("checkerboard", 9, 6, ""), 0.0),
+    "visp_franka_hand_eye/data-eye-to-hand/*.png": (("marker", 1, 1, "DICT_APRILTAG_36h11"), 0.0),
+}
+
+
+LARGE = (
+    "sessions/ric_charuco_eye_to_hand/images/*.png",
+    "doosan_a0509_charuco/intrinsics_images/*.jpg",
+)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "expected"),
+    [pytest.param(*it, marks=pytest.mark.slow if it[0] in LARGE else ()) for it in REAL.items()],
+    ids=str,
+)
+def test_real_photographs_are_named(real_data, pattern, expected):
+    (kind, columns, rows, dictionary), share = expected
+    files = sorted(real_data.glob(pattern))
+    assert len(files) >= 8
+    named = [identify(decode_image(file.read_bytes())) for file in files]
+    found = Counter((it.kind, it.columns, it.rows) for it in named)
+    assert found == {(kind, columns, rows): len(files)}
+    assert all(not dictionary or dictionary in (it.dictionary, *it.larger) for it in named)
+    # Bright light takes half a pixel off markers on squares of fifty.
+    assert np.median([it.marker_share for it in named]) == pytest.approx(share, abs=0.012)
+    # Two standard deviations: of 44 photographs two may be farther off.
+    far = [it for it in named if abs(it.marker_share - share) > 2 * it.marker_share_sigma]
+    assert len(far) <= 0.05 * len(named)
+
+
+def run(*arguments):
+    return CliRunner().invoke(target_app, ["check", *(str(it) for it in arguments)])
+
+
+@pytest.fixture(scope="module")
+def photo(tmp_path_factory):
+    path = tmp_path_factory.mktemp("photos") / "board [1].png"
+    cv2.imwrite(str(path), printed(SHIPPED["charuco_9x6_30mm"], 100))
+    return path
+
+
+def test_check_prints_a_description_and_writes_it(photo, tmp_path):
+    done = run(photo)
+    assert done.exit_code == 0, done.exception
+    assert tomllib.loads(done.stdout)["columns"] == 9
+    assert "square_m" not in tomllib.loads(done.stdout)
+    out = tmp_path / "found.toml"
+    assert isinstance(run(photo, "-o", out).exception, DataError)
+    assert run(photo, "-o", out, "--square-mm", 30).exit_code == 0
+    target, _ = load_target("found.toml", tmp_path)
+    assert (target.columns, target.rows, target.square_m) == (9, 6, 0.03)
+    assert isinstance(run(photo, "-o", out, "--square-mm", 30).exception, DataError)
+
+
+def test_check_prints_json(photo):
+    document = json.loads(run(photo, "--json", "--square-mm", 30).stdout)
+    assert (document["kind"], document["columns"], document["rows"]) == ("charuco", 9, 6)
+    assert document["corners_seen"] == document["corners"] == 40
+    assert document["target"]["square_m"] == 0.03
+    assert document["dictionary"] == "DICT_5X5_50"
+    assert "DICT_5X5_100" in document["same_markers"]
+
+
+def test_check_refuses_what_is_no_image_and_no_size(photo, tmp_path):
+    (tmp_path / "notes.png").write_bytes(b"not an image")
+    assert "decoded" in str(run(tmp_path / "notes.png").exception)
+    (tmp_path / "print.pdf").write_bytes(b"%PDF-1.4")
+    assert "a page of a PDF" in str(run(tmp_path / "print.pdf").exception)
+    for size_mm in (30000, "nan", "inf", -3):
+        assert f"--square-mm is {size_mm}" in str(run(photo, "--square-mm", size_mm).exception)

@@ -1,0 +1,235 @@
+"""Corners by the template against boards that are known, and the search in small copies."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from support.boards import charuco, checkerboard
+from support.marks import slow
+from support.rendered import Shot, photograph
+
+from visioncal.vision.finders import DetectedCorners, blur_of, board, find_target
+from visioncal.vision.finders.charuco import find_charuco
+from visioncal.vision.finders.checkerboard import find_checkerboard
+from visioncal.vision.finders.template import refine
+
+# Columns and rows differ by an odd number: the checkerboard has one numbering.
+CHECKERBOARD, CHARUCO = checkerboard(6, 5), charuco(6, 5)
+SMALL = Shot(square_px=20, noise=2)
+
+
+def detected(target, image):
+    return (find_charuco if target.kind == "charuco" else find_checkerboard)(image, target)
+
+
+def rms(errors):
+    return float(np.sqrt(np.mean(np.square(errors))))
+
+
+# Errors are rms of a coordinate [px]; the template's own noise is a third to a half of what is
+# allowed, the detectors' errors are three times as much.
+@pytest.mark.parametrize(
+    ("target", "shot", "most_px"),
+    [
+        (CHECKERBOARD, SMALL, 0.01),
+        (CHECKERBOARD, replace(SMALL, square_px=8, noise=1), 0.01),
+        (CHECKERBOARD, replace(SMALL, disc_px=2), 0.015),
+        (CHECKERBOARD, replace(SMALL, motion_px=6), 0.015),
+        (CHECKERBOARD, replace(SMALL, gamma=0.45, jpeg=85), 0.015),
+        (CHECKERBOARD, replace(SMALL, ink_px=1), 0.02),
+        (CHECKERBOARD, replace(SMALL, uneven=0.5), 0.015),
+        (CHECKERBOARD, replace(SMALL, bayer=True), 0.02),
+        (CHECKERBOARD, replace(SMALL, tilt_deg=60, square_px=30), 0.015),
+        slow(CHECKERBOARD, replace(SMALL, square_px=60, bend=0.15, noise=1), 0.006),
+        (CHECKERBOARD, replace(SMALL, levels=(0, 330)), 0.015),
+        (CHARUCO, replace(SMALL, square_px=36), 0.01),
+        (CHARUCO, replace(SMALL, square_px=36, jpeg=75, uneven=0.5), 0.015),
+        (CHARUCO, replace(SMALL, square_px=36, motion_px=5), 0.015),
+        (replace(CHARUCO, legacy=True, rows=6), replace(SMALL, square_px=36), 0.01),
+    ],
+)
+def test_corners_are_as_exact_as_the_image(target, shot, most_px):
+    image, truth = photograph(target, shot, 1)
+    seen = detected(target, image)
+    refined = refine(image, target, seen.ids, seen.px)
+    assert set(refined.reasons) == {""}
+    error = refined.px - truth[seen.ids]
+    assert rms(error) < most_px
+    assert rms(error) < 0.65 * rms(seen.px - truth[seen.ids])
+    # Nothing that all corners share: their mean is as good as their number allows.
+    assert np.abs(error.mean(axis=0)).max() < 4 * most_px / np.sqrt(len(error))
+
+
+@pytest.mark.parametrize("target", [CHECKERBOARD, CHARUCO])
+def test_noise_gives_the_standard_deviation(target):
+    image, truth = photograph(target, Shot(square_px=36, noise=10), 2)
+    seen = detected(target, image)
+    refined = refine(image, target, seen.ids, seen.px)
+    scaled = (refined.px - truth[seen.ids]) / refined.sigma_px[:, None]
+    # 40 to 60 coordinates tell a mean square to a quarter; the pixels' own shape adds residuals.
+    assert 0.4 < np.mean(scaled**2) < 1.6
+
+
+def test_blur_is_measured_along_both_families_of_lines():
+    image, truth = photograph(CHECKERBOARD, replace(SMALL, square_px=40, disc_px=4), 1)
+    # A disc has half its radius as its standard deviation; the lens and the pixels add a little.
+    blur_px = refine(image, CHECKERBOARD, np.arange(30), truth).blur_px
+    np.testing.assert_allclose(blur_px, np.hypot(2.0, 0.45), rtol=0.15)
+    moved = cv2.filter2D(photograph(CHECKERBOARD, replace(SMALL, square_px=40), 1)[0], -1,
+                         np.full((1, 9), 1 / 9))  # fmt: skip
+    blur_px = refine(moved, CHECKERBOARD, np.arange(30), truth).blur_px
+    assert blur_px.max() > 1.5 * blur_px.min()
+
+
+def test_the_start_may_be_off_by_more_than_a_pixel():
+    image, truth = photograph(CHECKERBOARD, replace(SMALL, square_px=36), 3)
+    start = truth + np.random.default_rng(0).uniform(-1.5, 1.5, truth.shape)
+    refined = refine(image, CHECKERBOARD, np.arange(30), start)
+    assert rms(refined.px - truth) < 0.01
+
+
+@pytest.mark.parametrize("target", [CHECKERBOARD, CHARUCO])
+def test_what_covers_a_corner_leaves_it_to_the_detector(target):
+    image, truth = photograph(target, replace(SMALL, square_px=40), 1)
+    ids = np.arange(len(truth))
+    u, v = np.rint(truth[7]).astype(int)
+    covered = image.copy()
+    covered[v - 3 : v + 30, u - 4 : u + 30] = 120
+    refined = refine(covered, target, ids, truth + 0.25)
+    assert refined.reasons[7]
+    np.testing.assert_array_equal(refined.px[7], truth[7] + 0.25)
+    assert np.isnan(refined.sigma_px[7])
+    fitted = np.array([not it for it in refined.reasons])
+    # The cover reaches into the patches of three others at most, and bends no map.
+    assert fitted.sum() >= len(truth) - 4
+    assert np.abs(refined.px - truth)[fitted].max() < 0.1
+    assert np.median(np.abs(refined.px - truth)[fitted]) < 0.006
+
+
+def test_a_corner_at_the_edge_of_the_image_is_exact_or_left_to_the_detector():
+    image, truth = photograph(CHECKERBOARD, replace(SMALL, square_px=40), 1)
+    ids = np.arange(30)
+    for inside in (2, 6, 10, 14):
+        left = int(truth[:, 0].min()) - inside
+        refined = refine(
+            np.ascontiguousarray(image[:, left:]), CHECKERBOARD, ids, truth - [left, 0]
+        )
+        fitted = np.array([not it for it in refined.reasons])
+        assert fitted.sum() >= 29
+        assert fitted.all() == (inside > 4)
+        assert np.abs(refined.px + np.array([left, 0]) - truth)[fitted].max() < 0.02
+
+
+def test_too_few_corners_stay_where_they_are():
+    image, truth = photograph(CHECKERBOARD, SMALL, 1)
+    for ids in (np.arange(3), np.arange(6)):
+        refined = refine(image, CHECKERBOARD, ids, truth[ids])
+        assert all("too few" in it for it in refined.reasons)
+        np.testing.assert_array_equal(refined.px, truth[ids])
+    nothing = refine(np.full_like(image, 90), CHECKERBOARD, np.arange(30), truth)
+    assert all(nothing.reasons)
+    np.testing.assert_array_equal(nothing.px, truth)
+    assert np.isnan(nothing.blur_px).all()
+
+
+def test_a_corner_unlike_the_print_is_left_out_of_a_view():
+    image, truth = photograph(CHECKERBOARD, replace(SMALL, square_px=40), 1)
+    u, v = np.rint(truth[14]).astype(int)
+    cv2.circle(image, (int(u) + 5, int(v) - 4), 6, 250, -1)
+    seen = find_target(image, CHECKERBOARD)
+    assert isinstance(seen, DetectedCorners)
+    assert seen.ids.tolist() == [*range(14), *range(15, 30)]
+    assert np.abs(seen.px - truth[seen.ids]).max() < 0.03
+
+
+def test_where_few_corners_are_like_the_print_the_detector_serves(monkeypatch):
+    image, truth = photograph(CHECKERBOARD, replace(SMALL, square_px=40), 1)
+    seen = DetectedCorners(np.arange(30), truth + 0.1)
+    monkeypatch.setitem(board.FINDERS, "checkerboard", lambda *_: seen)
+    for covered, fits in ((0.3, True), (0.7, False), (1.0, False)):
+        blank = image.copy()
+        blank[:, : int(covered * image.shape[1])] = 120
+        found = find_target(blank, CHECKERBOARD)
+        assert (found.weights is None) == fits
+        if fits:
+            assert np.abs(found.px - truth[found.ids]).max() < 0.03
+        else:
+            np.testing.assert_array_equal(found.px, seen.px)
+            assert (found.weights == 0.1).all()
+
+
+def test_places_that_no_board_has_break_nothing():
+    image, truth = photograph(CHARUCO, SMALL, 1)
+    rng = np.random.default_rng(0)
+    for ids in ([0, 2, 15, 17], [2, 8, 14, 19], [3, 5, 9, 10]):
+        same = truth[ids][[0, 0, 2, 3]]
+        thin = np.stack([truth[ids][:, 0]] * 2, axis=1) + rng.normal(0, 1e-7, (4, 2))
+        for px in (same, thin, np.zeros((4, 2)), truth[ids] - 1000.0):
+            refined = refine(image, CHARUCO, np.array(ids), px)
+            assert all(refined.reasons)
+            np.testing.assert_array_equal(refined.px, px)
+
+
+@pytest.fixture(scope="module")
+def large():
+    """A board in a picture of 2,300 x 1,000 px."""
+    image, truth = photograph(CHARUCO, replace(SMALL, square_px=60), 4)
+    rim = np.full((1000, 2300), 205, np.uint8)
+    rim[200 : 200 + len(image), 1500 : 1500 + image.shape[1]] = image
+    return rim, truth + np.array([1500, 200])
+
+
+def searched(monkeypatch):
+    """The sizes of the images that the detector is given."""
+    sizes, plain = [], board.FINDERS["charuco"]
+    monkeypatch.setitem(
+        board.FINDERS, "charuco", lambda im, it: sizes.append(im.shape) or plain(im, it)
+    )
+    return sizes
+
+
+def test_large_images_are_searched_in_a_small_copy(large, monkeypatch):
+    image, truth = large
+    sizes = searched(monkeypatch)
+    seen = find_target(image, CHARUCO)
+    assert sizes == [(500, 1150)]
+    assert len(seen.ids) == len(truth)
+    assert rms(seen.px - truth) < 0.01
+    find_target(image[:, 301:], CHARUCO)
+    assert sizes == [(500, 1150), (1000, 1999)]
+
+
+def test_what_the_small_copy_misses_is_searched_in_the_image_itself(large, monkeypatch):
+    image, truth = large
+    sizes = searched(monkeypatch)
+    # A board of few pixels has no readable markers in half the size.
+    tiny, places = photograph(CHARUCO, replace(SMALL, square_px=28, noise=1), 4)
+    page = np.full_like(image, 205)
+    page[200 : 200 + len(tiny), 500 : 500 + tiny.shape[1]] = tiny
+    seen = find_target(page, CHARUCO)
+    assert sizes == [(500, 1150), (1000, 2300)]
+    assert np.abs(seen.px - [500, 200] - places[seen.ids]).max() < 0.1
+    # What lies outside the image is not missed.
+    sizes.clear()
+    middle = int(truth[:, 0].mean())
+    part = np.ascontiguousarray(np.pad(image[:, :middle], ((0, 0), (400, 0)), mode="edge"))
+    seen = find_target(part, CHARUCO)
+    assert sizes == [(500, part.shape[1] // 2)]
+    assert 4 <= len(seen.ids) < len(truth)
+
+
+@pytest.mark.parametrize("target", [CHECKERBOARD, CHARUCO])
+def test_a_smear_in_one_direction_counts_as_blur(target):
+    # A line of 8 px has a standard deviation of 2.3 px; the sharp direction stays sharp.
+    still = find_target(photograph(target, replace(SMALL, square_px=40), 1)[0], target)
+    smear = np.zeros((9, 9), np.float32)
+    smear[4] = 1 / 9
+    image = photograph(target, replace(SMALL, square_px=40, tilt_deg=0), 2)[0]
+    moved = cv2.filter2D(image, -1, smear)
+    assert still.blur_px < 0.8
+    seen = find_target(image, target)
+    assert seen.blur_px < 0.8
+    assert 1.4 < blur_of(moved, target, seen.ids, seen.px) < 3.2
+    # Nothing of a print: the gradients are left.
+    assert np.isfinite(blur_of(np.full_like(image, 90), target, seen.ids, seen.px))
