@@ -41,7 +41,7 @@ def main() -> None:
             rows.append(
                 f"| {arm} | {'temperatures' if temperatures else 'currents'} | "
                 f"{np.median(drifts):.2f} | {np.median(left):.3f} | {np.median(shares):.2f} | "
-                f"{shares.max():.2f} | {np.median([it.mahalanobis_sq for it in found]):.2f} | "
+                f"{shares.max():.2f} | {np.median([it.error_over_sigma for it in found]):.2f} | "
                 f"{np.median(seconds):.1f} |"
             )
             print(rows[-1], flush=True)

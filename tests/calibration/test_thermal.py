@@ -68,7 +68,7 @@ def test_a_hundred_minutes_predict_five_hours(learnt, told, limit):
     assert np.median(found.true) > 2e-4
     assert found.share < limit
     # Root mean squares of 60 places that share 18 or 24 parameters.
-    assert 0.4 < found.mahalanobis_sq < 1.8
+    assert 0.4 < found.error_over_sigma < 1.8
 
 
 def test_coefficients_are_within_their_sigmas(learnt):

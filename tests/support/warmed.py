@@ -72,7 +72,7 @@ class Drift:
         return float(np.sqrt(np.sum(self.left**2) / np.sum(self.true**2)))
 
     @property
-    def mahalanobis_sq(self) -> float:
+    def error_over_sigma(self) -> float:
         """What is left over what was expected; of root mean squares."""
         return float(np.sqrt(np.mean((self.left / self.sigma) ** 2)))
 
