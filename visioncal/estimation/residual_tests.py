@@ -72,7 +72,12 @@ class LensField:
     is_significant: bool
 
 
-def lens_field(px: FloatArray, residuals: FloatArray, resolution: tuple[int, int]) -> LensField:
+def lens_field(
+    px: FloatArray,
+    residuals: FloatArray,
+    resolution: tuple[int, int],
+    shares: FloatArray | None = None,
+) -> LensField:
     """Compares the mean residuals of the image's cells with the scatter within them (F test).
 
     A lens beyond its model displaces all corners of a region alike, in all views: no number of
@@ -82,20 +87,24 @@ def lens_field(px: FloatArray, residuals: FloatArray, resolution: tuple[int, int
         px: (n, 2) corners of all views of one camera [px].
         residuals: (n, 2) of the fit [px].
         resolution: Width and height of the image [px].
+        shares: (n,) as how much of a corner each counts: of images that show the same, whatever is
+            wrong with one is wrong with all. All count whole where None.
     """
+    shares = np.ones(len(px)) if shares is None else shares
     place = np.clip((_CELLS * px / np.array(resolution)).astype(np.int64), 0, _CELLS - 1)
     cell = place[:, 0] + _CELLS * place[:, 1]
-    counts = np.bincount(cell, minlength=_CELLS**2)
+    counts = np.bincount(cell, shares, _CELLS**2)
     rows = counts[cell] >= _FEWEST_CORNERS
-    many, used = counts[counts >= _FEWEST_CORNERS], int(rows.sum())
-    between, within = 2 * len(many) - _ABSORBED, 2 * (used - len(many))
+    many = counts[counts >= _FEWEST_CORNERS]
+    between, within = 2 * len(many) - _ABSORBED, 2 * (float(many.sum()) - len(many))
     if between < 1:
         return LensField(1.0, 0.0, 0.0, is_significant=False)
     sums = np.stack(
-        [np.bincount(cell[rows], residuals[rows, it], _CELLS**2) for it in (0, 1)], axis=1
+        [np.bincount(cell[rows], (shares * residuals[:, it])[rows], _CELLS**2) for it in (0, 1)],
+        axis=1,
     )
     among = float(np.sum(sums[counts >= _FEWEST_CORNERS] ** 2 / many[:, None]))
-    noise = (float(np.sum(residuals[rows] ** 2)) - among) / within
+    noise = (float(np.sum(shares[rows, None] * residuals[rows] ** 2)) - among) / within
     factor = among / between / noise if noise > 0.0 else 1.0
     return LensField(
         max(factor, 1.0),

@@ -20,7 +20,12 @@ def lens_fields(solved: Solved) -> dict[str, LensField]:
         return {}
     problems = solved.seen.looks.problems.items()
     return {
-        name: lens_field(it.stack.px, own.residuals, it.scene.camera.resolution)
+        name: lens_field(
+            it.stack.px,
+            own.residuals,
+            it.scene.camera.resolution,
+            it.shares[it.stack.view_of],
+        )
         for (name, it), own in zip(problems, solved.seen.compressed, strict=True)
     }
 
