@@ -17,7 +17,7 @@ from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Verdict
 from visioncal.core.version import __version__
 from visioncal.estimation.tree import Branch, Step, Tree
-from visioncal.results.codec import KEPT, read, write
+from visioncal.results.codec import KEPT, read, reading, write
 from visioncal.results.edge import Edge, JointCovariance, StoredEdge
 from visioncal.results.frame import Frame
 from visioncal.results.lens import CameraResult, StoredCamera
@@ -258,24 +258,16 @@ class Alignment(CellSections):
         Raises:
             DataError: It is not an alignment of a known schema.
         """
-        try:
+        with reading(label, "an alignment", "Run visioncal align again."):
             return cls.from_document(parse_stored(text, label))
-        except DataError as error:
-            raise error.within(label) from error
-        except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
-            raise DataError(
-                f"{label}: not an alignment that this version can read: {error!r}.",
-                culprits=[label],
-                next_step="Run visioncal align again.",
-            ) from error
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> Self:
         """Reads what `document` built.
 
         Raises:
+            DataError: It is another; the message names the place.
             ValueError: It is of another schema.
-        DataError: It is another; the message names the place.
         """
         check_schema(document)
         form = read(AlignmentForm, document, "")

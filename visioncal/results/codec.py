@@ -5,7 +5,8 @@ is an empty default. Keys that a class does not know are left out, or kept in it
 `REST`. An error names the path of the value, as `kinematics.levels[2].rms_mm`.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from functools import cache
 from types import NoneType, UnionType
@@ -18,6 +19,30 @@ from visioncal.core.types import FloatArray
 
 _T = TypeVar("_T")
 _WORDS = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
+
+
+@contextmanager
+def reading(label: str, what: str, next_step: str) -> Iterator[None]:
+    """Names the file in the errors of reading it, whatever its content has made fail.
+
+    Args:
+        label: What the content came from.
+        what: What it has to be, such as `a calibration`.
+        next_step: How to make it again.
+
+    Raises:
+        DataError: It is not that.
+    """
+    try:
+        yield
+    except DataError as error:
+        raise error.within(label) from error
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise DataError(
+            f"{label}: not {what} that this version can read: {error!r}.",
+            culprits=[label],
+            next_step=next_step,
+        ) from error
 
 
 @dataclass(frozen=True)

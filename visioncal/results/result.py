@@ -19,6 +19,7 @@ from visioncal.estimation.intervals import freedom_of
 from visioncal.results.alignment import FILE as ALIGNMENT
 from visioncal.results.alignment import Alignment, is_alignment
 from visioncal.results.arm import NOMINAL, ArmResult
+from visioncal.results.codec import reading
 from visioncal.results.document import fields_from_document, to_document
 from visioncal.results.edge import Edge
 from visioncal.results.frame import Frame
@@ -308,18 +309,10 @@ class Calibration(CalibrationSections):
         Raises:
             DataError: It is not a calibration of a known schema.
         """
-        try:
+        with reading(label, "a calibration", "Calibrate the session again."):
             document = parse_stored(text, label)
             if is_whole(document):
                 return cls.whole(read_whole(document))
             if is_alignment(document):
                 return cls.whole(Alignment.from_document(document))
             return cls(**fields_from_document(document))
-        except DataError as error:
-            raise error.within(label) from error
-        except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
-            raise DataError(
-                f"{label}: not a calibration that this version can read: {error!r}.",
-                culprits=[label],
-                next_step="Calibrate the session again.",
-            ) from error
