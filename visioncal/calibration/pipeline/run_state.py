@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 from visioncal.calibration.pipeline.answer import Answer
 from visioncal.calibration.pipeline.budget import Work, work_of
@@ -18,6 +19,8 @@ from visioncal.results import Verdict
 from visioncal.robot import Convention, Loads
 from visioncal.session.loads import loads_of
 from visioncal.session.single import is_whole_cell
+
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,9 +71,7 @@ class RunState(Observed):
         Raises:
             RuntimeError: A step asks for it before it was read: the order is wrong.
         """
-        if self.read is None:
-            raise RuntimeError("a step that needs the cell comes before it is read")
-        return self.read
+        return _there(self.read, "the cell")
 
     @property
     def fitted(self) -> Solved:
@@ -79,9 +80,7 @@ class RunState(Observed):
         Raises:
             RuntimeError: A step asks for it before it was made: the order is wrong.
         """
-        if self.fit is None:
-            raise RuntimeError("a step that needs the fit comes before it")
-        return self.fit
+        return _there(self.fit, "the fit")
 
     @property
     def solved(self) -> Answer:
@@ -90,9 +89,7 @@ class RunState(Observed):
         Raises:
             RuntimeError: A step asks for it before it was made: the order is wrong.
         """
-        if self.answer is None:
-            raise RuntimeError("a step that needs the answer comes before it")
-        return self.answer
+        return _there(self.answer, "the answer")
 
     @cached_property
     def work(self) -> Work:
@@ -126,3 +123,10 @@ class RunState(Observed):
         """The views in the fit, in the session's order."""
         rows, used = self.fitted.cell.rows, self.fitted.agreed.used.tolist()
         return tuple(row.view for row, mine in zip(rows, used, strict=True) if mine)
+
+
+def _there(value: _T | None, name: str) -> _T:
+    """What an earlier step has made; without it, the steps are in a wrong order."""
+    if value is None:
+        raise RuntimeError(f"a step that needs {name} comes before it")
+    return value
