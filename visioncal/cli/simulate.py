@@ -210,11 +210,6 @@ def simulate_command(
     messages().print(f"wrote {folder}\nwrote {truth_path(folder)}")
 
 
-def _timed(clock_offset_ms: float, readout_ms: float) -> SweepOptions:
-    """When the frames of a sweep are stamped, and their rows taken."""
-    return SweepOptions(camera_minus_robot_s=1e-3 * clock_offset_ms, readout_s=1e-3 * readout_ms)
-
-
 def _single(options: CellOptions, folder: Path, *, images: bool, touches: bool) -> None:
     """Writes a cell of one robot, and what its tool touched."""
     cell = simulate(options)
