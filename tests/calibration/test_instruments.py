@@ -304,10 +304,11 @@ def test_motion_that_tells_too_little_is_refused():
     still = tracked(POINT, joints=np.repeat(shop.joints[:1], 12, axis=0))
     with pytest.raises(DegenerateError, match="12 used views are all from one pose of the robot"):
         known_of(session_of(still, joints=False, poses=True))
-    # Joint 1 alone: the point goes round in a circle.
+    # Joint 1 alone: the point goes round in a circle. Where a search without an answer ends is up
+    # to rounding, and with it which of the directions is named.
     turning = np.repeat(shop.joints[:1], 12, axis=0)
     turning[:, 0] = np.linspace(-1.5, 1.5, 12)
-    with pytest.raises(DegenerateError, match=r"are not determined at all.*about the base's z"):
+    with pytest.raises(DegenerateError, match=r"all 12 used views turn about the base's z"):
         known_of(session_of(tracked(POINT, joints=turning)))
     with pytest.raises(DataError, match="needs poses, and the instrument reads places alone"):
         known_of(session_of(shop), solver="tsai")

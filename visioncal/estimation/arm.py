@@ -167,13 +167,13 @@ def _most_likely_size(
     width, columns = reduced.errors.shape[1], reduced.jacobian.shape[2]
     units, places = np.divmod(np.arange(size), width)
     count = int(units[-1]) + 1
-    jacobian, part = np.zeros((count, width, columns)), np.zeros((count, width, width))
+    jacobian, part = np.zeros((count, width, columns)), np.zeros((count, width))
     jacobian[units, places, columns - size + np.arange(size)] = 1.0
-    part[units, places, places] = 1.0
-    parts = np.zeros((len(components.parts) + 1, len(reduced.errors) + count, width, width))
+    part[units, places] = 1.0
+    parts = np.zeros((len(components.parts) + 1, len(reduced.errors) + count, width))
     parts[:-1, :-count], parts[-1, -count:] = components.parts, part
     # Places that are left over in the last unit are of no unknown.
-    rest = np.eye(width) - part
+    rest = np.eye(width) * (1.0 - part)[:, None, :]
     grown = replace(
         likelihood,
         reduced=replace(

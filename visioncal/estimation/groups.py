@@ -68,8 +68,9 @@ class Groups:
     def _components(self) -> Components:
         both = self.observed[:, :, None] & self.observed[:, None, :]
         absent = np.eye(self.observed.shape[1]) * ~self.observed[:, None, :]
-        level = np.eye(self.observed.shape[1]) * self.observed[:, None, :]
-        return Components(np.where(both, self.known, 0.0) + absent, level[None])
+        return Components(
+            np.where(both, self.known, 0.0) + absent, self.observed[None].astype(np.float64)
+        )
 
     def level(self, start: float, *, free: bool = True) -> tuple[float, float]:
         """The most likely noise [m] and its negative log-likelihood; those of the start if held."""

@@ -112,6 +112,8 @@ class Problem:
     least_levels: FloatArray = field(default_factory=lambda: np.zeros(0))
     with_repeats: bool = False
     is_combined: bool = False
+    # The last of `linear`, ideal or not: a fit, its noise and its tests ask for the same one.
+    _last: dict[bool, tuple[State, Linear]] = field(default_factory=dict, init=False, repr=False)
 
     def __len__(self) -> int:
         return len(self.observations)
@@ -438,6 +440,12 @@ class Problem:
             ideal: As if all that was measured were what is predicted: noise then does not pass for
                 information about directions that are not determined.
         """
+        before = self._last.get(ideal)
+        if before is None or before[0] is not state:
+            before = self._last[ideal] = state, self._linearised(state, ideal=ideal)
+        return before[1]
+
+    def _linearised(self, state: State, *, ideal: bool) -> Linear:
         rotation, predicted = self.observations.has_rotation, self.predicted(state)
         error = np.broadcast_to(np.eye(4), predicted.shape)
         if not ideal:

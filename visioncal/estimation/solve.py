@@ -378,12 +378,12 @@ def robot_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLikel
     _, members = problem.units
     reduced = reduce(problem, state, problem.linear(state), problem.covariance(noise))
     count, width = len(problem.robots), members.shape[1]
-    parts = np.zeros((2 * count, len(members), 6 * width, 6 * width))
+    parts = np.zeros((2 * count, len(members), 6 * width))
     for robot in range(count):
         rows, slots = np.nonzero(members == robot)
         for axis in range(3):
             at = 6 * slots + axis
-            parts[2 * robot, rows, at, at] = parts[2 * robot + 1, rows, at + 3, at + 3] = 1.0
+            parts[2 * robot, rows, at] = parts[2 * robot + 1, rows, at + 3] = 1.0
     moving, known = problem.moving, reduced.covariance.copy()
     if problem.repeats:
         first = len(members) - len(problem.repeats)

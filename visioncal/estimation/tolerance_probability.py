@@ -10,6 +10,7 @@ sphere. Of a covariance whose scale was estimated with n degrees of freedom, r^2
 """
 
 import numpy as np
+from scipy.optimize import brentq
 from scipy.special import fdtr, ndtri
 
 from visioncal.core.types import FloatArray
@@ -17,8 +18,9 @@ from visioncal.core.types import FloatArray
 _POINTS, _SIZE = 4096, 6
 # Beyond, F cannot be told from chi-square, and its series lose digits.
 _MOST_FREEDOM = 1e6
-# Radii are sought by halving, to a millionth of a factor of this about a first guess.
-_HALVINGS, _FAR = 40, 1e3
+# Radii are sought within this factor about a first guess, to this share of them.
+_FAR, _TOLERANCE = 1e3, 1e-9
+_ROUNDS = 40
 _EXACT, _FAR_WITHIN = 1e-60, 1e30
 
 
@@ -50,14 +52,13 @@ def radius_within(spreads: FloatArray, share: float, freedom: float = np.inf) ->
     guess = float(np.sqrt(shifted.max()))
     if not guess > 0.0:
         return 0.0
-    low, high = guess / _FAR, guess * _FAR
-    for _ in range(_HALVINGS):
-        middle = float(np.sqrt(low * high))
-        if _mean_chance(_ratio(middle, shifted), freedom) < share:
-            low = middle
-        else:
-            high = middle
-    return high
+
+    def missing(logarithm: float) -> float:
+        return _mean_chance(_ratio(guess * float(np.exp(logarithm)), shifted), freedom) - share
+
+    found = brentq(missing, -np.log(_FAR), np.log(_FAR), xtol=_TOLERANCE)
+    # At the radius itself the share must be reached, so that a need of it is met.
+    return guess * float(np.exp(found + 2.0 * _TOLERANCE))
 
 
 def _mean_chance(squares: FloatArray, freedom: float) -> float:
@@ -85,7 +86,7 @@ def _directions() -> FloatArray:
     Its steps are powers of the root of x^7 = x + 1, the golden ratio's like in six dimensions.
     """
     ratio = 1.0
-    for _ in range(_HALVINGS):
+    for _ in range(_ROUNDS):
         ratio = (1.0 + ratio) ** (1.0 / (_SIZE + 1))
     steps = ratio ** -np.arange(1.0, _SIZE + 1.0)
     even = (0.5 + np.arange(1, _POINTS + 1)[:, None] * steps) % 1.0

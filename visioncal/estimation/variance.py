@@ -26,7 +26,7 @@ class Components:
 
     Attributes:
         known: (m, d, d) the part that needs no estimate.
-        parts: (k, m, d, d) what each component adds, at a standard deviation of one.
+        parts: (k, m, d) diagonals of what each component adds, at a standard deviation of one.
     """
 
     known: FloatArray
@@ -34,7 +34,8 @@ class Components:
 
     def total(self, sigmas: FloatArray) -> FloatArray:
         """Covariances (m, d, d) of the residuals at some (k,) standard deviations."""
-        return np.asarray(self.known + np.tensordot(sigmas**2, self.parts, axes=1))
+        added = np.tensordot(sigmas**2, self.parts, axes=1)
+        return np.asarray(self.known + added[:, :, None] * np.eye(added.shape[1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,18 +195,18 @@ def _likelihood(
         + best @ (known.information @ best - 2 * known.gradient)
     )
     # How the residuals' covariance grows with the logarithm of each sigma.
-    growth = 2 * sigmas[:, None, None, None] ** 2 * components.parts
-    whitened = weights @ growth
+    growth = 2 * sigmas[:, None, None] ** 2 * components.parts
     # What the parameters have taken of the weights, as y y^T.
     y = weighted @ root
-    removed = y @ np.swapaxes(y, 1, 2) @ growth
-    traces = np.einsum("kmii->k", whitened - removed)
-    asked = (growth @ pulled[:, :, None])[..., 0]
-    slope = 0.5 * (traces - np.einsum("mi,kmi->k", pulled, asked))
+    removed = y @ np.swapaxes(y, 1, 2)
+    left_over = np.diagonal(weights - removed, axis1=1, axis2=2)
+    asked = growth * pulled
+    slope = 0.5 * np.einsum("kmi,mi->k", growth, left_over - pulled**2)
     # Traces of P G_k P G_l, where P is the weight less what the parameters have taken of it.
-    shrunk = np.array([gram(y, it @ y) for it in growth])
+    shrunk = np.array([gram(y, it[:, :, None] * y) for it in growth])
+    crossed = growth[:, :, None, :] @ ((weights - 2.0 * removed) * weights)
     expected = 0.5 * (
-        np.einsum("kmij,lmji->kl", whitened - 2.0 * removed, whitened)
+        np.tensordot(crossed[:, :, 0], growth, axes=([1, 2], [1, 2]))
         + np.einsum("kij,lji->kl", shrunk, shrunk)
     )
     # Products of y P G_k P G_l P y: with them the second derivative itself, not its expectation.

@@ -20,6 +20,7 @@ have taken it up, and an arm that picks does it again.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -76,7 +77,7 @@ class Picks:
         parts = {name: it for name, it in self.parts.items() if name != source}
         return replace(self, parts=parts or {"none": np.zeros_like(self.parts[source])})
 
-    @property
+    @cached_property
     def good_for_mm(self) -> float:
         """The least need of places alone that would be met [mm]."""
         return 1e3 * radius_within(self.spreads, GOOD, self.freedom)
