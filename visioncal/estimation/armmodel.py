@@ -1,7 +1,7 @@
 """An arm whose errors are being estimated: its model, and how its flange moves with them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,6 +16,8 @@ _FUNCTIONS = {"offsets": (0,), "ratios": (1,), "eccentricity": (2, 3)}
 # What goes by the loads of a stop, and by the side from which it was approached; the others are
 # the same at all stops.
 COMPLIANCE, BACKLASH, WEIGHT = "compliance", "backlash", "weight"
+# Functions of the joints beyond their eccentricity.
+HARMONICS = "harmonics"
 RIGID = ("links", *_FUNCTIONS)
 
 
@@ -29,11 +31,16 @@ class ArmModel:
         weights: The blocks by name with the size of their errors, as a share of the first's:
             `offsets` of the joints, `links` (each by six, behind its joint), `ratios` of the gears,
             `eccentricity` (sine and cosine of each joint), `compliance` and `backlash` of each
-            joint, and how far it yields to the `weight` of links whose masses are not known.
+            joint, how far it yields to the `weight` of links whose masses are not known, and
+            `harmonics` of the joints' functions.
         values: (p,) present values [rad], block after block; all are of the first block's size.
         torque_nm: The torque under which a joint whose compliance is 1 rad bends by that [N m].
         yielding: (n,) which joints bend; None for all.
         functions: What the weight of links of unknown masses may do; None where it is known.
+        harmonic_directions: (2 n k, r) what each of the values of `harmonics` makes of sine and
+            cosine of each joint and order from 2 on.
+        harmonic_sizes: (2 n k,) how large these are, relative to the size of their block; what
+            `harmonic_directions` leaves of them is as open as it was.
     """
 
     nominal: Robot
@@ -43,6 +50,8 @@ class ArmModel:
     torque_nm: float = 1.0
     yielding: Mask | None = None
     functions: WeightFunctions | None = None
+    harmonic_directions: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    harmonic_sizes: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def of(cls, nominal: Robot, q: FloatArray, reported: FloatArray) -> "ArmModel":
@@ -90,7 +99,7 @@ class ArmModel:
     @cached_property
     def bare(self) -> Robot:
         """The arm with its errors, up to its own flange."""
-        return self.nominal.corrected(*self.changes(self.values))
+        return self.nominal.corrected(*self.changes(self.values), self.harmonics)
 
     @cached_property
     def compliance(self) -> FloatArray:
@@ -114,6 +123,8 @@ class ArmModel:
         """How many values a block has."""
         if name == WEIGHT:
             return 0 if self.functions is None else self.functions.size
+        if name == HARMONICS:
+            return int(self.harmonic_directions.shape[1])
         return block_size(name, self.nominal.joint_count)
 
     @cached_property
@@ -133,6 +144,33 @@ class ArmModel:
                 return slice(at, at + size)
             at += size
         return slice(at, at)
+
+    @property
+    def harmonics(self) -> FloatArray | None:
+        """(n, k, 2) harmonics of the joints' functions [rad]; None without any."""
+        if HARMONICS not in self.weights:
+            return None
+        found = self.harmonic_directions @ self.values[self.place_of(HARMONICS)]
+        return np.asarray(self.weights[HARMONICS] * found.reshape(self.nominal.joint_count, -1, 2))
+
+    @property
+    def is_kept(self) -> Mask:
+        """(p,) which values are no harmonics."""
+        kept = np.ones(len(self.values), dtype=bool)
+        kept[self.place_of(HARMONICS)] = False
+        return kept
+
+    def left_open(self, q: FloatArray) -> FloatArray:
+        """(m, 6, 6) covariance of the flange by functions of the joints of which no stop tells.
+
+        It is that for errors of unit size.
+        """
+        if HARMONICS not in self.weights:
+            return np.zeros((len(q), 6, 6))
+        orders = len(self.harmonic_sizes) // (2 * self.nominal.joint_count)
+        moved = self.weights[HARMONICS] * self.robot.harmonic_jacobian(q, orders)
+        whole, told = moved * self.harmonic_sizes, moved @ self.harmonic_directions
+        return np.asarray(whole @ np.swapaxes(whole, 1, 2) - told @ np.swapaxes(told, 1, 2))
 
     def _joint_values(self, name: str) -> FloatArray:
         """The values (n,) of a block that has one a joint; zeros where it is not there."""
@@ -199,6 +237,10 @@ class ArmModel:
             # The last link's own twist acts on the flange, before what is mounted on it.
             moved[:, :, -6:] = adjoint(invert(self.flange_from_reported))
             return np.asarray(moved * units)
+        if name == HARMONICS:
+            orders = len(self.harmonic_directions) // (2 * self.nominal.joint_count)
+            moved = self.robot.harmonic_jacobian(bent, orders)
+            return np.asarray(moved @ self.harmonic_directions)
         count = self.nominal.joint_count
         functions = self.robot.function_jacobian(bent).reshape(len(q), 6, count, 4)
         return np.concatenate([functions[..., it] for it in _FUNCTIONS[name]], axis=2)
@@ -208,6 +250,11 @@ class ArmModel:
         return np.concatenate(
             [weight * self.columns(name, q, loads) for name, weight in self.weights.items()], axis=2
         )
+
+    def kept_basis(self, q: FloatArray) -> FloatArray:
+        """The columns of `basis` that are of no harmonics."""
+        rest = {it: weight for it, weight in self.weights.items() if it != HARMONICS}
+        return np.concatenate([it * self.columns(name, q) for name, it in rest.items()], axis=2)
 
 
 def blocks_of(robot: Robot, loads: Loads) -> tuple[str, ...]:
@@ -219,7 +266,7 @@ def blocks_of(robot: Robot, loads: Loads) -> tuple[str, ...]:
 
 
 def block_size(name: str, joints: int) -> int:
-    """How many values a block has, for an arm of so many joints; of all but `weight`."""
+    """How many values a block has, for an arm of so many joints: of all that depends on no more."""
     if name in (COMPLIANCE, BACKLASH):
         return joints
     return (6 if name == "links" else len(_FUNCTIONS[name])) * joints

@@ -205,3 +205,28 @@ class ArmData:
     def basis(self, q: FloatArray) -> FloatArray:
         """(k, 6, p) how the flange moves with the arm's errors."""
         return self.model.basis(q)
+
+    def place_jacobian(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """How the place of what the arm carries moves at (k, n) joints [rad].
+
+        Returns:
+            (k, 3, f + p) by the chain's unknowns, and (k, 3, 6) by motions of the flange.
+        """
+        motions = np.broadcast_to(np.eye(6), (len(q), 6, 6))
+        moved_by = np.concatenate([self.basis(q), motions], axis=2)
+        poses, moved = self.pair.jacobian(self.model.base_from_flange(q), moved_by)
+        edges, errors = moved.shape[2] - moved_by.shape[2], len(self.columns)
+        jacobian = np.zeros((len(q), 6, self.problem.size))
+        jacobian[:, :, :edges] = moved[:, :, :edges]
+        jacobian[:, :, self.columns] = moved[:, :, edges : edges + errors]
+        found = np.concatenate([jacobian[:, :, self.chain], moved[:, :, edges + errors :]], axis=2)
+        place = self.pair.place_jacobian(poses, found, self.at)
+        return place[:, :, :-6], place[:, :, -6:]
+
+    def place_sigmas_m(self, q: FloatArray) -> FloatArray:
+        """(k,) predicted sigma of that place at (k, n) joints, over all three axes [m]."""
+        place, moved = self.place_jacobian(q)
+        seen = self.covariance[np.ix_(self.chain, self.chain)]
+        left_open = self.error_rad**2 * self.model.left_open(q)
+        variances = np.einsum("mij,jk,mik->m", place, seen, place)
+        return np.asarray(np.sqrt(variances + np.einsum("mij,mjk,mik->m", moved, left_open, moved)))

@@ -165,7 +165,7 @@ def fit_level(arm: ArmTrials, blocks: Blocks = _RIGID) -> LevelFit | None:
             found = arm.found(errors, arm.bases[name])
             if found is not None and found.is_significant:
                 gain += found.gain
-                errors = _without_springs(arm, errors | {name: found})
+                errors = without_springs(arm, errors | {name: found})
     if blocks.own and not errors.keys() & set(blocks.own):
         return None
     return arm.level(errors, gain)
@@ -189,7 +189,7 @@ def resized(arm: ArmTrials, fit: LevelFit) -> LevelFit:
     return arm.level(errors, fit.gain)
 
 
-def _without_springs(arm: ArmTrials, errors: Mapping[str, ArmErrors]) -> dict[str, ArmErrors]:
+def without_springs(arm: ArmTrials, errors: Mapping[str, ArmErrors]) -> dict[str, ArmErrors]:
     """Holds joints rigid that would yield against their load: the bound of a compliance is zero.
 
     An active set that only grows (Lawson and Hanson 1974, chapter 23, has the way back too, which

@@ -28,7 +28,8 @@ class Chain:
     The pose of the tip is `placement_1 M_1 placement_2 M_2 ... placement_{n+1}`, where M_i turns
     about (or moves along) axis i by the joint's effective position
     `offset + ratio q + sine sin(q) + cosine cos(q)`: gear ratio and the eccentricity of an encoder
-    (Mooring, Roth and Driels 1991, Fundamentals of Manipulator Calibration).
+    (Mooring, Roth and Driels 1991, Fundamentals of Manipulator Calibration), beside harmonics of
+    higher order.
 
     Attributes:
         joint_names: The joints from the base to the tip.
@@ -39,6 +40,7 @@ class Chain:
         lower: (n,) lower limits of q [rad or m]; -inf for a joint without limits.
         upper: (n,) upper limits of q [rad or m]; inf for a joint without limits.
         functions: (n, 4) offset [rad or m], ratio, sine and cosine [rad] of each joint.
+        harmonics: (n, k, 2) sine and cosine [rad] of each joint at orders from 2 on; None for none.
     """
 
     joint_names: tuple[str, ...]
@@ -48,6 +50,7 @@ class Chain:
     lower: FloatArray
     upper: FloatArray
     functions: FloatArray
+    harmonics: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.joint_names)
@@ -71,14 +74,16 @@ class Chain:
         turning = np.where(self.prismatic, 0.0, 1.0)
         return np.stack([np.ones_like(q), q, turning * np.sin(q), turning * np.cos(q)], axis=-1)
 
+    @property
+    def is_periodic(self) -> bool:
+        """Whether effective positions have a part that repeats itself every turn."""
+        return bool(self._waves.any())
+
     def effective(self, q: FloatArray) -> FloatArray:
         """Effective positions (m, n) of the joints where the encoders tell (m, n) `q`."""
         offset, ratio = self.functions[:, 0], self.functions[:, 1]
         plain = offset + ratio * q
-        if not self.functions[:, 2:].any():
-            return np.asarray(plain)
-        sine, cosine = self._eccentricity
-        return np.asarray(plain + sine * np.sin(q) + cosine * np.cos(q))
+        return np.asarray(plain + self._periodic(q, 0) if self.is_periodic else plain)
 
     def encoded(self, positions: FloatArray) -> FloatArray:
         """What encoders tell (m, n) where the joints' effective positions are (m, n): the inverse.
@@ -87,31 +92,39 @@ class Chain:
         """
         offset, ratio = self.functions[:, 0], self.functions[:, 1]
         q = (positions - offset) / ratio
-        if not self.functions[:, 2:].any():
+        if not self.is_periodic:
             return np.asarray(q)
-        sine, cosine = self._eccentricity
         for _ in range(_INVERSIONS):
-            sines, cosines = np.sin(q), np.cos(q)
-            off = offset + ratio * q + sine * sines + cosine * cosines - positions
-            q = q - off / (ratio + sine * cosines - cosine * sines)
+            off = offset + ratio * q + self._periodic(q, 0) - positions
+            q = q - off / (ratio + self._periodic(q, 1))
             if np.abs(off).max(initial=0.0) < _INVERTED:
                 break
         return np.asarray(q)
 
     def jacobian(self, q: FloatArray) -> FloatArray:
         """Derivatives (m, n) of the effective positions by (m, n) `q`."""
-        sine, cosine = self._eccentricity
-        return np.asarray(self.functions[:, 1] + sine * np.cos(q) - cosine * np.sin(q))
+        return np.asarray(self.functions[:, 1] + self._periodic(q, 1))
 
     def curvatures(self, q: FloatArray) -> FloatArray:
         """Second derivatives (m, n) of the effective positions by (m, n) `q`."""
-        sine, cosine = self._eccentricity
-        return np.asarray(-sine * np.sin(q) - cosine * np.cos(q))
+        return self._periodic(q, 2)
+
+    def _periodic(self, q: FloatArray, derivative: int) -> FloatArray:
+        """(m, n) what repeats itself every turn, or one of its derivatives."""
+        waves = self._waves
+        orders = np.arange(1, waves.shape[1] + 1)
+        # The derivative of a sine is one that leads by a quarter of a turn.
+        turned = orders * q[..., None] + derivative * np.pi / 2
+        moved = waves[..., 0] * np.sin(turned) + waves[..., 1] * np.cos(turned)
+        return np.asarray((moved * orders**derivative).sum(axis=-1))
 
     @property
-    def _eccentricity(self) -> FloatArray:
-        """(2, n) sine and cosine of the joints; a prismatic one has none."""
-        return np.where(self.prismatic, 0.0, self.functions[:, 2:].T)
+    def _waves(self) -> FloatArray:
+        """(n, k, 2) sine and cosine of the joints by order; a prismatic one has none."""
+        waves = self.functions[:, None, 2:]
+        if self.harmonics is not None:
+            waves = np.concatenate([waves, self.harmonics], axis=1)
+        return np.where(self.prismatic[:, None, None], 0.0, waves)
 
     def with_offsets_placed(self) -> "Chain":
         """The same arm with the functions' offsets in the placements."""
@@ -137,6 +150,8 @@ def chain_document(name: str, tip: str, chain: Chain) -> dict[str, Any]:
         limits = {"lower": chain.lower[place], "upper": chain.upper[place]}
         row |= {key: float(it) for key, it in limits.items() if np.isfinite(it)}
         row |= dict(zip(FUNCTION_NAMES, chain.functions[place].tolist(), strict=True))
+        if chain.harmonics is not None:
+            row["harmonics"] = chain.harmonics[place].tolist()
         joints.append(row)
     return {
         "schema": 1,
@@ -172,6 +187,29 @@ def chain_from_document(table: Table) -> Chain:
         lower,
         upper,
         np.array([joint_function(row, FUNCTION_NAMES) for _, row in rows]),
+        _harmonics([row for _, row in rows]),
+    )
+
+
+def _harmonics(rows: Sequence[Table]) -> FloatArray | None:
+    """(n, k, 2) harmonics of the joints; None where no row has any.
+
+    Raises:
+        DataError: They are no pairs of numbers, or not as many of each joint.
+    """
+    given = [row.content.get("harmonics", []) for row in rows]
+    if not any(given):
+        return None
+    size = len(given[0]) if isinstance(given[0], Sequence) else 0
+    needed = f"{size} pairs of numbers, sine and cosine of the orders from 2 on [rad]"
+    for row, pairs in zip(rows, given, strict=True):
+        if not isinstance(pairs, Sequence) or len(pairs) != size or not size:
+            raise row.refuse("harmonics", pairs, needed)
+    return np.array(
+        [
+            [number_list(Table({"harmonics": it}, row.label), "harmonics", 2) for it in pairs]
+            for row, pairs in zip(rows, given, strict=True)
+        ]
     )
 
 

@@ -286,8 +286,31 @@ class Robot:
         """What weight, payload and force turn the joints by; see `loads.load_torques`."""
         return load_torques(self, q, loads)
 
+    def harmonic_jacobian(self, q: FloatArray, orders: int) -> FloatArray:
+        """How the flange moves with harmonics of the joints' functions.
+
+        Args:
+            q: (m, n) joint angles [rad].
+            orders: How many orders k there are, from 2 on.
+
+        Returns:
+            (m, 6, 2 n k) right perturbations of `base_from_flange` for each joint's sine and cosine
+            of each order [rad], as `chain.harmonics` has them; none for a prismatic joint.
+
+        Raises:
+            DataError: The number of joints differs from the robot's.
+        """
+        moved = np.where(self.chain.prismatic, 0.0, self.axis_jacobian(q))
+        turned = np.arange(2, orders + 2) * np.asarray(q, dtype=float)[:, :, None]
+        waves = np.stack([np.sin(turned), np.cos(turned)], axis=-1)
+        columns = moved[:, :, :, None, None] * waves[:, None]
+        return np.asarray(columns.reshape(*moved.shape[:2], 2 * orders * self.joint_count))
+
     def corrected(
-        self, placements: FloatArray | None = None, functions: FloatArray | None = None
+        self,
+        placements: FloatArray | None = None,
+        functions: FloatArray | None = None,
+        harmonics: FloatArray | None = None,
     ) -> "Robot":
         """Builds the robot with another geometry.
 
@@ -296,6 +319,8 @@ class Robot:
                 multiplied on the right by its exponential. None leaves them.
             functions: (n, 4) what is added to each joint's offset [rad], ratio, sine and cosine
                 [rad]. None leaves them.
+            harmonics: (n, k, 2) what is added to each joint's sine and cosine [rad] of the orders
+                from 2 on. None leaves them.
 
         Returns:
             The robot, whose document stands alone and gives it back to the last bit.
@@ -317,6 +342,15 @@ class Robot:
                     "zero are needed.",
                     culprits=[self.name],
                 )
+        if harmonics is not None:
+            known = chain.harmonics
+            if known is not None:
+                orders = max(known.shape[1], harmonics.shape[1])
+                known, harmonics = (
+                    np.pad(it, ((0, 0), (0, orders - it.shape[1]), (0, 0)))
+                    for it in (known, harmonics)
+                )
+            chain = replace(chain, harmonics=harmonics if known is None else known + harmonics)
         document = chain_document(self.name, self.tip, chain)
         for row, known in zip(document["joint"], self.document.get("joint", ()), strict=False):
             row |= {key: known[key] for key in BODY_KEYS if key in known}

@@ -111,6 +111,6 @@ def effective_states(
         )
     chain = robot.chain
     jacobian = chain.jacobian(q)
-    if not chain.functions[:, 2:].any():
+    if not chain.is_periodic:
         return chain.effective(q), jacobian * dq, jacobian * ddq
     return chain.effective(q), jacobian * dq, jacobian * ddq + chain.curvatures(q) * dq**2

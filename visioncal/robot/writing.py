@@ -46,13 +46,18 @@ def numbers_text(pose: FloatArray) -> tuple[list[str], list[str]]:
 
 def unwritten(robot: Robot) -> tuple[str, ...]:
     """What a corrected robot has that neither a URDF nor a table of others can hold, in words."""
-    said = []
-    for joint, function in zip(robot.joint_names, robot.chain.functions, strict=True):
+    said, harmonics = [], robot.chain.harmonics
+    for at, (joint, function) in enumerate(
+        zip(robot.joint_names, robot.chain.functions, strict=True)
+    ):
         parts = [
             f"{name} {value:.9g}"
             for name, value, none in zip(FUNCTION_NAMES, function, IDENTITY_FUNCTION, strict=True)
             if name != "offset" and value != none
         ]
+        if harmonics is not None and harmonics[at].any():
+            rms_mrad = 1e3 * float(np.sqrt(np.sum(harmonics[at] ** 2) / 2))
+            parts.append(f"harmonics from order 2 on of {rms_mrad:.2g} mrad rms")
         said += [f"{joint}: {', '.join(parts)}"] if parts else []
     return tuple(said)
 
@@ -61,7 +66,7 @@ def small_urdf(robot: Robot, notes: Sequence[str] = ()) -> str:
     """Writes a URDF of bare links: the joints with their axes and limits, and the tip.
 
     Links have their inertias where the robot tells them. Joint offsets go into the origins. A URDF
-    has no place for gear ratio and eccentricity; a comment says which are missing.
+    has no place for gear ratio, eccentricity and harmonics; a comment says which are missing.
 
     Args:
         robot: The robot.

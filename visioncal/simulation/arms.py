@@ -15,6 +15,8 @@ from visioncal.core.types import FloatArray
 _HALF_TURN = np.pi
 # A strain-wave gear of ratio 100 ripples twice a turn of its wave generator.
 _TEETH = 200
+# Angles all around at which functions of the joints are drawn; between them they run straight.
+_NODES = 1440
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +36,8 @@ class Arm:
         offset: (n,) joint angles at which the encoders read zero [rad].
         waves: (4, n) what each joint turns beyond its encoder: sine and cosine of its angle, from
             an eccentric disc, and of the gear's ripple [rad].
+        beyond: (k, n) what each joint turns beyond all that, at k angles all around [rad]; None for
+            nothing.
     """
 
     name: str
@@ -43,6 +47,7 @@ class Arm:
     beta: FloatArray
     offset: FloatArray
     waves: FloatArray
+    beyond: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -55,6 +60,8 @@ class ArmErrors:
         offset_rad: Of the joint offsets, on top of `angle_rad` [rad].
         eccentricity_rad: Of the sine and the cosine of one turn of each joint [rad].
         ripple_rad: The same for the gear's ripple [rad].
+        function_rad: Of what each joint turns beyond all that, as a function of its angle [rad].
+        function_length_rad: Over which change of the angle that changes [rad].
     """
 
     length_m: float
@@ -62,6 +69,8 @@ class ArmErrors:
     offset_rad: float
     eccentricity_rad: float = 0.0
     ripple_rad: float = 0.0
+    function_rad: float = 0.0
+    function_length_rad: float = 0.06
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,6 +162,8 @@ def disturb(arm: Arm, errors: ArmErrors, rng: np.random.Generator) -> Arm:
     """
     draws, waves = rng.standard_normal((6, arm.a.size)), rng.standard_normal((4, arm.a.size))
     sizes = np.repeat([errors.eccentricity_rad, errors.ripple_rad], 2)
+    # Nothing is drawn for nothing: what others draw behind it stays.
+    beyond = _functions(errors, arm.a.size, rng) if errors.function_rad else arm.beyond
     return replace(
         arm,
         a=arm.a + errors.length_m * draws[0],
@@ -161,7 +172,17 @@ def disturb(arm: Arm, errors: ArmErrors, rng: np.random.Generator) -> Arm:
         beta=arm.beta + errors.angle_rad * draws[3],
         offset=arm.offset + errors.angle_rad * draws[4] + errors.offset_rad * draws[5],
         waves=arm.waves + sizes[:, None] * waves,
+        beyond=beyond,
     )
+
+
+def _functions(errors: ArmErrors, joints: int, rng: np.random.Generator) -> FloatArray:
+    """(k, n) smooth periodic functions of a random course, by filtering white noise on a circle."""
+    turned = np.linspace(0.0, 2.0 * np.pi, _NODES, endpoint=False)
+    near = np.exp(-2.0 * np.sin(0.5 * turned) ** 2 / errors.function_length_rad**2)
+    power = np.sqrt(np.maximum(np.fft.rfft(near).real, 0.0))[:, None]
+    white = np.fft.rfft(rng.standard_normal((_NODES, joints)), axis=0)
+    return np.asarray(errors.function_rad * np.fft.irfft(power * white, _NODES, axis=0))
 
 
 def reach_m(arm: Arm) -> float:
@@ -234,6 +255,9 @@ def _link(arm: Arm, i: int, angle: FloatArray) -> FloatArray:
         [np.sin(angle), np.cos(angle), np.sin(_TEETH * angle), np.cos(_TEETH * angle)]
     )
     turned = angle + arm.offset[i] + arm.waves[:, i] @ phases
+    if arm.beyond is not None:
+        nodes = np.linspace(0.0, 2.0 * np.pi, len(arm.beyond), endpoint=False)
+        turned = turned + np.interp(angle, nodes, arm.beyond[:, i], period=2.0 * np.pi)
     cos_q, sin_q = np.cos(turned), np.sin(turned)
     cos_a, sin_a = np.cos(arm.alpha[i]), np.sin(arm.alpha[i])
     matrices = np.zeros((angle.size, 4, 4))

@@ -135,6 +135,8 @@ def simulate(options: CellOptions, postures: FloatArray | None = None) -> Cell:
         options.offset_sigma_rad,
         options.eccentricity_sigma_rad,
         options.ripple_sigma_rad,
+        options.function_sigma_rad,
+        options.function_length_rad,
     )
     true_arm = disturb(arm, errors, stream(options, Stream.ARM))
     sheets = sheets_of(options)

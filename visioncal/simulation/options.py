@@ -171,6 +171,8 @@ class CellOptions:
         eccentricity_sigma_rad: How far each joint turns with the sine and the cosine of its angle
             beyond what its encoder says [rad].
         ripple_sigma_rad: The same for the ripple of its gear, many times a turn [rad].
+        function_sigma_rad: How far each joint turns beyond that by any function of its angle [rad].
+        function_length_rad: Over which change of the angle that function changes [rad].
         compliance_rad_per_nm: What each joint yields to a torque; empty for a rigid arm.
         payloads: What the arm carries, view by view in turn; empty for nothing.
         mass_share: Real over published masses of the links.
@@ -214,6 +216,8 @@ class CellOptions:
     offset_sigma_rad: float = 0.0
     eccentricity_sigma_rad: float = 0.0
     ripple_sigma_rad: float = 0.0
+    function_sigma_rad: float = 0.0
+    function_length_rad: float = 0.06
     compliance_rad_per_nm: tuple[float, ...] = ()
     payloads: tuple[Payload, ...] = ()
     mass_share: float = 1.0
@@ -259,6 +263,7 @@ def exact(options: CellOptions | None = None) -> CellOptions:
         offset_sigma_rad=0.0,
         eccentricity_sigma_rad=0.0,
         ripple_sigma_rad=0.0,
+        function_sigma_rad=0.0,
         compliance_rad_per_nm=(),
         backlash_rad=(),
         lens_mismatch_px=0.0,

@@ -28,6 +28,8 @@ class Tracked:
         robot_sigma_rad: The same of its rotation [rad].
         dh_sigma_m: Errors of the arm's lengths [m].
         dh_sigma_rad: Errors of its angles [rad].
+        function_sigma_rad: Errors of each joint as a function of its angle [rad].
+        function_length_rad: Over which change of the angle these change [rad].
         compliance: What each joint yields to a torque [rad/(N m)]; empty for a rigid arm.
         payloads: What hangs on the flange, stop by stop in turn.
         seed: Of everything random.
@@ -43,6 +45,8 @@ class Tracked:
     robot_sigma_rad: float = 3e-5
     dh_sigma_m: float = 0.0
     dh_sigma_rad: float = 0.0
+    function_sigma_rad: float = 0.0
+    function_length_rad: float = 0.06
     compliance: tuple[float, ...] = ()
     payloads: tuple[Payload, ...] = ()
     seed: int = 0
@@ -78,7 +82,13 @@ def tracked(options: Tracked, joints: FloatArray | None = None) -> Shop:
     """Moves the arm all over its workspace, or to (s, n) joints [rad], and reads."""
     rng = np.random.default_rng([7, options.seed])
     arm = arm_named(options.robot)
-    errors = ArmErrors(options.dh_sigma_m, options.dh_sigma_rad, options.dh_sigma_rad)
+    errors = ArmErrors(
+        options.dh_sigma_m,
+        options.dh_sigma_rad,
+        options.dh_sigma_rad,
+        function_rad=options.function_sigma_rad,
+        function_length_rad=options.function_length_rad,
+    )
     true_arm = disturb(arm, errors, rng)
     x = compose(exp(np.array([[0.1, -0.2, 2.5, 0, 0, 0]]))[0, :3, :3], np.array([2.5, -1.0, 0.4]))
     turn = exp(np.array([[0.5, 1.0, -0.3, 0, 0, 0]]))[0, :3, :3] if options.poses else np.eye(3)

@@ -6,6 +6,7 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import misfit_jacobian
+from visioncal.estimation.armmodel import HARMONICS
 from visioncal.estimation.effects.lenses import LENSES
 from visioncal.results.sections import FittedArm, JointFit
 from visioncal.session import frame_name
@@ -62,13 +63,15 @@ def _arm(known: RunState) -> FittedArm | None:
         return FittedArm(of="links" if arm.is_modelled else "poses", values=values)
     # What of its errors is not in its geometry goes by the loads of a stop.
     loaded = bool(model.values_by_stop.any())
+    # Functions of the joints are in the arm's geometry, as well as they are known.
+    kept = model.is_kept
     functions = model.functions if loaded else None
     return FittedArm(
         of="model",
-        values=values,
-        weights=model.weights,
+        values=values[kept],
+        weights={it: size for it, size in model.weights.items() if it != HARMONICS},
         flange_from_reported=model.flange_from_reported,
-        by_stop=model.values_by_stop if loaded else None,
+        by_stop=model.values_by_stop[kept] if loaded else None,
         torque_nm=model.torque_nm if loaded else None,
         yielding=model.yielding if loaded else None,
         weight_functions=None if functions is None else functions.parts,
@@ -104,4 +107,6 @@ def _written(known: RunState) -> FloatArray:
     ]
     nothing, arm = slice(0, 0), f"arm of {known.robot_arm.robot}"
     looks, errors = (problem.effect_columns.get(it, nothing) for it in (LENSES, arm))
-    return np.concatenate([rows[:12], rows[looks], *further, rows[errors]])
+    of_errors, model = rows[errors], known.robot_arm.model
+    kept = slice(None) if model is None else model.is_kept
+    return np.concatenate([rows[:12], rows[looks], *further, of_errors[kept]])

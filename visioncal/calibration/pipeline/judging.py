@@ -212,6 +212,7 @@ def _arms(answer: Answer) -> list[Arm]:
                 errs=solved.arms[robot].errors is not None,
                 workspace_mm=None if telling is None else 1e3 * float(np.median(telling.sigmas_m)),
                 modelled=robot in modelled,
+                by_functions=solved.arms[robot].has_functions,
                 name=robot if len(problem.robots) > 1 else "",
             )
         )

@@ -172,6 +172,8 @@ def solve(
         # What agrees by now has a say in how far the arms are calibrated.
         if np.array_equal(before, agreed.used):
             break
+    if asked != "hand-eye":
+        agreed, seen, arms = _with_functions(cell, agreed, seen, arms, late, asked)
     agreed = _with_repeats(agreed)
     found = Solved(cell, agreed, seen, tuple(views), (*lost, *unplaced), arms, asked, late)
     return found if solver == "joint" else _by_closed_form(found, solver)
@@ -265,6 +267,29 @@ def _levels(
         chosen[name] = arm.with_level(stated, start, asked, views, agreed.fit.noise)
         problem = chosen[name].put_into(problem)
     return chosen
+
+
+def _with_functions(
+    cell: Cell,
+    agreed: Agreed,
+    seen: LinearisedCorners | None,
+    arms: Mapping[str, RobotArm],
+    late: Sequence[Effect],
+    asked: str,
+) -> tuple[Agreed, LinearisedCorners | None, Mapping[str, RobotArm]]:
+    """Fits with functions of the joints of each arm that has any, beside the errors of the others.
+
+    What agrees is known by then: their many values would make each look for outliers slow.
+    """
+    problem, found = agreed.problem.subset(agreed.used), dict(arms)
+    for name, arm in arms.items():
+        stated = arm.without_errors(problem)
+        start = State(agreed.fit.state.edges, stated.start_values)
+        found[name] = arm.with_functions(stated, start, asked, agreed.fit.noise)
+        problem = found[name].put_into(problem)
+    if all(found[name] is arm for name, arm in arms.items()):
+        return agreed, seen, arms
+    return _at_rest(cell, agreed, seen, found, late)
 
 
 def _at_rest(

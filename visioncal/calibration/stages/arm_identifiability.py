@@ -175,9 +175,8 @@ def identify_arm(arm: ArmData, convention: Convention | None = None) -> ArmIdent
             lacking = _Lacking(
                 imitated(by_numbers, by_arm, told.missing), _moves(arm, told, weight)
             )
-        place = _place_jacobian(arm, anywhere)
-        seen = arm.covariance[np.ix_(arm.chain, arm.chain)]
-        sigmas_m = np.sqrt(np.einsum("mij,jk,mik->m", place, seen, place))
+        place = arm.place_jacobian(anywhere)[0]
+        sigmas_m = arm.place_sigmas_m(anywhere)
         fitted = (arm.problem, arm.state, arm.noise)
         worth = stop_worth(*fitted, arm.stops, place, arm.chain)
     nominal = arm.model.nominal
@@ -235,13 +234,13 @@ def _at_stops(arm: ArmData) -> Jacobians:
     """The stops' slopes, in units of their noise."""
     _, jacobian = whitened(arm.problem, arm.state, arm.noise, arm.measured)
     flat = jacobian.reshape(-1, arm.problem.size)
-    return Jacobians(flat[:, arm.frames], flat[:, arm.columns] * arm.error_rad)
+    return Jacobians(flat[:, arm.frames], flat[:, arm.columns[arm.model.is_kept]] * arm.error_rad)
 
 
 def _at(arm: ArmData, q: FloatArray, weight: FloatArray) -> Jacobians:
     """Slopes at any postures, in units of a noise like the stops'."""
     flange = arm.model.base_from_flange(q)
-    return _through(arm.pair, flange, arm.basis(q) * arm.error_rad, weight)
+    return _through(arm.pair, flange, arm.model.kept_basis(q) * arm.error_rad, weight)
 
 
 def _by_numbers(arm: ArmData, numbers: _Numbers, q: FloatArray, weight: FloatArray) -> Jacobians:
@@ -266,15 +265,6 @@ def _moves(arm: ArmData, told: Identifiability, weight: FloatArray) -> tuple[Mov
         return count_told(_at(arm, q, weight))
 
     return joints_to_move(arm.model.robot, arm.q, count, told.identifiable - told.told)
-
-
-def _place_jacobian(arm: ArmData, q: FloatArray) -> FloatArray:
-    """How the place of what the flange carries moves with the chain's unknowns, (k, 3, f + p)."""
-    poses, moved = arm.pair.jacobian(arm.model.base_from_flange(q), arm.basis(q))
-    edges = moved.shape[2] - len(arm.columns)
-    jacobian = np.zeros((len(q), 6, arm.problem.size))
-    jacobian[:, :, :edges], jacobian[:, :, arm.columns] = moved[:, :, :edges], moved[:, :, edges:]
-    return arm.pair.place_jacobian(poses, jacobian[:, :, arm.chain], arm.at)
 
 
 def _estimates(arm: ArmData, numbers: _Numbers) -> Iterator[Estimate]:

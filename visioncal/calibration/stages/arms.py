@@ -11,7 +11,12 @@ from visioncal.calibration.stages.arm_identifiability import ArmIdentifiability,
 from visioncal.calibration.stages.backlash import plays_of
 from visioncal.calibration.stages.elastic import Elastic, springs_of
 from visioncal.calibration.stages.joints import Matched
-from visioncal.calibration.stages.kinematics import Kinematics, choose_level
+from visioncal.calibration.stages.kinematics import (
+    Kinematics,
+    choose_level,
+    tells_functions,
+    with_functions,
+)
 from visioncal.calibration.stages.loads import check_elastic, check_poses
 from visioncal.calibration.stages.reported_poses import moved_arm
 from visioncal.calibration.stages.thermal import (
@@ -147,6 +152,11 @@ class RobotArm:
         """Whether its joints at all stops belong to a known model."""
         return self.matched is not None and self.joints_rad is not None
 
+    @property
+    def has_functions(self) -> bool:
+        """Whether functions of its joints were found."""
+        return self.kinematics is not None and self.kinematics.functions is not None
+
     def at(self, stops: IntArray) -> Self:
         """The arm at (k,) of its stops."""
         stood = self.stood[stops]
@@ -279,7 +289,7 @@ class RobotArm:
         found[self.stood] = np.all([it <= 2.0 * it[sound].max() + _ROUNDED for it in away], axis=0)
         return found
 
-    def _seen(
+    def data(
         self,
         problem: Problem,
         fit: Solution,
@@ -339,7 +349,7 @@ class RobotArm:
             stops = replace(seen.warming, places=stops_of(problem, self.robot))
             views = [] if seen.heat is None else seen.heat.views.tolist()
             drift = drift_result(self.drift, stops, views, problem, fit)
-        data = self._seen(problem, fit, covariance, middles)
+        data = self.data(problem, fit, covariance, middles)
         if data is None or self.kinematics is None:
             return ArmFound(drift=drift)
         # With nothing but play and springs its numbers are as stated.
@@ -419,6 +429,34 @@ class RobotArm:
         mine = np.flatnonzero(rows_of(problem, self.robot)).tolist()
         arm = replace(self, kinematics=replace(found, views=tuple(views[it] for it in mine)))
         return arm._bending(model.erring(found.errors)) if found.errors else arm
+
+    def with_functions(self, problem: Problem, start: State, asked: str, noise: Noise) -> Self:
+        """Looks for functions of its joints beside all that a level of its geometry has.
+
+        Args:
+            problem: The observations, with this arm as reported.
+            start: Where to start.
+            asked: A key of `stages.kinematics.ASKED`.
+            noise: The noise's levels to start from.
+        """
+        seen = self.at(stops_of(problem, self.robot))
+        q, reported = seen.joints_rad, seen.reported
+        if self.matched is None or self.joints_rad is None or q is None or self.kinematics is None:
+            return self
+        if not tells_functions(asked, len(q)):
+            return self
+        model = ArmModel.of(self.matched.arm, q, reported).loaded(q, seen.loads)
+        placed = np.eye(len(self.stood))[:, self.stood]
+        stops = (placed, self.joints_rad, self.loads)
+        found = with_functions(self.kinematics, problem, start, self.robot, model, stops, noise)
+        if found.functions is None:
+            return self
+        model = replace(
+            model,
+            harmonic_directions=found.functions.directions,
+            harmonic_sizes=found.functions.sizes,
+        ).erring(found.errors)
+        return replace(self, kinematics=found)._bending(model)
 
     def _columns(self, model: ArmModel, name: str) -> FloatArray:
         """(s, 6, p) how the flange moves with the errors of a block."""

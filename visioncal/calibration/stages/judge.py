@@ -132,6 +132,7 @@ class Arm:
         workspace_mm: Predicted sigma of a tool's place all over a calibrated arm's workspace, in
             the median; None for a nominal arm [mm].
         modelled: Whether its model is known.
+        by_functions: Whether functions of its joints follow the very stops of the fit.
         name: Its name; empty where there is no other.
     """
 
@@ -141,6 +142,7 @@ class Arm:
     errs: bool = False
     workspace_mm: float | None = None
     modelled: bool = False
+    by_functions: bool = False
     name: str = ""
 
 
@@ -356,7 +358,8 @@ def _scatter_doubts(findings: Findings, limits: Limits) -> Iterator[Finding]:
         if outside > _ROUNDING and within > 0.0
     ]
     ratio = max(ratios, default=0.0)
-    if ratio > limits.optimism[0]:
+    followed = any(it.by_functions for it in findings.arms)
+    if ratio > limits.optimism[0] and not followed:
         yield Finding(
             "optimism",
             f"Views left out fit {ratio:.1f} times worse than views in the fit: there are too few "

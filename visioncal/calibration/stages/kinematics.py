@@ -1,4 +1,4 @@
-"""Which errors of the arm the data tell: none, offsets of the joints, links, eccentric gears."""
+"""Which errors of the arm the data tell: none, offsets, links, eccentric gears, any functions."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,12 +11,26 @@ from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import CALIBRATE, Finding, Step
 from visioncal.estimation.arm import SIGNIFICANT, ArmErrors
-from visioncal.estimation.kinematics import LEVELS, ArmTrials, LevelFit, fit_level, resized
+from visioncal.estimation.armmodel import COMPLIANCE, WEIGHT, ArmModel
+from visioncal.estimation.joint_functions import (
+    JointFunctions,
+    find_joint_functions,
+    most_orders,
+)
+from visioncal.estimation.kinematics import (
+    LEVELS,
+    ArmTrials,
+    LevelFit,
+    fit_level,
+    resized,
+    without_springs,
+)
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import robot_levels, starting_noise
 from visioncal.results import Rms
 from visioncal.results.arm import NOMINAL, ArmLevel, ArmResult, UnseenView
+from visioncal.robot import Loads
 
 # What a zero that was found from the target's poses is still off by, before the corners are asked,
 # and the zeros of the other joints with it [rad].
@@ -29,6 +43,8 @@ ASKED: Mapping[str, tuple[str, ...]] = {
     "thermal": tuple(LEVELS),
     "auto": tuple(LEVELS),
 }
+# The level of an arm whose joints err by functions of their angles; of fewer stops it is not asked.
+FUNCTIONS, _FEWEST_STOPS = "functions", 20
 # Those that ask for no level of the geometry.
 _ALL = ("auto", "thermal")
 
@@ -77,6 +93,7 @@ class Kinematics:
         was_asked: Whether the user named the level.
         fits: The fits of the nominal arm and of that level.
         views: (m,) by which view each residual of these goes.
+        functions: Of its joints; None where they are not beyond chance.
     """
 
     level: str
@@ -85,6 +102,7 @@ class Kinematics:
     was_asked: bool
     fits: tuple[LevelFit, LevelFit]
     views: tuple[int, ...] = ()
+    functions: JointFunctions | None = None
 
     def left_out(self) -> tuple[UnseenView, ...]:
         """How far stops that are left out in turn are off by both arms, by view."""
@@ -164,6 +182,57 @@ def choose_level(
     return Kinematics(best.name, levels, chosen.errors, asked not in _ALL, (found[NOMINAL], chosen))
 
 
+def with_functions(
+    found: Kinematics,
+    problem: Problem,
+    state: State,
+    robot: str,
+    model: ArmModel,
+    stops: tuple[FloatArray, FloatArray, Loads],
+    noise: Noise,
+) -> Kinematics:
+    """Takes functions of the joints to a level of the geometry, where they are beyond chance.
+
+    Args:
+        found: What `choose_level` gave.
+        problem: The observations, without errors of this arm.
+        state: Where to start.
+        robot: The robot.
+        model: The arm as stated.
+        stops: (s, m) which of the robot's m places each stop is at, (m, n) its joints and its loads
+            there.
+        noise: The noise's levels to start from.
+    """
+    placed, q, loads = stops
+    count = model.nominal.joint_count
+    names = [*dict.fromkeys(["links", "eccentricity", *found.errors])]
+    names += [COMPLIANCE if model.functions is None else WEIGHT]
+    bases = {
+        it: np.tensordot(placed, model.columns(it, q, loads), axes=1)
+        for it in dict.fromkeys(names)
+        if it != "offsets"
+    }
+    harmonics = model.robot.harmonic_jacobian(q, most_orders()).reshape(len(q), -1)
+    harmonics = (placed @ harmonics).reshape(len(placed), 6, count, -1, 2)
+    with one_blas_thread():
+        functions = find_joint_functions(
+            problem, state, noise, robot, bases, harmonics, model.torque_nm
+        )
+        if functions is None:
+            return found
+        noise = replace(noise, robots=functions.levels)
+        arm = ArmTrials(problem, state, robot, bases, noise)
+        fit = arm.level(without_springs(arm, functions.errors), functions.gain)
+    return replace(
+        found,
+        level=FUNCTIONS,
+        levels=(*found.levels, _level(FUNCTIONS, fit)),
+        errors=fit.errors,
+        fits=(found.fits[0], fit),
+        functions=functions,
+    )
+
+
 def _with_lost_zero(
     fits: Mapping[str, LevelFit | None],
     problem: Problem,
@@ -216,6 +285,11 @@ def _rms(residuals: FloatArray, turned: Mask) -> Rms:
     turns, shifts = (np.sum(it**2, axis=1) for it in (residuals[turned, :3], residuals[:, 3:]))
     deg = float(np.rad2deg(np.sqrt(np.mean(turns)))) if turned.any() else None
     return Rms(mm=1e3 * float(np.sqrt(np.mean(shifts))), deg=deg)
+
+
+def tells_functions(asked: str, stops: int) -> bool:
+    """Whether so many stops may tell functions of the joints at a level that is asked for."""
+    return asked not in ("offsets", "hand-eye") and stops >= _FEWEST_STOPS
 
 
 def check_level(asked: str) -> None:

@@ -124,8 +124,11 @@ class ArmContent:
         missing = unwritten(self.robot)
         if not missing:
             return ""
+        what = "gear ratio and eccentricity"
+        if self.robot.chain.harmonics is not None:
+            what = "gear ratio, eccentricity and harmonics of the joints"
         return (
-            f"gear ratio and eccentricity ({'; '.join(missing)}) have no place in it. A reader "
+            f"{what} ({'; '.join(missing)}) have no place in it. A reader "
             f"without them is off by up to {omission_mm(self.robot):.2g} mm"
         )
 
@@ -199,16 +202,15 @@ def _drift(calibration: Calibration) -> tuple[tuple[float, float] | None, float]
 
 
 def omission_mm(robot: Robot) -> float:
-    """How far the flange is off at worst without gear ratios and eccentricity [mm].
+    """How far the flange is off at worst without gear ratios, eccentricity and harmonics [mm].
 
     Over random postures within the joints' limits, at most a turn from zero.
     """
     none = np.array(IDENTITY_FUNCTION) - robot.chain.functions
     none[:, 0] = 0.0
-    q = postures(robot, _POSTURES)
-    away: FloatArray = robot.base_from_flange(q) - robot.corrected(functions=none).base_from_flange(
-        q
-    )
+    q, harmonics = postures(robot, _POSTURES), robot.chain.harmonics
+    plain = robot.corrected(functions=none, harmonics=None if harmonics is None else -harmonics)
+    away: FloatArray = robot.base_from_flange(q) - plain.base_from_flange(q)
     return 1e3 * float(np.linalg.norm(away[:, :3, 3], axis=1).max())
 
 

@@ -1,0 +1,108 @@
+"""Arms whose joints err by functions of their angles: what is found of them, and how sure."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.tracked import known_of
+
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.stages.kinematics import FUNCTIONS
+from visioncal.core.transforms import invert
+from visioncal.core.types import FloatArray
+from visioncal.estimation.solve import Solution
+from visioncal.results.arm import ArmResult
+from visioncal.simulation.arms import forward
+from visioncal.simulation.tracked import Shop, Tracked, above, session_of, tracked
+
+# Long functions, which few harmonics carry, are quickly found.
+OPTIONS = Tracked(
+    stops=40,
+    poses=True,
+    dh_sigma_m=5e-4,
+    dh_sigma_rad=7e-4,
+    function_sigma_rad=3e-4,
+    function_length_rad=0.25,
+)
+
+
+@pytest.fixture(scope="module")
+def shop() -> Shop:
+    return tracked(OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def known(shop: Shop) -> RunState:
+    return known_of(session_of(shop))
+
+
+Q = above(tracked(OPTIONS).arm, 200, np.random.default_rng(1))
+
+
+def away_m(shop: Shop, known: RunState) -> FloatArray:
+    """(m, 3) how far the probe is predicted off at postures all over the workspace."""
+    x, z = known.solved.state.edges[:2]
+    model = known.robot_arm.model
+    found = invert(x) @ model.base_from_flange(Q) @ z
+    true = invert(shop.base_from_instrument) @ forward(shop.true_arm, Q) @ shop.flange_from_probe
+    return (invert(found) @ true)[:, :3, 3]
+
+
+def sigmas_m(known: RunState) -> FloatArray:
+    """(m,) what is predicted of that."""
+    answer = known.solved
+    fit = Solution(answer.state, answer.noise)
+    return known.robot_arm.data(answer.problem, fit, answer.covariance, {}).place_sigmas_m(Q)
+
+
+def test_they_are_found_and_make_the_arm_better_where_it_never_was(shop, known):
+    kinematics = known.robot_arm.kinematics
+    assert kinematics.level == FUNCTIONS
+    # One size from some hundred values, a length from a grid of factors of two.
+    assert kinematics.functions.sigma_rad == pytest.approx(3e-4, rel=0.4)
+    assert 0.12 <= kinematics.functions.length_rad <= 0.5
+    without = known_of(session_of(shop), level="offsets")
+    ours, theirs = (float(np.sqrt(np.mean(away_m(shop, it) ** 2))) for it in (known, without))
+    assert ours < 0.5 * theirs
+
+
+def test_the_predicted_error_is_the_error(shop, known):
+    squared = np.sum(away_m(shop, known) ** 2, axis=1)
+    # One arm: errors at 200 postures are of some dozen values that stops hardly tell.
+    assert 0.4 < np.mean(squared) / np.mean(sigmas_m(known) ** 2) < 2.0
+
+
+def test_left_out_stops_fit_worse_and_no_one_complains(known):
+    chosen = known.robot_arm.kinematics.levels[-1]
+    assert chosen.left_out.mm > chosen.inside.mm
+    assert chosen.left_out.mm < 0.3 * known.robot_arm.kinematics.levels[0].left_out.mm
+    assert "optimism" not in [it.kind for it in known.verdict.findings]
+
+
+def test_the_arm_of_the_result_has_them(known):
+    section = result_of(known).arm
+    assert isinstance(section, ArmResult)
+    assert section.level == FUNCTIONS
+    assert section.robot.chain.harmonics is not None
+    q = np.random.default_rng(4).uniform(-2.0, 2.0, (5, 6))
+    model = known.robot_arm.model
+    np.testing.assert_allclose(
+        section.robot.base_from_flange(q), model.bare.base_from_flange(q), atol=1e-12
+    )
+    # Numbers of a table, not harmonics, are what stops are asked to tell.
+    assert section.observability.identifiable < 80
+
+
+def test_an_arm_without_them_has_none():
+    shop = tracked(replace(OPTIONS, function_sigma_rad=0.0, seed=2))
+    kinematics = known_of(session_of(shop)).robot_arm.kinematics
+    assert kinematics.level != FUNCTIONS
+    assert kinematics.functions is None
+
+
+def test_places_alone_tell_of_them():
+    options = replace(OPTIONS, poses=False, stops=60)
+    shop = tracked(options)
+    known = known_of(session_of(shop))
+    assert known.robot_arm.kinematics.level == FUNCTIONS

@@ -1,0 +1,329 @@
+"""Functions of the joints: repeatable errors of each angle over its turn, beyond links and gears.
+
+Encoders and their mounts err by some tenths of a milliradian in a way that comes back every turn
+and is no low harmonic. Each joint's error is a periodic Gaussian process (MacKay 1998),
+`s^2 exp(-2 sin^2(d/2) / l^2)` for two angles d apart, carried as harmonics with the variances of
+that kernel's Fourier series; all joints have one size s and one length l. Beside it are twists of
+the links, gravity and the first two harmonics, each group with a size of its own. All sizes are by
+restricted likelihood with log-normal priors, the length on a grid (Gilmour, Thompson and Cullis
+1995 for the steps, Harville 1977 for the likelihood).
+"""
+
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import LinAlgError, lapack
+from scipy.special import ive
+
+from visioncal.core.types import FloatArray, IntArray
+from visioncal.estimation.arm import ArmErrors
+from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, HARMONICS, WEIGHT
+from visioncal.estimation.linalg import gram
+from visioncal.estimation.parts import Noise, State
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.solve import RATIO_PRIOR, RobotLikelihood, robot_levels, robot_likelihood
+from visioncal.estimation.variance import LEAST_SIGMA, MOST_SIGMA, Knowledge
+
+# Twice the gain in log-likelihood over the same arm without them.
+SIGNIFICANT = 20.0
+# Lengths that are tried [rad], the longest first, and how many lengths' inverses of harmonics are
+# carried: beyond, two percent of the variance is left.
+_LENGTHS_RAD, _CARRIED = (0.5, 0.25, 0.12, 0.06, 0.03), 2.4
+# Typical sizes of errors [rad], give or take a factor of e, and the torque of a spring's [N m].
+_TYPICAL = {
+    "links": 7e-4,
+    COMPLIANCE: 1e-4,
+    WEIGHT: 1e-4,
+    BACKLASH: 1e-4,
+    "ratios": 1e-4,
+    "eccentricity": 1.5e-4,
+    "second": 1e-4,
+    HARMONICS: 2e-4,
+}
+_TORQUE_NM, _SPREAD = 10.0, 1.0
+_ITERATIONS, _SETTLED, _LONGEST_STEP = 30, 1e-2, 1.0
+_WORST_DAMPING, _RIDGE = 1e4, 1e-12
+# Combinations of harmonics of which residuals tell by less than this share of what is known of them
+# beforehand are no unknowns: they stay as open as they were.
+_TELLING = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class JointFunctions:
+    """What was found of the functions of an arm's joints.
+
+    Attributes:
+        errors: The errors of the whole arm by block, with the sizes that were found beside them.
+        levels: (r, 2) of the robots' noise beside them; see `Noise`.
+        sizes: (2 n k,) of sine and cosine of each joint and order from 2 on, relative to that of
+            their block.
+        directions: (2 n k, r) what each value of their block makes of these: combinations that the
+            observations tell something of.
+        sigma_rad: Their size s [rad].
+        length_rad: Over which change of its angle a joint's error changes [rad].
+        gain: Twice the gain in log-likelihood over the arm as stated.
+    """
+
+    errors: Mapping[str, ArmErrors]
+    levels: FloatArray
+    sizes: FloatArray
+    directions: FloatArray
+    sigma_rad: float
+    length_rad: float
+    gain: float
+
+
+def most_orders() -> int:
+    """How many orders of harmonics, from 2 on, the shortest length takes."""
+    return _orders_of(min(_LENGTHS_RAD))
+
+
+def _orders_of(length_rad: float) -> int:
+    return max(int(np.ceil(_CARRIED / length_rad)) - 1, 1)
+
+
+def _series(length_rad: float) -> FloatArray:
+    """(k + 1,) variances of the harmonics of a process of unit size, from order 1 on."""
+    orders = np.arange(1, _orders_of(length_rad) + 2)
+    return np.asarray(2.0 * ive(orders, length_rad**-2))
+
+
+def find_joint_functions(
+    problem: Problem,
+    state: State,
+    noise: Noise,
+    robot: str,
+    bases: Mapping[str, FloatArray],
+    harmonics: FloatArray,
+    torque_nm: float,
+) -> JointFunctions | None:
+    """Looks for functions of the joints of one robot's arm.
+
+    Args:
+        problem: The observations, without errors of this arm.
+        state: The answer with the nominal arm.
+        noise: The levels of the sensors; those of robots are sought anew.
+        robot: The robot.
+        bases: (s, 6, p) by stop, how the flange moves with the errors of each other block.
+        harmonics: (s, 6, n, k, 2) the same for sine and cosine of each joint and order from 2 on.
+        torque_nm: The torque that a unit of a compliance is for [N m].
+
+    Returns:
+        The functions with all other errors of the arm; None where these explain about as much.
+    """
+    plain = _Arm.of(problem, state, noise, robot, bases, harmonics[:, :, :, :1])
+    without = plain.most_likely(plain.start(torque_nm), torque_nm)
+    if without is None:
+        return None
+    chosen, chosen_length, best = None, 0.0, without
+    for length in _LENGTHS_RAD:
+        orders = _orders_of(length)
+        arm = _Arm.of(problem, state, noise, robot, bases, harmonics[:, :, :, :orders], length)
+        found = arm.most_likely(np.append(best[0][: len(without[0])], np.log(2e-4)), torque_nm)
+        if found is None or (chosen is not None and found[1] > best[1]):
+            break
+        chosen, best, chosen_length = arm, found, length
+    if chosen is None or 2.0 * (without[1] - best[1]) < SIGNIFICANT:
+        return None
+    nominal = robot_levels(problem, state, noise, from_above=True)[1]
+    return chosen.found(best[0], chosen_length, 2.0 * (nominal - best[1]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Arm:
+    """An arm with groups of errors whose sizes are sought.
+
+    Attributes:
+        likelihood: Of the residuals, all errors of the arm among the unknowns.
+        names: The groups, in the order of the sizes.
+        shares: (q, g) which share of the variance of each error a group's is.
+        random: (q,) their places among the unknowns that move.
+        bases: The columns of each block.
+        length_rad: Of the functions; 0 without any.
+    """
+
+    likelihood: RobotLikelihood
+    names: tuple[str, ...]
+    shares: FloatArray
+    random: IntArray
+    bases: Mapping[str, FloatArray]
+    length_rad: float
+
+    @classmethod
+    def of(
+        cls,
+        problem: Problem,
+        state: State,
+        noise: Noise,
+        robot: str,
+        bases: Mapping[str, FloatArray],
+        harmonics: FloatArray,
+        length_rad: float = 0.0,
+    ) -> "_Arm":
+        stops, _, joints, orders, _ = harmonics.shape
+        every = {**bases, HARMONICS: harmonics.reshape(stops, 6, -1)}
+        basis = np.concatenate(list(every.values()), axis=2)
+        size = basis.shape[2]
+        freely = Knowledge(np.zeros((size, size)), np.zeros(size))
+        effect = replace(ArmErrors(basis, 1.0, 0.0, True).effect(robot), known=freely)
+        widened = problem.with_effects([*problem.effects, effect])
+        still = State(state.edges, np.concatenate([problem.start_values, np.zeros(size)]))
+        likelihood = robot_likelihood(widened, still, noise)
+        moving = np.cumsum(likelihood.moving) - 1
+        random = moving[np.arange(len(likelihood.moving))[widened.effect_columns[effect.name]]]
+        names = (*bases, "second", *([HARMONICS] if length_rad else []))
+        shares = np.zeros((size, len(names)))
+        at = 0
+        for group, it in enumerate(bases.values()):
+            shares[at : at + it.shape[2], group] = 1.0
+            at += it.shape[2]
+        by_order = shares[at:].reshape(joints, orders, 2, len(names))
+        by_order[:, 0, :, names.index("second")] = 1.0
+        if length_rad:
+            series = _series(length_rad)
+            by_order[..., -1] = series[1:, None]
+            # The process's own first harmonic is among those of eccentric gears.
+            shares[:, -1] += series[0] * shares[:, names.index("eccentricity")]
+        return cls(likelihood, names, shares, random, every, length_rad)
+
+    def start(self, torque_nm: float) -> FloatArray:
+        """Logarithms of the robots' levels, and of the sizes of the groups."""
+        levels = np.maximum(self.likelihood.rms, LEAST_SIGMA)
+        count = len(self.likelihood.components.parts) // 2
+        return np.concatenate([np.log(np.tile(levels, count)), self._typical(torque_nm)])
+
+    def _typical(self, torque_nm: float) -> FloatArray:
+        """(g,) logarithms of typical sizes of the groups."""
+        factor = {COMPLIANCE: torque_nm / _TORQUE_NM}
+        return np.log([_TYPICAL[it] * factor.get(it, 1.0) for it in self.names])
+
+    def most_likely(self, start: FloatArray, torque_nm: float) -> tuple[FloatArray, float] | None:
+        """The logarithms of the most likely levels and sizes, and the negative log-likelihood."""
+        logs, damping = start, 1e-3
+        try:
+            now = self._likelihood(logs, torque_nm)
+        except LinAlgError:
+            return None
+        for _ in range(_ITERATIONS):
+            curvature = now.curvature + damping * np.diag(np.diag(now.curvature))
+            step = np.clip(-np.linalg.solve(curvature, now.slope), -_LONGEST_STEP, _LONGEST_STEP)
+            candidate = np.clip(logs + step, np.log(LEAST_SIGMA), np.log(MOST_SIGMA))
+            then = None
+            with suppress(LinAlgError):
+                then = self._likelihood(candidate, torque_nm)
+            if then is not None and then.value <= now.value:
+                gained, logs, now = now.value - then.value, candidate, then
+                damping = max(damping / 10, 1e-6)
+                if gained < _SETTLED:
+                    break
+            else:
+                damping *= 10
+            if damping > _WORST_DAMPING:
+                break
+        return logs, now.value
+
+    def _likelihood(self, logs: FloatArray, torque_nm: float) -> "_Step":
+        reduced, components = self.likelihood.reduced, self.likelihood.components
+        known, levels = self.likelihood.known, len(components.parts)
+        residuals = reduced.errors
+        jacobian = reduced.jacobian[:, :, self.likelihood.moving]
+        sigmas, squares = np.exp(logs[:levels]), np.exp(2.0 * logs[levels:])
+        total, variances = components.total(sigmas), self.shares @ squares
+        weights = np.linalg.inv(total)
+        weighted = weights @ jacobian
+        information = gram(jacobian, weighted) + known.information
+        information[self.random, self.random] += 1.0 / variances
+        inverse, log_determinant = _inverted(information)
+        best = inverse @ (gram(weighted, residuals) + known.gradient)
+        left = residuals - jacobian @ best
+        pulled = (weights @ left[:, :, None])[:, :, 0]
+        effects = best[self.random]
+        value = 0.5 * float(
+            np.linalg.slogdet(total)[1].sum()
+            + log_determinant
+            + np.log(variances).sum()
+            + np.einsum("ui,ui->", left, pulled)
+            + best @ (known.information @ best - 2.0 * known.gradient)
+            + np.sum(effects**2 / variances)
+        )
+        growth = 2.0 * sigmas[:, None, None] ** 2 * components.parts
+        taken = np.einsum("uip,uip->ui", weighted @ inverse, weighted)
+        left_over = np.diagonal(weights, axis1=1, axis2=2) - taken
+        by_levels = 0.5 * np.einsum("kui,ui->k", growth, left_over - pulled**2)
+        asked = growth * pulled
+        owned = self.shares * squares
+        posterior = np.diag(inverse)[self.random] + effects**2
+        by_sizes = (1.0 / variances - posterior / variances**2) @ owned
+        # Products of the residuals' growth with each level and size, as the average information.
+        moved = np.zeros((len(best), len(squares)))
+        moved[self.random] = 2.0 * owned * (effects / variances)[:, None]
+        grown = np.concatenate([np.moveaxis(asked, 0, 2), jacobian @ moved], axis=2)
+        of_weights = gram(weighted, grown)
+        curvature = 0.5 * (gram(grown, weights @ grown) - of_weights.T @ inverse @ of_weights)
+        slope = np.concatenate([by_levels, by_sizes])
+        away = (logs[levels:] - self._typical(torque_nm)) / _SPREAD
+        slope[levels:] += away / _SPREAD
+        curvature[levels:, levels:] += np.eye(len(away)) / _SPREAD**2
+        value += 0.5 * float(away @ away)
+        for row in range(0, levels, 2):
+            lean = np.zeros(len(logs))
+            lean[row : row + 2] = np.array([-1.0, 1.0]) / RATIO_PRIOR.log_sigma
+            offset = lean @ logs - np.log(RATIO_PRIOR.ratio) / RATIO_PRIOR.log_sigma
+            value, slope = value + 0.5 * float(offset**2), slope + offset * lean
+            curvature = curvature + np.outer(lean, lean)
+        return _Step(value, slope, curvature)
+
+    def found(self, logs: FloatArray, length_rad: float, gain: float) -> JointFunctions:
+        """The errors of all blocks with the sizes of these logarithms."""
+        sizes = np.exp(logs[-len(self.names) :])
+        variances, sigma = self.shares @ sizes**2, float(sizes[-1])
+        errors, at = {}, 0
+        for name, basis in self.bases.items():
+            size = basis.shape[2]
+            size_rad, share = float(np.sqrt(variances[at])), gain / len(self.bases)
+            errors[name] = ArmErrors(basis, size_rad, share, of_links=True)
+            at += size
+        harmonics = self.bases[HARMONICS]
+        own = np.sqrt(variances[-harmonics.shape[2] :])
+        directions = own[:, None] * self._told(logs, own) / sigma
+        errors[HARMONICS] = replace(errors[HARMONICS], basis=harmonics @ directions, sigma=sigma)
+        levels = np.exp(logs[: -len(self.names)]).reshape(-1, 2)
+        return JointFunctions(errors, levels, own / sigma, directions, sigma, length_rad, gain)
+
+    def _told(self, logs: FloatArray, sizes: FloatArray) -> FloatArray:
+        """(q, r) unit vectors, in units of (q,) sizes, of harmonics that residuals tell of."""
+        components = self.likelihood.components
+        weights = np.linalg.inv(components.total(np.exp(logs[: len(components.parts)])))
+        jacobian = self.likelihood.reduced.jacobian[:, :, self.likelihood.moving]
+        jacobian = jacobian[:, :, self.random[-len(sizes) :]] * sizes
+        values, vectors = np.linalg.eigh(gram(jacobian, weights @ jacobian))
+        return np.asarray(vectors[:, values > _TELLING])
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """Negative log-likelihood at some logarithms, its slope and its average information."""
+
+    value: float
+    slope: FloatArray
+    curvature: FloatArray
+
+
+def _inverted(information: FloatArray) -> tuple[FloatArray, float]:
+    """The inverse of (p, p) information, and the logarithm of its determinant.
+
+    Raises:
+        LinAlgError: It has none.
+    """
+    diagonal = np.diag(information)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    scaled = information * np.outer(scale, scale) + _RIDGE * np.eye(len(scale))
+    factor, failed = lapack.dpotrf(scaled, lower=1)
+    if failed:
+        raise LinAlgError("the information has no inverse")
+    inverse, _ = lapack.dpotri(factor, lower=1)
+    inverse = np.tril(inverse) + np.tril(inverse, -1).T
+    logarithm = 2.0 * float(np.log(np.diag(factor)).sum() - np.log(scale).sum())
+    return inverse * np.outer(scale, scale), logarithm
