@@ -4,9 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pyarrow as pa
 import rerun as rr
 
-from visioncal.core.types import FloatArray
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.present.recording import colours, coverage, paths
 from visioncal.present.recording.coverage import PointChart
 from visioncal.results import Calibration
@@ -36,21 +37,44 @@ class JointChart:
     angle_deg: Mapping[int, float]
     residual_mm: Mapping[int, float]
 
-    def log(
-        self, stream: rr.RecordingStream, name: str, views: Sequence[int], *, static: bool
-    ) -> None:
-        """Draws bars for some of the views."""
-        angles = np.array([self.angle_deg[view] for view in views])
-        span_deg = np.ptp(list(self.angle_deg.values()))
-        marked = name == paths.THIS_VIEW
+    def log(self, stream: rr.RecordingStream) -> None:
+        """Draws the bars of all views."""
         bars = rr.BarChart(
-            [self.residual_mm[view] for view in views],
-            abscissa=angles,
-            # A joint that stood still still needs bars that can be seen.
-            widths=np.full(len(views), _BAR * max(span_deg, 1.0)),
-            color=colours.THIS_VIEW if marked else colours.USED,
+            list(self.residual_mm.values()),
+            abscissa=np.array(list(self.angle_deg.values())),
+            widths=np.full(len(self.angle_deg), self._width_deg),
+            color=colours.USED,
         )
-        stream.log(f"{paths.over_joint(self.joint)}/{name}", bars, static=static)
+        stream.log(f"{paths.over_joint(self.joint)}/{paths.USED}", bars, static=True)
+
+    def log_marks(self, stream: rr.RecordingStream, rows: Mapping[int, int]) -> None:
+        """Marks the bar of each view when that is looked at: all views as one message.
+
+        Args:
+            stream: Where to.
+            rows: The views' places in the session.
+        """
+        heights = _single_tensors([self.residual_mm.get(view) for view in rows])
+        angles_deg = _single_tensors([self.angle_deg.get(view) for view in rows])
+        colour = rr.components.ColorBatch([colours.THIS_VIEW] * len(rows))
+        widths_deg = rr.components.LengthBatch([self._width_deg] * len(rows))
+        columns = {
+            rr.BarChart.descriptor_values(): heights,
+            rr.BarChart.descriptor_abscissa(): angles_deg,
+            rr.BarChart.descriptor_color(): colour.as_arrow_array(),
+            rr.BarChart.descriptor_widths(): widths_deg.as_arrow_array(),
+        }
+        rr.send_columns(
+            f"{paths.over_joint(self.joint)}/{paths.THIS_VIEW}",
+            [rr.TimeColumn(paths.TIMELINE, sequence=rows.values())],
+            [rr.ComponentColumn(it, rr.AnyBatchValue(it, found)) for it, found in columns.items()],
+            recording=stream,
+        )
+
+    @property
+    def _width_deg(self) -> float:
+        """A joint that stood still still needs bars that can be seen."""
+        return _BAR * max(float(np.ptp(list(self.angle_deg.values()))), 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,23 +124,54 @@ class Charts:
                 if some:
                     points = rr.Points2D(np.vstack(some), colors=colour, radii=_POINT)
                     stream.log(f"{chart.entity}/{name}", points, static=True)
+            style = rr.Points2D.from_fields(
+                colors=colours.THIS_VIEW, radii=_MARK, draw_order=_ABOVE
+            )
+            stream.log(f"{chart.entity}/{paths.THIS_VIEW}", style, static=True)
         for joint in self.joints:
-            joint.log(stream, paths.USED, list(joint.angle_deg), static=True)
+            joint.log(stream)
+
+    def log_marks(self, stream: rr.RecordingStream, rows: Mapping[int, int]) -> None:
+        """Marks each view in the charts over the joints; see `JointChart.log_marks`."""
+        for joint in self.joints:
+            joint.log_marks(stream, rows)
 
     def log_view(self, stream: rr.RecordingStream, view: int) -> None:
         """Marks one view, at the stream's current time."""
         for chart in self.points:
             positions = chart.points.get(view, np.zeros((0, 2)))
-            points = rr.Points2D(
-                positions, colors=colours.THIS_VIEW, radii=_MARK, draw_order=_ABOVE
-            )
+            points = rr.Points2D.from_fields(positions=positions)
             stream.log(f"{chart.entity}/{paths.THIS_VIEW}", points)
-        for joint in self.joints:
-            if view in joint.angle_deg:
-                joint.log(stream, paths.THIS_VIEW, [view], static=False)
-            else:
-                entity = f"{paths.over_joint(joint.joint)}/{paths.THIS_VIEW}"
-                stream.log(entity, rr.Clear(recursive=False))
+
+
+def _single_tensors(values: Sequence[float | None]) -> pa.Array:
+    """Tensors of one number each, or of none; rerun itself makes no batches of them."""
+    kind = rr.components.TensorDataBatch(np.zeros(1)).as_arrow_array().type
+    union, count = kind.field("buffer").type, len(values)
+    sizes = np.array([it is not None for it in values], dtype=np.int64)
+    numbers = pa.array([it for it in values if it is not None], pa.float64())
+    children = [pa.nulls(0, field.type) for field in union]
+    place = [field.name for field in union].index("F64")
+    # By their buffers: what arrow makes itself may hold nulls, which is another type.
+    children[place] = _from_buffers(union[place].type, count, [_ends(sizes)], [numbers])
+    of_type, at = np.full(count, place, dtype=np.int8), np.arange(count, dtype=np.int32)
+    buffer = _from_buffers(union, count, [pa.py_buffer(of_type), pa.py_buffer(at)], children)
+    ones = pa.array(sizes, pa.uint64())
+    shape = _from_buffers(
+        kind.field("shape").type, count, [_ends(np.ones(count, dtype=np.int64))], [ones]
+    )
+    names = pa.nulls(count, kind.field("names").type)
+    return pa.StructArray.from_arrays([shape, names, buffer], fields=list(kind))
+
+
+def _ends(sizes: IntArray) -> pa.Buffer:
+    return pa.py_buffer(np.append(0, np.cumsum(sizes)).astype(np.int32))
+
+
+def _from_buffers(
+    kind: pa.DataType, count: int, buffers: list[pa.Buffer], children: list[pa.Array]
+) -> pa.Array:
+    return pa.Array.from_buffers(kind, count, [None, *buffers], children=children)
 
 
 def _joint_charts(session: Session, calibration: Calibration) -> tuple[JointChart, ...]:

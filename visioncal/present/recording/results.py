@@ -179,6 +179,7 @@ def _draw(
             notes.log_view(stream, results[view.number], ends)
         if view.number in drifts:
             thermal.log_view(stream, drifts[view.number])
+    scene.log_marks(stream)
     recorder.keep()
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import rerun as rr
@@ -141,13 +142,34 @@ class Scene:
         frames = {f"target_{name}" if name else paths.TARGET_FRAME: it for name, it in boards}
         return {frame: it for frame, it in frames.items() if frame in self._ends}
 
+    def log_marks(self, stream: rr.RecordingStream) -> None:
+        """Logs what is known of all views at once."""
+        if self.charts is not None:
+            rows = {view.number: row for row, view in enumerate(self.session.views)}
+            self.charts.log_marks(stream, rows)
+
+    @cached_property
+    def _edges(self) -> Mapping[str, FloatArray]:
+        """(4, 4) by name, exactly orthonormal."""
+        edges = {} if self.calibration is None else self.calibration.transforms
+        return {name: edge.as_matrix() for name, edge in edges.items()}
+
+    @cached_property
+    def _outlines(self) -> Mapping[str, FloatArray]:
+        """(k, 3) of each board."""
+        return {name: board.closed_outline(it) for name, it in self.session.boards.items()}
+
+    @cached_property
+    def _rejected(self) -> frozenset[int]:
+        views = () if self.calibration is None else self.calibration.views
+        return frozenset(view.view for view in views if not view.used)
+
     def _base_from(self, end: str, base_from_flange: FloatArray | None) -> FloatArray | None:
         """Where the calibration puts `cam` or `target` in one view; None where it is unknown."""
-        edges = {} if self.calibration is None else self.calibration.transforms
-        if f"base_from_{end}" in edges:
-            return np.asarray(edges[f"base_from_{end}"].as_matrix())
-        if base_from_flange is not None and f"flange_from_{end}" in edges:
-            return np.asarray(base_from_flange @ edges[f"flange_from_{end}"].as_matrix())
+        if f"base_from_{end}" in self._edges:
+            return self._edges[f"base_from_{end}"]
+        if base_from_flange is not None and f"flange_from_{end}" in self._edges:
+            return np.asarray(base_from_flange @ self._edges[f"flange_from_{end}"])
         return None
 
     def _radius(self, share: float) -> float:
@@ -173,11 +195,10 @@ class Scene:
 
     def _log_mount(self, stream: rr.RecordingStream) -> None:
         """Draws the edges that hang on the flange, as lines."""
-        edges = {} if self.calibration is None else self.calibration.transforms
-        for name, edge in edges.items():
+        for name, edge in self._edges.items():
             if name.startswith("flange_from_"):
                 line = rr.LineStrips3D(
-                    [[np.zeros(3), edge.translation]],
+                    [[np.zeros(3), edge[:3, 3]]],
                     colors=colours.JOINT,
                     radii=self._radius(2 * _LINE),
                 )
@@ -186,13 +207,11 @@ class Scene:
 
     def _log_stops(self, stream: rr.RecordingStream) -> None:
         """All places of the flange; those of views that were not used in another colour."""
-        views = () if self.calibration is None else self.calibration.views
-        rejected = {view.view for view in views if not view.used}
         for name, colour in ((paths.USED, colours.USED), (paths.REJECTED, colours.REJECTED)):
             poses = [
                 pose
                 for view, pose in self.base_from_flange.items()
-                if (view in rejected) is (name == paths.REJECTED)
+                if (view in self._rejected) is (name == paths.REJECTED)
             ]
             if not poses:
                 continue
@@ -249,16 +268,13 @@ class Scene:
         target = self.session.boards.get(self.session.board_of(view))
         if target is None:
             return
-        rejected = self.calibration is not None and any(
-            it.view == seen.view and not it.used for it in self.calibration.views
-        )
         strips = []
         if seen.cam_from_target is not None and base_from_cam is not None:
             base_from_target = base_from_cam @ seen.cam_from_target
-            corners = board.closed_outline(target)
+            corners = self._outlines[self.session.board_of(view)]
             strips.append(corners @ base_from_target[:3, :3].T + base_from_target[:3, 3])
         # Without strips, this takes those of the view before off the screen.
-        colour = colours.REJECTED if rejected else colours.DETECTED
+        colour = colours.REJECTED if seen.view in self._rejected else colours.DETECTED
         line = rr.LineStrips3D(strips, colors=colour, radii=self._radius(_LINE))
         stream.log(paths.SEEN_TARGET, rr.CoordinateFrame(paths.BASE_FRAME), line)
 

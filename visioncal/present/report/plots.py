@@ -42,7 +42,7 @@ def residuals(calibration: Calibration, outlying: Collection[int] = ()) -> Marku
     if not shown:
         return Markup("")
     with svg.style():
-        figure = svg.new_figure(_WIDE_IN, 1.3 * len(shown) + 0.25)
+        figure = svg.new_figure(_WIDE_IN, 1.3 * len(shown) + 0.25, svg.Margins(0.75, 0.75))
         rows = figure.subplots(len(shown), sharex=True, squeeze=False)[:, 0]
         for axes, (label, value_of, rms) in zip(rows, shown, strict=True):
             _residual_panel(axes, calibration.views, value_of, rms, outlying)
@@ -83,7 +83,9 @@ def image_coverage(calibration: Calibration, evidence: Sequence[ViewEvidence]) -
     known = np.isfinite(errors)
     width, height = calibration.camera.camera.resolution
     with svg.style():
-        figure = svg.new_figure(_SMALL_IN, 0.5 + 0.75 * _SMALL_IN * height / width)
+        figure = svg.new_figure(
+            _SMALL_IN, 0.5 + 0.75 * _SMALL_IN * height / width, svg.Margins(right=0.25)
+        )
         axes = figure.subplots()
         marks: dict[str, Any] = {"s": 5, "linewidths": 0, "rasterized": len(px) > _MANY_MARKS}
         axes.scatter(px[~known, 0], px[~known, 1], color=svg.ACCENT, **marks)
@@ -120,7 +122,7 @@ def viewing_directions(calibration: Calibration, evidence: Sequence[ViewEvidence
         return Markup("")
     used = {view.view for view in calibration.views if view.used}
     with svg.style():
-        figure = svg.new_figure(_SMALL_IN, 3.0)
+        figure = svg.new_figure(_SMALL_IN, 3.0, svg.Margins(0.5, 0.5, 0.4, 0.4))
         axes = figure.add_subplot(projection="polar")
         for is_used, mark, colour, label in (
             (True, "o", svg.ACCENT, "used"),
@@ -161,7 +163,7 @@ def flange_rotations(calibration: Calibration, evidence: Sequence[ViewEvidence])
     base_from_mean = nearest_rotation(rotations.mean(axis=0))
     turns_deg = np.rad2deg(Rotation.from_matrix(base_from_mean.T @ rotations).as_rotvec())
     with svg.style():
-        figure = svg.new_figure(_SMALL_IN, 2.0)
+        figure = svg.new_figure(_SMALL_IN, 2.0, svg.Margins(left=0.5))
         axes = figure.subplots()
         for row in range(3):
             axes.plot(turns_deg[:, row], np.full(len(turns_deg), row), "|", color=svg.ACCENT,

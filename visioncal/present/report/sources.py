@@ -12,6 +12,8 @@ from visioncal.present.report import svg
 from visioncal.results.sections import BoardResult, UncertaintyResult
 
 _WIDTH_IN = 5.0
+# Mean width of a letter, rounded up.
+_LETTER_IN = 0.068
 _LEVELS, _FINER = 13, 3
 # Height over width of the picture of an upright board.
 _TALLEST = 0.8
@@ -29,7 +31,9 @@ def budget(found: UncertaintyResult) -> Markup:
     labels.append(significant(found.total_mm))
     top = max(values) or 1.0
     with svg.style():
-        figure = svg.new_figure(_WIDTH_IN, 0.32 * len(names) + 0.6)
+        words = [SOURCES.get(it, it) for it in names]
+        margins = svg.Margins(0.2 + _LETTER_IN * max(map(len, words)))
+        figure = svg.new_figure(_WIDTH_IN, 0.32 * len(names) + 0.6, margins)
         axes = figure.subplots()
         colours = [svg.ACCENT] * len(found.parts_mm) + [svg.INK]
         axes.barh(range(len(names)), values, height=0.6, color=colours, alpha=0.9)
@@ -37,7 +41,7 @@ def budget(found: UncertaintyResult) -> Markup:
             axes.annotate(
                 label, (value, row), (4, 0), textcoords="offset points", fontsize=8, va="center"
             )
-        axes.set_yticks(range(len(names)), [SOURCES.get(it, it) for it in names])
+        axes.set_yticks(range(len(names)), words)
         axes.set_ylim(len(names) - 0.5, -0.5)
         # Room for the labels beside the longest bar.
         axes.set_xlim(0.0, 1.55 * top)
@@ -53,7 +57,7 @@ def directions(found: UncertaintyResult) -> Markup:
     if not len(values):
         return Markup("")
     with svg.style():
-        figure = svg.new_figure(_WIDTH_IN, 1.0)
+        figure = svg.new_figure(_WIDTH_IN, 1.0, svg.Margins(left=0.15))
         axes = figure.subplots()
         axes.plot(values, np.zeros(len(values)), "|", color=svg.ACCENT, markersize=18,
                   markeredgewidth=1.6)  # fmt: skip

@@ -4,10 +4,12 @@ import io
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import matplotlib as mpl
 from markupsafe import Markup, escape
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.typing import RcKeyType
 
@@ -34,6 +36,8 @@ _STYLE: dict[RcKeyType, Any] = {
     "lines.solid_capstyle": "butt",
     "font.family": ["DejaVu Sans"],
     "font.size": 9.0,
+    "figure.facecolor": "none",
+    "axes.facecolor": "none",
     "axes.edgecolor": LINE,
     "axes.labelcolor": INK,
     "axes.spines.top": False,
@@ -60,9 +64,35 @@ def style() -> Iterator[None]:
         yield
 
 
-def new_figure(width_in: float, height_in: float) -> Figure:
-    """A figure of its own, known to no global registry."""
-    return Figure(figsize=(width_in, height_in), layout="constrained")
+@dataclass(frozen=True)
+class Margins:
+    """Room around a figure's axes for their labels [inches]."""
+
+    left: float = 0.62
+    right: float = 0.1
+    bottom: float = 0.5
+    top: float = 0.1
+
+
+def new_figure(width_in: float, height_in: float, margins: Margins | None = None) -> Figure:
+    """A figure of its own, known to no global registry.
+
+    Args:
+        width_in: Its width [inches].
+        height_in: Likewise.
+        margins: Where its labels are as large as is known beforehand; they are measured where None,
+            which takes as long as drawing it.
+    """
+    if margins is None:
+        return Figure(figsize=(width_in, height_in), layout="constrained")
+    figure = Figure(figsize=(width_in, height_in))
+    figure.subplots_adjust(
+        margins.left / width_in,
+        margins.bottom / height_in,
+        1.0 - margins.right / width_in,
+        1.0 - margins.top / height_in,
+    )
+    return figure
 
 
 def inline(figure: Figure, name: str, words: str) -> Markup:
@@ -78,7 +108,8 @@ def inline(figure: Figure, name: str, words: str) -> Markup:
     """
     buffer = io.StringIO()
     with DRAWING, mpl.rc_context({"svg.hashsalt": name}):
-        figure.savefig(buffer, format="svg", transparent=True, metadata=_NO_METADATA)
+        # What `savefig` calls, without the drawing that it measures constrained layouts by.
+        FigureCanvasSVG(figure).print_svg(buffer, metadata=_NO_METADATA)
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
     # HTML needs no namespaces, and groups would repeat their identifiers in every figure.

@@ -87,7 +87,7 @@ def _figure(joints_deg: FloatArray, away_mm: FloatArray, away_deg: FloatArray) -
     """Draws (m, n) joint angles against (m, 3) residuals of position and of orientation."""
     count = joints_deg.shape[1]
     with svg.style():
-        figure = svg.new_figure(_WIDTH_IN, 2 * _ROW_IN + 0.5)
+        figure = svg.new_figure(_WIDTH_IN, 2 * _ROW_IN + 0.5, svg.Margins(0.85, top=0.3))
         grid = figure.subplots(2, count, sharex="col", sharey="row", squeeze=False)
         for row, values, label in ((0, away_mm, "position [mm]"), (1, away_deg, "rotation [deg]")):
             reach = _ROOM * float(np.percentile(np.abs(values), _KEPT_PERCENT)) or 1.0
@@ -97,7 +97,7 @@ def _figure(joints_deg: FloatArray, away_mm: FloatArray, away_deg: FloatArray) -
         for joint in range(count):
             grid[1, joint].set_xlabel(f"q{joint + 1} [deg]")
         handles, labels = grid[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper right", ncols=3)
+        figure.legend(handles, labels, loc="upper right", ncols=3)
         return svg.inline(figure, "trends", "Residuals of the used views over each joint's angle")
 
 
