@@ -145,6 +145,16 @@ def test_a_result_outlives_a_drawing_that_fails(tmp_path, monkeypatch, module, n
     assert "18 mm of 25 mm" in missing.cause
 
 
+@pytest.mark.parametrize("file", ["report.html", "recording.rrd"])
+def test_what_is_not_wanted_does_not_stay_of_an_earlier_result(tmp_path, file):
+    sample = made_up()
+    before = write_outputs(tmp_path, sample.session, Run(sample.calibration, sample.evidence))
+    run = Run(sample.calibration, sample.evidence)
+    done = write_outputs(tmp_path, sample.session, run, without=(file,))
+    assert {it.name for it in before.files} - {it.name for it in tmp_path.iterdir()} == {file}
+    assert sorted(it.name for it in tmp_path.iterdir()) == sorted(it.name for it in done.files)
+
+
 def test_frames_join_a_result_whose_report_cannot_be_drawn(tmp_path, monkeypatch):
     sample = made_up()
     write_outputs(tmp_path, sample.session, Run(sample.calibration, sample.evidence))
@@ -168,3 +178,10 @@ def test_calibrate_ends_with_1_and_the_result_where_a_drawing_fails(tmp_path, mo
         assert json.loads(done.out) == json.loads((out / "calibration.json").read_bytes())
     else:
         assert "views used" in done.err
+
+
+def test_calibrate_leaves_out_what_is_not_wanted(tmp_path):
+    cell = write_session(simulate(CellOptions(views=12, seed=1)), tmp_path / "p", images=False)
+    out = tmp_path / "out"
+    assert visioncal("calibrate", cell, "-o", out, "--no-report", "--no-recording").status == 0
+    assert [it.name for it in out.iterdir()] == ["calibration.json"]

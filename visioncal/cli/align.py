@@ -1,6 +1,7 @@
 """`visioncal align`, and what `calibrate` does with a whole cell."""
 
 import json
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -64,6 +65,7 @@ def align_into(
     level: str,
     quiet: bool,
     convention: Convention | None = None,
+    without: Collection[str] = (),
 ) -> Alignment:
     """Aligns the cell of a session from some path, writes the result and tells of it."""
     left = leftover(out)
@@ -72,7 +74,7 @@ def align_into(
     result = replace(result, verdict=result.verdict.with_paths(path, out))
     if left is not None:
         left.keep()
-    written = write_alignment(out, session, result)
+    written = write_alignment(out, session, result, without=without)
     if not quiet:
         _tell(result)
     if left is not None:

@@ -14,6 +14,7 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.running import check_dense, check_solver
 from visioncal.cli.align import align_into
 from visioncal.cli.console import messages, tell_written
+from visioncal.cli.drawings import NoRecording, NoReport, left_out
 from visioncal.cli.needs import NeedDeg, NeedMm
 from visioncal.cli.pointing import naming
 from visioncal.cli.progress import shown_progress
@@ -64,6 +65,8 @@ def calibrate_command(
     device: Annotated[
         str, typer.Option(metavar="auto|cpu|cuda", help="What --dense works on.")
     ] = "auto",
+    no_report: NoReport = False,
+    no_recording: NoRecording = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print calibration.json to stdout.")
     ] = False,
@@ -80,12 +83,15 @@ def calibrate_command(
     solved together, in one frame; other commands take one of each out of that result (--camera,
     --robot, --target).
     """
+    without = left_out(report=no_report, recording=no_recording)
     loaded = Session.load(session).needing(need_mm, need_deg)
     if is_whole_cell(loaded):
         check_solver(RunState(loaded, solver=solver))
         if dense:
             check_dense(RunState(loaded))
-        found = align_into(session, loaded, out, level=level, convention=convention, quiet=as_json)
+        found = align_into(
+            session, loaded, out, level=level, convention=convention, quiet=as_json, without=without
+        )
         document = whole_document(found)
         if as_json:
             typer.echo(json.dumps(document, indent=2))
@@ -102,7 +108,7 @@ def calibrate_command(
         result = replace(result, calibration=named)
         if left is not None:
             left.keep()
-        written = write_outputs(out, loaded, result)
+        written = write_outputs(out, loaded, result, without=without)
     if as_json:
         typer.echo(json.dumps(to_document(result.calibration), indent=2))
     else:

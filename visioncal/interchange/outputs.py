@@ -2,7 +2,7 @@
 
 import json
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -57,7 +57,12 @@ class Written:
 
 
 def write_outputs(
-    folder: Path, session: "Session | None", run: "Calibrated", note: str = ""
+    folder: Path,
+    session: "Session | None",
+    run: "Calibrated",
+    note: str = "",
+    *,
+    without: Collection[str] = (),
 ) -> Written:
     """Writes the three files into a folder, all at once whenever it is killed.
 
@@ -68,6 +73,8 @@ def write_outputs(
         session: What was calibrated; None where it was not kept, which leaves the recording out.
         run: The result and its evidence.
         note: What the reader should know of the report itself.
+        without: Files that are not wanted, `REPORT` or `RECORDING`; those of an earlier result are
+            taken away.
 
     Returns:
         The files that were written: the result even where drawing the report or recording failed.
@@ -94,7 +101,8 @@ def write_outputs(
             write_recording(path, session, run.calibration, run.evidence, layout)
 
         drawings[RECORDING] = record
-    return _write(folder, {CALIBRATION: run.calibration.save}, drawings, (ALIGNMENT,))
+    result = {CALIBRATION: run.calibration.save}
+    return _write(folder, result, drawings, (ALIGNMENT,), without)
 
 
 def write_check(
@@ -143,13 +151,20 @@ def refuse_calibration(folder: Path) -> None:
         )
 
 
-def write_alignment(folder: Path, session: "Session | None", found: "Alignment") -> Written:
+def write_alignment(
+    folder: Path,
+    session: "Session | None",
+    found: "Alignment",
+    *,
+    without: Collection[str] = (),
+) -> Written:
     """Writes the alignment of a cell, its report and its recording into a folder, all at once.
 
     Args:
         folder: Where to; it is made where there is none.
         session: What was aligned; None where it was not kept, which leaves the recording out.
         found: The result.
+        without: As in `write_outputs`.
 
     Returns:
         The files that were written: the result even where drawing the others failed.
@@ -176,7 +191,7 @@ def write_alignment(folder: Path, session: "Session | None", found: "Alignment")
     from visioncal.results import Calibration
 
     results = {CALIBRATION: Calibration.whole(found).save, ALIGNMENT: found.save}
-    return _write(folder, results, drawings)
+    return _write(folder, results, drawings, without=without)
 
 
 def write_plan(folder: Path, plan: "Plan", document: Mapping[str, Any]) -> Written:
@@ -283,6 +298,7 @@ def _write(
     results: Mapping[str, _Writer],
     drawings: Mapping[str, _Writer],
     others: Sequence[str] = (),
+    without: Collection[str] = (),
 ) -> Written:
     """Writes results, and what is drawn of them as far as that succeeds, as one generation.
 
@@ -291,7 +307,9 @@ def _write(
         results: What writes each file without which there is nothing; the one that counts first.
         drawings: What draws the others.
         others: Files that an earlier generation may have, and this one has not.
+        without: Drawings that are not wanted.
     """
+    drawings = {name: draw for name, draw in drawings.items() if name not in without}
     undrawn: list[Undrawn] = []
 
     def write(aside: Path) -> None:
@@ -308,7 +326,7 @@ def _write(
 
     # The result last: it is what the others are beside.
     mine = [*results, *drawings]
-    names = [*(it for it in others if it not in mine), *reversed(mine)]
+    names = [*(it for it in (*others, *without) if it not in mine), *reversed(mine)]
     return Written(write_generation(folder, names, write), tuple(undrawn))
 
 

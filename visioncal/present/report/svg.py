@@ -109,7 +109,8 @@ def inline(figure: Figure, name: str, words: str) -> Markup:
     buffer = io.StringIO()
     with DRAWING, mpl.rc_context({"svg.hashsalt": name}):
         # What `savefig` calls, without the drawing that it measures constrained layouts by.
-        FigureCanvasSVG(figure).print_svg(buffer, metadata=_NO_METADATA)
+        canvas = FigureCanvasSVG(figure)
+        canvas.print_svg(buffer, metadata=_NO_METADATA)  # type: ignore[no-untyped-call]
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
     # HTML needs no namespaces, and groups would repeat their identifiers in every figure.

@@ -1,0 +1,20 @@
+"""Options that leave out what is drawn of a result."""
+
+from typing import Annotated, TypeAlias
+
+import typer
+
+from visioncal.interchange.outputs import RECORDING, REPORT
+
+NoReport: TypeAlias = Annotated[
+    bool, typer.Option("--no-report", help=f"Leave {REPORT} out, which takes a second to draw.")
+]
+NoRecording: TypeAlias = Annotated[
+    bool, typer.Option("--no-recording", help=f"Leave {RECORDING} out, which holds all images.")
+]
+
+
+def left_out(*, report: bool, recording: bool) -> tuple[str, ...]:
+    """The files that these options leave out."""
+    asked = {REPORT: report, RECORDING: recording}
+    return tuple(name for name, is_left_out in asked.items() if is_left_out)
