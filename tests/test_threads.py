@@ -13,10 +13,13 @@ from support.kept import assert_same_evidence
 from support.marks import slow
 from threadpoolctl import threadpool_info
 
-from visioncal.calibration.pipeline import run
+from visioncal.calibration.pipeline import calibrate, run
+from visioncal.calibration.stages import detect
+from visioncal.core.errors import DataError
 from visioncal.core.threads import SharedSetting
 from visioncal.interchange.outputs import write_outputs
 from visioncal.present.recording import read_evidence
+from visioncal.results import to_document
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate, write_session
 
@@ -52,6 +55,25 @@ def test_threads_write_what_one_alone_writes(tmp_path, threads):
         for name in ("calibration.json", "report.html"):
             assert (folder / name).read_bytes() == (alone / name).read_bytes()
         assert_same_evidence(read_evidence(folder / "recording.rrd"), evidence)
+
+
+def test_threads_change_no_digit(tmp_path, monkeypatch):
+    write_session(simulate(CellOptions(views=6, seed=2)), tmp_path / "cell")
+    asked = []
+
+    class Pool(ThreadPoolExecutor):
+        def __init__(self, threads):
+            asked.append(threads)
+            super().__init__(threads)
+
+    monkeypatch.setattr(detect, "ThreadPoolExecutor", Pool)
+    one, three = (
+        replace(calibrate(tmp_path / "cell", threads=it), created=CREATED) for it in (1, 3)
+    )
+    assert asked == [1, 3]
+    assert to_document(one) == to_document(three)
+    with pytest.raises(DataError, match="threads is 0; at least 1"):
+        calibrate(tmp_path / "cell", threads=0)
 
 
 def test_a_shared_setting_is_made_by_the_first_and_undone_by_the_last():

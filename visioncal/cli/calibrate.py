@@ -14,11 +14,11 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.running import check_dense, check_solver
 from visioncal.cli.align import align_into
 from visioncal.cli.console import messages, tell_written
-from visioncal.cli.drawings import NoRecording, NoReport, left_out
 from visioncal.cli.needs import NeedDeg, NeedMm
 from visioncal.cli.pointing import naming
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.summary import print_summary
+from visioncal.cli.working import NoRecording, NoReport, Threads, left_out
 from visioncal.core.types import SolverName
 from visioncal.interchange.merge_results import leftover
 from visioncal.interchange.outputs import write_outputs
@@ -65,6 +65,7 @@ def calibrate_command(
     device: Annotated[
         str, typer.Option(metavar="auto|cpu|cuda", help="What --dense works on.")
     ] = "auto",
+    threads: Threads = None,
     no_report: NoReport = False,
     no_recording: NoRecording = False,
     as_json: Annotated[
@@ -90,7 +91,14 @@ def calibrate_command(
         if dense:
             check_dense(RunState(loaded))
         found = align_into(
-            session, loaded, out, level=level, convention=convention, quiet=as_json, without=without
+            session,
+            loaded,
+            out,
+            level=level,
+            convention=convention,
+            quiet=as_json,
+            without=without,
+            threads=threads,
         )
         document = whole_document(found)
         if as_json:
@@ -100,7 +108,12 @@ def calibrate_command(
     with naming(session, out), shown_progress(quiet=as_json) as told:
         calibrated = partial(run_dense, device=device) if dense else run
         result = calibrated(
-            loaded, solver=solver, level=level, convention=convention, progress=told
+            loaded,
+            solver=solver,
+            level=level,
+            convention=convention,
+            progress=told,
+            threads=threads,
         )
         told("write", 0, 1)
         calibration = result.calibration

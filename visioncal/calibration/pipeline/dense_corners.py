@@ -57,6 +57,7 @@ def run_dense(
     level: str = "auto",
     convention: Convention | None = None,
     progress: Progress | None = None,
+    threads: int | None = None,
 ) -> Run:
     """Calibrates a session by the template's corners and by dense ones; see `calibrate`.
 
@@ -67,6 +68,7 @@ def run_dense(
         level: Likewise.
         convention: Likewise.
         progress: Likewise.
+        threads: Likewise.
 
     Returns:
         The one with dense corners, unless it predicts views that were left out worse than the
@@ -91,11 +93,12 @@ def run_dense(
             convention=convention,
             progress=progress,
             dense=dense,
+            threads=threads,
         )
 
     plain = calibrated(None)
     try:
-        found = calibrated(Dense(on))
+        found = calibrated(Dense(on, threads=threads or 0))
     except VisioncalError as error:
         return _telling(plain, None, [f"Dense corners are not kept: {error.message}"])
     if found.dense is None or not found.dense.fits:

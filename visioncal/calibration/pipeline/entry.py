@@ -25,6 +25,7 @@ def calibrate(
     progress: Progress | None = None,
     dense: bool = False,
     device: str = "auto",
+    threads: int | None = None,
 ) -> Calibration:
     """Calibrates a session.
 
@@ -47,6 +48,8 @@ def calibrate(
             images; needs the extra `dense`. They are kept only where views that were left out
             are predicted no worse.
         device: What that works on: `auto` for a GPU where there is one, `cpu` or `cuda`.
+        threads: How many images are searched at a time; one a core where None. The result is the
+            same to the bit.
 
     Returns:
         The result with its verdict.
@@ -56,7 +59,9 @@ def calibrate(
         DegenerateError: The motion leaves a direction of the answer open.
         ConvergenceError: The intrinsics do not come to rest.
     """
-    known = known_at_first(session, progress, solver=solver, level=level, convention=convention)
+    known = known_at_first(
+        session, progress, solver=solver, level=level, convention=convention, threads=threads
+    )
     needing = replace(known, session=known.session.needing(need_mm, need_deg))
     if dense:
         check_dense(needing)
@@ -67,6 +72,7 @@ def calibrate(
             level=level,
             convention=convention,
             progress=progress,
+            threads=threads,
         ).calibration
     return result_of(run_steps(needing))
 
@@ -80,6 +86,7 @@ def align(
     need_deg: float | None = None,
     corners: Mapping[int, Corners] | None = None,
     progress: Progress | None = None,
+    threads: int | None = None,
 ) -> Alignment:
     """Calibrates a whole cell, and gives its result in the older form; see `calibrate`.
 
@@ -91,6 +98,7 @@ def align(
         need_deg: The same in rotation [deg].
         corners: What was found in its images before, by view; None to look.
         progress: Told of long work.
+        threads: As in `calibrate`.
 
     Returns:
         All frames with their joint covariance, and the verdict.
@@ -99,6 +107,6 @@ def align(
         DataError: The input is wrong or shows no target.
         DegenerateError: A robot is tied to nothing, or the observations leave a frame open.
     """
-    known = known_at_first(session, progress, level=level, convention=convention)
+    known = known_at_first(session, progress, level=level, convention=convention, threads=threads)
     needing = known.session.needing(need_mm, need_deg)
     return alignment_of(run_steps(replace(known, session=needing, found_before=corners)))

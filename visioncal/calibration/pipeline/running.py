@@ -48,9 +48,12 @@ def run(
     convention: Convention | None = None,
     progress: Progress | None = None,
     dense: Dense | None = None,
+    threads: int | None = None,
 ) -> Run:
     """Calibrates a session and keeps the evidence; see `calibrate`."""
-    first = known_at_first(session, progress, solver=solver, level=level, convention=convention)
+    first = known_at_first(
+        session, progress, solver=solver, level=level, convention=convention, threads=threads
+    )
     known = run_steps(replace(first, dense=dense))
     held = known.solved.held_out
     pairs = zip(held.away_m.tolist(), held.rms_px.tolist(), strict=True)
@@ -65,15 +68,25 @@ def known_at_first(
     solver: SolverName = "joint",
     level: str,
     convention: Convention | None,
+    threads: int | None = None,
 ) -> RunState:
     """What is known at the start, checked."""
+    if threads is not None and threads < 1:
+        raise DataError(f"threads is {threads}; at least 1 is needed.", culprits=["--threads"])
     if solver not in SOLVER_NAMES:
         raise DataError(f"solver {solver!r} is not one of {', '.join(SOLVER_NAMES)}.")
     check_level(level)
     if convention is not None and convention not in CONVENTIONS:
         raise DataError(f"convention {convention!r} is not one of {', '.join(CONVENTIONS)}.")
     loaded = session if isinstance(session, Session) else Session.load(session)
-    known = RunState(loaded, progress, solver=solver, level=level, convention=convention)
+    known = RunState(
+        loaded,
+        progress,
+        threads or 0,
+        solver=solver,
+        level=level,
+        convention=convention,
+    )
     check_solver(known)
     return known
 

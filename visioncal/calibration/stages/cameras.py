@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TypeVar
 
 from visioncal.calibration.stages.dense import fit_densely
-from visioncal.calibration.stages.detect import detect
+from visioncal.calibration.stages.detect import DetectOptions, detect
 from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.calibration.stages.observed import CameraLook, Observed, nothing_seen
 from visioncal.calibration.stages.pnp import estimate_poses, given_poses, measure_poses
@@ -41,7 +41,8 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
             continue
         if given is None:
             with _naming(session, frame):
-                found = detect(session, progress=seen.progress, among=views)
+                options = DetectOptions(threads=seen.threads)
+                found = detect(session, options, seen.progress, among=views)
             corners, resolution = found.corners, found.resolution
             seen = seen.noting(found.rejections)
             if seen.dense is not None:

@@ -38,10 +38,12 @@ class Dense:
     Attributes:
         device: What torch works on: `cpu` or `cuda`.
         fits: What was fitted, by view.
+        threads: How many images are worked on at a time on the CPU; 0 for one a core.
     """
 
     device: str
     fits: Mapping[int, Fitted] = field(default_factory=dict)
+    threads: int = 0
 
     @property
     def blurs(self) -> dict[int, Blur]:
@@ -120,7 +122,7 @@ def fit_densely(
         return start, found
 
     # One thread keeps a GPU busy.
-    threads = (os.cpu_count() or 1) if dense.device == "cpu" else 1
+    threads = (dense.threads or os.cpu_count() or 1) if dense.device == "cpu" else 1
     found = {}
     with ONE_TORCH_THREAD.held(), ThreadPoolExecutor(threads) as pool:
         sample = mine[:: max(1, len(mine) // _SAMPLE)][:_SAMPLE]
@@ -207,7 +209,7 @@ def explained(
         drawn, rest = (_as_jpeg(it) for it in (found.drawn, found.rest))
         return replace(seen, explained=ExplainedImage(drawn, rest, _words(fit, found)))
 
-    with ONE_TORCH_THREAD.held(), ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+    with ONE_TORCH_THREAD.held(), ThreadPoolExecutor(dense.threads or os.cpu_count() or 1) as pool:
         return tuple(pool.map(explained, evidence))
 
 

@@ -1,4 +1,4 @@
-"""Options that leave out what is drawn of a result."""
+"""Options of how a session is worked on, which change no result."""
 
 from typing import Annotated, TypeAlias
 
@@ -11,6 +11,12 @@ NoReport: TypeAlias = Annotated[
 ]
 NoRecording: TypeAlias = Annotated[
     bool, typer.Option("--no-recording", help=f"Leave {RECORDING} out, which holds all images.")
+]
+Threads: TypeAlias = Annotated[
+    int | None,
+    typer.Option(
+        min=1, help="Images searched at a time; one a core where left out. No result changes."
+    ),
 ]
 
 
