@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from visioncal.calibration.pipeline import align
 from visioncal.cli.console import messages, tell_written
-from visioncal.cli.needs import NeedDeg, NeedMm
+from visioncal.cli.options import AsJson, NeedOptions, OutFolder, SessionArgument
 from visioncal.cli.pointing import naming
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.summary import print_verdict, unused_words
@@ -27,8 +27,9 @@ _SHOWN_LEVEL = 1.2
 
 
 def align_command(
-    session: Annotated[Path, typer.Argument(help="A session's folder, or its .rrd recording.")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the result.")] = Path("out"),
+    session: SessionArgument,
+    need: NeedOptions,
+    out: OutFolder = Path("out"),
     level: Annotated[
         str,
         typer.Option(
@@ -37,11 +38,7 @@ def align_command(
             "elastic (joints that bend, too).",
         ),
     ] = "auto",
-    need_mm: NeedMm = None,
-    need_deg: NeedDeg = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print alignment.json to stdout.")
-    ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Put several robots, cameras and boards in one frame, adjusted together.
 
@@ -51,7 +48,7 @@ def align_command(
     there is a result, with a verdict; 2: nothing ties a robot to the rest, or the observations
     leave a frame open.
     """
-    loaded = Session.load(session).needing(need_mm, need_deg)
+    loaded = need.session(session)
     found = align_into(session, loaded, out, level=level, quiet=as_json)
     if as_json:
         typer.echo(json.dumps(found.document(), indent=2))

@@ -14,26 +14,25 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.running import check_dense, check_solver
 from visioncal.cli.align import align_into
 from visioncal.cli.console import messages, tell_written
-from visioncal.cli.needs import NeedDeg, NeedMm
+from visioncal.cli.options import AsJson, NeedOptions, OutFolder, SessionArgument
 from visioncal.cli.pointing import naming
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.summary import print_summary
-from visioncal.cli.working import NoRecording, NoReport, Threads, left_out
+from visioncal.cli.working import WorkOptions
 from visioncal.core.types import SolverName
 from visioncal.interchange.merge_results import leftover
 from visioncal.interchange.outputs import write_outputs
 from visioncal.results import to_document
 from visioncal.results.whole import whole_document
 from visioncal.robot import Convention
-from visioncal.session import Session
 from visioncal.session.single import is_whole_cell
 
 
 def calibrate_command(
-    session: Annotated[Path, typer.Argument(help="A session's folder, or its .rrd recording.")],
-    out: Annotated[
-        Path, typer.Option("-o", "--out", help="Folder for the result, report and recording.")
-    ] = Path("out"),
+    session: SessionArgument,
+    need: NeedOptions,
+    work: WorkOptions,
+    out: OutFolder = Path("out"),
     solver: Annotated[
         SolverName,
         typer.Option(help="The joint fit, or a closed form by name; all are compared anyway."),
@@ -52,8 +51,6 @@ def calibrate_command(
             help="Of the arm's joint table in the result; the stated one where it is left out."
         ),
     ] = None,
-    need_mm: NeedMm = None,
-    need_deg: NeedDeg = None,
     dense: Annotated[
         bool,
         typer.Option(
@@ -65,12 +62,7 @@ def calibrate_command(
     device: Annotated[
         str, typer.Option(metavar="auto|cpu|cuda", help="What --dense works on.")
     ] = "auto",
-    threads: Threads = None,
-    no_report: NoReport = False,
-    no_recording: NoRecording = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print calibration.json to stdout.")
-    ] = False,
+    as_json: AsJson = False,
     verbose: Annotated[
         bool, typer.Option("-v", "--verbose", help="Also show every solver's result.")
     ] = False,
@@ -84,8 +76,8 @@ def calibrate_command(
     solved together, in one frame; other commands take one of each out of that result (--camera,
     --robot, --target).
     """
-    without = left_out(report=no_report, recording=no_recording)
-    loaded = Session.load(session).needing(need_mm, need_deg)
+    without = work.left_out
+    loaded = need.session(session)
     if is_whole_cell(loaded):
         check_solver(RunState(loaded, solver=solver))
         if dense:
@@ -98,7 +90,7 @@ def calibrate_command(
             convention=convention,
             quiet=as_json,
             without=without,
-            threads=threads,
+            threads=work.threads,
         )
         document = whole_document(found)
         if as_json:
@@ -113,7 +105,7 @@ def calibrate_command(
             level=level,
             convention=convention,
             progress=told,
-            threads=threads,
+            threads=work.threads,
         )
         told("write", 0, 1)
         calibration = result.calibration

@@ -1,19 +1,25 @@
 """`visioncal convert`."""
 
 import sys
+from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
+from typing import Annotated
 
 import typer
 from rich.markup import escape
 
 from visioncal.calibration.guess import Candidate, Guess
 from visioncal.calibration.pipeline.guess_inputs import guess_session
-from visioncal.cli import convert_options as option
 from visioncal.cli.console import messages
 from visioncal.cli.guessed import print_guess
+from visioncal.cli.options import Force
+from visioncal.cli.pose_options import UNITS, RobotPoseOptions, names_in, poses_option
 from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
+from visioncal.core.types import CameraMount
 from visioncal.interchange.formats import (
+    FOREIGN_FORMATS,
     Foreign,
     ImportOptions,
     PoseImportOptions,
@@ -22,56 +28,125 @@ from visioncal.interchange.formats import (
 )
 from visioncal.session import Session
 
+_FORMATS = ", ".join(it.name for it in FOREIGN_FORMATS)
+_other = partial(typer.Option, rich_help_panel="The recording itself")
+_camera = partial(typer.Option, rich_help_panel="Its camera")
+_doubt = partial(typer.Option, rich_help_panel="Poses that may be misread, of a session as well")
+
+
+@dataclass(frozen=True)
+class ConvertOptions(RobotPoseOptions):
+    """How somebody else wrote a recording."""
+
+    form: Annotated[str | None, _other("--from", help=f"Its format, by name: {_FORMATS}.")] = None
+    mount: Annotated[CameraMount | None, _other("--mount", help="Where the camera is.")] = None
+    target: Annotated[
+        str | None,
+        _other(
+            "--target",
+            help="A name in targets/, a .toml, or in one word as checkerboard_9x6_23.6mm, "
+            "charuco_5x7_36.2mm_18.3mm_DICT_6X6_250, marker_DICT_4X4_50_10_48mm.",
+        ),
+    ] = None
+    tip: Annotated[str | None, _other("--tip", help="The frame that the poses are of.")] = None
+    camera_columns: Annotated[
+        str | None,
+        poses_option(
+            "--camera-columns",
+            "--camera-key",
+            help="Columns or keys of measured poses of the target: rvec,tvec.",
+        ),
+    ] = None
+    camera_form: Annotated[str | None, poses_option("--camera-form", help="As --robot-form.")] = (
+        None
+    )
+    camera_unit: Annotated[
+        str | None, poses_option("--camera-unit", metavar=UNITS, help="Of their positions.")
+    ] = None
+    camera_inverse: Annotated[
+        bool | None,
+        poses_option("--camera-inverse/--camera-as-is", help="They give the camera in the target."),
+    ] = None
+    camera_file: Annotated[
+        Path | None,
+        poses_option(
+            "--camera-file",
+            help="A second file with the camera's poses; with times in both, the clocks' offset is "
+            "found.",
+        ),
+    ] = None
+    images: Annotated[
+        Path | None,
+        _camera(
+            "--images",
+            help="The folder of the images; matched by name, by number, or in order.",
+        ),
+    ] = None
+    image_column: Annotated[
+        str | None,
+        _camera(
+            "--image-column",
+            "--image-key",
+            help="The column or key that names each row's image.",
+        ),
+    ] = None
+    intrinsics: Annotated[
+        str | None,
+        _camera(
+            "--intrinsics",
+            help="A file (ROS, OpenCV, Kalibr, ViSP, .npz, .json), or `estimate` to ignore those "
+            "of the source.",
+        ),
+    ] = None
+    resolution: Annotated[
+        str | None,
+        _camera("--resolution", help="WIDTH,HEIGHT that the intrinsics hold for."),
+    ] = None
+
+    def requested(self) -> ImportOptions:
+        """The same, as files are read.
+
+        Raises:
+            DataError: Names or a resolution are written otherwise.
+        """
+        columns = names_in(self.camera_columns, "--camera-columns")
+        return replace(
+            super().requested(),
+            camera=PoseImportOptions(
+                columns, self.camera_form, self.camera_unit, self.camera_inverse
+            ),
+            image=self.image_column,
+            camera_file=self.camera_file,
+            mount=self.mount,
+            target=self.target,
+            intrinsics=self.intrinsics,
+            images=self.images,
+            resolution=_size(self.resolution),
+            tip=self.tip,
+        )
+
 
 def convert_command(
-    source: option.Source,
-    dest: option.Dest,
-    force: option.Force = False,
-    form: option.Form = None,
-    mount: option.MountOption = None,
-    target: option.Target = None,
-    robot_model: option.RobotModel = None,
-    tip: option.Tip = None,
-    robot_columns: option.RobotColumns = None,
-    robot_form: option.RobotForm = None,
-    robot_unit: option.RobotUnit = None,
-    robot_inverse: option.RobotInverse = None,
-    camera_columns: option.CameraColumns = None,
-    camera_form: option.CameraForm = None,
-    camera_unit: option.CameraUnit = None,
-    camera_inverse: option.CameraInverse = None,
-    camera_file: option.CameraFile = None,
-    joint_columns: option.JointColumns = None,
-    joint_unit: option.JointUnit = "rad",
-    images: option.Images = None,
-    image_column: option.ImageColumn = None,
-    intrinsics: option.Intrinsics = None,
-    resolution: option.Resolution = None,
-    guess: option.TryOthers = False,
-    yes: option.TakeBest = False,
+    source: Annotated[
+        Path,
+        typer.Argument(help="A session's folder, its .rrd, or somebody else's file or folder."),
+    ],
+    dest: Annotated[Path, typer.Argument(help="An .rrd, or the folder to write.")],
+    written: ConvertOptions,
+    force: Force = False,
+    guess: Annotated[
+        bool, _doubt("--guess", help="Try other readings of the poses, and ask.")
+    ] = False,
+    yes: Annotated[
+        bool, _doubt("--yes", help="Take the best one where it stands out clearly.")
+    ] = False,
 ) -> None:
     """Write a session as a folder or a recording, or make one of another program's.
 
     Between our own forms nothing is lost, which digests prove. Exit status 0: it is written; 2:
     nothing was written, and the message says what is missing or wrong.
     """
-    robot_names = option.names_in(robot_columns, "--robot-columns")
-    camera_names = option.names_in(camera_columns, "--camera-columns")
-    requested = ImportOptions(
-        robot=PoseImportOptions(robot_names, robot_form, robot_unit, robot_inverse),
-        camera=PoseImportOptions(camera_names, camera_form, camera_unit, camera_inverse),
-        joints=option.names_in(joint_columns, "--joint-columns"),
-        joints_deg=joint_unit == "deg",
-        image=image_column,
-        camera_file=camera_file,
-        mount=mount,
-        target=target,
-        intrinsics=intrinsics,
-        images=images,
-        resolution=_size(resolution),
-        robot_model=robot_model,
-        tip=tip,
-    )
+    requested, form = written.requested(), written.form
     if yes and not guess:
         raise DataError("--yes takes the best guess; it needs --guess.", culprits=["--yes"])
     choose = partial(_chosen, yes=yes) if guess else None

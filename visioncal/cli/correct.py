@@ -9,9 +9,9 @@ import numpy as np
 import typer
 from rich.markup import escape
 
-from visioncal.cli.choosing import CameraName, RobotName, TargetName
 from visioncal.cli.console import messages
 from visioncal.cli.numbers import numbers_in
+from visioncal.cli.options import AsJson, Force, OutFile, PartOptions
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, did_you_mean, some_of, write_atomically
 from visioncal.core.number_format import figure
@@ -28,7 +28,7 @@ from visioncal.results.compensation.table import (
     table_to_send,
 )
 from visioncal.robot import Loads
-from visioncal.session.choosing import ARM, EYE, Choice
+from visioncal.session.choosing import ARM, EYE
 from visioncal.session.columns import no_celsius
 
 _SHOWN = 10
@@ -56,10 +56,8 @@ def correct_command(
             help="Of the calibrated arm: an output folder of calibrate, or its .rrd.",
         ),
     ],
-    out: Annotated[
-        Path | None,
-        typer.Option("-o", "--out", help="The table to write; otherwise, or as -, stdout."),
-    ] = None,
+    part: PartOptions,
+    out: OutFile = None,
     tool: Annotated[
         str | None,
         typer.Option(
@@ -100,22 +98,19 @@ def correct_command(
             "whose drift was calibrated; else as warm as it was when its session began.",
         ),
     ] = None,
-    camera: CameraName = None,
-    robot: RobotName = None,
-    target: TargetName = None,
     skip: Annotated[
         bool,
         typer.Option("--skip-unreachable", help="Write the other targets where some are refused."),
     ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the targets as JSON.")] = False,
+    force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Correct targets so that the arm reaches them by its nominal controller.
 
     Exit status 2: nothing was written, for the reason given; targets out of reach are named.
     """
     needs = EYE if tool is not None and tool.removeprefix(_TOOLS) == "cam" else ARM
-    chosen = load_calibration(calibration, Choice(camera, robot, target), needs)
+    chosen = load_calibration(calibration, part.choice, needs)
     known = _warm(chosen, temperatures)
     arm = CalibratedArm.of(known)
     written_to = None if out is None or out == Path("-") else out

@@ -11,6 +11,7 @@ from rich.markup import escape
 from visioncal.calibration.pipeline import run
 from visioncal.cli.against_truth import truth_table
 from visioncal.cli.console import messages, tell_written
+from visioncal.cli.options import OutFolder, Seed
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.summary import print_summary
 from visioncal.interchange.outputs import write_outputs
@@ -19,11 +20,9 @@ from visioncal.simulation import CellOptions, read_truth, simulate, truth_path, 
 
 
 def demo_command(
-    out: Annotated[
-        Path, typer.Option("-o", "--out", help="Folder for the session and its result.")
-    ] = Path("demo"),
+    out: OutFolder = Path("demo"),
     views: Annotated[int, typer.Option(min=3, help="Number of views.")] = 20,
-    seed: Annotated[int, typer.Option(min=0, help="Another cell for every number.")] = 0,
+    seed: Seed = 0,
 ) -> None:
     """Simulate a UR cell, calibrate it from its images, and compare with the truth.
 

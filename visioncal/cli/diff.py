@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from visioncal.cli.choosing import CameraName, RobotName, TargetName
+from visioncal.cli.options import AsJson, PartOptions
 from visioncal.interchange.result_files import load_result
 from visioncal.results.compare import Comparison, LensChange, Significance, compare, to_document
 
@@ -23,17 +23,19 @@ def diff_command(
         Path, typer.Argument(help="An output folder, its calibration.json, or a recording (.rrd).")
     ],
     second: Annotated[Path, typer.Argument(help="The one to compare with it.")],
-    camera: CameraName = None,
-    robot: RobotName = None,
-    target: TargetName = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the comparison as JSON.")] = False,
+    part: PartOptions,
+    as_json: AsJson = False,
 ) -> None:
     """Tell what changed between two calibrations, and what is only noise.
 
     Exit status 0, changed or not: `is_change` in the JSON says which; 2: one cannot be read.
     """
     comparison = compare(
-        load_result(first), load_result(second), camera=camera, robot=robot, target=target
+        load_result(first),
+        load_result(second),
+        camera=part.camera,
+        robot=part.robot,
+        target=part.target,
     )
     if as_json:
         typer.echo(json.dumps(to_document(comparison), indent=2))

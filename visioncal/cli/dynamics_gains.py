@@ -8,10 +8,10 @@ import numpy as np
 import typer
 from rich.markup import escape
 
-from visioncal.cli.choosing import RobotName
 from visioncal.cli.console import messages
-from visioncal.cli.dynamics_options import CutoffOption, SessionArgument
+from visioncal.cli.dynamics_options import CutoffOption, MotionsArgument
 from visioncal.cli.numbers import numbers_in
+from visioncal.cli.options import AsJson, RobotName
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import matched, significant
 from visioncal.core.types import FloatArray
@@ -22,7 +22,7 @@ from visioncal.session import Session
 
 
 def dynamics_gains_command(
-    session: SessionArgument,
+    session: MotionsArgument,
     loaded: Annotated[
         Path, typer.Option("--loaded", help="A session of the same arm with the body on it.")
     ],
@@ -43,7 +43,7 @@ def dynamics_gains_command(
     ] = "0,0,0,0,0,0",
     cutoff_hz: CutoffOption = None,
     named: RobotName = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print figures as JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Find how much torque a drive's current makes, by a body that is known.
 

@@ -1,6 +1,7 @@
 """`visioncal dynamics identify`."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -8,15 +9,9 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from visioncal.cli.choosing import RobotName
 from visioncal.cli.console import messages, tell_written
-from visioncal.cli.dynamics_options import (
-    CutoffOption,
-    GainsOption,
-    SessionArgument,
-    StreamOption,
-    number_list,
-)
+from visioncal.cli.dynamics_options import MotionsArgument, StreamOptions
+from visioncal.cli.options import AsJson
 from visioncal.cli.summary import print_verdict
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
@@ -25,7 +20,7 @@ from visioncal.dynamics.friction import FrictionTerms
 from visioncal.dynamics.identified import CLASSES, FILE, NOT_TOLD, Identified
 from visioncal.dynamics.identify import SLOW_RAD_S, Options
 from visioncal.dynamics.judge import judge
-from visioncal.dynamics.run import Request, identify_session
+from visioncal.dynamics.run import identify_session
 from visioncal.interchange.outputs import write_dynamics
 from visioncal.session import Session
 
@@ -33,8 +28,8 @@ _FRICTION = ("coulomb", "viscous", "offset")
 
 
 def dynamics_identify_command(
-    session: SessionArgument,
-    stream: StreamOption = None,
+    session: MotionsArgument,
+    streams: StreamOptions,
     validate_on: Annotated[
         str | None,
         typer.Option(help="A stream to predict. Default: the last 30 % of the fastest motion."),
@@ -58,28 +53,19 @@ def dynamics_identify_command(
     stribeck: Annotated[
         bool, typer.Option("--stribeck/--no-stribeck", help="Look for humps of dry friction.")
     ] = True,
-    cutoff_hz: CutoffOption = None,
-    gains: GainsOption = None,
     unchecked: Annotated[
         bool,
         typer.Option("--unchecked", help="Take torques that contradict the robot's inertias."),
     ] = False,
-    robot: RobotName = None,
-    as_json: Annotated[bool, typer.Option("--json", help=f"Print {FILE}.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Identify an arm's inertias and friction from the torques of its motions.
 
     Exit status 0: there is a result, with a verdict; 2: there is none, for the reason given.
     """
     options = Options(terms=_terms(friction), stribeck=stribeck, checked=not unchecked)
-    request = Request(
-        tuple(stream or ()),
-        validate_on or "",
-        cutoff_hz,
-        number_list(gains, "--gains"),
-        options,
-        rotors,
-        robot,
+    request = replace(
+        streams.request(), validate_on=validate_on or "", options=options, rotors=rotors
     )
     run = identify_session(Session.load(session), request)
     identified = run.identified

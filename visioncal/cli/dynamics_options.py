@@ -1,19 +1,18 @@
 """What the commands of `visioncal dynamics` share: which samples, and what was identified."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, TypeAlias
 
 import typer
 
+from visioncal.cli.options import RobotName
 from visioncal.core.errors import DataError
 from visioncal.dynamics.identified import FILE, Identified
+from visioncal.dynamics.run import Request
 
-SessionArgument: TypeAlias = Annotated[
+MotionsArgument: TypeAlias = Annotated[
     Path, typer.Argument(help="A session with streams of angles and torques: a folder or an .rrd.")
-]
-StreamOption: TypeAlias = Annotated[
-    list[str] | None,
-    typer.Option("--stream", help="A stream with torques; may be repeated. Default: all."),
 ]
 CutoffOption: TypeAlias = Annotated[
     float | None,
@@ -21,31 +20,49 @@ CutoffOption: TypeAlias = Annotated[
         "--cutoff-hz", min=0.1, help="Of the low-pass. Default: ten times the motion's band."
     ),
 ]
-GainsOption: TypeAlias = Annotated[
-    str | None,
-    typer.Option(
-        "--gains",
-        metavar="K1,K2,...",
-        help="Torque for a current, by joint [N m/A], where currents were recorded.",
-    ),
-]
 AgainstOption: TypeAlias = Annotated[
     Path | None, typer.Option("--against", help=f"A folder of identify, or its {FILE}.")
 ]
 
 
-def number_list(words: str | None, option: str) -> tuple[float, ...]:
-    """Reads a list of numbers, as many as there are.
+@dataclass(frozen=True)
+class StreamOptions:
+    """Which samples are taken, and how they become torques."""
 
-    Raises:
-        DataError: It is none.
-    """
-    try:
-        return () if words is None else tuple(float(it) for it in words.split(","))
-    except ValueError as error:
-        raise DataError(
-            f"{option} is {words!r}; numbers with commas between are needed.", culprits=[option]
-        ) from error
+    stream: Annotated[
+        list[str] | None,
+        typer.Option("--stream", help="A stream with torques; may be repeated. Default: all."),
+    ] = None
+    cutoff_hz: CutoffOption = None
+    gains: Annotated[
+        str | None,
+        typer.Option(
+            "--gains",
+            metavar="K1,K2,...",
+            help="Torque for a current, by joint [N m/A], where currents were recorded.",
+        ),
+    ] = None
+    robot: RobotName = None
+
+    def request(self) -> Request:
+        """The same, as samples are read.
+
+        Raises:
+            DataError: The gains are no numbers.
+        """
+        try:
+            gains = tuple(float(it) for it in self.gains.split(",")) if self.gains else ()
+        except ValueError as error:
+            raise DataError(
+                f"--gains is {self.gains!r}; numbers with commas between are needed.",
+                culprits=["--gains"],
+            ) from error
+        return Request(
+            tuple(self.stream or ()),
+            cutoff_hz=self.cutoff_hz,
+            gains_nm_a=gains,
+            robot=self.robot,
+        )
 
 
 def identified_of(against: Path | None, command: str) -> Identified:

@@ -5,46 +5,38 @@ from typing import Annotated
 
 import typer
 
-from visioncal.cli.choosing import RobotName
 from visioncal.cli.dynamics_options import (
     AgainstOption,
-    CutoffOption,
-    GainsOption,
-    SessionArgument,
-    StreamOption,
+    MotionsArgument,
+    StreamOptions,
     identified_of,
-    number_list,
 )
+from visioncal.cli.options import AsJson
 from visioncal.core.number_format import matched, significant
 from visioncal.core.types import FloatArray
 from visioncal.dynamics import Payload, estimate_payload
-from visioncal.dynamics.run import Request, conditioned_streams
+from visioncal.dynamics.run import conditioned_streams
 from visioncal.session import Session
 
 
 def dynamics_payload_command(
-    session: SessionArgument,
+    session: MotionsArgument,
+    streams: StreamOptions,
     against: AgainstOption = None,
-    stream: StreamOption = None,
-    cutoff_hz: CutoffOption = None,
-    gains: GainsOption = None,
     same_friction: Annotated[
         bool,
         typer.Option(
             "--same-friction", help="Friction is as it was without the payload, however it presses."
         ),
     ] = False,
-    robot: RobotName = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print figures as JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Weigh what the arm carries, by how much more its drives gave than without it.
 
     Exit status 0: there are figures; 2: there are none, for the reason given.
     """
     identified = identified_of(against, "payload")
-    torque_nm_a = number_list(gains, "--gains")
-    request = Request(tuple(stream or ()), "", cutoff_hz, torque_nm_a, robot=robot)
-    loaded = conditioned_streams(Session.load(session), identified, request)
+    loaded = conditioned_streams(Session.load(session), identified, streams.request())
     found = estimate_payload(identified, loaded, friction_changes=not same_friction)
     if as_json:
         typer.echo(json.dumps(found.document(), indent=2))

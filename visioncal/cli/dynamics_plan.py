@@ -1,17 +1,20 @@
 """`visioncal dynamics plan`."""
 
 import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import typer
 from rich.markup import escape
 
-from visioncal.cli import motion_options as options
 from visioncal.cli.console import messages, tell_written
 from visioncal.cli.numbers import numbers_in
-from visioncal.cli.plan_options import BoxOption, Clearance, Floor, Margin
-from visioncal.cli.planned_cell import box_of, floor_of
+from visioncal.cli.options import AsJson, OutFolder
+from visioncal.cli.plan_options import ClearanceOptions
 from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
@@ -23,36 +26,117 @@ from visioncal.dynamics.planned import MotionPlan
 from visioncal.dynamics.sweeps import SweepRequest, plan_sweeps
 from visioncal.dynamics.written import motion_document
 from visioncal.interchange.outputs import write_motions
+from visioncal.live.planning.cell import Box
 from visioncal.live.planning.motions import plan_warnings, plan_words
 from visioncal.robot import Robot, load_robot
 from visioncal.robot.bodies import Body, capsule
 
+_FRICTION = ("coulomb", "viscous", "offset", "motor-inertia")
+_motion = partial(typer.Option, rich_help_panel="The motion")
+_limits = partial(typer.Option, rich_help_panel="What the arm must keep")
+_missing = partial(typer.Option, rich_help_panel="What its description lacks")
+
+
+@dataclass(frozen=True)
+class ExcitationOptions:
+    """The motion."""
+
+    duration: Annotated[
+        float,
+        _motion("--duration", help="How long the exciting motion lasts, in s."),
+    ] = 20.0
+    harmonics: Annotated[int, _motion("--harmonics", help="Harmonics of that period.")] = 5
+    friction: Annotated[
+        str,
+        _motion(
+            "--friction",
+            help=f"What is to be told besides inertias: {', '.join(_FRICTION)}; or none.",
+        ),
+    ] = "coulomb,viscous,offset"
+    sweep_speeds: Annotated[
+        int,
+        _motion("--sweep-speeds", help="Speeds at which each joint sweeps."),
+    ] = 6
+    no_sweeps: Annotated[bool, _motion("--no-sweeps", help="The exciting motion alone.")] = False
+    rate_hz: Annotated[
+        float,
+        _motion("--rate", min=1.0, max=4000.0, help="Rows a second of the tables."),
+    ] = 500.0
+    starts: Annotated[
+        int,
+        _motion(
+            "--starts",
+            help="Random motions to search from; more take longer and find better ones.",
+        ),
+    ] = 4
+    seconds: Annotated[
+        float | None,
+        _motion(
+            "--seconds",
+            help="End the search after so many s of one core, once a motion is found; what is "
+            "found then depends on the computer.",
+        ),
+    ] = None
+    seed: Annotated[
+        int,
+        _motion("--seed", min=0, help="Other random starts for every number."),
+    ] = 0
+
+
+@dataclass(frozen=True)
+class ArmOptions:
+    """What the arm may do, carries and lacks."""
+
+    speed: Annotated[float, _limits("--speed", help="Share of the greatest speeds.")] = 0.9
+    acceleration: Annotated[
+        float,
+        _limits("--acceleration", help="Share of the greatest accelerations."),
+    ] = 0.9
+    torque_margin: Annotated[
+        float,
+        _limits(
+            "--torque-margin",
+            help="Torques may be so many times larger than the nominal inertias have them.",
+        ),
+    ] = 1.2
+    tool: Annotated[
+        str | None,
+        _limits(
+            "--tool",
+            metavar="LENGTH,RADIUS",
+            help="What sticks out of the flange, along its z, in mm.",
+        ),
+    ] = None
+    payload: Annotated[
+        str | None,
+        _limits(
+            "--payload",
+            metavar="KG,X,Y,Z",
+            help="What the flange carries: its mass, and its centre in the flange's frame in mm.",
+        ),
+    ] = None
+    range_deg: Annotated[
+        float | None,
+        _missing("--range-deg", help="Range to either side of joints without limits."),
+    ] = None
+    speed_deg: Annotated[
+        float | None, _missing("--speed-deg", help="Greatest speed, in deg/s.")
+    ] = None
+    acceleration_deg: Annotated[
+        float | None,
+        _missing("--acceleration-deg", help="Greatest acceleration, in deg/s^2."),
+    ] = None
+
 
 def dynamics_plan_command(
-    robot: options.RobotName,
-    out: options.Out = Path("motions"),
-    duration: options.Duration = 20.0,
-    harmonics: options.HarmonicsOption = 5,
-    friction: options.Friction = "coulomb,viscous,offset",
-    sweep_speeds: options.SweepSpeeds = 6,
-    no_sweeps: options.NoSweeps = False,
-    rate_hz: options.Rate = 500.0,
-    starts: options.Starts = 4,
-    seconds: options.Seconds = None,
-    seed: options.SearchSeed = 0,
-    margin_deg: Margin = 3.0,
-    speed: options.SpeedShare = 0.9,
-    acceleration: options.AccelerationShare = 0.9,
-    torque_margin: options.TorqueMargin = 1.2,
-    clearance_mm: Clearance = 30.0,
-    floor: Floor = "0",
-    boxes: BoxOption = None,
-    tool: options.Tool = None,
-    payload: options.Payload = None,
-    range_deg: options.RangeDeg = None,
-    speed_deg: options.SpeedDeg = None,
-    acceleration_deg: options.AccelerationDeg = None,
-    as_json: options.AsJson = False,
+    robot: Annotated[
+        str, typer.Argument(help="A built-in robot, or the path of a .urdf, .toml or .json.")
+    ],
+    motion: ExcitationOptions,
+    kept: ClearanceOptions,
+    able: ArmOptions,
+    out: OutFolder = Path("motions"),
+    as_json: AsJson = False,
 ) -> None:
     """Plan the motions that tell an arm's inertias and friction.
 
@@ -60,33 +144,36 @@ def dynamics_plan_command(
     and plan.rrd to look at. Nothing is sent to a robot. Exit status 2: the limits allow none.
     """
     share = Share(
-        float(np.deg2rad(margin_deg)),
-        speed,
-        acceleration,
-        torque_margin,
-        1e-3 * clearance_mm,
-        floor_of(floor),
+        float(np.deg2rad(kept.margin_deg)),
+        able.speed,
+        able.acceleration,
+        able.torque_margin,
+        1e-3 * kept.clearance_mm,
+        kept.floor_m,
     )
     arm = load_robot(robot)
+    missing = (able.range_deg, able.speed_deg, able.acceleration_deg)
     allowed = allowed_motion(
         arm,
         share,
-        missing=Missing(*map(_radians, (range_deg, speed_deg, acceleration_deg))),
-        bodies=_bodies(arm, boxes or [], tool),
-        payload=None if payload is None else _payload(payload),
+        missing=Missing(*map(_radians, missing)),
+        bodies=_bodies(arm, kept.bodies, able.tool),
+        payload=None if able.payload is None else _payload(able.payload),
     )
     wished = ExcitationRequest(
-        duration,
-        harmonics,
-        _terms(friction),
-        starts,
-        seed,
-        seconds=np.inf if seconds is None else seconds,
+        motion.duration,
+        motion.harmonics,
+        _terms(motion.friction),
+        motion.starts,
+        motion.seed,
+        seconds=np.inf if motion.seconds is None else motion.seconds,
     )
-    swept = None if no_sweeps else SweepRequest(speeds=sweep_speeds, seed=seed)
+    swept = None
+    if not motion.no_sweeps:
+        swept = SweepRequest(speeds=motion.sweep_speeds, seed=motion.seed)
     plan = _planned(allowed, wished, swept, quiet=as_json)
     document = motion_document(plan)
-    written = write_motions(out, plan, rate_hz, document)
+    written = write_motions(out, plan, motion.rate_hz, document)
     if as_json:
         typer.echo(json.dumps(document, indent=2, allow_nan=False))
     else:
@@ -124,18 +211,18 @@ def _radians(degrees: float | None) -> float | None:
 
 def _terms(words: str) -> FrictionTerms:
     wanted = [] if words.strip().lower() == "none" else [it.strip() for it in words.split(",")]
-    unknown = [it for it in wanted if it not in options.FRICTION]
+    unknown = [it for it in wanted if it not in _FRICTION]
     if unknown:
         raise DataError(
-            f"--friction is {words[:80]!r}; of {some_of(options.FRICTION)} is needed, with commas "
+            f"--friction is {words[:80]!r}; of {some_of(_FRICTION)} is needed, with commas "
             "between, or none.",
             culprits=["--friction"],
         )
-    return FrictionTerms(*(it in wanted for it in options.FRICTION))
+    return FrictionTerms(*(it in wanted for it in _FRICTION))
 
 
-def _bodies(arm: Robot, boxes: list[str], tool: str | None) -> tuple[Body, ...]:
-    found = [Body(box.name, 0, "box", box.size_m, box.base_from_box) for box in map(box_of, boxes)]
+def _bodies(arm: Robot, boxes: Sequence[Box], tool: str | None) -> tuple[Body, ...]:
+    found = [Body(box.name, 0, "box", box.size_m, box.base_from_box) for box in boxes]
     if tool is not None:
         length, radius = (1e-3 * it for it in numbers_in(tool, "--tool", "length,radius"))
         if min(length, radius) <= 0.0:

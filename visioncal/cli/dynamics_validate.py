@@ -2,48 +2,38 @@
 
 import json
 from collections.abc import Sequence
-from typing import Annotated
 
 import typer
 from rich.markup import escape
 from rich.table import Table
 
-from visioncal.cli.choosing import RobotName
 from visioncal.cli.console import messages
 from visioncal.cli.dynamics_options import (
     AgainstOption,
-    CutoffOption,
-    GainsOption,
-    SessionArgument,
-    StreamOption,
+    MotionsArgument,
+    StreamOptions,
     identified_of,
-    number_list,
 )
+from visioncal.cli.options import AsJson
 from visioncal.core.number_format import figure
 from visioncal.dynamics.identified import Identified
-from visioncal.dynamics.run import Request, validate_session
+from visioncal.dynamics.run import validate_session
 from visioncal.dynamics.validate import Prediction, validate
 from visioncal.session import Session
 
 
 def dynamics_validate_command(
-    session: SessionArgument,
+    session: MotionsArgument,
+    streams: StreamOptions,
     against: AgainstOption = None,
-    stream: StreamOption = None,
-    cutoff_hz: CutoffOption = None,
-    gains: GainsOption = None,
-    robot: RobotName = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print figures as JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Predict the torques of other motions, and say how near that comes.
 
     Exit status 0: there are figures; 2: there are none, for the reason given.
     """
     identified = identified_of(against, "validate")
-    request = Request(
-        tuple(stream or ()), "", cutoff_hz, number_list(gains, "--gains"), robot=robot
-    )
-    predictions = validate_session(Session.load(session), identified, request)
+    predictions = validate_session(Session.load(session), identified, streams.request())
     if as_json:
         typer.echo(json.dumps([_figures(it) for it in predictions], indent=2))
         return

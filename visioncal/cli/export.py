@@ -6,8 +6,8 @@ from typing import Annotated, get_args
 import typer
 from rich.markup import escape
 
-from visioncal.cli.choosing import CameraName, RobotName, TargetName
 from visioncal.cli.console import messages
+from visioncal.cli.options import Force, OutFile, PartOptions
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, read_text, write_atomically
 from visioncal.interchange.exports import EXPORT_FORMATS, Load, Selection, document
@@ -40,10 +40,8 @@ def export_command(
             help=f"{', '.join(it.name for it in EXPORT_FORMATS)}; --list says what each is.",
         ),
     ],
-    out: Annotated[
-        Path | None,
-        typer.Option("-o", "--out", help="The file to write; otherwise, or as -, stdout."),
-    ] = None,
+    part: PartOptions,
+    out: OutFile = None,
     edge: Annotated[
         str | None,
         typer.Option(
@@ -83,16 +81,13 @@ def export_command(
         str | None,
         typer.Option("--hash", help="ur-kinematics: the hash that ur_calibration extracts."),
     ] = None,
-    camera: CameraName = None,
-    robot: RobotName = None,
-    target: TargetName = None,
     onto: Annotated[
         Path | None,
         typer.Option(
             "--onto", help="oak: the device's own calibration JSON, of which all else is kept."
         ),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
+    force: Force = False,
     _list: Annotated[
         bool,
         typer.Option("--list", callback=_show_formats, is_eager=True, help="List the formats."),
@@ -115,9 +110,9 @@ def export_command(
         convention,
         calibration_hash,
         kept,
-        camera,
-        robot,
-        target,
+        part.camera,
+        part.robot,
+        part.target,
     )
     written = document(load_exportable(source), to, selection)
     for it in written.warnings:

@@ -1,45 +1,19 @@
 """`visioncal fixture`."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from visioncal.cli.choosing import CameraName, RobotName, TargetName
-from visioncal.cli.convert_options import (
-    JointColumns,
-    JointUnit,
-    RobotColumns,
-    RobotForm,
-    RobotInverse,
-    RobotModel,
-    RobotUnit,
-)
-from visioncal.cli.framing import (
-    CalibrationOption,
-    ForceOption,
-    JsonOption,
-    NameOption,
-    OutOption,
-    Place,
-    TouchNoise,
-    metres,
-    named_robot,
-    tell,
-    touch_wishes,
-)
+from visioncal.cli.framing import FrameOptions, Place, TouchOptions, tell
+from visioncal.cli.options import AsJson, PartOptions
 from visioncal.cli.refusing import refuse_given
-from visioncal.cli.target_in_images import (
-    PointOption,
-    frame_by_images,
-    image_session,
-    touch_options,
-)
+from visioncal.cli.target_in_images import PointOption, frame_by_images, image_session
 from visioncal.core.conventions import UNITS_M
 from visioncal.core.errors import DataError
 from visioncal.frames.fixture import touched_fixture
 from visioncal.frames.measured import NO_TOOL, Tool
-from visioncal.frames.naming import transform_name
 from visioncal.interchange.formats.touches import read_nominal, read_touches
 from visioncal.interchange.result_files import load_placed
 from visioncal.results import Calibration
@@ -54,9 +28,9 @@ def fixture_command(
             "or, with --cad, point. Or a session whose images show a target on the fixture."
         ),
     ],
-    calibration: CalibrationOption = None,
-    out: OutOption = None,
-    name: NameOption = None,
+    goes: FrameOptions,
+    written: TouchOptions,
+    part: PartOptions,
     cad: Annotated[
         Path | None,
         typer.Option(
@@ -76,19 +50,7 @@ def fixture_command(
         ),
     ] = None,
     point: PointOption = None,
-    touch_noise: TouchNoise = None,
-    robot_columns: RobotColumns = None,
-    robot_form: RobotForm = None,
-    robot_unit: RobotUnit = None,
-    robot_inverse: RobotInverse = None,
-    joint_columns: JointColumns = None,
-    joint_unit: JointUnit = "rad",
-    robot_model: RobotModel = None,
-    camera: CameraName = None,
-    robot: RobotName = None,
-    target: TargetName = None,
-    force: ForceOption = False,
-    as_json: JsonOption = False,
+    as_json: AsJson = False,
 ) -> None:
     """Find a fixture in the base, from touches of it or of a drawing's points.
 
@@ -98,40 +60,28 @@ def fixture_command(
     with --cad several markers, by the camera that -c names. Exit status 2: nothing was written, for
     the reason given.
     """
-    name = transform_name("fixture", name)
     drawing = None if cad is None else read_nominal(cad, cad_unit)
-    for_touches = touch_options(
-        robot_columns,
-        robot_form,
-        robot_unit,
-        robot_inverse,
-        joint_columns,
-        robot_model,
-        touch_noise,
-    )
-    session = image_session(touches, {"--tool": tool, **for_touches})
+    session = image_session(touches, {"--tool": tool, **written.given()})
     if session is not None:
-        choice = Choice(camera, robot, target)
-        place = Place.of(name, calibration, out, Choice(camera, robot), EYE, force=force)
+        choice = part.choice
+        place = Place.of(goes, "fixture", replace(choice, target=None), EYE)
         frame = frame_by_images(
             session, place, "fixture", point, drawing, choice=choice, quiet=as_json
         )
         tell(place, frame, place.keep(frame), as_json=as_json)
         return
     refuse_given({"--point-mm": point}, "touches say where the fixture's origin is")
-    refuse_given({"--camera": camera, "--target": target}, "touches need no camera")
-    place = Place.of(name, calibration, out, Choice(robot=robot), ARM, force=force)
-    touched_with = _tool(tool, place.calibration, robot)
-    requested = touch_wishes(
-        robot_columns, robot_form, robot_unit, robot_inverse, joint_columns, joint_unit
-    )
+    refuse_given({"--camera": part.camera, "--target": part.target}, "touches need no camera")
+    place = Place.of(goes, "fixture", Choice(robot=part.robot), ARM)
+    touched_with = _tool(tool, place.calibration, part.robot)
+    requested = written.requested()
     frame = touched_fixture(
-        read_touches(touches, requested, robot, positions=touched_with is None),
+        read_touches(touches, requested, part.robot, positions=touched_with is None),
         touched_with,
         drawing,
         place.calibration,
-        named_robot(robot_model),
-        touch_noise_m=metres(touch_noise, "--touch-noise-mm"),
+        written.model,
+        touch_noise_m=written.noise_m,
     )
     tell(place, frame, place.keep(frame), as_json=as_json)
 

@@ -4,54 +4,91 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import Annotated
 
 import typer
 from rich.markup import escape
 
 from visioncal.cli.console import messages, tell_written
-from visioncal.cli.convert_options import names_in
+from visioncal.cli.options import Force
+from visioncal.cli.pose_options import RobotPoseOptions
 from visioncal.cli.summary import print_verdict
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import pose_difference
-from visioncal.interchange.formats import ImportOptions, PoseImportOptions
+from visioncal.frames.naming import FrameKind, transform_name
 from visioncal.interchange.merge_results import rewrite
 from visioncal.interchange.outputs import RECORDING, Written
 from visioncal.interchange.result_files import load_result
 from visioncal.results import Calibration, Frame, FrameFile
 from visioncal.results.frame import frames_document
 from visioncal.results.selecting import placed_name
-from visioncal.robot import Robot, load_robot
 from visioncal.session.choosing import PARTS, Choice, Part
 
-CalibrationOption: TypeAlias = Annotated[
-    Path | None,
-    typer.Option(
-        "-c",
-        "--calibration",
-        help="An output folder of calibrate: what it knows is used, and the frame joins it.",
-    ),
-]
-OutOption: TypeAlias = Annotated[
-    Path | None,
-    typer.Option(
-        "-o", "--out", help="A file of frames (.json) to put it into instead; made where missing."
-    ),
-]
-NameOption: TypeAlias = Annotated[
-    str | None, typer.Option("--name", help="What to call it: gripper, jig_2.")
-]
-ForceOption: TypeAlias = Annotated[
-    bool, typer.Option("--force", help="Replace a frame of the same name.")
-]
-JsonOption: TypeAlias = Annotated[
-    bool, typer.Option("--json", help="Print the frame as JSON to stdout.")
-]
-TouchNoise: TypeAlias = Annotated[
-    float | None,
-    typer.Option("--touch-noise-mm", help="What a touch is known to repeat to, per axis."),
-]
+
+@dataclass(frozen=True)
+class FrameOptions:
+    """Where a frame goes, and under which name."""
+
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            "-c",
+            "--calibration",
+            help="An output folder of calibrate: what it knows is used, and the frame joins it.",
+        ),
+    ] = None
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "-o",
+            "--out",
+            help="A file of frames (.json) to put it into instead; made where missing.",
+        ),
+    ] = None
+    name: Annotated[str | None, typer.Option("--name", help="What to call it: gripper, jig_2.")] = (
+        None
+    )
+    force: Force = False
+
+
+@dataclass(frozen=True)
+class TouchOptions(RobotPoseOptions):
+    """How touches are written, and how well they repeat."""
+
+    touch_noise: Annotated[
+        float | None,
+        typer.Option("--touch-noise-mm", help="What a touch is known to repeat to, per axis."),
+    ] = None
+
+    @property
+    def noise_m(self) -> float | None:
+        """How well a touch repeats [m].
+
+        Raises:
+            DataError: It is no length from 0 to 1000 mm.
+        """
+        noise_mm = self.touch_noise
+        if noise_mm is None:
+            return None
+        if not 0.0 < noise_mm < 1e3:
+            raise DataError(
+                f"--touch-noise-mm is {noise_mm:g}; millimetres above 0 and under 1000 are needed.",
+                culprits=["--touch-noise-mm"],
+            )
+        return 1e-3 * noise_mm
+
+    def given(self) -> dict[str, object]:
+        """By their names; None for those that were not given."""
+        return {
+            "--robot-columns": self.robot_columns,
+            "--robot-form": self.robot_form,
+            "--robot-unit": self.robot_unit,
+            "--robot-inverse": self.robot_inverse,
+            "--joint-columns": self.joint_columns,
+            "--robot-model": self.robot_model,
+            "--touch-noise-mm": self.touch_noise,
+        }
 
 
 @dataclass(frozen=True)
@@ -75,27 +112,23 @@ class Place:
     @classmethod
     def of(
         cls,
-        name: str,
-        known: Path | None,
-        out: Path | None,
+        options: FrameOptions,
+        kind: FrameKind,
         choice: Choice,
         needs: Sequence[Part],
-        *,
-        force: bool,
     ) -> "Place":
         """Finds out what is known and where the frame will go, before anything is computed.
 
         Args:
-            name: The transform's name with one camera and one robot.
-            known: The result that it joins, or that is known.
-            out: A file of frames for it.
+            options: What the user says of it.
+            kind: What it is of.
             choice: Which camera and robot of a whole cell are meant.
             needs: What of them has to be clear.
-            force: Whether a frame of that name is replaced.
 
         Raises:
             DataError: A frame of that name is there, or the place cannot take one.
         """
+        name, known, out = transform_name(kind, options.name), options.calibration, options.out
         result = None if known is None else load_result(known)
         calibration = None if result is None else result.chosen(choice, needs)
         if result is None and choice:
@@ -109,7 +142,7 @@ class Place:
         folder = None if known is None or out is not None else _folder(known)
         place = cls(name, calibration, result, folder, out)
         place._check_names()
-        if not force and (there := place._there()) is not None:
+        if not options.force and (there := place._there()) is not None:
             raise DataError(
                 f"{there} already has {name}, and nothing is overwritten.",
                 culprits=[name],
@@ -158,43 +191,6 @@ def _folder(known: Path) -> Path:
             next_step="Name the folder that calibrate wrote, or a file for the frame with -o.",
         )
     return folder
-
-
-def touch_wishes(
-    columns: str | None,
-    form: str | None,
-    unit: str | None,
-    inverse: bool | None,
-    joint_columns: str | None,
-    joint_unit: str,
-) -> ImportOptions:
-    """What the user says of how touches are written."""
-    return ImportOptions(
-        robot=PoseImportOptions(names_in(columns, "--robot-columns"), form, unit, inverse),
-        joints=names_in(joint_columns, "--joint-columns"),
-        joints_deg=joint_unit == "deg",
-    )
-
-
-def named_robot(model: str | None) -> Robot | None:
-    """The robot that the user names."""
-    return None if model is None else load_robot(model)
-
-
-def metres(millimetres: float | None, option: str) -> float | None:
-    """Turns an option in millimetres into metres.
-
-    Raises:
-        DataError: It is not positive.
-    """
-    if millimetres is None:
-        return None
-    if not 0.0 < millimetres < 1e3:
-        raise DataError(
-            f"{option} is {millimetres:g}; millimetres above 0 and under 1000 are needed.",
-            culprits=[option],
-        )
-    return 1e-3 * millimetres
 
 
 def tell(place: Place, frame: Frame, written: Written, *, as_json: bool) -> None:

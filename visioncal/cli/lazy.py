@@ -1,11 +1,14 @@
 """Commands with help in plain text, and groups that import one when it is asked for."""
 
+import inspect
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import MISSING, fields, is_dataclass
+from functools import wraps
 from importlib import import_module
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_type_hints
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -92,5 +95,33 @@ class LazyGroup(TyperGroup):
         if hasattr(module, f"{own}_app"):
             return get_group(getattr(module, f"{own}_app"))
         app = typer.Typer(add_completion=False, rich_markup_mode=None)
-        app.command(name, cls=PlainCommand)(getattr(module, f"{own}_command"))
+        app.command(name, cls=PlainCommand)(with_fields(getattr(module, f"{own}_command")))
         return get_command(app)
+
+
+def with_fields(command: Callable[..., None]) -> Callable[..., None]:
+    """A command whose parameters that are dataclasses are given field by field."""
+    hints = get_type_hints(command, include_extras=True)
+    grouped = {name: it for name, it in hints.items() if isinstance(it, type) and is_dataclass(it)}
+    flat = []
+    for it in inspect.signature(command).parameters.values():
+        if it.name not in grouped:
+            flat.append(it.replace(annotation=hints[it.name], kind=it.KEYWORD_ONLY))
+            continue
+        own = get_type_hints(grouped[it.name], include_extras=True)
+        for field in fields(grouped[it.name]):
+            default = it.empty if field.default is MISSING else field.default
+            flat.append(it.replace(name=field.name, annotation=own[field.name], default=default))
+            flat[-1] = flat[-1].replace(kind=it.KEYWORD_ONLY)
+
+    @wraps(command)
+    def taking_each(**given: Any) -> None:  # noqa: ANN401 - of any type
+        for name, options in grouped.items():
+            own = {field.name: given.pop(field.name) for field in fields(options)}
+            given[name] = options(**own)
+        command(**given)
+
+    del taking_each.__wrapped__
+    taking_each.__signature__ = inspect.Signature(flat)  # type: ignore[attr-defined]
+    taking_each.__annotations__ = {it.name: it.annotation for it in flat}
+    return taking_each

@@ -11,9 +11,9 @@ import typer
 from rich.markup import escape
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from visioncal.cli.choosing import CameraName, RobotName
 from visioncal.cli.console import messages
 from visioncal.cli.numbers import numbers_in
+from visioncal.cli.options import AsJson, CameraName, RobotName
 from visioncal.cli.planes import FORMS, plane_of
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.refusing import refuse_given
@@ -106,7 +106,7 @@ def locate_command(
             help="Noise of a feature's coordinate; else that of the calibration's corners."
         ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the places as JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Locate what an image shows in the robot's base, with its uncertainty.
 

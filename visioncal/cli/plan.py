@@ -2,33 +2,30 @@
 
 import json
 from pathlib import Path
+from typing import Annotated
 
-import numpy as np
 import typer
 from rich.markup import escape
 
-from visioncal.cli import plan_options as options
 from visioncal.cli.console import messages, tell_written
-from visioncal.cli.numbers import numbers_in
+from visioncal.cli.options import AsJson, OutFolder
+from visioncal.cli.plan_options import CellOptions, ClearanceOptions, PlanOptions, SightOptions
 from visioncal.cli.planned_cell import (
-    CellWords,
+    Kept,
     Source,
     begun_session,
-    box_of,
     cell_of,
     chosen_part,
     find_source,
-    floor_of,
 )
 from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
-from visioncal.core.types import FloatArray, Progress
+from visioncal.core.types import Progress
 from visioncal.interchange.outputs import write_plan
-from visioncal.live.planning.accuracy import Wish
-from visioncal.live.planning.cell import Limits, PlanCell
+from visioncal.live.planning.cell import PlanCell
 from visioncal.live.planning.messages import accuracy_words, looks_note, summary_of
-from visioncal.live.planning.plan import Plan, Request, make_plan
+from visioncal.live.planning.plan import Plan, make_plan
 from visioncal.live.planning.purposes import purpose_of
 from visioncal.live.planning.recorded import Begun
 from visioncal.live.planning.written import plan_document
@@ -39,91 +36,36 @@ _FACE_DOWN = 0.7
 
 
 def plan_command(
-    source: options.Source,
-    out: options.Out = Path("plan"),
-    add: options.Add = None,
-    purpose: options.For = "hand-eye",
-    stops: options.Stops = None,
-    criterion: options.CriterionOption = "I",
-    wish_mm: options.WishMm = None,
-    wish_deg: options.WishDeg = None,
-    workspace: options.Workspace = None,
-    start_joints: options.StartJoints = None,
-    candidates: options.CandidatesOption = 1500,
-    seed: options.Seed = 0,
-    robot: options.RobotOption = None,
-    target: options.TargetOption = None,
-    camera: options.CameraOption = None,
-    resolution: options.Resolution = None,
-    mount: options.MountOption = None,
-    cam: options.CamOption = None,
-    board: options.BoardOption = None,
-    guess_mm: options.GuessMm = 20.0,
-    guess_deg: options.GuessDeg = 5.0,
-    noise_px: options.NoisePx = None,
-    noise_mm: options.NoiseMm = None,
-    noise_deg: options.NoiseDeg = None,
-    boxes: options.BoxOption = None,
-    floor: options.Floor = "0",
-    clearance_mm: options.Clearance = 30.0,
-    margin_deg: options.Margin = 3.0,
-    tilt_deg: options.Tilt = 50.0,
-    edge_px: options.Edge = 20.0,
-    distance_mm: options.Distance = None,
-    focus_mm: options.Focus = None,
-    as_json: options.AsJson = False,
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="A robot (a built-in name, a .urdf or .toml), a session, or an output folder of "
+            "calibrate.",
+        ),
+    ],
+    wanted: PlanOptions,
+    words: CellOptions,
+    kept: ClearanceOptions,
+    sight: SightOptions,
+    out: OutFolder = Path("plan"),
+    as_json: AsJson = False,
 ) -> None:
     """Propose the robot stops that tell most, or those to add to a session.
 
     Writes stops.csv, plan.json, plan.rrd to look at, and plan.script for a UR. Nothing is sent to
     a robot. Exit status 2: the cell or the session allows no plan, for the reason given.
     """
-    limits = Limits(
-        float(np.deg2rad(margin_deg)),
-        _span(distance_mm, "--distance-mm"),
-        _span(focus_mm, "--focus-mm"),
-        float(np.deg2rad(tilt_deg)),
-        edge_px,
-        1e-3 * clearance_mm,
-        floor_of(floor),
-    )
-    words = CellWords(
-        robot,
-        target,
-        camera,
-        resolution,
-        mount,
-        cam,
-        board,
-        guess_mm,
-        guess_deg,
-        noise_px,
-        noise_mm,
-        noise_deg,
-        limits,
-        tuple(box_of(it) for it in boxes or ()),
-    )
-    wanted = purpose_of(purpose, "--for")
+    limits, boxes = sight.limits(kept), kept.bodies
+    purpose_of(wanted.purpose, "--for")
     start, words = chosen_part(find_source(source), words)
-    wish = None if wish_mm is None and wish_deg is None else Wish(wish_mm, wish_deg)
     with shown_progress(quiet=as_json) as told:
-        cell, begun = _begin(start, words, add, stops, told)
-        if board is not None and cell.mount == "eye-in-hand" and cell.z[2, 2] > _FACE_DOWN:
+        cell, begun = _begin(start, words, (limits, boxes), wanted, told)
+        if words.board is not None and cell.mount == "eye-in-hand" and cell.z[2, 2] > _FACE_DOWN:
             messages().print(
                 "[bold yellow]warning:[/] this --board lies face down: its z points into the "
                 "paper, and a board that lies face up ends in 180 0 0"
             )
-        request = Request(
-            wanted,
-            add or stops or wanted.stops,
-            criterion,
-            wish,
-            candidates,
-            None if workspace is None else box_of(f"workspace:{workspace}", "--workspace"),
-            _start(start_joints, cell),
-            seed,
-        )
-        plan = make_plan(cell, request, begun=begun, progress=told)
+        plan = make_plan(cell, wanted.request(cell), begun=begun, progress=told)
         told("write", 0, 1)
         document = plan_document(plan, {"kind": start.words})
         written = write_plan(out, plan, document)
@@ -135,20 +77,20 @@ def plan_command(
 
 
 def _begin(
-    source: Source, words: CellWords, add: int | None, stops: int | None, told: Progress
+    source: Source, words: CellOptions, kept: Kept, wanted: PlanOptions, told: Progress
 ) -> tuple[PlanCell, Begun | None]:
     """The cell, and what was recorded of it where stops are added to that."""
-    if add is not None and stops is not None:
+    if wanted.add is not None and wanted.stops is not None:
         raise DataError(
             "--add and --stops exclude each other: stops are added to what was recorded, or "
             "planned without it.",
             culprits=["--add", "--stops"],
             next_step="Leave one out.",
         )
-    if add is None and (source.session is None or source.calibration is not None):
-        return cell_of(source, words), None
-    begun = begun_session(source, words, told)
-    return begun.cell, begun if add is not None else None
+    if wanted.add is None and (source.session is None or source.calibration is not None):
+        return cell_of(source, words, kept), None
+    begun = begun_session(source, words, kept, told)
+    return begun.cell, begun if wanted.add is not None else None
 
 
 def _tell(plan: Plan) -> None:
@@ -176,17 +118,3 @@ def _tell(plan: Plan) -> None:
             "the way from where the arm stands to the first stop was not looked at; --start-joints "
             "says where that is"
         )
-
-
-def _start(words: str | None, cell: PlanCell) -> FloatArray | None:
-    if words is None:
-        return None
-    form = ",".join(f"q{it + 1}" for it in range(cell.robot.joint_count))
-    return np.array(numbers_in(words, "--start-joints", form))
-
-
-def _span(words: str | None, option: str) -> tuple[float, float] | None:
-    if words is None:
-        return None
-    near, far = numbers_in(words, option, "near,far")
-    return 1e-3 * near, 1e-3 * far

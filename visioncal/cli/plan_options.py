@@ -1,281 +1,341 @@
-"""The options of `visioncal plan`, as types of its parameters."""
+"""The options of `visioncal plan`, and what they say."""
 
-from pathlib import Path
-from typing import Annotated, TypeAlias
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated
 
+import numpy as np
 import typer
 
+from visioncal.cli.numbers import numbers_in
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import compose
 from visioncal.core.types import Mount
-from visioncal.live.planning.purposes import PURPOSES
+from visioncal.live.planning.accuracy import Wish
+from visioncal.live.planning.cell import Box, Limits, PlanCell
+from visioncal.live.planning.plan import Request
+from visioncal.live.planning.purposes import PURPOSES, purpose_of
 from visioncal.live.planning.selection import Criterion
 
-_WHAT = "What is planned"
-_CELL = "The cell, where the source does not say it"
-_LIMITS = "What the arm must keep"
-_DOUBT = "How well it is known"
+_what = partial(typer.Option, rich_help_panel="What is planned")
+_cell = partial(typer.Option, rich_help_panel="The cell, where the source does not say it")
+_limits = partial(typer.Option, rich_help_panel="What the arm must keep")
+_doubt = partial(typer.Option, rich_help_panel="How well it is known")
 _USUAL_STOPS = ", ".join(f"{it.stops} for {it.name}" for it in PURPOSES.values())
 
 
-def _option(*names: str, panel: str, words: str, metavar: str | None = None) -> object:
-    return typer.Option(
-        *names, help=words, rich_help_panel=panel, show_default=False, metavar=metavar
-    )
+@dataclass(frozen=True)
+class PlanOptions:
+    """What is planned."""
+
+    add: Annotated[
+        int | None,
+        _what(
+            "--add",
+            min=1,
+            max=500,
+            help="How many stops to add to a recorded session, which counts.",
+        ),
+    ] = None
+    purpose: Annotated[
+        str,
+        _what("--for", metavar="|".join(PURPOSES), help="What they are for."),
+    ] = "hand-eye"
+    stops: Annotated[
+        int | None,
+        _what(
+            "--stops",
+            min=1,
+            max=500,
+            help=f"How many stops: {_USUAL_STOPS}.",
+        ),
+    ] = None
+    criterion: Annotated[
+        Criterion,
+        _what(
+            "--criterion",
+            help="I: mean variance of the places that count; D, A, E: of the unknowns; O1: of the "
+            "Jacobian.",
+        ),
+    ] = "I"
+    wish_mm: Annotated[
+        float | None,
+        _what("--wish-mm", help="Fewer stops where they predict this sigma, in mm."),
+    ] = None
+    wish_deg: Annotated[
+        float | None, _what("--wish-deg", help="The same of the rotation, in degrees.")
+    ] = None
+    workspace: Annotated[
+        str | None,
+        _what(
+            "--workspace",
+            metavar="X,Y,Z:SX,SY,SZ",
+            help="Where the arm's place counts: a box by its centre in the base and its lengths, "
+            "in mm; else all of its reach.",
+        ),
+    ] = None
+    start_joints: Annotated[
+        str | None,
+        _what(
+            "--start-joints",
+            metavar="Q1,Q2,...",
+            help="Where the arm stands now, in radians; else the way to the first stop is not "
+            "looked at.",
+        ),
+    ] = None
+    candidates: Annotated[
+        int,
+        _what(
+            "--candidates",
+            min=12,
+            max=20000,
+            help="From how many possible stops they are chosen.",
+        ),
+    ] = 1500
+    seed: Annotated[
+        int,
+        _what("--seed", min=0, help="Other possible stops for every number."),
+    ] = 0
+
+    def request(self, cell: PlanCell) -> Request:
+        """The same, as the planner takes it.
+
+        Raises:
+            DataError: A number, a box or a purpose is written otherwise.
+        """
+        wanted = purpose_of(self.purpose, "--for")
+        named = self.workspace and f"workspace:{self.workspace}"
+        form = ",".join(f"q{it + 1}" for it in range(cell.robot.joint_count))
+        start = self.start_joints and numbers_in(self.start_joints, "--start-joints", form)
+        unwished = self.wish_mm is None and self.wish_deg is None
+        return Request(
+            wanted,
+            self.add or self.stops or wanted.stops,
+            self.criterion,
+            None if unwished else Wish(self.wish_mm, self.wish_deg),
+            self.candidates,
+            box_of(named, "--workspace") if named else None,
+            np.array(start) if start else None,
+            self.seed,
+        )
 
 
-Source: TypeAlias = Annotated[
-    str,
-    typer.Argument(
-        help="A robot (a built-in name, a .urdf or .toml), a session, or an output folder of "
-        "calibrate.",
-    ),
-]
-Out: TypeAlias = Annotated[
-    Path, typer.Option("-o", "--out", help="Folder for table, program and preview.")
-]
-AsJson: TypeAlias = Annotated[bool, typer.Option("--json", help="Print plan.json to stdout.")]
+@dataclass(frozen=True)
+class CellOptions:
+    """What the user says of the cell; None for what is not said."""
 
-For: TypeAlias = Annotated[
-    str,
-    typer.Option(
-        "--for", metavar="|".join(PURPOSES), help="What they are for.", rich_help_panel=_WHAT
-    ),
-]
-Stops: TypeAlias = Annotated[
-    int | None,
-    typer.Option(
-        "--stops",
-        min=1,
-        max=500,
-        help=f"How many stops: {_USUAL_STOPS}.",
-        rich_help_panel=_WHAT,
-        show_default=False,
-    ),
-]
-Add: TypeAlias = Annotated[
-    int | None,
-    typer.Option(
-        "--add",
-        min=1,
-        max=500,
-        help="How many stops to add to a recorded session, which counts.",
-        rich_help_panel=_WHAT,
-        show_default=False,
-    ),
-]
-CriterionOption: TypeAlias = Annotated[
-    Criterion,
-    typer.Option(
-        "--criterion",
-        help="I: mean variance of the places that count; D, A, E: of the unknowns; O1: of the "
-        "Jacobian.",
-        rich_help_panel=_WHAT,
-    ),
-]
-WishMm: TypeAlias = Annotated[
-    float | None,
-    _option("--wish-mm", panel=_WHAT, words="Fewer stops where they predict this sigma, in mm."),
-]
-WishDeg: TypeAlias = Annotated[
-    float | None, _option("--wish-deg", panel=_WHAT, words="The same of the rotation, in degrees.")
-]
-Workspace: TypeAlias = Annotated[
-    str | None,
-    _option(
-        "--workspace",
-        panel=_WHAT,
-        metavar="X,Y,Z:SX,SY,SZ",
-        words="Where the arm's place counts: a box by its centre in the base and its lengths, in "
-        "mm; else all of its reach.",
-    ),
-]
-StartJoints: TypeAlias = Annotated[
-    str | None,
-    _option(
-        "--start-joints",
-        panel=_WHAT,
-        metavar="Q1,Q2,...",
-        words="Where the arm stands now, in radians; else the way to the first stop is not looked "
-        "at.",
-    ),
-]
-CandidatesOption: TypeAlias = Annotated[
-    int,
-    typer.Option(
-        "--candidates",
-        min=12,
-        max=20000,
-        help="From how many possible stops they are chosen.",
-        rich_help_panel=_WHAT,
-    ),
-]
-Seed: TypeAlias = Annotated[
-    int,
-    typer.Option(
-        "--seed", min=0, help="Other possible stops for every number.", rich_help_panel=_WHAT
-    ),
-]
+    robot: Annotated[
+        str | None,
+        _cell("--robot", help="The robot, where a session names none."),
+    ] = None
+    target: Annotated[
+        str | None,
+        _cell(
+            "--target",
+            help="The board: a name in targets/, a .toml, or in one word as "
+            "checkerboard_9x6_23.6mm.",
+        ),
+    ] = None
+    camera: Annotated[
+        str | None,
+        _cell(
+            "--camera",
+            metavar="FX,FY,CX,CY | FILE",
+            help="The lens: four numbers in pixels, a file of intrinsics, or an earlier "
+            "calibration.",
+        ),
+    ] = None
+    resolution: Annotated[
+        str | None,
+        _cell("--resolution", metavar="W,H", help="Size of the images in pixels."),
+    ] = None
+    mount: Annotated[Mount | None, _cell("--mount", help="Where the camera is.")] = None
+    cam: Annotated[
+        str | None,
+        _cell(
+            "--cam",
+            metavar="'X Y Z RX RY RZ'",
+            help="Rough place of the camera on the flange (or in the base), in mm and degrees: "
+            "turned about the fixed axes x, then y, then z. It looks along its z.",
+        ),
+    ] = None
+    board: Annotated[
+        str | None,
+        _cell(
+            "--board",
+            metavar="'X Y Z RX RY RZ'",
+            help="Rough place of the board in the base (or on the flange), in the same form. Its z "
+            "points into the paper: face up is '... 180 0 0'.",
+        ),
+    ] = None
+    guess_mm: Annotated[
+        float,
+        _doubt(
+            "--guess-mm",
+            min=0.1,
+            max=500.0,
+            help="How well both places are known, per axis.",
+        ),
+    ] = 20.0
+    guess_deg: Annotated[
+        float,
+        _doubt(
+            "--guess-deg",
+            min=0.01,
+            max=45.0,
+            help="The same of their rotations.",
+        ),
+    ] = 5.0
+    noise_px: Annotated[
+        float | None,
+        _doubt("--noise-px", help="Of a corner in the image; else 0.1, or as recorded."),
+    ] = None
+    noise_mm: Annotated[
+        float | None,
+        _doubt(
+            "--noise-mm",
+            help="Of the robot at a stop, per axis; else 0.03, or as recorded.",
+        ),
+    ] = None
+    noise_deg: Annotated[
+        float | None,
+        _doubt("--noise-deg", help="The same of its rotation; else 0.003, or as recorded."),
+    ] = None
 
-RobotOption: TypeAlias = Annotated[
-    str | None,
-    _option("--robot", panel=_CELL, words="The robot, where a session names none."),
-]
-TargetOption: TypeAlias = Annotated[
-    str | None,
-    _option(
-        "--target",
-        panel=_CELL,
-        words="The board: a name in targets/, a .toml, or in one word as checkerboard_9x6_23.6mm.",
-    ),
-]
-CameraOption: TypeAlias = Annotated[
-    str | None,
-    _option(
-        "--camera",
-        panel=_CELL,
-        metavar="FX,FY,CX,CY | FILE",
-        words="The lens: four numbers in pixels, a file of intrinsics, or an earlier calibration.",
-    ),
-]
-Resolution: TypeAlias = Annotated[
-    str | None,
-    _option("--resolution", panel=_CELL, metavar="W,H", words="Size of the images in pixels."),
-]
-MountOption: TypeAlias = Annotated[
-    Mount | None, _option("--mount", panel=_CELL, words="Where the camera is.")
-]
-CamOption: TypeAlias = Annotated[
-    str | None,
-    _option(
-        "--cam",
-        panel=_CELL,
-        metavar="'X Y Z RX RY RZ'",
-        words="Rough place of the camera on the flange (or in the base), in mm and degrees: turned "
-        "about the fixed axes x, then y, then z. It looks along its z.",
-    ),
-]
-BoardOption: TypeAlias = Annotated[
-    str | None,
-    _option(
-        "--board",
-        panel=_CELL,
-        metavar="'X Y Z RX RY RZ'",
-        words="Rough place of the board in the base (or on the flange), in the same form. Its z "
-        "points into the paper: face up is '... 180 0 0'.",
-    ),
-]
+    def given(self, *names: str) -> list[str]:
+        """Those of some options that were given."""
+        return [f"--{it}" for it in names if getattr(self, it) is not None]
 
-GuessMm: TypeAlias = Annotated[
-    float,
-    typer.Option(
-        "--guess-mm",
-        min=0.1,
-        max=500.0,
-        help="How well both places are known, per axis.",
-        rich_help_panel=_DOUBT,
-    ),
-]
-GuessDeg: TypeAlias = Annotated[
-    float,
-    typer.Option(
-        "--guess-deg",
-        min=0.01,
-        max=45.0,
-        help="The same of their rotations.",
-        rich_help_panel=_DOUBT,
-    ),
-]
-NoisePx: TypeAlias = Annotated[
-    float | None,
-    _option(
-        "--noise-px", panel=_DOUBT, words="Of a corner in the image; else 0.1, or as recorded."
-    ),
-]
-NoiseMm: TypeAlias = Annotated[
-    float | None,
-    _option(
-        "--noise-mm",
-        panel=_DOUBT,
-        words="Of the robot at a stop, per axis; else 0.03, or as recorded.",
-    ),
-]
-NoiseDeg: TypeAlias = Annotated[
-    float | None,
-    _option(
-        "--noise-deg", panel=_DOUBT, words="The same of its rotation; else 0.003, or as recorded."
-    ),
-]
 
-BoxOption: TypeAlias = Annotated[
-    list[str] | None,
-    _option(
-        "--box",
-        panel=_LIMITS,
-        metavar="NAME:X,Y,Z:SX,SY,SZ",
-        words="Something in the way, by its centre in the base and its lengths, in mm; as often as "
-        "needed.",
-    ),
-]
-Floor: TypeAlias = Annotated[
-    str,
-    typer.Option(
-        "--floor",
-        metavar="Z|none",
-        help="Height of the floor or table in the base, in mm.",
-        rich_help_panel=_LIMITS,
-    ),
-]
-Clearance: TypeAlias = Annotated[
-    float,
-    typer.Option(
-        "--clearance-mm",
-        min=0.0,
-        max=1000.0,
-        help="Of the arm from floor, board, boxes and itself.",
-        rich_help_panel=_LIMITS,
-    ),
-]
-Margin: TypeAlias = Annotated[
-    float,
-    typer.Option(
-        "--margin-deg",
-        min=0.0,
-        max=90.0,
-        help="Of the joints from their limits.",
-        rich_help_panel=_LIMITS,
-    ),
-]
-Tilt: TypeAlias = Annotated[
-    float,
-    typer.Option(
-        "--tilt-deg",
-        min=5.0,
-        max=80.0,
-        help="Most between the line of sight and the board's normal.",
-        rich_help_panel=_LIMITS,
-    ),
-]
-Edge: TypeAlias = Annotated[
-    float,
-    typer.Option(
-        "--edge-px",
-        min=0.0,
-        max=10000.0,
-        help="Of the board from the image's edge.",
-        rich_help_panel=_LIMITS,
-    ),
-]
-Distance: TypeAlias = Annotated[
-    str | None,
-    _option(
-        "--distance-mm",
-        panel=_LIMITS,
-        metavar="NEAR,FAR",
-        words="Of the camera from the board; else as the board fills the image.",
-    ),
-]
-Focus: TypeAlias = Annotated[
-    str | None,
-    _option(
-        "--focus-mm", panel=_LIMITS, metavar="NEAR,FAR", words="Depths at which images are sharp."
-    ),
-]
+@dataclass(frozen=True)
+class ClearanceOptions:
+    """What the arm must keep, in any motion."""
+
+    boxes: Annotated[
+        list[str] | None,
+        _limits(
+            "--box",
+            metavar="NAME:X,Y,Z:SX,SY,SZ",
+            help="Something in the way, by its centre in the base and its lengths, in mm; as often "
+            "as needed.",
+        ),
+    ] = None
+    floor: Annotated[
+        str,
+        _limits(
+            "--floor",
+            metavar="Z|none",
+            help="Height of the floor or table in the base, in mm.",
+        ),
+    ] = "0"
+    clearance_mm: Annotated[
+        float,
+        _limits(
+            "--clearance-mm",
+            min=0.0,
+            max=1000.0,
+            help="Of the arm from floor, board, boxes and itself.",
+        ),
+    ] = 30.0
+    margin_deg: Annotated[
+        float,
+        _limits(
+            "--margin-deg",
+            min=0.0,
+            max=90.0,
+            help="Of the joints from their limits.",
+        ),
+    ] = 3.0
+
+    @property
+    def bodies(self) -> tuple[Box, ...]:
+        """What is in the way.
+
+        Raises:
+            DataError: A box is written otherwise.
+        """
+        return tuple(box_of(it) for it in self.boxes or ())
+
+    @property
+    def floor_m(self) -> float | None:
+        """The height of the floor in the base; None for none.
+
+        Raises:
+            DataError: It is no number.
+        """
+        if self.floor.strip().lower() == "none":
+            return None
+        return 1e-3 * numbers_in(self.floor, "--floor", "z")[0]
+
+
+@dataclass(frozen=True)
+class SightOptions:
+    """What the camera must keep."""
+
+    tilt_deg: Annotated[
+        float,
+        _limits(
+            "--tilt-deg",
+            min=5.0,
+            max=80.0,
+            help="Most between the line of sight and the board's normal.",
+        ),
+    ] = 50.0
+    edge_px: Annotated[
+        float,
+        _limits(
+            "--edge-px",
+            min=0.0,
+            max=10000.0,
+            help="Of the board from the image's edge.",
+        ),
+    ] = 20.0
+    distance_mm: Annotated[
+        str | None,
+        _limits(
+            "--distance-mm",
+            metavar="NEAR,FAR",
+            help="Of the camera from the board; else as the board fills the image.",
+        ),
+    ] = None
+    focus_mm: Annotated[
+        str | None,
+        _limits("--focus-mm", metavar="NEAR,FAR", help="Depths at which images are sharp."),
+    ] = None
+
+    def limits(self, kept: ClearanceOptions) -> Limits:
+        """These limits and those of any motion."""
+        return Limits(
+            float(np.deg2rad(kept.margin_deg)),
+            _span(self.distance_mm, "--distance-mm"),
+            _span(self.focus_mm, "--focus-mm"),
+            float(np.deg2rad(self.tilt_deg)),
+            self.edge_px,
+            1e-3 * kept.clearance_mm,
+            kept.floor_m,
+        )
+
+
+def box_of(words: str, option: str = "--box") -> Box:
+    """Reads a box: NAME:x,y,z:sx,sy,sz, its centre in the base and its lengths [mm].
+
+    Raises:
+        DataError: It is written otherwise.
+    """
+    parts = words.split(":")
+    if len(parts) != 3 or not parts[0].strip():
+        raise DataError(
+            f"{option} is {words[:80]!r}; NAME:X,Y,Z:SX,SY,SZ is needed, with the centre in the "
+            "base and the lengths in mm.",
+            culprits=[option],
+        )
+    centre = numbers_in(parts[1], option, "x,y,z")
+    size = numbers_in(parts[2], option, "sx,sy,sz")
+    return Box(parts[0].strip(), compose(np.eye(3), 1e-3 * np.array(centre)), 1e-3 * np.array(size))
+
+
+def _span(words: str | None, option: str) -> tuple[float, float] | None:
+    if words is None:
+        return None
+    near, far = numbers_in(words, option, "near,far")
+    return 1e-3 * near, 1e-3 * far

@@ -3,15 +3,17 @@
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.cli.numbers import numbers_in
+from visioncal.cli.plan_options import CellOptions
 from visioncal.core.errors import DataError
 from visioncal.core.files import absence, read_bytes, some_of
 from visioncal.core.transforms import compose
-from visioncal.core.types import Camera, FloatArray, Mount, Progress, Target
+from visioncal.core.types import Camera, FloatArray, Progress, Target
 from visioncal.estimation.parts import Noise
 from visioncal.interchange.formats.boards import described_target
 from visioncal.interchange.formats.intrinsics import read_intrinsics
@@ -30,29 +32,8 @@ from visioncal.vision.targets import target_from_document
 
 _SESSION = "session.toml"
 
-
-@dataclass(frozen=True)
-class CellWords:
-    """What the user said of the cell, as it was written; None for what was not said."""
-
-    robot: str | None
-    target: str | None
-    camera: str | None
-    resolution: str | None
-    mount: Mount | None
-    cam: str | None
-    board: str | None
-    guess_mm: float
-    guess_deg: float
-    noise_px: float | None
-    noise_mm: float | None
-    noise_deg: float | None
-    limits: Limits
-    boxes: tuple[Box, ...]
-
-    def given(self, *names: str) -> list[str]:
-        """Those of some options that were given."""
-        return [f"--{it}" for it in names if getattr(self, it) is not None]
+# What the arm and the camera must keep, and what is in the way.
+Kept: TypeAlias = tuple[Limits, tuple[Box, ...]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +81,7 @@ def find_source(name: str) -> Source:
         ) from error
 
 
-def chosen_part(source: Source, words: CellWords) -> tuple[Source, CellWords]:
+def chosen_part(source: Source, words: CellOptions) -> tuple[Source, CellOptions]:
     """Takes one camera, robot and target out of a source of a whole cell, as the words name them.
 
     Raises:
@@ -119,7 +100,7 @@ def chosen_part(source: Source, words: CellWords) -> tuple[Source, CellWords]:
     return replace(source, session=session, calibration=result), rest
 
 
-def begun_session(source: Source, words: CellWords, told: Progress) -> Begun:
+def begun_session(source: Source, words: CellOptions, kept: Kept, told: Progress) -> Begun:
     """The session to which stops are added.
 
     Raises:
@@ -137,11 +118,11 @@ def begun_session(source: Source, words: CellWords, told: Progress) -> Begun:
         session = _with_robot(session, words.robot)
     guess = _guess(words) if words.given("cam", "board") else None
     found = so_far(session, progress=told)
-    begun = begin(found, guess=guess, limits=words.limits, boxes=words.boxes)
+    begun = begin(found, guess=guess, limits=kept[0], boxes=kept[1])
     return replace(begun, cell=_with_noise(begun.cell, words))
 
 
-def cell_of(source: Source, words: CellWords) -> PlanCell:
+def cell_of(source: Source, words: CellOptions, kept: Kept) -> PlanCell:
     """The cell of a plan of its own, from a calibration or from options.
 
     Raises:
@@ -149,7 +130,7 @@ def cell_of(source: Source, words: CellWords) -> PlanCell:
     """
     if source.calibration is not None:
         _refuse(words.given("camera", "resolution", "mount"), "the calibration has its own")
-        return _with_noise(_calibrated(source.calibration, source.session, words), words)
+        return _with_noise(_calibrated(source.calibration, source.session, words, kept), words)
     # What is written wrongly is told before what is missing.
     numbers = _camera_numbers(words.camera)
     for option, said in (("--cam", words.cam), ("--board", words.board)):
@@ -178,39 +159,9 @@ def cell_of(source: Source, words: CellWords) -> PlanCell:
         guess.sigma_m,
         TYPICAL_NOISE,
         TYPICAL_PX,
-        words.limits,
-        words.boxes,
+        *kept,
     )
     return _with_noise(cell, words)
-
-
-def box_of(words: str, option: str = "--box") -> Box:
-    """Reads a box: NAME:x,y,z:sx,sy,sz, its centre in the base and its lengths [mm].
-
-    Raises:
-        DataError: It is written otherwise.
-    """
-    parts = words.split(":")
-    if len(parts) != 3 or not parts[0].strip():
-        raise DataError(
-            f"{option} is {words[:80]!r}; NAME:X,Y,Z:SX,SY,SZ is needed, with the centre in the "
-            "base and the lengths in mm.",
-            culprits=[option],
-        )
-    centre = numbers_in(parts[1], option, "x,y,z")
-    size = numbers_in(parts[2], option, "sx,sy,sz")
-    return Box(parts[0].strip(), compose(np.eye(3), 1e-3 * np.array(centre)), 1e-3 * np.array(size))
-
-
-def floor_of(words: str) -> float | None:
-    """Reads the height of the floor [mm]: in metres, None for none.
-
-    Raises:
-        DataError: It is no number.
-    """
-    if words.strip().lower() == "none":
-        return None
-    return 1e-3 * numbers_in(words, "--floor", "z")[0]
 
 
 def pose_of(words: str, option: str) -> FloatArray:
@@ -257,7 +208,9 @@ def _with_robot(session: Session, name: str) -> Session:
     )
 
 
-def _calibrated(calibration: Calibration, session: Session | None, words: CellWords) -> PlanCell:
+def _calibrated(
+    calibration: Calibration, session: Session | None, words: CellOptions, kept: Kept
+) -> PlanCell:
     if words.target is not None:
         target = _target(words.target)
     elif session is not None and session.target is not None:
@@ -272,7 +225,7 @@ def _calibrated(calibration: Calibration, session: Session | None, words: CellWo
             next_step="Name the board with --target.",
         )
     robot = None if words.robot is None else load_robot(words.robot)
-    cell = cell_of_calibration(calibration, target, words.limits, words.boxes, robot=robot)
+    cell = cell_of_calibration(calibration, target, *kept, robot=robot)
     if words.cam is not None:
         cell = replace(cell, x=pose_of(words.cam, "--cam"))
     if words.board is not None:
@@ -284,7 +237,7 @@ def _calibrated(calibration: Calibration, session: Session | None, words: CellWo
     )
 
 
-def _guess(words: CellWords) -> Guess:
+def _guess(words: CellOptions) -> Guess:
     missing = [f"--{it}" for it in ("cam", "board") if getattr(words, it) is None]
     if missing:
         raise DataError(
@@ -299,7 +252,7 @@ def _guess(words: CellWords) -> Guess:
     )
 
 
-def _with_noise(cell: PlanCell, words: CellWords) -> PlanCell:
+def _with_noise(cell: PlanCell, words: CellOptions) -> PlanCell:
     for name in ("noise_px", "noise_mm", "noise_deg"):
         value = getattr(words, name)
         option = f"--{name.replace('_', '-')}"

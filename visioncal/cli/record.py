@@ -5,16 +5,19 @@ import math
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from typing import Any
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
 
-from visioncal.cli import record_options as options
 from visioncal.cli.console import messages
 from visioncal.cli.interrupts import ended_like_ctrl_c
 from visioncal.cli.numbers import numbers_in
-from visioncal.cli.recorded_cell import Scene, facts_of, guided, scene_of, shown_in
+from visioncal.cli.options import AsJson, View
+from visioncal.cli.recorded_cell import CellOptions, Scene, facts_of, guided, scene_of, shown_in
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.number_format import figure
 from visioncal.live.capture.clock import HostClock
@@ -23,57 +26,160 @@ from visioncal.live.capture.devices import ArmWish, is_folder, open_arm, open_ca
 from visioncal.live.capture.journal import Journal
 from visioncal.live.capture.live import LiveCell
 from visioncal.live.capture.messages import line_of
-from visioncal.live.capture.options import CaptureOptions, Stillness
+from visioncal.live.capture.options import CaptureOptions, Keep, Stillness
 from visioncal.live.capture.record import Departure, departure, record
 from visioncal.live.drivers.protocols import DeviceWishes, MovingArm
 from visioncal.live.planning.written import SPEED
 
+_taking = partial(typer.Option, rich_help_panel="How views are taken")
+_moving = partial(typer.Option, rich_help_panel="How the arm is moved")
+_camera = partial(typer.Option, rich_help_panel="What the camera is set to")
+
+
+@dataclass(frozen=True)
+class TakingOptions:
+    """How views are taken."""
+
+    frames: Annotated[
+        int,
+        _taking("--frames", min=1, max=100, help="Frames a view."),
+    ] = 3
+    keep: Annotated[
+        Keep,
+        _taking("--keep", help="The sharpest of these, or their mean."),
+    ] = "sharpest"
+    still_px: Annotated[
+        float,
+        _taking(
+            "--still-px",
+            min=0.01,
+            max=10.0,
+            help="Image motion over which nothing is taken.",
+        ),
+    ] = Stillness.image_px
+    settle_s: Annotated[
+        float,
+        _taking(
+            "--settle-s",
+            min=0.0,
+            max=30.0,
+            help="How long arm and image must have been still before.",
+        ),
+    ] = Stillness.quiet_s
+    speed: Annotated[
+        float,
+        _moving("--speed", help="Of the fastest joint, in rad/s; at most 1.5."),
+    ] = SPEED
+
+    def options(self, *, single: bool, lost: int) -> CaptureOptions:
+        """The same, as a recording takes it.
+
+        Args:
+            single: Whether the camera gives each picture once.
+            lost: How many stops in a row may give no view.
+        """
+        return CaptureOptions(
+            speed=self.speed,
+            frames=self.frames,
+            keep=self.keep,
+            still=Stillness(image_px=self.still_px, quiet_s=self.settle_s),
+            single=single,
+            lost=lost,
+        )
+
+
+@dataclass(frozen=True)
+class DeviceOptions:
+    """What the camera is set to."""
+
+    resolution: Annotated[
+        str | None,
+        _camera("--resolution", metavar="W,H", help="Size of the images in pixels."),
+    ] = None
+    exposure_us: Annotated[
+        int | None, _camera("--exposure-us", help="Exposure time in microseconds.")
+    ] = None
+    gain: Annotated[int | None, _camera("--gain", help="ISO, or the device's own unit.")] = None
+    focus: Annotated[
+        int | None, _camera("--focus", help="Lens position, in the device's own unit.")
+    ] = None
+
+    def wishes(self) -> DeviceWishes:
+        """The same, as drivers take it.
+
+        Raises:
+            DataError: The resolution is not two numbers.
+        """
+        size = self.resolution and numbers_in(self.resolution, "--resolution", "w,h")
+        resolution = (int(size[0]), int(size[1])) if size else None
+        return DeviceWishes(resolution, self.exposure_us, self.gain, self.focus)
+
 
 def record_command(
-    out: options.Out,
-    arm: options.ArmOption,
-    camera: options.CameraOption,
-    plan: options.PlanOption = None,
-    follow: options.Follow = False,
-    views: options.Views = 0,
-    resume: options.Resume = False,
-    dry_run: options.DryRun = False,
-    yes: options.Yes = False,
-    view: options.View = False,
-    target: options.TargetOption = None,
-    robot: options.RobotOption = None,
-    mount: options.MountOption = None,
-    pose_form: options.PoseForm = None,
-    frames: options.Frames = 3,
-    keep: options.KeepOption = "sharpest",
-    still_px: options.StillPx = Stillness.image_px,
-    settle_s: options.SettleS = Stillness.quiet_s,
-    speed: options.Speed = SPEED,
-    resolution: options.Resolution = None,
-    exposure_us: options.ExposureUs = None,
-    gain: options.Gain = None,
-    focus: options.Focus = None,
-    as_json: options.AsJson = False,
+    out: Annotated[
+        Path,
+        typer.Option("-o", "--out", metavar="SESSION", help="The session's folder; a new one."),
+    ],
+    arm: Annotated[
+        str,
+        typer.Option(
+            "--arm",
+            metavar="ur:HOST|manual",
+            help="The arm: a UR by its address, or poses that you type from the pendant.",
+        ),
+    ],
+    camera: Annotated[
+        str,
+        typer.Option(
+            "--camera",
+            metavar="oak|uvc:N|uvc:URL|folder:PATH",
+            help="The camera: an OAK (oak:SERIAL for one of several), a webcam, a network "
+            "camera's stream, or pictures that were taken already.",
+        ),
+    ],
+    described: CellOptions,
+    takes: TakingOptions,
+    device: DeviceOptions,
+    plan: Annotated[
+        Path | None,
+        typer.Option("--plan", help="What visioncal plan wrote: a folder, or its plan.json."),
+    ] = None,
+    follow: Annotated[
+        bool,
+        typer.Option(
+            "--follow", help="Move nothing: take a view whenever the arm, guided by hand, rests."
+        ),
+    ] = False,
+    views: Annotated[
+        int,
+        typer.Option(
+            "--views",
+            min=0,
+            help="With --follow or a manual arm: end after so many.",
+        ),
+    ] = 0,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with a recording that was ended or cut off.")
+    ] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only say what would be driven; nothing moves.")
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Begin to move without asking.")] = False,
+    view: View = False,
+    as_json: AsJson = False,
 ) -> None:
     """Record a session: drive the stops of a plan, or follow an arm guided by hand.
 
     Every view is on the disk before the next is taken. Exit status 0: all views are there; 2: the
     recording ended before, the arm stands still, and --resume goes on.
     """
-    scene = scene_of(plan, target=target, robot=robot, mount=mount)
+    scene = scene_of(plan, described)
     drives = not follow and arm.partition(":")[0] != "manual"
     if drives or dry_run:
         _check_driven(scene, drives=drives)
-    taking = CaptureOptions(
-        speed=speed,
-        frames=frames,
-        keep=keep,
-        still=Stillness(image_px=still_px, quiet_s=settle_s),
-        single=is_folder(camera),
-        lost=CaptureOptions.lost if drives else 0,
-    )
-    requested = DeviceWishes(_size(resolution), exposure_us, gain, focus)
-    wish = ArmWish("", not drives or dry_run, _asked, pose_form)
+    taking = takes.options(single=is_folder(camera), lost=CaptureOptions.lost if drives else 0)
+    requested = device.wishes()
+    wish = ArmWish("", not drives or dry_run, _asked, described.pose_form)
     with ended_like_ctrl_c(), _opened(arm, wish, camera, requested) as cell:
         scene.check(cell.camera.resolution, drives=drives)
         if dry_run:
@@ -252,13 +358,6 @@ def _asked(question: str) -> str:
     if not line:
         raise EOFError
     return line.rstrip("\r\n")
-
-
-def _size(words: str | None) -> tuple[int, int] | None:
-    if words is None:
-        return None
-    width, height = numbers_in(words, "--resolution", "w,h")
-    return int(width), int(height)
 
 
 def _minutes(seconds: float) -> str:

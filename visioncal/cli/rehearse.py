@@ -15,6 +15,7 @@ from rich.markup import escape
 
 from visioncal.cli.against_truth import truth_table
 from visioncal.cli.console import messages, tell_written
+from visioncal.cli.options import AsJson, OutFolder, Seed, View
 from visioncal.cli.rehearsed import TAKING, Recorded, calibrated, planned, recorded
 from visioncal.cli.summary import print_summary
 from visioncal.core.errors import DataError
@@ -39,15 +40,13 @@ _PACKAGES = ("ur-rtde", "depthai", "numpy", "opencv-contrib-python-headless")
 
 
 def rehearse_command(
-    out: Annotated[
-        Path, typer.Option("-o", "--out", help="Folder for the plan, the session and its result.")
-    ] = Path("rehearsal"),
+    out: OutFolder = Path("rehearsal"),
     robot: Annotated[
         Literal["ur3e", "ur5e", "ur10e"], typer.Option(help="The simulated arm.")
     ] = "ur5e",
     mount: Annotated[CameraMount, typer.Option(help="Where the camera is.")] = "eye-in-hand",
     views: Annotated[int, typer.Option(min=5, max=200, help="Number of planned stops.")] = 16,
-    seed: Annotated[int, typer.Option(min=0, help="Another cell for every number.")] = 0,
+    seed: Seed = 0,
     fault: Annotated[
         Faults | None,
         typer.Option(
@@ -56,10 +55,8 @@ def rehearse_command(
             show_default=False,
         ),
     ] = None,
-    view: Annotated[bool, typer.Option("--view", help="Show it in the rerun viewer.")] = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print rehearsal.json to stdout.")
-    ] = False,
+    view: View = False,
+    as_json: AsJson = False,
 ) -> None:
     """Plan, record and calibrate a simulated cell by the real client libraries.
 

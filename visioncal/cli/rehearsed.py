@@ -81,7 +81,7 @@ def planned(cell: RehearsedCell, options: RehearsalOptions, folder: Path) -> Sce
         written = write_plan(folder, plan, plan_document(plan, {"kind": "rehearsal"}))
     tell_written(written, quiet=True)
     messages().print(f"plan: {summary_of(plan)}")
-    return scene_of(folder, target=None, robot=None, mount=None)
+    return scene_of(folder)
 
 
 def recorded(

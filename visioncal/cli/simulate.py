@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 import typer
 
 from visioncal.cli.console import messages
+from visioncal.cli.options import Seed
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.simulated import given_for
 from visioncal.cli.simulated_cell import CENTRE_M, Along, Read, exercise_options, whole_cell
@@ -165,7 +166,7 @@ def simulate_command(
         float,
         typer.Option(min=0.0, max=100.0, help="How far the camera was knocked (mm); the first."),
     ] = 0.0,
-    seed: Annotated[int, typer.Option(min=0, help="Another cell for every number.")] = 0,
+    seed: Seed = 0,
 ) -> None:
     """Write a simulated session, and its truth in a file beside it."""
     given = given_for(context)

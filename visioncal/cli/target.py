@@ -9,6 +9,7 @@ from rich.markup import escape
 
 from visioncal.cli.console import messages
 from visioncal.cli.lazy import PlainCommand
+from visioncal.cli.options import AsJson
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, write_atomically
 from visioncal.core.types import Target
@@ -213,7 +214,7 @@ def check_command(
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="Write the description here.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print what is seen as JSON.")] = False,
+    as_json: AsJson = False,
     force: Annotated[
         bool, typer.Option("--force", help="Replace a description that is there.")
     ] = False,

@@ -63,27 +63,6 @@ def image_session(source: Path, for_touches: Mapping[str, object]) -> Session | 
     return session
 
 
-def touch_options(
-    columns: str | None,
-    form: str | None,
-    unit: str | None,
-    inverse: bool | None,
-    joint_columns: str | None,
-    model: str | None,
-    noise_mm: float | None,
-) -> dict[str, object]:
-    """Names the options that only touches have a use for."""
-    return {
-        "--robot-columns": columns,
-        "--robot-form": form,
-        "--robot-unit": unit,
-        "--robot-inverse": inverse,
-        "--joint-columns": joint_columns,
-        "--robot-model": model,
-        "--touch-noise-mm": noise_mm,
-    }
-
-
 def camera_of(place: Place, session: Session) -> Calibration:
     """The calibration of the camera that took the images.
 

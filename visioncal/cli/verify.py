@@ -18,8 +18,8 @@ from visioncal.calibration.verification import (
     verdict_of,
     verify,
 )
-from visioncal.cli.choosing import CameraName, RobotName, TargetName
 from visioncal.cli.console import messages, tell_written
+from visioncal.cli.options import AsJson, PartOptions
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.summary import print_steps
 from visioncal.core.errors import DataError
@@ -28,7 +28,6 @@ from visioncal.interchange.outputs import REPORT, VERIFY, Written, refuse_calibr
 from visioncal.interchange.result_files import load_result
 from visioncal.results import picked
 from visioncal.session import Session
-from visioncal.session.choosing import Choice
 
 # A check said no.
 _EXIT_FAILED = 3
@@ -44,6 +43,7 @@ def verify_command(
     session: Annotated[
         Path, typer.Argument(help="Five stops or more of the same cell: a folder or an .rrd.")
     ],
+    part: PartOptions,
     against: Annotated[
         Path | None,
         typer.Option(help="The calibration: an output folder of calibrate, or its .rrd."),
@@ -61,10 +61,7 @@ def verify_command(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help=f"A folder for {REPORT} and {VERIFY}.")
     ] = None,
-    camera: CameraName = None,
-    robot: RobotName = None,
-    target: TargetName = None,
-    as_json: Annotated[bool, typer.Option("--json", help=f"Print {VERIFY}.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Tell whether a calibration still holds, and what has changed if it does not.
 
@@ -79,7 +76,7 @@ def verify_command(
     if output is not None:
         refuse_calibration(output)
     triggers = load_policy(policy)
-    choice = Choice(camera, robot, target)
+    choice = part.choice
     loaded, calibration = picked(Session.load(session), load_result(against), choice)
     with shown_progress(quiet=as_json) as progress:
         check = verify(loaded, calibration, board_placed_anew=board_moved, progress=progress)

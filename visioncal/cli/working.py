@@ -1,26 +1,34 @@
 """Options of how a session is worked on, which change no result."""
 
-from typing import Annotated, TypeAlias
+from dataclasses import dataclass
+from typing import Annotated
 
 import typer
 
 from visioncal.interchange.outputs import RECORDING, REPORT
 
-NoReport: TypeAlias = Annotated[
-    bool, typer.Option("--no-report", help=f"Leave {REPORT} out, which takes a second to draw.")
-]
-NoRecording: TypeAlias = Annotated[
-    bool, typer.Option("--no-recording", help=f"Leave {RECORDING} out, which holds all images.")
-]
-Threads: TypeAlias = Annotated[
-    int | None,
-    typer.Option(
-        min=1, help="Images searched at a time; one a core where left out. No result changes."
-    ),
-]
 
+@dataclass(frozen=True)
+class WorkOptions:
+    """How a session is worked on, and what is drawn of its result."""
 
-def left_out(*, report: bool, recording: bool) -> tuple[str, ...]:
-    """The files that these options leave out."""
-    asked = {REPORT: report, RECORDING: recording}
-    return tuple(name for name, is_left_out in asked.items() if is_left_out)
+    threads: Annotated[
+        int | None,
+        typer.Option(
+            "--threads",
+            min=1,
+            help="Images searched at a time; one a core where left out. No result changes.",
+        ),
+    ] = None
+    no_report: Annotated[
+        bool, typer.Option("--no-report", help=f"Leave {REPORT} out, which takes a second to draw.")
+    ] = False
+    no_recording: Annotated[
+        bool, typer.Option("--no-recording", help=f"Leave {RECORDING} out, which holds all images.")
+    ] = False
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """The files that are left out."""
+        asked = {REPORT: self.no_report, RECORDING: self.no_recording}
+        return tuple(name for name, is_left_out in asked.items() if is_left_out)

@@ -1,0 +1,80 @@
+"""Options: each is declared once, as a field of a dataclass or as a type of a parameter."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, TypeAlias
+
+import typer
+
+from visioncal.session import Session
+from visioncal.session.choosing import Choice
+
+SessionArgument: TypeAlias = Annotated[
+    Path, typer.Argument(help="A session's folder, or its .rrd recording.")
+]
+OutFolder: TypeAlias = Annotated[
+    Path, typer.Option("-o", "--out", help="The folder to write into.")
+]
+OutFile: TypeAlias = Annotated[
+    Path | None,
+    typer.Option("-o", "--out", help="The file to write; otherwise, or as -, stdout."),
+]
+AsJson: TypeAlias = Annotated[
+    bool, typer.Option("--json", help="Print the result as JSON to stdout, without words.")
+]
+Force: TypeAlias = Annotated[
+    bool, typer.Option("--force", help="Replace what is there under the same name; never a folder.")
+]
+View: TypeAlias = Annotated[
+    bool, typer.Option("--view", help="Show it in the rerun viewer as it goes.")
+]
+Seed: TypeAlias = Annotated[
+    int, typer.Option("--seed", min=0, help="Another random draw for every number.")
+]
+CameraName: TypeAlias = Annotated[
+    str | None, typer.Option("--camera", help="Of a whole cell: which camera, as left.")
+]
+RobotName: TypeAlias = Annotated[
+    str | None, typer.Option("--robot", help="Of a whole cell: which robot, as a.")
+]
+
+
+@dataclass(frozen=True)
+class PartOptions:
+    """Which camera, robot and target of a whole cell are meant."""
+
+    camera: CameraName = None
+    robot: RobotName = None
+    target: Annotated[
+        str | None, typer.Option("--target", help="Of a whole cell: which target, as floor.")
+    ] = None
+
+    @property
+    def choice(self) -> Choice:
+        """The same, as sessions and results take it."""
+        return Choice(self.camera, self.robot, self.target)
+
+
+@dataclass(frozen=True)
+class NeedOptions:
+    """What the task needs."""
+
+    need_mm: Annotated[
+        float | None,
+        typer.Option(
+            "--need-mm",
+            help="How near picks have to come, in mm: the verdict is about it. In the place of "
+            "the need in session.toml.",
+        ),
+    ] = None
+    need_deg: Annotated[
+        float | None, typer.Option("--need-deg", help="The same in rotation, in degrees.")
+    ] = None
+
+    def session(self, path: Path) -> Session:
+        """Loads a session with that need.
+
+        Raises:
+            DataError: It cannot be read, or the need is no positive number.
+        """
+        return Session.load(path).needing(self.need_mm, self.need_deg)

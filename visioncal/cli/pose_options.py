@@ -1,0 +1,96 @@
+"""The options that say how somebody else wrote the robot's poses."""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated, Literal
+
+import typer
+
+from visioncal.core.conventions import POSE_FORMS, UNITS_M
+from visioncal.core.errors import DataError
+from visioncal.interchange.formats import ImportOptions, PoseImportOptions
+from visioncal.robot import Robot, load_robot
+
+poses_option = partial(typer.Option, rich_help_panel="The poses of somebody else's recording")
+FORMS = f"{', '.join(POSE_FORMS)}, or a rotation such as euler-ZYX-deg, quaternion-wxyz"
+UNITS = "|".join(UNITS_M)
+
+
+@dataclass(frozen=True)
+class RobotPoseOptions:
+    """How somebody else wrote the poses of the robot."""
+
+    robot_columns: Annotated[
+        str | None,
+        poses_option(
+            "--robot-columns",
+            "--robot-key",
+            help="Columns or keys of the robot's poses, position first: X,Y,Z,A,B,C or O_T_EE.",
+        ),
+    ] = None
+    robot_form: Annotated[
+        str | None, poses_option("--robot-form", help=f"How they are written: {FORMS}.")
+    ] = None
+    robot_unit: Annotated[
+        str | None, poses_option("--robot-unit", metavar=UNITS, help="Of their positions.")
+    ] = None
+    robot_inverse: Annotated[
+        bool | None,
+        poses_option("--robot-inverse/--robot-as-is", help="They give the base in the flange."),
+    ] = None
+    joint_columns: Annotated[
+        str | None,
+        poses_option(
+            "--joint-columns",
+            "--joint-key",
+            help="Columns or keys of the joint angles.",
+        ),
+    ] = None
+    joint_unit: Annotated[
+        Literal["rad", "deg"],
+        poses_option("--joint-unit", help="What they are in."),
+    ] = "rad"
+    robot_model: Annotated[
+        str | None,
+        poses_option("--robot-model", help="A built-in robot, or the path of a .urdf or .toml."),
+    ] = None
+
+    def requested(self) -> ImportOptions:
+        """The same, as files are read.
+
+        Raises:
+            DataError: A name is empty or there twice.
+        """
+        columns = names_in(self.robot_columns, "--robot-columns")
+        return ImportOptions(
+            robot=PoseImportOptions(columns, self.robot_form, self.robot_unit, self.robot_inverse),
+            joints=names_in(self.joint_columns, "--joint-columns"),
+            joints_deg=self.joint_unit == "deg",
+            robot_model=self.robot_model,
+        )
+
+    @property
+    def model(self) -> Robot | None:
+        """The robot that is named.
+
+        Raises:
+            DataError: It cannot be read.
+        """
+        return None if self.robot_model is None else load_robot(self.robot_model)
+
+
+def names_in(words: str | None, option: str) -> tuple[str, ...]:
+    """Splits an option of names with commas between.
+
+    Raises:
+        DataError: A name is empty or there twice.
+    """
+    if words is None:
+        return ()
+    names = tuple(it.strip() for it in words.split(","))
+    if not all(names) or len(set(names)) < len(names):
+        raise DataError(
+            f"{option} is {words[:80]!r}; names are needed, each once, with commas between.",
+            culprits=[option],
+        )
+    return names
