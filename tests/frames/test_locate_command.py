@@ -11,7 +11,9 @@ from support.plates import CENTRES, marked_plate, plate_session
 from support.samples import fixture_frame
 
 from visioncal.cli.fixture import fixture_command
+from visioncal.cli.framing import FrameOptions, TouchOptions
 from visioncal.cli.locate import locate_command
+from visioncal.cli.options import PartOptions
 from visioncal.cli.tcp import tcp_command
 from visioncal.core.errors import DataError
 from visioncal.frames.locate import locate
@@ -20,6 +22,11 @@ from visioncal.results import Calibration, Edge, FrameFile, Verdict
 
 IN_HAND, TO_HAND = "eye-in-hand", "eye-to-hand"
 PIXEL = "700,350"
+
+
+def _placed(command, source, calibration=None, *, out=None, name=None, touch_noise=None, **rest):
+    goes = FrameOptions(calibration, out, name)
+    command(source, goes, TouchOptions(touch_noise=touch_noise), PartOptions(), **rest)
 
 
 @pytest.fixture(scope="module", params=[IN_HAND, TO_HAND])
@@ -177,7 +184,7 @@ def test_a_frame_from_images_joins_the_calibration(capsys, tmp_path):
     cell, calibration = calibrated_cell(TO_HAND)
     calibration.save(tmp_path / "calibration.json")
     session_of(cell, shots(cell, 4)).save(tmp_path / "part")
-    tcp_command(tmp_path / "part", tmp_path, name="gripper", point="0,0,-120")
+    _placed(tcp_command, tmp_path / "part", tmp_path, name="gripper", point="0,0,-120")
     told = capsys.readouterr().err
     assert told.startswith("good  flange_from_gripper")
     assert "its point (0, 0, -120) mm" in told
@@ -188,7 +195,7 @@ def test_a_frame_from_images_joins_the_calibration(capsys, tmp_path):
     assert 1e3 * np.linalg.norm(kept.edge.matrix[:3, 3] - tip) < 4 * kept.edge.sigma_mm
     assert "flange_from_gripper" in (tmp_path / "report.html").read_text(encoding="utf-8")
     file = tmp_path / "frames.json"
-    tcp_command(tmp_path / "part", tmp_path, out=file, as_json=True)
+    _placed(tcp_command, tmp_path / "part", tmp_path, out=file, as_json=True)
     assert json.loads(capsys.readouterr().out).keys() == {"flange_from_tool"}
     assert FrameFile.load(file).frames.keys() == {"flange_from_tool"}
 
@@ -201,24 +208,24 @@ def test_options_and_sources_that_do_not_fit_are_named(tmp_path):
     session_of(cell, shots(cell, 2), kind=["", "point"]).save(both)
     table.write_text("x_m,y_m,z_m,qx,qy,qz,qw\n0,0,1,0,0,0,1\n", encoding="utf-8")
     with pytest.raises(DataError, match=r"images \(view 30\) and touches \(.* view 31\)"):
-        tcp_command(both, tmp_path)
+        _placed(tcp_command, both, tmp_path)
     with pytest.raises(DataError, match=r"the camera's calibration \(-c\) is needed"):
-        tcp_command(part)
+        _placed(tcp_command, part)
     with pytest.raises(DataError, match="--touch-noise-mm: session 'the part' has images"):
-        tcp_command(part, tmp_path, touch_noise=0.1)
+        _placed(tcp_command, part, tmp_path, touch_noise=0.1)
     with pytest.raises(DataError, match="--tool: session 'the part' has images"):
-        fixture_command(part, tmp_path, tool="none")
+        _placed(fixture_command, part, tmp_path, tool="none")
     for command in (tcp_command, fixture_command):
         with pytest.raises(DataError, match="--point-mm: touches say"):
-            command(table, tmp_path, point="1,2,3")
+            _placed(command, table, tmp_path, point="1,2,3")
         with pytest.raises(DataError, match="--point-mm is 'up'"):
-            command(part, tmp_path, point="up")
+            _placed(command, part, tmp_path, point="up")
     cad = tmp_path / "cad.csv"
     cad.write_text("point,x_mm,y_mm,z_mm\n1,0,0,0\n2,9,0,0\n3,0,9,0\n", encoding="utf-8")
     with pytest.raises(DataError, match="a charuco; beside a drawing"):
-        fixture_command(part, tmp_path, cad=cad)
+        _placed(fixture_command, part, tmp_path, cad=cad)
     with pytest.raises(DataError, match="beside --cad the drawing's origin"):
-        fixture_command(part, tmp_path, cad=cad, point="1,2,3")
+        _placed(fixture_command, part, tmp_path, cad=cad, point="1,2,3")
 
 
 def test_markers_place_a_fixture_from_the_command_line(capsys, tmp_path):
@@ -228,7 +235,7 @@ def test_markers_place_a_fixture_from_the_command_line(capsys, tmp_path):
     cad = tmp_path / "cad.csv"
     lines = [f"{name},{x},{y},0.0" for name, (x, y) in CENTRES.items()]
     cad.write_text("\n".join(["point,x_m,y_m,z_m", *lines]), encoding="utf-8")
-    fixture_command(tmp_path / "plate", tmp_path, cad=cad, name="plate")
+    _placed(fixture_command, tmp_path / "plate", tmp_path, cad=cad, name="plate")
     told = capsys.readouterr().err
     assert "best fit of 4 points to cad.csv" in told
     # Markers in one plane have no hand, and the drawing's z points into the plate.

@@ -9,10 +9,11 @@ from support.imaged import Shot, calibrated_cell, session_of, shots
 from support.plates import CENTRES, CLEAR, marked_plate, plate_session
 
 from visioncal.core.errors import DataError
+from visioncal.core.limits import ImageFrameLimits
 from visioncal.core.transforms import invert, log, skew
 from visioncal.frames.drawing_points import NominalPoints
 from visioncal.frames.fixture_from_markers import marked_fixture
-from visioncal.frames.frame_from_images import SeenOptions, rests_on_camera, seen_frame
+from visioncal.frames.frame_from_images import rests_on_camera, seen_frame
 from visioncal.results import Verdict
 from visioncal.robot import load_robot
 from visioncal.session import MemoryImages
@@ -186,7 +187,7 @@ def test_doubts_of_calibration_and_sigma_are_told():
     stated = replace(session, document={**session.document, "camera": other})
     frame = seen_frame(stated, calibration, "fixture")
     assert any("fx 600" in it and "same camera?" in it for it in frame.verdict.reasons)
-    strict = SeenOptions(sigma_mm=(1e-3, 10.0))
+    strict = ImageFrameLimits(sigma_mm=(1e-3, 10.0))
     frame = seen_frame(session, calibration, "fixture", options=strict)
     assert frame.verdict.status == "check"
     # The board's size, known to 0.1 %, is what most of it is from.

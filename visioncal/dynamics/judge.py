@@ -5,23 +5,14 @@ from collections.abc import Iterator
 import numpy as np
 
 from visioncal.core.files import some_of
+from visioncal.core.limits import DynamicsLimits
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import NOTE, Finding, Step, Verdict, VerdictStatus
 from visioncal.dynamics.base import random_motion
 from visioncal.dynamics.identified import NOT_TOLD, Identified, Validation
 
-# Other torques may be predicted so many times worse than those that were fitted, and bodies so many
-# times worse than base parameters.
-_WORSE, _BODIES_WORSE = 1.5, 1.3
-# An error under this share of a torque's range is no reason for doubt, whatever the noise was.
-_SLIGHT = 0.02
-# Beyond this share of a torque's range a prediction is of little use, beyond the other of none.
-_POOR, _USELESS = 0.2, 0.6
-# Known inertias that leave more of the range than this are another robot's.
-_STRANGE = 0.5
-# So many of the base parameters may be noise: those of the wrist weigh little.
-_UNTOLD = 0.5
+_LIMITS = DynamicsLimits()
 _PLAN = Step("Record the motion that visioncal dynamics plan writes, and fit it with this one.")
 
 
@@ -54,8 +45,8 @@ def _of_prediction(identified: Identified) -> Iterator[tuple[VerdictStatus, Find
     shares = validation.shares
     worst = int(np.argmax(shares))
     status: VerdictStatus = "good"
-    if shares[worst] > _POOR:
-        status = "bad" if shares.min() > _USELESS else "check"
+    if shares[worst] > _LIMITS.range_share[0]:
+        status = "bad" if shares.min() > _LIMITS.range_share[1] else "check"
     yield (
         status,
         Finding(
@@ -65,8 +56,8 @@ def _of_prediction(identified: Identified) -> Iterator[tuple[VerdictStatus, Find
         ),
     )
     fitted = identified.fitted_rms_nm
-    surprised = validation.rms_nm > _WORSE * np.maximum(fitted, validation.noise_nm)
-    surprised &= shares > _SLIGHT
+    surprised = validation.rms_nm > _LIMITS.worse * np.maximum(fitted, validation.noise_nm)
+    surprised &= shares > _LIMITS.slight_share
     if surprised.any():
         yield (
             "check",
@@ -107,7 +98,7 @@ def _of_known(
                     f"{identified.robot.name} comes with, in the median of the joints.",
                 ),
             )
-        strange = known > _STRANGE * validation.torque_nm
+        strange = known > _LIMITS.known_share * validation.torque_nm
         if strange.any():
             yield (
                 "check",
@@ -123,7 +114,7 @@ def _of_known(
                 ),
             )
     if bodies is not None:
-        worse = bodies > _BODIES_WORSE * validation.rms_nm
+        worse = bodies > _LIMITS.bodies_worse * validation.rms_nm
         if worse.any():
             yield (
                 "check",
@@ -143,12 +134,12 @@ def _of_range(identified: Identified) -> Iterator[tuple[VerdictStatus, Finding]]
     covariance = identified.covariance[: base.rank, : base.rank]
     sigma = np.sqrt(np.mean(np.einsum("mnp,pq,mnq->mn", x, covariance, x, optimize=True), axis=0))
     share = sigma / np.sqrt(np.mean((x @ identified.values) ** 2, axis=0))
-    if share.max() > _POOR:
+    if share.max() > _LIMITS.range_share[0]:
         yield (
             "check",
             Finding(
                 "weak_motion",
-                f"{_joints(share > _POOR)}: what fast motions take (up to "
+                f"{_joints(share > _LIMITS.range_share[0])}: what fast motions take (up to "
                 f"{np.abs(motion.dq).max():.0f} rad/s and {np.abs(motion.ddq).max():.0f} rad/s^2) "
                 f"is known to {figure(100.0 * float(share.max()))} % only: this motion was too "
                 "slow, too small or too short.",
@@ -159,7 +150,7 @@ def _of_range(identified: Identified) -> Iterator[tuple[VerdictStatus, Finding]]
 
 def _of_parameters(identified: Identified) -> Iterator[tuple[VerdictStatus, Finding]]:
     told = np.array([it == NOT_TOLD for it in identified.determined])
-    if told.mean() > _UNTOLD:
+    if told.mean() > _LIMITS.undetermined_share:
         names = [it for it, lost in zip(identified.base.names, told, strict=True) if lost]
         yield (
             "check",

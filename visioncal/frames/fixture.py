@@ -2,10 +2,11 @@
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
+from visioncal.core.limits import FixtureLimits
 from visioncal.core.verdict import Finding
 from visioncal.estimation.features import FEATURE_KINDS
 from visioncal.frames.drawing_points import NominalPoints
-from visioncal.frames.fixture_fit import FixtureOptions, Setting
+from visioncal.frames.fixture_fit import Setting
 from visioncal.frames.fixture_from_drawing import drawn_fixture
 from visioncal.frames.fixture_from_features import featured_fixture
 from visioncal.frames.measured import Tool, touched_points
@@ -22,7 +23,7 @@ def touched_fixture(
     robot: Robot | None = None,
     *,
     touch_noise_m: float | None = None,
-    options: FixtureOptions | None = None,
+    options: FixtureLimits | None = None,
 ) -> Frame:
     """Finds a fixture by touches of its features, or of points that a drawing has.
 
@@ -56,7 +57,7 @@ def touched_fixture(
         _check_named(rows)
     measured = touched_points(rows, tool, robot_noise(calibration), robot, calibration)
     setting = Setting(
-        touch_noise_m, tuple(_doubts(tool)), _details(tool), options or FixtureOptions()
+        touch_noise_m, tuple(_doubts(tool)), _details(tool), options or FixtureLimits()
     )
     if drawing is None:
         return featured_fixture(measured, rows.kinds, setting)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.core.limits import TOUCH_NOISE_MM, TOUCHED_MM
+from visioncal.core.limits import FixtureLimits
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import AGREEMENT, Finding, Verdict
@@ -18,23 +18,6 @@ from visioncal.estimation.placing import worst_of
 from visioncal.frames.measured import MeasuredPoints
 from visioncal.frames.verdicts import disputed, noisy, off_words, placed_name, weak_directions
 from visioncal.results import Edge, Frame, Observation
-
-
-@dataclass(frozen=True)
-class FixtureOptions:
-    """Where doubt begins and where trust ends: (check, bad) limits.
-
-    Attributes:
-        sigma_mm: Predicted sigma of the fixture's worst offset, amid its points [mm].
-        sigma_deg: The same of its rotation [deg]: 0.1 deg are half a millimetre over 300.
-        noise_mm: Noise of a touch per axis [mm]; a careful hand repeats to 0.1 mm or better.
-        points: Points of a drawing in the fit; with fewer none could be told wrong.
-    """
-
-    sigma_mm: tuple[float, float] = TOUCHED_MM
-    sigma_deg: tuple[float, float] = (0.1, 0.4)
-    noise_mm: tuple[float, float] = TOUCH_NOISE_MM
-    points: int = 4
 
 
 @dataclass(frozen=True)
@@ -77,7 +60,7 @@ class Setting:
     touch_noise_m: float | None = None
     doubts: tuple[Finding, ...] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
-    options: FixtureOptions = field(default_factory=FixtureOptions)
+    options: FixtureLimits = field(default_factory=FixtureLimits)
     words: Words = field(default_factory=Words)
 
 

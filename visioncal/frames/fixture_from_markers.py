@@ -8,12 +8,13 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
+from visioncal.core.limits import FixtureLimits
 from visioncal.core.types import Corners, FloatArray, Target
 from visioncal.core.verdict import remarks
 from visioncal.estimation.pointpairs import FEWEST_POINTS
 from visioncal.frames.camera_chain import Eye
 from visioncal.frames.drawing_points import NominalPoints
-from visioncal.frames.fixture_fit import FixtureOptions, Setting, Words
+from visioncal.frames.fixture_fit import Setting, Words
 from visioncal.frames.fixture_from_drawing import drawn_fixture
 from visioncal.frames.frame_from_images import camera_details, view_doubts
 from visioncal.frames.marker_points import SeenPoints, seen_markers
@@ -40,7 +41,7 @@ def marked_fixture(
     calibration: Calibration,
     drawing: NominalPoints,
     *,
-    options: FixtureOptions | None = None,
+    options: FixtureLimits | None = None,
 ) -> Frame:
     """Finds a fixture by the markers on it.
 
@@ -98,7 +99,7 @@ def marked_fixture(
     setting = Setting(
         doubts=doubts,
         details=_details(shown.target, found, calibration),
-        options=options or FixtureOptions(),
+        options=options or FixtureLimits(),
         words=_WORDS,
     )
     return drawn_fixture(measured, drawing, setting)

@@ -9,7 +9,7 @@ import numpy as np
 
 from visioncal.calibration.stages.observed import by_reason
 from visioncal.core.errors import DataError
-from visioncal.core.limits import PLACE_MM, SMALL_TURN_DEG
+from visioncal.core.limits import ImageFrameLimits
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray, Progress
 from visioncal.core.verdict import AGREEMENT, Finding, Verdict, remarks
@@ -49,19 +49,6 @@ _LOST_SHARE, _LISTED = 0.25, 3
 _COMMANDS: dict[FrameKind, str] = {"tool": "tcp", "fixture": "fixture"}
 
 
-@dataclass(frozen=True)
-class SeenOptions:
-    """Where doubt begins and where trust ends: (check, bad) limits.
-
-    Attributes:
-        sigma_mm: Predicted sigma of the offset's worst direction [mm].
-        sigma_deg: The same of the rotation [deg].
-    """
-
-    sigma_mm: tuple[float, float] = PLACE_MM
-    sigma_deg: tuple[float, float] = SMALL_TURN_DEG
-
-
 @dataclass(frozen=True, eq=False)
 class _Placed:
     """A target's place, with what it was made from.
@@ -89,7 +76,7 @@ def seen_frame(
     kind: FrameKind,
     point_target_m: FloatArray | Sequence[float] = _ORIGIN,
     *,
-    options: SeenOptions | None = None,
+    options: ImageFrameLimits | None = None,
     camera: str | None = None,
     robot: str | None = None,
     target: str | None = None,
@@ -120,7 +107,7 @@ def seen_frame(
     """
     choice = Choice(camera, robot, target)
     session, calibration = picked(session, calibration, choice, EYE, parted=False)
-    options = options or SeenOptions()
+    options = options or ImageFrameLimits()
     point = checked_point(point_target_m, "point_target_m")
     eye, parent = Eye.of(calibration), PARENTS[kind]
     shown = session_looks(session, calibration, parent, among=for_fits(session), progress=progress)

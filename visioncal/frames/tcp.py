@@ -1,14 +1,13 @@
 """A tool from touches: the fit, the words for it, and whether to trust it."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, cast
 
 import numpy as np
 
 from visioncal.core.errors import DataError, DegenerateError, VisioncalError
-from visioncal.core.limits import SMALL_TURN_DEG, TOUCH_NOISE_MM, TOUCHED_MM
+from visioncal.core.limits import ToolLimits
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray
@@ -31,30 +30,13 @@ from visioncal.robot import Robot
 TOUCH_KINDS = ("point", "z", "xz")
 
 
-@dataclass(frozen=True)
-class TcpOptions:
-    """Where doubt begins and where trust ends: (check, bad) limits.
-
-    Attributes:
-        sigma_mm: Predicted sigma of the tip's worst direction [mm].
-        sigma_deg: The same of the rotation [deg].
-        noise_mm: Noise of a touch per axis [mm]; a careful hand repeats to 0.1 mm or better.
-        touches: Touches in the fit; fewer leave too little to check it with.
-    """
-
-    sigma_mm: tuple[float, float] = TOUCHED_MM
-    sigma_deg: tuple[float, float] = SMALL_TURN_DEG
-    noise_mm: tuple[float, float] = TOUCH_NOISE_MM
-    touches: int = 5
-
-
 def touched_tool(
     rows: TouchRows,
     calibration: Calibration | None = None,
     robot: Robot | None = None,
     *,
     touch_noise_m: float | None = None,
-    options: TcpOptions | None = None,
+    options: ToolLimits | None = None,
 ) -> Frame:
     """Finds a tool's tip, and its rotation where that was touched too.
 
@@ -81,7 +63,7 @@ def touched_tool(
         fit = fit_pivot(touches, robot_noise(calibration), touch_noise_m)
     except (DataError, DegenerateError) as error:
         raise _with_reading(error, touches) from error
-    doubts = list(_doubts(fit, touches, rows.places, options or TcpOptions()))
+    doubts = list(_doubts(fit, touches, rows.places, options or ToolLimits()))
     doubts += nominal_poses(rows, calibration)
     return Frame(
         Edge(fit.flange_from_tool, fit.covariance),
@@ -167,7 +149,7 @@ def _wrong(fit: PivotFit, touches: Touches, at: int) -> str:
 
 
 def _doubts(
-    fit: PivotFit, touches: Touches, places: Sequence[str], options: TcpOptions
+    fit: PivotFit, touches: Touches, places: Sequence[str], options: ToolLimits
 ) -> Iterator[Finding]:
     rows = range(len(touches))
     yield from disputed(

@@ -18,7 +18,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtrc
 
-from visioncal.calibration.stages.need import GOOD, Picks
+from visioncal.calibration.stages.need import Picks
+from visioncal.core.limits import NeedLimits
 from visioncal.core.number_format import figure, percent
 from visioncal.core.verdict import (
     CALIBRATE,
@@ -145,7 +146,8 @@ def ranked(
         modelled: Whether the arms' models are known, so that views can be proposed.
     """
     found = _tested(doubts)
-    too_large = met.probability < GOOD if met else any(it.until_mm == 0.0 for it in doubts)
+    unmet = met is not None and met.probability < NeedLimits.probability[0]
+    too_large = unmet or (met is None and any(it.until_mm == 0.0 for it in doubts))
     if too_large and picks:
         known = {it.kind for it in found if it.probability}
         found += [it for it in _sources(picks, met, modelled) if it.kind not in known]

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.calibration.stages.cause_ranking import adding, ranked
-from visioncal.calibration.stages.need import CHECK, GOOD, Picks, need_met
-from visioncal.core.limits import PLACE_MM, TURN_DEG
+from visioncal.calibration.stages.need import Picks, need_met
+from visioncal.core.limits import CalibrationLimits, NeedLimits
 from visioncal.core.number_format import figure, percent
 from visioncal.core.types import Mount, Need, Rejection
 from visioncal.core.verdict import (
@@ -40,42 +40,6 @@ _CAUSES: Mapping[Mount, str] = {
 }
 # So many views in a row are not left out by chance.
 _LEAST_RUN = 3
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Where doubt begins and where trust ends: (check, bad) limits.
-
-    Attributes:
-        scatter_mm: Held-out scatter of the target's position [mm]. Pick cells live with 1 mm.
-        scatter_deg: Held-out scatter of its orientation [deg].
-        sigma_mm: Predicted sigma of the worst direction of an edge [mm].
-        sigma_deg: The same in rotation [deg].
-        pixel_px: Noise of a corner's coordinate [px]; sharp images give 0.05 to 0.3.
-        level: How much more a camera's poses scatter than its corners say.
-        robot_mm: Error of the flange from stop to stop [mm]; arms repeat to 0.1 mm or better, and
-            what is beyond is seldom independent from stop to stop, as the covariance takes it.
-        robot_deg: The same in rotation [deg].
-        stops: Stops of the robot in the fit; fewer leave too little to check the result with.
-        lost_share: Share of views that could not be used.
-        optimism: Held-out over in-sample scatter; large where each view carries the fit.
-        outlier: Residual of a view over the median of all.
-        holdout: Residuals of views held back over those of views left out in turn.
-    """
-
-    scatter_mm: tuple[float, float] = (2.0, 10.0)
-    scatter_deg: tuple[float, float] = (0.3, 2.0)
-    sigma_mm: tuple[float, float] = PLACE_MM
-    sigma_deg: tuple[float, float] = TURN_DEG
-    pixel_px: tuple[float, float] = (0.7, 3.0)
-    level: float = 2.0
-    robot_mm: float = 0.2
-    robot_deg: float = 0.02
-    stops: tuple[int, int] = (10, 5)
-    lost_share: tuple[float, float] = (0.25, 0.6)
-    optimism: tuple[float, float] = (1.6, 4.0)
-    outlier: float = 6.0
-    holdout: float = 4.0
 
 
 @dataclass(frozen=True)
@@ -223,7 +187,7 @@ class Findings:
         return Rms(pooled([it.mm for it in each]) or 0.0, pooled([it.deg for it in each]))
 
 
-def judge(findings: Findings, limits: Limits | None = None) -> Verdict:
+def judge(findings: Findings, limits: CalibrationLimits | None = None) -> Verdict:
     """Says whether the result can be trusted, why, and what to do next.
 
     Args:
@@ -235,7 +199,7 @@ def judge(findings: Findings, limits: Limits | None = None) -> Verdict:
         says what it needs, the chance that picks land within it decides: good from 0.95, check from
         0.5, bad below, and never good where something is not explained.
     """
-    limits = limits or Limits()
+    limits = limits or CalibrationLimits()
     scatter = list(_scatter_doubts(findings, limits))
     pairs, sensors = findings.pairs, findings.sensors
     doubts = [
@@ -256,11 +220,11 @@ def judge(findings: Findings, limits: Limits | None = None) -> Verdict:
     status: VerdictStatus = "good" if not doubts else "check"
     if met is None:
         status = "bad" if any(doubt.is_fatal for doubt in doubts) else status
-    elif met.probability >= GOOD:
+    elif met.probability >= NeedLimits.probability[0]:
         doubts = [it for it in doubts if it.until_mm > (met.need.mm or 0.0)]
         status = "check" if doubts else "good"
     else:
-        status = "check" if met.probability >= CHECK else "bad"
+        status = "check" if met.probability >= NeedLimits.probability[1] else "bad"
     ordered: Sequence[Finding] = sorted(doubts, key=lambda doubt: not doubt.is_fatal)
     if status != "good":
         ordered = ranked(ordered, findings.picks, met, modelled=findings.plannable)
@@ -268,7 +232,10 @@ def judge(findings: Findings, limits: Limits | None = None) -> Verdict:
     if met is None:
         said += _good_for(findings, good_for_mm, status)
     else:
-        said.insert(len(said) * (met.probability >= GOOD), Finding(NEED, met_words(findings, met)))
+        said.insert(
+            len(said) * (met.probability >= NeedLimits.probability[0]),
+            Finding(NEED, met_words(findings, met)),
+        )
     said += [] if doubts else [_praise(findings)]
     return Verdict(status, (*said, *remarks(findings.notes, NOTE)), good_for_mm)
 
@@ -317,9 +284,9 @@ def met_words(findings: Findings, met: NeedMet) -> str:
     )
 
 
-def is_scattered(findings: Findings, limits: Limits | None = None) -> bool:
+def is_scattered(findings: Findings, limits: CalibrationLimits | None = None) -> bool:
     """Whether views disagree with each other by more than a sound cell's do."""
-    return any(_scatter_doubts(findings, limits or Limits()))
+    return any(_scatter_doubts(findings, limits or CalibrationLimits()))
 
 
 def _praise(findings: Findings) -> Finding:
@@ -350,7 +317,7 @@ def _pairs(one: Rms, other: Rms) -> list[tuple[float, float]]:
     return pairs
 
 
-def _scatter_doubts(findings: Findings, limits: Limits) -> Iterator[Finding]:
+def _scatter_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
     yield from _pair_doubts(findings, limits)
     ratios = [
         outside / within
@@ -375,7 +342,7 @@ def _tilted(findings: Findings) -> Step:
     return adding(words, modelled=findings.plannable)
 
 
-def _pair_doubts(findings: Findings, limits: Limits) -> Iterator[Finding]:
+def _pair_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
     words, views, is_fatal = [], list[ViewResult](), False
     for pair in findings.pairs:
         held = pair.held_out
@@ -454,7 +421,7 @@ def _run(pair: Pair) -> str:
     return f" They follow each other: {when}, something had moved."
 
 
-def _outlier_doubts(findings: Findings, limits: Limits) -> Iterator[Finding]:
+def _outlier_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
     """Names single views whose residual stands out from the others'.
 
     Where the corners tell how well each view sees the board, the consensus has judged them better.
@@ -475,7 +442,7 @@ def _outlier_doubts(findings: Findings, limits: Limits) -> Iterator[Finding]:
 
 
 def outlying_views(
-    views: Sequence[ViewResult], limit: float = Limits.outlier
+    views: Sequence[ViewResult], limit: float = CalibrationLimits.outlier
 ) -> tuple[tuple[ViewResult, float], ...]:
     """The used views whose residual is over so many times the median, with their ratios."""
     used = [view for view in views if view.used]
@@ -491,7 +458,7 @@ def _residual(view: ViewResult, between: str = ", ") -> str:
     return f"{figure(view.residual_mm or 0.0)} mm{turned}"
 
 
-def _holdout_doubts(pair: Pair, mount: Mount, limits: Limits) -> Iterator[Finding]:
+def _holdout_doubts(pair: Pair, mount: Mount, limits: CalibrationLimits) -> Iterator[Finding]:
     holdout, held = pair.holdout, pair.held_out
     if holdout is None:
         return
@@ -508,7 +475,7 @@ def _holdout_doubts(pair: Pair, mount: Mount, limits: Limits) -> Iterator[Findin
         yield Finding("holdout", words, step).of(pair.name)
 
 
-def _worth_doubts(findings: Findings, limits: Limits) -> Iterator[Finding]:
+def _worth_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
     """Judges the answer where it counts.
 
     Edges are known in the arm's own frames. Those of a calibrated arm are as open as the errors of
@@ -539,7 +506,7 @@ def _worth_doubts(findings: Findings, limits: Limits) -> Iterator[Finding]:
             yield found.of(_robot(it))
 
 
-def _sigma_doubts(findings: Findings, limits: Limits) -> Iterator[Finding]:
+def _sigma_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
     weak, is_fatal = [], False
     for direction in findings.worst:
         scale, unit, (check, bad) = (
@@ -562,7 +529,7 @@ def _sigma_doubts(findings: Findings, limits: Limits) -> Iterator[Finding]:
         )
 
 
-def _budget_doubts(findings: Findings, limits: Limits) -> Iterator[Finding]:
+def _budget_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
     """Says what makes the result uncertain where it is to be used."""
     beyond = [it for it in findings.places if it.budget_mm["total"] > limits.sigma_mm[0]]
     if not beyond:
@@ -585,7 +552,7 @@ def _budget_doubts(findings: Findings, limits: Limits) -> Iterator[Finding]:
     )
 
 
-def _stop_doubts(findings: Findings, limits: Limits) -> Iterator[Finding]:
+def _stop_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
     used = sum(view.used for it in findings.pairs for view in it.views)
     check, bad = limits.stops
     for it in findings.arms:
@@ -601,7 +568,7 @@ def _stop_doubts(findings: Findings, limits: Limits) -> Iterator[Finding]:
             yield found.of(_robot(it))
 
 
-def _lost_doubts(sensor: Sensor, limits: Limits) -> Iterator[Finding]:
+def _lost_doubts(sensor: Sensor, limits: CalibrationLimits) -> Iterator[Finding]:
     lost, used = sensor.lost, sensor.used
     share = len(lost) / max(used + len(lost), 1)
     if share > limits.lost_share[0]:
@@ -621,7 +588,7 @@ def _lost_doubts(sensor: Sensor, limits: Limits) -> Iterator[Finding]:
         yield Finding(kind, words, step, views, is_fatal=is_fatal).of(sensor.name)
 
 
-def _noise_doubts(sensor: Sensor, limits: Limits) -> Iterator[Finding]:
+def _noise_doubts(sensor: Sensor, limits: CalibrationLimits) -> Iterator[Finding]:
     check, bad = limits.pixel_px
     noise = sensor.pixel_px
     if noise is None:
@@ -647,7 +614,7 @@ def _robot(arm: Arm) -> str:
     return f"Robot {arm.name}" if arm.name else ""
 
 
-def _robot_doubts(findings: Findings, limits: Limits) -> Iterator[Finding]:
+def _robot_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
     """An arm is a good instrument: what looks like its error is often something else's.
 
     A task that needs ten times as much has an arm that is as good as it has to be.

@@ -26,6 +26,7 @@ import numpy as np
 
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.validate import HeldOut
+from visioncal.core.limits import NeedLimits
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import adjoint, invert, skew
 from visioncal.core.types import FloatArray, IntArray, Need
@@ -35,11 +36,6 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.tolerance_probability import chance_within, radius_within
 from visioncal.results import NeedMet, Picker
 from visioncal.session.frames import thing_name
-
-# Of a need that is met, so many picks land within it; from the other on, most do.
-GOOD, CHECK = 0.95, 0.5
-# Left-out views of a sound cell err by more than this chance lets them in one session of a hundred.
-_CHANCE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +76,7 @@ class Picks:
     @cached_property
     def good_for_mm(self) -> float:
         """The least need of places alone that would be met [mm]."""
-        return 1e3 * radius_within(self.spreads, GOOD, self.freedom)
+        return 1e3 * radius_within(self.spreads, NeedLimits.probability[0], self.freedom)
 
     @property
     def budget_mm(self) -> dict[str, float]:
@@ -325,6 +321,6 @@ def _unpredicted(fitted: Fitted) -> FloatArray:
         mean, shown = float(variance.mean()), float(np.mean(away[known] ** 2))
         # A mean of sums of squares is about chi-square, with so many degrees (Satterthwaite 1946).
         count = float(variance.sum()) ** 2 / float(np.sum(among**2))
-        if shown > mean * chi2_limit(_CHANCE, count) / count:
+        if shown > mean * chi2_limit(NeedLimits.chance, count) / count:
             found[axes, axes] = (shown - mean) / 3.0 * np.eye(3)
     return found

@@ -20,6 +20,7 @@ from visioncal.calibration.verification.prediction import (
     predict_stops,
 )
 from visioncal.core.errors import DataError
+from visioncal.core.limits import CheckLimits
 from visioncal.core.quantiles import f_limit
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import log, mean_transform
@@ -36,17 +37,9 @@ from visioncal.results import Calibration, picked
 from visioncal.session import Session
 from visioncal.session.choosing import Choice
 
-# A change is told where it makes the stops so many times as likely as none. Chance does that in one
-# check of as many at most, by Markov's inequality: the ratio is one on average.
-EVIDENCE = 100.0
-# A cause that makes the stops so many times less likely than the best one is told apart from it.
-_TOLD_APART = 20.0
-# Noise leaves more than this unexplained by the right cause in one check of a thousand.
-_UNEXPLAINED = 1e-3
+_LIMITS = CheckLimits()
 # A board that was placed anew may lie anywhere near where it is seen [rad and m].
 _ANYWHERE = np.repeat([1.0, 1.0], 3)
-# Fewer stops hardly tell one cause from another.
-FEW_STOPS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +98,7 @@ class Check:
     @property
     def passed(self) -> bool:
         """Whether the calibration still holds as far as the stops tell."""
-        return bool(self.log_evidence < np.log(EVIDENCE))
+        return bool(self.log_evidence < np.log(_LIMITS.likelihood_ratio))
 
 
 def verify(
@@ -176,7 +169,7 @@ def check(
     shares = np.exp(scores - evidence)
     suspects = tuple(Suspect(causes[it].name, float(shares[it]), found[it]) for it in order)
     log_evidence = evidence - nothing.likelihood
-    named = () if log_evidence < np.log(EVIDENCE) else _not_told_apart(suspects)
+    named = () if log_evidence < np.log(_LIMITS.likelihood_ratio) else _not_told_apart(suspects)
     camera = next(it for it in suspects if it.name == CAMERA)
     away = log(seen.away(prior_calibration))
     left = _left(seen, belief, causes[order[0]], suspects[0].explained) if named else away
@@ -218,7 +211,7 @@ def _not_told_apart(suspects: Sequence[Suspect]) -> tuple[Suspect, ...]:
     best, *others = suspects
     if best.name in (NOISE, BOTH):
         return (best,)
-    margin = 2.0 * np.log(_TOLD_APART)
+    margin = 2.0 * np.log(_LIMITS.told_apart)
 
     def price(it: Suspect) -> float:
         return it.explained.misfit + len(it.explained.values)
@@ -229,7 +222,7 @@ def _not_told_apart(suspects: Sequence[Suspect]) -> tuple[Suspect, ...]:
         # Camera and board at once imitate either: that says nothing against it.
         if it.name != BOTH
         and (
-            it.probability * _TOLD_APART > best.probability
+            it.probability * _LIMITS.told_apart > best.probability
             or (it.name != NOISE and price(it) < price(best) + margin)
         )
     ]
@@ -241,4 +234,4 @@ def _is_explained(best: Suspect, freedom: float) -> bool:
     left = best.explained.freedom
     if best.name == NOISE or left < 1:
         return True
-    return bool(best.explained.misfit < left * f_limit(_UNEXPLAINED, left, freedom))
+    return bool(best.explained.misfit < left * f_limit(_LIMITS.unexplained, left, freedom))

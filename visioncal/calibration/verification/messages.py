@@ -15,7 +15,8 @@ from visioncal.calibration.verification.change_hypotheses import (
     NOISE,
     kind_of,
 )
-from visioncal.calibration.verification.check import FEW_STOPS, Check, Suspect
+from visioncal.calibration.verification.check import Check, Suspect
+from visioncal.core.limits import CheckLimits
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import exp, inverse_right_jacobian, skew
 from visioncal.core.types import FloatArray
@@ -290,9 +291,9 @@ def _agreement(check: Check) -> str:
 
 
 def _doubts(check: Check) -> Iterator[Finding]:
-    if check.seen.stops < FEW_STOPS:
+    if check.seen.stops < CheckLimits.stops:
         words = f"{_capital(_stops(check))} hardly tell one change from another."
-        yield Finding("few_stops", words, Step(f"Take {FEW_STOPS} stops or more."))
+        yield Finding("few_stops", words, Step(f"Take {CheckLimits.stops} stops or more."))
 
 
 def _stops(check: Check) -> str:

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.calibration.stages.judge import Limits
+from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import significant
 from visioncal.results import Calibration, ViewResult
 
 # Views whose residual is this many times the median are named, as by the verdict.
-_STANDS_OUT = Limits.outlier
+_STANDS_OUT = CalibrationLimits.outlier
 # So begins the reason of a view that was left out because pose and image do not go together.
 _CONTRADICTS = "disagrees with the other views"
 
