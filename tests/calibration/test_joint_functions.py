@@ -12,7 +12,7 @@ from visioncal.calibration.stages.kinematics import FUNCTIONS
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.solve import Solution
-from visioncal.results.arm import ArmResult
+from visioncal.results.arm import ArmResult, CarriedRegion, CarriesOver
 from visioncal.simulation.arms import forward
 from visioncal.simulation.tracked import Shop, Tracked, above, session_of, tracked
 
@@ -106,3 +106,43 @@ def test_places_alone_tell_of_them():
     shop = tracked(options)
     known = known_of(session_of(shop))
     assert known.robot_arm.kinematics.level == FUNCTIONS
+
+
+def test_where_it_carries_over_is_what_is_predicted_there(known):
+    found = known.arm_found.carries
+    assert found.measured_mm == known.robot_arm.kinematics.chosen.left_out.mm
+    # The wave's own noise and another session's share come on top of what is not known of the arm.
+    squares = [found.session_mm**2, 1e6 * np.mean(sigmas_m(known) ** 2)]
+    assert found.sigma_mm**2 > squares[0]
+    assert found.sigma_mm < found.nominal_mm
+    assert found.better_share > 0.9
+    assert {it.region for it in found.regions} >= {"box", "beside"}
+    assert found.words in known.verdict.reasons
+
+
+def test_stops_near_one_another_tell_less_elsewhere_and_the_arm_as_stated_is_worse():
+    options = replace(OPTIONS, function_sigma_rad=0.0, dh_sigma_m=2e-4, dh_sigma_rad=2e-4)
+    q = np.array([0.3, -1.2, 1.4, -0.4, 1.2, 0.1])
+    near = q + 0.15 * np.random.default_rng(5).standard_normal((24, 6))
+    shop = tracked(options, near)
+    known = known_of(session_of(shop), level="kinematics")
+    found = known.arm_found.carries
+    assert found.sigma_mm > 3.0 * found.measured_mm
+    # One arm of errors that few values tell of: its error is within a factor of what is predicted.
+    ours = 1e3 * float(np.sqrt(np.mean(np.sum(away_m(shop, known) ** 2, axis=1))))
+    assert 0.4 < ours / found.sigma_mm < 1.5
+
+
+def test_the_words_name_where_it_is_no_better():
+    regions = [CarriedRegion(*it) for it in (("box", 0.2, 1.0, True), ("behind", 0.9, 1.0, False))]
+    words = CarriesOver(
+        measured_mm=0.15,
+        measured_nominal_mm=0.98,
+        sigma_mm=0.5,
+        nominal_mm=1.1,
+        session_mm=0.15,
+        better_share=0.7,
+        regions=tuple(regions),
+    ).words
+    assert "errs by 0.15 mm (as stated 0.98); elsewhere 0.5 of 1.1 mm" in words
+    assert "70 % of the workspace; behind the base it is no better than as stated." in words

@@ -3,10 +3,11 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 
+from visioncal.core.number_format import figure, percent
 from visioncal.core.types import FloatArray
 from visioncal.estimation.bending import Factor
 from visioncal.results.codec import Array, Key, Matrix, Section, Written
@@ -111,6 +112,70 @@ class WorkspacePlace:
     sigma_mm: float
 
 
+Region = Literal["box", "ahead", "beside", "behind"]
+_WHERE = {
+    "box": "in the box of the stops",
+    "ahead": "before the base",
+    "beside": "beside the base",
+    "behind": "behind the base",
+}
+
+
+@dataclass(frozen=True)
+class CarriedRegion:
+    """A part of the workspace, as the calibrated arm and the arm as stated are predicted there.
+
+    Attributes:
+        region: The box of the stops' flanges; beside it what is before, beside or behind the base,
+            the stops being before it.
+        sigma_mm: What the calibrated arm errs by there in another session (rms) [mm].
+        nominal_mm: The same of the arm as stated [mm].
+        better: Whether the former is clearly less.
+    """
+
+    region: Region
+    sigma_mm: float
+    nominal_mm: float
+    better: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class CarriesOver:
+    """Where a calibrated arm is better than the arm as stated.
+
+    Attributes:
+        measured_mm: What it errs by at stops that were left out of the fit (rms) [mm].
+        measured_nominal_mm: The same of the arm as stated [mm].
+        sigma_mm: What it is predicted to err by outside the box of the stops in another session,
+            noise among it (rms over the workspace) [mm].
+        nominal_mm: The same of the arm as stated [mm].
+        session_mm: The share of another session in that, as it is taken of arms of this size [mm].
+        better_share: In which share of the workspace it is clearly better.
+        regions: Part by part.
+    """
+
+    measured_mm: float
+    measured_nominal_mm: float
+    sigma_mm: float
+    nominal_mm: float
+    session_mm: float
+    better_share: float
+    regions: tuple[CarriedRegion, ...]
+
+    @property
+    def words(self) -> str:
+        """All this in a sentence or two."""
+        worse = [_WHERE[it.region] for it in self.regions if not it.better]
+        where = f"; {' and '.join(worse)} it is no better than as stated" if worse else ""
+        return (
+            f"Where it was measured the calibrated arm errs by {figure(self.measured_mm)} mm (as "
+            f"stated {figure(self.measured_nominal_mm)}); elsewhere {figure(self.sigma_mm)} of "
+            f"{figure(self.nominal_mm)} mm are predicted, {figure(self.session_mm)} mm for another "
+            f"session among it. It is clearly better in {percent(self.better_share)} of the "
+            f"workspace{where}."
+        )
+
+
 @dataclass(frozen=True, kw_only=True)
 class Observability:
     """How well the stops determine the arm.
@@ -180,6 +245,7 @@ class ArmResult(Section):
         parameters: The table's numbers that were free.
         workspace_sigma_mm: The predicted sigma of a tool's place over the workspace.
         workspace_map: The same, place by place.
+        carries_over: Where it is better than the arm as stated.
         observability: How well the stops determine the arm.
         not_told: What they do not determine, in words.
         stops: The stops by their influence, most first.
@@ -195,6 +261,7 @@ class ArmResult(Section):
     parameters: tuple[ArmParameter, ...] = ()
     workspace_sigma_mm: WorkspaceSigma | None = None
     workspace_map: tuple[WorkspacePlace, ...] = ()
+    carries_over: CarriesOver | None = None
     observability: Observability | None = None
     not_told: tuple[str, ...] | None = None
     stops: tuple[StopInfluence, ...] = ()

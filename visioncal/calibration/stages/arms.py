@@ -9,6 +9,7 @@ import numpy as np
 from visioncal.calibration.stages import backlash, elastic, thermal
 from visioncal.calibration.stages.arm_identifiability import ArmIdentifiability, identify_arm
 from visioncal.calibration.stages.backlash import plays_of
+from visioncal.calibration.stages.carrying import carries_over
 from visioncal.calibration.stages.elastic import Elastic, springs_of
 from visioncal.calibration.stages.joints import Matched
 from visioncal.calibration.stages.kinematics import (
@@ -43,7 +44,13 @@ from visioncal.estimation.armpair import ArmData, ArmPair
 from visioncal.estimation.parts import Effect, Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import Solution
-from visioncal.results.arm import ArmErrorsResult, ArmSections, JointBacklash, ThermalResult
+from visioncal.results.arm import (
+    ArmErrorsResult,
+    ArmSections,
+    CarriesOver,
+    JointBacklash,
+    ThermalResult,
+)
 from visioncal.robot import Convention, Loads
 from visioncal.session import Session, View
 from visioncal.session.loads import loads_of
@@ -61,15 +68,19 @@ class ArmFound:
         springs: Of its joints as springs; None for a rigid one.
         plays: Of the play in its joints; empty where stops did not come from both sides.
         drift: Its drift with temperature; None for none.
+        carries: Where it is better than as stated; None where it stands as stated.
     """
 
     telling: ArmIdentifiability | None = None
     springs: Elastic | None = None
     plays: tuple[JointBacklash, ...] = ()
     drift: ThermalResult | None = None
+    carries: CarriesOver | None = None
 
     def notes(self) -> Iterator[str]:
         """Words what is no reason for doubt."""
+        if self.carries is not None:
+            yield self.carries.words
         if self.telling is not None and self.telling.advice:
             yield self.telling.advice
         yield from backlash.remarks(self.plays)
@@ -359,6 +370,7 @@ class RobotArm:
             springs_of(data, self.kinematics.errors),
             plays_of(data.model, data.arm_covariance),
             drift,
+            carries_over(data, self.kinematics) if erring else None,
         )
 
     def result(self, found: ArmFound, views: Sequence[int]) -> ArmSections:
@@ -379,7 +391,7 @@ class RobotArm:
         if found.telling is not None:
             zero = None if self.matched is None else self.matched.zero
             arm = found.telling.told_of(arm, self.model.nominal, views, zero)
-            arm = replace(arm, left_out=self.kinematics.left_out())
+            arm = replace(arm, left_out=self.kinematics.left_out(), carries_over=found.carries)
         springs = None if found.springs is None else found.springs.result(views)
         return replace(sections, arm=arm, elastic=springs)
 

@@ -104,6 +104,11 @@ class Kinematics:
     views: tuple[int, ...] = ()
     functions: JointFunctions | None = None
 
+    @property
+    def chosen(self) -> Level:
+        """The level that was taken."""
+        return next(it for it in self.levels if it.name == self.level)
+
     def left_out(self) -> tuple[UnseenView, ...]:
         """How far stops that are left out in turn are off by both arms, by view."""
         before, after = (np.linalg.norm(it.left_out.reshape(-1, 2, 3), axis=2) for it in self.fits)
@@ -326,7 +331,7 @@ def check_asked(asked: str, *, can: bool, misread: str = "") -> None:
 def doubts(kinematics: Kinematics) -> Iterator[Finding]:
     """Says where another level explains the views far better than the one that was asked for."""
     best = _best(kinematics.levels)
-    chosen = next(it for it in kinematics.levels if it.name == kinematics.level)
+    chosen = kinematics.chosen
     if best.likelihood_ratio - chosen.likelihood_ratio > SIGNIFICANT:
         yield Finding(
             "level",
@@ -345,7 +350,7 @@ def findings(kinematics: Kinematics) -> Iterator[str]:
             "better than chance, or there are too few stops to tell."
         )
     nominal = kinematics.levels[0]
-    chosen = next(it for it in kinematics.levels if it.name == kinematics.level)
+    chosen = kinematics.chosen
     if chosen is not nominal:
         yield (
             f"The arm was calibrated along ({chosen.name}): stops left out are predicted to "

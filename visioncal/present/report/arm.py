@@ -87,6 +87,8 @@ def arm_card(found: ArmResult) -> ArmCard:
             f"All over the workspace, a tool's place is predicted with a sigma of {median} mm "
             f"(median; 95 % of the places: under {p95} mm)."
         )
+    if found.carries_over is not None:
+        sentences.append(found.carries_over.words)
     worth = [WorthRow(f"view {it.view}", _percent(it.worth)) for it in found.stops]
     return ArmCard(
         tuple(sentences),
