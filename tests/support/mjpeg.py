@@ -1,6 +1,7 @@
 """A network camera on the loopback: numbered JPEG pictures over HTTP, and what it knows of each."""
 
 import base64
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -96,8 +97,14 @@ class NetworkCamera:
 @contextmanager
 def served(camera: NetworkCamera) -> Iterator[str]:
     """Serves a camera for as long as the block lasts, at the URL that is given."""
+    connections: list[socket.socket] = []
 
     class Handler(BaseHTTPRequestHandler):
+        def setup(self) -> None:
+            """Keeps the connection, to cut it in the end."""
+            super().setup()
+            connections.append(self.connection)
+
         def do_GET(self) -> None:
             """Answers with pictures until the client or the camera ends."""
             expected = f"Basic {base64.b64encode(camera.password.encode()).decode()}"
@@ -110,7 +117,7 @@ def served(camera: NetworkCamera) -> Iterator[str]:
             kind = f"multipart/x-mixed-replace; boundary={camera.boundary}"
             self.send_header("Content-Type", kind)
             self.end_headers()
-            with suppress(ConnectionError):
+            with suppress(OSError):
                 for part in camera.parts():
                     self.wfile.write(part)
 
@@ -118,8 +125,8 @@ def served(camera: NetworkCamera) -> Iterator[str]:
             """Says nothing."""
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    # Whoever ends while a picture is under way to nobody must not wait for it.
-    server.daemon_threads, server.block_on_close = True, False
+    # A daemon that encodes while the interpreter ends would abort it: threads are waited for.
+    server.daemon_threads = False
     thread = threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True)
     thread.start()
     try:
@@ -127,5 +134,9 @@ def served(camera: NetworkCamera) -> Iterator[str]:
     finally:
         camera.ended.set()
         server.shutdown()
+        # A picture that is under way to nobody must not be waited for.
+        for it in connections:
+            with suppress(OSError):
+                it.shutdown(socket.SHUT_RDWR)
         server.server_close()
         thread.join()
