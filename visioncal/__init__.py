@@ -17,6 +17,7 @@ from visioncal.core.version import __version__
 
 if TYPE_CHECKING:
     from visioncal.calibration.pipeline import align, calibrate
+    from visioncal.calibration.pipeline.checkup import Checkup, doctor
     from visioncal.calibration.verification import verify
     from visioncal.core.errors import (
         ConvergenceError,
@@ -42,6 +43,7 @@ _HOMES = {
     "Alignment": "visioncal.results",
     "CalibratedArm": "visioncal.results.compensation",
     "Calibration": "visioncal.results",
+    "Checkup": "visioncal.calibration.pipeline.checkup",
     "Corrected": "visioncal.results.compensation",
     "correct": "visioncal.results.compensation",
     "ConvergenceError": "visioncal.core.errors",
@@ -57,6 +59,7 @@ _HOMES = {
     "VisioncalError": "visioncal.core.errors",
     "align": "visioncal.calibration.pipeline",
     "calibrate": "visioncal.calibration.pipeline",
+    "doctor": "visioncal.calibration.pipeline.checkup",
     "locate": "visioncal.frames.locate",
     "locate_target": "visioncal.frames.locate",
     "locate_views": "visioncal.frames.picks",
@@ -69,6 +72,7 @@ __all__ = [
     "Alignment",
     "CalibratedArm",
     "Calibration",
+    "Checkup",
     "ConvergenceError",
     "Corrected",
     "DataError",
@@ -85,6 +89,7 @@ __all__ = [
     "align",
     "calibrate",
     "correct",
+    "doctor",
     "locate",
     "locate_target",
     "locate_views",

@@ -90,7 +90,7 @@ def test_with_poses_the_hand_eye_goes_on_without_misread_joints():
     assert known.reported.joints_rad is None
     assert known.robot_arm.kinematics is None
     assert known.verdict.status != "good"
-    assert any("--joint-unit deg" in it for it in known.verdict.reasons)
+    assert any("pi / 180" in it for it in known.verdict.reasons)
     alone = finished(replace(told, robot=None))
     # What is done with the poses is what would be done if there were no joints.
     assert np.array_equal(known.solved.state.edges[0], alone.solved.state.edges[0])
@@ -99,7 +99,7 @@ def test_with_poses_the_hand_eye_goes_on_without_misread_joints():
 def test_an_arm_asked_for_is_refused_where_its_joints_are_misread():
     with pytest.raises(DataError, match="needs the joint angles") as caught:
         finished(planted("joints in degrees", with_poses=True), level="kinematics")
-    assert "Multiply q1_rad to q6_rad by pi / 180" in caught.value.next_step
+    assert "multiply q1_rad to q6_rad by pi / 180" in caught.value.next_step
 
 
 def test_rows_without_poses_are_not_taken_by_misread_joints():

@@ -78,4 +78,4 @@ def test_joints_of_another_robot_are_noticed_whatever_single_rows_say():
     (sentence,) = (it.reason for it in reported_poses(stated, load_robot("ur5e")).warnings)
     assert sentence.startswith("The joint angles were not used: they are misread.")
     assert "With the arm a ur10e and not a ur5e" in sentence
-    assert 'Write [robot] model = "ur10e" into session.toml.' in sentence
+    assert 'In session.toml, write [robot] model = "ur10e".' in sentence

@@ -116,7 +116,7 @@ def test_a_board_in_millimetres_is_read_so_and_said(cell):
     (cell / "board.toml").write_text(f'{board}dictionary = "DICT_5X5_100"\n', encoding="utf-8")
     declared = (cell / "session.toml").read_text(encoding="utf-8")
     (cell / "session.toml").write_text(f'target = "board.toml"\n{declared}', encoding="utf-8")
-    session = load_in_doubt(cell)
+    session = load_in_doubt(cell).session
     assert session.target is not None
     # A factor of a thousand, and its rounding.
     assert session.target.square_m == pytest.approx(0.030, rel=1e-15)

@@ -204,10 +204,9 @@ def test_a_wrong_table_is_refused_by_field(change: dict[str, Any], words: str) -
 
 
 def test_an_unknown_robot_lists_the_names() -> None:
-    words = "no robot named 'ur5f'; the names are generic-6r-1800, irb120, panda"
-    with pytest.raises(DataError, match=words) as caught:
+    with pytest.raises(DataError, match=r"no robot named 'ur5f'\. Did you mean .*ur5") as caught:
         load_robot("ur5f")
-    assert "ur5" in caught.value.next_step
+    assert "The names are generic-6r-1800, irb120, panda" in caught.value.next_step
 
 
 @pytest.mark.parametrize("shape", [(6,), (3, 7), (1, 2, 6)])

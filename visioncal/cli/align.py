@@ -87,9 +87,9 @@ def _tell(result: Alignment) -> None:
     console.print(f"the cell's frame is that of {result.reference}")
     for name, edge in result.edges.items():
         x, y, z = 1e3 * edge.transform.translation
-        turned = f" and {edge.sigma_deg:.2g} deg" if edge.oriented else ""
+        turned = f" and {figure(edge.sigma_deg)} deg" if edge.oriented else ""
         console.print(
-            f"{name}: ({x:.2f}, {y:.2f}, {z:.2f}) mm, sigma {edge.sigma_mm:.2g} mm{turned}"
+            f"{name}: ({x:.2f}, {y:.2f}, {z:.2f}) mm, sigma {figure(edge.sigma_mm)} mm{turned}"
         )
     for name, levels in result.noise.items():
         words = [

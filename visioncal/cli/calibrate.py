@@ -77,7 +77,8 @@ def calibrate_command(
     --robot, --target).
     """
     without = work.left_out
-    loaded = need.session(session)
+    with naming(session, out):
+        loaded = need.session(session)
     if is_whole_cell(loaded):
         check_solver(RunState(loaded, solver=solver))
         if dense:

@@ -22,11 +22,11 @@ from visioncal.interchange.formats import (
     FOREIGN_FORMATS,
     Foreign,
     ImportOptions,
+    InDoubt,
     PoseImportOptions,
     convert,
     guess_foreign,
 )
-from visioncal.session import Session
 
 _FORMATS = ", ".join(it.name for it in FOREIGN_FORMATS)
 _other = partial(typer.Option, rich_help_panel="The recording itself")
@@ -168,13 +168,13 @@ def _size(words: str | None) -> tuple[int, int] | None:
     return int(sides[0]), int(sides[1])
 
 
-def _chosen(recorded: Session | Foreign, *, yes: bool) -> Candidate:
+def _chosen(recorded: InDoubt | Foreign, *, yes: bool) -> Candidate:
     """Tries other readings, prints them, and takes the one that is clearly right or confirmed."""
     with shown_progress(quiet=False) as told:
         if isinstance(recorded, Foreign):
             guess = guess_foreign(recorded, progress=told)
         else:
-            guess = guess_session(recorded, progress=told)
+            guess = guess_session(recorded.session, recorded.robot, progress=told)
     print_guess(guess)
     return _confirmed(guess, yes=yes)
 

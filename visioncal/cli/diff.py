@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from visioncal.cli.options import AsJson, PartOptions
+from visioncal.core.number_format import figure
 from visioncal.interchange.result_files import load_result
 from visioncal.results.compare import Comparison, LensChange, Significance, compare, to_document
 
@@ -78,7 +79,7 @@ def _edge_table(comparison: Comparison) -> Table:
             table.add_row(
                 edge.name,
                 f"{round(moved, _DECIMALS):.3g} {unit}",
-                f"{sigma:.2g} {unit}",
+                f"{figure(sigma)} {unit}",
                 f"{moved / sigma:.1f}" if sigma > 0.0 else "",
                 *_outcome(test),
             )
@@ -89,7 +90,7 @@ def _lens_table(lens: LensChange) -> Table:
     table = _table("lens", "first", "second", "difference", "sigma")
     sigmas = [""] * len(lens.names)
     if lens.sigmas is not None:
-        sigmas = [f"{sigma:.2g}" for sigma in lens.sigmas]
+        sigmas = [figure(sigma) for sigma in lens.sigmas]
     for name, a, b, sigma in zip(lens.names, lens.a, lens.b, sigmas, strict=True):
         table.add_row(name, f"{a:.6g}", f"{b:.6g}", f"{b - a:+.3g}", sigma)
     if lens.significance is not None:
@@ -108,7 +109,7 @@ def _noise_table(comparison: Comparison) -> Table:
 
 def _outcome(test: Significance) -> tuple[str, str]:
     percent = 100 * test.p_value
-    chance = f"{percent:.0f} %" if percent > _WHOLE_PERCENT else f"{percent:.2g} %"
+    chance = f"{percent:.0f} %" if percent > _WHOLE_PERCENT else f"{figure(percent)} %"
     return (
         "under 0.01 %" if percent < _LEAST_PERCENT else chance,
         "changed" if test.is_change else "noise",

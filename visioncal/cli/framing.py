@@ -204,12 +204,12 @@ def tell(place: Place, frame: Frame, written: Written, *, as_json: bool) -> None
     x, y, z = 1e3 * frame.edge.transform.translation
     turn = ", ".join(f"{it:.3f}" for it in frame.edge.transform.rotation.as_rotvec(degrees=True))
     rotation = (
-        f"turned by ({turn}) deg, sigma {frame.edge.sigma_deg:.2g} deg"
+        f"turned by ({turn}) deg, sigma {figure(frame.edge.sigma_deg)} deg"
         if frame.oriented
         else "rotation not measured"
     )
     console.print(
-        f"{place.name}: ({x:.3f}, {y:.3f}, {z:.3f}) mm, sigma {frame.edge.sigma_mm:.2g} mm; "
+        f"{place.name}: ({x:.3f}, {y:.3f}, {z:.3f}) mm, sigma {figure(frame.edge.sigma_mm)} mm; "
         f"{rotation}"
     )
     console.print(
@@ -236,5 +236,5 @@ def _tell_before(place: Place, frame: Frame) -> None:
     if before is not None:
         mm, deg = pose_difference(before.edge.matrix, frame.edge.matrix)
         messages().print(
-            f"it replaces the one of {before.created}, {mm:.2g} mm and {deg:.2g} deg away"
+            f"it replaces the one of {before.created}, {figure(mm)} mm and {figure(deg)} deg away"
         )

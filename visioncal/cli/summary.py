@@ -8,6 +8,7 @@ from rich.table import Table
 
 from visioncal.cli.console import messages
 from visioncal.core.files import some_of
+from visioncal.core.number_format import figure
 from visioncal.core.transforms import pose_difference
 from visioncal.results import Calibration, Sight, Step, Verdict, ViewResult
 
@@ -46,16 +47,20 @@ def print_summary(calibration: Calibration, *, verbose: bool) -> None:
     for name, edge in calibration.edges.items():
         x, y, z = 1e3 * edge.transform.translation
         console.print(
-            f"{name}: ({x:.2f}, {y:.2f}, {z:.2f}) mm, sigma {edge.sigma_mm:.2g} mm"
-            + (f" and {edge.sigma_deg:.2g} deg" if edge.oriented else ", its rotation not measured")
+            f"{name}: ({x:.2f}, {y:.2f}, {z:.2f}) mm, sigma {figure(edge.sigma_mm)} mm"
+            + (
+                f" and {figure(edge.sigma_deg)} deg"
+                if edge.oriented
+                else ", its rotation not measured"
+            )
         )
     used = sum(view.used for view in calibration.views)
     held = calibration.validation.held_out
     console.print(
         f"{used} of {len(calibration.views)} views used; left out of the fit they are predicted to "
-        f"{held.mm:.2g} mm"
-        + ("" if held.deg is None else f", {held.deg:.2g} deg")
-        + (f", {held.px:.2g} px" if held.px else "")
+        f"{figure(held.mm)} mm"
+        + ("" if held.deg is None else f", {figure(held.deg)} deg")
+        + (f", {figure(held.px)} px" if held.px else "")
     )
     for words in unused_words(calibration.views):
         console.print(f"  {escape(words)}")

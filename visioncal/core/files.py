@@ -116,6 +116,7 @@ MOST_BYTES, MOST_TOML_BYTES = 50_000_000, 2_000_000
 MOST_IMAGE_BYTES = 300_000_000
 # File systems take no longer name [bytes].
 _LONGEST_NAME = 255
+_UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 # Matrices in lists in tables need six.
 _DEEPEST = 40
 
@@ -216,7 +217,7 @@ def decode_text(data: bytes, label: str) -> str:
         raise DataError(
             f"{label}, line {line}: byte 0x{data[error.start]:02x} is not UTF-8 text.",
             culprits=[f"{label}, line {line}"],
-            next_step=save_as_utf8("LATIN1"),
+            next_step=save_as_utf8("UTF-16" if data[:2] in _UTF16_MARKS else "LATIN1"),
         ) from error
 
 
@@ -345,10 +346,10 @@ def find_described(
         return shipped[name_or_path]
     hint = did_you_mean(name_or_path, shipped)
     raise DataError(
-        f"There is no {what} named {name_or_path!r}; the names are {', '.join(sorted(shipped))}.",
+        f"There is no {what} named {name_or_path!r}. {hint}".strip(),
         culprits=[name_or_path],
-        next_step=f"{hint} A file of your own is named by its path, "
-        f"ending in {' or '.join(suffixes)}.".strip(),
+        next_step=f"The names are {', '.join(sorted(shipped))}. A file of your own is named by its "
+        f"path, ending in {' or '.join(suffixes)}.",
     )
 
 

@@ -18,6 +18,8 @@ VerdictStatus: TypeAlias = Literal["good", "check", "bad"]
 _SHOWN, _LEAST_LIKELY, _LIKELY = 3, 0.05, 0.2
 # Kinds of findings that are no doubts.
 AGREEMENT, NEED, GOOD_FOR, NOTE = "agreement", "need", "good_for", "note"
+# Files that a session names and does not have: no doubt about the rest, and said first.
+MISSING = "missing_images"
 # What says how large errors are, the most telling first.
 _SIZES = (NEED, GOOD_FOR, "unexplained", "optimism", "weak_motion", "place", "workspace")
 
@@ -32,6 +34,7 @@ SOURCES = ("calibration", "robot_noise", "robot_noise_of_pick")
 # Commands of steps.
 CALIBRATE, PLAN = "visioncal calibrate SESSION -o OUT", "visioncal plan SESSION --add 5"
 GUESS = "visioncal convert SESSION FIXED --guess --yes"
+GUESS_AND_CALIBRATE = f"{GUESS} && {CALIBRATE.replace('SESSION', 'FIXED')}"
 REVIEW, VERIFY = "visioncal review OUT", "visioncal verify SESSION --against OUT"
 _PATH = re.compile(r"\b(SESSION|FIXED|OUT)\b")
 
@@ -51,6 +54,11 @@ class Step:
 
     def __str__(self) -> str:
         return f"{self.words} Run: {self.command}" if self.command else self.words
+
+
+READ_AGAIN = Step(
+    "Write a copy of the session that is read so, and calibrate it.", GUESS_AND_CALIBRATE
+)
 
 
 @dataclass(frozen=True)
@@ -152,7 +160,8 @@ class Verdict:
         """All findings as people read them: the likeliest cause, what it costs, then the rest."""
         causes = [it for it in self.causes if it.probability >= _LEAST_LIKELY]
         costs = [it for kind in _SIZES for it in self.findings if it.kind == kind]
-        ordered = [*causes[:1], *costs[:1], *causes[1:], *self.findings]
+        missing = [it for it in self.findings if it.kind == MISSING]
+        ordered = [*missing, *causes[:1], *costs[:1], *causes[1:], *self.findings]
         return tuple({id(it): it for it in ordered}.values())
 
     @property

@@ -15,6 +15,7 @@ import numpy as np
 
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.files import some_of
+from visioncal.core.number_format import figure
 from visioncal.core.transforms import compose, exp, skew
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.group_outliers import GroupInliers, agreeing_groups
@@ -262,7 +263,7 @@ def _check_one_side(
         axes = "y and z axes" if kind == "x" else "x axis"
         raise DegenerateError(
             f"fixture: the fixture's rotation about its {axes} is not determined at all: touch "
-            f"{some_of(names)} of kind {kind} is {1e3 * distances[farthest]:.1g} mm from the "
+            f"{some_of(names)} of kind {kind} is {figure(1e3 * distances[farthest])} mm from the "
             f"{start}.",
             culprits=names,
             next_step=f"Touch a point far from the {start}.",

@@ -182,8 +182,7 @@ def _refuse_open(problem: Problem, state: State, noise: Noise, scene: Scene) -> 
         frame, culprit = _null_direction(null, problem, state, scene)
         verb = "are" if " and " in culprit else "is"
         raise DegenerateError(
-            f"{scene.title}: {culprit} {verb} not determined at all (information ratio "
-            f"{found.ratio:.0e}, needs {_NULL_RATIO:.0e}): {scene.motion(frame)}.",
+            f"{scene.title}: {culprit} {verb} not determined at all: {scene.motion(frame)}.",
             culprits=[culprit],
             next_step=scene.advice(frame, culprit),
         )
@@ -435,17 +434,16 @@ def motion_words(robot: FloatArray, flange: FloatArray, stops: str, frame: str) 
     if largest < 0.5:
         return (
             f"the {stops} differ in position only (largest rotation between two of "
-            f"them: {largest:.1g} deg)"
+            f"them: {figure(largest)} deg)"
         )
     main, aside, is_lone = _lone_axis(turns)
     if is_lone:
         return (
             f"all {stops} turn about {frame}'s {axis_words(main)} to "
-            f"within {max(aside, 0.01):.2g} deg"
+            f"within {figure(max(aside, 0.01))} deg"
         )
-    return (
-        f"the {stops} turn by at most {largest:.2g} deg, and by {aside:.2g} deg about a second axis"
-    )
+    about_second = f"by {figure(aside)} deg about a second axis"
+    return f"the {stops} turn by at most {figure(largest)} deg, and {about_second}"
 
 
 def _or_measured(mount: Mount, culprit: str) -> str:

@@ -6,6 +6,7 @@ import numpy as np
 
 from visioncal.core.errors import DegenerateError
 from visioncal.core.files import some_of
+from visioncal.core.number_format import figure
 from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.groups import GroupFit, State
@@ -29,7 +30,7 @@ def noise_words(sigma_m: float | None) -> str:
     """Says by which noise geometry was judged: `a noise of 0.1 mm, which nothing contradicts`."""
     if sigma_m is None:
         return f"at a noise of {1e3 * TOUCH_NOISE_M:g} mm, taken because nothing tells it"
-    return f"at a noise of {1e3 * sigma_m:.2g} mm"
+    return f"at a noise of {figure(1e3 * sigma_m)} mm"
 
 
 def left_out_words(labels: Sequence[str], used: Mask) -> str:

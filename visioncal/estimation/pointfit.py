@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.core.errors import DataError
+from visioncal.core.number_format import figure
 from visioncal.core.quantiles import t_chance
 from visioncal.core.transforms import exp, skew
 from visioncal.core.types import FloatArray, IntArray, Mask
@@ -238,8 +239,8 @@ def _check_numbering(pairs: PointPairs, numbering: Numbering, agree: Collection[
         more = f", or one of {numbering.equally_good - 1} other orders that fit as well"
     raise DataError(
         f"fixture: as they are numbered the points fit the drawing to "
-        f"{1e3 * numbering.stated_rms_m:.2g} mm, in another order to "
-        f"{1e3 * numbering.rms_m:.2g} mm (root mean square): "
+        f"{figure(1e3 * numbering.stated_rms_m)} mm, in another order to "
+        f"{figure(1e3 * numbering.rms_m)} mm (root mean square): "
         f"{numbering.words(pairs.drawn_labels)}{more}.",
         culprits=moved,
         next_step="Correct the points' names.",
@@ -252,7 +253,7 @@ def _no_fit(pairs: PointPairs, fit: GroupFit[Placed], scale: Scale) -> DataError
     rms_mm, worst = 1e3 * np.sqrt(np.mean(off**2)), int(np.argmax(off))
     scaled = pairs.nominal[fit.used] * scale.value
     left = np.sqrt(procrustes_residual(pairs.measured[fit.used], scaled) / fit.used.sum())
-    hint = f" A drawing {scale.value:.4g} times as large would fit to {1e3 * left:.2g} mm."
+    hint = f" A drawing {scale.value:.4g} times as large would fit to {figure(1e3 * left)} mm."
     return DataError(
         f"fixture: the points do not fit the drawing: they are {rms_mm:.3g} mm off (root mean "
         f"square), most of all {pairs.labels[worst]} with {1e3 * off[worst]:.3g} mm."

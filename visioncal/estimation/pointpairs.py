@@ -12,6 +12,7 @@ import numpy as np
 from visioncal.core.conventions import UNITS_M
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.files import some_of
+from visioncal.core.number_format import figure
 from visioncal.core.quantiles import f_limit
 from visioncal.core.types import FloatArray
 from visioncal.estimation.numbering import Numbering
@@ -165,7 +166,8 @@ def check_hand(pairs: PointPairs, numbering: Numbering, noise_m: float) -> None:
         other = f" Or another order is right, which fits as well: {words}."
     raise DataError(
         f"fixture: the measured points are the mirror image of the drawing: mirrored they fit to "
-        f"{rms_mm[1]:.2g} mm, as they are to {rms_mm[0]:.2g} mm only (root mean square).{other}",
+        f"{figure(rms_mm[1])} mm, as they are to {figure(rms_mm[0])} mm only (root mean "
+        f"square).{other}",
         culprits=list(pairs.labels),
         next_step="Look for a coordinate of the wrong sign or two exchanged axes, in the drawing's "
         "table or in the measured one: a robot's frames are right-handed.",
@@ -192,7 +194,7 @@ def line_words(points: FloatArray, whose: str) -> str:
     centred = points - points.mean(axis=0)
     axis = spreads(points)[1][0]
     aside = np.linalg.norm(centred - np.outer(centred @ axis, axis), axis=1).max()
-    return f"the {whose} points lie within {1e3 * aside:.2g} mm of a line"
+    return f"the {whose} points lie within {figure(1e3 * aside)} mm of a line"
 
 
 def _check_line(points: FloatArray, whose: str, labels: Sequence[str]) -> None:
@@ -202,7 +204,7 @@ def _check_line(points: FloatArray, whose: str, labels: Sequence[str]) -> None:
     if extents[0] <= LEAST_NOISE_M:
         raise DegenerateError(
             f"fixture: the fixture's rotation is not determined at all: the {whose} points are all "
-            f"in one place, to within {1e3 * extents[0]:.1g} mm.",
+            f"in one place, to within {figure(1e3 * extents[0])} mm.",
             culprits=list(labels),
             next_step="Measure three points that are far apart and not on one line.",
         )

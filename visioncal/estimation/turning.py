@@ -4,6 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.number_format import figure
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.groups import GroupFit
@@ -133,7 +134,7 @@ def _cause(problem: TouchProblem, fit: GroupFit[Placed], culprit: Direction) -> 
         if readings:
             return cause, (
                 f"Read the poses {readings[0].words}: then they close to "
-                f"{1e3 * readings[0].rms_m:.2g} mm."
+                f"{figure(1e3 * readings[0].rms_m)} mm."
             )
         return cause, "Look for poses of another tool or in other units, and touch again."
     if culprit.is_rotation:
@@ -147,8 +148,8 @@ def _levers(used: Touches, fit: GroupFit[Placed]) -> tuple[str, str]:
     along = 1e3 * seen[used.are("z"), 2].max()
     aside = 1e3 * seen[used.are("xz"), 0].max()
     return (
-        f"the touches of kind z have their point at most {along:.2g} mm from the tip, and those of "
-        f"kind xz at most {aside:.2g} mm beside the tool's z axis"
+        f"the touches of kind z have their point at most {figure(along)} mm from the tip, and "
+        f"those of kind xz at most {figure(aside)} mm beside the tool's z axis"
     ), "Move the tool back by 50 mm or more along its axes before touching for z and xz."
 
 
@@ -160,18 +161,18 @@ def _motion(used: Touches) -> str:
     if angles.max() < _STILL_RAD:
         return (
             f"the {count} used touches are all from one orientation of the flange (largest "
-            f"rotation between two of them: {largest:.1g} deg)"
+            f"rotation between two of them: {figure(largest)} deg)"
         )
     main = np.linalg.svd(turns, full_matrices=False)[2][0]
     aside = np.rad2deg(np.linalg.norm(turns - np.outer(turns @ main, main), axis=1).max())
     if aside < 0.1 * largest:
         return (
             f"all {count} used touches turn about the flange's {axis_words(main)} to within "
-            f"{max(aside, 0.01):.2g} deg"
+            f"{figure(max(aside, 0.01))} deg"
         )
     return (
-        f"the {count} used touches turn by at most {largest:.2g} deg, and by {aside:.2g} deg about "
-        "a second axis"
+        f"the {count} used touches turn by at most {figure(largest)} deg, and by {figure(aside)} "
+        "deg about a second axis"
     )
 
 

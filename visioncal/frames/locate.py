@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from visioncal.core.errors import DataError
+from visioncal.core.number_format import figure
 from visioncal.core.types import Corners, FloatArray, Image, Target
 from visioncal.estimation.observability import SIGMA_LIMIT_M
 from visioncal.frames.camera_chain import Eye, Pose, Stop, checked_point, point_slope
@@ -156,7 +157,7 @@ def _located(
     if worst_m <= SIGMA_LIMIT_M:
         return found
     told = (
-        f"The place is known to {1e3 * worst_m:.2g} mm only in its worst direction (limit "
+        f"The place is known to {figure(1e3 * worst_m)} mm only in its worst direction (limit "
         f"{1e3 * SIGMA_LIMIT_M:g}), mostly because of the {_SOURCES[found.largest]}."
     )
     return Located(place, kept, found.freedom, (*found.warnings, told))
@@ -249,6 +250,6 @@ def _rivals(view: SeenTarget, places: FloatArray, found: Located) -> str:
         else "Seen so flat, the target may as well be tilted the other way"
     )
     return (
-        f"{why}: the point would lie {away_mm:.2g} mm away then. Look from another side, from "
+        f"{why}: the point would lie {figure(away_mm)} mm away then. Look from another side, from "
         "nearer, or at a board without symmetry."
     )

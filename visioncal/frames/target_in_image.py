@@ -6,6 +6,8 @@ import numpy as np
 
 from visioncal.calibration.stages.pnp import ViewPoses, measure_poses
 from visioncal.core.errors import DataError
+from visioncal.core.limits import MAX_BLUR_PX
+from visioncal.core.number_format import figure
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, Corners, FloatArray, Image, IntArray, Target
@@ -32,8 +34,6 @@ _FALSE_ALARM = 1e-4
 _WORTH_A_WORD = 2.0
 # Wrong corners spoil the pose that they are judged by: so often it is made anew without them.
 _ROUNDS = 3
-# Edges wider than this hide an image's corners; the widest that detection takes.
-_MAX_BLUR_PX = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +120,7 @@ def _found(eye: Eye, image: Image, target: Target, label: str) -> Corners:
     check_size(eye, image, label)
     seen = find_target(image, target)
     if isinstance(seen, NotFound):
-        cause = why_hard_to_see(image, _MAX_BLUR_PX)
+        cause = why_hard_to_see(image, MAX_BLUR_PX)
         raise DataError(
             f"{label}: target {target.name}: {seen.reason}{'; ' if cause else ''}{cause}.",
             culprits=[label],
@@ -208,7 +208,7 @@ def _noise(
     if shown < _WORTH_A_WORD * noise_px:
         return shown, ()
     return shown, (
-        f"{label}: the corners scatter by {shown:.2g} px around the target's pose, and "
-        f"{noise_px:.2g} px was to be expected: look whether the image is sharp, and the target "
-        "flat and of the size that is stated.",
+        f"{label}: the corners scatter by {figure(shown)} px around the target's pose, and "
+        f"{figure(noise_px)} px was to be expected: look whether the image is sharp, and the "
+        "target flat and of the size that is stated.",
     )

@@ -6,6 +6,7 @@ from typing import Self
 
 import numpy as np
 
+from visioncal.core.number_format import figure
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import adjoint, compose, invert, pose_difference
 from visioncal.core.types import FloatArray, Mask, Target
@@ -188,8 +189,8 @@ def doubts(
         )
     elif found.variance * 6 * (inside - 1) > chi2_limit(_FALSE_ALARM, 6 * (inside - 1)):
         yield (
-            f"The images scatter {np.sqrt(found.variance):.2g} times as much as the calibration's "
-            "noise lets them; the sigmas are that much larger."
+            f"The images scatter {figure(np.sqrt(found.variance))} times as much as the "
+            "calibration's noise lets them; the sigmas are that much larger."
         )
     if found.rival is not None:
         yield _rival_words(found, looks, thing)
@@ -204,14 +205,15 @@ def _is_torn(found: ImageInliers) -> bool:
 
 def _distance(found: ImageInliers, at: int) -> str:
     away = found.away[at]
-    millimetres, degrees = 1e3 * np.linalg.norm(away[3:]), np.rad2deg(np.linalg.norm(away[:3]))
-    return f"{millimetres:.2g} mm and {degrees:.2g} deg"
+    millimetres = 1e3 * float(np.linalg.norm(away[3:]))
+    degrees = float(np.rad2deg(np.linalg.norm(away[:3])))
+    return f"{figure(millimetres)} mm and {figure(degrees)} deg"
 
 
 def _rival_words(found: ImageInliers, looks: Sequence[SeenTarget], thing: str) -> str:
     rival = np.eye(4) if found.rival is None else found.rival
     millimetres, degrees = pose_difference(found.mean.matrix, rival)
-    away = f"{millimetres:.2g} mm and {degrees:.2g} deg away"
+    away = f"{figure(millimetres)} mm and {figure(degrees)} deg away"
     if any(len(set(look.turns)) > 1 for look in looks):
         return (
             f"The {thing} looks the same when it is turned: it may as well be {away}. Use a board "

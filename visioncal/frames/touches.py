@@ -7,6 +7,7 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean, some_of
+from visioncal.core.number_format import figure
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import Finding, Step
@@ -183,7 +184,7 @@ def check_lengths(rows: TouchRows) -> None:
     farthest = float(np.max(away, initial=0.0, where=np.isfinite(away)))
     if 0.0 < farthest < _NEAR_M:
         raise DataError(
-            f"{rows.source}: all positions are within {1e3 * farthest:.2g} mm of the base's "
+            f"{rows.source}: all positions are within {figure(1e3 * farthest)} mm of the base's "
             "origin, where no arm works: these look like metres read as millimetres.",
             culprits=[rows.source],
             next_step="Say --robot-unit m, or write millimetres.",

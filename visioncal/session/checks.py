@@ -1,6 +1,6 @@
 """What a session's parts say about each other: contradictions, and what looks like a mistake."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -21,7 +21,7 @@ def check_images_can_be_used(declaration: Declaration, views: Sequence[View]) ->
         DataError: One of these is not declared, and a view has an image, or corners of one.
     """
     with_image = [view for view in views if view.image or view.has_corners]
-    for field, value, example in (
+    for field, declared, example in (
         (
             "target",
             declaration.target or declaration.targets or None,
@@ -29,13 +29,14 @@ def check_images_can_be_used(declaration: Declaration, views: Sequence[View]) ->
         ),
         ("camera", declaration.camera or declaration.cameras or None, "[camera]"),
     ):
-        if with_image and value is None:
-            for key in declaration.model_extra or {}:
+        if with_image and declared is None:
+            for key, value in (declaration.model_extra or {}).items():
                 if key.lower()[:3] == field[:3] or did_you_mean(key, (field,)):
                     raise DataError(
                         f"session.toml: {key} is no known name; {field} is needed.",
                         culprits=[f"session.toml: {key}"],
-                        next_step=f"Rename {key} to {field}.",
+                        next_step=f"In session.toml, replace {_as_written(key, value)} by "
+                        f"{_as_written(field, value)}.",
                     )
             raise DataError(
                 f"session.toml: {field} is missing, but view {with_image[0].number} has "
@@ -43,6 +44,11 @@ def check_images_can_be_used(declaration: Declaration, views: Sequence[View]) ->
                 culprits=[f"session.toml: {field}"],
                 next_step=f"Add {example}.",
             )
+
+
+def _as_written(key: str, value: object) -> str:
+    """How session.toml has a key: that of a table in brackets."""
+    return f"[{key}]" if isinstance(value, Mapping) else key
 
 
 def check_times(views: Sequence[View]) -> None:
@@ -77,9 +83,3 @@ def view_warnings(views: Sequence[View]) -> Iterator[str]:
             f"views.csv: the largest joint angle of a row is {np.median(angles):.4g} rad in the "
             "median. It looks like degrees: multiply q1_rad ... by pi / 180."
         )
-    first: dict[tuple[str, str], int] = {}
-    for view in views:
-        # One image may show several targets, in a row for each.
-        key = (view.image, view.text.get("target", ""))
-        if view.image and first.setdefault(key, view.number) != view.number:
-            yield f"views.csv: views {first[key]} and {view.number} share {view.image}."

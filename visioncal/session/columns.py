@@ -8,6 +8,7 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean
 from visioncal.core.types import FloatArray
+from visioncal.core.verdict import READ_AGAIN
 
 POSITION = ("x_m", "y_m", "z_m")
 QUATERNION = ("qx", "qy", "qz", "qw")
@@ -27,12 +28,14 @@ LOAD = (
     *(f"force_{axis}_n" for axis in "xyz"),
 )
 # Columns of rotations that are no quaternions, and the forms that they usually have.
-_ROTATIONS: Mapping[tuple[str, str, str], tuple[str, ...]] = {
+ROTATIONS: Mapping[tuple[str, str, str], tuple[str, ...]] = {
     ("rx", "ry", "rz"): ("rotation-vector", "euler-xyz-deg"),
     ("a", "b", "c"): ("euler-ZYX-deg",),
     ("w", "p", "r"): ("euler-xyz-deg",),
     ("roll", "pitch", "yaw"): ("euler-xyz-rad", "euler-xyz-deg"),
 }
+# Columns of positions in a unit that their names do not tell.
+_POSITIONS = (("x", "y", "z"), ("tx", "ty", "tz"), ("x_mm", "y_mm", "z_mm"))
 _PLAIN_NUMBERS = frozenset(
     {
         "stamp_s",
@@ -122,24 +125,32 @@ def check_header(columns: Sequence[str], where: str) -> None:
     if not problems:
         return
     spelt = {name.lower(): name for name in columns}
-    turned = next((it for it in _ROTATIONS if spelt.keys() >= set(it)), None)
+    places = position_columns(columns)
+    turned = next((it for it in ROTATIONS if spelt.keys() >= set(it)), None)
     if turned is not None and not set(QUATERNION) & set(columns):
         names = ",".join(spelt[it] for it in turned)
         raise DataError(
             f"{where}: the rotations are in {names}, and quaternions qx, qy, qz, qw are needed.",
             culprits=[where],
-            next_step="Let visioncal convert write them: --from table --robot-columns "
-            f"x_m,y_m,z_m,{names} --robot-form {' or '.join(_ROTATIONS[turned])}.",
+            next_step=f"They may be {' or '.join(ROTATIONS[turned])}, which the images tell. "
+            f"{READ_AGAIN}",
         )
-    others = [
-        name
-        for mark, name in ((";", "semicolons"), ("\t", "tabs"))
-        if len(columns) == 1 and mark in columns[0]
-    ]
-    raise DataError(
-        f"{where}: {'; '.join(problems)}.",
-        culprits=[where],
-        next_step=f"Separate the columns by commas, not {others[0]}." if others else "",
+    if places is not None:
+        raise DataError(
+            f"{where}: the positions are in {','.join(places)}, and {', '.join(POSITION)} [m] are "
+            "needed.",
+            culprits=[where],
+            next_step=f"The images tell their unit. {READ_AGAIN}",
+        )
+    raise DataError(f"{where}: {'; '.join(problems)}.", culprits=[where])
+
+
+def position_columns(columns: Sequence[str]) -> tuple[str, ...] | None:
+    """The columns of positions by the names that others give them; None where there are none."""
+    spelt = {name.lower(): name for name in columns}
+    found = next((it for it in _POSITIONS if spelt.keys() >= set(it)), None)
+    return (
+        None if found is None or set(POSITION) & set(columns) else tuple(spelt[it] for it in found)
     )
 
 

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, Literal, TypeAlias, cast
+from typing import Annotated, Any, Literal, TypeAlias, cast, get_args
 
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 
@@ -123,8 +123,16 @@ def read_declaration(
         raise DataError(
             f"{label}: {'; '.join(f'{field} {words}' for field, words in problems)}.",
             culprits=[f"{label}: {field}" for field, _ in problems],
+            next_step=_nearest_mount(document, label),
         )
     return declaration
+
+
+def _nearest_mount(document: Mapping[str, Any], label: str) -> str:
+    """What to write for a mount that is spelt otherwise; empty where that is not it."""
+    spelt = str(document.get("mount", "")).lower().replace("_", "-").replace(" ", "-")
+    mounts = get_args(CameraMount)
+    return f'In {label}, write mount = "{spelt}".' if spelt in mounts else ""
 
 
 def _dotted(location: Sequence[int | str]) -> str:

@@ -84,7 +84,11 @@ class Session:
 
     @classmethod
     def load(
-        cls, path: Path | str, *, target_document: Mapping[str, Any] | None = None
+        cls,
+        path: Path | str,
+        *,
+        target_document: Mapping[str, Any] | None = None,
+        table: tuple[tuple[str, ...], tuple[Row, ...]] | None = None,
     ) -> "Session":
         """Loads a session's folder, or the `.rrd` recording of one.
 
@@ -94,6 +98,7 @@ class Session:
         Args:
             path: The folder or the recording.
             target_document: Taken in the place of a folder's own target, or targets by name.
+            table: The columns and rows taken in the place of a folder's own views.csv.
 
         Raises:
             DataError: A file is missing, or a field, row or column of one is wrong.
@@ -117,7 +122,9 @@ class Session:
         columns: tuple[str, ...] = ALONE
         rows: tuple[Row, ...] = ()
         # What an arm's drives needed is told by streams alone.
-        if not streams or (path / "views.csv").exists():
+        if table is not None:
+            columns, rows = table
+        elif not streams or (path / "views.csv").exists():
             columns, rows = parse_csv(read_text_inside(path, "views.csv"), "views.csv")
         session = _build(
             document,

@@ -11,8 +11,10 @@ from typing import TypeVar
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from visioncal.core.documents.tables import with_points
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
+from visioncal.core.verdict import READ_AGAIN
 from visioncal.session import columns as known
 from visioncal.session.images import image_path
 from visioncal.session.loads import SIDES, load_problems
@@ -133,16 +135,22 @@ class Problem:
 def parse_csv(text: str, label: str) -> tuple[tuple[str, ...], tuple[Row, ...]]:
     """Splits a views.csv into its column names and its rows; blank lines are skipped.
 
+    Where the header has semicolons or tabs and no comma, they separate the columns, and a decimal
+    comma is read as a point: so spreadsheets write tables in half of the world.
+
     Raises:
         DataError: It is empty, has no rows, or its quotes do not close.
     """
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    header = text.lstrip().partition("\n")[0]
+    separator = next((it for it in ";\t" if it in header and "," not in header), ",")
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True, delimiter=separator)
     rows: list[Row] = []
     line = 1
     try:
         for cells in reader:
             if any(cell.strip() for cell in cells):
-                rows.append(Row(f"{label}, line {line}", tuple(cells)))
+                read = tuple(cells) if separator == "," else with_points(cells)
+                rows.append(Row(f"{label}, line {line}", read))
                 _check_count(rows, label)
             line = reader.line_num + 1
     except csv.Error as error:
@@ -231,15 +239,18 @@ def problems_error(problems: Sequence[Problem]) -> DataError:
             f"seems, {'Euler angles in degrees' if degrees else 'rotation vectors or Euler angles'}"
             f": their norms are {min(norms):.3g} to {max(norms):.3g}, and 1 is needed.",
             culprits=[problems[0].place],
-            next_step="Write quaternions x, y, z, w; or name the columns as they are meant, as rx, "
-            "ry, rz, and let visioncal convert read them.",
+            next_step=f"Which of them they are the images tell. {READ_AGAIN}",
         )
+    where = ", ".join(problems[0].place.split(", ")[:2])
+    step = f"Correct it, or delete {where}." if len(problems) == 1 else ""
     shown = problems[:_SHOWN_PROBLEMS]
     more = len(problems) - len(shown)
     lines = [f"{problem.place}: {problem.words}." for problem in shown]
     if more:
         lines.append(f"And {more} more of the kind.")
-    return DataError("\n".join(lines), culprits=[problem.place for problem in shown])
+    return DataError(
+        "\n".join(lines), culprits=[problem.place for problem in shown], next_step=step
+    )
 
 
 @dataclass(frozen=True)

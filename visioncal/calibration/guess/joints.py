@@ -94,14 +94,14 @@ def _units(declared: JointReading) -> Iterator[JointReading]:
         declared,
         mixing=np.diag(np.where(turns, np.pi / 180.0, 1.0)),
         words="the angles in degrees",
-        fix=f"Multiply {many} by pi / 180 (visioncal convert: --joint-unit deg).",
+        fix=f"In views.csv, multiply {many} by pi / 180.",
         cost=1,
     )
     yield replace(
         declared,
         mixing=np.diag(np.where(turns, 180.0 / np.pi, 1.0)),
         words="the angles in radians that were taken for degrees",
-        fix=f"Multiply {many} by 180 / pi (visioncal convert: without --joint-unit deg).",
+        fix=f"In views.csv, multiply {many} by 180 / pi.",
         cost=1,
     )
 
@@ -193,7 +193,7 @@ def _models(declared: JointReading) -> Iterator[JointReading]:
                 declared,
                 robot=model,
                 words=f"the arm a {name} and not a {robot.name}",
-                fix=f'Write [robot] model = "{name}" into session.toml.',
+                fix=f'In session.toml, write [robot] model = "{name}".',
                 cost=1,
             )
 

@@ -7,6 +7,7 @@ import numpy as np
 from visioncal.calibration.guess.given import CLOSING_SCORE
 from visioncal.calibration.guess.hypothesis import Hypothesis
 from visioncal.core.conventions import UNITS_M
+from visioncal.core.number_format import figure
 
 _LONG_MM, _WHOLE_FROM = 1000.0, 99.0
 
@@ -76,7 +77,7 @@ class Candidate:
 
 def _short(value: float) -> str:
     """Two digits; whole numbers from a hundred on."""
-    return f"{value:.0f}" if value > _WHOLE_FROM else f"{value:.2g}"
+    return f"{value:.0f}" if value > _WHOLE_FROM else figure(value)
 
 
 @dataclass(frozen=True, eq=False)

@@ -142,7 +142,7 @@ def _clock_words(known: RunState) -> Iterator[str]:
             yield (
                 f"{pair.words}: the fit of the whole cell has the camera's clock "
                 f"{1e3 * clock.camera_minus_robot_s:+.2f} ms ahead (sigma "
-                f"{1e3 * clock.sigma_s:.2g} ms)."
+                f"{figure(1e3 * clock.sigma_s)} ms)."
             )
 
 

@@ -54,7 +54,7 @@ def fields_found(fields: Mapping[str, LensField]) -> Iterator[Finding]:
             yield Finding(
                 "lens_field",
                 f"{of} departs from its model: corners of one part of the image are off alike, by "
-                f"{figure(it.sigma_px)} px, {np.sqrt(it.factor):.2g} times what their noise "
+                f"{figure(it.sigma_px)} px, {figure(np.sqrt(it.factor))} times what their noise "
                 "explains. The covariance counts it; more views do not lower it.",
                 Step(
                     "Fix the focus, give matrix and distortion of a model that fits the lens, or "

@@ -21,13 +21,17 @@ from visioncal.calibration.stages.refine import refined
 from visioncal.calibration.stages.side import FramesSide
 from visioncal.calibration.stages.validate import chain_rms_px
 from visioncal.core.errors import DegenerateError
-from visioncal.core.types import FloatArray, IntArray, Mask, SolverName, Target
+from visioncal.core.types import FloatArray, IntArray, Mask, Mount, SolverName, Target
 from visioncal.core.verdict import Finding
 from visioncal.estimation.arm import rows_of
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
 from visioncal.estimation.joint import Fitted
 from visioncal.estimation.joint import settle as settle_looks
-from visioncal.estimation.observability import FEWEST_VIEWS, refuse_too_few
+from visioncal.estimation.observability import (
+    FEWEST_VIEWS,
+    check_observability,
+    refuse_too_few,
+)
 from visioncal.estimation.outliers import Agreed, agree, settle
 from visioncal.estimation.parts import Effect, Observations, State
 from visioncal.estimation.problem import Problem
@@ -134,14 +138,7 @@ def solve(
         DataError: A level is asked for, and no arm has what it takes.
         DegenerateError: A robot is tied to nothing, or a frame may be in two places.
     """
-    missing = {
-        it.view: looked.reasons.get(it.view, "nothing was found in its image")
-        for it in cell.rows
-        if it.view not in looked.poses
-    }
-    cell = cell.without(missing)
-    if not cell.rows:
-        raise nothing_seen(looked)
+    cell = _with_poses(cell, looked)
     arms: Mapping[str, RobotArm] = arms_of(cell, looked.robots)
     check_arms(arms, asked)
     if cell.mount is not None:
@@ -177,6 +174,40 @@ def solve(
     agreed = _with_repeats(agreed)
     found = Solved(cell, agreed, seen, tuple(views), (*lost, *unplaced), arms, asked, late)
     return found if solver == "joint" else _by_closed_form(found, solver)
+
+
+def first_agreement(cell: Cell, looked: Observed, mount: Mount) -> tuple[Cell, Agreed]:
+    """Takes the first steps of `solve`: which views agree, before lens, board or arm are fitted.
+
+    Args:
+        cell: A cell of one robot and one camera.
+        looked: What was observed in it.
+        mount: Where the camera is.
+
+    Returns:
+        The cell, its rows in the order of the fit, and what agrees.
+
+    Raises:
+        DegenerateError: The motion is too poor for any answer, by its geometry alone.
+    """
+    cell, _ = _tied_part(_with_poses(cell, looked))
+    views = [looked.poses[it.view] for it in cell.rows]
+    cell, _, problem, state, _ = _started(cell, views)
+    check_observability(problem, state, starting_noise(problem), mount)
+    return cell, agree(problem, state, _movable(cell, problem))
+
+
+def _with_poses(cell: Cell, looked: Observed) -> Cell:
+    """The cell without the observations that gave no pose."""
+    missing = {
+        it.view: looked.reasons.get(it.view, "nothing was found in its image")
+        for it in cell.rows
+        if it.view not in looked.poses
+    }
+    cell = cell.without(missing)
+    if not cell.rows:
+        raise nothing_seen(looked)
+    return cell
 
 
 def _without_misreported(agreed: Agreed, arms: Mapping[str, RobotArm], before: Mask) -> Agreed:

@@ -18,6 +18,7 @@ from visioncal.calibration.stages.judge import judge
 from visioncal.calibration.stages.kinematics import check_asked
 from visioncal.calibration.stages.loads import check_stops
 from visioncal.calibration.stages.observed import all_held_back
+from visioncal.calibration.stages.pictures import pairing
 from visioncal.calibration.stages.readings import (
     exchanged_points,
     read_instrument,
@@ -48,7 +49,7 @@ def _read_robot(known: RunState) -> RunState:
             next_step="Calibration needs views.csv; streams of torques alone are for visioncal "
             "dynamics identify.",
         )
-    known = known.noting((), (*remarks(session.warnings), *not_used(known)))
+    known = known.noting((), (*pairing(session), *remarks(session.warnings), *not_used(known)))
     if len(known.held_back) == len(session.views):
         raise all_held_back(known)
     # Views that have a time alone get their poses once the camera's are known.

@@ -22,10 +22,9 @@ from visioncal.calibration.stages.need import Picks
 from visioncal.core.limits import NeedLimits
 from visioncal.core.number_format import figure, percent
 from visioncal.core.verdict import (
-    CALIBRATE,
     GOOD_FOR,
-    GUESS,
     PLAN,
+    READ_AGAIN,
     REVIEW,
     SOURCES,
     Finding,
@@ -61,6 +60,7 @@ EVIDENCE: Mapping[str, Evidence] = {
     "moved_frame": Evidence(1e-4),
     "holdout": Evidence(1e-3),
     "lost_views": Evidence(_REMARK),
+    "shared_image": Evidence(_FACT),
     "untied": Evidence(_FACT),
     "too_few_stops": Evidence(_FACT),
     "board_size": Evidence(2.7e-3, _CHAIN),
@@ -101,11 +101,7 @@ def read_otherwise(sentence: str) -> Finding:
     Args:
         sentence: How they are better read.
     """
-    again = CALIBRATE.replace("SESSION", "FIXED")
-    step = Step(
-        "Write a copy of the session that is read so, and calibrate it.", f"{GUESS} && {again}"
-    )
-    return Finding("misread_poses", sentence, step)
+    return Finding("misread_poses", sentence, READ_AGAIN)
 
 
 def with_misread(verdict: Verdict, found: Finding) -> Verdict:

@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 
 from visioncal.core.errors import DataError
+from visioncal.core.limits import MAX_BLUR_PX
 from visioncal.core.threads import SharedSetting
-from visioncal.core.types import Corners, Image, IntArray, Progress, Rejection, Target
+from visioncal.core.types import Corners, FloatArray, Image, IntArray, Progress, Rejection, Target
 from visioncal.estimation.planar import determines_pose
 from visioncal.session import Session, View
 from visioncal.session.kinds import name_of
@@ -29,6 +30,8 @@ from visioncal.vision.targets import corner_positions, point_numbers
 _FEWEST_GIVEN = 4
 # Corners that others have found may lie outside the image by this share of it.
 _OUTSIDE = 0.1
+# Sides whose shares differ by less are of images that were resized, and not cut.
+_SAME_SHAPE = 0.02
 # Images looked at to tell which layout was printed.
 _LAYOUT_SAMPLE = 3
 
@@ -45,7 +48,7 @@ class DetectOptions:
     """
 
     min_corners: int = 6
-    max_blur_px: float = 4.0
+    max_blur_px: float = MAX_BLUR_PX
     threads: int = 0
 
 
@@ -300,6 +303,8 @@ def _common_resolution(
         for view, look in zip(views, looks, strict=True)
         if look.resolution is not None and look.resolution != wanted
     ]
+    if len(culprits) == len(sizes) and len(set(sizes)) == 1:
+        raise _other_size(session, views, sizes[0], wanted, culprits)
     if culprits:
         source = "the camera's resolution" if stated else "most other images"
         raise DataError(
@@ -309,6 +314,36 @@ def _common_resolution(
             next_step="Correct [camera] resolution in session.toml, or take out these views.",
         )
     return wanted
+
+
+def _other_size(
+    session: Session,
+    views: Sequence[View],
+    size: tuple[int, int],
+    stated: tuple[int, int],
+    culprits: Sequence[str],
+) -> DataError:
+    """What to raise where all images are of one other size than the camera's."""
+    camera = session.cameras[name_of(session.declaration, "camera", views[0])]
+    step = f"In session.toml, write resolution = [{size[0]}, {size[1]}]"
+    scales = size[0] / stated[0], size[1] / stated[1]
+    if camera.stated is not None and size != stated[::-1]:
+        if abs(scales[0] / scales[1] - 1.0) < _SAME_SHAPE:
+            fx, fy, cx, cy = scaled_matrix(camera.stated.matrix, scales[0])
+            step += f" and matrix = [{fx:.2f}, {fy:.2f}, {cx:.2f}, {cy:.2f}]"
+        else:
+            step += ", and delete matrix and distortion: they are of other images"
+    return DataError(
+        f"All {len(culprits)} images are {size[0]} x {size[1]} px, but session.toml has "
+        f"resolution = [{stated[0]}, {stated[1]}].",
+        culprits=culprits,
+        next_step=f"{step}.",
+    )
+
+
+def scaled_matrix(matrix: FloatArray, scale: float) -> FloatArray:
+    """fx, fy, cx, cy of images that were resized; pixel centres are at whole numbers."""
+    return np.array([*(scale * matrix[:2]), *(scale * (matrix[2:] + 0.5) - 0.5)])
 
 
 def _stated_resolution(session: Session, views: Sequence[View]) -> tuple[int, int] | None:

@@ -77,8 +77,8 @@ def doubts(found: ResidualTest, arm: ArmErrors | None, *, calibrated: bool) -> I
         yield Finding(
             "correlated_errors",
             f"Neighbouring stops err alike: leaving them out in blocks moves the answer "
-            f"{np.sqrt(alike.factor):.2g} times farther than independent noise would. The robot's "
-            "share of the sigmas was multiplied by as much.",
+            f"{figure(np.sqrt(alike.factor))} times farther than independent noise would. The "
+            "robot's share of the sigmas was multiplied by as much.",
             Step("Record again, with the stops in an order of chance."),
         )
 

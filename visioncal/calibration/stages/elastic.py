@@ -177,7 +177,7 @@ def doubts(elastic: Elastic) -> Iterator[Finding]:
         yield Finding(
             "load",
             f"Load and bend do not fit: the stops with a load bend {factor.value:.2f} +- "
-            f"{factor.sigma:.1g} times as far as the load times its reach asks of joints that "
+            f"{figure(factor.sigma)} times as far as the load times its reach asks of joints that "
             f"yield to the arm's own weight as they do. The load is {more} than stated "
             "(payload_kg, payload_x_m ...), or the masses of the arm's links are off.",
             Step("Weigh the load, and correct payload_kg and its centre in views.csv."),
@@ -213,7 +213,7 @@ def deflection_words(
     if abs(seen_mm - expected_mm) <= 3.0 * sigma_mm:
         return ""
     joints = ", ".join(
-        f"{name} {torque:.3g} N m / {1.0 / yields:.3g} N m/rad = {1e3 * bend:.2g} mrad"
+        f"{name} {torque:.3g} N m / {1.0 / yields:.3g} N m/rad = {figure(1e3 * bend)} mrad"
         for name, torque, yields, bend in zip(
             robot.joint_names, torques[0], compliance, bends[0], strict=True
         )

@@ -25,7 +25,7 @@ from visioncal.estimation.solve import held_shift
 # A rig that is as stated seems not to be in one session of ten thousand.
 _FALSE_ALARM = 1e-4
 _NEW_LENS = Step(
-    "Leave matrix and distortion out of session.toml, so that they are estimated, or calibrate "
+    "In session.toml, delete matrix and distortion, so that they are estimated, or calibrate "
     "the camera anew.",
     CALIBRATE,
 )
@@ -93,13 +93,13 @@ def scale_found(board: str, square_m: float, measured: MeasuredScale) -> Finding
         square_m: The stated side of its squares [m].
         measured: What the robot's motion says.
     """
-    side, share = 1e3 * square_m, f"{100 * measured.stated_sigma:.1g} %"
+    side, share = 1e3 * square_m, f"{figure(100 * measured.stated_sigma)} %"
     sized = (
         f"By the robot's motion the {board} is "
-        f"{100 * abs(measured.scale):.2g} % "
+        f"{figure(100 * abs(measured.scale))} % "
         f"{'larger' if measured.scale > 0 else 'smaller'} than stated (sigma "
-        f"{100 * measured.sigma:.1g} %): squares of {side * (1 + measured.scale):.4g} mm, not of "
-        f"{side:.4g} mm"
+        f"{figure(100 * measured.sigma)} %): squares of {side * (1 + measured.scale):.4g} mm, "
+        f"not of {side:.4g} mm"
     )
     if not measured.contradicts:
         allowed = f"{sized}, which what is stated allows (to within {share})."
@@ -121,7 +121,7 @@ def bend_found(board: str, bend_mm: float) -> Finding:
     """Words a board that is not flat; `bend_mm` is the depth of its corners [mm]."""
     return Finding(
         "board_shape",
-        f"The {board} is not flat: its corners lie within {bend_mm:.2g} mm of "
+        f"The {board} is not flat: its corners lie within {figure(bend_mm)} mm of "
         "depth. Its shape was estimated with the rest.",
         Step("Put the board on a stiff, flat plate, and record again."),
     )

@@ -13,6 +13,7 @@ from visioncal.core.types import Mount, Need, Rejection
 from visioncal.core.verdict import (
     AGREEMENT,
     GOOD_FOR,
+    MISSING,
     NEED,
     NOTE,
     REVIEW,
@@ -213,7 +214,7 @@ def judge(findings: Findings, limits: CalibrationLimits | None = None) -> Verdic
         *(doubt for it in sensors for doubt in _lost_doubts(it, limits)),
         *(doubt for it in sensors for doubt in _noise_doubts(it, limits)),
         *([] if scatter else _robot_doubts(findings, limits)),
-        *(_warned(it, findings) for it in findings.warnings),
+        *(_warned(it, findings) for it in findings.warnings if it.kind != MISSING),
     ]
     good_for_mm = _good_for_mm(findings.picks, doubts)
     met = need_met(findings.need, findings.picks)
@@ -237,6 +238,7 @@ def judge(findings: Findings, limits: CalibrationLimits | None = None) -> Verdic
             Finding(NEED, met_words(findings, met)),
         )
     said += [] if doubts else [_praise(findings)]
+    said += [it for it in findings.warnings if it.kind == MISSING]
     return Verdict(status, (*said, *remarks(findings.notes, NOTE)), good_for_mm)
 
 
@@ -399,8 +401,8 @@ def _disagreement_doubts(pair: Pair) -> Iterator[Finding]:
         Step("Fasten what moved, and calibrate the views before and after it apart.")
         if run
         else Step(
-            "Look at the images and poses of these views: repeat them, or take them out of "
-            "views.csv."
+            "Look at the images and poses of these views: repeat them, or in views.csv, delete "
+            f"the row{'s' if len(views) > 1 else ''} of view {', '.join(map(str, views))}."
         )
     )
     kind, without_it = "something_moved" if run else "wrong_views", _without_them(pair.held_out)

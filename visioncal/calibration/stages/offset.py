@@ -84,7 +84,7 @@ def told_words(fit: ClockFit, match: Match, stream: str) -> str:
     """Says what the motion tells."""
     return (
         f"The camera's clock is {1e3 * fit.offset_s:+.2f} ms ahead of the robot's (sigma "
-        f"{1e3 * fit.sigma_s:.2g} ms), as {fit.frames} frames and streams/{stream}.csv tell by "
+        f"{figure(1e3 * fit.sigma_s)} ms), as {fit.frames} frames and streams/{stream}.csv tell by "
         "their motion (the turning of both goes along with a correlation of "
         f"{match.correlation:.2f})."
     )
@@ -95,7 +95,7 @@ def turning_doubt(match: Match) -> Finding:
     return Finding(
         "clock",
         f"The camera's clock is {1e3 * match.offset_s:+.1f} ms ahead of the robot's (sigma "
-        f"{1e3 * match.sigma_s:.2g} ms), as the turning of both tells (correlation "
+        f"{figure(1e3 * match.sigma_s)} ms), as the turning of both tells (correlation "
         f"{match.correlation:.2f}). It is known no better, because the chain of frames does not "
         "close over the motion.",
         Step("Try other conventions of the poses.", GUESS),
@@ -113,7 +113,7 @@ def stated_doubts(clock: Clock, views: Sequence[View]) -> Iterator[Finding]:
             "clock",
             f"[clock] camera_minus_robot_s is stated as {1e3 * clock.stated_s:+.2f} ms, but the "
             f"motion tells {1e3 * clock.camera_minus_robot_s:+.2f} ms (sigma "
-            f"{1e3 * clock.sigma_s:.2g} ms), which was taken.",
+            f"{figure(1e3 * clock.sigma_s)} ms), which was taken.",
             Step("Correct [clock] in session.toml, or look at how the stamps are made."),
         )
 
@@ -138,7 +138,7 @@ def why_untold(fits: Sequence[ClockFit], matches: Sequence[Match]) -> str:
         return "the motion is too even: any offset explains it"
     if fits[0].sigma_s > LARGEST_SIGMA_S:
         return (
-            f"the motion tells the offset to {1e3 * fits[0].sigma_s:.2g} ms only "
+            f"the motion tells the offset to {figure(1e3 * fits[0].sigma_s)} ms only "
             f"({1e3 * LARGEST_SIGMA_S:g} ms are needed)"
         )
     several = " and ".join(f"{1e3 * it.offset_s:+.0f}" for it in fits)

@@ -11,6 +11,7 @@ from functools import partial
 
 import numpy as np
 
+from visioncal.core.number_format import figure
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.arm import rows_of
@@ -126,16 +127,16 @@ def uninformative(inputs: Inputs, stamps_s: FloatArray) -> str:
     links = _expected(inputs).links_c(inputs, stamps_s)
     rise = float(np.ptp(links, axis=0).max())
     hours = float(np.ptp(stamps_s)) / 3600.0
-    during = f"in the {hours:.2g} h of the {len(stamps_s)} used stops"
+    during = f"in the {figure(hours)} h of the {len(stamps_s)} used stops"
     if inputs.kind == "temperatures" and rise < LEAST_RISE_K:
         return (
-            f"the joints' temperatures change by at most {rise:.2g} K {during}, and "
+            f"the joints' temperatures change by at most {figure(rise)} K {during}, and "
             f"{LEAST_RISE_K:g} K are needed"
         )
     if inputs.kind == "currents" and rise < LEAST_SHARE * RISE_K:
         return (
-            f"by their currents the joints warm up by at most {100.0 * rise / RISE_K:.2g} % of the "
-            f"way {during}, and {100.0 * LEAST_SHARE:g} % are needed"
+            f"by their currents the joints warm up by at most {figure(100.0 * rise / RISE_K)} % "
+            f"of the way {during}, and {100.0 * LEAST_SHARE:g} % are needed"
         )
     return ""
 

@@ -251,8 +251,8 @@ def thing(check: Check, suspect: Suspect) -> str:
         kelvins = [f"{abs(share) / it:.0f} K" for it in (_ALUMINIUM, _STEEL)]
         grown = "longer" if share > 0.0 else "shorter"
         return (
-            f"all lengths of the arm {grown} by {1e2 * abs(share):.2g} % (sigma {1e2 * sigma:.1g})"
-            f", as {kelvins[0]} do to aluminium and {kelvins[1]} to steel"
+            f"all lengths of the arm {grown} by {figure(1e2 * abs(share))} % (sigma "
+            f"{figure(1e2 * sigma)}), as {kelvins[0]} do to aluminium and {kelvins[1]} to steel"
         )
     if kind == NOISE:
         return f"the robot scatters about {explained.noise_factor:.0f} times as much as it did"

@@ -12,6 +12,7 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.pose_ambiguity import choose_by
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.core.errors import DataError
+from visioncal.core.number_format import figure
 from visioncal.core.transforms import invert, pose_difference
 from visioncal.core.types import FloatArray, IntArray, Progress, Rejection, Target
 from visioncal.estimation.arm import ArmErrors
@@ -321,8 +322,8 @@ def _check_robot(session: Session, stated: Robot, known: Robot) -> None:
     if off[0] > _ONE_ROBOT_MM or off[1] > _ONE_ROBOT_DEG:
         raise DataError(
             f"session {session.name!r} names robot {stated.name}, whose flange is up to "
-            f"{off[0]:.3g} mm and {off[1]:.2g} deg off from the calibrated {known.name}'s: it is "
-            "another robot, or another tip.",
+            f"{off[0]:.3g} mm and {figure(off[1])} deg off from the calibrated {known.name}'s: "
+            "it is another robot, or another tip.",
             culprits=culprit,
             next_step="Name the robot and tip as in the calibration's session.",
         )
@@ -341,6 +342,7 @@ def _warnings(known: ObservedPoses, prior_calibration: CalibrationPrior) -> Iter
     before, now = prior_calibration.calibration.noise.get("pixel_px"), known.pixel_px
     if before is not None and now is not None and now > _WORTH_A_WORD * max(before, 1e-3):
         yield (
-            f"The corners scatter by {now:.2g} px around the target's poses, and by {before:.2g} "
+            f"The corners scatter by {figure(now)} px around the target's poses, and by "
+            f"{figure(before)} "
             "px when it was calibrated: look whether the lens is clean, sharp and as it was."
         )

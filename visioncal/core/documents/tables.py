@@ -104,12 +104,13 @@ def _cells(line: str, separator: str, where: str) -> tuple[str, ...]:
         (cells,) = csv.reader(io.StringIO(line), delimiter=separator, skipinitialspace=True)
     except (csv.Error, ValueError) as error:
         raise DataError(f"{where}: {error}.", culprits=[where]) from error
-    stripped = (it.strip() for it in cells)
-    if separator in ";\t":
-        return tuple(
-            it.replace(",", ".") if _DECIMAL_COMMA.fullmatch(it) else it for it in stripped
-        )
-    return tuple(stripped)
+    stripped = tuple(it.strip() for it in cells)
+    return with_points(stripped) if separator in ";\t" else stripped
+
+
+def with_points(cells: Sequence[str]) -> tuple[str, ...]:
+    """Cells that commas do not separate, with decimal commas as points."""
+    return tuple(it.replace(",", ".") if _DECIMAL_COMMA.fullmatch(it) else it for it in cells)
 
 
 def _header_in_comments(

@@ -5,6 +5,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray
 from visioncal.estimation.effects.delays import Delay
 
@@ -45,7 +46,7 @@ def _words(readout_s: float, sigma_s: float) -> str:
     late = "after" if readout_s > 0.0 else "before"
     return (
         f"The camera has a rolling shutter, which is taken into account: the image's last line is "
-        f"taken {1e3 * abs(readout_s):.2f} ms {late} the first (sigma {1e3 * sigma_s:.2g} ms)."
+        f"taken {1e3 * abs(readout_s):.2f} ms {late} the first (sigma {figure(1e3 * sigma_s)} ms)."
     )
 
 

@@ -20,6 +20,7 @@ from visioncal.interchange.formats.registry import (
     write_session,
 )
 from visioncal.interchange.formats.rereading import (
+    InDoubt,
     guess_foreign,
     load_in_doubt,
     reread,
@@ -31,6 +32,7 @@ __all__ = [
     "OWN_FORMATS",
     "Foreign",
     "ImportOptions",
+    "InDoubt",
     "PoseImportOptions",
     "assemble",
     "convert",

@@ -17,7 +17,7 @@ from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.industrial import HAND_EYE, KINEMATICS
 from visioncal.interchange.formats.poses import check_radians
 from visioncal.interchange.formats.recording import RECORDING
-from visioncal.interchange.formats.rereading import load_in_doubt, reread, reread_session
+from visioncal.interchange.formats.rereading import InDoubt, load_in_doubt, reread, reread_session
 from visioncal.interchange.formats.ros import EASY_HANDEYE, MOVEIT
 from visioncal.interchange.formats.views import VIEWS
 from visioncal.interchange.formats.visp import VISP
@@ -42,7 +42,7 @@ FOREIGN_FORMATS: tuple[ForeignFormat, ...] = (
 _NO_WISHES = ImportOptions()
 
 # Tries other readings of the poses, and settles which is right.
-Choose: TypeAlias = Callable[[Session | Foreign], Candidate]
+Choose: TypeAlias = Callable[[InDoubt | Foreign], Candidate]
 
 
 def convert(
@@ -93,9 +93,9 @@ def convert(
     elif choose is None:
         session = own.read(source)
     else:
-        session = load_in_doubt(source)
-        check_one_of_each(session)
-        session = reread_session(session, choose(session))
+        doubtful = load_in_doubt(source)
+        check_one_of_each(doubtful.session)
+        session = reread_session(doubtful.session, choose(doubtful), doubtful.robot)
     write_session(session, dest)
     return session
 

@@ -1,7 +1,7 @@
 """Other readings of a recording's poses: which is right, and the recording read that way."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,19 +16,32 @@ from visioncal.calibration.pipeline.guess_inputs import (
     told_or_chained,
 )
 from visioncal.core.conventions import PoseNumbers, Reading
+from visioncal.core.documents.tables import is_number
 from visioncal.core.errors import DataError
-from visioncal.core.files import read_toml
+from visioncal.core.files import read_text_inside, read_toml
 from visioncal.core.types import MOUNTS, FloatArray, IntArray, Progress
 from visioncal.interchange.formats.assemble import assemble, pose_cells, spoken
 from visioncal.interchange.formats.foreign import Foreign
 from visioncal.session import Session, Stream
-from visioncal.session.columns import MEASURED_CAM_POSE, POSE, joint_columns
+from visioncal.session.columns import (
+    MEASURED_CAM_POSE,
+    POSE,
+    POSITION,
+    QUATERNION,
+    ROTATIONS,
+    joint_columns,
+    position_columns,
+)
+from visioncal.session.table import Row, parse_csv
 from visioncal.vision.targets import LARGEST_M
 
 # Distances between consecutive rows of one log go up and down together.
 _FEWEST_STEPS, _SAME_LOG = 4, 0.9
 # No printed square is larger.
 _LARGEST_MM = 1e3 * LARGEST_M
+# Rotations with larger numbers are in degrees [rad].
+_LARGEST_RAD = 7.0
+_NO_TURN = ("0.0", "0.0", "0.0", "1.0")
 _LENGTHS = ("square_m", "square_sigma_m", "marker_m", "size_m")
 
 
@@ -88,33 +101,111 @@ def reread(foreign: Foreign, candidate: Candidate) -> Foreign:
     )
 
 
-def load_in_doubt(path: Path) -> Session:
-    """Loads a session that is to be read anew: a board larger than any is taken for millimetres.
+@dataclass(frozen=True, eq=False)
+class InDoubt:
+    """A session that is to be read anew.
+
+    Attributes:
+        session: It, with any rotations where its own are of no form that sessions have.
+        robot: The numbers of its robot's poses as they are written; None for those that it has.
+    """
+
+    session: Session
+    robot: PoseNumbers | None = None
+
+
+def load_in_doubt(path: Path) -> InDoubt:
+    """Loads a session that is to be read anew, even where it cannot be read as it stands.
+
+    A board larger than any is taken for millimetres; positions and rotations may be in other
+    columns, or of another form, than those of sessions.
 
     Raises:
         DataError: It is no session.
     """
-    file = path / "session.toml"
+    file, target, notes = path / "session.toml", None, []
     name = read_toml(file, file.name).get("target") if file.is_file() else None
-    if not isinstance(name, str) or not name.endswith(".toml"):
-        return Session.load(path)
-    stated = read_toml(path / name, name)
-    sides = [stated[it] for it in ("square_m", "size_m") if isinstance(stated.get(it), int | float)]
-    if not sides or not LARGEST_M < sides[0] < _LARGEST_MM:
-        return Session.load(path)
-    session = Session.load(path, target_document=_scaled(stated, 1e-3))
-    note = f"{name} can only be in millimetres: a side of {sides[0]:g} is read as {sides[0]:g} mm."
-    return replace(session, warnings=(note, *session.warnings))
+    if isinstance(name, str) and name.endswith(".toml"):
+        stated = read_toml(path / name, name)
+        sides = (stated.get(it) for it in ("square_m", "size_m"))
+        large = [it for it in sides if isinstance(it, int | float) and LARGEST_M < it < _LARGEST_MM]
+        for side in large:
+            target = _scaled(stated, 1e-3)
+            notes = [f"{name} can only be in millimetres: {side:g} is read as {side:g} mm."]
+    table = _otherwise_written(path) if path.is_dir() else None
+    plain = None if table is None else table.plain
+    session = Session.load(path, target_document=target, table=plain)
+    session = replace(session, warnings=(*notes, *session.warnings))
+    return InDoubt(session, None if table is None else table.robot)
 
 
-def reread_session(session: Session, candidate: Candidate) -> Session:
+@dataclass(frozen=True, eq=False)
+class _Table:
+    """A views.csv whose poses are written otherwise than sessions have them.
+
+    Attributes:
+        plain: Its columns and rows, with positions as they are and the rotation of no turn.
+        robot: What it says of the poses.
+    """
+
+    plain: tuple[tuple[str, ...], tuple[Row, ...]]
+    robot: PoseNumbers
+
+
+def _otherwise_written(folder: Path) -> _Table | None:
+    """Reads positions and rotations of other columns or forms; None where there are none."""
+    if not (folder / "views.csv").is_file():
+        return None
+    columns, rows = parse_csv(read_text_inside(folder, "views.csv"), "views.csv")
+    places = position_columns(columns) or POSITION
+    spelt = {name.lower(): name for name in columns}
+    others = (tuple(spelt[it] for it in names) for names in ROTATIONS if spelt.keys() >= set(names))
+    turns = QUATERNION if set(QUATERNION) <= set(columns) else next(others, ())
+    if not turns or not {*places} <= {*columns}:
+        return None
+    cells = [dict(zip(columns, row.cells, strict=False)) for row in rows]
+    numbers = [[_number(row.get(name, "")) for name in (*places, *turns)] for row in cells]
+    values = np.array(numbers).reshape(-1, len(places) + len(turns))
+    positions, rotations = values[:, :3], values[:, 3:]
+    if turns == QUATERNION:
+        if not np.nan_to_num(rotations[:, 3]).any():
+            rotations = rotations[:, :3]
+        elif places == POSITION:
+            return None
+    form = "quaternion-xyzw"
+    if rotations.shape[1] == 3:
+        largest = float(np.nanmax(np.abs(rotations), initial=0.0))
+        form = "euler-xyz-deg" if largest > _LARGEST_RAD else "rotation-vector"
+    kept = [name for name in columns if name not in {*places, *turns}]
+    plain = []
+    for row, mine, position in zip(rows, cells, positions, strict=True):
+        is_there = np.isfinite(position).all()
+        pose = [*map(repr, position.tolist()), *_NO_TURN] if is_there else [""] * len(POSE)
+        plain.append(replace(row, cells=(*(mine.get(name, "") for name in kept), *pose)))
+    robot = PoseNumbers(positions, rotations, Reading(form), tuple(it.where for it in rows))
+    return _Table(((*kept, *POSE), tuple(plain)), robot)
+
+
+def _number(cell: str) -> float:
+    return float(cell) if is_number(cell) else np.nan
+
+
+def reread_session(
+    session: Session, candidate: Candidate, robot: PoseNumbers | None = None
+) -> Session:
     """Reads a session's poses as a candidate has it; everything else stays as it is.
+
+    Args:
+        session: The session.
+        candidate: How its poses are meant.
+        robot: The numbers of its robot's poses as they are written; left out, those that it has.
 
     Raises:
         DataError: The session that comes out is wrong; or as `reread`.
     """
     cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
-    robot, camera = numbers_in(session, POSE), numbers_in(session, MEASURED_CAM_POSE)
+    camera = numbers_in(session, MEASURED_CAM_POSE)
+    robot = numbers_in(session, POSE) if robot is None else robot
     taken = candidate.hypothesis
     _check_applies(candidate, robot)
     if _go_together(chain_poses(session), robot):

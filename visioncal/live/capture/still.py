@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from visioncal.core.number_format import figure
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, Image
 from visioncal.live.capture.options import Stillness
@@ -54,13 +55,13 @@ def why_arm_moves(first: ArmState, then: ArmState, still: Stillness) -> str:
     if first.q is not None and then.q is not None:
         turned = float(np.abs(then.q - first.q).max())
         if turned > still.joint_rad:
-            return f"a joint turned by {turned:.2g} rad (limit {still.joint_rad:g})"
+            return f"a joint turned by {figure(turned)} rad (limit {still.joint_rad:g})"
     moved = invert(first.base_from_flange) @ then.base_from_flange
     shift, angle = float(np.linalg.norm(moved[:3, 3])), float(rotation_angle(moved))
     if shift > still.flange_m:
-        return f"the flange moved by {1e3 * shift:.2g} mm (limit {1e3 * still.flange_m:g})"
+        return f"the flange moved by {figure(1e3 * shift)} mm (limit {1e3 * still.flange_m:g})"
     if angle > still.flange_rad:
-        return f"the flange turned by {angle:.2g} rad (limit {still.flange_rad:g})"
+        return f"the flange turned by {figure(angle)} rad (limit {still.flange_rad:g})"
     return ""
 
 
@@ -71,7 +72,7 @@ def why_image_moves(first: Image, then: Image, still: Stillness) -> tuple[str, f
         return "", moved
     if not np.isfinite(moved):
         return "the image shows something else from frame to frame", moved
-    return f"the image moved by {moved:.2g} px (limit {still.image_px:g})", moved
+    return f"the image moved by {figure(moved)} px (limit {still.image_px:g})", moved
 
 
 def image_motion_px(first: Image, then: Image) -> float:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.core.errors import DataError
+from visioncal.core.number_format import figure
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import IntArray
 from visioncal.live.planning.accuracy import Accuracy, Wish
@@ -125,7 +126,7 @@ def shortfall(design: Design, wish: Wish, count: int) -> str:
 
 def _words(accuracy: Accuracy, wish: Wish) -> str:
     return " and ".join(
-        f"{getattr(accuracy, unit):.2g} {unit}"
+        f"{figure(getattr(accuracy, unit))} {unit}"
         for unit in ("mm", "deg")
         if getattr(wish, unit) is not None
     )

@@ -1,6 +1,7 @@
 """A plan of motions in words."""
 
 from visioncal.core.files import some_of
+from visioncal.core.number_format import figure
 from visioncal.dynamics.limit_check import Kept
 from visioncal.dynamics.planned import MotionPlan
 from visioncal.dynamics.sweeps import Sweeps
@@ -45,6 +46,6 @@ def _sweeps(sweeps: Sweeps) -> str:
     joints = len({it.joint for it in sweeps.strokes})
     return (
         f"sweeps of {joints} joints, one at a time, there and back at "
-        f"{len(speeds) // (2 * joints)} speeds from {min(speeds):.2g} to {max(speeds):.2g} rad/s: "
-        f"{sweeps.begins_s[-1]:.0f} s"
+        f"{len(speeds) // (2 * joints)} speeds from {figure(min(speeds))} to "
+        f"{figure(max(speeds))} rad/s: {sweeps.begins_s[-1]:.0f} s"
     )

@@ -1,0 +1,88 @@
+"""What is wrong with a session before it is calibrated: named, with what to type."""
+
+import json
+
+import numpy as np
+import pytest
+from support.broken_sessions import BROKEN, broken_session, sound_session
+from support.commands import visioncal as command
+from support.typed_fixes import mended
+
+import visioncal
+from visioncal.calibration.pipeline.checkup import to_document
+from visioncal.calibration.stages.detect import scaled_matrix
+from visioncal.core.errors import DataError
+from visioncal.interchange.formats import load_in_doubt
+
+# Of each kind of finding one: what its first sentence is about, and the kind.
+NAMED = {
+    "quaternion with w first": "misread_poses",
+    "one pose typed wrong": "wrong_views",
+    "two images missing": "missing_images",
+    "images named .jpg": "missing_images",
+    "images in another folder": "missing_images",
+    "an image twice": "shared_image",
+    "another dictionary": "other_board",
+    "mirrored images": "mirrored_images",
+    "blurred images": "blurred_images",
+    "the lens of larger images": "lens",
+    "no turns": "motion",
+}
+# Files that cannot be read as they stand are refused, with what to type.
+REFUSED = ("columns rx, ry, rz", "columns x, y, z", "[cam] for [camera]", "eye_in_hand")
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory):
+    return sound_session(tmp_path_factory.mktemp("doctor") / "sound", BROKEN["semicolons"])
+
+
+def test_nothing_is_wrong_with_a_sound_session(sound):
+    found = visioncal.doctor(sound)
+    assert found.is_sound
+    assert "15 of 15 images" in str(found)
+    done = command("doctor", sound)
+    assert (done.status, done.out) == (0, "")
+    assert f"visioncal calibrate {sound} -o out" in done.err
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_what_is_wrong_is_named_first(tmp_path, name):
+    folder = broken_session(tmp_path / "session", BROKEN[name])
+    found = visioncal.doctor(folder)
+    assert found.findings[0].kind == NAMED[name]
+    assert found.findings[0].do is not None
+    assert "SESSION" not in str(found)
+    done = command("doctor", folder, "--json")
+    assert done.status == 3
+    assert json.loads(done.out) == to_document(found)
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_read_is_refused_with_what_to_type(tmp_path, name):
+    folder = broken_session(tmp_path / "session", BROKEN[name])
+    refused = command("doctor", folder)
+    assert refused.status == 2
+    assert mended(folder, refused.err, tmp_path / "out") == "good"
+
+
+def test_a_board_that_is_not_declared_is_named_by_calibrate(tmp_path):
+    folder = broken_session(tmp_path / "session", BROKEN["another size of board"])
+    with pytest.raises(DataError, match="ChArUco board of 9 x 6 squares") as caught:
+        visioncal.calibrate(folder)
+    assert 'target = "charuco_9x6_30mm"' in caught.value.next_step
+
+
+def test_rotations_of_another_form_are_loaded_in_doubt(tmp_path):
+    name = "Euler angles in degrees in quaternion columns"
+    doubtful = load_in_doubt(broken_session(tmp_path / "session", BROKEN[name]))
+    assert doubtful.robot is not None
+    assert doubtful.robot.reading.rotation == "euler-xyz-deg"
+    assert np.abs(doubtful.robot.rotations).max() > 90.0
+    assert doubtful.session.views[0].numbers["qw"] == 1.0
+
+
+def test_a_resized_image_has_the_matrix_that_its_rays_have():
+    # The middle of the first pixel of two is the middle of one.
+    matrix = scaled_matrix(np.array([900.0, 900.0, 0.5, 639.5]), 0.5)
+    np.testing.assert_allclose(matrix, [450.0, 450.0, 0.0, 319.5])

@@ -1,0 +1,256 @@
+"""What is wrong with a session before anything is solved, and what to type: `visioncal doctor`."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from visioncal.calibration.pipeline.guess_inputs import reading_hint
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.pipeline.running import known_at_first, unseen_cause
+from visioncal.calibration.pipeline.solving import first_agreement
+from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.stages.cell import read_cell
+from visioncal.calibration.stages.observed import by_reason
+from visioncal.calibration.stages.pictures import unnamed_images
+from visioncal.core.errors import VisioncalError
+from visioncal.core.files import some_of
+from visioncal.core.limits import CalibrationLimits
+from visioncal.core.number_format import figure
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.types import Mount, Progress
+from visioncal.core.verdict import CALIBRATE, MISSING, Finding, Step, with_paths
+from visioncal.session import Session
+
+# What is looked at; what comes after is the fit.
+_LAST = "joints"
+# A lens is estimated by corners all over the image: so many of these parts of it need some.
+_PARTS, _LEAST_PARTS = 4, 7
+# A lens's centre is nearer to the middle of its images than this share of it.
+_OFF_CENTRE = 0.15
+# Noise of corners beyond which a lens is in doubt [px], and of the flange [mm].
+_MOST_PX, _MOST_MM = CalibrationLimits().pixel_px[0], 1.0
+# What is allowed, and no mistake.
+_NO_FAULT = ("unused",)
+
+
+@dataclass(frozen=True)
+class Checkup:
+    """What is wrong with a session.
+
+    Attributes:
+        session: Its name.
+        seen: What is there, in a few words each.
+        findings: What is wrong, the likeliest cause first, each with what to do.
+    """
+
+    session: str
+    seen: tuple[str, ...]
+    findings: tuple[Finding, ...]
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether nothing is wrong."""
+        return not self.findings
+
+    def __str__(self) -> str:
+        lines = [f"{self.session}: {'; '.join(self.seen)}."]
+        lines += [f"- {it.reason}" for it in self.findings] or ["Nothing is wrong."]
+        return "\n".join(lines)
+
+
+def doctor(session: Session | Path | str, *, progress: Progress | None = None) -> Checkup:
+    """Looks for what is wrong with a session, in seconds: nothing is fitted to the chain.
+
+    Args:
+        session: A session, or the path of its folder or recording.
+        progress: Told of long work.
+
+    Returns:
+        What is wrong, the likeliest cause first; commands have the session's path where one is
+        given.
+
+    Raises:
+        DataError: It cannot be read.
+    """
+    known = known_at_first(session, progress, level="auto", convention=None)
+    with one_blas_thread():
+        known, error = _looked(known)
+        found = [*_findings(known, error)]
+    if not isinstance(session, Session):
+        found = [_of(it, session) for it in found]
+    return Checkup(known.session.name, tuple(_seen(known)), tuple(found))
+
+
+def to_document(checkup: Checkup) -> dict[str, object]:
+    """Writes what was found as the content of a JSON document."""
+    findings = []
+    for it in checkup.findings:
+        step = {"do": it.do.words, "command": it.do.command} if it.do else {}
+        entry = {"kind": it.kind, "sentence": it.words, "views": list(it.views), **step}
+        findings.append({name: value for name, value in entry.items() if value})
+    return {"session": checkup.session, "seen": list(checkup.seen), "findings": findings}
+
+
+def _of(found: Finding, session: Path | str) -> Finding:
+    if found.do is None:
+        return found
+    words, command = (with_paths(it, session) for it in (found.do.words, found.do.command))
+    return replace(found, do=Step(words, command))
+
+
+def _looked(known: RunState) -> tuple[RunState, VisioncalError | None]:
+    """Takes a session through the steps before the fit, as far as they go."""
+    for at, stage in enumerate(STAGES):
+        if known.progress is not None:
+            known.progress(stage.name, at, len(STAGES))
+        try:
+            known = stage.run(known)
+            if stage.name == _LAST:
+                break
+        except VisioncalError as error:
+            return known, error
+    return known, None
+
+
+def _findings(known: RunState, error: VisioncalError | None) -> Iterator[Finding]:
+    cause = unseen_cause(known) if error is not None or known.reasons else None
+    if cause is not None:
+        yield cause
+    hint = reading_hint(known) if error is None and known.mount is not None else None
+    if hint is not None:
+        yield hint
+    if error is not None and cause is None:
+        yield _refused("refused", error)
+    said = () if cause is None else (cause.kind,)
+    warned = [it for it in known.warnings if it.kind not in (*_NO_FAULT, *said)]
+    yield from sorted(warned, key=lambda it: it.do is None)
+    if error is None:
+        lens = list(_lenses(known))
+        yield from lens
+        if hint is None and known.mount is not None and not lens:
+            yield from _motion(known, known.mount)
+        yield from _lost(known)
+        yield from _coverage(known)
+    if not {MISSING, "shared_image"} & {it.kind for it in (*warned, cause) if it}:
+        yield from unnamed_images(known.session)
+
+
+def _refused(kind: str, error: VisioncalError) -> Finding:
+    return Finding(kind, error.message, Step(error.next_step) if error.next_step else None)
+
+
+def _lenses(known: RunState) -> Iterator[Finding]:
+    """Lenses that are stated and not those of the images."""
+    step = Step("In session.toml, delete matrix and distortion, so that they are estimated.")
+    for frame, look in known.cameras.items():
+        stated = look.table.stated
+        if stated is None:
+            continue
+        middle = (np.array(stated.resolution) - 1.0) / 2.0
+        shares = stated.matrix[2:] / middle
+        words = ""
+        if np.all(np.abs(shares - 1.0) > _OFF_CENTRE) and abs(shares[0] / shares[1] - 1.0) < 0.1:
+            x, y = stated.matrix[2:]
+            words = (
+                f"The stated matrix is of images of another size: its centre is at ({x:.0f}, "
+                f"{y:.0f}) px, and the middle of these is at ({middle[0]:.0f}, {middle[1]:.0f}) px."
+            )
+        elif look.pixel_px is not None and look.pixel_px > _MOST_PX:
+            words = (
+                f"Corners deviate by {figure(look.pixel_px)} px from any pose of a flat board "
+                f"(doubt begins at {_MOST_PX:g}): the stated lens is not this camera's, or the "
+                "board is not flat."
+            )
+        if words:
+            yield Finding("lens", words, step).of(frame if len(known.cameras) > 1 else "")
+
+
+def _motion(known: RunState, mount: Mount) -> Iterator[Finding]:
+    """Motion that is too poor, and views that disagree."""
+    try:
+        cell, agreed = first_agreement(read_cell(known), known, mount)
+    except VisioncalError as error:
+        yield _refused("motion", error)
+        return
+    out = [row.view for row, used in zip(cell.rows, agreed.used.tolist(), strict=True) if not used]
+    if out:
+        one = len(out) == 1
+        rows = ", ".join(map(str, out))
+        yield Finding(
+            "wrong_views",
+            f"{'View' if one else 'Views'} {some_of([*map(str, out)])} "
+            f"{'disagrees' if one else 'disagree'} with the others: {'its' if one else 'their'} "
+            "pose or image is wrong, or something moved.",
+            Step(
+                f"Look at {'its image and pose' if one else 'their images and poses'}: repeat "
+                f"{'it' if one else 'them'}, or in views.csv, delete the row{'' if one else 's'} "
+                f"of view {rows}."
+            ),
+            tuple(out),
+        )
+    rad, metres = agreed.fit.noise.robots[0].tolist()
+    if 1e3 * metres > _MOST_MM:
+        yield Finding(
+            "scatter",
+            f"The views disagree by {figure(1e3 * metres)} mm and {figure(np.rad2deg(rad))} deg "
+            "from stop to stop, and arms repeat to 0.1 mm: the board is of another size than "
+            "stated, the lens is not this camera's, or the poses are not of these images.",
+            Step("Calibrate: the verdict weighs the causes.", CALIBRATE),
+        )
+
+
+def _lost(known: RunState) -> Iterator[Finding]:
+    """Views that cannot be used, but for those whose images are missing: that was said."""
+    absent = {it for found in known.warnings for it in found.views}
+    reasons: Mapping[int, str] = {
+        view: why for view, why in known.reasons.items() if view not in absent
+    }
+    for words in by_reason(reasons):
+        yield Finding(
+            "lost_views",
+            f"{words[0].upper()}{words[1:]}.",
+            Step("Look at the image, and repeat the view or take it out of views.csv."),
+        )
+
+
+def _coverage(known: RunState) -> Iterator[Finding]:
+    """Cameras whose lens is to be estimated, and whose corners fill little of the image."""
+    for frame, look in known.cameras.items():
+        if look.resolution is None or look.table.stated is not None or not look.corners:
+            continue
+        px = np.concatenate([it.px for it in look.corners.values()])
+        part = np.floor(_PARTS * px / np.array(look.resolution)).clip(0, _PARTS - 1)
+        filled = len(np.unique(part @ [_PARTS, 1]))
+        if filled < _LEAST_PARTS:
+            words = (
+                f"The board was seen in {filled} of {_PARTS**2} parts of the image alone, and the "
+                f"lens, which session.toml does not state, needs it all over the image: "
+                f"{_LEAST_PARTS} parts and more."
+            )
+            step = Step("Add views with the board near the image's edges and corners, or nearer.")
+            yield Finding("coverage", words, step).of(frame if len(known.cameras) > 1 else "")
+
+
+def _seen(known: RunState) -> Iterator[str]:
+    session = known.session
+    yield f"{len(session.views)} views"
+    images = [it.image for it in session.views if it.image]
+    if images:
+        there = sum(session.images.exists(it) for it in images)
+        yield f"{there} of {len(images)} images"
+    for look in known.cameras.values():
+        blur = [it.blur_px for it in look.corners.values() if np.isfinite(it.blur_px)]
+        size = "" if look.resolution is None else " of {} x {} px".format(*look.resolution)
+        edges = f", edges {np.median(blur):.1f} px wide" if blur else ""
+        yield f"the board in {len(look.corners)} images{size}{edges}"
+    if known.base_from_flange:
+        yield f"{len(known.base_from_flange)} poses of the robot"
+    if session.streams:
+        yield f"streams {some_of(list(session.streams))}"
+
+
+def next_command(checkup: Checkup, session: Path | str) -> str:
+    """What to type where nothing is wrong."""
+    return "" if checkup.findings else with_paths(CALIBRATE, session, "out")

@@ -1,0 +1,243 @@
+"""What is wrong with a session's images and its board, and what to type: before any fit."""
+
+import shlex
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from visioncal.core.errors import DataError
+from visioncal.core.files import some_of
+from visioncal.core.limits import MAX_BLUR_PX
+from visioncal.core.types import Image, Target
+from visioncal.core.verdict import MISSING, Finding, Step
+from visioncal.session import Session, View
+from visioncal.session.images import FolderImages
+from visioncal.vision.finders.identify import Identity, identify
+from visioncal.vision.finders.identify_text import describe
+from visioncal.vision.finders.imaging import decode_image, why_hard_to_see
+from visioncal.vision.targets import load_target, target_names
+
+# So many names are listed, and so many images are searched for whatever board they show.
+_LISTED, _LOOKED_AT = 6, 3
+# No need is as small [mm]: what is left out of a result takes nothing from it.
+_LEAST_NEED_MM = 1e-3
+_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+# What a photograph tells of a board, beside the dictionary of its markers.
+_SEEN = ("kind", "columns", "rows", "legacy", "marker_id", "asymmetric")
+# A board is named by an image that shows so much of it.
+_CLEARLY = 0.2
+# Sizes of squares that are the same but for rounding.
+_SAME_SIZE = 0.01
+
+
+def pairing(session: Session) -> Iterator[Finding]:
+    """Says which rows have no image, and which share one."""
+    yield from _missing(session)
+    yield from _shared(session)
+
+
+def unnamed_images(session: Session) -> Iterator[Finding]:
+    """Says which images beside those of the session no row names."""
+    more = _unnamed(session)
+    if more:
+        have = "1 image has" if len(more) == 1 else f"{len(more)} images have"
+        yield Finding(
+            "unnamed_images",
+            f"{have} no row in views.csv: {some_of(more, _LISTED)}.",
+            Step("Add a row for each, with the robot's pose, or take them out of the folder."),
+            until_mm=0.0,
+        )
+
+
+def _missing(session: Session) -> Iterator[Finding]:
+    with_image = [it for it in session.views if it.image]
+    missing = [it for it in with_image if session.images.absence(it.image) == "is missing"]
+    if not missing:
+        return
+    names = [it.image for it in missing]
+    are = "image is" if len(with_image) == 1 else "images are"
+    words = f"{len(missing)} of {len(with_image)} {are} missing: {some_of(names, _LISTED)}"
+    old, new = _renamed(session, names)
+    if old:
+        words = f"{words}; there is {names[0].replace(old, new)} instead."
+        step = Step(f"In views.csv, replace {old} by {new}.")
+    else:
+        words = f"{words}."
+        rows = ", ".join(str(it.number) for it in missing)
+        step = Step(
+            f"Copy {'it' if len(names) == 1 else 'them'} there; or in views.csv, delete the "
+            f"row{'s' if len(names) > 1 else ''} of view {rows}."
+        )
+    views = tuple(it.number for it in missing)
+    yield Finding(MISSING, words, step, views, until_mm=0.0)
+
+
+def _renamed(session: Session, names: Sequence[str]) -> tuple[str, str]:
+    """What to replace in the names of images by what, so that all are there; empty if nothing."""
+    store = session.images
+    if not isinstance(store, FolderImages):
+        return "", ""
+    first = Path(names[0])
+    pairs = [(first.suffix, it) for it in (*_ENDINGS, *(it.upper() for it in _ENDINGS))]
+    if first.parent != Path():
+        folder = f"{first.parent.as_posix()}/"
+        others = sorted(f"{it.name}/" for it in store.folder.iterdir() if it.is_dir())
+        pairs += [(folder, it) for it in (*others, "")]
+    for old, new in pairs:
+        changed = [it.replace(old, new) for it in names]
+        if old != new and all(store.exists(it) for it in changed):
+            return old, new
+    return "", ""
+
+
+def _shared(session: Session) -> Iterator[Finding]:
+    first: dict[tuple[str, str], View] = {}
+    for view in session.views:
+        # One image may show several targets, in a row for each.
+        key = (view.image, view.text.get("target", ""))
+        before = first.setdefault(key, view)
+        if view.image and before is not view:
+            free = _unnamed(session)
+            words = f"Views {before.number} and {view.number} share the same image {view.image}"
+            do = "give each row its own image"
+            if len(free) == 1:
+                words = f"{words}, and {free[0]} has no row"
+                do = f"write {free[0]} into the row of view {view.number}, column image"
+            yield Finding(
+                "shared_image",
+                f"{words}.",
+                Step(f"In views.csv, {do}; or delete the row of view {view.number}."),
+                (before.number, view.number),
+                until_mm=_LEAST_NEED_MM,
+            )
+
+
+def _unnamed(session: Session) -> list[str]:
+    """Images in the folders of those that rows name, by their paths, that no row names."""
+    store = session.images
+    if not isinstance(store, FolderImages):
+        return []
+    named = {it.image for it in session.views if it.image}
+    folders = {Path(it).parent for it in named} - {Path()}
+    found = (file for it in folders for file in (store.folder / it).glob("*"))
+    paths = (it.relative_to(store.folder).as_posix() for it in found if it.suffix in _ENDINGS)
+    return sorted(set(paths) - named)
+
+
+def other_board(session: Session, unseen: Sequence[View]) -> Finding | None:
+    """Says what images show in which the declared target is not seen.
+
+    Args:
+        session: The session; of one target.
+        unseen: Its views without the target.
+
+    Returns:
+        It; None where nothing else is seen either.
+    """
+    declared = session.target
+    if declared is None or session.targets:
+        return None
+    there = [it for it in unseen if it.image and session.images.exists(it.image)]
+    shown: tuple[View, Identity] | None = None
+    hard: Finding | None = None
+    for view in _some(there):
+        image = decode_image(session.images.read(view.image))
+        if isinstance(image, str):
+            continue
+        why = why_hard_to_see(image, MAX_BLUR_PX)
+        if why:
+            hard = hard or _blurred(view, why, there)
+            continue
+        found = _identified(image)
+        if found is None and _identified(np.ascontiguousarray(image[:, ::-1])) is not None:
+            return _mirrored(view)
+        if found is not None and (shown is None or _is_better(found, shown[1])):
+            shown = view, found
+    if shown is None:
+        return hard
+    view, found = shown
+    return None if _is(found, declared) else _another(view, found, declared)
+
+
+def _identified(image: Image) -> Identity | None:
+    """The board of an image; None where few of its corners are seen, as where it is blurred."""
+    try:
+        found = identify(image)
+    except DataError:
+        return None
+    return found if found.corners_seen >= _CLEARLY * found.corners else None
+
+
+def _is_better(found: Identity, before: Identity) -> bool:
+    return (found.whole, found.corners_seen) > (before.whole, before.corners_seen)
+
+
+def _is(found: Identity, target: Target) -> bool:
+    """Whether a board that was seen is a target, but for its size."""
+    seen = found.target(target.name, target.square_m)
+    same = all(getattr(seen, it) == getattr(target, it) for it in _SEEN)
+    return same and target.dictionary in ("", found.dictionary, *found.larger)
+
+
+def _another(view: View, found: Identity, declared: Target) -> Finding:
+    shipped = (load_target(name, None)[0] for name in target_names())
+    mine = [it.name for it in shipped if _is(found, it) and _as_large(it, declared)]
+    if mine:
+        step = Step(f'In session.toml, write target = "{mine[0]}".')
+    else:
+        step = Step(
+            'In session.toml, write target = "seen.toml", which this command makes; give it the '
+            "measured side of a square.",
+            f"visioncal target check SESSION/{shlex.quote(view.image)} "
+            f"--square-mm {1e3 * declared.square_m:g} -o SESSION/seen.toml",
+        )
+    words = (
+        f"The images show another board than declared: a {describe(found)} (view {view.number}), "
+        f"and {declared.name} is a {_declared(declared)}."
+    )
+    return Finding("other_board", words, step, (view.number,))
+
+
+def _as_large(one: Target, other: Target) -> bool:
+    return abs(one.square_m / other.square_m - 1.0) < _SAME_SIZE
+
+
+def _declared(target: Target) -> str:
+    if target.kind == "checkerboard":
+        return f"checkerboard of {target.columns} x {target.rows} inner corners"
+    if target.kind == "charuco":
+        layout = ", legacy layout" if target.legacy else ""
+        size = f"{target.columns} x {target.rows} squares"
+        return f"ChArUco board of {size}, {target.dictionary}{layout}"
+    if target.kind == "marker":
+        return f"marker {target.marker_id} of {target.dictionary}"
+    return f"target of kind {target.kind}"
+
+
+def _mirrored(view: View) -> Finding:
+    return Finding(
+        "mirrored_images",
+        f"The images are mirrored: the board is seen in view {view.number} only where left and "
+        "right are exchanged.",
+        Step(
+            "Switch off mirroring (flip) in the camera's driver and record again; images that are "
+            "there can be turned back:",
+            f"mogrify -flop SESSION/{Path(view.image).parent.as_posix()}/*",
+        ),
+        (view.number,),
+    )
+
+
+def _blurred(view: View, why: str, views: Sequence[View]) -> Finding:
+    return Finding(
+        "blurred_images",
+        f"No board can be read: in view {view.number}, {why} (limit {MAX_BLUR_PX:g} px).",
+        Step("Focus the lens, expose for a shorter time with more light, and record again."),
+        tuple(it.number for it in views),
+    )
+
+
+def _some(views: Sequence[View]) -> Sequence[View]:
+    """A few views from all over the session."""
+    return views[:: max(len(views) // _LOOKED_AT, 1)][:_LOOKED_AT]

@@ -1,0 +1,50 @@
+"""`visioncal doctor`."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from visioncal.calibration.pipeline.checkup import Checkup, doctor, next_command, to_document
+from visioncal.cli.console import messages
+from visioncal.cli.pointing import naming
+from visioncal.cli.progress import shown_progress
+
+# Something is wrong.
+_EXIT_FINDINGS = 3
+
+
+def doctor_command(
+    session: Annotated[Path, typer.Argument(help="A session's folder, or its .rrd recording.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
+) -> None:
+    """Say what is wrong with a session before it is calibrated, and what to type.
+
+    Files, pairing, units, conventions of the poses, the board, blur, coverage, motion, clocks: in
+    seconds, as nothing is solved. Exit status 0: nothing is wrong; 3: something is; 2: it cannot be
+    read.
+    """
+    with naming(session), shown_progress(quiet=as_json) as told:
+        found = doctor(session, progress=told)
+    if as_json:
+        typer.echo(json.dumps(to_document(found), indent=2))
+    else:
+        _print(found, session)
+    if not found.is_sound:
+        raise typer.Exit(_EXIT_FINDINGS)
+
+
+def _print(found: Checkup, session: Path) -> None:
+    console = messages()
+    console.print(escape(f"{found.session}: {'; '.join(found.seen)}"))
+    for at, it in enumerate(found.findings, 1):
+        console.print(f"[bold]{at}.[/] {escape(it.words)}")
+        if it.do is not None:
+            console.print(escape(f"   {it.do.words}"))
+            if it.do.command:
+                console.print(f"   [bold]{escape(it.do.command)}[/]")
+    if found.is_sound:
+        command = next_command(found, session)
+        console.print(f"[bold green]Nothing is wrong.[/] Next: [bold]{escape(command)}[/]")
