@@ -2,13 +2,13 @@
 
 import json
 from pathlib import Path
-from typing import Annotated
 
 import typer
 from rich.markup import escape
 
 from visioncal.calibration.pipeline.checkup import Checkup, doctor, next_command, to_document
 from visioncal.cli.console import messages
+from visioncal.cli.options import AsJson, SessionArgument
 from visioncal.cli.pointing import naming
 from visioncal.cli.progress import shown_progress
 
@@ -17,8 +17,8 @@ _EXIT_FINDINGS = 3
 
 
 def doctor_command(
-    session: Annotated[Path, typer.Argument(help="A session's folder, or its .rrd recording.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
+    session: SessionArgument,
+    as_json: AsJson = False,
 ) -> None:
     """Say what is wrong with a session before it is calibrated, and what to type.
 

@@ -153,5 +153,6 @@ class DynamicsLimits:
     known_share: float = 0.5
     undetermined_share: float = 0.5
 
+
 # Widest edges of an image that a board is read in, as a Gaussian's sigma [px].
 MAX_BLUR_PX = 4.0
