@@ -12,6 +12,7 @@ from visioncal.calibration.stages.kinematics import FUNCTIONS
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.solve import Solution
+from visioncal.interchange.exports import document
 from visioncal.results.arm import ArmResult, CarriedRegion, CarriesOver
 from visioncal.simulation.arms import forward
 from visioncal.simulation.tracked import Shop, Tracked, above, session_of, tracked
@@ -146,3 +147,36 @@ def test_the_words_name_where_it_is_no_better():
     ).words
     assert "errs by 0.15 mm (as stated 0.98); elsewhere 0.5 of 1.1 mm" in words
     assert "70 % of the workspace; behind the base it is no better than as stated." in words
+
+
+def test_tables_of_the_functions_are_within_their_sigmas(shop, known):
+    found = known.arm_found.functions
+    assert [it.joint for it in found.joints] == list(known.robot.joint_names)
+    angles = np.linspace(-np.pi, np.pi, 180, endpoint=False)
+    nodes = np.linspace(0.0, 2 * np.pi, len(shop.true_arm.beyond), endpoint=False)
+    ratios = []
+    for at, it in enumerate(found.joints):
+        true = 1e3 * np.interp(angles, nodes, shop.true_arm.beyond[:, at], period=2 * np.pi)
+        away, sigma = true - np.array(it.error_mrad), np.array(it.sigma_mrad)
+        # What is constant is the joint's offset.
+        away -= np.sum(away / sigma**2) / np.sum(1 / sigma**2)
+        ratios.append(np.mean(away**2 / sigma**2))
+        # Stops reach to 2.5 rad; beyond, little more is known than beforehand.
+        assert sigma[np.abs(angles) < 2.0].mean() < 0.5 * sigma[np.abs(angles) > 2.9].mean()
+    assert 0.3 < np.mean(ratios) < 2.0
+
+
+def test_corrections_send_each_joint_to_where_it_is_wanted(known):
+    result = result_of(known)
+    written = document(result, "joint-corrections")
+    assert "Without it the flange is off by up to" in written.warnings[0]
+    lines = [it for it in written.text.splitlines() if not it.startswith("#")]
+    assert lines[0] == "joint,angle_deg,correction_deg,sigma_deg"
+    table = np.array([[float(it) for it in line.split(",")[1:]] for line in lines[1:]])
+    degrees, corrections, sigmas = table.reshape(6, 360, 3).transpose(2, 1, 0)
+    chain = result.arm.robot.chain
+    stood = chain.effective(np.deg2rad(degrees + corrections))
+    plain = chain.functions[:, 0] + chain.functions[:, 1] * np.deg2rad(degrees)
+    # Written to a millionth of a degree.
+    np.testing.assert_allclose(stood, plain, atol=2e-8)
+    assert (sigmas > 0.0).all()

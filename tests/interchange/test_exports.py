@@ -85,7 +85,7 @@ def test_any_edge_and_its_inverse(name, edge):
 
 def test_every_format_is_read_by_a_test_and_has_a_name_of_its_own():
     known = set(READERS) | set(TOOL_READERS) | set(FIXTURE_READERS) | LENSES
-    assert set(NAMES) == known | set(readers.ARM_FORMATS)
+    assert set(NAMES) == known | set(readers.ARM_FORMATS) | set(readers.ARM_TABLES)
     assert len(set(NAMES)) == len(NAMES)
 
 

@@ -311,6 +311,8 @@ FIXTURE_READERS = {
 
 # Those of an arm, which test_arm_exports.py reads.
 ARM_FORMATS = ("robot-urdf", "robot-dh", "ur-kinematics", "robot-json")
+# Read by the tests of what they are of.
+ARM_TABLES = ("joint-corrections",)
 
 # By the format's name: every format that holds any transform.
 READERS = {

@@ -6,7 +6,7 @@ import numpy as np
 
 from visioncal.core.transforms import adjoint, invert, skew
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.armmodel import ArmModel
+from visioncal.estimation.armmodel import HARMONICS, ArmModel
 from visioncal.estimation.parts import Noise, Observations, State
 from visioncal.estimation.problem import Linear, Problem
 from visioncal.robot import Loads
@@ -230,3 +230,34 @@ class ArmData:
         left_open = self.error_rad**2 * self.model.left_open(q)
         variances = np.einsum("mij,jk,mik->m", place, seen, place)
         return np.asarray(np.sqrt(variances + np.einsum("mij,mjk,mik->m", moved, left_open, moved)))
+
+    def function_errors(self, angles: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """How far joints turn beyond offset and ratio, and how surely that is known.
+
+        Args:
+            angles: (k,) angles of every joint [rad].
+
+        Returns:
+            (n, k) the error of each joint there, and its standard deviation [rad].
+        """
+        model = self.model
+        count, chain = model.nominal.joint_count, model.bare.chain
+        turned = np.repeat(angles[:, None], count, axis=1)
+        errors = chain.effective(turned) - chain.functions[:, 0] - chain.functions[:, 1] * turned
+        orders = len(model.harmonic_sizes) // (2 * count)
+        phases = np.arange(1, orders + 2) * angles[:, None]
+        waves = np.stack([np.sin(phases), np.cos(phases)], axis=2)
+        first = model.weights["eccentricity"] * waves[:, 0]
+        higher = model.weights[HARMONICS] * waves[:, 1:].reshape(len(angles), -1)
+        eccentric, harmonic = (model.place_of(it) for it in ("eccentricity", HARMONICS))
+        variances = np.zeros((count, len(angles)))
+        for joint in range(count):
+            rows = slice(2 * orders * joint, 2 * orders * (joint + 1))
+            told = higher @ model.harmonic_directions[rows]
+            slopes = np.zeros((len(angles), len(model.values)))
+            slopes[:, harmonic] = told
+            slopes[:, [eccentric.start + joint, eccentric.start + count + joint]] = first
+            whole = np.sum((higher * model.harmonic_sizes[rows]) ** 2, axis=1)
+            variances[joint] = np.einsum("kp,pq,kq->k", slopes, self.arm_covariance, slopes)
+            variances[joint] += self.error_rad**2 * (whole - np.sum(told**2, axis=1))
+        return errors.T, np.sqrt(np.maximum(variances, 0.0))

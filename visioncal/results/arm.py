@@ -112,6 +112,36 @@ class WorkspacePlace:
     sigma_mm: float
 
 
+@dataclass(frozen=True)
+class JointFunction:
+    """How far a joint turns beyond its offset and ratio, by its angle.
+
+    Attributes:
+        joint: Its name.
+        error_mrad: At equal steps from -180 degrees on, all around [mrad].
+        sigma_mrad: The standard deviation of that [mrad].
+    """
+
+    joint: str
+    error_mrad: tuple[float, ...]
+    sigma_mrad: tuple[float, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointFunctions:
+    """Repeatable errors of the joints by their angles.
+
+    Attributes:
+        size_mrad: Their typical size [mrad].
+        length_deg: Over which change of its angle a joint's error changes [deg].
+        joints: Joint by joint.
+    """
+
+    size_mrad: float
+    length_deg: float
+    joints: tuple[JointFunction, ...]
+
+
 Region = Literal["box", "ahead", "beside", "behind"]
 _WHERE = {
     "box": "in the box of the stops",
@@ -246,6 +276,7 @@ class ArmResult(Section):
         workspace_sigma_mm: The predicted sigma of a tool's place over the workspace.
         workspace_map: The same, place by place.
         carries_over: Where it is better than the arm as stated.
+        functions: Repeatable errors of its joints by their angles, at level `functions`.
         observability: How well the stops determine the arm.
         not_told: What they do not determine, in words.
         stops: The stops by their influence, most first.
@@ -262,6 +293,7 @@ class ArmResult(Section):
     workspace_sigma_mm: WorkspaceSigma | None = None
     workspace_map: tuple[WorkspacePlace, ...] = ()
     carries_over: CarriesOver | None = None
+    functions: JointFunctions | None = None
     observability: Observability | None = None
     not_told: tuple[str, ...] | None = None
     stops: tuple[StopInfluence, ...] = ()

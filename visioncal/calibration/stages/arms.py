@@ -9,7 +9,7 @@ import numpy as np
 from visioncal.calibration.stages import backlash, elastic, thermal
 from visioncal.calibration.stages.arm_identifiability import ArmIdentifiability, identify_arm
 from visioncal.calibration.stages.backlash import plays_of
-from visioncal.calibration.stages.carrying import carries_over
+from visioncal.calibration.stages.carrying import carries_over, functions_of
 from visioncal.calibration.stages.elastic import Elastic, springs_of
 from visioncal.calibration.stages.joints import Matched
 from visioncal.calibration.stages.kinematics import (
@@ -49,6 +49,7 @@ from visioncal.results.arm import (
     ArmSections,
     CarriesOver,
     JointBacklash,
+    JointFunctions,
     ThermalResult,
 )
 from visioncal.robot import Convention, Loads
@@ -69,6 +70,7 @@ class ArmFound:
         plays: Of the play in its joints; empty where stops did not come from both sides.
         drift: Its drift with temperature; None for none.
         carries: Where it is better than as stated; None where it stands as stated.
+        functions: Of its joints; None without any.
     """
 
     telling: ArmIdentifiability | None = None
@@ -76,6 +78,7 @@ class ArmFound:
     plays: tuple[JointBacklash, ...] = ()
     drift: ThermalResult | None = None
     carries: CarriesOver | None = None
+    functions: JointFunctions | None = None
 
     def notes(self) -> Iterator[str]:
         """Words what is no reason for doubt."""
@@ -371,6 +374,7 @@ class RobotArm:
             plays_of(data.model, data.arm_covariance),
             drift,
             carries_over(data, self.kinematics) if erring else None,
+            functions_of(data, self.kinematics),
         )
 
     def result(self, found: ArmFound, views: Sequence[int]) -> ArmSections:
@@ -387,7 +391,12 @@ class RobotArm:
         )
         if sections.arm is None or self.kinematics is None or self.model is None:
             return sections
-        arm = replace(sections.arm, robot=self.model.robot, backlash=found.plays)
+        arm = replace(
+            sections.arm,
+            robot=self.model.robot,
+            backlash=found.plays,
+            functions=found.functions,
+        )
         if found.telling is not None:
             zero = None if self.matched is None else self.matched.zero
             arm = found.telling.told_of(arm, self.model.nominal, views, zero)

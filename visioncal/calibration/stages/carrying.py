@@ -1,4 +1,4 @@
-"""Stage 7: where a calibrated arm is better than the arm as stated, and where it is not."""
+"""Stage 7: where a calibrated arm is better than as stated, and what its joints' functions are."""
 
 from dataclasses import dataclass
 
@@ -10,13 +10,21 @@ from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.armpair import ArmData, ArmPair
 from visioncal.estimation.workspace import postures
-from visioncal.results.arm import CarriedRegion, CarriesOver, Region
+from visioncal.results.arm import (
+    CarriedRegion,
+    CarriesOver,
+    JointFunction,
+    JointFunctions,
+    Region,
+)
 
 # What real arms of a metre's reach err by in another session, beyond what one session shows of
 # them: warmth, wear, another mount [m per m of reach]. Of a UR10, 0.15 to 0.2 mm after months.
 _SESSION_SHARE = 1.2e-4
 # It is better where it errs by less than this share of what the arm as stated errs by.
 _BETTER = 0.8
+# At so many angles all around functions of the joints are told.
+_ANGLES = 180
 # Ahead of the base, and behind it, is so far from the middle of the stops about its axis [rad].
 _AHEAD, _BEHIND = np.pi / 3, 2 * np.pi / 3
 
@@ -60,6 +68,23 @@ def carries_over(arm: ArmData, kinematics: Kinematics) -> CarriesOver:
         session_mm=1e3 * found.session_m,
         better_share=float(np.mean(found.sigmas_m < _BETTER * found.nominal_m)),
         regions=tuple(_region(name, found, it) for name, it in regions.items() if it.any()),
+    )
+
+
+def functions_of(arm: ArmData, kinematics: Kinematics) -> JointFunctions | None:
+    """The functions of an arm's joints as tables; None where none were found."""
+    found = kinematics.functions
+    if found is None:
+        return None
+    errors, sigmas = arm.function_errors(np.linspace(-np.pi, np.pi, _ANGLES, endpoint=False))
+    rows = zip(arm.model.nominal.joint_names, 1e3 * errors, 1e3 * sigmas, strict=True)
+    return JointFunctions(
+        size_mrad=1e3 * found.sigma_rad,
+        length_deg=float(np.rad2deg(found.length_rad)),
+        joints=tuple(
+            JointFunction(name, tuple(error.tolist()), tuple(sigma.tolist()))
+            for name, error, sigma in rows
+        ),
     )
 
 

@@ -12,7 +12,7 @@ from visioncal.interchange.exports.content import Selection
 from visioncal.interchange.exports.format import Takes
 from visioncal.interchange.exports.sources import Source
 from visioncal.results import Calibration, Verdict
-from visioncal.results.arm import WorkspaceSigma
+from visioncal.results.arm import JointFunctions, WorkspaceSigma
 from visioncal.robot import (
     CONVENTIONS,
     Convention,
@@ -40,6 +40,7 @@ class ArmContent:
         verdict: Whether it can be trusted.
         sigma_mm: Predicted standard deviation of a tool's place over the workspace;
             None where that is not known.
+        functions: Repeatable errors of its joints by their angles; None where none were found.
         convention: In which form joints are tabulated, where that was said.
         calibration_hash: What marks the arm for its driver, where that was said.
         sag_mm: How far the flange of an arm whose joints bend stands off at the most under its own
@@ -53,6 +54,7 @@ class ArmContent:
     origin: str
     verdict: Verdict
     sigma_mm: WorkspaceSigma | None
+    functions: JointFunctions | None = None
     convention: Convention | None = None
     calibration_hash: str | None = None
     sag_mm: float = 0.0
@@ -175,6 +177,7 @@ def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmCont
         f"calibrated by visioncal from {source.session_name!r}, {source.created}",
         source.verdict,
         arm.workspace_sigma_mm,
+        arm.functions,
         None if selection.convention is None else _convention(selection.convention),
         selection.calibration_hash,
         _sag_mm(source),

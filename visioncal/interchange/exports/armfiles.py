@@ -1,11 +1,12 @@
-"""A calibrated arm as a file: URDF, joint table, the kinematics of UR's driver, and a chain."""
+"""A calibrated arm as a file: URDF, joint table, UR's kinematics, a chain, joints' corrections."""
 
 import json
 
 import numpy as np
 
 from visioncal.core.transforms import log
-from visioncal.interchange.exports.arm import ArmContent, ArmFormat
+from visioncal.core.types import IntArray
+from visioncal.interchange.exports.arm import ArmContent, ArmFormat, omission_mm
 from visioncal.robot import (
     DHTable,
     corrected_tip,
@@ -105,6 +106,42 @@ def _write_chain(content: ArmContent) -> str:
     return json.dumps(document, indent=2, allow_nan=False) + "\n"
 
 
+def _write_corrections(content: ArmContent) -> str:
+    """A table of corrections: a line for each joint and degree."""
+    robot, degrees = content.robot, np.arange(-180, 180)
+    angles = np.repeat(np.deg2rad(degrees)[:, None], robot.joint_count, axis=1)
+    chain = robot.chain
+    wanted = chain.functions[:, 0] + chain.functions[:, 1] * angles
+    corrections = np.rad2deg(chain.encoded(wanted) - angles)
+    lines = [f"# {it}" for it in content.notes]
+    lines.append("joint,angle_deg,correction_deg,sigma_deg")
+    for at, joint in enumerate(robot.joint_names):
+        if chain.prismatic[at]:
+            continue
+        sigmas = _sigmas_deg(content, at, degrees)
+        rows = zip(degrees.tolist(), corrections[:, at].tolist(), sigmas, strict=True)
+        lines += [f"{joint},{angle},{more:.6f},{sigma}" for angle, more, sigma in rows]
+    return "\n".join([*lines, ""])
+
+
+def _sigmas_deg(content: ArmContent, joint: int, degrees: IntArray) -> list[str]:
+    """What corrections of a joint are known to; nothing where that is not known."""
+    if content.functions is None:
+        return [""] * len(degrees)
+    known = np.rad2deg(1e-3 * np.array(content.functions.joints[joint].sigma_mrad))
+    nodes = np.linspace(-180.0, 180.0, len(known), endpoint=False)
+    return [f"{it:.6f}" for it in np.interp(degrees, nodes, known, period=360.0).tolist()]
+
+
+def _warn_corrections(content: ArmContent) -> tuple[str, ...]:
+    return (
+        "It corrects what joints err by as functions of their angles, for links and offsets as "
+        "--to robot-dh or robot-urdf has them: send each joint to its angle and the correction "
+        f"there. Without it the flange is off by up to {omission_mm(content.robot):.2g} mm.",
+        *(f"{it}." for it in content.omitted),
+    )
+
+
 def _left_out(content: ArmContent) -> tuple[str, ...]:
     return (f"{content.left_out}.",) if content.left_out else ()
 
@@ -135,4 +172,11 @@ ROBOT_JSON = ArmFormat(
     _write_chain,
 )
 
-ARMS = (ROBOT_URDF, ROBOT_DH, UR_KINEMATICS, ROBOT_JSON)
+JOINT_CORRECTIONS = ArmFormat(
+    "joint-corrections",
+    "what to add to each joint's angle, degree by degree, for encoders that err (CSV) [deg]",
+    _write_corrections,
+    warn=_warn_corrections,
+)
+
+ARMS = (ROBOT_URDF, ROBOT_DH, UR_KINEMATICS, ROBOT_JSON, JOINT_CORRECTIONS)

@@ -1,0 +1,382 @@
+"""Arms whose joints err by functions of their angles: real ones from session to session, simulated.
+
+    PYTHONPATH=tests python tests/benchmarks/joint_functions.py [WORLDS]
+
+An arm is calibrated on one recording and judged on another, whose frames (instrument and probe)
+are fitted anew on twelve of its stops; the others are predicted. By stop, the squared error over
+what is predicted of it: posterior of all errors of the arm, frames, noise, and the share of another
+session. Simulated arms are judged with the frames of the calibration.
+"""
+
+import csv
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from results import QUICK, few, first, wished, write_section
+from scipy.spatial.transform import Rotation
+from support import thirdparty
+from support.tracked import known_of
+
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.stages.kinematics import FUNCTIONS
+from visioncal.core.transforms import adjoint, exp, invert, log
+from visioncal.core.types import FloatArray
+from visioncal.estimation import joint_functions
+from visioncal.estimation.armmodel import HARMONICS
+from visioncal.estimation.solve import Solution
+from visioncal.session import Session
+from visioncal.simulation.arms import forward
+from visioncal.simulation.tracked import Tracked, above, session_of, tracked
+
+WORLDS = 10
+SESSIONS = Path(__file__).parents[3] / "shared" / "data" / "sessions"
+# Stops on which the frames of another recording are fitted, and how often these are drawn.
+ANCHORS, DRAWS = 12, 6
+SERIES = {it: f"ur10_tracker_series_{it}" for it in "ac"}
+MECA = {it: f"meca500_tracker_{it}" for it in ("small", "large")}
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Joints (m, n) [rad] and the probe's pose (m, 4, 4) in the instrument, or its place alone."""
+
+    q: FloatArray
+    read: FloatArray
+    turned: bool
+
+
+def recording(name: str) -> Recording:
+    """Reads a recording; readings of one stop are averaged."""
+    with (SESSIONS / name / "views.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    joints = [key for key in rows[0] if key.startswith("q") and key.endswith("_rad")]
+    q = np.array([[float(row[key]) for key in joints] for row in rows])
+    read = np.tile(np.eye(4), (len(rows), 1, 1))
+    read[:, :3, 3] = [[float(row[f"meas_{axis}_m"]) for axis in "xyz"] for row in rows]
+    turned = "meas_qx" in rows[0]
+    if turned:
+        quaternions = [[float(row[f"meas_q{axis}"]) for axis in "xyzw"] for row in rows]
+        read[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix()
+    stops = [row.get("stop", str(at)) for at, row in enumerate(rows)]
+    firsts = [stops.index(it) for it in dict.fromkeys(stops)]
+    for at in firsts:
+        mine = [row for row, stop in enumerate(stops) if stop == stops[at]]
+        read[at, :3, 3] = read[mine, :3, 3].mean(axis=0)
+    return Recording(q[firsts], read[firsts], turned)
+
+
+def part_of(name: str, count: int, seed: int, folder: Path) -> Session:
+    """So many stops of a recording, drawn from those that its session does not hold back."""
+    lines = (SESSIONS / name / "views.csv").read_text().splitlines()
+    rows = [it for it in lines[1:] if "holdout" not in it]
+    chosen = np.sort(np.random.default_rng(seed).choice(len(rows), count, replace=False))
+    folder.mkdir(parents=True)
+    (folder / "session.toml").write_text((SESSIONS / name / "session.toml").read_text())
+    (folder / "views.csv").write_text("\n".join([lines[0], *(rows[it] for it in chosen), ""]))
+    return Session.load(folder)
+
+
+def slopes(flange: FloatArray, x: FloatArray, z: FloatArray) -> FloatArray:
+    """(m, 6, 12) how the probe moves with the instrument's frame and the probe's."""
+    by_x = -adjoint(invert(flange @ z) @ x)
+    return np.concatenate([by_x, np.broadcast_to(np.eye(6), by_x.shape)], axis=2)
+
+
+def predicted_covariance(known: RunState, q: FloatArray, z: FloatArray) -> FloatArray:
+    """(6 m, 6 m) of the probe at (m, n) joints by what is open about the arm, and its noise."""
+    answer, arm = known.solved, known.robot_arm
+    fit = Solution(answer.state, answer.noise)
+    data, model = arm.data(answer.problem, fit, answer.covariance, {}), arm.model
+    carried = adjoint(invert(z))
+    basis = (carried @ model.basis(q)).reshape(6 * len(q), -1)
+    found = basis @ data.arm_covariance @ basis.T
+    if HARMONICS in model.weights:
+        orders = len(model.harmonic_sizes) // (2 * model.nominal.joint_count)
+        moved = carried @ model.robot.harmonic_jacobian(q, orders)
+        moved = data.error_rad * model.weights[HARMONICS] * moved.reshape(6 * len(q), -1)
+        whole, told = moved * model.harmonic_sizes, moved @ model.harmonic_directions
+        found += whole @ whole.T - told @ told.T
+    noise = carried @ np.diag(np.repeat(answer.noise.robots[0], 3) ** 2) @ carried.T
+    return found + np.kron(np.eye(len(q)), noise)
+
+
+def placed(
+    flange: FloatArray, other: Recording, rows: FloatArray, start: tuple[FloatArray, FloatArray]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Fits the frames on some rows.
+
+    Returns:
+        The instrument's frame and the probe's, and (6 m, 6 r) how residuals of all follow those of
+        the rows.
+    """
+    (x, z), counts = start, few(40, 40)
+    # A mrad weighs as much as half a millimetre; of places alone rotation does not count.
+    weights = np.tile(np.repeat([0.5 if other.turned else 0.0, 1.0], 3), len(rows))
+    for _ in range(counts):
+        slope = slopes(flange, x, z)
+        away = residuals(flange, other, x, z)
+        inverse = np.linalg.pinv(weights[:, None] * slope[rows].reshape(-1, 12), rcond=1e-10)
+        step = inverse @ (weights * away[rows].ravel())
+        x, z = x @ exp(step[None, :6])[0], z @ exp(step[None, 6:])[0]
+        if np.abs(step).max() < 1e-10:
+            break
+    return x, z, slope.reshape(-1, 12) @ inverse * weights
+
+
+def residuals(flange: FloatArray, other: Recording, x: FloatArray, z: FloatArray) -> FloatArray:
+    """(m, 6) of the probe, or of its place alone."""
+    error = invert(invert(x) @ flange @ z) @ other.read
+    found = log(error)
+    if not other.turned:
+        found = np.concatenate([np.zeros_like(found[:, :3]), error[:, :3, 3]], axis=1)
+    return found
+
+
+@dataclass(frozen=True)
+class Carried:
+    """Errors of places [mm] by the arm as stated and as calibrated, and over what is predicted."""
+
+    nominal_mm: float
+    mm: float
+    ratio: float
+    predicted_mm: float
+
+
+def carried_over(known: RunState, other: Recording) -> Carried:
+    """How an arm predicts another recording, its frames fitted on a few of the stops."""
+    arm, edges = known.robot_arm, known.solved.state.edges
+    stated = arm.matched.arm.base_from_flange(other.q)
+    calibrated = stated if arm.model is None else arm.model.base_from_flange(other.q)
+    squares, predicted, session = {"stated": [], "calibrated": []}, [], 0.0
+    among = None
+    if arm.model is not None:
+        among = predicted_covariance(known, other.q, edges[1])
+        session = (1e-3 * known.arm_found.carries.session_mm) ** 2
+    for draw in range(few(DRAWS, 1)):
+        rows = np.random.default_rng(draw).choice(len(other.q), ANCHORS, replace=False)
+        rest = np.setdiff1d(np.arange(len(other.q)), rows)
+        for name, flange in (("stated", stated), ("calibrated", calibrated)):
+            x, z, followed = placed(flange, other, rows, (edges[0], edges[1]))
+            away = residuals(flange, other, x, z)[rest, 3:]
+            squares[name].append(np.sum(away**2, axis=1))
+        if among is None:
+            continue
+        shares = -followed
+        mine = (6 * rows[:, None] + np.arange(6)).ravel()
+        places = (6 * rest[:, None] + np.arange(3, 6)).ravel()
+        taken = shares[np.ix_(places, np.arange(len(mine)))]
+        cross = np.sum(taken * among[np.ix_(places, mine)], axis=1)
+        own = np.sum((taken @ among[np.ix_(mine, mine)]) * taken, axis=1)
+        variances = np.diag(among)[places] + 2.0 * cross + own
+        predicted.append(variances.reshape(-1, 3).sum(axis=1) + session)
+    found = {name: np.concatenate(it) for name, it in squares.items()}
+    rms = {name: 1e3 * float(np.sqrt(it.mean())) for name, it in found.items()}
+    if not predicted:
+        return Carried(rms["stated"], rms["calibrated"], np.nan, np.nan)
+    variance = np.concatenate(predicted)
+    ratio = float(found["calibrated"].mean() / variance.mean())
+    return Carried(rms["stated"], rms["calibrated"], ratio, 1e3 * float(np.sqrt(variance.mean())))
+
+
+def without_functions(session: Session) -> RunState:
+    """The calibration with the levels that are no functions of the joints."""
+    usual, joint_functions.SIGNIFICANT = joint_functions.SIGNIFICANT, np.inf
+    known = known_of(session)
+    joint_functions.SIGNIFICANT = usual
+    return known
+
+
+def cross_row(words: str, session: Session, other: Recording) -> str:
+    """One line of the first table."""
+    begun = time.perf_counter()
+    ours = known_of(session)
+    seconds = time.perf_counter() - begun
+    before = without_functions(session)
+    found, was = carried_over(ours, other), carried_over(before, other)
+    levels = [it.robot_arm.kinematics for it in (before, ours)]
+    return (
+        f"| {words} | {levels[1].level} "
+        f"| {levels[0].chosen.left_out.mm:.3f}, {levels[1].chosen.left_out.mm:.3f} "
+        f"| {found.nominal_mm:.2f} | {was.mm:.3f} | {was.ratio:.1f} | {found.mm:.3f} "
+        f"| {found.ratio:.2f} | {seconds:.0f} |"
+    )
+
+
+def crossings(folder: Path) -> list[str]:
+    """The first table: one recording by another."""
+    pairs = [
+        ("UR10, c by a", "c", "a"),
+        ("UR10, a by c", "a", "c"),
+    ]
+    rows = []
+    for words, of, by in first(pairs):
+        session = Session.load(SESSIONS / SERIES[of])
+        if QUICK:
+            session = part_of(SERIES[of], 24, 0, folder / "quick")
+        rows.append(cross_row(words, session, recording(SERIES[by])))
+    for draw in range(few(3, 0)):
+        for of, by in (("c", "a"), ("a", "c")):
+            session = part_of(SERIES[of], 60, draw, folder / f"{of}{draw}")
+            words = f"UR10, 60 stops of {of} by {by}, {draw + 1}"
+            rows.append(cross_row(words, session, recording(SERIES[by])))
+    for of, by in (("small", "large"), ("large", "small"))[: few(2, 0)]:
+        session = Session.load(SESSIONS / MECA[of])
+        rows.append(cross_row(f"Meca500, {of} by {by}", session, recording(MECA[by])))
+    return rows
+
+
+def within(words: str, session: Session) -> str:
+    """One line of the second table: stops left out, before and now."""
+    before, ours = without_functions(session), known_of(session)
+    was, now = before.robot_arm.kinematics, ours.robot_arm.kinematics
+    return (
+        f"| {words} | {was.levels[0].left_out.mm:.3f} | {was.level}, {was.chosen.left_out.mm:.3f} "
+        f"| {now.level}, {now.chosen.left_out.mm:.3f} | {ours.verdict.status} |"
+    )
+
+
+def others() -> list[str]:
+    """The second table: other arms."""
+    data = SESSIONS.parent
+    real: list[tuple[str, Callable[[], Session]]] = [
+        ("ROKAE, 30 poses by a laser", lambda: thirdparty.rokae(data)),
+        ("IRB 120, 36 places", lambda: thirdparty.irb120(data)),
+        ("TALOS, 61 contacts", lambda: thirdparty.talos(data)),
+    ]
+    return [within(words, session()) for words, session in first(real)]
+
+
+@dataclass(frozen=True)
+class World:
+    """Simulated stops: how many, over which range of the joints, and the functions of these."""
+
+    stops: int
+    range_rad: float
+    function_rad: float
+    length_rad: float
+
+    def tried(self, seed: int) -> tuple[bool, float, float, float, float, float, float]:
+        """Whether functions were taken; errors inside and outside [mm]; over predicted; seconds."""
+        options = Tracked(
+            stops=self.stops,
+            poses=True,
+            dh_sigma_m=5e-4,
+            dh_sigma_rad=7e-4,
+            function_sigma_rad=self.function_rad,
+            function_length_rad=self.length_rad,
+            seed=seed,
+        )
+        rng = np.random.default_rng([seed, 5])
+        anywhere = above(tracked(options, np.zeros((1, 6))).arm, self.stops + 400, rng)
+        middle = np.array([0.3, -1.2, 1.4, -0.4, 1.2, 0.1])
+        boxed = middle + rng.uniform(-1, 1, (self.stops + 100, 6)) * self.range_rad
+        near = boxed if self.range_rad < 2.5 else anywhere
+        shop = tracked(options, near[: self.stops])
+        session, begun = session_of(shop), time.perf_counter()
+        ours = known_of(session)
+        seconds = time.perf_counter() - begun
+        before = without_functions(session)
+        inside, outside = near[self.stops : self.stops + 100], anywhere[-200:]
+
+        def away(known: RunState, q: FloatArray) -> FloatArray:
+            x, z = known.solved.state.edges[:2]
+            arm = known.robot_arm
+            flange = (arm.model or arm.matched.arm).base_from_flange(q)
+            true = forward(shop.true_arm, q) @ shop.flange_from_probe
+            error = invert(invert(x) @ flange @ z) @ invert(shop.base_from_instrument) @ true
+            return np.sum(error[:, :3, 3] ** 2, axis=1)
+
+        ratios, answer = [], ours.solved
+        data = ours.robot_arm.data(
+            answer.problem, Solution(answer.state, answer.noise), answer.covariance, {}
+        )
+        for q in (inside, outside):
+            variances = data.place_sigmas_m(q) ** 2 if data else np.array([np.nan])
+            ratios.append(away(ours, q).mean() / variances.mean())
+        errors = [away(it, outside).mean() for it in (before, ours)]
+        return (
+            ours.robot_arm.kinematics.level == FUNCTIONS,
+            1e3 * float(np.sqrt(away(ours, inside).mean())),
+            1e3 * float(np.sqrt(errors[1])),
+            float(np.sqrt(errors[1] / errors[0])),
+            float(ratios[0]),
+            float(ratios[1]),
+            seconds,
+        )
+
+    def row(self, worlds: int) -> str:
+        """One line of the third table."""
+        found = np.array([self.tried(seed) for seed in range(worlds)], dtype=float)
+        taken, inside, outside, share, ratio, ratio_out, seconds = found.T
+        functions = f"{1e3 * self.function_rad:.1f}, {self.length_rad:.2f}"
+        return (
+            f"| {self.stops} | {self.range_rad:.1f} | {functions if self.function_rad else 'none'} "
+            f"| {int(taken.sum())} of {worlds} "
+            f"| {np.median(inside):.3f} | {np.median(outside):.3f} "
+            f"| {np.median(share):.2f} | {ratio.mean():.2f} | {ratio_out.mean():.2f} "
+            f"| {np.median(seconds):.0f} |"
+        )
+
+
+WORLD_ROWS = (
+    World(30, 0.4, 3e-4, 0.06),
+    World(30, 2.5, 3e-4, 0.06),
+    World(60, 0.4, 3e-4, 0.06),
+    World(60, 2.5, 3e-4, 0.06),
+    World(60, 2.5, 1e-4, 0.06),
+    World(60, 2.5, 5e-4, 0.03),
+    World(60, 2.5, 2e-4, 0.5),
+    World(120, 2.5, 3e-4, 0.06),
+    World(30, 2.5, 0.0, 0.06),
+    World(60, 0.4, 0.0, 0.06),
+    World(60, 2.5, 0.0, 0.06),
+)
+
+
+def main(worlds: int) -> None:
+    """Prints the tables and keeps them."""
+    with tempfile.TemporaryDirectory() as folder:
+        crossed = crossings(Path(folder))
+    real = others()
+    rows = first(WORLD_ROWS)
+    if QUICK:
+        rows = [replace(rows[0], length_rad=0.25)]
+    simulated = [it.row(worlds) for it in rows]
+    text = "\n".join(
+        [
+            "One recording by another: RMS of places [mm], the frames fitted on 12 stops. Left",
+            "out: at stops left out of the fit, by the levels before and by the one that was",
+            "taken. Over predicted: mean squared error over what is predicted.",
+            "",
+            "| recordings | taken | left out | as stated | levels before | over predicted "
+            "| now | over predicted | s |",
+            "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+            *crossed,
+            "",
+            "Other arms: RMS at stops left out of the fit [mm].",
+            "",
+            "| arm | as stated | levels before | now | verdict |",
+            "| --- | --- | --- | --- | --- |",
+            *real,
+            "",
+            f"Simulated arms ({worlds} worlds a row; 0.5 mm, 0.7 mrad; poses by a tracker): ranges",
+            "of the joints [rad], size [mrad] and length [rad] of the functions, how often they",
+            "were taken, RMS errors [mm] in that range and all over, the latter over that of the",
+            "levels before, and squared error over predicted in the range and all over.",
+            "",
+            "| stops | range | functions | taken | in it | all over | share "
+            "| over predicted | all over | s |",
+            "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+            *simulated,
+        ]
+    )
+    command = "PYTHONPATH=tests python tests/benchmarks/joint_functions.py"
+    write_section("Functions of the joints", command, text)
+
+
+if __name__ == "__main__":
+    main(wished(WORLDS))
