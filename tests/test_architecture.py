@@ -44,6 +44,8 @@ HOMES = {
     "rtde_receive": {"live.drivers"},
     "torch": {"vision.dense"},
     "kornia": {"vision.dense"},
+    "dask": {"interchange.batch"},
+    "distributed": {"interchange.batch"},
 }
 
 

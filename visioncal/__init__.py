@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from visioncal.frames.plane import Plane
     from visioncal.frames.single_view import Sight
     from visioncal.frames.target_pose import place_seen
+    from visioncal.interchange.batch import Batch, batch
     from visioncal.results import Alignment, Calibration
     from visioncal.results.compensation import CalibratedArm, Corrected, correct
     from visioncal.robot import Loads
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "Alignment": "visioncal.results",
+    "Batch": "visioncal.interchange.batch",
     "CalibratedArm": "visioncal.results.compensation",
     "Calibration": "visioncal.results",
     "Checkup": "visioncal.calibration.pipeline.checkup",
@@ -58,6 +60,7 @@ _HOMES = {
     "Sight": "visioncal.frames.single_view",
     "VisioncalError": "visioncal.core.errors",
     "align": "visioncal.calibration.pipeline",
+    "batch": "visioncal.interchange.batch",
     "calibrate": "visioncal.calibration.pipeline",
     "doctor": "visioncal.calibration.pipeline.checkup",
     "locate": "visioncal.frames.locate",
@@ -70,6 +73,7 @@ _HOMES = {
 
 __all__ = [
     "Alignment",
+    "Batch",
     "CalibratedArm",
     "Calibration",
     "Checkup",
@@ -87,6 +91,7 @@ __all__ = [
     "VisioncalError",
     "__version__",
     "align",
+    "batch",
     "calibrate",
     "correct",
     "doctor",

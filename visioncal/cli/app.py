@@ -22,6 +22,7 @@ class _Commands(LazyGroup):
         "rehearse": "Plan, record and calibrate a simulated cell by the real client libraries.",
         "calibrate": "Turn a session into a hand-eye calibration, with reasons to trust it or not.",
         "doctor": "Say what is wrong with a session before it is calibrated, and what to type.",
+        "batch": "Calibrate many sessions at once, and tell which stand out of their fleet.",
         "align": "Put several robots, cameras and boards in one frame, adjusted together.",
         "report": "Make the report of an earlier calibration again.",
         "verify": "Tell whether a calibration still holds, and what has changed if it does not.",

@@ -21,6 +21,7 @@ WORDS = {
     "examine": "leave views out and predict them",
     "judge": "judge the result",
     "write": "write the result, report and recording",
+    "batch": "calibrate the sessions",
     "render": "render the images",
     "candidates": "collect possible stops",
     "information": "compute the information of each stop",

@@ -10,7 +10,7 @@ from visioncal.core.types import FloatArray, Image
 from visioncal.results.evidence import ViewEvidence
 from visioncal.vision.finders.imaging import decode_image
 
-_WIDTH_PX = 720
+_WIDTH_PX, _SMALL_PX = 720, 240
 _JPEG_QUALITY = 78
 # A crop is this many times as large as the corners' extent, and a little of the image more.
 _ROOM, _LEAST_SHARE = 1.25, 0.05
@@ -125,3 +125,13 @@ def _jpeg_uri(image: Image) -> str:
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     _, encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode("ascii")
+
+
+def small_picture(image_bytes: bytes) -> bytes | None:
+    """A JPEG of an image for a listing; None where the bytes are no image that can be shown."""
+    pixels = decode_image(image_bytes, colour=True)
+    if isinstance(pixels, str):
+        return None
+    scale = _SMALL_PX / pixels.shape[1]
+    small = cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return bytes(cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1])

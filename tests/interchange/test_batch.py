@@ -1,0 +1,231 @@
+"""Many sessions at once: what a worker gives, what its death costs, and what is kept."""
+
+import os
+import signal
+from dataclasses import replace
+
+import pytest
+from pyarrow import parquet
+from support.commands import visioncal
+
+from visioncal.calibration.pipeline import run
+from visioncal.core.errors import DataError
+from visioncal.interchange.batch import Options, batch, jobs_of, workers
+from visioncal.interchange.batch import run as batch_run
+from visioncal.interchange.batch.work import work
+from visioncal.interchange.outputs import RECORDING, REPORT
+from visioncal.results import Calibration, to_document
+from visioncal.simulation import CellOptions, simulate, write_session
+
+BARE = (REPORT, RECORDING)
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory):
+    """Four sound sessions of two robots, one folder without a session, one with a broken table."""
+    folder = tmp_path_factory.mktemp("fleet")
+    for seed in range(4):
+        cell = simulate(CellOptions(views=10, seed=seed))
+        write_session(cell, folder / f"robot_{seed % 2}" / f"week_{seed // 2}", images=False)
+    (folder / "empty").mkdir()
+    broken = write_session(simulate(CellOptions(views=10)), folder / "broken", images=False)
+    table = broken / "views.csv"
+    table.write_text(table.read_text().replace("0.", "zero.", 1))
+    return folder
+
+
+@pytest.fixture
+def processes(monkeypatch):
+    """Works without Dask, whether it is there or not."""
+    monkeypatch.setattr(workers, "find_spec", lambda _: None)
+
+
+@pytest.fixture
+def here(monkeypatch):
+    """Works in this process: what its workers are does not matter."""
+    monkeypatch.setattr(batch_run, "rows_of", lambda jobs, *_: map(work, jobs))
+
+
+def facts(found: Calibration):
+    return to_document(replace(found, created=""))
+
+
+def expect_results_of_calibrate(fleet, out, rows):
+    done = {it.name: it for it in rows if it.state == "done"}
+    assert sorted(done) == [f"robot_{it}/week_{at}" for it in (0, 1) for at in (0, 1)]
+    for name, row in done.items():
+        alone = run(fleet / name).calibration
+        verdict = alone.verdict.with_paths(fleet / name, out.absolute() / name)
+        found = Calibration.load(out / name)
+        assert facts(found) == facts(replace(alone, verdict=verdict))
+        assert (row.residual_mm, row.used) == (found.rms.mm, 10)
+    failed = {it.name: it for it in rows if it.state == "failed"}
+    assert sorted(failed) == ["broken", "empty"]
+    assert "session.toml does not exist" in failed["empty"].words
+    assert "zero." in failed["broken"].words
+    assert {it.error for it in failed.values()} == {"DataError"}
+
+
+@pytest.mark.usefixtures("processes")
+def test_results_are_those_of_calibrate_and_errors_are_rows(fleet, tmp_path):
+    found = batch(fleet / "*", tmp_path, workers=2, without=BARE)
+    expect_results_of_calibrate(fleet, tmp_path, found.rows)
+    table = parquet.read_table(found.table).to_pylist()
+    assert [it["name"] for it in table] == [it.name for it in found.rows]
+    assert {it["residual_mm"] for it in table} == {it.residual_mm for it in found.rows}
+    page = found.page.read_text()
+    assert all(it.name in page for it in found.rows)
+
+
+@pytest.mark.usefixtures("here")
+def test_what_was_done_is_kept(fleet, tmp_path):
+    found = batch(fleet / "robot_*", tmp_path, without=BARE)
+
+    def of(name):
+        return (tmp_path / name / "calibration.json").stat().st_mtime_ns
+
+    before = {it.name: of(it.name) for it in found.rows}
+    (tmp_path / "robot_1/week_1/calibration.json").unlink()
+    again = batch(fleet / "robot_*", tmp_path, without=BARE, against=tmp_path)
+    states = {it.name: it.state for it in again.rows}
+    assert states.pop("robot_1/week_1") == "done"
+    assert set(states.values()) == {"kept"}
+    assert all(of(name) == before[name] for name in states)
+    assert again.counts["changed"] == 0
+    # Other options are other results.
+    asked = batch(fleet / "robot_*", tmp_path, without=BARE, need_mm=1.0)
+    assert [it.state for it in asked.rows] == 4 * ["done"]
+
+
+@pytest.mark.usefixtures("processes")
+def test_a_worker_that_dies_loses_nothing(fleet, tmp_path, monkeypatch):
+    asked, died = workers._asked, []
+
+    def mortal(worker, job):
+        if job.name.endswith("week_0") and ("robot_1" in job.name or not died):
+            died.append(job.name)
+            worker.kill()
+        return asked(worker, job)
+
+    monkeypatch.setattr(workers, "_asked", mortal)
+    rows = batch([fleet / "robot_0", fleet / "robot_1"], tmp_path, workers=1, without=BARE).rows
+    states = {it.name: it.state for it in rows}
+    assert died == ["robot_0/week_0", *3 * ["robot_1/week_0"]]
+    assert states == {
+        "robot_0/week_0": "done",
+        "robot_0/week_1": "done",
+        "robot_1/week_0": "failed",
+        "robot_1/week_1": "done",
+    }
+    (lost,) = (it for it in rows if it.state == "failed")
+    assert lost.error == "WorkerDied"
+    assert "died 3 times" in lost.words
+
+
+def test_sessions_are_found_and_named(fleet, tmp_path):
+    jobs = jobs_of([fleet / "robot_0", str(fleet / "robot_1" / "*_1")], tmp_path, Options())
+    assert [it.name for it in jobs] == ["robot_0/week_0", "robot_0/week_1", "robot_1/week_1"]
+    assert jobs[2].folder == tmp_path / "robot_1" / "week_1"
+    (only,) = jobs_of([fleet / "robot_0" / "week_0"], tmp_path, Options())
+    assert only.name == "week_0"
+    (missing,) = jobs_of([tmp_path / "missing"], tmp_path, Options())
+    assert missing.name == "missing"
+    with pytest.raises(DataError, match="there is no session"):
+        jobs_of([str(tmp_path / "*" / "none_*")], tmp_path, Options())
+    (tmp_path / "both").mkdir()
+    (tmp_path / "both.rrd").touch()
+    with pytest.raises(DataError, match="two sessions are called both"):
+        jobs_of([str(tmp_path / "both*")], tmp_path, Options())
+
+
+@pytest.mark.usefixtures("here")
+def test_a_changed_result_is_told(fleet, tmp_path):
+    old, new = tmp_path / "old", tmp_path / "new"
+    batch(fleet / "robot_0", old, workers=1, without=BARE)
+    file = old / "week_0" / "calibration.json"
+    found = Calibration.load(file)
+    name, edge = next(iter(found.edges.items()))
+    matrix = edge.matrix.copy()
+    matrix[0, 3] += 3e-3 * edge.sigma_mm
+    replace(found, edges={**found.edges, name: replace(edge, matrix=matrix)}).save(file)
+    done = visioncal("batch", fleet / "robot_0", "-o", new, "--against", old, "--workers", 1)
+    assert done.status == 0
+    assert "2 sessions: 2 good, 1 changed" in done.err
+    assert f"week_0: {name} moved by" in done.err
+    assert "What changed" in (new / "index.html").read_text()
+    assert (new / "week_1" / "report.html").exists()
+    nothing = visioncal("batch", fleet / "empty", "-o", tmp_path / "nothing")
+    assert nothing.status == 2
+    assert "session.toml does not exist" in nothing.err
+
+
+@pytest.mark.usefixtures("processes")
+def test_a_scheduler_needs_the_extra(fleet, tmp_path):
+    done = visioncal("batch", fleet / "robot_0", "-o", tmp_path, "--scheduler", "tcp://x:1")
+    assert done.status == 2
+    assert "visioncal[cluster]" in done.err
+
+
+@pytest.mark.usefixtures("here")
+def test_the_page_shows_a_picture_of_each_session(tmp_path):
+    session = write_session(simulate(CellOptions(views=6, seed=1)), tmp_path / "sessions" / "seen")
+    (row,) = batch(session, tmp_path / "out", workers=1, without=BARE).rows
+    assert row.has_picture
+    assert (tmp_path / "out" / "seen" / "picture.jpg").read_bytes()[:2] == b"\xff\xd8"
+    assert 'src="seen/picture.jpg"' in (tmp_path / "out" / "index.html").read_text()
+    assert row.camera == "1280 x 800"
+
+
+@pytest.mark.slow
+def test_a_scheduler_and_its_workers_do_the_same(fleet, tmp_path):
+    """Two workers in processes of their own, of which one is killed when the first row is there."""
+    distributed = pytest.importorskip("distributed")
+    from distributed.deploy.subprocess import SubprocessCluster
+
+    with SubprocessCluster(
+        n_workers=2,
+        threads_per_worker=1,
+        dashboard_address=None,
+        worker_kwargs={"memory_limit": 0, "dashboard": False},
+    ) as cluster:
+        assert cluster.scheduler_address.startswith("tcp://127.0.0.1:")
+        with distributed.Client(cluster, set_as_default=False) as client:
+            client.wait_for_workers(2)
+            pids = sorted(client.run(os.getpid).values())
+
+        def killing(_, done, __):
+            if done == 1:
+                os.kill(pids[0], signal.SIGKILL)
+
+        found = batch(
+            fleet / "*",
+            tmp_path,
+            scheduler=cluster.scheduler_address,
+            without=BARE,
+            progress=killing,
+        )
+    expect_results_of_calibrate(fleet, tmp_path, found.rows)
+
+
+@pytest.mark.slow
+def test_a_local_cluster_does_the_same(fleet, tmp_path):
+    pytest.importorskip("distributed")
+    found = batch(fleet / "*", tmp_path, workers=2, without=BARE)
+    expect_results_of_calibrate(fleet, tmp_path, found.rows)
+    with pytest.raises(DataError, match=r"no scheduler answers at tcp://127.0.0.1:1"):
+        batch(fleet / "*", tmp_path, scheduler="tcp://127.0.0.1:1")
+
+
+@pytest.mark.usefixtures("here")
+def test_a_session_whose_facts_changed_is_done_again(fleet, tmp_path):
+    name = "robot_0/week_0"
+    first = batch(fleet / name, tmp_path / "out", workers=1, without=BARE)
+    assert [it.state for it in first.rows] == ["done"]
+    table = fleet / name / "views.csv"
+    whole = table.read_text()
+    try:
+        table.write_text("\n".join(whole.splitlines()[:-1]) + "\n")
+        (row,) = batch(fleet / name, tmp_path / "out", workers=1, without=BARE).rows
+    finally:
+        table.write_text(whole)
+    assert (row.state, row.views) == ("done", 9)

@@ -1,0 +1,79 @@
+"""What stands out of a fleet, from made-up rows."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from visioncal.present.report.fleet import fleet_page
+from visioncal.results.fleet import FleetRow, with_outliers
+
+
+def row(robot: int, week: int, rng, **changes) -> FleetRow:
+    """A session of a sound robot; levels of noise from some twenty stops differ by a sixth."""
+    levels = np.exp(rng.normal(0.0, 0.16, 4)).tolist()
+    made = FleetRow(
+        name=f"robot_{robot}/week_{week:02d}",
+        session="",
+        state="done",
+        verdict="good",
+        robot="ur10e",
+        camera="1280 x 800",
+        views=20,
+        used=20,
+        noise_mm=0.03 * levels[0],
+        noise_deg=0.003 * levels[1],
+        noise_px=0.1 * levels[2],
+        residual_mm=0.06 * levels[3],
+        focal_px=914.0 * float(np.exp(rng.normal(0.0, 0.003))),
+        has_picture=True,
+    )
+    return replace(made, **changes)
+
+
+def fleet(seed: int) -> list[FleetRow]:
+    rng = np.random.default_rng(seed)
+    return [row(robot, week, rng) for robot in range(10) for week in range(20)]
+
+
+def test_of_a_sound_fleet_few_sessions_stand_out():
+    """Six figures of 200 sessions; one in a thousand lies beyond 3.5 spreads of 0.2 by chance."""
+    standing = [it for seed in range(5) for it in with_outliers(fleet(seed)) if it.score > 0.0]
+    assert len(standing) <= 3
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"noise_mm": 0.15, "residual_mm": 0.3}, "noise of the robot 0.15 mm, where 0.03 mm"),
+        ({"arm_mm": 0.9}, "errors of the arm 0.9 mm, where 0.2 mm is usual"),
+        ({"focal_px": 870.0}, "focal length 870 px, where 914 px is usual"),
+        ({"drift_mm": 0.4}, "drift of the arm 0.4 mm, where 0.05 mm is usual"),
+    ],
+)
+def test_the_odd_robot_comes_first(changes, words):
+    rows = [replace(it, arm_mm=0.2, drift_mm=0.05) for it in fleet(1)]
+    rows = [replace(it, **changes) if it.group == "robot_7" else it for it in rows]
+    found = with_outliers(rows)
+    assert {it.group for it in found[:20]} == {"robot_7"}
+    assert all(words in it.stands_out for it in found[:20])
+    # What is better than usual, or of another camera, is no fault.
+    quiet = [replace(it, noise_mm=0.001) if it.group == "robot_7" else it for it in fleet(1)]
+    assert not any("noise" in it.stands_out for it in with_outliers(quiet))
+    wide = {"camera": "640 x 480", "focal_px": 457.0}
+    other = [replace(it, **wide) if it.group == "robot_7" else it for it in fleet(1)]
+    assert not any("focal" in it.stands_out for it in with_outliers(other))
+
+
+def test_another_model_comes_first_and_robots_are_compared_with_their_own():
+    other = {"robot": "ur5e", "noise_mm": 0.3}
+    rows = [replace(it, **other) if it.group == "robot_2" else it for it in fleet(3)]
+    failed = FleetRow(name="robot_4/week_99", session="", state="failed", words="<no> table")
+    found = with_outliers([*rows, failed])
+    assert {it.group for it in found[:20]} == {"robot_2"}
+    assert found[0].stands_out == "its robot is a ur5e, where 180 of 200 are ur10e"
+    page = fleet_page(found)
+    assert page.index("robot_2") < page.index("robot_4/week_99") < page.index("All results")
+    assert "20 of 20 sessions" in page
+    assert "&lt;no&gt; table" in page
+    assert 'href="robot_2/week_00/calibration.json"' in page

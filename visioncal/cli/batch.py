@@ -1,0 +1,88 @@
+"""`visioncal batch`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from visioncal.cli.console import EXIT_NO_RESULT, messages
+from visioncal.cli.options import NeedOptions
+from visioncal.cli.progress import shown_progress
+from visioncal.interchange.batch import Batch, batch
+from visioncal.interchange.outputs import RECORDING, REPORT
+
+_MOST_NAMED = 5
+
+
+def batch_command(
+    sessions: Annotated[
+        list[str],
+        typer.Argument(help="Sessions, recordings, folders with some below them, or globs."),
+    ],
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="Folder for the results, one in each session's.")
+    ],
+    need: NeedOptions,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, help="How many work at a time, on one core each; one a core."),
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="A Dask scheduler, as tcp://HOST:8786, whose workers see the same files; needs "
+            "the extra cluster.",
+        ),
+    ] = None,
+    against: Annotated[
+        Path | None,
+        typer.Option(help="An earlier batch: which results changed by more than their sigmas."),
+    ] = None,
+    level: Annotated[
+        str, typer.Option(metavar="auto|hand-eye|offsets|...", help="As of calibrate.")
+    ] = "auto",
+    no_report: Annotated[
+        bool, typer.Option("--no-report", help=f"Leave each {REPORT} out.")
+    ] = False,
+    recordings: Annotated[
+        bool, typer.Option("--recordings", help="Also write each recording, with all images.")
+    ] = False,
+) -> None:
+    """Calibrate many sessions at once, and tell which stand out of their fleet.
+
+    Each result goes into a folder of its own; batch.parquet has a row a session, index.html shows
+    them, those first that stand out among robots of the same model. What is done already is kept:
+    started again, it goes on where it was. Exit status 0: there are results; 2: of no session.
+    """
+    wanted = {REPORT: not no_report, RECORDING: recordings}
+    with shown_progress(quiet=False) as told:
+        found = batch(
+            sessions,
+            out,
+            workers=workers,
+            scheduler=scheduler,
+            level=level,
+            need_mm=need.need_mm,
+            need_deg=need.need_deg,
+            without=[name for name, is_wanted in wanted.items() if not is_wanted],
+            against=against,
+            progress=told,
+        )
+    _tell(found)
+    if all(it.state == "failed" for it in found.rows):
+        raise typer.Exit(EXIT_NO_RESULT)
+
+
+def _tell(found: Batch) -> None:
+    console, counts = messages(), found.counts
+    named = ("good", "check", "bad", "failed", "kept", "changed", "standing out")
+    words = ", ".join(f"{counts[it]} {it}" for it in named if counts[it])
+    console.print(f"{len(found.rows)} sessions: {words}")
+    lines = [f"{it.name}: {it.stands_out}" for it in found.rows if it.score > 0.0][:_MOST_NAMED]
+    lines += [f"{it.name}: {it.change}" for it in found.rows if it.changed][:_MOST_NAMED]
+    failed = [f"{it.name}: {it.words}" for it in found.rows if it.state == "failed"]
+    for line in [*lines, *failed[:_MOST_NAMED]]:
+        console.print(escape(f"  {line}"))
+    console.print(escape(f"written: {found.page}, {found.table}"))

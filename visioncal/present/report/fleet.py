@@ -1,0 +1,60 @@
+"""The page of a batch: what stands out among many sessions, and the results of all."""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+
+from visioncal.core.number_format import significant
+from visioncal.core.version import __version__
+from visioncal.present.report.templating import template
+from visioncal.results.fleet import FleetRow
+
+_ICONS = {"good": "good", "check": "check"}
+# So many of the sessions of one robot are named by what stands out of them.
+_MOST_NAMED = 6
+
+
+@dataclass(frozen=True)
+class _Odd:
+    """What stands out of the sessions in one folder, as those of one robot are: of the worst."""
+
+    title: str
+    count: str
+    reasons: tuple[str, ...]
+    rows: tuple[FleetRow, ...]
+    more: int
+
+
+def fleet_page(rows: Sequence[FleetRow]) -> str:
+    """Renders the page as HTML text, whose links are relative to its folder.
+
+    Args:
+        rows: Those first that stand out the most.
+    """
+    states = Counter(it.verdict or it.state for it in rows)
+    return template("fleet.html.j2").render(
+        rows=rows,
+        odd=list(_odd(rows)),
+        states=[(name, states[name]) for name in ("good", "check", "bad", "failed")],
+        changed=[it for it in rows if it.changed],
+        is_compared=any(it.changed is not None for it in rows),
+        failed=[it for it in rows if it.state == "failed"],
+        icon_of=lambda it: _ICONS.get(it.verdict, "bad"),
+        figure=lambda value: "" if value is None else significant(value),
+        version=__version__,
+    )
+
+
+def _odd(rows: Sequence[FleetRow]) -> Iterator[_Odd]:
+    """By folder, in the order of the worst that stands out in each."""
+    standing = [it for it in rows if it.score > 0.0]
+    order = list(dict.fromkeys(it.group or it.name for it in standing))
+    sizes = Counter(it.group or it.name for it in rows)
+    by_place = sorted(standing, key=lambda it: order.index(it.group or it.name))
+    for name, members in groupby(by_place, key=lambda it: it.group or it.name):
+        mine = tuple(members)
+        reasons = tuple(mine[0].stands_out.split("; "))
+        count = f"{len(mine)} of {sizes[name]} sessions" if sizes[name] > 1 else ""
+        named = mine[:_MOST_NAMED]
+        yield _Odd(name, count, reasons, named, len(mine) - len(named))
