@@ -29,7 +29,7 @@ class Mistake:
 
     Attributes:
         plant: Breaks a sound session's folder.
-        names: Words (a regular expression) of which one tells the cause.
+        names: Words (a regular expression) of which one tells the cause; - where all is to be well.
         options: What the cell is otherwise like.
         joints: Whether its table has joint angles, and its session.toml a robot.
         is_mended: Whether the fix can be typed here; what takes a new recording is only advised.
@@ -262,7 +262,7 @@ _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 
 BROKEN: Mapping[str, Mistake] = {
     # The poses.
-    "positions in millimetres": Mistake(scaled(POSITION, 1e3), "millimetre"),
+    "positions in millimetres": Mistake(scaled(POSITION, 1e3), "positions in mm"),
     "the other mount": Mistake(_toml("eye-in-hand", "eye-to-hand"), "mount"),
     "quaternion with w first": Mistake(
         _rotations(lambda it: it.as_quat()[:, [3, 0, 1, 2]]), "w, x, y, z"
@@ -276,18 +276,16 @@ BROKEN: Mapping[str, Mistake] = {
     "rotation vectors in quaternion columns": Mistake(
         _rotations(lambda it: it.as_rotvec()), "rotation vector"
     ),
-    "columns rx, ry, rz": Mistake(_rotation_vectors, "rotation vector|rx, ry, rz"),
-    "columns x, y, z": Mistake(
-        _renamed({"x_m": "x", "y_m": "y", "z_m": "z"}), r"\bx, y, z\b|column x\b"
-    ),
+    "columns rx, ry, rz": Mistake(_rotation_vectors, "rx,ry,rz"),
+    "columns x, y, z": Mistake(_renamed({"x_m": "x", "y_m": "y", "z_m": "z"}), "x,y,z"),
     "inverse poses": Mistake(_poses(np.linalg.inv), "inverse"),
     "a left-handed frame": Mistake(_poses(lambda it: _MIRROR @ it @ _MIRROR), "handed|mirror"),
     "rows shifted by one": Mistake(
-        _moved_cells((*POSITION, *QUATERNION), lambda n: [*range(1, n), 0]), "one row|shift"
+        _moved_cells((*POSITION, *QUATERNION), lambda n: [*range(1, n), 0]), "one row"
     ),
     "two rows exchanged": Mistake(_moved_cells((*POSITION, *QUATERNION), _swapped), "exchanged"),
     "the same pose in all rows": Mistake(
-        _moved_cells((*POSITION, *QUATERNION), lambda n: [0] * n), "same pose|did not move"
+        _moved_cells((*POSITION, *QUATERNION), lambda n: [0] * n), "one pose"
     ),
     "one pose typed wrong": Mistake(_cell("z_m", (6,), "0.9"), "view 6"),
     "poses of the tool": Mistake(_poses(lambda it: it @ _tilted(0.4)), "tool|flange", joints=True),
@@ -301,15 +299,11 @@ BROKEN: Mapping[str, Mistake] = {
     ),
     "another robot": Mistake(_toml('"ur10e"', '"ur5e"'), "ur10e|ur5e|model", joints=True),
     # The table.
-    "semicolons": Mistake(_text(lambda it: it.replace(",", ";")), "semicolon"),
-    "decimal commas": Mistake(_text(_german), "semicolon|decimal comma"),
-    "a byte-order mark": Mistake(
-        _bytes(lambda it: it.encode("utf-8-sig")), "read as it is", is_mended=True
-    ),
+    "semicolons": Mistake(_text(lambda it: it.replace(",", ";")), "-"),
+    "decimal commas": Mistake(_text(_german), "-"),
+    "a byte-order mark": Mistake(_bytes(lambda it: it.encode("utf-8-sig")), "-"),
     "UTF-16": Mistake(_bytes(lambda it: it.encode("utf-16")), "UTF-16|UTF-8"),
-    "empty rows": Mistake(
-        _text(lambda it: it + "," * it.splitlines()[0].count(",") + "\n"), "empty"
-    ),
+    "empty rows": Mistake(_text(lambda it: it + "," * it.splitlines()[0].count(",") + "\n"), "-"),
     "no number (NaN)": Mistake(_cell("x_m", (5,), "nan"), "view 5|line 7"),
     "a view's number twice": Mistake(_cell("view", (5,), "4"), "already|twice"),
     "an image twice": Mistake(_cell("image", (5,), "images/004.png"), "share|same image"),
@@ -354,7 +348,7 @@ BROKEN: Mapping[str, Mistake] = {
     # The motion.
     "two views": Mistake(_few, "2 views|views", is_mended=False),
     "turns about one axis": Mistake(
-        _nothing, "axis", options=_poor(motion="one_axis"), is_mended=False
+        _nothing, "turn about", options=_poor(motion="one_axis"), is_mended=False
     ),
     "no turns": Mistake(
         _nothing, "turn|rotat", options=_poor(motion="translation"), is_mended=False

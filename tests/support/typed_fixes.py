@@ -7,6 +7,7 @@ import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import tomli_w
 from support.broken_sessions import edit, edit_rows, scaled
@@ -84,20 +85,33 @@ def _in_radians(folder: Path, found: _Found) -> None:
     scaled(tuple(f"q{it}_rad" for it in range(1, int(found[1]) + 1)), np.pi / 180.0)(folder)
 
 
+def _respelt(folder: Path, found: _Found) -> None:
+    edit(folder, lambda text: text.replace(f'"{found[1]}"', f'"{found[2]}"'))
+
+
+def _turned_back(folder: Path, _: _Found) -> None:
+    for file in (folder / "images").iterdir():
+        cv2.imwrite(str(file), cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)[:, ::-1])
+
+
 _EDITS: tuple[tuple[str, Callable[[Path, _Found], None]], ...] = (
     (r"iconv -f (\S+) -t", _encoded),
     (r"[Ii]n (session\.toml|views\.csv), replace (\S+) by (\S+?)\.?(?:\s|$)", _replaced),
     (r"[Ii]n views\.csv, write (\S+) into the row of view (\d+), column (\w+)", _cell_written),
     (r"delete views\.csv, line (\d+)", _line_deleted),
     (r"delete the rows? of view ([\d, ]+)", _rows_deleted),
+    (r"no target named '(\S+)'\. Did you mean (\S+)", _respelt),
+    (r"mogrify -flop", _turned_back),
     (r"multiply q1_rad to q(\d)_rad by pi / 180", _in_radians),
 )
-_WRITTEN = r"[Ii]n (\w+\.toml), write (.+?)(?:, which|\.(?:\s|$)|, and delete)"
+_WRITTEN = r"[Ii]n (\w+\.toml), write (.+?)(?:, which|;|\.(?:\s|$)|, and delete)"
 
 
 def _toml_written(folder: Path, said: str) -> bool:
     """Writes and deletes fields of .toml files."""
     found = False
+    board = re.search(r'target = "(\w+\.toml)"', (folder / "session.toml").read_text("utf-8"))
+    said = said.replace("its .toml", board[1]) if board else said
     for name, text in re.findall(_WRITTEN, said):
         document = tomllib.loads((folder / name).read_text("utf-8"))
         table = re.match(r"\[(\w+)\] ", text)

@@ -13,6 +13,8 @@ from visioncal.core.transforms import pose_difference
 from visioncal.results import Calibration, Sight, Step, Verdict, ViewResult
 
 _COLOURS = {"good": "bold green", "check": "bold yellow", "bad": "bold red"}
+# Beyond any image, what is predicted is nowhere [px].
+_MOST_PX = 1e4
 _SAME_REASON = 20  # more views of one reason share a line
 
 
@@ -60,7 +62,7 @@ def print_summary(calibration: Calibration, *, verbose: bool) -> None:
         f"{used} of {len(calibration.views)} views used; left out of the fit they are predicted to "
         f"{figure(held.mm)} mm"
         + ("" if held.deg is None else f", {figure(held.deg)} deg")
-        + (f", {figure(held.px)} px" if held.px else "")
+        + (f", {figure(held.px)} px" if held.px and held.px < _MOST_PX else "")
     )
     for words in unused_words(calibration.views):
         console.print(f"  {escape(words)}")

@@ -6,6 +6,7 @@ from typing import Any
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import Target
+from visioncal.core.verdict import READ_AGAIN
 from visioncal.session.document import Declaration
 from visioncal.session.outside import without_content
 from visioncal.vision.targets import load_target, target_from_document
@@ -59,7 +60,15 @@ def read_targets(
 
 def _load(place: str, folder: Path | None) -> tuple[Target, dict[str, Any]]:
     with without_content(place, "target", folder):
-        return load_target(place, folder)
+        try:
+            return load_target(place, folder)
+        except DataError as error:
+            if "metres, such as" not in error.message:
+                raise
+            # Sizes in millimetres are all read so at once.
+            raise type(error)(
+                error.message, culprits=error.culprits, next_step=str(READ_AGAIN)
+            ) from error
 
 
 def declared_targets(declaration: Declaration) -> dict[str, str]:

@@ -111,6 +111,14 @@ def fitted(recording: Recording, tried: Hypothesis, rows: IntArray, starts: int)
     return Scored(tried, robust_fit(robot[rows], camera[rows], starts), rows)
 
 
+def closes(recording: Recording) -> bool:
+    """Whether the chain closes as declared; also where too few rows could tell."""
+    rows = recording.common_rows()
+    if len(rows) < FEWEST_ROWS:
+        return True
+    return fitted(recording, recording.declared, rows, 0).score <= CLOSING_SCORE
+
+
 def is_likely_unit(recording: Recording, unit: str) -> bool:
     """Whether the target is at a likely distance where the camera's positions have this unit."""
     seen_from = np.nanmedian(np.linalg.norm(recording.camera.positions, axis=1))

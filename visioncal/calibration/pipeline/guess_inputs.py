@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from visioncal.calibration.guess import Guess, guess_reading
+from visioncal.calibration.guess.given import Recording, closes
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.cause_ranking import read_otherwise
@@ -140,6 +141,20 @@ def reading_hint(seen: RunState) -> Finding | None:
         # Too little to guess from: what failed has been said already.
         return None
     return read_otherwise(guess.sentence) if guess.stands_out else None
+
+
+def closes_as_declared(seen: RunState) -> bool:
+    """Whether the chain closes with the poses as they are declared: nothing else is tried.
+
+    Args:
+        seen: What is known once the camera's poses are.
+    """
+    seen = replace(seen, poses=seen.poses_of_one_board)
+    robot = _told_in_time(seen)
+    recording = Recording(
+        robot, _camera_numbers(seen), seen.session.mount, is_measured=bool(seen.corners)
+    )
+    return closes(recording)
 
 
 def is_suspect(known: RunState) -> bool:

@@ -4,12 +4,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from visioncal.calibration.pipeline.guess_inputs import is_suspect, reading_hint
+from visioncal.calibration.pipeline.guess_inputs import closes_as_declared, is_suspect, reading_hint
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.pipeline.view_evidence import view_evidence
-from visioncal.calibration.stages.cause_ranking import with_misread
+from visioncal.calibration.stages.cause_ranking import with_misread, with_other_board
 from visioncal.calibration.stages.dense import Dense
 from visioncal.calibration.stages.handeye import SOLVER_NAMES
 from visioncal.calibration.stages.kinematics import check_level
@@ -125,6 +125,7 @@ def run_steps(known: RunState) -> RunState:
     """Takes a session through all steps."""
     progress = known.progress
     seen: RunState | None = None
+    hint: Finding | None = None
     with one_blas_thread():
         for at, stage in enumerate(STAGES):
             if progress is not None:
@@ -143,7 +144,10 @@ def run_steps(known: RunState) -> RunState:
             # Joints that are misread explain themselves, and would mislead a guess about poses.
             if stage.name == "joints" and known.mount is not None:
                 seen = known
-        return _with_reading(known, seen)
+                if not closes_as_declared(known):
+                    hint = reading_hint(known)
+                    known = replace(known, is_misread=hint is not None)
+        return _with_other_board(_with_reading(known, seen, hint))
 
 
 def unseen_cause(known: RunState) -> Finding | None:
@@ -189,11 +193,22 @@ def _with_hint(error: VisioncalError, seen: RunState | None) -> VisioncalError:
     return type(error)(error.message, culprits=error.culprits, next_step=next_step)
 
 
-def _with_reading(known: RunState, seen: RunState | None) -> RunState:
+def _with_other_board(known: RunState) -> RunState:
+    """Adds to a verdict on views without a board which board they show."""
+    verdict = known.verdict
+    if verdict is None or all(it.kind != "lost_views" for it in verdict.findings):
+        return known
+    cause = unseen_cause(known)
+    if cause is None or cause.kind != "other_board":
+        return known
+    return replace(known, verdict=with_other_board(verdict, cause))
+
+
+def _with_reading(known: RunState, seen: RunState | None, hint: Finding | None) -> RunState:
     """Adds to a poor verdict how the poses should be read, where that explains it."""
     if known.verdict is None or seen is None or not is_suspect(known):
         return known
-    hint = reading_hint(seen)
+    hint = hint or reading_hint(seen)
     if hint is None:
         return known
     return replace(known, verdict=with_misread(known.verdict, hint))

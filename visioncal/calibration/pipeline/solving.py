@@ -277,6 +277,9 @@ def _with_looks(
     if looked.scenes and not agreed.problem.is_combined:
         side = _side(cell, agreed, arms, late)
         looks = side.looks(looked.scenes, _views_by_camera(looked, views))
+        if looked.is_misread:
+            fitted = settle_looks(looks, side, looks.first, _frames(agreed))
+            return _settled(agreed, side, fitted), fitted.seen, side.arms
         fitted, side = refined(side, looks, _frames(agreed))
         return _settled(agreed, side, fitted), fitted.seen, side.arms
     drifts = tuple(effects_of(arms))

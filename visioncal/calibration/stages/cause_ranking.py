@@ -61,6 +61,7 @@ EVIDENCE: Mapping[str, Evidence] = {
     "holdout": Evidence(1e-3),
     "lost_views": Evidence(_REMARK),
     "shared_image": Evidence(_FACT),
+    "other_board": Evidence(_FACT),
     "untied": Evidence(_FACT),
     "too_few_stops": Evidence(_FACT),
     "board_size": Evidence(2.7e-3, _CHAIN),
@@ -76,6 +77,8 @@ EVIDENCE: Mapping[str, Evidence] = {
     "misread_joints": Evidence(1e-3),
     "unexplained": Evidence(_REMARK, _CHAIN),
 }
+# What is measured by way of the robot says nothing where its poses are misread.
+_BY_THE_CHAIN = ("board_size", "board_shape", "lens", "lens_field", "corner_noise", "arm_errors")
 LOOK = Step(
     "Look at the worst views: does each pose belong to its image, did anything move?", REVIEW
 )
@@ -121,9 +124,22 @@ def with_misread(verdict: Verdict, found: Finding) -> Verdict:
     rest = (
         replace(it, probability=it.probability / (1.0 + odds), do=None)
         for it in verdict.findings
-        if it.kind not in (GOOD_FOR, *SOURCES)
+        if it.kind not in (GOOD_FOR, *SOURCES, *_BY_THE_CHAIN)
     )
     return replace(verdict, findings=(replace(found, probability=odds / (1.0 + odds)), *rest))
+
+
+def with_other_board(verdict: Verdict, found: Finding) -> Verdict:
+    """A verdict on images that show another board than the declared one, which is said first.
+
+    Args:
+        verdict: As the board is declared.
+        found: What the images show.
+    """
+    odds = _odds(EVIDENCE[found.kind].chance)
+    named = replace(found, probability=odds / (1.0 + odds))
+    rest = (it for it in verdict.findings if it.kind != "lost_views")
+    return replace(verdict, findings=(named, *rest))
 
 
 def ranked(

@@ -24,6 +24,8 @@ from visioncal.estimation.solve import held_shift
 
 # A rig that is as stated seems not to be in one session of ten thousand.
 _FALSE_ALARM = 1e-4
+# Intrinsics that would move by less move no corner that anybody could tell [px].
+_LEAST_MOVE_PX = 0.05
 _NEW_LENS = Step(
     "In session.toml, delete matrix and distortion, so that they are estimated, or calibrate "
     "the camera anew.",
@@ -109,8 +111,8 @@ def scale_found(board: str, square_m: float, measured: MeasuredScale) -> Finding
         f"{sized}, which is not what is stated (to within {share}). The result goes by the robot; "
         "if the board is right, the arm's model is off by as much.",
         Step(
-            "Measure the board over many squares, correct square_m and square_sigma_m in its "
-            "file, and calibrate again.",
+            "Measure the board over many squares. Where it is as the robot says, in its .toml, "
+            f"write square_m = {1e-3 * side * (1 + measured.scale):.4g}; otherwise see to the arm.",
             CALIBRATE,
         ),
         mahalanobis_sq=measured.scale**2 / (measured.sigma**2 + measured.stated_sigma**2),
@@ -172,7 +174,8 @@ def _lens_found(fitted: Fitted, camera: str) -> Iterator[Finding]:
     if problem.contested:
         shift = held_shift(fitted.problem, fitted.fit)[fitted.columns]
         moves = shift[np.searchsorted(fitted.seen.free, lens[:4])]
-        yield contest_found(problem.scene, moves)
+        if np.abs(moves).max() > _LEAST_MOVE_PX:
+            yield contest_found(problem.scene, moves)
 
 
 def lens_found(steps_px: FloatArray, *, is_doubtful: bool) -> Finding:

@@ -62,6 +62,8 @@ class Observed:
         warnings: What the user should know.
         notes: What is good to know and no reason for doubt.
         dense: How corners are fitted by all pixels around them; None for the template's.
+        is_misread: Whether robots' poses are clearly misread, so that they tell nothing of lenses
+            and boards.
     """
 
     session: Session
@@ -75,6 +77,7 @@ class Observed:
     warnings: tuple[Finding, ...] = ()
     notes: tuple[str, ...] = ()
     dense: Dense | None = None
+    is_misread: bool = False
 
     def noting(self, rejections: Iterable[Rejection], warnings: Iterable[Finding] = ()) -> Self:
         """Adds rejected views, of which the first reason counts, and warnings."""

@@ -1,0 +1,105 @@
+"""Sessions that are broken in the usual ways: what is said first, and whether that mends them.
+
+Each mistake of `support.broken_sessions` is planted into the same sound session. `calibrate` runs
+on it; what it says first is looked up for the mistake's name; and what it says to do is typed.
+
+    PYTHONPATH=tests python tests/benchmarks/first_hour.py [--quick]
+"""
+
+import re
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from results import first, write_section
+from support.broken_sessions import BROKEN, Mistake, broken_session
+from support.commands import visioncal
+from support.typed_fixes import mended
+
+_COMMAND = "PYTHONPATH=tests python tests/benchmarks/first_hour.py"
+# A sentence that is longer is cut in the table.
+_LONGEST = 230
+
+
+@dataclass(frozen=True)
+class Walked:
+    """What became of a broken session.
+
+    Attributes:
+        status: The exit status of calibrate.
+        sentence: What it said first.
+        seconds: How long it took.
+        is_named: Whether that names the mistake, or there was nothing to say.
+        after: The verdict once the fix was typed; empty where nothing can be typed.
+        found_s: How long doctor took [s].
+    """
+
+    status: int
+    sentence: str
+    seconds: float
+    is_named: bool
+    after: str
+    found_s: float
+
+
+def walked(mistake: Mistake, folder: Path) -> Walked:
+    """Breaks a session, calibrates it, and does what it says."""
+    session = broken_session(folder / "session", mistake)
+    begun = time.perf_counter()
+    visioncal("doctor", session)
+    doctored = time.perf_counter()
+    done = visioncal("calibrate", session, "-o", folder / "out")
+    seconds = time.perf_counter() - doctored
+    said = [it.strip() for it in done.err.splitlines() if it.strip()]
+    is_good = done.status == 0 and any(it.startswith("good ") for it in said)
+    lines = [it for it in said if it.startswith(("error:", "- "))]
+    sentence = re.sub(r"^(error:|- )\s*(Most likely \([^)]*\):)?\s*", "", lines[0])
+    sentence = sentence.replace(f"{session}/", "").replace(str(session), "SESSION")
+    nothing = is_good and not re.search(mistake.names, sentence, re.I)
+    is_named = bool(re.search(mistake.names, sentence, re.I)) or (nothing and mistake.names == "-")
+    if nothing and mistake.names == "-":
+        after = "good"
+    else:
+        after = mended(session, done.err, folder / "fixed") if mistake.is_mended else ""
+    return Walked(done.status, sentence, seconds, is_named, after, doctored - begun)
+
+
+def main() -> None:
+    rows = [
+        "| mistake | status | said first | names it | typed, the verdict is | calibrate [s] |"
+        " doctor [s] |",
+        "| --- | ---: | --- | --- | --- | ---: | ---: |",
+    ]
+    found = []
+    for name, mistake in first(list(BROKEN.items())):
+        with tempfile.TemporaryDirectory() as folder:
+            it = walked(mistake, Path(folder))
+        found.append(it)
+        cut = it.sentence if len(it.sentence) < _LONGEST else f"{it.sentence[:_LONGEST]} ..."
+        named, after = "yes" if it.is_named else "no", it.after or "(nothing to type)"
+        row = (
+            f"| {name} | {it.status} | {cut.replace('|', '/')} | {named} | {after} | "
+            f"{it.seconds:.1f} | {it.found_s:.1f} |"
+        )
+        print(row, flush=True)
+        rows.append(row)
+    named = sum(it.is_named for it in found)
+    good = sum(it.after == "good" for it in found)
+    text = "\n".join(
+        [
+            f"{len(found)} sessions of 15 rendered views, each with one mistake of the first hour: "
+            f"{named} are named by the first sentence of `calibrate`, and {good} are `good` once "
+            "what it says is typed, by a program that does what a reader would. Blur and "
+            "poor motion need a new recording; poses of the tool are a note alone. Files that are "
+            "merely another program's (semicolons, decimal commas, byte-order marks, empty rows) "
+            "are read as they are.",
+            "",
+            *rows,
+        ]
+    )
+    write_section("The first hour", _COMMAND, text)
+
+
+if __name__ == "__main__":
+    main()
