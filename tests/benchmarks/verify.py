@@ -63,6 +63,10 @@ CASES: Mapping[str, Case] = MappingProxyType(
         "board moved by 20 mm and 5 deg": Case(
             lambda rng: Change(board=knock(rng, 20.0, 5.0)), "board"
         ),
+        "board 0.5 % larger": Case(lambda _: Change(board_scale=1.005), "board_size"),
+        "another board, 1 % larger, 5 mm away": Case(
+            lambda rng: Change(board=knock(rng, 5.0, 1.0), board_scale=1.01), "board_replaced"
+        ),
     }
 )
 

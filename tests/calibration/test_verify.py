@@ -121,6 +121,20 @@ def test_a_board_that_was_turned_by_much_is_told(place):
     assert found.named[0].explained.values == pytest.approx(moved, abs=1e-3)
 
 
+def test_a_board_of_another_size_is_told_from_one_that_moved(place):
+    rng = np.random.default_rng(7)
+    found = checked(place, rng, Change(board_scale=1.005))
+    assert names(found) == ["board_size"]
+    # Five stops know it to some hundredths of a percent.
+    assert found.named[0].explained.values == pytest.approx([0.005], abs=5e-4)
+    assert "0.5 % larger" in verdict_of(found).reasons[0]
+    exchanged = Change(board=knock(rng, 5.0, 1.0), board_scale=0.99)
+    found = checked(place, rng, exchanged)
+    assert names(found) == ["board_replaced"]
+    assert found.named[0].explained.values[-1] == pytest.approx(-0.01, abs=5e-4)
+    assert names(checked(place, rng, exchanged, board_placed_anew=True)) == ["board_size"]
+
+
 def test_a_board_that_was_placed_anew_is_no_fault(place):
     rng = np.random.default_rng(5)
     anew = Change(board=np.array([0.0, 0.0, 0.3, 0.02, 0.01, 0.0]))

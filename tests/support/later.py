@@ -23,12 +23,13 @@ FITTED = 60
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """What has changed: twists (6,) on the right of x and z, offsets of the joints, the noise."""
+    """What has changed: twists (6,) on the right of x and z, joints' offsets, noise, size."""
 
     camera: FloatArray = field(default_factory=lambda: np.zeros(6))
     board: FloatArray = field(default_factory=lambda: np.zeros(6))
     joints_rad: FloatArray = field(default_factory=lambda: np.zeros(6))
     noise_factor: float = 1.0
+    board_scale: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,14 +86,18 @@ def again(
     x, z = cell.transforms.values()
     moved = x @ exp(change.camera), z @ exp(change.board)
     poses = target_in_camera(options.mount, *moved, flange)
-    corners = tuple(_detected(cell, at, pose, rng) for at, pose in enumerate(poses))
+    corners = tuple(
+        _detected(cell, at, pose, rng, change.board_scale) for at, pose in enumerate(poses)
+    )
     return replace(fresh, true_base_from_flange=flange, corners=corners)
 
 
-def _detected(cell: Cell, view: int, pose: FloatArray, rng: np.random.Generator) -> Corners:
+def _detected(
+    cell: Cell, view: int, pose: FloatArray, rng: np.random.Generator, scale: float
+) -> Corners:
     """The board as it was printed, as a detector reports it."""
     camera = cell.options.camera
-    px = project(camera, corners_m(cell.sheet) @ pose[:3, :3].T + pose[:3, 3])
+    px = project(camera, scale * corners_m(cell.sheet) @ pose[:3, :3].T + pose[:3, 3])
     ids = np.flatnonzero(np.all((px > 0) & (px < np.array(camera.resolution) - 1), axis=1))
     noise = cell.options.pixel_sigma_px * rng.standard_normal((len(ids), 2))
     return Corners(view, ids, px[ids] + noise, cell.options.blur_px)

@@ -14,10 +14,12 @@ from visioncal.estimation.model_evidence import TURN_PER_M, Cause
 from visioncal.estimation.observability import FEWEST_VIEWS
 from visioncal.robot import Robot
 
-CAMERA, BOARD, BOTH, JOINT, LENGTH, NOISE, VIEW = (
+CAMERA, BOARD, BOTH, SIZE, REPLACED, JOINT, LENGTH, NOISE, VIEW = (
     "camera",
     "board",
     "camera_and_board",
+    "board_size",
+    "board_replaced",
     "joint",
     "arm_length",
     "robot_noise",
@@ -25,6 +27,8 @@ CAMERA, BOARD, BOTH, JOINT, LENGTH, NOISE, VIEW = (
 )
 # What a robot's scatter may have grown by.
 _FACTORS = (2.0, 4.0, 8.0, 16.0, 32.0)
+# A board that lies a millimetre elsewhere differs by a percent where it is another one.
+_OTHER_SIZE_PER_M = 10.0
 _KNOCK = np.repeat([TURN_PER_M, 1.0], 3)
 
 
@@ -40,10 +44,16 @@ def causes_of(
     """
     camera = _camera(seen)
     boards = () if board_placed_anew else tuple(_boards(seen, prior_calibration))
+    sizes = tuple(_sizes(seen, prior_calibration))
     return (
         camera,
         *boards,
-        *(_both(camera, it) for it in boards if _tell_both(seen, prior_calibration)),
+        *sizes,
+        *(
+            _jointly(REPLACED, moved, replace(size, units=np.array([_OTHER_SIZE_PER_M])))
+            for moved, size in zip(boards, sizes, strict=False)
+        ),
+        *(_jointly(BOTH, camera, it) for it in boards if _tell_both(seen, prior_calibration)),
         *_joints(seen, prior_calibration),
         _noise(seen),
         *_views(seen, prior_calibration),
@@ -77,15 +87,32 @@ def _tell_both(seen: PredictedStops, prior_calibration: CalibrationPrior) -> boo
     return len(prior_calibration.boards) == 1 and len(seen.problem) >= FEWEST_VIEWS
 
 
-def _both(camera: Cause, board: Cause) -> Cause:
-    """Camera and board at once: nothing is left of the old hand-eye calibration but the arm."""
+def _jointly(kind: str, first: Cause, second: Cause) -> Cause:
+    """Two changes at once.
+
+    Of camera and board nothing is left of the old hand-eye calibration but the arm; a board of
+    another size that lies elsewhere is another board.
+    """
     return Cause(
-        BOTH,
-        np.concatenate([camera.by_sensor, board.by_sensor], axis=2),
-        np.concatenate([camera.flange_jacobian, board.flange_jacobian], axis=2),
-        np.concatenate([camera.units, board.units]),
-        np.concatenate([camera.start, np.zeros(len(board.units))]),
+        f"{kind} {second.name.partition(' ')[2]}".strip(),
+        np.concatenate([first.by_sensor, second.by_sensor], axis=2),
+        np.concatenate([first.flange_jacobian, second.flange_jacobian], axis=2),
+        np.concatenate([first.units, second.units]),
+        np.concatenate([first.start, np.zeros(len(second.units))]),
     )
+
+
+def _sizes(seen: PredictedStops, prior_calibration: CalibrationPrior) -> Iterator[Cause]:
+    """Each board's size, as a share: one that is larger is seen nearer by as much."""
+    if prior_calibration.calibration.mount == "instrument":
+        return
+    names, measured = tuple(prior_calibration.targets) or ("",), seen.problem.observations.measured
+    nearer = np.zeros((len(measured), 6, 1))
+    nearer[:, 3:, 0] = np.einsum("nji,nj->ni", measured[:, :3, :3], measured[:, :3, 3])
+    for at, board in enumerate(prior_calibration.boards):
+        if (mine := seen.boards == at).any():
+            by_sensor = np.where(mine[:, None, None], nearer, 0.0)
+            yield _cause(f"{SIZE} {names[board]}".strip(), seen, np.ones(1), by_sensor)
 
 
 def _joints(seen: PredictedStops, prior_calibration: CalibrationPrior) -> Iterator[Cause]:

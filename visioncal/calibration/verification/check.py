@@ -11,6 +11,7 @@ from visioncal.calibration.verification.change_hypotheses import (
     BOTH,
     CAMERA,
     NOISE,
+    REPLACED,
     causes_of,
     kind_of,
 )
@@ -38,6 +39,7 @@ from visioncal.session import Session
 from visioncal.session.choosing import Choice
 
 _LIMITS = CheckLimits()
+_PAIRS = (BOTH, REPLACED)
 # A board that was placed anew may lie anywhere near where it is seen [rad and m].
 _ANYWHERE = np.repeat([1.0, 1.0], 3)
 
@@ -48,6 +50,7 @@ class Suspect:
 
     Attributes:
         name: `camera`, `board` (with its name where there are several), `joint 3`, `arm_length`,
+            `board_size`, `board_replaced`,
             `robot_noise`, or `view 7`.
         probability: Its share among all changes, given the stops.
         explained: What the stops say under it.
@@ -209,7 +212,7 @@ def _not_told_apart(suspects: Sequence[Suspect]) -> tuple[Suspect, ...]:
     turned base looks like a slip of the first joint, however unlikely a turn about just that axis.
     """
     best, *others = suspects
-    if best.name in (NOISE, BOTH):
+    if kind_of(best.name) in (NOISE, *_PAIRS):
         return (best,)
     margin = 2.0 * np.log(_LIMITS.told_apart)
 
@@ -219,8 +222,8 @@ def _not_told_apart(suspects: Sequence[Suspect]) -> tuple[Suspect, ...]:
     rivals = [
         it
         for it in others
-        # Camera and board at once imitate either: that says nothing against it.
-        if it.name != BOTH
+        # Two changes at once imitate either: that says nothing against it.
+        if kind_of(it.name) not in _PAIRS
         and (
             it.probability * _LIMITS.told_apart > best.probability
             or (it.name != NOISE and price(it) < price(best) + margin)

@@ -13,6 +13,8 @@ from visioncal.calibration.verification.change_hypotheses import (
     JOINT,
     LENGTH,
     NOISE,
+    REPLACED,
+    SIZE,
     kind_of,
 )
 from visioncal.calibration.verification.check import Check, Suspect
@@ -30,6 +32,10 @@ _WORTH_A_WORD = 3.0
 # A camera that moves by so many sigmas is told from none in nearly every check.
 _SURE = 6.0
 _ALUMINIUM, _STEEL = 23e-6, 12e-6
+_ANOTHER_BOARD = Step(
+    "Verify with the board that was calibrated with; or measure the squares of this one, and "
+    "calibrate again with it."
+)
 _NEXT = {
     CAMERA: Step("Fasten the camera, and calibrate again."),
     BOARD: Step(
@@ -37,6 +43,8 @@ _NEXT = {
         f"{VERIFY} --board-moved",
     ),
     BOTH: Step("Fasten both, and calibrate again."),
+    SIZE: _ANOTHER_BOARD,
+    REPLACED: _ANOTHER_BOARD,
     JOINT: Step(
         "Look whether the joint keeps its zero (a coupling that slips does so again), then "
         "calibrate again."
@@ -128,12 +136,14 @@ def described(check: Check, suspect: Suspect) -> dict[str, Any]:
     values, sigmas = suspect.explained.values, np.sqrt(np.diag(suspect.explained.covariance))
     if kind == NOISE:
         return {"noise_factor": suspect.explained.noise_factor}
-    if kind == LENGTH:
+    if kind in (LENGTH, SIZE):
         return {"share": float(values[0]), "sigma": float(sigmas[0])}
     if kind == JOINT:
         value, sigma, unit = _joint_figures(check, suspect)
         return {f"offset_{unit}": value, f"sigma_{unit}": sigma}
     documents = {name: _motion_document(it) for name, it in motions(check, suspect).items()}
+    if kind == REPLACED:
+        return {**documents[suspect.name], "share": float(values[6]), "sigma": float(sigmas[6])}
     return documents if kind == BOTH else documents[suspect.name]
 
 
@@ -153,13 +163,17 @@ def motions(check: Check, suspect: Suspect) -> dict[str, MeasuredMove]:
     names = (CAMERA, BOARD) if kind_of(suspect.name) == BOTH else (suspect.name,)
     values, covariance = suspect.explained.values, suspect.explained.covariance
     parts = [slice(6 * at, 6 * at + 6) for at in range(len(names))]
+    grown = float(values[6]) if kind_of(suspect.name) == REPLACED else 0.0
     return {
-        name: _motion(check, name, values[it], covariance[it, it])
+        name: _motion(check, name, values[it], covariance[it, it], grown)
         for name, it in zip(names, parts, strict=True)
     }
 
 
-def _motion(check: Check, name: str, twist: FloatArray, covariance: FloatArray) -> MeasuredMove:
+def _motion(
+    check: Check, name: str, twist: FloatArray, covariance: FloatArray, grown: float
+) -> MeasuredMove:
+    """How far the middle of something moved that is larger by a share than it was."""
     x, *boards = check.prior_calibration.state.edges
     hand = check.calibration.mount == "eye-in-hand"
     if name == CAMERA:
@@ -169,7 +183,7 @@ def _motion(check: Check, name: str, twist: FloatArray, covariance: FloatArray) 
         rotation, point = boards[place][:3, :3], _middle(check, place)
         parent = "base" if hand else "tool"
     moved = exp(twist)
-    shift = moved[:3, :3] @ point + moved[:3, 3] - point
+    shift = moved[:3, :3] @ point * (1.0 + grown) + moved[:3, 3] - point
     # How the point goes on moving with the twist, by its right perturbation.
     onward = np.linalg.inv(inverse_right_jacobian(twist))
     slope = moved[:3, :3] @ np.concatenate([-skew(point), np.eye(3)], axis=1) @ onward
@@ -189,7 +203,7 @@ def _board(check: Check, name: str) -> int:
     """The place among the calibration's boards of the one that a cause is about."""
     kind, _, which = name.partition(" ")
     prior_calibration, seen = check.prior_calibration, check.seen
-    if kind == BOARD:
+    if kind in (BOARD, REPLACED):
         names = list(prior_calibration.targets)
         return prior_calibration.boards.index(names.index(which)) if which in names else 0
     return int(seen.boards[[int(which) in it for it in seen.views]][0])
@@ -222,7 +236,7 @@ def _signed_axis(vector: FloatArray) -> str:
 
 def _changed(check: Check, suspect: Suspect) -> str:
     kind = kind_of(suspect.name)
-    if kind in (JOINT, LENGTH, NOISE):
+    if kind in (JOINT, LENGTH, NOISE, SIZE, REPLACED):
         return f"{_capital(thing(check, suspect))}."
     moved = motions(check, suspect)
     if kind in (CAMERA, BOARD, BOTH):
@@ -254,12 +268,30 @@ def thing(check: Check, suspect: Suspect) -> str:
             f"all lengths of the arm {grown} by {figure(1e2 * abs(share))} % (sigma "
             f"{figure(1e2 * sigma)}), as {kelvins[0]} do to aluminium and {kelvins[1]} to steel"
         )
+    if kind in (SIZE, REPLACED):
+        return _other_board(check, suspect)
     if kind == NOISE:
         return f"the robot scatters about {explained.noise_factor:.0f} times as much as it did"
     if kind in (CAMERA, BOARD, BOTH):
         moved = motions(check, suspect)
         return listed([f"the {name} moved by {_short(it)}" for name, it in moved.items()])
     return f"{suspect.name} alone being wrong"
+
+
+def _other_board(check: Check, suspect: Suspect) -> str:
+    """A board of another size, with its place where that is another too."""
+    kind, _, which = suspect.name.partition(" ")
+    share = float(suspect.explained.values[-1])
+    sigma = float(np.sqrt(suspect.explained.covariance[-1, -1]))
+    size = "larger" if share > 0.0 else "smaller"
+    named = f"the board {which}".strip()
+    words = (
+        f"{named} is {figure(1e2 * abs(share))} % {size} (sigma {figure(1e2 * sigma)}) than it "
+        "was: it was printed again or exchanged"
+    )
+    if kind == SIZE:
+        return words
+    return f"{words}; its middle lies {_short(motions(check, suspect)[suspect.name])} elsewhere"
 
 
 def _short(moved: MeasuredMove) -> str:
