@@ -23,6 +23,7 @@ from visioncal.dynamics import (
     friction_at,
 )
 from visioncal.dynamics.conditioning import condition
+from visioncal.dynamics.document import stribeck_rows
 from visioncal.dynamics.identify import Options
 from visioncal.dynamics.reading import read_recorded
 from visioncal.dynamics.run import Request, conditioned_streams, identify_session
@@ -157,6 +158,20 @@ def test_a_payload_is_weighed(seed):
         q, Loads.alike(len(q), found.mass_kg, found.centre_m, (0.0, 0.0, 0.0))
     ) - identified.robot.load_torques(q)
     assert more == pytest.approx(-held, abs=1e-9)
+
+
+def test_what_the_drives_gains_are_known_to_counts_in_the_mass(run, world):
+    """All drives of one sign, as lists have it: the mass is as wrong as the gains."""
+    streams = loaded_streams(run.identified, world.full)
+    exact = estimate_payload(run.identified, streams)
+    currents = [replace(it, of_currents=True) for it in streams]
+    found = estimate_payload(run.identified, currents, gain_sigma=0.12)
+    assert exact.gains_sigma_kg == 0.0
+    assert found.mass_kg == exact.mass_kg
+    # The larger part is common to all drives, and a common error is that of the mass.
+    assert 0.8 * 0.12 < found.gains_sigma_kg / found.mass_kg < 0.13
+    assert found.mass_sigma_kg > found.gains_sigma_kg
+    assert found.document()["gains_sigma_kg"] == found.gains_sigma_kg
 
 
 def test_no_payload_is_none(world, run):
@@ -311,3 +326,24 @@ def test_base_parameters_are_read_as_they_were_kept(run, tmp_path):
     found = run.identification.streams[0].pieces[0].measured.motion.chosen(slice(0, 50))
     # Both are the same torques, to rounding of sums of some 60 products.
     assert again.torques(found) == pytest.approx(identified.torques(found), abs=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "gains",
+    [
+        (10.0, 10.6956, 8.4566, 9.0029, 9.48, 10.1232),
+        (14.87, 13.26, 11.13, 10.62, 11.03, 11.47),
+    ],
+)
+def test_a_real_load_lies_within_its_sigma_by_either_list_of_gains(real_data, gains):
+    """A UR10e with 2.805 kg, by its motors' currents."""
+    request, sessions = Request(gains_nm_a=gains), real_data / "sessions"
+    run = identify_session(Session.load(sessions / "ur10e_torques_free"), request)
+    loaded = Session.load(sessions / "ur10e_torques_loaded")
+    found = estimate_payload(run.identified, conditioned_streams(loaded, run.identified, request))
+    # The two lists differ by a quarter: truth lies between them, within two sigmas of each.
+    assert abs(found.mass_kg - 2.805) < 2.0 * found.mass_sigma_kg < 1.0
+    # Dry friction resists at every speed.
+    static = [it["static_nm"] for it in stribeck_rows(run.identified)]
+    assert min(static, default=0.0) >= 0.0

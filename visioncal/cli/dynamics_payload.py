@@ -15,6 +15,7 @@ from visioncal.cli.options import AsJson
 from visioncal.core.number_format import matched, significant
 from visioncal.core.types import FloatArray
 from visioncal.dynamics import Payload, estimate_payload
+from visioncal.dynamics.payload import GAIN_SIGMA
 from visioncal.dynamics.run import conditioned_streams
 from visioncal.session import Session
 
@@ -29,6 +30,14 @@ def dynamics_payload_command(
             "--same-friction", help="Friction is as it was without the payload, however it presses."
         ),
     ] = False,
+    gains_sigma: Annotated[
+        float,
+        typer.Option(
+            "--gains-sigma",
+            min=0.0,
+            help="What each of the --gains is known to, in percent.",
+        ),
+    ] = 100.0 * GAIN_SIGMA,
     as_json: AsJson = False,
 ) -> None:
     """Weigh what the arm carries, by how much more its drives gave than without it.
@@ -37,7 +46,9 @@ def dynamics_payload_command(
     """
     identified = identified_of(against, "payload")
     loaded = conditioned_streams(Session.load(session), identified, streams.request())
-    found = estimate_payload(identified, loaded, friction_changes=not same_friction)
+    found = estimate_payload(
+        identified, loaded, friction_changes=not same_friction, gain_sigma=0.01 * gains_sigma
+    )
     if as_json:
         typer.echo(json.dumps(found.document(), indent=2))
         return
@@ -48,7 +59,7 @@ def _lines(found: Payload) -> list[str]:
     mass = f"{matched(found.mass_kg, found.mass_sigma_kg)} kg"
     centre = _listed(1e3 * found.centre_m, 1e3 * found.centre_sigma_m)
     lines = [
-        f"mass {mass} (sigma {significant(found.mass_sigma_kg)})",
+        f"mass {mass} (sigma {significant(found.mass_sigma_kg)}{_of_gains(found)})",
         f"centre {centre} mm in the flange's frame",
     ]
     if found.consistent:
@@ -59,6 +70,13 @@ def _lines(found: Payload) -> list[str]:
     left = ", ".join(significant(it) for it in found.rms_nm.tolist())
     lines.append(f"unexplained {left} N m, joint by joint")
     return [*lines, f"on a UR: {_ur_words(found)}"]
+
+
+def _of_gains(found: Payload) -> str:
+    """What of the mass's sigma the drives' gains make up, where they do."""
+    if not found.gains_sigma_kg:
+        return ""
+    return f", {significant(found.gains_sigma_kg)} of it from the drives' gains"
 
 
 def _listed(values: FloatArray, sigmas: FloatArray) -> str:

@@ -92,6 +92,7 @@ class Conditioned:
         cutoff_hz: Where the low-pass is 6 dB down [Hz].
         rate_hz: Samples a second.
         notes: What was found in the samples and done about it, in words.
+        of_currents: Whether the torques are currents times gains.
     """
 
     label: str
@@ -100,6 +101,7 @@ class Conditioned:
     cutoff_hz: float
     rate_hz: float
     notes: tuple[str, ...]
+    of_currents: bool = False
 
     @property
     def count(self) -> int:
@@ -193,7 +195,15 @@ def condition(
             f"{recorded.label}: dq1_rad_s ... are not the speeds at which q1_rad ... change; they "
             "were left out. Are they in rad/s, measured, and not delayed?"
         )
-    return Conditioned(recorded.label, tuple(pieces), band_hz, cutoff, rate_hz, tuple(notes))
+    return Conditioned(
+        recorded.label,
+        tuple(pieces),
+        band_hz,
+        cutoff,
+        rate_hz,
+        tuple(notes),
+        recorded.of_currents,
+    )
 
 
 def _resting(motion: Motion, rate_hz: float) -> Mask:

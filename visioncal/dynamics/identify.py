@@ -79,7 +79,9 @@ def identify(
     fit = regress(blocks)
     humps = Stribeck.none()
     if options.stribeck and options.terms.coulomb:
-        humps, fit = fit_stribeck(streams, blocks, fit, options.terms.slow_rad_s)
+        names = [base.model.names[it] for it in base.independent]
+        sliding = np.array([names.index(f"Fc{it + 1}") for it in range(robot.joint_count)])
+        humps, fit = fit_stribeck(streams, blocks, fit, options.terms.slow_rad_s, sliding)
     consistent = None
     if options.consistent and robot.inertias is not None:
         kept = slice(base.rank)

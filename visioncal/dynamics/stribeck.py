@@ -67,7 +67,11 @@ class Stribeck:
 
 
 def fit_stribeck(
-    streams: Sequence[Conditioned], blocks: Sequence[Block], plain: Regression, slow_rad_s: float
+    streams: Sequence[Conditioned],
+    blocks: Sequence[Block],
+    plain: Regression,
+    slow_rad_s: float,
+    sliding: IntArray,
 ) -> tuple[Stribeck, Regression]:
     """Finds the humps that torques show.
 
@@ -76,6 +80,7 @@ def fit_stribeck(
         blocks: The same, as they were fitted without humps, to which humps may look like outliers.
         plain: That fit.
         slow_rad_s: See `friction.sign`.
+        sliding: (n,) which of its parameters is each joint's Fc.
 
     Returns:
         The humps, and the fit with them: its parameters are those of `plain`, humps [N m], and
@@ -88,7 +93,7 @@ def fit_stribeck(
         starts = [Stribeck(joints, ones, it * ones, slow_rad_s) for it in _STARTS]
         tried = [_descended(whole, it) for it in starts]
         found, fit = _polished(streams, blocks, min(tried, key=lambda it: it.cost).humps)
-        shown = _shown(found, fit)
+        shown = _shown(found, fit, fit.values[sliding[joints]])
         if shown.all():
             return found, fit
         joints = joints[shown]
@@ -109,13 +114,17 @@ def _polished(
     return found, fit
 
 
-def _shown(found: Stribeck, fit: Regression) -> FloatArray:
-    """(a,) whether a hump is above chance and within the range of speeds."""
+def _shown(found: Stribeck, fit: Regression, coulomb_nm: FloatArray) -> FloatArray:
+    """(a,) whether a hump is above chance and within the range of speeds.
+
+    Friction that would drive a joint at low speeds (Fs below 0) is none: something else is.
+    """
     count = len(found.joints)
     sigma = np.sqrt(np.diag(fit.covariance)[-2 * count : -count])
     limit = float(np.sqrt(chi2_limit(_CHANCE, 2.0)))
     inside = (found.speed_rad_s > 1.01 * _SLOWEST) & (found.speed_rad_s < 0.99 * _FASTEST)
-    return np.asarray((np.abs(found.hump_nm) > limit * sigma) & inside)
+    resists = coulomb_nm + found.hump_nm > 0.0
+    return np.asarray((np.abs(found.hump_nm) > limit * sigma) & inside & resists)
 
 
 def _descended(whole: "_Weighted", start: Stribeck) -> "_Look":
