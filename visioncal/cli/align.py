@@ -64,11 +64,19 @@ def align_into(
     convention: Convention | None = None,
     without: Collection[str] = (),
     threads: int | None = None,
+    keep_corners: bool = False,
 ) -> Alignment:
     """Aligns the cell of a session from some path, writes the result and tells of it."""
     left = leftover(out)
     with naming(path, out), shown_progress(quiet=quiet) as told:
-        result = align(session, level=level, convention=convention, progress=told, threads=threads)
+        result = align(
+            session,
+            level=level,
+            convention=convention,
+            progress=told,
+            threads=threads,
+            keep_corners=keep_corners,
+        )
     result = replace(result, verdict=result.verdict.with_paths(path, out))
     if left is not None:
         left.keep()

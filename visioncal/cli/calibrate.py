@@ -92,6 +92,7 @@ def calibrate_command(
             quiet=as_json,
             without=without,
             threads=work.threads,
+            keep_corners=work.keep_corners,
         )
         document = whole_document(found)
         if as_json:
@@ -107,6 +108,7 @@ def calibrate_command(
             convention=convention,
             progress=told,
             threads=work.threads,
+            keep_corners=work.keep_corners,
         )
         told("write", 0, 1)
         calibration = result.calibration

@@ -20,6 +20,14 @@ class WorkOptions:
             help="Images searched at a time; one a core where left out. No result changes.",
         ),
     ] = None
+    keep_corners: Annotated[
+        bool,
+        typer.Option(
+            "--keep-corners",
+            help="Keep what is found in the images, in .visioncal in the session's folder: the "
+            "next time need not look. It can be deleted.",
+        ),
+    ] = False
     no_report: Annotated[
         bool, typer.Option("--no-report", help=f"Leave {REPORT} out, which takes a second to draw.")
     ] = False

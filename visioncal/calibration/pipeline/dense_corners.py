@@ -58,6 +58,7 @@ def run_dense(
     convention: Convention | None = None,
     progress: Progress | None = None,
     threads: int | None = None,
+    keep_corners: bool = False,
 ) -> Run:
     """Calibrates a session by the template's corners and by dense ones; see `calibrate`.
 
@@ -69,6 +70,7 @@ def run_dense(
         convention: Likewise.
         progress: Likewise.
         threads: Likewise.
+        keep_corners: Likewise.
 
     Returns:
         The one with dense corners, unless it predicts views that were left out worse than the
@@ -94,6 +96,7 @@ def run_dense(
             progress=progress,
             dense=dense,
             threads=threads,
+            keep_corners=keep_corners,
         )
 
     plain = calibrated(None)

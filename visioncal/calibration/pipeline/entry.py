@@ -26,6 +26,7 @@ def calibrate(
     dense: bool = False,
     device: str = "auto",
     threads: int | None = None,
+    keep_corners: bool = False,
 ) -> Calibration:
     """Calibrates a session.
 
@@ -50,6 +51,9 @@ def calibrate(
         device: What that works on: `auto` for a GPU where there is one, `cpu` or `cuda`.
         threads: How many images are searched at a time; one a core where None. The result is the
             same to the bit.
+        keep_corners: Whether what is found in the images is kept in the session's folder, in
+            `.visioncal`, so that the next calibration need not look. It holds for the same
+            images, board and version, and can be deleted.
 
     Returns:
         The result with its verdict.
@@ -60,7 +64,13 @@ def calibrate(
         ConvergenceError: The intrinsics do not come to rest.
     """
     known = known_at_first(
-        session, progress, solver=solver, level=level, convention=convention, threads=threads
+        session,
+        progress,
+        solver=solver,
+        level=level,
+        convention=convention,
+        threads=threads,
+        keep_corners=keep_corners,
     )
     needing = replace(known, session=known.session.needing(need_mm, need_deg))
     if dense:
@@ -73,6 +83,7 @@ def calibrate(
             convention=convention,
             progress=progress,
             threads=threads,
+            keep_corners=keep_corners,
         ).calibration
     return result_of(run_steps(needing))
 
@@ -87,6 +98,7 @@ def align(
     corners: Mapping[int, Corners] | None = None,
     progress: Progress | None = None,
     threads: int | None = None,
+    keep_corners: bool = False,
 ) -> Alignment:
     """Calibrates a whole cell, and gives its result in the older form; see `calibrate`.
 
@@ -99,6 +111,7 @@ def align(
         corners: What was found in its images before, by view; None to look.
         progress: Told of long work.
         threads: As in `calibrate`.
+        keep_corners: Likewise.
 
     Returns:
         All frames with their joint covariance, and the verdict.
@@ -107,6 +120,13 @@ def align(
         DataError: The input is wrong or shows no target.
         DegenerateError: A robot is tied to nothing, or the observations leave a frame open.
     """
-    known = known_at_first(session, progress, level=level, convention=convention, threads=threads)
+    known = known_at_first(
+        session,
+        progress,
+        level=level,
+        convention=convention,
+        threads=threads,
+        keep_corners=keep_corners,
+    )
     needing = known.session.needing(need_mm, need_deg)
     return alignment_of(run_steps(replace(known, session=needing, found_before=corners)))

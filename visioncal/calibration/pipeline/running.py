@@ -51,10 +51,17 @@ def run(
     progress: Progress | None = None,
     dense: Dense | None = None,
     threads: int | None = None,
+    keep_corners: bool = False,
 ) -> Run:
     """Calibrates a session and keeps the evidence; see `calibrate`."""
     first = known_at_first(
-        session, progress, solver=solver, level=level, convention=convention, threads=threads
+        session,
+        progress,
+        solver=solver,
+        level=level,
+        convention=convention,
+        threads=threads,
+        keep_corners=keep_corners,
     )
     known = run_steps(replace(first, dense=dense))
     held = known.solved.held_out
@@ -71,6 +78,7 @@ def known_at_first(
     level: str,
     convention: Convention | None,
     threads: int | None = None,
+    keep_corners: bool = False,
 ) -> RunState:
     """What is known at the start, checked."""
     if threads is not None and threads < 1:
@@ -85,6 +93,7 @@ def known_at_first(
         loaded,
         progress,
         threads or 0,
+        keep_corners,
         solver=solver,
         level=level,
         convention=convention,

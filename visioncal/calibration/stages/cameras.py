@@ -41,7 +41,7 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
             continue
         if given is None:
             with _naming(session, frame):
-                options = DetectOptions(threads=seen.threads)
+                options = DetectOptions(threads=seen.threads, keeps=seen.keeps_corners)
                 found = detect(session, options, seen.progress, among=views)
             corners, resolution = found.corners, found.resolution
             seen = seen.noting(found.rejections)

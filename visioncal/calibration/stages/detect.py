@@ -13,6 +13,7 @@ from threading import Condition
 import cv2
 import numpy as np
 
+from visioncal.calibration.stages.kept_corners import KeptCorners, Searched
 from visioncal.core.errors import DataError
 from visioncal.core.limits import MAX_BLUR_PX
 from visioncal.core.threads import SharedSetting
@@ -45,11 +46,13 @@ class DetectOptions:
         max_blur_px: Widest edges, as a Gaussian's sigma [px]. Defocus of this size still gives
             corners to 0.1 px; motion of this size is a pose that changed during the exposure.
         threads: How many images are worked on at a time; 0 for one a core.
+        keeps: Whether what is found is kept beside the session, for the next search.
     """
 
     min_corners: int = 6
     max_blur_px: float = MAX_BLUR_PX
     threads: int = 0
+    keeps: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,14 +127,17 @@ def detect(
     stated = _stated_resolution(session, among)
     looks: list[_Look] = []
     room = _Room()
+    kept = KeptCorners.beside(session, options.min_corners, options.max_blur_px)
     with (
         _ONE_OPENCV_THREAD.held(),
         ThreadPoolExecutor(options.threads or os.cpu_count() or 1) as pool,
     ):
-        for look in pool.map(lambda view: _look(session, view, stated, options, room), views):
+        for look in pool.map(lambda view: _look(session, view, stated, options, room, kept), views):
             looks.append(look)
             if progress is not None:
                 progress("detect", len(looks), len(views))
+    if options.keeps:
+        kept.save()
     given = [view for view in among if view.has_corners]
     resolution = _common_resolution(session, views, looks, given, stated)
     for name in session.boards:
@@ -178,6 +184,7 @@ def _look(
     stated: tuple[int, int] | None,
     options: DetectOptions,
     room: _Room,
+    kept: KeptCorners,
 ) -> _Look:
     absence = session.images.absence(view.image)
     if absence:
@@ -190,13 +197,21 @@ def _look(
     if stated not in (None, size) and 0 < pixels <= MOST_PIXELS:
         # Refused in any case: what another size shows need not be looked at.
         return _Look(Rejection(view.number, f"{view.image} is of another size"), size)
+    # Digests of images take time, too.
+    key = kept.key(data, target, name) if kept.entries or options.keeps else ""
+    before = kept.get(key, view.number)
+    if before is not None:
+        return _Look(before.found, before.size, before.misfit)
     most = MOST_CHECKERBOARD_PIXELS if target.kind == "checkerboard" else MOST_PIXELS
     with room.taken(pixels / most):
         image = _decoded(view, data)
         if isinstance(image, Rejection):
             return _Look(image, None)
         found, misfit = look_for(image, target, view.number, options, name=name)
-    return _Look(found, (image.shape[1], image.shape[0]), misfit)
+    searched = Searched(found, misfit, (image.shape[1], image.shape[0]))
+    if key:
+        kept.put(key, searched)
+    return _Look(found, searched.size, misfit)
 
 
 def look_for(

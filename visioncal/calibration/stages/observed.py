@@ -54,6 +54,7 @@ class Observed:
         session: What was recorded.
         progress: Told of long work.
         threads: How many images are worked on at a time; 0 for one a core.
+        keeps_corners: Whether what is found in them is kept beside the session.
         cameras: What each camera with images gave, by its frame.
         poses: The target's pose by view; several candidates until they are chosen from.
         reasons: Why a view cannot be used, by view.
@@ -69,6 +70,7 @@ class Observed:
     session: Session
     progress: Progress | None = None
     threads: int = 0
+    keeps_corners: bool = False
     cameras: Mapping[str, CameraLook] = field(default_factory=dict)
     poses: Mapping[int, ViewPoses] = field(default_factory=dict)
     reasons: Mapping[int, str] = field(default_factory=dict)

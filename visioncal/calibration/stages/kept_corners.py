@@ -1,0 +1,133 @@
+"""Corners that an earlier search has found, kept beside the session by what was searched.
+
+They are a copy that can be deleted. Each entry is named by the digest of the image's bytes and of
+the board, so that what belongs to another image or board is not found; a file of another version of
+visioncal or OpenCV, or one that cannot be read, counts as none.
+"""
+
+import json
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import cv2
+import numpy as np
+
+from visioncal.core.errors import DataError
+from visioncal.core.files import read_text, sha256, write_atomically
+from visioncal.core.types import Corners, Rejection, Target
+from visioncal.core.version import __version__
+from visioncal.session import Session
+from visioncal.session.images import FolderImages
+
+FOLDER, FILE = ".visioncal", "corners.json"
+_MADE_BY = {"visioncal": __version__, "opencv": cv2.__version__}
+
+
+@dataclass(frozen=True, eq=False)
+class Searched:
+    """What a search of one image gave.
+
+    Attributes:
+        found: The corners, or why there are none.
+        misfit: Whether markers were seen that lie otherwise than on the target.
+        size: Of the image [px].
+    """
+
+    found: Corners | Rejection
+    misfit: bool
+    size: tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class KeptCorners:
+    """Searches by the digests of what was searched.
+
+    Attributes:
+        file: Where they are kept; None of a session without a folder.
+        limits: What a view needs, which belongs to the answer.
+        entries: What is known, as it stands in the file.
+        new: What came to it.
+    """
+
+    file: Path | None
+    limits: tuple[float, ...]
+    entries: dict[str, Any]
+    new: dict[str, Any] = field(default_factory=dict)
+    _lock: Lock = field(default_factory=Lock)
+
+    @classmethod
+    def beside(cls, session: Session, *limits: float) -> "KeptCorners":
+        """Reads those of a session; there are none of one without a folder."""
+        if not isinstance(session.images, FolderImages):
+            return cls(None, limits, {})
+        file = session.images.folder / FOLDER / FILE
+        document: Any = None
+        if file.exists():
+            with suppress(DataError, ValueError):
+                document = json.loads(read_text(file))
+        known = isinstance(document, dict) and document.get("made_by") == _MADE_BY
+        entries = document.get("searches") if known else None
+        return cls(file, limits, entries if isinstance(entries, dict) else {})
+
+    def key(self, image: bytes, target: Target, name: str) -> str:
+        """The name of a search: of an image's bytes, for a board, under some limits."""
+        board = json.dumps([asdict(target), name, self.limits], default=_plain, sort_keys=True)
+        return f"{sha256(image)}-{sha256(board.encode())}"
+
+    def get(self, key: str, view: int) -> Searched | None:
+        """What was found before, of a view by its number; None where nothing is known."""
+        try:
+            return _searched(self.entries[key], view)
+        except (KeyError, TypeError, ValueError):
+            return None
+
+    def put(self, key: str, searched: Searched) -> None:
+        """Adds what was found, by any thread."""
+        with self._lock:
+            self.new[key] = _document(searched)
+
+    def save(self) -> None:
+        """Writes what is new beside what was known; where that cannot be written, nothing."""
+        if self.file is None or not self.new:
+            return
+        document = {"made_by": _MADE_BY, "searches": {**self.entries, **self.new}}
+        with suppress(DataError, OSError):
+            self.file.parent.mkdir(exist_ok=True)
+            write_atomically(self.file, json.dumps(document))
+
+
+def _document(searched: Searched) -> dict[str, Any]:
+    found, common = searched.found, {"size": searched.size, "misfit": searched.misfit}
+    if isinstance(found, Rejection):
+        return {**common, "reason": found.reason}
+    return {
+        **common,
+        "ids": found.ids.tolist(),
+        "px": found.px.tolist(),
+        "blur_px": found.blur_px,
+        "weights": None if found.weights is None else found.weights.tolist(),
+    }
+
+
+def _searched(entry: Any, view: int) -> Searched:  # noqa: ANN401 - as it was read
+    width, height = (int(it) for it in entry["size"])
+    if "reason" in entry:
+        return Searched(
+            Rejection(view, str(entry["reason"])), bool(entry["misfit"]), (width, height)
+        )
+    weights = entry["weights"]
+    found = Corners(
+        view,
+        np.array(entry["ids"], dtype=np.int64),
+        np.array(entry["px"], dtype=np.float64).reshape(-1, 2),
+        float(entry["blur_px"]),
+        None if weights is None else np.array(weights, dtype=np.float64),
+    )
+    return Searched(found, bool(entry["misfit"]), (width, height))
+
+
+def _plain(value: object) -> object:
+    return value.tolist() if isinstance(value, np.ndarray) else str(value)
