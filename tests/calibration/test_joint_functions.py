@@ -4,15 +4,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.later import ANYHOW, Change, known_again, lot
 from support.tracked import known_of
 
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.kinematics import FUNCTIONS
+from visioncal.calibration.verification.calibration_prior import CalibrationPrior
+from visioncal.calibration.verification.check import check
+from visioncal.calibration.verification.prediction import seen_by
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.solve import Solution
 from visioncal.interchange.exports import document
+from visioncal.results import Calibration
 from visioncal.results.arm import ArmResult, CarriedRegion, CarriesOver
 from visioncal.simulation.arms import forward
 from visioncal.simulation.tracked import Shop, Tracked, above, session_of, tracked
@@ -180,3 +185,22 @@ def test_corrections_send_each_joint_to_where_it_is_wanted(known):
     # Written to a millionth of a degree.
     np.testing.assert_allclose(stood, plain, atol=2e-8)
     assert (sigmas > 0.0).all()
+
+
+def test_a_check_of_an_unchanged_cell_passes_and_a_bump_is_seen(tmp_path):
+    options = replace(ANYHOW, function_sigma_rad=3e-4, function_length_rad=0.12)
+    place = lot(options, 20)
+    assert place.calibration.arm.level == FUNCTIONS
+    # Through the file: harmonics are in the arm, not among the unknowns.
+    place.calibration.save(tmp_path / "calibration.json")
+    prior = CalibrationPrior.of(Calibration.load(tmp_path / "calibration.json"))
+    rng = np.random.default_rng(0)
+    found = [check(seen_by(known_again(place.cell, rng), prior), prior) for _ in range(4)]
+    assert all(it.passed and not it.named for it in found)
+    # Chi-square of thirty directions; views that were left out err by more than the stops of a cell
+    # that is well known, so that it comes out small.
+    assert 4.0 < np.mean([it.misfit for it in found]) < 45.0
+    bump = Change(camera=np.array([0.0, 0.0, 0.0, 0.0, 4e-3, 0.0]))
+    bumped = check(seen_by(known_again(place.cell, rng, bump), prior), prior)
+    assert not bumped.passed
+    assert [it.name for it in bumped.named] == ["camera"]

@@ -29,8 +29,12 @@ from visioncal.estimation.variance import LEAST_SIGMA, MOST_SIGMA, Knowledge
 # Twice the gain in log-likelihood over the same arm without them.
 SIGNIFICANT = 20.0
 # Lengths that are tried [rad], the longest first, and how many lengths' inverses of harmonics are
-# carried: beyond, two percent of the variance is left.
-_LENGTHS_RAD, _CARRIED = (0.5, 0.25, 0.12, 0.06, 0.03), 2.4
+# carried: beyond, three thousandths of the variance are left.
+_LENGTHS_RAD, _CARRIED = (0.5, 0.25, 0.12, 0.06, 0.03), 3.0
+# After so many lengths that are less likely than a longer one no shorter one is tried.
+_WORSE = 2
+# Combinations of harmonics of which a unit moves all stops by less are not carried [rad, m].
+_SHOWN = 5e-3
 # Typical sizes of errors [rad], give or take a factor of e, and the torque of a spring's [N m].
 _TYPICAL = {
     "links": 7e-4,
@@ -42,7 +46,7 @@ _TYPICAL = {
     "second": 1e-4,
     HARMONICS: 2e-4,
 }
-_TORQUE_NM, _SPREAD = 10.0, 1.0
+_TORQUE_NM, _SPREAD, _START_RAD = 10.0, 1.0, 2e-4
 _ITERATIONS, _SETTLED, _LONGEST_STEP = 30, 1e-2, 1.0
 _WORST_DAMPING, _RIDGE = 1e4, 1e-12
 # Combinations of harmonics of which residuals tell by less than this share of what is known of them
@@ -113,22 +117,72 @@ def find_joint_functions(
     Returns:
         The functions with all other errors of the arm; None where these explain about as much.
     """
-    plain = _Arm.of(problem, state, noise, robot, bases, harmonics[:, :, :, :1])
-    without = plain.most_likely(plain.start(torque_nm), torque_nm)
+    rest = (problem, state, noise, robot)
+    plain = _Arm.of(*rest, bases, _Waves.of(harmonics), torque_nm)
+    without = plain.most_likely(plain.start())
     if without is None:
         return None
-    chosen, chosen_length, best = None, 0.0, without
+    chosen, best, worse = None, without, 0
     for length in _LENGTHS_RAD:
-        orders = _orders_of(length)
-        arm = _Arm.of(problem, state, noise, robot, bases, harmonics[:, :, :, :orders], length)
-        found = arm.most_likely(np.append(best[0][: len(without[0])], np.log(2e-4)), torque_nm)
-        if found is None or (chosen is not None and found[1] > best[1]):
+        arm = _Arm.of(*rest, bases, _Waves.of(harmonics, length), torque_nm)
+        found = arm.most_likely(np.append(best.logs[: len(without.logs)], np.log(_START_RAD)))
+        if found is None or (chosen is not None and found.value > best.value):
+            worse += 1
+        else:
+            chosen, best, worse = arm, found, 0
+        if worse == _WORSE:
             break
-        chosen, best, chosen_length = arm, found, length
-    if chosen is None or 2.0 * (without[1] - best[1]) < SIGNIFICANT:
+    if chosen is None or 2.0 * (without.value - best.value) < SIGNIFICANT:
         return None
+    # Springs that would yield against their load are none.
+    while (against := chosen.springs_of(best) < 0.0).any():
+        bases = {**bases, COMPLIANCE: bases[COMPLIANCE] * ~against}
+        stiffer = _Arm.of(*rest, bases, chosen.waves, torque_nm)
+        found = stiffer.most_likely(best.logs)
+        if found is None:
+            break
+        chosen, best = stiffer, found
     nominal = robot_levels(problem, state, noise, from_above=True)[1]
-    return chosen.found(best[0], chosen_length, 2.0 * (nominal - best[1]))
+    return chosen.found(best, 2.0 * (nominal - best.value))
+
+
+@dataclass(frozen=True, eq=False)
+class _Waves:
+    """The harmonics of a process as columns.
+
+    Attributes:
+        columns: (s, 6, 2 n + r) how the flange moves with sine and cosine of order 2 of each joint,
+            and with r combinations of higher orders in units of the process.
+        series: (k + 1,) variances of the process's orders, from 1 on; of no process 0.
+        expanded: (2 n k, 2 n + r) what each column is of sine and cosine of each joint and order.
+        seconds: How many columns 2 n are of order 2.
+        length_rad: Of the process; 0 of none.
+    """
+
+    columns: FloatArray
+    series: FloatArray
+    expanded: FloatArray
+    seconds: int
+    length_rad: float
+
+    @classmethod
+    def of(cls, harmonics: FloatArray, length_rad: float = 0.0) -> "_Waves":
+        """Chooses the columns of a process among (s, 6, n, k, 2) harmonics."""
+        stops, _, joints, _, _ = harmonics.shape
+        series = _series(length_rad) if length_rad else np.zeros(2)
+        orders = len(series) - 1
+        sizes = np.sqrt(series[2:])[:, None]
+        second = harmonics[:, :, :, 0].reshape(stops, 6, -1)
+        higher = (harmonics[:, :, :, 1:orders] * sizes).reshape(6 * stops, -1)
+        values, vectors = np.linalg.eigh(higher.T @ higher)
+        shown = vectors[:, values > _SHOWN**2]
+        shape = (joints, orders - 1, 2, shown.shape[1])
+        expanded = np.zeros((joints, orders, 2, 2 * joints + shown.shape[1]))
+        expanded[:, 0, :, : 2 * joints] = np.eye(2 * joints).reshape(joints, 2, -1)
+        expanded[:, 1:, :, 2 * joints :] = sizes[..., None] * shown.reshape(shape)
+        columns = np.concatenate([second, (higher @ shown).reshape(stops, 6, -1)], axis=2)
+        rows = expanded.reshape(2 * joints * orders, -1)
+        return cls(columns, series, rows, 2 * joints, length_rad)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,8 +194,9 @@ class _Arm:
         names: The groups, in the order of the sizes.
         shares: (q, g) which share of the variance of each error a group's is.
         random: (q,) their places among the unknowns that move.
-        bases: The columns of each block.
-        length_rad: Of the functions; 0 without any.
+        bases: The columns of each block but the harmonics.
+        waves: These.
+        torque_nm: The torque that a unit of a compliance is for [N m].
     """
 
     likelihood: RobotLikelihood
@@ -149,7 +204,8 @@ class _Arm:
     shares: FloatArray
     random: IntArray
     bases: Mapping[str, FloatArray]
-    length_rad: float
+    waves: _Waves
+    torque_nm: float
 
     @classmethod
     def of(
@@ -159,12 +215,10 @@ class _Arm:
         noise: Noise,
         robot: str,
         bases: Mapping[str, FloatArray],
-        harmonics: FloatArray,
-        length_rad: float = 0.0,
+        waves: _Waves,
+        torque_nm: float,
     ) -> "_Arm":
-        stops, _, joints, orders, _ = harmonics.shape
-        every = {**bases, HARMONICS: harmonics.reshape(stops, 6, -1)}
-        basis = np.concatenate(list(every.values()), axis=2)
+        basis = np.concatenate([*bases.values(), waves.columns], axis=2)
         size = basis.shape[2]
         freely = Knowledge(np.zeros((size, size)), np.zeros(size))
         effect = replace(ArmErrors(basis, 1.0, 0.0, True).effect(robot), known=freely)
@@ -173,48 +227,55 @@ class _Arm:
         likelihood = robot_likelihood(widened, still, noise)
         moving = np.cumsum(likelihood.moving) - 1
         random = moving[np.arange(len(likelihood.moving))[widened.effect_columns[effect.name]]]
-        names = (*bases, "second", *([HARMONICS] if length_rad else []))
+        names = (*bases, "second", *([HARMONICS] if waves.length_rad else []))
+        groups = np.repeat(np.arange(len(bases)), [it.shape[2] for it in bases.values()])
         shares = np.zeros((size, len(names)))
-        at = 0
-        for group, it in enumerate(bases.values()):
-            shares[at : at + it.shape[2], group] = 1.0
-            at += it.shape[2]
-        by_order = shares[at:].reshape(joints, orders, 2, len(names))
-        by_order[:, 0, :, names.index("second")] = 1.0
-        if length_rad:
-            series = _series(length_rad)
-            by_order[..., -1] = series[1:, None]
+        shares[np.arange(len(groups)), groups] = 1.0
+        second = slice(len(groups), len(groups) + waves.seconds)
+        shares[second, len(bases)] = 1.0
+        if waves.length_rad:
+            shares[second, -1], shares[second.stop :, -1] = waves.series[1], 1.0
             # The process's own first harmonic is among those of eccentric gears.
-            shares[:, -1] += series[0] * shares[:, names.index("eccentricity")]
-        return cls(likelihood, names, shares, random, every, length_rad)
+            shares[:, -1] += waves.series[0] * shares[:, names.index("eccentricity")]
+        return cls(likelihood, names, shares, random, bases, waves, torque_nm)
 
-    def start(self, torque_nm: float) -> FloatArray:
+    def springs_of(self, step: "_Step") -> FloatArray:
+        """(n,) the compliances at some step; none without any."""
+        at = 0
+        for name, it in self.bases.items():
+            if name == COMPLIANCE:
+                return step.effects[at : at + it.shape[2]]
+            at += it.shape[2]
+        return np.zeros(0)
+
+    def start(self) -> FloatArray:
         """Logarithms of the robots' levels, and of the sizes of the groups."""
         levels = np.maximum(self.likelihood.rms, LEAST_SIGMA)
         count = len(self.likelihood.components.parts) // 2
-        return np.concatenate([np.log(np.tile(levels, count)), self._typical(torque_nm)])
+        return np.concatenate([np.log(np.tile(levels, count)), self._typical])
 
-    def _typical(self, torque_nm: float) -> FloatArray:
+    @property
+    def _typical(self) -> FloatArray:
         """(g,) logarithms of typical sizes of the groups."""
-        factor = {COMPLIANCE: torque_nm / _TORQUE_NM}
+        factor = {COMPLIANCE: self.torque_nm / _TORQUE_NM}
         return np.log([_TYPICAL[it] * factor.get(it, 1.0) for it in self.names])
 
-    def most_likely(self, start: FloatArray, torque_nm: float) -> tuple[FloatArray, float] | None:
-        """The logarithms of the most likely levels and sizes, and the negative log-likelihood."""
-        logs, damping = start, 1e-3
+    def most_likely(self, start: FloatArray) -> "_Step | None":
+        """Finds the most likely levels and sizes; None where there are none to start from."""
+        damping = 1e-3
         try:
-            now = self._likelihood(logs, torque_nm)
+            now = self._likelihood(start)
         except LinAlgError:
             return None
         for _ in range(_ITERATIONS):
             curvature = now.curvature + damping * np.diag(np.diag(now.curvature))
             step = np.clip(-np.linalg.solve(curvature, now.slope), -_LONGEST_STEP, _LONGEST_STEP)
-            candidate = np.clip(logs + step, np.log(LEAST_SIGMA), np.log(MOST_SIGMA))
+            candidate = np.clip(now.logs + step, np.log(LEAST_SIGMA), np.log(MOST_SIGMA))
             then = None
             with suppress(LinAlgError):
-                then = self._likelihood(candidate, torque_nm)
+                then = self._likelihood(candidate)
             if then is not None and then.value <= now.value:
-                gained, logs, now = now.value - then.value, candidate, then
+                gained, now = now.value - then.value, then
                 damping = max(damping / 10, 1e-6)
                 if gained < _SETTLED:
                     break
@@ -222,9 +283,9 @@ class _Arm:
                 damping *= 10
             if damping > _WORST_DAMPING:
                 break
-        return logs, now.value
+        return now
 
-    def _likelihood(self, logs: FloatArray, torque_nm: float) -> "_Step":
+    def _likelihood(self, logs: FloatArray) -> "_Step":
         reduced, components = self.likelihood.reduced, self.likelihood.components
         known, levels = self.likelihood.known, len(components.parts)
         residuals = reduced.errors
@@ -263,7 +324,7 @@ class _Arm:
         of_weights = gram(weighted, grown)
         curvature = 0.5 * (gram(grown, weights @ grown) - of_weights.T @ inverse @ of_weights)
         slope = np.concatenate([by_levels, by_sizes])
-        away = (logs[levels:] - self._typical(torque_nm)) / _SPREAD
+        away = (logs[levels:] - self._typical) / _SPREAD
         slope[levels:] += away / _SPREAD
         curvature[levels:, levels:] += np.eye(len(away)) / _SPREAD**2
         value += 0.5 * float(away @ away)
@@ -273,24 +334,32 @@ class _Arm:
             offset = lean @ logs - np.log(RATIO_PRIOR.ratio) / RATIO_PRIOR.log_sigma
             value, slope = value + 0.5 * float(offset**2), slope + offset * lean
             curvature = curvature + np.outer(lean, lean)
-        return _Step(value, slope, curvature)
+        # Residuals fall as errors that are left out of the prediction grow.
+        return _Step(logs, value, slope, curvature, -effects)
 
-    def found(self, logs: FloatArray, length_rad: float, gain: float) -> JointFunctions:
-        """The errors of all blocks with the sizes of these logarithms."""
-        sizes = np.exp(logs[-len(self.names) :])
+    def found(self, step: "_Step", gain: float) -> JointFunctions:
+        """The errors of all blocks with the sizes at some step."""
+        sizes = np.exp(step.logs[-len(self.names) :])
         variances, sigma = self.shares @ sizes**2, float(sizes[-1])
-        errors, at = {}, 0
+        share, errors, at = gain / (len(self.bases) + 1), {}, 0
         for name, basis in self.bases.items():
-            size = basis.shape[2]
-            size_rad, share = float(np.sqrt(variances[at])), gain / len(self.bases)
+            size_rad = float(np.sqrt(variances[at]))
             errors[name] = ArmErrors(basis, size_rad, share, of_links=True)
-            at += size
-        harmonics = self.bases[HARMONICS]
-        own = np.sqrt(variances[-harmonics.shape[2] :])
-        directions = own[:, None] * self._told(logs, own) / sigma
-        errors[HARMONICS] = replace(errors[HARMONICS], basis=harmonics @ directions, sigma=sigma)
-        levels = np.exp(logs[: -len(self.names)]).reshape(-1, 2)
-        return JointFunctions(errors, levels, own / sigma, directions, sigma, length_rad, gain)
+            at += basis.shape[2]
+        own, waves = np.sqrt(variances[at:]), self.waves
+        told = own[:, None] * self._told(step.logs, own) / sigma
+        errors[HARMONICS] = ArmErrors(waves.columns @ told, sigma, share, of_links=True)
+        of_orders = np.sqrt(waves.series[1:])
+        of_orders[0] = own[0] / sigma
+        return JointFunctions(
+            errors,
+            np.exp(step.logs[: -len(self.names)]).reshape(-1, 2),
+            np.tile(np.repeat(of_orders, 2), waves.seconds // 2),
+            waves.expanded @ told,
+            sigma,
+            waves.length_rad,
+            gain,
+        )
 
     def _told(self, logs: FloatArray, sizes: FloatArray) -> FloatArray:
         """(q, r) unit vectors, in units of (q,) sizes, of harmonics that residuals tell of."""
@@ -304,11 +373,21 @@ class _Arm:
 
 @dataclass(frozen=True, eq=False)
 class _Step:
-    """Negative log-likelihood at some logarithms, its slope and its average information."""
+    """What is found at some logarithms of levels and sizes.
 
+    Attributes:
+        logs: These.
+        value: The negative log-likelihood.
+        slope: Its slope by them.
+        curvature: Its average information.
+        effects: (q,) the most likely errors of the arm.
+    """
+
+    logs: FloatArray
     value: float
     slope: FloatArray
     curvature: FloatArray
+    effects: FloatArray
 
 
 def _inverted(information: FloatArray) -> tuple[FloatArray, float]:
