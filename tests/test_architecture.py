@@ -28,7 +28,7 @@ LAYERS = (
     "cli",
 )
 # The session's loader hands recordings over.
-LAZY = {("session", "present")}
+LAZY = {("session", "present"), ("results", "present")}
 SIMULATION_MAY_USE = {"core", "session", "simulation"}
 HOMES = {
     "rerun": {"present.recording", "present.viewer"},

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
         DriverError,
         VisioncalError,
     )
+    from visioncal.frames.fixture import touched_fixture
     from visioncal.frames.frame_from_images import seen_frame
     from visioncal.frames.locate import locate, locate_target
     from visioncal.frames.located import Located
@@ -33,24 +34,35 @@ if TYPE_CHECKING:
     from visioncal.frames.plane import Plane
     from visioncal.frames.single_view import Sight
     from visioncal.frames.target_pose import place_seen
+    from visioncal.frames.tcp import touched_tool
     from visioncal.interchange.batch import Batch, batch
-    from visioncal.results import Alignment, Calibration
+    from visioncal.interchange.exports import export
+    from visioncal.interchange.formats import convert
+    from visioncal.live.planning.plan import make_plan
+    from visioncal.present.report import write_report
+    from visioncal.present.report.drawing import Drawing
+    from visioncal.results import Alignment, Calibration, Verdict
+    from visioncal.results.compare import compare
     from visioncal.results.compensation import CalibratedArm, Corrected, correct
     from visioncal.robot import Loads
     from visioncal.robot.thermal import OnlineCompensator
     from visioncal.session import Session
+    from visioncal.simulation import CellOptions, simulate, write_session
+    from visioncal.vision.finders.identify import identify
+    from visioncal.vision.targets import load_target
 
 _HOMES = {
     "Alignment": "visioncal.results",
     "Batch": "visioncal.interchange.batch",
     "CalibratedArm": "visioncal.results.compensation",
     "Calibration": "visioncal.results",
+    "CellOptions": "visioncal.simulation",
     "Checkup": "visioncal.calibration.pipeline.checkup",
-    "Corrected": "visioncal.results.compensation",
-    "correct": "visioncal.results.compensation",
     "ConvergenceError": "visioncal.core.errors",
+    "Corrected": "visioncal.results.compensation",
     "DataError": "visioncal.core.errors",
     "DegenerateError": "visioncal.core.errors",
+    "Drawing": "visioncal.present.report.drawing",
     "DriverError": "visioncal.core.errors",
     "Loads": "visioncal.robot",
     "Located": "visioncal.frames.located",
@@ -58,17 +70,30 @@ _HOMES = {
     "Plane": "visioncal.frames.plane",
     "Session": "visioncal.session",
     "Sight": "visioncal.frames.single_view",
+    "Verdict": "visioncal.results",
     "VisioncalError": "visioncal.core.errors",
     "align": "visioncal.calibration.pipeline",
     "batch": "visioncal.interchange.batch",
     "calibrate": "visioncal.calibration.pipeline",
+    "compare": "visioncal.results.compare",
+    "convert": "visioncal.interchange.formats",
+    "correct": "visioncal.results.compensation",
     "doctor": "visioncal.calibration.pipeline.checkup",
+    "export": "visioncal.interchange.exports",
+    "identify": "visioncal.vision.finders.identify",
+    "load_target": "visioncal.vision.targets",
     "locate": "visioncal.frames.locate",
     "locate_target": "visioncal.frames.locate",
     "locate_views": "visioncal.frames.picks",
+    "make_plan": "visioncal.live.planning.plan",
     "place_seen": "visioncal.frames.target_pose",
     "seen_frame": "visioncal.frames.frame_from_images",
+    "simulate": "visioncal.simulation",
+    "touched_fixture": "visioncal.frames.fixture",
+    "touched_tool": "visioncal.frames.tcp",
     "verify": "visioncal.calibration.verification",
+    "write_report": "visioncal.present.report",
+    "write_session": "visioncal.simulation",
 }
 
 __all__ = [
@@ -76,11 +101,13 @@ __all__ = [
     "Batch",
     "CalibratedArm",
     "Calibration",
+    "CellOptions",
     "Checkup",
     "ConvergenceError",
     "Corrected",
     "DataError",
     "DegenerateError",
+    "Drawing",
     "DriverError",
     "Loads",
     "Located",
@@ -88,19 +115,31 @@ __all__ = [
     "Plane",
     "Session",
     "Sight",
+    "Verdict",
     "VisioncalError",
     "__version__",
     "align",
     "batch",
     "calibrate",
+    "compare",
+    "convert",
     "correct",
     "doctor",
+    "export",
+    "identify",
+    "load_target",
     "locate",
     "locate_target",
     "locate_views",
+    "make_plan",
     "place_seen",
     "seen_frame",
+    "simulate",
+    "touched_fixture",
+    "touched_tool",
     "verify",
+    "write_report",
+    "write_session",
 ]
 
 
@@ -111,4 +150,4 @@ def __getattr__(name: str) -> Any:  # noqa: ANN401 - the type is given under TYP
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted(__all__)

@@ -10,6 +10,7 @@ from typing import Literal, Self, TypeAlias
 import numpy as np
 
 from visioncal.core.number_format import percent
+from visioncal.core.shown import html_card
 
 VerdictStatus: TypeAlias = Literal["good", "check", "bad"]
 
@@ -138,6 +139,13 @@ class Verdict:
     def noting(self, sentences: Iterable[str]) -> Self:
         """The same verdict with notes."""
         return replace(self, findings=(*self.findings, *remarks(sentences, NOTE)))
+
+    def __repr__(self) -> str:
+        return "\n  ".join([f"Verdict: {self.status}", *self.top])
+
+    def _repr_html_(self) -> str:
+        steps = (f"Next: {it}" for it in self.next_steps)
+        return html_card(self.headline, {}, self.status, (*self.top, *steps))
 
     @property
     def headline(self) -> str:

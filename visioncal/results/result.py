@@ -2,10 +2,12 @@
 
 import json
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -13,6 +15,8 @@ from scipy.spatial.transform import RigidTransform
 from visioncal.core.documents import parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, write_atomically
+from visioncal.core.number_format import figure
+from visioncal.core.shown import ByName, html_card, text_card
 from visioncal.core.types import FloatArray, Mount
 from visioncal.core.verdict import Step, Verdict
 from visioncal.estimation.intervals import freedom_of
@@ -37,6 +41,12 @@ from visioncal.results.whole import is_whole, read_whole
 from visioncal.robot import Loads, Robot, bent_joints
 from visioncal.robot.thermal import ThermalModel
 from visioncal.session.choosing import PARTS, Choice, Part
+
+if TYPE_CHECKING:
+    from visioncal.present.report.drawing import Drawing
+
+# So many transforms are shown at once.
+_SHOWN = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,14 +146,65 @@ class Calibration(CalibrationSections):
         return self
 
     @property
-    def transforms(self) -> dict[str, RigidTransform]:
+    def transforms(self) -> ByName[RigidTransform]:
         """The estimated transforms by name, those of tools and fixtures among them."""
-        return {name: edge.transform for name, edge in self.placed.items()}
+        return ByName({name: edge.transform for name, edge in self.placed.items()})
 
     @property
-    def placed(self) -> dict[str, Edge]:
+    def placed(self) -> ByName[Edge]:
         """The estimated transforms by name with their covariances, frames among them."""
-        return {**self.edges, **{name: frame.edge for name, frame in self.frames.items()}}
+        return ByName({**self.edges, **{name: it.edge for name, it in self.frames.items()}})
+
+    def __repr__(self) -> str:
+        title = f"Calibration of {self.session_name!r}: {self.verdict.status}"
+        return text_card(title, self._facts)
+
+    def _repr_html_(self) -> str:
+        steps = (f"Next: {it}" for it in self.verdict.next_steps[:1])
+        says = (*self.verdict.top, *steps)
+        title = f"Calibration of {self.session_name}"
+        return html_card(title, self._facts, self.verdict.status, says)
+
+    @property
+    def _facts(self) -> dict[str, str]:
+        used = sum(it.used for it in self.views)
+        left_out = self.validation.held_out
+        turned = "" if left_out.deg is None else f", {figure(left_out.deg)} deg"
+        return {
+            "views used": f"{used} of {len(self.views)}",
+            "left out, predicted to": f"{figure(left_out.mm)} mm{turned}",
+            **{
+                name: f"({', '.join(f'{1e3 * it:.2f}' for it in edge.transform.translation)}) mm, "
+                f"sigma {figure(edge.sigma_mm)} mm"
+                + (f", {figure(edge.sigma_deg)} deg" if edge.oriented else "")
+                for name, edge in [*self.placed.items()][:_SHOWN]
+            },
+        }
+
+    def views_table(self) -> Any:  # noqa: ANN401 - a frame of pandas, or records
+        """What became of each view: a pandas.DataFrame where pandas is installed, else records.
+
+        Columns are the attributes of `ViewResult`; what was not computed is None (NaN in a frame).
+        """
+        records = [asdict(it) for it in self.views]
+        if find_spec("pandas") is None:
+            return records
+        return import_module("pandas").DataFrame.from_records(records, index="view")
+
+    def plot(self, what: str = "residuals") -> "Drawing":
+        """Draws a figure of the report, which a notebook shows and `save` writes as .svg.
+
+        Args:
+            what: `residuals` of each view, the `budget` of a pick's error, or the `directions` of
+                the transforms and how well each is known.
+
+        Raises:
+            DataError: There is no such figure.
+        """
+        # Figures are built on results; only this one call goes the other way.
+        from visioncal.present.report.drawing import draw
+
+        return draw(self, what)
 
     @property
     def noise_dof(self) -> float:
@@ -163,10 +224,7 @@ class Calibration(CalibrationSections):
         Raises:
             DataError: There is no transform of that name.
         """
-        placed = self.placed
-        if name not in placed:
-            raise DataError(f"no transform {name!r}: this calibration has {', '.join(placed)}.")
-        return placed[name].covariance
+        return self.placed[name].covariance
 
     def base_from_flange(
         self,

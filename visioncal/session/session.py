@@ -4,16 +4,20 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
+import numpy.typing as npt
 import tomli_w
+from scipy.spatial.transform import RigidTransform
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_TOML_BYTES, parse_toml, read_text_inside
-from visioncal.core.types import Camera, Corners, Mount, Need, Target
+from visioncal.core.shown import html_card, text_card
+from visioncal.core.types import Camera, Corners, FloatArray, Image, Mount, Need, Target
 from visioncal.session import columns as known
 from visioncal.session.arms import read_robots
+from visioncal.session.arrays import Cell, of_corners, of_images
 from visioncal.session.boards import COLUMN, read_targets
 from visioncal.session.checks import check_images_can_be_used, check_times, view_warnings
 from visioncal.session.choosing import Choice
@@ -184,6 +188,68 @@ class Session:
             robot_document=robot_document,
             corners=corners,
         )
+
+    @classmethod
+    def from_arrays(
+        cls,
+        images: Sequence[Image | bytes],
+        base_from_flange: RigidTransform | FloatArray,
+        board: Target | str,
+        **cell: Unpack[Cell],
+    ) -> "Session":
+        """Builds a session of images in memory.
+
+        Args:
+            images: (h, w) or (h, w, 3) arrays of uint8, blue first, or the bytes of image files.
+            base_from_flange: (n, 4, 4), or n transforms: where the robot stood at each.
+            board: What they show: a board, or the name of one that comes with visioncal.
+            **cell: What else is known: `mount`, `camera` (estimated where left out), `robot` (a
+                built-in model), `q` (n, j) [rad], `name`.
+
+        Raises:
+            DataError: The arrays do not match, or one is of another form.
+        """
+        return cls.assemble(**of_images(images, base_from_flange, board, **cell))
+
+    @classmethod
+    def from_corners(
+        cls,
+        corners: Sequence[tuple[npt.ArrayLike, npt.ArrayLike]],
+        base_from_flange: RigidTransform | FloatArray,
+        board: Target | str,
+        resolution: tuple[int, int],
+        **cell: Unpack[Cell],
+    ) -> "Session":
+        """Builds a session of corners that another detector found.
+
+        Args:
+            corners: For each view the (k,) numbers of its corners and their (k, 2) places [px].
+            base_from_flange: As in `from_arrays`.
+            board: Likewise.
+            resolution: (width, height) of the images [px].
+            **cell: Likewise.
+
+        Raises:
+            DataError: The arrays do not match, or one is of another form.
+        """
+        return cls.assemble(**of_corners(corners, base_from_flange, board, resolution, **cell))
+
+    def __repr__(self) -> str:
+        return text_card(f"Session {self.name!r}", self._facts)
+
+    def _repr_html_(self) -> str:
+        return html_card(f"Session {self.name}", self._facts, says=self.warnings)
+
+    @property
+    def _facts(self) -> dict[str, str]:
+        images = sum(bool(it.image) for it in self.views)
+        return {
+            "mount": self.mount,
+            "views": f"{len(self.views)}, {images} with images",
+            "boards": ", ".join(it.name for it in self.boards.values()) or "none",
+            "robots": ", ".join(it or (self.robot_name or "poses alone") for it in self.robots),
+            **({"streams": ", ".join(self.streams)} if self.streams else {}),
+        }
 
     def of(
         self, camera: str | None = None, robot: str | None = None, target: str | None = None

@@ -18,6 +18,7 @@ from visioncal.core.errors import VisioncalError
 from visioncal.core.files import some_of
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure
+from visioncal.core.shown import html_card
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Mount, Progress
 from visioncal.core.verdict import CALIBRATE, MISSING, Finding, Step, with_paths
@@ -54,7 +55,12 @@ class Checkup:
         """Whether nothing is wrong."""
         return not self.findings
 
-    def __str__(self) -> str:
+    def _repr_html_(self) -> str:
+        says = [it.reason for it in self.findings] or ["Nothing is wrong."]
+        seen = {"seen": "; ".join(self.seen)}
+        return html_card(self.session, seen, "good" if self.is_sound else "check", says)
+
+    def __repr__(self) -> str:
         lines = [f"{self.session}: {'; '.join(self.seen)}."]
         lines += [f"- {it.reason}" for it in self.findings] or ["Nothing is wrong."]
         return "\n".join(lines)

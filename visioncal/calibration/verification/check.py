@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.special import fdtrc
@@ -105,8 +106,8 @@ class Check:
 
 
 def verify(
-    session: Session,
-    calibration: Calibration,
+    session: Session | Path | str,
+    calibration: Calibration | Path | str,
     *,
     camera: str | None = None,
     robot: str | None = None,
@@ -119,8 +120,9 @@ def verify(
     Several threads may do so at once, as with `calibrate`.
 
     Args:
-        session: Five stops or more, with the same board where it was; nothing of it is fitted.
-        calibration: The one that is to hold.
+        session: Five stops or more, with the same board where it was; nothing of it is fitted. It,
+            or the path of its folder or recording.
+        calibration: The one that is to hold, or the path of its folder or calibration.json.
         camera: Which camera is meant, where session or calibration is of a whole cell.
         robot: Which robot, likewise.
         target: Which target, likewise.
@@ -131,6 +133,9 @@ def verify(
     Raises:
         DataError: The session is of another cell, or the calibration does not say enough.
     """
+    session = session if isinstance(session, Session) else Session.load(session)
+    if not isinstance(calibration, Calibration):
+        calibration = Calibration.load(calibration)
     is_its_own = session.digest() == calibration.session_sha256
     session, calibration = picked(session, calibration, Choice(camera, robot, target))
     # What the calibration has left out contradicts it now as it did then.

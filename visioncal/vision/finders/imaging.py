@@ -66,6 +66,22 @@ def decode_image(data: bytes, *, colour: bool = False) -> Image | str:
     return np.asarray(image, dtype=np.uint8) if image.dtype == np.uint8 else _to_eight_bits(image)
 
 
+def encode_png(image: Image) -> bytes:
+    """Writes a (h, w) or (h, w, 3) image of 8 or 16 bits as png, without loss.
+
+    Raises:
+        DataError: It is no such image.
+    """
+    pixels = np.asarray(image)
+    if pixels.dtype not in (np.uint8, np.uint16) or pixels.ndim not in (2, 3) or not pixels.size:
+        raise DataError(
+            f"an image has the shape {pixels.shape} and the type {pixels.dtype}; (h, w) or "
+            "(h, w, 3) of uint8 or uint16 is needed.",
+            culprits=["images"],
+        )
+    return bytes(cv2.imencode(".png", pixels)[1].tobytes())
+
+
 def read_image(path: Path) -> Image:
     """Reads a (h, w) grey image; see `decode_image`.
 

@@ -1,0 +1,60 @@
+"""Figures of the report on their own, for notebooks."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from visioncal.core.errors import DataError
+from visioncal.core.files import write_atomically
+from visioncal.present.report import plots, sources
+from visioncal.results import Calibration
+
+FIGURES = ("residuals", "budget", "directions")
+# The page of a report states its colours; on its own a figure brings them.
+_COLOURS = (
+    "--ink:#1c2733;--muted:#5c6b7a;--line:#cfd6dd;--accent:#1f6fb2;--good:#2e7d32;--bad:#c62828;"
+    "--check:#b26a00;--card:#ffffff;background:#fff"
+)
+_SPACES = 'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink"'
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A figure.
+
+    Attributes:
+        name: What it shows.
+        markup: It, as markup that pages embed.
+    """
+
+    name: str
+    markup: str
+
+    def __repr__(self) -> str:
+        return f"Drawing of {self.name}; save it as .svg, or show it in a notebook"
+
+    def _repr_html_(self) -> str:
+        return f'<div style="{_COLOURS};max-width:52em">{self.markup}</div>'
+
+    def save(self, path: Path | str) -> None:
+        """Writes it as an .svg, whole or not at all."""
+        begin = self.markup.index("<svg")
+        text = self.markup[begin : self.markup.rindex("</svg>") + len("</svg>")]
+        begun = f'<svg {_SPACES} style="{_COLOURS}"'
+        write_atomically(Path(path), text.replace("<svg", begun, 1))
+
+
+def draw(calibration: Calibration, what: str) -> Drawing:
+    """Draws a figure of a calibration's report; see `Calibration.plot`."""
+    known = calibration.budget
+    markup = ""
+    if what == "residuals":
+        markup = str(plots.residuals(calibration))
+    elif what in FIGURES and known is not None:
+        markup = str((sources.budget if what == "budget" else sources.directions)(known))
+    if not markup:
+        raise DataError(
+            f"There is no figure {what!r} of this calibration.",
+            culprits=[what],
+            next_step=f"The figures are {', '.join(FIGURES)}; the last two need a budget.",
+        )
+    return Drawing(what, markup)
