@@ -69,6 +69,16 @@ def test_where_nothing_agrees_nothing_is_left_out():
     assert inliers(mixed).used.all()
 
 
+def test_what_is_far_off_is_left_out_where_the_others_agree_to_nothing_good():
+    """Poses to 10 mm and 1 deg, which is more than any result may be off, and one to 100 deg."""
+    cell = simulate(replace(WORLDS["fine, given"], views=60, seed=4))
+    rng = np.random.default_rng(0)
+    noise = np.repeat([np.deg2rad(1.0), 0.01], 3) * rng.standard_normal((60, 6))
+    noise[17, 1] += np.deg2rad(100.0)
+    found = inliers(chain("eye-in-hand", cell.base_from_flange, cell.cam_from_target @ exp(noise)))
+    assert np.flatnonzero(~found.used).tolist() == [17]
+
+
 def test_a_stop_is_right_or_wrong_as_a_whole():
     cell = simulate(replace(WORLDS["fine, given"], seed=1, wrong_views=1))
     known = calibrated(cell)

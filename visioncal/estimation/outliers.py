@@ -57,6 +57,8 @@ _MOST_MOVES = 8
 _SET_SIZE = 3
 # An observation is near within so much [m], or so many times the median.
 _NEAR_M, _FAR = 0.04, 6.0
+# Where nothing agrees, what is off by so many times the median is wrong all the same.
+_GROSS = 20.0
 # Whatever robots err by more is wrong, and no noise [rad, m].
 _MOST_NOISE = np.array([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M])
 # The noise of measured poses differs by so much from view to view: with tilt and distance.
@@ -207,7 +209,8 @@ def inliers(problem: Problem, state: State | None = None, used: Mask | None = No
 
     Returns:
         Those that agree. Where fewer than half do, or those only to within more than any result
-        may be off, nothing tells which are right: all stay.
+        may be off, nothing tells which are right: all stay but what lies many times farther off
+        than most.
     """
     every = np.ones(len(problem), dtype=bool)
     if len(problem) > LEAST_VIEWS:
@@ -216,7 +219,11 @@ def inliers(problem: Problem, state: State | None = None, used: Mask | None = No
         is_noise = bool(np.all(fit.noise.robots < _MOST_NOISE))
         if mask.sum() >= max(_LEAST_SHARE * len(problem), LEAST_VIEWS) and is_noise:
             return _agreed(problem, mask, fit, ())
-    return _agreed(problem, *_fitted(problem, state, every), ())
+    mask, fit = _fitted(problem, state, every)
+    near = _near(problem, fit.state, every, _GROSS)
+    if LEAST_VIEWS <= near.sum() < len(problem):
+        mask, fit = _fitted(problem, fit.state, near)
+    return _agreed(problem, mask, fit, ())
 
 
 def closed_form(problem: Problem, rows: IntArray) -> State | None:
@@ -300,10 +307,10 @@ def _away(problem: Problem, state: State) -> FloatArray:
     return np.asarray(np.linalg.norm(between[:, :3, 3], axis=1) + LEVER_M * turned)
 
 
-def _near(problem: Problem, state: State, used: Mask) -> Mask:
+def _near(problem: Problem, state: State, used: Mask, far: float = _FAR) -> Mask:
     """(n,) whether an observation is where it is predicted, as most of some are."""
     away = _away(problem, state)
-    return np.asarray(away <= max(_FAR * float(np.median(away[used])), _NEAR_M))
+    return np.asarray(away <= max(far * float(np.median(away[used])), _NEAR_M))
 
 
 def _fitted(problem: Problem, state: State | None, used: Mask) -> tuple[Mask, Solution]:
