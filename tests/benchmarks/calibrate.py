@@ -1,32 +1,42 @@
-"""Speed of a whole calibration against detection alone with OpenCV, on the same files.
+"""Time of a whole calibration against detection alone with OpenCV, and of what surrounds it.
 
-Both sides read the same 40 five-megapixel images in one warm process on the same number of
-threads. The peer reads each file and calls OpenCV's ChArUco detector; visioncal does the whole
-way from `Session.load` to a validated result, without report and recording.
+Both sides work on the same 40 five-megapixel images with the same number of threads, one after the
+other in turns. The peer reads each file and calls OpenCV's ChArUco detector. visioncal is the
+command with report and recording, started anew; and its API without outputs in a warm process.
 
-    python tests/benchmarks/calibrate.py
+    PYTHONPATH=tests python tests/benchmarks/calibrate.py [--quick]
 """
 
 import os
+import resource
 import statistics
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 from results import few, first, write_section
+from support.cells import calibrated
 
 import visioncal
+from visioncal.calibration.pipeline import Run
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.pipeline.view_evidence import view_evidence
+from visioncal.interchange.outputs import write_outputs
 from visioncal.simulation import CellOptions, fine_camera, simulate, write_session
 from visioncal.vision.targets import charuco_board
 
-VIEWS, REPEATS = few((40, 5), (6, 1))
-THREADS = os.cpu_count() or 1
+VIEWS, REPEATS, MANY = few((40, 3, 1000), (6, 1, 30))
+THREADS = [it for it in (1, 2, 4) if it <= (os.cpu_count() or 1)]
+COMMAND = [sys.executable, "-m", "visioncal"]
 
 
-def opencv_alone(files: list[Path], board: cv2.aruco.CharucoBoard) -> int:
+def opencv_alone(files: list[Path], board: cv2.aruco.CharucoBoard, threads: int) -> int:
     """Detects in all files with OpenCV and nothing else; returns the number of corners."""
 
     def corners(file: Path) -> int:
@@ -35,7 +45,7 @@ def opencv_alone(files: list[Path], board: cv2.aruco.CharucoBoard) -> int:
         return 0 if ids is None else len(ids)
 
     cv2.setNumThreads(1)
-    with ThreadPoolExecutor(THREADS) as pool:
+    with ThreadPoolExecutor(threads) as pool:
         return sum(pool.map(corners, files))
 
 
@@ -46,49 +56,119 @@ def seconds(work: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
-def measured(ending: str, jpeg_quality: int | None, *, given: bool) -> list[str]:
-    """One row of the table: medians over interleaved repetitions."""
+def processor_seconds(command: list[str]) -> float:
+    """Processor time of a program."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run(command, check=True, capture_output=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def medians(*works: Callable[[], float]) -> list[float]:
+    """The median of each over interleaved repetitions, after one that is not counted."""
+    rounds = [[it() for it in works] for _ in range(REPEATS + 1)][1:]
+    return [statistics.median(column) for column in zip(*rounds, strict=True)]
+
+
+def rows_of(ending: str, quality: int | None, level: str, folder: Path) -> list[list[str]]:
+    """The rows of one kind of session, by the number of threads."""
     options = CellOptions(
-        views=VIEWS,
-        camera=fine_camera(),
-        jpeg_quality=jpeg_quality,
-        state_intrinsics=given,
-        cut_views=0.0,
-        seed=1,
+        views=VIEWS, camera=fine_camera(), jpeg_quality=quality, cut_views=0.0, seed=1
     )
-    with tempfile.TemporaryDirectory() as name:
-        folder = write_session(simulate(options), Path(name) / "session")
-        files = sorted((folder / "images").iterdir())
-        board = charuco_board(options.target)
+    if level == "arm":
+        options = replace(options, dh_sigma_m=3e-4, dh_sigma_rad=3e-4, branches=True)
+    session = write_session(simulate(options), folder / f"{ending}_{level}")
+    files, board = sorted((session / "images").iterdir()), charuco_board(options.target)
+    asked = "hand-eye" if level == "hand-eye" else "auto"
+    rows = []
+    for threads in first(THREADS):
+        command = [*COMMAND, "calibrate", str(session), "-o", str(folder / "out")]
+        command += ["--threads", str(threads), "--level", asked]
+        whole, bare, peer = medians(
+            lambda command=command: seconds(
+                lambda: subprocess.run(command, check=True, capture_output=True)
+            ),
+            lambda threads=threads: seconds(
+                lambda: visioncal.calibrate(session, level=asked, threads=threads)
+            ),
+            lambda threads=threads: seconds(lambda: opencv_alone(files, board, threads)),
+        )
+        rows.append([ending, level, str(threads), *(f"{it:.2f}" for it in (whole, bare, peer)),
+                     f"{whole / peer:.1f}", f"{bare / peer:.2f}"])  # fmt: skip
+    return rows
 
-        def ours() -> object:
-            return visioncal.calibrate(visioncal.Session.load(folder))
 
-        def theirs() -> object:
-            return opencv_alone(files, board)
+def started() -> list[list[str]]:
+    """Processor time of what is typed first, over that of importing typer."""
+    python = [sys.executable, "-c"]
+    commands = {
+        "--version": [*COMMAND, "--version"],
+        "--help": [*COMMAND, "--help"],
+        "calibrate --help": [*COMMAND, "calibrate", "--help"],
+        "import typer": [*python, "import typer"],
+        "nothing": [*python, "pass"],
+    }
+    found = medians(*(lambda it=it: processor_seconds(it) for it in commands.values()))
+    *_, typer, _ = found
+    return [[name, f"{it:.2f}", f"{it / typer:.1f}"]
+            for name, it in zip(commands, found, strict=True)]  # fmt: skip
 
-        ours(), theirs()
-        pairs = [(seconds(ours), seconds(theirs)) for _ in range(REPEATS)]
-    mine, other = (statistics.median(column) for column in zip(*pairs, strict=True))
-    lens = "given" if given else "estimated"
-    return [ending, lens, f"{mine:.2f}", f"{other:.2f}", f"{mine / other:.2f}"]
+
+def small(folder: Path) -> list[list[str]]:
+    """Processor time of a small session, by what is drawn."""
+    session = write_session(simulate(CellOptions(seed=1, views=few(20, 6))), folder / "small")
+    command = [*COMMAND, "calibrate", str(session), "-o", str(folder / "small_out")]
+    kinds = {
+        "all": [],
+        "--no-recording": ["--no-recording"],
+        "--no-report --no-recording": ["--no-report", "--no-recording"],
+        "the same, corners kept": ["--no-report", "--no-recording", "--keep-corners"],
+    }
+    found = medians(*(lambda it=it: processor_seconds([*command, *it]) for it in kinds.values()))
+    return [[name, f"{it:.2f}"] for name, it in zip(kinds, found, strict=True)]
+
+
+def outputs(folder: Path) -> float:
+    """Processor time of report and recording of many views, a view [ms]."""
+    options = CellOptions(views=MANY, camera=fine_camera(), pixel_sigma_px=0.1)
+    known = calibrated(simulate(options))
+    done = Run(result_of(known), view_evidence(known))
+
+    def written() -> float:
+        begin = time.process_time()
+        write_outputs(folder / "many", known.session, done)
+        return time.process_time() - begin
+
+    return 1e3 * medians(written)[0] / MANY
+
+
+def table(head: list[str], rows: list[list[str]]) -> str:
+    return "\n".join("| " + " | ".join(it) + " |" for it in [head, ["---"] * len(head), *rows])
 
 
 def main() -> None:
-    """Prints the table and keeps it."""
-    kinds = [(*it, given) for it in (("png", None), ("jpg", 95)) for given in (True, False)]
-    rows = [measured(ending, quality, given=given) for ending, quality, given in first(kinds)]
-    head = ["files", "intrinsics", "visioncal [s]", "OpenCV detection [s]", "ratio"]
-    lines = [head, ["---"] * len(head), *rows]
-    table = "\n".join("| " + " | ".join(row) + " |" for row in lines)
-    text = (
-        f"{VIEWS} views of 2448 x 2048 of a 9 x 6 ChArUco board, {THREADS} threads on both sides, "
-        f"median of {REPEATS} interleaved runs. visioncal: load, detect, intrinsics, poses, eight "
-        "hand-eye solvers, validation, verdict. OpenCV: read and detect, no more. The aim is a "
-        f"ratio of 1.3 at most.\n\n{table}\n"
-    )
+    """Prints the tables and keeps them."""
+    kinds = [(*it, level) for it in (("png", None), ("jpg", 95)) for level in ("hand-eye", "arm")]
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        rows = [row for kind in first(kinds) for row in rows_of(*kind, folder)]
+        text = (
+            f"{VIEWS} views of 2448 x 2048 of a 9 x 6 ChArUco board, median of {REPEATS} "
+            "interleaved runs, wall time. The command is started anew and writes report and "
+            "recording; the API is warm and writes nothing; OpenCV reads and detects, no more."
+        )
+        head = ["files", "level", "threads", "command [s]", "API [s]", "OpenCV detection [s]",
+                "command / OpenCV", "API / OpenCV"]  # fmt: skip
+        text += f"\n\n{table(head, rows)}"
+        text += "\n\nProcessor time of what is typed first:\n\n"
+        text += table(["", "s", "over import typer"], started())
+        text += "\n\nProcessor time of a small session, 20 views of 1280 x 800:\n\n"
+        text += table(["calibrate", "s"], small(folder))
+        text += f"\n\nReport and recording of {MANY} views: {outputs(folder):.1f} ms a view.\n"
     print(text)
-    write_section("A whole calibration", "python tests/benchmarks/calibrate.py", text)
+    write_section(
+        "A whole calibration", "PYTHONPATH=tests python tests/benchmarks/calibrate.py", text
+    )
 
 
 if __name__ == "__main__":

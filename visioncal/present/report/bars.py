@@ -5,12 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
 from matplotlib.ticker import MaxNLocator
 
 from visioncal.core.number_format import significant
 from visioncal.present.report import svg
 
-_ROOM = 1.25
+_ROOM, _WIDTH = 1.25, 0.7
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,13 @@ def draw(axes: Axes, bars: Sequence[Bar], rms: float | None, most_labels: int = 
     if known:
         places, shown, values = zip(*known, strict=True)
         colours = [bar.colour for bar in shown]
-        axes.bar(places, np.minimum(values, top), width=0.7, color=colours, alpha=0.9)
+        # One shape for all: a thousand rectangles take a second to be made.
+        heights, half = np.minimum(values, top), _WIDTH / 2
+        corners = [
+            [(at - half, 0.0), (at - half, it), (at + half, it), (at + half, 0.0)]
+            for at, it in zip(places, heights.tolist(), strict=True)
+        ]
+        axes.add_collection(PolyCollection(corners, facecolors=colours, alpha=0.9))
     for place, bar, value in known:
         if not bar.used:
             _mark(axes, place, bar, value, top)
