@@ -67,7 +67,10 @@ def test_the_levels_are_compared_and_the_taken_one_says_why(page, rows):
 
 def test_an_arm_that_stays_as_stated_takes_one_sentence(sample):
     html = render(with_arm(sample, stays_stated()), sample.session, sample.evidence)
-    words = section(Page(html), "The arm No level", "Where the uncertainty comes from")
+    page = Page(html)
+    # What was not taken stands folded, behind what was.
+    assert page.words.index("The arm No level") > page.words.index("Where the uncertainty comes")
+    words = section(page, "The arm No level", "How it was obtained")
     assert words.strip() == (
         "The arm No level was taken: none predicts stops that are left out of the fit better than "
         "the arm as stated does, beyond chance."

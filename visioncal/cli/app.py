@@ -24,7 +24,7 @@ class _Commands(LazyGroup):
         "doctor": "Say what is wrong with a session before it is calibrated, and what to type.",
         "batch": "Calibrate many sessions at once, and tell which stand out of their fleet.",
         "align": "Put several robots, cameras and boards in one frame, adjusted together.",
-        "report": "Make the report of an earlier calibration again.",
+        "report": "Make the report of an earlier calibration again, or its certificate.",
         "verify": "Tell whether a calibration still holds, and what has changed if it does not.",
         "diff": "Tell what changed between two calibrations, and what is only noise.",
         "convert": "Write a session as a folder or a recording, or make one of another program's.",

@@ -7,7 +7,13 @@ import typer
 from rich.markup import escape
 
 from visioncal.cli.console import messages
-from visioncal.interchange.result_files import load_stored
+from visioncal.cli.progress import shown_progress
+from visioncal.cli.refusing import refuse_given
+from visioncal.core.errors import DataError
+from visioncal.interchange.result_files import Stored, load_stored
+
+# Other numbers come out.
+_EXIT_OTHERS = 3
 
 
 def report_command(
@@ -17,19 +23,53 @@ def report_command(
             help="An output folder, its calibration.json or alignment.json, or a recording (.rrd)."
         ),
     ],
-    out: Annotated[Path, typer.Option("-o", "--out", help="The file to write.")] = Path(
-        "report.html"
-    ),
+    out: Annotated[
+        Path | None,
+        typer.Option("-o", "--out", help="The file; report.html or certificate.html otherwise."),
+    ] = None,
+    certificate: Annotated[
+        bool, typer.Option("--certificate", help="One page to print and sign, instead.")
+    ] = False,
+    operator: Annotated[
+        str, typer.Option("--operator", help="With --certificate: who calibrated.")
+    ] = "",
+    serial: Annotated[
+        list[str] | None,
+        typer.Option("--serial", metavar="WHAT=NUMBER", help="With --certificate, as camera=1234."),
+    ] = None,
+    recompute: Annotated[
+        bool,
+        typer.Option(
+            "--recompute", help="Calibrate the recording again: does it give the same numbers?"
+        ),
+    ] = False,
 ) -> None:
-    """Make the report of an earlier calibration again.
+    """Make the report of an earlier calibration again, or its certificate.
 
     Pictures, coverage and joint angles come from the recording.rrd beside a calibration.json;
-    where it is missing or belongs to another result, the report says so.
+    where it is missing or belongs to another result, the report says so. Exit status of
+    --recompute, which writes nothing: 0, the same numbers; 3, others.
     """
+    if not certificate:
+        refuse_given(
+            {"--operator": operator or None, "--serial": serial}, "they are for --certificate"
+        )
     # Plots take half a second to import, which help need not wait for.
     from visioncal.present.report import write_report
 
     stored = load_stored(calibration)
+    if recompute:
+        _recompute(stored)
+        return
+    if certificate:
+        from visioncal.present.report.certificate import Signed, write_certificate
+
+        page = out or Path("certificate.html")
+        signed = Signed(operator, dict(map(_pair, serial or ())))
+        write_certificate(page, stored.calibration, stored.session, signed)
+        messages().print(f"wrote {escape(str(page))}")
+        return
+    out = out or Path("report.html")
     if stored.calibration.cell is not None:
         from visioncal.present.report.cells import write_cell_report
 
@@ -40,3 +80,30 @@ def report_command(
     if stored.note:
         messages().print(escape(stored.note))
     messages().print(f"wrote {escape(str(out))}")
+
+
+def _recompute(stored: Stored) -> None:
+    """Calibrates once more, and ends with what came out."""
+    from visioncal.calibration.verification.recompute import recompute
+
+    if stored.session is None or stored.calibration.cell is not None:
+        raise DataError(
+            stored.note or "A whole cell cannot be recomputed here.",
+            culprits=["--recompute"],
+            next_step="Name an output folder of visioncal calibrate, with its recording.rrd.",
+        )
+    with shown_progress(quiet=False) as told:
+        found = recompute(stored.calibration, stored.session, progress=told)
+    messages().print(escape(found.words))
+    if not found.is_same:
+        raise typer.Exit(_EXIT_OTHERS)
+
+
+def _pair(text: str) -> tuple[str, str]:
+    what, sign, number = text.partition("=")
+    if not sign or not what:
+        raise DataError(
+            f"--serial is {text!r}; what it is of and the number are needed, as camera=1234.",
+            culprits=["--serial"],
+        )
+    return what, number

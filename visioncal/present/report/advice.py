@@ -14,6 +14,9 @@ _STANDS_OUT = CalibrationLimits.outlier
 # So begins the reason of a view that was left out because pose and image do not go together.
 _CONTRADICTS = "disagrees with the other views"
 
+# So many views of one reason are named.
+_MOST_LISTED = 12
+
 
 @dataclass(frozen=True)
 class Suspects:
@@ -88,4 +91,6 @@ def listed(views: Sequence[int]) -> str:
     """Names views in a sentence: `view 3`, or `views 3, 6 and 9`."""
     if len(views) == 1:
         return f"view {views[0]}"
+    if len(views) > _MOST_LISTED:
+        return f"{len(views)} views, as {', '.join(map(str, views[:_MOST_LISTED]))}"
     return f"views {', '.join(map(str, views[:-1]))} and {views[-1]}"

@@ -31,7 +31,13 @@ class Bar:
     colour: str
 
 
-def draw(axes: Axes, bars: Sequence[Bar], rms: float | None, most_labels: int = 25) -> None:
+def draw(
+    axes: Axes,
+    bars: Sequence[Bar],
+    rms: float | None,
+    most_labels: int = 25,
+    limit: float | None = None,
+) -> None:
     """Draws bars side by side; what exceeds the used ones' scale is clipped.
 
     Args:
@@ -39,6 +45,7 @@ def draw(axes: Axes, bars: Sequence[Bar], rms: float | None, most_labels: int = 
         bars: From left to right.
         rms: Root mean square over the used ones, drawn as a line; None draws none.
         most_labels: How many labels have room below them.
+        limit: Where doubt begins; a line where the scale holds it, else words. None for nothing.
     """
     known = [(place, bar, bar.value) for place, bar in enumerate(bars) if bar.value is not None]
     unknown = [it for it in enumerate(bars) if it[1].value is None and not it[1].used]
@@ -65,6 +72,8 @@ def draw(axes: Axes, bars: Sequence[Bar], rms: float | None, most_labels: int = 
             f"rms {significant(rms)}", (1.0, rms), (4, 0), xycoords=("axes fraction", "data"),
             textcoords="offset points", fontsize=8, va="center",
         )  # fmt: skip
+    if limit is not None:
+        _draw_limit(axes, limit, top)
     axes.set_ylim(0.0, top * 1.2)
     axes.set_xlim(-0.7, len(bars) - 0.3)
     axes.grid(visible=False, axis="x")
@@ -72,6 +81,21 @@ def draw(axes: Axes, bars: Sequence[Bar], rms: float | None, most_labels: int = 
     step = max(1, -(-len(bars) // most_labels))
     labelled = range(0, len(bars), step)
     axes.set_xticks(list(labelled), [bars[place].label for place in labelled])
+
+
+def _draw_limit(axes: Axes, limit: float, top: float) -> None:
+    words, place = f"doubt from {limit:g}", (1.0, 1.0)
+    if limit < top * 1.1:
+        axes.axhline(limit, color=svg.BAD, linewidth=0.9, linestyle=(0, (1, 2)))
+        axes.annotate(
+            words, (0.0, limit), (4, 2), xycoords=("axes fraction", "data"),
+            textcoords="offset points", fontsize=8, color=svg.BAD,
+        )  # fmt: skip
+        return
+    axes.annotate(
+        f"{words} \N{UPWARDS ARROW}", place, (0, -2), xycoords="axes fraction",
+        textcoords="offset points", fontsize=8, ha="right", va="top", color=svg.MUTED,
+    )  # fmt: skip
 
 
 def _mark(axes: Axes, place: int, bar: Bar, value: float, top: float) -> None:

@@ -141,6 +141,7 @@ def _arm(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> dict[str
     poses = [it.base_from_flange for it in evidence if it.view in used]
     stops_m = np.reshape([it[:3, 3] for it in poses if it is not None], (-1, 3))
     return {
+        "arm_is_calibrated": found is not None and found.is_calibrated,
         "arm_card": None if found is None else arm.arm_card(found),
         "unseen_plot": "" if found is None else armplots.before_and_after(found),
         "side_plot": armplots.side_map(found, stops_m) if found and mapped else "",

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 from scipy.spatial.transform import Rotation
 
+from visioncal.core.limits import CalibrationLimits
 from visioncal.core.transforms import nearest_rotation
 from visioncal.core.types import FloatArray
 from visioncal.present.report import bars, svg
@@ -33,10 +34,16 @@ def residuals(calibration: Calibration, outlying: Collection[int] = ()) -> Marku
     Returns:
         The figure; empty where there are no residuals.
     """
-    panels: list[tuple[str, Callable[[ViewResult], float | None], float | None]] = [
-        ("position [mm]", lambda view: view.residual_mm, calibration.rms.mm),
-        ("orientation [deg]", lambda view: view.residual_deg, calibration.rms.deg),
-        ("reprojection [px]", lambda view: view.rms_px, calibration.rms.px),
+    limits = CalibrationLimits()
+    panels: list[tuple[str, Callable[[ViewResult], float | None], float | None, float | None]] = [
+        ("position [mm]", lambda view: view.residual_mm, calibration.rms.mm, limits.scatter_mm[0]),
+        (
+            "orientation [deg]",
+            lambda view: view.residual_deg,
+            calibration.rms.deg,
+            limits.scatter_deg[0],
+        ),
+        ("reprojection [px]", lambda view: view.rms_px, calibration.rms.px, None),
     ]
     shown = [it for it in panels if any(it[1](view) is not None for view in calibration.views)]
     if not shown:
@@ -44,8 +51,8 @@ def residuals(calibration: Calibration, outlying: Collection[int] = ()) -> Marku
     with svg.style():
         figure = svg.new_figure(_WIDE_IN, 1.3 * len(shown) + 0.25, svg.Margins(0.75, 0.75))
         rows = figure.subplots(len(shown), sharex=True, squeeze=False)[:, 0]
-        for axes, (label, value_of, rms) in zip(rows, shown, strict=True):
-            _residual_panel(axes, calibration.views, value_of, rms, outlying)
+        for axes, (label, value_of, rms, limit) in zip(rows, shown, strict=True):
+            _residual_panel(axes, calibration.views, value_of, rms, outlying, limit)
             axes.set_ylabel(label)
         rows[-1].set_xlabel("view")
         return svg.inline(figure, "residuals", "Bars: residuals of each view")
@@ -57,12 +64,14 @@ def _residual_panel(
     value_of: Callable[[ViewResult], float | None],
     rms: float | None,
     outlying: Collection[int],
+    limit: float | None,
 ) -> None:
     """Bars by the view's place in the session."""
     bars.draw(
         axes,
         [Bar(str(it.view), value_of(it), it.used, _colour(it, outlying)) for it in views],
         rms,
+        limit=limit,
     )
 
 

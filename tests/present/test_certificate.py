@@ -1,0 +1,56 @@
+"""The certificate, and whether a result comes out again of its recording."""
+
+from dataclasses import replace
+
+from support.broken_sessions import BROKEN, sound_session
+from support.commands import visioncal
+from support.pages import Page
+from support.samples import made_up
+
+from visioncal.interchange.result_files import load_stored
+from visioncal.present.report.certificate import Signed, write_certificate
+
+
+def test_a_certificate_says_whose_it_is_and_has_room_to_sign(tmp_path):
+    sample = made_up()
+    page = tmp_path / "certificate.html"
+    signed = Signed("A. Smith <1>", {"camera": "18443010"})
+    write_certificate(page, sample.calibration, sample.session, signed)
+    words = Page(page.read_text("utf-8")).words
+    for it in (
+        "bench <1> & 2",
+        "CHECK",
+        "Serial number, camera 18443010",
+        "Operator A. Smith <1>",
+        "Board charuco_9x6_30mm, 9 x 6, 30 mm",
+        "flange_from_cam (31.000, -12.000, 81.000) mm",
+        "Doubt begins at views left out 2 mm and 0.3 deg",
+        sample.calibration.session_sha256,
+        "Calibrated by, date",
+    ):
+        assert it in words
+    # It is one page, however many views there are: they are counted, not listed.
+    many = replace(sample.calibration, views=sample.calibration.views * 50)
+    write_certificate(page, many, None, Signed())
+    assert abs(len(Page(page.read_text("utf-8")).words) - len(words)) < 200
+
+
+def test_a_result_comes_out_again_of_its_recording(tmp_path):
+    session = sound_session(tmp_path / "session", BROKEN["semicolons"])
+    out = tmp_path / "out"
+    assert visioncal("calibrate", session, "-o", out).status == 0
+    done = visioncal("report", out, "--recompute")
+    assert (done.status, "bit for bit" in done.err) == (0, True)
+    page = tmp_path / "certificate.html"
+    done = visioncal("report", out, "--certificate", "--serial", "robot=7", "-o", page)
+    assert done.status == 0
+    assert "Serial number, robot 7" in Page(page.read_text("utf-8")).words
+    assert visioncal("report", out, "--operator", "me").status == 2
+    assert visioncal("report", out, "--certificate", "--serial", "7").status == 2
+    # Another solver gives other numbers, and that is said.
+    other = visioncal("calibrate", session, "-o", out, "--solver", "tsai")
+    assert other.status == 0
+    done = visioncal("report", out, "--recompute")
+    assert done.status == 3
+    assert "flange_from_cam by " in done.err
+    assert load_stored(out).session is not None

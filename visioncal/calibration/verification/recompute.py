@@ -1,0 +1,57 @@
+"""Whether a result comes out again of what was recorded."""
+
+from dataclasses import dataclass
+
+from visioncal.calibration.pipeline import run
+from visioncal.core.number_format import figure
+from visioncal.core.transforms import pose_difference
+from visioncal.core.types import Progress
+from visioncal.results import Calibration, to_document
+from visioncal.session import Session
+
+# What is computed; the rest is when, by which version, and in which words.
+_NUMBERS = ("transforms", "joint_covariance", "camera", "noise", "views", "rms", "validation")
+
+
+@dataclass(frozen=True)
+class Recomputed:
+    """What came out.
+
+    Attributes:
+        is_same: Whether all numbers are the same, bit for bit.
+        words: The same in a sentence, with how far the transforms are off where they are.
+    """
+
+    is_same: bool
+    words: str
+
+
+def recompute(
+    calibration: Calibration, session: Session, *, progress: Progress | None = None
+) -> Recomputed:
+    """Calibrates a recorded session once more and compares the numbers.
+
+    Args:
+        calibration: The result.
+        session: What was recorded; of one camera and one robot.
+        progress: Told of long work.
+
+    Raises:
+        VisioncalError: It cannot be calibrated.
+    """
+    again = run(session, progress=progress).calibration
+    before, after = to_document(calibration), to_document(again)
+    differing = [it for it in _NUMBERS if before.get(it) != after.get(it)]
+    if not differing:
+        return Recomputed(True, "Recomputed from the recording: the same numbers, bit for bit.")
+    moved = [
+        f"{name} by {figure(mm)} mm and {figure(deg)} deg (sigma {figure(edge.sigma_mm)} mm)"
+        for name, edge in calibration.edges.items()
+        if name in again.edges
+        for mm, deg in [pose_difference(edge.matrix, again.edges[name].matrix)]
+    ]
+    return Recomputed(
+        False,
+        f"Recomputed from the recording, {', '.join(differing)} differ: {'; '.join(moved)}. Other "
+        "versions or options (--solver, --level, --dense) give other numbers.",
+    )

@@ -1,0 +1,117 @@
+"""The certificate: one page to print and to sign."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from visioncal.core.files import write_atomically
+from visioncal.core.limits import CalibrationLimits
+from visioncal.core.number_format import figure
+from visioncal.core.version import __version__
+from visioncal.present.report.content import need_facts, readable_time
+from visioncal.present.report.templating import template
+from visioncal.results import Calibration
+from visioncal.session import Session
+
+# More do not fit a page; the report has them all.
+_MOST_EDGES = 4
+_Facts = list[tuple[str, str]]
+
+
+@dataclass(frozen=True)
+class Signed:
+    """What a person says of a calibration.
+
+    Attributes:
+        operator: Who made it; empty where that is left to be signed.
+        serials: Serial numbers by what they are of.
+    """
+
+    operator: str = ""
+    serials: Mapping[str, str] = field(default_factory=dict)
+
+
+def write_certificate(
+    path: Path, calibration: Calibration, session: Session | None, signed: Signed
+) -> None:
+    """Writes the certificate as one HTML page that prints on one sheet of A4.
+
+    Args:
+        path: The file; it appears whole or not at all.
+        calibration: What is certified.
+        session: What it was made of; None where that is not at hand.
+        signed: What a person says of it.
+
+    Raises:
+        DataError: The file cannot be written.
+    """
+    verdict = calibration.verdict
+    text = template("certificate.html.j2").render(
+        name=calibration.session_name,
+        status=verdict.status,
+        says=verdict.top[:2],
+        parts=(
+            ("Cell", [*_cell(calibration, session, signed)]),
+            ("Result", [*_result(calibration)]),
+            ("Limits", [*_limits(calibration)]),
+            ("Provenance", _provenance(calibration)),
+        ),
+    )
+    write_atomically(path, text)
+
+
+def _cell(
+    calibration: Calibration, session: Session | None, signed: Signed
+) -> Iterator[tuple[str, str]]:
+    yield "Mount", calibration.mount
+    if calibration.robot is not None:
+        yield "Robot", calibration.robot.name
+    if session is not None:
+        yield "Camera", session.camera_name
+        boards = [
+            f"{it.name}, {it.columns} x {it.rows}, {1e3 * it.square_m:g} mm"
+            for it in session.boards.values()
+        ]
+        if boards:
+            yield "Board", "; ".join(boards)
+    yield from ((f"Serial number, {of}", number) for of, number in signed.serials.items())
+    if signed.operator:
+        yield "Operator", signed.operator
+
+
+def _result(calibration: Calibration) -> Iterator[tuple[str, str]]:
+    for it in need_facts(calibration.need, calibration.verdict):
+        yield it.label[0].upper() + it.label[1:], f"{it.value} {it.note}".strip()
+    for name, edge in [*calibration.placed.items()][:_MOST_EDGES]:
+        x, y, z = 1e3 * edge.transform.translation
+        turn = ", ".join(f"{it:.4f}" for it in edge.transform.rotation.as_rotvec(degrees=True))
+        sigma = f"sigma {figure(edge.sigma_mm)} mm"
+        if edge.oriented:
+            sigma += f" and {figure(edge.sigma_deg)} deg"
+        yield name, f"({x:.3f}, {y:.3f}, {z:.3f}) mm; ({turn}) deg; {sigma}"
+    left_out = calibration.validation.held_out
+    turned = "" if left_out.deg is None else f" and {figure(left_out.deg)} deg"
+    used = sum(it.used for it in calibration.views)
+    yield "Views used", f"{used} of {len(calibration.views)}"
+    yield "Left out, views are predicted to", f"{figure(left_out.mm)} mm{turned} (rms)"
+
+
+def _limits(calibration: Calibration) -> Iterator[tuple[str, str]]:
+    if calibration.need is not None:
+        yield "Good", "a pick lands within the need with 95 % or more, and nothing is unexplained"
+        return
+    limits = CalibrationLimits()
+    yield (
+        "Doubt begins at",
+        f"views left out {limits.scatter_mm[0]:g} mm and {limits.scatter_deg[0]:g} deg; sigma of "
+        f"a transform {limits.sigma_mm[0]:g} mm and {limits.sigma_deg[0]:g} deg; corners "
+        f"{limits.pixel_px[0]:g} px; robot {limits.robot_mm:g} mm; under {limits.stops[0]} stops",
+    )
+
+
+def _provenance(calibration: Calibration) -> _Facts:
+    return [
+        ("Calibrated", readable_time(calibration.created)),
+        ("SHA-256 of the session", calibration.session_sha256),
+        ("Software", f"visioncal {__version__}"),
+    ]
