@@ -16,6 +16,7 @@ from visioncal.cli.pointing import naming
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.summary import print_verdict, unused_words
 from visioncal.core.number_format import figure
+from visioncal.core.types import ImagesKept
 from visioncal.interchange.merge_results import leftover
 from visioncal.interchange.outputs import write_alignment
 from visioncal.results import Alignment
@@ -63,6 +64,7 @@ def align_into(
     quiet: bool,
     convention: Convention | None = None,
     without: Collection[str] = (),
+    images: ImagesKept = "full",
     threads: int | None = None,
     keep_corners: bool = False,
 ) -> Alignment:
@@ -80,7 +82,7 @@ def align_into(
     result = replace(result, verdict=result.verdict.with_paths(path, out))
     if left is not None:
         left.keep()
-    written = write_alignment(out, session, result, without=without)
+    written = write_alignment(out, session, result, without=without, images=images)
     if not quiet:
         _tell(result)
     if left is not None:

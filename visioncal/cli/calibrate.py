@@ -91,6 +91,7 @@ def calibrate_command(
             convention=convention,
             quiet=as_json,
             without=without,
+            images=work.images,
             threads=work.threads,
             keep_corners=work.keep_corners,
         )
@@ -116,7 +117,7 @@ def calibrate_command(
         result = replace(result, calibration=named)
         if left is not None:
             left.keep()
-        written = write_outputs(out, loaded, result, without=without)
+        written = write_outputs(out, loaded, result, without=without, images=work.images)
     if as_json:
         typer.echo(json.dumps(to_document(result.calibration), indent=2))
     else:

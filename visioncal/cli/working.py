@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from visioncal.core.types import ImagesKept
 from visioncal.interchange.outputs import RECORDING, REPORT
 
 
@@ -34,6 +35,15 @@ class WorkOptions:
     no_recording: Annotated[
         bool, typer.Option("--no-recording", help=f"Leave {RECORDING} out, which holds all images.")
     ] = False
+
+    images: Annotated[
+        ImagesKept,
+        typer.Option(
+            "--images",
+            help=f"What {RECORDING} keeps of them: full, so that it is the whole session; faint "
+            "copies to look at; or none. Their digests are kept in any case.",
+        ),
+    ] = "full"
 
     @property
     def left_out(self) -> tuple[str, ...]:

@@ -26,6 +26,8 @@ TargetKind: TypeAlias = Literal[
 SolverName: TypeAlias = Literal[
     "joint", "tsai", "park", "horaud", "daniilidis", "andreff", "shah", "li"
 ]
+# What a recording keeps of the images of its session, beside their digests.
+ImagesKept: TypeAlias = Literal["full", "thumbnail", "none"]
 
 # Called with a stage's name, its steps done, and its steps in all.
 Progress: TypeAlias = Callable[[str, int, int], None]

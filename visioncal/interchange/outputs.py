@@ -15,6 +15,7 @@ from visioncal.core.output_generations import write_generation
 if TYPE_CHECKING:
     from visioncal.calibration.pipeline import Run as Calibrated
     from visioncal.calibration.verification import Check, Outcome
+    from visioncal.core.types import ImagesKept
     from visioncal.core.verdict import Verdict
     from visioncal.dynamics import Run
     from visioncal.dynamics.planned import MotionPlan
@@ -63,6 +64,7 @@ def write_outputs(
     note: str = "",
     *,
     without: Collection[str] = (),
+    images: "ImagesKept" = "full",
 ) -> Written:
     """Writes the three files into a folder, all at once whenever it is killed.
 
@@ -75,6 +77,7 @@ def write_outputs(
         note: What the reader should know of the report itself.
         without: Files that are not wanted, `REPORT` or `RECORDING`; those of an earlier result are
             taken away.
+        images: What the recording keeps of the images beside their digests.
 
     Returns:
         The files that were written: the result even where drawing the report or recording failed.
@@ -98,7 +101,7 @@ def write_outputs(
             from visioncal.present.viewer import blueprint
 
             layout = blueprint(session, run.calibration)
-            write_recording(path, session, run.calibration, run.evidence, layout)
+            write_recording(path, session, run.calibration, run.evidence, layout, images)
 
         drawings[RECORDING] = record
     result = {CALIBRATION: run.calibration.save}
@@ -157,6 +160,7 @@ def write_alignment(
     found: "Alignment",
     *,
     without: Collection[str] = (),
+    images: "ImagesKept" = "full",
 ) -> Written:
     """Writes the alignment of a cell, its report and its recording into a folder, all at once.
 
@@ -165,6 +169,7 @@ def write_alignment(
         session: What was aligned; None where it was not kept, which leaves the recording out.
         found: The result.
         without: As in `write_outputs`.
+        images: Likewise.
 
     Returns:
         The files that were written: the result even where drawing the others failed.
@@ -185,7 +190,7 @@ def write_alignment(
             from visioncal.present.recording import write_cell_recording
             from visioncal.present.viewer.cells import cell_blueprint
 
-            write_cell_recording(path, session, found, cell_blueprint(session, found))
+            write_cell_recording(path, session, found, cell_blueprint(session, found), images)
 
         drawings[RECORDING] = record
     from visioncal.results import Calibration

@@ -29,14 +29,14 @@ def digest_facts(
     and heavy the robot's links are, how strong its drives, and what the task needs, is no fact of
     what was recorded.
     """
-    paths = sorted({view.image for view in views if view.image and images.exists(view.image)})
+    digests = {path: images.sha256(path) for path in sorted({it.image for it in views} - {""})}
     facts: dict[str, object] = {
         "document": _without_paths(document),
         "target": target_document,
         "robot": None if robot_document is None else _robots(document, robot_document),
         "columns": columns,
         "rows": [[_fact(view, column) for column in columns] for view in views],
-        "images": {path: sha256(images.read(path)) for path in paths},
+        "images": {path: it for path, it in digests.items() if it},
     }
     if streams:
         facts["streams"] = {name: stream.fact() for name, stream in streams.items()}

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Protocol
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import MOST_IMAGE_BYTES, absence, is_inside, read_bytes
+from visioncal.core.files import MOST_IMAGE_BYTES, absence, is_inside, read_bytes, sha256
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 
@@ -22,6 +22,9 @@ class ImageStore(Protocol):
         Raises:
             DataError: There is no such image, or it cannot be read.
         """
+
+    def sha256(self, path: str) -> str:
+        """Digest of the bytes of an image, also of one that is elsewhere; empty of one unknown."""
 
     def absence(self, path: str) -> str:
         """Says why there is no such image to read, after its name; empty where there is one."""
@@ -42,6 +45,10 @@ class FolderImages:
         if why_not:
             raise DataError(f"{self.folder / inside_path(path)} {why_not}.", culprits=[path])
         return read_bytes(self.folder / inside_path(path), MOST_IMAGE_BYTES)
+
+    def sha256(self, path: str) -> str:
+        """Digest of the bytes of an image; empty where there is none."""
+        return sha256(self.read(path)) if self.exists(path) else ""
 
     def absence(self, path: str) -> str:
         """Says why there is no such image to read, after its name; empty where there is one."""
@@ -74,6 +81,10 @@ class MemoryImages:
         if path not in self.files:
             raise DataError(f"The session has no image {path}.", culprits=[path])
         return self.files[path]
+
+    def sha256(self, path: str) -> str:
+        """Digest of the bytes of an image; empty where there is none."""
+        return sha256(self.files[path]) if path in self.files else ""
 
     def absence(self, path: str) -> str:
         """Says why there is no such image; empty where there is one."""

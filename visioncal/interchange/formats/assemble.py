@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.documents import is_number
 from visioncal.core.errors import DataError
-from visioncal.core.files import MOST_IMAGE_BYTES, absence, read_bytes, some_of
+from visioncal.core.files import MOST_IMAGE_BYTES, absence, read_bytes, sha256, some_of
 from visioncal.core.types import Mount
 from visioncal.interchange.formats.boards import described_target, target_name
 from visioncal.interchange.formats.foreign import Foreign, Sweep, rows_of
@@ -35,6 +35,10 @@ class FileImages:
         if path not in self.files:
             raise DataError(f"The session has no image {path}.", culprits=[path])
         return _image_bytes(self.files[path])
+
+    def sha256(self, path: str) -> str:
+        """Digest of the bytes of an image; empty where there is none."""
+        return sha256(self.read(path)) if self.exists(path) else ""
 
     def absence(self, path: str) -> str:
         """Says why there is no such image; empty where there is one."""

@@ -27,8 +27,8 @@ from visioncal.session.columns import is_number
 from visioncal.session.corners import CornerTable
 
 # 2: the writer's version, a mark behind the last view, and seals on the results; 3: streams;
-# 4: corners that another detector found.
-FORMAT = 4
+# 4: corners that another detector found; 5: images that are elsewhere.
+FORMAT = 5
 # In place of the number of views where that was not known from the start.
 UNKNOWN = -1
 
@@ -57,6 +57,8 @@ class Header:
         robot_json: The robot's model.
         streams: The names of the streams, and as many seals of them behind.
         corners: The seal of the corners that another detector found; empty where there are none.
+        images: What there is of the images: empty for all, `thumbnail`, or `none`; their digests
+            are in the rows in any case.
     """
 
     rows: int
@@ -67,9 +69,10 @@ class Header:
     robot_json: str
     streams: tuple[str, ...] = ()
     corners: str = ""
+    images: str = ""
 
     @classmethod
-    def of(cls, session: Session, announced: int) -> "Header":
+    def of(cls, session: Session, announced: int, images: str = "") -> "Header":
         """Collects what holds for all rows of a session."""
         return cls(
             announced,
@@ -80,13 +83,15 @@ class Header:
             _to_json(session.robot_document),
             (*session.streams, *map(stream_seal, session.streams.values())),
             "" if session.corner_table is None else corner_seal(session.corner_table),
+            images,
         )
 
     def seal(self) -> str:
         """SHA-256 of the content."""
         content = list(vars(self).values())
-        # Before the third format there were no streams, and before the fourth no corners.
-        while not content[-1] and len(content) > len(vars(self)) - 2:
+        # Before the third format there were no streams, before the fourth no corners, and before
+        # the fifth all images.
+        while not content[-1] and len(content) > len(vars(self)) - 3:
             content.pop()
         return sha256(json.dumps(content).encode())
 
@@ -124,12 +129,12 @@ class Row:
     image_sha256: str
 
     @classmethod
-    def of(cls, columns: tuple[str, ...], view: View, image: bytes | None) -> "Row":
+    def of(cls, columns: tuple[str, ...], view: View, image_sha256: str) -> "Row":
         """Collects the cells of a view."""
         return cls(
             tuple(view.numbers.get(name, math.nan) for name in columns if is_number(name)),
             tuple(view.cell(name) for name in columns if not is_number(name)),
-            "" if image is None else sha256(image),
+            image_sha256,
         )
 
     def seal(self) -> str:
@@ -151,6 +156,7 @@ def log_header(stream: rr.RecordingStream, header: Header) -> None:
         "robot_json": pa.array([header.robot_json], pa.string()),
         "streams": pa.array(header.streams, pa.string()),
         "corners": pa.array([header.corners], pa.string()),
+        "images": pa.array([header.images], pa.string()),
         "seal": pa.array([header.seal()], pa.string()),
     }
     stream.log(paths.SESSION, rr.DynamicArchetype(_HEADER, components=components), static=True)
@@ -246,6 +252,7 @@ def read_header(batch: pa.RecordBatch, path: Path) -> tuple[int, Header]:
         values["robot_json"][0],
         tuple(values.get("streams") or ()),
         (values.get("corners") or [""])[0],
+        (values.get("images") or [""])[0],
     )
     if header.seal() != values["seal"][0]:
         raise ValueError("the session's declaration was changed or damaged after it was written")

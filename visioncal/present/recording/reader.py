@@ -2,6 +2,7 @@
 
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 
@@ -9,14 +10,18 @@ import pyarrow as pa
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import parse_toml, sha256
+from visioncal.core.types import ImagesKept
 from visioncal.present.recording import codec, paths
+from visioncal.present.recording.elsewhere import ImagesElsewhere
 from visioncal.present.recording.frames import CHUNK, Frame, Scan, read_payload, scan
 from visioncal.present.recording.messages import record_batch
 from visioncal.session import Session, Stream
 from visioncal.session.corners import CornerTable
+from visioncal.session.images import ImageStore
 
 _AGAIN = "Take the recording again from its origin, or calibrate the session's folder."
 _SHOWN_ROWS = 10
+_ELSEWHERE: Mapping[str, ImagesKept] = {"thumbnail": "thumbnail", "none": "none"}
 # What a chunk can raise whose names or shapes were damaged in a way that Arrow cannot notice.
 _DAMAGE = (ValueError, KeyError, IndexError, TypeError, AttributeError)
 
@@ -45,12 +50,24 @@ def read_session(path: Path) -> Session:
         parse_toml(records.header.session_toml, "session.toml"),
         records.header.columns,
         cells,
-        RecordedImages(path, records.images_by_name(complete)),
+        _images_of(path, records, complete),
         target_document=codec.from_json(records.header.target_json),
         robot_document=codec.from_json(records.header.robot_json),
         corners=_corners_of(path, records, cells),
     ).with_streams(_whole_streams(path, records))
-    return replace(session, warnings=(*session.warnings, *_losses(scanned, records, len(complete))))
+    warnings = (*session.warnings, *_losses(scanned, records, len(complete)))
+    return replace(session, warnings=warnings)
+
+
+def _images_of(path: Path, records: "_Records", complete: Sequence[int]) -> ImageStore:
+    """The images of these rows, or what there is of those that are elsewhere."""
+    images = RecordedImages(path, records.images_by_name(complete))
+    kept = _ELSEWHERE.get(records.header.images)
+    if kept is None:
+        return images
+    digests = {records.image_name(it): records.rows[it].image_sha256 for it in complete}
+    pictures = {name: partial(images.read, name) for name in images.places}
+    return ImagesElsewhere(path, kept, {k: it for k, it in digests.items() if it}, pictures)
 
 
 @dataclass(frozen=True)
@@ -98,6 +115,10 @@ class RecordedImages:
             raise moved
         return data
 
+    def sha256(self, path: str) -> str:
+        """Digest of the bytes of an image; empty where there is none."""
+        return self.places[path].digest if path in self.places else ""
+
     def absence(self, path: str) -> str:
         """Says why there is no such image; empty where there is one."""
         return "" if self.exists(path) else "is missing"
@@ -132,6 +153,8 @@ class _Records:
     @property
     def begun(self) -> bool:
         """Whether the last view lacks its row or its image."""
+        if self.header.images:
+            return False
         with_image = {it for it, row in self.rows.items() if row.image_sha256}
         return with_image != set(self.images)
 
@@ -297,6 +320,8 @@ def _complete_rows(path: Path, records: _Records) -> list[int]:
             culprits=missing,
             next_step=_AGAIN,
         )
+    if records.header.images:
+        return sorted(rows)
     lacking = [row for row in rows if rows[row].image_sha256 and row not in images]
     changed = [
         row for row in rows if row in images and images[row].digest != rows[row].image_sha256
@@ -319,6 +344,8 @@ def _changed_images(path: Path, names: Sequence[str]) -> DataError:
 def _losses(scanned: Scan, records: _Records, complete: int) -> Iterator[str]:
     """Words what is not in the recording any more."""
     name, announced = scanned.path.name, records.header.rows
+    if records.header.images:
+        yield f"{name}: the images are elsewhere, and only their digests are kept."
     if records.closed is not None:
         if scanned.cut:
             yield (

@@ -10,8 +10,10 @@ from rerun.blueprint import BlueprintLike
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import named_errors, sha256, written_beside
+from visioncal.core.types import ImagesKept
 from visioncal.present.recording import codec
 from visioncal.present.recording.cells import log_cell
+from visioncal.present.recording.elsewhere import ImagesElsewhere, faint_picture
 from visioncal.present.recording.recorder import Recorder
 from visioncal.present.recording.results import log_results
 from visioncal.results import Alignment, Calibration
@@ -39,6 +41,7 @@ class RecordingWriter:
         announced: int | None = None,
         blueprint: BlueprintLike | None = None,
         label: Path | None = None,
+        images: ImagesKept = "full",
     ) -> None:
         """Begins the file.
 
@@ -48,6 +51,8 @@ class RecordingWriter:
             announced: How many views are to come, so that a reader can say how many were lost.
             blueprint: The layout to open the recording in.
             label: The path that it is written aside for, which messages name; None for none.
+            images: What is kept of the images beside their digests. Of a session whose images are
+                elsewhere it is what there is.
 
         Raises:
             DataError: The file exists or cannot be written.
@@ -56,12 +61,15 @@ class RecordingWriter:
         self._session = session
         self._numbers: set[int] = set()
         self._images: dict[str, str] = {}
+        elsewhere = session.images
+        self._kept = elsewhere.kept if isinstance(elsewhere, ImagesElsewhere) else images
         with named_errors(self._label):
             if label is None:
                 path.open("xb").close()
             self._recorder = Recorder(path)
             self._recorder.stream.send_recording_name(session.name)
-            header = codec.Header.of(session, codec.UNKNOWN if announced is None else announced)
+            rows = codec.UNKNOWN if announced is None else announced
+            header = codec.Header.of(session, rows, "" if self._kept == "full" else self._kept)
             codec.log_header(self._recorder.stream, header)
             for place, (name, samples) in enumerate(session.streams.items()):
                 self._recorder.at(place)
@@ -85,11 +93,18 @@ class RecordingWriter:
                 before stay as they are.
         """
         view = self._checked(cells, image)
+        shown = image
+        if image is not None and self._kept != "full":
+            shown = faint_picture(image) if self._kept == "thumbnail" else None
+        self._log(view, "" if image is None else sha256(image), shown)
+
+    def _log(self, view: View, image_sha256: str, shown: bytes | None) -> None:
         row, recorder = len(self._numbers), self._recorder
+        name = view.image if self._kept == "full" else f"{view.image}.jpg"
         with named_errors(self._label):
             recorder.at(row)
-            codec.log_row(recorder.stream, codec.Row.of(self._session.columns, view, image))
-            codec.log_image(recorder.stream, view.image, image)
+            codec.log_row(recorder.stream, codec.Row.of(self._session.columns, view, image_sha256))
+            codec.log_image(recorder.stream, name, shown)
             recorder.keep()
         self._numbers.add(view.number)
 
@@ -128,10 +143,15 @@ class RecordingWriter:
         Raises:
             DataError: An image cannot be read, or the file cannot be written.
         """
+        images = session.images
         for view in session.views:
-            known = bool(view.image) and session.images.exists(view.image)
             cells = [view.cell(column) for column in session.columns]
-            self.add_view(cells, session.images.read(view.image) if known else None)
+            if isinstance(images, ImagesElsewhere):
+                checked = self._checked(cells, None)
+                self._log(checked, images.sha256(view.image), images.shown(view.image))
+            else:
+                known = bool(view.image) and images.exists(view.image)
+                self.add_view(cells, images.read(view.image) if known else None)
 
     def draw(self, log: Callable[[Recorder], None]) -> None:
         """Adds what is drawn and belongs to no view.
@@ -195,6 +215,7 @@ def write_recording(
     calibration: Calibration | None,
     evidence: Sequence[ViewEvidence],
     blueprint: BlueprintLike | None,
+    images: ImagesKept = "full",
 ) -> None:
     """Writes a session and its results as one recording.
 
@@ -205,16 +226,21 @@ def write_recording(
         evidence: What was seen and computed of the views, in any order.
         blueprint: The layout to open it in, as `viewer.blueprint` makes it; the viewer
             makes its own where None.
+        images: What is kept of the images beside their digests.
 
     Raises:
         DataError: The file cannot be written, or an image of the session cannot be read.
     """
-    with _whole(path, session, blueprint) as writer:
+    with _whole(path, session, blueprint, images) as writer:
         writer.add_results(session, calibration, evidence)
 
 
 def write_cell_recording(
-    path: Path, session: Session, found: Alignment, blueprint: BlueprintLike | None
+    path: Path,
+    session: Session,
+    found: Alignment,
+    blueprint: BlueprintLike | None,
+    images: ImagesKept = "full",
 ) -> None:
     """Writes a session and the alignment of its cell as one recording.
 
@@ -223,23 +249,29 @@ def write_cell_recording(
         session: What was recorded; `read_session` gives it back.
         found: Its result.
         blueprint: The layout to open it in.
+        images: As in `write_recording`.
 
     Raises:
         DataError: The file cannot be written, or an image of the session cannot be read.
     """
-    with _whole(path, session, blueprint) as writer:
+    with _whole(path, session, blueprint, images) as writer:
         writer.add_alignment(session, found)
 
 
 @contextmanager
 def _whole(
-    path: Path, session: Session, blueprint: BlueprintLike | None
+    path: Path, session: Session, blueprint: BlueprintLike | None, images: ImagesKept
 ) -> Iterator[RecordingWriter]:
     """A writer that has a session's views; the file appears once nothing went wrong."""
     with (
         written_beside(path) as aside,
         RecordingWriter(
-            aside, session, announced=len(session.views), blueprint=blueprint, label=path
+            aside,
+            session,
+            announced=len(session.views),
+            blueprint=blueprint,
+            label=path,
+            images=images,
         ) as writer,
     ):
         writer.add_session(session)
