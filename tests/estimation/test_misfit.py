@@ -62,6 +62,19 @@ def test_a_creeping_base_is_noticed_and_its_way_told(mount):
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
+def test_a_bump_is_told_from_a_creep(mount):
+    for seed in range(3):
+        cell = simulate(replace(FINE, mount=mount, seed=seed))
+        lifted = np.where(np.arange(20) < 8, 0.0, 1e-3)[:, None] * np.eye(6)[5]
+        moved = replace(cell, base_from_flange=exp(lifted) @ cell.base_from_flange)
+        _, known = answered(moved)
+        words = [it.reason for it in known.warnings if "moved at once" in it.reason]
+        assert len(words) == 1
+        assert "before stop 9 of" in words[0]
+        assert not any("drift with time" in it.reason for it in known.warnings)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
 def test_a_turning_base_moves_the_target_by_its_distance(mount):
     cell = simulate(replace(FINE, mount=mount, seed=0))
     turn = np.array([2e-3, 0, 0, 0, 0, 0.0])

@@ -51,6 +51,7 @@ class Move:
         stop: The first stop at which it stands elsewhere.
         change: (4, 4) where it then is, in its own frame before: as first estimated.
         rivals: Frames of which the same may be said as well.
+        mahalanobis_sq: The evidence for it, where it is slight.
     """
 
     frame: str
@@ -58,6 +59,7 @@ class Move:
     stop: int
     change: FloatArray
     rivals: tuple[str, ...] = ()
+    mahalanobis_sq: float = 0.0
 
 
 def moved(problem: Problem, fit: Solution, move: Move) -> tuple[Problem, Solution]:
@@ -324,7 +326,8 @@ def slight_move(problem: Problem, fit: Solution, movable: Sequence[str]) -> Move
     if best is None:
         return None
     frame, stop, step = best
-    return _move(problem, _Step(0, frame, stop, exp(step)))
+    found = _move(problem, _Step(0, frame, stop, exp(step)))
+    return replace(found, mahalanobis_sq=limit)
 
 
 def _move_limit(problem: Problem, tried: int) -> float:

@@ -49,10 +49,12 @@ class Drift:
         moved_m: How far a target at rest moved from the first stop to the last, where it is on
             average [m].
         moved_rad: How far it turned [rad].
+        mahalanobis_sq: The evidence for it.
     """
 
     moved_m: float
     moved_rad: float
+    mahalanobis_sq: float
 
 
 @dataclass(frozen=True)
@@ -199,11 +201,13 @@ def drift(problem: Problem, state: State, noise: Noise, robot: str) -> Drift | N
     information, gradient = normal_equations(widened, there, noise)
     gradient[: problem.size] = 0.0
     step = -covariance_among(information, widened.moving) @ gradient
-    if -gradient @ step < chi2_limit(_FALSE_ALARM, 6):
+    mahalanobis_sq = float(-gradient @ step)
+    if mahalanobis_sq < chi2_limit(_FALSE_ALARM, 6):
         return None
     base = step[problem.size :]
     moved = base[3:] + np.cross(base[:3], _where_it_looks(problem, state, robot))
-    return Drift(float(np.linalg.norm(moved)), float(np.linalg.norm(base[:3])))
+    turned = float(np.linalg.norm(base[:3]))
+    return Drift(float(np.linalg.norm(moved)), turned, mahalanobis_sq)
 
 
 def _where_it_looks(problem: Problem, state: State, robot: str) -> FloatArray:

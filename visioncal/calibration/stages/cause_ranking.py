@@ -70,6 +70,7 @@ EVIDENCE: Mapping[str, Evidence] = {
     "lens_field": Evidence(1e-4, _CHAIN),
     "corner_noise": Evidence(1e-4, "corners"),
     "moved_slowly": Evidence(1e-4, _CHAIN),
+    "moved_at_once": Evidence(1e-4, _CHAIN),
     "correlated_errors": Evidence(1e-4, _CHAIN),
     "arm_errors": Evidence(1e-4, _CHAIN),
     "weak_lens": Evidence(_REMARK, "lens"),

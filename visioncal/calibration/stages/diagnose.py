@@ -6,12 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.core.number_format import figure
+from visioncal.core.transforms import pose_difference
 from visioncal.core.verdict import PLAN, Finding, Step
 from visioncal.estimation.arm import LEVER_M, SIGNIFICANT, ArmErrors, stops_of
+from visioncal.estimation.moves import Move, slight_move
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.residual_tests import Drift, Neighbours, drift, neighbours
 from visioncal.estimation.solve import Solution
 
+_THINGS = {"cam": "The camera", "target": "The target"}
 # Fewer stops than this leave no residuals to be tested.
 _FEWEST_STOPS = 6
 
@@ -23,10 +26,12 @@ class ResidualTest:
     Attributes:
         alike: Whether neighbouring stops err alike.
         moved: How its base or what it looks at crept; None where noise explains it.
+        step: What moved at once, and where that explains more than a creep does.
     """
 
     alike: Neighbours
     moved: Drift | None
+    step: Move | None = None
 
 
 def misfits(problem: Problem, fit: Solution) -> dict[str, ResidualTest]:
@@ -40,7 +45,22 @@ def misfits(problem: Problem, fit: Solution) -> dict[str, ResidualTest]:
     for robot in problem.robots:
         if len(stops_of(problem, robot)) >= _FEWEST_STOPS:
             fitted = (problem, fit.state, fit.noise, robot)
-            found[robot] = ResidualTest(neighbours(*fitted), drift(*fitted))
+            alike, crept = neighbours(*fitted), drift(*fitted)
+            step = _step(problem, fit, crept) if crept or alike.is_significant else None
+            found[robot] = ResidualTest(alike, None if step else crept, step)
+    return found
+
+
+def _step(problem: Problem, fit: Solution, crept: Drift | None) -> Move | None:
+    """What moved at once, where that explains the residuals better than a creep from end to end.
+
+    A step may be at any stop and of any frame: it must gain by twice the logarithm of these.
+    """
+    frames = tuple(problem.unknown)
+    found = slight_move(problem, fit, frames)
+    price = 2.0 * np.log(len(frames) * (1 + int(problem.observations.stops.max())))
+    if found is None or (crept and found.mahalanobis_sq < crept.mahalanobis_sq + price):
+        return None
     return found
 
 
@@ -65,6 +85,16 @@ def doubts(found: ResidualTest, arm: ArmErrors | None, *, calibrated: bool) -> I
             _of_arm(arm),
             until_mm=0.0,
             mahalanobis_sq=arm.gain,
+        )
+    if found.step is not None:
+        shift_mm, turn_deg = pose_difference(np.eye(4), found.step.change)
+        frame, stop = found.step.frame, found.step.stop
+        yield Finding(
+            "moved_at_once",
+            f"{_THINGS.get(frame, frame)} moved at once, before stop {stop + 1} of the "
+            f"session, by {figure(shift_mm)} mm and {figure(turn_deg)} deg; the result is between "
+            "both places.",
+            Step("Fasten it, and record again; or keep only the views before or after."),
         )
     if moved is not None:
         yield Finding(
