@@ -7,6 +7,7 @@ import pytest
 from support.later import ANYHOW, Change, known_again, lot
 from support.tracked import known_of
 
+from visioncal import correct
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.kinematics import FUNCTIONS
@@ -204,3 +205,22 @@ def test_a_check_of_an_unchanged_cell_passes_and_a_bump_is_seen(tmp_path):
     bumped = check(seen_by(known_again(place.cell, rng, bump), prior), prior)
     assert not bumped.passed
     assert [it.name for it in bumped.named] == ["camera"]
+
+
+def test_corrected_targets_reach_where_functions_would_have_led_them_astray(shop, known):
+    result, q = result_of(known), 0.9 * Q[:40]
+    x, z = known.solved.state.edges[:2]
+    stated = known.robot_arm.kinematics.fits[0].fit.state.edges
+    wanted = known.robot.base_from_flange(q)
+    sent = correct(result, wanted, q)
+    assert sent.reached.all()
+
+    def away_mm(joints, frames):
+        there = invert(frames[0]) @ wanted @ frames[1]
+        real = forward(shop.true_arm, joints) @ shop.flange_from_probe
+        error = invert(there) @ invert(shop.base_from_instrument) @ real
+        return 1e3 * float(np.sqrt(np.mean(np.sum(error[:, :3, 3] ** 2, axis=1))))
+
+    # As stated, with the frames that go with that arm, they are off by millimetres.
+    assert away_mm(q, stated) > 1.0
+    assert away_mm(sent.q, (x, z)) < 0.15
