@@ -36,6 +36,7 @@ WORLDS = 10
 SESSIONS = Path(__file__).parents[3] / "shared" / "data" / "sessions"
 # Stops on which the frames of another recording are fitted, and how often these are drawn.
 ANCHORS, DRAWS = 12, 6
+_STEPS = 40
 SERIES = {it: f"ur10_tracker_series_{it}" for it in "ac"}
 MECA = {it: f"meca500_tracker_{it}" for it in ("small", "large")}
 
@@ -113,10 +114,10 @@ def placed(
         The instrument's frame and the probe's, and (6 m, 6 r) how residuals of all follow those of
         the rows.
     """
-    (x, z), counts = start, few(40, 40)
+    x, z = start
     # A mrad weighs as much as half a millimetre; of places alone rotation does not count.
     weights = np.tile(np.repeat([0.5 if other.turned else 0.0, 1.0], 3), len(rows))
-    for _ in range(counts):
+    for _ in range(_STEPS):
         slope = slopes(flange, x, z)
         away = residuals(flange, other, x, z)
         inverse = np.linalg.pinv(weights[:, None] * slope[rows].reshape(-1, 12), rcond=1e-10)
@@ -245,7 +246,9 @@ def others() -> list[str]:
     real: list[tuple[str, Callable[[], Session]]] = [
         ("ROKAE, 30 poses by a laser", lambda: thirdparty.rokae(data)),
         ("IRB 120, 36 places", lambda: thirdparty.irb120(data)),
+        ("Positioner of two axes, 205 poses", lambda: thirdparty.positioner(data)),
         ("TALOS, 61 contacts", lambda: thirdparty.talos(data)),
+        ("figaroh's UR10, 23 poses", lambda: thirdparty.figaroh_ur10(data)),
     ]
     return [within(words, session()) for words, session in first(real)]
 
