@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.later import ANYHOW, Change, known_again, lot
+from support.marks import slow
 from support.tracked import known_of
 
 from visioncal import correct
@@ -108,6 +109,7 @@ def test_an_arm_without_them_has_none():
     assert kinematics.functions is None
 
 
+@slow
 def test_places_alone_tell_of_them():
     options = replace(OPTIONS, poses=False, stops=60)
     shop = tracked(options)

@@ -10,6 +10,7 @@ import numpy as np
 from visioncal.core.number_format import figure, percent
 from visioncal.core.types import FloatArray
 from visioncal.estimation.bending import Factor
+from visioncal.estimation.null_space import listed
 from visioncal.results.codec import Array, Key, Matrix, Section, Written
 from visioncal.results.edge import Covariance
 from visioncal.robot import Convention, Robot
@@ -196,7 +197,7 @@ class CarriesOver:
     def words(self) -> str:
         """All this in a sentence or two."""
         worse = [_WHERE[it.region] for it in self.regions if not it.better]
-        where = f"; {' and '.join(worse)} it is no better than as stated" if worse else ""
+        where = f"; {listed(worse)} it is no better than as stated" if worse else ""
         return (
             f"Where it was measured the calibrated arm errs by {figure(self.measured_mm)} mm (as "
             f"stated {figure(self.measured_nominal_mm)}); elsewhere {figure(self.sigma_mm)} of "
