@@ -16,14 +16,14 @@ _MOST_NAMED = 5
 
 
 def batch_command(
-    sessions: Annotated[
-        list[str],
-        typer.Argument(help="Sessions, recordings, folders with some below them, or globs."),
-    ],
     out: Annotated[
         Path, typer.Option("-o", "--out", help="Folder for the results, one in each session's.")
     ],
     need: NeedOptions,
+    sessions: Annotated[
+        list[str] | None,
+        typer.Argument(help="Sessions, recordings, folders with some below them, or globs."),
+    ] = None,
     workers: Annotated[
         int | None,
         typer.Option(min=1, help="How many work at a time, on one core each; one a core."),
@@ -39,6 +39,13 @@ def batch_command(
     against: Annotated[
         Path | None,
         typer.Option(help="An earlier batch: which results changed by more than their sigmas."),
+    ] = None,
+    cells: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.toml",
+            help="Simulate cells in the place of sessions: all combinations of the values in it.",
+        ),
     ] = None,
     level: Annotated[
         str, typer.Option(metavar="auto|hand-eye|offsets|...", help="As of calibrate.")
@@ -59,7 +66,7 @@ def batch_command(
     wanted = {REPORT: not no_report, RECORDING: recordings}
     with shown_progress(quiet=False) as told:
         found = batch(
-            sessions,
+            sessions or (),
             out,
             workers=workers,
             scheduler=scheduler,
@@ -68,6 +75,7 @@ def batch_command(
             need_deg=need.need_deg,
             without=[name for name, is_wanted in wanted.items() if not is_wanted],
             against=against,
+            cells=cells,
             progress=told,
         )
     _tell(found)

@@ -60,6 +60,7 @@ class FleetRow:
         arm_mm: Typical error of the arm's links.
         drift_mm: How far the arm's drift with temperature went.
         focal_px: Mean focal length.
+        error_mm: How far the camera's place is from the truth, of a simulated cell.
         seconds: How long it took.
         has_picture: Whether there is a picture of it in its folder.
         has_report: Whether there is a report.
@@ -96,6 +97,7 @@ class FleetRow:
     arm_mm: float | None = None
     drift_mm: float | None = None
     focal_px: float | None = None
+    error_mm: float | None = None
     seconds: float | None = None
     has_picture: bool = False
     has_report: bool = False
@@ -115,10 +117,7 @@ def row_of(name: str, session: str, found: Calibration, version: str) -> FleetRo
     size = None if found.camera is None else found.camera.camera.resolution
     matrix = None if found.camera is None else found.camera.camera.matrix
     known, arm, drift = found.budget, found.arm_errors, found.thermal
-    edge = next(
-        (it for key, it in found.edges.items() if key.rpartition("_from_")[2].startswith("cam")),
-        next(iter(found.edges.values())),
-    )
+    edge = found.edges[camera_edge(found)]
     noise = {key: value for key, value in found.noise.items() if math.isfinite(value)}
     return FleetRow(
         name=name,
@@ -147,6 +146,59 @@ def row_of(name: str, session: str, found: Calibration, version: str) -> FleetRo
         drift_mm=None if drift is None else max((it.drift_mm for it in drift.course), default=0.0),
         focal_px=None if matrix is None else float(np.mean(matrix[:2])),
     )
+
+
+def camera_edge(found: Calibration) -> str:
+    """The name of the transform that places the camera, or what is observed in its place."""
+    placed = (it for it in found.edges if it.rpartition("_from_")[2].startswith("cam"))
+    return next(placed, next(iter(found.edges)))
+
+
+@dataclass(frozen=True)
+class CellFigures:
+    """What many simulated cells of one kind came to; figures are None where none has a result.
+
+    Attributes:
+        name: What they have in common.
+        count: How many there are.
+        results: How many have a result.
+        good: How many of them are good.
+        radius95_mm: Predicted: within which 95 % of points are placed; the median.
+        sigma_mm: Predicted: of the camera's place; the median.
+        error_mm: True: how far 95 % of the cameras' places are off at most.
+    """
+
+    name: str
+    count: int
+    results: int
+    good: int
+    radius95_mm: float | None
+    sigma_mm: float | None
+    error_mm: float | None
+
+
+def cell_figures(rows: Sequence[FleetRow]) -> list[CellFigures]:
+    """The figures of simulated cells by what they have in common."""
+    groups: dict[str, list[FleetRow]] = defaultdict(list)
+    for it in sorted(rows, key=lambda it: it.name):
+        groups[it.group].append(it)
+
+    def share(some: Sequence[FleetRow], field: str, percent: float) -> float | None:
+        values = [value for it in some if (value := getattr(it, field)) is not None]
+        return float(np.percentile(values, percent)) if values else None
+
+    return [
+        CellFigures(
+            name,
+            len(some),
+            sum(it.state != "failed" for it in some),
+            sum(it.verdict == "good" for it in some),
+            share(some, "radius95_mm", 50.0),
+            share(some, "sigma_mm", 50.0),
+            share(some, "error_mm", 95.0),
+        )
+        for name, some in groups.items()
+    ]
 
 
 @dataclass(frozen=True)

@@ -3,19 +3,30 @@
 import io
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import write_atomically
+from visioncal.core.transforms import pose_difference
 from visioncal.core.types import Progress
+from visioncal.interchange.batch.cells import write_cells
 from visioncal.interchange.batch.jobs import Options, jobs_of
 from visioncal.interchange.batch.workers import rows_of
 from visioncal.interchange.outputs import CALIBRATION
 from visioncal.results import Calibration
-from visioncal.results.fleet import FleetRow, with_changes, with_outliers
+from visioncal.results.fleet import (
+    FleetRow,
+    camera_edge,
+    cell_figures,
+    with_changes,
+    with_outliers,
+)
+from visioncal.simulation import read_truth
 
-TABLE, PAGE = "batch.parquet", "index.html"
+TABLE, PAGE, _CELLS = "batch.parquet", "index.html", "cells"
 
 
 @dataclass(frozen=True)
@@ -43,8 +54,8 @@ class Batch:
 
 
 def batch(
-    sessions: Iterable[Path | str] | Path | str,
-    out: Path | str,
+    sessions: Iterable[Path | str] | Path | str = (),
+    out: Path | str = "out",
     *,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -53,6 +64,7 @@ def batch(
     need_deg: float | None = None,
     without: Iterable[str] = (),
     against: Path | str | None = None,
+    cells: Path | str | None = None,
     progress: Progress | None = None,
 ) -> Batch:
     """Calibrates many sessions, each into a folder of its own.
@@ -72,6 +84,8 @@ def batch(
         need_deg: Likewise.
         without: `report.html` or `recording.rrd`, where they are not wanted.
         against: The folder of an earlier batch, whose results these are compared with.
+        cells: A file of cells to simulate in the place of sessions; see `write_cells`. Their
+            sessions go into `cells` in the folder.
         progress: Told of each session.
 
     Returns:
@@ -84,6 +98,10 @@ def batch(
     folder = Path(out)
     given = [sessions] if isinstance(sessions, Path | str) else list(sessions)
     options = Options(level, need_mm, need_deg, tuple(sorted(without)))
+    if cells is not None:
+        if given:
+            raise DataError("cells are simulated in the place of sessions.", culprits=["--cells"])
+        given = [*write_cells(Path(cells), folder / _CELLS, progress)]
     jobs = jobs_of(given, folder, options)
     if against is not None and not Path(against).is_dir():
         raise DataError(f"{against} is no folder of results.", culprits=["--against"])
@@ -103,12 +121,25 @@ def batch(
             lambda name: _result(old / name),
             lambda name: None if name in failed else _result(folder / name),
         )
+    if cells is not None:
+        rows = [_beside_truth(it, folder) for it in rows]
     found = Batch(tuple(with_outliers(rows)), folder / TABLE, folder / PAGE)
     write_atomically(found.table, _table(found.rows))
     from visioncal.present.report.fleet import fleet_page
 
-    write_atomically(found.page, fleet_page(found.rows))
+    write_atomically(
+        found.page, fleet_page(found.rows, cell_figures(rows) if cells is not None else ())
+    )
     return found
+
+
+def _beside_truth(row: FleetRow, folder: Path) -> FleetRow:
+    found = _result(folder / row.name)
+    if row.state == "failed" or found is None:
+        return row
+    name = camera_edge(found)
+    true = np.asarray(read_truth(row.session).transforms[name])
+    return replace(row, error_mm=pose_difference(found.edges[name].matrix, true)[0])
 
 
 def _result(folder: Path) -> Calibration | None:

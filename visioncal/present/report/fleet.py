@@ -8,7 +8,7 @@ from itertools import groupby
 from visioncal.core.number_format import significant
 from visioncal.core.version import __version__
 from visioncal.present.report.templating import template
-from visioncal.results.fleet import FleetRow
+from visioncal.results.fleet import CellFigures, FleetRow
 
 _ICONS = {"good": "good", "check": "check"}
 # So many of the sessions of one robot are named by what stands out of them.
@@ -26,15 +26,17 @@ class _Odd:
     more: int
 
 
-def fleet_page(rows: Sequence[FleetRow]) -> str:
+def fleet_page(rows: Sequence[FleetRow], cells: Sequence[CellFigures] = ()) -> str:
     """Renders the page as HTML text, whose links are relative to its folder.
 
     Args:
         rows: Those first that stand out the most.
+        cells: What simulated ones came to, by what they have in common.
     """
     states = Counter(it.verdict or it.state for it in rows)
     return template("fleet.html.j2").render(
         rows=rows,
+        cells=cells,
         odd=list(_odd(rows)),
         states=[(name, states[name]) for name in ("good", "check", "bad", "failed")],
         changed=[it for it in rows if it.changed],
