@@ -127,7 +127,7 @@ def test_errors_as_json_have_one_form(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with_json = [name for name, it in every_command() if "as_json" in {p.name for p in it.params}]
     # It looks at its libraries first, which may not be there.
-    assert len(with_json) == 18
+    assert len(with_json) == 19
     for name in with_json:
         if name == "rehearse":
             continue

@@ -32,6 +32,7 @@ class _Commands(LazyGroup):
         "tcp": "Find a tool's tip, and its rotation, from touches of fixed points; or from images.",
         "locate": "Locate what an image shows in the robot's base, with its uncertainty.",
         "fixture": "Find a fixture in the base, from touches of it or of a drawing's points.",
+        "touch-test": "Prove a calibration: touch what the camera locates, and enter the gaps.",
         "correct": "Correct targets so that the arm reaches them by its nominal controller.",
         "review": "Open a recording in the rerun viewer, on this machine alone.",
         "simulate": "Write a simulated session, and its truth in a file beside it.",

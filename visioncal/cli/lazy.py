@@ -90,7 +90,7 @@ class LazyGroup(TyperGroup):
     @classmethod
     def imported(cls, name: str) -> Any:  # noqa: ANN401 - a command of typer's
         """A command of this group, with its parameters."""
-        own = f"{cls.prefix}{name}"
+        own = f"{cls.prefix}{name}".replace("-", "_")
         module = import_module(f"visioncal.cli.{own}")
         if hasattr(module, f"{own}_app"):
             return get_group(getattr(module, f"{own}_app"))

@@ -325,6 +325,40 @@ class DenseResult(Section):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class TouchedPoint(Section):
+    """A point that the camera located and the tool touched.
+
+    Attributes:
+        name: Which point of the board.
+        base_m: (3,) where it was located, in the base [m].
+        radius95_mm: How near the tip comes with 95 %, as predicted [mm].
+        gap_mm: How far the tip was from it [mm].
+    """
+
+    name: str
+    base_m: Vector
+    radius95_mm: float
+    gap_mm: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TouchTest(Section):
+    """The touch test that joined the result: `touch_test` in calibration.json.
+
+    Attributes:
+        created: When, in ISO 8601.
+        tool: With which tool.
+        passed: Whether the gaps are as small as predicted.
+        points: What was touched.
+    """
+
+    created: str
+    tool: str
+    passed: bool
+    points: tuple[TouchedPoint, ...]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class CalibrationSections(ArmSections):
     """What was found beside transforms, cameras and views; None or empty where not computed.
 
@@ -340,6 +374,7 @@ class CalibrationSections(ArmSections):
         conditions: Mean values over the used views, by the columns `ambient_c` and `payload_kg`.
         joint_fit: The unknowns of the fit and their covariance, for a later check.
         dense: What corners of dense image fits brought.
+        touch_test: What was touched to prove it.
         further: Sections that this version does not know, as the file has them.
     """
 
@@ -354,6 +389,7 @@ class CalibrationSections(ArmSections):
     conditions: Mapping[str, float] = field(default_factory=dict)
     joint_fit: JointFit | None = None
     dense: DenseResult | None = None
+    touch_test: TouchTest | None = None
     further: Annotated[Mapping[str, Any], REST] = field(default_factory=dict)
 
     @property

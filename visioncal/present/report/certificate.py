@@ -89,6 +89,10 @@ def _result(calibration: Calibration) -> Iterator[tuple[str, str]]:
         if edge.oriented:
             sigma += f" and {figure(edge.sigma_deg)} deg"
         yield name, f"({x:.3f}, {y:.3f}, {z:.3f}) mm; ({turn}) deg; {sigma}"
+    if (test := calibration.touch_test) is not None:
+        largest = max(it.gap_mm for it in test.points)
+        words = "passed" if test.passed else "not passed"
+        yield "Touch test", f"{words}, largest gap {figure(largest)} mm, with {test.tool}"
     left_out = calibration.validation.held_out
     turned = "" if left_out.deg is None else f" and {figure(left_out.deg)} deg"
     used = sum(it.used for it in calibration.views)

@@ -83,9 +83,10 @@ def render(
 
 
 def _words(calibration: Calibration) -> dict[str, object]:
-    found = advice.suspects(calibration)
+    found, touched = advice.suspects(calibration), calibration.touch_test
     return {
         "created": content.readable_time(calibration.created),
+        "touched_at": content.readable_time(touched.created) if touched else "",
         "suspects": [(advice.listed(it.views), it) for it in found],
         "has_outliers": any(it.used for it in found),
         "has_contradicting": any(it.contradict for it in found),

@@ -1,0 +1,75 @@
+"""The touch test: what the camera locates, touched by a simulated arm that knows the truth."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.commands import visioncal
+from support.pages import Page
+
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import invert
+from visioncal.frames.touch_test import judged, touch_points
+from visioncal.results import Calibration
+from visioncal.session import Session
+from visioncal.simulation import CellOptions, simulate, write_session
+from visioncal.vision.targets import corner_positions
+
+CELL = replace(CellOptions(), views=12, seed=21)
+
+
+@pytest.fixture(scope="module")
+def proved(tmp_path_factory):
+    """A calibrated cell, new images of its board, and where its corners really are."""
+    folder = tmp_path_factory.mktemp("touched")
+    session = write_session(simulate(CELL), folder / "session")
+    assert visioncal("calibrate", session, "-o", folder / "out").status == 0
+    later = simulate(replace(CELL, views=3, recording=1))
+    look = write_session(later, folder / "look")
+    place = later.transforms["base_from_target"]
+    corners = corner_positions(CELL.target) @ place[:3, :3].T + place[:3, 3]
+    return folder, look, corners
+
+
+def test_the_tip_comes_as_near_as_predicted(proved):
+    folder, look, corners = proved
+    points = touch_points(Session.load(look), Calibration.load(folder / "out"), "")
+    assert len(points) == 5
+    away_mm = [1e3 * np.linalg.norm(it.base_m - corners[int(it.name.split()[1])]) for it in points]
+    # A ball of 95 % holds five points that share the camera's error, nineteen times of twenty.
+    assert max(away_mm) < max(it.radius95_mm for it in points)
+    for it in points:
+        # The flange stands on the point, its z into the board; above it, along that z.
+        np.testing.assert_allclose(it.base_from_flange[:3, 3], it.base_m)
+        step = invert(it.base_from_flange) @ it.above(0.05)
+        np.testing.assert_allclose(step[:3, 3], [0.0, 0.0, -0.05], atol=1e-12)
+    assert judged(points, away_mm, "").passed
+    assert not judged(points, [5.0] * 5, "").passed
+    with pytest.raises(DataError, match="5 of 0 mm and more"):
+        judged(points, [0.1], "")
+
+
+def test_targets_are_printed_and_gaps_join_the_result(proved):
+    folder, look, _ = proved
+    out = folder / "out"
+    done = visioncal("touch-test", look, "-c", out)
+    assert done.status == 0
+    assert done.err.count("hover:") == done.err.count("touch:") == 5
+    targets = json.loads(visioncal("touch-test", look, "-c", out, "--json").out)["points"]
+    lifted = np.array(targets[0]["hover"][:3]) - targets[0]["touch"][:3]
+    assert np.linalg.norm(lifted) == pytest.approx(0.05)
+    done = visioncal("touch-test", look, "-c", out, "--gaps-mm", "0.1,0,0.1,0.1,0.05")
+    assert done.status == 0
+    known = Calibration.load(out)
+    assert known.touch_test.passed
+    assert [it.gap_mm for it in known.touch_test.points] == [0.1, 0.0, 0.1, 0.1, 0.05]
+    words = Page((out / "report.html").read_text("utf-8")).words
+    assert "Touch test Passed, with flange" in words
+    done = visioncal("touch-test", look, "-c", out, "--gaps-mm", "3,3,3,3,3")
+    assert done.status == 3
+    assert "Measure the tool's tip anew" in done.err
+    assert not Calibration.load(out).touch_test.passed
+    done = visioncal("touch-test", look, "-c", out, "--tool", "gripper")
+    assert done.status == 2
+    assert "flange_from_gripper" in done.err

@@ -1,0 +1,121 @@
+"""`visioncal touch-test`."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+from scipy.spatial.transform import RigidTransform
+
+from visioncal.cli.console import messages, tell_written
+from visioncal.cli.numbers import numbers_in
+from visioncal.cli.options import AsJson, SessionArgument
+from visioncal.cli.progress import shown_progress
+from visioncal.core.errors import DataError
+from visioncal.core.number_format import figure
+from visioncal.core.types import FloatArray
+from visioncal.frames.touch_test import TouchPoint, finding_of, judged, touch_points
+from visioncal.interchange.merge_results import rewrite
+from visioncal.interchange.result_files import load_result
+from visioncal.results import Calibration, to_document
+from visioncal.results.compensation import correct
+from visioncal.session import Session
+
+# The gaps are larger than predicted.
+_EXIT_LARGER = 3
+
+
+def touch_test_command(
+    session: SessionArgument,
+    calibration: Annotated[
+        Path | None, typer.Option("-c", "--calibration", help="An output folder of calibrate.")
+    ] = None,
+    tool: Annotated[
+        str, typer.Option("--tool", help="Which tool of the calibration has the tip; see tcp.")
+    ] = "",
+    height_mm: Annotated[
+        float, typer.Option("--height-mm", min=1.0, max=1000.0, help="To hover at, first.")
+    ] = 50.0,
+    gaps_mm: Annotated[
+        str | None,
+        typer.Option(
+            "--gaps-mm", metavar="A,B,C,D,E", help="Tip to point, as measured, in their order."
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Prove a calibration: touch what the camera locates, and enter the gaps.
+
+    The session has one image or more of a board as it lies now. Without gaps: where to send the
+    robot, hovering first, corrected where the arm is calibrated. With them: compared with what was
+    predicted, and kept in the result and its report. Exit status 3: they are larger.
+    """
+    if calibration is None:
+        raise DataError(
+            "touch-test: the calibration to prove (-c) is needed.",
+            culprits=["-c"],
+            next_step="Name the output folder of visioncal calibrate.",
+        )
+    loaded, known = Session.load(session), load_result(calibration)
+    if known.cell is not None:
+        raise DataError("touch-test is for one camera and one robot.", culprits=["-c"])
+    with shown_progress(quiet=as_json):
+        points = touch_points(loaded, known, tool)
+    targets = [_target(known, it, 1e-3 * height_mm) for it in points]
+    if gaps_mm is None:
+        _tell(points, targets, as_json=as_json)
+        return
+    count = gaps_mm.count(",") + 1
+    gaps = numbers_in(gaps_mm, "--gaps-mm", ",".join("abcdefghij"[:count]))
+    test = judged(points, gaps, tool)
+    proved = replace(known, touch_test=test)
+    written = rewrite(calibration if calibration.is_dir() else calibration.parent, proved)
+    if as_json:
+        document = {"points": targets, "touch_test": to_document(proved)["touch_test"]}
+        typer.echo(json.dumps(document, indent=2))
+    else:
+        messages().print(escape(finding_of(test).reason))
+    tell_written(written, quiet=as_json, status=0 if test.passed else _EXIT_LARGER)
+
+
+def _target(known: Calibration, point: TouchPoint, height_m: float) -> dict[str, Any]:
+    """Where to send the robot: as its own controller has to be told."""
+    touch, hover = point.base_from_flange, point.above(height_m)
+    found: dict[str, Any] = {
+        "name": point.name,
+        "base_m": point.base_m.tolist(),
+        "radius95_mm": point.radius95_mm,
+    }
+    if known.arm_is_calibrated:
+        sent = correct(known, [hover, touch])
+        (hover, touch), found["q_rad"] = sent.base_from_flange, sent.q[1].tolist()
+    return found | {"hover": _numbers(hover), "touch": _numbers(touch)}
+
+
+def _numbers(pose: FloatArray) -> list[float]:
+    transform = RigidTransform.from_matrix(pose)
+    return [*transform.translation.tolist(), *transform.rotation.as_rotvec().tolist()]
+
+
+def _tell(
+    points: Sequence[TouchPoint], targets: Sequence[dict[str, Any]], *, as_json: bool
+) -> None:
+    if as_json:
+        typer.echo(json.dumps({"points": targets}, indent=2))
+        return
+    console = messages()
+    console.print("Flange targets: x, y, z [mm], rotation vector [rad]; hover first, then touch.")
+    for point, target in zip(points, targets, strict=True):
+        x, y, z = 1e3 * point.base_m
+        console.print(
+            f"{point.name} at ({x:.2f}, {y:.2f}, {z:.2f}) mm, 95 % within "
+            f"{figure(point.radius95_mm)} mm"
+        )
+        for name in ("hover", "touch"):
+            place, turn = target[name][:3], target[name][3:]
+            numbers = [*(f"{1e3 * it:.2f}" for it in place), *(f"{it:.5f}" for it in turn)]
+            console.print(f"  {name}: {', '.join(numbers)}")
+    console.print("Enter the gaps with --gaps-mm, in this order.")

@@ -1,0 +1,149 @@
+"""The touch test: points that the camera locates, touched by the tool; the gaps against prediction.
+
+It is the proof that counts: everything between pixels and the tip has a part in the gap.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+import numpy as np
+
+from visioncal.core.errors import DataError
+from visioncal.core.number_format import figure
+from visioncal.core.transforms import compose, invert
+from visioncal.core.types import FloatArray, Target
+from visioncal.core.verdict import Finding, Step
+from visioncal.estimation.budget import point_covariance, radius95
+from visioncal.frames.frame_from_images import seen_frame
+from visioncal.frames.naming import transform_name
+from visioncal.results import Calibration, Edge
+from visioncal.results.sections import TouchedPoint, TouchTest
+from visioncal.session import Session
+from visioncal.vision.targets import corner_positions
+
+# A gap is read to so much: by a feeler gauge, or by eye over a tip [mm].
+READING_MM = 0.1
+# So many gaps beyond what is predicted for 95 % are chance, of five.
+_BY_CHANCE = 1
+
+
+@dataclass(frozen=True, eq=False)
+class TouchPoint:
+    """A point to be touched.
+
+    Attributes:
+        name: Which point of the board it is.
+        base_m: (3,) where the camera locates it in the base [m].
+        base_from_flange: (4, 4) where the flange has the tip on it, the tool's z into the board.
+        radius95_mm: The tip comes as near as this with 95 % [mm].
+        normal: (3,) of the board there, in the base, into the board.
+    """
+
+    name: str
+    base_m: FloatArray
+    base_from_flange: FloatArray
+    radius95_mm: float
+    normal: FloatArray
+
+    def above(self, height_m: float) -> FloatArray:
+        """(4, 4) the flange with the tip so high above the point, along the board's normal [m]."""
+        lifted = self.base_from_flange.copy()
+        lifted[:3, 3] -= height_m * self.normal
+        return lifted
+
+
+def touch_points(session: Session, calibration: Calibration, tool: str) -> tuple[TouchPoint, ...]:
+    """Locates five points of a board, and says where the flange brings the tip onto each.
+
+    Args:
+        session: Images of the board by the calibrated camera, where it lies now; one will do.
+        calibration: The camera's; a tool in it has the tip.
+        tool: The tool's name; empty for the flange itself.
+
+    Raises:
+        DataError: No image serves, or there is no such tool.
+    """
+    board = next(iter(session.boards.values()), None)
+    if board is None:
+        raise DataError(
+            f"session {session.name!r} names no board to touch.",
+            culprits=["session.toml: target"],
+            next_step="Name it in session.toml.",
+        )
+    frame = seen_frame(session, calibration, "fixture")
+    tip = _tip(calibration, tool)
+    noise = calibration.noise
+    turned = np.deg2rad(noise.get("robot_rotation_deg", 0.0)) * np.linalg.norm(tip.matrix[:3, 3])
+    shifted = 1e-3 * noise.get("robot_translation_mm", 0.0)
+    # The robot stands at a point with its noise; the tip is where the tool was measured to have it.
+    own = (shifted**2 + turned**2) * np.eye(3) + tip.covariance[3:, 3:]
+    rotation = frame.edge.matrix[:3, :3]
+    points = []
+    for name, at in _five(board).items():
+        placed = frame.edge.matrix @ compose(np.eye(3), at)
+        located = point_covariance(frame.edge.matrix, frame.edge.covariance, at)
+        spread = located + rotation @ own @ rotation.T
+        flange = placed @ invert(tip.matrix)
+        radius_mm = float(np.hypot(1e3 * radius95(spread), READING_MM))
+        points.append(TouchPoint(name, placed[:3, 3], flange, radius_mm, rotation[:, 2]))
+    return tuple(points)
+
+
+def judged(points: Sequence[TouchPoint], gaps_mm: Sequence[float], tool: str) -> TouchTest:
+    """Compares the gaps that were measured with what was predicted.
+
+    Args:
+        points: The points, in order.
+        gaps_mm: The distance from tip to point at each [mm].
+        tool: The tool's name.
+
+    Raises:
+        DataError: There are as many gaps as points in no way, or one is no length.
+    """
+    if len(gaps_mm) != len(points) or not all(0.0 <= it < np.inf for it in gaps_mm):
+        raise DataError(
+            f"touch-test: the gaps are {', '.join(f'{it:g}' for it in gaps_mm)} mm; "
+            f"{len(points)} of 0 mm and more are needed, one a point.",
+            culprits=["--gaps-mm"],
+            next_step="Give them in the order of the points, as --gaps-mm 0.2,0.1,0.3,0.2,0.2.",
+        )
+    touched = tuple(
+        TouchedPoint(name=it.name, base_m=it.base_m, radius95_mm=it.radius95_mm, gap_mm=float(gap))
+        for it, gap in zip(points, gaps_mm, strict=True)
+    )
+    beyond = sum(it.gap_mm > it.radius95_mm for it in touched)
+    created = datetime.now(UTC).isoformat(timespec="seconds")
+    return TouchTest(
+        created=created, tool=tool or "flange", passed=beyond <= _BY_CHANCE, points=touched
+    )
+
+
+def finding_of(test: TouchTest) -> Finding:
+    """What a touch test says, and what to do about it."""
+    gaps = [it.gap_mm for it in test.points]
+    radius = max(it.radius95_mm for it in test.points)
+    words = (
+        f"Touched with {test.tool}, {len(gaps)} points have gaps of {figure(min(gaps))} to "
+        f"{figure(max(gaps))} mm; 95 % were predicted within {figure(radius)} mm."
+    )
+    if test.passed:
+        return Finding("touch_test", words)
+    step = Step("Measure the tool's tip anew, then look whether the camera or the robot was moved.")
+    return Finding("touch_test", f"{words} That is more than predicted.", step, is_fatal=True)
+
+
+def _tip(calibration: Calibration, tool: str) -> Edge:
+    if not tool:
+        return Edge(np.eye(4), np.zeros((6, 6)))
+    return calibration.placed[transform_name("tool", tool)]
+
+
+def _five(board: Target) -> dict[str, FloatArray]:
+    """The corners farthest out and the one nearest to the middle, by what they are called."""
+    places = corner_positions(board)
+    middle = (places.min(axis=0) + places.max(axis=0)) / 2.0
+    signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    chosen = [int(np.argmax((places - middle)[:, :2] @ it)) for it in signs]
+    chosen.append(int(np.argmin(np.linalg.norm(places - middle, axis=1))))
+    return {f"corner {it}": places[it] for it in dict.fromkeys(chosen)}
