@@ -53,13 +53,14 @@ def touch_test_command(
     robot, hovering first, corrected where the arm is calibrated. With them: compared with what was
     predicted, and kept in the result and its report. Exit status 3: they are larger.
     """
+    loaded = Session.load(session)
     if calibration is None:
         raise DataError(
             "touch-test: the calibration to prove (-c) is needed.",
             culprits=["-c"],
             next_step="Name the output folder of visioncal calibrate.",
         )
-    loaded, known = Session.load(session), load_result(calibration)
+    known = load_result(calibration)
     if known.cell is not None:
         raise DataError("touch-test is for one camera and one robot.", culprits=["-c"])
     with shown_progress(quiet=as_json):
