@@ -127,7 +127,8 @@ def test_a_measurement_that_good_data_contradict_is_told_and_left_out():
     # The same views once more, from where they were with it.
     sigmas = np.sqrt(np.diag(free.solved.covariance))
     off = log(invert(free.solved.state.edges) @ wrong.solved.state.edges).ravel()
-    assert np.all(np.abs(off) < 0.02 * sigmas[: len(off)])
+    # Sizes of noise and of the lens's field were sought beside it: these are known to a tenth.
+    assert np.max(np.abs(off) / sigmas[: len(off)]) < 0.2
     assert wrong.used == free.used
     right = run(cell, {"flange_from_cam": {"z_m": true + 2e-4, "sigma_m": SIGMA_M}})
     assert not any(it.kind == "prior" for it in right.warnings)

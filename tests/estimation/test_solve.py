@@ -89,7 +89,8 @@ def test_views_of_a_stop_move_with_the_lens_by_their_information():
         observations=replace(seen, covariance=known),
         effects=(replace(effect, by_sensor=lens),),
     ).merged()
-    np.testing.assert_allclose(lopsided.by_sensor, problem.by_sensor, rtol=1e-6)
+    # What hardly moves a pose is known to a share of what does.
+    np.testing.assert_allclose(lopsided.by_sensor, problem.by_sensor, rtol=1e-6, atol=1e-12)
     before = problem.observations.covariance
     np.testing.assert_allclose(lopsided.observations.covariance, 2 * before, rtol=1e-6)
 

@@ -15,8 +15,10 @@ from itertools import pairwise
 import numpy as np
 from scipy.linalg import block_diag
 
+from visioncal.core.transforms import exp
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Target
 from visioncal.estimation.corners import CornerStack, reproject
+from visioncal.estimation.lens_field import Coefficients, LensLevels, mode_columns
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.parts import Effect
 from visioncal.estimation.poses import fit_poses
@@ -181,6 +183,9 @@ class Compressed:
         shared_information: (k, k) on the appearance, the poses being free.
         shared_pulls: (v, k) half the gradient of the squared error by the appearance.
         residuals: (n, 2) [px].
+        by_field: (v, 6, m) how each pose moves with what is open of the lens beyond its model, by
+            coefficients as large as the corners' noise; see `lens_field`.
+        field_freedom: How many coefficients of that the corners determine.
     """
 
     cam_from_target: FloatArray
@@ -189,6 +194,8 @@ class Compressed:
     shared_information: FloatArray
     shared_pulls: FloatArray
     residuals: FloatArray
+    by_field: FloatArray
+    field_freedom: float = 0.0
 
     @property
     def shared_gradient(self) -> FloatArray:
@@ -203,6 +210,7 @@ def compress(
     starts: FloatArray,
     scales: IntArray | None = None,
     shares: FloatArray | None = None,
+    levels: LensLevels | None = None,
 ) -> Compressed:
     """Compresses corners to normal equations in each view's pose and the shared appearance.
 
@@ -215,10 +223,11 @@ def compress(
             not tell.
         shares: (v,) as how much of a view each counts for the appearance: of those that show the
             same as others, whatever is wrong with one is wrong with all.
+        levels: Sizes of what the lens does beyond its model; nothing where None.
     """
     shape = basis[stack.ids]
     bent = stack.with_points(stack.points + shape @ appearance.board)
-    found = compress_points(bent, appearance.camera, starts, shape, shares=shares)
+    found = compress_points(bent, appearance.camera, starts, shape, shares=shares, levels=levels)
     # A larger board farther away looks the same: what is left is rounding.
     if scales is not None:
         information = found.shared_information
@@ -234,6 +243,7 @@ def compress_points(
     *,
     lens: bool = True,
     shares: FloatArray | None = None,
+    levels: LensLevels | None = None,
 ) -> Compressed:
     """Compresses corners to normal equations in poses, lens and whatever moves corners.
 
@@ -244,10 +254,18 @@ def compress_points(
         by_values: (n, 3, s) how the corners move on the target with s values.
         lens: Whether the intrinsics come first of what is shared; else they are held.
         shares: As `compress` has them.
+        levels: Sizes of what the lens does beyond its model; nothing where None.
     """
     fit = fit_poses(stack, camera, starts)
     now = reproject(stack, camera, fit.cam_from_target, lens=lens)
-    by_shared = np.concatenate([now.by_intrinsics, now.by_pose[:, :, 3:] @ by_values], axis=2)
+    moved = now.by_point @ by_values
+    stack.weigh(moved)
+    by_shared = np.concatenate([now.by_intrinsics, moved], axis=2)
+    shared = by_shared.shape[2]
+    if levels is not None:
+        beyond = mode_columns(stack, camera, fit.cam_from_target, levels)
+        stack.weigh(beyond)
+        by_shared = np.concatenate([by_shared, beyond], axis=2)
     between = stack.products_by_view(now.by_pose, by_shared)
     answer = -covariance_from(fit.information) @ between
     # What is left once the poses have followed, squared: never less than none, and as exact as the
@@ -259,12 +277,23 @@ def compress_points(
         left, residuals = roots[..., None] * left, roots * residuals
     flat = left.reshape(-1, left.shape[2])
     information = flat.T @ flat
+    poses, own, freedom = fit.cam_from_target, now.residuals, 0.0
+    answer, by_field = answer[:, :, :shared], answer[:, :, shared:]
+    if by_field.shape[2]:
+        found = Coefficients.of(
+            information[shared:, shared:],
+            information[shared:, :shared],
+            flat[:, shared:].T @ residuals.ravel(),
+            by_field,
+            fit.information,
+        )
+        # Coefficients follow what is shared: that then says nothing of them, nor they of it.
+        information = information[:shared, :shared] + information[:shared, shared:] @ found.slope
+        answer = answer + by_field @ found.slope
+        poses = poses @ exp(by_field @ found.mean)
+        away = left[:, :, shared:] @ found.mean
+        residuals, left = residuals + away, left[:, :, :shared]
+        own = residuals if shares is None else now.residuals + away / roots
+        by_field, freedom = by_field @ found.open, found.freedom
     pulls = stack.sum_by_view(np.einsum("nij,ni->nj", left, residuals))
-    return Compressed(
-        fit.cam_from_target,
-        fit.information,
-        answer,
-        information,
-        pulls,
-        now.residuals,
-    )
+    return Compressed(poses, fit.information, answer, information, pulls, own, by_field, freedom)

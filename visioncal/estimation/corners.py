@@ -42,6 +42,8 @@ class CornerStack:
         weights: (n,) by how much more than others each corner is known, as a ratio of standard
             deviations; None where all are known alike.
         stated_px: Standard deviation of a corner of weight one, where it is stated [px].
+        zooms: (n, 2) how far one random change of each view's focus displaces its corners, in units
+            of their noise, by no weights; None where there is none.
     """
 
     views: tuple[int, ...]
@@ -53,6 +55,7 @@ class CornerStack:
     px: FloatArray
     weights: FloatArray | None = None
     stated_px: float | None = None
+    zooms: FloatArray | None = None
 
     @classmethod
     def of(cls, corners: Mapping[int, Corners], positions: FloatArray) -> Self:
@@ -86,6 +89,7 @@ class CornerStack:
             self.px[mask],
             None if self.weights is None else self.weights[mask],
             self.stated_px,
+            None if self.zooms is None else self.zooms[mask],
         )
 
     def with_points(self, points: FloatArray) -> "CornerStack":
@@ -107,6 +111,27 @@ class CornerStack:
             return self
         before = 1.0 if self.weights is None else self.weights
         return replace(self, weights=before * by_view[self.view_of])
+
+    def weigh(self, *rows: FloatArray) -> None:
+        """Puts (n, 2, ...) rows in units of the corners' noise, in place.
+
+        Noise of a corner is its own, by its weight, and what a random change of focus makes of it.
+        """
+        kept = [it for it in rows if it.size]
+        if self.weights is not None:
+            for array in kept:
+                np.multiply(array, self.weights.reshape(-1, *[1] * (array.ndim - 1)), out=array)
+        if self.zooms is None:
+            return
+        zooms = self.zooms if self.weights is None else self.weights[:, None] * self.zooms
+        squares = self.sum_by_view(np.sum(zooms**2, axis=1))
+        # The inverse root of 1 + z z^T.
+        share = (1.0 - 1.0 / np.sqrt(1.0 + squares)) / np.maximum(squares, np.finfo(float).tiny)
+        for array in kept:
+            flat = array.reshape(len(array), 2, -1)
+            along = share[:, None] * self.products_by_view(zooms[:, :, None], flat)[:, 0]
+            taken = zooms[:, :, None] * along[self.view_of][:, None]
+            np.subtract(array, taken.reshape(array.shape), out=array)
 
     @property
     def counts(self) -> IntArray:
@@ -166,11 +191,13 @@ class Reprojection:
         residuals: (n, 2) predicted minus seen, by the corners' weights [px].
         by_pose: (n, 2, 6) derivatives by each view's right perturbation of cam_from_target.
         by_intrinsics: (n, 2, k) derivatives by the intrinsics.
+        by_point: (n, 2, 3) derivatives by each corner's place on the target, by no weights.
     """
 
     residuals: FloatArray
     by_pose: FloatArray
     by_intrinsics: FloatArray
+    by_point: FloatArray
 
 
 def reproject(
@@ -214,12 +241,11 @@ def reproject(
         residuals[behind] = max(camera.resolution)
         by_pose[behind] = 0.0
         projection.by_intrinsics[behind] = 0.0
-    if stack.weights is not None:
-        # In place: each of the three belongs to this call alone.
-        residuals *= stack.weights[:, None]
-        by_pose *= stack.weights[:, None, None]
-        projection.by_intrinsics[:] *= stack.weights[:, None, None]
-    return Reprojection(residuals, by_pose, projection.by_intrinsics)
+    is_weighed = stack.weights is not None or stack.zooms is not None
+    by_point = by_pose[:, :, 3:].copy() if is_weighed else by_pose[:, :, 3:]
+    # Each of the three belongs to this call alone.
+    stack.weigh(residuals, by_pose, projection.by_intrinsics)
+    return Reprojection(residuals, by_pose, projection.by_intrinsics, by_point)
 
 
 def mean_square_by_view(stack: CornerStack, residuals: FloatArray) -> FloatArray:

@@ -16,7 +16,7 @@ from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.corners import floored_sigma_px
-from visioncal.estimation.effects.lenses import CameraParameters, LinearisedCorners
+from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
 from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
@@ -66,6 +66,9 @@ class Side(Protocol):
     def problem(self, seen: LinearisedCorners) -> Problem:
         """The problem of what the fit uses, with lenses and boards as its first effect."""
 
+    def rows(self, seen: LinearisedCorners) -> IntArray:
+        """(n,) which view each observation of this problem is; -1 for none of them."""
+
     def with_errors(self, fitted: "Fitted") -> Self:
         """The side with those errors of its arms that a fit shows in which they are not free."""
 
@@ -95,7 +98,8 @@ class Fitted:
     @property
     def others(self) -> FloatArray:
         """(k,) the values of all other effects."""
-        return self.fit.state.values[len(self.seen.free) :]
+        mine = self.problem.effect_columns.get(LENSES, self.columns)
+        return self.fit.state.values[mine.stop - self.columns.start :]
 
     @property
     def change(self) -> FloatArray:
@@ -190,7 +194,8 @@ def _fitted(
     problem = side.problem(seen)
     start = problem.start(frames)
     if others is not None:
-        start = State(start.edges, np.concatenate([start.values[: len(seen.free)], others]))
+        first = len(start.values) - len(others)
+        start = State(start.edges, np.concatenate([start.values[:first], others]))
     return Fitted(seen, problem, fit_problem(problem, start, side.noise))
 
 
@@ -309,6 +314,6 @@ class Scores:
 
 def _at(side: Side, fitted: Fitted, seen: LinearisedCorners) -> tuple[Problem, State]:
     """The problem with other values free, and a fit's state in it."""
-    values = fitted.looks.values[seen.free]
-    state = State(fitted.fit.state.edges, np.concatenate([values, fitted.others]))
-    return side.problem(seen), state
+    values = fitted.fit.state.values[len(fitted.seen.free) :]
+    values = np.concatenate([fitted.looks.values[seen.free], values])
+    return side.problem(seen), State(fitted.fit.state.edges, values)

@@ -145,9 +145,10 @@ def check_determined(
     _refuse_open(problem.with_effects(()), State(state.edges, np.zeros(0)), noise, scene)
     if looks and problem.effects:
         cause, advice = scene.untold
+        first = problem.effects[0].determined
         _refuse_vague(
-            problem.with_effects(problem.effects[:1]),
-            State(state.edges, state.values[: len(problem.effects[0])]),
+            problem.with_effects([first]),
+            State(state.edges, state.values[: len(first)]),
             noise,
             replace(scene, motion=lambda _: cause, advice=lambda *_: advice),
         )

@@ -90,6 +90,7 @@ class Effect:
         by_sensor: (n, 6, k) how the measured poses move with them, on their right; None for not.
         flange_jacobian: By robot, (s, 6, k) how its flange moves at each stop, on its right.
         concerned: (n,) the observations at which flanges move so; None for all.
+        random: How many of the last values are random coefficients of what no stop determines.
     """
 
     name: str
@@ -99,6 +100,7 @@ class Effect:
     by_sensor: FloatArray | None = None
     flange_jacobian: Mapping[str, FloatArray] = field(default_factory=dict)
     concerned: Mask | None = None
+    random: int = 0
 
     @classmethod
     def free(
@@ -116,6 +118,20 @@ class Effect:
 
     def __len__(self) -> int:
         return len(self.values)
+
+    @property
+    def determined(self) -> "Effect":
+        """The effect as if its random coefficients were known."""
+        kept = len(self) - self.random
+        information = self.known.information[:kept, :kept]
+        return replace(
+            self,
+            values=self.values[:kept],
+            known=Knowledge(information, self.known.gradient[:kept]),
+            held=self.held[:kept],
+            by_sensor=None if self.by_sensor is None else self.by_sensor[:, :, :kept],
+            random=0,
+        )
 
     def take(self, rows: IntArray) -> "Effect":
         """Returns it for (m,) rows of the observations."""

@@ -7,10 +7,9 @@ from scipy.special import chdtri, fdtrc
 
 from visioncal.core.quantiles import chi2_limit, f_limit
 from visioncal.core.transforms import adjoint, invert
-from visioncal.core.types import FloatArray
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.arm import rows_of, stops_of
-from visioncal.estimation.budget import weighted_jacobian
-from visioncal.estimation.linalg import covariance_among, gram
+from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.parts import Effect, Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import fisher_information, normal_equations
@@ -92,17 +91,26 @@ def lens_field(
         shares: (n,) as how much of a corner each counts: of images that show the same, whatever is
             wrong with one is wrong with all. All count whole where None.
     """
-    shares = np.ones(len(px)) if shares is None else shares
     place = np.clip((_CELLS * px / np.array(resolution)).astype(np.int64), 0, _CELLS - 1)
-    cell = place[:, 0] + _CELLS * place[:, 1]
-    counts = np.bincount(cell, shares, _CELLS**2)
+    return common_errors(place[:, 0] + _CELLS * place[:, 1], residuals, shares)
+
+
+def common_errors(
+    cell: IntArray, residuals: FloatArray, shares: FloatArray | None = None
+) -> LensField:
+    """Compares the mean residuals of cells, numbered from 0, with the scatter within them.
+
+    Arguments and result are those of `lens_field`, of any (n,) cells.
+    """
+    shares = np.ones(len(cell)) if shares is None else shares
+    counts = np.bincount(cell, shares)
     rows = counts[cell] >= _FEWEST_CORNERS
     many = counts[counts >= _FEWEST_CORNERS]
     between, within = 2 * len(many) - _ABSORBED, 2 * (float(many.sum()) - len(many))
     if between < 1:
         return LensField(1.0, 0.0, 0.0, is_significant=False)
     sums = np.stack(
-        [np.bincount(cell[rows], (shares * residuals[:, it])[rows], _CELLS**2) for it in (0, 1)],
+        [np.bincount(cell[rows], (shares * residuals[:, it])[rows], len(counts)) for it in (0, 1)],
         axis=1,
     )
     among = float(np.sum(sums[counts >= _FEWEST_CORNERS] ** 2 / many[:, None]))
@@ -114,31 +122,6 @@ def lens_field(
         float(chdtri(1.0, max(fdtrc(between, within, factor), _LEAST_CHANCE))),
         bool(factor > f_limit(_FALSE_ALARM, between, within)),
     )
-
-
-def lens_inflation(
-    problem: Problem,
-    state: State,
-    noise: Noise,
-    camera: str,
-    corners: FloatArray,
-    factor: float,
-) -> FloatArray:
-    """What is to be added to a covariance (p, p) where corners err alike by parts of the image.
-
-    Args:
-        problem: The observations.
-        state: The answer.
-        noise: Its levels.
-        camera: The frame that observed.
-        corners: (p, p) what its corners say of lens and boards, as information on the unknowns.
-        factor: By how much more its corners contribute than independent noise lets them.
-    """
-    fitted = covariance_among(fisher_information(problem, state, noise), problem.counted)
-    mine = np.array([it == camera for it in problem.observations.observers])
-    linear, own = problem.linear(state, ideal=True), problem.covariance(noise)
-    gain = weighted_jacobian(problem, linear, own, noise)[mine] @ fitted
-    return np.asarray((factor - 1.0) * (gram(gain, own[mine] @ gain) + fitted @ corners @ fitted))
 
 
 def neighbours(problem: Problem, state: State, noise: Noise, robot: str) -> Neighbours:

@@ -15,6 +15,7 @@ from visioncal.estimation.appearance import (
     shape_slices,
 )
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
+from visioncal.estimation.lens_field import LensLevels, zooms
 from visioncal.vision.targets import first_corners, numbered_positions
 
 # The frame of the only camera, where there is one.
@@ -37,6 +38,7 @@ class Scene:
         mode: What to do with given ones: `hold`, `refine` or `auto`.
         matrix_sigma_px: What given fx, fy, cx, cy are known to; None where that is not said.
         names: What several targets are called.
+        is_focus_fixed: Whether the focal length follows neither the distance nor chance.
     """
 
     targets: tuple[Target, ...]
@@ -45,6 +47,7 @@ class Scene:
     mode: str = "auto"
     matrix_sigma_px: float | None = None
     names: tuple[str, ...] = ("",)
+    is_focus_fixed: bool = False
 
 
 def repeat_shares(shown: Mapping[int, Hashable]) -> dict[int, float]:
@@ -71,6 +74,7 @@ class CornerProblem:
         prior_sigma: (k + s,) what lens and boards are known to; inf where nothing is known.
         shares: (m,) as how much of a view each counts for lens and board; see `repeat_shares`.
         contested: Whether given intrinsics are held although the corners speak against them.
+        levels: Sizes of what the lens does beyond its model; None before they were estimated.
     """
 
     scene: Scene
@@ -80,6 +84,7 @@ class CornerProblem:
     prior_sigma: FloatArray
     shares: FloatArray
     contested: bool = False
+    levels: LensLevels | None = None
 
     @classmethod
     def of(
@@ -103,6 +108,16 @@ class CornerProblem:
             np.concatenate([lens_prior(scene), *priors]),
             np.array([shares.get(it, 1.0) for it in corners]),
         )
+
+    def with_levels(self, levels: LensLevels) -> "CornerProblem":
+        """The same problem, its lens erring beyond its model."""
+        zoomed = levels.jitter * zooms(self.stack, self.scene.camera)
+        stack = replace(self.stack, zooms=zoomed if levels.jitter > 0.0 else None)
+        return replace(self, stack=stack, levels=levels)
+
+    def without_levels(self) -> "CornerProblem":
+        """The same problem, its lens being what its model says."""
+        return replace(self, stack=replace(self.stack, zooms=None), levels=None)
 
     def without_prior(self, columns: IntArray) -> "CornerProblem":
         """The same problem, some values of which nobody has stated."""
@@ -173,7 +188,7 @@ class CornerProblem:
         sigma_px = self.stack.shown_px(compressed.residuals, 6 * len(compressed.information))
         told = np.diag(compressed.shared_information)[rigs] * self.prior_sigma[rigs] ** 2
         share = told / (told + floored_sigma_px(sigma_px) ** 2)
-        exact = len(moving) - len(rigs)
+        exact = len(moving) - len(rigs) + round(compressed.field_freedom)
         return 6 * len(compressed.information) + exact + round(float(share.sum()))
 
     def sigma_px(self, compressed: Compressed, moving: IntArray) -> float:

@@ -40,6 +40,7 @@ class CameraTable(TableModel):
     distortion: list[Number] | None = None
     intrinsics: Literal["auto", "hold", "refine"] = "auto"
     matrix_sigma_px: PixelSigma | None = None
+    focus: Literal["auto", "fixed"] = "auto"
 
     @property
     def size(self) -> tuple[int, int] | None:

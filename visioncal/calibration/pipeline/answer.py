@@ -18,7 +18,7 @@ from visioncal.calibration.pipeline.fault_messages import (
     versions,
 )
 from visioncal.calibration.pipeline.holdout import held_sights
-from visioncal.calibration.pipeline.lens_fields import covariance_of_fields, lens_fields
+from visioncal.calibration.pipeline.lens_fields import LensErrors, lens_errors
 from visioncal.calibration.pipeline.solving import Solved, sensors_of
 from visioncal.calibration.stages.arms import ArmFound
 from visioncal.calibration.stages.cell import Cell
@@ -33,7 +33,6 @@ from visioncal.estimation.chain import scatter
 from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.residual_tests import LensField
 from visioncal.estimation.solve import Solution, covariance_of, fit_problem
 from visioncal.results import Edge, Moved, Sight
 from visioncal.robot import Convention
@@ -48,7 +47,7 @@ class Answer:
         problem: The observations in it.
         covariance: (p, p) of its unknowns, with all that counts beside noise.
         beside: (p, p) what that is, by its source.
-        fields: What the lens's model leaves of the corners, by camera.
+        lenses: What lenses do beyond their models, by camera.
         misfits: What the residuals of each robot's stops show beyond noise.
         arms: What the stops tell of the arms, by robot.
         held_out: Residuals of observations that were left out of the fit in turn.
@@ -62,7 +61,7 @@ class Answer:
     problem: Problem
     covariance: FloatArray
     beside: Mapping[str, FloatArray]
-    fields: Mapping[str, LensField]
+    lenses: Mapping[str, LensErrors]
     misfits: Mapping[str, ResidualTest]
     arms: Mapping[str, ArmFound]
     held_out: HeldOut
@@ -164,8 +163,6 @@ def answer_of(
     # A closed form is not at rest, and that would pass for a misfit.
     found = misfits(part, fit if solved.solver == "joint" else fit_problem(part, fit.state))
     beside = covariance_beside_noise(part, fit, solved.arms, found, is_fit=solved.solver == "joint")
-    fields = lens_fields(solved)
-    beside |= covariance_of_fields(solved, fields)
     covariance = sum(beside.values(), covariance_of(part, fit))
     faults, held_out = pose_faults(solved), left_out(solved)
     return Answer(
@@ -173,7 +170,7 @@ def answer_of(
         part,
         covariance,
         beside,
-        fields,
+        lens_errors(solved),
         found,
         _arms_found(solved, covariance, convention),
         held_out,

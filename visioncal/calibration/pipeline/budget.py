@@ -138,6 +138,8 @@ def _sources(solved: Solved) -> Sources:
             columns[called] = np.append(
                 columns.get(called, np.zeros(0, np.int64)), np.arange(it.start, it.stop)
             )
+    if len(solved.field_columns):
+        columns["lens_field"] = solved.field_columns
     if is_pair:
         kind = "instrument" if solved.cell.mount == "instrument" else "pixels"
         robot = "poses" if problem.is_combined else "robot"

@@ -7,7 +7,6 @@ from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import misfit_jacobian
 from visioncal.estimation.armmodel import HARMONICS
-from visioncal.estimation.effects.lenses import LENSES
 from visioncal.results.sections import FittedArm, JointFit
 from visioncal.session import frame_name
 from visioncal.vision.targets import target_document
@@ -106,7 +105,8 @@ def _written(known: RunState) -> FloatArray:
         for at in range(1, len(placed))
     ]
     nothing, arm = slice(0, 0), f"arm of {known.robot_arm.robot}"
-    looks, errors = (problem.effect_columns.get(it, nothing) for it in (LENSES, arm))
+    errors, seen = problem.effect_columns.get(arm, nothing), known.fitted.seen
+    looks = known.fitted.columns_of(np.zeros(0, dtype=np.int64) if seen is None else seen.free)
     of_errors, model = rows[errors], known.robot_arm.model
     kept = slice(None) if model is None else model.is_kept
     return np.concatenate([rows[:12], rows[looks], *further, of_errors[kept]])

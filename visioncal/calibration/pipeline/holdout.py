@@ -15,6 +15,7 @@ from visioncal.calibration.stages.pose_ambiguity import choose_by, chosen
 from visioncal.calibration.stages.validate import apart, chain_rms_px
 from visioncal.estimation.chain import scatter
 from visioncal.estimation.corners import CornerStack
+from visioncal.estimation.parts import State
 from visioncal.estimation.poses import fit_poses
 from visioncal.estimation.problem import Problem
 from visioncal.results import HELD_BACK, Sight
@@ -99,7 +100,7 @@ def held_by_both_arms(solved: Solved, looked: Observed, robot: str) -> tuple[Uns
     stated = arm.without_errors(held.problem)
     stated = arm.stated(stated) or stated
     was, now = (
-        np.stack(apart(problem, state)[::-1], axis=1)
+        np.stack(apart(problem, _in(problem, state))[::-1], axis=1)
         for problem, state in (
             (stated, arm.kinematics.fits[0].fit.state),
             (held.problem, solved.agreed.fit.state),
@@ -107,6 +108,16 @@ def held_by_both_arms(solved: Solved, looked: Observed, robot: str) -> tuple[Uns
     )
     views = [it.view for it in held.rows]
     return unseen_views(views, was, now, np.isfinite(now[:, 0]))
+
+
+def _in(problem: Problem, state: State) -> State:
+    """The state of an earlier fit, of other random coefficients of lenses: these move nothing."""
+    if not problem.effects:
+        return state
+    first = problem.effects[0]
+    behind = len(problem.start_values) - len(first)
+    values = [state.values[: len(first.determined)], np.zeros(first.random)]
+    return State(state.edges, np.concatenate([*values, state.values[len(state.values) - behind :]]))
 
 
 def _problem(solved: Solved, looked: Observed, views: Sequence[ViewPoses]) -> Problem:

@@ -9,7 +9,7 @@ from visioncal.calibration.pipeline.answer import Answer
 from visioncal.calibration.pipeline.arm_results import doubts_of_arms, notes_on_arms
 from visioncal.calibration.pipeline.budget import columns_of_boards, middles_of
 from visioncal.calibration.pipeline.fault_messages import by_way_of, moved_found
-from visioncal.calibration.pipeline.lens_fields import fields_found
+from visioncal.calibration.pipeline.lens_fields import errors_found
 from visioncal.calibration.pipeline.network_ties import robot_motion, untied_words
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell import Cell
@@ -57,7 +57,7 @@ def findings_of(known: RunState) -> Findings:
         (
             *(it.found for it in answer.faults),
             *doubts_of_arms(solved.arms, answer.misfits, answer.arms, solved.asked),
-            *fields_found(answer.fields),
+            *errors_found(answer.lenses),
             *known.warnings,
             *(it for it in of_rest if it.kind != NOTE),
             *warnings,

@@ -17,7 +17,7 @@ from visioncal.calibration.stages.kinematics import check_asked
 from visioncal.calibration.stages.observed import Observed, nothing_seen
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.priors import most_contradicted
-from visioncal.calibration.stages.refine import refined
+from visioncal.calibration.stages.refine import lens_levels, refined
 from visioncal.calibration.stages.side import FramesSide
 from visioncal.calibration.stages.validate import chain_rms_px
 from visioncal.core.errors import DegenerateError
@@ -27,6 +27,7 @@ from visioncal.estimation.arm import rows_of
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
 from visioncal.estimation.joint import Fitted
 from visioncal.estimation.joint import settle as settle_looks
+from visioncal.estimation.lens_field import LensLevels
 from visioncal.estimation.observability import (
     FEWEST_VIEWS,
     check_observability,
@@ -97,8 +98,9 @@ class Solved:
         """Lenses and boards as some state has them; None without images."""
         if self.seen is None:
             return None
-        found = self.agreed.problem.values_of(LENSES, state)
-        return self.seen.looks.with_values(self.seen.free, found)
+        free = self.seen.free
+        found = self.agreed.problem.values_of(LENSES, state)[: len(free)]
+        return self.seen.looks.with_values(free, found)
 
     def chain_px(self, rows: IntArray, state: State) -> FloatArray:
         """Reprojection errors (m,) [px] of some observations through the chain; NaN for none.
@@ -115,6 +117,13 @@ class Solved:
         seen = [self.poses[it].corners for it in rows]
         cameras = [lenses.get(self.cell.rows[it].seer) for it in rows]
         return chain_rms_px(seen, poses, cameras, np.concatenate(looks.corners))
+
+    @property
+    def field_columns(self) -> IntArray:
+        """The problem's columns of what lenses do beyond their models."""
+        mine = self.agreed.problem.effect_columns.get(LENSES, slice(0, 0))
+        free = 0 if self.seen is None else len(self.seen.free)
+        return np.arange(mine.start + free, mine.stop)
 
     def columns_of(self, places: IntArray) -> IntArray:
         """The problem's columns of free values of lenses and boards, by their places."""
@@ -252,8 +261,10 @@ def _agreeing_looks(
     In a whole cell, what moved must not be taken for a wrong view: there it is left to the end,
     when the arms are calibrated.
     """
+    levels: Mapping[str, LensLevels] = {}
     for _ in range(_ROUNDS):
-        agreed, seen, fitted = _with_looks(cell, looked, views, agreed, arms, late)
+        agreed, seen, fitted = _with_looks(cell, looked, views, agreed, arms, late, levels)
+        levels = {} if seen is None else seen.looks.levels
         if cell.mount is None:
             break
         before, agreed = agreed.used, settle(agreed)
@@ -269,6 +280,7 @@ def _with_looks(
     agreed: Agreed,
     arms: Mapping[str, RobotArm],
     late: Sequence[Effect],
+    levels: Mapping[str, LensLevels],
 ) -> tuple[Agreed, LinearisedCorners | None, Mapping[str, RobotArm]]:
     """Fits lenses, boards and frames, with errors of the arms sought anew beside their drift."""
     arms = {name: it.erring(None) for name, it in arms.items()}
@@ -276,7 +288,7 @@ def _with_looks(
     agreed = replace(agreed, problem=replace(agreed.problem, poses=poses))
     if looked.scenes and not agreed.problem.is_combined:
         side = _side(cell, agreed, arms, late)
-        looks = side.looks(looked.scenes, _views_by_camera(looked, views))
+        looks = side.looks(looked.scenes, _views_by_camera(looked, views)).with_levels(levels)
         if looked.is_misread:
             fitted = settle_looks(looks, side, looks.first, _frames(agreed))
             return _settled(agreed, side, fitted), fitted.seen, side.arms
@@ -334,7 +346,7 @@ def _at_rest(
     late: Sequence[Effect],
 ) -> tuple[Agreed, LinearisedCorners | None, Mapping[str, RobotArm]]:
     """Fits with calibrated arms that are linearised anew until they stay."""
-    for _ in range(_ROUNDS if any(it.model is not None for it in arms.values()) else 0):
+    for turn in range(_ROUNDS if any(it.model is not None for it in arms.values()) else 0):
         poses = {**agreed.problem.poses, **{name: it.poses for name, it in arms.items()}}
         agreed = replace(agreed, problem=replace(agreed.problem, poses=poses))
         if seen is None:
@@ -342,6 +354,9 @@ def _at_rest(
         else:
             side = _side(cell, agreed, arms, late)
             fitted = settle_looks(seen.looks, side, seen.moving, _frames(agreed))
+            if turn == 0:  # What the arm did wrong may have passed for the lens's doing.
+                looks = fitted.looks.with_levels(lens_levels(side, fitted))
+                fitted = settle_looks(looks, side, fitted.moving, fitted.frames, fitted.others)
             agreed, seen = _settled(agreed, side, fitted), fitted.seen
         moved = {name: it.moved(agreed.problem, agreed.fit.state) for name, it in arms.items()}
         arms = {name: arm for name, (arm, _) in moved.items()}

@@ -68,6 +68,7 @@ EVIDENCE: Mapping[str, Evidence] = {
     "board_shape": Evidence(1e-4, _CHAIN),
     "lens": Evidence(1e-4, _CHAIN),
     "lens_field": Evidence(1e-4, _CHAIN),
+    "focus": Evidence(1e-4, _CHAIN),
     "corner_noise": Evidence(1e-4, "corners"),
     "moved_slowly": Evidence(1e-4, _CHAIN),
     "moved_at_once": Evidence(1e-4, _CHAIN),

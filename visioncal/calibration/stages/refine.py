@@ -29,10 +29,15 @@ from visioncal.estimation.joint import (
     moved_mahalanobis_sq,
     settle,
 )
+from visioncal.estimation.lens_field import LensLevels
+from visioncal.estimation.lens_levels import estimate_levels
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.estimation.parts import State
 from visioncal.estimation.solve import covariance_of, left_out_residuals
+
+# A board that is off by so much is beyond what is linear.
+_FAR = 2e-3
 
 
 def free_of(seen: LinearisedCorners) -> LensBoardParameters:
@@ -66,13 +71,17 @@ def refined(
     Returns:
         The fit, and the side with the errors of its arms.
     """
+    levels = looks.levels
     answer, side = _equally_weighed(side, looks, frames)
     looks = answer.looks.weighed(answer.seen)
     if any(
         it.stack is not answer.looks.problems[name].stack for name, it in looks.problems.items()
     ):
         answer = again(answer, side, answer.moving, looks)
-    return answer, side
+    elif np.array_equal(answer.moving, looks.first) and not (levels or side.errors):
+        return answer, side
+    looks = answer.looks.with_levels(lens_levels(side, answer))
+    return again(answer, side, answer.moving, looks), side
 
 
 def _equally_weighed(
@@ -86,6 +95,9 @@ def _equally_weighed(
     stated lenses and boards: a board that changes its size with the arm hides a part of it.
     """
     stated = settle(looks, side, looks.first, frames)
+    if not looks.levels:
+        levels = lens_levels(side, _sized(side, stated))
+        stated = again(stated, side, stated.moving, stated.looks.with_levels(levels))
     answer = chosen(side, stated)
     found = side.with_errors(answer)
     if not any(it.is_significant for it in found.errors):
@@ -98,6 +110,38 @@ def _equally_weighed(
         return answer, estimating
     fitted = settle(answer.looks, estimating, answer.moving, answer.frames)
     return fitted, estimating.with_errors(fitted)
+
+
+def _sized(side: Side, fitted: Fitted) -> Fitted:
+    """The fit with boards as large as the motion says, where that is far from what is stated."""
+    looks = fitted.looks
+    away = [measured_scale(side, fitted, it).scale for it in looks.printed]
+    if not np.any(np.abs(away) > _FAR):
+        return fitted
+    sizes = np.concatenate([looks.scale_of(it) for it in looks.printed])
+    return again(
+        fitted, side, np.union1d(fitted.moving, sizes), looks.without_prior(sizes.tolist())
+    )
+
+
+def lens_levels(side: Side, fitted: Fitted) -> dict[str, LensLevels]:
+    """Estimates the sizes of what lenses do beyond their models, near a fit.
+
+    Lenses and boards are free for that, so that what they have wrong is not taken for it.
+    """
+    looks = fitted.seen.looks
+    # A size of the board is left to the motion: a wrong one would pass for breathing.
+    sizes = [looks.scale_of(it) for it in looks.printed]
+    unsized = looks.without_prior(np.concatenate([np.zeros(0), *sizes]).tolist())
+    seen = fitted.seen.freed(np.arange(len(looks.values)), unsized)
+    # What was measured by hand may be wrong; it is looked at later.
+    problem = replace(side.problem(seen), priors=())
+    first = np.append(looks.values, np.zeros(seen.by_field.shape[2]))
+    state = State(fitted.fit.state.edges, np.concatenate([first, fitted.others]))
+    return {
+        name: estimate_levels(seen, problem, side.rows(seen), state, fitted.fit.noise, name)
+        for name in looks.problems
+    }
 
 
 def _still_asked_for(erring: Side, stated: Fitted, answer: Fitted) -> Fitted:
@@ -224,7 +268,7 @@ def _is_determined(wider: Fitted, fitted: Fitted) -> bool:
 
 def _worst(fitted: Fitted) -> FloatArray:
     """(2 e,) the largest sigma of each unknown frame's rotation [rad] and place [m]."""
-    looks, fit = fitted.problem.effects[:1], fitted.fit
+    looks, fit = [it.determined for it in fitted.problem.effects[:1]], fitted.fit
     problem = fitted.problem.with_effects(looks)
     values = fit.state.values[: sum(map(len, looks))]
     covariance = covariance_of(problem, replace(fit, state=State(fit.state.edges, values)))
@@ -298,7 +342,18 @@ def _shapes(side: Side, fitted: Fitted) -> Iterator[IntArray]:
 
 
 def _predicts_worse(wider: Fitted, fitted: Fitted) -> bool:
-    """Whether views that are left out are predicted worse, in position and in rotation."""
+    """Whether views that are left out are predicted worse, in position and in rotation.
+
+    Intrinsics whose sigma is stated are free to move within that, whatever they predict.
+    """
+    looks = wider.looks
+    freed = [
+        it.scene
+        for name, it in looks.problems.items()
+        if np.isin(looks.lens_of(name), np.setdiff1d(wider.moving, fitted.moving)).all()
+    ]
+    if freed and all(it.matrix_sigma_px is not None for it in freed):
+        return False
     errors = [
         left_out_residuals(it.problem, it.fit.state, it.fit.noise).reshape(-1, 2, 3)
         for it in (wider, fitted)

@@ -8,7 +8,7 @@ import numpy as np
 
 from visioncal.calibration.stages.arms import RobotArm, effects_of
 from visioncal.calibration.stages.pnp import ViewPoses
-from visioncal.core.types import Corners, Mask
+from visioncal.core.types import Corners, IntArray, Mask
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.effects.lenses import CameraParameters, LinearisedCorners
 from visioncal.estimation.joint import Fitted
@@ -58,10 +58,17 @@ class FramesSide:
         """The problem of the observations that agree, repeated ones sharing an error."""
         return replace(self.whole(seen), with_repeats=True).subset(self.used)
 
+    def rows(self, seen: LinearisedCorners) -> IntArray:
+        """(n,) which of the corners' views each observation of `problem` is; see `joint.Side`."""
+        return self._all_rows(seen)[self.used]
+
+    def _all_rows(self, seen: LinearisedCorners) -> IntArray:
+        places = {view: at for at, view in enumerate(seen.views)}
+        return np.array([places.get(it, -1) for it in self.views], dtype=np.int64)
+
     def whole(self, seen: LinearisedCorners) -> Problem:
         """The problem of all observations, with poses as lenses and boards make them."""
-        places, problem = {view: at for at, view in enumerate(seen.views)}, self.observed
-        rows = np.array([places.get(it, -1) for it in self.views], dtype=np.int64)
+        problem, rows = self.observed, self._all_rows(seen)
         mine, before = rows >= 0, problem.observations
         measured, covariance = before.measured.copy(), before.covariance.copy()
         measured[mine], covariance[mine] = seen.looks.poses[rows[mine]], seen.covariance[rows[mine]]

@@ -9,10 +9,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.estimation.appearance import Appearance, Compressed, compress
 from visioncal.estimation.corners import floored_sigma_px
+from visioncal.estimation.lens_field import LensLevels
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.parts import Effect
 from visioncal.estimation.scene import CornerProblem
@@ -171,6 +173,19 @@ class CameraParameters:
         }
         return replace(self, problems=problems)
 
+    def with_levels(self, levels: Mapping[str, LensLevels]) -> "CameraParameters":
+        """The same, lenses erring beyond their models by these sizes."""
+        problems = {
+            name: it.with_levels(levels[name]) if name in levels else it
+            for name, it in self.problems.items()
+        }
+        return replace(self, problems=problems)
+
+    @property
+    def levels(self) -> dict[str, LensLevels]:
+        """The sizes of what lenses do beyond their models, as far as they were estimated."""
+        return {name: it.levels for name, it in self.problems.items() if it.levels is not None}
+
     def camera(self, name: str) -> Camera:
         """A camera with its lens as it is taken to be."""
         return with_intrinsics(self.problems[name].scene.camera, self.values[self.lenses[name]])
@@ -197,6 +212,7 @@ class CameraParameters:
                 self.poses[begin:end],
                 problem.scale,
                 problem.shares,
+                problem.levels,
             )
             places = self.places(name)
             sigma = problem.sigma_px(compressed, np.flatnonzero(np.isin(places, moving)))
@@ -290,15 +306,36 @@ class LinearisedCorners:
             parts.append(every[:, :, self.free])
         return np.concatenate(parts)
 
+    @cached_property
+    def by_field(self) -> FloatArray:
+        """How all views' poses (v, 6, m) move with what is open of lenses beyond their models."""
+        sizes = [it.by_field.shape[2] for it in self.compressed]
+        found = np.zeros((len(self.views), 6, sum(sizes)))
+        view = at = 0
+        for it, size in zip(self.compressed, sizes, strict=True):
+            found[view : view + len(it.by_field), :, at : at + size] = it.by_field
+            view, at = view + len(it.by_field), at + size
+        return found
+
     def effect(self, rows: IntArray) -> Effect:
-        """The free values as an effect on observations.
+        """The free values as an effect on observations, and behind them those of `by_field`.
 
         Args:
             rows: (n,) which of the views each observation is; -1 for none of them.
         """
-        by_sensor = np.zeros((len(rows), 6, len(self.free)))
-        by_sensor[rows >= 0] = self.by_free[rows[rows >= 0]]
-        return Effect(LENSES, self.looks.values[self.free], self.known, self.held, by_sensor)
+        mine, fields = rows >= 0, self.by_field.shape[2]
+        by_sensor = np.zeros((len(rows), 6, len(self.free) + fields))
+        by_sensor[mine] = np.concatenate([self.by_free, self.by_field], axis=2)[rows[mine]]
+        sizes = [it.by_field.shape[2] for it in self.compressed]
+        variances = np.repeat([floored_sigma_px(it) ** 2 for it in self.sigmas_px], sizes)
+        # Coefficients follow the free values: neither says anything of the other.
+        known = Knowledge(
+            np.asarray(block_diag(self.known.information, np.diag(1.0 / variances))),
+            np.append(self.known.gradient, np.zeros(fields)),
+        )
+        values = np.append(self.looks.values[self.free], np.zeros(fields))
+        held = np.append(self.held, np.zeros(fields, dtype=bool))
+        return Effect(LENSES, values, known, held, by_sensor, random=fields)
 
     @property
     def views(self) -> tuple[int, ...]:

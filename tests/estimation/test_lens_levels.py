@@ -1,0 +1,123 @@
+"""What lenses do beyond their models: its elimination from corners, and its sizes by REML."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.cells import calibrated, known_of
+
+from visioncal.calibration.stages import refine
+from visioncal.estimation import lens_levels
+from visioncal.estimation.appearance import Appearance, compress
+from visioncal.estimation.corners import reproject
+from visioncal.estimation.lens_field import LensLevels, field_columns, mode_columns
+from visioncal.simulation import CellOptions, fine_camera, simulate
+
+FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1, views=8, seed=1)
+LEVELS = LensLevels(field=1.5, length=0.35, breathing=0.05, jitter=0.01)
+
+
+@pytest.fixture(scope="module")
+def corners():
+    """The corners of one camera as the fit has them, with their poses."""
+    looks = calibrated(simulate(FINE), joints=False).fitted.looks
+    (problem,) = looks.problems.values()
+    return replace(problem.with_levels(LEVELS), levels=LEVELS), looks
+
+
+def test_a_field_of_size_one_has_it_all_over_the_image():
+    px = np.random.default_rng(0).uniform(0, [1280, 1024], (500, 2))
+    for length in (0.07, 0.2, 0.35):
+        variances = np.sum(field_columns(px, (1280, 1024), length)[:, 0] ** 2, axis=1)
+        # A hundredth of the variance is left out, most of it at the edges.
+        assert np.mean(variances) == pytest.approx(1.0, abs=0.02)
+        assert np.min(variances) > 0.8
+
+
+def test_what_is_eliminated_is_noise_that_corners_share(corners):
+    """The Schur complement of the whole problem by a dense covariance, as generalised squares."""
+    problem, looks = corners
+    stack, poses = problem.stack, looks.poses
+    appearance = Appearance(looks.camera("cam"), looks.values[looks.boards])
+    found = compress(stack, problem.basis, appearance, poses, levels=LEVELS)
+    bare = replace(stack, zooms=None)
+    now = reproject(bare, appearance.camera, poses)
+    shared = np.concatenate([now.by_intrinsics, now.by_point @ problem.basis[stack.ids]], axis=2)
+    beyond = mode_columns(bare, appearance.camera, poses, LEVELS)
+    beyond = beyond.reshape(2 * len(stack.px), -1)
+    views = len(stack.views)
+    by_poses = np.zeros((len(stack.px), 2, 6 * views))
+    covariance = np.eye(2 * len(stack.px)) + beyond @ beyond.T
+    for view in range(views):
+        rows = stack.view_of == view
+        by_poses[rows, :, 6 * view : 6 * view + 6] = now.by_pose[rows]
+        zoom = np.where(rows[:, None], stack.zooms, 0.0).ravel()
+        covariance += np.outer(zoom, zoom)
+    jacobian = np.concatenate([by_poses, shared], axis=2).reshape(len(covariance), -1)
+    normal = jacobian.T @ np.linalg.solve(covariance, jacobian)
+    inner, size = normal[: 6 * views, : 6 * views], 6 * views
+    left = normal[size:, size:] - normal[size:, :size] @ np.linalg.solve(
+        inner, normal[:size, size:]
+    )
+    # All but the board's scale, which views alone do not tell; linearised where poses are the best
+    # ones by other weights.
+    kept = np.arange(len(left)) != len(now.by_intrinsics[0, 0])
+    scale = np.sqrt(np.diag(left)[kept])
+    apart = (found.shared_information - left)[np.ix_(kept, kept)] / np.outer(scale, scale)
+    assert np.abs(apart).max() < 1e-2
+
+
+def test_how_poses_follow_a_board_is_the_same_with_any_focus(corners):
+    """A larger board farther away looks the same, whatever corners are weighed by."""
+    problem, looks = corners
+    appearance = Appearance(looks.camera("cam"), looks.values[looks.boards])
+    scale = problem.scale
+    plain, zoomed = (
+        compress(stack, problem.basis, appearance, looks.poses).by_shared[:, :, scale]
+        for stack in (replace(problem.stack, zooms=None), problem.stack)
+    )
+    # Poses that fit best by other weights are a little elsewhere, by less than 1 mm.
+    np.testing.assert_allclose(zoomed, plain, atol=1e-3)
+
+
+@pytest.mark.parametrize("still", [False, True], ids=["by a robot", "some by none"])
+def test_the_slope_of_the_likelihood_is_that_of_its_differences(monkeypatch, still):
+    found = []
+    original = lens_levels._Likelihood.minimised
+
+    def kept(self, logs, closed):
+        found.append((self, logs))
+        return original(self, logs, closed)
+
+    monkeypatch.setattr(lens_levels._Likelihood, "minimised", kept)
+    calibrated(simulate(replace(FINE, views=12)), joints=False)
+    likelihood, logs = found[0]
+    if still:  # Views between which no flange stands have no error of one.
+        for array in (likelihood.local, likelihood.cross, likelihood.pulls):
+            array[:3, :6] = 0.0
+        likelihood.local[:3, :, :6] = 0.0
+        likelihood.kinds[:3, :6] = -1
+    logs = np.clip(logs, *likelihood.limits(())) + 0.2
+    _, slope = likelihood(logs)
+    for level, step in enumerate(1e-4 * np.eye(len(logs))):
+        difference = (likelihood(logs + step)[0] - likelihood(logs - step)[0]) / 2e-4
+        # The third order of the step, and rounding of values of some thousands.
+        assert slope[level] == pytest.approx(difference, rel=1e-3, abs=1e-3)
+
+
+def test_a_focus_that_is_fixed_neither_breathes_nor_jitters(monkeypatch):
+    estimated = []
+    original = refine.estimate_levels
+    monkeypatch.setattr(
+        refine, "estimate_levels", lambda *them: estimated.append(original(*them)) or estimated[-1]
+    )
+    cell = simulate(replace(FINE, views=12))
+    session = known_of(cell).session
+    camera = session.document["camera"] | {"focus": "fixed"}
+    calibrated(
+        cell,
+        joints=False,
+        session=replace(session, document=session.document | {"camera": camera}),
+    )
+    assert estimated
+    assert all((it.breathing, it.jitter) == (0.0, 0.0) for it in estimated)
