@@ -155,7 +155,8 @@ def main() -> None:
         text = (
             f"{VIEWS} views of 2448 x 2048 of a 9 x 6 ChArUco board, median of {REPEATS} "
             "interleaved runs, wall time. The command is started anew and writes report and "
-            "recording; the API is warm and writes nothing; OpenCV reads and detects, no more."
+            "recording; the API is warm and writes nothing; OpenCV reads and detects, no more. "
+            f"Load average meanwhile: {os.getloadavg()[2]:.0f}."
         )
         head = ["files", "level", "threads", "command [s]", "API [s]", "OpenCV detection [s]",
                 "command / OpenCV", "API / OpenCV"]  # fmt: skip
