@@ -16,12 +16,13 @@ from rich.markup import escape
 from visioncal.cli.against_truth import truth_table
 from visioncal.cli.console import messages, tell_written
 from visioncal.cli.options import AsJson, OutFolder, Seed, View
-from visioncal.cli.rehearsed import TAKING, Recorded, calibrated, planned, recorded
+from visioncal.cli.rehearsed import TAKING, Recorded, calibrated, planned, recorded, touched
 from visioncal.cli.summary import print_summary
 from visioncal.core.errors import DataError
 from visioncal.core.files import write_atomically
 from visioncal.core.types import CameraMount
 from visioncal.core.version import __version__
+from visioncal.frames.touch_test import finding_of
 from visioncal.interchange.outputs import Written
 from visioncal.live.drivers.extras import client_library
 from visioncal.live.rehearsal.bench import Bench
@@ -31,6 +32,7 @@ from visioncal.live.rehearsal.fault_injection import Faults
 from visioncal.live.rehearsal.witness import Pace, Witness, pace_of
 from visioncal.results import Calibration
 from visioncal.results.arm import NOMINAL
+from visioncal.results.sections import TouchTest
 
 # A check said no: the result is there, and it is farther from the truth than it says.
 EXIT_WRONG = 3
@@ -92,6 +94,8 @@ def _rehearse(
     captured = time.monotonic()
     run, written = calibrated(out / "session", out / "result")
     found = run.calibration
+    board = cell.truth.transforms.get("base_from_target")
+    test = None if board is None else touched(out / "session", found, board)
     ended = time.monotonic()
     return _Rehearsal(
         options,
@@ -109,6 +113,7 @@ def _rehearse(
             "all": ended - begun,
         },
         bench.through_depthai,
+        test,
     )
 
 
@@ -127,6 +132,7 @@ class _Rehearsal:
         away_mm: For each view, how far the flange was from what was recorded [mm].
         times_s: How long each part took [s].
         through_depthai: Whether the pictures went through depthai's pipeline.
+        touch_test: Points of the board that a tip touched; None for a board on the flange.
     """
 
     options: RehearsalOptions
@@ -139,6 +145,7 @@ class _Rehearsal:
     away_mm: tuple[float, ...]
     times_s: dict[str, float]
     through_depthai: bool
+    touch_test: TouchTest | None = None
 
     def document(self) -> dict[str, Any]:
         """The content of rehearsal.json; what does not apply is absent."""
@@ -164,6 +171,12 @@ class _Rehearsal:
         }
         if self.pace is not None:
             document["capture"] = asdict(self.pace)
+        if self.touch_test is not None:
+            document["touch_test"] = {
+                "passed": self.touch_test.passed,
+                "gaps_mm": [it.gap_mm for it in self.touch_test.points],
+                "radius95_mm": [it.radius95_mm for it in self.touch_test.points],
+            }
         if self.taken.fault is not None:
             suffered = asdict(self.taken.fault)
             document["fault"] = {key: it for key, it in suffered.items() if it is not None}
@@ -181,6 +194,8 @@ class _Rehearsal:
             f"the error {verb} the sigmas: chi-square {error.chi_square:.1f} of {error.freedom} "
             f"numbers, and up to {error.limit:.0f} is believed"
         )
+        if self.touch_test is not None:
+            say(escape(finding_of(self.touch_test).words))
         if self.pace is not None:
             pace = self.pace
             say(

@@ -7,6 +7,8 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from visioncal.calibration.pipeline import Run, run
 from visioncal.cli.console import messages, report_error, tell_written
 from visioncal.cli.interrupts import ended_like_ctrl_c
@@ -14,6 +16,8 @@ from visioncal.cli.progress import shown_progress
 from visioncal.cli.record import ViewLines, driven
 from visioncal.cli.recorded_cell import Scene, facts_of, scene_of, shown_in
 from visioncal.core.errors import DataError, DriverError, VisioncalError
+from visioncal.core.types import FloatArray
+from visioncal.frames.touch_test import judged, touch_points
 from visioncal.interchange.outputs import Written, write_outputs, write_plan
 from visioncal.live.capture.core import Step, Watcher, missed
 from visioncal.live.capture.journal import Journal
@@ -26,6 +30,8 @@ from visioncal.live.planning.written import plan_document
 from visioncal.live.rehearsal.bench import Bench
 from visioncal.live.rehearsal.cell import RehearsalOptions, RehearsedCell
 from visioncal.live.rehearsal.fault_injection import Befalling, Faults
+from visioncal.results import Calibration
+from visioncal.results.sections import TouchTest
 from visioncal.session import Session
 
 # The pace at which a UR moves where its program says nothing else; nobody stands beside this one.
@@ -34,6 +40,22 @@ TAKING = CaptureOptions(speed=1.05, acceleration=1.4)
 
 # Fewer than a real plan is chosen from: it matters more that a rehearsal is short.
 _CANDIDATES = 600
+
+
+def touched(folder: Path, calibration: Calibration, base_from_target: FloatArray) -> TouchTest:
+    """Touches what the camera located, with a tip that knows where the board really is.
+
+    Args:
+        folder: The session's.
+        calibration: Its result.
+        base_from_target: (4, 4) the truth.
+    """
+    points = touch_points(Session.load(folder), calibration, "")
+    true = [base_from_target[:3, :3] @ it.board_m + base_from_target[:3, 3] for it in points]
+    gaps = [
+        1e3 * float(np.linalg.norm(it.base_m - at)) for it, at in zip(points, true, strict=True)
+    ]
+    return judged(points, gaps, "")
 
 
 @dataclass(frozen=True, eq=False)

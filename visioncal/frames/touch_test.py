@@ -34,6 +34,7 @@ class TouchPoint:
 
     Attributes:
         name: Which point of the board it is.
+        board_m: (3,) where it is on the board [m].
         base_m: (3,) where the camera locates it in the base [m].
         base_from_flange: (4, 4) where the flange has the tip on it, the tool's z into the board.
         radius95_mm: The tip comes as near as this with 95 % [mm].
@@ -41,6 +42,7 @@ class TouchPoint:
     """
 
     name: str
+    board_m: FloatArray
     base_m: FloatArray
     base_from_flange: FloatArray
     radius95_mm: float
@@ -86,7 +88,7 @@ def touch_points(session: Session, calibration: Calibration, tool: str) -> tuple
         spread = located + rotation @ own @ rotation.T
         flange = placed @ invert(tip.matrix)
         radius_mm = float(np.hypot(1e3 * radius95(spread), READING_MM))
-        points.append(TouchPoint(name, placed[:3, 3], flange, radius_mm, rotation[:, 2]))
+        points.append(TouchPoint(name, at, placed[:3, 3], flange, radius_mm, rotation[:, 2]))
     return tuple(points)
 
 
