@@ -10,11 +10,14 @@ from support.problems import observed, world
 
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.stages import refine
+from visioncal.calibration.stages.diagnose import misfits
 from visioncal.core.transforms import exp
 from visioncal.estimation.arm import ArmErrors, covariance_of_size
 from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance, radius95
+from visioncal.estimation.chain import chain
 from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.lens_field import LensLevels
+from visioncal.estimation.outliers import inliers
 from visioncal.estimation.parts import ROBOT
 from visioncal.estimation.residual_tests import drift, lens_field, neighbours
 from visioncal.estimation.solve import covariance_of
@@ -74,6 +77,18 @@ def test_a_bump_is_told_from_a_creep(mount):
         assert len(words) == 1
         assert "before stop 9 of" in words[0]
         assert not any("drift with time" in it.reason for it in known.warnings)
+
+
+def test_a_bump_among_measured_poses_is_found():
+    """Their noise is counted as one with the robot's: observations have none of their own."""
+    cell = simulate(replace(FINE, views=24, seed=1))
+    lifted = np.where(np.arange(24) < 12, 0.0, 2e-3)[:, None] * np.eye(6)[5]
+    measured = cell.cam_from_target @ exp(1e-4 * np.random.default_rng(0).normal(size=(24, 6)))
+    problem = chain("eye-in-hand", exp(lifted) @ cell.base_from_flange, measured)
+    assert problem.is_combined
+    found = misfits(problem, inliers(problem).fit)[ROBOT]
+    assert found.moved is None
+    assert found.step.stop == 12
 
 
 @pytest.mark.parametrize("mount", MOUNTS)

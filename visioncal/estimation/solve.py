@@ -535,22 +535,22 @@ def equations_from(
         Each stop with what it and all after it say: what is known besides does not count.
     """
     state, noise = solution.state, solution.noise
-    weights = np.linalg.inv(problem.covariance(noise))
+    alone, shared = problem.covariance(noise), problem.error_covariance(noise)
     linear = problem.linear(state)
     stops, of = problem.observations.stops, problem.units[0]
     every = np.concatenate([linear.jacobian, linear.residuals[:, :, None]], axis=2)
-    inverse = np.linalg.inv(problem.error_covariance(noise))
     total = np.zeros((every.shape[2], every.shape[2]))
     for stop in np.unique(stops)[::-1].tolist():
         mine = np.flatnonzero(stops == stop)
-        weighted = weights[mine] @ every[mine]
-        total = total + gram(every[mine], weighted)
-        for unit in np.unique(of[mine][of[mine] >= 0]).tolist():
-            rows = of[mine] == unit
-            jacobian = linear.by_errors[mine[rows]]
-            own = inverse[unit] + gram(jacobian, weights[mine[rows]] @ jacobian)
-            cross = gram(jacobian, weighted[rows])
-            total -= cross.T @ np.linalg.solve(own, cross)
+        for unit in np.unique(of[mine]).tolist():
+            rows = mine[of[mine] == unit]
+            # Observations may have no noise but that of the robot that they share.
+            covariance = block_diag(*alone[rows])
+            if unit >= 0:
+                jacobian = linear.by_errors[rows].reshape(-1, shared.shape[1])
+                covariance += jacobian @ shared[unit] @ jacobian.T
+            columns = every[rows].reshape(-1, every.shape[2])
+            total = total + columns.T @ np.linalg.solve(covariance, columns)
         yield stop, total[:-1, :-1], total[:-1, -1]
 
 
