@@ -24,10 +24,10 @@ from visioncal.estimation.solve import RATIO_PRIOR, normal_equations
 
 # Lengths of the field that are tried, as shares of the image's width, from the third on; another
 # one has to gain so much.
-_LENGTHS, _FIRST, _GAIN = (0.07, 0.12, 0.2, 0.35), 2, 0.5
+_LENGTHS, _FIRST, _GAIN = (0.07, 0.12, 0.2), 2, 0.5
 # A field is no larger [px], and no change of focus, as a share. The noise of corners is about what
 # lens, board and field, all free, leave of them.
-_MOST_FIELD_PX, _MOST_FOCUS, _NOISE_RANGE = 2.0, 0.02, (0.7, 3.0)
+_MOST_FIELD_PX, _MOST_FOCUS, _NOISE_RANGE = 1.0, 0.02, (0.7, 3.0)
 # Sizes below these are none: of the field in units of the noise, of focus as a share; and those
 # from which the search starts.
 _LEAST, _START = (1e-3, 1e-6, 1e-6), (0.3, 1e-3, 3e-4)

@@ -7,6 +7,7 @@ import numpy as np
 
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.side import FramesSide
+from visioncal.core.errors import ConvergenceError
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Corners, FloatArray, IntArray
 from visioncal.estimation.appearance import (
@@ -71,6 +72,21 @@ def refined(
     Returns:
         The fit, and the side with the errors of its arms.
     """
+    try:
+        return _refined(side, looks, frames, is_plain=False)
+    except ConvergenceError:
+        # A field of many pixels is none: poses run away with it. Lenses are then what they say.
+        plain = dict.fromkeys(looks.problems, LensLevels())
+        return _refined(side, looks.with_levels(plain), frames, is_plain=True)
+
+
+def _refined(
+    side: FramesSide,
+    looks: CameraParameters,
+    frames: Mapping[str, FloatArray],
+    *,
+    is_plain: bool,
+) -> tuple[Fitted, FramesSide]:
     levels = looks.levels
     answer, side = _equally_weighed(side, looks, frames)
     looks = answer.looks.weighed(answer.seen)
@@ -79,6 +95,8 @@ def refined(
     ):
         answer = again(answer, side, answer.moving, looks)
     elif np.array_equal(answer.moving, looks.first) and not (levels or side.errors):
+        return answer, side
+    if is_plain:
         return answer, side
     looks = answer.looks.with_levels(lens_levels(side, answer))
     return again(answer, side, answer.moving, looks), side
