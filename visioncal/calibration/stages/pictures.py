@@ -51,7 +51,7 @@ def unnamed_images(session: Session) -> Iterator[Finding]:
 
 
 def _missing(session: Session) -> Iterator[Finding]:
-    with_image = [it for it in session.views if it.image]
+    with_image = [it for it in session.views if it.image and not it.has_corners]
     missing = [it for it in with_image if session.images.absence(it.image) == "is missing"]
     if not missing:
         return
