@@ -25,9 +25,11 @@ from visioncal.estimation.solve import RATIO_PRIOR, normal_equations
 # Lengths of the field that are tried, as shares of the image's width, from the third on; another
 # one has to gain so much.
 _LENGTHS, _FIRST, _GAIN = (0.07, 0.12, 0.2), 2, 0.5
-# A field is no larger [px], and no change of focus, as a share. The noise of corners is about what
-# lens, board and field, all free, leave of them.
-_MOST_FIELD_PX, _MOST_FOCUS, _NOISE_RANGE = 1.0, 0.02, (0.7, 3.0)
+# A field is no larger [px], and no change of focus with the distance or from view to view, as a
+# share: autofocus repeats to some 0.1 %. The noise of corners is about what lens, board and field,
+# all free, leave of them.
+_MOST = (1.0, 0.02, 5e-3)
+_NOISE_RANGE = (0.7, 3.0)
 # Sizes below these are none: of the field in units of the noise, of focus as a share; and those
 # from which the search starts.
 _LEAST, _START = (1e-3, 1e-6, 1e-6), (0.3, 1e-3, 3e-4)
@@ -210,9 +212,19 @@ class _Likelihood:
         high = np.repeat([_FLANGE_RANGE[1]], len(low))
         low[_NOISE], high[_NOISE] = np.multiply(_NOISE_RANGE, self.noise_px)
         low[_FIELD : _JITTER + 1] = np.multiply(_LEAST, (self.noise_px, 1.0, 1.0))
-        high[_FIELD : _JITTER + 1] = _MOST_FIELD_PX, _MOST_FOCUS, _MOST_FOCUS
+        high[_FIELD : _JITTER + 1] = _MOST
         high[[*closed]] = low[[*closed]]
         return np.log(low), np.log(high)
+
+
+def are_beyond(levels: LensLevels, sigma_px: float) -> bool:
+    """Whether levels are larger than any lens has them, by the corners' noise of a fit with them.
+
+    They are in units of that noise: where poses run away with them, both grow.
+    """
+    sizes = sigma_px * np.array([levels.field, levels.breathing, levels.jitter])
+    # Noise is estimated anew, and differs by some percent.
+    return bool(np.any(sizes > 1.2 * np.array(_MOST)))
 
 
 def estimate_levels(

@@ -31,7 +31,7 @@ from visioncal.estimation.joint import (
     settle,
 )
 from visioncal.estimation.lens_field import LensLevels
-from visioncal.estimation.lens_levels import estimate_levels
+from visioncal.estimation.lens_levels import are_beyond, estimate_levels
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.estimation.parts import State
@@ -73,11 +73,16 @@ def refined(
         The fit, and the side with the errors of its arms.
     """
     try:
-        return _refined(side, looks, frames, is_plain=False)
+        fitted, found = _refined(side, looks, frames, is_plain=False)
+        levels = fitted.looks.levels
+        sizes = zip(fitted.looks.problems, fitted.seen.sigmas_px, strict=True)
+        if not any(name in levels and are_beyond(levels[name], it) for name, it in sizes):
+            return fitted, found
     except ConvergenceError:
-        # A field of many pixels is none: poses run away with it. Lenses are then what they say.
-        plain = dict.fromkeys(looks.problems, LensLevels())
-        return _refined(side, looks.with_levels(plain), frames, is_plain=True)
+        pass
+    # A field of many pixels is none: poses run away with it. Lenses are then what they say.
+    plain = dict.fromkeys(looks.problems, LensLevels())
+    return _refined(side, looks.with_levels(plain), frames, is_plain=True)
 
 
 def _refined(
