@@ -51,7 +51,8 @@ def test_a_camera_that_saw_nothing_else_is_placed_as_its_covariance_says(swept, 
     away = log(invert(cell.between("cam_left", "cam_side")) @ edge.matrix)
     # Chi-square of 6 beyond 22 is 0.1 %.
     assert away @ np.linalg.solve(edge.covariance, away) < 22.0
-    assert edge.sigma_mm < 0.2
+    # Its lens is estimated, with a field and a focus of its own.
+    assert edge.sigma_mm < 0.3
     used = [it for it in found.sights if it.seer == "cam_side" and it.used]
     assert len(used) > 30
     assert found.session_sha256 == session.digest()

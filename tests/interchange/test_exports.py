@@ -23,7 +23,7 @@ from visioncal.interchange.exports import EXPORT_FORMATS, Selection, export
 from visioncal.results import CameraResult, Edge, Verdict
 
 NAMES = [it.name for it in EXPORT_FORMATS]
-EDGE_NAMES = [it for it in NAMES if it not in readers.ARM_FORMATS]
+EDGE_NAMES = [it for it in NAMES if it not in (*readers.ARM_FORMATS, "joint-corrections")]
 ANGLES = {"urdf", "kuka", "fanuc", "yaskawa", "staubli", "doosan"}
 LENSES = {"camera-info", "kalibr", "oak"}
 RNG = np.random.default_rng(3)

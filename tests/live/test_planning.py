@@ -235,8 +235,9 @@ def test_five_planned_stops_make_a_session_about_one_axis_solvable(mount):
     known = calibrated(simulate(free, np.concatenate([cell.joints, q[rows]])), level="hand-eye")
     covariance = known.solved.covariance
     obtained = 1e3 * np.sqrt(np.trace(covariance[3:6, 3:6]))
-    # The noise of 13 stops is told to a fifth, and that of 8 beforehand to a fourth.
-    assert obtained == pytest.approx(added.design.predicted.mm, rel=0.45)
+    # The noise of 13 stops is told to a fifth, and that of 8 beforehand to a fourth; what a lens
+    # does beyond its model counts in a result, and is not foreseen.
+    assert obtained == pytest.approx(added.design.predicted.mm, rel=0.6)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
@@ -323,8 +324,9 @@ def test_errors_of_the_arm_count_in_the_prediction_as_in_the_result(case):
     covariance = known.solved.covariance - untold
     obtained = 1e3 * np.sqrt(np.trace(covariance[3:6, 3:6]))
     world = worlds_of([begun.cell], HAND_EYE, q, recorded=begun.recorded)[0]
-    # A result holds the board's size; in the plan it is open, and takes up errors of the arm.
-    assert mm(world, []) == pytest.approx(obtained, rel=0.01)
+    # A result holds the board's size; in the plan it is open, and takes up errors of the arm. What
+    # a lens does beyond its model is in the result alone.
+    assert mm(world, []) == pytest.approx(obtained, rel=0.02)
     assert design.before.mm == pytest.approx(obtained, rel=0.1)
     assert design.predicted.mm == pytest.approx(mm(world, design.rows), rel=0.1)
     wish = Wish(mm=1.0)

@@ -70,7 +70,8 @@ def _each(command: str, words: str, *inputs: str) -> tuple[Reading, ...]:
 
 
 # What reads no file of the user's, or only once a robot has answered.
-READS_NOTHING = ("demo", "rehearse", "simulate", "dynamics record")
+# `batch` reads sessions as `calibrate` does, in processes of its own.
+READS_NOTHING = ("batch", "demo", "rehearse", "simulate", "dynamics record")
 _FEW = "-o OUT --candidates 20"
 _PLAN = f"{_FEW} --stops 3 --guess-deg 2 --cam '0 -60 60 0 0 0' --board '500 0 5 180 0 0'"
 _LENS = "--camera 1000,1000,640,400 --resolution 1280,800"
@@ -87,6 +88,8 @@ READINGS: tuple[Reading, ...] = (
     *_each("calibrate", "IT -o OUT", "warm", "tracked", "board.rrd", "pairs.rrd"),
     Reading("calibrate", "pairs", "IT -o OUT --json"),
     *_each("align", "IT -o OUT", "network", "network", "pairs"),
+    *_each("doctor", "IT", "board", "pairs", "arm"),
+    Reading("touch-test", "board", "IT -c [board_out]"),
     *_each("report", "IT -o OUT/report.html", "out", "board_out", "network_out", "warm_out"),
     Reading("report", "arm_out", "IT/calibration.json -o OUT/report.html"),
     Reading("verify", "pairs", "IT --against [out] -o NEW"),

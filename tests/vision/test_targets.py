@@ -68,7 +68,7 @@ def test_a_path_is_relative_to_the_folder_that_names_it(tmp_path: Path) -> None:
 def test_an_unknown_name_lists_the_names_and_a_near_one() -> None:
     with pytest.raises(DataError, match="checkerboard_9x6_25mm") as caught:
         load_target("charuco_9x6", None)
-    assert "Did you mean charuco_9x6_30mm" in caught.value.next_step
+    assert "Did you mean charuco_9x6_30mm" in caught.value.message
 
 
 @pytest.mark.parametrize(

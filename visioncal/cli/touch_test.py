@@ -108,7 +108,9 @@ def _tell(
         typer.echo(json.dumps({"points": targets}, indent=2))
         return
     console = messages()
-    console.print("Flange targets: x, y, z [mm], rotation vector [rad]; hover first, then touch.")
+    console.print(
+        "Flange targets: x, y, z \\[mm], rotation vector \\[rad]; hover first, then touch."
+    )
     for point, target in zip(points, targets, strict=True):
         x, y, z = 1e3 * point.base_m
         console.print(

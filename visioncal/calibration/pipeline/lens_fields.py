@@ -57,7 +57,7 @@ def _is_of_lens(solved: Solved, camera: str) -> bool:
     stack, shares = problem.stack, problem.shares[problem.stack.view_of]
     by_place = lens_field(stack.px, own.residuals, problem.scene.camera.resolution, shares)
     by_corner = common_errors(stack.ids, own.residuals, shares)
-    return by_place.mahalanobis_sq > by_corner.mahalanobis_sq
+    return by_place.is_significant and by_place.mahalanobis_sq > by_corner.mahalanobis_sq
 
 
 def errors_found(lenses: Mapping[str, LensErrors]) -> Iterator[Finding]:
