@@ -46,8 +46,9 @@ def review_command(
         return
 
     def opened(url: str) -> None:
-        typer.echo(url)
+        # The URL last: who reads it may end the server at once, and an import would be cut off.
         messages().print("Ctrl-C ends.")
+        typer.echo(url)
         if not no_open and not webbrowser.open(url):
             messages().print("No browser could be opened; visit the address above.")
 
