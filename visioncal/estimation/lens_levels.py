@@ -305,9 +305,8 @@ def _rows(
     camera: str,
 ) -> _Rows:
     looks, which = seen.looks, list(seen.looks.problems).index(camera)
-    counts = [len(it.stack.views) for it in looks.problems.values()]
-    first = sum(counts[:which])
-    mine, poses = looks.problems[camera], looks.poses[first : first + counts[which]]
+    of_camera = looks.rows(camera)
+    mine, poses = looks.problems[camera], looks.poses[of_camera]
     shape = mine.basis[mine.stack.ids]
     stack = mine.stack.with_points(mine.stack.points + shape @ looks.values[looks.boards])
     stack, lens = replace(stack, zooms=None), looks.camera(camera)
@@ -315,7 +314,7 @@ def _rows(
     breath = distances(stack, poses)[stack.view_of][:, None] * zooms(stack, lens)
     by_board = now.by_point @ shape
     stack.weigh(breath, by_board)
-    here = np.flatnonzero((rows >= first) & (rows < first + counts[which]))
+    here = np.flatnonzero((rows >= of_camera.start) & (rows < of_camera.stop))
     linear, (of, members) = problem.linear(state), problem.units
     jacobian = linear.jacobian[here]
     places = problem.effect_columns[LENSES].start + np.searchsorted(seen.free, looks.places(camera))
@@ -334,7 +333,7 @@ def _rows(
         now.residuals,
         stack.products_by_view(now.by_pose, now.by_pose),
         np.sqrt(mine.shares),
-        rows[here] - first,
+        rows[here] - of_camera.start,
         jacobian[:, :, kept],
         linear.by_errors[here],
         linear.residuals[here],

@@ -53,7 +53,7 @@ def _is_of_lens(solved: Solved, camera: str) -> bool:
     if problem.levels is None or problem.levels.gains[0] < SIGNIFICANT:
         return False
     bare = replace(looks, problems={**looks.problems, camera: problem.without_levels()})
-    own = dict(zip(looks.problems, bare.seen(seen.moving).compressed, strict=True))[camera]
+    own = bare.compressed(camera)
     stack, shares = problem.stack, problem.shares[problem.stack.view_of]
     by_place = lens_field(stack.px, own.residuals, problem.scene.camera.resolution, shares)
     by_corner = common_errors(stack.ids, own.residuals, shares)

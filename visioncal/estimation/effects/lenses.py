@@ -201,31 +201,37 @@ class CameraParameters:
         found, sigmas = [], []
         information = np.zeros((len(self.values), len(self.values)))
         gradient = np.zeros(len(self.values))
-        begin = 0
         for name, problem in self.problems.items():
-            end = begin + len(problem.stack.views)
-            appearance = Appearance(self.camera(name), self.values[self.boards])
-            compressed = compress(
-                problem.stack,
-                problem.basis,
-                appearance,
-                self.poses[begin:end],
-                problem.scale,
-                problem.shares,
-                problem.levels,
-            )
-            places = self.places(name)
+            compressed, places = self.compressed(name), self.places(name)
             sigma = problem.sigma_px(compressed, np.flatnonzero(np.isin(places, moving)))
             weight = 1.0 / floored_sigma_px(sigma) ** 2
             information[np.ix_(places, places)] += weight * compressed.shared_information
             gradient[places] += weight * compressed.shared_gradient
             found.append(compressed)
             sigmas.append(sigma)
-            begin = end
         poses = np.concatenate([it.cam_from_target for it in found])
         corners = Knowledge(information, gradient)
         looks = replace(self, poses=poses)
         return LinearisedCorners(looks, np.sort(moving), tuple(found), tuple(sigmas), corners)
+
+    def compressed(self, name: str) -> Compressed:
+        """What one camera's corners say, linearised at its poses."""
+        problem = self.problems[name]
+        return compress(
+            problem.stack,
+            problem.basis,
+            Appearance(self.camera(name), self.values[self.boards]),
+            self.poses[self.rows(name)],
+            problem.scale,
+            problem.shares,
+            problem.levels,
+        )
+
+    def rows(self, name: str) -> slice:
+        """The rows of one camera's views among all."""
+        names, counts = list(self.problems), [len(it.stack.views) for it in self.problems.values()]
+        first = sum(counts[: names.index(name)])
+        return slice(first, first + counts[names.index(name)])
 
     def places(self, name: str) -> IntArray:
         """Places of what one camera's corners tell of: its lens and all boards."""
