@@ -1,7 +1,6 @@
 """`visioncal calibrate`."""
 
 import json
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -100,21 +99,19 @@ def calibrate_command(
             typer.echo(json.dumps(document, indent=2))
         return
     left = leftover(out)
-    with naming(session, out), shown_progress(quiet=as_json) as told:
+    with naming(session, out), shown_progress(quiet=as_json) as progress:
         calibrated = partial(run_dense, device=device) if dense else run
         result = calibrated(
             loaded,
             solver=solver,
             level=level,
             convention=convention,
-            progress=told,
+            progress=progress,
             threads=work.threads,
             keep_corners=work.keep_corners,
         )
-        told("write", 0, 1)
-        calibration = result.calibration
-        named = replace(calibration, verdict=calibration.verdict.with_paths(session, out))
-        result = replace(result, calibration=named)
+        progress("write", 0, 1)
+        result = result.with_paths(session, out)
         if left is not None:
             left.keep()
         written = write_outputs(out, loaded, result, without=without, images=work.images)

@@ -41,6 +41,11 @@ class Run:
     dense: Dense | None = None
     left_out: Mapping[int, tuple[float, float]] = field(default_factory=dict)
 
+    def with_paths(self, session: Path | str, out: Path | str) -> "Run":
+        """The same with the paths of a run in the verdict's commands."""
+        verdict = self.calibration.verdict.with_paths(session, out)
+        return replace(self, calibration=replace(self.calibration, verdict=verdict))
+
 
 def run(
     session: Session | Path | str,

@@ -107,11 +107,8 @@ def _calibrated(job: Job, session: Session) -> tuple[Calibration, Written]:
         cell = replace(cell, verdict=cell.verdict.with_paths(job.session, job.folder))
         written = write_alignment(job.folder, session, cell, without=options.without)
         return Calibration.whole(cell), written
-    done = run(session, level=options.level, threads=1)
-    found = done.calibration
-    found = replace(found, verdict=found.verdict.with_paths(job.session, job.folder))
-    done = replace(done, calibration=found)
-    return found, write_outputs(job.folder, session, done, without=options.without)
+    done = run(session, level=options.level, threads=1).with_paths(job.session, job.folder)
+    return done.calibration, write_outputs(job.folder, session, done, without=options.without)
 
 
 def _draw(folder: Path, session: Session, found: Calibration) -> bool:
