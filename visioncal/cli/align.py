@@ -70,12 +70,12 @@ def align_into(
 ) -> Alignment:
     """Aligns the cell of a session from some path, writes the result and tells of it."""
     left = leftover(out)
-    with naming(path, out), shown_progress(quiet=quiet) as told:
+    with naming(path, out), shown_progress(quiet=quiet) as progress:
         result = align(
             session,
             level=level,
             convention=convention,
-            progress=told,
+            progress=progress,
             threads=threads,
             keep_corners=keep_corners,
         )

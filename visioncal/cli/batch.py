@@ -64,7 +64,7 @@ def batch_command(
     started again, it goes on where it was. Exit status 0: there are results; 2: of no session.
     """
     wanted = {REPORT: not no_report, RECORDING: recordings}
-    with shown_progress(quiet=False) as told:
+    with shown_progress(quiet=False) as progress:
         found = batch(
             sessions or (),
             out,
@@ -76,7 +76,7 @@ def batch_command(
             without=[name for name, is_wanted in wanted.items() if not is_wanted],
             against=against,
             cells=cells,
-            progress=told,
+            progress=progress,
         )
     _tell(found)
     if all(it.state == "failed" for it in found.rows):

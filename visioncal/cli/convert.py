@@ -170,11 +170,11 @@ def _size(words: str | None) -> tuple[int, int] | None:
 
 def _chosen(recorded: InDoubt | Foreign, *, yes: bool) -> Candidate:
     """Tries other readings, prints them, and takes the one that is clearly right or confirmed."""
-    with shown_progress(quiet=False) as told:
+    with shown_progress(quiet=False) as progress:
         if isinstance(recorded, Foreign):
-            guess = guess_foreign(recorded, progress=told)
+            guess = guess_foreign(recorded, progress=progress)
         else:
-            guess = guess_session(recorded.session, recorded.robot, progress=told)
+            guess = guess_session(recorded.session, recorded.robot, progress=progress)
     print_guess(guess)
     return _confirmed(guess, yes=yes)
 

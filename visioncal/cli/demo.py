@@ -30,13 +30,13 @@ def demo_command(
     """
     session, result = out / "session", out / "result"
     options = CellOptions(views=views, seed=seed, state_intrinsics=False)
-    with shown_progress(quiet=False) as told:
+    with shown_progress(quiet=False) as progress:
         _replace_session(
-            options, session, lambda share: told("render", round(share * views), views)
+            options, session, lambda share: progress("render", round(share * views), views)
         )
         loaded = Session.load(session)
-        done = run(loaded, progress=told)
-        told("write", 0, 1)
+        done = run(loaded, progress=progress)
+        progress("write", 0, 1)
         written = write_outputs(result, loaded, done)
     print_summary(done.calibration, verbose=True)
     truth = read_truth(session)

@@ -26,8 +26,8 @@ def doctor_command(
     seconds, as nothing is solved. Exit status 0: nothing is wrong; 3: something is; 2: it cannot be
     read.
     """
-    with naming(session), shown_progress(quiet=as_json) as told:
-        found = doctor(session, progress=told)
+    with naming(session), shown_progress(quiet=as_json) as progress:
+        found = doctor(session, progress=progress)
     if as_json:
         typer.echo(json.dumps(to_document(found), indent=2))
     else:

@@ -192,10 +192,10 @@ def _tell(plan: MotionPlan) -> None:
 def _planned(
     allowed: Allowed, wished: ExcitationRequest, swept: SweepRequest | None, *, quiet: bool
 ) -> MotionPlan:
-    with shown_progress(quiet=quiet) as told:
+    with shown_progress(quiet=quiet) as progress:
         # The sweeps first: they are quick, and fail for the same reasons.
         sweeps = None if swept is None else plan_sweeps(allowed, swept)
-        return MotionPlan(allowed, excite(allowed, wished, told), sweeps)
+        return MotionPlan(allowed, excite(allowed, wished, progress), sweeps)
 
 
 def _radians(degrees: float | None) -> float | None:

@@ -244,13 +244,13 @@ def _by_plane(
             next_step=f"It is {FORMS}.",
         )
     px = np.array([numbers_in(it, "--pixel", "u,v") for it in pixels])
-    declared, told = plane_of(plane, sigma_mm, calibration, boards)
+    declared, note = plane_of(plane, sigma_mm, calibration, boards)
     places = locate(calibration, px, declared, flange, sigma_px=sigma_px)
     return tuple(
         _Found(
             f"pixel ({u:g}, {v:g})",
             {"pixel": [u, v]},
-            replace(it, warnings=(*it.warnings, told)) if told else it,
+            replace(it, warnings=(*it.warnings, note)) if note else it,
         )
         for (u, v), it in zip(px.tolist(), places, strict=True)
     )
@@ -269,9 +269,9 @@ def _by_views(
     from visioncal.calibration.stages.observed import by_reason
     from visioncal.frames.picks import locate_views
 
-    with shown_progress(quiet=quiet) as told:
+    with shown_progress(quiet=quiet) as progress:
         picks = locate_views(
-            session, calibration, point_m, among=views, sigma_px=sigma_px, progress=told
+            session, calibration, point_m, among=views, sigma_px=sigma_px, progress=progress
         )
     for told_of in (*by_reason(picks.lost), *picks.warnings):
         messages().print(escape(told_of))
@@ -321,8 +321,8 @@ def _tell(found: Sequence[_Found], *, as_json: bool) -> None:
     for it in found:
         typer.echo(f"{it.words}: {_line(it.located)}")
         for warning in it.located.warnings:
-            told = warning if warning.startswith(it.words) else f"{it.words}: {warning}"
-            messages().print(f"[bold yellow]warning:[/] {escape(told)}")
+            words = warning if warning.startswith(it.words) else f"{it.words}: {warning}"
+            messages().print(f"[bold yellow]warning:[/] {escape(words)}")
 
 
 def _line(located: Located) -> str:

@@ -58,15 +58,15 @@ def plan_command(
     limits, boxes = sight.limits(kept), kept.bodies
     purpose_of(wanted.purpose, "--for")
     start, words = chosen_part(find_source(source), words)
-    with shown_progress(quiet=as_json) as told:
-        cell, begun = _begin(start, words, (limits, boxes), wanted, told)
+    with shown_progress(quiet=as_json) as progress:
+        cell, begun = _begin(start, words, (limits, boxes), wanted, progress)
         if words.board is not None and cell.mount == "eye-in-hand" and cell.z[2, 2] > _FACE_DOWN:
             messages().print(
                 "[bold yellow]warning:[/] this --board lies face down: its z points into the "
                 "paper, and a board that lies face up ends in 180 0 0"
             )
-        plan = make_plan(cell, wanted.request(cell), begun=begun, progress=told)
-        told("write", 0, 1)
+        plan = make_plan(cell, wanted.request(cell), begun=begun, progress=progress)
+        progress("write", 0, 1)
         document = plan_document(plan, {"kind": start.words})
         written = write_plan(out, plan, document)
     if as_json:
@@ -77,7 +77,7 @@ def plan_command(
 
 
 def _begin(
-    source: Source, words: CellOptions, kept: Kept, wanted: PlanOptions, told: Progress
+    source: Source, words: CellOptions, kept: Kept, wanted: PlanOptions, progress: Progress
 ) -> tuple[PlanCell, Begun | None]:
     """The cell, and what was recorded of it where stops are added to that."""
     if wanted.add is not None and wanted.stops is not None:
@@ -89,7 +89,7 @@ def _begin(
         )
     if wanted.add is None and (source.session is None or source.calibration is not None):
         return cell_of(source, words, kept), None
-    begun = begun_session(source, words, kept, told)
+    begun = begun_session(source, words, kept, progress)
     return begun.cell, begun if wanted.add is not None else None
 
 

@@ -100,7 +100,7 @@ def chosen_part(source: Source, words: CellOptions) -> tuple[Source, CellOptions
     return replace(source, session=session, calibration=result), rest
 
 
-def begun_session(source: Source, words: CellOptions, kept: Kept, told: Progress) -> Begun:
+def begun_session(source: Source, words: CellOptions, kept: Kept, progress: Progress) -> Begun:
     """The session to which stops are added.
 
     Raises:
@@ -117,7 +117,7 @@ def begun_session(source: Source, words: CellOptions, kept: Kept, told: Progress
     if words.robot is not None:
         session = _with_robot(session, words.robot)
     guess = _guess(words) if words.given("cam", "board") else None
-    found = so_far(session, progress=told)
+    found = so_far(session, progress=progress)
     begun = begin(found, guess=guess, limits=kept[0], boxes=kept[1])
     return replace(begun, cell=_with_noise(begun.cell, words))
 

@@ -98,8 +98,8 @@ def planned(cell: RehearsedCell, options: RehearsalOptions, folder: Path) -> Sce
     request = Request(
         purpose_of("hand-eye"), options.stops, candidates=_CANDIDATES, seed=options.seed
     )
-    with shown_progress(quiet=False) as told:
-        plan = make_plan(cell.known, request, progress=told)
+    with shown_progress(quiet=False) as progress:
+        plan = make_plan(cell.known, request, progress=progress)
         written = write_plan(folder, plan, plan_document(plan, {"kind": "rehearsal"}))
     tell_written(written, quiet=True)
     messages().print(f"plan: {summary_of(plan)}")
@@ -154,9 +154,9 @@ def recorded(
 def calibrated(folder: Path, out: Path) -> tuple[Run, Written]:
     """Calibrates what was recorded, and writes the result."""
     session = Session.load(folder)
-    with shown_progress(quiet=not sys.stderr.isatty()) as told:
-        found = run(session, progress=told)
-        told("write", 0, 1)
+    with shown_progress(quiet=not sys.stderr.isatty()) as progress:
+        found = run(session, progress=progress)
+        progress("write", 0, 1)
         return found, write_outputs(out, session, found)
 
 

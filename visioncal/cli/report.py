@@ -92,8 +92,8 @@ def _recompute(stored: Stored) -> None:
             culprits=["--recompute"],
             next_step="Name an output folder of visioncal calibrate, with its recording.rrd.",
         )
-    with shown_progress(quiet=False) as told:
-        found = recompute(stored.calibration, stored.session, progress=told)
+    with shown_progress(quiet=False) as progress:
+        found = recompute(stored.calibration, stored.session, progress=progress)
     messages().print(escape(found.words))
     if not found.is_same:
         raise typer.Exit(_EXIT_OTHERS)

@@ -215,11 +215,11 @@ def _single(options: CellOptions, folder: Path, *, images: bool, touches: bool) 
     """Writes a cell of one robot, and what its tool touched."""
     cell = simulate(options)
     touched = touch(cell) if touches else None
-    with shown_progress(quiet=False) as told:
+    with shown_progress(quiet=False) as progress:
         write_session(
             cell,
             folder,
-            lambda share: told("render", round(share * options.views), options.views),
+            lambda share: progress("render", round(share * options.views), options.views),
             images=images,
         )
     if touched is not None:

@@ -73,12 +73,12 @@ def whole_cell(
         for at, it in enumerate(described.robots if along.torques else ())
     }
     touched = touch_network(cell) if along.touches else {}
-    with shown_progress(quiet=False) as told:
+    with shown_progress(quiet=False) as progress:
         count = len(cell.sights)
         write_network(
             cell,
             folder,
-            lambda share: told("render", round(share * count), count),
+            lambda share: progress("render", round(share * count), count),
             seen="images" if images else "poses",
             touched=touched,
             exercised=exercised,

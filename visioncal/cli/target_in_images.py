@@ -110,5 +110,5 @@ def frame_by_images(
         refuse_given({"--point-mm": point_mm}, "beside --cad the drawing's origin is the frame's")
         return marked_fixture(session, calibration, drawing)
     point = numbers_in(point_mm or "0,0,0", "--point-mm", "x,y,z")
-    with shown_progress(quiet=quiet) as told:
-        return seen_frame(session, calibration, kind, 1e-3 * np.array(point), progress=told)
+    with shown_progress(quiet=quiet) as progress:
+        return seen_frame(session, calibration, kind, 1e-3 * np.array(point), progress=progress)

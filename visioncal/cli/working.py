@@ -35,7 +35,6 @@ class WorkOptions:
     no_recording: Annotated[
         bool, typer.Option("--no-recording", help=f"Leave {RECORDING} out, which holds all images.")
     ] = False
-
     images: Annotated[
         ImagesKept,
         typer.Option(

@@ -139,9 +139,9 @@ def make_plan(
     Raises:
         DataError: The cell allows too few stops, or none has a safe way to another.
     """
-    told = progress or _silent
+    progress = progress or _silent
     found = candidates(cell, request.candidates, request.seed, progress)
-    told("information", 0, 1)
+    progress("information", 0, 1)
     worlds = worlds_of(
         (cell, *cell.guesses(WORLDS - 1, request.seed)),
         request.purpose,
@@ -149,8 +149,8 @@ def make_plan(
         recorded=None if begun is None else begun.recorded,
         workspace=request.workspace,
     )
-    told("choice", 0, 1)
-    chosen_stops = _with_a_way(cell, request, found.q, worlds, told)
+    progress("choice", 0, 1)
+    chosen_stops = _with_a_way(cell, request, found.q, worlds, progress)
     world, route = worlds[0], chosen_stops.route
     design = chosen_stops.design
     first = 1 if begun is None else 1 + max(begun.views)
@@ -192,7 +192,7 @@ def _with_a_way(
     request: Request,
     q: FloatArray,
     worlds: tuple[World, ...],
-    told: Progress,
+    progress: Progress,
 ) -> _Chosen:
     """Chooses stops that can be driven to one after the other."""
     left = np.arange(len(q))
@@ -203,7 +203,7 @@ def _with_a_way(
         if not len(design.rows):
             raise _needless(design)
         design = replace(design, rows=left[design.rows])
-        told("path", turn, _ROUNDS)
+        progress("path", turn, _ROUNDS)
         route = ordered(cell, request.start_q, q[design.rows], request.seed)
         if not route.unreachable:
             return _Chosen(design, route, tuple(given_up))
