@@ -215,7 +215,7 @@ def test_a_session_about_one_axis_is_pointed_here_and_gets_its_missing_stops(one
         ("ur5e", {}, ("--start-joints", "1,2"), "--start-joints"),
         ("ur5e", {}, ("--floor", "high"), "--floor"),
         ("ur5e", {}, ("--wish-mm", "-1"), "above zero"),
-        ("ur5e", {}, ("--robot", "ur3"), "--robot has no use here"),
+        ("ur5e", {}, ("--robot", "ur3"), "--robot: robot ur5e is named already"),
     ],
 )
 def test_what_cannot_be_planned_is_refused_by_name(source, cell, more, words, tmp_path):

@@ -13,6 +13,7 @@ from visioncal.calibration.guess import Candidate, Guess
 from visioncal.calibration.pipeline.guess_inputs import guess_session
 from visioncal.cli.console import messages
 from visioncal.cli.guessed import print_guess
+from visioncal.cli.numbers import size_in
 from visioncal.cli.options import Force
 from visioncal.cli.pose_options import UNITS, RobotPoseOptions, names_in, poses_option
 from visioncal.cli.progress import shown_progress
@@ -121,7 +122,7 @@ class ConvertOptions(RobotPoseOptions):
             target=self.target,
             intrinsics=self.intrinsics,
             images=self.images,
-            resolution=_size(self.resolution),
+            resolution=None if self.resolution is None else size_in(self.resolution),
             tip=self.tip,
         )
 
@@ -154,18 +155,6 @@ def convert_command(
     for warning in session.warnings:
         messages().print(escape(f"note: {warning}"))
     messages().print(escape(f"wrote {dest}\nsha256 {session.digest()}"))
-
-
-def _size(words: str | None) -> tuple[int, int] | None:
-    if words is None:
-        return None
-    sides = words.replace("x", ",").split(",")
-    if len(sides) != 2 or not all(it.strip().isdecimal() and len(it) < 7 for it in sides):
-        raise DataError(
-            f"--resolution is {words[:40]!r}; width and height are needed, as 1280,800.",
-            culprits=["--resolution"],
-        )
-    return int(sides[0]), int(sides[1])
 
 
 def _chosen(recorded: InDoubt | Foreign, *, yes: bool) -> Candidate:

@@ -4,6 +4,9 @@ import math
 
 from visioncal.core.errors import DataError
 
+# Digits of the width or height of an image, and more than any has.
+_MOST_DIGITS = 6
+
 
 def numbers_in(words: str, option: str, form: str) -> tuple[float, ...]:
     """Reads an option of numbers.
@@ -26,3 +29,22 @@ def numbers_in(words: str, option: str, form: str) -> tuple[float, ...]:
             culprits=[option],
         )
     return values
+
+
+def size_in(words: str, option: str = "--resolution") -> tuple[int, int]:
+    """Reads the width and height of images [px], written as 1280,800 or 1280x800.
+
+    Raises:
+        DataError: It is not two whole numbers above 0.
+    """
+    sides = words.replace("x", ",").split(",")
+    numbers = [
+        int(it) for it in sides if it.strip().isdecimal() and len(it.strip()) <= _MOST_DIGITS
+    ]
+    if len(sides) != 2 or len(numbers) != 2 or min(numbers) < 1:
+        raise DataError(
+            f"{option} is {words[:40]!r}; width and height of the images are needed [px], two "
+            "whole numbers above 0, as 1280,800.",
+            culprits=[option],
+        )
+    return numbers[0], numbers[1]

@@ -202,9 +202,9 @@ class CellOptions:
         _doubt("--noise-deg", help="The same of its rotation; else 0.003, or as recorded."),
     ] = None
 
-    def given(self, *names: str) -> list[str]:
-        """Those of some options that were given."""
-        return [f"--{it}" for it in names if getattr(self, it) is not None]
+    def options(self, *names: str) -> dict[str, object]:
+        """Some of them by their names; None for those that were not given."""
+        return {f"--{it}": getattr(self, it) for it in names}
 
 
 @dataclass(frozen=True)

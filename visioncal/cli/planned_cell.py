@@ -8,8 +8,9 @@ from typing import TypeAlias
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.cli.numbers import numbers_in
+from visioncal.cli.numbers import numbers_in, size_in
 from visioncal.cli.plan_options import CellOptions
+from visioncal.cli.refusing import refuse_given
 from visioncal.core.errors import DataError
 from visioncal.core.files import absence, read_bytes, some_of
 from visioncal.core.transforms import compose
@@ -113,10 +114,12 @@ def begun_session(source: Source, words: CellOptions, kept: Kept, progress: Prog
             culprits=["--add"],
             next_step="Name the session, or ask for a plan of its own with --stops.",
         )
-    _refuse(words.given("target", "camera", "resolution", "mount"), "the session has its own")
+    refuse_given(
+        words.options("target", "camera", "resolution", "mount"), "the session has its own"
+    )
     if words.robot is not None:
         session = _with_robot(session, words.robot)
-    guess = _guess(words) if words.given("cam", "board") else None
+    guess = _guess(words) if words.cam or words.board else None
     found = so_far(session, progress=progress)
     begun = begin(found, guess=guess, limits=kept[0], boxes=kept[1])
     return replace(begun, cell=_with_noise(begun.cell, words))
@@ -129,7 +132,7 @@ def cell_of(source: Source, words: CellOptions, kept: Kept) -> PlanCell:
         DataError: Something is missing or cannot be read.
     """
     if source.calibration is not None:
-        _refuse(words.given("camera", "resolution", "mount"), "the calibration has its own")
+        refuse_given(words.options("camera", "resolution", "mount"), "the calibration has its own")
         return _with_noise(_calibrated(source.calibration, source.session, words, kept), words)
     # What is written wrongly is told before what is missing.
     numbers = _camera_numbers(words.camera)
@@ -145,7 +148,7 @@ def cell_of(source: Source, words: CellOptions, kept: Kept) -> PlanCell:
             culprits=missing,
             next_step="Or plan from a session or a calibration of the cell, which say it all.",
         )
-    _refuse(words.given("robot"), f"{source.words} is named already")
+    refuse_given(words.options("robot"), f"{source.words} is named already")
     camera = _camera(str(words.camera), words.resolution)
     guess = _guess(words)
     cell = PlanCell(
@@ -186,16 +189,6 @@ def _holds_a_result(path: Path) -> bool:
     return isinstance(document, dict) and "transforms" in document
 
 
-def _refuse(given: list[str], why: str) -> None:
-    if given:
-        verb = "has" if len(given) == 1 else "have"
-        raise DataError(
-            f"{some_of(given)} {verb} no use here: {why}.",
-            culprits=given,
-            next_step="Leave it out.",
-        )
-
-
 def _with_robot(session: Session, name: str) -> Session:
     document = {**session.document, "robot": {**session.document.get("robot", {}), "model": name}}
     return Session.assemble(
@@ -230,7 +223,7 @@ def _calibrated(
         cell = replace(cell, x=pose_of(words.cam, "--cam"))
     if words.board is not None:
         cell = replace(cell, z=pose_of(words.board, "--board"))
-    if not words.given("cam", "board"):
+    if words.cam is None and words.board is None:
         return cell
     return replace(
         cell, sigma_m=1e-3 * words.guess_mm, sigma_rad=float(np.deg2rad(words.guess_deg))
@@ -304,10 +297,4 @@ def _size(words: str | None) -> tuple[int, int]:
             "--resolution is needed beside this --camera: width and height of the images [px].",
             culprits=["--resolution"],
         )
-    width, height = numbers_in(words, "--resolution", "w,h")
-    if min(width, height) < 1 or width != int(width) or height != int(height):
-        raise DataError(
-            f"--resolution is {words[:80]!r}; two whole numbers above 0 are needed, as 1280,800.",
-            culprits=["--resolution"],
-        )
-    return int(width), int(height)
+    return size_in(words)

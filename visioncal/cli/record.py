@@ -15,7 +15,7 @@ from rich.markup import escape
 
 from visioncal.cli.console import messages
 from visioncal.cli.interrupts import ended_like_ctrl_c
-from visioncal.cli.numbers import numbers_in
+from visioncal.cli.numbers import size_in
 from visioncal.cli.options import AsJson, View
 from visioncal.cli.recorded_cell import CellOptions, Scene, facts_of, guided, scene_of, shown_in
 from visioncal.core.errors import DataError, DriverError
@@ -110,8 +110,7 @@ class DeviceOptions:
         Raises:
             DataError: The resolution is not two numbers.
         """
-        size = self.resolution and numbers_in(self.resolution, "--resolution", "w,h")
-        resolution = (int(size[0]), int(size[1])) if size else None
+        resolution = None if self.resolution is None else size_in(self.resolution)
         return DeviceWishes(resolution, self.exposure_us, self.gain, self.focus)
 
 

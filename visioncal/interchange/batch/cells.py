@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -22,8 +23,8 @@ _NUMBERS: Mapping[str, tuple[str, float]] = {
 }
 # That of the names that a key takes, and what they stand for.
 _NAMES: Mapping[str, tuple[str, Mapping[str, Any]]] = {
-    "robot": ("robot", {name: lambda name=name: name for name in ARMS}),
-    "mount": ("mount", {it: lambda it=it: it for it in ("eye-in-hand", "eye-to-hand")}),
+    "robot": ("robot", {it: partial(str, it) for it in ARMS}),
+    "mount": ("mount", {it: partial(str, it) for it in ("eye-in-hand", "eye-to-hand")}),
     "camera": ("camera", CAMERAS),
     "board": ("target", TARGETS),
 }
