@@ -4,6 +4,7 @@ import base64
 import re
 import shutil
 from dataclasses import replace
+from html import unescape
 from pathlib import Path
 
 import cv2
@@ -20,6 +21,7 @@ from visioncal.core.types import Target
 from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import load_stored
 from visioncal.present.recording import write_recording
+from visioncal.present.recording.notes import view_markdown
 from visioncal.present.report import write_report
 from visioncal.present.report.advice import listed, suspects
 from visioncal.present.report.page import render
@@ -34,6 +36,7 @@ from visioncal.results import (
     Verdict,
     VerdictStatus,
 )
+from visioncal.results.parts import worst_view
 from visioncal.robot import load_robot
 from visioncal.session import MemoryImages
 from visioncal.simulation import CellOptions, simulate, write_session
@@ -311,9 +314,26 @@ def outputs(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_report_made_again_is_the_same(outputs: Path, tmp_path: Path, name: str) -> None:
     stored = load_stored(outputs / name)
     write_report(
-        tmp_path / "again.html", stored.calibration, stored.session, stored.evidence, stored.note
+        tmp_path / "again.html",
+        stored.calibration,
+        stored.session,
+        stored.evidence,
+        stored.note,
+        stored.review,
     )
     assert (tmp_path / "again.html").read_bytes() == (outputs / "report.html").read_bytes()
+
+
+def test_views_lead_to_the_recording_and_back(sample: Sample, outputs: Path) -> None:
+    page = (outputs / "report.html").read_text(encoding="utf-8")
+    worst = worst_view(sample.calibration.views, sample.calibration.rms)
+    assert f"visioncal review '{outputs}' --view {worst}" in unescape(page)
+    for it in sample.calibration.views:
+        anchor = f"view-{it.view}"
+        assert f'id="{anchor}"' in page
+        assert f"(report.html#{anchor})" in view_markdown(it)
+    # Where there is no recording, nothing leads to it.
+    assert "visioncal review" not in render(sample.calibration, None, ())
 
 
 def test_report_without_its_recording_says_so(outputs: Path, tmp_path: Path) -> None:

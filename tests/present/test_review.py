@@ -20,6 +20,8 @@ from support import browser
 from support.commands import visioncal
 from support.samples import made_up
 
+from visioncal.interchange.result_files import load_result
+from visioncal.present import viewer
 from visioncal.present.recording import write_recording
 from visioncal.present.viewer import blueprint
 
@@ -106,6 +108,22 @@ def test_what_cannot_be_reviewed_is_refused_with_the_next_step(tmp_path):
         done = visioncal("review", path)
         assert done.status == 2
         assert words in done.err
+
+
+def test_it_opens_at_the_worst_view_or_at_the_named_one(out, monkeypatch):
+    opened = []
+    monkeypatch.setattr(viewer, "review_native", lambda _, row: opened.append(row))
+    views = load_result(out / "recording.rrd").views
+    assert visioncal("review", out).status == 0
+    worst = views[opened[0]]
+    assert not worst.used
+    assert worst.residual_mm == max(it.residual_mm or 0.0 for it in views)
+    # Views are numbered as the session says, and stand in its order.
+    assert visioncal("review", out, "--view", views[3].view).status == 0
+    assert opened[1] == 3
+    refused = visioncal("review", out, "--view", "99")
+    assert refused.status == 2
+    assert "no view 99" in refused.err
 
 
 def test_options_of_the_server_belong_to_it(out):
@@ -198,17 +216,28 @@ def test_a_browser_draws_it_and_asks_nobody_else(out, tmp_path):
         shaded = len(np.unique(cell.reshape(-1, 3), axis=0)) > 1000
         return shaded and bool(np.mean(np.all(np.abs(image.astype(int) - 150) < 4, axis=2)) > 0.1)
 
+    def moved(now: np.ndarray, before: np.ndarray) -> bool:
+        # The words about the view, at the lower right.
+        height, width = now.shape[:2]
+        part = np.s_[6 * height // 7 : -40, width // 2 :]
+        return bool(np.mean(np.any(now[part] != before[part], axis=2)) > 0.005)
+
     with served(out) as (process, url):
         with browser.chromium(tmp_path / "profile") as page:
             assert not drawn(page.picture())
             page.visit(url)
             picture = page.picture_once(drawn, patience_s=90)
+            # The viewer goes where the address says.
+            page.call("Runtime.evaluate", expression="location.hash = '#when=view@0'")
+            elsewhere = page.picture_once(lambda it: moved(it, picture), patience_s=30)
             requested = page.requested
         process.send_signal(signal.SIGTERM)
         assert process.wait(timeout=60) == 0
     assert drawn(picture)
-    assert f"{url}recording.rrd" in requested
-    assert [it for it in requested if not it.startswith((url, "data:", "blob:"))] == []
+    server = url.partition("#")[0]
+    assert f"{server}recording.rrd" in requested
+    assert [it for it in requested if not it.startswith((server, "data:", "blob:"))] == []
+    assert moved(elsewhere, picture)
 
 
 STUB = """

@@ -76,7 +76,14 @@ def report_command(
         write_cell_report(out, stored.calibration.cell)
         messages().print(f"wrote {escape(str(out))}")
         return
-    write_report(out, stored.calibration, stored.session, stored.evidence, stored.note)
+    write_report(
+        out,
+        stored.calibration,
+        stored.session,
+        stored.evidence,
+        stored.note,
+        stored.review,
+    )
     if stored.note:
         messages().print(escape(stored.note))
     messages().print(f"wrote {escape(str(out))}")

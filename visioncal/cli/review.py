@@ -1,6 +1,7 @@
 """`visioncal review`."""
 
 import webbrowser
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -8,8 +9,10 @@ import typer
 
 from visioncal.cli.console import messages
 from visioncal.core.errors import DataError
-from visioncal.core.files import absence
+from visioncal.core.files import absence, some_of
 from visioncal.interchange.outputs import PREVIEW, RECORDING
+from visioncal.interchange.result_files import load_result
+from visioncal.results.parts import worst_view
 
 # The first bytes of every recording that rerun writes.
 _MAGIC = b"RRF2"
@@ -30,6 +33,10 @@ def review_command(
     no_open: Annotated[
         bool, typer.Option("--no-open", help="With --web: print the URL and open no browser.")
     ] = False,
+    view: Annotated[
+        int | None,
+        typer.Option("--view", help="The number of the view to open it at. Default: the worst."),
+    ] = None,
 ) -> None:
     """Open a recording in the rerun viewer, on this machine alone.
 
@@ -41,8 +48,9 @@ def review_command(
     # Half a second, which help need not wait for.
     from visioncal.present.viewer import review_native, review_web
 
+    row = _row(file, view)
     if not web:
-        review_native(file)
+        review_native(file, row)
         return
 
     def opened(url: str) -> None:
@@ -52,7 +60,31 @@ def review_command(
         if not no_open and not webbrowser.open(url):
             messages().print("No browser could be opened; visit the address above.")
 
-    review_web(file, port or 0, opened)
+    review_web(file, port or 0, opened, row)
+
+
+def _row(file: Path, view: int | None) -> int | None:
+    """The place among its views at which a recording is opened; None for the first.
+
+    Raises:
+        DataError: The session in it has no such view.
+    """
+    from visioncal.present.recording import read_session
+
+    if view is None:
+        # A plan, and a session that is not calibrated yet, have no worst view.
+        with suppress(DataError):
+            result = load_result(file)
+            view = worst_view(result.views, result.rms)
+        if view is None:
+            return None
+    numbers = [it.number for it in read_session(file).views]
+    if view not in numbers:
+        raise DataError(
+            f"{file} has no view {view}; it has {some_of([*map(str, numbers)])}.",
+            culprits=["--view"],
+        )
+    return numbers.index(view)
 
 
 def find_recording(path: Path) -> Path:

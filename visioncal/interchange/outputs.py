@@ -1,6 +1,7 @@
 """What `calibrate`, `align`, `verify`, `plan` and `dynamics` write into a folder."""
 
 import json
+import shlex
 import traceback
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -29,6 +30,12 @@ ALIGNMENT = "alignment.json"
 STOPS, PLAN, PROGRAM, PREVIEW = "stops.csv", "plan.json", "plan.script", "plan.rrd"
 
 _Writer: TypeAlias = Callable[[Path], None]
+
+
+def review_command(recording: Path) -> str:
+    """The command that opens a recording, which the folder of its result stands for."""
+    named = recording.parent if recording.name == RECORDING else recording
+    return f"visioncal review {shlex.quote(str(named))}"
 
 
 @dataclass(frozen=True)
@@ -91,7 +98,9 @@ def write_outputs(
         # for.
         from visioncal.present.report import write_report
 
-        write_report(path, run.calibration, session, run.evidence, note)
+        kept = session is not None and RECORDING not in without
+        review = review_command(folder / RECORDING) if kept else ""
+        write_report(path, run.calibration, session, run.evidence, note, review)
 
     drawings: dict[str, _Writer] = {REPORT: report}
     if session is not None:

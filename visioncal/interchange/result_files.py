@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import absence, read_bytes
-from visioncal.interchange.outputs import CALIBRATION, RECORDING
+from visioncal.interchange.outputs import CALIBRATION, RECORDING, review_command
 from visioncal.results import Alignment, Calibration, FrameFile, to_document
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
@@ -32,12 +32,14 @@ class Stored:
         session: What it was computed from; None where it was not kept.
         evidence: What was seen and computed of each view; empty likewise.
         note: Why something is missing, in words for the user; empty where nothing is.
+        review: The command that opens the recording; empty where there is none.
     """
 
     calibration: Calibration
     session: Session | None
     evidence: tuple[ViewEvidence, ...]
     note: str = ""
+    review: str = ""
 
 
 def load_calibration(
@@ -197,7 +199,8 @@ def load_stored(path: Path) -> Stored:
 def _with_recording(calibration: Calibration, recording: Path) -> Stored:
     from visioncal.present.recording import read_evidence, read_session
 
-    return Stored(calibration, read_session(recording), read_evidence(recording))
+    session, evidence = read_session(recording), read_evidence(recording)
+    return Stored(calibration, session, evidence, review=review_command(recording))
 
 
 def _alone(calibration: Calibration, why: str) -> Stored:

@@ -1,6 +1,6 @@
 """What a calibration is made of, beside its transforms."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -106,6 +106,26 @@ class Rms:
     mm: float
     deg: float | None = None
     px: float | None = None
+
+
+def worst_view(views: Sequence[ViewResult], rms: Rms) -> int | None:
+    """The number of the view that is farthest off, used or not; None where none is known.
+
+    Args:
+        views: What became of each.
+        rms: Residuals of the used ones, in units of which millimetres, degrees and pixels compare.
+    """
+
+    def off(view: ViewResult) -> float:
+        pairs = (
+            (view.residual_mm, rms.mm),
+            (view.residual_deg, rms.deg),
+            (view.rms_px, rms.px),
+        )
+        return max((value / typical for value, typical in pairs if value and typical), default=0.0)
+
+    worst = max(views, key=off, default=None)
+    return worst.view if worst is not None and off(worst) else None
 
 
 @dataclass(frozen=True)

@@ -260,7 +260,8 @@ def view_markdown(view: ViewResult) -> str:
         ("orientation residual", view.residual_deg, " deg"),
     )
     known = [f"{label} {value:.3g}{unit}" for label, value, unit in figures if value is not None]
-    return "\n".join([*lines, ", ".join(known)])
+    row = f"[report.html](report.html#view-{view.view})"
+    return "\n".join([*lines, ", ".join(known), "", f"Among all views: {row}, view {view.view}"])
 
 
 def plain(text: str) -> str:

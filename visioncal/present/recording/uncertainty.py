@@ -105,12 +105,12 @@ class Uncertainty:
             line_radii=_LINE * self.size_m,
         )
         stream.log(entity, frame, ellipsoid, static=True)
-        if child not in (paths.CAM_FRAME, paths.TARGET_FRAME, *self.frames.values()):
+        if child not in (paths.TARGET_FRAME, *self.frames.values()):
             # All are drawn alike, and tools are close to the camera: more labels would hide them.
             return
-        # Above the camera and beside the board, clear of the name of the frame.
+        # Beside the board, clear of the name of the frame.
         label = rr.Points3D(
-            [[0.0, -1.2 * _SHARE * self.size_m, 0.0]],
+            [[0.0, -2.0 * _SHARE * self.size_m, 0.0]],
             radii=0.0,
             colors=colours.UNCERTAINTY,
             labels=f"95 %, {self.factor} x",

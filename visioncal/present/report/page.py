@@ -42,6 +42,7 @@ def write_report(
     session: Session | None,
     evidence: Sequence[ViewEvidence],
     note: str = "",
+    review: str = "",
 ) -> None:
     """Writes the report as one HTML file that needs no network and no script.
 
@@ -54,11 +55,13 @@ def write_report(
         session: Where its images and joint angles are; without it the report shows none.
         evidence: What was seen and computed of each view, in any order.
         note: What the reader should know of this report itself.
+        review: The command that opens the recording, to which the number of a view is added; empty
+            where there is none.
 
     Raises:
         DataError: The file cannot be written, or what was found beside the edges cannot be read.
     """
-    write_atomically(path, render(calibration, session, evidence, note))
+    write_atomically(path, render(calibration, session, evidence, note, review))
 
 
 def render(
@@ -66,11 +69,13 @@ def render(
     session: Session | None,
     evidence: Sequence[ViewEvidence],
     note: str = "",
+    review: str = "",
 ) -> str:
     """Renders the report as HTML text; see `write_report`."""
     return template("report.html.j2").render(
         calibration=calibration,
         note=note,
+        review=f"{review} --view" if review else "",
         version=__version__,
         python=platform.python_version(),
         versions=content.dependency_versions(),

@@ -1,23 +1,37 @@
 """A recording in rerun's native viewer."""
 
+import socket
+import time
 from pathlib import Path
+from subprocess import Popen
+from threading import Thread
+
+from rerun.experimental import ViewerClient
 
 from visioncal.core.errors import DriverError
+from visioncal.present.recording import paths
 from visioncal.present.viewer.process import until_interrupted, viewer_process
 
+# How long a recording is waited for, and how often it is asked for.
+_PATIENCE_S, _AGAIN_S = 60.0, 0.2
 
-def review_native(recording: Path) -> None:
+
+def review_native(recording: Path, row: int | None = None) -> None:
     """Shows a recording in a window, until that is closed or Ctrl-C or SIGTERM comes.
 
     Args:
         recording: The `.rrd`.
+        row: The place of the view to open it at; None for the first.
 
     Raises:
         DriverError: The viewer cannot be shown here.
     """
     # The viewer listens to other programs, on this machine only.
-    arguments = ("--bind", "127.0.0.1", "--port", "auto", str(recording.absolute()))
+    port = _free_port()
+    arguments = ("--bind", "127.0.0.1", "--port", str(port), str(recording.absolute()))
     with until_interrupted(), viewer_process(*arguments) as process:
+        if row is not None:
+            Thread(target=_seek, args=(process, port, row), daemon=True).start()
         said, _ = process.communicate()
         if process.returncode != 0:
             last = said.strip().splitlines()[-1:] or ["it did not say why"]
@@ -25,3 +39,22 @@ def review_native(recording: Path) -> None:
                 f"rerun's viewer ended with status {process.returncode}: {last[0]}.",
                 next_step="Without a display, show the recording in a browser: --web.",
             )
+
+
+def _free_port() -> int:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
+
+
+def _seek(process: Popen[str], port: int, row: int) -> None:
+    """Goes to a view once the viewer has the recording; where it never has, it stays as it is."""
+    end = time.monotonic() + _PATIENCE_S
+    while process.poll() is None and time.monotonic() < end:
+        try:
+            viewer = ViewerClient(f"rerun+http://127.0.0.1:{port}/proxy")
+            viewer.set_time(paths.TIMELINE, sequence=row, play_state="paused")
+        except (OSError, RuntimeError, ValueError):
+            time.sleep(_AGAIN_S)
+        else:
+            return

@@ -17,12 +17,14 @@ from typing import Any, BinaryIO
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes
+from visioncal.present.recording import paths
 from visioncal.present.viewer.assets import MODULE, SCRIPT, viewer_assets
 from visioncal.present.viewer.process import until_interrupted
 
 _HOST = "127.0.0.1"
 _PAGE, _STYLE, _STARTER, _RECORDING = "review.html", "review.css", "review.js", "recording.rrd"
-_JAVASCRIPT = "text/javascript; charset=utf-8"
+_REPORT = "report.html"
+_HTML, _JAVASCRIPT = "text/html; charset=utf-8", "text/javascript; charset=utf-8"
 
 _HEADERS = {
     "Content-Security-Policy": "; ".join(
@@ -68,20 +70,24 @@ class _Route:
         return file, self.source.stat().st_size
 
 
-def review_web(recording: Path, port: int, opened: Callable[[str], None]) -> None:
+def review_web(
+    recording: Path, port: int, opened: Callable[[str], None], row: int | None = None
+) -> None:
     """Serves a recording with the viewer to this machine, until Ctrl-C or SIGTERM comes.
 
     Args:
         recording: The `.rrd`.
         port: Where to listen; 0 for any free port.
         opened: Called with the page's URL once it can be visited.
+        row: The place of the view to open it at; None for the first.
 
     Raises:
         DataError: The port cannot be had.
         DriverError: Rerun's command does not hand out its web viewer.
     """
     with until_interrupted(), _server(_routes(recording), port) as server:
-        opened(f"http://{_HOST}:{server.server_port}/")
+        at = "" if row is None else f"#when={paths.TIMELINE}@{row}"
+        opened(f"http://{_HOST}:{server.server_port}/{at}")
         server.serve_forever()
 
 
@@ -89,8 +95,11 @@ def _routes(recording: Path) -> dict[str, _Route]:
     """All that can be asked for; no path is ever made of a request."""
     own = {name: read_bytes(Path(__file__).with_name(name)) for name in (_PAGE, _STYLE, _STARTER)}
     assets = viewer_assets()
-    return {
-        "/": _Route("text/html; charset=utf-8", own[_PAGE]),
+    report = recording.with_name(_REPORT)
+    # What the notes of the views lead to.
+    beside = {f"/{_REPORT}": _Route(_HTML, report)} if report.is_file() else {}
+    return beside | {
+        "/": _Route(_HTML, own[_PAGE]),
         f"/{_STYLE}": _Route("text/css; charset=utf-8", own[_STYLE]),
         f"/{_STARTER}": _Route(_JAVASCRIPT, own[_STARTER]),
         f"/{SCRIPT}": _Route(_JAVASCRIPT, assets[SCRIPT]),
