@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from visioncal.robot import Loads
     from visioncal.robot.thermal import OnlineCompensator
     from visioncal.session import Session
+    from visioncal.session.shared_arm import join_sessions
     from visioncal.simulation import CellOptions, simulate, write_session
     from visioncal.vision.finders.identify import identify
     from visioncal.vision.targets import load_target
@@ -82,6 +83,7 @@ _HOMES = {
     "export": "visioncal.interchange.exports",
     "identify": "visioncal.vision.finders.identify",
     "load_target": "visioncal.vision.targets",
+    "join_sessions": "visioncal.session.shared_arm",
     "locate": "visioncal.frames.locate",
     "locate_target": "visioncal.frames.locate",
     "locate_views": "visioncal.frames.picks",
@@ -127,6 +129,7 @@ __all__ = [
     "doctor",
     "export",
     "identify",
+    "join_sessions",
     "load_target",
     "locate",
     "locate_target",

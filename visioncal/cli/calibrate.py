@@ -1,6 +1,7 @@
 """`visioncal calibrate`."""
 
 import json
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -13,22 +14,31 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.running import check_dense, check_solver
 from visioncal.cli.align import align_into
 from visioncal.cli.console import messages, tell_written
-from visioncal.cli.options import AsJson, NeedOptions, OutFolder, SessionArgument
+from visioncal.cli.options import AsJson, NeedOptions, OutFolder
 from visioncal.cli.pointing import naming
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.summary import print_summary
 from visioncal.cli.working import WorkOptions
+from visioncal.core.errors import DataError
 from visioncal.core.types import SolverName
 from visioncal.interchange.merge_results import leftover
-from visioncal.interchange.outputs import write_outputs
+from visioncal.interchange.outputs import RECORDING, write_outputs
 from visioncal.results import to_document
 from visioncal.results.whole import whole_document
 from visioncal.robot import Convention
+from visioncal.session import Session
+from visioncal.session.shared_arm import join_sessions
 from visioncal.session.single import is_whole_cell
 
 
 def calibrate_command(
-    session: SessionArgument,
+    sessions: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SESSION...",
+            help="A session's folder, or its .rrd recording; several with --robot-shared.",
+        ),
+    ],
     need: NeedOptions,
     work: WorkOptions,
     out: OutFolder = Path("out"),
@@ -50,6 +60,14 @@ def calibrate_command(
             help="Of the arm's joint table in the result; the stated one where it is left out."
         ),
     ] = None,
+    robot_shared: Annotated[
+        bool,
+        typer.Option(
+            "--robot-shared",
+            help="Several sessions of one arm, each with a camera and a board of its own: the arm "
+            "is calibrated from all of them.",
+        ),
+    ] = False,
     dense: Annotated[
         bool,
         typer.Option(
@@ -76,8 +94,10 @@ def calibrate_command(
     --robot, --target).
     """
     without = work.left_out
+    # Of several sessions, the recording is the session of them all.
+    session = sessions[0] if len(sessions) == 1 else out / RECORDING
     with naming(session, out):
-        loaded = need.session(session)
+        loaded = _joined([need.session(it) for it in sessions], shared=robot_shared)
     if is_whole_cell(loaded):
         check_solver(RunState(loaded, solver=solver))
         if dense:
@@ -122,3 +142,13 @@ def calibrate_command(
     if left is not None:
         messages().print(escape(left.words))
     tell_written(written, quiet=as_json)
+
+
+def _joined(sessions: Sequence[Session], *, shared: bool) -> Session:
+    if len(sessions) == 1 or shared:
+        return join_sessions(sessions)
+    raise DataError(
+        f"{len(sessions)} sessions are given, and one is calibrated at a time.",
+        culprits=[it.name for it in sessions],
+        next_step="visioncal batch calibrates each by itself; --robot-shared one arm from all.",
+    )

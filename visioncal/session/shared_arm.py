@@ -1,0 +1,196 @@
+"""Several sessions of one arm as one of a whole cell: the arm is shared, all else is each its own.
+
+The more sessions an arm is calibrated from, the more of its joints' range they cover, whichever
+camera and board each of them had. Nothing of the cells is taken for the same but the arm: every
+session keeps a camera, a board and their frames of its own.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from visioncal.core.errors import DataError
+from visioncal.core.files import some_of
+from visioncal.session.boards import COLUMN as TARGET
+from visioncal.session.corners import CornerTable
+from visioncal.session.images import ImageStore
+from visioncal.session.selecting import has_several
+from visioncal.session.session import Session
+from visioncal.session.table import View
+
+# Tables of session.toml that a session of the whole cell has by name, or of the arm alone.
+_NAMED = ("camera", "target", "mount", "frames", "clock", "clocks", "prior", "name")
+# Between two sessions whose clocks overlap [s]: long enough for a robot to be as cold as before.
+_BETWEEN_S = 86_400.0
+
+
+@dataclass(frozen=True, eq=False)
+class JoinedImages:
+    """The images of several sessions, each below a folder of its session's name."""
+
+    stores: Mapping[str, ImageStore]
+
+    def read(self, path: str) -> bytes:
+        """Reads the bytes of one image file."""
+        store, name = self._of(path)
+        return store.read(name)
+
+    def sha256(self, path: str) -> str:
+        """Digest of the bytes of an image; empty where there is none."""
+        store, name = self._of(path)
+        return store.sha256(name)
+
+    def absence(self, path: str) -> str:
+        """Says why there is no such image; empty where there is one."""
+        store, name = self._of(path)
+        return store.absence(name)
+
+    def exists(self, path: str) -> bool:
+        """Tells whether there is such an image."""
+        return not self.absence(path)
+
+    def _of(self, path: str) -> tuple[ImageStore, str]:
+        first, _, rest = path.partition("/")
+        return self.stores[first], rest
+
+
+def join_sessions(sessions: Sequence[Session]) -> Session:
+    """Joins sessions of one arm.
+
+    Args:
+        sessions: Of one camera and one board each, with the same robot; their cameras and boards
+            are named s1, s2, ... in this order.
+
+    Returns:
+        The session of a cell with that robot, a camera and a board a session. Stops and views are
+        numbered anew, one session after the other; times that overlap are moved apart.
+
+    Raises:
+        DataError: One is a whole cell, has streams or no robot, or the robots differ.
+    """
+    if len(sessions) == 1:
+        return sessions[0]
+    for session in sessions:
+        _check(session, sessions[0])
+    names = [f"s{at}" for at in range(1, len(sessions) + 1)]
+    by_name = dict(zip(names, sessions, strict=True))
+    document = {it: value for it, value in sessions[0].document.items() if it not in _NAMED}
+    document |= {
+        "name": " + ".join(it.name for it in sessions),
+        "cameras": {name: it.document.get("camera", {}) for name, it in by_name.items()},
+        "targets": {name: it.document["target"] for name, it in by_name.items()},
+        "frames": dict(_frames(by_name)),
+    }
+    if clocks := {name: it.document["clock"] for name, it in by_name.items() if _has_clock(it)}:
+        document["clocks"] = clocks
+    if priors := dict(_priors(by_name)):
+        document["prior"] = priors
+    columns = list(dict.fromkeys(name for it in sessions for name in it.columns))
+    columns += [it for it in ("stop", "camera", TARGET) if it not in columns]
+    rows: list[list[str]] = []
+    tables: list[CornerTable] = []
+    views, stops, until_s = 0, 0, -np.inf
+    for name, session in by_name.items():
+        later_s = _later(session, until_s)
+        for view in session.views:
+            own = {
+                "view": str(views + view.number),
+                "stop": "" if view.stop is None else str(stops + view.stop),
+                "image": view.image and f"{name}/{view.image}",
+                "camera": name,
+                TARGET: name,
+            }
+            if view.stamp_s is not None:
+                own["stamp_s"] = repr(view.stamp_s + later_s)
+            rows.append([own.get(it, view.cell(it)) for it in columns])
+        if session.corner_table is not None:
+            tables.append(_moved(session.corner_table, views, name))
+        views += 1 + max((it.number for it in session.views), default=0)
+        stops += 1 + max((it.stop or 0 for it in session.views), default=0)
+        until_s = max([until_s, *(it + later_s for it in _stamps(session.views))])
+    return Session.assemble(
+        document,
+        columns,
+        rows,
+        JoinedImages({name: it.images for name, it in by_name.items()}),
+        target_document={name: it.target_document for name, it in by_name.items()},
+        robot_document=sessions[0].robot_document,
+        corners=_stacked(tables) if tables else None,
+    )
+
+
+def _check(session: Session, first: Session) -> None:
+    label = f"session {session.name!r}"
+    if has_several(session) or session.declaration.frames or session.target is None:
+        raise DataError(
+            f"{label}: only sessions of one camera and one board each are joined by their arm.",
+            culprits=[session.name],
+            next_step="Calibrate a whole cell by itself.",
+        )
+    if session.streams:
+        raise DataError(
+            f"{label} has streams ({some_of(list(session.streams))}), and sessions are joined "
+            "without.",
+            culprits=[session.name],
+            next_step="Take still views alone, or calibrate it by itself.",
+        )
+    if session.robot_document is None:
+        raise DataError(
+            f"{label} names no robot, and the arm is what the sessions share.",
+            culprits=["session.toml"],
+            next_step="Name it as [robot] model, and record its joint angles.",
+        )
+    if session.robot_document != first.robot_document:
+        raise DataError(
+            f"the robots of {first.name!r} and {session.name!r} differ.",
+            culprits=[session.name],
+            next_step="Join sessions of one arm alone; visioncal batch calibrates each by itself.",
+        )
+
+
+def _frames(by_name: Mapping[str, Session]) -> Iterator[tuple[str, str]]:
+    for name, session in by_name.items():
+        on = ("flange", "base") if session.mount == "eye-in-hand" else ("base", "flange")
+        yield f"cam_{name}", on[0]
+        yield f"target_{name}", on[1]
+
+
+def _priors(by_name: Mapping[str, Session]) -> Iterator[tuple[str, Any]]:
+    for name, session in by_name.items():
+        for edge, prior in session.document.get("prior", {}).items():
+            ends = [
+                f"{it}_{name}" if it in ("cam", "target") else it for it in edge.split("_from_")
+            ]
+            yield "_from_".join(ends), prior
+
+
+def _has_clock(session: Session) -> bool:
+    return "clock" in session.document
+
+
+def _stamps(views: Sequence[View]) -> list[float]:
+    return [it.stamp_s for it in views if it.stamp_s is not None]
+
+
+def _later(session: Session, until_s: float) -> float:
+    """By how much its times are moved to come after those before [s]."""
+    stamps = _stamps(session.views)
+    return until_s + _BETWEEN_S - min(stamps) if stamps and min(stamps) <= until_s else 0.0
+
+
+def _moved(table: CornerTable, views: int, target: str) -> CornerTable:
+    return replace(table, views=table.views + views, targets=(target,) * len(table))
+
+
+def _stacked(tables: Sequence[CornerTable]) -> CornerTable:
+    """All corners in one table; a sigma is stated of all or of none."""
+    sigmas = [it.sigmas_px for it in tables if it.sigmas_px is not None]
+    return CornerTable(
+        np.concatenate([it.views for it in tables]),
+        np.concatenate([it.points for it in tables]),
+        np.concatenate([it.px for it in tables]),
+        tuple(name for it in tables for name in it.targets),
+        np.concatenate(sigmas) if len(sigmas) == len(tables) else None,
+    )
