@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.beyond import an_error, moved, with_error, with_field
 from support.cells import session_of
 from support.marks import slow
 from support.picks import (
@@ -23,7 +24,7 @@ from visioncal.core.transforms import exp, invert, log
 from visioncal.frames.locate import locate, locate_target
 from visioncal.frames.located import Located
 from visioncal.frames.plane import Plane
-from visioncal.results import Calibration, CameraResult, Edge, Verdict, to_document
+from visioncal.results import Calibration, Edge, Verdict, to_document
 from visioncal.session import Session
 from visioncal.simulation import (
     CellOptions,
@@ -35,7 +36,7 @@ from visioncal.simulation import (
     wide_camera,
     write_session,
 )
-from visioncal.vision.camera import intrinsics, with_intrinsics
+from visioncal.vision.camera import intrinsics
 from visioncal.vision.finders.imaging import decode_image
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
@@ -54,41 +55,21 @@ def in_hand():
     return cell, calibration_of(cell)
 
 
-def moved(calibration: Calibration, step: np.ndarray) -> Calibration:
-    """The calibration after a (6 + k,) step of the camera's edge and its lens."""
-    name, camera = next(iter(calibration.edges)), calibration.camera.camera
-    edge = calibration.edges[name]
-    edges = {**calibration.edges, name: replace(edge, matrix=edge.matrix @ exp(step[:6]))}
-    lens = with_intrinsics(camera, intrinsics(camera) + step[6:])
-    return replace(calibration, edges=edges, camera=replace(calibration.camera, camera=lens))
-
-
-def with_error(calibration: Calibration, error: np.ndarray) -> Calibration:
-    """The calibration with the covariance of one (6 + k,) error of random size."""
-    name = next(iter(calibration.edges))
-    edge = replace(calibration.edges[name], covariance=np.outer(error[:6], error[:6]))
-    lens = error[6:]
-    between = np.concatenate([np.outer(lens, error[:6]), np.zeros((len(lens), 6))], axis=1)
-    camera = CameraResult(calibration.camera.camera, True, np.outer(lens, lens), between)
-    return replace(calibration, edges={**calibration.edges, name: edge}, camera=camera)
-
-
-def an_error(calibration: Calibration, seed: int) -> np.ndarray:
-    """A (6 + k,) error: some mrad, mm, pixels and thousandths of distortion."""
-    lens = 4 + len(calibration.camera.camera.distortion)
-    size = np.concatenate([np.full(6, 1e-3), np.full(4, 1.0), np.full(lens - 4, 1e-3)])
-    return size * np.random.default_rng(seed).standard_normal(len(size))
-
-
-def agrees_with_differences(part: np.ndarray, ahead: Located, behind: Located, step: float) -> None:
+def agrees_with_differences(
+    part: np.ndarray, ahead: Located, behind: Located, step: float, *, beyond: bool = False
+) -> None:
     slope = (ahead.p_base - behind.p_base) / (2 * step)
-    # Truncation of second order in a step of a thousandth, relative; rounding is less.
-    np.testing.assert_allclose(part, np.outer(slope, slope), atol=1e-4 * slope @ slope)
+    # Truncation of second order in a step of a thousandth, relative; rounding is less. A lens that
+    # breathes by a thousandth moves with its centre and the distance by as much less.
+    share = 5e-3 if beyond else 1e-4
+    np.testing.assert_allclose(part, np.outer(slope, slope), atol=share * slope @ slope)
 
 
+@pytest.mark.parametrize("beyond", [False, True], ids=["model", "field"])
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_what_moves_a_ray_agrees_with_central_differences(exact_cell, seed):
+def test_what_moves_a_ray_agrees_with_central_differences(exact_cell, seed, beyond):
     cell, calibration = exact_cell
+    calibration = with_field(calibration) if beyond else calibration
     rng = np.random.default_rng(seed)
     at = stand(cell, rng)
     place, px = seen_point(cell, at, rng)
@@ -100,22 +81,31 @@ def test_what_moves_a_ray_agrees_with_central_differences(exact_cell, seed):
         locate(moved(calibration, sign * step * error), px, plane, at.base_from_flange)[0]
         for sign in (1, -1)
     )
-    agrees_with_differences(found.parts["calibration"], ahead, behind, step)
+    agrees_with_differences(found.parts["calibration"], ahead, behind, step, beyond=beyond)
     pixels = [
         [locate(calibration, px + sign * shift, plane, at.base_from_flange)[0] for sign in (1, -1)]
         for shift in 0.1 * np.eye(2)
     ]
     jacobian = np.array([(a.p_base - b.p_base) / 0.2 for a, b in pixels]).T
-    # Truncation: a tenth of a pixel in a thousand, squared.
-    np.testing.assert_allclose(found.parts["pixels"], jacobian @ jacobian.T, rtol=1e-5, atol=1e-14)
+    # Truncation: a tenth of a pixel in a thousand, squared. The field is taken for flat where a
+    # pixel errs: by up to 0.3 px in a fifth of 1280.
+    apart = (1e-2 if beyond else 1e-5) * np.trace(jacobian @ jacobian.T)
+    np.testing.assert_allclose(found.parts["pixels"], jacobian @ jacobian.T, atol=apart)
 
 
+@pytest.mark.parametrize("beyond", [False, True], ids=["model", "field"])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_what_moves_a_target_agrees_with_central_differences(exact_cell, seed):
+def test_what_moves_a_target_agrees_with_central_differences(exact_cell, seed, beyond):
     cell, calibration = exact_cell
     rng = np.random.default_rng(seed)
     at, point = stand(cell, rng), np.array([0.1, 0.05, 0.02])
     corners = seen_corners(cell, before_camera(cell, BOARD, rng), BOARD, rng)
+    if beyond:
+        calibration = with_field(calibration)
+        # What the field displaces is seen so.
+        lens = calibration.camera
+        away = corners.px - lens.in_model(corners.px, 0.5)
+        corners = replace(corners, px=corners.px + away)
     error = an_error(calibration, seed)
     # Corners that fit the pose exactly move it with the lens as the normal equations say.
     found = locate_target(
@@ -128,7 +118,7 @@ def test_what_moves_a_target_agrees_with_central_differences(exact_cell, seed):
         )
         for sign in (1, -1)
     )
-    agrees_with_differences(found.parts["calibration"], ahead, behind, step)
+    agrees_with_differences(found.parts["calibration"], ahead, behind, step, beyond=beyond)
     larger, smaller = (
         locate_target(
             calibration,
@@ -142,7 +132,9 @@ def test_what_moves_a_target_agrees_with_central_differences(exact_cell, seed):
     slope = (larger.p_base - smaller.p_base) / (2 * step)
     sigma = BOARD.square_sigma_m / BOARD.square_m
     expected = sigma**2 * np.outer(slope, slope)
-    np.testing.assert_allclose(found.parts["target"], expected, atol=1e-4 * np.trace(expected))
+    # Corners that a field of another distance displaced fit no pose exactly.
+    share = 1e-2 if beyond else 1e-4
+    np.testing.assert_allclose(found.parts["target"], expected, atol=share * np.trace(expected))
 
 
 def test_the_robots_noise_at_the_stop_agrees_with_central_differences(in_hand):

@@ -87,7 +87,9 @@ def test_what_moves_a_sight_agrees_with_central_differences(mount, parent):
             replace(
                 eye,
                 edge=eye.edge @ exp(sign * step[:6]),
-                camera=with_intrinsics(camera, intrinsics(camera) + sign * step[6:]),
+                lens=replace(
+                    eye.lens, camera=with_intrinsics(camera, intrinsics(camera) + sign * step[6:])
+                ),
             )
             for sign in (1, -1)
         )
@@ -99,7 +101,7 @@ def test_what_moves_a_sight_agrees_with_central_differences(mount, parent):
     analytic = here.by_common[:, :15] @ np.array(steps).T
     # The fit of a pose stops at steps of 1e-6, whose next ones are a hundred times smaller.
     np.testing.assert_allclose(analytic, np.array(differences).T, atol=3e-8)
-    np.testing.assert_allclose(here.by_common[:, 15], scale, atol=1e-4)
+    np.testing.assert_allclose(here.by_common[:, len(eye.covariance)], scale, atol=1e-4)
     for at, twist in enumerate(1e-4 * np.eye(6)):
         ahead, behind = (
             replace(sight, base_from_flange=sight.base_from_flange @ exp(sign * twist))

@@ -188,7 +188,7 @@ def test_one_camera_robot_and_target_are_as_near_as_their_covariance_says(
         )
     error = np.concatenate(error)
     assert error @ np.linalg.solve(one.joint_covariance, error) < MOST_OF_TWELVE
-    assert one.camera is found.cell.cameras[f"cam_{camera}"]
+    assert one.camera.camera is found.cell.cameras[f"cam_{camera}"].camera
     assert one.robot.name == "ur5e"
     ends = (f"cam_{camera}", f"target_{target}")
     mine = [it.view for it in found.cell.sights if (it.seer, it.seen) == ends]

@@ -185,7 +185,7 @@ class Compressed:
         residuals: (n, 2) [px].
         by_field: (v, 6, m) how each pose moves with what is open of the lens beyond its model, by
             coefficients as large as the corners' noise; see `lens_field`.
-        field_freedom: How many coefficients of that the corners determine.
+        coefficients: What corners say of these coefficients; None where there are none.
     """
 
     cam_from_target: FloatArray
@@ -195,7 +195,12 @@ class Compressed:
     shared_pulls: FloatArray
     residuals: FloatArray
     by_field: FloatArray
-    field_freedom: float = 0.0
+    coefficients: Coefficients | None = None
+
+    @property
+    def field_freedom(self) -> float:
+        """How many coefficients of the lens beyond its model the corners determine."""
+        return 0.0 if self.coefficients is None else self.coefficients.freedom
 
     @property
     def shared_gradient(self) -> FloatArray:
@@ -277,7 +282,7 @@ def compress_points(
         left, residuals = roots[..., None] * left, roots * residuals
     flat = left.reshape(-1, left.shape[2])
     information = flat.T @ flat
-    poses, own, freedom = fit.cam_from_target, now.residuals, 0.0
+    poses, own, found = fit.cam_from_target, now.residuals, None
     answer, by_field = answer[:, :, :shared], answer[:, :, shared:]
     if by_field.shape[2]:
         found = Coefficients.of(
@@ -294,6 +299,6 @@ def compress_points(
         away = left[:, :, shared:] @ found.mean
         residuals, left = residuals + away, left[:, :, :shared]
         own = residuals if shares is None else now.residuals + away / roots
-        by_field, freedom = by_field @ found.open, found.freedom
+        by_field = by_field @ found.open
     pulls = stack.sum_by_view(np.einsum("nij,ni->nj", left, residuals))
-    return Compressed(poses, fit.information, answer, information, pulls, own, by_field, freedom)
+    return Compressed(poses, fit.information, answer, information, pulls, own, by_field, found)

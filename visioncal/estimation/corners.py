@@ -173,7 +173,8 @@ class CornerStack:
 
     def products_by_view(self, left: FloatArray, right: FloatArray) -> FloatArray:
         """Sums `left^T right` over the corners of each view: (n, 2, j), (n, 2, k) to (v, j, k)."""
-        rows_l, rows_r = left.reshape(-1, left.shape[2]), right.reshape(-1, right.shape[2])
+        rows = 2 * len(self.px)
+        rows_l, rows_r = left.reshape(rows, left.shape[2]), right.reshape(rows, right.shape[2])
         ends = 2 * np.append(self.starts[1:], len(self.px))
         return np.array(
             [

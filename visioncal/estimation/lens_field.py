@@ -57,7 +57,7 @@ def field_columns(px: FloatArray, resolution: tuple[int, int], length: float) ->
         _modes(at, extent / scale) for at, extent in zip(px.T / scale, resolution, strict=True)
     )
     sizes = np.outer(size_x, size_y)
-    order = np.argsort(-sizes, axis=None)
+    order = np.argsort(-sizes, axis=None, kind="stable")
     enough = int(np.searchsorted(np.cumsum(sizes.ravel()[order]), _KEPT * sizes.sum())) + 1
     at_x, at_y = np.unravel_index(order[:enough], sizes.shape)
     one = by_x[:, at_x] * by_y[:, at_y]
@@ -78,7 +78,8 @@ def _grid_modes(extent: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     grid = np.linspace(0.0, extent, _POINTS)
     values, vectors = np.linalg.eigh(np.exp(-0.5 * (grid[:, None] - grid) ** 2))
     kept = values > (1.0 - _KEPT) ** 2 * values[-1]
-    return grid, vectors[:, kept], values[kept]
+    # Signs are chosen: coefficients that were stored are of the same modes on any machine.
+    return grid, vectors[:, kept] * np.sign(vectors[0, kept]), values[kept]
 
 
 def zooms(stack: CornerStack, camera: Camera) -> FloatArray:
@@ -86,11 +87,16 @@ def zooms(stack: CornerStack, camera: Camera) -> FloatArray:
     return np.asarray(stack.px - camera.matrix[2:])
 
 
-def distances(stack: CornerStack, cam_from_target: FloatArray) -> FloatArray:
-    """(v,) distances of the views' corners over the mean one, less one."""
+def depths_m(stack: CornerStack, cam_from_target: FloatArray) -> FloatArray:
+    """(v,) mean distances of the views' corners along the camera's axis [m]."""
     turned = cam_from_target[:, 2, :3][stack.view_of]
     depth = np.sum(turned * stack.points, axis=1)
-    far = stack.sum_by_view(depth) / stack.counts + cam_from_target[:, 2, 3]
+    return np.asarray(stack.sum_by_view(depth) / stack.counts + cam_from_target[:, 2, 3])
+
+
+def distances(stack: CornerStack, cam_from_target: FloatArray) -> FloatArray:
+    """(v,) distances of the views' corners over the mean one, less one."""
+    far = depths_m(stack, cam_from_target)
     return np.asarray(far / far.mean() - 1.0)
 
 
@@ -98,12 +104,30 @@ def mode_columns(
     stack: CornerStack, camera: Camera, cam_from_target: FloatArray, levels: LensLevels
 ) -> FloatArray:
     """(n, 2, m) what field and breathing displace, by coefficients as large as corners' noise."""
-    found = np.zeros((len(stack.px), 2, 0))
+    far = distances(stack, cam_from_target)[stack.view_of] if levels.breathing > 0.0 else 0.0
+    return displacements(stack.px, camera, far, levels)
+
+
+def displacements(
+    px: FloatArray, camera: Camera, far: FloatArray | float, levels: LensLevels
+) -> FloatArray:
+    """What field and breathing displace, by coefficients of variance one.
+
+    Args:
+        px: (n, 2) pixels.
+        camera: The lens.
+        far: (n,) distances over the mean one, less one; or one for all.
+        levels: The sizes.
+
+    Returns:
+        (n, 2, m) in the unit of the levels; those of breathing, where it has a size, come last.
+    """
+    found = np.zeros((len(px), 2, 0))
     if levels.field > 0.0:
-        found = levels.field * field_columns(stack.px, camera.resolution, levels.length)
+        found = levels.field * field_columns(px, camera.resolution, levels.length)
     if levels.breathing > 0.0:
-        far = distances(stack, cam_from_target)[stack.view_of]
-        breath = levels.breathing * far[:, None] * zooms(stack, camera)
+        share = levels.breathing * np.broadcast_to(far, len(px))
+        breath = share[:, None] * (px - camera.matrix[2:])
         found = np.concatenate([found, breath[:, :, None]], axis=2)
     return found
 
@@ -116,12 +140,14 @@ class Coefficients:
         mean: (m,) the most likely ones.
         slope: (m, k) how these move with what is shared.
         open: (m, o) roots of their covariance, as far as poses move with them.
+        rest: (m, m - o) roots of what is left of it.
         freedom: How many of them the corners determine.
     """
 
     mean: FloatArray
     slope: FloatArray
     open: FloatArray
+    rest: FloatArray
     freedom: float
 
     @classmethod
@@ -149,9 +175,11 @@ class Coefficients:
         inward = np.linalg.inv(root).T
         moved = by_coefficients @ inward
         values, vectors = np.linalg.eigh(gram(moved, poses @ moved))
+        moving = values > _MOVED
         return cls(
             -solved[:, between.shape[1]],
             -solved[:, : between.shape[1]],
-            inward @ vectors[:, values > _MOVED],
+            inward @ vectors[:, moving],
+            inward @ vectors[:, ~moving],
             float(len(root) - np.trace(inverse)),
         )

@@ -17,7 +17,7 @@ from visioncal.core.transforms import adjoint, invert, skew
 from visioncal.core.types import Camera, FloatArray, Mount
 from visioncal.estimation.arm import pose_basis
 from visioncal.estimation.chain import edge_names
-from visioncal.results import Calibration
+from visioncal.results import Calibration, CameraResult
 
 # A transform, or its (4, 4) matrix.
 Pose: TypeAlias = FloatArray | RigidTransform
@@ -34,9 +34,9 @@ class Eye:
 
     Attributes:
         mount: Where it is mounted.
-        camera: The intrinsics, k values.
+        lens: The intrinsics, k values, and m coefficients of what the lens does beyond its model.
         edge: (4, 4) `flange_from_cam` or `base_from_cam`.
-        covariance: (6 + k, 6 + k) of the edge's right perturbation and the intrinsics together.
+        covariance: (6 + k + m,) squared, of the edge's right perturbation and the lens together.
         flange_sigmas: (6,) noise of the flange at one stop, per axis [rad, m].
         arm_sigma: Size of errors that follow the arm's posture [rad], 0.5 m of length for each
             radian; zero where there are none.
@@ -46,7 +46,7 @@ class Eye:
     """
 
     mount: Mount
-    camera: Camera
+    lens: CameraResult
     edge: FloatArray
     covariance: FloatArray
     flange_sigmas: FloatArray
@@ -74,15 +74,30 @@ class Eye:
         bad = f"The calibration's verdict is bad: {' '.join(verdict.reasons[:1])}"
         return cls(
             calibration.mount,
-            result.camera,
+            result,
             edge.matrix,
-            _together(edge.covariance, result.covariance, result.edge_covariance, result.camera),
+            result.covariance_with(edge.covariance),
             _flange_sigmas(calibration),
             _arm_sigma(calibration),
             calibration.noise.get("pixel_px"),
             calibration.noise_dof,
             (bad,) if verdict.status == "bad" else (),
         )
+
+    @property
+    def camera(self) -> Camera:
+        """The intrinsics."""
+        return self.lens.camera
+
+    @property
+    def breathes(self) -> bool:
+        """Whether the focal length follows the distance."""
+        return self.lens.field is not None and self.lens.field.breathing > 0.0
+
+    @property
+    def jitter(self) -> float:
+        """Standard deviation of the focal length from view to view, as a share of it."""
+        return 0.0 if self.lens.field is None else self.lens.field.jitter
 
     def noise_px(self, stated: float | None) -> float:
         """The noise of a coordinate in the image: the stated one, or the calibration's [px].
@@ -215,25 +230,6 @@ def checked_point(point_m: FloatArray | Sequence[float], name: str) -> FloatArra
             next_step="It looks like millimetres: multiply it by 0.001.",
         )
     return point
-
-
-def _together(
-    edge: FloatArray, lens: FloatArray | None, between: FloatArray | None, camera: Camera
-) -> FloatArray:
-    """The (6 + k, 6 + k) covariance of the camera's edge and its lens.
-
-    A calibration of an older version does not hold what both have in common: they count as
-    independent then.
-    """
-    size = 4 + len(camera.distortion)
-    covariance = np.zeros((6 + size, 6 + size))
-    covariance[:6, :6] = edge
-    if lens is not None:
-        covariance[6:, 6:] = lens
-    if lens is not None and between is not None:
-        covariance[6:, :6] = between[:, :6]
-        covariance[:6, 6:] = between[:, :6].T
-    return covariance
 
 
 def _flange_sigmas(calibration: Calibration) -> FloatArray:

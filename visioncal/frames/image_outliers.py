@@ -21,6 +21,8 @@ from visioncal.frames.single_view import Place
 _FALSE_ALARM = 1e-3
 # Poses farther apart than 95 % of what noise does are two, and worth telling apart.
 _ANOTHER = float(chi2_limit(0.05, 6))
+# Scores that differ by a smaller share are equal.
+_SAME = 1e-6
 # The mean settles to the rounding of metres in a few steps: the places are near each other.
 _STEPS, _SETTLED = 10, 1e-12
 
@@ -134,7 +136,8 @@ def _core(sights: CandidateViews) -> tuple[IntArray, Mask]:
     for seed in (place for view in sights.views for place in view):
         nearest, picks = _nearest(sights, seed)
         score = float(np.sort(nearest)[:half].sum())
-        if best is None or score < best[0] - 1e-9:
+        # Poses of a board that is turned fit alike, but for where their fits have stopped.
+        if best is None or score < (1.0 - _SAME) * best[0] - 1e-9:
             best = (score, picks, nearest)
     if best is None:
         raise RuntimeError("there are no images to agree")

@@ -14,7 +14,7 @@ from visioncal.frames.plane import Plane
 from visioncal.frames.target_in_image import SeenTarget, see
 from visioncal.results import Calibration
 from visioncal.session.choosing import EYE, Choice
-from visioncal.vision.camera import normalise, project_with_jacobian
+from visioncal.vision.camera import normalise
 
 # A ray within this angle of a plane [rad] does not meet it at any place that could be told.
 _PARALLEL = 1e-6
@@ -54,8 +54,7 @@ def locate(
     px = np.atleast_2d(np.asarray(px, dtype=float))
     rays = _rays(eye, px)
     return tuple(
-        _on_plane(eye, stop, plane, ray, noise_px, f"pixel ({u:.1f}, {v:.1f})")
-        for ray, (u, v) in zip(rays, px.tolist(), strict=True)
+        _on_plane(eye, stop, plane, ray, at, noise_px) for ray, at in zip(rays, px, strict=True)
     )
 
 
@@ -65,7 +64,9 @@ def _rays(eye: Eye, px: FloatArray) -> FloatArray:
         raise DataError(f"locate: pixels have the shape {px.shape}; (n, 2) is needed.")
     size = np.array(eye.camera.resolution)
     inside = np.all((px >= -0.5) & (px <= size - 0.5), axis=1)
-    plane = normalise(eye.camera, np.where(inside[:, None], px, eye.camera.matrix[2:]))
+    plane = normalise(
+        eye.camera, eye.lens.in_model(np.where(inside[:, None], px, eye.camera.matrix[2:]))
+    )
     for at, (u, v) in enumerate(px.tolist()):
         if not inside[at]:
             raise DataError(
@@ -83,10 +84,12 @@ def _rays(eye: Eye, px: FloatArray) -> FloatArray:
     return np.concatenate([plane, np.ones((len(px), 1))], axis=1)
 
 
-def _on_plane(
-    eye: Eye, stop: Stop, plane: Plane, ray: FloatArray, noise_px: float, label: str
-) -> Located:
-    """Cuts a ray with the plane, and carries all that is open about both to the cut."""
+def _depth(stop: Stop, plane: Plane, ray: FloatArray, label: str) -> float:
+    """How far along a ray of unit depth it meets the plane.
+
+    Raises:
+        DataError: It does not, in front of the camera.
+    """
     along = stop.base_from_cam[:3, :3] @ ray
     rise = float(plane.normal @ along)
     gap = plane.offset_m - float(plane.normal @ stop.base_from_cam[:3, 3])
@@ -101,16 +104,32 @@ def _on_plane(
             "behind the camera.",
             next_step=_LOOK_AT_PLANE,
         )
+    return depth
+
+
+def _on_plane(
+    eye: Eye, stop: Stop, plane: Plane, ray: FloatArray, px: FloatArray, noise_px: float
+) -> Located:
+    """Cuts a pixel's ray with the plane, and carries all that is open about both to the cut."""
+    label = f"pixel ({px[0]:.1f}, {px[1]:.1f})"
+    depth = _depth(stop, plane, ray, label)
+    # The ray is that of the mean distance: where the lens breathes, there is another one.
+    ray = np.append(normalise(eye.camera, eye.lens.in_model(px[None], depth))[0], 1.0)
+    depth = _depth(stop, plane, ray, label)
+    along = stop.base_from_cam[:3, :3] @ ray
+    rise = float(plane.normal @ along)
     point_cam = depth * ray
     place = stop.point(point_cam)
     # The point stays on the plane: what moves its ray carries it there along the ray.
     kept = np.eye(3) - np.outer(along, plane.normal) / rise
-    by_px, by_lens = _ray_jacobian(eye, point_cam)
+    (by_px,), (by_lens,) = eye.lens.rays_by_lens(px[None], point_cam[None], depth)
     turned = kept @ stop.base_from_cam[:3, :3]
+    by_focus = eye.jitter * turned @ by_px @ (px - eye.camera.matrix[2:])
     by_camera = kept @ stop.by_camera(point_cam)
     by_plane = np.outer(along / rise, np.append(-place, 1.0))
     parts = {
         "pixels": _carried(noise_px * turned @ by_px, np.eye(2)),
+        "focus": np.outer(by_focus, by_focus),
         "plane": _carried(by_plane, plane.covariance),
         **_camera_parts(eye, stop, by_camera, turned @ by_lens),
     }
@@ -120,14 +139,6 @@ def _on_plane(
 _LOOK_AT_PLANE = (
     "Check the plane (metres, in the base) and the robot's pose (base_from_flange, no inverse)."
 )
-
-
-def _ray_jacobian(eye: Eye, point_cam: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """How the point at this depth moves with its pixel, (3, 2), and with the lens, (3, k)."""
-    seen = project_with_jacobian(eye.camera, point_cam[None])
-    inverse = np.zeros((3, 2))
-    inverse[:2] = np.linalg.inv(seen.by_point[0, :, :2])
-    return inverse, -inverse @ seen.by_intrinsics[0]
 
 
 def _camera_parts(
@@ -179,6 +190,7 @@ _ESTIMATED = {"calibration", "robot", "arm"}
 
 _SOURCES = {
     "pixels": "pixel's noise: look from nearer, or less along the plane",
+    "focus": "focal length, which changes from view to view: fix the focus",
     "plane": "plane's own uncertainty",
     "calibration": "hand-eye calibration",
     "robot": "robot's noise",

@@ -21,7 +21,8 @@ class Located:
     Attributes:
         p_base: (3,) [m].
         parts: (3, 3) covariance by source [m^2]: `pixels`, `calibration` (the camera's transform
-            and its lens together), `robot` (at this stop), `arm`, `plane`, `target`.
+            and its lens together), `robot` (at this stop), `arm`, `plane`, `target`, `focus` (a
+            pixel's, by the change of the focal length at this view).
         freedom: Degrees of freedom of the noise's levels that all of it rests on.
         warnings: What to know before a robot is sent there, in sentences.
     """

@@ -18,8 +18,9 @@ from visioncal.estimation.appearance import (
     compress,
     shape_basis,
 )
-from visioncal.estimation.corners import CornerStack
+from visioncal.estimation.corners import CornerStack, reproject
 from visioncal.estimation.gating import gate
+from visioncal.estimation.lens_field import depths_m, zooms
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.planar import determines_pose
 from visioncal.frames.camera_chain import Eye
@@ -43,7 +44,8 @@ class SeenTarget:
     Attributes:
         cam_from_target: (c, 4, 4).
         covariance: (c, 6, 6) of the right perturbations, by the pixels' noise alone.
-        by_lens: (c, 6, k) how each moves with the camera's intrinsics.
+        by_lens: (c, 6, k + m) how each moves with the camera's intrinsics, and with what its lens
+            does beyond them.
         by_scale: (c, 6) how each moves with the target's size, as a share of it.
         scale_sigma: How well the size is known, as a share of it.
         turns: (c,) which of the target's own symmetries each has applied.
@@ -81,18 +83,24 @@ def see(
     _check(corners, target, label)
     noise_px = eye.noise_px(corners.stated_px if sigma_px is None else sigma_px)
     with one_blas_thread():
-        poses, corners, squares = _fitted(eye.camera, corners, target, label, noise_px)
+        straight = replace(corners, px=eye.lens.in_model(corners.px))
+        poses, kept, squares = _fitted(eye, straight, target, label, noise_px)
+        distance_m = _distance_m(poses, kept, target)
+        if eye.breathes:
+            straight = replace(corners, px=eye.lens.in_model(corners.px, distance_m))
+            poses, kept, squares = _fitted(eye, straight, target, label, noise_px)
         looks = [
-            _jacobian(eye.camera, poses, at, corners, target) for at in range(len(poses.turns))
+            _jacobian(eye, poses, at, kept, target, noise_px, distance_m)
+            for at in range(len(poses.turns))
         ]
-    noise_px, warnings = _noise(noise_px, squares, 2 * len(corners.ids) - 6, label)
+    noise_px, warnings = _noise(noise_px, squares, 2 * len(kept.ids) - 6, label)
     # Exact corners show no noise; a millionth of a pixel keeps their covariance a covariance.
     variance, lens = max(noise_px, 1e-6) ** 2, 4 + len(eye.camera.distortion)
     return SeenTarget(
-        np.array([it.cam_from_target[0] for it in looks]),
-        np.array([variance * covariance_from(it.information[0]) for it in looks]),
-        np.array([it.by_shared[0, :, :lens] for it in looks]),
-        np.array([_by_scale(it.by_shared[0, :, lens:], target) for it in looks]),
+        np.array([it.cam_from_target[0] for it, _ in looks]),
+        np.array([variance * covariance_from(it.information[0]) for it, _ in looks]),
+        np.array([np.hstack([it.by_shared[0, :, :lens], beyond]) for it, beyond in looks]),
+        np.array([_by_scale(it.by_shared[0, :, lens:], target) for it, _ in looks]),
         target.square_sigma_m / target.square_m,
         poses.turns,
         warnings,
@@ -146,15 +154,21 @@ def _check(corners: Corners, target: Target, label: str) -> None:
         )
 
 
+def _distance_m(poses: ViewPoses, corners: Corners, target: Target) -> float:
+    """How far the corners are along the camera's axis, on average."""
+    stack = CornerStack.of({corners.view: corners}, corner_positions(target))
+    return float(depths_m(stack, poses.cam_from_target[:1])[0])
+
+
 def _fitted(
-    camera: Camera, corners: Corners, target: Target, label: str, noise_px: float
+    eye: Eye, corners: Corners, target: Target, label: str, noise_px: float
 ) -> tuple[ViewPoses, Corners, float]:
     """The poses, the corners that fit the best of them, and the sum of their squares [px^2]."""
     positions = corner_positions(target)
     for _ in range(_ROUNDS):
-        (poses,) = measure_poses({corners.view: corners}, [target], camera, noise_px)
-        stack = CornerStack.of({corners.view: corners}, positions)
-        residuals = _compressed(camera, stack, target, poses.cam_from_target[:1]).residuals
+        (poses,) = measure_poses({corners.view: corners}, [target], eye.camera, noise_px)
+        stack = _stack(eye, corners, positions, noise_px)
+        residuals = _compressed(eye.camera, stack, target, poses.cam_from_target[:1]).residuals
         passed = gate(stack, residuals)
         if passed.reasons:
             reason = next(iter(passed.reasons.values()))
@@ -166,16 +180,39 @@ def _fitted(
     return poses, corners, float(np.sum(residuals[passed.mask] ** 2))
 
 
+def _stack(eye: Eye, corners: Corners, positions: FloatArray, noise_px: float) -> CornerStack:
+    """The corners, which share a change of the focus."""
+    stack = CornerStack.of({corners.view: corners}, positions)
+    if eye.jitter == 0.0:
+        return stack
+    return replace(stack, zooms=eye.jitter / max(noise_px, 1e-6) * zooms(stack, eye.camera))
+
+
 def _jacobian(
-    camera: Camera, poses: ViewPoses, at: int, corners: Corners, target: Target
-) -> Compressed:
-    """One of the poses with all that moves it, under the numbering that it stands for."""
+    eye: Eye,
+    poses: ViewPoses,
+    at: int,
+    corners: Corners,
+    target: Target,
+    noise_px: float,
+    distance_m: float,
+) -> tuple[Compressed, FloatArray]:
+    """One of the poses with all that moves it, under the numbering that it stands for.
+
+    Returns:
+        Them, and (6, m) how it moves with what the lens does beyond its model.
+    """
     # Turned, corner i lies where corner p[i] was: what was seen as that one is i.
     ids = np.argsort(rotations(target)[poses.turns[at]])[corners.ids]
     order = np.argsort(ids)
     turned = _chosen(corners, ids[order], order)
-    stack = CornerStack.of({turned.view: turned}, corner_positions(target))
-    return _compressed(camera, stack, target, poses.cam_from_target[at : at + 1])
+    stack = _stack(eye, turned, corner_positions(target), noise_px)
+    found = _compressed(eye.camera, stack, target, poses.cam_from_target[at : at + 1])
+    by_pose = reproject(stack, eye.camera, found.cam_from_target, lens=False).by_pose
+    beyond = eye.lens.displacements(stack.px, distance_m)
+    stack.weigh(beyond)
+    moved = stack.products_by_view(by_pose, beyond)
+    return found, -(covariance_from(found.information) @ moved)[0]
 
 
 def _chosen(corners: Corners, ids: IntArray, rows: IntArray) -> Corners:

@@ -10,6 +10,7 @@ from scipy.special import chdtrc, fdtrc
 from visioncal.core.files import some_of
 from visioncal.core.transforms import inverse_right_jacobian, invert, log, pose_difference
 from visioncal.core.types import Camera, FloatArray, Mount
+from visioncal.estimation.chain import edge_names
 from visioncal.results import Calibration, CameraResult, Edge, VerdictStatus
 from visioncal.session.choosing import ANY, Choice
 from visioncal.vision.camera import intrinsics
@@ -43,7 +44,8 @@ class EdgeChange:
     """How one transform differs between two calibrations.
 
     Attributes:
-        name: Its name, such as `flange_from_cam`.
+        name: Its name, such as `flange_from_cam`. That of a camera is compared in the frame of its
+            centre ray, where both calibrations have that (`Calibration.ray_frame`).
         twist: (6,) of (rotation [rad], translation [m]) that leads from the first to the second,
             on the right: `second = first * exp(twist)`.
         covariance: (6, 6) of the twist, where nothing changed.
@@ -191,7 +193,7 @@ def compare(
     # Two tests a transform, and one of the lens.
     limit = FALSE_ALARMS / (2 * len(names) + 1)
     freedom = (_freedom(a), _freedom(b))
-    edges = tuple(_edge_change(it, a.edges[it], b.edges[it], freedom, limit) for it in names)
+    edges = tuple(_edge_change(it, *_comparable(a, b, it), freedom, limit) for it in names)
     levels = (_levels(a), _levels(b))
     lens = _lens_change(a.camera, b.camera, limit)
     return Comparison(
@@ -208,6 +210,19 @@ def compare(
         ),
         findings=tuple(_findings(a, b, edges, lens)),
     )
+
+
+def _comparable(a: Calibration, b: Calibration, name: str) -> tuple[Edge, Edge]:
+    """A transform of both; a camera's in the frame of its centre ray, where both have that.
+
+    Where an optical axis points is a convention that lenses take up: a ray is where it is.
+    """
+    first, second = a.ray_frame, b.ray_frame
+    if name != edge_names(a.mount)[0] or first is None or second is None:
+        return a.edges[name], b.edges[name]
+    if not np.array_equal(first.px, second.px):
+        return a.edges[name], b.edges[name]
+    return first.transform, second.transform
 
 
 def _mount(calibration: Calibration) -> str:

@@ -21,6 +21,7 @@ from visioncal.results.parts import (
     ViewResult,
     check_schema,
 )
+from visioncal.results.ray_frame import RayFrame
 from visioncal.results.sections import CalibrationSections
 from visioncal.results.verdicts import StoredVerdict
 from visioncal.results.whole import whole_document
@@ -43,6 +44,7 @@ class CalibrationForm:
         joint_covariance: Their covariance together.
         solvers: What every solver made of it.
         camera: The camera.
+        ray_frame: Its transform in the frame of its image's centre ray.
         robot: The nominal robot model.
         noise: Estimated standard deviations per axis, by name.
         views: One entry for each view of the session.
@@ -62,6 +64,7 @@ class CalibrationForm:
     joint_covariance: JointCovariance
     solvers: Mapping[str, SolverResult]
     camera: StoredCamera | None = None
+    ray_frame: RayFrame | None = None
     robot: StoredRobot | None = None
     noise: Mapping[str, float]
     views: tuple[ViewResult, ...]
@@ -107,6 +110,8 @@ def to_document(calibration: "Calibration") -> dict[str, Any]:
         session=SessionForm(calibration.session_name, calibration.session_sha256),
         transforms=calibration.edges,
         joint_covariance=JointCovariance.of(calibration.edges, calibration.joint_covariance),
+        # It follows from transform and camera, and is written for other readers.
+        ray_frame=calibration.ray_frame,
         **{name: getattr(calibration, name) for name in _SAME},
     )
     return write(CalibrationForm, form) | write(CalibrationSections, calibration)

@@ -1,11 +1,58 @@
 """A camera in a result, and how it stands on disk."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
+import numpy as np
+
 from visioncal.core.types import Camera, CameraKind, FloatArray
-from visioncal.results.codec import Array, Matrix, Vector, Written
+from visioncal.estimation.lens_field import LensLevels, displacements
+from visioncal.results.codec import Array, Matrix, Section, Vector, Written
 from visioncal.results.edge import Covariance
+from visioncal.vision.camera import project_with_jacobian
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LensField(Section):
+    """What a lens does beyond its model: `field` of a camera in calibration.json.
+
+    A pixel is displaced by m coefficients of variance one beforehand, those of the field first and
+    then that of breathing: see `estimation.lens_field`.
+
+    Attributes:
+        field_px: Standard deviation of a smooth field over the image, an axis [px].
+        length: Its length, as a share of the image's width.
+        breathing: Standard deviation of the focal length's change as the distance doubles, as a
+            share of it.
+        jitter: And from view to view.
+        distance_m: The mean distance of the views, about which the lens breathes [m].
+        coefficients: (m,) as they were found.
+        root: (m, r) of their covariance, `root root^T`.
+        intrinsics_covariance: (m, k) with matrix and distortion.
+        edge_covariance: (m, 6 e) with the transforms, in the order of `joint_covariance`.
+    """
+
+    field_px: float
+    length: float
+    breathing: float
+    jitter: float
+    distance_m: float
+    coefficients: Vector
+    root: Matrix
+    intrinsics_covariance: Matrix
+    edge_covariance: Matrix
+
+    def columns(self, camera: Camera, px: FloatArray, distance_m: float | None) -> FloatArray:
+        """(n, 2, m) by how much the coefficients displace (n, 2) pixels [px].
+
+        Args:
+            camera: The lens.
+            px: The pixels.
+            distance_m: How far along the camera's axis that is which they show; None for the mean.
+        """
+        levels = LensLevels(self.field_px, self.length, self.breathing, self.jitter)
+        far = 0.0 if distance_m is None else distance_m / self.distance_m - 1.0
+        return displacements(px, camera, far, levels)
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,12 +65,84 @@ class CameraResult:
         covariance: (k, k) of fx, fy, cx, cy and the distortion, where estimated.
         edge_covariance: (k, 6 e) of these with the calibration's edges in the order of its
             `joint_covariance`, where both were estimated together.
+        field: What the lens does beyond its model; None where nothing shows that.
     """
 
     camera: Camera
     estimated: bool
     covariance: FloatArray | None = None
     edge_covariance: FloatArray | None = None
+    field: LensField | None = None
+
+    def covariance_with(self, edge: FloatArray) -> FloatArray:
+        """The (6 + k + m,) squared covariance of the camera's edge, its lens, and its field.
+
+        A calibration of an older version does not hold what edge and lens have in common: they
+        count as independent then.
+
+        Args:
+            edge: (6, 6) of the edge, the first of the calibration's.
+        """
+        size, field = 4 + len(self.camera.distortion), self.field
+        lens, fields = slice(6, 6 + size), slice(6 + size, None)
+        found = np.zeros((6 + size + (0 if field is None else len(field.coefficients)),) * 2)
+        found[:6, :6] = edge
+        if self.covariance is not None:
+            found[lens, lens] = self.covariance
+            if self.edge_covariance is not None:
+                found[lens, :6] = self.edge_covariance[:, :6]
+        if field is not None and len(field.coefficients):
+            found[fields, fields] = field.root @ field.root.T
+            found[fields, lens] = field.intrinsics_covariance
+            found[fields, :6] = field.edge_covariance[:, :6]
+        low = np.tril(found, -1)
+        return np.asarray(low + low.T + np.diag(np.diag(found)))
+
+    def displacements(self, px: FloatArray, distance_m: float | None = None) -> FloatArray:
+        """(n, 2, m) by how much coefficients beyond the model displace pixels [px]."""
+        if self.field is None:
+            return np.zeros((len(px), 2, 0))
+        return self.field.columns(self.camera, px, distance_m)
+
+    def in_model(self, px: FloatArray, distance_m: float | None = None) -> FloatArray:
+        """(n, 2) where the lens, were it what its model says, would show what is at pixels [px].
+
+        Args:
+            px: (n, 2) the pixels.
+            distance_m: How far along the camera's axis that is which they show; None for the mean.
+        """
+        if self.field is None:
+            return px
+        return np.asarray(px - self.displacements(px, distance_m) @ self.field.coefficients)
+
+    def rays_by_lens(
+        self, px: FloatArray, rays: FloatArray, distance_m: float | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """How points on rays move at their depth: with pixels, (n, 3, 2), and with the lens.
+
+        Args:
+            px: (n, 2) the pixels.
+            rays: (n, 3) points on their rays.
+            distance_m: As `in_model` has it.
+
+        Returns:
+            Both; the latter (n, 3, k + m) by the intrinsics and by what is beyond them.
+        """
+        seen = project_with_jacobian(self.camera, rays)
+        inverse = np.zeros((len(px), 3, 2))
+        inverse[:, :2] = np.linalg.inv(seen.by_point[:, :, :2])
+        beyond = self.displacements(px, distance_m)
+        return inverse, -inverse @ np.concatenate([seen.by_intrinsics, beyond], axis=2)
+
+    def carried(self, jacobian: FloatArray) -> "CameraResult":
+        """The same beside other edges, by how these move with those that it has."""
+        if self.edge_covariance is None and self.field is None:
+            return self
+        edges, field = self.edge_covariance, self.field
+        if field is not None:
+            field = replace(field, edge_covariance=field.edge_covariance @ jacobian.T)
+        edges = None if edges is None else edges @ jacobian.T
+        return replace(self, edge_covariance=edges, field=field)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +157,7 @@ class CameraForm:
         estimated: Whether it was estimated from this session's images.
         covariance: (k, k) of matrix and distortion, where estimated.
         edge_covariance: (k, 6 e) of these with the transforms, in the order of `joint_covariance`.
+        field: What the lens does beyond its model.
     """
 
     model: CameraKind
@@ -47,32 +167,44 @@ class CameraForm:
     estimated: bool
     covariance: Covariance | None = None
     edge_covariance: Matrix | None = None
+    field: LensField | None = None
 
     @classmethod
     def of(cls, result: CameraResult) -> "CameraForm":
         """Writes a camera."""
-        camera, both = result.camera, (result.covariance, result.edge_covariance)
+        camera = result.camera
         return cls(
             camera.model,
             camera.resolution,
             camera.matrix,
             camera.distortion,
             result.estimated,
-            *both,
+            result.covariance,
+            result.edge_covariance,
+            result.field,
         )
 
     def result(self, _: str) -> CameraResult:
         """Reads it.
 
         Raises:
-            ValueError: The covariances are not of its intrinsics.
+            ValueError: The covariances are not of its intrinsics, or of its field.
         """
         size = len(self.matrix) + len(self.distortion)
         for it in (self.covariance, self.edge_covariance):
             if it is not None and len(it) != size:
                 raise ValueError(f"a covariance has {len(it)} rows; {size} are needed")
         camera = Camera(self.model, self.resolution, self.matrix, self.distortion)
-        return CameraResult(camera, self.estimated, self.covariance, self.edge_covariance)
+        found = CameraResult(
+            camera, self.estimated, self.covariance, self.edge_covariance, self.field
+        )
+        if self.field is not None:
+            count = found.displacements(np.zeros((1, 2))).shape[2]
+            for name in ("coefficients", "root", "intrinsics_covariance", "edge_covariance"):
+                rows = len(getattr(self.field, name))
+                if rows != count:
+                    raise ValueError(f"field.{name} has {rows} rows; {count} are needed")
+        return found
 
 
 StoredCamera = Annotated[CameraResult, Written(CameraForm.of, CameraForm.result, CameraForm)]

@@ -19,6 +19,7 @@ from visioncal.core.number_format import figure
 from visioncal.core.shown import ByName, html_card, text_card
 from visioncal.core.types import FloatArray, Mount
 from visioncal.core.verdict import Step, Verdict
+from visioncal.estimation.chain import edge_names
 from visioncal.estimation.intervals import freedom_of
 from visioncal.results.alignment import FILE as ALIGNMENT
 from visioncal.results.alignment import Alignment, is_alignment
@@ -35,6 +36,7 @@ from visioncal.results.parts import (
     Validation,
     ViewResult,
 )
+from visioncal.results.ray_frame import RayFrame, ray_frame
 from visioncal.results.sections import CalibrationSections
 from visioncal.results.selecting import selected_fields, whole_fields
 from visioncal.results.whole import is_whole, read_whole
@@ -93,6 +95,14 @@ class Calibration(CalibrationSections):
     frames: Mapping[str, Frame] = field(default_factory=dict)
     cell: Alignment | None = None
     need: NeedMet | None = None
+
+    @cached_property
+    def ray_frame(self) -> RayFrame | None:
+        """The camera's transform in the frame of its image's centre ray; see `RayFrame`."""
+        edge = edge_names(self.mount)[0]
+        if self.camera is None or edge not in self.edges:
+            return None
+        return ray_frame(edge, self.edges[edge], self.camera)
 
     @property
     def next_steps(self) -> tuple[Step, ...]:

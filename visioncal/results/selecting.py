@@ -15,7 +15,6 @@ from visioncal.results.arm import ArmSections
 from visioncal.results.codec import entries
 from visioncal.results.edge import Edge
 from visioncal.results.frame import Frame
-from visioncal.results.lens import CameraResult
 from visioncal.results.parts import Rms, RobotResult, Validation
 from visioncal.results.sections import ClockResult, JointFit, NoiseIntervals
 from visioncal.results.whole import holdout_rms, left_out_rms, rms_of, view_results
@@ -67,6 +66,7 @@ def selected_fields(cell: Alignment, choice: Choice, needs: Collection[Part]) ->
         if chosen.camera in ("", it.seer) and chosen.target in ("", it.seen)
     ]
     rms, target = rms_of(sights), thing_name(chosen.target, "target")
+    camera = cell.cameras.get(chosen.camera)
     return whole_fields(cell) | {
         "mount": chosen.mount,
         "edges": {
@@ -79,7 +79,7 @@ def selected_fields(cell: Alignment, choice: Choice, needs: Collection[Part]) ->
         "rms": rms,
         "validation": _validation(cell, sights),
         "verdict": _verdict(cell),
-        "camera": _camera(cell.cameras.get(chosen.camera), jacobian),
+        "camera": None if camera is None else camera.carried(jacobian),
         "robot": arm.model,
         "frames": _placed(cell, chosen),
         **{it.name: getattr(arm, it.name) for it in entries(ArmSections)},
@@ -164,14 +164,6 @@ def _noise(cell: Alignment, chosen: Chosen, rms: Rms) -> dict[str, float]:
             f"combined_{name}": it / np.sqrt(3.0) for name, it in zip(names, each, strict=True)
         }
     return found
-
-
-def _camera(result: CameraResult | None, jacobian: FloatArray) -> CameraResult | None:
-    if result is None or result.edge_covariance is None:
-        return result
-    return CameraResult(
-        result.camera, result.estimated, result.covariance, result.edge_covariance @ jacobian.T
-    )
 
 
 def _verdict(cell: Alignment) -> Verdict:

@@ -1,10 +1,11 @@
 """What is written of lenses and targets beside the frames."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from visioncal.calibration.pipeline.lens_fields import lens_field_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.types import FloatArray, IntArray, TargetKind
 from visioncal.estimation.appearance import BOARD_NAMES, shape_slices
@@ -43,6 +44,7 @@ def cameras_of(known: RunState) -> dict[str, CameraResult]:
             own[np.ix_(free, free)] = covariance[np.ix_(at, at)]
             shared[free] = covariance[at, :edges]
             found[name] = CameraResult(looks.camera(name), estimated, own, shared)
+        found[name] = replace(found[name], field=lens_field_of(solved, name, covariance, edges))
     return found
 
 

@@ -3,12 +3,21 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from visioncal.calibration.pipeline.solving import Solved
 from visioncal.core.number_format import figure
+from visioncal.core.types import Camera, FloatArray, IntArray
 from visioncal.core.verdict import Finding, Step
-from visioncal.estimation.lens_field import LensLevels
+from visioncal.estimation.corners import floored_sigma_px
+from visioncal.estimation.effects.lenses import LENSES, LinearisedCorners
+from visioncal.estimation.lens_field import LensLevels, depths_m, displacements
 from visioncal.estimation.lens_levels import SIGNIFICANT
 from visioncal.estimation.residual_tests import common_errors, lens_field
+from visioncal.results.lens import LensField
+
+# Variance of displacements that is none beside that of corners; and places an axis to see that.
+_INVISIBLE, _GRID = 1e-4, 12
 
 
 @dataclass(frozen=True)
@@ -58,6 +67,80 @@ def _is_of_lens(solved: Solved, camera: str) -> bool:
     by_place = lens_field(stack.px, own.residuals, problem.scene.camera.resolution, shares)
     by_corner = common_errors(stack.ids, own.residuals, shares)
     return by_place.is_significant and by_place.mahalanobis_sq > by_corner.mahalanobis_sq
+
+
+def lens_field_of(
+    solved: Solved, camera: str, covariance: FloatArray, edges: int
+) -> LensField | None:
+    """What one lens does beyond its model, as a result has it; None where that is nothing.
+
+    Args:
+        solved: The fit.
+        camera: The camera.
+        covariance: (p, p) of its unknowns.
+        edges: How many of these, the first, are edges'.
+    """
+    seen = solved.seen
+    if seen is None:
+        return None
+    looks, which = seen.looks, list(seen.looks.problems).index(camera)
+    levels, noise_px = looks.problems[camera].levels, floored_sigma_px(seen.sigmas_px[which])
+    if levels is None or not (levels.field or levels.breathing or levels.jitter):
+        return None
+    lens, place = looks.lens_of(camera), looks.places(camera)
+    mean, rows, root = np.zeros(0), np.zeros((0, len(covariance))), np.zeros((0, 0))
+    if (found := seen.compressed[which].coefficients) is not None:
+        # Coefficients follow lens and boards; what poses moved with of the rest is in the fit.
+        state = solved.agreed.fit.state
+        open_, beyond = np.isin(place, seen.free), _columns_beyond(solved, which)
+        shared = solved.columns_of(place[open_])
+        rows = np.zeros((len(found.mean), len(covariance)))
+        rows[:, shared], rows[:, beyond] = found.slope[:, open_], found.open
+        values = solved.agreed.problem.values_of(LENSES, state)
+        moved = values[: len(seen.free)] - looks.values[seen.free]
+        fitted = values[beyond - solved.agreed.problem.effect_columns[LENSES].start]
+        mean = found.mean + found.slope[:, open_] @ moved[np.isin(seen.free, place)]
+        mean = (mean + found.open @ fitted) / noise_px
+        own = rows @ covariance @ rows.T / noise_px**2 + found.rest @ found.rest.T
+        root = _root(own, looks.camera(camera), levels)
+    shared_lens, free = np.zeros((len(mean), len(lens))), np.isin(lens, seen.free)
+    shared_lens[:, free] = rows @ covariance[:, solved.columns_of(lens[free])] / noise_px
+    return LensField(
+        field_px=noise_px * levels.field,
+        length=levels.length,
+        breathing=noise_px * levels.breathing,
+        jitter=noise_px * levels.jitter,
+        distance_m=_distance_m(seen, which),
+        coefficients=mean,
+        root=root,
+        intrinsics_covariance=shared_lens,
+        edge_covariance=rows @ covariance[:, :edges] / noise_px,
+    )
+
+
+def _columns_beyond(solved: Solved, which: int) -> IntArray:
+    """The problem's columns of what one lens does beyond its model."""
+    seen = solved.seen
+    sizes = [] if seen is None else [it.by_field.shape[2] for it in seen.compressed]
+    first = sum(sizes[:which])
+    return solved.field_columns[first : first + sizes[which]]
+
+
+def _distance_m(seen: LinearisedCorners, which: int) -> float:
+    """The mean distance of one camera's views."""
+    stack = [*seen.looks.problems.values()][which].stack
+    return float(np.mean(depths_m(stack, seen.compressed[which].cam_from_target)))
+
+
+def _root(covariance: FloatArray, camera: Camera, levels: LensLevels) -> FloatArray:
+    """(m, r) root of a covariance of coefficients, without what displaces no pixel visibly."""
+    wide, high = (np.linspace(0.0, it - 1.0, _GRID) for it in camera.resolution)
+    px = np.stack(np.meshgrid(wide, high), axis=-1).reshape(-1, 2)
+    # Breathing by as much as the distance changes.
+    size = np.sqrt(np.mean(np.sum(displacements(px, camera, 1.0, levels) ** 2, axis=1), axis=0))
+    values, vectors = np.linalg.eigh(np.outer(size, size) * covariance)
+    kept = values > _INVISIBLE
+    return np.asarray(vectors[:, kept] * np.sqrt(values[kept]) / size[:, None])
 
 
 def errors_found(lenses: Mapping[str, LensErrors]) -> Iterator[Finding]:

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from visioncal.core.types import FloatArray, Mount
 from visioncal.results import CameraResult, Edge, Verdict
 
+_OF_LENS = "it goes with the lens of that calibration: with other intrinsics, use its ray_frame"
+
 
 @dataclass(frozen=True)
 class Load:
@@ -109,4 +111,5 @@ class Content:
     @property
     def notes(self) -> list[str]:
         """Lines for a comment: where it comes from, its worth, and what it does."""
-        return [self.origin, self.worth, self.direction]
+        is_of_lens = self.lens is not None and any(it.startswith("cam") for it in self.frames)
+        return [self.origin, self.worth, self.direction, *([_OF_LENS] if is_of_lens else [])]
