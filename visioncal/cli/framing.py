@@ -1,6 +1,7 @@
 """What the commands that place a frame share: options, where the frame goes, how it is told."""
 
 import json
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -191,6 +192,22 @@ def _folder(known: Path) -> Path:
             next_step="Name the folder that calibrate wrote, or a file for the frame with -o.",
         )
     return folder
+
+
+def keep_and_tell(place: Place, frame: Frame, source: Path, *, as_json: bool) -> None:
+    """Writes a frame where it goes, and prints it for people, or as JSON.
+
+    Args:
+        place: Where it goes.
+        frame: The frame.
+        source: What it was found from.
+        as_json: Whether to print JSON.
+    """
+    # What is said to be run again has something to replace.
+    again = [*sys.argv, *([] if "--force" in sys.argv else ["--force"])]
+    out = place.file or place.folder or ""
+    frame = replace(frame, verdict=frame.verdict.with_paths(source, out, ["visioncal", *again[1:]]))
+    tell(place, frame, place.keep(frame), as_json=as_json)
 
 
 def tell(place: Place, frame: Frame, written: Written, *, as_json: bool) -> None:

@@ -37,7 +37,10 @@ CALIBRATE, PLAN = "visioncal calibrate SESSION -o OUT", "visioncal plan SESSION 
 GUESS = "visioncal convert SESSION FIXED --guess --yes"
 GUESS_AND_CALIBRATE = f"{GUESS} && {CALIBRATE.replace('SESSION', 'FIXED')}"
 REVIEW, VERIFY = "visioncal review OUT", "visioncal verify SESSION --against OUT"
-_PATH = re.compile(r"\b(SESSION|FIXED|OUT)\b")
+CALIBRATE_ANEW = "visioncal calibrate SESSION -o NEW"
+# The command line as it was typed, to which options are added.
+AGAIN = "AGAIN"
+_PATH = re.compile(r"\b(SESSION|FIXED|OUT|NEW|AGAIN)\b")
 
 
 @dataclass(frozen=True)
@@ -47,14 +50,21 @@ class Step:
     Attributes:
         words: A sentence in the imperative.
         command: A command line that does it or leads on; empty where there is none. SESSION, FIXED
-            (a corrected copy of the session) and OUT stand for paths that `with_paths` fills in.
+            (a corrected copy of the session), OUT, NEW (beside OUT) and AGAIN (the command as it
+            was typed) stand for what `with_paths` fills in.
     """
 
     words: str
     command: str = ""
 
     def __str__(self) -> str:
-        return f"{self.words} Run: {self.command}" if self.command else self.words
+        is_shown = self.command and AGAIN not in self.command
+        return f"{self.words} Run: {self.command}" if is_shown else self.words
+
+
+def look_at(view: int) -> str:
+    """The command that shows a view."""
+    return f"{REVIEW} --view {view}"
 
 
 READ_AGAIN = Step(
@@ -199,25 +209,39 @@ class Verdict:
                 steps.setdefault(it.do.command or it.do.words, it.do)
         return tuple(steps.values())[:_SHOWN]
 
-    def with_paths(self, session: Path | str, out: Path | str = "") -> Self:
+    def with_paths(
+        self, session: Path | str, out: Path | str = "", again: Sequence[str] = ()
+    ) -> Self:
         """Fills the paths of a run into the commands of its steps.
 
         Args:
             session: The session's folder or recording.
             out: The folder of its result; empty leaves it open.
+            again: The command line as it was typed, in words.
         """
 
         def filled(it: Finding) -> Finding:
             if it.do is None:
                 return it
-            return replace(it, do=replace(it.do, command=with_paths(it.do.command, session, out)))
+            command = with_paths(it.do.command, session, out, again)
+            return replace(it, do=replace(it.do, command=command))
 
         return replace(self, findings=tuple(map(filled, self.findings)))
 
 
-def with_paths(command: str, session: Path | str, out: Path | str = "") -> str:
+def with_paths(
+    command: str, session: Path | str, out: Path | str = "", again: Sequence[str] = ()
+) -> str:
     """Fills the paths of a run into a command; see `Verdict.with_paths`."""
-    folder = Path(session)
-    fixed = f"{folder.with_suffix('') if folder.is_file() else folder}-fixed"
-    paths = {"SESSION": str(session), "FIXED": fixed, "OUT": str(out) or "OUT"}
-    return _PATH.sub(lambda found: shlex.quote(paths[found[0]]), command)
+    folder, result = Path(session), Path(out or "out")
+    fixed = _free(f"{folder.with_suffix('') if folder.is_file() else folder}-fixed")
+    new = f"{result.parent if result.suffix else result}-new"
+    paths = {"SESSION": str(session), "FIXED": fixed, "OUT": str(out) or "out", "NEW": new}
+    words = {name: shlex.quote(it) for name, it in paths.items()} | {AGAIN: shlex.join(again)}
+    return _PATH.sub(lambda found: words[found[0]], command)
+
+
+def _free(name: str) -> str:
+    """A name that no folder has yet: nothing is written over."""
+    names = (name, *(f"{name}-{it}" for it in range(2, 100)))
+    return next((it for it in names if not Path(it).exists()), name)

@@ -11,9 +11,17 @@ from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import NOTE, Finding, Step, Verdict, VerdictStatus
 from visioncal.dynamics.base import random_motion
 from visioncal.dynamics.identified import NOT_TOLD, Identified, Validation
+from visioncal.robot.files import robot_names
 
 _LIMITS = DynamicsLimits()
-_PLAN = Step("Record the motion that visioncal dynamics plan writes, and fit it with this one.")
+_MOTION = "Record, and fit with this one, a motion"
+
+
+def _plan(identified: Identified, words: str) -> Step:
+    """Advice to record a planned motion; an arm that has a name can be planned for."""
+    name = identified.robot.name
+    command = f"visioncal dynamics plan {name} -o motions" if name in robot_names() else ""
+    return Step(f"{words}; visioncal dynamics plan writes some.", command)
 
 
 def judge(identified: Identified) -> Verdict:
@@ -38,7 +46,7 @@ def _of_prediction(identified: Identified) -> Iterator[tuple[VerdictStatus, Find
             Finding(
                 "unchecked",
                 "Nothing was left to predict: the torques that were fitted are no proof.",
-                Step("Record a second motion, and name it with --validate-on."),
+                _plan(identified, "Record a second motion, and name it with --validate-on"),
             ),
         )
         return
@@ -66,7 +74,7 @@ def _of_prediction(identified: Identified) -> Iterator[tuple[VerdictStatus, Find
                 f"{_joints(surprised)}: torques are predicted "
                 f"{figure(float((validation.rms_nm / fitted)[surprised].max()))} times worse than "
                 "they were fitted: the motion says too little, or something changed.",
-                _PLAN,
+                _plan(identified, _MOTION),
             ),
         )
     yield from _of_known(identified, validation)
@@ -85,7 +93,7 @@ def _of_known(
                     "worse_than_known",
                     f"{_joints(lost)}: the inertias that {identified.robot.name} comes with "
                     "predict torques better than the identified ones.",
-                    _PLAN,
+                    _plan(identified, _MOTION),
                 ),
             )
         else:
@@ -143,7 +151,7 @@ def _of_range(identified: Identified) -> Iterator[tuple[VerdictStatus, Finding]]
                 f"{np.abs(motion.dq).max():.0f} rad/s and {np.abs(motion.ddq).max():.0f} rad/s^2) "
                 f"is known to {figure(100.0 * float(share.max()))} % only: this motion was too "
                 "slow, too small or too short.",
-                _PLAN,
+                _plan(identified, _MOTION),
             ),
         )
 
@@ -158,7 +166,7 @@ def _of_parameters(identified: Identified) -> Iterator[tuple[VerdictStatus, Find
                 "undetermined",
                 f"{told.sum()} of {len(told)} base parameters are not determined by this motion, "
                 f"among them {some_of(names, 3)}.",
-                _PLAN,
+                _plan(identified, _MOTION),
             ),
         )
 

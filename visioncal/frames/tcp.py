@@ -11,7 +11,7 @@ from visioncal.core.limits import ToolLimits
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray
-from visioncal.core.verdict import AGREEMENT, Finding, Step, Verdict
+from visioncal.core.verdict import AGAIN, AGREEMENT, Finding, Step, Verdict
 from visioncal.estimation.pivot import PivotFit, fit_pivot
 from visioncal.estimation.readings import readings_that_close
 from visioncal.estimation.touching import Touches, TouchKind
@@ -172,7 +172,7 @@ def _doubts(
             "inverse_poses",
             "The tip would be farther from the flange than the point from the base: poses read the "
             "other way round look like this.",
-            Step("If the columns hold flange_from_base, say --robot-inverse."),
+            Step("If the columns hold flange_from_base, say so.", f"{AGAIN} --robot-inverse"),
         )
     yield from weak_directions(
         fit.worst,

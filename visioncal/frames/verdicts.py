@@ -7,7 +7,7 @@ import numpy as np
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
 from visioncal.core.types import Mask
-from visioncal.core.verdict import Finding, Step
+from visioncal.core.verdict import AGAIN, Finding, Step
 from visioncal.estimation.observability import Direction
 
 
@@ -90,7 +90,10 @@ def noisy(
             "noise",
             f"The {things} scatter by more than they are stated to, without one that stands out: "
             f"{figure(noise_mm)} mm per axis.",
-            Step("Repeat them, or state the noise as it is."),
+            Step(
+                "Repeat them, or state the noise as it is.",
+                f"{AGAIN} --touch-noise-mm {noise_mm:.2g}",
+            ),
         )
 
 

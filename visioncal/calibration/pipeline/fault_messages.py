@@ -13,7 +13,7 @@ from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import distances, mean_transform, pose_difference
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.core.verdict import CALIBRATE, Finding, Step
+from visioncal.core.verdict import CALIBRATE, Finding, Step, look_at
 from visioncal.estimation.problem import Problem
 from visioncal.results import Moved
 
@@ -202,8 +202,9 @@ def _pushed_bases(solved: Solved) -> list[PoseFault]:
             f"{solved.cell.stops[int(stops[after].min())]} on disagree with those before{as_if}: "
             f"{branch.parent} is where it stood before."
         )
-        step = Step("Fasten it, and align the stops from there on alone.")
-        pushed = Finding("something_moved", words, step, _numbers(solved, after.tolist()))
+        views = _numbers(solved, after.tolist())
+        step = Step("Fasten it, and align the stops from there on alone.", look_at(views[0]))
+        pushed = Finding("something_moved", words, step, views)
         found.append(PoseFault(pushed, tuple(after.tolist())))
     return found
 
@@ -237,8 +238,9 @@ def _wrong_poses(solved: Solved, explained: set[int]) -> Iterator[PoseFault]:
                     f"as if it had been moved by {moved}, and were left out "
                     f"({_views(solved, rows.tolist())})."
                 )
-                step = Step("Correct its pose there in views.csv, or leave the stop out.")
-                found = Finding("wrong_pose", words, step, _numbers(solved, rows.tolist()))
+                views = _numbers(solved, rows.tolist())
+                fix = "Correct its pose there in views.csv, or leave the stop out."
+                found = Finding("wrong_pose", words, Step(fix, look_at(views[0])), views)
                 short = (
                     f"the pose of robot {branch.robot} at stop {solved.cell.stops[stop]} is wrong"
                 )

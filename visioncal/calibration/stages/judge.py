@@ -21,6 +21,7 @@ from visioncal.core.verdict import (
     Step,
     Verdict,
     VerdictStatus,
+    look_at,
     remarks,
 )
 from visioncal.estimation.observability import Direction
@@ -402,7 +403,8 @@ def _disagreement_doubts(pair: Pair) -> Iterator[Finding]:
         if run
         else Step(
             "Look at the images and poses of these views: repeat them, or in views.csv, delete "
-            f"the row{'s' if len(views) > 1 else ''} of view {', '.join(map(str, views))}."
+            f"the row{'s' if len(views) > 1 else ''} of view {', '.join(map(str, views))}.",
+            look_at(views[0]),
         )
     )
     kind, without_it = "something_moved" if run else "wrong_views", _without_them(pair.held_out)
@@ -438,7 +440,8 @@ def _outlier_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[F
                 "at it."
             )
             step = Step(
-                "Look at its image and its pose, and take it out of views.csv if one is wrong."
+                "Look at its image and its pose, and take it out of views.csv if one is wrong.",
+                look_at(view.view),
             )
             yield Finding("wrong_views", words, step, (view.view,)).of(pair.name)
 
@@ -583,7 +586,8 @@ def _lost_doubts(sensor: Sensor, limits: CalibrationLimits) -> Iterator[Finding]
             told += f"; the first{' but for these' if disagree else ''}: view {others[0].view}, "
             told += others[0].reason
         words = f"{len(lost)} of {used + len(lost)} views are not used{told}."
-        step = Step("Look at the first of them, and repeat what is missing.") if others else None
+        words_do = "Look at the first of them, and repeat what is missing."
+        step = Step(words_do, look_at(others[0].view)) if others else None
         views, is_fatal = tuple(it.view for it in lost), share > limits.lost_share[1]
         # Those that disagree have a finding of their own.
         kind = "lost_views" if others else "left_out"

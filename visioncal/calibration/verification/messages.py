@@ -22,32 +22,45 @@ from visioncal.core.limits import CheckLimits
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import exp, inverse_right_jacobian, skew
 from visioncal.core.types import FloatArray
-from visioncal.core.verdict import AGREEMENT, VERIFY, Finding, Step, Verdict
+from visioncal.core.verdict import (
+    AGREEMENT,
+    CALIBRATE_ANEW,
+    PLAN,
+    VERIFY,
+    Finding,
+    Step,
+    Verdict,
+)
 from visioncal.estimation.null_space import joint_words, listed
 from visioncal.estimation.observability import axis_words
 from visioncal.vision.targets import corner_positions
 
 # A part of a motion that is less than so many sigmas is not worth a word.
 _WORTH_A_WORD = 3.0
+# So many stops say roughly where camera and board are, by which more are planned.
+_LEAST_STOPS = 3
 # A camera that moves by so many sigmas is told from none in nearly every check.
 _SURE = 6.0
 _ALUMINIUM, _STEEL = 23e-6, 12e-6
+_ANEW = "calibrate again; these stops make a first result, and more a good one."
 _ANOTHER_BOARD = Step(
     "Verify with the board that was calibrated with; or measure the squares of this one, and "
-    "calibrate again with it."
+    f"{_ANEW}",
+    CALIBRATE_ANEW,
 )
 _NEXT = {
-    CAMERA: Step("Fasten the camera, and calibrate again."),
+    CAMERA: Step(f"Fasten the camera, and {_ANEW}", CALIBRATE_ANEW),
     BOARD: Step(
         "Put the board back; if it was moved on purpose, verify without its place.",
         f"{VERIFY} --board-moved",
     ),
-    BOTH: Step("Fasten both, and calibrate again."),
+    BOTH: Step(f"Fasten both, and {_ANEW}", CALIBRATE_ANEW),
     SIZE: _ANOTHER_BOARD,
     REPLACED: _ANOTHER_BOARD,
     JOINT: Step(
         "Look whether the joint keeps its zero (a coupling that slips does so again), then "
-        "calibrate again."
+        f"{_ANEW}",
+        CALIBRATE_ANEW,
     ),
     LENGTH: Step(
         "Let the arm come to the temperature at which it was calibrated, or calibrate it at the "
@@ -55,10 +68,13 @@ _NEXT = {
     ),
     NOISE: Step(
         "Look for play in mounts and joints, and whether the robot stood still at each image; "
-        "then verify again."
+        "then verify again.",
+        VERIFY,
     ),
 }
-_WRONG_VIEW = Step("Take that stop again: its image and its pose do not belong together.")
+_WRONG_VIEW = Step(
+    "Take that stop again, whose image and pose do not belong together; then verify again.", VERIFY
+)
 
 
 @dataclass(frozen=True)
@@ -107,7 +123,7 @@ def verdict_of(check: Check) -> Verdict:
     changed = Finding(
         kind_of(best.name),
         _changed(check, best),
-        _NEXT.get(kind_of(best.name), _WRONG_VIEW),
+        _runnable(check, _NEXT.get(kind_of(best.name), _WRONG_VIEW)),
         probability=best.probability,
     )
     told = [changed]
@@ -115,8 +131,24 @@ def verdict_of(check: Check) -> Verdict:
         told.append(_rivals(check, best, others))
     if not check.explained:
         words = "Alone it does not explain the stops: something else has changed too."
-        told.append(Finding("unexplained", words, Step("Calibrate again.")))
+        anew = _runnable(check, Step(_capital(_ANEW), CALIBRATE_ANEW))
+        told.append(Finding("unexplained", words, anew))
     return Verdict("bad", (*told, *(doubts if others else ())))
+
+
+def _runnable(check: Check, step: Step) -> Step:
+    """Advice without its command where these stops do not allow it."""
+    session = check.seen.known.session
+    of_images = any(it.image for it in session.views)
+    is_lens_known = not of_images or session.camera is not None
+    allowed = {
+        CALIBRATE_ANEW: check.seen.stops >= CheckLimits.stops and is_lens_known,
+        PLAN: of_images
+        and is_lens_known
+        and check.seen.stops >= _LEAST_STOPS
+        and check.calibration.robot is not None,
+    }
+    return step if allowed.get(step.command, True) else Step(step.words)
 
 
 def _rivals(check: Check, best: Suspect, others: Sequence[Suspect]) -> Finding:
@@ -127,7 +159,8 @@ def _rivals(check: Check, best: Suspect, others: Sequence[Suspect]) -> Finding:
         # A base that turns about the first axis, or a tool about the last, looks the same anywhere.
         return Finding("rivals", f"No stops can tell that from {named}.", Step("Look at both."))
     words = f"These {_stops(check)} cannot tell that from {named}."
-    return Finding("rivals", words, Step("Verify with stops all over the workspace."))
+    step = _runnable(check, Step("Verify with stops all over the workspace.", PLAN))
+    return Finding("rivals", words, step)
 
 
 def described(check: Check, suspect: Suspect) -> dict[str, Any]:
@@ -325,7 +358,8 @@ def _agreement(check: Check) -> str:
 def _doubts(check: Check) -> Iterator[Finding]:
     if check.seen.stops < CheckLimits.stops:
         words = f"{_capital(_stops(check))} hardly tell one change from another."
-        yield Finding("few_stops", words, Step(f"Take {CheckLimits.stops} stops or more."))
+        step = _runnable(check, Step(f"Take {CheckLimits.stops} stops or more.", PLAN))
+        yield Finding("few_stops", words, step)
 
 
 def _stops(check: Check) -> str:

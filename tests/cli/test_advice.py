@@ -1,0 +1,109 @@
+"""Commands that are printed as advice are run word for word, as a reader would paste them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.advice import failures, printed_commands
+from support.broken_sessions import BROKEN, broken_session, edit_rows
+from support.commands import turned_poses, visioncal, write_poses
+from support.whole_cells import OPTIONS, recorded
+
+from visioncal.core.transforms import invert
+from visioncal.session import Session
+from visioncal.simulation import CellOptions, simulate, simulate_network, write_session
+from visioncal.simulation.dynamics import real_dynamics
+from visioncal.simulation.exercise import exercise_session, record, slow_sweep
+
+# Of each kind of advice one; the others are slow.
+QUICK = (
+    "two rows exchanged",
+    "one pose typed wrong",
+    "two images missing",
+    "columns rx, ry, rz",
+    "another dictionary",
+)
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """A folder that the commands are typed in: some write beside it."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(it, marks=() if it in QUICK else pytest.mark.slow) for it in BROKEN]
+)
+def test_of_broken_sessions(place, name):
+    broken_session(place / "session", BROKEN[name])
+    for words in (("doctor", "session"), ("calibrate", "session", "-o", "out")):
+        done = visioncal(*words)
+        assert done.status in (0, 2, 3)
+        assert list(failures(done.err)) == []
+
+
+@pytest.mark.parametrize("poor", [{"tilt_rad": (0.0, 0.1), "views": 8}, {"views": 5}])
+def test_of_poor_motion_with_a_modelled_arm(place, poor):
+    write_session(simulate(CellOptions(seed=4, **poor)), place / "session")
+    done = visioncal("calibrate", "session", "-o", "out", "--need-mm", "0.02")
+    assert "visioncal plan session --add 5" in done.err
+    assert list(failures(done.err)) == []
+
+
+def test_of_verify(place):
+    whole = Session.load(write_session(simulate(CellOptions(views=20, seed=5)), place / "all"))
+    replace(whole, views=whole.views[:15]).save(place / "fit")
+    assert visioncal("calibrate", "fit", "-o", "out").status == 0
+    for name, last, change in (
+        ("few", 18, lambda row: row),
+        ("knocked", 20, lambda row: row | {"x_m": str(float(row["x_m"]) + 0.01)}),
+    ):
+        replace(whole, views=whole.views[15:last]).save(place / name)
+        edit_rows(place / name, lambda rows, change=change: [*map(change, rows)])
+        done = visioncal("verify", name, "--against", "out")
+        assert printed_commands(done.err), name
+        assert list(failures(done.err)) == []
+
+
+def test_of_a_tool(place):
+    rng = np.random.default_rng(3)
+    above, tip = np.eye(3), np.array([0.02, 0.01, 0.15])
+    tips = np.tile([0.4, 0.1, 0.2], (8, 1)) + rng.normal(scale=1e-4, size=(8, 3))
+    poses = turned_poses(rng, tips, tip, above)
+    write_poses(place / "inverse.csv", invert(poses))
+    write_poses(place / "touches.csv", poses)
+    for words in (
+        ("tcp", "inverse.csv", "-o", "frames.json"),
+        ("tcp", "touches.csv", "-o", "frames.json", "--force", "--touch-noise-mm", "0.01"),
+    ):
+        done = visioncal(*words)
+        assert done.status == 0
+        assert printed_commands(done.err), done.err
+        assert list(failures(done.err)) == []
+
+
+def test_of_a_whole_cell(place):
+    recorded(simulate_network(OPTIONS)).save(place / "cell")
+
+    def pushed(row):
+        is_there = (row["stop"], row["robot"]) == ("5", "a")
+        return row | ({"x_m": str(float(row["x_m"]) + 0.03)} if is_there else {})
+
+    edit_rows(place / "cell", lambda rows: [*map(pushed, rows)])
+    done = visioncal("align", "cell", "-o", "out")
+    assert done.status == 0
+    assert printed_commands(done.err), done.err
+    assert list(failures(done.err)) == []
+
+
+@pytest.mark.slow
+def test_of_dynamics(place):
+    rng = np.random.default_rng(2)
+    built = real_dynamics("ur5e", rng)
+    streams = {"sweeps": record(built, slow_sweep(6, rng, seconds=30.0), rng)}
+    exercise_session("ur5e", streams).save(place / "session")
+    done = visioncal("dynamics", "identify", "session", "-o", "out")
+    assert done.status == 0
+    assert "visioncal dynamics plan ur5e -o motions" in printed_commands(done.err)
+    assert list(failures(done.err)) == []
