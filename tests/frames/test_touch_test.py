@@ -1,5 +1,6 @@
 """The touch test: what the camera locates, touched by a simulated arm that knows the truth."""
 
+import io
 import json
 from dataclasses import replace
 
@@ -50,7 +51,7 @@ def test_the_tip_comes_as_near_as_predicted(proved):
         judged(points, [0.1], "")
 
 
-def test_targets_are_printed_and_gaps_join_the_result(proved):
+def test_targets_are_printed_and_gaps_join_the_result(proved, monkeypatch):
     folder, look, _ = proved
     out = folder / "out"
     done = visioncal("touch-test", look, "-c", out)
@@ -70,6 +71,18 @@ def test_targets_are_printed_and_gaps_join_the_result(proved):
     assert done.status == 3
     assert "Measure the tool's tip anew" in done.err
     assert not Calibration.load(out).touch_test.passed
+    # At a terminal each point is asked for, until a length is typed.
+    typed = io.StringIO("0.1\nnothing\n0,2\n-1\n0.1\n0.1\n0.1\n")
+    typed.isatty = lambda: True
+    monkeypatch.setattr("sys.stdin", typed)
+    done = visioncal("touch-test", look, "-c", out)
+    assert done.status == 0
+    assert done.err.count("gap [mm]:") == 7
+    gaps_mm = [it.gap_mm for it in Calibration.load(out).touch_test.points]
+    assert gaps_mm == [0.1, 0.2, 0.1, 0.1, 0.1]
+    ended = visioncal("touch-test", look, "-c", out)
+    assert ended.status == 2
+    assert "nothing was kept" in ended.err
     done = visioncal("touch-test", look, "-c", out, "--tool", "gripper")
     assert done.status == 2
     assert "flange_from_gripper" in done.err

@@ -1,11 +1,14 @@
 """`visioncal touch-test`."""
 
 import json
+import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 from rich.markup import escape
 from scipy.spatial.transform import RigidTransform
@@ -26,6 +29,7 @@ from visioncal.session import Session
 
 # The gaps are larger than predicted.
 _EXIT_LARGER = 3
+_FORM = "Flange targets: x, y, z \\[mm], rotation vector \\[rad]; hover first, then touch."
 
 
 def touch_test_command(
@@ -49,8 +53,9 @@ def touch_test_command(
 ) -> None:
     """Prove a calibration: touch what the camera locates, and enter the gaps.
 
-    The session has one image or more of a board as it lies now. Without gaps: where to send the
-    robot, hovering first, corrected where the arm is calibrated. With them: compared with what was
+    The session has one image or more of a board as it lies now. Says where to send the robot,
+    hovering first, corrected where the arm is calibrated; at a terminal it asks for each gap. With
+    all gaps: compared with what was
     predicted, and kept in the result and its report. Exit status 3: they are larger.
     """
     loaded = Session.load(session)
@@ -66,11 +71,14 @@ def touch_test_command(
     with shown_progress(quiet=as_json):
         points = touch_points(loaded, known, tool)
     targets = [_target(known, it, 1e-3 * height_mm) for it in points]
-    if gaps_mm is None:
+    if gaps_mm is not None:
+        count = gaps_mm.count(",") + 1
+        gaps = [*numbers_in(gaps_mm, "--gaps-mm", ",".join("abcdefghij"[:count]))]
+    elif sys.stdin.isatty() and not as_json:
+        gaps = _asked(points, targets)
+    else:
         _tell(points, targets, as_json=as_json)
         return
-    count = gaps_mm.count(",") + 1
-    gaps = numbers_in(gaps_mm, "--gaps-mm", ",".join("abcdefghij"[:count]))
     test = judged(points, gaps, tool)
     proved = replace(known, touch_test=test)
     written = rewrite(calibration if calibration.is_dir() else calibration.parent, proved)
@@ -108,17 +116,52 @@ def _tell(
         typer.echo(json.dumps({"points": targets}, indent=2))
         return
     console = messages()
-    console.print(
-        "Flange targets: x, y, z \\[mm], rotation vector \\[rad]; hover first, then touch."
-    )
+    console.print(_FORM)
     for point, target in zip(points, targets, strict=True):
-        x, y, z = 1e3 * point.base_m
-        console.print(
-            f"{point.name} at ({x:.2f}, {y:.2f}, {z:.2f}) mm, 95 % within "
-            f"{figure(point.radius95_mm)} mm"
-        )
-        for name in ("hover", "touch"):
-            place, turn = target[name][:3], target[name][3:]
-            numbers = [*(f"{1e3 * it:.2f}" for it in place), *(f"{it:.5f}" for it in turn)]
-            console.print(f"  {name}: {', '.join(numbers)}")
+        _tell_point(point, target)
     console.print("Enter the gaps with --gaps-mm, in this order.")
+
+
+def _tell_point(point: TouchPoint, target: dict[str, Any]) -> None:
+    """Says where a point is, and where to send the robot."""
+    console, (x, y, z) = messages(), 1e3 * point.base_m
+    console.print(
+        f"{point.name} at ({x:.2f}, {y:.2f}, {z:.2f}) mm, 95 % within {figure(point.radius95_mm)} "
+        "mm"
+    )
+    for name in ("hover", "touch"):
+        place, turn = target[name][:3], target[name][3:]
+        numbers = [*(f"{1e3 * it:.2f}" for it in place), *(f"{it:.5f}" for it in turn)]
+        console.print(f"  {name}: {', '.join(numbers)}")
+
+
+def _asked(points: Sequence[TouchPoint], targets: Sequence[dict[str, Any]]) -> list[float]:
+    """Asks for the gaps, one point after the other.
+
+    Raises:
+        DataError: Nothing more is typed.
+    """
+    messages().print(_FORM)
+    gaps = []
+    for point, target in zip(points, targets, strict=True):
+        _tell_point(point, target)
+        gaps.append(_gap())
+    return gaps
+
+
+def _gap() -> float:
+    """Asks until a length is typed."""
+    while True:
+        messages().print("  gap \\[mm]: ", end="")
+        line = sys.stdin.readline()
+        if not line:
+            raise DataError(
+                "touch-test: the gaps are at their end, and nothing was kept.",
+                culprits=["stdin"],
+                next_step="Give all with --gaps-mm.",
+            )
+        with suppress(ValueError):
+            gap = float(line.replace(",", "."))
+            if 0.0 <= gap < np.inf:
+                return gap
+        messages().print("  A length of 0 mm or more is needed, as 0.2.")
