@@ -250,7 +250,8 @@ def _difference(value: float) -> str:
 
 def view_markdown(view: ViewResult) -> str:
     """What became of one view."""
-    lines = [f"# View {view.view}: {'used' if view.used else 'not used'}", ""]
+    state = "used" if view.used else "not used"
+    lines = [f"# View {view.view}: {state} ([report](report.html#view-{view.view}))", ""]
     if view.reason:
         lines += [plain(view.reason), ""]
     figures = (
@@ -260,8 +261,7 @@ def view_markdown(view: ViewResult) -> str:
         ("orientation residual", view.residual_deg, " deg"),
     )
     known = [f"{label} {value:.3g}{unit}" for label, value, unit in figures if value is not None]
-    row = f"[report.html](report.html#view-{view.view})"
-    return "\n".join([*lines, ", ".join(known), "", f"Among all views: {row}, view {view.view}"])
+    return "\n".join([*lines, ", ".join(known)])
 
 
 def plain(text: str) -> str:

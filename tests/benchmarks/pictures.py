@@ -1,0 +1,109 @@
+"""The pictures that the pages show: report, certificate, viewer and notebook card, in recordings/.
+
+    PYTHONPATH=tests python tests/benchmarks/pictures.py [--quick]
+
+It needs Chromium. A quick run takes the pictures of pages, and leaves recordings/ as it is.
+"""
+
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import chdir, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from threading import Thread
+
+import cv2
+import numpy as np
+from results import QUICK
+from support.broken_sessions import BROKEN, broken_session
+from support.browser import CHROMIUM, Page, chromium
+from support.commands import visioncal
+
+import visioncal as package
+from visioncal.present.viewer import web
+from visioncal.simulation import CellOptions, simulate, write_session
+
+_FOLDER = Path(__file__).parents[2] / "recordings"
+# How long the viewer has for its drawing, without a graphics card [s].
+_PATIENCE_S = 240.0
+
+
+def main() -> None:
+    if CHROMIUM is None:
+        words = "Chromium is not installed."
+        print(f"left out: {words}")
+        sys.exit(None if QUICK else words)
+    with tempfile.TemporaryDirectory() as place, chdir(place):
+        write_session(simulate(replace(CellOptions(), views=15, seed=3)), "cell-4")
+        broken_session(Path("cell-5"), BROKEN["one pose typed wrong"])
+        visioncal("calibrate", "cell-4", "-o", "out", "--need-mm", "0.5")
+        visioncal("calibrate", "cell-5", "-o", "doubted")
+        signed = ("--operator", "A. Smith", "--serial", "camera=1944301", "--serial", "robot=UR-77")
+        visioncal("report", "out", "--certificate", *signed, "-o", "certificate.html")
+        card = package.Calibration.load("out")._repr_html_()
+        Path("card.html").write_text(f"<meta charset=utf-8>{card}", "utf-8")
+        with chromium(Path("profile")) as page:
+            for name, file, width, height in (
+                ("report", "out/report.html", 1100, 1300),
+                ("report_phone", "out/report.html", 390, 1300),
+                ("certificate", "certificate.html", 800, 1130),
+                ("notebook_card", "card.html", 800, 330),
+            ):
+                _sized(page, width, height, is_phone=width < 500)
+                page.visit(Path(file).absolute().as_uri())
+                _keep(name, page.picture())
+            for name, folder, row in () if QUICK else (("viewer", "doubted", 6),):
+                _sized(page, 1400, 880, is_phone=False)
+                with _served(Path(folder, "recording.rrd")) as url:
+                    page.visit(f"{url}#when=view@{row}")
+                    _keep(name, page.picture_once(_Settled(), _PATIENCE_S))
+
+
+def _sized(page: Page, width: int, height: int, *, is_phone: bool) -> None:
+    page.call(
+        "Emulation.setDeviceMetricsOverride",
+        width=width,
+        height=height,
+        deviceScaleFactor=1,
+        mobile=is_phone,
+    )
+
+
+class _Settled:
+    """Whether a picture shows much, and the same as the one some seconds before."""
+
+    def __init__(self) -> None:
+        self._before = np.zeros(0)
+
+    def __call__(self, picture: np.ndarray) -> bool:
+        time.sleep(8.0)
+        same = self._before.shape == picture.shape and np.mean(self._before != picture) < 1e-3
+        self._before = picture
+        return bool(same and picture.std() > 40.0)
+
+
+@contextmanager
+def _served(recording: Path) -> Iterator[str]:
+    server = web._server(web._routes(recording), 0)
+    Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}/"
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+def _keep(name: str, picture: np.ndarray) -> None:
+    """Writes a picture where the pages have it; a quick run, beside what it was taken of."""
+    file = (Path(os.curdir) if QUICK else _FOLDER) / f"{name}.png"
+    cv2.imwrite(str(file), picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    print(
+        f"{file.name}: {picture.shape[1]} x {picture.shape[0]}, {file.stat().st_size / 1e3:.0f} kB"
+    )
+
+
+if __name__ == "__main__":
+    main()
