@@ -27,8 +27,10 @@ EXCHANGED = Finding(
     (3, 4),
 )
 POSTURE = Finding("arm_errors", "Residuals follow the arm's posture.", mahalanobis_sq=45.0)
+FIELD = Finding("lens_field", "The lens departs.", mahalanobis_sq=300.0, up_to_mm=0.08)
 DRIFT = Finding("moved_slowly", "Residuals drift with time.")
-SIZE = scale_found("board", 0.03, MeasuredScale(0, 4.7e-3, 6e-4, 8e-4))
+MEASURED = MeasuredScale(0, 4.7e-3, 6e-4, 8e-4)
+SIZE = scale_found("board", 0.03, MEASURED, replace(MEASURED, scale=4e-3, sigma=9e-4))
 
 
 def chi2_chance(square: float) -> float:
@@ -74,6 +76,24 @@ def test_explanations_of_one_misfit_share_it(warnings, chances) -> None:
     (unexplained,) = (it for it in verdict.causes if it.kind == "unexplained")
     assert unexplained.probability == pytest.approx(1.0 / (1.0 + sum(odds.values())))
     assert sum(it.probability for it in verdict.causes) == pytest.approx(1.0)
+
+
+def test_a_size_is_said_as_the_result_has_it() -> None:
+    assert "0.4 % larger than stated (sigma 0.09 %): squares of 30.12 mm" in SIZE.words
+    assert "square_m = 0.03012;" in SIZE.do.words
+
+
+def test_what_moves_picks_little_is_no_cause_of_a_large_misfit() -> None:
+    """However sure it is that it is there."""
+    found = changed(SOUND, warnings=(FIELD, SIZE), away_mm=1.0)
+    verdict = judge(found)
+    assert ids(verdict)[0] == "board_size"
+    share = (FIELD.up_to_mm / found.held_out.mm) ** 2
+    assert next(it for it in verdict.causes if it.kind == "lens_field").probability < share
+    # Of what is small, or not known, the evidence decides.
+    for warnings in ((replace(FIELD, up_to_mm=5.0), SIZE), (replace(FIELD, up_to_mm=np.inf), SIZE)):
+        assert ids(judge(replace(found, warnings=warnings)))[0] == "lens_field"
+    assert ids(judge(replace(changed(SOUND), warnings=(FIELD,)))) == ["lens_field"]
 
 
 def test_what_nothing_explains_is_the_cause_itself() -> None:

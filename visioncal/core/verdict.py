@@ -89,6 +89,7 @@ class Finding:
             unexplained.
         mahalanobis_sq: The evidence for it, as the square of a standard normal variable; zero where
             the limit of the test that found it has to do.
+        up_to_mm: A pick errs by no more because of it [mm]; infinite where that is not known.
     """
 
     kind: str
@@ -100,6 +101,7 @@ class Finding:
     is_fatal: bool = field(default=False, compare=False)
     until_mm: float = field(default=np.inf, compare=False)
     mahalanobis_sq: float = field(default=0.0, compare=False)
+    up_to_mm: float = field(default=np.inf, compare=False)
 
     def of(self, name: str) -> Self:
         """The same finding with whom it is of, where there are several; empty names nobody."""

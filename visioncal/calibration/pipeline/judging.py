@@ -46,7 +46,7 @@ def findings_of(known: RunState) -> Findings:
     worst, places, warnings = _of_pair(known) if known.mount else _of_cell(known)
     of_rest = [
         *prior_words(answer.problem, answer.state, answer.covariance, solved.cell.priors),
-        *solved.found_of_looks(),
+        *solved.found_of_looks(answer.covariance),
     ]
     return Findings(
         _pairs(tied, explained, alone=known.mount is not None),

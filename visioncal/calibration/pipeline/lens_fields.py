@@ -28,11 +28,15 @@ class LensErrors:
         levels: Its sizes, over the noise of a corner's coordinate.
         noise_px: That [px].
         is_of_lens: Whether corners err by where they are in the image, not by which ones they are.
+        distance_m: The mean distance of the views [m].
+        focal_px: The focal length [px].
     """
 
     levels: LensLevels
     noise_px: float
     is_of_lens: bool
+    distance_m: float
+    focal_px: float
 
     @property
     def field_px(self) -> float:
@@ -46,9 +50,14 @@ def lens_errors(solved: Solved) -> dict[str, LensErrors]:
     if seen is None:
         return {}
     found = {}
-    for (name, problem), noise_px in zip(seen.looks.problems.items(), seen.sigmas_px, strict=True):
-        levels = problem.levels or LensLevels()
-        found[name] = LensErrors(levels, noise_px, _is_of_lens(solved, name))
+    for which, (name, problem) in enumerate(seen.looks.problems.items()):
+        found[name] = LensErrors(
+            problem.levels or LensLevels(),
+            seen.sigmas_px[which],
+            _is_of_lens(solved, name),
+            _distance_m(seen, which),
+            float(np.mean(seen.looks.camera(name).matrix[:2])),
+        )
     return found
 
 
@@ -158,6 +167,7 @@ def errors_found(lenses: Mapping[str, LensErrors]) -> Iterator[Finding]:
                     "the middle of the image."
                 ),
                 mahalanobis_sq=field,
+                up_to_mm=1e3 * it.field_px / it.focal_px * it.distance_m,
             )
         if max(breathing, jitter) > SIGNIFICANT:
             share = 100.0 * it.noise_px
@@ -171,4 +181,5 @@ def errors_found(lenses: Mapping[str, LensErrors]) -> Iterator[Finding]:
                 f"{of} changes its focal length {' and '.join(how)}. The result counts it.",
                 Step("Fix the focus (no autofocus), or work at one distance."),
                 mahalanobis_sq=max(breathing, jitter),
+                up_to_mm=10.0 * share * max(it.levels.breathing, it.levels.jitter) * it.distance_m,
             )

@@ -82,12 +82,13 @@ class Solved:
         """The observations that the fit was made from."""
         return self.agreed.problem.subset(self.agreed.used)
 
-    def found_of_looks(self) -> Iterator[Finding]:
+    def found_of_looks(self, covariance: FloatArray) -> Iterator[Finding]:
         """Says what was found of lenses and boards; see `stages.fit_messages`."""
         if self.seen is not None:
             part = self.agreed.problem.subset(self.agreed.used)
             side = _side(self.cell, self.agreed, self.arms, self.late)
-            yield from found_of_looks(side, Fitted(self.seen, part, self.agreed.fit))
+            fitted = Fitted(self.seen, part, self.agreed.fit)
+            yield from found_of_looks(side, fitted, covariance)
 
     @property
     def looks(self) -> CameraParameters | None:

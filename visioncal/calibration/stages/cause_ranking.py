@@ -5,7 +5,8 @@ How likely a cause is rests on what is computed today:
 - Of what a test found, by the chance p with which sound data pass its limit: against "nothing is
   wrong" its odds are at least 1 to -e p ln p (Sellke, Bayarri and Berger 2001), both alike
   beforehand. What explains the same misfit competes: odds are put in proportion, "none of these"
-  among them, which is the cause `unexplained`.
+  among them, which is the cause `unexplained`. What is known to move picks by less than left-out
+  views disagree explains no more of that than its square.
 - Of errors that are too large with nothing wrong, by the share of a pick's mean squared error that
   comes from them.
 - Of what is a fact, as a frame that nothing ties, it is one; remarks that no test is behind are no
@@ -150,6 +151,7 @@ def ranked(
     met: NeedMet | None,
     *,
     modelled: bool = False,
+    left_out_mm: float = 0.0,
 ) -> tuple[Finding, ...]:
     """Doubts with how likely each is the cause, and the sources of errors that are too large.
 
@@ -158,8 +160,9 @@ def ranked(
         picks: What picks err by.
         met: What is needed, and how likely it is met; None where nothing is.
         modelled: Whether the arms' models are known, so that views can be proposed.
+        left_out_mm: By how much left-out views disagree [mm].
     """
-    found = _tested(doubts)
+    found = _tested(doubts, left_out_mm)
     unmet = met is not None and met.probability < NeedLimits.probability[0]
     too_large = unmet or (met is None and any(it.until_mm == 0.0 for it in doubts))
     if too_large and picks:
@@ -168,13 +171,14 @@ def ranked(
     return tuple(found)
 
 
-def _tested(doubts: Sequence[Finding]) -> list[Finding]:
+def _tested(doubts: Sequence[Finding], left_out_mm: float) -> list[Finding]:
     """Doubts, each weighed against what explains the same; of one kind, the first is the cause."""
     first: dict[str, Finding] = {}
     for it in doubts:
         if it.kind in EVIDENCE:
             first.setdefault(it.kind, it)
-    odds = {name: _odds(_chance(it)) for name, it in first.items()}
+    misfit_mm = left_out_mm if "unexplained" in first else 0.0
+    odds = {name: _explaining(it, misfit_mm) for name, it in first.items()}
     weighed = []
     for doubt in doubts:
         name = doubt.kind
@@ -190,6 +194,15 @@ def _tested(doubts: Sequence[Finding]) -> list[Finding]:
         none = float(name != "unexplained" and not (rivals and "unexplained" in first))
         weighed.append(replace(doubt, probability=odds[name] / (none + odds[name] + rivals)))
     return weighed
+
+
+def _explaining(doubt: Finding, misfit_mm: float) -> float:
+    """The odds of a finding, which explains no more of a misfit than it moves picks by."""
+    odds = _odds(_chance(doubt))
+    if doubt.up_to_mm >= misfit_mm:
+        return odds
+    most = (doubt.up_to_mm / misfit_mm) ** 2 * odds / (1.0 + odds)
+    return most / (1.0 - most)
 
 
 _LEAST_CHANCE = 1e-12

@@ -1,6 +1,7 @@
 """What the joint fit found of lenses and boards, in sentences for the user."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -33,12 +34,13 @@ _NEW_LENS = Step(
 )
 
 
-def found_of_looks(side: Side, fitted: Fitted) -> Iterator[Finding]:
+def found_of_looks(side: Side, fitted: Fitted, covariance: FloatArray) -> Iterator[Finding]:
     """Says what a joint fit found of lenses and boards; what is no reason for doubt is a note.
 
     Args:
         side: The frames' side of the fit.
         fitted: The answer.
+        covariance: (p, p) of its unknowns, with all that counts beside the noise.
     """
     looks = fitted.looks
     cameras = zip(looks.problems.items(), fitted.seen.compressed, strict=True)
@@ -54,7 +56,13 @@ def found_of_looks(side: Side, fitted: Fitted) -> Iterator[Finding]:
             continue
         called = f"board {scene.names[board]}".strip()
         if _moves(fitted, looks.scale_of(board)):
-            yield scale_found(called, target.square_m, measured_scale(side, fitted, board))
+            (place,) = looks.scale_of(board)
+            at = fitted.columns.start + int(np.searchsorted(fitted.seen.free, place))
+            measured = measured_scale(side, fitted, board)
+            written = replace(
+                measured, scale=float(looks.values[place]), sigma=float(covariance[at, at] ** 0.5)
+            )
+            yield scale_found(called, target.square_m, measured, written)
         if _moved(fitted, looks.shape_of(board)):
             yield bend_found(called, 1e3 * float(np.ptp(looks.corners[board][:, 2])))
 
@@ -87,20 +95,23 @@ def noise_found(stack: CornerStack, residuals: FloatArray, unknowns: int) -> Ite
     )
 
 
-def scale_found(board: str, square_m: float, measured: MeasuredScale) -> Finding:
+def scale_found(
+    board: str, square_m: float, measured: MeasuredScale, written: MeasuredScale
+) -> Finding:
     """Words another size than the file states; a note where that allows it.
 
     Args:
         board: What the board is called.
         square_m: The stated side of its squares [m].
         measured: What the robot's motion says.
+        written: What the result has, with all that counts beside the noise.
     """
     side, share = 1e3 * square_m, f"{figure(100 * measured.stated_sigma)} %"
     sized = (
         f"By the robot's motion the {board} is "
-        f"{figure(100 * abs(measured.scale))} % "
-        f"{'larger' if measured.scale > 0 else 'smaller'} than stated (sigma "
-        f"{figure(100 * measured.sigma)} %): squares of {side * (1 + measured.scale):.4g} mm, "
+        f"{figure(100 * abs(written.scale))} % "
+        f"{'larger' if written.scale > 0 else 'smaller'} than stated (sigma "
+        f"{figure(100 * written.sigma)} %): squares of {side * (1 + written.scale):.4g} mm, "
         f"not of {side:.4g} mm"
     )
     if not measured.contradicts:
@@ -112,7 +123,7 @@ def scale_found(board: str, square_m: float, measured: MeasuredScale) -> Finding
         "if the board is right, the arm's model is off by as much.",
         Step(
             "Measure the board over many squares. Where it is as the robot says, in its .toml, "
-            f"write square_m = {1e-3 * side * (1 + measured.scale):.4g}; otherwise see to the arm.",
+            f"write square_m = {1e-3 * side * (1 + written.scale):.4g}; otherwise see to the arm.",
             CALIBRATE,
         ),
         mahalanobis_sq=measured.scale**2 / (measured.sigma**2 + measured.stated_sigma**2),

@@ -229,7 +229,13 @@ def judge(findings: Findings, limits: CalibrationLimits | None = None) -> Verdic
         status = "check" if met.probability >= NeedLimits.probability[1] else "bad"
     ordered: Sequence[Finding] = sorted(doubts, key=lambda doubt: not doubt.is_fatal)
     if status != "good":
-        ordered = ranked(ordered, findings.picks, met, modelled=findings.plannable)
+        ordered = ranked(
+            ordered,
+            findings.picks,
+            met,
+            modelled=findings.plannable,
+            left_out_mm=findings.held_out.mm,
+        )
     said = list(ordered)
     if met is None:
         said += _good_for(findings, good_for_mm, status)
