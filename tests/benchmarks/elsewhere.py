@@ -183,6 +183,7 @@ class Case:
     corners: np.ndarray
     pixels: np.ndarray
     given: np.ndarray
+    mean_m: float
 
 
 def pose(turn, place):
@@ -252,7 +253,8 @@ def cell(world: World, mount: str, given: bool, seed: int, folder: Path) -> Case
         x = pose(np.array([0.1, 2.9, 0.2]), [0.9, 0.1, 0.7])
         z = pose(rng.normal(0, 0.2, 3), [-0.1, -0.08, 0.05])
         robot = x @ boards @ np.linalg.inv(z)
-    far = boards[:, 2, 3] / boards[:, 2, 3].mean()
+    mean_m = float(boards[:, 2, 3].mean())
+    far = boards[:, 2, 3] / mean_m
     focal = world.focus(far, rng) if world.focus else np.ones(len(far))
     pixels = np.array(
         [
@@ -271,7 +273,7 @@ def cell(world: World, mount: str, given: bool, seed: int, folder: Path) -> Case
     if given and world.is_said:
         with (folder / "session.toml").open("a") as file:
             file.write(f"matrix_sigma_px = {world.off_px}\n")
-    return Case(world, mount, x, z, reported, shift, corners, pixels, stated)
+    return Case(world, mount, x, z, reported, shift, corners, pixels, stated, mean_m)
 
 
 def write(folder, mount, matrix, reported, pixels):
@@ -383,7 +385,9 @@ def looks_of(case: Case, seed: int, count: int = 4) -> Iterator[Look]:
         error = pose(world.robot_rad * noise[:3], world.robot_m * noise[3:])
         robot = case.z @ np.linalg.inv(board) @ np.linalg.inv(case.x)
         camera = robot @ case.x if case.mount == "eye-in-hand" else case.x
-        px = seen(there[None, :3], case.shift)[0] + world.pixel_px * rng.normal(size=2)
+        far = board[2:3, 3] / case.mean_m
+        focal = float(world.focus(far, rng)[0]) if world.focus else 1.0
+        px = seen(there[None, :3], case.shift, focal)[0] + world.pixel_px * rng.normal(size=2)
         yield Look(px, (camera @ there)[:3], camera[:3, 2], robot @ error)
 
 
