@@ -319,6 +319,9 @@ def test_json_is_the_frame_alone(tmp_path):
     done = tcp(tmp_path, touched(Job(), 1).touches, "-o", path, "--json")
     assert json.loads(done.out) == json.loads(path.read_text())["frames"]
     assert done.err == ""
+    refused = visioncal("tcp", tmp_path / "nowhere.csv", "--json")
+    assert refused.status == 2
+    assert json.loads(refused.out)["error"]["message"] in refused.err
 
 
 @pytest.fixture(scope="module")

@@ -206,6 +206,22 @@ def test_bare_numbers_are_asked_for_once():
     assert sum("Which is it?" in it for it in questions) == 2
 
 
+def test_lines_of_a_file_are_a_pose_each_and_none_is_passed_over():
+    lines = ["", "p[0.4,0,0,0,0,0]", "p[0.5,0,0,0,0,0]", "p[0.6,0", "p[0.7,0,0,0,0,0]", "q"]
+    ask, questions = asked(lines)
+    arm = ManualArm(ask, answers=False)
+    assert [arm.state().base_from_flange[0, 3] for _ in range(2)] == [0.4, 0.5]
+    with pytest.raises(DriverError, match="is no pose"):
+        arm.state()
+    assert arm.state().base_from_flange[0, 3] == 0.7
+    with pytest.raises(EOFError):
+        arm.state()
+    assert set(questions) == {""}
+    ask, _ = asked(["400 -100 300 10 -20 170"])
+    with pytest.raises(DriverError, match="--pose-form"):
+        ManualArm(ask, answers=False).state()
+
+
 def test_the_form_can_be_said_beforehand():
     ask, questions = asked(["400 -100 300 10 -20 170", ""])
     ManualArm(ask, "fanuc").state()

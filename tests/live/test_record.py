@@ -293,9 +293,8 @@ def test_typed_poses_and_pictures_in_a_folder_make_a_session(planned, tmp_path):
         pose = arm.true_flange(0.0)
         turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
         numbers = ", ".join(f"{it:.6f}" for it in [*pose[:3, 3], *turn])
-        # Take it, its pose, and yes, that is what it means.
-        lines += ["", f"p[{numbers}]", ""]
-    answers = io.StringIO("\n".join([*lines, "q", ""]))
+        lines.append(f"p[{numbers}]")
+    answers = io.StringIO("\n".join([*lines, ""]))
     words = ["--arm", "manual", "--camera", f"folder:{tmp_path / 'pictures'}"]
     words += ["--target", "charuco_9x6_30mm", "-o", tmp_path / "live"]
     with patch.object(sys, "stdin", answers):

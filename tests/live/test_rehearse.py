@@ -57,18 +57,19 @@ def test_a_rehearsal_through_a_protective_stop_is_as_near_to_the_truth_as_it_say
 
 
 def test_without_the_client_library_the_command_that_installs_it_is_told(tmp_path, monkeypatch):
-    def missing(module: str, extra: str) -> None:
-        raise DriverError(f"{module} is missing", next_step=f"pip install the extra {extra}")
+    def missing(needed: str, extras: dict[str, str]) -> None:
+        words = f"pip install the extras {', '.join(extras)}"
+        raise DriverError(f"{extras[needed]} is missing", next_step=words)
 
-    monkeypatch.setattr(command, "client_library", missing)
+    monkeypatch.setattr(command, "refuse_without", missing)
     done = visioncal("rehearse", "-o", tmp_path / "out")
     assert done.status == 2
-    assert "the extra ur" in done.err
+    assert "the extras ur, oak" in done.err
     assert not (tmp_path / "out").exists()
 
 
 def test_a_session_of_something_else_is_left_alone(tmp_path, monkeypatch):
-    monkeypatch.setattr(command, "client_library", lambda *_: None)
+    monkeypatch.setattr(command, "refuse_without", lambda *_: None)
     (tmp_path / "session").mkdir()
     (tmp_path / "session" / "views.csv").write_text("precious")
     done = visioncal("rehearse", "-o", tmp_path)

@@ -25,7 +25,7 @@ def messages() -> Console:
 
 
 def report_error(error: VisioncalError, *, as_json: bool) -> None:
-    """Prints an error: one message to stderr, or a JSON object to stdout."""
+    """Prints an error as one message to stderr, and where asked as a JSON object to stdout, too."""
     if as_json:
         document = {
             "class": type(error).__name__,
@@ -34,7 +34,6 @@ def report_error(error: VisioncalError, *, as_json: bool) -> None:
             "next": error.next_step,
         }
         typer.echo(json.dumps({"error": document}, indent=2))
-        return
     console = messages()
     console.print(f"[bold red]error:[/] {escape(error.message)}")
     unsaid = [it for it in error.culprits if it not in error.message]

@@ -178,7 +178,8 @@ def record_command(
         _check_driven(scene, drives=drives)
     taking = takes.options(single=is_folder(camera), lost=CaptureOptions.lost if drives else 0)
     requested = device.wishes()
-    wish = ArmWish("", not drives or dry_run, _asked, described.pose_form)
+    answers = sys.stdin.isatty()
+    wish = ArmWish("", not drives or dry_run, _asked, described.pose_form, answers)
     with ended_like_ctrl_c(), _opened(arm, wish, camera, requested) as cell:
         scene.check(cell.camera.resolution, drives=drives)
         if dry_run:
@@ -196,7 +197,8 @@ def record_command(
             if drives:
                 steps = driven(cell, scene, journal, taking, watchers, asks=not yes)
             else:
-                steps = guided(cell, scene, journal, taking, watchers, views, _asked)
+                ask = _asked if answers else None
+                steps = guided(cell, scene, journal, taking, watchers, views, ask)
     if drives:
         _check_all(journal, steps)
     _finish(journal, steps, as_json=as_json)

@@ -183,7 +183,7 @@ def guided(
     taking: CaptureOptions,
     watchers: Sequence[Watcher],
     views: int,
-    ask: Callable[[str], str],
+    ask: Callable[[str], str] | None,
 ) -> list[Step]:
     """Records an arm that a person moves.
 

@@ -24,7 +24,7 @@ from visioncal.core.types import CameraMount
 from visioncal.core.version import __version__
 from visioncal.frames.touch_test import finding_of
 from visioncal.interchange.outputs import Written
-from visioncal.live.drivers.extras import client_library
+from visioncal.live.drivers.extras import refuse_without
 from visioncal.live.rehearsal.bench import Bench
 from visioncal.live.rehearsal.cell import RehearsalOptions, RehearsedCell, rehearsed_cell
 from visioncal.live.rehearsal.compared import Explained, edge_errors, explained
@@ -66,7 +66,8 @@ def rehearse_command(
     not quite as it should be; the camera draws what that arm sees. Nothing real moves. Exit status
     0: the result is as near to the truth as it says; 3: it is not.
     """
-    client_library("rtde_control", "ur")
+    # Without depthai, pictures come straight from the simulated camera.
+    refuse_without("ur", {"ur": "rtde_control", "oak": "depthai"})
     _make_place(out)
     whole = _rehearse(RehearsalOptions(robot, mount, views, seed), out, fault, view=view)
     document = whole.document()

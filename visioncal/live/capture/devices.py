@@ -1,7 +1,7 @@
 """Devices by the words in which a user names them: `ur:192.168.0.10`, `oak`, `folder:images`."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TypeAlias, TypeVar
@@ -20,12 +20,14 @@ class ArmWish:
         watch_only: Whether it is only looked at, and need not be ready to be driven.
         ask: Asks a question and gives the line that was typed.
         form: In which form poses are typed; None to have it told by their looks.
+        answers: Whether a person types; lines of a file answer nothing.
     """
 
     address: str
     watch_only: bool
     ask: Callable[[str], str]
     form: str | None = None
+    answers: bool = True
 
 
 ArmOpener: TypeAlias = Callable[[ArmWish], Arm]
@@ -47,7 +49,7 @@ def open_arm(words: str, wish: ArmWish, openers: Mapping[str, ArmOpener] | None 
     """
     kind, _, address = words.partition(":")
     opener = _opener(kind, ARMS if openers is None else openers, "--arm")
-    return opener(ArmWish(address, wish.watch_only, wish.ask, wish.form))
+    return opener(replace(wish, address=address))
 
 
 def open_camera(
@@ -96,7 +98,7 @@ def _ur(wish: ArmWish) -> Arm:
 def _manual(wish: ArmWish) -> Arm:
     from visioncal.live.drivers.manual import ManualArm
 
-    return ManualArm(wish.ask, wish.form)
+    return ManualArm(wish.ask, wish.form, answers=wish.answers)
 
 
 def _oak(address: str, requested: DeviceWishes) -> CameraDevice:

@@ -81,14 +81,17 @@ def follow(capture: Capture, count: int) -> list[Step]:
     return capture.steps
 
 
-def ask_and_take(capture: Capture, arm: Arm, count: int, ask: Callable[[str], str]) -> list[Step]:
+def ask_and_take(
+    capture: Capture, arm: Arm, count: int, ask: Callable[[str], str] | None
+) -> list[Step]:
     """Takes a view whenever a person says so, and asks for its pose.
 
     Args:
         capture: The recording.
         arm: What asks for the pose.
         count: How many views; 0 until `q`.
-        ask: Asks a question and gives the line that was typed.
+        ask: Asks a question and gives the line that was typed; None where nobody answers, and the
+            arm's poses are those of a file.
 
     Returns:
         What became of each.
@@ -104,9 +107,12 @@ def ask_and_take(capture: Capture, arm: Arm, count: int, ask: Callable[[str], st
             number = _next(capture)
             wish = capture.coach.advice()
             hint = f" ({wish})" if wish else ""
-            if _ends(ask, f"View {number}{hint}: Enter takes it, q ends: "):
+            if ask is not None and _ends(ask, f"View {number}{hint}: Enter takes it, q ends: "):
                 break
-            held = HeldArm(arm.name, arm.state(), clock)
+            try:
+                held = HeldArm(arm.name, arm.state(), clock)
+            except EOFError:
+                break
             capture.cell = LiveCell(held, camera, clock)
             place = len(capture.journal.views) + 1
             capture.view(number, place, count, 0.0, capture.coach.advice)

@@ -1,12 +1,35 @@
 """Client libraries that only some users need, and the command that installs a missing one."""
 
+from collections.abc import Mapping
 from importlib import import_module
+from importlib.util import find_spec
 from types import ModuleType
 
 from visioncal.core.errors import DriverError
 
 # What the extras of this package install, by their names in pyproject.toml.
 _PACKAGES = {"ur": "ur-rtde>=1.6.5,<2", "oak": "depthai>=3.12,<4"}
+
+
+def refuse_without(needed: str, extras: Mapping[str, str]) -> None:
+    """Refuses what needs client libraries, naming all that are missing.
+
+    Args:
+        needed: The extra that it cannot do without.
+        extras: The module of each extra that it uses.
+
+    Raises:
+        DriverError: The one that is needed is not installed, with the command that installs all.
+    """
+    missing = [extra for extra, module in extras.items() if find_spec(module) is None]
+    if needed in missing:
+        modules = [extras[it] for it in missing]
+        packages = " ".join(f"'{_PACKAGES[it]}'" for it in missing)
+        raise DriverError(
+            f"{' and '.join(modules)} {'are' if len(missing) > 1 else 'is'} not installed.",
+            culprits=modules,
+            next_step=f"Install what is missing: pip install {packages}",
+        )
 
 
 def client_library(module: str, extra: str) -> ModuleType:

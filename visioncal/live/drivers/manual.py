@@ -26,13 +26,17 @@ class ManualArm:
         ask: Asks a question and gives the line that was typed.
         form: In which form poses are typed: a name among `POSE_FORMS`, or `ours`; None to have it
             told by their looks, and asked where these do not tell.
+        answers: Whether a person answers. Lines of a file are a pose each: nothing is asked back,
+            and the file's end, which a `q` is too, raises EOFError.
 
     Raises:
         DriverError: There is no such form.
     """
 
-    def __init__(self, ask: Callable[[str], str], form: str | None = None) -> None:
-        self._ask = ask
+    def __init__(
+        self, ask: Callable[[str], str], form: str | None = None, *, answers: bool = True
+    ) -> None:
+        self._ask, self.answers = ask, answers
         self._form = None if form is None else _known(form)
 
     @property
@@ -44,8 +48,11 @@ class ManualArm:
         """Asks for the pose of the flange; it takes as long as the person does.
 
         Raises:
-            DriverError: The input is at its end.
+            DriverError: The input is at its end; or a line of a file is no pose, as a pose that was
+                passed over would shift all that follow.
         """
+        if not self.answers:
+            return self._next()
         line = self._answer("Pose of the flange: ")
         while True:
             found = self._read(line)
@@ -58,6 +65,24 @@ class ManualArm:
             )
             if not line.strip():
                 return ArmState(time.monotonic(), found.pose)
+
+    def _next(self) -> ArmState:
+        """The pose of the next line of a file that is not empty."""
+        while not (line := self._ask("").strip()):
+            pass
+        if line.lower() == "q":
+            raise EOFError
+        forms = possible_forms(line)
+        if self._form is None and len(forms) > 1:
+            raise DriverError(
+                f"{line!r} may be a pose of {', '.join(forms)}.",
+                culprits=["stdin"],
+                next_step=f"Say which: --pose-form {forms[0]}.",
+            )
+        found = self._read(line)
+        if isinstance(found, str):
+            raise DriverError(found, culprits=["stdin"], next_step="Correct it: a pose a line.")
+        return ArmState(time.monotonic(), found.pose)
 
     def close(self) -> None:
         """Lets go of it; there is nothing to let go of."""
