@@ -5,12 +5,14 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import eigh
+from scipy.linalg import eigh, lapack
 
 from visioncal.core.types import FloatArray, IntArray, Mask
 
 _Floats: TypeAlias = npt.NDArray[np.floating[Any]]
 
+# Squared pivots of a matrix of unit diagonal below which Cholesky's factor is mostly rounding.
+_LEAST_PIVOT_SQ = 1e-11
 # Share of the noise's variance under which a fit has taken all of it.
 _VANISHED = 1e-6
 
@@ -55,9 +57,14 @@ def covariance_from(information: FloatArray) -> FloatArray:
 
 
 def covariance_root(information: FloatArray) -> FloatArray:
-    """Factors `covariance_from(information)` as (..., n, n) `root @ root^T`, however singular."""
+    """Factors `covariance_from(information)` as (n, n) `root @ root^T`, however singular."""
+    scale = _scale(information)
+    factor, failed = lapack.dpotrf(information * np.outer(scale, scale), lower=1)
+    if not failed and np.diag(factor).min(initial=1.0) ** 2 > _LEAST_PIVOT_SQ:
+        inverse, _ = lapack.dtrtri(factor, lower=1)
+        return np.asarray(scale[:, None] * np.tril(inverse).T)
     values, vectors, scale = _floored(information)
-    return np.asarray(scale[..., :, None] * vectors / np.sqrt(values)[..., None, :])
+    return np.asarray(scale[:, None] * vectors / np.sqrt(values))
 
 
 def _floored(information: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -15,9 +15,9 @@ _ITERATIONS = 60
 # A step changes a sigma by a factor of e at most; 1e-4 of it is far below its own uncertainty.
 _LONGEST_STEP, _SETTLED = 1.0, 1e-4
 _WORST_DAMPING = 1e6
-# Twice the log-likelihood that a 95 % interval of one unknown gives away (chi-square), and how far
-# it is followed, in logarithms.
-_SURPRISE_95, _FIRST_WIDTH, _WIDEST = 3.84, 0.125, 4.0
+# The root of twice the log-likelihood that a 95 % interval of one unknown gives away (chi-square),
+# and how far and how exactly it is followed, in logarithms.
+_SURPRISE_95, _FIRST_WIDTH, _WIDEST, _EXACT = 1.96, 0.125, 4.0, 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +110,9 @@ def estimate_sigmas(
         step = np.clip(-np.linalg.solve(curvature, slope), -_LONGEST_STEP, _LONGEST_STEP)
         candidate = np.clip(logs + step, *limits)
         moved = np.abs(candidate - logs).max()
+        if moved < _SETTLED and damping < 1.0:
+            logs = candidate
+            break
         then = None
         # Of levels too far apart, one is lost in the rounding of the other.
         with suppress(np.linalg.LinAlgError):
@@ -138,26 +141,31 @@ def profile_interval(
         Low and high: a low of zero where the residuals do not speak against no noise at all, and a
         high of fifty times the sigma where they do not speak against that.
     """
-    # An import as long as that of all the rest, which locating needs not.
-    from scipy.optimize import brentq
-
     middle = float(np.log(max(sigma, LEAST_SIGMA)))
     # A fit that rests at another maximum than the highest has its interval about that.
     here = profile(middle)
-    if 2.0 * (here - lowest) > _SURPRISE_95:
+    if 2.0 * (here - lowest) > _SURPRISE_95**2:
         lowest = here
 
-    def mahalanobis_sq(logarithm: float) -> float:
-        return 2.0 * (profile(logarithm) - lowest) - _SURPRISE_95
-
     def crossing(side: float, beyond: float) -> float:
-        inner, outer = 0.0, _FIRST_WIDTH
-        while mahalanobis_sq(middle + side * outer) <= 0.0:
-            if outer == _WIDEST:
+        inner, outer, width = (0.0, 0.0), None, _FIRST_WIDTH
+        while True:
+            # It is about linear in the width.
+            root = float(np.sqrt(max(2.0 * (profile(middle + side * width) - lowest), 0.0)))
+            if root < _SURPRISE_95:
+                inner = width, root
+            else:
+                outer = width, root
+            if outer is not None:
+                share = (_SURPRISE_95 - inner[1]) / (outer[1] - inner[1])
+                then = inner[0] + share * (outer[0] - inner[0])
+            elif width == _WIDEST:
                 return beyond
-            inner, outer = outer, min(2.0 * outer, _WIDEST)
-        width = brentq(lambda it: mahalanobis_sq(middle + side * it), inner, outer, xtol=0.02)
-        return float(np.exp(middle + side * width))
+            else:
+                then = min(width * min(1.1 * _SURPRISE_95 / max(root, 1e-9), 4.0), _WIDEST)
+            if not abs(then - width) >= _EXACT:
+                return float(np.exp(middle + side * then))
+            width = then
 
     return crossing(-1.0, 0.0), crossing(1.0, float(np.exp(middle + _WIDEST)))
 
@@ -179,7 +187,7 @@ def _likelihood(
     logs: FloatArray,
     prior: RatioPrior | None,
 ) -> _Likelihood:
-    sigmas = np.exp(logs)
+    sigmas, columns = np.exp(logs), jacobian.shape[-1]
     total = components.total(sigmas)
     weights = np.linalg.inv(total)
     weighted = weights @ jacobian
@@ -197,21 +205,19 @@ def _likelihood(
     # How the residuals' covariance grows with the logarithm of each sigma.
     growth = 2 * sigmas[:, None, None] ** 2 * components.parts
     # What the parameters have taken of the weights, as y y^T.
-    y = weighted @ root
+    y = (weighted.reshape(-1, columns) @ root).reshape(weighted.shape)
     removed = y @ np.swapaxes(y, 1, 2)
     left_over = np.diagonal(weights - removed, axis1=1, axis2=2)
     asked = growth * pulled
     slope = 0.5 * np.einsum("kmi,mi->k", growth, left_over - pulled**2)
     # Traces of P G_k P G_l, where P is the weight less what the parameters have taken of it.
-    shrunk = np.array([gram(y, it[:, :, None] * y) for it in growth])
+    shrunk = np.array([_shrunk(y, it) for it in growth])
     crossed = growth[:, :, None, :] @ ((weights - 2.0 * removed) * weights)
-    expected = 0.5 * (
-        np.tensordot(crossed[:, :, 0], growth, axes=([1, 2], [1, 2]))
-        + np.einsum("kij,lji->kl", shrunk, shrunk)
-    )
+    flat = shrunk.reshape(len(shrunk), -1)
+    expected = 0.5 * (np.tensordot(crossed[:, :, 0], growth, axes=([1, 2], [1, 2])) + flat @ flat.T)
     # Products of y P G_k P G_l P y: with them the second derivative itself, not its expectation.
     answer = (weights @ asked[..., None])[..., 0]
-    by_unknowns = asked.reshape(len(asked), -1) @ y.reshape(-1, y.shape[-1])
+    by_unknowns = asked.reshape(len(asked), -1) @ y.reshape(-1, columns)
     seen = np.einsum("kmi,lmi->kl", asked, answer) - by_unknowns @ by_unknowns.T
     curvature = seen - expected + 2.0 * np.diag(slope)
     if np.linalg.eigvalsh(curvature)[0] <= 0.0:
@@ -225,3 +231,10 @@ def _likelihood(
     return _Likelihood(
         value + 0.5 * float(offset @ offset), slope + offset @ lean, curvature + lean.T @ lean
     )
+
+
+def _shrunk(y: FloatArray, growth: FloatArray) -> FloatArray:
+    """(p, p) `y^T diag(growth) y` of (m, d, p) y, by the rows that grow."""
+    rows = growth > 0.0
+    half = np.sqrt(growth[rows])[:, None] * y[rows]
+    return np.asarray(half.T @ half)
