@@ -275,7 +275,7 @@ def compress_points(
     answer = -covariance_from(fit.information) @ between
     # What is left once the poses have followed, squared: never less than none, and as exact as the
     # square of their error. A difference of two squares would magnify it a millionfold.
-    left = by_shared + now.by_pose @ answer[stack.view_of]
+    left = by_shared + stack.products_with_views(now.by_pose, answer)
     residuals = now.residuals
     if shares is not None:
         roots = np.sqrt(shares)[stack.view_of, None]

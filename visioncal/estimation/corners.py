@@ -6,6 +6,7 @@ over a view's corners are segments of the stack.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Self
 
 import numpy as np
@@ -182,6 +183,14 @@ class CornerStack:
                 for start, end in zip((2 * self.starts).tolist(), ends.tolist(), strict=True)
             ]
         )
+
+    def products_with_views(self, left: FloatArray, right: FloatArray) -> FloatArray:
+        """Products `left right` of each view's corners (n, 2, j) and its (v, j, k): (n, 2, k)."""
+        found = np.empty((2 * len(left), right.shape[2]))
+        rows, ends = left.reshape(len(found), -1), 2 * np.append(self.starts, len(left))
+        for (start, end), it in zip(pairwise(ends.tolist()), right, strict=True):
+            np.matmul(rows[start:end], it, out=found[start:end])
+        return found.reshape(*left.shape[:2], -1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -288,8 +288,7 @@ class _Arm:
     def _likelihood(self, logs: FloatArray) -> "_Step":
         reduced, components = self.likelihood.reduced, self.likelihood.components
         known, levels = self.likelihood.known, len(components.parts)
-        residuals = reduced.errors
-        jacobian = reduced.jacobian[:, :, self.likelihood.moving]
+        residuals, jacobian = reduced.errors, self.likelihood.jacobian
         sigmas, squares = np.exp(logs[:levels]), np.exp(2.0 * logs[levels:])
         total, variances = components.total(sigmas), self.shares @ squares
         weights = np.linalg.inv(total)
@@ -310,7 +309,8 @@ class _Arm:
             + np.sum(effects**2 / variances)
         )
         growth = 2.0 * sigmas[:, None, None] ** 2 * components.parts
-        taken = np.einsum("uip,uip->ui", weighted @ inverse, weighted)
+        flat = weighted.reshape(-1, len(best))
+        taken = np.einsum("np,np->n", flat @ inverse, flat).reshape(residuals.shape)
         left_over = np.diagonal(weights, axis1=1, axis2=2) - taken
         by_levels = 0.5 * np.einsum("kui,ui->k", growth, left_over - pulled**2)
         asked = growth * pulled
@@ -320,7 +320,8 @@ class _Arm:
         # Products of the residuals' growth with each level and size, as the average information.
         moved = np.zeros((len(best), len(squares)))
         moved[self.random] = 2.0 * owned * (effects / variances)[:, None]
-        grown = np.concatenate([np.moveaxis(asked, 0, 2), jacobian @ moved], axis=2)
+        by_moved = (jacobian.reshape(-1, len(best)) @ moved).reshape(*residuals.shape, -1)
+        grown = np.concatenate([np.moveaxis(asked, 0, 2), by_moved], axis=2)
         of_weights = gram(weighted, grown)
         curvature = 0.5 * (gram(grown, weights @ grown) - of_weights.T @ inverse @ of_weights)
         slope = np.concatenate([by_levels, by_sizes])
@@ -365,8 +366,7 @@ class _Arm:
         """(q, r) unit vectors, in units of (q,) sizes, of harmonics that residuals tell of."""
         components = self.likelihood.components
         weights = np.linalg.inv(components.total(np.exp(logs[: len(components.parts)])))
-        jacobian = self.likelihood.reduced.jacobian[:, :, self.likelihood.moving]
-        jacobian = jacobian[:, :, self.random[-len(sizes) :]] * sizes
+        jacobian = self.likelihood.jacobian[:, :, self.random[-len(sizes) :]] * sizes
         values, vectors = np.linalg.eigh(gram(jacobian, weights @ jacobian))
         return np.asarray(vectors[:, values > _TELLING])
 

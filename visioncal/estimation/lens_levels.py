@@ -380,7 +380,7 @@ def _assembled(rows: _Rows, length: float, robots: int) -> _Likelihood:
         [rows.columns, modes, focus[:, :, None], rows.residuals[:, :, None]], axis=2
     )
     answer = -covariance_from(rows.information) @ stack.products_by_view(rows.by_pose, every)
-    left = every + rows.by_pose @ answer[stack.view_of]
+    left = every + stack.products_with_views(rows.by_pose, answer)
     left *= rows.roots[stack.view_of, None, None]
     flat = left.reshape(-1, left.shape[2])
     products = flat.T @ flat

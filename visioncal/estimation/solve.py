@@ -2,12 +2,17 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cache, cached_property
 
 import numpy as np
 from scipy.linalg import block_diag
 
-from visioncal.core.types import FloatArray, Mask
-from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
+from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.estimation.levenberg_marquardt import (
+    NEAR_DAMPING,
+    Linearised,
+    levenberg_marquardt,
+)
 from visioncal.estimation.linalg import (
     covariance_among,
     covariance_from,
@@ -91,8 +96,8 @@ def fit_problem(problem: Problem, state: State, noise: Noise | None = None) -> S
     settled = False
     if noise is None:
         noise = estimate_noise(problem, state, starting_noise(problem), from_above=True)
-    for _ in range(_ROUNDS):
-        state, settled = solve_problem(problem, state, noise)
+    for turn in range(_ROUNDS):
+        state, settled = solve_problem(problem, state, noise, is_near=turn > 0)
         before, noise = noise, estimate_noise(problem, state, noise)
         if _alike(before.robots, noise.robots) and _alike(before.sensors, noise.sensors):
             break
@@ -103,30 +108,110 @@ def _alike(before: FloatArray, after: FloatArray) -> bool:
     return bool(np.allclose(before, after, rtol=_LEVELS_SETTLED, atol=_FLOOR))
 
 
-def solve_problem(problem: Problem, state: State, noise: Noise) -> tuple[State, bool]:
+def solve_problem(
+    problem: Problem, state: State, noise: Noise, *, is_near: bool = False
+) -> tuple[State, bool]:
     """Minimises the residuals whitened by a known noise.
+
+    Args:
+        problem: The observations.
+        state: Where to start.
+        noise: The noise.
+        is_near: Whether that is the answer under another noise.
 
     Returns:
         The unknowns, and whether they converged.
     """
-    own, errors, moving = problem.covariance(noise), problem.error_covariance(noise), problem.moving
+    moving = problem.moving
     # Held at the start: weights that follow the unknowns would reward those with large noise.
-    by_errors = problem.linear(state, ideal=True).by_errors
+    whitening = _Whitening.of(problem, noise, problem.linear(state, ideal=True).by_errors)
 
     def linearise(at: State) -> Linearised[State]:
-        linear = replace(problem.linear(at), by_errors=by_errors)
-        reduced = reduce(problem, at, linear, own)
-        information, gradient, cost = _whole(reduced, errors)
+        information, gradient, cost = whitening.equations(problem, at, problem.linear(at))
         free, slope = information[np.ix_(moving, moving)], gradient[moving]
 
-        def step(damping: float) -> State:
+        @cache
+        def move(damping: float) -> FloatArray:
             whole = np.zeros(len(moving))
             whole[moving] = damped_step(free, slope, damping)
-            return at.moved(whole)
+            return whole
 
-        return Linearised(at, cost, step)
+        return Linearised(
+            at,
+            cost,
+            lambda damping: at.moved(move(damping)),
+            lambda damping: -float(gradient @ move(damping)),
+        )
 
-    return levenberg_marquardt(state, linearise, _SETTLED)
+    damping = (NEAR_DAMPING,) if is_near else ()
+    return levenberg_marquardt(state, linearise, _SETTLED, *damping)
+
+
+@dataclass(frozen=True, eq=False)
+class _Whitening:
+    """The inverse of the observations' covariance, with what flanges' errors take of it.
+
+    Attributes:
+        weights: (n, 6, 6) the inverse of each one's own noise; of what is alone with its flange's
+            error, with that.
+        taken: (n, 6 w, 6) of what shares its unit's errors, how it moves these in units of their
+            root: summed over the unit and squared, that is taken off.
+        units: (n,) these units; -1 where nothing is shared.
+        count: How many there are.
+    """
+
+    weights: FloatArray
+    taken: FloatArray
+    units: IntArray
+    count: int
+
+    @classmethod
+    def of(cls, problem: Problem, noise: Noise, by_errors: FloatArray) -> "_Whitening":
+        """The noise of observations that move with (n, 6, 6 w) their units' errors."""
+        (of, members), alone = problem.units, problem.alone
+        own, errors = problem.covariance(noise), problem.error_covariance(noise)
+        among = by_errors[alone]
+        own[alone] += among @ errors[of[alone]] @ np.swapaxes(among, 1, 2)
+        weights, units = np.asarray(np.linalg.inv(own), dtype=float), np.where(alone, -1, of)
+        shared, width = units >= 0, by_errors.shape[2]
+        taken = np.zeros((len(weights), width, 6))
+        pulled = np.swapaxes(by_errors[shared], 1, 2) @ weights[shared]
+        information = np.zeros((len(members), width, width))
+        np.add.at(information, units[shared], pulled @ by_errors[shared])
+        # Errors of flanges are independent; those of repeats are not.
+        roots, first = np.sqrt(np.maximum(errors, 0.0)), len(members) - len(problem.repeats)
+        roots[first:] = np.linalg.cholesky(errors[first:])
+        turned = np.swapaxes(roots, 1, 2)
+        left = np.linalg.cholesky(turned @ information @ roots + np.eye(width))
+        taken[shared] = (np.linalg.inv(left) @ turned)[units[shared]] @ pulled
+        return cls(weights, taken, units, len(members))
+
+    def equations(
+        self, problem: Problem, state: State, linear: Linear
+    ) -> tuple[FloatArray, FloatArray, float]:
+        """Information (p, p), gradient (p,) of half the whitened squared error, and that error."""
+        size, width = linear.size, self.taken.shape[1]
+        total, shared = np.zeros((size + 1, size + 1)), np.zeros((self.count, width, size + 1))
+        for block in linear.blocks:
+            # Residuals are the last column.
+            columns, rows = np.append(block.columns, size), block.rows
+            every = np.concatenate([block.jacobian, linear.residuals[rows, :, None]], axis=2)
+            total[np.ix_(columns, columns)] += gram(every, self.weights[rows] @ every)
+            inside = self.units[rows] >= 0
+            if not inside.any():
+                continue
+            rows, every = rows[inside], every[inside]
+            order = np.argsort(self.units[rows], kind="stable")
+            units, first = np.unique(self.units[rows[order]], return_index=True)
+            taken = np.add.reduceat(self.taken[rows[order]] @ every[order], first)
+            shared[np.ix_(units, np.arange(width), columns)] += taken
+        total -= gram(shared, shared)
+        known = problem.knowledge(state)
+        return (
+            total[:-1, :-1] + known.information,
+            total[:-1, -1] + known.gradient,
+            float(total[-1, -1]) + problem.cost_of_knowledge(state),
+        )
 
 
 def reduce(problem: Problem, state: State, linear: Linear, covariance: FloatArray) -> Reduced:
@@ -240,8 +325,7 @@ def equations_and_cost(
 ) -> tuple[FloatArray, FloatArray, float]:
     """What `normal_equations` gives, and the whitened squared error."""
     linear = problem.linear(state, ideal=ideal)
-    reduced = reduce(problem, state, linear, problem.covariance(noise))
-    return _whole(reduced, problem.error_covariance(noise))
+    return _Whitening.of(problem, noise, linear.by_errors).equations(problem, state, linear)
 
 
 def fitted_covariance(problem: Problem, state: State, noise: Noise) -> FloatArray:
@@ -343,6 +427,11 @@ class RobotLikelihood:
     moving: Mask
     seen: Mask
 
+    @cached_property
+    def jacobian(self) -> FloatArray:
+        """(u, 6 w, q) how the flanges' errors move with the unknowns that move."""
+        return np.ascontiguousarray(self.reduced.jacobian[:, :, self.moving])
+
     @property
     def rms(self) -> FloatArray:
         """(2,) root mean square of the errors' rotation [rad] and translation [m]."""
@@ -362,7 +451,7 @@ class RobotLikelihood:
         seen = np.flatnonzero(self.seen).tolist()
         sigmas, value = estimate_sigmas(
             self.reduced.errors,
-            self.reduced.jacobian[:, :, self.moving],
+            self.jacobian,
             self.components,
             self.known,
             start.ravel(),
@@ -422,7 +511,8 @@ def posterior(problem: Problem, state: State, noise: Noise) -> tuple[FloatArray,
         residuals[rows] -= (by_errors @ flange)[:, :, 0]
         jacobian[rows] -= by_errors @ (gain @ reduced.jacobian)[of[rows]]
         gone[rows] = by_errors @ left[of[rows]] @ np.swapaxes(by_errors, 1, 2)
-    gone = gone + jacobian @ known @ np.swapaxes(jacobian, 1, 2)
+    spread = (jacobian.reshape(-1, jacobian.shape[2]) @ known).reshape(jacobian.shape)
+    gone = gone + spread @ np.swapaxes(jacobian, 1, 2)
     squares = np.einsum("ni,nij,nj->n", residuals, weights, residuals)
     directions = np.where(problem.observations.has_rotation, 6.0, 3.0)
     return squares, directions - np.einsum("nij,nji->n", weights, gone)
