@@ -25,6 +25,7 @@ from support.rigs import (
 
 from visioncal import align, calibrate
 from visioncal.calibration.pipeline import run
+from visioncal.calibration.stages.corner_numbers import OTHER_NUMBERS
 from visioncal.calibration.stages.detect import detect
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.calibration.verification.prediction import predict_stops
@@ -203,6 +204,32 @@ def test_views_that_do_not_serve_are_left_out_by_name(cube):
     assert "neither image nor rows in corners.csv" in reasons[2]
     assert "on one line" in reasons[3]
     assert f"point {point} at ({float(u_px):g}, 4000) px lies far outside" in reasons[4]
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "stated"), [("charuco", (9, 6), (6, 9)), ("checkerboard", (8, 5), (7, 6))]
+)
+def test_numbers_of_a_board_of_other_columns_are_refused_before_anything_is_fitted(
+    kind, size, stated, tmp_path
+):
+    folder = write_rig(tmp_path / kind, Rig(kind))
+    (file,) = (it.name for it in folder.glob("*.toml") if it.name != "session.toml")
+    changed(folder, file, *("columns = {}\nrows = {}\n".format(*it) for it in (size, stated)))
+    with pytest.raises(DataError, match="they do with columns = {}".format(*size[:1])) as caught:
+        detect(Session.load(folder))
+    assert "Set columns = {} and rows = {} in".format(*size) in caught.value.next_step
+
+
+def test_one_view_of_other_numbers_is_left_out_by_name(tmp_path):
+    folder = write_rig(tmp_path / "board", Rig("charuco"))
+    rows = [it.split(",") for it in (folder / "corners.csv").read_text().splitlines()]
+    # In view 2 the corners are numbered column by column.
+    for row in rows[1:]:
+        if row[0] == "2":
+            row[1] = str(int(row[1]) % 5 * 8 + int(row[1]) // 5)
+    (folder / "corners.csv").write_text("\n".join(map(",".join, rows)) + "\n")
+    found = detect(Session.load(folder))
+    assert [(it.view, it.reason) for it in found.rejections] == [(2, OTHER_NUMBERS)]
 
 
 def test_a_rig_is_not_looked_for_in_images(cube):

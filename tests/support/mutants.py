@@ -34,7 +34,7 @@ from visioncal.cli.app import main
 from visioncal.core.errors import VisioncalError
 from visioncal.present import viewer
 
-LONGEST_S = 60.0
+LONGEST_S = 300.0
 MOST_BYTES = 2 * 1024**3
 # A page of text; longer messages are no message.
 _MOST_LETTERS = 4000

@@ -214,7 +214,8 @@ class _Likelihood:
         low[_FIELD : _JITTER + 1] = np.multiply(_LEAST, (self.noise_px, 1.0, 1.0))
         high[_FIELD : _JITTER + 1] = _MOST
         high[[*closed]] = low[[*closed]]
-        return np.log(low), np.log(high)
+        # Noise of a thousand pixels is larger than any level.
+        return np.log(low), np.log(np.maximum(low, high))
 
 
 def are_beyond(levels: LensLevels, sigma_px: float) -> bool:

@@ -130,9 +130,10 @@ def read_declaration(
 
 def _nearest_mount(document: Mapping[str, Any], label: str) -> str:
     """What to write for a mount that is spelt otherwise; empty where that is not it."""
-    spelt = str(document.get("mount", "")).lower().replace("_", "-").replace(" ", "-")
-    mounts = get_args(CameraMount)
-    return f'In {label}, write mount = "{spelt}".' if spelt in mounts else ""
+    given = str(document.get("mount", ""))
+    spelt = given.lower().replace("_", "-").replace(" ", "-")
+    is_meant = spelt in get_args(CameraMount) and spelt != given
+    return f'In {label}, write mount = "{spelt}".' if is_meant else ""
 
 
 def _dotted(location: Sequence[int | str]) -> str:

@@ -13,6 +13,7 @@ from threading import Condition
 import cv2
 import numpy as np
 
+from visioncal.calibration.stages.corner_numbers import OTHER_NUMBERS, check_numbers
 from visioncal.calibration.stages.kept_corners import KeptCorners, Searched
 from visioncal.core.errors import DataError
 from visioncal.core.limits import MAX_BLUR_PX
@@ -143,7 +144,13 @@ def detect(
     for name in session.boards:
         _check_layout(session, name, views, looks)
     own = {view.number: look.found for view, look in zip(views, looks, strict=True)}
-    own |= {view.number: _given(session, view, resolution) for view in given}
+    elsewhere = {view.number: _given(session, view, resolution) for view in given}
+    for name, target in session.boards.items():
+        mine = [elsewhere[view.number] for view in given if session.board_of(view) == name]
+        several = name if len(session.boards) > 1 else ""
+        wrong = check_numbers([it for it in mine if isinstance(it, Corners)], target, several)
+        elsewhere |= {it: Rejection(it, OTHER_NUMBERS) for it in wrong}
+    own |= elsewhere
     found = [own[view.number] for view in among if view.number in own]
     return Detections(
         {it.view: it for it in found if isinstance(it, Corners)},
