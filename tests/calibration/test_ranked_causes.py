@@ -96,6 +96,12 @@ def test_what_moves_picks_little_is_no_cause_of_a_large_misfit() -> None:
     assert ids(judge(replace(changed(SOUND), warnings=(FIELD,)))) == ["lens_field"]
 
 
+def test_what_moves_with_the_time_passes_for_a_focus_and_not_the_other_way() -> None:
+    focus = Finding("focus", "The lens changes its focal length.", mahalanobis_sq=300.0)
+    assert ids(judge(changed(SOUND, warnings=(focus, DRIFT))))[0] == "moved_slowly"
+    assert ids(judge(changed(SOUND, warnings=(focus,)))) == ["focus"]
+
+
 def test_what_nothing_explains_is_the_cause_itself() -> None:
     (only,) = judge(changed(SOUND, away_mm=1.0)).causes
     assert (only.kind, only.probability) == ("unexplained", 1.0)
