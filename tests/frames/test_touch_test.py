@@ -2,6 +2,7 @@
 
 import io
 import json
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,10 @@ from support.pages import Page
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert
 from visioncal.frames.touch_test import judged, touch_points
+from visioncal.live.capture.hover import Hovering
+from visioncal.live.drivers.ur import UrArm
+from visioncal.live.rehearsal.controller import spawn
+from visioncal.live.rehearsal.options import ControllerOptions
 from visioncal.results import Calibration
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate, write_session
@@ -49,6 +54,42 @@ def test_the_tip_comes_as_near_as_predicted(proved):
     assert not judged(points, [5.0] * 5, "").passed
     with pytest.raises(DataError, match="5 of 0 mm and more"):
         judged(points, [0.1], "")
+
+
+@pytest.mark.usefixtures("patient")
+def test_a_driven_arm_hovers_above_each_point(proved, monkeypatch):
+    pytest.importorskip("rtde_control", reason="ur-rtde is not installed (the extra `ur`)")
+    folder, look, _ = proved
+    known, session = Calibration.load(folder / "out"), Session.load(folder / "session")
+    start = session.views[0].joints_rad
+    points = touch_points(Session.load(look), known, "")
+    # The controller believes in the data sheet, as the calibration's nominal arm does.
+    with spawn(ControllerOptions(q=tuple(start), tcp=(0.0,) * 6)) as controller:
+        with closing(UrArm(controller.host)) as arm:
+            for it in points[:2]:
+                plane = it.base_m, it.normal
+                hovering = Hovering(arm, known.robot, np.zeros(3), *plane, 0.05)
+                hovering.bring(it.above(0.05))
+                away = invert(it.above(0.05)) @ arm.state().base_from_flange
+                # A tenth of the least gap that can be read.
+                assert np.linalg.norm(away[:3, 3]) < 1e-5
+            # Through the board leads no way.
+            with pytest.raises(DataError, match="above the board"):
+                hovering.bring(points[1].above(-0.03))
+        typed = io.StringIO("y\n" + "0.1\n" * 5)
+        monkeypatch.setattr("sys.stdin", typed)
+        done = visioncal(
+            "touch-test", look, "-c", folder / "out", "--drive", f"ur:{controller.host}"
+        )
+        assert done.status == 0, done.err
+        away = invert(points[-1].above(0.05)) @ _stands(controller, known)
+        assert np.linalg.norm(away[:3, 3]) < 2e-3
+
+
+def _stands(controller, known):
+    """Where the simulated arm's flange is, by its encoders and the data sheet."""
+    with closing(UrArm(controller.host, watch_only=True)) as arm:
+        return known.robot.base_from_flange(arm.state().q[None])[0]
 
 
 def test_targets_are_printed_and_gaps_join_the_result(proved, monkeypatch):

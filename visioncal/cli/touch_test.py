@@ -3,7 +3,7 @@
 import json
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,18 +11,22 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from rich.markup import escape
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
-from visioncal.cli.console import messages, tell_written
+from visioncal.cli.console import messages, report_error, tell_written
 from visioncal.cli.numbers import numbers_in
 from visioncal.cli.options import AsJson, SessionArgument
 from visioncal.cli.progress import shown_progress
-from visioncal.core.errors import DataError
+from visioncal.core.errors import DataError, DriverError
 from visioncal.core.number_format import figure
+from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray
 from visioncal.frames.touch_test import TouchPoint, finding_of, judged, touch_points
 from visioncal.interchange.merge_results import rewrite
 from visioncal.interchange.result_files import load_result
+from visioncal.live.capture.devices import ArmWish, open_arm
+from visioncal.live.capture.hover import Hovering
+from visioncal.live.drivers.protocols import MovingArm
 from visioncal.results import Calibration, to_document
 from visioncal.results.compensation import correct
 from visioncal.session import Session
@@ -49,6 +53,17 @@ def touch_test_command(
             "--gaps-mm", metavar="A,B,C,D,E", help="Tip to point, as measured, in their order."
         ),
     ] = None,
+    drive: Annotated[
+        str | None,
+        typer.Option(
+            "--drive",
+            metavar="ur:HOST",
+            help="Bring the tip above each point by this arm, slowly; the rest is by hand.",
+        ),
+    ] = None,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="With --drive: begin to move without asking.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Prove a calibration: touch what the camera locates, and enter the gaps.
@@ -74,6 +89,8 @@ def touch_test_command(
     if gaps_mm is not None:
         count = gaps_mm.count(",") + 1
         gaps = [*numbers_in(gaps_mm, "--gaps-mm", ",".join("abcdefghij"[:count]))]
+    elif drive is not None:
+        gaps = _driven(drive, known, points, targets, 1e-3 * height_mm, asks=not yes)
     elif sys.stdin.isatty() and not as_json:
         gaps = _asked(points, targets)
     else:
@@ -149,19 +166,85 @@ def _asked(points: Sequence[TouchPoint], targets: Sequence[dict[str, Any]]) -> l
     return gaps
 
 
+def _driven(
+    words: str,
+    known: Calibration,
+    points: Sequence[TouchPoint],
+    targets: Sequence[dict[str, Any]],
+    height_m: float,
+    *,
+    asks: bool,
+) -> list[float]:
+    """Brings the tip above each point, and asks for its gap.
+
+    Raises:
+        DataError: The arm's model is not known, nobody can be asked, or no way leads there.
+        DriverError: The arm cannot be driven.
+    """
+    if known.robot is None:
+        raise DataError(
+            "--drive: the calibration has no model of the robot.",
+            culprits=["--drive"],
+            next_step="Name it as [robot] model in session.toml, and calibrate again.",
+        )
+    if asks and not typer.confirm("The arm will move. Is the cell clear?", err=True):
+        raise DataError("touch-test: not begun; nothing moved.", culprits=["--drive"])
+    gaps = []
+    with closing(open_arm(words, ArmWish("", watch_only=False, ask=_line))) as arm:
+        if not isinstance(arm, MovingArm):
+            raise DataError(f"{arm.name} cannot be driven.", culprits=["--drive"])
+        for point, target in zip(points, targets, strict=True):
+            tip_m = (invert(point.base_from_flange) @ [*point.base_m, 1.0])[:3]
+            hovering = Hovering(arm, known.robot, tip_m, point.base_m, point.normal, height_m)
+            _brought(hovering, _pose(target["hover"]))
+            _tell_point(point, target)
+            gaps.append(_gap())
+    return gaps
+
+
+def _brought(hovering: Hovering, base_from_flange: FloatArray) -> None:
+    """Brings the tip there; where the arm refuses, as in local control, a person mends that."""
+    while True:
+        try:
+            hovering.bring(base_from_flange)
+        except DriverError as error:
+            report_error(error, as_json=False)
+            if _line("Enter tries again, q ends: ").strip().lower() == "q":
+                raise
+        else:
+            return
+
+
+def _pose(numbers: Sequence[float]) -> FloatArray:
+    """(4, 4) of x, y, z [m] and a rotation vector [rad]."""
+    return np.asarray(
+        RigidTransform.from_components(numbers[:3], Rotation.from_rotvec(numbers[3:])).as_matrix()
+    )
+
+
 def _gap() -> float:
     """Asks until a length is typed."""
     while True:
-        messages().print("  gap \\[mm]: ", end="")
-        line = sys.stdin.readline()
-        if not line:
-            raise DataError(
-                "touch-test: the gaps are at their end, and nothing was kept.",
-                culprits=["stdin"],
-                next_step="Give all with --gaps-mm.",
-            )
+        line = _line("  gap [mm]: ")
         with suppress(ValueError):
             gap = float(line.replace(",", "."))
             if 0.0 <= gap < np.inf:
                 return gap
         messages().print("  A length of 0 mm or more is needed, as 0.2.")
+
+
+def _line(question: str) -> str:
+    """Asks, and gives the line that was typed.
+
+    Raises:
+        DataError: Nothing more is typed.
+    """
+    messages().print(escape(question), end="")
+    line = sys.stdin.readline()
+    if not line:
+        raise DataError(
+            "touch-test: the gaps are at their end, and nothing was kept.",
+            culprits=["stdin"],
+            next_step="Give all with --gaps-mm.",
+        )
+    return line
