@@ -85,6 +85,7 @@ def test_a_lens_is_that_of_the_camera_that_is_named():
         ("ros", Selection("all", inverse=True), "--inverse, --parent and --child are of one"),
         ("opencv", Selection("all"), "opencv holds one transform"),
         ("camera-info", Selection(camera="tpo"), "no camera 'tpo'"),
+        ("easy-handeye", Selection(), "holds the camera"),
         ("easy-handeye2", Selection(), "holds the camera"),
         ("robot-json", Selection(), "robot"),
         ("abb-tooldata", Selection(), "has no tool"),

@@ -73,7 +73,7 @@ def test_a_matrix_in_metres_comes_back_bit_for_bit(name):
         assert np.array_equal(READERS[name](export(calibration(matrix), name)), matrix)
 
 
-@pytest.mark.parametrize("name", sorted(set(READERS) - {"easy-handeye2"}))
+@pytest.mark.parametrize("name", sorted(set(READERS) - {"easy-handeye", "easy-handeye2"}))
 @pytest.mark.parametrize("edge", ["flange_from_cam", "base_from_target"])
 def test_any_edge_and_its_inverse(name, edge):
     matrix = SAMPLE.edges[edge].matrix
@@ -103,7 +103,9 @@ def test_the_inverse_carries_the_covariance_along():
     assert abs(edge.sigma_mm / sampled_mm - 1) > 0.1
 
 
-@pytest.mark.parametrize("name", ["ros", "ros-launch", "moveit", "easy-handeye2", "urdf"])
+@pytest.mark.parametrize(
+    "name", ["ros", "ros-launch", "moveit", "easy-handeye", "easy-handeye2", "urdf"]
+)
 @pytest.mark.parametrize(("mount", "parent"), [("eye-in-hand", "tool0"), ("eye-to-hand", "base")])
 def test_ros_gets_its_own_names_and_is_told_what_they_mean(name, mount, parent):
     text = export(calibration(np.eye(4), mount), name)
@@ -144,7 +146,7 @@ def test_the_inverse_exchanges_the_frames():
         ("eye-to-hand", "eye_on_base", "mine", "tool0"),
     ],
 )
-def test_easy_handeye2_has_all_fields_of_its_message(mount, kind, base, effector):
+def test_easy_handeye_has_all_fields_that_its_readers_take(mount, kind, base, effector):
     chosen = Selection(parent="mine", child="eye")
     document = yaml.safe_load(export(calibration(np.eye(4), mount), "easy-handeye2", chosen))
     assert document["parameters"] == {
@@ -158,14 +160,27 @@ def test_easy_handeye2_has_all_fields_of_its_message(mount, kind, base, effector
         "move_group_namespace": "/",
         "move_group": "manipulator",
     }
+    first = yaml.safe_load(export(calibration(np.eye(4), mount), "easy-handeye", chosen))
+    # Its reader takes these by name, and refuses any other.
+    assert first["parameters"] == {
+        "namespace": "/visioncal/",
+        "eye_on_hand": mount == "eye-in-hand",
+        "robot_base_frame": base,
+        "robot_effector_frame": effector,
+        "tracking_base_frame": "eye",
+        "tracking_marker_frame": "target",
+        "move_group_namespace": "/",
+        "move_group": "manipulator",
+    }
 
 
+@pytest.mark.parametrize("name", ["easy-handeye", "easy-handeye2"])
 @pytest.mark.parametrize(
     "chosen", [Selection("base_from_target"), Selection(inverse=True), Selection("base_from_cam")]
 )
-def test_easy_handeye2_takes_the_camera_only(chosen):
+def test_easy_handeye_takes_the_camera_only(name, chosen):
     with pytest.raises(DataError):
-        export(SAMPLE, "easy-handeye2", chosen)
+        export(SAMPLE, name, chosen)
 
 
 BAD_NAMES = ['tool"0', "a b", "-x", "/world", "x\nimport os", "x'", "größe", "a<b", "${x}", "."]

@@ -56,7 +56,7 @@ def test_what_is_read_back_is_the_frame(name, kind):
         assert off(name, export(source, name, wanted(name)), matrix) < tolerance
 
 
-@pytest.mark.parametrize("name", sorted(set(READERS) - {"easy-handeye2"}))
+@pytest.mark.parametrize("name", sorted(set(READERS) - {"easy-handeye", "easy-handeye2"}))
 @pytest.mark.parametrize(
     ("edge", "matrix"), [(TOOL, FLANGE_FROM_TOOL), (FIXTURE, BASE_FROM_FIXTURE)]
 )
@@ -308,7 +308,7 @@ def test_a_suffix_of_the_parent_is_no_other_kind():
     assert off("ur-tcp", export(FrameFile(frames), "ur-tcp"), FLANGE_FROM_TOOL) < 1e-9
 
 
-@pytest.mark.parametrize("name", ["camera-info", "kalibr", "easy-handeye2"])
+@pytest.mark.parametrize("name", ["camera-info", "kalibr", "easy-handeye", "easy-handeye2"])
 def test_frames_alone_have_no_camera(name):
     with pytest.raises(DataError, match=r"holds the camera.*has none"):
         export(ALONE, name)

@@ -74,6 +74,13 @@ def ros(text):
     return message(yaml.safe_load(text)["transform"])
 
 
+def easy_handeye(text):
+    found = yaml.safe_load(text)["transformation"]
+    place = {it: found[it] for it in "xyz"}
+    turn = {it: found[f"q{it}"] for it in "xyzw"}
+    return message({"translation": place, "rotation": turn})
+
+
 def launch_arguments(text):
     """The options that a launch file passes on, from its syntax tree."""
     compile(text, "calibration.launch.py", "exec")
@@ -319,6 +326,7 @@ READERS = {
     "ros": ros,
     "ros-launch": launch,
     "moveit": launch,
+    "easy-handeye": easy_handeye,
     "easy-handeye2": ros,
     "urdf": urdf,
     "opencv": opencv,

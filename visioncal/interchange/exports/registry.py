@@ -18,7 +18,7 @@ from visioncal.interchange.exports.matrices import OPENCV, TEXT, ZIVID
 from visioncal.interchange.exports.oak import OAK
 from visioncal.interchange.exports.programs import PROGRAMS
 from visioncal.interchange.exports.robots import ROBOTS
-from visioncal.interchange.exports.ros import EASY_HANDEYE2, ROS
+from visioncal.interchange.exports.ros import EASY_HANDEYE, EASY_HANDEYE2, ROS
 from visioncal.interchange.exports.sources import Source
 from visioncal.interchange.exports.urdf import URDF
 from visioncal.results import Alignment, Calibration, Verdict
@@ -28,6 +28,7 @@ EXPORT_FORMATS: tuple[ExportFormat | ArmFormat, ...] = (
     ROS,
     ROS_LAUNCH,
     MOVEIT,
+    EASY_HANDEYE,
     EASY_HANDEYE2,
     URDF,
     CAMERA_INFO,

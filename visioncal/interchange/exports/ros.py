@@ -1,4 +1,4 @@
-"""A transform for ROS as YAML: the fields of a message, and a calibration of easy_handeye2."""
+"""A transform for ROS as YAML: the fields of a message, a calibration of easy_handeye."""
 
 from collections.abc import Sequence
 
@@ -28,6 +28,39 @@ def _write_transform(content: Content) -> str:
     return comments("#", ros_notes(content)) + yaml_text(document)
 
 
+def _write_easy_handeye(content: Content) -> str:
+    """Writes what easy_handeye of ROS 1 keeps in its calibrations' folder.
+
+    The fields are those that `to_dict` of its handeye_calibration.py writes and its publisher
+    reads: the pose of `tracking_base_frame` in the effector's frame, or in the base's for a fixed
+    camera.
+    """
+    in_hand = content.mount == "eye-in-hand"
+    x, y, z, qx, qy, qz, qw = numbers(write_pose(content.matrix, POSE_FORMS["ros"]))
+    document = {
+        "parameters": {
+            "namespace": "/visioncal/",
+            "eye_on_hand": in_hand,
+            **_calibrated_frames(content),
+            "move_group_namespace": "/",
+            "move_group": "manipulator",
+        },
+        "transformation": {"x": x, "y": y, "z": z, "qx": qx, "qy": qy, "qz": qz, "qw": qw},
+    }
+    use = "its publisher finds it as ~/.ros/easy_handeye/visioncal.yaml"
+    return comments("#", [*ros_notes(content), use]) + yaml_text(document)
+
+
+def _calibrated_frames(content: Content) -> dict[str, str]:
+    in_hand = content.mount == "eye-in-hand"
+    return {
+        "robot_base_frame": ROS_FRAMES["base"] if in_hand else content.parent,
+        "robot_effector_frame": content.parent if in_hand else ROS_FRAMES["flange"],
+        "tracking_base_frame": content.child,
+        "tracking_marker_frame": "target",
+    }
+
+
 def _write_easy_handeye2(content: Content) -> str:
     """Writes what easy_handeye2 keeps in its calibrations' folder.
 
@@ -40,10 +73,7 @@ def _write_easy_handeye2(content: Content) -> str:
         "parameters": {
             "name": "visioncal",
             "calibration_type": "eye_in_hand" if in_hand else "eye_on_base",
-            "robot_base_frame": ROS_FRAMES["base"] if in_hand else content.parent,
-            "robot_effector_frame": content.parent if in_hand else ROS_FRAMES["flange"],
-            "tracking_base_frame": content.child,
-            "tracking_marker_frame": "target",
+            **_calibrated_frames(content),
             "freehand_robot_movement": True,
             "move_group_namespace": "/",
             "move_group": "manipulator",
@@ -65,6 +95,13 @@ ROS = ExportFormat(
     _write_transform,
     frames=ROS_FRAMES,
     write_all=_write_transforms,
+)
+EASY_HANDEYE = ExportFormat(
+    "easy-handeye",
+    "a calibration of ROS 1's easy_handeye, YAML [m, quaternion x, y, z, w]",
+    _write_easy_handeye,
+    holds="hand-eye",
+    frames=ROS_FRAMES,
 )
 EASY_HANDEYE2 = ExportFormat(
     "easy-handeye2",
