@@ -91,6 +91,13 @@ def test_a_mount_that_nothing_tells_is_asked_for():
     assert guess.best.hypothesis.mount == "eye-in-hand"
 
 
+def test_mirrored_images_are_named_before_a_left_handed_frame():
+    poses = MISTAKES["one axis left-handed"](cell_poses("eye-in-hand"), np.random.default_rng(0))
+    guess = guessed(poses)
+    assert guess.best.words.startswith("the images mirrored, or the robot's poses in a left-handed")
+    assert any("Mirrored images look the same, and are the usual cause" in it for it in guess.notes)
+
+
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_two_mistakes_that_hide_each_other_are_told_of(mount):
     poses = cell_poses(mount)

@@ -144,6 +144,9 @@ def test_poses_that_are_misread_explain_the_rest() -> None:
     assert sum(it.probability for it in after.causes) <= 1.0
     assert after.top[0].startswith("Most likely (98 %): The quaternions are w, x, y, z.")
     assert after.reasons[1:] == before.reasons
+    # Mirrored images fit as well, and no reading of the poses helps these.
+    mirrored = with_misread(before, read_otherwise("One axis is mirrored.", is_mirrored=True))
+    assert mirrored.causes[0].do.words.startswith("Look at an image first: where it is mirrored")
 
 
 def test_the_cause_its_cost_and_what_to_do_come_first() -> None:

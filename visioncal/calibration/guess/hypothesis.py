@@ -219,7 +219,7 @@ def _of_side(whose: str, tried: Taken, declared: Taken) -> Iterator[str]:
     if tried.transposed != declared.transposed:
         yield f"{whose} rotations transposed"
     if tried.signs == "mirror":
-        yield f"{whose} poses in a left-handed frame (one axis mirrored)"
+        yield f"the images mirrored, or {whose} poses in a left-handed frame (one axis mirrored)"
     elif tried.signs:
         yield f"{whose} positions with {tried.signs} negated"
     if tried.half_turned:

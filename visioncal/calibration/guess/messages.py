@@ -92,6 +92,10 @@ def notes(
         )
     if best.hypothesis.robot.signs == "mirror":
         yield (
+            "Mirrored images look the same, and are the usual cause: turn those back instead of "
+            "changing poses that are right."
+        )
+        yield (
             "Which axis is mirrored cannot be told from the views: another one turns the base and "
             "the flange by half a turn. y was taken."
         )

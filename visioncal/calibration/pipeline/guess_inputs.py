@@ -140,7 +140,10 @@ def reading_hint(seen: RunState) -> Finding | None:
     except VisioncalError:
         # Too little to guess from: what failed has been said already.
         return None
-    return read_otherwise(guess.sentence) if guess.stands_out else None
+    if not guess.stands_out:
+        return None
+    is_mirrored = guess.best.hypothesis.robot.signs == "mirror"
+    return read_otherwise(guess.sentence, is_mirrored=is_mirrored)
 
 
 def closes_as_declared(seen: RunState) -> bool:

@@ -24,6 +24,7 @@ from visioncal.core.limits import NeedLimits
 from visioncal.core.number_format import figure, percent
 from visioncal.core.verdict import (
     GOOD_FOR,
+    GUESS_AND_CALIBRATE,
     PLAN,
     READ_AGAIN,
     REVIEW,
@@ -36,6 +37,13 @@ from visioncal.results import NeedMet
 
 # The limits of tests that are passed by chance: none is behind the first, the last is a fact.
 _REMARK, _FACT = float(np.exp(-1.0)), 1e-12
+
+_MIRRORED = Step(
+    "Look at an image first: where it is mirrored (a flip in the camera's driver, a mirror before "
+    "the lens), turn the images back, and calibrate anew. Only where the robot's frame is "
+    "left-handed, write a copy of the session that is read so, and calibrate it.",
+    GUESS_AND_CALIBRATE,
+)
 
 
 @dataclass(frozen=True)
@@ -104,13 +112,14 @@ def adding(words: str, *, modelled: bool, purpose: str = "") -> Step:
     return Step(f"{words} {model}")
 
 
-def read_otherwise(sentence: str) -> Finding:
+def read_otherwise(sentence: str, *, is_mirrored: bool = False) -> Finding:
     """The finding that poses are misread.
 
     Args:
         sentence: How they are better read.
+        is_mirrored: Whether mirrored images are as good an explanation.
     """
-    return Finding("misread_poses", sentence, READ_AGAIN)
+    return Finding("misread_poses", sentence, _MIRRORED if is_mirrored else READ_AGAIN)
 
 
 def with_misread(verdict: Verdict, found: Finding) -> Verdict:
