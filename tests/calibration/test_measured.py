@@ -123,7 +123,7 @@ def test_a_measurement_that_good_data_contradict_is_told_and_left_out():
     (told,) = (it.words for it in wrong.warnings if it.kind == "prior")
     assert "is contradicted by the views" in told
     assert f"{1e3 * true + 5.0:g} mm" in told
-    assert "it is not used" in told
+    assert told.endswith("it is not used.")
     # The same views once more, from where they were with it.
     sigmas = np.sqrt(np.diag(free.solved.covariance))
     off = log(invert(free.solved.state.edges) @ wrong.solved.state.edges).ravel()
@@ -134,6 +134,27 @@ def test_a_measurement_that_good_data_contradict_is_told_and_left_out():
     assert not any(it.kind == "prior" for it in right.warnings)
     (note,) = (it for it in right.notes if "was used" in it)
     assert "the views alone tell it to" in note
+
+
+# Ten sigma, and so many that noise beside the priors would explain them.
+@pytest.mark.parametrize("off_m", [0.005, 0.04])
+def test_only_the_components_that_views_contradict_are_left_out(off_m):
+    height = float(X[2, 3])
+    prior = {"x_m": float(X[0, 3]) + off_m, "y_m": float(X[1, 3]) - off_m, "z_m": height}
+    found = calibrate(scara(0, {"flange_from_cam": prior | {"sigma_m": SIGMA_M}}))
+    assert found.verdict.status == "check"
+    doubts = [it.words for it in found.verdict.findings if it.kind == "prior"]
+    for doubt, axis in zip(doubts, "xy", strict=True):
+        stated_mm = 1e3 * prior[f"{axis}_m"]
+        assert f"{axis}_m of flange_from_cam = {stated_mm:g} mm, known to 0.5 mm, is" in doubt
+        seen_mm = float(doubt.partition("alone say ")[2].split()[0])
+        # Some ten of their sigmas, and a fifth of the smaller of both offsets.
+        assert seen_mm == pytest.approx(1e3 * X["xy".index(axis), 3], abs=1.0)
+    kept = f"The measured z_m of flange_from_cam = {1e3 * height:g} mm was used"
+    assert any(it.startswith(kept) for it in found.verdict.reasons)
+    off, covariance = away(found), found.covariance("flange_from_cam")
+    # Chi-square of 6 beyond 22 is 0.1 %.
+    assert off @ np.linalg.solve(covariance, off) < 22.0
 
 
 def test_what_cannot_be_used_is_said():

@@ -132,6 +132,8 @@ def test_sigmas_weigh_the_corners(tmp_path):
         (1.1, "good", "", 1.1 * NOISE_PX),
         (0.4, "check", "corners.csv states 0.08 px", NOISE_PX),
         (2.5, "good", "corners.csv states 0.5 px", 2.5 * NOISE_PX),
+        # More than would be doubted, if it were measured.
+        (5.0, "good", "corners.csv states 1 px", 5.0 * NOISE_PX),
     ],
 )
 def test_the_verdict_says_where_the_corners_contradict_what_is_stated(
@@ -142,6 +144,7 @@ def test_the_verdict_says_where_the_corners_contradict_what_is_stated(
     sentences = " ".join(result.verdict.reasons)
     assert said in sentences
     assert ("corners.csv states" in sentences) is bool(said)
+    assert "Corners deviate by" not in sentences
     # The scatter of 1200 coordinates shows the noise to 2 %.
     assert result.noise["pixel_px"] == pytest.approx(level, rel=0.06)
 

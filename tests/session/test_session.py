@@ -376,6 +376,16 @@ TOML_REFUSALS = [
     ("[robot]", "[clock]\ncamera_minus_robot_s = '0'\n[robot]", "clock.camera_minus_robot_s is"),
     ("[robot]", "[prior.flange_from_cam]\nz_m = 1.0\n[robot]", "prior.flange_from_cam.sigma_m is"),
     ("[robot]", "[prior.flange_from_cam]\nsigma_m = 1.0\n[robot]", "cam names no component"),
+    (
+        "[robot]",
+        "[prior.flange_from_cam]\nz_m = 81.2\nsigma_m = 1e-3\n[robot]",
+        r"cam\.z_m is 81\.2, .* metres, at most 3 on a flange: write 0\.0812 for 81\.2 mm\.$",
+    ),
+    (
+        "[robot]",
+        "[prior.base_from_target]\nx_m = 520\nsigma_m = 1e-3\n[robot]",
+        r"target\.x_m is 520, .* metres, at most 100 in a cell: write 0\.52 for 520 mm",
+    ),
     ("[robot]", "[instrument]\nsigma_m = -1\n[robot]", "instrument.sigma_m is -1, .*at least 0"),
     ("[robot]\nmodel = ", "robot = ", "robot is 'ur10e', but must be a table"),
     ("[robot]", "[need]\nmm = 0\n[robot]", "need.mm is 0, but must be a number above 0"),

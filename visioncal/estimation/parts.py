@@ -194,6 +194,15 @@ class FramePrior:
         found[:3, :3], found[:3, 3] = self.rotation, self.values_m
         return found
 
+    def without(self, axis: int) -> "FramePrior":
+        """Returns the prior without one of its measured components."""
+        kept = [
+            (it, value) for it, value in zip(self.axes, self.values_m, strict=True) if it != axis
+        ]
+        return replace(
+            self, axes=tuple(it for it, _ in kept), values_m=tuple(value for _, value in kept)
+        )
+
     def whitened(self, found: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Residuals (d,) in units of sigma, and their slopes (d, 6).
 

@@ -26,6 +26,9 @@ KINDS: tuple[Kind, ...] = ("camera", "robot", "target", "instrument")
 _COEFFICIENTS: Mapping[str, tuple[int, ...]] = {"brown": (5, 8), "fisheye": (4,)}
 # Names become parts of the names of frames: base_from_target_NAME.
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
+# No arm carries a camera or a board farther out, and no cell is larger [m]; offsets written in
+# millimetres are beyond, from 4 mm on a flange and 101 mm in a cell.
+_MOST_ON_FLANGE_M, _MOST_M = 3.0, 100.0
 _EDGES = ("flange_from_cam", "base_from_target", "base_from_cam", "flange_from_target")
 
 
@@ -210,6 +213,20 @@ def _prior_contradictions(declaration: Declaration) -> Iterator[tuple[str, str]]
             yield f"prior.{edge}", "needs quaternion_xyzw and sigma_rad together, or neither"
         if turn is not None and not 0.9 < sum(it * it for it in turn) < 1.1:
             yield f"prior.{edge}.quaternion_xyzw", f"is {turn}, but its length must be 1"
+        yield from _far_components(edge, prior)
+
+
+def _far_components(edge: str, prior: PriorTable) -> Iterator[tuple[str, str]]:
+    on_flange = any(it.partition("_")[0] == "flange" for it in edge.split("_from_"))
+    most, where = (_MOST_ON_FLANGE_M, "on a flange") if on_flange else (_MOST_M, "in a cell")
+    for name in ("x_m", "y_m", "z_m"):
+        value = getattr(prior, name)
+        if value is not None and abs(value) > most:
+            yield (
+                f"prior.{edge}.{name}",
+                f"is {value:g}, but is in metres, at most {most:g} {where}: write "
+                f"{1e-3 * value:g} for {value:g} mm",
+            )
 
 
 def _several_contradictions(declaration: Declaration, kind: Kind) -> Iterator[tuple[str, str]]:

@@ -12,7 +12,7 @@ from visioncal.calibration.pipeline.running import known_at_first, unseen_cause
 from visioncal.calibration.pipeline.solving import first_agreement
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.cell import read_cell
-from visioncal.calibration.stages.observed import by_reason
+from visioncal.calibration.stages.observed import CameraLook, by_reason
 from visioncal.calibration.stages.pictures import unnamed_images
 from visioncal.core.errors import VisioncalError
 from visioncal.core.files import some_of
@@ -163,14 +163,20 @@ def _lenses(known: RunState) -> Iterator[Finding]:
                 f"The stated matrix is of images of another size: its centre is at ({x:.0f}, "
                 f"{y:.0f}) px, and the middle of these is at ({middle[0]:.0f}, {middle[1]:.0f}) px."
             )
-        elif look.pixel_px is not None and look.pixel_px > _MOST_PX:
+        elif (noise_px := _measured_px(look)) > _MOST_PX:
             words = (
-                f"Corners deviate by {figure(look.pixel_px)} px from any pose of a flat board "
+                f"Corners deviate by {figure(noise_px)} px from any pose of a flat board "
                 f"(doubt begins at {_MOST_PX:g}): the stated lens is not this camera's, or the "
                 "board is not flat."
             )
         if words:
             yield Finding("lens", words, step).of(frame if len(known.cameras) > 1 else "")
+
+
+def _measured_px(look: CameraLook) -> float:
+    """Noise of a corner's coordinate [px]; zero where it is not measured, but stated."""
+    stated = {it.stated_px for it in look.corners.values()}
+    return 0.0 if look.pixel_px is None or look.pixel_px in stated else look.pixel_px
 
 
 def _motion(known: RunState, mount: Mount) -> Iterator[Finding]:

@@ -50,7 +50,7 @@ def findings_of(known: RunState) -> Findings:
     ]
     return Findings(
         _pairs(tied, explained, alone=known.mount is not None),
-        _sensors(tied, answer.sigmas, known.spared.keys() | known.held_back),
+        _sensors(tied, answer.sigmas, solved.shown_px, known.spared.keys() | known.held_back),
         _arms(answer),
         worst,
         places,
@@ -174,7 +174,10 @@ def _disagrees(sight: Sight) -> bool:
 
 
 def _sensors(
-    sights: Sequence[Sight], noise: Mapping[str, Mapping[str, float]], spared: Collection[int]
+    sights: Sequence[Sight],
+    noise: Mapping[str, Mapping[str, float]],
+    shown_px: Mapping[str, float],
+    spared: Collection[int],
 ) -> list[Sensor]:
     seers = dict.fromkeys(it.seer for it in sights)
     found = []
@@ -189,7 +192,7 @@ def _sensors(
                 sum(it.used for it in mine),
                 lost,
                 [it.view for it in mine if _disagrees(it)],
-                levels.get("pixel_px"),
+                shown_px.get(seer, levels.get("pixel_px")),
                 levels.get("level", 1.0),
                 seer if len(seers) > 1 else "",
             )

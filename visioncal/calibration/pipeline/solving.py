@@ -16,7 +16,7 @@ from visioncal.calibration.stages.init_frames import init_frames
 from visioncal.calibration.stages.kinematics import check_asked
 from visioncal.calibration.stages.observed import Observed, nothing_seen
 from visioncal.calibration.stages.pnp import ViewPoses
-from visioncal.calibration.stages.priors import most_contradicted
+from visioncal.calibration.stages.priors import loosened, without_most_contradicted
 from visioncal.calibration.stages.refine import lens_levels, refined
 from visioncal.calibration.stages.side import FramesSide
 from visioncal.calibration.stages.validate import chain_rms_px
@@ -41,6 +41,7 @@ from visioncal.estimation.solve import (
     covariance_of,
     estimate_noise,
     fit_problem,
+    solve_problem,
     starting_noise,
 )
 
@@ -89,6 +90,18 @@ class Solved:
             side = _side(self.cell, self.agreed, self.arms, self.late)
             fitted = Fitted(self.seen, part, self.agreed.fit)
             yield from found_of_looks(side, fitted, covariance)
+
+    @property
+    def shown_px(self) -> dict[str, float]:
+        """Each camera's noise of a corner by its residuals, per axis, whatever is stated [px]."""
+        if self.seen is None:
+            return {}
+        looks, found = self.seen.looks, {}
+        for (camera, it), corners in zip(looks.problems.items(), self.seen.compressed, strict=True):
+            moving = np.flatnonzero(np.isin(looks.places(camera), self.seen.moving))
+            unknowns = it.unknowns(corners, moving)
+            found[camera] = it.stack.shown_px(corners.residuals, unknowns)
+        return found
 
     @property
     def looks(self) -> CameraParameters | None:
@@ -159,7 +172,7 @@ def solve(
     cell, lost = _tied_part(cell)
     views = [looked.poses[it.view] for it in cell.rows]
     cell, views, problem, state, unplaced = _started(cell, views)
-    agreed = agree(problem, state, _movable(cell, problem))
+    agreed = _agree(cell, problem, state)
     late = clock_effects(cell, looked.clocks)
     agreed, seen, arms = _agreeing_looks(cell, looked, views, agreed, arms, late)
     arms = with_drifts(arms, agreed.problem.subset(agreed.used), agreed.fit, asked)
@@ -173,7 +186,7 @@ def solve(
             late = clock_effects(cell, looked.clocks, erring)
             agreed, seen, arms = _at_rest(cell, agreed, seen, arms, late)
         before = agreed.used
-        agreed = _without_contradicted(cell, settle(agreed, _movable(cell, agreed.problem)))
+        agreed = _settle(cell, agreed)
         agreed = _without_misreported(agreed, arms, before)
         agreed, seen, arms = _at_rest(cell, agreed, seen, arms, late)
         # What agrees by now has a say in how far the arms are calibrated.
@@ -204,7 +217,7 @@ def first_agreement(cell: Cell, looked: Observed, mount: Mount) -> tuple[Cell, A
     views = [looked.poses[it.view] for it in cell.rows]
     cell, _, problem, state, _ = _started(cell, views)
     check_observability(problem, state, starting_noise(problem), mount)
-    return cell, agree(problem, state, _movable(cell, problem))
+    return cell, _agree(cell, problem, state)
 
 
 def _with_poses(cell: Cell, looked: Observed) -> Cell:
@@ -403,17 +416,40 @@ def _with_repeats(agreed: Agreed) -> Agreed:
     return replace(agreed, problem=problem, fit=fit)
 
 
-def _without_contradicted(cell: Cell, agreed: Agreed) -> Agreed:
-    """Leaves out priors that the observations contradict, the worst first: it misleads the rest."""
-    for _ in agreed.problem.priors:
-        part = agreed.problem.subset(agreed.used)
-        worst = most_contradicted(part, agreed.fit.state, covariance_of(part, agreed.fit))
-        if worst is None:
-            break
-        kept = tuple(it for it in agreed.problem.priors if it is not worst)
-        problem = replace(agreed.problem, priors=kept)
-        agreed = settle(replace(agreed, problem=problem), _movable(cell, problem))
-    return agreed
+def _agree(cell: Cell, problem: Problem, state: State) -> Agreed:
+    """Finds what belongs together, and what of the priors the observations do not contradict."""
+    movable = _movable(cell, problem)
+    if not cell.priors:
+        return agree(problem, state, movable)
+    loose = replace(problem, priors=loosened(cell.priors))
+    agreed = _with_priors(cell, agree(loose, state, movable))
+    fit = fit_problem(agreed.problem.subset(agreed.used), agreed.fit.state, agreed.fit.noise)
+    return replace(agreed, fit=fit)
+
+
+def _settle(cell: Cell, agreed: Agreed) -> Agreed:
+    """Settles what agrees, and what of the priors the observations do not contradict."""
+    if cell.priors:
+        loose = replace(agreed.problem, priors=loosened(cell.priors))
+        agreed = settle(replace(agreed, problem=loose), _movable(cell, loose))
+        agreed = _with_priors(cell, agreed)
+    return settle(agreed, _movable(cell, agreed.problem))
+
+
+def _with_priors(cell: Cell, agreed: Agreed) -> Agreed:
+    """Puts in the components of priors that the observations do not contradict.
+
+    The worst is left out first: it misleads about the rest. The noise is that of a fit with loose
+    priors: estimated beside a wrong one, it would grow until it explains it.
+    """
+    problem, noise = replace(agreed.problem, priors=cell.priors), agreed.fit.noise
+    while True:
+        part = problem.subset(agreed.used)
+        fit = Solution(solve_problem(part, agreed.fit.state, noise)[0], noise)
+        kept = without_most_contradicted(part, fit.state, covariance_of(part, fit))
+        if kept is None:
+            return replace(agreed, problem=problem, fit=fit)
+        problem = replace(problem, priors=kept)
 
 
 def _levelled(cell: Cell, views: Sequence[ViewPoses], agreed: Agreed) -> Agreed:

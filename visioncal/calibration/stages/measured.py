@@ -35,6 +35,8 @@ class Component:
     """A measured component beside what the views alone say of it [m]."""
 
     label: str
+    axis: int
+    is_used: bool
     stated_m: float
     sigma_m: float
     seen_m: float
@@ -56,25 +58,6 @@ class Component:
         apart_m = abs(self.seen_m - self.stated_m)
         return float(apart_m / np.hypot(self.sigma_m, self.seen_sigma_m))
 
-    @classmethod
-    def beside(
-        cls, label: str, stated_m: float, sigma_m: float, off_m: float, found_sigma_m: float
-    ) -> "Component":
-        """Takes what was measured out of an answer again.
-
-        Args:
-            label: Of which frame it is.
-            stated_m: What was measured [m].
-            sigma_m: Its standard deviation [m].
-            off_m: How far the answer is from it [m].
-            found_sigma_m: What the answer is known to [m].
-        """
-        own = max(found_sigma_m**-2.0 - sigma_m**-2.0, 0.0)
-        covariance = np.inf if own == 0.0 else 1.0 / np.sqrt(own)
-        # Both together are their mean, each weighted with its information.
-        seen = stated_m + off_m + off_m * (covariance / sigma_m) ** 2
-        return cls(label, stated_m, sigma_m, float(seen), float(covariance))
-
     @property
     def remark(self) -> str:
         """Says that the answer rests on it."""
@@ -92,8 +75,7 @@ class Component:
         return (
             f"The measured {self.label} = {1e3 * self.stated_m:g} mm, known to "
             f"{figure(1e3 * self.sigma_m)} mm, is contradicted by the views, which alone say "
-            f"{1e3 * self.seen_m:.4g} mm to {figure(1e3 * self.seen_sigma_m)} mm; it is not used. "
-            "Measure it again, or leave it out."
+            f"{1e3 * self.seen_m:.4g} mm to {figure(1e3 * self.seen_sigma_m)} mm; it is not used."
         )
 
 
@@ -118,7 +100,7 @@ def _components(
     prior: FramePrior, problem: Problem, state: State, covariance: FloatArray
 ) -> Iterator[Component]:
     away, jacobian = problem.prior_rows(prior, state)
-    used = {it.name for it in problem.priors}
+    used = {(it.name, axis) for it in problem.priors for axis in it.axes}
     sigmas = np.sqrt(np.einsum("dp,pq,dq->d", jacobian, covariance, jacobian)) * prior.sigma_m
     # Behind those of the rotation, which no word is said of.
     places = slice(len(away) - len(prior.axes), len(away))
@@ -129,8 +111,21 @@ def _components(
         sigmas[places].tolist(),
         strict=True,
     ):
+        is_used = (prior.name, axis) in used
+        seen = _without_prior(off, sigma, prior.sigma_m) if is_used else (off, sigma)
         label = f"{_COMPONENTS[axis]} of {prior.name}"
-        if prior.name in used:
-            yield Component.beside(label, stated, prior.sigma_m, off, sigma)
-        else:
-            yield Component(label, stated, prior.sigma_m, stated + off, sigma)
+        yield Component(label, axis, is_used, stated, prior.sigma_m, stated + seen[0], seen[1])
+
+
+def _without_prior(off_m: float, sigma_m: float, prior_m: float) -> tuple[float, float]:
+    """How far the views alone are from a measured component, and to what they know it [m].
+
+    Args:
+        off_m: How far the answer is from it [m].
+        sigma_m: What the answer is known to [m].
+        prior_m: What the component is known to [m].
+    """
+    own = max(sigma_m**-2.0 - prior_m**-2.0, 0.0)
+    alone = np.inf if own == 0.0 else 1.0 / np.sqrt(own)
+    # Both together are their mean, each weighted with its information.
+    return float(off_m + off_m * (alone / prior_m) ** 2), float(alone)

@@ -1,16 +1,20 @@
 """What a session knows of a cell's frames beforehand: `[prior.A_from_B]`, and what became of it."""
 
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 
 from visioncal.calibration.stages.measured import components, prior_of
 from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean
 from visioncal.core.types import FloatArray
-from visioncal.core.verdict import NOTE, Finding, remarks
+from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Step, remarks
 from visioncal.estimation.parts import FramePrior, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.tree import Tree
 from visioncal.session.tables import PriorTable
+
+# A place of this sigma is overruled by any that views determine well enough to be accepted [m].
+_LOOSE_M = 1.0
 
 
 def priors_of(tables: Mapping[str, PriorTable], tree: Tree) -> tuple[FramePrior, ...]:
@@ -50,21 +54,35 @@ def _prior(name: str, table: PriorTable, tree: Tree) -> FramePrior:
     return found
 
 
-def most_contradicted(problem: Problem, state: State, covariance: FloatArray) -> FramePrior | None:
-    """The prior that the observations contradict most; None where they contradict none.
+def loosened(priors: Iterable[FramePrior]) -> tuple[FramePrior, ...]:
+    """The priors with places so uncertain that the observations overrule them."""
+    return tuple(replace(it, sigma_m=max(it.sigma_m, _LOOSE_M)) for it in priors)
+
+
+def without_most_contradicted(
+    problem: Problem, state: State, covariance: FloatArray
+) -> tuple[FramePrior, ...] | None:
+    """The priors without the component that the observations contradict most.
 
     Args:
         problem: The observations in the fit.
         state: The answer.
         covariance: (p, p) covariance of the unknowns.
+
+    Returns:
+        The others; None where the observations contradict none.
     """
     found = [
-        (it.contradiction, at)
+        (it.contradiction, at, it.axis)
         for at, prior in enumerate(problem.priors)
         for it in components(problem, state, covariance, [prior])
         if it.is_contradicted
     ]
-    return problem.priors[max(found)[1]] if found else None
+    if not found:
+        return None
+    _, worst, axis = max(found)
+    kept = [it.without(axis) if at == worst else it for at, it in enumerate(problem.priors)]
+    return tuple(it for it in kept if it.axes or it.rotation is not None)
 
 
 def prior_words(
@@ -73,15 +91,14 @@ def prior_words(
     """Says what became of priors; what contradicts none is a note.
 
     Args:
-        problem: The observations in the fit, with the priors that these do not contradict.
+        problem: The observations in the fit, with what of priors these do not contradict.
         state: The answer.
         covariance: (p, p) covariance of the unknowns.
-        stated: All priors.
+        stated: All priors, whole.
     """
-    used = {it.name for it in problem.priors}
-    for prior in stated:
-        found = components(problem, state, covariance, [prior])
-        if prior.name in used:
-            yield from remarks((it.remark for it in found), NOTE)
-        elif found:
-            yield Finding("prior", max(found, key=lambda it: it.contradiction).doubt)
+    for it in components(problem, state, covariance, tuple(stated)):
+        if it.is_used:
+            yield from remarks([it.remark], NOTE)
+        else:
+            step = Step("Measure it again, or delete it from session.toml.", CALIBRATE)
+            yield Finding("prior", it.doubt, step)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.calibration.stages.pnp import ViewPoses
+from visioncal.calibration.stages.priors import loosened
 from visioncal.calibration.stages.side import FramesSide
 from visioncal.core.errors import ConvergenceError
 from visioncal.core.threads import one_blas_thread
@@ -157,8 +158,9 @@ def lens_levels(side: Side, fitted: Fitted) -> dict[str, LensLevels]:
     sizes = [looks.scale_of(it) for it in looks.printed]
     unsized = looks.without_prior(np.concatenate([np.zeros(0), *sizes]).tolist())
     seen = fitted.seen.freed(np.arange(len(looks.values)), unsized)
-    # What was measured by hand may be wrong; it is looked at later.
-    problem = replace(side.problem(seen), priors=())
+    # What was measured by hand may be wrong, which is looked at later; all may hang on it.
+    problem = side.problem(seen)
+    problem = replace(problem, priors=loosened(problem.priors))
     first = np.append(looks.values, np.zeros(seen.by_field.shape[2]))
     state = State(fitted.fit.state.edges, np.concatenate([first, fitted.others]))
     return {
