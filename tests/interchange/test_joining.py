@@ -140,7 +140,7 @@ def pairs(tmp_path: Path) -> Path:
 
 def test_frames_of_a_replaced_result_are_kept_beside_the_new_one(sample, pairs, tmp_path, capsys):
     out = tmp_path / "out"
-    calibrate_command(pairs, NeedOptions(), WorkOptions(), out)
+    calibrate_command([pairs], NeedOptions(), WorkOptions(), out)
     assert leftover(out) is None
     assert not (out / "frames.json").exists()
     # Of what had joined, the fixture was placed by the camera.
@@ -153,7 +153,7 @@ def test_frames_of_a_replaced_result_are_kept_beside_the_new_one(sample, pairs, 
     FrameFile({"flange_from_old": tool_frame(), "flange_from_tool": tool_frame()}).save(
         out / "frames.json"
     )
-    calibrate_command(pairs, NeedOptions(), WorkOptions(), out)
+    calibrate_command([pairs], NeedOptions(), WorkOptions(), out)
     assert not Calibration.load(out).frames
     kept = FrameFile.load(out / "frames.json").frames
     assert kept.keys() == {"flange_from_old", *frames}
@@ -166,13 +166,13 @@ def test_frames_of_a_replaced_result_are_kept_beside_the_new_one(sample, pairs, 
 
 def test_frames_that_cannot_be_kept_stop_a_new_result(sample, pairs, tmp_path):
     out = tmp_path / "out"
-    calibrate_command(pairs, NeedOptions(), WorkOptions(), out)
+    calibrate_command([pairs], NeedOptions(), WorkOptions(), out)
     frames = with_frames(sample).calibration.frames
     replace(Calibration.load(out), frames=frames).save(out / "calibration.json")
     (out / "frames.json").write_text("not frames", encoding="utf-8")
     before = contents(out)
     with pytest.raises(DataError, match=r"frames\.json, line 1.* is no JSON"):
-        calibrate_command(pairs, NeedOptions(), WorkOptions(), out)
+        calibrate_command([pairs], NeedOptions(), WorkOptions(), out)
     assert contents(out) == before
 
 
