@@ -18,7 +18,7 @@ from visioncal.vision.targets import corner_positions, marked_squares, marker_ce
 
 SAMPLES = 4
 FOCAL_PX = 1300.0
-# The white margin around a print [squares].
+# The white margin around a print [squares]; a quarter of that around a marker, which is one square.
 MARGIN = 1
 
 
@@ -73,6 +73,9 @@ def _print(target: Target):
         light = np.ones((1, 1), bool)
     elif target.kind == "aprilgrid":
         lines, light = _aprilgrid(target)
+    elif target.kind == "marker":
+        light = ~marker_cells(target.dictionary, target.marker_id)
+        lines = (np.arange(len(light) + 1) / len(light) - 0.5,) * 2
     else:
         columns, rows = target.columns, target.rows
         share = target.marker_m / target.square_m
@@ -126,7 +129,8 @@ def photograph(target: Target, shot: Shot, seed: int = 0) -> tuple[np.ndarray, n
     flat = np.stack([*turn.as_matrix().T[:2], place], axis=1)
     flat = np.diag([FOCAL_PX, FOCAL_PX, 1.0]) @ flat
     edges = np.array([[low[0], low[1]], [high[0], low[1]], high, [low[0], high[1]]])
-    edges = edges + MARGIN * np.sign(edges - (low + high) / 2)
+    margin = MARGIN / 4 if target.kind == "marker" else MARGIN
+    edges = edges + margin * np.sign(edges - (low + high) / 2)
     bounds = cv2.perspectiveTransform(edges[None], flat)[0]
     origin = bounds.min(axis=0) - rng.uniform(3, 4, 2)
     width, height = np.ceil(bounds.max(axis=0) - origin + 4).astype(int)

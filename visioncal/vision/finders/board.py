@@ -21,7 +21,7 @@ _LONG_SIDE_PX = 2000
 # Corners that the template does not fit are left out: a detector is off there by up to a pixel. Of
 # views where fewer than these fit, the detector's corners serve, all of them, with a tenth of the
 # weight: so much less exact they are in the median of what was measured.
-_FEWEST_FITTED, _LEAST_FITTED, _DETECTED_WEIGHT = 6, 0.5, 0.1
+_FEWEST_FITTED, _LEAST_FITTED, DETECTED_WEIGHT = 6, 0.5, 0.1
 
 FINDERS: dict[TargetKind, Callable[[Image, Target], DetectedCorners | NotFound]] = {
     "charuco": find_charuco,
@@ -61,7 +61,7 @@ def _refined(image: Image, target: Target, seen: DetectedCorners) -> DetectedCor
     refined = refine(image, target, seen.ids, seen.px)
     fitted = np.array([not it for it in refined.reasons])
     if fitted.sum() < max(min(_FEWEST_FITTED, len(fitted)), _LEAST_FITTED * len(fitted)):
-        return replace(seen, weights=np.full(len(fitted), _DETECTED_WEIGHT))
+        return replace(seen, weights=np.full(len(fitted), DETECTED_WEIGHT))
     return DetectedCorners(
         seen.ids[fitted], refined.px[fitted], blur_px=float(refined.blur_px.max())
     )

@@ -13,7 +13,6 @@ from visioncal.vision.targets import aruco_dictionary, corner_positions, tag_cor
 
 # So many whole tags in one plane tell whether they lie as described.
 _LEAST_TAGS = 2
-_SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
 
 
 def find_tags(image: Image, target: Target) -> DetectedCorners | NotFound:
@@ -49,10 +48,9 @@ def find_tags(image: Image, target: Target) -> DetectedCorners | NotFound:
             return NotFound("the tags do not lie as the target describes them", misfit=True)
     modules = int(dictionary.markerSize) + 2
     if places is None:
-        # Of each tag by itself it is known that it is square.
-        parts = [refine_tags(image, modules, _SQUARE[None], it[None]) for it in quads.values()]
+        parts = [refine_tags(image, modules, it[None]) for it in quads.values()]
     else:
-        parts = [refine_tags(image, modules, places, np.array(list(quads.values())))]
+        parts = [refine_tags(image, modules, np.array(list(quads.values())), places)]
     points = np.concatenate([known[it] for it in quads])
     fitted = np.array([not it for part in parts for it in part.reasons]) & (points >= 0)
     if not fitted.any():

@@ -20,7 +20,9 @@ markers and of their blurred edges are left out. All corners of an image are wor
 
 The corners of an AprilGrid's tags are such corners too, for each touches a small dark square. The
 white between tags takes the place of the squares' side: within it lie a corner's lines alone, and
-the next ones.
+the next ones. A corner of a tag by itself is one dark square before white. Around it neither uneven
+light nor what lies beyond the white is even, so that the slopes of white are unknowns of its own,
+and what blur brings in from beyond is left out. Ink and a tone curve move its two edges.
 
 Around the centre of a printed circle of radius r the product of edges becomes one edge,
 
@@ -55,9 +57,16 @@ _HALF, _LEAST_PX, _MOST_PX = 0.42, 3.0, 20.0
 _FEWEST = 4
 # What is looked at around the outermost corners [px].
 _RIM_PX = 32
+_SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
 # The patch of a tag's corner, in modules, and what is left out around the corner itself, in widths
 # of an edge.
 _TAG_HALF, _SLANT = 1.2, 1.5
+# Shares of a module that white reaches around a tag. The one of least variance is taken: what lies
+# beyond the white leaves residuals.
+_TAG_WHITE = (1.0, 0.7, 0.4)
+# How far from a tag's bits, and from what is beyond its white, pixels have to be, in widths of an
+# edge. At 1.5 they draw all corners inwards by 0.02 px, but small tags have no others.
+_TAG_CLEAR = (2.5, 1.5)
 # What is looked at around a circle: a share of its radius, and no less [px]. Text may be near.
 _AROUND_CIRCLE, _AROUND_PX = 0.35, 4.0
 # Larger circles are looked at in half of the size.
@@ -70,7 +79,7 @@ _BLUR_SAMPLE, _BLUR_START_PX, _BLUR_LEAST_PX = 30, 1.5, 0.5
 _BLUR_TURNS, _MOST_TURNS, _STILL_PX = 8, 8, 0.004
 # Beyond this share of a square, blur brings in the next lines.
 _WIDE = 0.16
-# Pixels nearer to a marker than this many widths of an edge are left out.
+# Pixels nearer to a ChArUco board's marker than this many widths of an edge are left out.
 _CLEAR = 1.5
 # No step is longer [squares].
 _MOST_STEP = 0.25
@@ -116,6 +125,8 @@ class _Pattern:
         lone: (n, 2) signs of x and y where the one dark square of a tag's corner is; 0 where two
             dark squares meet.
         outside: How far around a lone one white reaches [squares].
+        clear: Pixels nearer to a marker, or to what lies beyond a lone one's white, than this many
+            widths of an edge are left out.
         axes: (n, 2, 2) from the board to each corner's own axes and squares; None where these are
             the board's.
     """
@@ -126,6 +137,7 @@ class _Pattern:
     radius: float = 0.0
     lone: FloatArray | None = None
     outside: float = np.inf
+    clear: float = _CLEAR
     axes: FloatArray | None = None
 
     @classmethod
@@ -299,21 +311,25 @@ def refine(image: Image, target: Target, ids: IntArray, px: FloatArray) -> Refin
     return _placed(image, _Pattern.of(target, ids, board), board, px)
 
 
-def refine_tags(image: Image, modules: int, board: FloatArray, px: FloatArray) -> Refined:
+def refine_tags(
+    image: Image, modules: int, px: FloatArray, board: FloatArray | None = None
+) -> Refined:
     """Refines the corners of tags in one plane, likewise.
 
     Around a corner the print is dark in one square, (1 + E(x)) (1 + E(y)), and white as far as a
-    module reaches; of the tag itself its border is looked at.
+    module reaches, or less; of the tag itself its border is looked at.
 
     Args:
         image: (h, w) grey image.
         modules: Modules along a tag's side, its border included.
-        board: (t, 4, 2) where the corners are, clockwise from each tag's upper left, in any unit.
-        px: (t, 4, 2) where a detector has them [px].
+        px: (t, 4, 2) where a detector has the corners, clockwise from each tag's upper left [px].
+        board: (t, 4, 2) where they are in their plane, in any unit; None of a tag by itself, of
+            which it is known that it is square.
 
     Returns:
         The corners, four of each tag.
     """
+    board = _SQUARE[None] if board is None else board
     inward = np.tile([[1.0, 1], [-1, 1], [-1, -1], [1, -1]], (len(board), 1))
     sides = np.stack([board[:, 1] - board[:, 0], board[:, 3] - board[:, 0]], axis=1)
     unit = float(np.mean(np.linalg.norm(sides, axis=2)))
@@ -325,10 +341,23 @@ def refine_tags(image: Image, modules: int, board: FloatArray, px: FloatArray) -
         # What the corners around tell of the lens's bend, one tag alone does not.
         module * (_TAG_HALF if len(board) > 1 else 1.0),
         lone=inward,
-        outside=module,
         axes=np.repeat(unit * sides / lengths, 4, axis=0),
     )
-    return _placed(image, pattern, board.reshape(-1, 2) / unit, px.reshape(-1, 2))
+    places, start = board.reshape(-1, 2) / unit, px.reshape(-1, 2)
+    tried: list[Refined] = []
+    for clear in _TAG_CLEAR:
+        for white in _TAG_WHITE:
+            printed = replace(pattern, outside=white * module, clear=clear)
+            tried.append(_placed(image, printed, places, start))
+        best = min(tried, key=_uncertainty)
+        if not any(best.reasons):
+            break
+    return best
+
+
+def _uncertainty(refined: Refined) -> tuple[int, float]:
+    """How many corners could not be fitted, and the sum of the others' variances [px^2]."""
+    return sum(map(bool, refined.reasons)), float(np.nansum(refined.sigma_px**2))
 
 
 def _placed(image: Image, pattern: _Pattern, board: FloatArray, px: FloatArray) -> Refined:
@@ -398,7 +427,8 @@ def _refined(image: Image, pattern: _Pattern, board: FloatArray, px: FloatArray)
 def _measured_blur(windows: _Windows, pattern: _Pattern) -> tuple[FloatArray, float]:
     """(2,) widths of the smoothed image's edges, medians over the corners [px], and the radius."""
     side_px = 1.0 / np.median(windows.widths)
-    blur_px = np.full(2, min(_BLUR_START_PX, 0.2 * side_px))
+    # A wider one would leave out all white around a lone corner.
+    blur_px = np.full(2, min(_BLUR_START_PX, 0.2 * min(pattern.outside, 1.0) * side_px))
     shift = np.zeros((len(windows.px), 2))
     for _ in range(_BLUR_TURNS):
         step = _step(windows, pattern, shift, blur_px, np.zeros((len(shift), 2, 2)), blurs=True)
@@ -463,11 +493,15 @@ def _step(
     x, y = windows.x - dx, windows.y - dy
     used = windows.within & windows.inside
     if np.isfinite(pattern.inset):
-        clear_x, clear_y = (np.float32(pattern.inset) - np.float32(_CLEAR) * it for it in (sx, sy))
+        clear_x, clear_y = (
+            np.float32(pattern.inset) - np.float32(pattern.clear) * it for it in (sx, sy)
+        )
         used = used & ~((np.abs(x) > clear_x) & (np.abs(y) > clear_y) & (signs * x * y > 0))
     if pattern.lone is not None:
         lone_x, lone_y = np.asarray(pattern.lone.T, np.float32)[:, :, None, None]
-        far_x, far_y = (np.float32(_CLEAR) * it - np.float32(pattern.outside) for it in (sx, sy))
+        far_x, far_y = (
+            np.float32(pattern.clear) * it - np.float32(pattern.outside) for it in (sx, sy)
+        )
         used = used & (lone_x * x > far_x) & (lone_y * y > far_y)
         # Where a view slants the corner, its blur is not the product of two.
         used = used & (
@@ -476,6 +510,10 @@ def _step(
     draw = _circle if pattern.radius else _crossing
     product, *slopes_of = draw(pattern, x, y, sx, sy)
     columns = [np.ones_like(x), product, *slopes_of[: None if blurs else 2]]
+    widened = len(columns)
+    if pattern.lone is not None:
+        # Light slopes where it is white, and there the product is 0; in the dark it is 4.
+        columns += [(1 - product / 4) * it for it in (x, y)]
     unknowns = len(columns)
     columns.append(windows.grey - ox * x - oy * y - (gx * x + gy * y) * product)
     stack = np.empty((count, unknowns + 1, *x.shape[1:]), np.float32)
@@ -496,7 +534,7 @@ def _step(
     return _Step(
         found[:, :2],
         -found[:, 2:4] / contrast,
-        found[:, 4:] / contrast,
+        found[:, 4:widened] / contrast,
         inverse[:, 2:4, 2:4] * (variance / _NOISE_LEFT)[:, None, None] / contrast[:, :, None] ** 2,
         np.sqrt(variance) / np.abs(contrast[:, 0]),
     )
