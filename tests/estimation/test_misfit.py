@@ -159,14 +159,17 @@ def test_intervals_of_the_noise_hold_the_truth():
 
 
 def test_an_interval_is_about_the_level_that_was_found():
-    """Also where another one, far away, is likelier."""
+    """Also where another one, far away, is likelier; each look at the likelihood is a fit."""
+    looks = []
 
     def profile(logarithm):
+        looks.append(logarithm)
         return 2.0 * min((logarithm - np.log(1e-4)) ** 2, (logarithm - np.log(1e-2)) ** 2 - 5.0)
 
     low, high = profile_interval(profile, 1e-4, -10.0)
     # Chi-square of one is under 3.84 in 95 %: 0.98 in logarithms either way, sought to 0.02.
     assert np.log([low, high]) == pytest.approx(np.log(1e-4) + np.array([-0.98, 0.98]), abs=0.03)
+    assert len(looks) <= 9
 
 
 def test_the_size_of_an_arms_errors_is_known_as_well_as_these_are_told():

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from support.cells import calibrated
 
 from visioncal.core.errors import ConvergenceError
@@ -11,6 +12,7 @@ from visioncal.estimation import joint
 from visioncal.estimation.parts import ROBOT, Effect
 from visioncal.estimation.solve import (
     RATIO_PRIOR,
+    equations_and_cost,
     fit_problem,
     left_out_residuals,
     normal_equations,
@@ -111,6 +113,47 @@ def test_the_likelihood_jacobian_as_its_differences_say(given):
         slope = (at(logs + shift).value - at(logs - shift).value) / (2 * step)
         # The third order of a step of 1e-4 is left, and rounding of values of some thousands.
         assert at(logs).slope[level] == pytest.approx(slope, rel=1e-4, abs=1e-4)
+
+
+def test_shared_errors_of_flanges_are_eliminated_exactly():
+    """Against the covariance of all observations, written out."""
+    problem, fit = answered(False, views=6, seed=5)
+    problem = doubled(problem)
+    linear = problem.linear(fit.state)
+    by_errors = np.zeros((len(problem), 6, 6 * 6))
+    for row, unit in enumerate(problem.units[0]):
+        by_errors[row, :, 6 * unit : 6 * unit + 6] = linear.by_errors[row]
+    by_errors = by_errors.reshape(-1, 36)
+    noise = block_diag(*problem.covariance(fit.noise))
+    noise += by_errors @ block_diag(*problem.error_covariance(fit.noise)) @ by_errors.T
+    jacobian, residuals = linear.jacobian.reshape(len(noise), -1), linear.residuals.ravel()
+    known = problem.knowledge(fit.state)
+    weighted = np.linalg.solve(noise, jacobian)
+    information, gradient, cost = equations_and_cost(problem, fit.state, fit.noise)
+    scale = np.sqrt(np.diag(information))
+    # Rounding, of numbers whose squares differ by ten powers of ten.
+    np.testing.assert_allclose(
+        (information - known.information - jacobian.T @ weighted) / np.outer(scale, scale),
+        0.0,
+        atol=1e-8,
+    )
+    away = gradient - known.gradient - weighted.T @ residuals
+    np.testing.assert_allclose(away / scale, 0.0, atol=1e-8)
+    whole = residuals @ np.linalg.solve(noise, residuals)
+    assert cost == pytest.approx(whole + problem.cost_of_knowledge(fit.state), rel=1e-8)
+
+
+def test_a_fit_at_its_answer_looks_twice(monkeypatch):
+    """Once where it starts, and once more for a change of the noise."""
+    problem, fit = answered(False, views=8, seed=2)
+    looked = []
+    linear = type(problem).linear
+    monkeypatch.setattr(
+        type(problem), "linear", lambda *at, **how: looked.append(at[1]) or linear(*at, **how)
+    )
+    noise = replace(fit.noise, robots=1.01 * fit.noise.robots)
+    solve_problem(problem, fit.state, noise, is_near=True)
+    assert len({id(it) for it in looked}) <= 2
 
 
 def test_a_fit_that_runs_away_is_an_error_of_the_input(monkeypatch):

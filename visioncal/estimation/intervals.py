@@ -14,6 +14,8 @@ from visioncal.estimation.variance import profile_interval
 
 # The normal quantile that a 95 % interval reaches to.
 _TWO_SIDED_95 = 1.96
+# Steps of the other levels' logarithms after which an interval's end moves by less than 1 %.
+_SETTLED = 1e-2
 # Noise that cannot be told from none is known as well as by a handful of stops, at the least.
 _LEAST_FREEDOM = 8.0
 
@@ -39,7 +41,7 @@ def noise_intervals(problem: Problem, state: State, noise: Noise) -> FloatArray:
     def profile(level: int, logarithm: float) -> float:
         at, others = sigmas.copy(), np.arange(len(sigmas)) != level
         at[level] = np.exp(logarithm)
-        return likelihood.most_likely(at.reshape(noise.robots.shape), others)[1]
+        return likelihood.most_likely(at.reshape(noise.robots.shape), others, settled=_SETTLED)[1]
 
     found = [
         profile_interval(partial(profile, level), sigma, lowest)

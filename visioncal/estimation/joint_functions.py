@@ -20,7 +20,7 @@ from scipy.special import ive
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, HARMONICS, WEIGHT
-from visioncal.estimation.linalg import gram
+from visioncal.estimation.linalg import gram, weighted_gram
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import RATIO_PRIOR, RobotLikelihood, robot_levels, robot_likelihood
@@ -309,10 +309,9 @@ class _Arm:
             + np.sum(effects**2 / variances)
         )
         growth = 2.0 * sigmas[:, None, None] ** 2 * components.parts
-        flat = weighted.reshape(-1, len(best))
-        taken = np.einsum("np,np->n", flat @ inverse, flat).reshape(residuals.shape)
-        left_over = np.diagonal(weights, axis1=1, axis2=2) - taken
-        by_levels = 0.5 * np.einsum("kui,ui->k", growth, left_over - pulled**2)
+        taken = np.array([np.sum(inverse * weighted_gram(weighted, it)) for it in growth])
+        own = np.diagonal(weights, axis1=1, axis2=2)
+        by_levels = 0.5 * (np.einsum("kui,ui->k", growth, own - pulled**2) - taken)
         asked = growth * pulled
         owned = self.shares * squares
         posterior = np.diag(inverse)[self.random] + effects**2

@@ -154,13 +154,16 @@ class _Likelihood:
         factor = _factor(information * np.outer(scale, scale))
         covariance = cho_solve(factor, np.diag(scale), check_finite=False) * scale[:, None]
         best = -covariance @ gradient
-        single = -weight * (inverse @ self.pulls[:, :, None])[:, :, 0] - taken @ best
+        pulled = (inverse @ self.pulls[:, :, None])[:, :, 0]
+        single = -weight * pulled - taken @ best
         squared = weight * self.cost + gradient @ best
-        squared -= weight**2 * float(np.einsum("vl,vlm,vm->", self.pulls, inverse, self.pulls))
+        squared -= weight**2 * float(np.sum(self.pulls * pulled))
         determinants = 2.0 * float(np.log(np.diag(factor[0])).sum() - np.log(scale).sum())
         determinants += float(np.linalg.slogdet(local)[1].sum() + 2.0 * self.counts @ logs)
         # Where a level's values are, and how well they are known: in units of the level.
-        spread = np.diagonal(inverse, axis1=1, axis2=2) + np.sum((taken @ covariance) * taken, 2)
+        flat = taken.reshape(-1, len(best))
+        spread = np.einsum("np,np->n", flat @ covariance, flat).reshape(single.shape)
+        spread += np.diagonal(inverse, axis1=1, axis2=2)
         of_single, of_modes = precision * single**2, prior * best[t:] ** 2
         open_single, open_modes = precision * spread, prior * np.diag(covariance)[t:]
         slope = self.counts.copy()

@@ -121,6 +121,16 @@ def gram(left: _Floats, right: _Floats) -> FloatArray:
     return np.asarray(rows.T @ right.reshape(len(rows), *right.shape[2:]))
 
 
+def weighted_gram(blocks: FloatArray, weights: FloatArray) -> FloatArray:
+    """(p, p) products of (m, d, p) blocks with themselves, by the (m, d) rows that have a weight.
+
+    One product of a matrix with its own transpose, which takes half of what two matrices take.
+    """
+    rows = weights > 0.0
+    half = np.sqrt(weights[rows])[:, None] * blocks[rows]
+    return np.asarray(half.T @ half)
+
+
 def damped_step(
     information: FloatArray, gradient: FloatArray, damping: FloatArray | float
 ) -> FloatArray:

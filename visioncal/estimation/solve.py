@@ -24,6 +24,7 @@ from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import ANYTHING, Linear, Problem
 from visioncal.estimation.variance import (
     LEAST_SIGMA,
+    SETTLED,
     Components,
     Knowledge,
     RatioPrior,
@@ -439,7 +440,11 @@ class RobotLikelihood:
         return np.asarray(np.sqrt(np.mean(squares, axis=(0, 2))))
 
     def most_likely(
-        self, start: FloatArray, free: Mask, least: FloatArray | float = LEAST_SIGMA
+        self,
+        start: FloatArray,
+        free: Mask,
+        least: FloatArray | float = LEAST_SIGMA,
+        settled: float = SETTLED,
     ) -> tuple[FloatArray, float]:
         """The most likely levels, and the negative logarithm of their likelihood.
 
@@ -447,6 +452,7 @@ class RobotLikelihood:
             start: (r, 2) the levels to start from; or (2 r + k,) with those of k more components.
             free: (2 r + k,) which of them are sought, robot by robot.
             least: Below which they are not sought.
+            settled: See `estimate_sigmas`.
         """
         seen = np.flatnonzero(self.seen).tolist()
         sigmas, value = estimate_sigmas(
@@ -458,6 +464,7 @@ class RobotLikelihood:
             replace(RATIO_PRIOR, places=tuple((2 * it, 2 * it + 1) for it in seen)),
             free,
             least,
+            settled,
         )
         return sigmas.reshape(start.shape), value
 

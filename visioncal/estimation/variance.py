@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.core.types import FloatArray, Mask
-from visioncal.estimation.linalg import covariance_root, gram
+from visioncal.estimation.linalg import covariance_root, gram, weighted_gram
 
 # Standard deviations stay within these, in units of the residuals [rad and m].
 LEAST_SIGMA, MOST_SIGMA = 1e-10, 1e2
 _ITERATIONS = 60
 # A step changes a sigma by a factor of e at most; 1e-4 of it is far below its own uncertainty.
-_LONGEST_STEP, _SETTLED = 1.0, 1e-4
+_LONGEST_STEP, SETTLED = 1.0, 1e-4
 _WORST_DAMPING = 1e6
 # The root of twice the log-likelihood that a 95 % interval of one unknown gives away (chi-square),
 # and how far and how exactly it is followed, in logarithms.
@@ -75,6 +75,7 @@ def estimate_sigmas(
     prior: RatioPrior | None = None,
     free: Mask | None = None,
     least: FloatArray | float = LEAST_SIGMA,
+    settled: float = SETTLED,
 ) -> tuple[FloatArray, float]:
     """Estimates the standard deviations of variance components.
 
@@ -94,6 +95,7 @@ def estimate_sigmas(
             kind of them can be fitted away altogether. None where nothing is known of it.
         free: (k,) which sigmas to estimate; the others stay at their start. All where None.
         least: Below which they are not sought: one for all, or (k,).
+        settled: The step of the logarithms under which they have come to rest.
 
     Returns:
         (k,) standard deviations, and the negative log-likelihood there.
@@ -110,7 +112,7 @@ def estimate_sigmas(
         step = np.clip(-np.linalg.solve(curvature, slope), -_LONGEST_STEP, _LONGEST_STEP)
         candidate = np.clip(logs + step, *limits)
         moved = np.abs(candidate - logs).max()
-        if moved < _SETTLED and damping < 1.0:
+        if moved < settled and damping < 1.0:
             logs = candidate
             break
         then = None
@@ -122,7 +124,7 @@ def estimate_sigmas(
         else:
             damping *= 10
         # Where no step goes down any more, rounding is all that is left.
-        if moved < _SETTLED or damping > _WORST_DAMPING:
+        if moved < settled or damping > _WORST_DAMPING:
             break
     return np.asarray(np.exp(logs), dtype=float), now.value
 
@@ -211,7 +213,7 @@ def _likelihood(
     asked = growth * pulled
     slope = 0.5 * np.einsum("kmi,mi->k", growth, left_over - pulled**2)
     # Traces of P G_k P G_l, where P is the weight less what the parameters have taken of it.
-    shrunk = np.array([_shrunk(y, it) for it in growth])
+    shrunk = np.array([weighted_gram(y, it) for it in growth])
     crossed = growth[:, :, None, :] @ ((weights - 2.0 * removed) * weights)
     flat = shrunk.reshape(len(shrunk), -1)
     expected = 0.5 * (np.tensordot(crossed[:, :, 0], growth, axes=([1, 2], [1, 2])) + flat @ flat.T)
@@ -231,10 +233,3 @@ def _likelihood(
     return _Likelihood(
         value + 0.5 * float(offset @ offset), slope + offset @ lean, curvature + lean.T @ lean
     )
-
-
-def _shrunk(y: FloatArray, growth: FloatArray) -> FloatArray:
-    """(p, p) `y^T diag(growth) y` of (m, d, p) y, by the rows that grow."""
-    rows = growth > 0.0
-    half = np.sqrt(growth[rows])[:, None] * y[rows]
-    return np.asarray(half.T @ half)
