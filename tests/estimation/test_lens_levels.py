@@ -7,6 +7,7 @@ import pytest
 from support.cells import calibrated, known_of
 
 from visioncal.calibration.stages import refine
+from visioncal.core.errors import ConvergenceError
 from visioncal.estimation import lens_levels
 from visioncal.estimation.appearance import Appearance, compress
 from visioncal.estimation.corners import reproject
@@ -121,3 +122,9 @@ def test_a_focus_that_is_fixed_neither_breathes_nor_jitters(monkeypatch):
     )
     assert estimated
     assert all((it.breathing, it.jitter) == (0.0, 0.0) for it in estimated)
+
+
+def test_a_fit_that_has_run_away_is_no_bug_of_the_likelihood():
+    """`refine.refined` then takes lenses for what their models say."""
+    with pytest.raises(ConvergenceError, match="runs away"):
+        lens_levels._factor(np.array([[1.0, 1e9], [1e9, 1.0]]))

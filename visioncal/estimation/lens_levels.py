@@ -12,6 +12,7 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
+from visioncal.core.errors import ConvergenceError
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.estimation.corners import CornerStack, floored_sigma_px, reproject
@@ -286,15 +287,23 @@ def estimate_levels(
 
 
 def _factor(scaled: FloatArray) -> tuple[FloatArray, bool]:
-    """Cholesky's factor of a matrix of unit diagonal; what rounding made negative is raised."""
+    """Cholesky's factor of a matrix of unit diagonal; what rounding made negative is raised.
+
+    Raises:
+        ConvergenceError: It is far from positive: the fit behind it has run away.
+    """
     ridge = _RIDGE
     while True:
         raised = scaled + ridge * np.eye(len(scaled))
         try:
             factor, is_lower = cho_factor(raised, lower=True, check_finite=False)
-        except np.linalg.LinAlgError:
+        except np.linalg.LinAlgError as error:
             if ridge > 1.0:
-                raise
+                raise ConvergenceError(
+                    "lens: no sizes of its errors are likely: the fit that they are sought in runs "
+                    "away.",
+                    next_step="Look whether poses, images and board go together.",
+                ) from error
             ridge *= 1e3
         else:
             return factor, is_lower
