@@ -141,6 +141,114 @@ def lifted(by_m):
     return moved
 
 
+# Denavit-Hartenberg rows (theta, d, a, alpha) of an arm of six joints that reaches 1.75 m.
+ARM = np.array(
+    [
+        [0.0, 0.2363, 0.0, np.pi / 2],
+        [0.0, 0.0, -0.862, 0.0],
+        [0.0, 0.0, -0.7287, 0.0],
+        [0.0, 0.201, 0.0, np.pi / 2],
+        [0.0, 0.1593, 0.0, -np.pi / 2],
+        [0.0, 0.1543, 0.0, 0.0],
+    ]
+)
+HOME = np.array([0.0, -1.2, -1.8, -1.6, 1.6, 0.0])
+
+
+def links(q, arm=ARM):
+    """(m, 7, 4, 4) the base and the frames behind each joint, at (m, 6) joint angles."""
+    found = [np.broadcast_to(np.eye(4), (len(q), 4, 4))]
+    for joint, (theta, d, a, alpha) in enumerate(arm):
+        c, s = np.cos(q[:, joint] + theta), np.sin(q[:, joint] + theta)
+        step = np.zeros((len(q), 4, 4))
+        step[:, 0] = np.stack([c, -s * np.cos(alpha), s * np.sin(alpha), a * c], axis=1)
+        step[:, 1] = np.stack([s, c * np.cos(alpha), -c * np.sin(alpha), a * s], axis=1)
+        step[:, 2], step[:, 3, 3] = [0.0, np.sin(alpha), np.cos(alpha), d], 1.0
+        found.append(found[-1] @ step)
+    return np.stack(found, axis=1)
+
+
+def joints_at(poses, flange=links, rng=None):
+    """(m, 6) joint angles of flange poses, all of one posture where they can be."""
+    rng, q = rng or np.random.default_rng(5), np.tile(HOME, (len(poses), 1))
+    for _ in range(60):
+        for _ in range(40):
+            frames = flange(q)
+            away = np.zeros((len(q), 6))
+            away[:, :3] = Rotation.from_matrix(
+                poses[:, :3, :3] @ np.swapaxes(frames[:, -1, :3, :3], 1, 2)
+            ).as_rotvec()
+            away[:, 3:] = poses[:, :3, 3] - frames[:, -1, :3, 3]
+            axis, origin = frames[:, :-1, :3, 2], frames[:, :-1, :3, 3]
+            slope = np.concatenate([axis, np.cross(axis, frames[:, -1:, :3, 3] - origin)], axis=2)
+            square = np.swapaxes(slope, 1, 2) @ slope + 1e-9 * np.eye(6)
+            step = np.einsum("mki,mi->mk", slope, np.linalg.solve(square, away[..., None])[..., 0])
+            q = q + np.clip(step, -0.3, 0.3)
+        lost = np.abs(away).max(axis=1) > 1e-10
+        if not lost.any():
+            return q
+        q[lost] = HOME + rng.normal(0, 0.8, (lost.sum(), 6))
+    raise RuntimeError("a pose is out of reach")
+
+
+def arm_off_by(size_m):
+    """An arm whose lengths are off by so much, and its angles by that over half a metre."""
+
+    def moved(poses, rng):
+        errors = rng.normal(0, size_m, ARM.shape) / [0.5, 1.0, 1.0, 0.5]
+        return links(joints_at(poses, lambda q: links(q, ARM + errors)))[:, -1]
+
+    return moved
+
+
+def joints_off_by(by_rad):
+    """An arm whose joints stand elsewhere than it reports: by (m, 6) of its frames and a seed."""
+
+    def moved(poses, rng):
+        q = joints_at(poses)
+        return links(q + by_rad(links(q), q, rng))[:, -1]
+
+    return moved
+
+
+def sagging(size):
+    """Springs under the weight of the links beyond them: so much at the shoulder, stretched [m]."""
+
+    def by_rad(frames, q, _):
+        found = np.zeros_like(q)
+        masses = np.array([0.0, 1.0, 0.6, 0.2, 0.2, 0.1, 0.1])
+        for joint in (1, 2, 3):
+            arms = frames[:, joint + 1 :, :3, 3] - frames[:, joint, None, :3, 3]
+            force = np.array([0.0, 0.0, -1.0]) * masses[joint + 1 :, None]
+            torque = np.cross(arms, force).sum(axis=1)
+            found[:, joint] = np.sum(torque * frames[:, joint, :3, 2], axis=1)
+        return size * found
+
+    return by_rad
+
+
+def playing(size_rad):
+    """Each joint stands on the side that it came from."""
+
+    def by_rad(_, q, rng):
+        way = np.sign(np.diff(q, axis=0, prepend=rng.normal(q[:1], 1.0)))
+        return 0.5 * size_rad * way * np.abs(rng.normal(1.0, 0.3, 6))
+
+    return by_rad
+
+
+def bending(size_m):
+    """What the flange carries bends with its weight: it looks as if the flange were elsewhere."""
+
+    def moved(poses, rng):
+        down = poses[:, 2, :3]
+        turn, shift = size_m / 0.1 * rng.normal(size=(3, 3)), size_m * rng.normal(size=(3, 3))
+        bends = [pose(turn @ it, shift @ it) for it in down]
+        return poses @ np.linalg.inv(np.array(bends))
+
+    return moved
+
+
 WORLDS = {
     "clean": World(),
     "clean, 6 views": World(views=6),
@@ -167,6 +275,12 @@ WORLDS = {
     "given lens off by 0.5 px, said": World(off_px=0.5, is_said=True),
     "given lens off by 2 px, said": World(off_px=2.0, is_said=True),
     "camera bumped 1 mm": World(robot=lifted(lambda share: 1e-3 * ((share > 0) - 0.5))),
+    "arm off by 0.05 mm": World(robot=arm_off_by(5e-5)),
+    "arm off by 0.1 mm": World(robot=arm_off_by(1e-4)),
+    "arm off by 0.3 mm": World(robot=arm_off_by(3e-4)),
+    "backlash 0.2 mrad": World(robot=joints_off_by(playing(2e-4))),
+    "sag 1 mm": World(robot=joints_off_by(sagging(5e-4))),
+    "mount flex 0.1 mm": World(robot=bending(1e-4)),
 }
 
 

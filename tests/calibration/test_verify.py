@@ -197,8 +197,8 @@ def test_an_arm_off_by_its_posture_raises_no_alarm_near_the_calibration():
     cell = simulate(replace(options, views=FITTED + 20))
     calibration = result_of(calibrated(part(cell, range(FITTED)), joints=False))
     prior_calibration = CalibrationPrior.of(calibration)
-    assert prior_calibration.arm == "poses"
-    # What the fit has in common with errors that only count in it leaves a covariance one.
+    # Without joint angles, its errors are in the noise of a look.
+    assert prior_calibration.arm == "none"
     assert np.linalg.eigvalsh(prior_calibration.covariance)[0] > -1e-12
     rng = np.random.default_rng(8)
     for _ in range(4):

@@ -311,10 +311,8 @@ def test_errors_of_the_arm_count_in_the_prediction_as_in_the_result(case):
     found = so_far_of(cell, **poses)
     known = found.known
     errors = known.robot_arm.errors
-    assert (errors is None) == (case == "neighbours alike")
-    assert errors is None or errors.is_estimated == (case == "estimated")
-    alike = known.solved.misfits["robot"].alike
-    assert alike.is_significant == (case == "neighbours alike")
+    assert errors.is_significant
+    assert errors.is_estimated == (case == "estimated")
     begun, q = begin(found), postures_in_view(CELL, 40)
     design = next_best(begun, HAND_EYE, q, 3).design
     # Neither how far data pull at what is held nor how well the size of the arm's errors is known
@@ -326,8 +324,9 @@ def test_errors_of_the_arm_count_in_the_prediction_as_in_the_result(case):
     world = worlds_of([begun.cell], HAND_EYE, q, recorded=begun.recorded)[0]
     # A result holds the board's size; in the plan it is open, and takes up errors of the arm. What
     # a lens does beyond its model is in the result alone.
-    assert mm(world, []) == pytest.approx(obtained, rel=0.02)
-    assert design.before.mm == pytest.approx(obtained, rel=0.1)
+    # Where errors make up for noise in some direction, the plan does not take them off.
+    assert mm(world, []) == pytest.approx(obtained, rel=0.02 if case == "estimated" else 0.15)
+    assert design.before.mm == pytest.approx(obtained, rel=0.15)
     assert design.predicted.mm == pytest.approx(mm(world, design.rows), rel=0.1)
     wish = Wish(mm=1.0)
     short = shortfall(next_best(begun, HAND_EYE, q, 3, wish=wish).design, wish, 3)

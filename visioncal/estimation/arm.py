@@ -13,6 +13,7 @@ import numpy as np
 
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.estimation.budget import less_noise
 from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.parts import Effect, Noise, State
 from visioncal.estimation.problem import Problem
@@ -50,17 +51,28 @@ class ArmErrors:
         gain: Twice the gain in log-likelihood over white noise alone.
         of_links: Whether they are errors of this arm's links, which can be estimated along; else
             they have the shape of any arm's, and only their size is worth something.
+        white: (2,) the noise that is left beside them, of rotation [rad] and place [m]; None where
+            that is the noise of the fit.
+        look: (2,) both together as single stops show them, which is the noise of the fit; of the
+            errors, what looks the same at all stops is not in it. None of links.
     """
 
     basis: FloatArray
     sigma: float
     gain: float
     of_links: bool
+    white: FloatArray | None = None
+    look: FloatArray | None = None
 
     @property
     def is_significant(self) -> bool:
         """Whether they are beyond chance; others are likely enough to be counted with."""
         return self.gain > SIGNIFICANT
+
+    @property
+    def is_likely(self) -> bool:
+        """Whether they are likelier than noise alone."""
+        return self.gain > _LIKELY
 
     @property
     def is_estimated(self) -> bool:
@@ -209,6 +221,9 @@ def misfit_covariance(
 ) -> FloatArray:
     """What errors of the arm add to the covariance of a fit that takes them for white noise.
 
+    Where the noise beside them is known, the fit's covariance is that of too much noise: what it
+    has too much of is taken off.
+
     Args:
         problem: The observations.
         state: The answer.
@@ -220,7 +235,10 @@ def misfit_covariance(
         (p, p) among the unknowns.
     """
     answer = errors.sigma * misfit_jacobian(problem, state, noise, robot, errors)
-    return np.asarray(answer @ answer.T)
+    found = answer @ answer.T
+    if errors.white is not None:
+        found += less_noise(problem, state, noise, robot, errors.white)
+    return np.asarray(found)
 
 
 def covariance_of_size(

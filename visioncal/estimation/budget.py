@@ -79,6 +79,29 @@ def covariance_by_source(
     return dict(found)
 
 
+def less_noise(
+    problem: Problem, state: State, noise: Noise, robot: str, white: FloatArray
+) -> FloatArray:
+    """What a fit's covariance changes by where a robot has another noise than it was weighted with.
+
+    Args:
+        problem: The observations.
+        state: The answer.
+        noise: The levels that it was weighted with.
+        robot: The robot.
+        white: (2,) its noise, of rotation [rad] and place [m].
+
+    Returns:
+        (p, p) among the unknowns.
+    """
+    fitted = covariance_among(fisher_information(problem, state, noise), problem.counted)
+    linear, place = problem.linear(state, ideal=True), problem.robots.index(robot)
+    gain = weighted_jacobian(problem, linear, problem.covariance(noise), noise) @ fitted
+    mine = _of_flange(problem, linear, gain, place)
+    change = np.repeat(white**2 - noise.robots[place] ** 2, 3)
+    return gram(mine, change[:, None] * mine)
+
+
 def weighted_jacobian(
     problem: Problem, linear: Linear, own: FloatArray, noise: Noise
 ) -> FloatArray:
@@ -119,23 +142,35 @@ def _by_errors(
     problem: Problem, linear: Linear, gain: FloatArray, noise: Noise, sources: Sources
 ) -> list[tuple[str, FloatArray]]:
     """What flanges' errors contribute, and those that repeats share, by their sources."""
-    of, members = problem.units
+    _, members = problem.units
     errors = problem.error_covariance(noise)
-    rows = of >= 0
-    by_unit = np.zeros((len(members), errors.shape[1], gain.shape[2]))
-    np.add.at(by_unit, of[rows], np.swapaxes(linear.by_errors[rows], 1, 2) @ gain[rows])
     found = []
     for at, robot in enumerate(problem.robots):
-        units, slots = np.nonzero(members == at)
-        places = 6 * slots[:, None] + np.arange(6)
-        mine = by_unit[units[:, None], places]
-        variances = errors[units[:, None], places, places]
-        found.append((sources.robots[robot], gram(mine, variances[:, :, None] * mine)))
+        mine = _of_flange(problem, linear, gain, at)
+        variances = np.repeat(noise.robots[at] ** 2, 3)
+        found.append((sources.robots[robot], gram(mine, variances[:, None] * mine)))
+    by_unit = _by_unit(problem, linear, gain)
     first = len(members) - len(problem.repeats)
     for unit, repeated in enumerate(problem.repeats, start=first):
         frame = problem.observations.observers[repeated[0]]
         part = by_unit[unit].T @ errors[unit] @ by_unit[unit]
         found.append((sources.sensors[frame], part))
+    return found
+
+
+def _of_flange(problem: Problem, linear: Linear, gain: FloatArray, robot: int) -> FloatArray:
+    """(u, 6, c) how the estimate moves with a robot's flange at each unit that it has a part in."""
+    units, slots = np.nonzero(problem.units[1] == robot)
+    places = 6 * slots[:, None] + np.arange(6)
+    return np.asarray(_by_unit(problem, linear, gain)[units[:, None], places])
+
+
+def _by_unit(problem: Problem, linear: Linear, gain: FloatArray) -> FloatArray:
+    """(u, 6 w, c) how the estimate moves with the errors that the observations of a unit share."""
+    of, members = problem.units
+    rows = of >= 0
+    found = np.zeros((len(members), linear.by_errors.shape[2], gain.shape[2]))
+    np.add.at(found, of[rows], np.swapaxes(linear.by_errors[rows], 1, 2) @ gain[rows])
     return found
 
 

@@ -243,4 +243,5 @@ def _flange_sigmas(calibration: Calibration) -> FloatArray:
 
 def _arm_sigma(calibration: Calibration) -> float:
     found = calibration.arm_errors
-    return 0.0 if found is None else float(np.deg2rad(found.sigma_deg))
+    # Where joints are not known, the flange's noise is that of single looks, all of them in it.
+    return float(np.deg2rad(found.sigma_deg)) if found and found.of is None else 0.0

@@ -341,16 +341,19 @@ class ArmErrorsResult(Section):
     """Errors that follow the arm's posture: `arm_errors` in calibration.json.
 
     Attributes:
-        sigma_mm: Typical error of a link's lengths [mm].
-        sigma_deg: Typical error of its angles [deg].
+        sigma_mm: Typical error of a link's lengths, or of the flange's place an axis [mm].
+        sigma_deg: Typical error of the link's angles, or of the flange's rotation an axis [deg].
         likelihood_ratio: By how much they explain the residuals better than white noise.
         estimated: Whether they were estimated along with the transforms.
+        of: The `flange` where joints are not known: by so much, beside its noise, it errs from
+            posture to posture. None where the sizes are those of links.
     """
 
     sigma_mm: float
     sigma_deg: float
     likelihood_ratio: float
     estimated: bool
+    of: Literal["flange"] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -161,7 +161,9 @@ def answer_of(
     """
     part, fit = solved.part, solved.agreed.fit
     # A closed form is not at rest, and that would pass for a misfit.
-    found = misfits(part, fit if solved.solver == "joint" else fit_problem(part, fit.state))
+    at_rest = fit if solved.solver == "joint" else fit_problem(part, fit.state)
+    arms = {name: it.errors for name, it in solved.arms.items() if not it.is_modelled and it.errors}
+    found = misfits(part, at_rest, arms)
     beside = covariance_beside_noise(part, fit, solved.arms, found, is_fit=solved.solver == "joint")
     covariance = sum(beside.values(), covariance_of(part, fit))
     faults, held_out = pose_faults(solved), left_out(solved)

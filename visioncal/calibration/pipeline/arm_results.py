@@ -1,6 +1,7 @@
 """The robots' arms of a whole cell: read from its session, calibrated with its frames, worded."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from visioncal.core.types import FloatArray
 from visioncal.core.verdict import NOTE, Finding, remarks
 from visioncal.estimation.arm import covariance_of_size, misfit_covariance
 from visioncal.estimation.parts import State
+from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.residual_tests import inflation
 from visioncal.estimation.solve import Solution, covariance_of, held_shift
@@ -63,7 +65,7 @@ def covariance_beside_noise(
                 problem, covariance, robot, arm.errors
             )
     for robot, it in found.items():
-        if it.alike.is_significant:
+        if it.alike is not None and it.alike.is_significant:
             more = inflation(problem, fit.state, fit.noise, robot, it.alike.factor)
             parts[f"misfit{_of(arms, robot)}"] = more
     return parts
@@ -144,3 +146,15 @@ def with_errors(
 ) -> dict[str, RobotArm]:
     """Looks for errors of each arm that follow its posture, the others being as stated."""
     return {name: arm.with_errors(problem, fit) for name, arm in arms.items()}
+
+
+def with_pose_errors(
+    arms: Mapping[str, RobotArm], problem: Problem, fit: Solution
+) -> dict[str, RobotArm]:
+    """Weighs what arms do wrong of which the joints are not known."""
+    return {
+        name: it
+        if it.is_modelled
+        else replace(it, errors=find_pose_errors(problem, fit.state, fit.noise, name))
+        for name, it in arms.items()
+    }

@@ -50,7 +50,7 @@ def _arm(known: RunState) -> FittedArm | None:
     """What the arm's errors are of, and what they were found to be beside the arm that is told."""
     arm = known.robot_arm
     model, errors = arm.model, arm.errors
-    if errors is None:
+    if errors is None or not errors.of_links:
         return None
     count = errors.basis.shape[2]
     # Errors that only count are where they were stated; those of a model are in its arm already.
@@ -59,7 +59,7 @@ def _arm(known: RunState) -> FittedArm | None:
     values = problem.values_of(name, known.solved.state) - problem.values_of(name, linearised)
     values = values if errors.is_estimated else np.zeros(count)
     if model is None:
-        return FittedArm(of="links" if arm.is_modelled else "poses", values=values)
+        return FittedArm(of="links", values=values)
     # What of its errors is not in its geometry goes by the loads of a stop.
     loaded = bool(model.values_by_stop.any())
     # Functions of the joints are in the arm's geometry, as well as they are known.
@@ -81,7 +81,7 @@ def _covariance(known: RunState) -> FloatArray:
     """The fit's own, and beside it what it has in common with errors that only count in it."""
     answer, arm, written = known.solved, known.robot_arm, _written(known)
     own = written @ answer.covariance @ written.T
-    if arm.errors is None or arm.errors.is_estimated:
+    if arm.errors is None or arm.errors.is_estimated or not arm.errors.of_links:
         return own
     jacobian = written @ misfit_jacobian(
         answer.problem, answer.state, answer.noise, arm.robot, arm.errors

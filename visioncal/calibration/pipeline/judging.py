@@ -12,6 +12,7 @@ from visioncal.calibration.pipeline.fault_messages import by_way_of, moved_found
 from visioncal.calibration.pipeline.lens_fields import errors_found
 from visioncal.calibration.pipeline.network_ties import robot_motion, untied_words
 from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.judge import Arm, Findings, Pair, Place, Sensor
 from visioncal.calibration.stages.need import Fitted, picks_of
@@ -212,7 +213,7 @@ def _arms(answer: Answer) -> list[Arm]:
                 len(stops_of(problem, robot)),
                 noise["translation_mm"] if known else None,
                 noise["rotation_deg"] if known else None,
-                errs=solved.arms[robot].errors is not None,
+                errs=_errs(solved.arms[robot]),
                 workspace_mm=None if telling is None else 1e3 * float(np.median(telling.sigmas_m)),
                 modelled=robot in modelled,
                 by_functions=solved.arms[robot].has_functions,
@@ -220,6 +221,10 @@ def _arms(answer: Answer) -> list[Arm]:
             )
         )
     return found
+
+
+def _errs(arm: RobotArm) -> bool:
+    return arm.errors is not None and arm.errors.is_likely
 
 
 def check_answer(known: RunState) -> None:

@@ -167,7 +167,8 @@ def _uncertainty(known: RunState) -> UncertaintyResult:
     work, answer = known.work, known.solved
     of = "combined" if answer.problem.is_combined else "robot"
     (turn_rad, shift_m) = answer.intervals[0]
-    alike = [it.alike.factor for it in answer.misfits.values() if it.alike.is_significant]
+    tests = (it.alike for it in answer.misfits.values())
+    alike = [it.factor for it in tests if it is not None and it.is_significant]
     return UncertaintyResult(
         point_cam_m=work.point_cam,
         budget_mm=work.budget_mm,

@@ -5,7 +5,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.calibration.pipeline.arm_results import arms_of, with_drifts, with_errors
+from visioncal.calibration.pipeline.arm_results import (
+    arms_of,
+    with_drifts,
+    with_errors,
+    with_pose_errors,
+)
 from visioncal.calibration.pipeline.network_ties import ambiguous_error, untied_robots
 from visioncal.calibration.stages.arms import RobotArm, check_arms, effects_of
 from visioncal.calibration.stages.cell import Cell
@@ -195,6 +200,7 @@ def solve(
     if asked != "hand-eye":
         agreed, seen, arms = _with_functions(cell, agreed, seen, arms, late, asked)
     agreed = _with_repeats(agreed)
+    arms = with_pose_errors(arms, agreed.problem.subset(agreed.used), agreed.fit)
     found = Solved(cell, agreed, seen, tuple(views), (*lost, *unplaced), arms, asked, late)
     return found if solver == "joint" else _by_closed_form(found, solver)
 

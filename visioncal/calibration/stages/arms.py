@@ -385,7 +385,7 @@ class RobotArm:
             views: By which views these stops go.
         """
         sections = ArmSections(
-            arm_errors=None if self.errors is None else _size_of(self.errors),
+            arm_errors=_size_of(self.errors) if self.errors and self.errors.is_likely else None,
             thermal=found.drift,
             arm=None if self.kinematics is None else self.kinematics.result(),
         )
@@ -517,6 +517,15 @@ class RobotArm:
 
 def _size_of(errors: ArmErrors) -> ArmErrorsResult:
     """The size of errors, as a section of a calibration."""
+    if errors.look is not None and errors.white is not None:
+        turned, shifted = np.sqrt(np.maximum(errors.look**2 - errors.white**2, 0.0))
+        return ArmErrorsResult(
+            sigma_mm=1e3 * float(shifted),
+            sigma_deg=float(np.rad2deg(turned)),
+            likelihood_ratio=errors.gain,
+            estimated=False,
+            of="flange",
+        )
     return ArmErrorsResult(
         sigma_mm=1e3 * LEVER_M * errors.sigma,
         sigma_deg=float(np.rad2deg(errors.sigma)),

@@ -97,6 +97,12 @@ LOOK = Step(
     "Look at the worst views: does each pose belong to its image, did anything move?", REVIEW
 )
 
+# What helps where an arm errs whose joints are not known.
+NO_JOINTS = Step(
+    "Record joint angles with the poses, and name the arm as [robot] model in session.toml: "
+    "calibrate then estimates the arm, too."
+)
+
 
 def adding(words: str, *, modelled: bool, purpose: str = "") -> Step:
     """Advice to add views, with the command that proposes them where the arm's model is known.
@@ -179,7 +185,8 @@ def ranked(
     too_large = unmet or (met is None and any(it.until_mm == 0.0 for it in doubts))
     if too_large and picks:
         known = {it.kind for it in found if it.probability}
-        found += [it for it in _sources(picks, met, modelled) if it.kind not in known]
+        more = None if any(it.do is NO_JOINTS for it in found) else adding(_MORE, modelled=modelled)
+        found += [it for it in _sources(picks, met, more) if it.kind not in known]
     return tuple(found)
 
 
@@ -233,6 +240,7 @@ def _odds(chance: float) -> float:
     return float(-1.0 / (np.e * chance * np.log(chance)))
 
 
+_MORE = "Add views from other poses of the robot."
 # What picks are limited by: as a kind, in words, and what helps.
 _SOURCES: Mapping[str, tuple[str, str, Step | None]] = {
     "calibration": (
@@ -253,10 +261,7 @@ _SOURCES: Mapping[str, tuple[str, str, Step | None]] = {
     "arm": (
         "arm_errors",
         "the arm's own errors, which more views do not change",
-        Step(
-            "Record joint angles with the poses, and name the arm as [robot] model in "
-            "session.toml: calibrate then estimates the arm, too."
-        ),
+        NO_JOINTS,
     ),
     "left out": (
         "unexplained",
@@ -266,8 +271,14 @@ _SOURCES: Mapping[str, tuple[str, str, Step | None]] = {
 }
 
 
-def _sources(picks: Sequence[Picks], met: NeedMet | None, modelled: bool) -> list[Finding]:
-    """What makes errors as large as they are, by the worst camera and robot."""
+def _sources(picks: Sequence[Picks], met: NeedMet | None, more_views: Step | None) -> list[Finding]:
+    """What makes errors as large as they are, by the worst camera and robot.
+
+    Args:
+        picks: What picks err by.
+        met: What is needed, and how likely it is met; None where nothing is.
+        more_views: What helps the calibration; None where more views do not.
+    """
     if met is None:
         worst = max(picks, key=lambda it: it.good_for_mm)
     else:
@@ -284,7 +295,7 @@ def _sources(picks: Sequence[Picks], met: NeedMet | None, modelled: bool) -> lis
             kind,
             f"Of the {figure(total)} mm that picks err by (sigma), {figure(mm)} mm come from "
             f"{words}.",
-            do or adding("Add views from other poses of the robot.", modelled=modelled),
+            do or more_views,
             probability=mm**2 / total**2,
             without_it=f"{without}.",
             until_mm=0.0,

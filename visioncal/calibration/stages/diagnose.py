@@ -1,10 +1,11 @@
 """Whether the residuals are noise: what they show beyond it, in words."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from visioncal.calibration.stages.cause_ranking import NO_JOINTS
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import pose_difference
 from visioncal.core.verdict import PLAN, Finding, Step
@@ -24,29 +25,40 @@ class ResidualTest:
     """What the residuals of one robot's stops show beyond noise.
 
     Attributes:
-        alike: Whether neighbouring stops err alike.
+        alike: Whether neighbouring stops err alike; None of an arm whose joints are not known,
+            whose covariance has that.
         moved: How its base or what it looks at crept; None where noise explains it.
         step: What moved at once, and where that explains more than a creep does.
     """
 
-    alike: Neighbours
+    alike: Neighbours | None
     moved: Drift | None
     step: Move | None = None
 
 
-def misfits(problem: Problem, fit: Solution) -> dict[str, ResidualTest]:
+def misfits(
+    problem: Problem, fit: Solution, errors: Mapping[str, ArmErrors]
+) -> dict[str, ResidualTest]:
     """Tests the residuals of each robot's stops for what is no noise; of few stops, none.
 
     Args:
         problem: The observations, their stops in the order of the session.
         fit: Their fit, at rest.
+        errors: Those of arms whose joints are not known, by the robot.
     """
     found = {}
     for robot in problem.robots:
         if len(stops_of(problem, robot)) >= _FEWEST_STOPS:
             fitted = (problem, fit.state, fit.noise, robot)
-            alike, crept = neighbours(*fitted), drift(*fitted)
-            step = _step(problem, fit, crept) if crept or alike.is_significant else None
+            crept, arm = drift(*fitted), errors.get(robot)
+            alike = None if arm else neighbours(*fitted)
+            last = arm.is_significant if arm else alike is not None and alike.is_significant
+            step = _step(problem, fit, crept) if crept or last else None
+            # What a process over postures or time explains as well is no motion.
+            if arm and step and step.mahalanobis_sq < arm.gain:
+                step = None
+            if arm and crept and crept.mahalanobis_sq < arm.gain:
+                crept = None
             found[robot] = ResidualTest(alike, None if step else crept, step)
     return found
 
@@ -67,25 +79,25 @@ def _step(problem: Problem, fit: Solution, crept: Drift | None) -> Move | None:
 def doubts(found: ResidualTest, arm: ArmErrors | None, *, calibrated: bool) -> Iterator[Finding]:
     """Finds what of a robot's residuals is no noise, and what it probably is."""
     alike, moved = found.alike, found.moved
-    if arm is not None and arm.is_significant and not calibrated:
+    if arm is not None and arm.is_significant and not calibrated and arm.of_links:
         size = (
             f"{figure(1e3 * LEVER_M * arm.sigma)} mm and {figure(float(np.rad2deg(arm.sigma)))} deg"
-        )
-        told = (
-            "they were estimated along"
-            if arm.of_links
-            else "without joint angles and a known [robot] model they cannot be estimated along"
         )
         yield Finding(
             "arm_errors",
             f"Residuals follow the arm's posture (likelihood ratio {arm.gain:.0f}, noise stays "
             f"under {SIGNIFICANT:.0f}): its links are off from the model by typically {size}; "
-            f"{told}. What of them looks the same in all views is in no residual, and counts in "
-            "the covariance.",
-            _of_arm(arm),
+            "they were estimated along. What of them looks the same in all views is in no "
+            "residual, and counts in the covariance.",
+            Step(
+                "Add stops all over the workspace, so that the arm can be calibrated along.",
+                f"{PLAN} --for kinematics",
+            ),
             until_mm=0.0,
             mahalanobis_sq=arm.gain,
         )
+    if arm is not None and arm.is_significant and arm.look is not None:
+        yield _of_looks(arm, *(np.sqrt(3.0) * arm.look).tolist())
     if found.step is not None:
         shift_mm, turn_deg = pose_difference(np.eye(4), found.step.change)
         frame, stop = found.step.frame, found.step.stop
@@ -103,7 +115,7 @@ def doubts(found: ResidualTest, arm: ArmErrors | None, *, calibrated: bool) -> I
             f"{_size(moved.moved_m, moved.moved_rad)}.",
             Step("Fasten base and target, let the arm warm up, and record again."),
         )
-    if alike.is_significant:
+    if alike is not None and alike.is_significant:
         yield Finding(
             "correlated_errors",
             f"Neighbouring stops err alike: leaving them out in blocks moves the answer "
@@ -117,14 +129,16 @@ def _size(shift_m: float, turn_rad: float) -> str:
     return f"{figure(1e3 * shift_m)} mm and {figure(float(np.rad2deg(turn_rad)))} deg"
 
 
-def _of_arm(arm: ArmErrors) -> Step:
-    """What lets the arm's errors be estimated."""
-    if arm.of_links:
-        return Step(
-            "Add stops all over the workspace, so that the arm can be calibrated along.",
-            f"{PLAN} --for kinematics",
-        )
-    return Step(
-        "Record joint angles with the poses, and name the arm as [robot] model in session.toml: "
-        "calibrate then estimates the arm, too."
+def _of_looks(arm: ArmErrors, turned: float, shifted: float) -> Finding:
+    """What an arm does wrong whose joints are not known, by how far [rad, m] a look errs."""
+    return Finding(
+        "arm_errors",
+        "Residuals follow the arm's posture, or last from stop to stop (likelihood ratio "
+        f"{arm.gain:.0f}, noise stays under {SIGNIFICANT:.0f}): a look near the views errs by "
+        f"{_size(shifted, turned)} (rms). More views will not help: joint angles or a kinematic "
+        "calibration of the arm will. What of its errors looks the same in all views is in no "
+        "residual, and counts in the covariance.",
+        NO_JOINTS,
+        until_mm=0.0,
+        mahalanobis_sq=arm.gain,
     )

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.calibration.stages.cause_ranking import adding, ranked
+from visioncal.calibration.stages.cause_ranking import NO_JOINTS, adding, ranked
 from visioncal.calibration.stages.need import Picks, need_met
 from visioncal.core.limits import CalibrationLimits, NeedLimits
 from visioncal.core.number_format import figure, percent
@@ -346,6 +346,18 @@ def _scatter_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[F
         )
 
 
+def _is_of_arm(findings: Findings) -> bool:
+    """Whether what is uncertain is mostly what an arm does wrong whose joints are not known."""
+    if not any(it.do is NO_JOINTS for it in findings.warnings):
+        return False
+    of_arm = of_all = 0.0
+    for place in findings.places:
+        for name, mm in place.budget_mm.items():
+            of_arm += mm**2 * name.startswith(("arm", "robot", "poses"))
+            of_all += mm**2 * (name == "total")
+    return of_arm > 0.5 * of_all
+
+
 def _tilted(findings: Findings) -> Step:
     words = "Add 5 views or more, tilted by 20 to 40 degrees about different axes."
     return adding(words, modelled=findings.plannable)
@@ -530,11 +542,19 @@ def _sigma_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Fin
             weak.append(f"{direction.words} ({figure(sigma)} {unit})")
             is_fatal |= bool(sigma > bad)
     if weak:
+        of_arm = _is_of_arm(findings)
+        least = f"{limits.sigma_mm[0]:g} mm and {limits.sigma_deg[0]:g} deg"
+        words = (
+            f"As mounts, known to {', '.join(weak)} (sigma; doubt begins at {least}): most of that "
+            "is the arm's, and is the same in every recording."
+            if of_arm
+            else f"Weakly determined by the motion, with their sigmas: {', '.join(weak)}; doubt "
+            f"begins at {least}."
+        )
         yield Finding(
             "weak_motion",
-            f"Weakly determined by the motion, with their sigmas: {', '.join(weak)}; doubt begins "
-            f"at {limits.sigma_mm[0]:g} mm and {limits.sigma_deg[0]:g} deg.",
-            _tilted(findings),
+            words,
+            NO_JOINTS if of_arm else _tilted(findings),
             is_fatal=is_fatal,
             until_mm=0.0,
         )

@@ -174,7 +174,10 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
     carries = np.array([_is_between(problem, it, base, robot) for it in seen.observers])
     calibrated = arm is not None and arm.model is not None
     errors = None if arm is None or calibrated else arm.errors
-    unfitted = errors if errors is not None and not errors.is_estimated else None
+    # Errors of postures that are not beyond chance are in the noise of a look.
+    unfitted = errors
+    if errors is None or errors.is_estimated or not (errors.of_links or errors.is_significant):
+        unfitted = None
     level = np.diag(np.repeat(noise.robots[problem.robots.index(robot)], 3) ** 2)
     whole = calibrated or unfitted is not None
     if whole:
@@ -190,7 +193,11 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
         # Errors that follow the posture are why neighbours err alike.
         covariance = covariance - fitted.inflation * off @ off.T
         parts["arm"] = _left_by_arm(fitted, robot, unfitted, off)
-    elif errors is not None:
+        if unfitted.white is not None:
+            levels = noise.robots.copy()
+            levels[problem.robots.index(robot)] = unfitted.white
+            noise = replace(noise, robots=levels)
+    elif errors is not None and errors.of_links:
         parts["arm"] = _of_arm(problem, robot, errors)
     parts["calibration"] = linear.covariance(covariance)
     if problem.is_combined:

@@ -5,7 +5,7 @@ what comes out is the information that the joint fit would have of it.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -22,7 +22,7 @@ from visioncal.estimation.appearance import (
     compress,
     shape_basis,
 )
-from visioncal.estimation.arm import ArmErrors, link_basis, pose_basis
+from visioncal.estimation.arm import ArmErrors, link_basis
 from visioncal.estimation.armmodel import COMPLIANCE, ArmModel, block_size
 from visioncal.estimation.armpair import ArmPair
 from visioncal.estimation.chain import chain
@@ -67,6 +67,8 @@ class Recorded:
         first_corner: The number of the first corner of the board that is planned for.
         arm: Errors that follow the arm's posture, at the stops; None where the stops show none.
         inflation: By how much larger their noise's variance counts than they show alone.
+        beside: (12, c) by how much the edges are off beside that, for c independent errors of one:
+            of an arm without joint angles, which more stops do not change.
     """
 
     problem: Problem
@@ -77,6 +79,7 @@ class Recorded:
     first_corner: int = 0
     arm: ArmErrors | None = None
     inflation: float = 1.0
+    beside: FloatArray = field(default_factory=lambda: np.zeros((12, 0)))
 
     @property
     def shared(self) -> FloatArray:
@@ -211,8 +214,7 @@ def stop_factors(
         )
         arm = None if recorded is None else recorded.arm
         if arm is not None:
-            basis = link_basis(cell.robot, q[seen]) if arm.of_links else pose_basis(flange)
-            arm = replace(arm, basis=basis)
+            arm = replace(arm, basis=link_basis(cell.robot, q[seen]))
         problem = _erring(cell, purpose, problem, q[seen], arm)
         state = State(np.stack([cell.x, cell.z]), problem.start_values)
         linear = problem.linear(state, ideal=True)
@@ -295,6 +297,10 @@ def _world(
     else:
         judged = _of_workspace(cell, purpose, workspace)
     counted, place, turn = (_widened(it, looks) for it in judged)
+    misfit, gradient = factors[:, :, size:], known[:size, size:]
+    if recorded is not None and not purpose.blocks and recorded.beside.shape[1]:
+        gradient = (prior + known[:size, :size])[:, :12] @ recorded.beside
+        misfit = factors[:, :, :12] @ recorded.beside
     return World(
         factors[:, :, :size],
         prior,
@@ -304,8 +310,8 @@ def _world(
         turn,
         units,
         looks,
-        factors[:, :, size:],
-        known[:size, size:],
+        misfit,
+        gradient,
     )
 
 

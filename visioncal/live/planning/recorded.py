@@ -164,8 +164,9 @@ def begin(
         arm.joints_rad,
         told.noise,
         int(first_corners(targets)[told.board]),
-        arm.errors,
-        max((it.factor for it in alike if it.is_significant), default=1.0),
+        arm.errors if arm.is_modelled else None,
+        max((it.factor for it in alike if it is not None and it.is_significant), default=1.0),
+        _beside_noise(known, told),
     )
     return Begun(cell, recorded, found.refusal, told.views)
 
@@ -258,6 +259,17 @@ def _guessed(known: RunState, guess: Guess | None) -> _Told:
         board,
         tuple(looked.first_of_stops(mine)),
     )
+
+
+def _beside_noise(known: RunState, told: "_Told") -> FloatArray:
+    """(12, c) how the edges err by what an arm does wrong whose joints are not known, if any."""
+    if known.answer is None or told.arm.is_modelled or "arm" not in known.answer.beside:
+        return np.zeros((12, 0))
+    names = tuple(told.problem.unknown)[:2]
+    columns = [np.arange(it.start, it.stop) for it in map(known.solved.problem.edge_columns, names)]
+    at = np.concatenate(columns)
+    values, vectors = np.linalg.eigh(known.answer.beside["arm"][np.ix_(at, at)])
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0)))[:, values > 0.0])
 
 
 def _arm(arm: RobotArm, robot: Robot) -> Robot:

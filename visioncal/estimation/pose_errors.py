@@ -1,0 +1,377 @@
+"""Errors of an arm without joint angles: processes over its postures, and over time.
+
+What such an arm does wrong follows its posture, or lasts from stop to stop: residuals are not white
+noise, and the mean of many is not as good as their number says. Several models of it are weighed by
+their restricted likelihood (Bayesian model averaging; Hoeting et al. 1999), and none is chosen:
+
+    white       nothing but noise from stop to stop
+    basis       smooth functions of the posture, see `arm.pose_basis`
+    posture     Gaussian processes over the posture, one of the flange and one of the base, over a
+                short or a long range (Rasmussen and Williams 2006)
+    time        an Ornstein-Uhlenbeck process over the stops, of a short or a long memory
+    both        the likeliest two of these
+
+The answer stays that of white noise; its covariance is theirs.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import lapack
+
+from visioncal.core.transforms import adjoint, invert
+from visioncal.core.types import FloatArray, IntArray
+from visioncal.estimation.arm import TWIST_UNITS, ArmErrors, pose_basis, stops_of
+from visioncal.estimation.linalg import covariance_root
+from visioncal.estimation.parts import Effect, Noise, State
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.solve import RATIO_PRIOR, robot_likelihood
+from visioncal.estimation.variance import LEAST_SIGMA, MOST_SIGMA, Knowledge
+
+# Postures are as far apart by so much of a place as by a radian of a direction [m].
+_REACH_M = 0.5
+# Ranges of the processes over the posture [rad], and memories of those over time [stops].
+_RANGES, _MEMORIES = (0.15, 0.4, 1.0, 2.8), (3.0, 10.0, 30.0)
+_PRIOR = {"white": 1 / 4, "basis": 1 / 4, "posture": 1 / 4, "time": 3 / 16, "both": 1 / 16}
+# Models of less weight are left out.
+_NO_WEIGHT = 1e-4
+# Fewer stops have hardly more residuals than the edges and the noise take.
+_FEWEST_STOPS = 6
+# Unknowns of stops whose errors are weighed together: the work grows with their cube.
+_MOST_ROWS = 360
+# Columns that stand for the errors of all stops; what they leave counts as noise.
+_MOST_COLUMNS = 360
+# Variances of so little of the whole are rounding.
+_FACTORED = 1e-6
+# A process begins at such a share of the noise, and is none at the other.
+_BEGINS, _NOTHING = 0.7, 1e-2
+_ITERATIONS, _SETTLED, _WORST_DAMPING, _LONGEST_STEP = 30, 5e-3, 1e4, 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class _Process:
+    """Errors of which `size^2 kernel_ij at_i at_j'` is common to stops i and j.
+
+    Attributes:
+        kernel: (s, s) how alike they are.
+        at: (s, 6, q) how each of q independent ones moves the flange at each stop.
+        size: Their standard deviation, in units of `at`.
+    """
+
+    kernel: FloatArray
+    at: FloatArray
+    size: float
+
+    def between(self, some: IntArray, others: IntArray) -> FloatArray:
+        """(a, b, 6, 6) the covariance of what is at some stops and at others."""
+        alike = self.size**2 * self.kernel[np.ix_(some, others)]
+        moved = np.tensordot(self.at[some], self.at[others], axes=(2, 2))
+        return np.asarray(alike[:, :, None, None] * np.swapaxes(moved, 1, 2))
+
+
+@dataclass(frozen=True, eq=False)
+class _Model:
+    """One model of an arm's errors.
+
+    Attributes:
+        kind: A key of the priors.
+        prior: Its own.
+        processes: What is beside the noise.
+        white: (2,) the noise, of rotation [rad] and place [m].
+        value: The negative restricted log-likelihood of the likeliest sizes.
+    """
+
+    kind: str
+    prior: float
+    processes: tuple[_Process, ...]
+    white: FloatArray
+    value: float = np.inf
+
+    @property
+    def evidence(self) -> float:
+        """The logarithm of its weight, but for what all models have in common."""
+        return float(np.log(self.prior) - self.value - len(self.processes))
+
+
+def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -> ArmErrors | None:
+    """Weighs models of what an arm without joint angles does wrong.
+
+    Args:
+        problem: The observations.
+        state: The answer under white noise.
+        noise: Its levels; those of the sensors and of other robots are kept.
+        robot: The robot.
+
+    Returns:
+        Its errors, and the noise beside them, both as means over all models; None of too few stops.
+    """
+    seen = stops_of(problem, robot)
+    if len(seen) < _FEWEST_STOPS:
+        return None
+    poses = problem.poses[robot]
+    stood = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
+    likelihood = _Likelihood.of(problem, state, noise, robot, stood)
+    levels = np.maximum(noise.robots[problem.robots.index(robot)], LEAST_SIGMA)
+    white = likelihood.maximised(_Model("white", _PRIOR["white"], (), levels))
+    models = [white, *map(likelihood.maximised, _models(poses[stood], white.white))]
+    likeliest = [
+        max((it for it in models if it.kind == kind), key=lambda it: it.evidence)
+        for kind in ("posture", "time")
+    ]
+    both = tuple(it for model in likeliest for it in model.processes)
+    models.append(likelihood.maximised(_Model("both", _PRIOR["both"], both, white.white)))
+    logs = np.array([it.evidence for it in models])
+    shares = np.exp(logs - logs.max())
+    gain = 2.0 * float(logs.max() + np.log(shares.sum()) + white.value)
+    weights = np.where(shares / shares.sum() > _NO_WEIGHT, shares, 0.0)
+    weights /= weights.sum()
+    pairs = [pair for pair in zip(models, weights.tolist(), strict=True) if pair[1]]
+    processes = [
+        replace(it, size=weight**0.5 * it.size) for model, weight in pairs for it in model.processes
+    ]
+    columns, left = _columns(processes, len(stood), np.searchsorted(stood, seen))
+    squares = sum((weight * model.white**2 for model, weight in pairs), left)
+    basis = np.zeros((len(poses), 6, columns.shape[2]))
+    basis[stood] = columns
+    return ArmErrors(basis, 1.0, gain, of_links=False, white=np.sqrt(squares), look=levels)
+
+
+def _models(poses: FloatArray, white: FloatArray) -> Iterator[_Model]:
+    """All models but white noise alone, and both kinds of processes at once.
+
+    Args:
+        poses: (s, 4, 4) of the flange.
+        white: (2,) the noise where nothing else is; errors of the flange have its shape.
+    """
+    flange = np.broadcast_to(np.diag(np.repeat(white, 3)), (len(poses), 6, 6))
+    level = float(np.sqrt(np.mean(np.square(white / TWIST_UNITS[[0, 3]]))))
+    base = level * adjoint(invert(poses)) * TWIST_UNITS
+    smooth = _Process(np.ones((len(poses),) * 2), level * pose_basis(poses), _BEGINS)
+    yield _Model("basis", _PRIOR["basis"], (smooth,), white)
+    away = _squared_distances(poses)
+    for length in _RANGES:
+        kernel = np.exp(-away / (2.0 * length**2))
+        processes = tuple(_Process(kernel, it, _BEGINS) for it in (flange, base))
+        yield _Model("posture", _PRIOR["posture"] / len(_RANGES), processes, white)
+    order = np.arange(len(poses))
+    for memory in _MEMORIES:
+        kernel = np.exp(-np.abs(order[:, None] - order) / memory)
+        process = _Process(kernel, flange, _BEGINS)
+        yield _Model("time", _PRIOR["time"] / len(_MEMORIES), (process,), white)
+
+
+def _squared_distances(poses: FloatArray) -> FloatArray:
+    """(s, s) how far postures are apart, squared; 2 (1 - cos) of an angle [rad^2]."""
+    places, turns = poses[:, :3, 3] / _REACH_M, poses[:, :3, :3].reshape(-1, 9) / np.sqrt(2.0)
+    at = np.concatenate([places, turns], axis=1)
+    return np.asarray(np.sum((at[:, None] - at) ** 2, axis=2))
+
+
+def _columns(
+    processes: Sequence[_Process], count: int, seen: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Factors the covariance of processes by blocks of stops, those that leave most first.
+
+    Args:
+        processes: They.
+        count: How many stops s there are.
+        seen: (m,) those that were observed.
+
+    Returns:
+        (s, 6, c) columns, and (2,) the variance that they leave, in the mean of those observed.
+    """
+    every, columns = np.arange(count), np.zeros((count, 6, 0))
+    left = np.zeros((count, 6, 6))
+    for it in processes:
+        left += it.size**2 * it.at @ np.swapaxes(it.at, 1, 2)
+    whole = np.diagonal(left[seen].mean(axis=0)).reshape(2, 3).mean(axis=1)
+    scale = np.repeat(np.sqrt(np.maximum(whole, LEAST_SIGMA**2)), 3)
+    for _ in range(min(len(seen), _MOST_COLUMNS // 6) if processes else 0):
+        sizes = np.diagonal(left[seen], axis1=1, axis2=2) / scale**2
+        at = int(seen[np.argmax(sizes.sum(axis=1))])
+        values, vectors = np.linalg.eigh(left[at] / np.outer(scale, scale))
+        if values[-1] < _FACTORED:
+            break
+        kept = values > _FACTORED
+        cross = -columns @ columns[at].T
+        for it in processes:
+            cross += it.between(every, np.array([at]))[:, 0]
+        found = cross / scale @ (vectors[:, kept] / np.sqrt(values[kept]))
+        columns = np.concatenate([columns, found], axis=2)
+        left -= found @ np.swapaxes(found, 1, 2)
+    mean = np.diagonal(left[seen].mean(axis=0))
+    return columns, np.maximum(mean.reshape(2, 3).mean(axis=1), 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """Stops whose errors are weighed together.
+
+    Attributes:
+        stops: (u,) the stop of each unit, among those at which the robot stood.
+        errors: (n,) what the units say of their flanges' errors.
+        jacobian: (n, p) how that moves with the unknowns.
+        known: (n, n) its covariance without the robot's own errors.
+        white: (2, n) what the robot's rotation and place add to its diagonal.
+        by_flange: (u, n / u, 6) how it moves with the robot's flange.
+    """
+
+    stops: IntArray
+    errors: FloatArray
+    jacobian: FloatArray
+    known: FloatArray
+    white: FloatArray
+    by_flange: FloatArray
+
+    def common(self, it: _Process) -> FloatArray:
+        """(n, n) what a process of unit size adds to the covariance."""
+        among = replace(it, size=1.0).between(self.stops, self.stops)
+        turned = self.by_flange[:, None] @ among @ np.swapaxes(self.by_flange, 1, 2)
+        return np.asarray(np.swapaxes(turned, 1, 2).reshape(self.known.shape))
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """The negative log-likelihood at logarithms of sizes, its slope and average information."""
+
+    logs: FloatArray
+    value: float
+    slope: FloatArray
+    curvature: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Likelihood:
+    """The restricted likelihood of one robot's errors.
+
+    Attributes:
+        blocks: Its stops; those of different blocks count as independent.
+        information: (p, p) on the unknowns by all else.
+        gradient: (p,) of that.
+    """
+
+    blocks: tuple[_Block, ...]
+    information: FloatArray
+    gradient: FloatArray
+
+    @classmethod
+    def of(
+        cls, problem: Problem, state: State, noise: Noise, robot: str, stood: IntArray
+    ) -> "_Likelihood":
+        """Linearises the observations; arguments are those of `find_pose_errors`."""
+        place, count = problem.robots.index(robot), len(problem.poses[robot])
+        moves = np.zeros((count, 6, 6))
+        moves[stood] = np.eye(6)
+        nothing = Knowledge(np.zeros((6, 6)), np.zeros(6))
+        effect = Effect.free("flange", nothing, flange_jacobian={robot: moves})
+        widened = problem.with_effects([*problem.effects, effect])
+        there = State(state.edges, np.append(state.values, np.zeros(6)))
+        likelihood = robot_likelihood(widened, there, noise)
+        jacobian = likelihood.reduced.jacobian[:, :, likelihood.moving]
+        jacobian, by_flange = jacobian[:, :, :-6], jacobian[:, :, -6:]
+        information = likelihood.known.information[:-6, :-6].copy()
+        gradient = likelihood.known.gradient[:-6].copy()
+        levels = noise.robots.copy()
+        levels[place] = 0.0
+        others = problem.error_covariance(replace(noise, robots=levels))
+        known = likelihood.reduced.covariance + others
+        errors, parts = likelihood.reduced.errors, likelihood.components.parts
+        of, members = problem.units
+        mine = (members == place).any(axis=1)
+        weighted = np.linalg.solve(known[~mine], jacobian[~mine])
+        information += np.einsum("uip,uiq->pq", weighted, jacobian[~mine])
+        gradient += np.einsum("uip,ui->p", weighted, errors[~mine])
+        stops = np.zeros(len(members), dtype=np.int64)
+        stops[of[of >= 0]] = problem.observations.stops[of >= 0]
+        units = np.flatnonzero(mine)
+        units = units[np.argsort(stops[units], kind="stable")]
+        width = errors.shape[1]
+        blocks = []
+        for rows in np.array_split(units, -(-len(units) * width // _MOST_ROWS)):
+            own = np.zeros((len(rows), width, len(rows), width))
+            own[np.arange(len(rows)), :, np.arange(len(rows))] = known[rows]
+            blocks.append(
+                _Block(
+                    np.searchsorted(stood, stops[rows]),
+                    errors[rows].ravel(),
+                    jacobian[rows].reshape(-1, jacobian.shape[2]),
+                    own.reshape((len(rows) * width,) * 2),
+                    parts[2 * place : 2 * place + 2, rows].reshape(2, -1),
+                    by_flange[rows],
+                )
+            )
+        return cls(tuple(blocks), information, gradient)
+
+    def maximised(self, model: _Model) -> _Model:
+        """The model with its likeliest sizes, by Newton's steps from those that it has."""
+        common = [np.array([block.common(it) for it in model.processes]) for block in self.blocks]
+        sizes = np.array([it.size for it in model.processes])
+        least = np.append([LEAST_SIGMA] * 2, np.full(len(sizes), _NOTHING))
+        damping, now = 1e-3, self._step(common, np.log(np.append(model.white, sizes)))
+        for _ in range(_ITERATIONS):
+            if now is None or damping > _WORST_DAMPING:
+                break
+            curvature = now.curvature + damping * np.diag(np.diag(now.curvature) + 1e-6)
+            step = np.clip(-np.linalg.solve(curvature, now.slope), -_LONGEST_STEP, _LONGEST_STEP)
+            there = self._step(common, np.clip(now.logs + step, np.log(least), np.log(MOST_SIGMA)))
+            if there is None or there.value > now.value:
+                damping *= 10.0
+                continue
+            gained, now, damping = now.value - there.value, there, damping / 10.0
+            if gained < _SETTLED:
+                break
+        if now is None:
+            return model
+        found = np.exp(now.logs)
+        pairs = zip(model.processes, found[2:].tolist(), strict=True)
+        processes = tuple(replace(it, size=size) for it, size in pairs)
+        return replace(model, processes=processes, white=found[:2], value=now.value)
+
+    def _step(self, common: Sequence[FloatArray], logs: FloatArray) -> _Step | None:
+        """The likelihood there; None where levels are too far apart for it."""
+        squares, count = np.exp(2.0 * logs), len(logs)
+        information, gradient = self.information.copy(), self.gradient.copy()
+        value, solved = 0.0, []
+        for block, parts in zip(self.blocks, common, strict=True):
+            total = block.known + np.diag(squares[:2] @ block.white)
+            if len(parts):
+                total = total + np.tensordot(squares[2:], parts, axes=1)
+            factor, failed = lapack.dpotrf(total, lower=1)
+            if failed:
+                return None
+            inverse = lapack.dpotri(factor, lower=1)[0]
+            inverse = np.tril(inverse) + np.tril(inverse, -1).T
+            weighted, pulled = inverse @ block.jacobian, inverse @ block.errors
+            information += block.jacobian.T @ weighted
+            gradient += block.jacobian.T @ pulled
+            value += 2.0 * float(np.log(np.diag(factor)).sum()) + float(block.errors @ pulled)
+            solved.append((inverse, weighted, pulled))
+        root = covariance_root(information)
+        best = root @ (root.T @ gradient)
+        value -= 2.0 * float(np.linalg.slogdet(root)[1]) + float(gradient @ best)
+        slope, seen = np.zeros(count), np.zeros((count, count))
+        taken = np.zeros((len(root), count))
+        for block, parts, (inverse, weighted, pulled) in zip(
+            self.blocks, common, solved, strict=True
+        ):
+            left_over = pulled - weighted @ best
+            by_root = weighted @ root
+            left = inverse - by_root @ by_root.T
+            of_white = block.white * left_over
+            grown = np.concatenate([of_white, parts @ left_over]) if len(parts) else of_white
+            traces = [*(block.white @ np.diag(left)), *(np.sum(left * it) for it in parts)]
+            slope += squares * (np.array(traces) - grown @ left_over)
+            grown = 2.0 * squares[:, None] * grown
+            seen += grown @ inverse @ grown.T
+            taken += by_root.T @ grown.T
+        curvature = 0.5 * (seen - taken.T @ taken)
+        lean = np.zeros(count)
+        lean[:2] = np.array([-1.0, 1.0]) / RATIO_PRIOR.log_sigma
+        offset = float(lean @ logs - np.log(RATIO_PRIOR.ratio) / RATIO_PRIOR.log_sigma)
+        return _Step(
+            logs,
+            0.5 * (value + offset**2),
+            slope + offset * lean,
+            curvature + np.outer(lean, lean),
+        )
