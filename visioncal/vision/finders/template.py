@@ -67,6 +67,9 @@ _TAG_WHITE = (1.0, 0.7, 0.4)
 # How far from a tag's bits, and from what is beyond its white, pixels have to be, in widths of an
 # edge. At 1.5 they draw all corners inwards by 0.02 px, but small tags have no others.
 _TAG_CLEAR = (2.5, 1.5)
+# Sides of a tag by itself that have directions of their own at its corners: shorter ones bend less
+# than these add noise [px].
+_BENT_PX = 115.0
 # What is looked at around a circle: a share of its radius, and no less [px]. Text may be near.
 _AROUND_CIRCLE, _AROUND_PX = 0.35, 4.0
 # Larger circles are looked at in half of the size.
@@ -514,6 +517,9 @@ def _step(
     if pattern.lone is not None:
         # Light slopes where it is white, and there the product is 0; in the dark it is 4.
         columns += [(1 - product / 4) * it for it in (x, y)]
+        # A lens bends the sides of a tag by itself, and its corners do not tell how.
+        if windows.around.shape[1] == _FEWEST and np.median(windows.widths) * _BENT_PX < 1.0:
+            columns += [y * slopes_of[0], x * slopes_of[1]]
     unknowns = len(columns)
     columns.append(windows.grey - ox * x - oy * y - (gx * x + gy * y) * product)
     stack = np.empty((count, unknowns + 1, *x.shape[1:]), np.float32)
