@@ -9,16 +9,20 @@ import pytest
 from scipy.special import chdtrc
 from support.sound_findings import SOUND, changed, directions, left_out
 
+from visioncal.calibration.pipeline import calibrate
 from visioncal.calibration.stages.cause_ranking import read_otherwise, with_misread
 from visioncal.calibration.stages.fit_messages import scale_found
 from visioncal.calibration.stages.judge import judge
 from visioncal.calibration.stages.need import Picks
+from visioncal.core.transforms import exp, invert
 from visioncal.core.types import Need
 from visioncal.core.verdict import CALIBRATE, GUESS, PLAN, Finding, Step, Verdict, with_paths
 from visioncal.estimation.joint import MeasuredScale
 from visioncal.results import Rms
 from visioncal.results.codec import read, write
 from visioncal.results.verdicts import VerdictForm
+from visioncal.session import Session
+from visioncal.simulation import CellOptions, simulate
 
 EXCHANGED = Finding(
     "exchanged_views",
@@ -207,3 +211,31 @@ def _scattered() -> Verdict:
 
 def test_scatter_without_any_finding_is_unexplained() -> None:
     assert ids(_scattered()) == ["unexplained"]
+
+
+@pytest.mark.parametrize("bumped", [False, True])
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_what_was_bumped_on_the_flange_is_named_whatever_the_need(mount, bumped):
+    cell = simulate(CellOptions(mount=mount, views=18, seed=3))
+    flange = cell.base_from_flange.copy()
+    if bumped:
+        # Camera, or board, stand elsewhere on the flange from the tenth view on.
+        on_flange = next(it for name, it in cell.transforms.items() if name.startswith("flange"))
+        knock = on_flange @ exp(np.array([0.006, -0.003, 0.0, 0.0, 0.003, 0.001]))
+        flange[9:] = flange[9:] @ on_flange @ invert(knock)
+    session = Session.from_corners(
+        [(it.ids, it.px) for it in cell.corners],
+        flange,
+        cell.options.target,
+        cell.stated_camera.resolution,
+        mount=mount,
+        camera=cell.stated_camera,
+    )
+    verdict = calibrate(session, need_mm=20.0).verdict
+    causes = [it.kind for it in verdict.findings if it.probability > 0.5]
+    assert ("moved_at_once" in causes) == bumped
+    assert (verdict.status == "good") == (not bumped)
+    if bumped:
+        (found,) = (it for it in verdict.findings if it.kind == "moved_at_once")
+        assert found.words.startswith("The camera" if mount == "eye-in-hand" else "The target")
+        assert "before stop 10" in found.words

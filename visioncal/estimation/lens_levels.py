@@ -31,6 +31,8 @@ _LENGTHS, _FIRST, _GAIN = (0.07, 0.12, 0.2), 2, 0.5
 # all free, leave of them.
 _MOST = (1.0, 0.02, 5e-3)
 _NOISE_RANGE = (0.7, 3.0)
+# Corners of which lens, board and field, all free, leave more [px] are wrong, and no noise.
+_WRONG_PX = 10.0
 # Sizes below these are none: of the field in units of the noise, of focus as a share; and those
 # from which the search starts.
 _LEAST, _START = (1e-3, 1e-6, 1e-6), (0.3, 1e-3, 3e-4)
@@ -218,8 +220,7 @@ class _Likelihood:
         low[_FIELD : _JITTER + 1] = np.multiply(_LEAST, (self.noise_px, 1.0, 1.0))
         high[_FIELD : _JITTER + 1] = _MOST
         high[[*closed]] = low[[*closed]]
-        # Noise of a thousand pixels is larger than any level.
-        return np.log(low), np.log(np.maximum(low, high))
+        return np.log(low), np.log(high)
 
 
 def are_beyond(levels: LensLevels, sigma_px: float) -> bool:
@@ -258,6 +259,8 @@ def estimate_levels(
     closed = () if is_open else (_BREATHING, _JITTER)
     at, before = _FIRST, mine.levels
     likelihood = _assembled(found, _LENGTHS[at], len(noise.robots))
+    if likelihood.noise_px > _WRONG_PX:
+        return LensLevels()
     sizes = np.array([1.0, _START[0], 0.0, 0.0]) * likelihood.noise_px + [0.0, 0.0, *_START[1:]]
     if before is not None:
         at = _LENGTHS.index(before.length)

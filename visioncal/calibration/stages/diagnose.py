@@ -1,7 +1,7 @@
 """Whether the residuals are noise: what they show beyond it, in words."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,6 +18,8 @@ from visioncal.estimation.solve import Solution
 _THINGS = {"cam": "The camera", "target": "The target"}
 # Fewer stops than this leave no residuals to be tested.
 _FEWEST_STOPS = 6
+# Noise is left, however much a step explains.
+_MOST_EXPLAINED = 0.99
 
 
 @dataclass(frozen=True)
@@ -52,8 +54,7 @@ def misfits(
             fitted = (problem, fit.state, fit.noise, robot)
             crept, arm = drift(*fitted), errors.get(robot)
             alike = None if arm else neighbours(*fitted)
-            last = arm.is_significant if arm else alike is not None and alike.is_significant
-            step = _step(problem, fit, crept) if crept or last else None
+            step = _step(problem, fit, crept)
             # What a process over postures or time explains as well is no motion.
             if arm and step and step.mahalanobis_sq < arm.gain:
                 step = None
@@ -73,7 +74,10 @@ def _step(problem: Problem, fit: Solution, crept: Drift | None) -> Move | None:
     price = 2.0 * np.log(len(frames) * (1 + int(problem.observations.stops.max())))
     if found is None or (crept and found.mahalanobis_sq < crept.mahalanobis_sq + price):
         return None
-    return found
+    # The noise is that of a fit without the step: with it, twice the logarithm gains more.
+    freedom = max(6 * len(problem) - problem.size, 7)
+    share = min(found.mahalanobis_sq / freedom, _MOST_EXPLAINED)
+    return replace(found, mahalanobis_sq=-freedom * float(np.log1p(-share)) - price)
 
 
 def doubts(found: ResidualTest, arm: ArmErrors | None, *, calibrated: bool) -> Iterator[Finding]:
@@ -107,6 +111,7 @@ def doubts(found: ResidualTest, arm: ArmErrors | None, *, calibrated: bool) -> I
             f"session, by {figure(shift_mm)} mm and {figure(turn_deg)} deg; the result is between "
             "both places.",
             Step("Fasten it, and record again; or keep only the views before or after."),
+            mahalanobis_sq=found.step.mahalanobis_sq,
         )
     if moved is not None:
         yield Finding(
@@ -115,7 +120,8 @@ def doubts(found: ResidualTest, arm: ArmErrors | None, *, calibrated: bool) -> I
             f"{_size(moved.moved_m, moved.moved_rad)}.",
             Step("Fasten base and target, let the arm warm up, and record again."),
         )
-    if alike is not None and alike.is_significant:
+    # Before and after a step, neighbours err alike because of it.
+    if alike is not None and alike.is_significant and found.step is None:
         yield Finding(
             "correlated_errors",
             f"Neighbouring stops err alike: leaving them out in blocks moves the answer "
