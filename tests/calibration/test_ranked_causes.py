@@ -239,3 +239,27 @@ def test_what_was_bumped_on_the_flange_is_named_whatever_the_need(mount, bumped)
         (found,) = (it for it in verdict.findings if it.kind == "moved_at_once")
         assert found.words.startswith("The camera" if mount == "eye-in-hand" else "The target")
         assert "before stop 10" in found.words
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_a_held_lens_that_is_wrong_is_no_board_of_another_size(mount):
+    cell = simulate(CellOptions(mount=mount, views=12, seed=2))
+    lens = cell.stated_camera
+    session = Session.from_corners(
+        [(it.ids, it.px) for it in cell.corners],
+        cell.base_from_flange,
+        "charuco_9x6_30mm",
+        lens.resolution,
+        mount=mount,
+        camera=replace(lens, matrix=lens.matrix * [1.01, 1.01, 1.0, 1.0]),
+    )
+    document = dict(session.document)
+    document["camera"] = {**document["camera"], "intrinsics": "hold"}
+    held = Session.assemble(
+        document,
+        session.columns,
+        [[*map(it.cell, session.columns)] for it in session.views],
+        session.images,
+        corners=session.corner_table,
+    )
+    assert calibrate(held).verdict.causes[0].kind == "lens"

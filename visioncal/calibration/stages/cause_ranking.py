@@ -91,6 +91,9 @@ EVIDENCE: Mapping[str, Evidence] = {
 # What moves along a camera's axis passes for changes of its focus, which are random in the fit; a
 # focus that changes does not go by the time, and is found moving in one session of ten thousand.
 _MOVED, _FEIGNED = ("moved_slowly", "moved_at_once"), {"focus"}
+# What a held lens that the corners contradict does to views passes for a board of another size or
+# shape; the corners alone cannot tell of the size, and the lens is tested beside both.
+_BY_HELD_LENS = {"board_size", "board_shape"}
 # What is measured by way of the robot says nothing where its poses are misread.
 _BY_THE_CHAIN = ("board_size", "board_shape", "lens", "lens_field", "corner_noise", "arm_errors")
 LOOK = Step(
@@ -200,6 +203,8 @@ def _tested(doubts: Sequence[Finding], left_out_mm: float) -> list[Finding]:
     odds = {name: _explaining(it, misfit_mm) for name, it in first.items()}
     if any(it in first for it in _MOVED):
         odds |= dict.fromkeys(_FEIGNED & odds.keys(), 1.0)
+    if "lens" in first and first["lens"].mahalanobis_sq:
+        odds |= dict.fromkeys(_BY_HELD_LENS & odds.keys(), 1.0)
     weighed = []
     for doubt in doubts:
         name = doubt.kind

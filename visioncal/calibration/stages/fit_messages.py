@@ -21,7 +21,7 @@ from visioncal.estimation.joint import (
     moved_mahalanobis_sq,
 )
 from visioncal.estimation.scene import ONLY_CAMERA, Scene
-from visioncal.estimation.solve import held_shift
+from visioncal.estimation.solve import covariance_of, held_shift
 
 # A rig that is as stated seems not to be in one session of ten thousand.
 _FALSE_ALARM = 1e-4
@@ -183,10 +183,13 @@ def _lens_found(fitted: Fitted, camera: str) -> Iterator[Finding]:
         steps = (looks.values - looks.stated)[lens[:4]]
         yield lens_found(steps, is_doubtful=is_exact or contradicted_lens(fitted, camera))
     if problem.contested:
-        shift = held_shift(fitted.problem, fitted.fit)[fitted.columns]
-        moves = shift[np.searchsorted(fitted.seen.free, lens[:4])]
+        at = np.arange(fitted.problem.size)[fitted.columns]
+        at = at[np.searchsorted(fitted.seen.free, lens[:4])]
+        moves = held_shift(fitted.problem, fitted.fit)[at]
         if np.abs(moves).max() > _LEAST_MOVE_PX:
-            yield contest_found(problem.scene, moves)
+            known = covariance_of(fitted.problem, fitted.fit)[np.ix_(at, at)]
+            squared = float(moves @ np.linalg.solve(known, moves))
+            yield replace(contest_found(problem.scene, moves), mahalanobis_sq=squared)
 
 
 def lens_found(steps_px: FloatArray, *, is_doubtful: bool) -> Finding:
