@@ -40,6 +40,8 @@ _NO_WEIGHT = 1e-4
 _FEWEST_STOPS = 6
 # Unknowns of stops whose errors are weighed together: the work grows with their cube.
 _MOST_ROWS = 360
+# So many blocks, spread over the session, tell the sizes: the rest counts as noise as it is known.
+_MOST_BLOCKS = 5
 # Columns that stand for the errors of all stops; what they leave counts as noise.
 _MOST_COLUMNS = 360
 # Variances of so little of the whole are rounding.
@@ -278,17 +280,21 @@ class _Likelihood:
         known = likelihood.reduced.covariance + others
         errors, parts = likelihood.reduced.errors, likelihood.components.parts
         of, members = problem.units
-        mine = (members == place).any(axis=1)
-        weighted = np.linalg.solve(known[~mine], jacobian[~mine])
-        information += np.einsum("uip,uiq->pq", weighted, jacobian[~mine])
-        gradient += np.einsum("uip,ui->p", weighted, errors[~mine])
+        width = errors.shape[1]
         stops = np.zeros(len(members), dtype=np.int64)
         stops[of[of >= 0]] = problem.observations.stops[of >= 0]
-        units = np.flatnonzero(mine)
+        units = np.flatnonzero((members == place).any(axis=1))
         units = units[np.argsort(stops[units], kind="stable")]
-        width = errors.shape[1]
+        every = np.array_split(units, -(-len(units) * width // _MOST_ROWS))
+        spread = np.linspace(0, len(every) - 1, min(len(every), _MOST_BLOCKS)).round().astype(int)
+        chosen = [every[at] for at in spread]
+        rest = np.setdiff1d(np.arange(len(members)), np.concatenate(chosen))
+        whole = likelihood.reduced.covariance[rest] + problem.error_covariance(noise)[rest]
+        weighted = np.linalg.solve(whole, jacobian[rest])
+        information += np.einsum("uip,uiq->pq", weighted, jacobian[rest])
+        gradient += np.einsum("uip,ui->p", weighted, errors[rest])
         blocks = []
-        for rows in np.array_split(units, -(-len(units) * width // _MOST_ROWS)):
+        for rows in chosen:
             own = np.zeros((len(rows), width, len(rows), width))
             own[np.arange(len(rows)), :, np.arange(len(rows))] = known[rows]
             blocks.append(
