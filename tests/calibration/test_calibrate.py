@@ -38,6 +38,7 @@ CONTRACT_KEYS = {
     "camera",
     "robot",
     "noise",
+    "ray_frame",
     "views",
     "rms",
     "validation",
