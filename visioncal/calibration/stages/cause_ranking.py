@@ -188,6 +188,8 @@ def ranked(
     too_large = unmet or (met is None and any(it.until_mm == 0.0 for it in doubts))
     if too_large and picks:
         known = {it.kind for it in found if it.probability}
+        # What moved is in the arm's errors by posture and time, too, which are no cause then.
+        known |= {"arm_errors"} if known & {*_MOVED} else set()
         more = None if any(it.do is NO_JOINTS for it in found) else adding(_MORE, modelled=modelled)
         found += [it for it in _sources(picks, met, more) if it.kind not in known]
     return tuple(found)
@@ -201,8 +203,12 @@ def _tested(doubts: Sequence[Finding], left_out_mm: float) -> list[Finding]:
             first.setdefault(it.kind, it)
     misfit_mm = left_out_mm if "unexplained" in first else 0.0
     odds = {name: _explaining(it, misfit_mm) for name, it in first.items()}
-    if any(it in first for it in _MOVED):
+    moved = [first[it].mahalanobis_sq for it in _MOVED if it in first]
+    if moved:
         odds |= dict.fromkeys(_FEIGNED & odds.keys(), 1.0)
+    if moved and "arm_errors" in first and max(moved) > first["arm_errors"].mahalanobis_sq:
+        # Before and after a step, errors by posture and time are alike because of it.
+        odds["arm_errors"] = 1.0
     if "lens" in first and first["lens"].mahalanobis_sq:
         odds |= dict.fromkeys(_BY_HELD_LENS & odds.keys(), 1.0)
     weighed = []
