@@ -383,7 +383,7 @@ def _called(words: Sequence[str], answers: str) -> _Done:
         patch.object(sys, "argv", ["visioncal", *words]),
         patch.object(sys, "stdin", io.StringIO(answers)),
         patch.object(console, "report_error", reported),
-        patch.object(viewer, "review_native", lambda _: None),
+        patch.object(viewer, "review_native", lambda *_: None),
         redirect_stdout(out),
         redirect_stderr(err),
     ):
