@@ -151,10 +151,11 @@ def _models(poses: FloatArray, white: FloatArray) -> Iterator[_Model]:
     base = level * adjoint(invert(poses)) * TWIST_UNITS
     smooth = _Process(np.ones((len(poses),) * 2), level * pose_basis(poses), _BEGINS)
     yield _Model("basis", _PRIOR["basis"], (smooth,), white)
+    both = np.concatenate([flange, base], axis=2)
     away = _squared_distances(poses)
     for length in _RANGES:
         kernel = np.exp(-away / (2.0 * length**2))
-        processes = tuple(_Process(kernel, it, _BEGINS) for it in (flange, base))
+        processes = (_Process(kernel, both, _BEGINS),)
         yield _Model("posture", _PRIOR["posture"] / len(_RANGES), processes, white)
     order = np.arange(len(poses))
     for memory in _MEMORIES:
