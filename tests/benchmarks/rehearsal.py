@@ -229,7 +229,7 @@ class _Acknowledged:
 def record_beside(host: str, folder: Path, stops: int) -> None:
     """Goes on with a recording, at a controller that others started: what is killed."""
     cell = rehearsed_cell(RehearsalOptions(stops=stops, seed=SEED))
-    scene = scene_of(folder.parent / "plan", target=None, robot=None, mount=None)
+    scene = scene_of(folder.parent / "plan")
     eyes = TruthClient(host)
     sight = RehearsalCamera(cell.truth, lambda at: eyes.state(at.tolist()).q)
     through = HostedOak(sight.frame, sight.resolution, factory=sight.factory)

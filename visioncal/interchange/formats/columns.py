@@ -109,7 +109,9 @@ def _fields_of_document(document: object, path: Path) -> Fields:
             columns = {k: v for k, v in document.items() if isinstance(v, list) and len(v) == count}
             document = [{k: v[at] for k, v in columns.items()} for at in range(count)]
     if not isinstance(document, list) or not document:
-        raise DataError(f"{path} holds no rows; a list with one entry a pose is needed.")
+        raise DataError(
+            f"{path} holds no rows; a list with one entry a pose is needed.", culprits=[str(path)]
+        )
     places = [f"{path.name}, entry {at}" for at in range(len(document))]
     records = [flattened(it) for it in document]
     return fields_of_records(records, places, path.stem, path.parent)
