@@ -1,6 +1,7 @@
 """What the commands share: messages to stderr, results to stdout."""
 
 import json
+import sys
 from typing import TYPE_CHECKING
 
 import typer
@@ -22,6 +23,19 @@ _SHORT = 12  # culprits of fewer letters share a line
 def messages() -> Console:
     """The console for messages: stderr."""
     return Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+def asked(question: str) -> str:
+    """Asks on stderr, which leaves stdout to results, and gives the line that was typed.
+
+    Raises:
+        EOFError: Nothing more is typed.
+    """
+    messages().print(escape(question), end="")
+    line = sys.stdin.readline()
+    if not line:
+        raise EOFError
+    return line.rstrip("\r\n")
 
 
 def report_error(error: VisioncalError, *, as_json: bool) -> None:

@@ -31,7 +31,7 @@ def numbers_in(words: str, option: str, form: str) -> tuple[float, ...]:
     return values
 
 
-def size_in(words: str, option: str = "--resolution") -> tuple[int, int]:
+def size_in(words: str) -> tuple[int, int]:
     """Reads the width and height of images [px], written as 1280,800 or 1280x800.
 
     Raises:
@@ -43,8 +43,8 @@ def size_in(words: str, option: str = "--resolution") -> tuple[int, int]:
     ]
     if len(sides) != 2 or len(numbers) != 2 or min(numbers) < 1:
         raise DataError(
-            f"{option} is {words[:40]!r}; width and height of the images are needed [px], two "
+            f"--resolution is {words[:40]!r}; width and height of the images are needed [px], two "
             "whole numbers above 0, as 1280,800.",
-            culprits=[option],
+            culprits=["--resolution"],
         )
     return numbers[0], numbers[1]

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import messages
+from visioncal.cli.console import asked, messages
 from visioncal.cli.interrupts import ended_like_ctrl_c
 from visioncal.cli.numbers import size_in
 from visioncal.cli.options import AsJson, View
@@ -179,7 +179,7 @@ def record_command(
     taking = takes.options(single=is_folder(camera), lost=CaptureOptions.lost if drives else 0)
     requested = device.wishes()
     answers = sys.stdin.isatty()
-    wish = ArmWish("", not drives or dry_run, _asked, described.pose_form, answers)
+    wish = ArmWish("", not drives or dry_run, asked, described.pose_form, answers)
     with ended_like_ctrl_c(), _opened(arm, wish, camera, requested) as cell:
         scene.check(cell.camera.resolution, drives=drives)
         if dry_run:
@@ -197,7 +197,7 @@ def record_command(
             if drives:
                 steps = driven(cell, scene, journal, taking, watchers, asks=not yes)
             else:
-                ask = _asked if answers else None
+                ask = asked if answers else None
                 steps = guided(cell, scene, journal, taking, watchers, views, ask)
     if drives:
         _check_all(journal, steps)
@@ -346,19 +346,6 @@ def _check_not_begun(journal: Journal, camera: str) -> None:
             culprits=["--resume"],
             next_step="Record all of it into a new folder.",
         )
-
-
-def _asked(question: str) -> str:
-    """Asks on stderr, which leaves stdout to results.
-
-    Raises:
-        EOFError: Nothing more is typed.
-    """
-    messages().print(escape(question), end="")
-    line = sys.stdin.readline()
-    if not line:
-        raise EOFError
-    return line.rstrip("\r\n")
 
 
 def _minutes(seconds: float) -> str:

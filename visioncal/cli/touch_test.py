@@ -13,7 +13,7 @@ import typer
 from rich.markup import escape
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from visioncal.cli.console import messages, report_error, tell_written
+from visioncal.cli.console import asked, messages, report_error, tell_written
 from visioncal.cli.numbers import numbers_in
 from visioncal.cli.options import AsJson, SessionArgument
 from visioncal.cli.progress import shown_progress
@@ -239,12 +239,11 @@ def _line(question: str) -> str:
     Raises:
         DataError: Nothing more is typed.
     """
-    messages().print(escape(question), end="")
-    line = sys.stdin.readline()
-    if not line:
+    try:
+        return asked(question)
+    except EOFError:
         raise DataError(
             "touch-test: the gaps are at their end, and nothing was kept.",
             culprits=["stdin"],
             next_step="Give all with --gaps-mm.",
-        )
-    return line
+        ) from None

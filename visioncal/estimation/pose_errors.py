@@ -108,8 +108,8 @@ def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -
     Returns:
         Its errors, and the noise beside them, both as means over all models; None of too few stops.
     """
-    seen = stops_of(problem, robot)
-    if len(seen) < _FEWEST_STOPS:
+    observed = stops_of(problem, robot)
+    if len(observed) < _FEWEST_STOPS:
         return None
     poses = problem.poses[robot]
     stood = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
@@ -132,7 +132,7 @@ def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -
     processes = [
         replace(it, size=weight**0.5 * it.size) for model, weight in pairs for it in model.processes
     ]
-    columns, left = _columns(processes, len(stood), np.searchsorted(stood, seen))
+    columns, left = _columns(processes, len(stood), np.searchsorted(stood, observed))
     squares = sum((weight * model.white**2 for model, weight in pairs), left)
     basis = np.zeros((len(poses), 6, columns.shape[2]))
     basis[stood] = columns
@@ -172,14 +172,14 @@ def _squared_distances(poses: FloatArray) -> FloatArray:
 
 
 def _columns(
-    processes: Sequence[_Process], count: int, seen: IntArray
+    processes: Sequence[_Process], count: int, observed: IntArray
 ) -> tuple[FloatArray, FloatArray]:
     """Factors the covariance of processes by blocks of stops, those that leave most first.
 
     Args:
         processes: They.
         count: How many stops s there are.
-        seen: (m,) those that were observed.
+        observed: (m,) those that were observed.
 
     Returns:
         (s, 6, c) columns, and (2,) the variance that they leave, in the mean of those observed.
@@ -188,11 +188,11 @@ def _columns(
     left = np.zeros((count, 6, 6))
     for it in processes:
         left += it.size**2 * it.at @ np.swapaxes(it.at, 1, 2)
-    whole = np.diagonal(left[seen].mean(axis=0)).reshape(2, 3).mean(axis=1)
+    whole = np.diagonal(left[observed].mean(axis=0)).reshape(2, 3).mean(axis=1)
     scale = np.repeat(np.sqrt(np.maximum(whole, LEAST_SIGMA**2)), 3)
-    for _ in range(min(len(seen), _MOST_COLUMNS // 6) if processes else 0):
-        sizes = np.diagonal(left[seen], axis1=1, axis2=2) / scale**2
-        at = int(seen[np.argmax(sizes.sum(axis=1))])
+    for _ in range(min(len(observed), _MOST_COLUMNS // 6) if processes else 0):
+        sizes = np.diagonal(left[observed], axis1=1, axis2=2) / scale**2
+        at = int(observed[np.argmax(sizes.sum(axis=1))])
         values, vectors = np.linalg.eigh(left[at] / np.outer(scale, scale))
         if values[-1] < _FACTORED:
             break
@@ -203,7 +203,7 @@ def _columns(
         found = cross / scale @ (vectors[:, kept] / np.sqrt(values[kept]))
         columns = np.concatenate([columns, found], axis=2)
         left -= found @ np.swapaxes(found, 1, 2)
-    mean = np.diagonal(left[seen].mean(axis=0))
+    mean = np.diagonal(left[observed].mean(axis=0))
     return columns, np.maximum(mean.reshape(2, 3).mean(axis=1), 0.0)
 
 
@@ -357,7 +357,7 @@ class _Likelihood:
         root = covariance_root(information)
         best = root @ (root.T @ gradient)
         value -= 2.0 * float(np.linalg.slogdet(root)[1]) + float(gradient @ best)
-        slope, seen = np.zeros(count), np.zeros((count, count))
+        slope, average = np.zeros(count), np.zeros((count, count))
         taken = np.zeros((len(root), count))
         for block, parts, (inverse, weighted, pulled) in zip(
             self.blocks, common, solved, strict=True
@@ -370,9 +370,9 @@ class _Likelihood:
             traces = [*(block.white @ np.diag(left)), *(np.sum(left * it) for it in parts)]
             slope += squares * (np.array(traces) - grown @ left_over)
             grown = 2.0 * squares[:, None] * grown
-            seen += grown @ inverse @ grown.T
+            average += grown @ inverse @ grown.T
             taken += by_root.T @ grown.T
-        curvature = 0.5 * (seen - taken.T @ taken)
+        curvature = 0.5 * (average - taken.T @ taken)
         lean = np.zeros(count)
         lean[:2] = np.array([-1.0, 1.0]) / RATIO_PRIOR.log_sigma
         offset = float(lean @ logs - np.log(RATIO_PRIOR.ratio) / RATIO_PRIOR.log_sigma)

@@ -83,7 +83,9 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
         "targets": {name: it.document["target"] for name, it in by_name.items()},
         "frames": dict(_frames(by_name)),
     }
-    if clocks := {name: it.document["clock"] for name, it in by_name.items() if _has_clock(it)}:
+    if clocks := {
+        name: it.document["clock"] for name, it in by_name.items() if "clock" in it.document
+    }:
         document["clocks"] = clocks
     if priors := dict(_priors(by_name)):
         document["prior"] = priors
@@ -164,10 +166,6 @@ def _priors(by_name: Mapping[str, Session]) -> Iterator[tuple[str, Any]]:
                 f"{it}_{name}" if it in ("cam", "target") else it for it in edge.split("_from_")
             ]
             yield "_from_".join(ends), prior
-
-
-def _has_clock(session: Session) -> bool:
-    return "clock" in session.document
 
 
 def _stamps(views: Sequence[View]) -> list[float]:

@@ -88,12 +88,7 @@ EVIDENCE: Mapping[str, Evidence] = {
     "misread_joints": Evidence(1e-3),
     "unexplained": Evidence(_REMARK, _CHAIN),
 }
-# What moves along a camera's axis passes for changes of its focus, which are random in the fit; a
-# focus that changes does not go by the time, and is found moving in one session of ten thousand.
-_MOVED, _FEIGNED = ("moved_slowly", "moved_at_once"), {"focus"}
-# What a held lens that the corners contradict does to views passes for a board of another size or
-# shape; the corners alone cannot tell of the size, and the lens is tested beside both.
-_BY_HELD_LENS = {"board_size", "board_shape"}
+_MOVED = ("moved_slowly", "moved_at_once")
 # What is measured by way of the robot says nothing where its poses are misread.
 _BY_THE_CHAIN = ("board_size", "board_shape", "lens", "lens_field", "corner_noise", "arm_errors")
 LOOK = Step(
@@ -203,14 +198,7 @@ def _tested(doubts: Sequence[Finding], left_out_mm: float) -> list[Finding]:
             first.setdefault(it.kind, it)
     misfit_mm = left_out_mm if "unexplained" in first else 0.0
     odds = {name: _explaining(it, misfit_mm) for name, it in first.items()}
-    moved = [first[it].mahalanobis_sq for it in _MOVED if it in first]
-    if moved:
-        odds |= dict.fromkeys(_FEIGNED & odds.keys(), 1.0)
-    if moved and "arm_errors" in first and max(moved) > first["arm_errors"].mahalanobis_sq:
-        # Before and after a step, errors by posture and time are alike because of it.
-        odds["arm_errors"] = 1.0
-    if "lens" in first and first["lens"].mahalanobis_sq:
-        odds |= dict.fromkeys(_BY_HELD_LENS & odds.keys(), 1.0)
+    odds |= dict.fromkeys(_feigned(first) & odds.keys(), 1.0)
     weighed = []
     for doubt in doubts:
         name = doubt.kind
@@ -226,6 +214,25 @@ def _tested(doubts: Sequence[Finding], left_out_mm: float) -> list[Finding]:
         none = float(name != "unexplained" and not (rivals and "unexplained" in first))
         weighed.append(replace(doubt, probability=odds[name] / (none + odds[name] + rivals)))
     return weighed
+
+
+def _feigned(first: Mapping[str, Finding]) -> set[str]:
+    """Kinds of findings that another one of these passes for.
+
+    What moves along a camera's axis passes for changes of its focus, which are random in the fit;
+    a focus that changes does not go by the time, and is found moving in one session of ten
+    thousand. Before and after a step, errors by posture and time are alike because of it. What a
+    held lens that the corners contradict does to views passes for a board of another size or
+    shape; the corners alone cannot tell of the size, and the lens is tested beside both.
+    """
+    feigned: set[str] = set()
+    if moved := [first[it].mahalanobis_sq for it in _MOVED if it in first]:
+        feigned.add("focus")
+        if "arm_errors" in first and max(moved) > first["arm_errors"].mahalanobis_sq:
+            feigned.add("arm_errors")
+    if "lens" in first and first["lens"].mahalanobis_sq:
+        feigned |= {"board_size", "board_shape"}
+    return feigned
 
 
 def _explaining(doubt: Finding, misfit_mm: float) -> float:
