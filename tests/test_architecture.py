@@ -33,7 +33,7 @@ SIMULATION_MAY_USE = {"core", "session", "simulation"}
 HOMES = {
     "rerun": {"present.recording", "present.viewer"},
     "pinocchio": {"robot"},
-    "matplotlib": {"vision.printing", "present.report"},
+    "matplotlib": {"vision.printing"},
     "jinja2": {"present.report"},
     "pydantic": {"session"},
     "yaml": {"core.documents", "interchange.exports"},
@@ -103,7 +103,7 @@ def test_heavy_libraries_enter_in_one_place():
     [
         (
             "visioncal.cli.calibrate, visioncal.cli.record",
-            {"depthai", "rtde_control", "rtde_receive", "torch", "kornia"},
+            {"depthai", "rtde_control", "rtde_receive", "torch", "kornia", "matplotlib"},
         ),
         # Every command waits for what is loaded here, `--help` and `--version` too.
         (

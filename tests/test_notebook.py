@@ -3,6 +3,7 @@
 import ast
 import json
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -80,6 +81,9 @@ def test_figures_of_the_report_are_drawn_on_their_own(tmp_path):
     drawing.save(tmp_path / "residuals.svg")
     text = (tmp_path / "residuals.svg").read_text("utf-8")
     assert text.startswith("<svg xmlns=")
+    # Each view's bar, in two panels at least.
+    bars = [it.get("d", "") for it in ElementTree.fromstring(text) if it.tag.endswith("path")]
+    assert sum(it.count("z") for it in bars) >= 2 * sum(it.used for it in calibration.views)
     assert "--ink:" in drawing._repr_html_()
     with pytest.raises(DataError, match="no figure 'colours'") as caught:
         calibration.plot("colours")

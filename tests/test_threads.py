@@ -7,7 +7,6 @@ from pathlib import Path
 from threading import Barrier
 
 import cv2
-import matplotlib as mpl
 import pytest
 from support.kept import assert_same_evidence
 from support.marks import slow
@@ -28,7 +27,7 @@ CREATED = "2026-11-21T00:00:00+00:00"
 
 def settings():
     blas = sorted((it["filepath"], it["num_threads"]) for it in threadpool_info())
-    return cv2.getNumThreads(), blas, dict(mpl.rcParams)
+    return cv2.getNumThreads(), blas
 
 
 @pytest.mark.parametrize("threads", [2, slow(4)])

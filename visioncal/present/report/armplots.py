@@ -4,12 +4,12 @@ from collections.abc import Callable
 
 import numpy as np
 from markupsafe import Markup
-from matplotlib.axes import Axes
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from visioncal.core.number_format import significant
 from visioncal.core.types import FloatArray
 from visioncal.present.report import svg
+from visioncal.present.report.axes import Margins, Panel, Scale, boxes
+from visioncal.present.report.svg import Figure
 from visioncal.results.arm import ArmResult, UnseenView
 
 _WIDE_IN, _MAP_IN = 9.2, 5.0
@@ -21,8 +21,10 @@ _MOST_LABELS = 25
 _LOW_PERCENT, _HIGH_PERCENT = 1.0, 98.0
 # A scale of decades has no room for zero [mm, deg].
 _LEAST = 1e-6
-# A map is no taller than this many times its width.
-_TALLEST = 1.0
+# A map is no taller than this many times its width; its steps of colour.
+_TALLEST, _SHADES = 1.0, 32
+# Above and below marks on a scale of decades, as a factor.
+_SPARE = 1.25
 
 _BEFORE, _AFTER = svg.CHECK, svg.ACCENT
 
@@ -43,65 +45,58 @@ def before_and_after(found: ArmResult) -> Markup:
     panels: list[tuple[str, _Pair]] = [("position [mm]", lambda it: (it.nominal_mm, it.mm))]
     if all(it.deg is not None for it in views):
         panels.append(("orientation [deg]", lambda it: (it.nominal_deg, it.deg)))
-    with svg.style():
-        figure = svg.new_figure(_WIDE_IN, 1.7 * len(panels))
-        rows = figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0]
-        for axes, (label, pair) in zip(rows, panels, strict=True):
-            pairs = np.array([pair(it) for it in views], dtype=float)
-            _dumbbells(axes, places, pairs)
-            _mark_rms(axes, pairs[: len(found.left_out)])
-            axes.set_ylabel(label)
-            if found.holdout:
-                axes.axvline(len(found.left_out) - 0.5 + 0.5 * _GAP, color=svg.MUTED, linewidth=0.9)
+    step = max(1, -(-len(views) // _MOST_LABELS))
+    ticks = [(float(it), str(view.view)) for it, view in zip(places, views, strict=True)][::step]
+    figure = Figure(_WIDE_IN, 1.7 * len(panels) + 0.2)
+    rows = boxes(figure, len(panels), 1, Margins(0.75, 0.75, top=0.45), (0.0, 0.2))
+    for (box,), (label, pair) in zip(rows, panels, strict=True):
+        last = box is rows[-1][0]
+        pairs = np.maximum(np.array([pair(it) for it in views], dtype=float), _LEAST)
+        heights = Scale(float(pairs.min()) / _SPARE, float(pairs.max()) * _SPARE, decades=True)
+        panel = Panel(figure, box, Scale(places[0] - 0.8, places[-1] + 0.8), heights)
+        panel.x_axis("view" if last else "", ticks, grid=False, words=last)
+        panel.y_axis(label)
+        _dumbbells(panel, places, pairs)
+        _mark_rms(panel, pairs[: len(found.left_out)])
         if found.holdout:
-            _name_sets(rows[0], places[len(found.left_out)])
-        step = max(1, -(-len(views) // _MOST_LABELS))
-        rows[-1].set_xticks(places[::step], [str(it.view) for it in views[::step]])
-        rows[-1].set_xlabel("view")
-        handles, labels = rows[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper right", ncols=2)
-        words = "Residuals of each view that was left out, before and after the arm was calibrated"
-        return svg.inline(figure, "unseen", words)
+            panel.post(len(found.left_out) - 0.5 + 0.5 * _GAP, svg.MUTED)
+            if box is rows[0][0]:
+                _name_sets(panel, places[len(found.left_out)])
+    entries = [
+        ("\N{WHITE CIRCLE}", _BEFORE, "arm as stated"),
+        ("\N{BLACK CIRCLE}", _AFTER, "calibrated arm"),
+    ]
+    figure.legend(rows[0][0].right, 10.0, entries)
+    return figure.inline(
+        "Residuals of each view that was left out, before and after the arm was calibrated"
+    )
 
 
-def _dumbbells(axes: Axes, places: FloatArray, values: FloatArray) -> None:
-    """Draws (m, 2) residuals, before and after, one above the other on a logarithmic scale."""
-    shown = np.maximum(values, _LEAST)
-    axes.set_yscale("log")
-    axes.vlines(places, shown.min(axis=1), shown.max(axis=1), color=svg.LINE, linewidth=1.6)
-    for column, colour, face, label in (
-        (0, _BEFORE, "none", "arm as stated"),
-        (1, _AFTER, _AFTER, "calibrated arm"),
-    ):
-        axes.plot(
-            places, shown[:, column], "o", color=colour, markerfacecolor=face, markersize=4.5,
-            label=label,
-        )  # fmt: skip
-    axes.set_xlim(places[0] - 0.8, places[-1] + 0.8)
-    axes.grid(visible=False, axis="x")
-    axes.yaxis.set_major_locator(LogLocator(numticks=5))
-    axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+def _dumbbells(panel: Panel, places: FloatArray, values: FloatArray) -> None:
+    """Draws (m, 2) residuals, before and after, one above the other."""
+    gap = np.full(len(places), np.nan)
+    stems = np.stack([places, places, gap], axis=1).ravel()
+    heights = np.stack([values[:, 0], values[:, 1], gap], axis=1).ravel()
+    panel.line(stems, heights, svg.LINE)
+    panel.marks(places, values[:, 0], "ring", _BEFORE)
+    panel.marks(places, values[:, 1], "dot", _AFTER)
 
 
-def _mark_rms(axes: Axes, values: FloatArray) -> None:
+def _mark_rms(panel: Panel, values: FloatArray) -> None:
     """Writes the root mean squares of (m, 2) residuals beside the panel."""
     # Apart from each other where both are alike.
     marks = ((_BEFORE, "bottom"), (_AFTER, "top"))
     for rms, (colour, side) in zip(np.sqrt(np.mean(values**2, axis=0)), marks, strict=True):
-        axes.annotate(
-            f"rms {significant(float(rms))}", (1.0, max(float(rms), _LEAST)), (6, 0), fontsize=8,
-            va=side, xycoords=("axes fraction", "data"), textcoords="offset points", color=colour,
-        )  # fmt: skip
+        x, y = panel.box.right + 6.0, float(panel.y_at(float(rms)))
+        words = f"rms {significant(float(rms))}"
+        panel.figure.text(x, y, words, size=svg.SMALL, colour=colour, rise=side)
 
 
-def _name_sets(axes: Axes, first_held: float) -> None:
+def _name_sets(panel: Panel, first_held: float) -> None:
     """Says above the panels which views are which."""
     for words, place in (("left out in turn", -0.4), ("held back by the session", first_held)):
-        axes.annotate(
-            words, (place, 1.0), (0, 4), xycoords=("data", "axes fraction"),
-            textcoords="offset points", fontsize=8, color=svg.MUTED,
-        )  # fmt: skip
+        x, y = float(panel.x_at(place)), panel.box.top - 4.0
+        panel.figure.text(x, y, words, size=svg.SMALL, colour=svg.MUTED)
 
 
 def side_map(found: ArmResult, stops_m: FloatArray) -> Markup:
@@ -142,26 +137,23 @@ def _map(
     order = np.argsort(found.map_sigmas_mm)
     low, high = np.percentile(found.map_sigmas_mm, [_LOW_PERCENT, _HIGH_PERCENT])
     ends = np.vstack([places_m, stops_m, np.zeros((1, 2))])
-    width, height = np.ptp(ends, axis=0)
-    share = min(height / max(width, 1e-9), _TALLEST)
-    with svg.style():
-        figure = svg.new_figure(_MAP_IN, 0.7 + 0.72 * _MAP_IN * share)
-        axes = figure.subplots()
-        coloured = axes.scatter(
-            places_m[order, 0], places_m[order, 1], c=found.map_sigmas_mm[order], cmap="plasma",
-            vmin=low, vmax=high, s=26, linewidths=0,
-        )  # fmt: skip
-        axes.plot(*stops_m.T, "x", color=svg.INK, markersize=4.5, markeredgewidth=0.9)
-        axes.plot(0.0, 0.0, "s", color=svg.INK, markersize=6)
-        bar = figure.colorbar(coloured, ax=axes, shrink=0.85, extend="both")
-        bar.locator = MaxNLocator(5)
-        bar.update_ticks()
-        bar.set_label("sigma [mm]")
-        bar.outline.set_visible(False)
-        axes.set_aspect("equal")
-        axes.set_xlabel(labels[0])
-        axes.set_ylabel(labels[1])
-        sigmas = f"{significant(low)} to {significant(high)} mm"
-        return svg.inline(
-            figure, f"workspace-{name}", f"The workspace from the {name}, sigma {sigmas}"
-        )
+    start, end = ends.min(axis=0), ends.max(axis=0)
+    spare = 0.05 * np.maximum(end - start, 1e-3)
+    start, end = start - spare, end + spare
+    share = min(float((end - start)[1] / (end - start)[0]), _TALLEST)
+    # A map that is too tall for the room is as high as that, and less wide.
+    figure = Figure(_MAP_IN, 0.6 + (_MAP_IN - 1.5) * share)
+    ((box,),) = boxes(figure, 1, 1, Margins(right=0.9))
+    box = box.shaped(float((end - start)[1] / (end - start)[0]))
+    panel = Panel(figure, box, Scale(start[0], end[0]), Scale(start[1], end[1]))
+    panel.x_axis(labels[0], 6)
+    panel.y_axis(labels[1], 6)
+    steps, colours = svg.shades(found.map_sigmas_mm[order], low, high, svg.PLASMA, _SHADES)
+    for step, colour in enumerate(colours):
+        some = places_m[order][steps == step]
+        panel.marks(some[:, 0], some[:, 1], "dot", colour, 5.1)
+    panel.marks(stops_m[:, 0], stops_m[:, 1], "x", svg.INK, 4.5)
+    panel.marks([0.0], [0.0], "square", svg.INK, 6.0)
+    panel.colour_bar(Scale(low, high), svg.PLASMA, "sigma [mm]")
+    sigmas = f"{significant(low)} to {significant(high)} mm"
+    return figure.inline(f"The workspace from the {name}, sigma {sigmas}")

@@ -3,13 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.collections import PolyCollection
-from matplotlib.ticker import MaxNLocator
-
 from visioncal.core.number_format import significant
 from visioncal.present.report import svg
+from visioncal.present.report.axes import Box, Panel, Scale
+from visioncal.present.report.svg import Figure
 
 _ROOM, _WIDTH = 1.25, 0.7
 
@@ -32,78 +29,73 @@ class Bar:
 
 
 def draw(
-    axes: Axes,
+    figure: Figure,
+    box: Box,
     bars: Sequence[Bar],
     rms: float | None,
     most_labels: int = 25,
     limit: float | None = None,
+    *,
+    titles: tuple[str, str] = ("", ""),
+    labelled: bool = True,
+    turned: bool = False,
 ) -> None:
     """Draws bars side by side; what exceeds the used ones' scale is clipped.
 
     Args:
-        axes: Where to.
+        figure: Where to.
+        box: Where in it.
         bars: From left to right.
         rms: Root mean square over the used ones, drawn as a line; None draws none.
         most_labels: How many labels have room below them.
         limit: Where doubt begins; a line where the scale holds it, else words. None for nothing.
+        titles: Of the axis below and of that at the left.
+        labelled: Whether bars have labels.
+        turned: Whether these stand upright.
     """
     known = [(place, bar, bar.value) for place, bar in enumerate(bars) if bar.value is not None]
-    unknown = [it for it in enumerate(bars) if it[1].value is None and not it[1].used]
     used = [value for _, bar, value in known if bar.used]
     top = _ROOM * max(used or [value for _, _, value in known], default=1.0) or 1.0
-    if known:
-        places, shown, values = zip(*known, strict=True)
-        colours = [bar.colour for bar in shown]
-        # One shape for all: a thousand rectangles take a second to be made.
-        heights, half = np.minimum(values, top), _WIDTH / 2
-        corners = [
-            [(at - half, 0.0), (at - half, it), (at + half, it), (at + half, 0.0)]
-            for at, it in zip(places, heights.tolist(), strict=True)
-        ]
-        axes.add_collection(PolyCollection(corners, facecolors=colours, alpha=0.9))
+    panel = Panel(figure, box, Scale(-0.7, len(bars) - 0.3), Scale(0.0, 1.2 * top))
+    step = max(1, -(-len(bars) // most_labels))
+    ticks = [(float(place), bars[place].label) for place in range(0, len(bars), step)]
+    panel.x_axis(titles[0], ticks, grid=False, words=labelled, turned=turned)
+    panel.y_axis(titles[1])
+    for colour in dict.fromkeys(bar.colour for _, bar, _ in known):
+        shown = [(place, value) for place, bar, value in known if bar.colour == colour]
+        panel.bars([it for it, _ in shown], [min(it, top) for _, it in shown], _WIDTH, colour)
     for place, bar, value in known:
         if not bar.used:
-            _mark(axes, place, bar, value, top)
-    for place, bar in unknown:
-        axes.plot(place, 0.05 * top, "x", color=bar.colour, markersize=5)
+            _mark(panel, place, bar, value, top)
+    for place, bar in enumerate(bars):
+        if bar.value is None and not bar.used:
+            panel.marks([place], [0.05 * top], "x", bar.colour, 5.0)
     if rms is not None:
-        axes.axhline(rms, color=svg.INK, linewidth=0.9, linestyle=(0, (4, 3)))
-        axes.annotate(
-            f"rms {significant(rms)}", (1.0, rms), (4, 0), xycoords=("axes fraction", "data"),
-            textcoords="offset points", fontsize=8, va="center",
-        )  # fmt: skip
+        panel.level(rms, svg.INK, dash=svg.DASHED)
+        words, at = f"rms {significant(rms)}", float(panel.y_at(rms))
+        figure.text(box.right + 4.0, at, words, size=svg.SMALL, rise="middle")
     if limit is not None:
-        _draw_limit(axes, limit, top)
-    axes.set_ylim(0.0, top * 1.2)
-    axes.set_xlim(-0.7, len(bars) - 0.3)
-    axes.grid(visible=False, axis="x")
-    axes.yaxis.set_major_locator(MaxNLocator(4))
-    step = max(1, -(-len(bars) // most_labels))
-    labelled = range(0, len(bars), step)
-    axes.set_xticks(list(labelled), [bars[place].label for place in labelled])
+        _draw_limit(panel, limit, top)
 
 
-def _draw_limit(axes: Axes, limit: float, top: float) -> None:
-    words, place = f"doubt from {limit:g}", (1.0, 1.0)
+def _draw_limit(panel: Panel, limit: float, top: float) -> None:
+    words, box = f"doubt from {limit:g}", panel.box
     if limit < top * 1.1:
-        axes.axhline(limit, color=svg.BAD, linewidth=0.9, linestyle=(0, (1, 2)))
-        axes.annotate(
-            words, (0.0, limit), (4, 2), xycoords=("axes fraction", "data"),
-            textcoords="offset points", fontsize=8, color=svg.BAD,
-        )  # fmt: skip
+        panel.level(limit, svg.BAD, dash=svg.DOTTED)
+        above = float(panel.y_at(limit)) - 2.0
+        panel.figure.text(box.left + 4.0, above, words, size=svg.SMALL, colour=svg.BAD)
         return
-    axes.annotate(
-        f"{words} \N{UPWARDS ARROW}", place, (0, -2), xycoords="axes fraction",
-        textcoords="offset points", fontsize=8, ha="right", va="top", color=svg.MUTED,
+    panel.figure.text(
+        box.right, box.top + 2.0, f"{words} \N{UPWARDS ARROW}", size=svg.SMALL, colour=svg.MUTED,
+        anchor="end", rise="top",
     )  # fmt: skip
 
 
-def _mark(axes: Axes, place: int, bar: Bar, value: float, top: float) -> None:
+def _mark(panel: Panel, place: int, bar: Bar, value: float, top: float) -> None:
     """Marks one that was not used, with its value where that lies beyond the scale."""
     clipped = value > top
-    axes.plot(place, min(value, top), "^" if clipped else "x", color=bar.colour, markersize=5)
+    panel.marks([place], [min(value, top)], "^" if clipped else "x", bar.colour, 5.0)
     if clipped:
-        axes.annotate(
-            significant(value), (place, top), (0, 5), textcoords="offset points",
-            fontsize=8, color=bar.colour, ha="center",
-        )  # fmt: skip
+        x, y = float(panel.x_at(place)), float(panel.y_at(top)) - 5.0
+        panel.figure.text(x, y, significant(value), size=svg.SMALL, colour=bar.colour,
+                          anchor="middle")  # fmt: skip

@@ -13,8 +13,10 @@ from visioncal.core.number_format import significant
 from visioncal.core.version import __version__
 from visioncal.present.recording import cellmap
 from visioncal.present.report import bars, content, network, svg, tools
+from visioncal.present.report.axes import Margins, boxes
 from visioncal.present.report.bars import Bar
 from visioncal.present.report.content import Fact
+from visioncal.present.report.svg import Figure
 from visioncal.results import HELD_BACK, Alignment, Calibration, CameraResult, Sight
 
 _DEG = "\N{DEGREE SIGN}"
@@ -241,15 +243,13 @@ def residuals(found: Alignment) -> Markup:
     shown = {seer: rows for seer, rows in mine.items() if any(it.residual_mm for it in rows)}
     if not shown:
         return Markup("")
-    with svg.style():
-        figure = svg.new_figure(_WIDE_IN, 1.45 * len(shown) + 0.25)
-        panels = figure.subplots(len(shown), squeeze=False)[:, 0]
-        for axes, (seer, rows) in zip(panels, shown.items(), strict=True):
-            bars.draw(axes, [_bar(it) for it in rows], _rms(rows))
-            axes.set_ylabel("mm")
-            axes.set_title(seer, loc="left", fontsize=9)
-        panels[-1].set_xlabel("view")
-        return svg.inline(figure, "cell-residuals", "Bars: residuals of each observation")
+    figure = Figure(_WIDE_IN, 1.45 * len(shown) + 0.25)
+    grid = boxes(figure, len(shown), 1, Margins(0.75, 0.75, top=0.25), (0.0, 0.45))
+    for (box,), (seer, rows) in zip(grid, shown.items(), strict=True):
+        title = "view" if box is grid[-1][0] else ""
+        bars.draw(figure, box, [_bar(it) for it in rows], _rms(rows), titles=(title, "mm"))
+        figure.text(box.left, box.top - 5.0, seer)
+    return figure.inline("Bars: residuals of each observation")
 
 
 def _bar(sight: Sight) -> Bar:

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 from markupsafe import Markup
-from matplotlib.axes import Axes
-from matplotlib.ticker import MaxNLocator
 
 from visioncal.core.files import write_atomically
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Verdict
 from visioncal.core.version import __version__
 from visioncal.present.report import svg
+from visioncal.present.report.axes import Margins, Panel, Scale, boxes
+from visioncal.present.report.svg import Figure
 from visioncal.present.report.templating import template
 
 _WIDE_IN, _HIGH_IN = 9.2, 3.6
@@ -100,33 +100,26 @@ def render_check(page: CheckPage) -> str:
 
 def _residuals(page: CheckPage) -> Markup:
     """Residuals stop by stop: as the calibration has the cell, and with the change undone."""
-    with svg.style():
-        figure = svg.new_figure(_WIDE_IN, _HIGH_IN)
-        position, rotation = figure.subplots(2, 1, sharex=True)
-        for column, axes, label in (
-            (0, position, "position [mm]"),
-            (1, rotation, "rotation [deg]"),
-        ):
-            _bars(axes, page, column)
-            axes.set_ylabel(label)
-        step = -(-len(page.stops) // _MOST_LABELS)
-        places = range(0, len(page.stops), step)
-        rotation.set_xticks(list(places), [page.stops[it] for it in places])
-        rotation.set_xlabel("stop, by its views")
-        if page.undone:
-            figure.legend(*position.get_legend_handles_labels(), loc="outside upper right", ncols=2)
-        return svg.inline(figure, "check", "Residuals of each stop, before and after the change")
-
-
-def _bars(axes: Axes, page: CheckPage, column: int) -> None:
-    places = np.arange(len(page.stops))
+    count, sides = len(page.stops), [("as calibrated", svg.ACCENT, page.before)]
     if page.undone:
-        colours = svg.BAD, svg.ACCENT
-        axes.bar(places - 0.5 * _BAR, page.before[:, column], _BAR, color=colours[0],
-                 label="as calibrated")  # fmt: skip
-        axes.bar(places + 0.5 * _BAR, page.after[:, column], _BAR, color=colours[1],
-                 label="with the change undone")  # fmt: skip
-    else:
-        axes.bar(places, page.before[:, column], 1.5 * _BAR, color=svg.ACCENT)
-    axes.grid(visible=False, axis="x")
-    axes.yaxis.set_major_locator(MaxNLocator(4))
+        sides = [("as calibrated", svg.BAD, page.before),
+                 ("with the change undone", svg.ACCENT, page.after)]  # fmt: skip
+    step = -(-count // _MOST_LABELS)
+    ticks = [(float(it), page.stops[it]) for it in range(0, count, step)]
+    figure = Figure(_WIDE_IN, _HIGH_IN)
+    rows = boxes(figure, 2, 1, Margins(0.75, top=0.3), (0.0, 0.2))
+    for column, label in enumerate(("position [mm]", "rotation [deg]")):
+        ((box,), last) = (rows[column], column == 1)
+        top = 1.05 * max(float(values[:, column].max()) for *_, values in sides) or 1.0
+        panel = Panel(figure, box, Scale(-0.7, count - 0.3), Scale(0.0, top))
+        panel.x_axis("stop, by its views" if last else "", ticks, grid=False, words=last)
+        panel.y_axis(label)
+        for side, (_, colour, values) in enumerate(sides):
+            # Side by side where there are two.
+            shift = (side - 0.5) * _BAR if page.undone else 0.0
+            width = _BAR if page.undone else 1.5 * _BAR
+            panel.bars([it + shift for it in range(count)], values[:, column], width, colour)
+    if page.undone:
+        entries = [("\N{BLACK SQUARE}", colour, words) for words, colour, _ in sides]
+        figure.legend(rows[0][0].right, 12.0, entries)
+    return figure.inline("Residuals of each stop, before and after the change")

@@ -14,7 +14,7 @@ _COLOURS = (
     "--ink:#1c2733;--muted:#5c6b7a;--line:#cfd6dd;--accent:#1f6fb2;--good:#2e7d32;--bad:#c62828;"
     "--check:#b26a00;--card:#ffffff;background:#fff"
 )
-_SPACES = 'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink"'
+_SPACE = 'xmlns="http://www.w3.org/2000/svg"'
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Drawing:
         """Writes it as an .svg, whole or not at all."""
         begin = self.markup.index("<svg")
         text = self.markup[begin : self.markup.rindex("</svg>") + len("</svg>")]
-        begun = f'<svg {_SPACES} style="{_COLOURS}"'
+        begun = f'<svg {_SPACE} style="{_COLOURS};font-family:sans-serif"'
         write_atomically(Path(path), text.replace("<svg", begun, 1))
 
 

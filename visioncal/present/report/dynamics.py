@@ -108,8 +108,8 @@ def render_dynamics(run: Run) -> str:
 
 def _plots(shown: Sequence[tuple[Prediction, str]]) -> Iterator[tuple[str, Markup]]:
     """Torques over time, with a title each."""
-    for number, (prediction, how) in enumerate(shown, start=1):
-        yield f"{prediction.label}, {how}", torqueplots.torques(prediction, number)
+    for prediction, how in shown:
+        yield f"{prediction.label}, {how}", torqueplots.torques(prediction)
 
 
 def _key_figures(identified: Identified) -> Iterator[Fact]:

@@ -46,9 +46,6 @@ def write_report(
 ) -> None:
     """Writes the report as one HTML file that needs no network and no script.
 
-    Several threads may do so at once; their figures are drawn one at a time, since matplotlib's
-    settings are the process's. Nothing else may use matplotlib meanwhile.
-
     Args:
         path: The file to write; it appears whole or not at all.
         calibration: What to report.

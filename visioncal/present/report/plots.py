@@ -1,20 +1,21 @@
 """The report's plots: residuals, image coverage and coverage of orientations."""
 
+import base64
 from collections.abc import Callable, Collection, Sequence
-from typing import Any
 
+import cv2
 import numpy as np
 from markupsafe import Markup
-from matplotlib.axes import Axes
-from matplotlib.ticker import MaxNLocator
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.transforms import nearest_rotation
-from visioncal.core.types import FloatArray
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.present.report import bars, svg
 from visioncal.present.report.advice import contradicts
+from visioncal.present.report.axes import Box, Margins, Panel, Scale, boxes
 from visioncal.present.report.bars import Bar
+from visioncal.present.report.svg import Figure
 from visioncal.results import Calibration, ViewResult
 from visioncal.results.evidence import ViewEvidence
 
@@ -22,6 +23,8 @@ from visioncal.results.evidence import ViewEvidence
 _MANY_MARKS = 2500
 # Widths of figures, such that their text is as large as the page's.
 _WIDE_IN, _SMALL_IN = 9.2, 3.7
+# Colours that errors have, and how large dots are: in points, and of a bitmap in its pixels.
+_SHADES, _DOT_PT, _DOTS_A_POINT, _DOT_REACH = 24, 2.2, 2.0, 2
 
 
 def residuals(calibration: Calibration, outlying: Collection[int] = ()) -> Markup:
@@ -48,31 +51,15 @@ def residuals(calibration: Calibration, outlying: Collection[int] = ()) -> Marku
     shown = [it for it in panels if any(it[1](view) is not None for view in calibration.views)]
     if not shown:
         return Markup("")
-    with svg.style():
-        figure = svg.new_figure(_WIDE_IN, 1.3 * len(shown) + 0.25, svg.Margins(0.75, 0.75))
-        rows = figure.subplots(len(shown), sharex=True, squeeze=False)[:, 0]
-        for axes, (label, value_of, rms, limit) in zip(rows, shown, strict=True):
-            _residual_panel(axes, calibration.views, value_of, rms, outlying, limit)
-            axes.set_ylabel(label)
-        rows[-1].set_xlabel("view")
-        return svg.inline(figure, "residuals", "Bars: residuals of each view")
-
-
-def _residual_panel(
-    axes: Axes,
-    views: Sequence[ViewResult],
-    value_of: Callable[[ViewResult], float | None],
-    rms: float | None,
-    outlying: Collection[int],
-    limit: float | None,
-) -> None:
-    """Bars by the view's place in the session."""
-    bars.draw(
-        axes,
-        [Bar(str(it.view), value_of(it), it.used, _colour(it, outlying)) for it in views],
-        rms,
-        limit=limit,
-    )
+    figure = Figure(_WIDE_IN, 1.3 * len(shown) + 0.25)
+    rows = boxes(figure, len(shown), 1, Margins(0.75, 0.75))
+    for (box,), (label, value_of, rms, limit) in zip(rows, shown, strict=True):
+        last = box is rows[-1][0]
+        marked = [Bar(str(it.view), value_of(it), it.used, _colour(it, outlying))
+                  for it in calibration.views]  # fmt: skip
+        bars.draw(figure, box, marked, rms, limit=limit, labelled=last,
+                  titles=("view" if last else "", label))  # fmt: skip
+    return figure.inline("Bars: residuals of each view")
 
 
 def _colour(view: ViewResult, outlying: Collection[int]) -> str:
@@ -91,28 +78,45 @@ def image_coverage(calibration: Calibration, evidence: Sequence[ViewEvidence]) -
     errors = np.concatenate([corner_errors(it) for it in seen])
     known = np.isfinite(errors)
     width, height = calibration.camera.camera.resolution
-    with svg.style():
-        figure = svg.new_figure(
-            _SMALL_IN, 0.5 + 0.75 * _SMALL_IN * height / width, svg.Margins(right=0.25)
-        )
-        axes = figure.subplots()
-        marks: dict[str, Any] = {"s": 5, "linewidths": 0, "rasterized": len(px) > _MANY_MARKS}
-        axes.scatter(px[~known, 0], px[~known, 1], color=svg.ACCENT, **marks)
-        if known.any():
-            top = float(np.percentile(errors[known], 98))
-            marks |= {"c": errors[known], "cmap": "plasma", "vmin": 0.0, "vmax": top}
-            coloured = axes.scatter(px[known, 0], px[known, 1], **marks)
-            bar = figure.colorbar(coloured, ax=axes, shrink=0.8, extend="max")
-            bar.set_label("reprojection error [px]")
-            bar.outline.set_visible(False)
-        axes.set_xlim(-0.5, width - 0.5)
-        axes.set_ylim(height - 0.5, -0.5)
-        axes.set_aspect("equal")
-        for spine in axes.spines.values():
-            spine.set_visible(True)
-        axes.set_xlabel("image x [px]")
-        axes.set_ylabel("image y [px]")
-        return svg.inline(figure, "coverage", "Corners of all used views over the image")
+    errors_known = bool(known.any())
+    margins = Margins(right=0.85 if errors_known else 0.15)
+    wide = _SMALL_IN - margins.left - margins.right
+    figure = Figure(_SMALL_IN, margins.top + wide * height / width + margins.bottom)
+    ((box,),) = boxes(figure, 1, 1, margins)
+    across, down = Scale(-0.5, width - 0.5), Scale(height - 0.5, -0.5)
+    panel = Panel(figure, box.shaped(height / width), across, down)
+    panel.x_axis("image x [px]", 4)
+    panel.y_axis("image y [px]", 5)
+    panel.frame()
+    top = float(np.percentile(errors[known], 98)) if errors_known else 1.0
+    steps, colours = svg.shades(errors[known], 0.0, top, svg.PLASMA, _SHADES)
+    layers = [(px[~known], svg.ACCENT), *((px[known][steps == it], colours[it])
+                                          for it in range(_SHADES))]  # fmt: skip
+    if len(px) > _MANY_MARKS and errors_known:
+        _draw_bitmap(panel, px[known], steps, colours)
+    else:
+        for places, colour in layers:
+            panel.marks(places[:, 0], places[:, 1], "dot", colour, _DOT_PT)
+    if errors_known:
+        panel.colour_bar(Scale(0.0, top), svg.PLASMA, "reprojection error [px]")
+    return figure.inline("Corners of all used views over the image")
+
+
+def _draw_bitmap(panel: Panel, px: FloatArray, steps: IntArray, colours: Sequence[str]) -> None:
+    """Draws coloured dots as pixels."""
+    box: Box = panel.box
+    size = np.array([box.right - box.left, box.bottom - box.top]) * _DOTS_A_POINT
+    image = np.zeros((int(size[1]) + 1, int(size[0]) + 1, 4), np.uint8)
+    shades = np.array([[int(it[k : k + 2], 16) for k in (5, 3, 1)] for it in colours])
+    shares = np.stack([panel.x.shares(px[:, 0]), 1.0 - panel.y.shares(px[:, 1])], axis=1)
+    middle = np.round(shares * size - 0.5).astype(int)
+    reach = range(-_DOT_REACH, _DOT_REACH + 1)
+    for shift in ((i, j) for i in reach for j in reach if abs(i) + abs(j) < 2 * _DOT_REACH):
+        x, y = np.clip(middle + shift, 0, size.astype(int)).T
+        image[y, x, :3], image[y, x, 3] = shades[steps], 255
+    encoded = cv2.imencode(".png", image)[1].tobytes()
+    uri = "data:image/png;base64," + base64.b64encode(encoded).decode("ascii")
+    panel.figure.image(box.left, box.top, box.right - box.left, box.bottom - box.top, uri)
 
 
 def corner_errors(evidence: ViewEvidence) -> FloatArray:
@@ -130,25 +134,53 @@ def viewing_directions(calibration: Calibration, evidence: Sequence[ViewEvidence
     if not poses or calibration.mount == "instrument":
         return Markup("")
     used = {view.view for view in calibration.views if view.used}
-    with svg.style():
-        figure = svg.new_figure(_SMALL_IN, 3.0, svg.Margins(0.5, 0.5, 0.4, 0.4))
-        axes = figure.add_subplot(projection="polar")
-        for is_used, mark, colour, label in (
-            (True, "o", svg.ACCENT, "used"),
+    seen = [
+        (mark, colour, words, *_tilt(np.stack(some)))
+        for is_used, mark, colour, words in (
+            (True, "dot", svg.ACCENT, "used"),
             (False, "x", svg.BAD, "not used"),
-        ):
-            some = [pose for view, pose in poses.items() if (view in used) is is_used]
-            if some:
-                azimuth, tilt_deg = _tilt(np.stack(some))
-                axes.plot(azimuth, tilt_deg, mark, color=colour, markersize=4.5, label=label)
-        axes.set_theta_direction(-1)  # type: ignore[attr-defined]
-        axes.set_xticks(np.arange(0.0, 2 * np.pi, np.pi / 2), ["x", "y", "-x", "-y"])
-        axes.set_ylim(0.0, max(45.0, 5.0 + axes.get_ylim()[1]))
-        axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
-        axes.yaxis.set_major_formatter(lambda value, _: f"{value:.0f}\N{DEGREE SIGN}")
-        if len(axes.lines) > 1:
-            axes.legend(loc="lower left", bbox_to_anchor=(-0.32, -0.08))
-        return svg.inline(figure, "directions", "Where the camera looked from")
+        )
+        if (some := [pose for view, pose in poses.items() if (view in used) is is_used])
+    ]
+    top = max(45.0, *(5.0 + float(tilt_deg.max()) for *_, tilt_deg in seen))
+    figure = Figure(_SMALL_IN, 3.0)
+    middle, radius = 0.5 * figure.width, 0.5 * figure.height - 24.0
+    box = Box(middle - radius, 24.0, middle + radius, 24.0 + 2.0 * radius)
+    panel = Panel(figure, box, Scale(-top, top), Scale(top, -top))
+    _draw_rings(panel, [it for it in Scale(0.0, top).ticks(4, whole=True) if it > 0.0], top)
+    for mark, colour, _, azimuth, tilt_deg in seen:
+        # Azimuths go clockwise, as y of the target goes down.
+        panel.marks(tilt_deg * np.cos(azimuth), tilt_deg * np.sin(azimuth), mark, colour)
+    if len(seen) > 1:
+        signs = {"dot": "\N{BLACK CIRCLE}", "x": "\N{MULTIPLICATION SIGN}"}
+        entries = [(signs[mark], colour, words) for mark, colour, words, *_ in seen]
+        figure.legend(4.0, figure.height - 4.0, entries, anchor="start")
+    return figure.inline("Where the camera looked from")
+
+
+def _draw_rings(panel: Panel, rings_deg: Sequence[float], top_deg: float) -> None:
+    """Draws the lines of equal tilt with their degrees, and the target's axes."""
+    figure, box = panel.figure, panel.box
+    x, y = 0.5 * (box.left + box.right), 0.5 * (box.top + box.bottom)
+    radius = 0.5 * (box.right - box.left)
+    for tilt_deg in (*rings_deg, top_deg):
+        r = radius * tilt_deg / top_deg
+        ring = f"a{r:.1f} {r:.1f} 0 1 0 {2 * r:.1f} 0a{r:.1f} {r:.1f} 0 1 0 -{2 * r:.1f} 0z"
+        figure.path(f"M{x - r:.1f} {y:.1f}{ring}", stroke=svg.LINE, width=0.6)
+    cross = f"M{box.left:.1f} {y:.1f}H{box.right:.1f}M{x:.1f} {box.top:.1f}V{box.bottom:.1f}"
+    figure.path(cross, stroke=svg.LINE, width=0.6)
+    for tilt_deg in rings_deg:
+        # Along a line between two axes.
+        at = radius * tilt_deg / top_deg
+        words = f"{tilt_deg:.0f}\N{DEGREE SIGN}"
+        figure.text(x + 0.92 * at, y - 0.38 * at, words, colour=svg.MUTED)
+    for words, across, down, anchor in (
+        ("x", radius + 6.0, 0.0, "start"),
+        ("y", 0.0, radius + 9.0, "middle"),
+        ("-x", -radius - 6.0, 0.0, "end"),
+        ("-y", 0.0, -radius - 9.0, "middle"),
+    ):
+        figure.text(x + across, y + down, words, colour=svg.MUTED, anchor=anchor, rise="middle")
 
 
 def _tilt(cam_from_target: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -171,16 +203,12 @@ def flange_rotations(calibration: Calibration, evidence: Sequence[ViewEvidence])
     rotations = np.stack(poses)[:, :3, :3]
     base_from_mean = nearest_rotation(rotations.mean(axis=0))
     turns_deg = np.rad2deg(Rotation.from_matrix(base_from_mean.T @ rotations).as_rotvec())
-    with svg.style():
-        figure = svg.new_figure(_SMALL_IN, 2.0, svg.Margins(left=0.5))
-        axes = figure.subplots()
-        for row in range(3):
-            axes.plot(turns_deg[:, row], np.full(len(turns_deg), row), "|", color=svg.ACCENT,
-                      markersize=17, markeredgewidth=1.4)  # fmt: skip
-        axes.set_yticks(range(3), ["x", "y", "z"])
-        axes.set_ylim(2.6, -0.6)
-        reach = max(10.0, 1.1 * float(np.abs(turns_deg).max()))
-        axes.set_xlim(-reach, reach)
-        axes.set_xlabel("rotation from the mean orientation [deg]")
-        axes.set_ylabel("flange axis")
-        return svg.inline(figure, "rotations", "Rotations of the flange in the used views")
+    reach = max(10.0, 1.1 * float(np.abs(turns_deg).max()))
+    figure = Figure(_SMALL_IN, 2.0)
+    ((box,),) = boxes(figure, 1, 1, Margins(left=0.5))
+    panel = Panel(figure, box, Scale(-reach, reach), Scale(2.6, -0.6))
+    panel.x_axis("rotation from the mean orientation [deg]")
+    panel.y_axis("flange axis", [(0.0, "x"), (1.0, "y"), (2.0, "z")])
+    for row in range(3):
+        panel.marks(turns_deg[:, row], np.full(len(turns_deg), row), "|", svg.ACCENT, 17.0)
+    return figure.inline("Rotations of the flange in the used views")

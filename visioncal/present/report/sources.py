@@ -1,20 +1,23 @@
 """Plots of what makes a result uncertain: sources, directions, and the board's shape."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from markupsafe import Markup
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
-from matplotlib.tri import Triangulation, UniformTriRefiner
 
 from visioncal.core.number_format import significant
-from visioncal.core.types import Target
+from visioncal.core.types import FloatArray, IntArray, Target
 from visioncal.present.recording.words import SOURCES
 from visioncal.present.report import svg
+from visioncal.present.report.axes import Margins, Panel, Scale, boxes
+from visioncal.present.report.svg import Figure
 from visioncal.results.sections import BoardResult, UncertaintyResult
 
 _WIDTH_IN = 5.0
 # Mean width of a letter, rounded up.
 _LETTER_IN = 0.068
-_LEVELS, _FINER = 13, 3
+# Steps of colour, and cells of the map of a board across it.
+_LEVELS, _CELLS = 13, 96
 # Height over width of the picture of an upright board.
 _TALLEST = 0.8
 # Less depth than this is rounding.
@@ -30,25 +33,21 @@ def budget(found: UncertaintyResult) -> Markup:
     ]
     labels.append(significant(found.total_mm))
     top = max(values) or 1.0
-    with svg.style():
-        words = [SOURCES.get(it, it) for it in names]
-        margins = svg.Margins(0.2 + _LETTER_IN * max(map(len, words)))
-        figure = svg.new_figure(_WIDTH_IN, 0.32 * len(names) + 0.6, margins)
-        axes = figure.subplots()
-        colours = [svg.ACCENT] * len(found.parts_mm) + [svg.INK]
-        axes.barh(range(len(names)), values, height=0.6, color=colours, alpha=0.9)
-        for row, (value, label) in enumerate(zip(values, labels, strict=True)):
-            axes.annotate(
-                label, (value, row), (4, 0), textcoords="offset points", fontsize=8, va="center"
-            )
-        axes.set_yticks(range(len(names)), words)
-        axes.set_ylim(len(names) - 0.5, -0.5)
-        # Room for the labels beside the longest bar.
-        axes.set_xlim(0.0, 1.55 * top)
-        axes.xaxis.set_major_locator(MaxNLocator(4))
-        axes.grid(visible=False, axis="y")
-        axes.set_xlabel("sigma of the point's place [mm]")
-        return svg.inline(figure, "budget", "Bars: standard deviation by source")
+    words = [SOURCES.get(it, it) for it in names]
+    figure = Figure(_WIDTH_IN, 0.32 * len(names) + 0.6)
+    margins = Margins(0.2 + _LETTER_IN * max(map(len, words)))
+    ((box,),) = boxes(figure, 1, 1, margins)
+    # Room for the labels beside the longest bar.
+    panel = Panel(figure, box, Scale(0.0, 1.55 * top), Scale(len(names) - 0.5, -0.5))
+    panel.x_axis("sigma of the point's place [mm]", 4)
+    panel.y_axis("", [(float(row), it) for row, it in enumerate(words)], grid=False)
+    for row, (value, label) in enumerate(zip(values, labels, strict=True)):
+        end, high = float(panel.x_at(value)), panel.y_at([row + 0.3, row - 0.3]).tolist()
+        bar = f"M{box.left:.1f} {high[0]:.1f}V{high[1]:.1f}H{end:.1f}V{high[0]:.1f}z"
+        colour = svg.INK if names[row] == "total" else svg.ACCENT
+        figure.path(bar, fill=colour, opacity=0.9)
+        figure.text(end + 4.0, 0.5 * sum(high), label, size=svg.SMALL, rise="middle")
+    return figure.inline("Bars: standard deviation by source")
 
 
 def directions(found: UncertaintyResult) -> Markup:
@@ -56,30 +55,16 @@ def directions(found: UncertaintyResult) -> Markup:
     values = found.spectrum[found.spectrum > 0.0]
     if not len(values):
         return Markup("")
-    with svg.style():
-        figure = svg.new_figure(_WIDTH_IN, 1.0, svg.Margins(left=0.15))
-        axes = figure.subplots()
-        axes.plot(values, np.zeros(len(values)), "|", color=svg.ACCENT, markersize=18,
-                  markeredgewidth=1.6)  # fmt: skip
-        axes.axvline(1.0, color=svg.BAD, linewidth=1.4)
-        axes.annotate(
-            "limit", (1.0, 1.0), (4, -9), xycoords=("data", "axes fraction"),
-            textcoords="offset points", fontsize=8, color=svg.BAD,
-        )  # fmt: skip
-        axes.set_xscale("log")
-        axes.set_xlim(min(1e-2, 0.5 * float(values.min())), max(2.5, 1.5 * float(values.max())))
-        axes.set_ylim(-1.0, 1.0)
-        axes.yaxis.set_major_locator(NullLocator())
-        axes.xaxis.set_major_locator(LogLocator(numticks=8))
-        axes.xaxis.set_minor_locator(NullLocator())
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axes.spines["left"].set_visible(False)
-        axes.set_xlabel("sigma / largest accepted")
-        return svg.inline(
-            figure,
-            "spectrum",
-            "Sigmas of the directions, and the limit",
-        )
+    low, high = min(1e-2, 0.5 * float(values.min())), max(2.5, 1.5 * float(values.max()))
+    figure = Figure(_WIDTH_IN, 1.0)
+    ((box,),) = boxes(figure, 1, 1, Margins(left=0.15))
+    panel = Panel(figure, box, Scale(low, high, decades=True), Scale(-1.0, 1.0))
+    panel.x_axis("sigma / largest accepted", 8)
+    panel.marks(values, np.zeros(len(values)), "|", svg.ACCENT, 18.0)
+    panel.post(1.0, svg.BAD, 1.4)
+    at = float(panel.x_at(1.0)) + 4.0
+    figure.text(at, box.top + 9.0, "limit", size=svg.SMALL, colour=svg.BAD)
+    return figure.inline("Sigmas of the directions, and the limit")
 
 
 def board_shape(board: BoardResult, target: Target, name: str = "") -> Markup:
@@ -88,25 +73,58 @@ def board_shape(board: BoardResult, target: Target, name: str = "") -> Markup:
     reach = float(np.abs(depth_mm).max())
     if not board.is_bent or reach < _LEAST_DEPTH_MM:
         return Markup("")
-    width, height = np.ptp(x_mm), np.ptp(y_mm)
-    with svg.style():
-        figure = svg.new_figure(_WIDTH_IN, 0.7 + 0.75 * _WIDTH_IN * min(height / width, _TALLEST))
-        axes = figure.subplots()
-        levels = np.linspace(-reach, reach, _LEVELS)
-        finer, smooth_mm = UniformTriRefiner(Triangulation(x_mm, y_mm)).refine_field(
-            depth_mm, subdiv=_FINER
-        )
-        smooth_mm = np.clip(smooth_mm, -reach, reach)
-        filled = axes.tricontourf(finer, smooth_mm, levels, cmap="coolwarm")
-        axes.plot(x_mm, y_mm, ".", color="#202020", markersize=2.0, clip_on=False)
-        bar = figure.colorbar(filled, ax=axes, shrink=0.85)
-        bar.locator = MaxNLocator(5)
-        bar.update_ticks()
-        bar.set_label("depth [mm]")
-        axes.set_aspect("equal")
-        axes.invert_yaxis()
-        axes.grid(visible=False)
-        axes.set_xlabel("target x [mm]")
-        axes.set_ylabel("target y [mm]")
-        slug = f"board_{name}".removesuffix("_")
-        return svg.inline(figure, slug, f"Depth of the board {name}".strip() + " over its plane")
+    (left, right), (above, below) = ((it.min(), it.max()) for it in (x_mm, y_mm))
+    share = (below - above) / (right - left)
+    figure = Figure(_WIDTH_IN, 0.7 + 0.75 * _WIDTH_IN * min(share, _TALLEST))
+    ((box,),) = boxes(figure, 1, 1, Margins(right=0.85))
+    # Wider by half a cell at each side: a cell lies about its place.
+    columns = _CELLS
+    rows = max(round(columns * share), 2)
+    x, y = np.linspace(left, right, columns), np.linspace(above, below, rows)
+    half_x, half_y = 0.5 * (x[1] - x[0]), 0.5 * (y[1] - y[0])
+    panel = Panel(
+        figure,
+        box.shaped((below - above + 2.0 * half_y) / (right - left + 2.0 * half_x)),
+        Scale(left - half_x, right + half_x),
+        Scale(below + half_y, above - half_y),
+    )
+    panel.x_axis("target x [mm]", grid=False)
+    panel.y_axis("target y [mm]", 5, grid=False)
+    depths = _between(x_mm, y_mm, depth_mm, *np.meshgrid(x, y))
+    steps, colours = svg.shades(depths.ravel(), -reach, reach, svg.COOLWARM, _LEVELS)
+    _draw_map(panel, steps.reshape(depths.shape), colours)
+    panel.marks(x_mm, y_mm, "dot", "#202020", 1.4)
+    panel.colour_bar(Scale(-reach, reach), svg.COOLWARM, "depth [mm]")
+    return figure.inline(f"Depth of the board {name}".strip() + " over its plane")
+
+
+def _between(
+    x: FloatArray, y: FloatArray, depth: FloatArray, to_x: FloatArray, to_y: FloatArray
+) -> FloatArray:
+    """Depths between the corners: a bent board's is a polynomial of the third degree."""
+    terms = [(a, b) for a in range(4) for b in range(4 - a)]
+    centre, size = np.array([x.mean(), y.mean()]), max(np.ptp(x), np.ptp(y))
+
+    def powers(u: FloatArray, v: FloatArray) -> FloatArray:
+        u, v = (u - centre[0]) / size, (v - centre[1]) / size
+        return np.stack([u**a * v**b for a, b in terms], axis=-1)
+
+    found = np.linalg.lstsq(powers(x, y), depth, rcond=None)[0]
+    return np.asarray(powers(to_x, to_y) @ found)
+
+
+def _draw_map(panel: Panel, steps: IntArray, colours: Sequence[str]) -> None:
+    """Fills cells, those side by side of one colour as one."""
+    box, (rows, columns) = panel.box, steps.shape
+    wide, high = (box.right - box.left) / columns, (box.bottom - box.top) / rows
+    data: dict[str, list[str]] = {it: [] for it in colours}
+    for row in range(rows):
+        ends = [*np.flatnonzero(np.diff(steps[row])) + 1, columns]
+        for first, last in zip([0, *ends], ends, strict=False):
+            # A little larger, that nothing shows through between them.
+            size = f"h{(last - first) * wide + 0.2:.2f}v{high + 0.2:.2f}H"
+            start = f"{box.left + first * wide:.2f}"
+            part = f"M{start} {box.top + row * high:.2f}{size}{start}z"
+            data[colours[steps[row, first]]].append(part)
+    for colour, parts in data.items():
+        panel.figure.path("".join(parts), fill=colour)

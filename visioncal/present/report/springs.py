@@ -10,10 +10,14 @@ from visioncal.core.number_format import significant
 from visioncal.present.recording.armtext import spring_words
 from visioncal.present.recording.words import joint_words
 from visioncal.present.report import svg
+from visioncal.present.report.axes import Margins, Panel, boxes, spanning
 from visioncal.present.report.content import Fact
+from visioncal.present.report.svg import Figure
 from visioncal.results.arm import ElasticResult
 
 _COLUMNS, _WIDE_IN, _HIGH_IN = 3, 9.2, 2.3
+# Between the panels, for their labels.
+_ACROSS_IN, _DOWN_IN = 0.75, 0.75
 
 
 @dataclass(frozen=True)
@@ -62,18 +66,19 @@ def deflection_against_load(elastic: ElasticResult) -> Markup:
     if not told:
         return Markup("")
     rows = -(-len(told) // _COLUMNS)
-    with svg.style():
-        figure = svg.new_figure(_WIDE_IN, _HIGH_IN * rows)
-        panels = figure.subplots(rows, _COLUMNS, squeeze=False).ravel()
-        for axes, (spring, points) in zip(panels, told.items(), strict=False):
-            torques_nm, bends_mrad = points.T
-            ends = np.array([min(torques_nm.min(), 0.0), max(torques_nm.max(), 0.0)])
-            slope = 1e3 * spring.compliance_rad_per_nm
-            axes.plot(ends, slope * ends, color=svg.LINE, linewidth=1.6)
-            axes.plot(torques_nm, bends_mrad, "o", color=svg.ACCENT, markersize=3.0)
-            axes.set_title(joint_words(spring.joint), fontsize=9)
-            axes.set_xlabel("torque [N m]")
-            axes.set_ylabel("bend [mrad]")
-        for axes in panels[len(told) :]:
-            axes.set_axis_off()
-        return svg.inline(figure, "springs", "How far each joint bends over the torque on it")
+    figure = Figure(_WIDE_IN, _HIGH_IN * rows)
+    gaps_in = (_ACROSS_IN, _DOWN_IN)
+    grid = boxes(figure, rows, _COLUMNS, Margins(top=0.25), gaps_in)
+    panels = (box for row in grid for box in row)
+    for box, (spring, points) in zip(panels, told.items(), strict=False):
+        torques_nm, bends_mrad = points.T
+        ends = np.array([min(torques_nm.min(), 0.0), max(torques_nm.max(), 0.0)])
+        line = 1e3 * spring.compliance_rad_per_nm * ends
+        heights = spanning(np.concatenate([bends_mrad, line]))
+        panel = Panel(figure, box, spanning(ends), heights)
+        panel.x_axis("torque [N m]", 5)
+        panel.y_axis("bend [mrad]", 5)
+        panel.title(joint_words(spring.joint))
+        panel.line(ends, line, svg.LINE)
+        panel.marks(torques_nm, bends_mrad, "dot", svg.ACCENT, 4.0)
+    return figure.inline("How far each joint bends over the torque on it")

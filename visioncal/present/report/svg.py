@@ -1,126 +1,201 @@
-"""Figures as inline SVG whose text stays text and whose colours follow the page's theme."""
+"""Figures as inline SVG whose text stays text and whose colours follow the page's theme.
 
-import io
-import re
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any
+They are written by hand: a plotting library takes longer to load than a session to be calibrated.
+"""
 
-import matplotlib as mpl
+from collections.abc import Sequence
+
+import numpy as np
 from markupsafe import Markup, escape
-from matplotlib.backends.backend_svg import FigureCanvasSVG
-from matplotlib.figure import Figure
-from matplotlib.typing import RcKeyType
 
-from visioncal.core.threads import DRAWING
+from visioncal.core.types import FloatArray
 
-# Drawn with these stand-ins, figures get the page's own colours, in light, dark and print alike.
-INK, MUTED, LINE = "#010101", "#020202", "#030303"
-ACCENT, GOOD, BAD, CHECK = "#040404", "#050505", "#060606", "#070707"
-CARD = "#080808"
-_THEME = {
-    INK: "var(--ink)",
-    MUTED: "var(--muted)",
-    LINE: "var(--line)",
-    ACCENT: "var(--accent)",
-    GOOD: "var(--good)",
-    BAD: "var(--bad)",
-    CHECK: "var(--check)",
-    CARD: "var(--card)",
-}
-
-_STYLE: dict[RcKeyType, Any] = {
-    "svg.fonttype": "none",
-    "path.simplify": False,
-    "lines.solid_capstyle": "butt",
-    "font.family": ["DejaVu Sans"],
-    "font.size": 9.0,
-    "figure.facecolor": "none",
-    "axes.facecolor": "none",
-    "axes.edgecolor": LINE,
-    "axes.labelcolor": INK,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": LINE,
-    "grid.linewidth": 0.6,
-    "text.color": INK,
-    "xtick.color": LINE,
-    "ytick.color": LINE,
-    "xtick.labelcolor": MUTED,
-    "ytick.labelcolor": MUTED,
-    "legend.frameon": False,
-    "legend.fontsize": 8.0,
-}
-_NO_METADATA = {"Date": None, "Creator": None, "Format": None, "Type": None}
+# The page states its colours, in light, dark and print.
+INK, MUTED, LINE = "var(--ink)", "var(--muted)", "var(--line)"
+ACCENT, GOOD, BAD, CHECK = "var(--accent)", "var(--good)", "var(--bad)", "var(--check)"
+CARD = "var(--card)"
+# Dashes and gaps of lines [points].
+DASHED, DOTTED = "3.6 2.7", "0.9 1.8"
+SIZE, SMALL = 9.0, 8.0
+# Stops of colour scales, from low to high (red, green, blue): matplotlib's, by equal steps.
+PLASMA = (
+    (13, 8, 135), (76, 2, 161), (126, 3, 168), (170, 35, 149), (204, 71, 120), (230, 108, 92),
+    (248, 149, 64), (253, 197, 39), (240, 249, 33),
+)  # fmt: skip
+COOLWARM = (
+    (59, 76, 192), (98, 130, 234), (141, 176, 254), (185, 208, 249), (221, 220, 220),
+    (245, 196, 172), (244, 152, 122), (221, 95, 75), (180, 4, 38),
+)  # fmt: skip
+# How a line of text lies about its place, in heights of its letters.
+_RISES = {"baseline": 0.0, "middle": 0.36, "top": 0.8, "bottom": -0.25}
+_POINTS_AN_INCH = 72.0
 
 
-@contextmanager
-def style() -> Iterator[None]:
-    """Applies the report's style while figures are drawn, by one thread at a time."""
-    with DRAWING, mpl.rc_context(_STYLE):
-        yield
+class Figure:
+    """A drawing; places are in points (1/72 inch) from its upper left, y downwards."""
+
+    def __init__(self, width_in: float, height_in: float) -> None:
+        """Begins one that is empty.
+
+        Args:
+            width_in: Its width [inches].
+            height_in: Likewise.
+        """
+        self.width, self.height = _POINTS_AN_INCH * width_in, _POINTS_AN_INCH * height_in
+        self._parts: list[str] = []
+
+    def path(
+        self,
+        data: str,
+        *,
+        fill: str = "none",
+        stroke: str = "none",
+        width: float = 1.0,
+        dash: str = "",
+        opacity: float = 1.0,
+        cap: str = "",
+    ) -> None:
+        """Adds a path; nothing where it is empty.
+
+        Args:
+            data: Its commands, as in SVG's `d`.
+            fill: Colour within.
+            stroke: Colour of the line.
+            width: Of the line [points].
+            dash: Lengths of dashes and gaps [points]; empty for none.
+            opacity: Of all of it.
+            cap: How lines end where not bluntly.
+        """
+        if not data:
+            return
+        style = f"fill:{fill}"
+        if stroke != "none":
+            style += f";stroke:{stroke};stroke-width:{width:g}"
+            style += f";stroke-dasharray:{dash}" if dash else ""
+            style += f";stroke-linecap:{cap}" if cap else ""
+        style += f";opacity:{opacity:g}" if opacity < 1.0 else ""
+        self._parts.append(f'<path d="{data}" style="{style}"/>')
+
+    def text(
+        self,
+        x: float,
+        y: float,
+        words: str,
+        *,
+        size: float = SIZE,
+        colour: str = INK,
+        anchor: str = "start",
+        rise: str = "baseline",
+        turned: bool = False,
+        bold: bool = False,
+    ) -> None:
+        """Adds a line of text.
+
+        Args:
+            x: Where it is [points].
+            y: Likewise.
+            words: What it says.
+            size: Of its letters [points].
+            colour: Theirs.
+            anchor: Which end is at `x`: `start`, `middle` or `end`.
+            rise: What of it is at `y`: `baseline`, `middle`, `top` or `bottom`.
+            turned: Whether it reads upwards.
+            bold: Whether it is bold.
+        """
+        self._text(x, y, str(escape(words)), size, colour, anchor, rise, turned, bold)
+
+    def _text(
+        self,
+        x: float,
+        y: float,
+        markup: str,
+        size: float,
+        colour: str,
+        anchor: str,
+        rise: str = "baseline",
+        turned: bool = False,
+        bold: bool = False,
+    ) -> None:
+        shift = _RISES[rise] * size
+        turn = f' transform="rotate(-90 {x:.1f} {y:.1f})"' if turned else ""
+        weight = ";font-weight:bold" if bold else ""
+        style = f"font-size:{size:.3g}px;fill:{colour};text-anchor:{anchor}{weight}"
+        place = f'x="{x:.1f}" y="{y + shift:.1f}"'
+        self._parts.append(f'<text {place}{turn} style="{style}">{markup}</text>')
+
+    def legend(
+        self, x: float, y: float, entries: Sequence[tuple[str, str, str]], anchor: str = "end"
+    ) -> None:
+        """Says what marks mean, side by side in one line.
+
+        Args:
+            x: Where it ends, or begins [points].
+            y: Its baseline.
+            entries: Sign, colour and words of each.
+            anchor: `end` or `start`.
+        """
+        parts = (
+            f'<tspan style="fill:{colour}">{sign}</tspan> {escape(words)}'
+            for sign, colour, words in entries
+        )
+        self._text(x, y, "\N{NO-BREAK SPACE}\N{NO-BREAK SPACE} ".join(parts), SMALL, INK, anchor)
+
+    def image(self, left: float, top: float, width: float, height: float, uri: str) -> None:
+        """Adds a bitmap that is stretched to a box [points]."""
+        box = f'x="{left:.1f}" y="{top:.1f}" width="{width:.1f}" height="{height:.1f}"'
+        self._parts.append(f'<image {box} preserveAspectRatio="none" href="{uri}"/>')
+
+    def inline(self, words: str) -> Markup:
+        """The figure as an `<svg>` element for an HTML page, scaling with its container.
+
+        Args:
+            words: What it shows, for those who do not see it.
+        """
+        # Our own numbers and colours; all words are escaped.
+        return Markup(
+            f'<svg role="img" aria-label="{escape(words)}" '
+            f'viewBox="0 0 {self.width:.1f} {self.height:.1f}">{"".join(self._parts)}</svg>'
+        )
 
 
-@dataclass(frozen=True)
-class Margins:
-    """Room around a figure's axes for their labels [inches]."""
+def polyline(x: FloatArray, y: FloatArray) -> str:
+    """Commands of a line through (n,) places [points]; NaN parts it."""
+    parts, pen = [], "M"
+    for at, height in zip(x.tolist(), y.tolist(), strict=True):
+        if at != at or height != height:
+            pen = "M"
+            continue
+        parts.append(f"{pen}{at:.1f} {height:.1f}")
+        pen = "L"
+    return "".join(parts)
 
-    left: float = 0.62
-    right: float = 0.1
-    bottom: float = 0.5
-    top: float = 0.1
+
+def rounded(left: float, top: float, width: float, height: float, radius: float) -> str:
+    """Commands of a box with round corners [points]."""
+    r, h, v = f"{radius:g}", f"{width - 2 * radius:.1f}", f"{height - 2 * radius:.1f}"
+    arc = f"a{r} {r} 0 0 1 "
+    around = f"h{h}{arc}{r} {r}v{v}{arc}-{r} {r}h-{h}{arc}-{r} -{r}v-{v}{arc}{r} -{r}z"
+    return f"M{left + radius:.1f} {top:.1f}{around}"
 
 
-def new_figure(width_in: float, height_in: float, margins: Margins | None = None) -> Figure:
-    """A figure of its own, known to no global registry.
+def shades(
+    values: FloatArray, low: float, high: float, scale: Sequence[tuple[int, int, int]], count: int
+) -> tuple[np.ndarray, list[str]]:
+    """Parts a scale of colours into steps.
 
     Args:
-        width_in: Its width [inches].
-        height_in: Likewise.
-        margins: Where its labels are as large as is known beforehand; they are measured where None,
-            which takes as long as drawing it.
-    """
-    if margins is None:
-        return Figure(figsize=(width_in, height_in), layout="constrained")
-    figure = Figure(figsize=(width_in, height_in))
-    figure.subplots_adjust(
-        margins.left / width_in,
-        margins.bottom / height_in,
-        1.0 - margins.right / width_in,
-        1.0 - margins.top / height_in,
-    )
-    return figure
-
-
-def inline(figure: Figure, name: str, words: str) -> Markup:
-    """Renders a figure as an `<svg>` element for an HTML page.
-
-    Args:
-        figure: What to draw.
-        name: Unique within the page; it keeps the identifiers of its figures apart.
-        words: What it shows, for those who do not see it.
+        values: What is coloured.
+        low: Where the scale begins; what lies beyond has the colour of its end.
+        high: Where it ends.
+        scale: Its colours.
+        count: How many steps.
 
     Returns:
-        The element, scaling with its container.
+        The step of each value, and the colours of all steps.
     """
-    buffer = io.StringIO()
-    with DRAWING, mpl.rc_context({"svg.hashsalt": name}):
-        # What `savefig` calls, without the drawing that it measures constrained layouts by.
-        canvas = FigureCanvasSVG(figure)
-        canvas.print_svg(buffer, metadata=_NO_METADATA)  # type: ignore[no-untyped-call]
-    text = buffer.getvalue()
-    text = text[text.index("<svg") :]
-    # HTML needs no namespaces, and groups would repeat their identifiers in every figure.
-    text = re.sub(r' xmlns(:xlink)?="[^"]*"', "", text)
-    text = re.sub(r'<g id="[^"]*"', "<g", text)
-    text = re.sub(r"<style[^>]*>.*?</style>", "", text, flags=re.DOTALL)
-    text = re.sub(r'(<svg[^>]*?) width="[^"]*" height="[^"]*"', r"\1", text, count=1)
-    text = text.replace("<svg", f'<svg role="img" aria-label="{escape(words)}"', 1)
-    text = text.replace("'DejaVu Sans'", "inherit")
-    for stand_in, variable in _THEME.items():
-        text = text.replace(stand_in, variable)
-    # The text comes from our own numbers and labels, which the backend has escaped.
-    return Markup(text)
+    steps = np.linspace(0.0, len(scale) - 1.0, count)
+    known = np.arange(float(len(scale)))
+    parts = [np.interp(steps, known, column) for column in np.transpose(scale)]
+    colours = [f"#{int(r):02x}{int(g):02x}{int(b):02x}" for r, g, b in zip(*parts, strict=True)]
+    share = (values - low) / ((high - low) or 1.0)
+    return np.clip((share * count).astype(int), 0, count - 1), colours

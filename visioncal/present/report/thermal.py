@@ -8,6 +8,8 @@ from markupsafe import Markup
 
 from visioncal.core.number_format import significant
 from visioncal.present.report import svg
+from visioncal.present.report.axes import Margins, Panel, Scale, boxes
+from visioncal.present.report.svg import Figure
 from visioncal.results.arm import JointDrift, ThermalResult
 
 _WIDE_IN, _HIGH_IN = 9.2, 2.6
@@ -69,26 +71,22 @@ def course(found: ThermalResult) -> Markup:
     band_mm = _BAND * np.array([it.sigma_mm for it in found.course])
     low, high = drift_mm - band_mm, drift_mm + band_mm
     seen = [(_hours(found, it.stamp_s), it.drift_mm) for it in found.seen or ()]
-    with svg.style():
-        figure = svg.new_figure(_WIDE_IN, _HIGH_IN)
-        axes = figure.subplots()
-        axes.fill_between(hours, low, high, color=svg.ACCENT, alpha=0.2, linewidth=0.0)
-        axes.plot(hours, drift_mm, color=svg.ACCENT, linewidth=1.6, label="the model")
-        if seen:
-            axes.plot(
-                *np.transpose(seen),
-                "o",
-                color=svg.INK,
-                markersize=3.5,
-                label="seen by the stops",
-            )
-            axes.legend(loc="lower right")
-        axes.set_xlim(hours[0], hours[-1])
-        least = min(0.0, float(low.min()), *(mm for _, mm in seen))
-        axes.set_ylim(bottom=1.1 * least)
-        axes.set_xlabel("time since the start [h]")
-        axes.set_ylabel("drift of the flange [mm]")
-        return svg.inline(figure, "drift", "Drift of the flange against time, with its 95 % band")
+    values_mm = np.concatenate([low, high, [mm for _, mm in seen]])
+    least, most = 1.1 * min(0.0, float(values_mm.min())), float(values_mm.max())
+    figure = Figure(_WIDE_IN, _HIGH_IN)
+    ((box,),) = boxes(figure, 1, 1, Margins())
+    scale = Scale(least, most + 0.05 * (most - least))
+    panel = Panel(figure, box, Scale(hours[0], hours[-1]), scale)
+    panel.x_axis("time since the start [h]")
+    panel.y_axis("drift of the flange [mm]", 6)
+    panel.band(np.array(hours), low, high, svg.ACCENT)
+    panel.line(hours, drift_mm, svg.ACCENT)
+    if seen:
+        panel.marks([at for at, _ in seen], [mm for _, mm in seen], "dot", svg.INK)
+        line, dot = 2 * "\N{BOX DRAWINGS HEAVY HORIZONTAL}", "\N{BLACK CIRCLE}"
+        entries = [(line, svg.ACCENT, "the model"), (dot, svg.INK, "seen by the stops")]
+        figure.legend(box.right - 6.0, box.bottom - 6.0, entries)
+    return figure.inline("Drift of the flange against time, with its 95 % band")
 
 
 def _with_sigma(value: float, sigma: float) -> str:

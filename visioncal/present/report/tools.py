@@ -7,8 +7,10 @@ from markupsafe import Markup
 from visioncal.core.number_format import significant
 from visioncal.present.recording.details import details
 from visioncal.present.report import bars, svg
+from visioncal.present.report.axes import Margins, boxes
 from visioncal.present.report.bars import Bar
 from visioncal.present.report.content import EdgeCard, Fact, edge_card, readable_time
+from visioncal.present.report.svg import Figure
 from visioncal.results import Calibration, Frame, Observation
 
 _WIDTH_IN, _HEIGHT_IN = 5.0, 1.7
@@ -16,6 +18,8 @@ _COLUMNS = 3
 # More characters than this below the bars run into each other, so their labels stand upright.
 _MOST_CHARACTERS, _LONGEST = 36, 12
 _MOST_LABELS = 24
+# Mean width of a letter.
+_LETTER_IN = 0.068
 
 
 @dataclass(frozen=True)
@@ -107,18 +111,16 @@ def _plot(name: str, frame: Frame) -> Markup:
         return Markup("")
     labels = [_short(it.name) for it in frame.observations]
     upright = sum(map(len, labels)) > _MOST_CHARACTERS
-    with svg.style():
-        figure = svg.new_figure(_WIDTH_IN, _HEIGHT_IN + (0.4 if upright else 0.0))
-        axes = figure.subplots()
-        shown = [
-            Bar(label, it.residual_mm, it.used, _colour(it))
-            for label, it in zip(labels, frame.observations, strict=True)
-        ]
-        bars.draw(axes, shown, frame.rms_mm, _MOST_LABELS)
-        axes.set_ylabel("off by [mm]")
-        if upright:
-            axes.tick_params(axis="x", rotation=90)
-        return svg.inline(figure, f"frame-{name}", f"Bars: what each observation of {name} is off")
+    shown = [
+        Bar(label, it.residual_mm, it.used, _colour(it))
+        for label, it in zip(labels, frame.observations, strict=True)
+    ]
+    below_in = 0.25 + _LETTER_IN * max(map(len, labels)) if upright else 0.3
+    figure = Figure(_WIDTH_IN, _HEIGHT_IN + (0.4 if upright else 0.0))
+    ((box,),) = boxes(figure, 1, 1, Margins(0.65, 0.65, below_in))
+    bars.draw(figure, box, shown, frame.rms_mm, _MOST_LABELS, titles=("", "off by [mm]"),
+              turned=upright)  # fmt: skip
+    return figure.inline(f"Bars: what each observation of {name} is off")
 
 
 def _colour(observation: Observation) -> str:

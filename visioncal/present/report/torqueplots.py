@@ -4,12 +4,12 @@ from collections.abc import Sequence
 
 import numpy as np
 from markupsafe import Markup
-from matplotlib.axes import Axes
-from matplotlib.ticker import MaxNLocator
 
 from visioncal.core.types import FloatArray
 from visioncal.dynamics import Identified, Prediction, friction_at, left_for_friction
 from visioncal.present.report import svg
+from visioncal.present.report.axes import Box, Margins, Panel, Scale, boxes, spanning
+from visioncal.present.report.svg import Figure
 
 _WIDE_IN, _PANEL_IN, _SQUARE_IN = 9.2, 1.15, 3.0
 # Widths of torques and of errors beside them.
@@ -18,36 +18,41 @@ _SHARES = (2.2, 1.0)
 _MOST_POINTS, _MOST_MARKS = 1500, 600
 _COLUMNS = 3
 _CURVE_POINTS, _TICKS = 401, 5
+# Between columns and between rows.
+_FRICTION_GAPS_IN = (0.55, 0.5)
 
 
-def torques(found: Prediction, number: int) -> Markup:
+def torques(found: Prediction) -> Markup:
     """Measured and predicted torques of each joint over time, and what the prediction is off.
 
     Args:
         found: What to show.
-        number: Its place among those of the page.
     """
     some = slice(None, None, max(len(found.times_s) // _MOST_POINTS, 1))
     times = (found.times_s - found.times_s[0])[some]
     measured, predicted = found.measured_nm[some], found.predicted_nm[some]
     off = np.where(found.used[some], measured - predicted, np.nan)
-    with svg.style():
-        joints = measured.shape[1]
-        figure = svg.new_figure(_WIDE_IN, _PANEL_IN * joints + 0.4)
-        panels = figure.subplots(joints, 2, sharex=True, squeeze=False, width_ratios=_SHARES)
-        for joint, (axes, beside) in enumerate(panels):
-            axes.plot(times, measured[:, joint], color=svg.MUTED, linewidth=2.0, label="measured")
-            axes.plot(times, predicted[:, joint], color=svg.ACCENT, linewidth=0.9,
-                      label="predicted")  # fmt: skip
-            axes.set_ylabel(f"joint {joint + 1}\n[N m]")
-            beside.plot(times, off[:, joint], color=svg.BAD, linewidth=0.7, label="error")
-        for axes in panels[0]:
-            axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderaxespad=0.0)
-        for axes in panels[-1]:
-            axes.set_xlabel("time [s]")
-            axes.set_xlim(float(times[0]), float(times[-1]))
-            axes.xaxis.set_major_locator(MaxNLocator(_TICKS))
-        return svg.inline(figure, f"torques-{number}", f"Torques over time: {found.label}")
+    joints = measured.shape[1]
+    figure = Figure(_WIDE_IN, _PANEL_IN * joints + 0.4)
+    margins, gaps_in = Margins(left=0.85, top=0.3), (0.75, 0.15)
+    span = Scale(float(times[0]), float(times[-1]))
+    for joint, pair in enumerate(boxes(figure, joints, 2, margins, gaps_in, _SHARES)):
+        last = joint == joints - 1
+        heights = spanning(np.concatenate([measured[:, joint], predicted[:, joint]]))
+        panel = Panel(figure, pair[0], span, heights)
+        beside = Panel(figure, pair[1], span, spanning(off[:, joint]))
+        for it, title in ((panel, f"joint {joint + 1}\n[N m]"), (beside, "")):
+            it.x_axis("time [s]" if last else "", _TICKS, words=last)
+            it.y_axis(title, 3)
+        panel.line(times, measured[:, joint], svg.MUTED, 2.0)
+        panel.line(times, predicted[:, joint], svg.ACCENT, 0.9)
+        beside.line(times, off[:, joint], svg.BAD, 0.7)
+        if joint == 0:
+            line, above = 2 * "\N{BOX DRAWINGS HEAVY HORIZONTAL}", pair[0].top - 6.0
+            entries = [(line, svg.MUTED, "measured"), (line, svg.ACCENT, "predicted")]
+            figure.legend(pair[0].left, above, entries, anchor="start")
+            figure.legend(pair[1].left, above, [(line, svg.BAD, "error")], anchor="start")
+    return figure.inline(f"Torques over time: {found.label}")
 
 
 def friction(identified: Identified, found: Sequence[Prediction]) -> Markup:
@@ -61,34 +66,39 @@ def friction(identified: Identified, found: Sequence[Prediction]) -> Markup:
         return Markup("")
     joints = identified.robot.joint_count
     rows = -(-joints // _COLUMNS)
-    with svg.style():
-        figure = svg.new_figure(_WIDE_IN, 0.75 * _SQUARE_IN * rows)
-        panels = figure.subplots(rows, _COLUMNS, squeeze=False).ravel()
-        for joint, axes in enumerate(panels[:joints]):
-            _friction_panel(axes, identified, found, joint)
-            axes.set_title(identified.robot.joint_names[joint], fontsize=9.0)
-        for axes in panels[joints:]:
-            axes.set_visible(False)
-        for axes in panels[max(joints - _COLUMNS, 0) : joints]:
-            axes.set_xlabel("speed [rad/s]")
-        for axes in panels[:joints:_COLUMNS]:
-            axes.set_ylabel("friction [N m]")
-        return svg.inline(figure, "friction", "Friction of each joint over its speed")
+    figure = Figure(_WIDE_IN, 0.75 * _SQUARE_IN * rows)
+    grid = boxes(figure, rows, _COLUMNS, Margins(top=0.25), _FRICTION_GAPS_IN)
+    panels = [box for row in grid for box in row]
+    for joint, box in enumerate(panels[:joints]):
+        speed = "speed [rad/s]" if joint >= joints - _COLUMNS else ""
+        torque = "" if joint % _COLUMNS else "friction [N m]"
+        panel = _friction_panel(figure, box, (speed, torque), identified, found, joint)
+        panel.title(identified.robot.joint_names[joint])
+    return figure.inline("Friction of each joint over its speed")
 
 
 def _friction_panel(
-    axes: Axes, identified: Identified, found: Sequence[Prediction], joint: int
-) -> None:
+    figure: Figure,
+    box: Box,
+    titles: tuple[str, str],
+    identified: Identified,
+    found: Sequence[Prediction],
+    joint: int,
+) -> Panel:
     samples = np.concatenate([_samples(identified, it, joint) for it in found])
     speeds, left = samples[:: max(len(samples) // _MOST_MARKS, 1)].T
     reach = max(float(np.abs(speeds).max(initial=0.0)), 1e-3)
-    axes.plot(speeds, left, ".", color=svg.MUTED, markersize=2.0, alpha=0.5, rasterized=True)
     # Close to rest, where dry friction turns over, in small steps.
     around = np.linspace(-1.0, 1.0, _CURVE_POINTS)
     curve = np.zeros((_CURVE_POINTS, identified.robot.joint_count))
     curve[:, joint] = reach * np.sign(around) * np.abs(around) ** 3
     taken = friction_at(identified, curve)[:, joint]
-    axes.plot(curve[:, joint], taken, color=svg.ACCENT, linewidth=1.6)
+    panel = Panel(figure, box, spanning(curve[:, joint]), spanning(np.concatenate([left, taken])))
+    panel.x_axis(titles[0], 5)
+    panel.y_axis(titles[1], 5)
+    panel.marks(speeds, left, "dot", svg.MUTED, 3.0, 0.5)
+    panel.line(curve[:, joint], taken, svg.ACCENT)
+    return panel
 
 
 def _samples(identified: Identified, found: Prediction, joint: int) -> FloatArray:

@@ -4,13 +4,13 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 from markupsafe import Markup
-from matplotlib.axes import Axes
-from matplotlib.ticker import MaxNLocator
 
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import FloatArray
 from visioncal.present.recording.target_frames import target_frames
 from visioncal.present.report import svg
+from visioncal.present.report.axes import Margins, Panel, Scale, boxes, spanning
+from visioncal.present.report.svg import Figure
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
@@ -19,8 +19,8 @@ _AXES = (("x", svg.ACCENT), ("y", svg.CHECK), ("z", svg.GOOD))
 _WIDTH_IN, _ROW_IN = 9.2, 1.25
 # Few points beyond the scale do not flatten the cloud of the others.
 _ROOM, _KEPT_PERCENT = 1.3, 95.0
-# Half a point's width, in ranges of its joint.
-_DASH = 0.014
+# How wide a point is.
+_DASH_PT = 2.4
 
 
 def residuals_over_joints(
@@ -86,31 +86,24 @@ def twist_of(
 def _figure(joints_deg: FloatArray, away_mm: FloatArray, away_deg: FloatArray) -> Markup:
     """Draws (m, n) joint angles against (m, 3) residuals of position and of orientation."""
     count = joints_deg.shape[1]
-    with svg.style():
-        figure = svg.new_figure(_WIDTH_IN, 2 * _ROW_IN + 0.5, svg.Margins(0.85, top=0.3))
-        grid = figure.subplots(2, count, sharex="col", sharey="row", squeeze=False)
-        for row, values, label in ((0, away_mm, "position [mm]"), (1, away_deg, "rotation [deg]")):
-            reach = _ROOM * float(np.percentile(np.abs(values), _KEPT_PERCENT)) or 1.0
-            for joint in range(count):
-                _cloud(grid[row, joint], joints_deg[:, joint], values, reach)
-            grid[row, 0].set_ylabel(label)
-        for joint in range(count):
-            grid[1, joint].set_xlabel(f"q{joint + 1} [deg]")
-        handles, labels = grid[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="upper right", ncols=3)
-        return svg.inline(figure, "trends", "Residuals of the used views over each joint's angle")
-
-
-def _cloud(axes: Axes, joint_deg: FloatArray, values: FloatArray, reach: float) -> None:
-    """Draws each axis's points as the dashes of one path: a mark each would take ten times more."""
-    axes.axhline(0.0, color=svg.INK, linewidth=0.7)
-    half_deg = _DASH * max(float(np.ptp(joint_deg)), 1e-3)
-    gap = np.full(len(joint_deg), np.nan)
-    dashes_deg = np.stack([joint_deg - half_deg, joint_deg + half_deg, gap], axis=1).ravel()
-    for column, (name, colour) in enumerate(_AXES):
-        shown = np.clip(values[:, column], -reach, reach)
-        heights = np.stack([shown, shown, gap], axis=1).ravel()
-        axes.plot(dashes_deg, heights, color=colour, linewidth=2.8, label=f"target {name}")
-    axes.set_ylim(-1.1 * reach, 1.1 * reach)
-    axes.xaxis.set_major_locator(MaxNLocator(3, integer=True))
-    axes.yaxis.set_major_locator(MaxNLocator(4))
+    figure = Figure(_WIDTH_IN, 2 * _ROW_IN + 0.5)
+    upper, lower = boxes(figure, 2, count, Margins(0.85, top=0.3))
+    for row, values, label in (
+        (upper, away_mm, "position [mm]"),
+        (lower, away_deg, "rotation [deg]"),
+    ):
+        reach = _ROOM * float(np.percentile(np.abs(values), _KEPT_PERCENT)) or 1.0
+        shown, is_lower = np.clip(values, -reach, reach), row is lower
+        for joint, box in enumerate(row):
+            angles_deg = joints_deg[:, joint]
+            panel = Panel(figure, box, spanning(angles_deg), Scale(-1.1 * reach, 1.1 * reach))
+            title = f"q{joint + 1} [deg]" if is_lower else ""
+            panel.x_axis(title, 3, words=is_lower, whole=True)
+            panel.y_axis("" if joint else label, words=joint == 0)
+            panel.level(0.0, svg.INK, 0.7)
+            for column, (_, colour) in enumerate(_AXES):
+                panel.marks(angles_deg, shown[:, column], "-", colour, _DASH_PT)
+    sign = 2 * "\N{BOX DRAWINGS HEAVY HORIZONTAL}"
+    entries = [(sign, colour, f"target {name}") for name, colour in _AXES]
+    figure.legend(upper[-1].right, 12.0, entries)
+    return figure.inline("Residuals of the used views over each joint's angle")

@@ -1,0 +1,363 @@
+"""Axes of the report's figures: scales, ticks, and what is drawn between them."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from visioncal.core.types import FloatArray
+from visioncal.present.report import svg
+from visioncal.present.report.svg import Figure
+
+Places: TypeAlias = Sequence[float] | FloatArray
+
+_THIN, _TICK_PT, _GAP_PT = 0.6, 3.0, 2.5
+_STEPS = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
+_MOST_DECIMALS = 6
+# What of a colour bar's height is beside its panel, and its width and distance [points].
+_BAR_SHARE, _BAR_PT, _BAR_GAP_PT, _BAR_STEPS = 0.85, 9.0, 9.0, 48
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Values along an axis, from its start at the left or below.
+
+    Attributes:
+        low: Its value at the start; larger than that at the end where it runs backwards.
+        high: Its value at the end.
+        decades: Whether it is logarithmic.
+    """
+
+    low: float
+    high: float
+    decades: bool = False
+
+    def shares(self, values: Places | float) -> FloatArray:
+        """Where values lie, from 0 to 1."""
+        found = np.asarray(values, dtype=float)
+        low, high = self.low, self.high
+        if self.decades:
+            found, low, high = np.log10(found), math.log10(low), math.log10(high)
+        return np.asarray((found - low) / ((high - low) or 1.0))
+
+    def ticks(self, most: int, whole: bool = False) -> list[float]:
+        """Round values along it, in at most so many steps.
+
+        Args:
+            most: How many steps.
+            whole: Only whole numbers.
+        """
+        low, high = min(self.low, self.high), max(self.low, self.high)
+        if self.decades:
+            return _decades(low, high, most)
+        if not high > low:
+            return [low]
+        exponent = math.floor(math.log10((high - low) / most))
+        for step in (it * 10.0**power for power in (exponent, exponent + 1) for it in _STEPS):
+            if whole and step != round(step):
+                continue
+            first, last = math.ceil(low / step - 1e-6), math.floor(high / step + 1e-6)
+            if (high - low) / step <= most + 1e-6:
+                # Rounded, as many steps of 0.1 add up to 0.30000000000000004.
+                return [round(it * step, 12) for it in range(first, last + 1)]
+        return [low, high]
+
+
+def spanning(values: FloatArray, room: float = 0.05) -> Scale:
+    """A scale that holds values, with some room at both ends; NaN are passed over."""
+    known = values[np.isfinite(values)]
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    spare = room * (high - low) or 0.5
+    return Scale(low - spare, high + spare)
+
+
+def _decades(low: float, high: float, most: int) -> list[float]:
+    first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
+    step = max(1, -(-(last - first) // most))
+    # Where few powers of ten lie within, others beside them.
+    for digits in ((1.0,), (1.0, 3.0), (1.0, 2.0, 5.0)):
+        found = [it * 10.0**power for power in range(first, last + 1, step) for it in digits]
+        inside = [it for it in found if low <= it <= high]
+        if len(inside) > 1:
+            break
+    return inside
+
+
+def tick_words(values: Sequence[float]) -> list[str]:
+    """Writes the values of ticks with the decimals that they need."""
+    for decimals in range(_MOST_DECIMALS + 1):
+        if all(math.isclose(round(it, decimals), it, abs_tol=1e-12) for it in values):
+            texts = [f"{it:.{decimals}f}" for it in values]
+            break
+    else:
+        texts = [f"{it:g}" for it in values]
+    return [it.replace("-", "\N{MINUS SIGN}") for it in texts]
+
+
+@dataclass(frozen=True)
+class Margins:
+    """Room around a figure's panels for their labels [inches]."""
+
+    left: float = 0.62
+    right: float = 0.1
+    bottom: float = 0.5
+    top: float = 0.1
+
+
+@dataclass(frozen=True)
+class Box:
+    """A rectangle of a figure [points]."""
+
+    left: float
+    top: float
+    right: float
+    bottom: float
+
+    def shaped(self, height_over_width: float) -> "Box":
+        """The largest box of such a shape at its upper left."""
+        width, height = self.right - self.left, self.bottom - self.top
+        width = min(width, height / height_over_width)
+        return Box(self.left, self.top, self.left + width, self.top + width * height_over_width)
+
+
+def boxes(
+    figure: Figure,
+    rows: int,
+    columns: int,
+    margins: Margins,
+    gaps_in: tuple[float, float] = (0.15, 0.15),
+    shares: Sequence[float] | None = None,
+) -> list[list[Box]]:
+    """Parts a figure into rows and columns.
+
+    Args:
+        figure: What to part.
+        rows: How many.
+        columns: Likewise.
+        margins: Room around all.
+        gaps_in: Between columns and between rows [inches].
+        shares: Widths of the columns among themselves; equal where None.
+    """
+    left, top = 72.0 * margins.left, 72.0 * margins.top
+    across, down = 72.0 * gaps_in[0], 72.0 * gaps_in[1]
+    wide = figure.width - left - 72.0 * margins.right - across * (columns - 1)
+    high = (figure.height - top - 72.0 * margins.bottom - down * (rows - 1)) / rows
+    widths = wide * np.array(shares or [1.0] * columns) / sum(shares or [columns])
+    starts = left + np.concatenate([[0.0], np.cumsum(widths + across)[:-1]])
+    return [
+        [
+            Box(float(start), y, float(start + width), y + high)
+            for start, width in zip(starts, widths, strict=True)
+        ]
+        for y in (top + row * (high + down) for row in range(rows))
+    ]
+
+
+class Panel:
+    """A part of a figure with two scales."""
+
+    def __init__(self, figure: Figure, box: Box, x: Scale, y: Scale) -> None:
+        """Begins one without axes."""
+        self.figure, self.box, self.x, self.y = figure, box, x, y
+
+    def x_at(self, values: Places | float) -> FloatArray:
+        """Where values lie in the figure [points]."""
+        return self.box.left + self.x.shares(values) * (self.box.right - self.box.left)
+
+    def y_at(self, values: Places | float) -> FloatArray:
+        """Likewise, of the scale that goes upwards."""
+        return self.box.bottom - self.y.shares(values) * (self.box.bottom - self.box.top)
+
+    def x_axis(
+        self,
+        title: str = "",
+        ticks: Sequence[tuple[float, str]] | int = 7,
+        *,
+        grid: bool = True,
+        words: bool = True,
+        whole: bool = False,
+        turned: bool = False,
+    ) -> None:
+        """Draws the axis below.
+
+        Args:
+            title: What it is.
+            ticks: Places and their words, or how many steps at most.
+            grid: Whether lines go up from the ticks.
+            words: Whether ticks have words.
+            whole: Whether only whole numbers have ticks.
+            turned: Whether the words stand upright.
+        """
+        box, marked = self.box, self._ticks(self.x, ticks, whole)
+        places = self.x_at([it for it, _ in marked]).tolist()
+        if grid:
+            lines = "".join(f"M{it:.1f} {box.bottom:.1f}V{box.top:.1f}" for it in places)
+            self.figure.path(lines, stroke=svg.LINE, width=_THIN)
+        data = "".join(f"M{it:.1f} {box.bottom:.1f}v{_TICK_PT}" for it in places)
+        data += f"M{box.left:.1f} {box.bottom:.1f}H{box.right:.1f}"
+        self.figure.path(data, stroke=svg.LINE, width=0.8)
+        below = box.bottom + _TICK_PT + _GAP_PT
+        for place, (_, text) in zip(places, marked if words else (), strict=bool(words)):
+            if turned:
+                self.figure.text(place + 0.36 * svg.SIZE, below, text, colour=svg.MUTED,
+                                 anchor="end", turned=True)  # fmt: skip
+            else:
+                self.figure.text(place, below, text, colour=svg.MUTED, anchor="middle", rise="top")
+        if title:
+            middle, under = 0.5 * (box.left + box.right), below + 1.45 * svg.SIZE
+            self.figure.text(middle, under, title, anchor="middle", rise="top")
+
+    def y_axis(
+        self,
+        title: str = "",
+        ticks: Sequence[tuple[float, str]] | int = 4,
+        *,
+        grid: bool = True,
+        words: bool = True,
+    ) -> None:
+        """Draws the axis at the left; see `x_axis`."""
+        box, marked = self.box, self._ticks(self.y, ticks, whole=False)
+        places = self.y_at([it for it, _ in marked]).tolist()
+        if grid:
+            lines = "".join(f"M{box.left:.1f} {it:.1f}H{box.right:.1f}" for it in places)
+            self.figure.path(lines, stroke=svg.LINE, width=_THIN)
+        data = "".join(f"M{box.left:.1f} {it:.1f}h-{_TICK_PT}" for it in places)
+        data += f"M{box.left:.1f} {box.bottom:.1f}V{box.top:.1f}"
+        self.figure.path(data, stroke=svg.LINE, width=0.8)
+        beside = box.left - _TICK_PT - _GAP_PT
+        for place, (_, text) in zip(places, marked if words else (), strict=bool(words)):
+            self.figure.text(beside, place, text, colour=svg.MUTED, anchor="end", rise="middle")
+        if title:
+            letters = max((len(text) for _, text in marked), default=0) if words else 0
+            before = beside - 0.62 * svg.SIZE * letters - 6.0
+            middle = 0.5 * (box.top + box.bottom)
+            for row, line in enumerate(reversed(title.split("\n"))):
+                self.figure.text(before - 1.2 * svg.SIZE * row, middle, line, anchor="middle",
+                                 turned=True)  # fmt: skip
+
+    @staticmethod
+    def _ticks(
+        scale: Scale, ticks: Sequence[tuple[float, str]] | int, whole: bool
+    ) -> Sequence[tuple[float, str]]:
+        if not isinstance(ticks, int):
+            return ticks
+        values = scale.ticks(ticks, whole)
+        words = [f"{it:g}" for it in values] if scale.decades else tick_words(values)
+        return list(zip(values, words, strict=True))
+
+    def frame(self) -> None:
+        """Draws the box around it."""
+        box = self.box
+        data = f"M{box.left:.1f} {box.top:.1f}H{box.right:.1f}V{box.bottom:.1f}"
+        self.figure.path(data + f"H{box.left:.1f}z", stroke=svg.LINE, width=0.8)
+
+    def title(self, words: str, anchor: str = "middle") -> None:
+        """Writes above it."""
+        box = self.box
+        x = 0.5 * (box.left + box.right) if anchor == "middle" else box.left
+        self.figure.text(x, box.top - 5.0, words, anchor=anchor)
+
+    def line(
+        self,
+        x: Places,
+        y: Places,
+        colour: str,
+        width: float = 1.6,
+    ) -> None:
+        """Draws a line through places; NaN parts it."""
+        self.figure.path(
+            svg.polyline(self.x_at(x), self.y_at(y)), stroke=colour, width=width, cap="butt"
+        )
+
+    def band(self, x: FloatArray, low: FloatArray, high: FloatArray, colour: str) -> None:
+        """Fills between two lines, faintly."""
+        places = np.concatenate([self.x_at(x), self.x_at(x)[::-1]])
+        heights = np.concatenate([self.y_at(low), self.y_at(high)[::-1]])
+        self.figure.path(svg.polyline(places, heights) + "z", fill=colour, opacity=0.2)
+
+    def level(self, y: float, colour: str, width: float = 0.9, dash: str = "") -> None:
+        """Draws a line across, at a value."""
+        at = float(self.y_at(y))
+        data = f"M{self.box.left:.1f} {at:.1f}H{self.box.right:.1f}"
+        self.figure.path(data, stroke=colour, width=width, dash=dash)
+
+    def post(self, x: float, colour: str, width: float = 0.9) -> None:
+        """Draws a line upwards, at a value."""
+        at = float(self.x_at(x))
+        self.figure.path(
+            f"M{at:.1f} {self.box.bottom:.1f}V{self.box.top:.1f}", stroke=colour, width=width
+        )
+
+    def bars(self, x: Places, y: Places, width: float, colour: str) -> None:
+        """Draws bars from zero upwards, centred at `x`, so wide in its units."""
+        lefts, rights = self.x_at(np.subtract(x, width / 2)), self.x_at(np.add(x, width / 2))
+        foot = float(self.y_at(0.0))
+        rows = zip(lefts.tolist(), rights.tolist(), self.y_at(y).tolist(), strict=True)
+        data = "".join(f"M{a:.1f} {foot:.1f}V{top:.1f}H{b:.1f}V{foot:.1f}z" for a, b, top in rows)
+        self.figure.path(data, fill=colour, opacity=0.9)
+
+    def marks(
+        self,
+        x: Places,
+        y: Places,
+        shape: str,
+        colour: str,
+        size: float = 5.5,
+        opacity: float = 1.0,
+    ) -> None:
+        """Draws a mark at each place, all as one path.
+
+        Args:
+            x: Where.
+            y: Likewise.
+            shape: `dot`, `ring`, `x`, `^`, `square`, `|` or `-`.
+            colour: Theirs.
+            size: Theirs [points].
+            opacity: Theirs.
+        """
+        half = 0.5 * size
+        arc = f"a{half:g} {half:g} 0 1 0"
+        strokes = {
+            "dot": (0.0, 0.0, "h0"),
+            "ring": (-half, 0.0, f"{arc} {size:g} 0{arc} -{size:g} 0"),
+            "x": (-half, -half, f"l{size:g} {size:g}m0 -{size:g}l-{size:g} {size:g}"),
+            "^": (-half, half, f"h{size:g}l-{half:g} -{size:g}z"),
+            "square": (-half, -half, f"h{size:g}v{size:g}h-{size:g}z"),
+            "|": (0.0, -half, f"v{size:g}"),
+            "-": (-half, 0.0, f"h{size:g}"),
+        }  # fmt: skip
+        across, down, pen = strokes[shape]
+        places = zip((self.x_at(x) + across).tolist(), (self.y_at(y) + down).tolist(), strict=True)
+        data = "".join(f"M{a:.1f} {b:.1f}{pen}" for a, b in places if a == a and b == b)
+        if shape in ("^", "square"):
+            self.figure.path(data, fill=colour, opacity=opacity)
+        else:
+            # A stroke of no length with round ends is a dot.
+            width = {"dot": size, "|": 1.5, "-": 2.8}.get(shape, 1.0)
+            self.figure.path(data, stroke=colour, width=width, opacity=opacity,
+                             cap="round" if shape == "dot" else "")  # fmt: skip
+
+    def colour_bar(
+        self, scale: Scale, colours: Sequence[tuple[int, int, int]], title: str, most: int = 5
+    ) -> None:
+        """Draws what colours mean, at the right."""
+        box, figure = self.box, self.figure
+        high = _BAR_SHARE * (box.bottom - box.top)
+        left, top = box.right + _BAR_GAP_PT, 0.5 * (box.top + box.bottom - high)
+        part = high / _BAR_STEPS
+        names = svg.shades(np.zeros(0), 0.0, 1.0, colours, _BAR_STEPS)[1]
+        for step, name in enumerate(reversed(names)):
+            # A little longer than a step, that none shows through between them.
+            size = f"h{_BAR_PT}v{part + (0.3 if step < _BAR_STEPS - 1 else 0.0):.2f}h-{_BAR_PT}z"
+            figure.path(f"M{left:.1f} {top + step * part:.2f}{size}", fill=name)
+        values = scale.ticks(most)
+        words = tick_words(values)
+        for value, text in zip(values, words, strict=True):
+            y = top + high * (1.0 - float(scale.shares(value)))
+            figure.path(f"M{left + _BAR_PT:.1f} {y:.1f}h{_TICK_PT}", stroke=svg.LINE, width=0.8)
+            figure.text(left + _BAR_PT + _TICK_PT + 2.0, y, text, colour=svg.MUTED, rise="middle")
+        beyond = left + _BAR_PT + _TICK_PT + 0.62 * svg.SIZE * max(map(len, words), default=0)
+        figure.text(beyond + 1.5 * svg.SIZE, 0.5 * (box.top + box.bottom), title, anchor="middle",
+                    turned=True)  # fmt: skip
