@@ -294,6 +294,11 @@ class _Step:
     covariance: FloatArray
     misfit: FloatArray
 
+    def replace(self, chosen: IntArray, others: Self) -> None:
+        """Takes the steps of some corners from elsewhere."""
+        for it in fields(self):
+            getattr(self, it.name)[chosen] = getattr(others, it.name)
+
 
 def refine(image: Image, target: Target, ids: IntArray, px: FloatArray) -> Refined:
     """Refines corners of a checkerboard, a ChArUco board or an AprilGrid; see the module.
@@ -405,15 +410,25 @@ def _refined(image: Image, pattern: _Pattern, board: FloatArray, px: FloatArray)
     blur_px, radius = _measured_blur(windows, pattern.at(some))
     pattern = replace(pattern, radius=radius)
     windows = _Windows.cut(smooth, board, px, all_good, every, pattern)
-    shift, step = _fitted(windows, pattern, blur_px, np.zeros((len(px), 2, 2)))
+    level = np.zeros((len(px), 2, 2))
+    first = _step(windows, pattern, np.zeros_like(px), blur_px, level)
+    shift, step = _fitted(windows, pattern, blur_px, level, first)
     better = windows.moved(shift)
     good = np.array([not it for it in _reasons(windows, step, better - px)])
     windows = _Windows.cut(smooth, board, np.where(good[:, None], better, px), good, every, pattern)
     slopes = windows.slopes(step.levels)
     # Glare and shadows have edges: where slopes do not explain more of a corner, it has none.
-    tried = _step(windows, pattern, np.zeros_like(px), blur_px, slopes)
-    slopes[~(tried.misfit < step.misfit)] = 0.0
-    shift, step = _fitted(windows, pattern, blur_px, slopes)
+    none = np.zeros_like(px)
+    first = _step(windows, pattern, none, blur_px, slopes)
+    even = np.flatnonzero(~(first.misfit < step.misfit))
+    slopes[even] = 0.0
+    # What a lone corner's unknowns are depends on all of them.
+    again = even if pattern.lone is None else every
+    if even.size:
+        other = _step(windows.at(again), pattern.at(again), none[again], blur_px, slopes[again],
+                      wide=_is_wide(windows, blur_px))  # fmt: skip
+        first.replace(again, other)
+    shift, step = _fitted(windows, pattern, blur_px, slopes, first)
     better = windows.moved(shift)
     reasons = _reasons(windows, step, better - px)
     good = np.array([not it for it in reasons])
@@ -447,13 +462,12 @@ def _measured_blur(windows: _Windows, pattern: _Pattern) -> tuple[FloatArray, fl
 
 
 def _fitted(
-    windows: _Windows, pattern: _Pattern, blur_px: FloatArray, slopes: FloatArray
+    windows: _Windows, pattern: _Pattern, blur_px: FloatArray, slopes: FloatArray, first: _Step
 ) -> tuple[FloatArray, _Step]:
     """Where the corners are from where they were (n, 2) [squares], and their last steps."""
     shift = np.zeros((len(windows.px), 2))
-    last = _step(windows, pattern, shift, blur_px, slopes)
     moving = np.arange(len(shift))
-    step = last
+    last = step = first
     for _ in range(_MOST_TURNS):
         shift[moving] += _bounded(step.shift)
         still = windows.length_px(last.shift)[moving] < _STILL_PX
@@ -461,8 +475,7 @@ def _fitted(
         if not moving.size:
             break
         step = _step(windows.at(moving), pattern.at(moving), shift[moving], blur_px, slopes[moving])
-        for it in fields(_Step):
-            getattr(last, it.name)[moving] = getattr(step, it.name)
+        last.replace(moving, step)
     return shift, last
 
 
@@ -480,8 +493,10 @@ def _step(
     slopes: FloatArray,
     *,
     blurs: bool = False,
+    wide: bool | None = None,
 ) -> _Step:
     """One Gauss-Newton step; `slopes` (n, 2, 2) of offset and contrast by x and y."""
+    wide = _is_wide(windows, blur_px) if wide is None else wide
     count = len(shift)
     sx, sy, dx, dy, signs, ox, oy, gx, gy = (
         np.asarray(it, np.float32)[:, None, None]
@@ -499,7 +514,11 @@ def _step(
         clear_x, clear_y = (
             np.float32(pattern.inset) - np.float32(pattern.clear) * it for it in (sx, sy)
         )
-        used = used & ~((np.abs(x) > clear_x) & (np.abs(y) > clear_y) & (signs * x * y > 0))
+        # Light squares are where the signs of x and y agree, or do not.
+        light = np.logical_xor(np.logical_xor(x > 0, y > 0), signs > 0)
+        light &= np.abs(x) > clear_x
+        light &= np.abs(y) > clear_y
+        used = used & ~light
     if pattern.lone is not None:
         lone_x, lone_y = np.asarray(pattern.lone.T, np.float32)[:, :, None, None]
         far_x, far_y = (
@@ -510,21 +529,27 @@ def _step(
         used = used & (
             (np.abs(x) > np.float32(_SLANT) * sx) | (np.abs(y) > np.float32(_SLANT) * sy)
         )
-    draw = _circle if pattern.radius else _crossing
-    product, *slopes_of = draw(pattern, x, y, sx, sy)
-    columns = [np.ones_like(x), product, *slopes_of[: None if blurs else 2]]
-    widened = len(columns)
+    if pattern.radius:
+        product, *slopes_of = _circle(pattern, x, y, sx, sy)[: None if blurs else 3]
+    else:
+        product, *slopes_of = _crossing(pattern, x, y, sx, sy, blurs=blurs, wide=wide)
+    columns: list[npt.NDArray[np.floating]] = [product, *slopes_of]
+    widened = len(columns) + 1
     if pattern.lone is not None:
         # Light slopes where it is white, and there the product is 0; in the dark it is 4.
         columns += [(1 - product / 4) * it for it in (x, y)]
         # A lens bends the sides of a tag by itself, and its corners do not tell how.
         if windows.around.shape[1] == _FEWEST and np.median(windows.widths) * _BENT_PX < 1.0:
             columns += [y * slopes_of[0], x * slopes_of[1]]
-    unknowns = len(columns)
-    columns.append(windows.grey - ox * x - oy * y - (gx * x + gy * y) * product)
+    unknowns = len(columns) + 1
+    if slopes.any():
+        columns.append(windows.grey - ox * x - oy * y - (gx * x + gy * y) * product)
+    else:
+        columns.append(windows.grey)
     stack = np.empty((count, unknowns + 1, *x.shape[1:]), np.float32)
-    for at, column in enumerate(columns):
-        stack[:, at] = column * used
+    stack[:, 0] = used
+    for at, column in enumerate(columns, start=1):
+        np.multiply(column, stack[:, 0], out=stack[:, at])
     stack = stack.reshape(count, unknowns + 1, -1)
     sums = np.asarray(stack @ stack.transpose(0, 2, 1), float)
     pixels = sums[:, 0, 0]
@@ -552,24 +577,27 @@ def _crossing(
     y: _Float32Array,
     sx: _Float32Array,
     sy: _Float32Array,
+    *,
+    blurs: bool,
+    wide: bool,
 ) -> tuple[_Float32Array, ...]:
     """Two edges that cross: their product, and its derivatives.
 
-    These are by x and y, and by the logarithms of the widths.
+    These are by x and y and, with `blurs`, by the logarithms of the widths.
     """
     signs = np.asarray(pattern.signs, np.float32)[:, None, None]
-    wide = bool(max(sx.max(), sy.max()) > _WIDE)
-    edge_x, slope_x, wider_x = _edges(x, sx, wide=wide)
-    edge_y, slope_y, wider_y = _edges(y, sy, wide=wide)
+    edge_x, slope_x, *wider_x = _edges(x, sx, blurs=blurs, wide=wide)
+    edge_y, slope_y, *wider_y = _edges(y, sy, blurs=blurs, wide=wide)
     if pattern.lone is not None:
         lone_x, lone_y = np.asarray(pattern.lone.T, np.float32)[:, :, None, None]
         edge_x, edge_y = edge_x + lone_x, edge_y + lone_y
+    edge_x *= signs
     return (
-        signs * edge_x * edge_y,
-        signs * slope_x * edge_y,
-        signs * edge_x * slope_y,
-        signs * wider_x * edge_y,
-        signs * edge_x * wider_y,
+        edge_x * edge_y,
+        np.multiply(signs * slope_x, edge_y),
+        edge_x * slope_y,
+        *(signs * it * edge_y for it in wider_x),
+        *(edge_x * it for it in wider_y),
     )
 
 
@@ -584,7 +612,8 @@ def _circle(
     away = np.hypot(x, y) + np.float32(1e-6)
     of_x, of_y = (sx * x / away) ** 2, (sy * y / away) ** 2
     width = np.sqrt(of_x + of_y)
-    edge, slope, wider = _edges(np.float32(pattern.radius) - away, width, wide=False)
+    off = np.float32(pattern.radius) - away
+    edge, slope, wider = _edges(off, width, blurs=True, wide=False)
     inward = -slope / away
     by_width = wider / (of_x + of_y)
     return edge, inward * x, inward * y, by_width * of_x, by_width * of_y, slope
@@ -596,19 +625,34 @@ def _turned(smoother: FloatArray, axes: FloatArray) -> FloatArray:
     return np.concatenate([smoother[:, :1], slopes, smoother[:, 3:]], axis=1)
 
 
+def _is_wide(windows: _Windows, blur_px: FloatArray) -> bool:
+    """Whether blur brings in the next lines of some corner."""
+    return bool(np.asarray(blur_px * windows.widths, np.float32).max() > _WIDE)
+
+
 def _edges(
-    at: _Float32Array, sigma: _Float32Array, *, wide: bool
-) -> tuple[_Float32Array, _Float32Array, _Float32Array]:
-    """E of the module, its derivative by the place, and by the logarithm of sigma."""
-    edge, slope, wider = (np.zeros_like(at) for _ in range(3))
-    for line, sign in ((0, 1), (-1, -1), (1, -1))[: 3 if wide else 1]:
-        t = (at - np.float32(line)) / sigma
-        bell = np.exp(np.float32(-0.5) * t * t)
-        edge += np.float32(sign) * _erf(t, bell)
-        bell *= np.float32(sign * np.sqrt(2.0 / np.pi))
-        slope += bell / sigma
-        wider -= t * bell
-    return edge, slope, wider
+    at: _Float32Array, sigma: _Float32Array, *, blurs: bool, wide: bool
+) -> tuple[_Float32Array, ...]:
+    """E of the module, its derivative by the place, and with `blurs` by the logarithm of sigma."""
+    sums = _edge(at / sigma, sigma, blurs=blurs)
+    for line in (-1, 1) if wide else ():
+        beside = _edge((at - np.float32(line)) / sigma, sigma, blurs=blurs)
+        for total, part in zip(sums, beside, strict=True):
+            np.subtract(total, part, out=total)
+    return sums
+
+
+def _edge(t: _Float32Array, sigma: _Float32Array, *, blurs: bool) -> tuple[_Float32Array, ...]:
+    """One line's share of `_edges`."""
+    bell = np.float32(-0.5) * t
+    bell *= t
+    np.exp(bell, out=bell)
+    edge = _erf(t, bell)
+    bell *= np.float32(np.sqrt(2.0 / np.pi))
+    if not blurs:
+        bell /= sigma
+        return edge, bell
+    return edge, bell / sigma, -t * bell
 
 
 def _erf(t: _Float32Array, bell: _Float32Array) -> _Float32Array:
@@ -616,12 +660,17 @@ def _erf(t: _Float32Array, bell: _Float32Array) -> _Float32Array:
 
     Five times as fast as scipy's, which has no vector instructions.
     """
-    u = 1 / (1 + np.float32(0.3275911 / np.sqrt(2.0)) * np.abs(t))
-    total = np.full_like(u, 1.061405429)
+    u = np.abs(t)
+    u *= np.float32(0.3275911 / np.sqrt(2.0))
+    u += 1
+    np.reciprocal(u, out=u)
+    total = np.float32(1.061405429) * u
     for factor in (-1.453152027, 1.421413741, -0.284496736, 0.254829592):
-        total *= u
         total += np.float32(factor)
-    return np.asarray(np.copysign(1 - total * u * bell, t), np.float32)
+        total *= u
+    total *= bell
+    np.subtract(1, total, out=total)
+    return np.copysign(total, t, out=total)
 
 
 def _reasons(windows: _Windows, step: _Step, moved_px: FloatArray) -> tuple[str, ...]:
