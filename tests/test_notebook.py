@@ -7,6 +7,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
 from support.samples import made_up
 
 import visioncal
@@ -100,7 +101,76 @@ def test_views_are_records_where_pandas_is_not_installed(monkeypatch):
 def test_arrays_that_do_not_match_are_refused():
     poses = np.tile(np.eye(4), (3, 1, 1))
     image = np.zeros((8, 8), dtype=np.uint8)
-    with pytest.raises(DataError, match="beside 2 of image"):
+    with pytest.raises(DataError, match=r"^2 images and 3 poses"):
         visioncal.Session.from_arrays([image] * 2, poses, "charuco_9x6_30mm")
     with pytest.raises(DataError, match=r"type float64; .* uint8"):
         visioncal.Session.from_arrays([0.5 * image] * 3, poses, "charuco_9x6_30mm")
+
+
+BOARD = "charuco_9x6_30mm"
+POSES = np.stack([np.eye(4)] * 3)
+POSES[:, :3, :3] = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
+POSES[:, :3, 3] = 0.4, 0.1, 0.5
+SEEN = [(np.arange(8), np.arange(16.0).reshape(8, 2))] * 3
+
+
+def from_corners(corners, poses=POSES, **more):
+    return visioncal.Session.from_corners(corners, poses, BOARD, (640, 480), **more)
+
+
+def test_views_without_corners_keep_their_place():
+    session = from_corners([SEEN[0], (None, None), SEEN[2]])
+    assert [view.has_corners for view in session.views] == [True, False, True]
+
+
+@pytest.mark.parametrize(
+    ("corners", "words"),
+    [
+        (SEEN[:2], r"^2 corners and 3 poses"),
+        (SEEN * 2, r"^6 corners and 3 poses"),
+        ([SEEN[0], (SEEN[0][0][1:], SEEN[0][1]), SEEN[2]], r"corners\[1\]: 7 ids and .*\(8, 2\)"),
+        ([SEEN[0], (SEEN[0][0], SEEN[0][1].T), SEEN[2]], r"corners\[1\]: 8 ids and .*\(2, 8\)"),
+        ([(np.arange(8) + 0.5, SEEN[0][1]), *SEEN[1:]], r"corners\[0\]: its ids are no whole"),
+        ([(np.arange(8) + 99, SEEN[0][1]), *SEEN[1:]], r"^corners\[0\], ids\[0\]: .*no point 99"),
+        (
+            [SEEN[0], (np.arange(8) % 7, SEEN[0][1]), SEEN[2]],
+            r"^corners\[1\], ids\[7\]: .*ids\[0\]",
+        ),
+        ([SEEN[0], (np.arange(8), SEEN[0][1] * np.nan), SEEN[2]], r"corners\[1\]: px\[0\].*7 more"),
+        (
+            [SEEN[0], (np.arange(8), SEEN[0][1] + np.inf), SEEN[2]],
+            r"corners\[1\]: px\[0\], of id 0",
+        ),
+    ],
+)
+def test_corners_that_are_none_are_refused_by_array_and_index(corners, words):
+    with pytest.raises(DataError, match=words) as caught:
+        from_corners(corners)
+    assert "corners.csv" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "words", "step"),
+    [
+        (POSES.swapaxes(1, 2), r"\[0\] .* transposed.* So are 2 more of 3", "Transpose"),
+        (POSES * [[[-1], [-1], [-1], [1]]], r"\[0\] .* reflection", "right-handed"),
+        (POSES * [[[1.05]] * 3 + [[1]]], r"\[0\] .* scaled by 1.05", "Divide"),
+        ([POSES[0], 0.0 * POSES[0], POSES[0]], r"\[1\] .* entries are zero", "never filled"),
+        ([POSES[0], POSES[0] * np.nan, POSES[0]], r"\[1\] .* not finite", "reported"),
+        ([POSES[0], POSES[0] + np.eye(4)[3], POSES[0]], r"\[1\] .* last row is", "0, 0, 0, 1"),
+        ([POSES[0], POSES[0] + 0.1 * np.eye(4, k=1), POSES[0]], r"\[1\] .* right angles", "3 x 3"),
+        (POSES[:, :3], r"\[0\] has the shape \(3, 4\)", ""),
+    ],
+)
+def test_poses_that_are_no_rigid_transforms_are_refused_with_the_likely_cause(spoilt, words, step):
+    with pytest.raises(DataError, match=rf"^base_from_flange{words}") as caught:
+        from_corners(SEEN, spoilt)
+    assert step in caught.value.next_step
+
+
+def test_joint_angles_of_other_views_are_refused_and_rounded_rotations_are_not():
+    with pytest.raises(DataError, match=r"^q has the shape \(2, 6\) beside 3 poses"):
+        from_corners(SEEN, q=np.zeros((2, 6)))
+    assert len(from_corners(SEEN, [RigidTransform.from_matrix(it) for it in POSES]).views) == 3
+    # As a print with three decimals has them.
+    assert len(from_corners(SEEN, POSES.round(3)).views) == 3

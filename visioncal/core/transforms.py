@@ -10,6 +10,10 @@ from scipy.spatial.transform import RigidTransform
 
 from visioncal.core.types import FloatArray
 
+# Poses come with five digits or more; a matrix that is off by more is no rotation.
+RIGID = 1e-4
+LAST_ROW = (0.0, 0.0, 0.0, 1.0)
+
 
 def invert(matrices: FloatArray) -> FloatArray:
     """Inverts rigid transforms.
@@ -152,3 +156,42 @@ def pose_difference(a: FloatArray, b: FloatArray) -> tuple[float, float]:
     """Distance between the origins [mm] and angle [deg] of two (4, 4) poses in one frame."""
     between = invert(a) @ b
     return 1e3 * float(np.linalg.norm(between[:3, 3])), float(np.rad2deg(rotation_angle(between)))
+
+
+def rigid_fault(matrix: FloatArray, most: float = RIGID) -> tuple[str, str]:
+    """Says why a matrix is no rigid transform, the likeliest mistake first.
+
+    Args:
+        matrix: (4, 4).
+        most: By how much an entry of the rotation's product with its transpose may be off.
+
+    Returns:
+        What it is, and what to do about it; both empty where it is a rigid transform.
+    """
+    rotation, last = matrix[:3, :3], matrix[3]
+    if not np.isfinite(matrix).all():
+        return "it has entries that are not finite", "Give the pose that the robot reported."
+    if not matrix.any():
+        return "all its entries are zero", "It was never filled: give the pose there."
+    if not np.allclose(last, LAST_ROW, atol=most):
+        if np.allclose(matrix[:, 3], LAST_ROW, atol=most):
+            return "it is transposed: its translation is in the last row", "Transpose it."
+        row = ", ".join(f"{it:.4g}" for it in last)
+        return f"its last row is [{row}]", "The last row is [0, 0, 0, 1]."
+    product = rotation.T @ rotation
+    scale = float(np.sqrt(np.trace(product) / 3.0))
+    if np.abs(product - np.eye(3)).max() < most:
+        if np.linalg.det(rotation) > 0.0:
+            return "", ""
+        return (
+            "its rotation is a reflection: its determinant is -1, and 1 is needed",
+            "Its axes are left-handed: give them right-handed.",
+        )
+    if scale > 0.0 and np.abs(product / scale**2 - np.eye(3)).max() < most:
+        return f"its rotation is scaled by {scale:.4g}", f"Divide the rotation by {scale:.4g}."
+    off = np.abs(product - np.eye(3)).max()
+    return (
+        f"the columns of its rotation are no unit vectors at right angles: they are off by "
+        f"{off:.2g}, and {most:g} is allowed",
+        "Give a rotation in its upper left 3 x 3.",
+    )

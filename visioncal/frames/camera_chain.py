@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import adjoint, invert, skew
+from visioncal.core.transforms import adjoint, invert, rigid_fault, skew
 from visioncal.core.types import Camera, FloatArray, Mount
 from visioncal.estimation.arm import pose_basis
 from visioncal.estimation.chain import edge_names
@@ -24,8 +24,6 @@ Pose: TypeAlias = FloatArray | RigidTransform
 
 # No arm reaches this far [m]: such numbers are in millimetres.
 FAR_M = 20.0
-# Poses come with five digits or more; a matrix that is off by more is no rotation.
-_RIGID = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,10 +196,11 @@ def checked_pose(pose: FloatArray, name: str) -> None:
     Raises:
         DataError: It is no (4, 4) rigid transform, or it lies farther off than any arm reaches.
     """
-    rotation = pose[:3, :3] if pose.shape == (4, 4) else np.zeros((3, 3))
-    rigid = np.allclose(rotation.T @ rotation, np.eye(3), atol=_RIGID)
-    if not (rigid and np.linalg.det(rotation) > 0.0 and np.isfinite(pose).all()):
-        raise DataError(f"{name}: not a (4, 4) rigid transform of finite numbers.", culprits=[name])
+    fault, step = (f"its shape is {pose.shape}", "") if pose.shape != (4, 4) else rigid_fault(pose)
+    if fault:
+        raise DataError(
+            f"{name}: not a (4, 4) rigid transform: {fault}.", culprits=[name], next_step=step
+        )
     length = float(np.linalg.norm(pose[:3, 3]))
     if length > FAR_M:
         raise DataError(

@@ -8,7 +8,8 @@ import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from visioncal.core.errors import DataError
-from visioncal.core.types import Camera, FloatArray, Image, Mount, Target
+from visioncal.core.transforms import LAST_ROW, rigid_fault
+from visioncal.core.types import Camera, FloatArray, Image, IntArray, Mount, Target
 from visioncal.session.columns import POSE
 from visioncal.session.corners import CornerTable
 from visioncal.session.images import MemoryImages
@@ -16,6 +17,11 @@ from visioncal.vision.finders.imaging import encode_png
 from visioncal.vision.targets import target_document
 
 Poses: TypeAlias = RigidTransform | FloatArray
+# Entries of a rotation that were written with three decimals are off by half of that.
+_ROUGH = 5e-3
+_KEPT_PLACE = (
+    "A view in which nothing was found keeps its place: give (None, None) for its corners."
+)
 
 
 class Cell(TypedDict, total=False):
@@ -51,12 +57,13 @@ def of_images(
     images: Sequence[Image | bytes], poses: Poses, board: Target | str, **cell: Unpack[Cell]
 ) -> Facts:
     """The facts of a session of images; see `Session.from_arrays`."""
+    matrices = _matrices(poses, "images", len(images))
     paths = [f"images/{at:03d}.png" for at in range(len(images))]
     files = {
         path: it if isinstance(it, bytes) else encode_png(it)
         for path, it in zip(paths, images, strict=True)
     }
-    return _facts(poses, board, cell, {"image": paths}, MemoryImages(files))
+    return _facts(matrices, board, cell, {"image": paths}, MemoryImages(files))
 
 
 def of_corners(
@@ -67,33 +74,98 @@ def of_corners(
     **cell: Unpack[Cell],
 ) -> Facts:
     """The facts of a session of corners; see `Session.from_corners`."""
-    points = [np.asarray(ids, dtype=np.int64).ravel() for ids, _ in corners]
+    matrices = _matrices(poses, "corners", len(corners))
+    read = [_corners(at, *it) for at, it in enumerate(corners)]
+    counts = [len(ids) for ids, _ in read]
     table = CornerTable(
-        np.repeat(np.arange(len(points)), [len(it) for it in points]),
-        np.concatenate(points) if points else np.zeros(0, dtype=np.int64),
-        np.concatenate([np.asarray(px, dtype=float).reshape(-1, 2) for _, px in corners]),
-        ("",) * sum(map(len, points)),
+        np.repeat(np.arange(len(read)), counts),
+        np.concatenate([np.zeros(0, dtype=np.int64), *(ids for ids, _ in read)]),
+        np.concatenate([np.zeros((0, 2)), *(px for _, px in read)]),
+        ("",) * sum(counts),
+        is_file=False,
     )
-    facts = _facts(poses, board, cell, {}, MemoryImages({}), resolution)
+    facts = _facts(matrices, board, cell, {}, MemoryImages({}), resolution)
     return {**facts, "corners": table}
 
 
+def _corners(view: int, ids: npt.ArrayLike, px: npt.ArrayLike) -> tuple[IntArray, FloatArray]:
+    """The numbers and places of a view's corners, checked; detectors give None for no corners."""
+    name = f"corners[{view}]"
+    numbers = np.asarray([] if ids is None else ids)
+    places = np.asarray([] if px is None else px, dtype=float)
+    if places.size != 2 * numbers.size or (places.size and places.shape[-1] != 2):
+        raise DataError(
+            f"{name}: {numbers.size} ids and px of the shape {places.shape}; (k,) ids and (k, 2) "
+            "px are needed, one place for each id.",
+            culprits=[name],
+            next_step="Take both from one call of the detector.",
+        )
+    numbers, places = numbers.ravel(), places.reshape(-1, 2)
+    if not np.array_equal(numbers, np.floor(numbers)):
+        raise DataError(f"{name}: its ids are no whole numbers.", culprits=[name])
+    wrong = np.flatnonzero(~np.isfinite(places).all(axis=1))
+    if wrong.size:
+        at = int(wrong[0])
+        more = f", and {wrong.size - 1} more are not" if wrong.size > 1 else ""
+        raise DataError(
+            f"{name}: px[{at}], of id {int(numbers[at])}, is ({places[at, 0]:g}, "
+            f"{places[at, 1]:g}) and not finite{more}.",
+            culprits=[f"{name}: px[{at}]"],
+            next_step="Leave corners that were not found out of ids and px.",
+        )
+    return numbers.astype(np.int64), places
+
+
+def _matrices(poses: Poses, what: str, count: int) -> FloatArray:
+    """The (n, 4, 4) poses of as many views, checked."""
+    given = poses.as_matrix() if isinstance(poses, RigidTransform) else poses
+    matrices = [
+        np.array(it.as_matrix() if isinstance(it, RigidTransform) else it, float) for it in given
+    ]
+    for at, matrix in enumerate(matrices):
+        if matrix.shape != (4, 4):
+            raise DataError(
+                f"base_from_flange[{at}] has the shape {matrix.shape}; (4, 4) is needed, one pose "
+                "for each view.",
+                culprits=[f"base_from_flange[{at}]"],
+            )
+    if len(matrices) != count:
+        raise DataError(
+            f"{count} {what} and {len(matrices)} poses in base_from_flange: each view has one of "
+            "each, in the same order.",
+            culprits=[what, "base_from_flange"],
+            next_step=_KEPT_PLACE if what == "corners" else "",
+        )
+    told = enumerate(rigid_fault(it, _ROUGH) for it in matrices)
+    faults = {at: it for at, it in told if it[0]}
+    if faults:
+        at, (fault, step) = next(iter(faults.items()))
+        more = f" So are {len(faults) - 1} more of {count}." if len(faults) > 1 else ""
+        raise DataError(
+            f"base_from_flange[{at}] is no rigid transform: {fault}.{more}",
+            culprits=[f"base_from_flange[{it}]" for it in faults],
+            next_step=step,
+        )
+    stacked = np.array(matrices).reshape(-1, 4, 4)
+    stacked[:, 3] = LAST_ROW
+    return stacked
+
+
 def _facts(
-    poses: Poses,
+    matrices: FloatArray,
     board: Target | str,
     cell: Cell,
     columns: Mapping[str, Sequence[str]],
     images: MemoryImages,
     resolution: tuple[int, int] | None = None,
 ) -> Facts:
-    matrices = poses.as_matrix() if isinstance(poses, RigidTransform) else np.asarray(poses, float)
-    count = len(matrices) if matrices.ndim == 3 else 0
-    if matrices.shape != (count, 4, 4) or any(len(it) != count for it in columns.values()):
-        seen = ", ".join(f"{len(it)} of {name}" for name, it in columns.items())
+    count = len(matrices)
+    q = np.asarray(cell.get("q", np.zeros((count, 0))), dtype=float)
+    if q.ndim != 2 or len(q) != count:
         raise DataError(
-            f"base_from_flange has the shape {matrices.shape}, beside {seen or 'the corners'}; "
-            "(n, 4, 4) is needed, one pose a view.",
-            culprits=["base_from_flange"],
+            f"q has the shape {q.shape} beside {count} poses; (n, j) is needed, the joint angles "
+            "[rad] of each view.",
+            culprits=["q"],
         )
     document: dict[str, Any] = {
         "schema": 1,
@@ -108,7 +180,6 @@ def _facts(
     transforms = RigidTransform.from_matrix(matrices)
     numbers = np.hstack([transforms.translation, transforms.rotation.as_quat()])
     names = ["view", *columns, *POSE]
-    q = np.asarray(cell.get("q", np.zeros((count, 0))), dtype=float).reshape(count, -1)
     names += [f"q{at}_rad" for at in range(1, q.shape[1] + 1)]
     if "robot" in cell:
         document["robot"] = {"model": cell["robot"]}

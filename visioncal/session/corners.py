@@ -33,6 +33,7 @@ class CornerTable:
         px: (n, 2) where it was seen [px].
         targets: (n,) the target's name; empty where the row does not say it.
         sigmas_px: (n,) standard deviation per axis [px]; None where it is not stated.
+        is_file: Whether they are the lines of a corners.csv; else they are arrays of a program.
     """
 
     views: IntArray
@@ -40,9 +41,17 @@ class CornerTable:
     px: FloatArray
     targets: tuple[str, ...]
     sigmas_px: FloatArray | None = None
+    is_file: bool = True
 
     def __len__(self) -> int:
         return len(self.views)
+
+    def place(self, row: int) -> str:
+        """Where a row is, for messages."""
+        if self.is_file:
+            return f"{FILE}, line {row + 2}"
+        view = int(self.views[row])
+        return f"corners[{view}], ids[{int(np.sum(self.views[:row] == view))}]"
 
     def of_views(self, views: Sequence[int]) -> "CornerTable":
         """The corners of some views."""
@@ -53,6 +62,7 @@ class CornerTable:
             self.px[rows],
             tuple(self.targets[at] for at in rows),
             None if self.sigmas_px is None else self.sigmas_px[rows],
+            self.is_file,
         )
 
     def without_targets(self) -> "CornerTable":
@@ -275,13 +285,14 @@ def check_points(table: CornerTable, boards: Sequence[Target]) -> None:
     problems: list[Problem] = []
     seen: dict[tuple[int, int], int] = {}
     for at, key in enumerate(zip(table.views.tolist(), table.points.tolist(), strict=True)):
-        place, target = f"{FILE}, line {at + 2}, column point", boards[at]
+        place, target = table.place(at) + (", column point" if table.is_file else ""), boards[at]
         earlier = seen.setdefault(key, at)
         if key[1] not in numbers[target]:
             words = f"target {target.name} has no point {key[1]}; {_range(target)}"
             problems.append(Problem(place, words))
         elif earlier != at:
-            words = f"point {key[1]} of view {key[0]} is there twice, first in line {earlier + 2}"
+            first = f"line {earlier + 2}" if table.is_file else table.place(earlier)
+            words = f"point {key[1]} of view {key[0]} is there twice, first in {first}"
             problems.append(Problem(place, words))
     if problems:
         raise problems_error(problems)

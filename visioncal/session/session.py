@@ -223,7 +223,8 @@ class Session:
         """Builds a session of corners that another detector found.
 
         Args:
-            corners: For each view the (k,) numbers of its corners and their (k, 2) places [px].
+            corners: For each view the (k,) numbers of its corners and their (k, 2) places [px];
+                None for both, or empty ones, where nothing was found.
             base_from_flange: As in `from_arrays`.
             board: Likewise.
             resolution: (width, height) of the images [px].

@@ -8,7 +8,15 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import compose, invert, nearest_rotation, rotation_angle
+from visioncal.core.transforms import (
+    LAST_ROW,
+    RIGID,
+    compose,
+    invert,
+    nearest_rotation,
+    rigid_fault,
+    rotation_angle,
+)
 from visioncal.core.types import FloatArray, Mask
 from visioncal.results import Calibration
 from visioncal.results.compensation.arms import CalibratedArm
@@ -24,8 +32,6 @@ Poses: TypeAlias = FloatArray | RigidTransform
 WIDEST_RAD = float(np.pi / 2)
 # No arm reaches this far [m], and no joint of one turns this far [rad].
 FAR_M, WIDE_RAD = 20.0, 4 * np.pi
-# Poses come with five digits or more; a matrix that is off by more is no rotation.
-_RIGID = 1e-4
 # No rotation is at a matrix that is off by more: it is written with fewer digits than count here.
 _ROUNDED = 1e-12
 
@@ -156,14 +162,16 @@ def _matrices(poses: Poses) -> FloatArray:
         )
     rotations = matrices[:, :3, :3]
     off = np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0)
-    rigid = off < _RIGID
+    rigid = (off < RIGID) & (np.abs(matrices[:, 3] - LAST_ROW).max(axis=1, initial=0.0) < RIGID)
     if rigid.all():
         rigid = np.linalg.det(rotations) > 0.0
     if not rigid.all():
         at = int(np.argmin(rigid))
+        fault, step = rigid_fault(matrices[at])
         raise DataError(
-            f"correct: target {at} is no rigid transform: its rotation is off by {off[at]:.2g}.",
+            f"correct: target {at} is no rigid transform: {fault}.",
             culprits=[f"target {at}"],
+            next_step=step,
         )
     away = np.abs(matrices[:, :3, 3]).max(axis=1, initial=0.0)
     near = away < FAR_M
