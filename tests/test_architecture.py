@@ -102,7 +102,8 @@ def test_heavy_libraries_enter_in_one_place():
     ("imported", "unwanted"),
     [
         (
-            "visioncal.cli.calibrate, visioncal.cli.record",
+            "visioncal.calibration.pipeline, visioncal.interchange.outputs, "
+            "visioncal.present.report, visioncal.present.recording, visioncal.cli.record",
             {"depthai", "rtde_control", "rtde_receive", "torch", "kornia", "matplotlib"},
         ),
         # Every command waits for what is loaded here, `--help` and `--version` too.
@@ -110,6 +111,7 @@ def test_heavy_libraries_enter_in_one_place():
             "visioncal.cli.app",
             {"numpy", "rich", "visioncal.core.types"},
         ),
+        ("visioncal.cli.calibrate", {"numpy", "rich", "visioncal.core.types"}),
         ("visioncal", {"numpy", "typer", "visioncal.core.types"}),
         # A place of a pixel is a millisecond's work.
         (

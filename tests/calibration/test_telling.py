@@ -14,6 +14,7 @@ import visioncal
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.arm_identifiability import identify_arm
+from visioncal.core.choices import CONVENTIONS
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import MOUNTS
@@ -26,7 +27,7 @@ from visioncal.estimation.solve import fisher_information
 from visioncal.estimation.variance import Knowledge
 from visioncal.estimation.workspace import postures
 from visioncal.results import to_document
-from visioncal.robot import CONVENTIONS, Robot, convert_table, load_robot, robot_names, table_of
+from visioncal.robot import Robot, convert_table, load_robot, robot_names, table_of
 from visioncal.robot.jacobians import number_jacobian, table_moves
 from visioncal.robot.tables import table_document, table_from_document
 from visioncal.simulation import simulate

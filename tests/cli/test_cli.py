@@ -20,15 +20,16 @@ from visioncal.cli import progress
 from visioncal.cli import simulate as simulate_module
 from visioncal.cli.app import app
 from visioncal.cli.lazy import LazyGroup
+from visioncal.core.choices import Convention, SolverName
 from visioncal.core.conventions import POSE_FORMS, UNITS_M
 from visioncal.core.errors import DataError
-from visioncal.core.types import Mount, SolverName
+from visioncal.core.types import Mount
 from visioncal.interchange.exports import EXPORT_FORMATS
 from visioncal.interchange.formats import FOREIGN_FORMATS
 from visioncal.live.capture.options import Keep
 from visioncal.live.planning.purposes import PURPOSES
 from visioncal.live.planning.selection import Criterion
-from visioncal.robot import Convention, robot_names
+from visioncal.robot import robot_names
 from visioncal.session import Session
 from visioncal.simulation import ARMS, CellOptions, read_truth, simulate, truth_path, write_session
 from visioncal.vision.dense.library import DEVICES

@@ -15,13 +15,14 @@ from support.readers import ARM_FORMATS, rx, ry, rz, transform
 from support.samples import made_up
 from support.urdf_arm import URDF, of_urdf, some_changes, some_joints
 
+from visioncal.core.choices import CONVENTIONS
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp
 from visioncal.interchange.exports import Selection, document, export
 from visioncal.interchange.exports.arm import omission_mm
 from visioncal.interchange.result_files import load_placed
 from visioncal.results.arm import ArmResult, WorkspaceSigma
-from visioncal.robot import CONVENTIONS, Robot, load_robot
+from visioncal.robot import Robot, load_robot
 from visioncal.session import Session
 
 SAMPLE = made_up(5).calibration

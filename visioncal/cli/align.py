@@ -15,12 +15,11 @@ from visioncal.cli.options import AsJson, NeedOptions, OutFolder, SessionArgumen
 from visioncal.cli.pointing import naming
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.summary import print_verdict, unused_words
+from visioncal.core.choices import Convention, ImagesKept
 from visioncal.core.number_format import figure
-from visioncal.core.types import ImagesKept
 from visioncal.interchange.merge_results import leftover
 from visioncal.interchange.outputs import write_alignment
 from visioncal.results import Alignment
-from visioncal.robot import Convention
 from visioncal.session import Session
 
 # Levels of noise that are nearer to what is said are not worth a word.

@@ -4,31 +4,16 @@ import json
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.markup import escape
 
-from visioncal.calibration.pipeline import run, run_dense
-from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.pipeline.running import check_dense, check_solver
-from visioncal.cli.align import align_into
-from visioncal.cli.console import messages, tell_written
 from visioncal.cli.options import AsJson, NeedOptions, OutFolder
-from visioncal.cli.pointing import naming
-from visioncal.cli.progress import shown_progress
-from visioncal.cli.summary import print_summary
 from visioncal.cli.working import WorkOptions
-from visioncal.core.errors import DataError
-from visioncal.core.types import SolverName
-from visioncal.interchange.merge_results import leftover
-from visioncal.interchange.outputs import RECORDING, write_outputs
-from visioncal.results import to_document
-from visioncal.results.whole import whole_document
-from visioncal.robot import Convention
-from visioncal.session import Session
-from visioncal.session.shared_arm import join_sessions
-from visioncal.session.single import is_whole_cell
+from visioncal.core.choices import Convention, SolverName
+
+if TYPE_CHECKING:
+    from visioncal.session import Session
 
 
 def calibrate_command(
@@ -93,6 +78,23 @@ def calibrate_command(
     solved together, in one frame; other commands take one of each out of that result (--camera,
     --robot, --target).
     """
+    # What help and a mistyped option need not wait for.
+    from rich.markup import escape
+
+    from visioncal.calibration.pipeline import run, run_dense
+    from visioncal.calibration.pipeline.run_state import RunState
+    from visioncal.calibration.pipeline.running import check_dense, check_solver
+    from visioncal.cli.align import align_into
+    from visioncal.cli.console import messages, tell_written
+    from visioncal.cli.pointing import naming
+    from visioncal.cli.progress import shown_progress
+    from visioncal.cli.summary import print_summary
+    from visioncal.interchange.merge_results import leftover
+    from visioncal.interchange.outputs import RECORDING, write_outputs
+    from visioncal.results import to_document
+    from visioncal.results.whole import whole_document
+    from visioncal.session.single import is_whole_cell
+
     without = work.left_out
     # Of several sessions, the recording is the session of them all.
     session = sessions[0] if len(sessions) == 1 else out / RECORDING
@@ -144,7 +146,10 @@ def calibrate_command(
     tell_written(written, quiet=as_json)
 
 
-def _joined(sessions: Sequence[Session], *, shared: bool) -> Session:
+def _joined(sessions: Sequence["Session"], *, shared: bool) -> "Session":
+    from visioncal.core.errors import DataError
+    from visioncal.session.shared_arm import join_sessions
+
     if len(sessions) == 1 or shared:
         return join_sessions(sessions)
     raise DataError(

@@ -8,11 +8,11 @@ from rich.markup import escape
 
 from visioncal.cli.console import messages
 from visioncal.cli.options import Force, OutFile, PartOptions
+from visioncal.core.choices import Convention
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, read_text, write_atomically
 from visioncal.interchange.exports import EXPORT_FORMATS, Load, Selection, document
 from visioncal.interchange.result_files import load_exportable
-from visioncal.robot import Convention
 
 
 def _show_formats(wanted: bool) -> None:

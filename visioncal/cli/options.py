@@ -2,12 +2,14 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
 
-from visioncal.session import Session
-from visioncal.session.choosing import Choice
+# Help does not wait for them.
+if TYPE_CHECKING:
+    from visioncal.session import Session
+    from visioncal.session.choosing import Choice
 
 SessionArgument: TypeAlias = Annotated[
     Path, typer.Argument(help="A session's folder, or its .rrd recording.")
@@ -50,8 +52,10 @@ class PartOptions:
     ] = None
 
     @property
-    def choice(self) -> Choice:
+    def choice(self) -> "Choice":
         """The same, as sessions and results take it."""
+        from visioncal.session.choosing import Choice
+
         return Choice(self.camera, self.robot, self.target)
 
 
@@ -71,10 +75,12 @@ class NeedOptions:
         float | None, typer.Option("--need-deg", help="The same in rotation, in degrees.")
     ] = None
 
-    def session(self, path: Path) -> Session:
+    def session(self, path: Path) -> "Session":
         """Loads a session with that need.
 
         Raises:
             DataError: It cannot be read, or the need is no positive number.
         """
+        from visioncal.session import Session
+
         return Session.load(path).needing(self.need_mm, self.need_deg)

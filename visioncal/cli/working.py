@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from visioncal.core.types import ImagesKept
+from visioncal.core.choices import ImagesKept
 from visioncal.interchange.outputs import RECORDING, REPORT
 
 

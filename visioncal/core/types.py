@@ -22,12 +22,6 @@ TargetKind: TypeAlias = Literal[
     "charuco", "checkerboard", "aprilgrid", "circles", "marker", "points"
 ]
 
-# The joint fit, or one of the closed forms.
-SolverName: TypeAlias = Literal[
-    "joint", "tsai", "park", "horaud", "daniilidis", "andreff", "shah", "li"
-]
-# What a recording keeps of the images of its session, beside their digests.
-ImagesKept: TypeAlias = Literal["full", "thumbnail", "none"]
 
 # Called with a stage's name, its steps done, and its steps in all.
 Progress: TypeAlias = Callable[[str, int, int], None]

@@ -16,7 +16,7 @@ from visioncal.core.output_generations import write_generation
 if TYPE_CHECKING:
     from visioncal.calibration.pipeline import Run as Calibrated
     from visioncal.calibration.verification import Check, Outcome
-    from visioncal.core.types import ImagesKept
+    from visioncal.core.choices import ImagesKept
     from visioncal.core.verdict import Verdict
     from visioncal.dynamics import Run
     from visioncal.dynamics.planned import MotionPlan

@@ -36,8 +36,6 @@ from visioncal.robot.momentum import mass_matrices, momenta
 from visioncal.robot.rates import RATE_KEYS, Rates
 from visioncal.robot.recognising import Recognised, other_convention, recognised_convention
 from visioncal.robot.tables import (
-    CONVENTIONS,
-    Convention,
     DHTable,
     table_document,
     table_from_document,
@@ -57,7 +55,6 @@ from visioncal.robot.writing import (
 
 __all__ = [
     "BODY_KEYS",
-    "CONVENTIONS",
     "FUNCTION_NAMES",
     "INERTIA_KEY",
     "LINK_KEYS",
@@ -67,7 +64,6 @@ __all__ = [
     "RATE_KEYS",
     "ROBOT_SUFFIXES",
     "Chain",
-    "Convention",
     "DHTable",
     "Inertias",
     "Loads",

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from visioncal.core.choices import Convention
 from visioncal.core.transforms import compose, invert, skew
 from visioncal.core.types import FloatArray, Mask
 from visioncal.robot.chain import Chain, chain_document
 from visioncal.robot.model import LINK_KEYS, Robot
 from visioncal.robot.tables import (
-    Convention,
     DHTable,
     about_x,
     about_z,

@@ -5,13 +5,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from visioncal.core.choices import Convention
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, invert, nearest_rotation, rotation_angle
 from visioncal.core.types import FloatArray
 from visioncal.robot.chain import IDENTITY_FUNCTION, chain_document
 from visioncal.robot.kinematics import build_model, flange_poses
 from visioncal.robot.model import Robot
-from visioncal.robot.tables import Convention, DHTable, chain_of_table, table_from_document
+from visioncal.robot.tables import DHTable, chain_of_table, table_from_document
 
 # Two constant transforms have twelve unknowns; fewer rows fit anything.
 _FEWEST_ROWS = 5

@@ -3,10 +3,11 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias, cast
+from typing import Any, cast
 
 import numpy as np
 
+from visioncal.core.choices import CONVENTIONS, Convention
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, write_pose
 from visioncal.core.errors import DataError
 from visioncal.core.files import Table
@@ -14,8 +15,6 @@ from visioncal.core.transforms import compose
 from visioncal.core.types import FloatArray, Mask
 from visioncal.robot.chain import Chain, joint_function, joint_tables, number_list, subtable
 
-Convention: TypeAlias = Literal["standard", "modified", "hayati"]
-CONVENTIONS: tuple[Convention, ...] = ("standard", "modified", "hayati")
 # The offset is theta_offset_rad or d_m.
 _FUNCTION_KEYS = ("", "gear_ratio", "sine_rad", "cosine_rad")
 _POSE_KEYS = ("xyz_m", "rpy_rad")

@@ -28,6 +28,7 @@ from visioncal.calibration.stages.image_delays import FoundDelay
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.offset import Clock
 from visioncal.calibration.stages.validate import HeldOut
+from visioncal.core.choices import Convention
 from visioncal.core.types import FloatArray
 from visioncal.estimation.chain import scatter
 from visioncal.estimation.intervals import noise_intervals
@@ -35,7 +36,6 @@ from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import Solution, covariance_of, fit_problem
 from visioncal.results import Edge, Moved, Sight
-from visioncal.robot import Convention
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,12 +7,12 @@ import numpy as np
 
 from visioncal.calibration.pipeline.running import Run, run
 from visioncal.calibration.stages.dense import Dense, explained
+from visioncal.core.choices import Convention, SolverName
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.number_format import figure
-from visioncal.core.types import Progress, SolverName
+from visioncal.core.types import Progress
 from visioncal.results import Calibration, Rms
 from visioncal.results.sections import CornerResiduals, DenseResult, ImageBlur
-from visioncal.robot import Convention
 from visioncal.session import Session
 from visioncal.vision.dense.library import chosen_device
 

@@ -8,9 +8,9 @@ from visioncal.calibration.pipeline.dense_corners import run_dense
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.running import check_dense, known_at_first, run_steps
 from visioncal.calibration.pipeline.whole import alignment_of
-from visioncal.core.types import Corners, Progress, SolverName
+from visioncal.core.choices import Convention, SolverName
+from visioncal.core.types import Corners, Progress
 from visioncal.results import Alignment, Calibration
-from visioncal.robot import Convention
 from visioncal.session import Session
 
 

@@ -14,9 +14,10 @@ from visioncal.calibration.stages.judge import Findings
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.offset import Clock
 from visioncal.calibration.stages.readings import Readings
-from visioncal.core.types import Corners, Mount, SolverName
+from visioncal.core.choices import Convention, SolverName
+from visioncal.core.types import Corners, Mount
 from visioncal.results import Verdict
-from visioncal.robot import Convention, Loads
+from visioncal.robot import Loads
 from visioncal.session.loads import loads_of
 from visioncal.session.single import is_whole_cell
 

@@ -15,13 +15,13 @@ from visioncal.calibration.stages.handeye import SOLVER_NAMES
 from visioncal.calibration.stages.kinematics import check_level
 from visioncal.calibration.stages.next_views_hint import with_proposal
 from visioncal.calibration.stages.pictures import other_board, pairing
+from visioncal.core.choices import CONVENTIONS, Convention, SolverName
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.types import Progress, SolverName
+from visioncal.core.types import Progress
 from visioncal.core.verdict import MISSING, Finding
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
-from visioncal.robot import CONVENTIONS, Convention
 from visioncal.session import Session
 
 

@@ -25,8 +25,9 @@ from visioncal.calibration.stages.priors import loosened, without_most_contradic
 from visioncal.calibration.stages.refine import lens_levels, refined
 from visioncal.calibration.stages.side import FramesSide
 from visioncal.calibration.stages.validate import chain_rms_px
+from visioncal.core.choices import SolverName
 from visioncal.core.errors import DegenerateError
-from visioncal.core.types import FloatArray, IntArray, Mask, Mount, SolverName, Target
+from visioncal.core.types import FloatArray, IntArray, Mask, Mount, Target
 from visioncal.core.verdict import Finding
 from visioncal.estimation.arm import rows_of
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.calibration.guess.joints import JointReading
+from visioncal.core.choices import Convention
 from visioncal.core.number_format import figure
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray
@@ -45,7 +46,6 @@ from visioncal.results.arm import (
     WorkspaceSigma,
 )
 from visioncal.robot import (
-    Convention,
     DHTable,
     Robot,
     convert_table,

@@ -27,6 +27,7 @@ from visioncal.calibration.stages.thermal import (
     heating,
 )
 from visioncal.calibration.stages.thermal_fit import Stops, ThermalFit
+from visioncal.core.choices import Convention
 from visioncal.core.transforms import distances, invert, mean_transform
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.core.verdict import Finding
@@ -52,7 +53,7 @@ from visioncal.results.arm import (
     JointFunctions,
     ThermalResult,
 )
-from visioncal.robot import Convention, Loads
+from visioncal.robot import Loads
 from visioncal.session import Session, View
 from visioncal.session.loads import loads_of
 

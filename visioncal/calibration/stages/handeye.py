@@ -5,8 +5,9 @@ from typing import get_args
 
 import numpy as np
 
+from visioncal.core.choices import SolverName
 from visioncal.core.transforms import invert
-from visioncal.core.types import FloatArray, Mount, SolverName
+from visioncal.core.types import FloatArray, Mount
 from visioncal.estimation.chain import robot_part, scatter
 from visioncal.estimation.closed_form import SOLVERS
 from visioncal.estimation.parts import State

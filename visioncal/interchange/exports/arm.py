@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from visioncal.core.choices import CONVENTIONS, Convention
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.estimation.workspace import postures
@@ -14,8 +15,6 @@ from visioncal.interchange.exports.sources import Source
 from visioncal.results import Calibration, Verdict
 from visioncal.results.arm import JointFunctions, WorkspaceSigma
 from visioncal.robot import (
-    CONVENTIONS,
-    Convention,
     DHTable,
     Robot,
     parallel_axes,

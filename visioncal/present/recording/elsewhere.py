@@ -6,8 +6,8 @@ from pathlib import Path
 
 import cv2
 
+from visioncal.core.choices import ImagesKept
 from visioncal.core.errors import DataError
-from visioncal.core.types import ImagesKept
 from visioncal.vision.finders.imaging import decode_image
 
 # Of the full size, so that corners lie over it where they were found: a twentieth of the bytes.

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pyarrow as pa
 
+from visioncal.core.choices import ImagesKept
 from visioncal.core.errors import DataError
 from visioncal.core.files import parse_toml, sha256
-from visioncal.core.types import ImagesKept
 from visioncal.present.recording import codec, paths
 from visioncal.present.recording.elsewhere import ImagesElsewhere
 from visioncal.present.recording.frames import CHUNK, Frame, Scan, read_payload, scan

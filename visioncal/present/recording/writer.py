@@ -8,9 +8,9 @@ from typing import Self
 
 from rerun.blueprint import BlueprintLike
 
+from visioncal.core.choices import ImagesKept
 from visioncal.core.errors import DataError
 from visioncal.core.files import named_errors, sha256, written_beside
-from visioncal.core.types import ImagesKept
 from visioncal.present.recording import codec
 from visioncal.present.recording.cells import log_cell
 from visioncal.present.recording.elsewhere import ImagesElsewhere, faint_picture
