@@ -319,6 +319,13 @@ BROKEN: Mapping[str, Mistake] = {
         _images(lambda it: cv2.resize(it, (960, 600), interpolation=cv2.INTER_AREA)),
         "960 x 600",
     ),
+    "images turned clockwise": Mistake(
+        _images(lambda it: cv2.rotate(it, cv2.ROTATE_90_CLOCKWISE)), "turned by 90 degrees clockw"
+    ),
+    "images turned counterclockwise": Mistake(
+        _images(lambda it: cv2.rotate(it, cv2.ROTATE_90_COUNTERCLOCKWISE)),
+        "turned by 90 degrees counterclockw",
+    ),
     "the lens of larger images": Mistake(
         lambda folder: (
             _images(lambda it: cv2.resize(it, (960, 600), interpolation=cv2.INTER_AREA))(folder),

@@ -117,7 +117,7 @@ def _toml_written(folder: Path, said: str) -> bool:
         table = re.match(r"\[(\w+)\] ", text)
         fields = text[table.end() if table else 0 :].replace(" and ", "\n")
         for key, value in tomllib.loads(fields).items():
-            in_camera = key in ("resolution", "matrix")
+            in_camera = key in ("resolution", "matrix", "distortion")
             where = table[1] if table else "camera" if in_camera else ""
             (document[where] if where else document)[key] = value
         (folder / name).write_text(tomli_w.dumps(document), "utf-8")

@@ -14,11 +14,12 @@ import cv2
 import numpy as np
 
 from visioncal.calibration.stages.corner_numbers import OTHER_NUMBERS, check_numbers
+from visioncal.calibration.stages.image_size import other_size_step
 from visioncal.calibration.stages.kept_corners import KeptCorners, Searched
 from visioncal.core.errors import DataError
 from visioncal.core.limits import MAX_BLUR_PX
 from visioncal.core.threads import SharedSetting
-from visioncal.core.types import Corners, FloatArray, Image, IntArray, Progress, Rejection, Target
+from visioncal.core.types import Corners, Image, IntArray, Progress, Rejection, Target
 from visioncal.estimation.planar import determines_pose
 from visioncal.session import Session, View
 from visioncal.session.kinds import name_of
@@ -32,10 +33,8 @@ from visioncal.vision.targets import corner_positions, point_numbers
 _FEWEST_GIVEN = 4
 # Corners that others have found may lie outside the image by this share of it.
 _OUTSIDE = 0.1
-# Sides whose shares differ by less are of images that were resized, and not cut.
-_SAME_SHAPE = 0.02
-# Images looked at to tell which layout was printed.
-_LAYOUT_SAMPLE = 3
+# Images with corners that tell which layout was printed, or how they were turned; of so many.
+_LAYOUT_SAMPLE, _MOST_LOOKED_AT = 3, 12
 
 
 @dataclass(frozen=True)
@@ -347,25 +346,32 @@ def _other_size(
 ) -> DataError:
     """What to raise where all images are of one other size than the camera's."""
     camera = session.cameras[name_of(session.declaration, "camera", views[0])]
-    step = f"In session.toml, write resolution = [{size[0]}, {size[1]}]"
-    scales = size[0] / stated[0], size[1] / stated[1]
-    if camera.stated is not None and size != stated[::-1]:
-        if abs(scales[0] / scales[1] - 1.0) < _SAME_SHAPE:
-            fx, fy, cx, cy = scaled_matrix(camera.stated.matrix, scales[0])
-            step += f" and matrix = [{fx:.2f}, {fy:.2f}, {cx:.2f}, {cy:.2f}]"
-        else:
-            step += ", and delete matrix and distortion: they are of other images"
+    words, step = "", f"In session.toml, write resolution = [{size[0]}, {size[1]}]"
+    if camera.stated is not None:
+        name = session.board_of(views[0])
+        seen = _sample(session, views, name) if size == stated[::-1] else {}
+        words, step = other_size_step(camera.stated, size, seen, session.boards[name])
     return DataError(
         f"All {len(culprits)} images are {size[0]} x {size[1]} px, but session.toml has "
-        f"resolution = [{stated[0]}, {stated[1]}].",
+        f"resolution = [{stated[0]}, {stated[1]}]{words and f': {words}'}.",
         culprits=culprits,
         next_step=f"{step}.",
     )
 
 
-def scaled_matrix(matrix: FloatArray, scale: float) -> FloatArray:
-    """fx, fy, cx, cy of images that were resized; pixel centres are at whole numbers."""
-    return np.array([*(scale * matrix[:2]), *(scale * (matrix[2:] + 0.5) - 0.5)])
+def _sample(session: Session, views: Sequence[View], name: str) -> dict[int, Corners]:
+    """The corners of a few views that show a board."""
+    found: dict[int, Corners] = {}
+    for view in [it for it in views if session.board_of(it) == name][:_MOST_LOOKED_AT]:
+        image = image_of(session, view)
+        if isinstance(image, Rejection):
+            continue
+        seen, _ = look_for(image, session.boards[name], view.number)
+        if isinstance(seen, Corners):
+            found[view.number] = seen
+        if len(found) == _LAYOUT_SAMPLE:
+            break
+    return found
 
 
 def _stated_resolution(session: Session, views: Sequence[View]) -> tuple[int, int] | None:

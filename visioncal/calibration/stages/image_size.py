@@ -1,0 +1,88 @@
+"""Images of another size than the camera's: resized, cut or turned, and the lens that they have."""
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from visioncal.calibration.stages.pnp import estimate_poses
+from visioncal.core.errors import DataError
+from visioncal.core.types import Camera, Corners, FloatArray, Target
+
+# Sides whose shares differ by less are of images that were resized, and not cut.
+_SAME_SHAPE = 0.02
+
+
+def other_size_step(
+    stated: Camera, size: tuple[int, int], corners: Mapping[int, Corners], target: Target
+) -> tuple[str, str]:
+    """Says what happened to the images of a lens, and what to write in [camera].
+
+    Args:
+        stated: The lens as it is stated.
+        size: The size of all images [px].
+        corners: What some of them show.
+        target: What that is.
+
+    Returns:
+        What happened to the images, empty where nothing is known of it; and what to write.
+    """
+    step = f"In session.toml, write resolution = [{size[0]}, {size[1]}]"
+    scales = size[0] / stated.resolution[0], size[1] / stated.resolution[1]
+    if size == stated.resolution[::-1]:
+        how, lens = _turned_how(stated, corners, target)
+        if not how:
+            return "", step
+        step += f" and {_written('matrix', lens.matrix, '.2f')}"
+        if np.any(stated.distortion[2:4]) and stated.model == "brown":
+            step += f" and {_written('distortion', lens.distortion, '.6g')}"
+        return (
+            f"the images were turned by 90 degrees {how} after the matrix was made",
+            f"{step}; the camera's frame turns with them",
+        )
+    if abs(scales[0] / scales[1] - 1.0) < _SAME_SHAPE:
+        matrix = scaled_matrix(stated.matrix, scales[0])
+        return "", f"{step} and {_written('matrix', matrix, '.2f')}"
+    return "", f"{step}, and delete matrix and distortion: they are of other images"
+
+
+def _written(key: str, values: FloatArray, form: str) -> str:
+    return f"{key} = [{', '.join(format(it, form) for it in values.tolist())}]"
+
+
+def scaled_matrix(matrix: FloatArray, scale: float) -> FloatArray:
+    """fx, fy, cx, cy of images that were resized; pixel centres are at whole numbers."""
+    return np.array([*(scale * matrix[:2]), *(scale * (matrix[2:] + 0.5) - 0.5)])
+
+
+def turned_lens(camera: Camera, *, clockwise: bool) -> Camera:
+    """The lens of images that were turned by 90 degrees; their camera's frame turns with them."""
+    (width, height), (fx, fy, cx, cy) = camera.resolution, camera.matrix
+    matrix = [fy, fx, height - 1 - cy, cx] if clockwise else [fy, fx, cy, width - 1 - cx]
+    distortion = camera.distortion.copy()
+    if camera.model == "brown":
+        p1, p2 = distortion[2:4]
+        distortion[2:4] = (p2, -p1) if clockwise else (-p2, p1)
+    return Camera(camera.model, (height, width), np.array(matrix), distortion)
+
+
+def _turned_how(
+    stated: Camera, corners: Mapping[int, Corners], target: Target
+) -> tuple[str, Camera]:
+    """Which way images were turned; empty where the stated matrix is theirs as it stands."""
+
+    def readings() -> Iterator[tuple[str, Camera]]:
+        yield "", Camera(stated.model, stated.resolution[::-1], stated.matrix, stated.distortion)
+        yield "clockwise", turned_lens(stated, clockwise=True)
+        yield "counterclockwise", turned_lens(stated, clockwise=False)
+
+    def misfit(reading: tuple[str, Camera]) -> float:
+        lens = reading[1]
+        if not corners:
+            # A principal point is near the middle.
+            return float(np.linalg.norm(lens.matrix[2:] - np.array(lens.resolution) / 2))
+        try:
+            return estimate_poses(corners, [target], lens).sigma_px
+        except DataError:
+            return np.inf
+
+    return min(readings(), key=misfit)
