@@ -3,13 +3,13 @@
 Both sides work on the same 40 five-megapixel images with the same number of threads, one after the
 other in turns. The peer reads each file and calls OpenCV's ChArUco detector. visioncal is the
 command with report and recording, started anew; and its API without outputs in a warm process.
+Processor time counts all threads, and other programs on the machine move it less than wall time.
 
-    PYTHONPATH=tests python tests/benchmarks/calibrate.py [--quick]
+    PYTHONPATH=tests python tests/benchmarks/calibrate.py [REPEATS] [--quick]
 """
 
 import os
 import resource
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -20,7 +20,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
-from results import few, first, write_section
+import numpy as np
+from results import few, first, wished, write_section
 from support.cells import calibrated
 
 import visioncal
@@ -31,9 +32,13 @@ from visioncal.interchange.outputs import write_outputs
 from visioncal.simulation import CellOptions, fine_camera, simulate, write_session
 from visioncal.vision.targets import charuco_board
 
-VIEWS, REPEATS, MANY = few((40, 3, 1000), (6, 1, 30))
+VIEWS, MANY = few((40, 1000), (6, 30))
+# As many as are wished on the command line.
+REPEATS = wished(3)
 THREADS = [it for it in (1, 2, 4) if it <= (os.cpu_count() or 1)]
 COMMAND = [sys.executable, "-m", "visioncal"]
+# Installed packages have their byte code beside them.
+ENVIRONMENT = {it: value for it, value in os.environ.items() if it != "PYTHONDONTWRITEBYTECODE"}
 
 
 def opencv_alone(files: list[Path], board: cv2.aruco.CharucoBoard, threads: int) -> int:
@@ -49,25 +54,26 @@ def opencv_alone(files: list[Path], board: cv2.aruco.CharucoBoard, threads: int)
         return sum(pool.map(corners, files))
 
 
-def seconds(work: Callable[[], object]) -> float:
-    """Times one call."""
-    start = time.perf_counter()
+def seconds(work: Callable[[], object]) -> np.ndarray:
+    """Wall and processor time of one call, (2,)."""
+    start = time.perf_counter(), time.process_time()
     work()
-    return time.perf_counter() - start
+    return np.subtract((time.perf_counter(), time.process_time()), start)
 
 
-def processor_seconds(command: list[str]) -> float:
-    """Processor time of a program."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run(command, check=True, capture_output=True)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+def of_program(command: list[str]) -> np.ndarray:
+    """Wall and processor time of a program, (2,)."""
+    before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    subprocess.run(command, check=True, capture_output=True, env=ENVIRONMENT)
+    after, wall = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter() - start
+    used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return np.array([wall, used])
 
 
-def medians(*works: Callable[[], float]) -> list[float]:
-    """The median of each over interleaved repetitions, after one that is not counted."""
+def medians(*works: Callable[[], np.ndarray]) -> np.ndarray:
+    """The medians of each over interleaved repetitions, after one that is not counted, (n, 2)."""
     rounds = [[it() for it in works] for _ in range(REPEATS + 1)][1:]
-    return [statistics.median(column) for column in zip(*rounds, strict=True)]
+    return np.median(rounds, axis=0)
 
 
 def rows_of(ending: str, quality: int | None, level: str, folder: Path) -> list[list[str]]:
@@ -84,17 +90,17 @@ def rows_of(ending: str, quality: int | None, level: str, folder: Path) -> list[
     for threads in first(THREADS):
         command = [*COMMAND, "calibrate", str(session), "-o", str(folder / "out")]
         command += ["--threads", str(threads), "--level", asked]
-        whole, bare, peer = medians(
-            lambda command=command: seconds(
-                lambda: subprocess.run(command, check=True, capture_output=True)
-            ),
+        times = medians(
+            lambda command=command: of_program(command),
             lambda threads=threads: seconds(
                 lambda: visioncal.calibrate(session, level=asked, threads=threads)
             ),
             lambda threads=threads: seconds(lambda: opencv_alone(files, board, threads)),
         )
-        rows.append([ending, level, str(threads), *(f"{it:.2f}" for it in (whole, bare, peer)),
-                     f"{whole / peer:.1f}", f"{bare / peer:.2f}"])  # fmt: skip
+        ratios = times[:2] / times[2]
+        rows.append([ending, level, str(threads), *(f"{it:.2f}" for it in times[:, 1]),
+                     *(f"{it:.2f}" for it in ratios[:, 1]),
+                     *(f"{it:.2f}" for it in ratios[:, 0])])  # fmt: skip
     return rows
 
 
@@ -108,7 +114,7 @@ def started() -> list[list[str]]:
         "import typer": [*python, "import typer"],
         "nothing": [*python, "pass"],
     }
-    found = medians(*(lambda it=it: processor_seconds(it) for it in commands.values()))
+    found = medians(*(lambda it=it: of_program(it) for it in commands.values()))[:, 1]
     *_, typer, _ = found
     return [[name, f"{it:.2f}", f"{it / typer:.1f}"]
             for name, it in zip(commands, found, strict=True)]  # fmt: skip
@@ -124,7 +130,7 @@ def small(folder: Path) -> list[list[str]]:
         "--no-report --no-recording": ["--no-report", "--no-recording"],
         "the same, corners kept": ["--no-report", "--no-recording", "--keep-corners"],
     }
-    found = medians(*(lambda it=it: processor_seconds([*command, *it]) for it in kinds.values()))
+    found = medians(*(lambda it=it: of_program([*command, *it]) for it in kinds.values()))[:, 1]
     return [[name, f"{it:.2f}"] for name, it in zip(kinds, found, strict=True)]
 
 
@@ -134,12 +140,10 @@ def outputs(folder: Path) -> float:
     known = calibrated(simulate(options))
     done = Run(result_of(known), view_evidence(known))
 
-    def written() -> float:
-        begin = time.process_time()
+    def write() -> None:
         write_outputs(folder / "many", known.session, done)
-        return time.process_time() - begin
 
-    return 1e3 * medians(written)[0] / MANY
+    return float(1e3 * medians(lambda: seconds(write))[0, 1] / MANY)
 
 
 def table(head: list[str], rows: list[list[str]]) -> str:
@@ -154,12 +158,14 @@ def main() -> None:
         rows = [row for kind in first(kinds) for row in rows_of(*kind, folder)]
         text = (
             f"{VIEWS} views of 2448 x 2048 of a 9 x 6 ChArUco board, median of {REPEATS} "
-            "interleaved runs, wall time. The command is started anew and writes report and "
-            "recording; the API is warm and writes nothing; OpenCV reads and detects, no more. "
-            f"Load average meanwhile: {os.getloadavg()[2]:.0f}."
+            "interleaved runs, processor time of all threads together. The command is started "
+            "anew and writes report and recording; the API is warm and writes nothing; OpenCV "
+            "reads and detects, no more. "
+            f"Load average meanwhile: {os.getloadavg()[2]:.0f} on {os.cpu_count()} cores."
         )
         head = ["files", "level", "threads", "command [s]", "API [s]", "OpenCV detection [s]",
-                "command / OpenCV", "API / OpenCV"]  # fmt: skip
+                "command / OpenCV", "API / OpenCV", "command / OpenCV, wall",
+                "API / OpenCV, wall"]  # fmt: skip
         text += f"\n\n{table(head, rows)}"
         text += "\n\nProcessor time of what is typed first:\n\n"
         text += table(["", "s", "over import typer"], started())
