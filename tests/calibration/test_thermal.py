@@ -153,14 +153,14 @@ def test_motion_is_that_of_the_arm_with_its_links_grown():
 @pytest.mark.parametrize("kind", ["temperatures", "currents"])
 def test_links_follow_the_differential_equation(kind):
     heating, heat = Heating(kind, np.full(6, 900.0), np.full(6, 2.0)), inputs(kind)
-    rest = heating.rest(heat.told, heat.ambient_c)
+    rest = heating.rest(heat.signal, heat.ambient_c)
     held = 0.5 * (rest[:-1] + rest[1:])
 
     def slope(t, s):
         at = min(int(t // 40.0), len(held) - 1)
         return (held[at] - s) / 900.0
 
-    start = heating.cold(heat.told, heat.ambient_c)
+    start = heating.cold(heat.signal, heat.ambient_c)
     end_s = heat.stamps_s[-1]
     exact = solve_ivp(slope, (0.0, end_s), start, max_step=10.0, rtol=1e-8).y[:, -1]
     # The integration steps across the jumps of the input; its own error is about a millikelvin.
@@ -206,7 +206,7 @@ def test_the_flange_moves_with_the_parameters_as_it_is_told():
 def test_the_compensator_follows_what_the_fit_computes(kind):
     heat, drifting = inputs(kind), model(kind)
     following = OnlineCompensator(drifting)
-    given = heat.told if kind == "temperatures" else np.sqrt(heat.told)
+    given = heat.signal if kind == "temperatures" else np.sqrt(heat.measured)
     name = "temperatures_c" if kind == "temperatures" else "currents_a"
     for stamp_s, row, air in zip(heat.stamps_s, given, heat.ambient_c, strict=True):
         following.feed(stamp_s, **{name: row}, ambient_c=air)

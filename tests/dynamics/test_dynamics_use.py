@@ -176,7 +176,7 @@ def test_what_the_drives_gains_are_known_to_counts_in_the_mass(run, world):
 
 def test_no_payload_is_none(world, run):
     same = exercise_session("ur10e", {"again": world.empty.streams["check"]})
-    with pytest.raises(DegenerateError, match="cannot be told from none"):
+    with pytest.raises(DegenerateError, match="does not differ from none"):
         estimate_payload(run.identified, loaded_streams(run.identified, same))
 
 
@@ -191,7 +191,7 @@ def test_a_known_payload_tells_the_drives_gains():
 
     empty, full = currents(world.empty, "exercise"), currents(world.full, "loaded")
     found = drive_gains(base, empty, full, body_of(load))
-    assert found.told.all()
+    assert found.determined.all()
     # Four sigmas, and half a percent at the most.
     assert (np.abs(found.nm_per_a - gains) < 4.0 * found.sigma).all()
     assert found.nm_per_a == pytest.approx(gains, rel=0.02)
@@ -300,7 +300,7 @@ def test_gains_need_currents(world, tmp_path):
     known = ("--mass-kg", 8.0, "--com-mm", "80,-30,80")
     path = tmp_path / "loaded"
     done = visioncal("dynamics", "gains", path, "--loaded", path, *known)
-    assert (done.status, "tells torques and no currents" in done.err) == (2, True)
+    assert (done.status, "has torques and no currents" in done.err) == (2, True)
 
 
 def test_base_parameters_are_read_as_they_were_kept(run, tmp_path):

@@ -243,9 +243,9 @@ def test_what_cannot_be_checked_is_said(tmp_path):
     path.write_text(tomli_w.dumps(document))
     done = plan(path, tmp_path / "out", "--no-sweeps", "--harmonics", 3)
     assert done.status == 0, done.err
-    assert "warning: not checked: torques: the description of small tells no inertias" in done.err
+    assert "warning: not checked: torques: the description of small states no inertias" in done.err
     written = json.loads((tmp_path / "out" / "plan.json").read_text(encoding="utf-8"))
-    assert "tells no inertias" in written["not_checked"][0]
+    assert "states no inertias" in written["not_checked"][0]
 
 
 @pytest.mark.parametrize(

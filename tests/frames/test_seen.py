@@ -179,7 +179,7 @@ def test_one_image_is_checked_by_nothing_and_two_do_not_tell_which_is_right(cell
     assert alone.scatter == 1.0
     wrong = sights_of(made, parent, place @ exp(np.array([0, 0, 0.02, 0.004, 0, 0])), rng, 2)
     torn = place_seen(calibration, [sights[0], wrong[1]], BOARD, parent)
-    assert "nothing tells which are right" in torn.warnings[0]
+    assert "it is not known which are right" in torn.warnings[0]
     assert torn.agrees.all()
     # The contradiction counts in the sigmas.
     assert torn.scatter > 5.0

@@ -86,7 +86,7 @@ def _body(mass_kg: float, com_mm: str, inertia: str) -> FloatArray:
 
 def _row(name: str, found: Gains, at: int) -> dict[str, str | float]:
     """What is told of a drive; nothing where that is not told."""
-    if not found.told[at]:
+    if not found.determined[at]:
         return {"joint": name}
     gain, sigma = float(found.nm_per_a[at]), float(found.sigma[at])
     return {"joint": name, "nm_per_a": gain, "sigma_nm_per_a": sigma}
@@ -94,12 +94,12 @@ def _row(name: str, found: Gains, at: int) -> dict[str, str | float]:
 
 def _tell(names: tuple[str, ...], found: Gains) -> None:
     for name, gain, sigma, told in zip(
-        names, found.nm_per_a.tolist(), found.sigma.tolist(), found.told, strict=True
+        names, found.nm_per_a.tolist(), found.sigma.tolist(), found.determined, strict=True
     ):
         words = "not told: the body hardly moves it"
         if told:
             words = f"{matched(gain, sigma)} N m/A (sigma {significant(sigma)})"
         messages().print(escape(f"{name}: {words}"))
-    if found.told.all():
+    if found.determined.all():
         gains = ",".join(f"{it:.5g}" for it in found.nm_per_a)
         typer.echo(f"--gains {gains}")

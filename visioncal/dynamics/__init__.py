@@ -1,4 +1,4 @@
-"""Dynamics: the torques that an arm needs, and the parameters that measured ones tell."""
+"""Dynamics: the torques that an arm needs, and the parameters identified from measured ones."""
 
 from visioncal.dynamics.arm import ArmDynamics
 from visioncal.dynamics.base import BaseModel

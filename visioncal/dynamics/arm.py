@@ -114,5 +114,5 @@ class ArmDynamics:
         return replace(self, inertias=Inertias(values))
 
     def weighed(self) -> Robot:
-        """The robot whose document tells these inertias, as the elastic level uses them."""
+        """The robot whose document states these inertias, as the elastic level uses them."""
         return with_inertias(self.robot, self.inertias)

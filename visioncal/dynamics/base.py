@@ -1,4 +1,4 @@
-"""The parameters that a motion can tell: independent combinations of a model's.
+"""Base parameters, all that a motion can identify: independent combinations of a model's.
 
 Many of a model's parameters move the torques alike, or not at all. A rank-revealing decomposition
 of its regressor in many random states finds a set of columns that are independent, and how the

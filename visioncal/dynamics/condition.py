@@ -1,4 +1,4 @@
-"""How well a motion tells the base parameters: the condition of its regressor."""
+"""How well a motion determines the base parameters: the condition of its regressor."""
 
 from dataclasses import dataclass
 

@@ -17,8 +17,8 @@ from visioncal.dynamics.reading import Recorded
 from visioncal.dynamics.smoothing import WIDER, band_of, smoothed_motion, window_of
 
 # Torques of a rigid arm have all but their friction's corners within so many times the band of its
-# motion; below so many a second there is little to tell noise by, and beyond the other gears and
-# links swing by themselves [Hz]. Motions are smoothed no less than so many times wider.
+# motion; below so many a second there is little to estimate noise from, and beyond the other gears
+# and links swing by themselves [Hz]. Motions are smoothed no less than so many times wider.
 _TORQUE_BAND, _LEAST_HZ, _MOST_HZ, _WIDEST = 10.0, 4.0, 10.0, 3.0
 # Samples farther apart than so many times the usual, and than so much [s], have others missing
 # between them; steps that differ by more than this share of the usual are resampled.
@@ -43,7 +43,7 @@ class Piece:
 
     Attributes:
         measured: The samples.
-        bad: (m, n) torques that tell nothing: cut off, or of a joint that stands still.
+        bad: (m, n) torques without information: cut off, or of a joint that stands still.
         lowpass: For torques and regressor alike.
     """
 
@@ -280,8 +280,8 @@ def _cleaned(
         ("far off from their neighbours", spikes, "these are used in their place"),
     ):
         if wrong.any():
-            told = [f"tau{at + 1} ({n} times)" for at, n in enumerate(wrong.sum(axis=0)) if n]
-            notes.append(f"{recorded.label}: torques are {what}: {some_of(told)}; {done}.")
+            joints = [f"tau{at + 1} ({n} times)" for at, n in enumerate(wrong.sum(axis=0)) if n]
+            notes.append(f"{recorded.label}: torques are {what}: {some_of(joints)}; {done}.")
     return torques, np.asarray(flat)
 
 

@@ -1,6 +1,6 @@
 """Standard parameters that are those of bodies, near known ones, and explain the measured torques.
 
-A motion tells base parameters alone. What is left free, and what is told badly, follows what is
+A motion determines base parameters only. What is free or badly determined follows what is
 known of the links before: the fit goes over log-Cholesky coordinates, in which every link is a body
 whatever the torques say, with a weak prior at the known one (Wensing, Kim and Slotine 2018; Lee,
 Wensing and Park 2019; Rucker and Wensing 2022).

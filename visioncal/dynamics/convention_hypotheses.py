@@ -1,4 +1,4 @@
-"""Torques of other units, other joints or the other sign, told by what the robot should need.
+"""Torques of other units, other joints or the other sign, found by what the robot should need.
 
 The robot's own inertias are off by a fifth, but a recording that is mistaken is off by far more. So
 each mistake is tried out: the recording is taken as if it had been made, and what is predicted of
@@ -20,7 +20,7 @@ from visioncal.dynamics.friction import sign
 from visioncal.dynamics.motion import Measured, Motion
 from visioncal.robot import Inertias, Robot, joint_torques
 
-# So many samples are enough to tell, and fewer than these, as of sweeps of single joints, are not.
+# So many samples are enough for a test; fewer, as of sweeps of single joints, are not.
 _SAMPLES, _LEAST = 250, 100
 # A mistake is named where undoing it divides the unexplained power of the torques by this much, and
 # leaves of the joints concerned no more than this share.
@@ -106,9 +106,9 @@ def _predicted_better(robot: Robot, as_it_is: _Guess) -> tuple[_Guess, str] | No
 
 
 def _fitted_better(base: BaseModel, as_it_is: _Guess) -> tuple[_Guess, str] | None:
-    """Two joints in each other's place that a fit tells, if there are, and why.
+    """Two exchanged joints, if a fit finds such a pair, and why.
 
-    Where friction is most of their torques, predictions hardly tell them; but no inertias at all
+    Where friction is most of their torques, predictions hardly show it; but no inertias at all
     can explain the others' torques.
     """
     before, predicted = _unfitted(base, as_it_is.measured), _left(as_it_is)
@@ -258,8 +258,8 @@ def _check_units(label: str, robot: Robot, guess: _Guess) -> None:
     wrong = np.flatnonzero((scales > _HIGH) | (scales < _LOW))
     if not len(wrong):
         return
-    told = np.isfinite(scales).sum()
-    whose = "the torques" if len(wrong) == told else f"the torques of {_named(tuple(wrong))}"
+    tested = np.isfinite(scales).sum()
+    whose = "the torques" if len(wrong) == tested else f"the torques of {_named(tuple(wrong))}"
     scale = float(np.median(scales[wrong]))
     raise DataError(
         f"{label}: {whose} are {scale:.3g} times what the inertias of {robot.name} need; "

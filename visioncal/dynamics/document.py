@@ -30,8 +30,8 @@ def to_document(identified: Identified) -> dict[str, Any]:
         "robot": dict(identified.robot.document),
         "friction": vars(base.model.terms),
         "base": [
-            {"name": name, "value": value, "sigma": sigma, "determined": told}
-            for name, value, sigma, told in zip(
+            {"name": name, "value": value, "sigma": sigma, "determined": determined}
+            for name, value, sigma, determined in zip(
                 base.names,
                 identified.values.tolist(),
                 identified.sigmas.tolist(),
@@ -52,7 +52,7 @@ def to_document(identified: Identified) -> dict[str, Any]:
 
 
 def stribeck_rows(identified: Identified) -> list[dict[str, Any]]:
-    """What is told of each joint whose friction has a hump at low speed."""
+    """The parameters of each joint whose friction has a hump at low speed."""
     humps, count = identified.stribeck, len(identified.stribeck.joints)
     names = [identified.base.model.names[it] for it in identified.base.independent]
     rows = []
@@ -113,8 +113,8 @@ def _standard_document(identified: Identified, consistent: Consistent) -> dict[s
 
 def _validation_document(validation: Validation) -> dict[str, Any]:
     arrays = {name: getattr(validation, name) for name in (*_ALWAYS, *_MAYBE)}
-    told = {name: it.tolist() for name, it in arrays.items() if it is not None}
-    return {"samples": validation.label, **told, "share": validation.shares.tolist()}
+    present = {name: it.tolist() for name, it in arrays.items() if it is not None}
+    return {"samples": validation.label, **present, "share": validation.shares.tolist()}
 
 
 _OWN_KEYS = frozenset(

@@ -1,4 +1,4 @@
-"""Exciting motions: those that tell an arm's base parameters best.
+"""Exciting motions: those that determine an arm's base parameters best.
 
 Swevers, Verdonck and De Schutter (2007, Dynamic model identification for industrial robots): the
 coefficients of finite Fourier series are optimised for the condition of the regressor, within the
@@ -28,8 +28,8 @@ from visioncal.dynamics.limits import Allowed
 from visioncal.dynamics.model import DynamicModel
 from visioncal.dynamics.objective import Objective
 
-# How long a motion may be [s], and of how many harmonics: fewer cannot tell the parameters of six
-# joints, more have speeds that shake the arm.
+# How long a motion may be [s], and of how many harmonics: fewer cannot determine the parameters of
+# six joints, more have speeds that shake the arm.
 SHORTEST_S, LONGEST_S = 10.0, 30.0
 FEWEST, MOST = 3, 10
 # Sharpness of the condition and price of breaches, round by round.
@@ -43,7 +43,7 @@ _HALVINGS, _CLEAR_HZ = 8, 10.0
 _SMALLER, _TRIES = 0.97, 5
 # Figures do not change with more samples than these.
 _FIGURES_HZ = 100.0
-# Random motions whose condition is told, to compare with.
+# Random motions whose condition is reported for comparison.
 _COMPARED = 20
 # Broken limits that a message names.
 _NAMED = 3
@@ -56,7 +56,7 @@ class ExcitationRequest:
     Attributes:
         period_s: How long it lasts [s].
         harmonics: How many harmonics of that period it has.
-        terms: The friction that is to be told besides the inertias.
+        terms: The friction to be identified besides the inertias.
         starts: How many random motions the search starts from.
         seed: Of these.
         steps: The most of each round of a descent.
@@ -99,7 +99,7 @@ class Excitation:
 
     Attributes:
         request: What was wished.
-        base: The parameters that it tells.
+        base: The parameters that it determines.
         weights: (n,) inverse of the joints' torque noise: the share that they have of the greatest
             torque, or one each where that is not known.
         series: The motion.
@@ -124,7 +124,7 @@ class Excitation:
 def excite(
     allowed: Allowed, request: ExcitationRequest, progress: Progress | None = None
 ) -> Excitation:
-    """Searches for the motion that tells the base parameters best.
+    """Searches for the motion that determines the base parameters best.
 
     Args:
         allowed: What it must keep.

@@ -16,8 +16,8 @@ def sign(dq: FloatArray, slow_rad_s: float = SLOW_RAD_S) -> FloatArray:
     """The sense of a motion, -1 to 1.
 
     A joint that stands still may be held by any torque between its friction's bounds, and noise
-    tells it to move either way: up to `slow_rad_s` the sense grows with the speed, and is zero at
-    rest; beyond, it is the sign of the speed.
+    lets it seem to move either way: up to `slow_rad_s` the sense grows with the speed, and is zero
+    at rest; beyond, it is the sign of the speed.
 
     Args:
         dq: Speeds [rad/s].
@@ -50,13 +50,13 @@ class FrictionTerms:
     @property
     def symbols(self) -> tuple[str, ...]:
         """The names of one joint's parameters."""
-        told = (
+        terms = (
             ("Fc", self.coulomb),
             ("Fv", self.viscous),
             ("offset", self.offset),
             ("Ia", self.motor_inertia),
         )
-        return tuple(name for name, there in told if there)
+        return tuple(name for name, there in terms if there)
 
     def names(self, joints: int) -> tuple[str, ...]:
         """The names of all joints' parameters: Fc1, Fv1, offset1, Fc2, ..."""

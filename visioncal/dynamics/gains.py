@@ -1,7 +1,7 @@
 """What torque a current makes: the gains of drives, by a payload that is known.
 
 From motion alone an arm twice as heavy with gains twice as high is the same arm. A body whose mass,
-centre and inertia are known, carried in one of two runs, tells them apart (Gautier and Briot 2014,
+centre and inertia are known, carried in one of two runs, separates them (Gautier and Briot 2014,
 Global identification of joint drive gains and dynamic parameters of robots).
 """
 
@@ -18,7 +18,7 @@ from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.motion import Motion
 from visioncal.robot import body_regressor
 
-# A gain that is known no better than to this share of itself is not told [-].
+# A gain that is known no better than to this share of itself counts as not determined [-].
 _WORST = 0.1
 # Columns of which less is left are multiples of others [-].
 _RANK = 1e-8
@@ -37,8 +37,8 @@ class Gains:
     sigma: FloatArray
 
     @property
-    def told(self) -> FloatArray:
-        """(n,) which of them are told to a tenth of themselves."""
+    def determined(self) -> FloatArray:
+        """(n,) which of them are determined to a tenth of their value."""
         return np.asarray(self.sigma < _WORST * np.abs(self.nm_per_a))
 
 
@@ -60,7 +60,7 @@ def drive_gains(
         body: (10,) the payload's inertial parameters in the flange's frame.
 
     Raises:
-        DegenerateError: No joint's gain is told.
+        DegenerateError: No joint's gain is determined.
     """
     robot = base.model.robot
 
@@ -81,7 +81,7 @@ def drive_gains(
         ]
     )
     gains = Gains(found[:, 0], found[:, 1])
-    if not gains.told.any():
+    if not gains.determined.any():
         raise DegenerateError(
             "drive gains: the payload's torques stand out at no joint.",
             next_step="Carry a heavier one, off the last joint's axis, and move all joints.",

@@ -20,14 +20,14 @@ from visioncal.dynamics.stribeck import Stribeck
 from visioncal.robot import Inertias, Robot
 
 FILE = "dynamics.json"
-# A parameter is told to so many percent of itself, or worse, or not at all.
+# A parameter is determined to so many percent of itself, or worse, or not at all.
 CLASSES = ((0.02, "2 %"), (0.1, "10 %"), (1.0, "poorly"))
 NOT_TOLD = "not at all"
 
 
 @dataclass(frozen=True, eq=False)
 class StreamFacts:
-    """What is told of a stream that was fitted.
+    """The figures of a fitted stream.
 
     Attributes:
         label: Its place.
@@ -151,7 +151,7 @@ class Identified:
 
     @property
     def determined(self) -> tuple[str, ...]:
-        """How well each base parameter is told: to `2 %` of itself, `10 %`, worse, or not."""
+        """How well each base parameter is determined: to `2 %` of itself, `10 %`, worse, or not."""
         shares = self.sigmas / np.maximum(np.abs(self.values), 1e-300)
         return tuple(next((word for most, word in CLASSES if it < most), NOT_TOLD) for it in shares)
 

@@ -13,7 +13,7 @@ from visioncal.dynamics.convention_hypotheses import check_mistakes
 from visioncal.dynamics.friction import FrictionTerms
 from visioncal.dynamics.identified import Identified, StreamFacts
 from visioncal.dynamics.model import DynamicModel
-from visioncal.dynamics.null_space import check_told, check_turning
+from visioncal.dynamics.null_space import check_identifiable, check_turning
 from visioncal.dynamics.regression import Block, Regression, regress, rms_of, spread_of
 from visioncal.dynamics.stribeck import Stribeck, fit_stribeck
 from visioncal.robot import Robot
@@ -67,7 +67,7 @@ def identify(
 
     Raises:
         DataError: Torques are of other units, of other joints, or of the other sign.
-        DegenerateError: The motion cannot tell all base parameters; they are named.
+        DegenerateError: The motion does not determine all base parameters; the error names them.
     """
     options = Options() if options is None else options
     base = BaseModel.reduce(DynamicModel(robot, options.terms))
@@ -75,7 +75,7 @@ def identify(
     if options.checked and robot.inertias is not None:
         check_mistakes(base, streams)
     blocks = [block_of(base, it) for it in streams]
-    check_told(base, blocks)
+    check_identifiable(base, blocks)
     fit = regress(blocks)
     humps = Stribeck.none()
     if options.stribeck and options.terms.coulomb:
@@ -101,7 +101,7 @@ def block_of(base: BaseModel, stream: Conditioned) -> Block:
 
 
 def facts(streams: Sequence[Conditioned], fit: Regression) -> tuple[StreamFacts, ...]:
-    """What is told of each stream."""
+    """The figures of each stream."""
     return tuple(
         StreamFacts(
             label=stream.label,

@@ -135,7 +135,7 @@ def _of_known(
 
 
 def _of_range(identified: Identified) -> Iterator[tuple[VerdictStatus, Finding]]:
-    """Whether the motion told what fast motions all around take."""
+    """Whether the parameters predict the torques of fast motions of all joints."""
     base = identified.base
     motion = random_motion(base.model, np.random.default_rng(0))
     x = base.regressor(motion)
@@ -157,14 +157,14 @@ def _of_range(identified: Identified) -> Iterator[tuple[VerdictStatus, Finding]]
 
 
 def _of_parameters(identified: Identified) -> Iterator[tuple[VerdictStatus, Finding]]:
-    told = np.array([it == NOT_TOLD for it in identified.determined])
-    if told.mean() > _LIMITS.undetermined_share:
-        names = [it for it, lost in zip(identified.base.names, told, strict=True) if lost]
+    lost = np.array([it == NOT_TOLD for it in identified.determined])
+    if lost.mean() > _LIMITS.undetermined_share:
+        names = [it for it, is_lost in zip(identified.base.names, lost, strict=True) if is_lost]
         yield (
             "check",
             Finding(
                 "undetermined",
-                f"{told.sum()} of {len(told)} base parameters are not determined by this motion, "
+                f"{lost.sum()} of {len(lost)} base parameters are not determined by this motion, "
                 f"among them {some_of(names, 3)}.",
                 _plan(identified, _MOTION),
             ),

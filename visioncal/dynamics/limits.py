@@ -50,7 +50,7 @@ class Share:
 
 @dataclass(frozen=True)
 class Missing:
-    """What stands for limits that the robot's description does not tell; None where none is given.
+    """What stands for limits that the robot's description does not state; None where none is given.
 
     Attributes:
         range_rad: Farthest position to either side [rad].
@@ -111,7 +111,7 @@ class Allowed:
         """What cannot be looked at for want of knowledge, in words."""
         if self.inertias is None:
             return (
-                f"torques: the description of {self.robot.name} tells no inertias of its links",
+                f"torques: the description of {self.robot.name} states no inertias of its links",
             )
         unknown = [
             name
@@ -119,7 +119,7 @@ class Allowed:
             if not np.isfinite(limit)
         ]
         if unknown:
-            return (f"torques: no greatest torque is told of {some_of(unknown)}",)
+            return (f"torques: no greatest torque is stated of {some_of(unknown)}",)
         return ()
 
     def torques(self, motion: Motion) -> FloatArray | None:
@@ -142,26 +142,26 @@ def allowed_motion(
     Args:
         robot: The arm.
         share: The margins.
-        missing: What stands for limits that its description does not tell.
+        missing: What stands for limits that its description does not state.
         bodies: What it carries, and what stands in the cell.
         payload: (10,) inertial parameters of what it carries, in the flange's frame, about its
             origin; None for nothing.
 
     Raises:
-        DataError: A limit is not told, or nothing is left of one.
+        DataError: A limit is not stated, or nothing is left of one.
     """
     missing = missing or Missing()
     given = np.full(robot.joint_count, np.inf if missing.range_rad is None else missing.range_rad)
     lower = np.where(np.isfinite(robot.lower_rad), robot.lower_rad, -given)
     upper = np.where(np.isfinite(robot.upper_rad), robot.upper_rad, given)
     rates = [
-        np.where(np.isfinite(told), told, np.inf if instead is None else instead)
-        for told, instead in (
+        np.where(np.isfinite(stated), stated, np.inf if instead is None else instead)
+        for stated, instead in (
             (robot.velocity_rad_s, missing.speed_rad_s),
             (robot.acceleration_rad_s2, missing.acceleration_rad_s2),
         )
     ]
-    _check_told(robot, np.minimum(-lower, upper), *rates)
+    _check_stated(robot, np.minimum(-lower, upper), *rates)
     allowed = Allowed(
         robot,
         lower + share.margin_rad,
@@ -177,22 +177,22 @@ def allowed_motion(
     return allowed if payload is None else _carrying(allowed, payload)
 
 
-def _check_told(robot: Robot, reach: FloatArray, speed: FloatArray, hard: FloatArray) -> None:
+def _check_stated(robot: Robot, reach: FloatArray, speed: FloatArray, hard: FloatArray) -> None:
     for values, what, keys, option in (
         (reach, "positions", "lower_deg and upper_deg", "--range-deg"),
         (speed, "speed", "velocity_rad_s", "--speed-deg"),
         (hard, "acceleration", "acceleration_rad_s2", "--acceleration-deg"),
     ):
-        lacking = [
+        unlimited = [
             name
             for name, value in zip(robot.joint_names, values, strict=True)
             if not np.isfinite(value)
         ]
-        if lacking:
+        if unlimited:
             raise DataError(
-                f"robot {robot.name}: its description tells no limits of {what} for "
-                f"{some_of(lacking)}; a motion is planned within limits only.",
-                culprits=lacking,
+                f"robot {robot.name}: its description states no limits of {what} for "
+                f"{some_of(unlimited)}; a motion is planned within limits only.",
+                culprits=unlimited,
                 next_step=f"Write {keys} into its description (a <limit> into a URDF), or give "
                 f"{option}.",
             )

@@ -1,4 +1,4 @@
-"""One low-pass for torques and regressor alike, and as many samples as it leaves worth having."""
+"""One low-pass for torques and regressor, and as many samples as it leaves independent."""
 
 from dataclasses import dataclass
 from typing import Self

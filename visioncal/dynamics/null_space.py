@@ -1,4 +1,4 @@
-"""Whether a motion tells all base parameters; which ones it does not, and why."""
+"""Base parameters that a motion does not determine, and why."""
 
 from collections.abc import Sequence
 
@@ -13,10 +13,10 @@ from visioncal.dynamics.regression import Block
 
 # A joint that never gets faster than this stands still, and its speed is noise [rad/s].
 _STILL_RAD_S = 0.01
-# Directions that get less than this share of the information of a motion all around are not told.
+# Not determined are directions with less than this share of a full motion's information.
 # Fast multi-sines get 1e-4 of it along the worst direction, motion about one axis 1e-16.
-_UNTOLD = 1e-9
-# Parameters with this share of an untold direction are named with it.
+_UNDETERMINED = 1e-9
+# Parameters with this share of an undetermined direction are named with it.
 _SHARE = 0.3
 _NEXT = (
     "Let all joints move at once, to and fro, fast and over a wide range: visioncal dynamics plan "
@@ -37,14 +37,14 @@ def check_turning(base: BaseModel, streams: Sequence[Conditioned]) -> None:
     if not len(still):
         return
     names = base.model.robot.joint_names
-    told = [f"joint {it + 1} ({names[it]})" for it in still]
+    stopped = [f"joint {it + 1} ({names[it]})" for it in still]
     kept = zip(base.names, base.independent, strict=True)
     lost = [name for name, at in kept if _joint_of(base.model.names[at]) in still + 1]
     raise DegenerateError(
-        f"dynamics: {some_of(told)} {'stands' if len(told) == 1 else 'stand'} still in "
+        f"dynamics: {some_of(stopped)} {'stands' if len(stopped) == 1 else 'stand'} still in "
         f"{some_of([it.label for it in streams])} (at most {fastest[still].max():.2g} rad/s): "
-        f"{len(lost)} of {base.rank} base parameters, {some_of(lost, 5)}, are not told.",
-        culprits=told,
+        f"{len(lost)} of {base.rank} base parameters, {some_of(lost, 5)}, are not determined.",
+        culprits=stopped,
         next_step=_NEXT,
     )
 
@@ -54,7 +54,7 @@ def _joint_of(name: str) -> int:
     return int(name[len(name.rstrip("0123456789")) :])
 
 
-def check_told(base: BaseModel, blocks: Sequence[Block]) -> None:
+def check_identifiable(base: BaseModel, blocks: Sequence[Block]) -> None:
     """Refuses motions that leave a combination of base parameters open.
 
     Raises:
@@ -64,7 +64,7 @@ def check_told(base: BaseModel, blocks: Sequence[Block]) -> None:
     if lost:
         names = base.names
         raise DegenerateError(
-            f"dynamics: the motion does not tell {len(lost)} of {base.rank} base parameters: "
+            f"dynamics: the motion does not determine {len(lost)} of {base.rank} base parameters: "
             f"{some_of([names[it] for it in lost], 5)}.",
             culprits=[names[it] for it in lost],
             next_step=_NEXT,
@@ -83,7 +83,7 @@ def null_space(base: BaseModel, blocks: Sequence[Block]) -> list[int]:
     sizes = _usual(base)
     relative = information / np.outer(sizes, sizes) / max(rows, 1)
     values, vectors = np.linalg.eigh(relative)
-    null = np.flatnonzero(values < _UNTOLD)
+    null = np.flatnonzero(values < _UNDETERMINED)
     shares = np.sqrt(np.sum(vectors[:, null] ** 2, axis=1))
     return [int(it) for it in np.flatnonzero(shares > _SHARE)]
 

@@ -39,7 +39,7 @@ class Objective:
 
         Args:
             allowed: What the motion must keep.
-            base: The parameters that it is to tell.
+            base: The parameters that it is to determine.
             weights: (n,) inverse of each joint's torque noise.
             harmonics: What it is made of.
         """
@@ -75,10 +75,10 @@ class Objective:
             The value, and its derivatives (k,).
         """
         numbers = self.series(free).free
-        told, by_told = self._condition(numbers, sharpness, price)
+        value, by_value = self._condition(numbers, sharpness, price)
         lost, by_lost = self._beyond(numbers)
-        jacobian = _back(self._basis, by_told) + price * _back(self._looks, by_lost)
-        return told + price * lost, jacobian.ravel()
+        jacobian = _back(self._basis, by_value) + price * _back(self._looks, by_lost)
+        return value + price * lost, jacobian.ravel()
 
     def _condition(
         self, numbers: FloatArray, sharpness: float, price: float

@@ -16,7 +16,7 @@ USUAL_GAIN = 25.0
 
 
 class MomentumObserver:
-    """Follows a moving arm sample by sample, and tells the torques that others put on its joints.
+    """Follows a moving arm sample by sample, and estimates external torques on its joints.
 
     The residual r obeys `dr/dt = gain (external torque - r)`: that of a push comes through a
     first-order filter, joint by joint. It is computed by an implicit Euler step, which is stable

@@ -1,8 +1,8 @@
 """What an arm carries, by what its drives give more than without it.
 
-The torques of a body on the flange are linear in its ten inertial parameters, and all ten are told:
-what the arm itself takes is known from a run without it (Atkeson, An and Hollerbach 1986,
-Estimation of inertial parameters of manipulator loads and links).
+The torques of a body on the flange are linear in its ten inertial parameters, and all ten are
+identifiable: what the arm itself takes is known from a run without it (Atkeson, An and Hollerbach
+1986, Estimation of inertial parameters of manipulator loads and links).
 """
 
 from collections.abc import Sequence
@@ -93,8 +93,8 @@ class Payload:
         return Inertias(self.values[None])
 
     def document(self) -> dict[str, Any]:
-        """What is told of it, for JSON."""
-        told: dict[str, Any] = {
+        """The estimate as JSON."""
+        document: dict[str, Any] = {
             "mass_kg": self.mass_kg,
             "mass_sigma_kg": self.mass_sigma_kg,
             "com_m": self.centre_m.tolist(),
@@ -102,10 +102,10 @@ class Payload:
             "unexplained_nm": self.rms_nm.tolist(),
         }
         if self.gains_sigma_kg:
-            told["gains_sigma_kg"] = self.gains_sigma_kg
+            document["gains_sigma_kg"] = self.gains_sigma_kg
         if self.consistent:
-            told["inertia_kg_m2"] = self.inertia_kg_m2.tolist()
-        return told
+            document["inertia_kg_m2"] = self.inertia_kg_m2.tolist()
+        return document
 
 
 def estimate_payload(
@@ -126,7 +126,7 @@ def estimate_payload(
             times gains.
 
     Raises:
-        DegenerateError: The motion does not tell a mass, or there is none.
+        DegenerateError: The motion does not determine a mass, or there is none.
     """
     terms = FrictionTerms(
         coulomb=friction_changes,
@@ -138,7 +138,7 @@ def estimate_payload(
         fit = regress([_block(identified, terms, it) for it in loaded])
     except np.linalg.LinAlgError as error:
         raise DegenerateError(
-            "payload: the motion does not tell all of its inertia.", next_step=_HOW
+            "payload: the motion does not determine all of its inertia.", next_step=_HOW
         ) from error
     of_gains = _of_gains(loaded, fit, gain_sigma)
     found = Payload(
@@ -150,7 +150,7 @@ def estimate_payload(
     if not found.mass_sigma_kg < _WORST * found.mass_kg:
         raise DegenerateError(
             f"payload: a mass of {figure(found.mass_kg)} kg, with a sigma of "
-            f"{figure(found.mass_sigma_kg)} kg, cannot be told from none.",
+            f"{figure(found.mass_sigma_kg)} kg, does not differ from none.",
             next_step=f"{_HOW} Is this the run with it?",
         )
     return found

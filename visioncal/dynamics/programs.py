@@ -19,7 +19,7 @@ _LOOKAHEAD_S, _GAIN = 0.1, 300
 
 
 def is_programmed(robot: Robot) -> bool:
-    """Whether a robot is programmed like a UR, as far as its joints tell."""
+    """Whether a robot is programmed like a UR, by its joints."""
     return robot.joint_count == _UR_JOINTS and not robot.chain.prismatic.any()
 
 

@@ -134,6 +134,6 @@ def _gains(label: str, count: int, gains_nm_a: Sequence[float]) -> FloatArray:
         f"them into torques, not {list(gains_nm_a)}.",
         culprits=[label],
         next_step="Give them with --gains K1,K2,...: the motor's torque constant times the gear's "
-        "ratio. From motion alone gains and masses cannot be told apart; visioncal dynamics gains "
+        "ratio. From motion alone gains and masses cannot be separated; visioncal dynamics gains "
         "finds them by a known body on the flange.",
     )

@@ -1,7 +1,7 @@
 """Weighted least squares on many filtered torques, with a covariance that counts what they share.
 
-Each joint has a noise of its own, which its residuals tell. Filtered noise is correlated from one
-sample to the next; the estimate stands that, but its covariance must know.
+Each joint has a noise of its own, estimated from its residuals. Filtered noise is correlated from
+one sample to the next; the estimate stands that, but its covariance must know.
 """
 
 from collections.abc import Sequence
@@ -114,7 +114,7 @@ def regress(blocks: Sequence[Block]) -> Regression:
     """Fits parameters, the joints' noise, and finds outliers.
 
     Raises:
-        numpy.linalg.LinAlgError: The rows do not tell all parameters.
+        numpy.linalg.LinAlgError: The rows do not determine all parameters.
     """
     blocks = tuple(blocks)
     with one_blas_thread():
@@ -228,7 +228,7 @@ def _covariance(fit: Regression) -> FloatArray:
             rows = block.x[:, joint] * used[:, None] / sigma[joint]
             columns = np.flatnonzero(rows.any(axis=0))
             scores[np.ix_(columns, columns)] += _scores(rows[:, columns], shares)
-    # By a root, which leaves no variance below zero, however badly parameters are told.
+    # By a root, which leaves no variance below zero, however badly parameters are determined.
     sizes = np.sqrt(np.maximum(np.diag(scores), 1e-300))
     values, vectors = np.linalg.eigh(scores / np.outer(sizes, sizes))
     root = white @ (sizes[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))

@@ -36,8 +36,8 @@ class Request:
         cutoff_hz: Of the low-pass [Hz]; by the motion where None.
         gains_nm_a: Torque for a current, by joint, where currents were recorded [N m/A].
         options: What is estimated.
-        rotors: Whether that are rotors, too; None where the torques shall tell: those behind the
-            gears have none in them.
+        rotors: Whether rotors' inertias are estimated; None to let the torques decide: those behind
+            the gears have none in them.
         robot: Which robot of a whole cell; its streams are those that have or begin with its name.
     """
 
@@ -91,7 +91,7 @@ def identify_session(session: Session, request: Request | None = None) -> Run:
 
     Raises:
         DataError: The session has no robot or no such stream, or a stream is wrong.
-        DegenerateError: The motion cannot tell all base parameters.
+        DegenerateError: The motion does not determine all base parameters.
     """
     request = Request() if request is None else request
     session = of_one_arm(session, request.robot)
@@ -177,9 +177,9 @@ def current_streams(
     recorded = [it for it in recorded if it.of_currents]
     if not recorded:
         raise DataError(
-            f"session {session.name!r} tells torques and no currents.",
+            f"session {session.name!r} has torques and no currents.",
             culprits=[f"{STREAMS}/{it}.csv" for it in session.streams],
-            next_step="Drives whose torques are told need no gains: visioncal dynamics identify.",
+            next_step="Drives that report torques need no gains: visioncal dynamics identify.",
         )
     return [condition(it, cutoff_hz) for it in recorded]
 
@@ -251,7 +251,7 @@ def _conditioned(robot: Robot, recorded: Recorded, request: Request) -> Conditio
 def _split(
     robot: Robot, recorded: Sequence[Recorded], streams: Sequence[Conditioned], request: Request
 ) -> _Split | None:
-    """Leaves the end of the fastest motion out; None where the rest tells too little.
+    """Leaves the end of the fastest motion out; None where the rest determines too little.
 
     Sweeps move one joint after the other: no part of them stands for the others.
     """

@@ -6,7 +6,7 @@ from visioncal.core.types import FloatArray, IntArray
 from visioncal.dynamics.motion import Motion
 
 # A motion's band ends where the power of its accelerations stays under this share of its peak,
-# sought in parts of a quarter octave; it is told by joints that move at least this share of the
+# sought in parts of a quarter octave; joints count that move at least this share of the
 # fastest one.
 _OUT_OF_BAND, _PARTS, _MOVING = 0.03, 4, 0.05
 # Polynomials of fourth order keep all within a sixth of their own band, to a few in ten thousand.

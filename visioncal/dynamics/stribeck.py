@@ -148,7 +148,7 @@ class _Look:
     """Humps of given speeds at their best.
 
     Attributes:
-        humps: They.
+        humps: The humps, with the given speeds.
         cost: What is left with them, in units of the noise.
         information: (a, a) by the logarithms of the speeds, all else being at its best.
         gradient: (a,) of half the cost, likewise.

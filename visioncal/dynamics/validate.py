@@ -113,7 +113,7 @@ def friction_of_known(identification: Identification) -> FloatArray | None:
     try:
         return regress(blocks).values
     except np.linalg.LinAlgError as error:
-        raise DegenerateError("dynamics: the motion does not tell friction.") from error
+        raise DegenerateError("dynamics: the motion does not determine friction.") from error
 
 
 def _link_torques(model: DynamicModel, motion: Motion) -> FloatArray:

@@ -232,7 +232,7 @@ def checked_point(point_m: FloatArray | Sequence[float], name: str) -> FloatArra
 
 
 def _flange_sigmas(calibration: Calibration) -> FloatArray:
-    """The flange's noise; of both together where it could not be told from the camera's."""
+    """The flange's noise; of both together where it could not be separated from the camera's."""
     noise = calibration.noise
     of = "robot" if "robot_translation_mm" in noise else "combined"
     rotation = np.deg2rad(noise.get(f"{of}_rotation_deg", 0.0))

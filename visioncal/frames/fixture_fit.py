@@ -76,12 +76,12 @@ class Fitted:
         covariance: (6, 6) of its right perturbation, what the points share included.
         centre: (3,) amid the points, in the fixture [m].
         agrees: (n,) which points the answer was made from.
-        doubtful: (n,) of which some are wrong, while nothing tells which: all are used.
+        doubtful: (n,) of which some are wrong, not known which: all are used.
         explained: Whether what is stated of a touch explains those that are used.
         reasons: (n,) what is wrong with each; empty where nothing is.
         residuals_m: (n,) how far off each is [m].
         noise_m: Noise of a touch per axis [m].
-        sigma_95_m: Its 95 % interval [m]; (0, inf) where nothing tells.
+        sigma_95_m: Its 95 % interval [m]; (0, inf) where nothing determines it.
     """
 
     measured: MeasuredPoints

@@ -116,7 +116,7 @@ def _doubts(
         yield Finding(
             "few_points",
             f"Only {used} points are used: with {setting.options.points} or more a wrong one can "
-            "be told.",
+            "be found.",
         )
 
 
@@ -146,7 +146,7 @@ def _scaled(fit: PointFit, pairs: PointPairs) -> Iterator[Finding]:
 
 
 def _mirrored(fitted: Fitted, pairs: PointPairs, seen_from: str) -> Iterator[Finding]:
-    """Doubts points in a plane, unless the side that they were touched from tells their hand."""
+    """Doubts points in a plane, unless the side of the touches determines their handedness."""
     drawn = pairs.nominal[fitted.agrees]
     normal = np.linalg.svd(drawn - drawn.mean(axis=0))[2][2]
     along = fitted.measured.outward[fitted.agrees] @ fitted.matrix[:3, 2]

@@ -20,8 +20,8 @@ from visioncal.frames.measured import MeasuredPoints
 from visioncal.results import Frame
 
 # Touches of each feature twice leave so many numbers to spare. Fewer agree too well by chance to
-# tell the noise: a single one is within a tenth of its sigma in one fixture of twelve.
-_TELLING = 6
+# estimate the noise: a single one is within a tenth of its sigma in one fixture of twelve.
+_ENOUGH = 6
 _CAUSE = "the tip had slipped, it is of another kind, or the pose is of another moment"
 _THINGS = {"origin": "the origin", "x": "the x axis", "xy": "the xy plane"}
 
@@ -49,7 +49,7 @@ def featured_fixture(measured: MeasuredPoints, kinds: Sequence[str], setting: Se
     )
     expected = setting.touch_noise_m
     if expected is None and len(measured) == len(FEATURE_KINDS):
-        # One of each kind leaves nothing to tell the noise by.
+        # One of each kind leaves no residual to estimate the noise from.
         expected = TOUCH_NOISE_M
     fitted = _fitted(fit_features(touches, expected), measured, setting)
     counts = ", ".join(f"{kinds.count(it)} {it}" for it in FEATURE_KINDS)
@@ -61,7 +61,7 @@ def featured_fixture(measured: MeasuredPoints, kinds: Sequence[str], setting: Se
 def _fitted(fit: FeatureFit, measured: MeasuredPoints, setting: Setting) -> Fitted:
     agreement, matrix = fit.agreement, fit.base_from_fixture
     noise_m = agreement.fit.sigma
-    if agreement.fit.freedom < _TELLING:
+    if agreement.fit.freedom < _ENOUGH:
         noise_m = max(noise_m, _expected_m(setting))
     agrees = agreement.agrees
     away = np.linalg.norm(fit.residuals, axis=1)

@@ -217,10 +217,10 @@ def _method(placed: _Placed, point: FloatArray) -> str:
         "points": "rig",
     }
     images = "one image" if count == 1 else f"{count} images"
-    told = f"{words.get(target.kind, target.kind)} {target.name} seen in {images}"
+    note = f"{words.get(target.kind, target.kind)} {target.name} seen in {images}"
     if not point.any():
-        return told
-    return f"{told}; its point ({', '.join(f'{it:.6g}' for it in 1e3 * point)}) mm"
+        return note
+    return f"{note}; its point ({', '.join(f'{it:.6g}' for it in 1e3 * point)}) mm"
 
 
 def _noise_mm(seen: TargetPose) -> float:

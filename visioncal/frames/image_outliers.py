@@ -19,7 +19,7 @@ from visioncal.frames.single_view import Place
 
 # A sound image is lost in one set of a thousand.
 _FALSE_ALARM = 1e-3
-# Poses farther apart than 95 % of what noise does are two, and worth telling apart.
+# Poses farther apart than 95 % of what noise does are two different ones.
 _ANOTHER = float(chi2_limit(0.05, 6))
 # Scores that differ by a smaller share are equal.
 _SAME = 1e-6
@@ -104,7 +104,7 @@ class ImageInliers:
 def agreeing(sights: CandidateViews) -> ImageInliers:
     """Finds the images that put the target in one place.
 
-    Where no more than half agree, nothing tells which are right: all stay.
+    Where no more than half agree, the right ones are unknown: all stay.
     """
     picks, agrees = _core(sights)
     search = _Search(sights, picks)

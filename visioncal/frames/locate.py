@@ -16,7 +16,7 @@ from visioncal.results import Calibration
 from visioncal.session.choosing import EYE, Choice
 from visioncal.vision.camera import normalise
 
-# A ray within this angle of a plane [rad] does not meet it at any place that could be told.
+# A ray within this angle of a plane [rad] meets it at no place of use.
 _PARALLEL = 1e-6
 
 
@@ -167,11 +167,11 @@ def _located(
     worst_m = float(np.sqrt(max(np.linalg.eigvalsh(found.covariance)[-1], 0.0)))
     if worst_m <= SIGMA_LIMIT_M:
         return found
-    told = (
+    warning = (
         f"The place is known to {figure(1e3 * worst_m)} mm only in its worst direction (limit "
         f"{1e3 * SIGMA_LIMIT_M:g}), mostly because of the {_SOURCES[found.largest]}."
     )
-    return Located(place, kept, found.freedom, (*found.warnings, told))
+    return Located(place, kept, found.freedom, (*found.warnings, warning))
 
 
 def _freedom(eye: Eye, parts: Mapping[str, FloatArray]) -> float:

@@ -90,7 +90,7 @@ class Located:
 
 def _quantile95(count: float, freedom: float) -> float:
     """Of the mean of so many squared errors, in units of a variance with that much freedom."""
-    # Beyond, F cannot be told from chi-square, and its series lose digits.
+    # Beyond, F does not differ from chi-square, and its series lose digits.
     return float(f_limit(0.05, count, min(freedom, 1e6)))
 
 

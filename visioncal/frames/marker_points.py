@@ -110,9 +110,9 @@ def seen_markers(
         agreeing(CandidateViews(it.views, eye.flange_noise, common, eye.freedom)) for it in markers
     ]
     warnings = [
-        told
+        warning
         for marker, agreement in zip(markers, found, strict=True)
-        for told in _warnings(eye, marker, agreement, sights)
+        for warning in _warnings(eye, marker, agreement, sights)
     ]
     return SeenPoints(
         tuple(it.name for it in markers),

@@ -101,7 +101,7 @@ class MeasuredPoints:
     def scattered(self) -> FloatArray:
         """(n, 3, 3) covariance by which points scatter: their own, and what they share unevenly.
 
-        What all share alike moves the whole set, and no fit to it could tell.
+        What all share alike moves the whole set, and no fit to it shows that.
         """
         count = len(self)
         centring = np.kron(np.eye(count) - 1.0 / count, np.eye(3))

@@ -1,4 +1,4 @@
-"""Declared planes: what features lie in whose depth no single image tells."""
+"""Declared planes of features, whose depth no single image determines."""
 
 from dataclasses import dataclass
 from typing import Self

@@ -141,21 +141,21 @@ def pose_of(session: Session, view: View, calibration: Calibration) -> FloatArra
 def _warnings(session: Session, calibration: Calibration) -> tuple[str, ...]:
     """What is odd about the session itself, or beside the calibration."""
     known, stated = calibration.camera, session.camera
-    told = session.warnings
+    words = session.warnings
     if calibration.arm_is_calibrated and any(it.joints_rad is None for it in session.views):
-        told = (
-            *told,
+        words = (
+            *words,
             "The calibration is of a calibrated arm, but views come without joint angles: their "
             "poses are the nominal arm's, off by as much as its errors. Record q1_rad ... too.",
         )
     if known is None or stated is None:
-        return told
+        return words
     off = stated.matrix - known.camera.matrix
     if np.abs(off).max() <= _OTHER_LENS * known.camera.matrix[0]:
-        return told
+        return words
     fx, cx, of_fx, of_cx = (it.matrix[at] for it in (stated, known.camera) for at in (0, 2))
     return (
-        *told,
+        *words,
         f"The session states a lens of fx {fx:.0f} and cx {cx:.0f} px, and the camera was "
         f"calibrated to {of_fx:.0f} and {of_cx:.0f}: is it the same camera? The calibrated lens "
         "was used.",

@@ -45,7 +45,7 @@ class Sight:
 
     @property
     def stop_key(self) -> object:
-        """What tells the robot's stops apart; of an image without a pose, its label."""
+        """The stop of the robot; of an image without a pose, its label."""
         if self.stop is not None:
             return self.stop
         return self.label if self.base_from_flange is None else self.base_from_flange.tobytes()

@@ -142,7 +142,7 @@ def place_looks(
         float(np.sqrt(found.variance)),
         (
             *eye.warnings,
-            *(told for look in looks for told in look.warnings),
+            *(words for look in looks for words in look.warnings),
             *doubts(found, labels, looks, stops),
         ),
     )
@@ -185,7 +185,7 @@ def doubts(
         worst = int(np.where(found.agrees, found.mahalanobis_sq, -1.0).argmax())
         yield (
             f"The images disagree, by up to {_distance(found, worst)}, and with {count} of them "
-            "nothing tells which are right: take more."
+            "it is not known which are right: take more."
         )
     elif found.variance * 6 * (inside - 1) > chi2_limit(_FALSE_ALARM, 6 * (inside - 1)):
         yield (

@@ -192,10 +192,10 @@ def _doubts(
 
 def _praise(fit: PivotFit, touches: Touches) -> str:
     worst = fit.worst[0]
-    told = "" if fit.oriented else " The rotation was not touched: it is the flange's own."
+    rotation = "" if fit.oriented else " The rotation was not touched: it is the flange's own."
     return (
         f"{len(touches)} touches agree to {figure(1e3 * fit.sigma_m)} mm per axis, and "
-        f"{worst.words}, the worst direction, is known to {figure(1e3 * worst.sigma)} mm.{told}"
+        f"{worst.words}, the worst direction, is known to {figure(1e3 * worst.sigma)} mm.{rotation}"
     )
 
 

@@ -47,7 +47,7 @@ def disputed(
         names: (n,) what messages call the touches, points or images.
         reasons: (n,) what is wrong with each.
         agrees: (n,) mask of those that were used.
-        doubtful: (n,) mask of those of which some are wrong, while nothing tells which.
+        doubtful: (n,) mask of those of which some are wrong, unknown which.
         again: What to do about the latter, as a sentence.
     """
     for at in np.flatnonzero(~agrees).tolist():
@@ -55,7 +55,7 @@ def disputed(
         yield Finding("left_out", f"{names[at]} was left out: {reasons[at]}{end}")
     if doubtful.any():
         some = some_of([names[at] for at in np.flatnonzero(doubtful).tolist()])
-        words = f"{some} contradict each other, and nothing tells which is wrong: all are used."
+        words = f"{some} contradict each other, and which is wrong is not known: all are used."
         yield Finding("contradicting", words, Step(again))
 
 

@@ -66,7 +66,7 @@ class Chain:
         """Derivatives of the effective positions by the joints' functions.
 
         Args:
-            q: (m, n) positions that the encoders tell [rad or m].
+            q: (m, n) positions that the encoders report [rad or m].
 
         Returns:
             (m, n, 4): 1, q, sin(q), cos(q), the last two zero for a prismatic joint.
@@ -80,13 +80,13 @@ class Chain:
         return bool(self._waves.any())
 
     def effective(self, q: FloatArray) -> FloatArray:
-        """Effective positions (m, n) of the joints where the encoders tell (m, n) `q`."""
+        """Effective positions (m, n) of the joints where the encoders report (m, n) `q`."""
         offset, ratio = self.functions[:, 0], self.functions[:, 1]
         plain = offset + ratio * q
         return np.asarray(plain + self._periodic(q, 0) if self.is_periodic else plain)
 
     def encoded(self, positions: FloatArray) -> FloatArray:
-        """What encoders tell (m, n) where the joints' effective positions are (m, n): the inverse.
+        """What encoders report (m, n) at effective positions (m, n) of the joints: the inverse.
 
         Newton's iteration; an eccentricity is some thousandths of the ratio: three steps do.
         """

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 # Stops keep so much more than the clearance, so that ways between them can leave and arrive [m].
 SLACK_M = 0.004
-# Postures by which parts that are always near one another are told from those that may meet.
+# Postures by which parts that are always near one another are separated from those that may meet.
 _SAMPLES = 300
 # Parts of an arm that are near one another in a larger share of all postures are so by design;
 # joint limits keep them apart, and thick capsules do not show it.
@@ -112,8 +112,8 @@ class Collisions:
                 self._model, self._data, self._geometry, self._memory, positions, True
             )
             if touching:
-                lacking = self._distances(positions) - self._pairs.needed_m
-                found[row] = int(lacking.argmin())
+                margin_m = self._distances(positions) - self._pairs.needed_m
+                found[row] = int(margin_m.argmin())
         return found
 
     def distances(self, q: FloatArray) -> FloatArray:
@@ -178,8 +178,8 @@ class Collisions:
         most = np.where(chain.prismatic, _TRAVEL_M, _TURN_RAD)
         lower, upper = np.maximum(chain.lower, -most), np.minimum(chain.upper, most)
         postures = chain.effective(rng.uniform(lower, upper, (_SAMPLES, len(chain))))
-        lacking = np.array([self._distances(it) for it in postures]) - pairs.needed_m
-        often = (lacking < SLACK_M).mean(axis=0)
+        margin_m = np.array([self._distances(it) for it in postures]) - pairs.needed_m
+        often = (margin_m < SLACK_M).mean(axis=0)
         parts = np.array([*(it.of_arm for it in bodies), False])[pairs.bodies].all(axis=1)
         carried = np.array([*(it.link > 0 for it in bodies), False])[pairs.bodies].all(axis=1)
         stands = np.array([*(it.link == 1 for it in bodies), False])[pairs.bodies].any(axis=1)

@@ -174,7 +174,7 @@ def with_zeros(robot: Robot, zeros_rad: FloatArray) -> Robot:
 
     Args:
         robot: The robot; one that is described by a table stays so.
-        zeros_rad: (n,) what is to be added to the angles that the joints tell [rad].
+        zeros_rad: (n,) what is to be added to the angles that the joints report [rad].
     """
     added = robot.chain.functions[:, 1] * zeros_rad
     table = _described(robot)
@@ -193,7 +193,7 @@ def _of_table(
 ) -> Robot:
     """The robot with the numbers of a table of its own form; its links' bodies stay what they are.
 
-    A mass is told where a joint's row ends, and stays there.
+    A mass is stated where a joint's row ends, and stays there.
     """
     source = str(robot.document.get("source", ""))
     document = table_document(table, source)

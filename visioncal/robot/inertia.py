@@ -138,10 +138,10 @@ def inertias_of_rows(rows: Sequence[Table], joint_from_row: FloatArray) -> Inert
         joint_from_row: (n, 4, 4) these frames in the joints' frames after their motion.
 
     Returns:
-        The inertias; None where no joint tells one, or none its mass.
+        The inertias; None where no joint states one, or none its mass.
 
     Raises:
-        DataError: Some joints tell their inertia and others do not, or it is no list of numbers.
+        DataError: Some joints state their inertia and others do not, or it is no list of numbers.
     """
     if not all(any(key in row.content for row in rows) for key in (INERTIA_KEY, MASS_KEYS[0])):
         return None

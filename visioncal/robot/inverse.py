@@ -51,7 +51,7 @@ _FLOOR = 1e-13
 
 @dataclass(frozen=True, eq=False)
 class Posture:
-    """How near an arm comes to a pose.
+    """The distance between a pose and the nearest that an arm reaches.
 
     Attributes:
         positions: (n,) effective positions of the joints [rad or m].
@@ -99,7 +99,7 @@ class _Bounds:
         return float(np.linalg.norm(turned - _TURN * turns))
 
     def middle_and_half(self, around: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Middle (n,) and half (n,) of the range; about the given positions where it is open."""
+        """Middle (n,) and half (n,) of the range; about the given positions if unlimited."""
         known = np.isfinite(self.lower) & np.isfinite(self.upper)
         lower, upper = (np.where(known, it, 0.0) for it in (self.lower, self.upper))
         half = np.where(known, 0.5 * (upper - lower), _SPREAD)

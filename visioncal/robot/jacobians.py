@@ -130,7 +130,7 @@ def _row_jacobian(table: DHTable, row: int) -> FloatArray:
 
 
 def _columns(table: DHTable, row: int) -> list[int]:
-    """Which numbers of a row move; the others stay by the convention or because nothing tells them.
+    """Which numbers of a row move; the others stay by the convention or are not identifiable.
 
     Between exactly parallel axes d stays, and theta too where the axes are one.
     """

@@ -177,7 +177,7 @@ _MOST_JOINTS = 2000
 
 
 class UrdfArm(NamedTuple):
-    """What a URDF says of the arm from its root to the tip; None where it tells no mass."""
+    """What a URDF says of the arm from its root to the tip; None where it states no mass."""
 
     chain: Chain
     tip: str

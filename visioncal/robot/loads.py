@@ -53,7 +53,7 @@ class Loads:
         payload_m: (m, 3) its centre, in the flange's frame [m].
         force_n: (m, 3) external force on the flange's origin, in the base's frame [N].
         side: (m,) the side from which the joints came to the stop, +1 from above, -1 from below;
-            0 where that is not told, in the middle of their play.
+            0 where that is not known, in the middle of their play.
     """
 
     payload_kg: FloatArray
@@ -118,7 +118,7 @@ class Loads:
 
     @property
     def from_both_sides(self) -> bool:
-        """Whether stops were approached from either side: only that tells play from an offset."""
+        """Whether stops were approached from either side: only that separates play from offset."""
         return bool((self.side > 0.0).any() and (self.side < 0.0).any())
 
 
@@ -127,17 +127,17 @@ def masses_of_rows(rows: Sequence[Table], joint_from_row: FloatArray) -> Masses 
 
     Args:
         rows: The joints' tables.
-        joint_from_row: (n, 4, 4) the frames in which the centres are told, in the joints' frames
+        joint_from_row: (n, 4, 4) the frames in which the centres are stated, in the joints' frames
             after their motion.
 
     Returns:
-        The masses; None where no joint tells one.
+        The masses; None where no joint states one.
 
     Raises:
-        DataError: Some joints tell their mass and others do not, or one is not a mass.
+        DataError: Some joints state their mass and others do not, or one is not a mass.
     """
-    told = [row for row in rows if any(key in row.content for key in MASS_KEYS)]
-    if not told:
+    stated = [row for row in rows if any(key in row.content for key in MASS_KEYS)]
+    if not stated:
         return None
     kg, centres = [], []
     for row, frame in zip(rows, joint_from_row, strict=True):

@@ -2,8 +2,8 @@
 
 The pseudo-inertia of a body is positive, and so has a root: log-Cholesky coordinates (Rucker and
 Wensing 2022, Smooth parameterization of rigid-body inertia) are the entries of that root, those on
-its diagonal as logarithms. Here they are told relative to a body that is known, which lies at zero:
-then a change of 0.1 is one of ten percent, whatever the body's size and place.
+its diagonal as logarithms. Here they are given relative to a body that is known, which lies at
+zero: then a change of 0.1 is one of ten percent, whatever the body's size and place.
 """
 
 from dataclasses import dataclass
@@ -42,7 +42,7 @@ class LogCholesky:
         wrong = np.flatnonzero((values[:, 0] < -1e-9 * values[:, -1]) | (values[:, -1] <= 0.0))
         if len(wrong):
             raise DataError(
-                f"robot: the inertia that is told of link {wrong[0] + 1} is that of no body: its "
+                f"robot: the inertia stated for link {wrong[0] + 1} is that of no body: its "
                 "second moments of mass are negative.",
                 culprits=[f"joint {it + 1}" for it in wrong],
                 next_step="Check mass_kg, com_m and inertia_kg_m2 (about the centre of mass).",

@@ -81,7 +81,7 @@ class Robot:
         Args:
             document: A DH table (name, tip, convention, [[joint]], base, flange); or name, tip and
                 the URDF's text; or a chain as `corrected` writes it. A table's or a chain's joints
-                may tell their links' `mass_kg` and its centre `com_m`, in the frame in which the
+                may state their links' `mass_kg` and its centre `com_m`, in the frame in which the
                 joint's row ends, their `inertia_kg_m2` about it, and how fast and strong their
                 drives are; any description the `gravity_m_s2` in its base.
 

@@ -1,4 +1,4 @@
-"""Which convention a table of joints was written in, as the poses of a controller tell."""
+"""Which convention a table of joints was written in, by the poses that a controller reports."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -69,9 +69,9 @@ def recognised_convention(
         for reading in _readings(table)
     }
     best, other = sorted(misfit, key=lambda it: misfit[it])
-    told = misfit[other] > _CLEARLY * max(misfit[best], _FINEST_M)
+    distinct = misfit[other] > _CLEARLY * max(misfit[best], _FINEST_M)
     fits = misfit[best] < _FITS * length
-    return Recognised(best if told and fits else None, misfit)
+    return Recognised(best if distinct and fits else None, misfit)
 
 
 def other_convention(robot: Robot) -> tuple[Robot, Convention] | None:

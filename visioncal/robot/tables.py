@@ -132,7 +132,7 @@ def chain_of_table(table: DHTable) -> Chain:
 def row_frames(table: DHTable) -> FloatArray:
     """(n, 4, 4) the frames in which a table's rows end, in the joints' frames after their motion.
 
-    Makers tell the centres of their links' masses in them.
+    Makers state the centres of their links' masses in them.
     """
     if table.convention == "modified":
         return np.broadcast_to(np.eye(4), (len(table), 4, 4))

@@ -96,7 +96,7 @@ def body_regressor(robot: Robot, q: FloatArray, dq: FloatArray, ddq: FloatArray)
 def effective_states(
     robot: Robot, q: FloatArray, dq: FloatArray, ddq: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Positions, speeds and accelerations (m, n) of the joints' axes, where encoders tell (m, n).
+    """Positions, speeds and accelerations (m, n) of the joints' axes, where encoders report (m, n).
 
     Raises:
         DataError: A shape is wrong.

@@ -86,7 +86,7 @@ def corrected_urdf(nominal: Robot, corrected: Robot, notes: Sequence[str] = ()) 
 
 
 def corrected_tip(nominal: Robot, corrected: Robot) -> str:
-    """Names the frame in `corrected_urdf` of which `corrected.base_from_flange` tells the pose."""
+    """Names the frame in `corrected_urdf` whose pose `corrected.base_from_flange` gives."""
     if np.array_equal(nominal.chain.placements[-1], corrected.chain.placements[-1]):
         return nominal.tip
     joints, _ = _read(str(nominal.document["urdf"]).encode("utf-8"))

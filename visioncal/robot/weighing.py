@@ -20,7 +20,7 @@ def with_inertias(robot: Robot, inertias: Inertias) -> Robot:
         inertias: Of its links, in the joints' frames.
 
     Returns:
-        The arm, whose document tells the masses, their centres and the inertias.
+        The arm, whose document states the masses, their centres and the inertias.
     """
     if "convention" in robot.document:
         document = dict(robot.document)

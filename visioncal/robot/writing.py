@@ -65,7 +65,7 @@ def unwritten(robot: Robot) -> tuple[str, ...]:
 def small_urdf(robot: Robot, notes: Sequence[str] = ()) -> str:
     """Writes a URDF of bare links: the joints with their axes and limits, and the tip.
 
-    Links have their inertias where the robot tells them. Joint offsets go into the origins. A URDF
+    Links have their inertias where the robot states them. Joint offsets go into the origins. A URDF
     has no place for gear ratio, eccentricity and harmonics; a comment says which are missing.
 
     Args:
@@ -124,7 +124,7 @@ def inertial_lines(kg: float, centre_m: FloatArray, about: FloatArray) -> list[s
 
 
 def _inertials(robot: Robot) -> list[list[str]]:
-    """Each link's body as lines; none where the robot tells no inertias."""
+    """Each link's body as lines; none where the robot states no inertias."""
     if robot.inertias is None:
         return [[] for _ in robot.joint_names]
     masses = robot.inertias.masses

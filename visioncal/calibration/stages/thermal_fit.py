@@ -292,7 +292,7 @@ def _start(robot: Robot, nominal: Robot, inputs: Inputs) -> ThermalModel:
     return ThermalModel(
         robot,
         heating,
-        heating.cold(inputs.told, inputs.ambient_c),
+        heating.cold(inputs.signal, inputs.ambient_c),
         np.full(count, _GROWTH_PER_K),
         np.zeros(count),
         np.zeros((0, 0)),
@@ -302,8 +302,8 @@ def _start(robot: Robot, nominal: Robot, inputs: Inputs) -> ThermalModel:
 
 def _expected(inputs: Inputs) -> Heating:
     """How links are expected to follow what heats them."""
-    count = inputs.told.shape[1]
+    count = inputs.signal.shape[1]
     gain = np.ones(count)
     if inputs.kind == "currents":
-        gain = RISE_K / np.maximum(inputs.told.mean(axis=0), 1e-9)
+        gain = RISE_K / np.maximum(inputs.signal.mean(axis=0), 1e-9)
     return Heating(inputs.kind, np.full(count, _TAU_S[inputs.kind]), gain)

@@ -62,7 +62,7 @@ def _bunched(inputs: Inputs) -> Inputs:
     return Inputs(
         inputs.kind,
         np.add.reduceat(inputs.stamps_s, starts) / lengths,
-        np.add.reduceat(inputs.told, starts, axis=0) / lengths[:, None],
+        np.add.reduceat(inputs.signal, starts, axis=0) / lengths[:, None],
         np.add.reduceat(inputs.ambient_c, starts) / lengths,
     )
 

@@ -27,7 +27,7 @@ class Advice:
         rate_um_min: How fast the flange drifts now [um/min].
         limit_um_min: How fast it may [um/min].
         wait_s: How long until then if work goes on as it does; zero where it is warm, None where it
-            does not come to that within ten hours or too little was told as yet.
+            does not come to that within ten hours or too few samples were given as yet.
     """
 
     rate_um_min: float | None
@@ -38,7 +38,7 @@ class Advice:
     def words(self) -> str:
         """The advice in a sentence."""
         if self.rate_um_min is None:
-            return "Too little was told of the temperatures to say how fast the arm drifts."
+            return "Too few temperatures were given to say how fast the arm drifts."
         now = f"The flange drifts by {self.rate_um_min:.2g} um/min"
         if self.wait_s is None:
             return f"{now} and does not come under {self.limit_um_min:g} within ten hours."
@@ -97,40 +97,40 @@ class OnlineCompensator:
             stamp_s: When; later than the sample before [s].
             temperatures_c: (n,) of the joints, where the model was fitted to these.
             currents_a: (n,) of the motors, where it was fitted to these [A].
-            ambient_c: The air, with currents; that of the reference where it is not told.
+            ambient_c: The air, with currents; that of the reference where it is not given.
 
         Raises:
             DataError: The time does not ascend, the wrong kind was given, or numbers are missing.
         """
         heating, count = self._model.heating, self._model.joint_count
         given = temperatures_c if heating.kind == "temperatures" else currents_a
-        told = np.asarray([] if given is None else given, dtype=float)
-        if told.shape != (count,) or not np.isfinite(told).all():
+        signal = np.asarray([] if given is None else given, dtype=float)
+        if signal.shape != (count,) or not np.isfinite(signal).all():
             raise DataError(
                 f"thermal: the model was fitted to {heating.kind}; {count} of them are needed in a "
-                f"sample, not {told.tolist()}."
+                f"sample, not {signal.tolist()}."
             )
         if self._stamps_s and stamp_s <= self._stamps_s[-1]:
             raise DataError(
                 f"thermal: a sample at {stamp_s:g} s does not come after the one before, at "
                 f"{self._stamps_s[-1]:g} s."
             )
-        told = told if heating.kind == "temperatures" else told**2
+        signal = signal if heating.kind == "temperatures" else signal**2
         air = float(self._model.reference_c.mean()) if ambient_c is None else ambient_c
-        self._last = self._after(told, air, stamp_s)
+        self._last = self._after(signal, air, stamp_s)
         self._stamps_s.append(stamp_s)
         self._links.append(self._last.links)
         self._forget()
 
-    def _after(self, told: FloatArray, air: float, stamp_s: float) -> _Sample:
+    def _after(self, signal: FloatArray, air: float, stamp_s: float) -> _Sample:
         """The links at a new sample of what heats them (n,) and of the air [deg C]."""
         heating, last = self._model.heating, self._last
         ambient = np.array([air])
-        rest = heating.rest(told[None], ambient)[0]
+        rest = heating.rest(signal[None], ambient)[0]
         driven = rest - air if heating.kind == "currents" else np.zeros_like(rest)
         if last is None:
             still = np.zeros((len(rest), heating.size // len(rest)))
-            return _Sample(rest, driven, heating.cold(told[None], ambient), still)
+            return _Sample(rest, driven, heating.cold(signal[None], ambient), still)
         seconds = stamp_s - self._stamps_s[-1]
         mean = 0.5 * (rest + last.rest)
         by = 0.5 * (driven + last.driven)

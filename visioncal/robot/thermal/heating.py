@@ -2,7 +2,7 @@
 
 A link is one RC element: `tau ds/dt = rest - s`. Where temperatures of the joints are measured,
 the rest is the joint's, and tau is by how much the link lags behind its sensor; where motor
-currents are all that is told, the rest is the air and a gain times the squared current. The rest is
+only currents are recorded, the rest is the air and a gain times the squared current. The rest is
 taken for constant, at its mean, from one sample to the next; under that the step is exact.
 """
 
@@ -21,15 +21,15 @@ class Inputs:
     """What heats an arm with n joints, at t samples.
 
     Attributes:
-        kind: Whether joints' temperatures or motors' currents are told.
+        kind: Whether joints' temperatures or motors' currents were recorded.
         stamps_s: (t,) ascending [s].
-        told: (t, n) temperatures of the joints [deg C], or squared currents [A^2].
-        ambient_c: (t,) the air; zero where it is not told, and temperatures are those above it.
+        signal: (t, n) temperatures of the joints [deg C], or squared currents [A^2].
+        ambient_c: (t,) the air; zero where not recorded: temperatures are then relative to it.
     """
 
     kind: Kind
     stamps_s: FloatArray
-    told: FloatArray
+    signal: FloatArray
     ambient_c: FloatArray
 
     def until(self, stamp_s: float) -> Self:
@@ -38,7 +38,7 @@ class Inputs:
         return replace(
             self,
             stamps_s=self.stamps_s[kept],
-            told=self.told[kept],
+            signal=self.signal[kept],
             ambient_c=self.ambient_c[kept],
         )
 
@@ -48,10 +48,10 @@ class Heating:
     """How links follow what heats them.
 
     Attributes:
-        kind: What is told.
+        kind: What was recorded.
         tau_s: (n,) time constants [s].
         gain_k_per_a2: (n,) rise over the air for a squared current, at rest [K/A^2]; one where
-            temperatures are told.
+            temperatures were recorded.
     """
 
     kind: Kind
@@ -71,15 +71,15 @@ class Heating:
             gain = gain * np.exp(steps[count:])
         return replace(self, tau_s=self.tau_s * np.exp(steps[:count]), gain_k_per_a2=gain)
 
-    def rest(self, told: FloatArray, ambient_c: FloatArray) -> FloatArray:
+    def rest(self, signal: FloatArray, ambient_c: FloatArray) -> FloatArray:
         """Where links would come to rest (t, n), if what heats them stayed [deg C]."""
         if self.kind == "temperatures":
-            return told
-        return np.asarray(ambient_c[:, None] + self.gain_k_per_a2 * told)
+            return signal
+        return np.asarray(ambient_c[:, None] + self.gain_k_per_a2 * signal)
 
-    def cold(self, told: FloatArray, ambient_c: FloatArray) -> FloatArray:
+    def cold(self, signal: FloatArray, ambient_c: FloatArray) -> FloatArray:
         """(n,) what links have at the first of some samples: in balance with their surroundings."""
-        return told[0] if self.kind == "temperatures" else np.full_like(told[0], ambient_c[0])
+        return signal[0] if self.kind == "temperatures" else np.full_like(signal[0], ambient_c[0])
 
     def step(self, before: FloatArray, rest: FloatArray, seconds: float) -> FloatArray:
         """(n,) temperatures some time after others, under a constant rest [deg C]."""
@@ -122,7 +122,7 @@ class Heating:
 
         Returns:
             (m, n, s) derivatives by the parameters of the link's own joint: of the logarithms of
-            tau and, where currents are told, of the gain.
+            tau and, where currents were recorded, of the gain.
         """
         states, rests, kept = self._course(inputs)
         hours = np.diff(inputs.stamps_s)[:, None] / self.tau_s
@@ -136,10 +136,10 @@ class Heating:
 
     def _course(self, inputs: Inputs) -> tuple[FloatArray, FloatArray, FloatArray]:
         """States (t, n) at the samples; rests and what is kept (t - 1, n) between them."""
-        rest = self.rest(inputs.told, inputs.ambient_c)
+        rest = self.rest(inputs.signal, inputs.ambient_c)
         rests = 0.5 * (rest[:-1] + rest[1:])
         kept = np.exp(-np.diff(inputs.stamps_s)[:, None] / self.tau_s)
-        first = self.cold(inputs.told, inputs.ambient_c)[None]
+        first = self.cold(inputs.signal, inputs.ambient_c)[None]
         return _scanned(first, kept, (1.0 - kept) * rests), rests, kept
 
     def _at(self, inputs: Inputs, at_s: FloatArray, states: FloatArray) -> FloatArray:
