@@ -117,7 +117,7 @@ def test_a_row_with_another_pose_than_its_stop_is_of_a_state_of_its_own(folder):
     )
     session = Session.load(folder)
     (warning,) = [it for it in session.warnings if "another pose" in it]
-    assert "view 2 tells another pose of robot a than view 0 of the same stop 0" in warning
+    assert "view 2 has another pose of robot a than view 0 of the same stop 0" in warning
     found = {it.view.number: it.station for it in session.observations}
     assert found[0] == found[1] != found[2]
 

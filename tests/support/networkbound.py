@@ -84,7 +84,7 @@ def _jacobian(
     """How one sight's pixels move with the unknowns and the flanges, in units of their noise."""
     camera, board = frame_name("camera", sight.camera), frame_name("target", sight.board)
     keys = [camera, board, f"size {sight.board}", f"lens {sight.camera}"]
-    carriers = [cell.teller(camera), cell.teller(board)]
+    carriers = [cell.robot_of(camera), cell.robot_of(board)]
     keys += [frame_name("base", it) for it in carriers if it is not None]
     keys = [it for it in keys if it in places]
     if sight.stop < 0:
@@ -142,7 +142,7 @@ def _pixels(cell: Network, sight: Sight, key: str, change: FloatArray) -> FloatA
 def _place(cell: Network, stop: int, frame: str, key: str, change: FloatArray) -> FloatArray:
     """(4, 4) `cell_from_frame` when one thing changes."""
     place = cell.transforms[frame] @ (exp(change) if key == frame else np.eye(4))
-    robot = cell.teller(frame)
+    robot = cell.robot_of(frame)
     if robot is None:
         return place
     base = frame_name("base", robot)

@@ -1,4 +1,4 @@
-"""The printed targets of a session: one, or several that the column `target` tells apart."""
+"""The printed targets of a session: one, or several named by the column `target`."""
 
 from collections.abc import Mapping
 from pathlib import Path

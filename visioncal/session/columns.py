@@ -34,7 +34,7 @@ ROTATIONS: Mapping[tuple[str, str, str], tuple[str, ...]] = {
     ("w", "p", "r"): ("euler-xyz-deg",),
     ("roll", "pitch", "yaw"): ("euler-xyz-rad", "euler-xyz-deg"),
 }
-# Columns of positions in a unit that their names do not tell.
+# Columns of positions in a unit that their names do not state.
 _POSITIONS = (("x", "y", "z"), ("tx", "ty", "tz"), ("x_mm", "y_mm", "z_mm"))
 _PLAIN_NUMBERS = frozenset(
     {
@@ -132,7 +132,7 @@ def check_header(columns: Sequence[str], where: str) -> None:
         raise DataError(
             f"{where}: the rotations are in {names}, and quaternions qx, qy, qz, qw are needed.",
             culprits=[where],
-            next_step=f"They may be {' or '.join(ROTATIONS[turned])}, which the images tell. "
+            next_step=f"They may be {' or '.join(ROTATIONS[turned])}, which the images show. "
             f"{READ_AGAIN}",
         )
     if places is not None:
@@ -140,7 +140,7 @@ def check_header(columns: Sequence[str], where: str) -> None:
             f"{where}: the positions are in {','.join(places)}, and {', '.join(POSITION)} [m] are "
             "needed.",
             culprits=[where],
-            next_step=f"The images tell their unit. {READ_AGAIN}",
+            next_step=f"The images show their unit. {READ_AGAIN}",
         )
     raise DataError(f"{where}: {'; '.join(problems)}.", culprits=[where])
 

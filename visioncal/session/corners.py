@@ -233,9 +233,9 @@ def with_corners(
             numbers[[at for at in mine if shown[at] == board]] = new
             new += 1
     more = [it for it in ("stop", COLUMN) if it not in columns]
-    told = {"stop": any(it.stop is not None for it in rows.values()), COLUMN: True}
+    wanted = {"stop": any(it.stop is not None for it in rows.values()), COLUMN: True}
     return (
-        (*columns, *(it for it in more if told[it])),
+        (*columns, *(it for it in more if wanted[it])),
         (*rows.values(), *made),
         replace(table, views=numbers, targets=tuple(shown)),
     )

@@ -73,7 +73,7 @@ class Declaration(TableModel):
 
     @property
     def is_network(self) -> bool:
-        """Whether frames have to be told apart: several cameras, robots or instruments, or said."""
+        """Whether frames need names: several cameras, robots or instruments, or said."""
         several = (self.cameras, self.robots, self.instruments)
         return bool(self.frames) or any(len(it) > 1 for it in several)
 
@@ -182,8 +182,8 @@ def _contradictions(declaration: Declaration, observed: bool) -> Iterator[tuple[
     """Finds fields that are well typed but do not fit together: (dotted path, words)."""
     camera = declaration.camera
     reads = declaration.instrument is not None or bool(declaration.instruments) or not observed
-    told = declaration.is_network or (reads and not declaration.named("camera"))
-    if declaration.mount is None and not told:
+    implied = declaration.is_network or (reads and not declaration.named("camera"))
+    if declaration.mount is None and not implied:
         yield "mount", "is missing" + _MISSING["mount"]
     if camera is not None:
         yield from _camera_contradictions(camera, "camera")

@@ -11,7 +11,7 @@ from functools import cached_property
 from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean, some_of
 from visioncal.session.document import Declaration, Kind
-from visioncal.session.kinds import is_read, is_seen, name_of, tells_robot
+from visioncal.session.kinds import has_robot_state, is_read, is_seen, name_of
 from visioncal.session.table import View
 from visioncal.session.tables import RobotTable
 
@@ -34,15 +34,15 @@ def frame_name(kind: str, name: str) -> str:
 def robots_of(
     declaration: Declaration, views: Sequence[View], *, in_streams: bool = False
 ) -> dict[str, RobotTable]:
-    """The robots by name; one without a name where poses are told and none is declared.
+    """The robots by name; one without a name where poses are given and none is declared.
 
     Args:
         declaration: What the session declares.
         views: Its rows.
-        in_streams: Whether a stream tells poses or joints.
+        in_streams: Whether a stream has poses or joints.
     """
     found = declaration.named("robot")
-    if not found and (in_streams or any(tells_robot(view) for view in views)):
+    if not found and (in_streams or any(has_robot_state(view) for view in views)):
         return {"": RobotTable()}
     return {name: it for name, it in found.items() if isinstance(it, RobotTable)}
 
@@ -128,7 +128,7 @@ class _Tree:
         return {frame_name(kind, name): (kind, name) for kind, name in listed}
 
     def _names(self, kind: Kind) -> tuple[str, ...]:
-        """Those of a kind; one without a name where rows tell of it and none is declared."""
+        """Those of a kind; one without a name where rows are of it and none is declared."""
         test = is_read if kind == "instrument" else is_seen
         declared = tuple(self.declaration.named(kind))
         return declared or (("",) if any(test(view) for view in self.views) else ())
@@ -221,10 +221,10 @@ class _Tree:
         return None
 
     def _of_point(self, frame: str) -> str | None:
-        """A point moves with the robot that its rows name; where they tell no pose, it is fixed."""
+        """A point moves with the robot that its rows name; where they have no pose, it is fixed."""
         _, name = self.frames[frame]
         rows = [it for it in self.views if is_read(it) and point_name(it) == name]
-        moved = [it for it in rows if tells_robot(it)]
+        moved = [it for it in rows if has_robot_state(it)]
         if not moved and len(self.robots) < 2:
             return CELL if self.declaration.is_network else self._flange_of(frame)
         if not moved:
@@ -238,7 +238,7 @@ class _Tree:
         named = {
             name_of(self.declaration, "robot", view)
             for view in self.views
-            if tells_robot(view) and frame in observed(self.declaration, view)
+            if has_robot_state(view) and frame in observed(self.declaration, view)
         }
         return frame_name("flange", named.pop()) if len(named) == 1 else None
 

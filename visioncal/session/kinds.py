@@ -13,24 +13,24 @@ _Test: TypeAlias = Callable[[View], bool]
 
 
 def is_seen(view: View) -> bool:
-    """Whether a camera saw what a row tells: an image, corners of one, or a measured pose."""
+    """Whether a row is a camera's observation: an image, corners of one, or a measured pose."""
     return bool(view.image) or view.has_corners or "cft_x_m" in view.numbers
 
 
-def tells_robot(view: View) -> bool:
-    """Whether a row tells where a robot stood."""
+def has_robot_state(view: View) -> bool:
+    """Whether a row has a robot's pose or joints."""
     return POSITION[0] in view.numbers or "q1_rad" in view.numbers
 
 
 def is_read(view: View) -> bool:
-    """Whether an instrument read what a row tells."""
+    """Whether a row is an instrument's reading."""
     return view.reading_m is not None
 
 
 # Which rows must name one of several, what the column names, and how to mend a row.
 _NEEDS: Mapping[Kind, tuple[_Test, str, str]] = {
     "camera": (is_seen, "the one that took a row's image", ""),
-    "robot": (tells_robot, "the one whose pose or joints a row has", ""),
+    "robot": (has_robot_state, "the one whose pose or joints a row has", ""),
     "target": (
         is_seen,
         "the one that a row shows",

@@ -44,7 +44,7 @@ def load_problems(numbers: Mapping[str, float]) -> Iterator[tuple[str, str]]:
     if mass is None and placed:
         yield (
             placed[0],
-            "it tells where a payload's centre is, and payload_kg, its mass, is missing; a row "
+            "it gives a payload's centre, and payload_kg, its mass, is missing; a row "
             "without a payload has payload_kg = 0 or leaves all of them empty",
         )
     for name in _FORCE:

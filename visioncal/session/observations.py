@@ -11,7 +11,7 @@ from visioncal.core.transforms import pose_difference
 from visioncal.session.columns import LOAD, POSE, joint_columns
 from visioncal.session.document import Declaration
 from visioncal.session.frames import observed, robots_between
-from visioncal.session.kinds import name_of, tells_robot
+from visioncal.session.kinds import has_robot_state, name_of
 from visioncal.session.table import View
 
 # Reports of one robot at one stop that are farther apart are of two poses [mm, deg, rad].
@@ -28,12 +28,12 @@ class Observation:
 
     Attributes:
         view: Its row.
-        station: Which state of the cell it is of; all rows of a stop share one, unless they tell
+        station: Which state of the cell it is of; all rows of a stop share one, unless they give
             different poses of a robot.
         seer: The frame of the camera or instrument.
         seen: The frame of the target or point.
-        robots: Of each robot between the two that is told of at this stop, the row that tells it.
-        lacks: The robots between the two of which no row of the stop tells where they stood.
+        robots: The row with the pose of each robot between the two at this stop.
+        lacks: The robots between the two of which no row of the stop has a pose.
     """
 
     view: View
@@ -45,16 +45,16 @@ class Observation:
 
     @property
     def is_of_lens(self) -> bool:
-        """Whether it tells of the camera's lens alone."""
+        """Whether it serves the camera's lens alone."""
         return self.view.is_of_lens or bool(self.lacks)
 
 
 @dataclass(frozen=True, eq=False)
 class _Stop:
-    """The rows of one stop, and the row that tells each robot's pose for most of them."""
+    """The rows of one stop, and for each robot the row whose pose most of them agree with."""
 
     rows: tuple[View, ...]
-    told: Mapping[str, View]
+    robot_rows: Mapping[str, View]
 
 
 def observations_of(
@@ -68,35 +68,35 @@ def observations_of(
         frames: What hangs on what, as `resolve_frames` gives it.
 
     Returns:
-        One observation a row that has one: rows that only tell where a robot stood have none.
+        One observation a row that has one: rows that only have a robot's pose have none.
     """
     place_of = {view.number: at for at, view in enumerate(views)}
     found, station = [], 0
     for stop in _stops(declaration, views):
-        # Rows that tell other poses than the rest are of a state of the cell of their own.
+        # Rows that have other poses than the rest are of a state of the cell of their own.
         states: dict[tuple[int, ...], int] = {}
         for view in stop.rows:
-            own = {name_of(declaration, "robot", view): view} if tells_robot(view) else {}
-            strays = {it: row for it, row in own.items() if _differ(row, stop.told[it])}
-            told = {**stop.told, **strays}
-            key = tuple(told[it].number for it in sorted(told))
+            own = {name_of(declaration, "robot", view): view} if has_robot_state(view) else {}
+            strays = {it: row for it, row in own.items() if _differ(row, stop.robot_rows[it])}
+            by_robot = {**stop.robot_rows, **strays}
+            key = tuple(by_robot[it].number for it in sorted(by_robot))
             seer, seen = observed(declaration, view)
             if not seer:
                 continue
             if key not in states:
                 states[key], station = station, station + 1
             needed = () if view.is_of_lens else robots_between(frames, seer, seen)
-            robots = {it: told[it] for it in needed if it in told}
-            lacks = tuple(it for it in needed if it not in told)
+            robots = {it: by_robot[it] for it in needed if it in by_robot}
+            lacks = tuple(it for it in needed if it not in by_robot)
             found.append(Observation(view, states[key], seer, seen, robots, lacks))
     return tuple(sorted(found, key=lambda it: place_of[it.view.number]))
 
 
 def standing(declaration: Declaration, views: Sequence[View]) -> dict[int, Mapping[str, View]]:
-    """Of each row, by its view: the rows that tell where the robots stood at its stop, by robot."""
+    """Of each row, by its view: the rows with the robots' poses at its stop, by robot."""
     found: dict[int, Mapping[str, View]] = {}
     for stop in _stops(declaration, views):
-        found |= dict.fromkeys((it.number for it in stop.rows), stop.told)
+        found |= dict.fromkeys((it.number for it in stop.rows), stop.robot_rows)
     return found
 
 
@@ -104,7 +104,7 @@ def still_since(views: Iterable[View]) -> dict[int, int]:
     """Of each row of one robot, by its view: the row since which the robot has not moved.
 
     Args:
-        views: Rows that tell its pose and name no stop, in their order.
+        views: Rows that have its pose and name no stop, in their order.
     """
     found: dict[int, int] = {}
     first = last = None
@@ -116,7 +116,7 @@ def still_since(views: Iterable[View]) -> dict[int, int]:
 
 
 def _moved(first: View, second: View) -> bool:
-    """Whether two rows tell poses that differ by more than readings of one pose do, or loads."""
+    """Whether two rows have poses that differ by more than readings of one pose do, or loads."""
     if any(first.numbers.get(it) != second.numbers.get(it) for it in LOAD):
         return True
     before, after = ([it.numbers.get(name, math.nan) for name in POSE] for it in (first, second))
@@ -139,15 +139,15 @@ def _long(first: View, second: View) -> bool:
 
 
 def stop_warnings(declaration: Declaration, views: Sequence[View]) -> Iterator[str]:
-    """Words rows that tell another pose of a robot than the rest of their stop."""
+    """Words rows that have another pose of a robot than the rest of their stop."""
     for stop in _stops(declaration, views):
         for view in stop.rows:
             robot = name_of(declaration, "robot", view)
-            if tells_robot(view) and _differ(view, stop.told[robot]):
+            if has_robot_state(view) and _differ(view, stop.robot_rows[robot]):
                 of = f" of robot {robot}" if robot else ""
                 yield (
-                    f"views.csv: view {view.number} tells another pose{of} than view "
-                    f"{stop.told[robot].number} of the same stop {view.stop}. One of the two "
+                    f"views.csv: view {view.number} has another pose{of} than view "
+                    f"{stop.robot_rows[robot].number} of the same stop {view.stop}. One of the two "
                     "belongs to another stop."
                 )
 
@@ -155,32 +155,32 @@ def stop_warnings(declaration: Declaration, views: Sequence[View]) -> Iterator[s
 def _stops(declaration: Declaration, views: Sequence[View]) -> list[_Stop]:
     """Groups rows by their stop; without one, by runs in which their robot stood still."""
     groups: dict[tuple[int, int], list[View]] = {}
-    telling: dict[str, list[View]] = {}
+    rows_of: dict[str, list[View]] = {}
     for view in views:
-        if view.stop is None and not view.is_of_lens and tells_robot(view):
-            telling.setdefault(name_of(declaration, "robot", view), []).append(view)
-    since = {row: first for mine in telling.values() for row, first in still_since(mine).items()}
+        if view.stop is None and not view.is_of_lens and has_robot_state(view):
+            rows_of.setdefault(name_of(declaration, "robot", view), []).append(view)
+    since = {row: first for mine in rows_of.values() for row, first in still_since(mine).items()}
     for view in views:
         alone = view.stop is None or view.is_of_lens
         key = (1, since.get(view.number, view.number)) if alone else (0, view.stop or 0)
         groups.setdefault(key, []).append(view)
-    return [_Stop(tuple(rows), _told(declaration, rows)) for rows in groups.values()]
+    return [_Stop(tuple(rows), _robot_rows(declaration, rows)) for rows in groups.values()]
 
 
-def _told(declaration: Declaration, rows: Sequence[View]) -> dict[str, View]:
+def _robot_rows(declaration: Declaration, rows: Sequence[View]) -> dict[str, View]:
     """Of each robot, the row with the pose that most rows of a stop agree on."""
-    telling: dict[str, list[View]] = {}
+    rows_of: dict[str, list[View]] = {}
     for view in rows:
-        if tells_robot(view):
-            telling.setdefault(name_of(declaration, "robot", view), []).append(view)
-    told = {}
-    for robot, mine in telling.items():
+        if has_robot_state(view):
+            rows_of.setdefault(name_of(declaration, "robot", view), []).append(view)
+    agreed = {}
+    for robot, mine in rows_of.items():
         counts, first = Counter(map(_pose_cells, mine)), {_pose_cells(it): it for it in mine[::-1]}
         agreeing = Counter(
             {a: sum(counts[b] for b in counts if not _differ(first[a], first[b])) for a in counts}
         )
-        told[robot] = first[agreeing.most_common(1)[0][0]]
-    return told
+        agreed[robot] = first[agreeing.most_common(1)[0][0]]
+    return agreed
 
 
 def _pose_cells(view: View) -> tuple[float | None, ...]:
@@ -190,7 +190,7 @@ def _pose_cells(view: View) -> tuple[float | None, ...]:
 
 
 def _differ(first: View, second: View) -> bool:
-    """Whether two rows tell of one robot that it stood in different poses."""
+    """Whether two rows have different poses of one robot."""
     if _pose_cells(first) == _pose_cells(second):
         return False
     poses = first.base_from_flange(), second.base_from_flange()

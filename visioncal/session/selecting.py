@@ -8,7 +8,7 @@ from visioncal.session.boards import COLUMN as TARGET
 from visioncal.session.choosing import PARTS, Choice, Chosen, Part, choose
 from visioncal.session.columns import SELECTORS, is_number
 from visioncal.session.document import KINDS
-from visioncal.session.kinds import is_seen, name_of, tells_robot
+from visioncal.session.kinds import has_robot_state, is_seen, name_of
 from visioncal.session.observations import standing
 from visioncal.session.streams import Stream
 from visioncal.session.table import View
@@ -16,7 +16,7 @@ from visioncal.session.table import View
 if TYPE_CHECKING:
     from visioncal.session.session import Session
 
-# What a camera or the air tells: all other numbers of a row are the robot's.
+# What is a camera's or the air's: all other numbers of a row are the robot's.
 _NOT_OF_ROBOTS = ("stamp_s", "ambient_c", "cft_", "meas_")
 
 
@@ -38,7 +38,7 @@ def select(
         session: A session.
         choice: What is meant.
         needs: What has to be clear: where no camera is needed, the rows are those without images
-            that tell where the robot stood.
+            with the robot's pose.
         parted: Whether the robot is to move camera and target before each other.
 
     Raises:
@@ -54,7 +54,7 @@ def select(
         chosen = replace(chosen, camera="", target="")
     rows = dict(_rows(session, chosen))
     columns = tuple(it for it in session.columns if it not in (*SELECTORS, TARGET))
-    cells = [[_cell(row, told, it) for it in columns] for row, told in rows.values()]
+    cells = [[_cell(row, robot_row, it) for it in columns] for row, robot_row in rows.values()]
     table, target = session.corner_table, chosen.target.partition("_")[2]
     models, boards = session.robot_documents, session.target_document
     found = session.assemble(
@@ -85,7 +85,7 @@ def _robot_of(session: "Session", stream: str) -> str | None:
 def _rows(
     session: "Session", chosen: Chosen
 ) -> Iterator[tuple[int, tuple[View, Mapping[str, float]]]]:
-    """The rows that are meant, by view, with what their stop tells of the robot."""
+    """The rows that are meant, by view, with the robot's numbers at their stop."""
     declaration, stood = session.declaration, standing(session.declaration, session.views)
     seen = {it.view.number: (it.seer, it.seen) for it in session.observations}
     for view in session.views:
@@ -93,15 +93,15 @@ def _rows(
             mine = is_seen(view) and seen.get(view.number) == (chosen.camera, chosen.target)
         else:
             of = name_of(declaration, "robot", view)
-            mine = tells_robot(view) and not is_seen(view) and of == chosen.robot
+            mine = has_robot_state(view) and not is_seen(view) and of == chosen.robot
         if mine:
-            told = stood[view.number].get(chosen.robot)
-            yield view.number, (view, {} if told is None else told.numbers)
+            robot_row = stood[view.number].get(chosen.robot)
+            yield view.number, (view, {} if robot_row is None else robot_row.numbers)
 
 
-def _cell(view: View, told: Mapping[str, float], column: str) -> str:
+def _cell(view: View, robot_row: Mapping[str, float], column: str) -> str:
     if is_number(column) and not column.startswith(_NOT_OF_ROBOTS):
-        return repr(float(told[column])) if column in told else ""
+        return repr(float(robot_row[column])) if column in robot_row else ""
     return view.cell(column)
 
 

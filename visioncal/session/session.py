@@ -125,7 +125,7 @@ class Session:
         streams = read_streams(path)
         columns: tuple[str, ...] = ALONE
         rows: tuple[Row, ...] = ()
-        # What an arm's drives needed is told by streams alone.
+        # Streams alone have what an arm's drives needed.
         if table is not None:
             columns, rows = table
         elif not streams or (path / "views.csv").exists():
@@ -395,7 +395,7 @@ class Session:
     @cached_property
     def robots(self) -> Mapping[str, RobotTable]:
         """The robots by name; that of `[robot]`, and of poses without a robot, is empty."""
-        in_streams = any(it.tells_robot for it in self.streams.values())
+        in_streams = any(it.has_robot_state for it in self.streams.values())
         return robots_of(self.declaration, self.views, in_streams=in_streams)
 
     @cached_property

@@ -42,9 +42,9 @@ def check_one_of_each(session: Session) -> None:
 def _several(session: Session) -> str:
     """What makes a session that of a whole cell; empty where it is none."""
     several = {it: list(session.declaration.named(it)) for it in KINDS if it != "target"}
-    told = [f"{kind}s ({some_of(names)})" for kind, names in several.items() if len(names) > 1]
-    if told:
-        return f"has several {' and several '.join(told)}; this takes one"
+    words = [f"{kind}s ({some_of(names)})" for kind, names in several.items() if len(names) > 1]
+    if words:
+        return f"has several {' and several '.join(words)}; this takes one"
     if not session.declaration.frames or session.mount == "instrument":
         return ""
     boards = [frame_name("target", name) for name in session.declaration.named("target")]

@@ -73,7 +73,7 @@ class Stream:
         return stamps_s, np.asarray(poses.as_matrix())
 
     @property
-    def tells_robot(self) -> bool:
+    def has_robot_state(self) -> bool:
         """Whether it has poses or joints of a robot."""
         return known.POSE[0] in self or "q1_rad" in self
 

@@ -64,7 +64,7 @@ class View:
 
     @property
     def is_of_lens(self) -> bool:
-        """Whether it tells of the camera's lens alone, as the board was anywhere."""
+        """Whether it serves the camera's lens alone, as the board was anywhere."""
         return self.text.get("role", "").strip() == "intrinsics"
 
     @property
@@ -239,7 +239,7 @@ def problems_error(problems: Sequence[Problem]) -> DataError:
             f"seems, {'Euler angles in degrees' if degrees else 'rotation vectors or Euler angles'}"
             f": their norms are {min(norms):.3g} to {max(norms):.3g}, and 1 is needed.",
             culprits=[problems[0].place],
-            next_step=f"Which of them they are the images tell. {READ_AGAIN}",
+            next_step=f"The images show which. {READ_AGAIN}",
         )
     where = ", ".join(problems[0].place.split(", ")[:2])
     step = f"Correct it, or delete {where}." if len(problems) == 1 else ""
@@ -290,7 +290,7 @@ class _RowReader:
             )
         self._check_sizes(numbers)
         self._check_groups(numbers)
-        # A row of a stop may tell no more than where one of several robots stood.
+        # A row of a stop may have no more than the pose of one of several robots.
         stands = {"x_m", "q1_rad"} & numbers.keys() and stop is not None and "robot" in text
         observed = {"cft_x_m", "meas_x_m"} & numbers.keys() or "point" in text or stands
         if not image and not observed and not self.with_corners and not self.problems:
@@ -341,7 +341,7 @@ class _RowReader:
         if not (image or self.with_corners) or poses:
             self.report(
                 "role",
-                "intrinsics is for an image that tells of the camera's lens alone, but the row has "
+                "intrinsics is for an image that serves the camera's lens alone, but the row has "
                 + (f"{poses[0]}; leave that empty" if poses else "no image"),
             )
 

@@ -82,7 +82,7 @@ class Cell:
         shown: Which stop and which board each view is of: a stop that shows two has two views.
         payloads: What the arm carried, view by view; empty where nothing.
         approach: (m,) the side from which each stop was approached, +1 or -1; None where that is
-            not told.
+            not stated.
     """
 
     options: CellOptions
@@ -206,7 +206,7 @@ def _approach(options: CellOptions) -> FloatArray:
 
 
 def stream(options: CellOptions, purpose: Stream, *index: int) -> np.random.Generator:
-    """The generator of one source of randomness; `index` tells views apart."""
+    """The generator of one source of randomness; `index` is of the view."""
     again: tuple[int, ...] = (options.draw,) if options.draw and purpose in _DRAWN_ANEW else ()
     if options.recording and purpose in _RECORDED_ANEW:
         again += (_RECORDING, options.recording)

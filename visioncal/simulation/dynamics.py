@@ -174,7 +174,7 @@ def _off(body: Body, share: float, rng: np.random.Generator) -> Body:
 def drive_torques(built: DynamicArm, q: FloatArray, dq: FloatArray, ddq: FloatArray) -> FloatArray:
     """What the drives have to give for a motion (Luh, Walker and Paul 1980).
 
-    All vectors are told in the base's frame.
+    All vectors are in the base's frame.
 
     Args:
         built: The arm.

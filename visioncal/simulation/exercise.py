@@ -34,7 +34,7 @@ class Senses:
         torque_share: That of the torques, as a share of their root mean square by joint.
         torque_nm: What is added to it, whatever the torques are [N m].
         gains_nm_a: (n,) torque for a current; currents are recorded in the place of torques where
-            it is told [N m/A].
+            it is reported [N m/A].
     """
 
     q_rad: float = 1e-5

@@ -14,7 +14,7 @@ from visioncal.simulation.rasters import Float32Array, Patch, between, trace
 from visioncal.simulation.render import developed, light_on, prepare_scene
 from visioncal.simulation.textures import margin_m
 
-# No corner can be found so well that it tells such a shift [px].
+# No corner is found so well that such a shift shows [px].
 _STILL_PX = 0.003
 # A shorter smear may pass for rest, so it is made of exact pictures; a longer one of shifted ones.
 _SHORT_PX = 2.0

@@ -71,7 +71,7 @@ def simulate_network(options: NetworkOptions) -> Network:
         true_base_from_flange=flanges,
         sights=(),
         readings=(),
-        told=(),
+        pose_rows=(),
         wrong_views=(),
         streams=heat,
     )
@@ -79,9 +79,9 @@ def simulate_network(options: NetworkOptions) -> Network:
     last = {name: it[-1] for name, it in _hanging(cell).items()}
     for swept in options.sweeps:
         taken = [it.view for it in cell.sights] + [it.view for it in cell.readings]
-        first = 1 + max([*taken, *(it[0] for it in cell.told)], default=-1)
-        sights, told = sweep_network(cell, swept, last, first)
-        streams = {**cell.streams, swept.robot: told}
+        first = 1 + max([*taken, *(it[0] for it in cell.pose_rows)], default=-1)
+        sights, recorded = sweep_network(cell, swept, last, first)
+        streams = {**cell.streams, swept.robot: recorded}
         cell = replace(cell, sights=(*cell.sights, *sights), streams=streams)
     return cell
 
@@ -99,7 +99,7 @@ def _observed(cell: Network) -> Network:
     shown = {key: _shown(cell, *key, pose) for key, pose in poses.items()}
     sights: list[Sight] = []
     readings: list[Reading] = []
-    told: list[tuple[int, int, str]] = []
+    pose_rows: list[tuple[int, int, str]] = []
     view = 0
     for stop in range(options.stops):
         needed: dict[str, bool] = {}
@@ -112,16 +112,16 @@ def _observed(cell: Network) -> Network:
             readings.append(reading)
             _need(cell, needed, frame_name("point", reading.point), "")
             view += 1
-        for robot in [it for it, is_told in needed.items() if not is_told]:
-            told.append((view, stop, robot))
+        for robot in [it for it, is_given in needed.items() if not is_given]:
+            pose_rows.append((view, stop, robot))
             view += 1
     sights += _of_lenses(cell, view)
-    return replace(cell, sights=tuple(sights), readings=tuple(readings), told=tuple(told))
+    return replace(cell, sights=tuple(sights), readings=tuple(readings), pose_rows=tuple(pose_rows))
 
 
 def _need(cell: Network, needed: dict[str, bool], first: str, second: str) -> None:
-    """Notes the robots between two frames, and that the row tells of the first of them."""
-    robots = [it for frame in (first, second) if frame and (it := cell.teller(frame)) is not None]
+    """Notes the robots between two frames, and that the row has the pose of the first of them."""
+    robots = [it for frame in (first, second) if frame and (it := cell.robot_of(frame)) is not None]
     if len(set(robots)) < len(robots):
         return
     for place, robot in enumerate(robots):

@@ -106,13 +106,13 @@ def network_session(
     views = {it.view: _row(cell, it, seen) for it in sights}
     turned = {it.name for it in cell.options.instruments if it.sigma_rad}
     for reading in cell.readings:
-        robot = cell.teller(frame_name("point", reading.point))
+        robot = cell.robot_of(frame_name("point", reading.point))
         keys = POSE if reading.instrument in turned else POSE[:3]
         read = pose_row(reading.instrument_from_point)
         numbers = {f"meas_{key}": read[key] for key in keys}
         text = {"instrument": reading.instrument, "point": reading.point}
         views[reading.view] = _view(cell, reading.view, reading.stop, robot, numbers, text)
-    for number, stop, robot in cell.told:
+    for number, stop, robot in cell.pose_rows:
         views[number] = _view(cell, number, stop, robot, {}, {})
     rows = [views[number] for number in sorted(views)]
     files = _rendered(cell, sights, progress) if seen == "images" else {}
@@ -170,7 +170,7 @@ def _row(cell: Network, sight: Sight, seen: Seen) -> View:
     if sight.stop < 0 and not timed:
         return View(sight.view, image=_image(sight), text=text | {"role": "intrinsics"})
     frames = frame_name("camera", sight.camera), frame_name("target", sight.board)
-    robots = [it for frame in frames if (it := cell.teller(frame)) is not None]
+    robots = [it for frame in frames if (it := cell.robot_of(frame)) is not None]
     robot = robots[0] if len(set(robots)) == len(robots) > 0 else None
     if seen != "poses":
         return _view(cell, sight.view, sight.stop, robot, {}, text, _image(sight))
@@ -194,16 +194,16 @@ def _view(
     text: Mapping[str, str],
     image: str = "",
 ) -> View:
-    """A row of a stop, with what it tells of a robot."""
+    """A row of a stop, with a robot's pose and joints."""
     pace_s = cell.options.pace_s
-    told: dict[str, float] = {"stamp_s": stop * pace_s} if pace_s else {}
+    state: dict[str, float] = {"stamp_s": stop * pace_s} if pace_s else {}
     named: dict[str, str] = {}
     if robot is not None:
-        told |= pose_row(cell.base_from_flange[robot][stop])
+        state |= pose_row(cell.base_from_flange[robot][stop])
         joints = cell.joints[robot][stop].tolist()
-        told |= {f"q{at}_rad": angle for at, angle in enumerate(joints, start=1)}
+        state |= {f"q{at}_rad": angle for at, angle in enumerate(joints, start=1)}
         named = {"robot": robot}
-    return View(number, image, stop=stop, numbers=told | dict(numbers), text=named | dict(text))
+    return View(number, image, stop=stop, numbers=state | dict(numbers), text=named | dict(text))
 
 
 def _image(sight: Sight) -> str:

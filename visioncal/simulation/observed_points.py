@@ -71,10 +71,10 @@ class Network:
         true_base_from_flange: (s, 4, 4) where its flange really stood.
         sights: What cameras saw, by ascending view, and last the images of lenses alone.
         readings: What instruments read.
-        told: The row that tells where a robot stood, for those that no other row of their stop
-            tells: (view, stop, robot).
+        pose_rows: The row with a robot's pose, for those of which no other row of their stop
+            has it: (view, stop, robot).
         wrong_views: Rows with another row's image, ascending.
-        streams: What robots' controllers told in sweeps, by the robots' names, and of temperatures.
+        streams: Robots' states in sweeps, by the robots' names, and temperatures.
     """
 
     options: NetworkOptions
@@ -87,7 +87,7 @@ class Network:
     true_base_from_flange: Mapping[str, FloatArray]
     sights: tuple[Sight, ...]
     readings: tuple[Reading, ...]
-    told: tuple[tuple[int, int, str], ...]
+    pose_rows: tuple[tuple[int, int, str], ...]
     wrong_views: tuple[int, ...]
     streams: Mapping[str, Recorded] = field(default_factory=dict)
 
@@ -108,8 +108,8 @@ class Network:
             raise DataError(f"simulation: {frame} does not stand in the cell.")
         return self.transforms[frame]
 
-    def teller(self, frame: str) -> str | None:
-        """The robot whose pose the rows of a camera, board or point tell; None for none."""
+    def robot_of(self, frame: str) -> str | None:
+        """The robot whose pose the rows of a camera, board or point have; None for none."""
         on = self.parents[frame]
         return on.removeprefix("flange_") if on.startswith("flange_") else None
 

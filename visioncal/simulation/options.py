@@ -27,7 +27,7 @@ def charuco_target() -> Target:
 
 
 def checkerboard_target() -> Target:
-    """A checkerboard with 9x6 inner corners of 25 mm, whose corner 0 the colours tell."""
+    """A checkerboard with 9x6 inner corners of 25 mm, whose colours determine corner 0."""
     return Target(
         name="checkerboard_9x6_25mm",
         kind="checkerboard",

@@ -381,7 +381,7 @@ def load_row(load: Payload) -> dict[str, float]:
 
 
 def approach_text(cell: Cell, view: int) -> dict[str, str]:
-    """The column of the side from which a stop was approached, where that is told."""
+    """The column of the side from which a stop was approached, where that is recorded."""
     return {} if cell.approach is None else {"approach": "+" if cell.approach[view] > 0 else "-"}
 
 

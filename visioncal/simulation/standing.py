@@ -51,7 +51,7 @@ _KEPT = (Stream.MOUNTING, Stream.ARM, Stream.LENS)
 
 
 def stream(options: NetworkOptions, purpose: Stream, *index: int) -> np.random.Generator:
-    """The generator of one source of randomness; `index` tells things apart."""
+    """The generator of one source of randomness; `index` is of the thing."""
     again = (options.recording,) if options.recording and purpose not in _KEPT else ()
     return np.random.default_rng([options.seed, int(purpose), *again, *index])
 

@@ -1,8 +1,8 @@
 """A sweep: the robot moves without a rest, and camera and controller stamp by clocks of their own.
 
 The flange goes through a cell's stops on a smooth way, with joints of continuous acceleration. The
-camera takes frames at its rate, wherever the robot is; the controller tells its joints and poses at
-a higher one.
+camera takes frames at its rate, wherever the robot is; the controller reports its joints and poses
+at a higher one.
 """
 
 from collections.abc import Sequence
@@ -51,7 +51,7 @@ class SweepOptions:
             the middle [s]; 0 for a global shutter.
         camera_minus_robot_s: What the camera's stamps are ahead of the controller's [s].
         jitter_s: Noise of the camera's stamps, as a standard deviation [s].
-        encoder_sigma_rad: Noise of the joint angles that the controller tells [rad].
+        encoder_sigma_rad: Noise of the joint angles that the controller reports [rad].
     """
 
     stops: int = 12
@@ -76,7 +76,7 @@ class Sweep:
         options: How it was made.
         cell: The cell at the m frames, each of them a view.
         frames_s: (m,) when they were taken, by the camera's clock [s].
-        robot: What the controller told: `stamp_s` by its own clock, poses and joints.
+        robot: What the controller reported: `stamp_s` by its own clock, poses and joints.
     """
 
     options: SweepOptions
@@ -110,7 +110,7 @@ def sweep(options: CellOptions, how: SweepOptions | None = None) -> Sweep:
         raise DataError(f"simulation: {len(seen)} frames of the sweep show the board.")
     taken_s = taken_s[seen]
     rng = stream(options, Stream.SWEEP)
-    told = way(robot_s) + how.encoder_sigma_rad * rng.standard_normal(
+    reported = way(robot_s) + how.encoder_sigma_rad * rng.standard_normal(
         (len(robot_s), stops.shape[1])
     )
     ahead_s = how.camera_minus_robot_s + how.jitter_s * rng.standard_normal(len(taken_s))
@@ -118,7 +118,7 @@ def sweep(options: CellOptions, how: SweepOptions | None = None) -> Sweep:
         how,
         _only(frames, seen),
         taken_s + ahead_s,
-        recorded(robot_s, told, forward(frames.arm, told)),
+        recorded(robot_s, reported, forward(frames.arm, reported)),
     )
 
 

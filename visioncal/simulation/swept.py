@@ -51,8 +51,8 @@ def sweep_network(
     way = CubicSpline(how.pace_s * np.arange(len(stops)), stops, bc_type="clamped")
     end_s = how.pace_s * (len(stops) - 1)
     robot_s = np.arange(0.0, end_s, 1.0 / how.robot_hz)
-    told = way(robot_s)
-    told = told + how.encoder_sigma_rad * rng.standard_normal(told.shape)
+    reported = way(robot_s)
+    reported = reported + how.encoder_sigma_rad * rng.standard_normal(reported.shape)
     sigma = np.repeat([robot.sigma_rad, robot.sigma_m], 3)
     optics, sheet = camera_named(options, swept.camera).camera, sheet_named(options, swept.target)
     corners = corners_m(sheet)
@@ -77,7 +77,7 @@ def sweep_network(
         stamp_s = taken_s + swept.camera_minus_robot_s
         names = swept.camera, swept.target
         sights.append(Sight(view, -1, *names, middle, exact, found, stamp_s=stamp_s))
-    return sights, recorded(robot_s, told, forward(cell.arms[swept.robot], told))
+    return sights, recorded(robot_s, reported, forward(cell.arms[swept.robot], reported))
 
 
 def _chain(

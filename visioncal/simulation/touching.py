@@ -244,7 +244,7 @@ def write_touches(touched: Mapping[str, Touching], folder: Path) -> None:
     """Writes `touches.csv`, `features.csv`, `points.csv` and the drawing, `cad.csv`.
 
     Args:
-        touched: By robot; rows tell the robot's name in a column `robot`, where it has one.
+        touched: By robot; rows have the robot's name in a column `robot`, where it has one.
         folder: Where to.
 
     Raises:

@@ -41,7 +41,7 @@ class Heat:
         drift_rad_per_k: (n,) drift of a joint's zero [rad/K].
         ambient_c: The air at the start; cold, the whole arm is as warm as it.
         ambient_swing_k: How far the air warms and cools again in the course of six hours [K].
-        sensor_sigma_k: Noise of a temperature that is told [K].
+        sensor_sigma_k: Noise of a recorded temperature [K].
     """
 
     duty_a: FloatArray
@@ -74,8 +74,8 @@ class Warming:
 
     Attributes:
         stamps_s: (t,) [s].
-        currents_a: (t, n) as they are told [A].
-        sensors_c: (t, n) temperatures as they are told.
+        currents_a: (t, n) as recorded [A].
+        sensors_c: (t, n) temperatures as recorded [deg C].
         links_c: (t, n) what the links really have.
         ambient_c: (t,) the air.
     """
@@ -92,12 +92,12 @@ class Warming:
         return np.stack(columns, axis=1)
 
     def recorded(self, *, temperatures: bool, until_s: float = np.inf) -> Recorded:
-        """The stream of what the controller tells up to a time: temperatures, or else currents."""
+        """The controller's stream up to a time: temperatures, or else currents."""
         kept = self.stamps_s <= until_s
-        told = self.sensors_c if temperatures else self.currents_a
+        signals = self.sensors_c if temperatures else self.currents_a
         form = "temp{}_c" if temperatures else "current{}_a"
-        names = [form.format(at + 1) for at in range(told.shape[1])]
-        columns = [self.stamps_s[:, None], told, self.ambient_c[:, None]]
+        names = [form.format(at + 1) for at in range(signals.shape[1])]
+        columns = [self.stamps_s[:, None], signals, self.ambient_c[:, None]]
         return Recorded(("stamp_s", *names, "ambient_c"), np.hstack(columns)[kept])
 
 
@@ -124,8 +124,8 @@ def warm_up(heat: Heat, hours: float, *, step_s: float = 10.0, seed: int = 0) ->
         rest = ambient[at] + heat.k_per_a2 * duty[at] ** 2
         joints[at + 1] = rest + kept * (joints[at] - rest)
         links[at + 1] = joints[at] + followed * (links[at] - joints[at])
-    told = joints + heat.sensor_sigma_k * rng.standard_normal(joints.shape)
-    return Warming(stamps, duty, told, links, ambient)
+    measured = joints + heat.sensor_sigma_k * rng.standard_normal(joints.shape)
+    return Warming(stamps, duty, measured, links, ambient)
 
 
 def heated_poses(arm: Arm, heat: Heat, q: FloatArray, links_c: FloatArray) -> FloatArray:
@@ -160,17 +160,17 @@ class WarmUp:
 
         Args:
             name: Its name.
-            temperatures: Whether the controller tells temperatures; else currents.
+            temperatures: Whether the controller reports temperatures; else currents.
         """
         plain = pairs_session(self.cell, name)
         views = tuple(
             replace(view, numbers={**view.numbers, "stamp_s": float(stamp_s)})
             for view, stamp_s in zip(plain.views, self.stamps_s, strict=True)
         )
-        told = self.warming.recorded(temperatures=temperatures, until_s=self.stamps_s[-1])
+        stream = self.warming.recorded(temperatures=temperatures, until_s=self.stamps_s[-1])
         cells = [[view.cell(it) for it in plain.columns] for view in views]
         session = Session.assemble(plain.document, plain.columns, cells, plain.images)
-        return session.with_streams({"heat": told})
+        return session.with_streams({"heat": stream})
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,7 +240,7 @@ def write_warm_up(moved: WarmUp, folder: Path | str, *, temperatures: bool = Tru
     Args:
         moved: What was seen meanwhile.
         folder: The session's folder; it must not hold anything yet.
-        temperatures: Whether the controller tells temperatures; else currents.
+        temperatures: Whether the controller reports temperatures; else currents.
 
     Returns:
         The session's folder.

@@ -45,7 +45,7 @@ _MIN_TAGS, _MOST_SPACING, _MOST_BORDER = 1, 1.0, 2
 APRILGRID_DICTIONARY = "DICT_APRILTAG_36h11"
 # A marker's corners, clockwise from its upper left, in its sides.
 _CLOCKWISE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-# Circles leave so much white between them that their edges are told apart.
+# Circles leave so much white between them that their edges stay separate.
 _WIDEST = 0.85
 # Kinds that are found where the image shows a part of them; so are rigs of tags.
 FOUND_IN_PART: frozenset[TargetKind] = frozenset(("charuco", "aprilgrid"))
@@ -566,7 +566,7 @@ def _turns_of_circles(target: Target) -> FloatArray:
 
 
 def rotations(target: Target) -> tuple[IntArray, ...]:
-    """Lists the corner numberings that the printed pattern itself cannot tell apart.
+    """Lists the corner numberings that the printed pattern itself does not distinguish.
 
     Returns:
         Permutations p, the identity first, one for each of `rotation_transforms`: turned by that

@@ -81,7 +81,7 @@ class Blur:
 
     @property
     def cause(self) -> str:
-        """What widens edges most: `motion`, `focus`, or nothing worth a word."""
+        """What widens edges most: `motion`, `focus`, or empty for little."""
         moved, focus = self.length_px**2 / 12, self.disc_px**2 / 4 + self.sigma_px**2
         if self.width_px < 1.0:
             return ""

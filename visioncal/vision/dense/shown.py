@@ -24,7 +24,7 @@ MAGNIFIED, MIDDLE = 4, 128
 _RIM = 1.0
 # Polynomials through so many places a side carry a map over an image.
 _NODES = 14
-# Pixels that tell the light, at least and at most.
+# Pixels that show the light, at least and at most.
 _FEWEST_LIT, _LIT_BY = 100, 50_000
 # Beyond so many pixels, there is one sample in each.
 _MOST_FINE = 1_500_000

@@ -1,4 +1,4 @@
-"""Finding AprilGrids, and telling whether they are as described."""
+"""Finding AprilGrids, and checking whether they are as described."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -27,12 +27,12 @@ _LEAST_TAGS = 2
 _WINDOW, _WINDOWS_PX = 0.35, (2, 6)
 _ENDS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-2)
 # The white between tags that is seen may differ by so much from the stated one [sides]; so many
-# sides in line have to tell, and half of them within so much.
+# sides in line have to be seen, and half of them within so much.
 _SPACING, _LEAST_SPACINGS, _SCATTER = 0.02, 4, 0.05
 # Places along a tag's side, and so far inside it, in its dark border [sides].
 _ALONG, _INSIDE = (0.06, 0.35, 0.65, 0.94), 0.06
 # An outer line of tags is missing where so many places on its near side are lighter than grey; the
-# tags of so many lines beside it tell where it would be.
+# tags of so many lines beside it show where it would be.
 _MOST_OF, _NEAR_LINES = 0.8, 2
 _SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
 
@@ -153,7 +153,7 @@ def laid(target: Target, numbers: IntArray, px: FloatArray, own: Mask) -> tuple[
     Returns:
         (t, 4, 2) the corners, and the misfit of `layout_misfit`; 0 of one tag.
     """
-    # Kalibr's pages have the tags upside down; others are told by where the tags lie.
+    # Kalibr's pages have the tags upside down; others are recognised by where the tags lie.
     turned = [np.roll(px, turn, axis=1) for turn in (2, 0, 1, 3)]
     if own.sum() < _LEAST_TAGS:
         return turned[0], 0.0
@@ -227,7 +227,7 @@ def seen_spacing(target: Target, numbers: IntArray, px: FloatArray) -> float:
         for one, other in ((c - a, d - b), (c - b, d - a))
     )
     quarter, middle, last = np.percentile(np.sqrt(far / np.maximum(far - near, 1e-9)), [25, 50, 75])
-    # Corners that scatter, as in blurred images, tell nothing.
+    # Corners that scatter, as in blurred images, show nothing.
     return target.spacing if last - quarter > _SCATTER else float(middle) - 1.0
 
 
@@ -259,7 +259,7 @@ def _lacks(
 ) -> bool:
     """Whether a line is missing: the tags whose number `across` it is `end`."""
     line = np.flatnonzero(across == end)
-    # The nearest tags tell where those would be, whatever the lens.
+    # The nearest tags show where those would be, whatever the lens.
     beside = np.abs(across[numbers] - end) <= _NEAR_LINES
     if np.isin(line, numbers).any() or beside.sum() < _LEAST_TAGS:
         return False

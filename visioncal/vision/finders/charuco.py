@@ -1,4 +1,4 @@
-"""Finding ChArUco boards, and telling which layout was printed."""
+"""Finding ChArUco boards, and recognising which layout was printed."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -15,7 +15,7 @@ from visioncal.vision.targets import circle_places
 
 # Dark is darker than its surroundings, so wide as a share of the image's shorter side, by so many
 # levels. Blobs have areas [px] and fill the ellipse of their moments; a square fills 0.955 of it,
-# and a circle of few pixels somewhat less than all: in their median they are told apart.
+# and a circle of few pixels somewhat less than all: their median separates them.
 _SURROUNDINGS, _DARKER, _LEAST_AREA, _FILL, _ROUND = 0.12, 12, 12.0, 0.88, 0.97
 # The inner edge of a blob has so much of its width.
 _INNER = 0.5

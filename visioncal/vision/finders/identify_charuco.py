@@ -89,8 +89,8 @@ def find_lattices(image: Image, markers: Sequence[Marker]) -> tuple[Lattice, ...
         markers: Markers of one family; some may be look-alikes.
 
     Returns:
-        The boards that explain the most markers: more than one where too few rows are seen to tell
-        the number of columns, none where the markers do not lie as on a ChArUco board.
+        The boards that explain the most markers: more than one where too few rows are seen to
+        decide the number of columns, none where the markers do not lie as on a ChArUco board.
     """
     fits: list[_Fit] = []
     for bend in BENDS:
@@ -107,7 +107,7 @@ def find_lattices(image: Image, markers: Sequence[Marker]) -> tuple[Lattice, ...
     best = max(fits, key=lambda it: it.score, default=None)
     if best is None or best.score[0] < least:
         return ()
-    # With the same markers in the same places the misfit is the same; noise alone tells no lattice.
+    # With the same markers in the same places the misfit is the same but for noise.
     tied = [
         it for it in fits if it.score[0] == best.score[0] and it.misfit < _SAME_MISFIT * best.misfit
     ]

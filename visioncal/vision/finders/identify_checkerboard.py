@@ -19,7 +19,7 @@ _REACH = 0.25
 _REACHES_OUT = (_REACH, 0.1, 0.05)
 # Of the corners along one more line, so many must alternate for the line to belong to the board.
 _MOST_OF = 0.8
-# Fewer of them in the image do not tell whether the board goes on.
+# Fewer of them in the image do not show whether the board goes on.
 _ENOUGH = 0.5
 _OUTWARD = {"left": (-1.0, 0.0), "top": (0.0, -1.0), "right": (1.0, 0.0), "bottom": (0.0, 1.0)}
 # Places in a square, from its middle, where a marker would be, in squares.

@@ -1,4 +1,4 @@
-"""Decoding markers of every family at once, and telling real ones from look-alikes."""
+"""Decoding markers of every family at once, and separating real ones from look-alikes."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -73,7 +73,7 @@ def decode_markers(image: Image) -> tuple[Marker, ...]:
         image: (h, w) grey image.
 
     Returns:
-        The markers, look-alikes included: a lattice or `Marker.likeness` tells them apart.
+        The markers, look-alikes included: a lattice or `Marker.likeness` separates them.
     """
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX

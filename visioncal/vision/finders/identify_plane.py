@@ -17,7 +17,7 @@ BENDS = (0.0, -0.1, -0.25, -0.45)
 _LEAST_BEND, _MOST_BEND = -0.8, 0.3
 # A homography takes four points; fewer than eight say nothing of a bend.
 _LEAST_POINTS, _LEAST_FOR_BEND = 4, 8
-# So near the image's edge nothing can be told [px].
+# So near the image's edge nothing can be concluded [px].
 _BORDER_PX = 3.0
 
 

@@ -1,4 +1,4 @@
-"""Where dark and light squares meet: telling a chessboard's corners from what only lies near."""
+"""Where dark and light squares meet: a chessboard's corners, separated from what only lies near."""
 
 import numpy as np
 

@@ -11,7 +11,7 @@ from visioncal.vision.finders.result import DetectedCorners, NotFound
 from visioncal.vision.finders.template import refine_tags
 from visioncal.vision.targets import aruco_dictionary, corner_positions, tag_corners
 
-# So many whole tags in one plane tell whether they lie as described.
+# So many whole tags in one plane show whether they lie as described.
 _LEAST_TAGS = 2
 
 

@@ -346,7 +346,7 @@ def refine_tags(
     pattern = _Pattern(
         inward.prod(axis=1),
         module,
-        # What the corners around tell of the lens's bend, one tag alone does not.
+        # The corners around show the lens's bend; one tag alone does not.
         module * (_TAG_HALF if len(board) > 1 else 1.0),
         lone=inward,
         axes=np.repeat(unit * sides / lengths, 4, axis=0),
@@ -538,7 +538,7 @@ def _step(
     if pattern.lone is not None:
         # Light slopes where it is white, and there the product is 0; in the dark it is 4.
         columns += [(1 - product / 4) * it for it in (x, y)]
-        # A lens bends the sides of a tag by itself, and its corners do not tell how.
+        # A lens bends the sides of a tag by itself, and its corners do not show how.
         if windows.around.shape[1] == _FEWEST and np.median(windows.widths) * _BENT_PX < 1.0:
             columns += [y * slopes_of[0], x * slopes_of[1]]
     unknowns = len(columns) + 1

@@ -1,4 +1,4 @@
-"""From a few wishes to a target: sizes that are left open become the largest that fit."""
+"""From a few requirements to a target: sizes that are left open become the largest that fit."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -88,7 +88,7 @@ def requested_target(request: Request, pages: tuple[Page, ...]) -> Target:
     """Builds the target that is wished for.
 
     Args:
-        request: The wishes. A side left out becomes the largest in whole millimetres that fits one
+        request: The sizes. A side left out becomes the largest in whole millimetres that fits one
             of the pages, a marker's side three quarters of its square's, in whole millimetres.
         pages: The pages that it may be printed on.
 
