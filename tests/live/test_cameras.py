@@ -18,7 +18,7 @@ from visioncal.live.drivers.images import FolderCamera
 from visioncal.live.drivers.newest import Arrival
 from visioncal.live.drivers.oak import OakCamera
 from visioncal.live.drivers.oak_hosted import HostedOak
-from visioncal.live.drivers.protocols import CameraDevice, DeviceWishes
+from visioncal.live.drivers.protocols import CameraDevice, DeviceSetup
 from visioncal.live.drivers.uvc import UvcCamera
 
 RNG = np.random.default_rng(7)
@@ -124,7 +124,7 @@ def test_a_video_file_gives_its_pictures_and_then_says_that_it_is_at_its_end(tmp
 def test_another_resolution_than_wished_is_refused(tmp_path):
     a_video(tmp_path / "a.avi")
     with pytest.raises(DriverError, match="gives 64x48 pixels, not 640x480"):
-        UvcCamera(str(tmp_path / "a.avi"), DeviceWishes(resolution=(640, 480)))
+        UvcCamera(str(tmp_path / "a.avi"), DeviceSetup(resolution=(640, 480)))
 
 
 def test_what_cannot_be_opened_tells_where_to_look(tmp_path, capfd):

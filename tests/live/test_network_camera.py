@@ -10,7 +10,7 @@ import pytest
 from support.mjpeg import NetworkCamera, number_of, served
 
 from visioncal.core.errors import DriverError
-from visioncal.live.drivers.protocols import CameraDevice, DeviceWishes
+from visioncal.live.drivers.protocols import CameraDevice, DeviceSetup
 from visioncal.live.drivers.uvc import UvcCamera
 
 SMALL = np.full((240, 320), 110, np.uint8)
@@ -102,9 +102,9 @@ def test_what_a_url_cannot_do_is_refused():
     sent = NetworkCamera(lambda: SMALL)
     with served(sent) as url:
         with pytest.raises(DriverError, match="gives 320x240 pixels, not 640x480"):
-            UvcCamera(url, DeviceWishes(resolution=(640, 480)))
+            UvcCamera(url, DeviceSetup(resolution=(640, 480)))
         with pytest.raises(DriverError, match="cannot be set from here"):
-            UvcCamera(url, DeviceWishes(exposure_us=5000))
+            UvcCamera(url, DeviceSetup(exposure_us=5000))
     with pytest.raises(DriverError, match=r"cannot be opened: .*refused"):
         UvcCamera(url)
     assert not [it for it in threading.enumerate() if it.name.startswith("pictures of")]

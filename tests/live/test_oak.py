@@ -19,7 +19,7 @@ from visioncal.live.drivers.oak_calibration import calibration_json, factory_int
 from visioncal.live.drivers.oak_hosted import HostedOak
 from visioncal.live.drivers.oak_library import depthai
 from visioncal.live.drivers.oak_replay import ReplayedOak
-from visioncal.live.drivers.protocols import CameraDevice, DeviceWishes, Frame
+from visioncal.live.drivers.protocols import CameraDevice, DeviceSetup, Frame
 from visioncal.live.rehearsal.camera import RehearsalCamera
 from visioncal.results import CameraResult
 from visioncal.simulation import CellOptions, fisheye_camera, simulate, wide_camera
@@ -249,7 +249,7 @@ def test_a_device_is_held_where_automatic_exposure_and_focus_went(monkeypatch):
 
 def test_what_is_wished_is_set_from_the_start(monkeypatch):
     _, seen = a_device(monkeypatch, is_colour=False)
-    requested = DeviceWishes((640, 400), 5000, 200, 90, {"rate_hz": "20"})
+    requested = DeviceSetup((640, 400), 5000, 200, 90, {"rate_hz": "20"})
     camera = OakCamera(requested)
     camera.close()
     assert seen.initial.getExposureTime().total_seconds() == pytest.approx(5e-3)
@@ -262,7 +262,7 @@ def test_what_is_wished_is_set_from_the_start(monkeypatch):
 
 def test_it_focuses_where_the_factory_calibrated(monkeypatch):
     _, seen = a_device(monkeypatch, lens=120)
-    camera = OakCamera(DeviceWishes((640, 400)))
+    camera = OakCamera(DeviceSetup((640, 400)))
     camera.close()
     assert seen.initial.getLensPosition() == 120
     assert camera.settings["focus"] == 120
@@ -271,7 +271,7 @@ def test_it_focuses_where_the_factory_calibrated(monkeypatch):
 
 def test_the_factorys_intrinsics_are_scaled_and_cropped(monkeypatch):
     a_device(monkeypatch, coefficients=(-0.1, 0.05, 1e-3, -1e-3, 0.01))
-    camera = OakCamera(DeviceWishes((2028, 1140)))
+    camera = OakCamera(DeviceSetup((2028, 1140)))
     camera.close()
     # Half the size; 1520 rows are cropped to 1140 about the middle.
     assert camera.factory.matrix == pytest.approx([1500.25, 1500.75, 1015.125, 569.25], abs=1e-3)
@@ -282,7 +282,7 @@ def test_the_factorys_intrinsics_are_scaled_and_cropped(monkeypatch):
 def test_a_device_without_calibration_is_used_without(monkeypatch):
     device, _ = a_device(monkeypatch)
     device.calibration = dai.CalibrationHandler()
-    camera = OakCamera(DeviceWishes((640, 400)))
+    camera = OakCamera(DeviceSetup((640, 400)))
     camera.close()
     assert camera.factory is None
     assert "no calibration of CAM_A" in camera.settings["factory_intrinsics"]
@@ -291,7 +291,7 @@ def test_a_device_without_calibration_is_used_without(monkeypatch):
 def test_a_devices_raw_frames_are_recorded(monkeypatch, tmp_path):
     a_device(monkeypatch)
     raw = tmp_path / "raw.mkv"
-    camera = OakCamera(DeviceWishes((64, 48), more={"raw": str(raw)}))
+    camera = OakCamera(DeviceSetup((64, 48), more={"raw": str(raw)}))
     camera.frame(timeout_s=PATIENT_S)
     frame = camera.frame(timeout_s=PATIENT_S)
     camera.close()
@@ -307,7 +307,7 @@ def test_a_devices_raw_frames_are_recorded(monkeypatch, tmp_path):
 
 def test_a_lens_that_no_model_of_ours_describes_is_not_taken(monkeypatch):
     a_device(monkeypatch, coefficients=[0.1] * 9)
-    camera = OakCamera(DeviceWishes((640, 400)))
+    camera = OakCamera(DeviceSetup((640, 400)))
     camera.close()
     assert camera.factory is None
     assert "thin-prism" in camera.settings["factory_intrinsics"]
@@ -325,7 +325,7 @@ def test_a_lens_that_no_model_of_ours_describes_is_not_taken(monkeypatch):
 def test_options_that_are_wrong_are_refused_and_the_device_let_go(monkeypatch, more, words):
     device, _ = a_device(monkeypatch)
     with pytest.raises(DriverError) as caught:
-        OakCamera(DeviceWishes(more=more))
+        OakCamera(DeviceSetup(more=more))
     assert words in str(caught.value)
     # What is wrong by itself is told before the device is opened.
     assert device.is_closed == ("CAM_B" in more.values())

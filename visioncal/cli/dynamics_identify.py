@@ -17,7 +17,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.dynamics.document import stribeck_rows, to_document
 from visioncal.dynamics.friction import FrictionTerms
-from visioncal.dynamics.identified import CLASSES, FILE, NOT_TOLD, Identified
+from visioncal.dynamics.identified import CLASSES, FILE, UNKNOWN, Identified
 from visioncal.dynamics.identify import SLOW_RAD_S, Options
 from visioncal.dynamics.judge import judge
 from visioncal.dynamics.run import identify_session
@@ -114,7 +114,7 @@ def _tell(identified: Identified) -> None:
     told = ", ".join(f"{count} to {word}" for word, count in counts[:-1])
     console.print(
         f"{identified.base.rank} base parameters: {told}, {counts[-1][1]} {counts[-1][0]}, "
-        f"{identified.determined.count(NOT_TOLD)} {NOT_TOLD}"
+        f"{identified.determined.count(UNKNOWN)} {UNKNOWN}"
     )
     console.print(_joint_table(identified))
     console.print("in N m, N m s/rad, kg m^2 and rad/s; before: with the robot's own inertias")

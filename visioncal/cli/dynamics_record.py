@@ -44,7 +44,7 @@ def dynamics_record_command(
     path = out / STREAMS / f"{stream}.csv"
     check_free(path, force=False, replaceable=False)
     with ended_like_ctrl_c(), closing(UrMotion(host)) as joints:
-        found = record_motion(joints, rest_s=rest_s, told=messages().print)
+        found = record_motion(joints, rest_s=rest_s, report=messages().print)
         model = robot or joints.model
     check_stream(stream, found)
     _keep(out, stream, found, model)

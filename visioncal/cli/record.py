@@ -28,7 +28,7 @@ from visioncal.live.capture.live import LiveCell
 from visioncal.live.capture.messages import line_of
 from visioncal.live.capture.options import CaptureOptions, Keep, Stillness
 from visioncal.live.capture.record import Departure, departure, record
-from visioncal.live.drivers.protocols import DeviceWishes, MovingArm
+from visioncal.live.drivers.protocols import DeviceSetup, MovingArm
 from visioncal.live.planning.written import SPEED
 
 _taking = partial(typer.Option, rich_help_panel="How views are taken")
@@ -104,14 +104,14 @@ class DeviceOptions:
         int | None, _camera("--focus", help="Lens position, in the device's own unit.")
     ] = None
 
-    def wishes(self) -> DeviceWishes:
+    def wishes(self) -> DeviceSetup:
         """The same, as drivers take it.
 
         Raises:
             DataError: The resolution is not two numbers.
         """
         resolution = None if self.resolution is None else size_in(self.resolution)
-        return DeviceWishes(resolution, self.exposure_us, self.gain, self.focus)
+        return DeviceSetup(resolution, self.exposure_us, self.gain, self.focus)
 
 
 def record_command(
@@ -205,7 +205,7 @@ def record_command(
 
 
 @contextmanager
-def _opened(arm: str, wish: ArmWish, camera: str, requested: DeviceWishes) -> Iterator[LiveCell]:
+def _opened(arm: str, wish: ArmWish, camera: str, requested: DeviceSetup) -> Iterator[LiveCell]:
     """Opens both devices; the block's end lets go of them."""
     with closing(open_arm(arm, wish)) as opened:
         if not wish.watch_only and not isinstance(opened, MovingArm):

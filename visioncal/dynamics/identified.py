@@ -22,7 +22,7 @@ from visioncal.robot import Inertias, Robot
 FILE = "dynamics.json"
 # A parameter is determined to so many percent of itself, or worse, or not at all.
 CLASSES = ((0.02, "2 %"), (0.1, "10 %"), (1.0, "poorly"))
-NOT_TOLD = "not at all"
+UNKNOWN = "not at all"
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +153,7 @@ class Identified:
     def determined(self) -> tuple[str, ...]:
         """How well each base parameter is determined: to `2 %` of itself, `10 %`, worse, or not."""
         shares = self.sigmas / np.maximum(np.abs(self.values), 1e-300)
-        return tuple(next((word for most, word in CLASSES if it < most), NOT_TOLD) for it in shares)
+        return tuple(next((word for most, word in CLASSES if it < most), UNKNOWN) for it in shares)
 
     @cached_property
     def inertias(self) -> Inertias | None:

@@ -10,7 +10,7 @@ from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import NOTE, Finding, Step, Verdict, VerdictStatus
 from visioncal.dynamics.base import random_motion
-from visioncal.dynamics.identified import NOT_TOLD, Identified, Validation
+from visioncal.dynamics.identified import UNKNOWN, Identified, Validation
 from visioncal.robot.files import robot_names
 
 _LIMITS = DynamicsLimits()
@@ -157,7 +157,7 @@ def _of_range(identified: Identified) -> Iterator[tuple[VerdictStatus, Finding]]
 
 
 def _of_parameters(identified: Identified) -> Iterator[tuple[VerdictStatus, Finding]]:
-    lost = np.array([it == NOT_TOLD for it in identified.determined])
+    lost = np.array([it == UNKNOWN for it in identified.determined])
     if lost.mean() > _LIMITS.undetermined_share:
         names = [it for it, is_lost in zip(identified.base.names, lost, strict=True) if is_lost]
         yield (

@@ -13,7 +13,7 @@ from visioncal.core.types import Camera, Corners, FloatArray, Mask, Target
 _ACROSS, _DOWN = 8, 5
 # Noise of a corner by which a view's pose is found [px]; words need no better.
 _PIXEL_PX = 0.2
-# Views that look from less than this are alike in tilt; to tell the board's distance from the
+# Views that look from less than this are alike in tilt; to separate the board's distance from the
 # lens's length they must lean farther [deg].
 _STRAIGHT_DEG, _LEANING_DEG = 10.0, 20.0
 # A few views are for the eye, before anything is asked of them.
@@ -31,7 +31,7 @@ class Coach:
     Attributes:
         target: What is seen.
         resolution: (width, height) of the images [px].
-        camera: The lens, by which tilt and distance are told; None where it is not known.
+        camera: The lens, by which tilt and distance are computed; None where it is not known.
     """
 
     target: Target
@@ -63,12 +63,12 @@ class Coach:
 
     def words(self) -> str:
         """What is covered: `coverage 45 %, tilts to 32 deg, 0.4 to 0.7 m away`."""
-        told = [f"coverage {100 * self.coverage:.0f} %"]
+        words = [f"coverage {100 * self.coverage:.0f} %"]
         if self._normals:
-            told.append(f"tilts to {max(self._tilts()):.0f} deg")
+            words.append(f"tilts to {max(self._tilts()):.0f} deg")
             near, far = min(self._distances), max(self._distances)
-            told.append(f"{near:.2f} to {far:.2f} m away")
-        return ", ".join(told)
+            words.append(f"{near:.2f} to {far:.2f} m away")
+        return ", ".join(words)
 
     def advice(self) -> str:
         """What the next view should be, where a person chooses it; empty where all is there."""
@@ -111,7 +111,7 @@ class Coach:
         return across if down == "middle" else down if across == "middle" else f"{down} {across}"
 
     def _poses(self, corners: Corners) -> Sequence[FloatArray]:
-        """The pose of the board in a view, (4, 4); nothing where it cannot be told."""
+        """The pose of the board in a view, (4, 4); nothing where it cannot be computed."""
         if self.camera is None:
             return ()
         seen = {corners.view: corners}

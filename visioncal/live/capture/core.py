@@ -1,4 +1,4 @@
-"""One view after the other: settled, taken, checked, put on the disk, and told."""
+"""One view after the other: settled, taken, checked, put on the disk, and reported."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -58,7 +58,7 @@ class Watcher(Protocol):
     """Whoever watches a recording; what it does must be quick."""
 
     def stepped(self, step: Step) -> None:
-        """Is told of a view that is on the disk, or of a stop that gave none."""
+        """Takes note of a view on the disk, or of a stop that gave none."""
 
 
 @dataclass(eq=False)
@@ -73,7 +73,7 @@ class Capture:
         agreement: Whether joints and pose belong together.
         coach: What is covered.
         prediction: How accurate the result will be.
-        watchers: Who is told.
+        watchers: Who is notified.
         steps: What became of each stop so far.
     """
 

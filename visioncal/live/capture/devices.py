@@ -8,7 +8,7 @@ from typing import TypeAlias, TypeVar
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean
-from visioncal.live.drivers.protocols import Arm, CameraDevice, DeviceWishes
+from visioncal.live.drivers.protocols import Arm, CameraDevice, DeviceSetup
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class ArmWish:
         address: What follows the kind: a host.
         watch_only: Whether it is only looked at, and need not be ready to be driven.
         ask: Asks a question and gives the line that was typed.
-        form: In which form poses are typed; None to have it told by their looks.
+        form: In which form poses are typed; None to recognise it.
         answers: Whether a person types; lines of a file answer nothing.
     """
 
@@ -31,7 +31,7 @@ class ArmWish:
 
 
 ArmOpener: TypeAlias = Callable[[ArmWish], Arm]
-CameraOpener: TypeAlias = Callable[[str, DeviceWishes], CameraDevice]
+CameraOpener: TypeAlias = Callable[[str, DeviceSetup], CameraDevice]
 _Opener = TypeVar("_Opener")
 
 
@@ -53,7 +53,7 @@ def open_arm(words: str, wish: ArmWish, openers: Mapping[str, ArmOpener] | None 
 
 
 def open_camera(
-    words: str, requested: DeviceWishes, openers: Mapping[str, CameraOpener] | None = None
+    words: str, requested: DeviceSetup, openers: Mapping[str, CameraOpener] | None = None
 ) -> CameraDevice:
     """Opens a camera; the arguments are like those of `open_arm`.
 
@@ -82,7 +82,7 @@ def _opener(kind: str, openers: Mapping[str, _Opener], option: str) -> _Opener:
 
 def _needs(address: str, words: str) -> str:
     if not address:
-        raise DataError(f"{words.split(':')[0]} needs to be told where: {words}.")
+        raise DataError(f"{words.split(':')[0]} needs an address: {words}.")
     return address
 
 
@@ -101,19 +101,19 @@ def _manual(wish: ArmWish) -> Arm:
     return ManualArm(wish.ask, wish.form, answers=wish.answers)
 
 
-def _oak(address: str, requested: DeviceWishes) -> CameraDevice:
+def _oak(address: str, requested: DeviceSetup) -> CameraDevice:
     from visioncal.live.drivers.oak import OakCamera
 
     return OakCamera(requested, device=address or None)
 
 
-def _uvc(address: str, requested: DeviceWishes) -> CameraDevice:
+def _uvc(address: str, requested: DeviceSetup) -> CameraDevice:
     from visioncal.live.drivers.uvc import UvcCamera
 
     return UvcCamera(int(address or 0) if (address or "0").isdecimal() else address, requested)
 
 
-def _folder(address: str, _: DeviceWishes) -> CameraDevice:
+def _folder(address: str, _: DeviceSetup) -> CameraDevice:
     from visioncal.live.drivers.images import FolderCamera
 
     return FolderCamera(Path(_needs(address, "folder:PATH")))

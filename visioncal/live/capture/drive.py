@@ -60,7 +60,7 @@ def drive(
     """
 
     def glance() -> None:
-        # What is gone is told now, not at the end of a long way.
+        # What is gone is reported now, not at the end of a long way.
         cell.camera.frame(timeout_s=_FRAME_S)
         look()
 
@@ -113,12 +113,12 @@ def joints_of(cell: LiveCell) -> FloatArray:
     """(n,) where the joints are [rad].
 
     Raises:
-        DriverError: The arm does not tell, or is stopped.
+        DriverError: The arm reports no state, or is stopped.
     """
     q = cell.state().q
     if q is None:
         raise DriverError(
-            f"{cell.arm.name}: it does not tell its joint angles, and cannot be driven by them.",
+            f"{cell.arm.name}: it does not report its joint angles, and cannot be driven by them.",
             culprits=[cell.arm.name],
             next_step="Guide it by hand: --follow.",
         )

@@ -31,7 +31,7 @@ class Facts:
         arm: What the arm calls itself.
         camera: What the camera calls itself.
         resolution: (width, height) of its pictures [px].
-        lens: The intrinsics that it tells, to be refined; None to have them estimated.
+        lens: The intrinsics that it reports, to be refined; None to have them estimated.
         settings: What it is set to.
         plan: The digest of the plan that is driven; empty for none.
     """

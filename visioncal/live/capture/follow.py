@@ -25,21 +25,21 @@ _NEW_MM, _NEW_DEG = 20.0, 5.0
 
 @dataclass(frozen=True, eq=False)
 class HeldArm:
-    """An arm that stands where its pose was told, until the next one is.
+    """An arm that stands where its pose was given, until the next one is.
 
     Attributes:
         name: What it is, for people.
-        told: Its state when it was asked.
+        reported: Its state when it was asked.
         clock: By which the state is always new.
     """
 
     name: str
-    told: ArmState
+    reported: ArmState
     clock: Clock
 
     def state(self) -> ArmState:
         """The state, as of now."""
-        return replace(self.told, stamp_s=self.clock.now())
+        return replace(self.reported, stamp_s=self.clock.now())
 
     def close(self) -> None:
         """Nothing is held."""

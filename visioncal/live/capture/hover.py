@@ -129,7 +129,7 @@ class Hovering:
         state = self.arm.state()
         if state.q is None or state.safety not in ("normal", "reduced"):
             raise DriverError(
-                f"{self.arm.name} cannot be driven: it is in {state.safety}, or tells no joint "
+                f"{self.arm.name} cannot be driven: it is in {state.safety}, or reports no joint "
                 "angles.",
                 culprits=[self.arm.name],
                 next_step="Start it on the pendant.",

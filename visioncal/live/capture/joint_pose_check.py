@@ -38,7 +38,7 @@ class JointPoseCheck:
             return ""
         if len(state.q) != self.robot.joint_count:
             return (
-                f"the arm tells {len(state.q)} joints, and {self.robot.name} has "
+                f"the arm reports {len(state.q)} joints, and {self.robot.name} has "
                 f"{self.robot.joint_count}: check --robot"
             )
         if not self._states:

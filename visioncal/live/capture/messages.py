@@ -22,8 +22,8 @@ def line_of(step: Step) -> str:
 
 def note_of(step: Step) -> str:
     """The same in Markdown, for the viewer."""
-    told = "" if step.accuracy is None else f"\n\nPredicted sigma: {accuracy_words(step.accuracy)}"
-    return f"**View {step.view}**\n\n{step.covered}{told}\n\nNext: {step.advice or 'anything new'}"
+    sigma = "" if step.accuracy is None else f"\n\nPredicted sigma: {accuracy_words(step.accuracy)}"
+    return f"**View {step.view}**\n\n{step.covered}{sigma}\n\nNext: {step.advice or 'anything new'}"
 
 
 def _accuracy(found: Accuracy | None) -> str:

@@ -20,15 +20,15 @@ def record_motion(
     *,
     rest_s: float = 3.0,
     patience_s: float = 120.0,
-    told: Callable[[str], None] = lambda _: None,
+    report: Callable[[str], None] = lambda _: None,
 ) -> Stream:
     """Waits for a motion, and records it until its joints have come to rest.
 
     Args:
-        joints: Who tells what they do.
+        joints: Who reports what they do.
         rest_s: Joints at rest for so long have come to the motion's end [s].
         patience_s: How long the motion's begin is waited for [s].
-        told: Called with what is going on, in words.
+        report: Called with what is going on, in words.
 
     Returns:
         Times on the controller's clock, angles, speeds and currents.
@@ -38,7 +38,7 @@ def record_motion(
     """
     lead: deque[JointSample] = deque(maxlen=max(int(_LEAD_S * joints.rate_hz), 1))
     first = joints.sample()
-    told(f"waiting for the {joints.name} to move: start its program now")
+    report(f"waiting for the {joints.name} to move: start its program now")
     while not _moves(sample := joints.sample()):
         lead.append(sample)
         if sample.stamp_s - first.stamp_s > patience_s:
@@ -47,14 +47,14 @@ def record_motion(
                 culprits=[joints.name],
                 next_step="Start the program on the pendant while this command waits.",
             )
-    told("it moves")
+    report("it moves")
     kept, moved_s = [*lead, sample], sample.stamp_s
     while sample.stamp_s - moved_s < rest_s:
         sample = joints.sample()
         kept.append(sample)
         if _moves(sample):
             moved_s = sample.stamp_s
-    told(f"it has come to rest after {moved_s - kept[0].stamp_s:.1f} s")
+    report(f"it has come to rest after {moved_s - kept[0].stamp_s:.1f} s")
     return _stream([it for it in kept if it.stamp_s <= moved_s + _LEAD_S])
 
 

@@ -59,7 +59,7 @@ class PlannedAccuracy:
 class RecordedAccuracy:
     """Predicts by calibrating what is on the disk, on a thread beside the recording.
 
-    What it tells is of the views that were there when it began; a new look begins when the last one
+    What it says is of the views that were there when it began; a new look begins when the last one
     has ended.
     """
 
@@ -88,7 +88,7 @@ def _calibrated(folder: Path) -> Accuracy | None:
     try:
         known = so_far(Session.load(folder)).known
     except VisioncalError:
-        # Too little as yet; why is told when the session is calibrated.
+        # Too little as yet; why is reported when the session is calibrated.
         return None
     if known.answer is None:
         return None

@@ -61,7 +61,7 @@ def departure(
         options: Speed and acceleration.
 
     Raises:
-        DriverError: The arm does not tell where it is, or is stopped.
+        DriverError: The arm does not report where it is, or is stopped.
         DataError: The plan is for another arm, or the way to the first stop cannot be shown to be
             free.
     """
@@ -89,15 +89,15 @@ def record(
 ) -> list[Step]:
     """Records the stops of a plan that have no view yet.
 
-    However it ends, the arm stands still and every view that was told of is on the disk.
+    However it ends, the arm stands still and every reported view is on the disk.
 
     Args:
         cell: The devices; its arm can be driven.
         plan: The stops.
         journal: Where the views go.
         options: How they are taken.
-        watchers: Who is told of each.
-        lens: The intrinsics that the camera tells; else those of the plan are good enough to tell
+        watchers: Who is notified of each.
+        lens: The intrinsics that the camera reports; else those of the plan are good enough for
             tilts and distances.
 
     Returns:

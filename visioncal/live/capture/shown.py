@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """A watcher that draws what it is told of."""
+    """A watcher that draws each view."""
 
     drawing: "LiveDrawing"
 

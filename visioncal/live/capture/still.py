@@ -13,7 +13,7 @@ from visioncal.live.drivers.protocols import ArmState, Frame
 
 # Points by which the motion of an image is followed, over windows of so many pixels.
 _POINTS, _WINDOW_PX = 80, 21
-# Fewer points tell nothing: the image shows nothing, and no view comes of it.
+# Fewer points show nothing: the image shows nothing, and no view comes of it.
 _FEWEST = 8
 # Under this many grey levels from dark to light there is nothing but noise to follow.
 _CONTRAST = 20

@@ -22,8 +22,8 @@ class GrabbedPictures:
         capture: Opened.
         name: Whose pictures they are, for people.
         exposure_s: How long they are exposed, where that is known [s].
-        is_stream: Whether the times that it tells are those of a camera's clock, as RTSP has them,
-            and none of this host's.
+        is_stream: Whether the times that it reports are those of a camera's clock, as RTSP has
+            them, and none of this host's.
     """
 
     def __init__(
@@ -31,7 +31,7 @@ class GrabbedPictures:
     ) -> None:
         self._capture, self._name, self._exposure_s = capture, name, exposure_s
         self._is_stream = is_stream
-        self._told_s, self._ahead_s, self._stamp_s = np.inf, np.inf, -np.inf
+        self._reported_s, self._ahead_s, self._stamp_s = np.inf, np.inf, -np.inf
 
     def grab(self) -> Arrival:
         """Waits for the next picture.
@@ -42,13 +42,13 @@ class GrabbedPictures:
         if not self._capture.grab():
             raise _gone(self._name)
         came_s = time.monotonic()
-        told_s = 1e-3 * float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
+        reported_s = 1e-3 * float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
         if self._is_stream:
-            before_s, self._stamp_s = self._stamp_s, self._undelayed(came_s, told_s)
+            before_s, self._stamp_s = self._stamp_s, self._undelayed(came_s, reported_s)
             return Arrival(self._stamp_s, before_s)
-        # Only Linux' V4L2 tells when the kernel had it.
-        if came_s - _RECENT_S < told_s <= came_s:
-            return Arrival(told_s, told_s - self._exposure_s)
+        # Only Linux' V4L2 reports when the kernel had it.
+        if came_s - _RECENT_S < reported_s <= came_s:
+            return Arrival(reported_s, reported_s - self._exposure_s)
         return Arrival(came_s)
 
     def take(self) -> Image:
@@ -66,15 +66,15 @@ class GrabbedPictures:
         """Lets go of it."""
         self._capture.release()
 
-    def _undelayed(self, came_s: float, told_s: float) -> float:
+    def _undelayed(self, came_s: float, reported_s: float) -> float:
         """When a picture came that may have waited for its decoding: the least delay counts."""
-        ahead_s = came_s - told_s
-        # A stream that tells no times, or begins again, is taken as it comes.
-        is_onward = told_s > self._told_s
-        drift_s = _DRIFT * (told_s - self._told_s)
+        ahead_s = came_s - reported_s
+        # A stream that reports no times, or begins again, is taken as it comes.
+        is_onward = reported_s > self._reported_s
+        drift_s = _DRIFT * (reported_s - self._reported_s)
         self._ahead_s = min(ahead_s, self._ahead_s + drift_s) if is_onward else ahead_s
-        self._told_s = told_s
-        return told_s + self._ahead_s
+        self._reported_s = reported_s
+        return reported_s + self._ahead_s
 
 
 class FilePictures:

@@ -1,4 +1,4 @@
-"""An arm that tells nothing itself: a person types or pastes its poses from the pendant."""
+"""An arm without a connection: a person types or pastes its poses from the pendant."""
 
 import time
 from collections.abc import Callable
@@ -25,7 +25,7 @@ class ManualArm:
     Args:
         ask: Asks a question and gives the line that was typed.
         form: In which form poses are typed: a name among `POSE_FORMS`, or `ours`; None to have it
-            told by their looks, and asked where these do not tell.
+            recognised by their numbers, and asked where these leave it open.
         answers: Whether a person answers. Lines of a file are a pose each: nothing is asked back,
             and the file's end, which a `q` is too, raises EOFError.
 

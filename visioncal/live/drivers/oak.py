@@ -12,9 +12,9 @@ from visioncal.core.errors import DriverError
 from visioncal.core.files import did_you_mean
 from visioncal.core.types import Camera
 from visioncal.live.drivers.oak_calibration import SOCKETS, factory_intrinsics
-from visioncal.live.drivers.oak_frames import FrameEnd, began_after, told_by
+from visioncal.live.drivers.oak_frames import FrameEnd, began_after, worded
 from visioncal.live.drivers.oak_library import Handle, depthai
-from visioncal.live.drivers.protocols import DeviceWishes, Frame
+from visioncal.live.drivers.protocols import DeviceSetup, Frame
 
 # Where no resolution is wished the sensor's is divided by a whole number, to about this width [px].
 _WIDTH_PX = 2048
@@ -43,14 +43,14 @@ class OakCamera:
         DataError: Frames cannot be recorded into that file.
     """
 
-    def __init__(self, requested: DeviceWishes | None = None, *, device: str | None = None) -> None:
+    def __init__(self, requested: DeviceSetup | None = None, *, device: str | None = None) -> None:
         dai = depthai()
-        requested = requested or DeviceWishes()
+        requested = requested or DeviceSetup()
         self._socket, rate_hz = _options(requested.more)
         with ExitStack() as closing:
             opened = _opened(dai, device)
             closing.callback(opened.close)
-            with told_by(dai, "The OAK", "does not start"):
+            with worded(dai, "The OAK", "does not start"):
                 sensor = _sensor(opened, self._socket)
                 self._name = f"{opened.getDeviceName()} {self._socket} ({sensor.sensorName})"
                 self._resolution = requested.resolution or _fitting(sensor.width, sensor.height)
@@ -114,7 +114,7 @@ class OakCamera:
         self._closing.close()
 
     def _output(
-        self, dai: ModuleType, node: Handle, requested: DeviceWishes, sensor: Handle, rate_hz: float
+        self, dai: ModuleType, node: Handle, requested: DeviceSetup, sensor: Handle, rate_hz: float
     ) -> Handle:
         """Sets what is known beforehand, and asks the camera's node for pictures."""
         if requested.focus is not None:
@@ -128,28 +128,28 @@ class OakCamera:
         return node.requestOutput(self._resolution, kind, crop, rate_hz, False)
 
     def _held(
-        self, dai: ModuleType, requested: DeviceWishes, sensor: Handle, control_queue: Handle
+        self, dai: ModuleType, requested: DeviceSetup, sensor: Handle, control_queue: Handle
     ) -> dict[str, str | float]:
-        """Holds what the camera set by itself, and tells what it is."""
-        told = self._end.message(_FIRST_S)
+        """Holds what the camera set by itself, and returns it."""
+        frame = self._end.message(_FIRST_S)
         until = time.monotonic() + _SETTLE_S
-        while told is not None and time.monotonic() < until:
-            told = self._end.message(1.0)
-        if told is None:
+        while frame is not None and time.monotonic() < until:
+            frame = self._end.message(1.0)
+        if frame is None:
             raise DriverError(
                 f"{self.name} starts, but gives no picture.",
                 culprits=[self.name],
                 next_step="Look at its cable: USB 3 and short; and at its power.",
             )
-        found_us = round(1e6 * told.getExposureTime().total_seconds())
+        found_us = round(1e6 * frame.getExposureTime().total_seconds())
         exposure_us = found_us if requested.exposure_us is None else requested.exposure_us
-        gain = told.getSensitivity() if requested.gain is None else requested.gain
+        gain = frame.getSensitivity() if requested.gain is None else requested.gain
         held: dict[str, str | float] = {"exposure_us": exposure_us, "gain": gain}
         control = dai.CameraControl()
         control.setManualExposure(exposure_us, gain)
         control.setAutoWhiteBalanceLock(True)
         if sensor.hasAutofocus:
-            held["focus"] = told.getLensPosition() if requested.focus is None else requested.focus
+            held["focus"] = frame.getLensPosition() if requested.focus is None else requested.focus
             control.setManualFocus(int(held["focus"]))
         control_queue.send(control)
         return held
@@ -226,7 +226,7 @@ def _fitting(width: int, height: int) -> tuple[int, int]:
     return width // parts // 2 * 2, height // parts // 2 * 2
 
 
-def _focused(requested: DeviceWishes, calibration: Handle, sensor: Handle) -> DeviceWishes:
+def _focused(requested: DeviceSetup, calibration: Handle, sensor: Handle) -> DeviceSetup:
     """Focuses where the factory calibrated, unless another focus is wished."""
     if requested.focus is not None or not sensor.hasAutofocus:
         return requested

@@ -54,14 +54,14 @@ class FrameEnd:
         self._dai, self._name = dai, name
         self._recorder = None if raw is None else _recorder(dai, pipeline, output, raw)
         self._queue = output.createOutputQueue(maxSize=4, blocking=keeps_all)
-        with told_by(dai, name, "does not start"):
+        with worded(dai, name, "does not start"):
             pipeline.start()
         # A pipeline that still runs when Python ends aborts the process.
         self._stop = weakref.finalize(self, _stop, pipeline)
 
     def drop_old(self) -> None:
         """Forgets the frames that nobody has taken."""
-        with told_by(self._dai, self._name):
+        with worded(self._dai, self._name):
             self._queue.tryGetAll()
 
     def next(self, timeout_s: float) -> Frame | None:
@@ -75,7 +75,7 @@ class FrameEnd:
 
     def message(self, timeout_s: float) -> Handle | None:
         """Takes the next frame as depthai has it, with all that the camera says of it."""
-        with told_by(self._dai, self._name):
+        with worded(self._dai, self._name):
             return self._queue.get(timedelta(seconds=max(timeout_s, 0.0)))
 
     def close(self) -> None:
@@ -99,7 +99,7 @@ def began_after(frame: Frame, asked: float) -> bool:
 
 
 @contextmanager
-def told_by(dai: ModuleType, name: str, what: str = "gives no frames any more") -> Iterator[None]:
+def worded(dai: ModuleType, name: str, what: str = "gives no frames any more") -> Iterator[None]:
     """Words what depthai raises: RuntimeError of devices and pipelines, and of closed queues.
 
     Raises:

@@ -115,7 +115,7 @@ class HostedOak:
 
 
 class _Feed:
-    """What the pipeline's thread and the one that wants a frame tell each other."""
+    """What the pipeline's thread and the one that wants a frame share."""
 
     def __init__(self, source: Callable[[], Frame | None]) -> None:
         self._source = source

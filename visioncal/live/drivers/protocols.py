@@ -12,7 +12,7 @@ Safety = Literal["normal", "reduced", "protective-stop", "emergency-stop", "faul
 
 @dataclass(frozen=True, eq=False)
 class ArmState:
-    """What the arm says of itself at one moment; what it does not tell is None.
+    """What the arm says of itself at one moment; what it does not report is None.
 
     Attributes:
         stamp_s: When the host had it, on the host's monotonic clock (`time.monotonic`) [s].
@@ -46,7 +46,7 @@ class Frame:
     Attributes:
         image: (h, w) grey or (h, w, 3) blue, green, red.
         stamp_s: The middle of its exposure, on the host's monotonic clock [s].
-        exposure_s: How long it was exposed [s], where the camera tells.
+        exposure_s: How long it was exposed [s], where the camera reports it.
     """
 
     image: Image
@@ -72,11 +72,11 @@ class JointSample:
 
 
 class Joints(Protocol):
-    """Joints that tell what they do, many times a second.
+    """Joints that report what they do, many times a second.
 
     Attributes:
         name: What and where they are, for people: `UR10e at 192.168.0.10`.
-        rate_hz: How often they tell it.
+        rate_hz: How often they report it.
     """
 
     name: str
@@ -87,7 +87,7 @@ class Joints(Protocol):
 
 
 class Arm(Protocol):
-    """An arm that tells where it is.
+    """An arm that reports where it is.
 
     Every call returns within a second, or raises DriverError: link lost, stopped, refused.
     """
@@ -140,7 +140,7 @@ class CameraDevice(Protocol):
 
     @property
     def factory(self) -> Camera | None:
-        """The intrinsics that the device itself tells, at this resolution."""
+        """The intrinsics that the device itself reports, at this resolution."""
 
     @property
     def settings(self) -> Mapping[str, str | float]:
@@ -158,7 +158,7 @@ class CameraDevice(Protocol):
 
 
 @dataclass(frozen=True)
-class DeviceWishes:
+class DeviceSetup:
     """What a user may ask of a camera; what is None is the driver's choice, then held.
 
     Attributes:

@@ -91,7 +91,7 @@ class UrArm:
     def state(self) -> ArmState:
         """Waits for the next state that the controller sends.
 
-        A stop by the safety system is told in it, and is no error.
+        A stop by the safety system is reported in it, and is no error.
 
         Raises:
             DriverError: None comes for half a second.
@@ -215,7 +215,7 @@ class UrArm:
             raise self._explain(f"does not take the control script: {error}") from error
         self._line = Line(self._name, self._kick, _KICK_S)
         offset = self._line.call(
-            self._control.getTCPOffset, limit_s=_CALL_S, what="tell its tool offset"
+            self._control.getTCPOffset, limit_s=_CALL_S, what="report its tool offset"
         )
         self._flange_from_tool = _matrix(offset)
         self._watch_me(self._line)
@@ -249,7 +249,7 @@ class UrArm:
         self._control.disconnect()
 
     def _load(self) -> tuple[float | None, FloatArray | None]:
-        if not self._states.tells_load:
+        if not self._states.reports_load:
             return None, None
         client = self._states.client
         return float(client.getPayload()), np.array(client.getPayloadCog())
@@ -292,7 +292,7 @@ def check_controller(host: str, *, moves: bool) -> Condition:
     """Asks everything by plain connections first: the library's constructors wait without end.
 
     Raises:
-        DriverError: It cannot be reached, is no UR, tells nothing, or could not be moved.
+        DriverError: It cannot be reached, is no UR, reports nothing, or could not be moved.
     """
     condition = read_condition(host)
     if moves:

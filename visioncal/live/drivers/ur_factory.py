@@ -31,7 +31,7 @@ def read_factory_dh(host: str) -> JointTable:
         host: The controller's address.
 
     Raises:
-        DriverError: The controller cannot be reached, or does not tell it.
+        DriverError: The controller cannot be reached, or does not report it.
     """
     return read_joint_table(host)
 
@@ -39,7 +39,7 @@ def read_factory_dh(host: str) -> JointTable:
 def read_factory_file(path: Path, model: str) -> JointTable:
     """Reads the maker's calibration from a controller's file, `/root/.urcontrol/calibration.conf`.
 
-    The file tells how the arm departs from the data sheet.
+    The file says how the arm departs from the data sheet.
 
     Args:
         path: The file.

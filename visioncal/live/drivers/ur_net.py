@@ -27,7 +27,7 @@ def resolve(host: str) -> str:
     """Finds a host's address, as `192.168.0.10`.
 
     Raises:
-        DriverError: The name is not known, or no server of names tells it in time.
+        DriverError: The name is not known, or no server of names answers in time.
     """
     found: queue.SimpleQueue[str | OSError] = queue.SimpleQueue()
 

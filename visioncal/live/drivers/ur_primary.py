@@ -1,4 +1,4 @@
-"""What only a UR's primary interface tells: its table of joints and its tool offset.
+"""What only a UR's primary interface reports: its table of joints and its tool offset.
 
 Source: Universal Robots, "Remote Control Via TCP/IP": a message is its size, its type and its
 content; a robot state message (16) holds packages of the same form; numbers are big-endian.
@@ -49,7 +49,7 @@ def read_joint_table(host: str) -> JointTable:
     """Reads the table by which the controller reckons, the maker's calibration included.
 
     Raises:
-        DriverError: The controller cannot be reached, or does not tell it.
+        DriverError: The controller cannot be reached, or does not report it.
     """
     numbers = _TABLE.unpack_from(_package(host, _KINEMATICS, _TABLE.size, "its table of joints"))
     theta, a, d, alpha = np.array(numbers[6:30]).reshape(4, 6)
@@ -60,7 +60,7 @@ def read_tool_offset(host: str) -> list[float]:
     """Reads the tool offset that is set: x, y, z [m] and a rotation vector [rad].
 
     Raises:
-        DriverError: The controller cannot be reached, or does not tell it.
+        DriverError: The controller cannot be reached, or does not report it.
     """
     content = _package(host, _CARTESIAN, _TOOL.size, "its tool offset")
     return list(_TOOL.unpack_from(content)[6:])
@@ -71,7 +71,7 @@ def _package(host: str, kind: int, size: int, what: str) -> bytes:
         if found == kind and len(content) >= size:
             return content
     raise DriverError(
-        f"The controller at {host} does not tell {what} on its primary interface.",
+        f"The controller at {host} does not report {what} on its primary interface.",
         culprits=[host],
         next_step="It takes PolyScope 3.4 or newer; open the primary client interface under "
         "Settings > Security > Services.",

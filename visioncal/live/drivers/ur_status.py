@@ -10,12 +10,12 @@ from visioncal.live.drivers.ur_net import Dashboard
 _VERSION = re.compile(r"(\d+)\.(\d+)\.(\d+)\.\d+")
 # What ur-rtde's control script needs: registers of floating-point numbers for programs.
 _LEAST = {3: (3, 4), 5: (5, 4)}
-# From here on, the controller tells whether it is in remote control.
+# From here on, the controller reports whether it is in remote control.
 _TELLS_REMOTE = (5, 6)
 _RUNNING = "RUNNING"
-# The dashboard tells the size alone of arms that there are, or could be, in two series.
+# The dashboard reports the size alone of arms that there are, or could be, in two series.
 _BOTH_SERIES = ("UR3", "UR5", "UR10", "UR16")
-# In which modes joints tell where they are.
+# In which modes joints report where they are.
 _AWAKE = (_RUNNING, "IDLE", "BACKDRIVE")
 _MODE_STEPS = {
     "POWER_OFF": "Switch it on at the pendant: the circle at the lower left, then On and Start.",
@@ -50,7 +50,7 @@ _SAFETY_BITS: tuple[tuple[int, Safety], ...] = (
 
 @dataclass(frozen=True)
 class Condition:
-    """What the dashboard tells.
+    """The dashboard's answers.
 
     Attributes:
         host: The controller's address.
@@ -58,7 +58,7 @@ class Condition:
         model: The arm's name, as `UR10e`.
         mode: The robot's mode, as `RUNNING`.
         safety: The state of the safety system, as `NORMAL`.
-        remote: Whether it is in remote control; True where it does not tell.
+        remote: Whether it is in remote control; True where it does not report it.
     """
 
     host: str
@@ -90,7 +90,7 @@ class Condition:
             )
 
     def check_tells(self) -> None:
-        """Checks that it tells where its joints are.
+        """Checks that it reports where its joints are.
 
         Raises:
             DriverError: It does not, with what to press.

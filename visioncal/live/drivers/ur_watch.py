@@ -1,4 +1,4 @@
-"""The stream of a UR's states: what the arm tells of itself, and since when it has been silent."""
+"""The stream of a UR's states: what the arm reports, and since when it has been silent."""
 
 import time
 from collections import deque
@@ -23,9 +23,9 @@ _VARIABLES = (
     "robot_status_bits",
     "safety_status_bits",
 )
-# What newer controllers tell, and from which version on, by major version.
+# What newer controllers report, and from which version on, by major version.
 _LOAD = ("payload", "payload_cog")
-_TELLS_LOAD = {3: (3, 11, 0), 5: (5, 5, 1)}
+_REPORTS_LOAD = {3: (3, 11, 0), 5: (5, 5, 1)}
 # The arm's motion is slow beside it, the computer's load is small.
 _RATE_HZ = 125.0
 # A controller sends every 8 ms; after this silence it is gone [s].
@@ -54,8 +54,8 @@ class StateStream:
         rate_hz: float = _RATE_HZ,
     ) -> None:
         self._host = host
-        self.tells_load = version >= _TELLS_LOAD[version[0]]
-        names = [*_VARIABLES, *(_LOAD if self.tells_load else ())]
+        self.reports_load = version >= _REPORTS_LOAD[version[0]]
+        names = [*_VARIABLES, *(_LOAD if self.reports_load else ())]
         try:
             self.client: Any = library.RTDEReceiveInterface(host, rate_hz, names)
         except RuntimeError as error:

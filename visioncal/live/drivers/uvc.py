@@ -17,7 +17,7 @@ from visioncal.live.drivers.multipart import (
     without_password,
 )
 from visioncal.live.drivers.newest import Arrival, Newest
-from visioncal.live.drivers.protocols import DeviceWishes, Frame
+from visioncal.live.drivers.protocols import DeviceSetup, Frame
 from visioncal.vision.finders.imaging import decode_image
 
 # Some cameras take their time for the first picture [s].
@@ -34,7 +34,7 @@ _EXPOSURE_UNIT_S = 1e-4
 class UvcCamera:
     """A camera device through OpenCV's VideoCapture, or a stream of JPEG files over HTTP.
 
-    What is asked for is set where the camera can; `settings` tell what it then says of itself.
+    What is asked for is set where the camera can; `settings` are what it then reports.
     Autofocus, which would move the intrinsics, is switched off. Exposure that is not wished stays
     as the camera has it, which is automatic for most. All that comes is read at once, so that no
     old picture waits in a buffer; of a video file every picture counts.
@@ -47,8 +47,8 @@ class UvcCamera:
         DriverError: It cannot be opened or gives no picture, or refuses what is wished.
     """
 
-    def __init__(self, source: int | str, requested: DeviceWishes | None = None) -> None:
-        requested = requested or DeviceWishes()
+    def __init__(self, source: int | str, requested: DeviceSetup | None = None) -> None:
+        requested = requested or DeviceSetup()
         self._name = f"camera {without_password(str(source))}"
         self._exposure_s = 1e-6 * (requested.exposure_us or 0)
         settings: dict[str, str | float] = {}
@@ -88,7 +88,7 @@ class UvcCamera:
 
     @property
     def factory(self) -> Camera | None:
-        """None: such a camera does not tell its intrinsics."""
+        """None: such a camera does not report its intrinsics."""
         return None
 
     @property
@@ -144,7 +144,7 @@ def _scheme(source: int | str) -> str:
     return scheme.lower() if found else ""
 
 
-def _multipart(source: int | str, requested: DeviceWishes) -> MultipartPictures | None:
+def _multipart(source: int | str, requested: DeviceSetup) -> MultipartPictures | None:
     """The JPEG files of a URL that sends such; None for every other source."""
     if not _scheme(source):
         return None
@@ -180,7 +180,7 @@ def _opened(source: int | str, name: str) -> cv2.VideoCapture:
     return capture
 
 
-def _set(capture: cv2.VideoCapture, requested: DeviceWishes) -> dict[str, str | float]:
+def _set(capture: cv2.VideoCapture, requested: DeviceSetup) -> dict[str, str | float]:
     """Sets what is wished, stops the focus from moving by itself, and asks what came of it."""
     if requested.resolution is not None:
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, requested.resolution[0])
@@ -194,7 +194,7 @@ def _set(capture: cv2.VideoCapture, requested: DeviceWishes) -> dict[str, str | 
         capture.set(cv2.CAP_PROP_EXPOSURE, round(1e-6 * requested.exposure_us / _EXPOSURE_UNIT_S))
     if requested.gain is not None:
         capture.set(cv2.CAP_PROP_GAIN, requested.gain)
-    told = {
+    values = {
         "exposure": capture.get(cv2.CAP_PROP_EXPOSURE),
         "auto_exposure": capture.get(cv2.CAP_PROP_AUTO_EXPOSURE),
         "focus": capture.get(cv2.CAP_PROP_FOCUS),
@@ -202,4 +202,4 @@ def _set(capture: cv2.VideoCapture, requested: DeviceWishes) -> dict[str, str | 
         "rate_hz": capture.get(cv2.CAP_PROP_FPS),
     }
     # OpenCV says 0 or -1 of what the camera does not have.
-    return {name: it for name, it in told.items() if math.isfinite(it) and it > 0.0}
+    return {name: it for name, it in values.items() if math.isfinite(it) and it > 0.0}

@@ -1,1 +1,1 @@
-"""Planning: which stops of the robot tell most, among those that it can reach and look from."""
+"""Planning: the most informative stops among those that the robot can reach and look from."""

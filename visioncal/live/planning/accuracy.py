@@ -7,7 +7,7 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.live.planning.information import WEAK_SIGMA
 
-# A sigma over this means that nothing tells: it is that of what is assumed beforehand [rad or m].
+# A sigma over this is the prior's: no data determine it [rad or m].
 OPEN_SIGMA = 0.25 * WEAK_SIGMA
 
 

@@ -41,8 +41,8 @@ _BATCH, _DRAWS, _FIRST_DRAWS, _NEXT_TO_NONE = 2000, 100, 8, 0.03
 _UNSURE, _ENOUGH = 0.5, 0.2
 # Fewer than this share of the wish, or than a plan needs, are too few.
 _LEAST_SHARE, _LEAST = 0.1, 12
-# So many stops tell at what distances others may be found.
-_TELLING = 100
+# So many stops show at what distances others may be found.
+_SAMPLE = 100
 # An arm with fewer joints reaches a drawn view only by chance: its postures are drawn instead.
 _FREE = 6
 # A joint that stands nowhere in such a range [rad], and touches something there in this share of
@@ -141,7 +141,7 @@ class _Search:
 
     def _narrow(self) -> None:
         """Draws at the distances that turn out well, once some have: others cost time alone."""
-        if not self._narrowed and len(self.kept) >= min(_TELLING, self._count):
+        if not self._narrowed and len(self.kept) >= min(_SAMPLE, self._count):
             q = np.array([q for q, _ in self.kept])
             self._sight = self._sight.nearer_to(self._cell.cam_from_target(q))
             self._narrowed = True
@@ -197,7 +197,7 @@ class _Search:
         return q[sure], share[sure]
 
     def _unhidden(self, behind: IntArray) -> Mask:
-        """Counts and names the boxes (k,) that hide the board, and tells where none does."""
+        """Counts and names the boxes (k,) that hide the board, and where none does."""
         free = self.losses.passed(HIDDEN, behind < 0)
         self.losses.blame(HIDDEN, [self._cell.boxes[place].name for place in behind[~free]])
         return free
@@ -245,7 +245,7 @@ def _unwound(cell: PlanCell, collisions: Collisions, q: FloatArray) -> FloatArra
         barred, cut = _BARRED, None
         for place in np.flatnonzero(gaps > _WIDE_RAD):
             between = angles[place] + 0.5 * gaps[place]
-            turned = positions[:_TELLING].copy()
+            turned = positions[:_SAMPLE].copy()
             turned[:, joint] = between
             share = float((collisions.first_contact(chain.encoded(turned)) >= 0).mean())
             if share > barred:

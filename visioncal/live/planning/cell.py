@@ -104,8 +104,8 @@ class PlanCell:
         limits: What every stop and every way between two of them keeps.
         boxes: What else stands in the cell.
         covariance: (12, 12) covariance of both edges together (rotation, translation; right
-            perturbations), where recorded stops tell it: then both sigmas are typical of it. None
-            where the sigmas say all.
+            perturbations), where recorded stops determine it: then both sigmas are typical of it.
+            None where the sigmas say all.
     """
 
     mount: Mount

@@ -1,4 +1,4 @@
-"""Choosing the stops that tell most: experimental design by greedy start and exchange."""
+"""Choosing the most informative stops: experimental design by greedy start and exchange."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ class Design:
     """Chosen stops.
 
     Attributes:
-        rows: (n,) which candidates, the most telling first.
+        rows: (n,) which candidates, the most informative first.
         criterion: By what they were chosen.
         value: The criterion at these stops: a sigma [mm] for I, else in its own units.
         history: What is predicted without any of them, and after each in the order of `rows`.
@@ -59,14 +59,14 @@ def chosen(
     criterion: Criterion = "I",
     wish: Wish | None = None,
 ) -> Design:
-    """Chooses the stops that tell most beside what is recorded.
+    """Chooses the most informative stops beside what is recorded.
 
     Stops are added greedily until there are enough of them, or the wish is met in prediction; then
     the best that is left out is exchanged for the least of those taken while that gains (Mitchell
     1974, DETMAX, with excursions of one).
 
     Args:
-        worlds: What the candidates tell, in each of the cells that may be.
+        worlds: The candidates' information, in each of the cells that may be.
         count: The most stops that may be taken.
         criterion: What makes stops good.
         wish: Where to stop before.
@@ -193,7 +193,7 @@ def _thinned(state: Selection, wish: Wish) -> Selection:
 
 
 def _ranked(state: Selection) -> IntArray:
-    """The chosen rows, the most telling first."""
+    """The chosen rows, the most informative first."""
     rows = np.array(state.rows, dtype=np.int64)
     few = tuple(
         replace(it, factors=it.factors[rows], misfit=it.misfit[rows]) for it in state.problem

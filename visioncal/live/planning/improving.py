@@ -24,7 +24,7 @@ from visioncal.robot import Robot
 _NEARLY_AXIS, _ASIDE = 0.95, 0.4
 # Smaller turns from a stop that is there are no new direction [rad].
 _TURN_RAD = 0.17
-# What takes less than a hundredth off an error is not worth a figure.
+# What takes less than a hundredth off an error gets no figure.
 _LITTLE_SHARE = 0.99
 # What a rotation counts beside an offset: its effect at this distance [m].
 _LEVER_M = 0.5
@@ -75,7 +75,7 @@ def next_best(
     """Chooses the stops that add most to a session.
 
     Args:
-        begun: What the session tells.
+        begun: The session's information.
         purpose: What the stops are for.
         q: (k, n) joint angles of the candidates [rad].
         count: The most stops that may be added.
@@ -115,7 +115,7 @@ def helps(
         cell: The cell as it is guessed to be.
         purpose: What the stops are for.
         q: (k, n) joint angles of the candidates [rad].
-        world: What the candidates tell if the guesses are right.
+        world: The candidates' information if the guesses are right.
         design: Which of them are chosen.
         names: What to call the chosen ones, in their order.
         begun: What was recorded already; None for nothing.
@@ -169,12 +169,12 @@ def _effect(
     if purpose.judged == "sight":
         return _edge_effect(before, after)
     then, now = (1e-3 * it.mm for it in history)
-    joint = _joint_told(cell.robot, purpose, np.diag(before - after))
+    joint = _joint_determined(cell.robot, purpose, np.diag(before - after))
     change = _change("the error over the workspace", then, now, is_rotation=False)
-    return f"{change}; tells most of {joint}"
+    return f"{change}; most information on {joint}"
 
 
-def _joint_told(robot: Robot, purpose: Purpose, drops: FloatArray) -> str:
+def _joint_determined(robot: Robot, purpose: Purpose, drops: FloatArray) -> str:
     """Which joint's errors (p,) lessened variances are of."""
     count = robot.joint_count
     by_joint, left = np.zeros(count), drops

@@ -1,4 +1,4 @@
-"""What a stop of the robot would tell, by the estimator's own derivatives and priors.
+"""The predicted information of a stop, by the estimator's own derivatives and priors.
 
 A stop's corners are predicted, compressed as seen ones are, and joined with the noise of the robot;
 what comes out is the information that the joint fit would have of it.
@@ -94,7 +94,7 @@ class Recorded:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """What k candidates tell of p unknowns if a cell is as it is guessed to be.
+    """The information of k candidates on p unknowns if a cell is as it is guessed to be.
 
     Unknown are x, z, what is open about lens and board, and the arm's errors, in this order.
 
@@ -161,7 +161,7 @@ def worlds_of(
     recorded: Recorded | None = None,
     workspace: Box | None = None,
 ) -> tuple[World, ...]:
-    """Predicts what candidates tell, in each of some cells.
+    """Predicts the information of candidates, in each of some cells.
 
     Args:
         cells: The cell as it is guessed to be, and as it may be.
@@ -182,13 +182,13 @@ def worlds_of(
 def stop_factors(
     cell: PlanCell, purpose: Purpose, q: FloatArray, recorded: Recorded | None = None
 ) -> FloatArray:
-    """Predicts what stops tell.
+    """Predicts the information of stops.
 
     Args:
         cell: The cell, taken as it is guessed to be.
         purpose: What is unknown.
         q: (k, n) joint angles [rad].
-        recorded: What tells of lens and board; None where they are as stated, the board's size
+        recorded: Information on lens and board; None where they are as stated, the board's size
             being open by as much as is stated.
 
     Returns:
@@ -371,7 +371,7 @@ def _model(robot: Robot, purpose: Purpose) -> ArmModel:
         return model
     if robot.masses is None:
         raise DataError(
-            f"stops for {purpose.name} cannot be planned: the model of {robot.name} does not tell "
+            f"stops for {purpose.name} cannot be planned: the model of {robot.name} does not state "
             "the masses of its links, and their weight is what bends it.",
             culprits=[robot.name],
             next_step="Add mass_kg and com_m to each [[joint]] of its table, or take its URDF.",

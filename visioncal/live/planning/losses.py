@@ -36,7 +36,7 @@ _ADVICE = {
 
 
 # So many limits are named in a message, those that most was lost to.
-_TOLD = 6
+_NAMED = 6
 
 
 @dataclass
@@ -65,11 +65,11 @@ class Losses:
 
     def counts(self) -> Mapping[str, int]:
         """How many were lost to what, the most first."""
-        told = Counter(self.named)
+        counts = Counter(self.named)
         for limit, times in self.lost.items():
             known = sum(it for name, it in self.named.items() if name.startswith(f"{limit} ("))
-            told[limit] += times - known
-        return {limit: times for limit, times in told.most_common() if times > 0}
+            counts[limit] += times - known
+        return {limit: times for limit, times in counts.most_common() if times > 0}
 
     def worst(self) -> str:
         """The limit that lets the smallest share through."""
@@ -82,11 +82,11 @@ class Losses:
         own = {name: it for name, it in self.counts().items() if name.startswith(f"{worst} (")}
         culprit = max(own, key=lambda name: own[name], default=worst)
         tried = max(self.tried.values())
-        told = some_of([f"{times} to {what}" for what, times in self.counts().items()], _TOLD)
+        lost = some_of([f"{times} to {what}" for what, times in self.counts().items()], _NAMED)
         share = 100.0 * self.lost[worst] / self.tried[worst]
         return DataError(
             f"plan: {found} of {wished} possible stops were found in {tried} tries. Lost were "
-            f"{told}. Most in the way is {culprit}: {worst} kept out {share:.1f} % of the "
+            f"{lost}. Most in the way is {culprit}: {worst} kept out {share:.1f} % of the "
             f"{self.tried[worst]} that came so far.",
             culprits=[culprit],
             next_step=_ADVICE[worst],

@@ -8,10 +8,10 @@ from visioncal.dynamics.sweeps import Sweeps
 
 
 def plan_words(plan: MotionPlan) -> tuple[str, ...]:
-    """What a plan is worth and what it uses, in sentences."""
+    """The quality of a plan and what it uses, in sentences."""
     found = plan.excitation
     condition, random = found.condition, found.random
-    told = [
+    words = [
         f"exciting motion of {found.request.period_s:g} s: condition {condition.weighted:.1f} for "
         f"{found.base.rank} base parameters (random motions: {random.weighted:.0f})",
         "joints weighted by their greatest torques, columns of unit length; unweighted "
@@ -20,8 +20,8 @@ def plan_words(plan: MotionPlan) -> tuple[str, ...]:
         f"it uses {_used(found.kept)}",
     ]
     if plan.sweeps is not None:
-        told += [_sweeps(plan.sweeps), f"they use {_used(plan.sweeps.kept)}"]
-    return tuple(told)
+        words += [_sweeps(plan.sweeps), f"they use {_used(plan.sweeps.kept)}"]
+    return tuple(words)
 
 
 def plan_warnings(plan: MotionPlan) -> tuple[str, ...]:

@@ -62,7 +62,7 @@ class PlannedStop:
         base_from_flange: (4, 4) where the flange is, by the robot's model [m].
         cam_from_target: (4, 4) how the board is seen if the guesses are right [m].
         seen: In which share of what the cell may be the whole board is in the image.
-        rank: 1 for the stop that tells most, 2 for that which tells most besides it, ...
+        rank: 1 for the most informative stop, 2 for the most informative besides it, ...
         words: What it is good for.
         before: What is predicted of the stops of lower rank, and of what was recorded.
         after: The same with this one.

@@ -36,7 +36,7 @@ def _note(stop: PlannedStop) -> str:
     distance = 1e3 * float(np.linalg.norm(stop.cam_from_target[:3, 3]))
     return "\n\n".join(
         [
-            f"**View {stop.view}** (number {stop.rank} by what it tells): {stop.words}",
+            f"**View {stop.view}** (number {stop.rank} by information): {stop.words}",
             f"Joints ({degrees}) deg; flange at ({x:.0f}, {y:.0f}, {z:.0f}) mm; board's origin at "
             f"{distance:.0f} mm from the camera. The whole board is in the image in "
             f"{100 * stop.seen:.0f} % of what the cell may be.",
@@ -55,7 +55,7 @@ def _plan_note(plan: Plan, name: str) -> str:
         lines += ["", f"So far: {plan.begun.refusal}"]
     lines += [
         "",
-        "The most telling first, each with what is predicted of it and all above it. Views are "
+        "The most informative first, each with what is predicted of it and all above it. Views are "
         "numbered as the arm drives to them.",
         "",
     ]

@@ -1,4 +1,4 @@
-"""What stops are planned for: which unknowns they should tell, and which errors count.
+"""What stops are planned for: which unknowns they should determine, and which errors count.
 
 A later stage registers its purpose by one more entry of `PURPOSES`.
 """
@@ -27,7 +27,7 @@ class Purpose:
             that is known of them beforehand [rad]; lengths are off by 0.5 m times as much.
         judged: Which errors count.
         errors: What they are, in words.
-        stops: How many a plan of its own has; with more, each is worth little.
+        stops: How many a plan of its own has; with more, each adds little.
     """
 
     name: str

@@ -49,7 +49,7 @@ class PlanFile:
 
     Attributes:
         cell: What it is for.
-        purpose: What its stops should tell.
+        purpose: What its stops should determine.
         stops: In the order in which the robot drives to them.
         start_q: (n,) where the arm was to stand before [rad]; None where that was not said, and the
             way to the first stop was not looked at.

@@ -1,4 +1,4 @@
-"""Where a plan begins that adds to a session: what the session tells, be it ever so little."""
+"""The start of a plan that adds to a session: what the session determines so far."""
 
 from dataclasses import dataclass, field, replace
 
@@ -64,8 +64,8 @@ class Begun:
     """A session to which stops are added.
 
     Attributes:
-        cell: The cell as far as the session tells it.
-        recorded: What the session tells.
+        cell: The cell as far as the session determines it.
+        recorded: The session's information.
         refusal: Why the session alone gives no result; empty where it does.
         views: The number of the first view of each stop.
     """
@@ -125,32 +125,32 @@ def begin(
         boxes: What else stands in the cell.
 
     Raises:
-        DataError: The session lacks a robot's model, a camera or a board, or it tells too little to
-            begin without a guess.
+        DataError: The session lacks a robot's model, a camera or a board, or has too few
+            views to begin without a guess.
     """
     known = found.known
     robot, targets = known.robot, tuple(known.session.boards.values())
     if robot is None or not targets or known.pixel_px is None or not known.scenes:
         raise _lacking(known)
     with one_blas_thread():
-        told = _guessed(known, guess) if known.fit is None else _fitted(known, known.fit)
+        begun = _guessed(known, guess) if known.fit is None else _fitted(known, known.fit)
         edges, covariance = _nearest(
-            told.problem, told.state, told.noise, known.session.mount, guess
+            begun.problem, begun.state, begun.noise, known.session.mount, guess
         )
     sigmas = np.sqrt(np.diag(covariance).reshape(2, 2, 3).mean(axis=(0, 2)))
     if sigmas[0] > _TOO_VAGUE_RAD or sigmas[1] > _TOO_VAGUE_M:
-        raise _too_vague(known, len(told.views))
-    arm = told.arm
+        raise _too_vague(known, len(begun.views))
+    arm = begun.arm
     cell = PlanCell(
         known.session.mount,
         _arm(arm, robot),
-        told.free.appearance.camera,
-        targets[told.board],
+        begun.free.appearance.camera,
+        targets[begun.board],
         edges[0],
         edges[1],
         float(sigmas[0]),
         float(sigmas[1]),
-        told.noise,
+        begun.noise,
         known.pixel_px,
         limits or Limits(),
         boxes,
@@ -158,22 +158,22 @@ def begin(
     )
     alike = () if known.answer is None else (it.alike for it in known.answer.misfits.values())
     recorded = Recorded(
-        told.problem,
+        begun.problem,
         edges,
-        told.free,
+        begun.free,
         arm.joints_rad,
-        told.noise,
-        int(first_corners(targets)[told.board]),
+        begun.noise,
+        int(first_corners(targets)[begun.board]),
         arm.errors if arm.is_modelled else None,
         max((it.factor for it in alike if it is not None and it.is_significant), default=1.0),
-        _beside_noise(known, told),
+        _beside_noise(known, begun),
     )
-    return Begun(cell, recorded, found.refusal, told.views)
+    return Begun(cell, recorded, found.refusal, begun.views)
 
 
 @dataclass(frozen=True, eq=False)
-class _Told:
-    """What a session tells.
+class _Start:
+    """What a session determines.
 
     Attributes:
         problem: Its s stops, without errors of the arm; the board that is planned for comes first.
@@ -194,8 +194,8 @@ class _Told:
     views: tuple[int, ...]
 
 
-def _fitted(known: RunState, solved: Solved) -> _Told:
-    """What the fit of a session tells, even where that leaves a direction open."""
+def _fitted(known: RunState, solved: Solved) -> _Start:
+    """What the fit of a session determines, even where that leaves a direction open."""
     if solved.seen is None:
         raise _lacking(known)
     part, arm = solved.part, known.robot_arm
@@ -217,7 +217,7 @@ def _fitted(known: RunState, solved: Solved) -> _Told:
         effects=tuple(it.of_stops(seen_at) for it in bare.effects),
     ).merged()
     noise = solved.agreed.fit.noise
-    return _Told(
+    return _Start(
         problem,
         problem.start(frames),
         replace(noise, robots=np.maximum(noise.robots, _LEAST_NOISE.robots)),
@@ -228,8 +228,8 @@ def _fitted(known: RunState, solved: Solved) -> _Told:
     )
 
 
-def _guessed(known: RunState, guess: Guess | None) -> _Told:
-    """What stops tell that are too few for a fit, beside a guess."""
+def _guessed(known: RunState, guess: Guess | None) -> _Start:
+    """What stops too few for a fit determine, beside a guess."""
     looked = ObservedPoses.of(known)
     views = [it for it in known.poses if it in known.base_from_flange and it not in known.held_back]
     if guess is None or not views:
@@ -250,7 +250,7 @@ def _guessed(known: RunState, guess: Guess | None) -> _Told:
     looks = FramesSide(problem, alone, mine, {}).looks({frame: scene}, {frame: poses})
     looked = replace(looked, free=free_of(looks.seen(looks.first))).posed(poses)
     problem = looked.problem(mine).merged()
-    return _Told(
+    return _Start(
         problem,
         problem.start(looked.frames),
         _TYPICAL,
@@ -261,11 +261,11 @@ def _guessed(known: RunState, guess: Guess | None) -> _Told:
     )
 
 
-def _beside_noise(known: RunState, told: "_Told") -> FloatArray:
+def _beside_noise(known: RunState, begun: "_Start") -> FloatArray:
     """(12, c) how the edges err by what an arm does wrong whose joints are not known, if any."""
-    if known.answer is None or told.arm.is_modelled or "arm" not in known.answer.beside:
+    if known.answer is None or begun.arm.is_modelled or "arm" not in known.answer.beside:
         return np.zeros((12, 0))
-    names = tuple(told.problem.unknown)[:2]
+    names = tuple(begun.problem.unknown)[:2]
     columns = [np.arange(it.start, it.stop) for it in map(known.solved.problem.edge_columns, names)]
     at = np.concatenate(columns)
     values, vectors = np.linalg.eigh(known.answer.beside["arm"][np.ix_(at, at)])
@@ -340,7 +340,7 @@ def _lacking(known: RunState) -> DataError:
 def _too_vague(known: RunState, stops: int) -> DataError:
     return DataError(
         f"session {known.session.name!r}: its {stops} usable stop{'s' if stops != 1 else ''} "
-        "of the robot do not tell where camera and board are, not even roughly.",
+        "of the robot do not show where camera and board are, not even roughly.",
         culprits=[f"session {known.session.name!r}"],
         next_step="Give rough guesses of both transforms.",
     )

@@ -1,4 +1,4 @@
-"""Chosen candidates and what they tell, under one criterion: one more, one less, which is best.
+"""Chosen candidates and their information, under one criterion: one more, one less, which is best.
 
 Criteria (Atkinson, Donev and Tobias 2007, chapter 10; Borm and Menq 1991 for O1), each as a mean
 over the worlds in which the plan must be good:
@@ -6,7 +6,7 @@ over the worlds in which the plan must be good:
     I   mean variance of the places that count
     D   determinant of the unknowns' covariance
     A   mean variance of the unknowns, each in its own unit
-    E   largest variance of a combination of unknowns, of those that the candidates tell
+    E   largest variance of a combination of unknowns, of those that the candidates determine
     O1  geometric mean of the stacked Jacobian's singular values, over the root of the stops
 
 A stop adds six rows, so that its effect on a covariance C is a correction of rank six (Woodbury):
@@ -30,8 +30,8 @@ CRITERIA: tuple[str, ...] = get_args(Criterion)
 
 # Directions of which all candidates together take less than this share of the variance are left
 # aside: that changes no figure.
-_UNTOLD = 1e-9
-# Singular values under this share of the largest are no directions that a stop could tell.
+_NULL = 1e-9
+# Singular values under this share of the largest are no directions that a stop could determine.
 _LEAST_SHARE = 1e-7
 # For O1 next to nothing is known beforehand.
 _LITTLE = 1e-4
@@ -46,7 +46,7 @@ class Variance:
 
     Attributes:
         roots: (s, r).
-        rest: The share of the directions that nobody tells.
+        rest: The share of the directions that nobody determines.
     """
 
     roots: FloatArray
@@ -62,13 +62,13 @@ class Reduced:
     """A world in coordinates in which what is known beforehand is the identity.
 
     Attributes:
-        factors: (k, 6, r) of what candidates or recorded stops tell at all.
+        factors: (k, 6, r) of the information of candidates or recorded stops.
         start: (r, r) information without any candidate.
         counted: What counts for the criterion.
         place: The variance of the place that the accuracy is stated of [m^2].
         turn: The same for the rotation [rad^2].
-        told: (r, t) directions that the candidates tell well enough to count for O1.
-        watched: (r, r) of edges and arm in their units, as far as the candidates tell them well;
+        determined: (r, t) directions that the candidates determine well enough to count for O1.
+        watched: (r, r) of edges and arm in their units, as far as the candidates determine them;
             the largest variance among them counts for E.
         misfit: (k, 6, a) and
         gradient: (r, a) by errors of the arm that a fit takes for noise; see `World`.
@@ -79,7 +79,7 @@ class Reduced:
     counted: Variance
     place: Variance
     turn: Variance
-    told: FloatArray
+    determined: FloatArray
     watched: FloatArray
     misfit: FloatArray
     gradient: FloatArray
@@ -89,15 +89,15 @@ def reduced(world: World, criterion: Criterion) -> Reduced:
     """Puts a world into the coordinates in which stops are chosen by a criterion."""
     prior = world.prior * (_LITTLE if criterion == "O1" else 1.0)
     size = len(prior)
-    # theta = out @ phi, and phi has the identity for a prior. What corners tell of a rational lens
-    # is singular to rounding.
+    # theta = out @ phi, and phi has the identity for a prior. What corners determine of a rational
+    # lens is singular to rounding.
     out = covariance_root(prior)
     factors = (world.factors.reshape(-1, size) @ out).reshape(-1, 6, size)
     rows = factors.reshape(-1, size)
     recorded = out.T @ world.recorded @ out
     values, vectors = np.linalg.eigh(rows.T @ rows + recorded)
-    basis = vectors[:, values > _UNTOLD]
-    share = values[values > _UNTOLD]
+    basis = vectors[:, values > _NULL]
+    share = values[values > _NULL]
     # Lens and board are in the way of what is wanted, and not wanted themselves.
     inverse = 1.0 / world.units
     inverse[12 : 12 + world.looks] = 0.0
@@ -125,13 +125,13 @@ def reduced(world: World, criterion: Criterion) -> Reduced:
 def _square_root(square: FloatArray) -> FloatArray:
     """(s, r) whose square is a non-negative (r, r)."""
     values, vectors = np.linalg.eigh(square)
-    kept = values > _UNTOLD**2 * values.max(initial=0.0)
+    kept = values > _NULL**2 * values.max(initial=0.0)
     return np.asarray((vectors[:, kept] * np.sqrt(values[kept])).T)
 
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """Some chosen candidates, and what they tell in each world.
+    """Some chosen candidates, and their information in each world.
 
     Attributes:
         problem: The worlds.
@@ -208,19 +208,19 @@ class Selection:
 
     @property
     def figure(self) -> float:
-        """The criterion's value as it is told."""
+        """The criterion's value as it is reported."""
         if self.criterion == "I":
             return 1e3 * float(np.sqrt(self.value))
         if self.criterion != "O1":
             return float(np.sqrt(self.value))
         # What little is known beforehand is no part of the Jacobian.
-        told = [
-            np.linalg.slogdet(world.told.T @ (it - np.eye(len(it))) @ world.told)
+        volumes = [
+            np.linalg.slogdet(world.determined.T @ (it - np.eye(len(it))) @ world.determined)
             for world, it in zip(self.problem, self.information, strict=True)
         ]
         mean = [
-            np.exp(it / (2 * max(world.told.shape[1], 1))) if sign > 0 else 0.0
-            for world, (sign, it) in zip(self.problem, told, strict=True)
+            np.exp(it / (2 * max(world.determined.shape[1], 1))) if sign > 0 else 0.0
+            for world, (sign, it) in zip(self.problem, volumes, strict=True)
         ]
         return float(np.mean(mean)) / float(np.sqrt(max(len(self.rows), 1)))
 

@@ -134,7 +134,7 @@ class Sight:
     def _drawn_shows(self, base_from_flange: FloatArray, which: slice) -> Mask:
         in_hand = self.cell.mount == "eye-in-hand"
         flange = invert(base_from_flange) if in_hand else base_from_flange
-        # Its corners tell well enough for a share, and sides between them are nearly straight.
+        # Its corners do for a share, and sides between them are nearly straight.
         outlines = _moved(self.z[which], self.outline[:_CORNERS])
         points = _moved(flange, outlines.reshape(-1, 3))
         cam_from_here = invert(self.x[which])

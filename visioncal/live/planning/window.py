@@ -1,4 +1,4 @@
-"""Whether points are in an image: by planes through the lens where these tell, else exactly."""
+"""Whether points are in an image: by planes through the lens where these decide, else exactly."""
 
 import numpy as np
 

@@ -52,7 +52,7 @@ class RehearsalCamera:
 
     Args:
         cell: The cell: its true arm, edges and lens, its board and its noise. Its true arm must be
-            the one whose joints are told.
+            the one whose joints are given.
         true_joints: Tells the arm's true joints, (k, n) [rad], at k past moments of the monotonic
             clock, (k,) [s]. Where it raises DriverError the arm is taken to stand where it was last
             known: a camera works on when a controller dies.

@@ -194,7 +194,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         options = _read(given.options, robot=given.robot, seed=given.seed)
         _end_by(ends_with_input=given.until_input_ends)
-        asyncio.run(ControllerServer(options, given.host).run(_tell_ready))
+        asyncio.run(ControllerServer(options, given.host).run(_say_ready))
     except (DataError, OSError) as error:
         sys.stderr.write(f"{error}\n")
         return 2
@@ -217,7 +217,7 @@ def _end_with_input() -> None:
     os._exit(0)
 
 
-def _tell_ready() -> None:
+def _say_ready() -> None:
     sys.stdout.buffer.write(_READY + b"\n")
     sys.stdout.buffer.flush()
 

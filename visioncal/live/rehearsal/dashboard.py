@@ -17,9 +17,9 @@ _SAFETY = {
 def answer(machine: Machine, line: str, now_s: float) -> str:
     """Answers one line of a client, and does what it orders."""
     asked = line.strip().lower()
-    told = _tell(machine, asked)
-    if told is not None:
-        return told
+    state = _state(machine, asked)
+    if state is not None:
+        return state
     if asked == "stop":
         machine.stop_program(now_s)
         return "Stopped"
@@ -38,7 +38,7 @@ def answer(machine: Machine, line: str, now_s: float) -> str:
     return f"could not understand: '{line.strip()}'"
 
 
-def _tell(machine: Machine, asked: str) -> str | None:
+def _state(machine: Machine, asked: str) -> str | None:
     """Answers a question; None where it is none."""
     playing = machine.program == "playing"
     answers = {

@@ -79,7 +79,7 @@ class Machine:
         return self.safety == "normal" and self.mode == "RUNNING"
 
     def joints(self, at_s: float) -> tuple[FloatArray, FloatArray]:
-        """(n,) joint angles [rad] and (n,) speeds [rad/s] that the encoders tell."""
+        """(n,) joint angles [rad] and (n,) speeds [rad/s] that the encoders report."""
         stretch = self._stretch(at_s)
         return stretch.motion.at(max(0.0, at_s - stretch.start_s))
 

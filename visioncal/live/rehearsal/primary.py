@@ -1,4 +1,4 @@
-"""The primary interface of a simulated controller: what it tells of tool and geometry.
+"""The primary interface of a simulated controller: its tool and geometry.
 
 Source: Universal Robots, "Remote Control Via TCP/IP": a robot state message is its size (int32),
 16, and packages of size, type and content; numbers are big-endian.

@@ -56,7 +56,7 @@ class ControlScript:
             33: self._halt,
             34: self._halt,
             35: self._set_watchdog,
-            40: self._tell_tcp,
+            40: self._send_tcp,
             43: self._forward,
             44: self._forward_of,
             46: self._inverse,
@@ -166,7 +166,7 @@ class ControlScript:
             self._signal(running=False)
 
     def _signal(self, *, running: bool) -> None:
-        """Tells of the asynchronous motion: how often told, its number, whether it goes on."""
+        """Reports the asynchronous motion: how often reported, its number, whether it goes on."""
         self._writes = (self._writes + 1) % 256
         self.registers.int_out[2] = self._operation << 24 | self._writes << 16 | int(running) << 15
 
@@ -191,24 +191,24 @@ class ControlScript:
 
     # What is asked.
 
-    def _tell(self, numbers: FloatArray) -> None:
+    def _send(self, numbers: FloatArray) -> None:
         self.registers.double_out[: numbers.size] = numbers.tolist()
 
-    def _tell_tcp(self, now_s: float) -> None:  # noqa: ARG002
-        self._tell(self._machine.tcp)
+    def _send_tcp(self, now_s: float) -> None:  # noqa: ARG002
+        self._send(self._machine.tcp)
 
     def _forward(self, now_s: float) -> None:
-        self._tell(tool_pose(self._machine, self._machine.joints(now_s)[0]))
+        self._send(tool_pose(self._machine, self._machine.joints(now_s)[0]))
 
     def _forward_of(self, now_s: float) -> None:  # noqa: ARG002
-        self._tell(flange_pose(self._machine, self._goal(), self.registers.double_in[6:12]))
+        self._send(flange_pose(self._machine, self._goal(), self.registers.double_in[6:12]))
 
     def _inverse(self, now_s: float) -> None:
         goal = posture(self._machine, self._goal(), self._machine.joints(now_s)[0])
         if goal is None:
             self._fail(now_s)
         else:
-            self._tell(goal)
+            self._send(goal)
 
     def _steady(self, now_s: float) -> None:
         self.registers.int_out[1] = int(not self._machine.moving(now_s))

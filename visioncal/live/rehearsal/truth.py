@@ -135,7 +135,7 @@ class TruthClient:
             DriverError: The controller is gone, other than by this.
         """
         if fault == "die":
-            # No answer comes; the end of the stream tells that it happened.
+            # No answer comes; the end of the stream shows that it happened.
             self._send({"fault": fault})
             self._file.read()
         else:

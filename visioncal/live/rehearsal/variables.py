@@ -1,4 +1,4 @@
-"""What a simulated controller tells of itself, by RTDE's names."""
+"""What a simulated controller reports of itself, by RTDE's names."""
 
 import math
 from collections.abc import Callable, Mapping

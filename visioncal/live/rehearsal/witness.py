@@ -1,4 +1,4 @@
-"""What a recording of a simulated cell was worth, by what really happened."""
+"""The accuracy of a recording of a simulated cell, by what really happened."""
 
 from collections.abc import Sequence
 from contextlib import closing
