@@ -76,7 +76,7 @@ def world(options: CellOptions) -> tuple[tuple[float, ...], list[tuple[float, fl
     elif ours.arm_found.springs is not None:
         bound = compliance_bound(cell)
         for at, it in enumerate(ours.arm_found.springs.springs):
-            if it.told:
+            if it.determined:
                 off = it.compliance_rad_per_nm - options.compliance_rad_per_nm[at]
                 springs.append((it.sigma_rad_per_nm / bound[at], off / it.sigma_rad_per_nm))
     return tuple(1e3 * it for it in errors), springs

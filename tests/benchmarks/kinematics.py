@@ -62,7 +62,7 @@ def measured(options: CellOptions) -> tuple[float, ...]:
     if model is None:
         return 1e3 * before, 1e3 * before, 1e3 * bound, np.nan, seconds, 0.0
     after = error_m(cell, known, model.robot)
-    predicted = 1e3 * float(np.sqrt(np.mean(known.arm_found.telling.sigmas_m**2)))
+    predicted = 1e3 * float(np.sqrt(np.mean(known.arm_found.numbers.sigmas_m**2)))
     taken = known.robot_arm.kinematics.level == "geometry"
     return 1e3 * before, 1e3 * after, 1e3 * bound, predicted, seconds, float(taken)
 

@@ -609,9 +609,9 @@ def test_an_arm_that_bends_is_as_elastic_in_a_cell_as_by_itself(tmp_path):
         assert other.compliance_rad_per_nm == pytest.approx(
             one.compliance_rad_per_nm, abs=1.5 * sigma
         )
-        if other.told:
+        if other.determined:
             assert other.compliance_rad_per_nm == pytest.approx(true, abs=4.5 * sigma)
-    assert sum(other.told for other in cell.elastic.joints) >= 2
+    assert sum(other.determined for other in cell.elastic.joints) >= 2
     np.testing.assert_allclose(
         cell.compliance, [it.compliance_rad_per_nm for it in cell.elastic.joints]
     )

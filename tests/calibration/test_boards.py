@@ -116,16 +116,17 @@ def test_two_boards_tell_more_of_an_arm_than_one():
 
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", slow("eye-to-hand")])
-def test_each_board_adds_six_values_that_are_told(mount):
+def test_each_board_adds_six_values_that_are_determined(mount):
     """Everett and Hsu (1988): 4 a revolute joint, 6 for the frames, and 6 a further board."""
     cell = simulate(replace(TWO, **WRONG_LINKS, mount=mount, views=24, seed=1))
     known = calibrated(cell)
-    told = known.arm_found.telling.told
+    counts = known.arm_found.numbers.counts
     assert known.robot_arm.kinematics.level == "geometry"
-    assert (told.columns, told.identifiable, told.told) == (54, 36, 36)
-    # The first board alone tells thirty.
+    assert (counts.columns, counts.identifiable, counts.determined) == (54, 36, 36)
+    # The first board alone determines thirty.
     one = calibrated(without(cell, set(np.flatnonzero(cell.shown.boards == 1).tolist())))
-    assert (one.arm_found.telling.told.columns, one.arm_found.telling.told.identifiable) == (48, 30)
+    counts = one.arm_found.numbers.counts
+    assert (counts.columns, counts.identifiable) == (48, 30)
 
 
 def error_m(cell, known):

@@ -86,7 +86,7 @@ def test_a_robot_without_temperatures_stays_and_is_named(found):
     assert found.arms["b"].thermal is None
     reasons = found.verdict.reasons
     assert any(it.startswith("Robot a: the arm drifts with its temp") for it in reasons)
-    assert any(it.startswith("Robot b: nothing tells how it drifts") for it in reasons)
+    assert any(it.startswith("Robot b: no data show how it drifts") for it in reasons)
     budget = found.uncertainty.budget_mm["flange_a_from_target_plate_a"]
     assert 0.0 < budget["temperature of a"] < budget["total"]
 

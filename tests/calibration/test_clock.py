@@ -163,7 +163,7 @@ def test_a_sweep_is_written_with_its_truth(moved, tmp_path):
 
 def test_a_stated_offset_is_compared(session):
     right, wrong = (calibrate(stating(session, it)) for it in (AHEAD_S + 1e-3, 0.0))
-    told = "camera_minus_robot_s is stated as +0.00 ms, but the motion tells +37.2"
+    told = "camera_minus_robot_s is stated as +0.00 ms, but the motion gives +37.2"
     # A millisecond is a thirtieth of a frame: nobody stamps better.
     assert not any("is stated as" in it for it in right.verdict.reasons)
     assert any(told in it for it in wrong.verdict.reasons)
@@ -259,7 +259,7 @@ def streamed(name: str, camera, robot) -> Session:
 
 
 def test_motion_that_does_not_tell_the_offset_is_refused():
-    with pytest.raises(DegenerateError, match=r"is not told by 540 views, of which 0 .* at rest"):
+    with pytest.raises(DegenerateError, match=r"is left open by 540 views, of which 0 .* at rest"):
         calibrate(screwed())
 
 

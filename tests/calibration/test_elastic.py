@@ -45,7 +45,7 @@ def test_a_sagging_arm_is_calibrated_all_over_its_workspace():
     assert error_m(cell, rigid, rigid.robot_arm.model) > 0.3 * before
     assert any("speak for more" in it for it in rigid.verdict.reasons)
     # The first axis is upright: no weight turns it.
-    assert known.arm_found.springs.untold[0] == "shoulder_pan_joint"
+    assert known.arm_found.springs.rigid[0] == "shoulder_pan_joint"
     assert any("taken for rigid" in it for it in known.verdict.reasons)
 
 
@@ -55,7 +55,7 @@ def test_springs_are_told_to_their_bound(carrying):
     assert len(known.used) == len(cell.corners)
     bound = compliance_bound(cell)
     for at, spring in enumerate(known.arm_found.springs.springs[1:5], start=1):
-        assert spring.told
+        assert spring.determined
         # The bound knows the sizes of all errors; the fit estimates them from forty stops.
         assert spring.sigma_rad_per_nm < 1.2 * bound[at]
         assert spring.sigma_rad_per_nm > 0.7 * bound[at]
@@ -113,7 +113,7 @@ def test_stops_are_planned_that_tell_springs():
     assert told[0] < 1e-6 * told[1]
     assert told[1:5].min() > 0.0
     bare = replace(cell, robot=replace(cell.robot, masses=None))
-    with pytest.raises(DataError, match="does not tell the masses of its links"):
+    with pytest.raises(DataError, match="does not state the masses of its links"):
         stop_factors(bare, PURPOSES["elastic"], q)
 
 

@@ -119,8 +119,8 @@ def test_so_many_values_are_told_of_a_six_axis_arm(options, rank):
     Three points have six values more than one, of their places.
     """
     shop = tracked(replace(options, **WRONG))
-    seen = known_of(session_of(shop)).arm_found.telling.told
-    assert (seen.identifiable, seen.told) == (rank, rank)
+    seen = known_of(session_of(shop)).arm_found.numbers.counts
+    assert (seen.identifiable, seen.determined) == (rank, rank)
     whole = information(shop, arm_columns=True)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(whole), 1e-30))
     values = np.linalg.eigvalsh(whole * np.outer(scale, scale))

@@ -85,9 +85,9 @@ def test_coefficients_are_within_their_sigmas(learnt):
 def test_what_is_not_told_stays_at_its_prior_and_is_named(learnt):
     thermal = learnt["temperatures"].calibration.thermal
     # The last link is a tenth of a metre: it grows by a micrometre for a kelvin.
-    assert "growth of wrist_3_joint" in thermal.not_told
+    assert "growth of wrist_3_joint" in thermal.not_determined
     assert thermal.joints[5].growth_per_k == pytest.approx(17.5e-6, abs=5.5e-6)
-    assert "drift of shoulder_lift_joint" not in thermal.not_told
+    assert "drift of shoulder_lift_joint" not in thermal.not_determined
     assert thermal.residual_mm.with_drift < 0.85 * thermal.residual_mm.without
 
 

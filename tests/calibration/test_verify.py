@@ -106,7 +106,7 @@ def test_what_no_stops_can_tell_apart_is_named_together(place):
     # A slip of the first joint turns all that stands in the base; of the last, what is carried.
     first = checked(place, rng, slip(1, 0.05))
     assert set(names(first)) == {"joint 1", stands}
-    assert "No stops can tell that from" in verdict_of(first).reasons[1]
+    assert "No stops separate that from" in verdict_of(first).reasons[1]
     assert set(names(checked(place, rng, slip(6, 0.05)))) == {"joint 6", carried}
 
 

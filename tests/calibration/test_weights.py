@@ -1,4 +1,4 @@
-"""Arms whose model does not tell the masses of their links: what can be told of their springs."""
+"""Arms whose model does not state the masses of their links: and their springs."""
 
 from dataclasses import replace
 
@@ -41,7 +41,7 @@ def test_an_arm_of_unknown_weight_is_calibrated_with_its_sag(bare):
     known = calibrated(cell, robot=bare)
     assert known.robot_arm.kinematics.level == "elastic"
     assert all(it.stiffness_nm_per_rad is None for it in known.arm_found.springs.springs)
-    assert any("of which its model tells nothing" in it for it in known.verdict.reasons)
+    assert any("of which its model states nothing" in it for it in known.verdict.reasons)
     before = error_m(cell, calibrated(cell, joints=False), bare)
     assert error_m(cell, known, known.robot_arm.model) < 0.06 * before
     q = postures(bare)[:20]
@@ -56,7 +56,7 @@ def test_payloads_tell_its_stiffness(bare):
     known = calibrated(simulate(replace(SAGGING, views=60, payloads=CARRIED, seed=5)), robot=bare)
     for at in (1, 2):
         spring = known.arm_found.springs.springs[at]
-        assert spring.told
+        assert spring.determined
         # One draw, at three and a half sigma.
         assert abs(spring.compliance_rad_per_nm - 1.0 / COBOT[at]) < 3.5 * spring.sigma_rad_per_nm
         assert spring.sigma_rad_per_nm < 0.1 / COBOT[at]

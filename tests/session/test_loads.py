@@ -77,7 +77,7 @@ def test_springs_need_something_that_bends_them():
         {key: it for key, it in row.items() if key not in ("mass_kg", "com_m")}
         for row in bare["joint"]
     ]
-    with pytest.raises(DataError, match="does not tell the masses of its links, and no view has"):
+    with pytest.raises(DataError, match="does not state the masses of its links, and no view has"):
         known_of(replace(session, robot_document=bare), level="elastic")
 
 

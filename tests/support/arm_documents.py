@@ -12,7 +12,7 @@ from visioncal.robot import Robot, load_robot
 
 # What the parameters' changes are, with their sigmas: one sure, one chance, one held.
 SURE, CHANCE = (1.2e-3, 1e-4), (-2e-4, 1.5e-4)
-NOT_TOLD = "the offset of <b>shoulder_pan_joint</b> cannot be told from the base frame"
+NOT_TOLD = "the offset of <b>shoulder_pan_joint</b> cannot be separated from the base frame"
 # The order of worth: view 5 most, view 0 least.
 WORTH = {5: 0.31, 4: 0.2, 7: 0.12, 2: 0.08, 1: 0.05, 8: 0.04, 0: 0.003}
 WORKSPACE_MM = {"median": 0.071, "p95": 0.14}

@@ -324,7 +324,7 @@ def find_described(
         name_or_path: A shipped name, or a path that ends in one of `suffixes`.
         what: What is looked for, for messages: `target`, `robot`.
         shipped: The files that come with visioncal, by name.
-        suffixes: The endings by which a path is told from a name.
+        suffixes: The endings by which a path differs from a name.
         folder: Relative paths start here; the working directory where None.
 
     Raises:

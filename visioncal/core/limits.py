@@ -90,7 +90,7 @@ class FixtureLimits:
         sigma_mm: Predicted sigma of the fixture's worst offset, amid its points [mm].
         sigma_deg: The same of its rotation [deg]: 0.1 deg are half a millimetre over 300.
         noise_mm: Noise of a touch per axis [mm].
-        points: Points of a drawing in the fit; with fewer none could be told wrong.
+        points: Points of a drawing in the fit; with fewer none could be shown wrong.
     """
 
     sigma_mm: Pair = _TOUCHED_MM
@@ -120,14 +120,14 @@ class CheckLimits:
         likelihood_ratio: A change is reported where it makes the stops so many times as likely as
             none. Chance does that in one check of as many at most, by Markov's inequality: the
             ratio is one on average.
-        told_apart: A cause that makes the stops so many times less likely than the best is ruled
+        ruled_out: A cause that makes the stops so many times less likely than the best is ruled
             out.
         unexplained: Noise leaves more than the right cause explains in so many checks.
-        stops: Fewer hardly tell one cause from another.
+        stops: Fewer hardly separate one cause from another.
     """
 
     likelihood_ratio: float = 100.0
-    told_apart: float = 20.0
+    ruled_out: float = 20.0
     unexplained: float = 1e-3
     stops: int = 5
 

@@ -2,7 +2,7 @@
 
 They are called `.HEX.tmp`. Whoever writes one holds a lock (flock) on it, which ends with the
 process: one that nobody holds is abandoned, and the next writer in the same folder removes it.
-Where there are no such locks (Windows, some network drives) nobody can tell, and they stay.
+Where there are no such locks (Windows, some network drives) they stay.
 """
 
 import os

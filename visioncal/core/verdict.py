@@ -21,7 +21,7 @@ _SHOWN, _LEAST_LIKELY, _LIKELY = 3, 0.05, 0.2
 AGREEMENT, NEED, GOOD_FOR, NOTE = "agreement", "need", "good_for", "note"
 # Files that a session names and does not have: no doubt about the rest, and said first.
 MISSING = "missing_images"
-# What says how large errors are, the most telling first.
+# What says how large errors are, the most important first.
 _SIZES = (NEED, GOOD_FOR, "unexplained", "optimism", "weak_motion", "place", "workspace")
 
 

@@ -1,8 +1,8 @@
-"""Which errors of an arm the stops tell, which any posture would, and what would have to move.
+"""Identifiability: the errors of an arm that the stops determine, and that any posture would.
 
 Slopes are taken in units of the noise by rows and of the errors' own size by columns, and the
 frames at both ends of the chain, of which nothing is known, are taken out. A singular value is then
-how much better the stops know a direction than it was known before: over one, it is told.
+how much better the stops know a direction than it was known before: over one, it is determined.
 """
 
 from dataclasses import dataclass
@@ -11,25 +11,25 @@ import numpy as np
 
 from visioncal.core.types import FloatArray
 
-# Directions that move the pose by less than this share of the best told move nothing.
+# Directions that move the pose by less than this share of the best determined move nothing.
 LEAST_SHARE = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
 class Identifiability:
-    """What stops tell of an arm.
+    """What stops determine of an arm.
 
     Attributes:
         columns: How many values are carried: the frames' and the arm's errors.
-        identifiable: How many of them, or of their combinations, any postures tell apart.
-        told: How many of them the stops tell better than they were known before.
-        values: (L,) singular values of the arm's part of what is told, in descending order.
-        missing: (p, k) the k directions of the arm's errors that are identifiable and not told.
+        identifiable: How many of them, or of their combinations, any postures distinguish.
+        determined: How many of them the stops determine better than they were known before.
+        values: (L,) singular values of the arm's part of what is determined, in descending order.
+        missing: (p, k) the k directions of the arm's errors identifiable but not determined.
     """
 
     columns: int
     identifiable: int
-    told: int
+    determined: int
     values: FloatArray
     missing: FloatArray
 
@@ -58,8 +58,8 @@ class Jacobians:
         return basis.shape[1], self.arm - basis @ (basis.T @ self.arm)
 
 
-def what_is_told(stops: Jacobians, anywhere: Jacobians) -> Identifiability:
-    """Counts what stops tell, and what any stops could.
+def identifiability(stops: Jacobians, anywhere: Jacobians) -> Identifiability:
+    """Counts what stops determine, and what any stops could.
 
     Args:
         stops: Slopes at the stops.
@@ -68,26 +68,26 @@ def what_is_told(stops: Jacobians, anywhere: Jacobians) -> Identifiability:
     most, free = anywhere.free()
     sizes, turned = right_vectors(free)
     can = turned[sizes > LEAST_SHARE * sizes[0]]
-    seen, values, here = _told(stops)
-    # What is identifiable and not among what is told; both are spanned by unit vectors.
+    seen, values, here = _determined(stops)
+    # What is identifiable and not among what is determined; both are spanned by unit vectors.
     missing = np.linalg.svd(can.T - here.T @ (here @ can.T), full_matrices=False)[0]
     return Identifiability(
         columns=stops.frames.shape[1] + stops.arm.shape[1],
         identifiable=most + len(can) + stops.frames.shape[1] - anywhere.frames.shape[1],
-        told=seen + len(values),
+        determined=seen + len(values),
         values=values,
         missing=missing[:, : max(len(can) - len(values), 0)],
     )
 
 
-def count_told(jacobian: Jacobians) -> int:
-    """How many values and combinations are told better than they were known before."""
-    seen, values, _ = _told(jacobian)
+def count_determined(jacobian: Jacobians) -> int:
+    """How many values and combinations are determined better than they were known before."""
+    seen, values, _ = _determined(jacobian)
     return seen + len(values)
 
 
-def _told(jacobian: Jacobians) -> tuple[int, FloatArray, FloatArray]:
-    """Directions of the frames, and values and directions (k, p) of the arm that are told."""
+def _determined(jacobian: Jacobians) -> tuple[int, FloatArray, FloatArray]:
+    """Directions of the frames, and values and directions (k, p) of the arm that are determined."""
     seen, free = jacobian.free()
     sizes, turned = right_vectors(free)
     return seen, sizes[sizes > 1.0], turned[sizes > 1.0]

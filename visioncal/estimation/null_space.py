@@ -1,4 +1,4 @@
-"""What of an arm cannot be told, in words: by any stops, and by these."""
+"""The null space of an arm's parameters, in words: of any stops, and of these."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ _WORDS = {
 
 @dataclass(frozen=True, eq=False)
 class Null:
-    """What changes of a table's numbers no stops of the arm can tell.
+    """The changes of a table's numbers that no stops of the arm can determine.
 
     Attributes:
         directions: (r, k) reduced to row echelon form: each but for a few numbers is zero.
@@ -40,7 +40,7 @@ class Null:
 
 
 def null_of(jacobian: Jacobians) -> Null:
-    """Finds what no stops can tell.
+    """Finds what no stops can determine.
 
     Args:
         jacobian: By the frames and by the table's numbers, at postures all over the workspace.
@@ -81,7 +81,7 @@ def imitated(numbers: Jacobians, arm: Jacobians, directions: FloatArray) -> Floa
 
 
 def null_words(null: Null, parameters: Sequence[Parameter], robot: Robot) -> Iterator[str]:
-    """Says what no stops can tell, number by number.
+    """Says what no stops can determine, number by number.
 
     Args:
         null: What that is.
@@ -93,14 +93,14 @@ def null_words(null: Null, parameters: Sequence[Parameter], robot: Robot) -> Ite
         named = [parameters[at] for at in involved]
         if len(named) == 1:
             frame = _frame(null.frames[:, rows[0]])
-            yield f"{_thing(named[0], robot)} cannot be told from the {frame} frame"
+            yield f"{_thing(named[0], robot)} cannot be separated from the {frame} frame"
         elif len(rows) < len(named) - 1:
             left = len(named) - len(rows)
-            yield f"of {_listed(named, robot)} only {left} combinations are told"
+            yield f"of {_listed(named, robot)} only {left} combinations are determined"
         elif _is_sum(null.directions[rows][:, involved], named):
-            yield f"{_summed(named, robot)}: only their sum is told"
+            yield f"{_summed(named, robot)}: only their sum is determined"
         else:
-            yield f"{_listed(named, robot)}: only one combination of them is told"
+            yield f"{_listed(named, robot)}: only one combination of them is determined"
 
 
 def _connected(directions: FloatArray) -> Iterator[list[int]]:

@@ -1,4 +1,4 @@
-"""What each stop is worth: how much worse the arm would be known without it."""
+"""The influence of each stop: how much worse the arm would be known without it."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import fisher_information, whitened
 
 
-def stop_worth(
+def stop_influence(
     problem: Problem,
     state: State,
     noise: Noise,
@@ -31,10 +31,10 @@ def stop_worth(
         stops: (m,) the stops to be left out in turn.
         place: (k, 3, f) derivatives of the places by the free unknowns.
         free: (f,) which of the unknowns these are; others are held, such as the board's size, of
-            which no stop tells much.
+            which no stop determines much.
 
     Returns:
-        (m,) shares; large where a stop alone tells something.
+        (m,) shares; large where a stop alone determines something.
     """
     moving = np.isin(np.arange(problem.size), free) & problem.counted
     fitted = covariance_among(fisher_information(problem, state, noise), moving)

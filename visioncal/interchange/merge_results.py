@@ -70,19 +70,19 @@ class Leftover:
         from visioncal.frames.frame_from_images import rests_on_camera
 
         seen = [name for name, frame in self.frames.items() if rests_on_camera(frame)]
-        told = (
+        words = (
             f"{some_of(list(self.frames))} had joined the result that this one replaces: kept in "
             f"{self.file}."
         )
         replaced = sorted(self.before.keys() & self.frames.keys())
         if replaced:
-            told += f" It had another {some_of(replaced)} of an earlier time."
+            words += f" It had another {some_of(replaced)} of an earlier time."
         if seen:
-            told += (
+            words += (
                 f" By images of the camera as it was calibrated before: {some_of(seen)}. Place "
                 "these again."
             )
-        return told
+        return words
 
 
 def leftover(folder: Path) -> Leftover | None:

@@ -17,7 +17,7 @@ from visioncal.session.choosing import ANY, ARM, PARTS, Choice, Part
 if TYPE_CHECKING:
     from visioncal.dynamics import Identified
 
-# What tells the folder of a session.
+# The files by which a session's folder is recognised.
 _SESSION = "session.toml"
 # Frames of a robot without a calibration, in a folder.
 FRAMES = "frames.json"
@@ -91,7 +91,7 @@ def load_placed(path: Path, robot: str | None = None) -> Calibration | FrameFile
     """Loads a result, or frames that belong to none.
 
     Args:
-        path: As for `load_calibration`, or a file of frames, which its content tells, or a folder
+        path: As for `load_calibration`, or a file of frames, recognised by its content, or a folder
             with one and no calibration.json.
         robot: Which robot of a whole cell is meant.
 
@@ -109,7 +109,7 @@ def load_exportable(path: Path) -> "Calibration | FrameFile | Alignment | Identi
     """Loads what `load_placed` does, the alignment of a whole cell, or an arm's dynamics.
 
     Args:
-        path: As there, or an alignment.json or a dynamics.json, which its content tells, a folder
+        path: As there, or an alignment.json or a dynamics.json, recognised by its content, a folder
             with one and no calibration.json, or the recording of a cell.
 
     Raises:

@@ -74,7 +74,7 @@ class Moved:
         first_stop: The first stop at which it stands elsewhere.
         shift_mm: How far its origin moved [mm].
         turn_deg: How far it turned [deg].
-        rivals: Frames that may have moved in its place: the session cannot tell.
+        rivals: Frames that may have moved in its place: the session does not show which.
     """
 
     frame: str

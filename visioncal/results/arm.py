@@ -215,7 +215,7 @@ class Observability:
     Attributes:
         columns: How many values the fit carries, redundant ones among them.
         identifiable: How many directions any stops could determine.
-        told: How many these stops do.
+        determined: How many these stops do.
         condition: The best determined over the worst, scaled; None where none is.
         o1: Geometric mean of the singular values over the root of the stops' number.
         o2: The smallest over the largest.
@@ -226,7 +226,7 @@ class Observability:
 
     columns: int
     identifiable: int
-    told: int
+    determined: Annotated[int, Key("told")]
     condition: float | None = None
     o1: float | None = None
     o2: float | None = None
@@ -240,7 +240,7 @@ class StopInfluence:
     """A stop by its view, and by which share the mean variance would grow without it."""
 
     view: int
-    worth: float
+    influence: Annotated[float, Key("worth")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -280,7 +280,7 @@ class ArmResult(Section):
         carries_over: Where it is better than the arm as stated.
         functions: Repeatable errors of its joints by their angles, at level `functions`.
         observability: How well the stops determine the arm.
-        not_told: What they do not determine, in words.
+        not_determined: What they do not determine, in words.
         stops: The stops by their influence, most first.
         left_out: Views that were left out of the fit in turn.
         holdout: Views that the session keeps from every fit.
@@ -297,7 +297,7 @@ class ArmResult(Section):
     carries_over: CarriesOver | None = None
     functions: JointFunctions | None = None
     observability: Observability | None = None
-    not_told: tuple[str, ...] | None = None
+    not_determined: Annotated[tuple[str, ...] | None, Key("not_told")] = None
     stops: tuple[StopInfluence, ...] = ()
     left_out: tuple[UnseenView, ...] = ()
     holdout: tuple[UnseenView, ...] = ()
@@ -366,7 +366,7 @@ class JointSpring:
         compliance_rad_per_nm: Its compliance, zero or more [rad/(N m)].
         sigma_rad_per_nm: The standard deviation of that; where the stops do not determine it, that
             of springs at large.
-        told: Whether the stops determine it; others stay rigid.
+        determined: Whether the stops determine it; others stay rigid.
         torque_nm: Least and greatest torque on it at the stops [N m].
         stiffness_nm_per_rad: Its stiffness [N m/rad]; None where it is as good as rigid.
         stiffness_sigma_nm_per_rad: The standard deviation of that, to first order [N m/rad].
@@ -375,7 +375,7 @@ class JointSpring:
     joint: str
     compliance_rad_per_nm: float
     sigma_rad_per_nm: float
-    told: bool
+    determined: Annotated[bool, Key("told")]
     torque_nm: tuple[float, float]
     stiffness_nm_per_rad: float | None = None
     stiffness_sigma_nm_per_rad: float | None = None
@@ -414,7 +414,7 @@ class ElasticResult(Section):
 
     Attributes:
         joints: Joint by joint.
-        not_told: The joints whose compliance the loads do not determine.
+        not_determined: The joints whose compliance the loads do not determine.
         weight: Whether the weight of the links is of the model's masses, or unknown.
         payload_kg: Least and greatest payload [kg].
         sag_mm: How far the loads of the stops move the flange.
@@ -426,7 +426,7 @@ class ElasticResult(Section):
     """
 
     joints: tuple[JointSpring, ...]
-    not_told: tuple[str, ...]
+    not_determined: Annotated[tuple[str, ...], Key("not_told")]
     weight: str
     payload_kg: tuple[float, float]
     sag_mm: Sag
@@ -529,7 +529,7 @@ class ThermalResult(Section):
         joints: Joint by joint.
         covariance: (p, p) of growth and drift of all joints, then tau, and gain where there is one.
         lengths_m: (n + 1, 3) from each joint's frame to the next, in the earlier one [m].
-        not_told: Coefficients that the views do not determine: what was known before counts.
+        not_determined: Coefficients that the views do not determine: what was known before counts.
         residual_mm: Residuals without and with drift.
         likelihood_ratio: Twice the gain in log-likelihood over an arm that does not drift.
         rises_k: (n,) range of each link's temperature over the views [K].
@@ -543,7 +543,7 @@ class ThermalResult(Section):
     joints: tuple[JointDrift, ...]
     covariance: Covariance
     lengths_m: Annotated[FloatArray, Array((-1, 3))]
-    not_told: tuple[str, ...]
+    not_determined: Annotated[tuple[str, ...], Key("not_told")]
     residual_mm: DriftResidual
     likelihood_ratio: float
     rises_k: tuple[float, ...]

@@ -262,7 +262,7 @@ def _alternatives(kind: Any) -> list[Any]:  # noqa: ANN401 - a type
 
 
 def _fitting(kinds: list[Any], value: object) -> Any:  # noqa: ANN401 - a type
-    """The type that a value is of: of dataclasses, that of whose keys it has most, lacking few."""
+    """The type that a value is of: of dataclasses, that of whose keys it has most, missing few."""
     if len(kinds) == 1:
         return kinds[0]
     if not isinstance(value, Mapping):

@@ -15,7 +15,7 @@ from visioncal.results import Calibration, CameraResult, Edge, VerdictStatus
 from visioncal.session.choosing import ANY, Choice
 from visioncal.vision.camera import intrinsics
 
-# How often two calibrations of an unchanged cell may be told apart, over all tests of a pair.
+# How often two calibrations of an unchanged cell may count as changed, over all tests of a pair.
 FALSE_ALARMS = 0.01
 # No cell is known better [rad and m]; exact data would otherwise measure rounding by zero.
 _LEAST_SIGMA = 1e-9
@@ -355,7 +355,7 @@ _BOARD_MOVED = {
 
 
 def _edge_finding(mount: Mount, changed: Sequence[str]) -> str:
-    """Says which of the two bodies moved; an edge is told by the body at its end."""
+    """Says which of the two bodies moved; an edge is named by the body at its end."""
     ends = [name.rpartition("_from_")[2] for name in changed]
     camera = any(it.startswith(("cam", "instrument")) for it in ends)
     board = any(it.startswith(("target", "probe")) for it in ends)

@@ -253,7 +253,7 @@ class Calibration(CalibrationSections):
             payload_m: (3,) or (m, 3) its centre in the flange's frame [m].
             force_n: (3,) or (m, 3) external force on the flange's origin, in the base's frame [N].
             temperatures_c: (m, n) of the links behind the joints, or (n,) for all [deg C]; None for
-                those at which the views began. `OnlineCompensator` tells them.
+                those at which the views began. `OnlineCompensator` gives them.
 
         Returns:
             m transforms, as one batched RigidTransform.
@@ -308,7 +308,7 @@ class Calibration(CalibrationSections):
         arm = self.calibrated_robot
         if arm is None or self.thermal is None:
             raise DataError(
-                f"calibration {self.session_name!r} does not tell how its arm drifts with "
+                f"calibration {self.session_name!r} does not say how its arm drifts with "
                 "temperature.",
                 culprits=["temperatures"],
                 next_step="Record reference views while the arm warms up, with temp1_c ... or "
@@ -320,7 +320,7 @@ class Calibration(CalibrationSections):
         """Returns the calibration of the arm as it is with its links at (n,) temperatures [deg C].
 
         Raises:
-            DataError: It does not tell how the arm drifts, or has another number of joints.
+            DataError: It does not say how the arm drifts, or has another number of joints.
         """
         warm = self.drift.robot_at(np.asarray(temperatures_c, dtype=float))
         return replace(
@@ -341,7 +341,7 @@ class Calibration(CalibrationSections):
     def weight_moments(self) -> FloatArray | None:
         """(n, 4 n) compliance times unknown masses and first moments; None where none were found.
 
-        What `bent_joints` takes of an arm whose model does not tell the masses of its links.
+        What `bent_joints` takes of an arm whose model does not state the masses of its links.
         """
         return None if self.elastic is None else self.elastic.weight_moments
 

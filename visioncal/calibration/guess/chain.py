@@ -1,4 +1,4 @@
-"""The poses against the robot's own joints: what no camera can tell.
+"""The poses against the robot's own joints: what no camera can show.
 
 Reported poses are `base_from_model @ FK(q) @ flange_from_tool` with two constant transforms. A
 base that is turned, and an inverse that could as well be another mount, show here alone.

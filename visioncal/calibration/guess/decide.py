@@ -60,7 +60,7 @@ def guess_reading(
         mount: The declared mount; None where it is not known: it then is the one of the likelier
             cell.
         chain: (n, 4, 4) `base_from_flange` through a robot's model at the recorded joints, NaN in
-            rows without; it tells what no camera can.
+            rows without; it shows what no camera can.
         is_measured: Whether the camera's poses were measured from images by visioncal, so that
             only the board's stated size can be wrong about them.
 
@@ -69,7 +69,7 @@ def guess_reading(
 
     Raises:
         DataError: The rows do not match, a rotation has not as many numbers as its form, or
-            nothing tells which mount it is.
+            the mount is not known.
         DegenerateError: Too few rows have both poses.
     """
     mounts = MOUNTS if mount is None else (mount,)
@@ -166,13 +166,13 @@ def _check(recording: Recording) -> None:
     if common < FEWEST_ROWS:
         raise DegenerateError(
             f"guess: {common} rows have a pose of the robot and one of the camera; "
-            f"{FEWEST_ROWS} or more are needed to tell readings apart.",
+            f"{FEWEST_ROWS} or more are needed to distinguish readings.",
             next_step="Add views, tilted about different axes.",
         )
 
 
 def _by_chain(scored: Scored, recording: Recording, chain: FloatArray) -> Scored:
-    """Lets the joints choose among readings that the camera cannot tell apart."""
+    """Lets the joints choose among readings that the camera cannot distinguish."""
     chosen = by_chain(scored.labels, recording.robot, chain)
     return scored if chosen is None else replace(scored, hypothesis=chosen)
 
@@ -205,7 +205,7 @@ def _guess(found: _Found, chain: FloatArray | None, mount_note: str = "") -> Gue
         ranked[-1] = declared
     is_poor = _is_poor(recording, best)
     is_other = chosen is not declared
-    told = notes(
+    words = notes(
         recording, best, has_chain=chain is not None, is_declared=not is_other, is_poor=is_poor
     )
     return Guess(
@@ -214,7 +214,7 @@ def _guess(found: _Found, chain: FloatArray | None, mount_note: str = "") -> Gue
         chosen,
         is_other,
         sentence(declared, chosen, ranked, is_poor=is_poor),
-        ((mount_note,) if mount_note else ()) + tuple(told),
+        ((mount_note,) if mount_note else ()) + tuple(words),
     )
 
 

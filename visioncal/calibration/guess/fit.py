@@ -73,7 +73,7 @@ class Fit:
 
 
 def is_about_one_axis(rotations: FloatArray) -> bool:
-    """Whether (n, 3, 3) rotations differ by turns about one axis at most: such tell too little."""
+    """Whether (n, 3, 3) rotations differ by turns about one axis at most: too few directions."""
     # Turning about one axis leaves what lies along it in place: the last value vanishes.
     singular = np.linalg.svd((rotations - rotations.mean(axis=0)).reshape(-1, 3), compute_uv=False)
     singular /= np.sqrt(len(rotations))

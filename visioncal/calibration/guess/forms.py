@@ -3,7 +3,7 @@
 The angle of a relative motion between two views is the same for robot and camera, whatever the
 unknown edges are (Chen 1991, "A screw motion approach to uniqueness analysis of head-eye
 geometry"). So forms and pairings are screened without solving for anything. The angle is also the
-same for a pose and its inverse: these, and all that concerns positions, are told apart later.
+same for a pose and its inverse: these, and all that concerns positions, are distinguished later.
 """
 
 from collections.abc import Iterator, Sequence

@@ -112,7 +112,7 @@ def fitted(recording: Recording, tried: Hypothesis, rows: IntArray, starts: int)
 
 
 def closes(recording: Recording) -> bool:
-    """Whether the chain closes as declared; also where too few rows could tell."""
+    """Whether the chain closes as declared; also where too few rows could show it."""
     rows = recording.common_rows()
     if len(rows) < FEWEST_ROWS:
         return True

@@ -20,7 +20,7 @@ class JointReading:
 
     Attributes:
         robot: The model.
-        mixing: (n, n) the angles meant are `mixing @ told + zeros`.
+        mixing: (n, n) the angles meant are `mixing @ recorded + zeros`.
         zeros: (n,) what is added to each joint's zero [rad].
         words: What is different from what was declared; empty for the declared reading.
         fix: What the user can do about it.
@@ -41,17 +41,17 @@ class JointReading:
         """Whether a joint's zero is all that it changes."""
         return bool(np.any(self.zeros))
 
-    def angles(self, told: FloatArray) -> FloatArray:
-        """The angles (m, n) that are meant by those that are told [rad]."""
-        return np.asarray(told @ self.mixing.T + self.zeros)
+    def angles(self, recorded: FloatArray) -> FloatArray:
+        """The angles (m, n) that are meant by those that are recorded [rad]."""
+        return np.asarray(recorded @ self.mixing.T + self.zeros)
 
-    def poses(self, told: FloatArray) -> FloatArray:
+    def poses(self, recorded: FloatArray) -> FloatArray:
         """(m, 4, 4) `base_from_flange` by this reading [m]."""
-        return self.robot.base_from_flange(self.angles(told))
+        return self.robot.base_from_flange(self.angles(recorded))
 
 
 def declared_reading(robot: Robot) -> JointReading:
-    """The joints as they are told."""
+    """The joints as they are recorded."""
     return JointReading(robot, np.eye(robot.joint_count), np.zeros(robot.joint_count))
 
 

@@ -1,7 +1,7 @@
 """Which of the readings that close the chain alike is that of a cell as cells are.
 
 The inverse of the robot's poses, that of the camera's, and another mount exchange the unknown
-edges: no residual tells them apart, but what sits on the flange is near it, and a camera looks at
+edges: no residual distinguishes them, but what sits on the flange is near it, and a camera looks at
 what is before it.
 """
 

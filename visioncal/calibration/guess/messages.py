@@ -28,7 +28,7 @@ def sentence(
     others = f"the next, {rivals[0].words}, to {_figures(rivals[0])}" if rivals else ""
     if is_poor:
         return (
-            "The motion cannot tell readings apart: all views turn about one axis at most. As "
+            "The motion cannot distinguish readings: all views turn about one axis at most. As "
             f"declared, the chain closes to {_figures(declared)}{others and f'; {others}'}. Add "
             "views tilted about different axes."
         )
@@ -69,7 +69,7 @@ def _figures(it: Candidate) -> str:
 def notes(
     recording: Recording, best: Scored, *, has_chain: bool, is_declared: bool, is_poor: bool
 ) -> Iterator[str]:
-    """Says what residuals cannot tell here.
+    """Says what residuals cannot show here.
 
     Args:
         recording: What was recorded.
@@ -96,7 +96,7 @@ def notes(
             "changing poses that are right."
         )
         yield (
-            "Which axis is mirrored cannot be told from the views: another one turns the base and "
+            "Which axis is mirrored cannot be seen in the views: another one turns the base and "
             "the flange by half a turn. y was taken."
         )
     if not has_chain:

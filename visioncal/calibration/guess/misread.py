@@ -39,11 +39,11 @@ _FITS, FITS_SEEN = 3.0 * SCORE_FLOOR, 2e-3
 _ALIKE, _RIVALS = 2.0, 1.5
 _STARTS, _REFINED = 12, 6
 # The scatter over a joint's zero falls from afar: it halves only some 30 degrees from its least.
-# Where most of it is gone as told, the zero is nearer than that. A half turn looks like an opposite
-# sign of the joint before it, or behind it, and is not meant.
+# Where most of it is gone as recorded, the zero is nearer than that. A half turn looks like an
+# opposite sign of the joint before it, or behind it, and is not meant.
 _STEP_RAD, _FARTHEST_RAD = 0.25, 2.75
-# Rows that are looked at first, and the share of what is left as told that is worth a second look.
-_SCREENED, _WORTH = 16, 0.6
+# Rows that are looked at first, and the share of what is left as recorded that gets a second look.
+_SCREENED, _SHARE = 16, 0.6
 # Rows beyond this many times the typical distance do not belong to the others.
 _OUT = 5.0
 
@@ -92,7 +92,7 @@ class JointGuess:
     """How the joints are to be taken.
 
     Attributes:
-        declared: The joints as they are told.
+        declared: The joints as they are recorded.
         best: The reading that explains the poses; the declared one where none stands out.
         rivals: Other readings that explain them as well and are as simple.
     """
@@ -123,7 +123,7 @@ class JointGuess:
         agreeing = len(fit.away) - len(self.best.out)
         rows = "" if agreeing == len(fit.away) else f" in {agreeing} of {len(fit.away)} views"
         return (
-            f"With {words}, they fit {what} to {self.best.figures}{rows}; as told, to "
+            f"With {words}, they fit {what} to {self.best.figures}{rows}; as recorded, to "
             f"{self.declared.figures}."
         )
 
@@ -138,62 +138,62 @@ def guess_joints(robot: Robot, q: FloatArray, poses: FloatArray, fits: float = _
 
     Args:
         robot: The model that is declared.
-        q: (m, n) joint angles as they are told [rad], of `FEWEST_JOINT_ROWS` rows or more.
+        q: (m, n) joint angles as recorded [rad], of `FEWEST_JOINT_ROWS` rows or more.
         poses: (m, 4, 4) `base_from_flange` that belong to them, up to a constant on either side.
         fits: The score under which the declared reading is right without a look at others.
 
     Returns:
         The reading, and how well it does; the declared one where it is right, where no other is
-        clearly better, or where the poses turn about one axis at most and tell nothing.
+        clearly better, or where the poses turn about one axis at most and determine nothing.
     """
     declared = declared_reading(robot)
     with one_blas_thread():
-        told = _fitted(declared, q, poses, _STARTS)
-        if told.score <= fits or is_about_one_axis(poses[:, :3, :3]):
-            return JointGuess(told, told)
+        declared_fit = _fitted(declared, q, poses, _STARTS)
+        if declared_fit.score <= fits or is_about_one_axis(poses[:, :3, :3]):
+            return JointGuess(declared_fit, declared_fit)
         few = thinned(np.arange(len(q)), _SCREENED)
-        screened = _screened(told, q[few], poses[few])
+        screened = _screened(declared_fit, q[few], poses[few])
         best = [_fitted(it, q, poses, _STARTS) for it in screened]
-    return _decided(told, best) if best else JointGuess(told, told)
+    return _decided(declared_fit, best) if best else JointGuess(declared_fit, declared_fit)
 
 
-def _screened(told: FittedJoints, q: FloatArray, poses: FloatArray) -> list[JointReading]:
+def _screened(start: FittedJoints, q: FloatArray, poses: FloatArray) -> list[JointReading]:
     """The readings that may explain a few rows far better than the declared one."""
-    declared = told.reading
+    declared = start.reading
     tried = [_fitted(it, q, poses, 0) for it in joint_readings(declared.robot)]
     tried.sort(key=lambda it: it.score * (1.0 + it.reading.cost))
-    best = [*tried[:_REFINED], *_with_zeros(told, q, poses)]
-    limit = _WORTH * _fitted(declared, q, poses, 0).score
+    best = [*tried[:_REFINED], *_with_zeros(start, q, poses)]
+    limit = _SHARE * _fitted(declared, q, poses, 0).score
     return [it.reading for it in best if it.score < limit]
 
 
-def _decided(told: FittedJoints, tried: Sequence[FittedJoints]) -> JointGuess:
+def _decided(start: FittedJoints, tried: Sequence[FittedJoints]) -> JointGuess:
     least = min(it.score for it in tried)
     alike = [it for it in tried if it.score <= _ALIKE * least]
     alike.sort(key=lambda it: (it.reading.cost, it.score))
     best, others = alike[0], alike[1:]
-    if best.score > _CLOSES or told.score <= STANDS_OUT * best.score:
-        return JointGuess(told, told)
+    if best.score > _CLOSES or start.score <= STANDS_OUT * best.score:
+        return JointGuess(start, start)
     rivals = tuple(
         it.reading
         for it in others
         if it.reading.cost == best.reading.cost and it.score < _RIVALS * best.score
     )
-    return JointGuess(told, best, rivals)
+    return JointGuess(start, best, rivals)
 
 
-def _with_zeros(told: FittedJoints, q: FloatArray, poses: FloatArray) -> Iterator[FittedJoints]:
+def _with_zeros(start: FittedJoints, q: FloatArray, poses: FloatArray) -> Iterator[FittedJoints]:
     """The best zero of each joint between the first and the last, whose zeros hide in constants."""
-    declared = told.reading
+    declared = start.reading
     turns = ~declared.robot.chain.prismatic
-    farthest = 2.0 * _STEP_RAD if told.score < _CLOSES else _FARTHEST_RAD
+    farthest = 2.0 * _STEP_RAD if start.score < _CLOSES else _FARTHEST_RAD
     for joint in np.flatnonzero(turns[1:-1]) + 1:
 
         def score(zero: float, joint: int = int(joint)) -> float:
             return _fitted(with_zero(declared, joint, zero), q, poses, 0).fit.score
 
-        start = min(np.arange(-farthest, farthest + _STEP_RAD, _STEP_RAD), key=score)
-        reach = start - _STEP_RAD, start + _STEP_RAD
+        coarse = min(np.arange(-farthest, farthest + _STEP_RAD, _STEP_RAD), key=score)
+        reach = coarse - _STEP_RAD, coarse + _STEP_RAD
         least = minimize_scalar(score, bounds=reach, method="bounded", options={"xatol": 1e-6})
         yield _fitted(with_zero(declared, int(joint), float(least.x)), q, poses, 0)
 

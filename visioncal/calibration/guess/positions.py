@@ -27,7 +27,7 @@ UNITS = ("m", "mm", "cm", "inch")
 class Turned:
     """A pairing with the unknown rotation solved for.
 
-    `robot` and `camera` are (n, 3, 3) rotations of the chain's parts, `transposed` tells whether
+    `robot` and `camera` are (n, 3, 3) rotations of the chain's parts, `transposed` is whether
     those are the transposes of what the forms give.
     """
 

@@ -87,11 +87,11 @@ class Guess:
     Attributes:
         declared: The reading that was declared.
         candidates: The readings that come near, the best first, the declared one among them; one
-            stands for all that residuals cannot tell from it.
+            stands for all that residuals cannot distinguish from it.
         best: The reading that stands out; the declared one where none does.
         stands_out: Whether another reading than the declared one is clearly right.
         sentence: What was found, with its figures.
-        notes: What residuals cannot tell here, in sentences.
+        notes: What residuals cannot show here, in sentences.
     """
 
     declared: Candidate

@@ -38,7 +38,7 @@ _STARTS = 12
 
 
 def thinned(rows: IntArray, most: int = _MOST_ROWS) -> IntArray:
-    """At most so many rows as are worth their time, evenly spread."""
+    """At most so many rows, evenly spread."""
     if len(rows) <= most:
         return rows
     return np.asarray(rows[np.linspace(0, len(rows) - 1, most).round().astype(int)])
@@ -49,7 +49,7 @@ def search(recording: Recording) -> list[Scored]:
 
     Returns:
         The declared reading first; then the others, the best first, one for each class of readings
-        that residuals can tell apart.
+        that residuals can distinguish.
     """
     kept = thinned(recording.common_rows())
     looked_at = _with_neighbours(kept, len(recording.robot))
@@ -74,7 +74,7 @@ def _with_neighbours(rows: IntArray, count: int) -> IntArray:
 def _closing(
     recording: Recording, robot: Forms, camera: Forms, turned: Sequence[Turned]
 ) -> tuple[list[Hypothesis], list[list[Hypothesis]]]:
-    """The declared reading's class, and the others worth fitting, as their simplest readings."""
+    """The declared reading's class, and the others to be fitted, as their simplest readings."""
     scored = [
         (float(score), turn, variant)
         for turn in turned

@@ -49,7 +49,7 @@ class Answer:
         beside: (p, p) what that is, by its source.
         lenses: What lenses do beyond their models, by camera.
         misfits: What the residuals of each robot's stops show beyond noise.
-        arms: What the stops tell of the arms, by robot.
+        arms: What the stops determine of the arms, by robot.
         held_out: Residuals of observations that were left out of the fit in turn.
         moved: What moved, in the order of time.
         faults: What wrong poses of robots explain.
@@ -157,7 +157,7 @@ def answer_of(
         cell: The cell as it was read.
         looked: What was observed in it.
         solved: The fit of what of it is tied.
-        convention: Of the joint table in which calibrated arms' numbers are told.
+        convention: Of the joint table in which calibrated arms' numbers are given.
     """
     part, fit = solved.part, solved.agreed.fit
     # A closed form is not at rest, and that would pass for a misfit.
@@ -186,7 +186,7 @@ def answer_of(
 def _arms_found(
     solved: Solved, covariance: FloatArray, convention: Convention | None
 ) -> dict[str, ArmFound]:
-    """What the stops tell of the arms, by robot."""
+    """What the stops determine of the arms, by robot."""
     agreed, middles = solved.agreed, middles_of(solved.cell)
     part = solved.part
     return {

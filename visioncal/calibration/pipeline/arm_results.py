@@ -79,21 +79,21 @@ def _of(arms: Mapping[str, RobotArm], robot: str) -> str:
 def doubts_of_arms(
     arms: Mapping[str, RobotArm],
     found: Mapping[str, ResidualTest],
-    told: Mapping[str, ArmFound],
+    results: Mapping[str, ArmFound],
     asked: str,
 ) -> Iterator[Finding]:
     """Finds what speaks against the robots."""
     for robot, arm in arms.items():
-        for it in (*_doubts(arm, found.get(robot), asked), *told[robot].doubts()):
+        for it in (*_doubts(arm, found.get(robot), asked), *results[robot].doubts()):
             yield it.of(_called(arms, robot))
 
 
-def notes_on_arms(arms: Mapping[str, RobotArm], told: Mapping[str, ArmFound]) -> Iterator[str]:
+def notes_on_arms(arms: Mapping[str, RobotArm], results: Mapping[str, ArmFound]) -> Iterator[str]:
     """Words what was found of the arms and is no reason for doubt."""
     for robot, arm in arms.items():
         drifts = () if arm.thermal is None else thermal.findings(arm.thermal)
         chosen = () if arm.kinematics is None else findings(arm.kinematics)
-        for it in remarks((*drifts, *chosen, *told[robot].notes()), NOTE):
+        for it in remarks((*drifts, *chosen, *results[robot].notes()), NOTE):
             yield it.of(_called(arms, robot)).words
 
 
@@ -104,7 +104,7 @@ def _doubts(arm: RobotArm, found: ResidualTest | None, asked: str) -> Iterator[F
             "It stays as it reports itself: its errors take joint angles and a known model.",
         )
     elif arm.thermal is None and asked == thermal.LEVEL:
-        words = "Nothing tells how it drifts with its temperature: that stays in its noise."
+        words = "No data show how it drifts with its temperature: that stays in its noise."
         yield Finding("level", words)
     if arm.kinematics is not None:
         yield from doubts(arm.kinematics)

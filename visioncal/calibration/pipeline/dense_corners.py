@@ -103,9 +103,9 @@ def run_dense(
     try:
         found = calibrated(Dense(on, threads=threads or 0))
     except VisioncalError as error:
-        return _telling(plain, None, [f"Dense corners are not kept: {error.message}"])
+        return _noting(plain, None, [f"Dense corners are not kept: {error.message}"])
     if found.dense is None or not found.dense.fits:
-        return _telling(plain, None, ["Dense corners are not kept: no image could be fitted."])
+        return _noting(plain, None, ["Dense corners are not kept: no image could be fitted."])
     both = [it.calibration.validation.held_out for it in (plain, found)]
     kept = not _is_worse(plain, found)
     result = DenseResult(
@@ -122,7 +122,7 @@ def run_dense(
         camera = chosen.calibration.camera.camera
         evidence = explained(session, chosen.evidence, found.dense, camera)
         chosen = replace(chosen, evidence=evidence)
-    return _telling(chosen, result, words)
+    return _noting(chosen, result, words)
 
 
 def _images(dense: Dense) -> Iterator[ImageBlur]:
@@ -138,7 +138,7 @@ def _images(dense: Dense) -> Iterator[ImageBlur]:
         )
 
 
-def _telling(found: Run, result: DenseResult | None, words: list[str]) -> Run:
+def _noting(found: Run, result: DenseResult | None, words: list[str]) -> Run:
     """The result with what is said of dense corners."""
     calibration: Calibration = found.calibration
     verdict = calibration.verdict.noting(words)

@@ -40,7 +40,7 @@ def calibrate(
         level: How far to go: `auto` for all that the data allows, `hand-eye` without a calibrated
             arm, `offsets` of its joints, its `kinematics`, `elastic` for joints that bend, too, or
             `thermal` for its drift with temperature, too.
-        convention: Of the joint table in which a calibrated arm's numbers are told: `standard`,
+        convention: Of the joint table in which a calibrated arm's numbers are given: `standard`,
             `modified` or `hayati`; None for the stated one, or Hayati's where axes are parallel.
         need_mm: How near picks have to come [mm], in the place of what `[need]` declares.
         need_deg: The same in rotation [deg].
@@ -105,7 +105,7 @@ def align(
     Args:
         session: A session, or the path of its folder or recording.
         level: How far each arm is calibrated; beyond `hand-eye` it takes joint angles and a model.
-        convention: Of the joint table in which calibrated arms' numbers are told.
+        convention: Of the joint table in which calibrated arms' numbers are given.
         need_mm: How near picks have to come [mm], in the place of what `[need]` declares.
         need_deg: The same in rotation [deg].
         corners: What was found in its images before, by view; None to look.

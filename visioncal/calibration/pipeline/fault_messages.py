@@ -124,7 +124,7 @@ def moved_found(moved: Moved) -> Finding:
     """Says that something moved."""
     what = "was bumped" if moved.frame.startswith("cam") else "moved"
     rivals = (
-        f" (or {' or '.join(moved.rivals)} did: this session cannot tell)" if moved.rivals else ""
+        f" (or {' or '.join(moved.rivals)} did: the session leaves it open)" if moved.rivals else ""
     )
     return Finding(
         "moved_frame",

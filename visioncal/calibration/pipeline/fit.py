@@ -47,7 +47,7 @@ def conditions_of(known: RunState) -> dict[str, float]:
 
 
 def _arm(known: RunState) -> FittedArm | None:
-    """What the arm's errors are of, and what they were found to be beside the arm that is told."""
+    """The arm's errors: of what they are, and their estimates beside the stated arm."""
     arm = known.robot_arm
     model, errors = arm.model, arm.errors
     if errors is None or not errors.of_links:

@@ -69,8 +69,8 @@ def guess_seen(seen: RunState, robot: PoseNumbers | None = None) -> Guess:
         else chain_poses(seen.session, None if matched is None else matched.arm)
     )
     if robot is None:
-        told = numbers_in(seen.session, POSE)
-        robot = told_or_chained(_told_in_time(seen) if seen.clocks else told, chain)
+        poses = numbers_in(seen.session, POSE)
+        robot = reported_or_chained(_at_times(seen) if seen.clocks else poses, chain)
     is_measured, mount = bool(seen.corners), seen.session.mount
     for camera in _seen_ways(seen, robot):
         guess = guess_reading(robot, camera, mount, chain=chain, is_measured=is_measured)
@@ -114,9 +114,9 @@ def chain_poses(session: Session, robot: Robot | None = None) -> FloatArray | No
     return poses if np.isfinite(poses).any() else None
 
 
-def told_or_chained(told: PoseNumbers, chain: FloatArray | None) -> PoseNumbers:
+def reported_or_chained(read: PoseNumbers, chain: FloatArray | None) -> PoseNumbers:
     """The robot's poses as they were reported; those of its joints where none were."""
-    return told if chain is None or told.there.any() else PoseNumbers.of_poses(chain, told.places)
+    return read if chain is None or read.there.any() else PoseNumbers.of_poses(chain, read.places)
 
 
 def numbers_in(session: Session, columns: tuple[str, ...]) -> PoseNumbers:
@@ -153,7 +153,7 @@ def closes_as_declared(seen: RunState) -> bool:
         seen: What is known once the camera's poses are.
     """
     seen = replace(seen, poses=seen.poses_of_one_board)
-    robot = _told_in_time(seen)
+    robot = _at_times(seen)
     recording = Recording(
         robot, _camera_numbers(seen), seen.session.mount, is_measured=bool(seen.corners)
     )
@@ -169,7 +169,7 @@ def is_suspect(known: RunState) -> bool:
     return out or is_scattered(findings) or known.robot is not None
 
 
-def _told_in_time(seen: RunState) -> PoseNumbers:
+def _at_times(seen: RunState) -> PoseNumbers:
     """The robot's numbers out of its stream, at the views' times; NaN where it has none."""
     numbers = np.full((len(seen.session.views), 7), np.nan)
     for at, view in enumerate(seen.session.views):
@@ -180,7 +180,7 @@ def _told_in_time(seen: RunState) -> PoseNumbers:
 
 
 def _seen(known: RunState) -> RunState:
-    # Which moment of a stream a view belongs to is told by how both turned, however they are read.
+    # Which moment of a stream a view belongs to is found by how both turned, however they are read.
     names = (*_SEEING, "robot", "clock") if waits_for_clock(known.session) else _SEEING
     for stage in STAGES:
         if stage.name in names:

@@ -137,7 +137,7 @@ def _mount(sights: Sequence[Sight]) -> Mount:
 
 
 def _clock_words(known: RunState) -> Iterator[str]:
-    """Says what the fit makes of clocks that the motion told."""
+    """Says what the fit makes of clocks that the motion determined."""
     for pair, clock in known.solved.clocks(known).items():
         if known.mount is None and clock is not known.clocks[pair].clock:
             yield (
@@ -206,7 +206,7 @@ def _arms(answer: Answer) -> list[Arm]:
     modelled = {name or "robot" for name in solved.cell.session.robot_documents}
     found = []
     for robot in problem.robots:
-        noise, telling = answer.sigmas[robot], answer.arms[robot].telling
+        noise, numbers = answer.sigmas[robot], answer.arms[robot].numbers
         known = not problem.is_combined
         found.append(
             Arm(
@@ -214,7 +214,7 @@ def _arms(answer: Answer) -> list[Arm]:
                 noise["translation_mm"] if known else None,
                 noise["rotation_deg"] if known else None,
                 errs=_errs(solved.arms[robot]),
-                workspace_mm=None if telling is None else 1e3 * float(np.median(telling.sigmas_m)),
+                workspace_mm=None if numbers is None else 1e3 * float(np.median(numbers.sigmas_m)),
                 modelled=robot in modelled,
                 by_functions=solved.arms[robot].has_functions,
                 name=robot if len(problem.robots) > 1 else "",
@@ -278,12 +278,12 @@ def _of_frame(problem: Problem, frame: str) -> Mask:
 
 def _motion(cell: Cell, part: Problem, frame: str) -> str:
     """Says how the robots stood by way of which a frame was observed."""
-    rows, told = _of_frame(part, frame), []
+    rows, words = _of_frame(part, frame), []
     for branch in part.tree.branches.values():
         if branch.robot:
             stops = np.unique(part.observations.stops[rows & by_way_of(part, branch.robot)])
-            told += [robot_motion(cell, branch.parent, stops)] if len(stops) > 1 else []
-    return "; ".join(told) or f"{int(rows.sum())} observations are too few or too poor"
+            words += [robot_motion(cell, branch.parent, stops)] if len(stops) > 1 else []
+    return "; ".join(words) or f"{int(rows.sum())} observations are too few or too poor"
 
 
 def worst_direction(cell: Cell, frame: str, edge: Edge) -> Direction:

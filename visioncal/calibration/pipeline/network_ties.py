@@ -38,10 +38,10 @@ def untied_robots(cell: Cell, lost: Collection[str], *, seen: bool = False) -> N
     why = f"no observation links {robots} to the rest of the cell"
     parts = []
     if seen:
-        told = [robot_motion(cell, it, _stations(cell, it)) for it in bases]
+        moves = [robot_motion(cell, it, _stations(cell, it)) for it in bases]
         why = (
             f"the observations that link {robots} to the rest of the cell are too few, too much "
-            f"alike, or wrong (it takes 3 stops or more, turned about two axes): {'; '.join(told)}"
+            f"alike, or wrong (it takes 3 stops or more, turned about two axes): {'; '.join(moves)}"
         )
         parts = [part for it in bases if it in lost and (part := _open_part(cell, it))]
         if parts:
@@ -135,7 +135,7 @@ def ambiguous_error(cell: Cell, frames: Sequence[str]) -> DegenerateError:
     boards = sorted({it.seen for it in cell.rows if it.seer in frames or it.seen in frames})
     return DegenerateError(
         f"align: {some_of(frames)} may be in two places: {some_of(boards)} looks the same after "
-        "half a turn, and no other observation tells which way round it was seen.",
+        "half a turn, and no other observation shows which way round it was seen.",
         culprits=list(frames),
         next_step=f"Let {some_of(frames)} see a second board as well, or use a ChArUco board or a "
         "checkerboard with an odd and an even number of corners.",

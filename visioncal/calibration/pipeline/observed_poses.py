@@ -140,8 +140,8 @@ class ObservedPoses(Observed):
     def stops_of(self, views: Sequence[int]) -> IntArray:
         """(m,) which stop of the robot each view was taken at, numbered from 0.
 
-        Views of one stop share the robot's error. Poses that were measured by others are not told
-        apart from the robot's: of several boards, each has stops of its own then.
+        Views of one stop share the robot's error. Poses that were measured by others are not
+        distinguished apart from the robot's: of several boards, each has stops of its own then.
         """
         own = len(self.boards) > 1 and any(self.poses[view].corners is None for view in views)
         keys: dict[tuple[int, int], int] = {}

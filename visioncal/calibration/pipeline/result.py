@@ -27,7 +27,7 @@ from visioncal.results.whole import holdout_rms, view_results
 from visioncal.session import View
 from visioncal.session.frames import thing_name
 
-_OF_LENS = "it tells of the camera's lens alone (role = intrinsics)"
+_OF_LENS = "it serves the camera's lens alone (role = intrinsics)"
 _NO_POSE = (
     "no pose of the target: it has neither image nor rows in corners.csv nor cft_ nor meas_ columns"
 )
@@ -105,7 +105,7 @@ def _views(known: RunState) -> tuple[ViewResult, ...]:
 
 
 def _reason(known: RunState, row: View) -> str:
-    """Why a row tells of no chain."""
+    """Why a row is of no chain."""
     if row.is_of_lens:
         return _OF_LENS
     return known.reasons.get(row.number) or (HELD_BACK if row.holdout else _NO_POSE)

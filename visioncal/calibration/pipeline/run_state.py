@@ -31,10 +31,10 @@ class RunState(Observed):
     Attributes:
         solver: The solver asked for, where there are one robot and one camera.
         level: How far to go: a key of `stages.kinematics.ASKED`.
-        convention: Of the joint table in which arms are told; None for the stated one.
+        convention: Of the joint table in which arms are given; None for the stated one.
         found_before: The corners in the images by view, where they were found before.
         readings: What an instrument read, where that is all that was observed.
-        read: The cell as the session tells it.
+        read: The cell as the session states it.
         fit: Its fit.
         answer: The fit with its covariance, and what speaks against it.
         findings: What the verdict is made of.
@@ -67,7 +67,7 @@ class RunState(Observed):
 
     @property
     def cell(self) -> Cell:
-        """The cell as the session tells it.
+        """The cell as the session states it.
 
         Raises:
             RuntimeError: A step asks for it before it was read: the order is wrong.
@@ -116,7 +116,7 @@ class RunState(Observed):
 
     @property
     def arm_found(self) -> ArmFound:
-        """What the stops tell of the only robot's arm."""
+        """What the stops determine of the only robot's arm."""
         return next(iter(self.solved.arms.values()))
 
     @property

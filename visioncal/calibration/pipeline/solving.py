@@ -502,7 +502,7 @@ def _with_effects(agreed: Agreed, effects: Sequence[Effect]) -> Agreed:
 def _movable(cell: Cell, problem: Problem) -> tuple[str, ...]:
     """What may be bumped or slip: all that is unknown but bases.
 
-    One camera that sees one robot move cannot tell what slipped from a pose that is wrong.
+    One camera that sees one robot move cannot distinguish what slipped from a wrong pose.
     """
     if cell.mount is not None:
         return ()
@@ -562,10 +562,10 @@ def _refuse_few_of_each(cell: Cell) -> None:
     shown = [it.seen for it in cell.rows]
     counts = {it: shown.count(it) for it in dict.fromkeys(shown)}
     if len(counts) > 1 and max(counts.values()) < FEWEST_VIEWS and cell.mount != "instrument":
-        told = ", ".join(f"{it.partition('_')[2]} in {count}" for it, count in counts.items())
+        shares = ", ".join(f"{it.partition('_')[2]} in {count}" for it, count in counts.items())
         raise DegenerateError(
             f"hand-eye: of several targets, at least one must be seen in {FEWEST_VIEWS} views, to "
-            f"begin with; here {told}.",
+            f"begin with; here {shares}.",
             culprits=[it.replace("_", " ", 1) for it in counts],
             next_step="Add views of one of them, tilted about different axes.",
         )

@@ -1,4 +1,4 @@
-"""Stage 7: what the stops tell of a calibrated arm, and what it is worth all over its workspace."""
+"""Identifiability of a calibrated arm, and its predicted accuracy all over its workspace."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -16,8 +16,8 @@ from visioncal.estimation.excitation_advice import Move, joints_to_move
 from visioncal.estimation.identifiability import (
     Identifiability,
     Jacobians,
-    count_told,
-    what_is_told,
+    count_determined,
+    identifiability,
 )
 from visioncal.estimation.indices import Indices
 from visioncal.estimation.null_space import (
@@ -35,7 +35,7 @@ from visioncal.estimation.parameters import (
     parameter_moves,
 )
 from visioncal.estimation.solve import whitened
-from visioncal.estimation.stop_influence import stop_worth
+from visioncal.estimation.stop_influence import stop_influence
 from visioncal.estimation.workspace import postures
 from visioncal.results.arm import (
     ArmParameter,
@@ -66,8 +66,8 @@ class Estimate:
         parameter: Which.
         nominal: As stated [rad or m].
         identified: As found.
-        sigma: Standard deviation of what was found. What the stops do not tell keeps about what was
-            stated, and the sigma of the arm's errors.
+        sigma: Standard deviation of what was found. What the stops do not determine keeps about
+            what was stated, and the sigma of the arm's errors.
     """
 
     parameter: Parameter
@@ -78,16 +78,16 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class ArmIdentifiability:
-    """What the stops tell of the arm.
+    """Identifiability of the arm's parameters.
 
     Attributes:
-        convention: Of the table whose numbers are told.
+        convention: Of the table whose numbers are estimated.
         estimates: Its numbers that are not held.
-        told: What the stops tell, and what any stops could.
-        indices: How well; None where they tell nothing of the arm.
-        not_told: What they do not, in words: first what no stops tell.
-        advice: What to do where other stops would tell more; empty where they would not.
-        worth: (m,) by which share the mean predicted variance of the places below would grow
+        counts: What the stops determine, and what any stops could.
+        indices: How well; None where they determine nothing of the arm.
+        not_determined: What they do not, in words: first what no stops determine.
+        advice: What to do where other stops would determine more; empty where they would not.
+        influence: (m,) by which share the mean predicted variance of the places below would grow
             without each stop, lens and board as they are.
         places: (k, 3) of the flange all over the workspace, in the base's frame [m].
         sigmas_m: (k,) predicted sigma of the place of what the flange carries there [m].
@@ -95,15 +95,15 @@ class ArmIdentifiability:
 
     convention: Convention
     estimates: tuple[Estimate, ...]
-    told: Identifiability
+    counts: Identifiability
     indices: Indices | None
-    not_told: tuple[str, ...]
+    not_determined: tuple[str, ...]
     advice: str
-    worth: FloatArray
+    influence: FloatArray
     places: FloatArray
     sigmas_m: FloatArray
 
-    def told_of(
+    def in_result(
         self, result: ArmResult, robot: Robot, views: Sequence[int], lost: JointReading | None
     ) -> ArmResult:
         """A section of a calibration, with this in it.
@@ -114,7 +114,7 @@ class ArmIdentifiability:
             views: (m,) by which views the stops go.
             lost: A joint whose zero was found far from where it was stated.
         """
-        ordered = sorted(zip(self.worth.tolist(), views, strict=True), key=lambda it: -it[0])
+        ordered = sorted(zip(self.influence.tolist(), views, strict=True), key=lambda it: -it[0])
         rows = np.column_stack([self.places, 1e3 * self.sigmas_m])[:_PLACES]
         return replace(
             result,
@@ -126,17 +126,17 @@ class ArmIdentifiability:
             ),
             workspace_map=tuple(WorkspacePlace(*row) for row in rows.tolist()),
             observability=self._observability(),
-            not_told=self.not_told,
-            stops=tuple(StopInfluence(view, worth) for worth, view in ordered),
+            not_determined=self.not_determined,
+            stops=tuple(StopInfluence(view, share) for share, view in ordered),
         )
 
     def _observability(self) -> Observability:
         indices = self.indices
         figures = {} if indices is None else {"condition": indices.condition, **vars(indices)}
         return Observability(
-            columns=self.told.columns,
-            identifiable=self.told.identifiable,
-            told=self.told.told,
+            columns=self.counts.columns,
+            identifiable=self.counts.identifiable,
+            determined=self.counts.determined,
             **figures,
         )
 
@@ -144,7 +144,7 @@ class ArmIdentifiability:
 def _number(estimate: Estimate, robot: Robot, lost: JointReading | None) -> ArmParameter:
     joint, nominal = estimate.parameter.joint, estimate.nominal
     if lost is not None and estimate.parameter.name == "theta_rad":
-        # The fit starts where the zero was found; what is told starts where it was stated.
+        # The fit starts where the zero was found; what is reported starts where it was stated.
         nominal -= float(robot.chain.functions[joint, 1] * lost.zeros[joint])
     return ArmParameter(
         joint=robot.joint_names[joint],
@@ -157,7 +157,7 @@ def _number(estimate: Estimate, robot: Robot, lost: JointReading | None) -> ArmP
 
 
 def identify_arm(arm: ArmData, convention: Convention | None = None) -> ArmIdentifiability:
-    """Says what the stops tell of an arm, and what it is worth.
+    """Says what the stops determine of an arm, and how accurate it is.
 
     Args:
         arm: What was seen of it.
@@ -169,28 +169,28 @@ def identify_arm(arm: ArmData, convention: Convention | None = None) -> ArmIdent
         numbers = _numbers(arm.model, convention)
         weight = arm.pair.weight(arm.noise, arm.measured)
         by_arm, by_numbers = _at(arm, anywhere, weight), _by_numbers(arm, numbers, anywhere, weight)
-        told, null = what_is_told(_at_stops(arm), by_arm), null_of(by_numbers)
-        lacking = None
-        if told.missing.size:
-            lacking = _Lacking(
-                imitated(by_numbers, by_arm, told.missing), _moves(arm, told, weight)
+        counts, null = identifiability(_at_stops(arm), by_arm), null_of(by_numbers)
+        missing = None
+        if counts.missing.size:
+            missing = _Missing(
+                imitated(by_numbers, by_arm, counts.missing), _moves(arm, counts, weight)
             )
         place = arm.place_jacobian(anywhere)[0]
         sigmas_m = arm.place_sigmas_m(anywhere)
         fitted = (arm.problem, arm.state, arm.noise)
-        worth = stop_worth(*fitted, arm.stops, place, arm.chain)
+        influence = stop_influence(*fitted, arm.stops, place, arm.chain)
     nominal = arm.model.nominal
     return ArmIdentifiability(
         convention=numbers.before.convention,
         estimates=tuple(_estimates(arm, numbers)),
-        told=told,
-        indices=Indices.of(told.values, len(arm.stops)) if len(told.values) else None,
-        not_told=(
+        counts=counts,
+        indices=Indices.of(counts.values, len(arm.stops)) if len(counts.values) else None,
+        not_determined=(
             *null_words(null, numbers.parameters, nominal),
-            *([_missing_words(lacking, numbers.parameters, nominal)] if lacking else []),
+            *([_missing_words(missing, numbers.parameters, nominal)] if missing else []),
         ),
-        advice=_advice(lacking, told, numbers.parameters, nominal) if lacking else "",
-        worth=worth,
+        advice=_advice(missing, counts, numbers.parameters, nominal) if missing else "",
+        influence=influence,
         places=arm.model.robot.base_from_flange(anywhere)[:, :3, 3],
         sigmas_m=sigmas_m,
     )
@@ -207,8 +207,8 @@ class _Numbers:
 
 
 @dataclass(frozen=True, eq=False)
-class _Lacking:
-    """What numbers of the table (k, n) do what is not told, and the joints that would tell."""
+class _Missing:
+    """What numbers of the table (k, n) do what is not determined, and the joints to move."""
 
     changes: FloatArray
     moves: tuple[Move, ...]
@@ -258,13 +258,13 @@ def _through(pair: ArmPair, flange: FloatArray, moved: FloatArray, weight: Float
     return Jacobians(frames.reshape(-1, 12), arm.reshape(-1, moved.shape[2]))
 
 
-def _moves(arm: ArmData, told: Identifiability, weight: FloatArray) -> tuple[Move, ...]:
-    """The joints that would tell what is missing, for noise that is alike at all stops."""
+def _moves(arm: ArmData, counts: Identifiability, weight: FloatArray) -> tuple[Move, ...]:
+    """The joints that would determine what is missing, for noise that is alike at all stops."""
 
     def count(q: FloatArray) -> int:
-        return count_told(_at(arm, q, weight))
+        return count_determined(_at(arm, q, weight))
 
-    return joints_to_move(arm.model.robot, arm.q, count, told.identifiable - told.told)
+    return joints_to_move(arm.model.robot, arm.q, count, counts.identifiable - counts.determined)
 
 
 def _estimates(arm: ArmData, numbers: _Numbers) -> Iterator[Estimate]:
@@ -281,30 +281,30 @@ def _estimates(arm: ArmData, numbers: _Numbers) -> Iterator[Estimate]:
         )
 
 
-def _missing_words(lacking: _Lacking, parameters: Sequence[Parameter], robot: Robot) -> str:
-    named = dominant_words(lacking.changes, parameters, robot)
-    if not lacking.moves:
-        return f"these stops do not tell {named}"
+def _missing_words(missing: _Missing, parameters: Sequence[Parameter], robot: Robot) -> str:
+    named = dominant_words(missing.changes, parameters, robot)
+    if not missing.moves:
+        return f"these stops do not determine {named}"
     first, *others = (
-        (joint_words(it.joint, robot), _length(it.moved, it.joint, robot)) for it in lacking.moves
+        (joint_words(it.joint, robot), _length(it.moved, it.joint, robot)) for it in missing.moves
     )
     moved = listed([f"{first[0]} moved by {first[1]}", *(f"{it} by {way}" for it, way in others)])
-    return f"{moved} only, too little to tell {named}"
+    return f"{moved} only, too little to determine {named}"
 
 
 def _advice(
-    lacking: _Lacking, told: Identifiability, parameters: Sequence[Parameter], robot: Robot
+    missing: _Missing, counts: Identifiability, parameters: Sequence[Parameter], robot: Robot
 ) -> str:
     further = "Add stops in which the arm stands otherwise, all over the workspace."
-    if lacking.moves:
+    if missing.moves:
         joints = [
-            f"joint {it.joint + 1} by {_length(it.wanted, it.joint, robot)}" for it in lacking.moves
+            f"joint {it.joint + 1} by {_length(it.wanted, it.joint, robot)}" for it in missing.moves
         ]
         further = f"Add stops that move {listed(joints)} or more."
     return (
-        f"The stops tell {told.told} of the {told.identifiable} values that can be told of this "
-        f"arm and its frames: {_missing_words(lacking, parameters, robot)}. What is not told stays "
-        f"about as stated. {further}"
+        f"The stops determine {counts.determined} of the {counts.identifiable} identifiable values "
+        f"of this arm and its frames: {_missing_words(missing, parameters, robot)}. What is not "
+        f"determined stays about as stated. {further}"
     )
 
 

@@ -14,8 +14,8 @@ from visioncal.calibration.stages.elastic import Elastic, springs_of
 from visioncal.calibration.stages.joints import Matched
 from visioncal.calibration.stages.kinematics import (
     Kinematics,
+    allows_functions,
     choose_level,
-    tells_functions,
     with_functions,
 )
 from visioncal.calibration.stages.loads import check_elastic, check_poses
@@ -63,10 +63,10 @@ _ROUNDED = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class ArmFound:
-    """What the stops tell of an arm.
+    """What the stops determine of an arm.
 
     Attributes:
-        telling: Of its numbers; None where it stands as stated.
+        numbers: Identifiability of its parameters; None where it stands as stated.
         springs: Of its joints as springs; None for a rigid one.
         plays: Of the play in its joints; empty where stops did not come from both sides.
         drift: Its drift with temperature; None for none.
@@ -74,7 +74,7 @@ class ArmFound:
         functions: Of its joints; None without any.
     """
 
-    telling: ArmIdentifiability | None = None
+    numbers: ArmIdentifiability | None = None
     springs: Elastic | None = None
     plays: tuple[JointBacklash, ...] = ()
     drift: ThermalResult | None = None
@@ -85,8 +85,8 @@ class ArmFound:
         """Words what is no reason for doubt."""
         if self.carries is not None:
             yield self.carries.words
-        if self.telling is not None and self.telling.advice:
-            yield self.telling.advice
+        if self.numbers is not None and self.numbers.advice:
+            yield self.numbers.advice
         yield from backlash.remarks(self.plays)
         if self.springs is not None:
             yield from elastic.remarks(self.springs)
@@ -141,7 +141,7 @@ class RobotArm:
         Args:
             robot: The robot, as the problem has it.
             reported: (s, 4, 4) `base_from_flange`; not a number at stops at which it was not.
-            views: The rows that tell of it at the m stops at which it was.
+            views: The rows that have its pose at the m stops at which it was.
             matched: Its model, beside poses and joints; None where none is known.
             recorded: The session, and the robot's name there.
         """
@@ -242,7 +242,7 @@ class RobotArm:
         return self.erring(None).put_into(problem)
 
     def with_drift(self, problem: Problem, start: State, asked: str) -> Self:
-        """Looks for how it drifts with its temperature, where the session tells.
+        """Looks for how it drifts with its temperature, where the session determines it.
 
         Args:
             problem: The observations, with this arm as reported.
@@ -349,7 +349,7 @@ class RobotArm:
         middles: Mapping[str, FloatArray],
         convention: Convention | None = None,
     ) -> ArmFound:
-        """What the stops tell of it.
+        """What the stops determine of it.
 
         Args:
             problem: The observations that agree, with its errors among the unknowns.
@@ -382,7 +382,7 @@ class RobotArm:
         """What was found of it, as sections of a calibration.
 
         Args:
-            found: What the stops tell of it.
+            found: What the stops determine of it.
             views: By which views these stops go.
         """
         sections = ArmSections(
@@ -398,9 +398,9 @@ class RobotArm:
             backlash=found.plays,
             functions=found.functions,
         )
-        if found.telling is not None:
+        if found.numbers is not None:
             zero = None if self.matched is None else self.matched.zero
-            arm = found.telling.told_of(arm, self.model.nominal, views, zero)
+            arm = found.numbers.in_result(arm, self.model.nominal, views, zero)
             arm = replace(arm, left_out=self.kinematics.left_out(), carries_over=found.carries)
         springs = None if found.springs is None else found.springs.result(views)
         return replace(sections, arm=arm, elastic=springs)
@@ -465,7 +465,7 @@ class RobotArm:
         q, reported = seen.joints_rad, seen.reported
         if self.matched is None or self.joints_rad is None or q is None or self.kinematics is None:
             return self
-        if not tells_functions(asked, len(q)):
+        if not allows_functions(asked, len(q)):
             return self
         model = ArmModel.of(self.matched.arm, q, reported).loaded(q, seen.loads)
         placed = np.eye(len(self.stood))[:, self.stood]

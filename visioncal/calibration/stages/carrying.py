@@ -23,7 +23,7 @@ from visioncal.results.arm import (
 _SESSION_SHARE = 1.2e-4
 # It is better where it errs by less than this share of what the arm as stated errs by.
 _BETTER = 0.8
-# At so many angles all around functions of the joints are told.
+# At so many angles all around functions of the joints are evaluated.
 _ANGLES = 180
 # Ahead of the base, and behind it, is so far from the middle of the stops about its axis [rad].
 _AHEAD, _BEHIND = np.pi / 3, 2 * np.pi / 3

@@ -223,7 +223,7 @@ def _feigned(first: Mapping[str, Finding]) -> set[str]:
     a focus that changes does not go by the time, and is found moving in one session of ten
     thousand. Before and after a step, errors by posture and time are alike because of it. What a
     held lens that the corners contradict does to views passes for a board of another size or
-    shape; the corners alone cannot tell of the size, and the lens is tested beside both.
+    shape; the corners alone do not show the size, and the lens is tested beside both.
     """
     feigned: set[str] = set()
     if moved := [first[it].mahalanobis_sq for it in _MOVED if it in first]:

@@ -1,4 +1,4 @@
-"""What a session tells of a whole cell: its frames, where its robots stood, who saw what."""
+"""A whole cell as its session has it: its frames, where its robots stood, who saw what."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -115,7 +115,7 @@ def read_cell(seen: Observed) -> Cell:
     observations = [it for it in session.observations if not it.view.is_of_lens]
     if not observations:
         raise DataError(
-            f"session {session.name!r}: no row tells what a camera or an instrument saw.",
+            f"session {session.name!r}: no row has an observation of a camera or an instrument.",
             next_step="Give rows images and cameras, or poses in cft_ columns.",
         )
     rows = [
@@ -183,7 +183,7 @@ def _poses(seen: Observed, observations: Sequence[Observation]) -> dict[str, Flo
     for it in observations:
         for name, row in it.robots.items():
             known = seen.robots[name].base_from_flange
-            # What most rows of a stop tell comes before what each tells itself.
+            # What most rows of a stop say comes before what each says itself.
             at = row.number if row.number in known else it.view.number
             if at in known:
                 poses[robot_key(name)][it.station] = known[at]

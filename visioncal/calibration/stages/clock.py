@@ -16,12 +16,12 @@ from visioncal.calibration.stages.offset import (
     LARGEST_SIGMA_S,
     LEAST_CORRELATION,
     Clock,
+    clock_words,
     no_offset,
     speed_words,
     stated_doubts,
-    told_words,
     turning_doubt,
-    why_untold,
+    why_undetermined,
 )
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Mount, Rejection
@@ -132,8 +132,8 @@ def set_clock(sweep: Sweep, poses: Mapping[int, ViewPoses]) -> Clocked:
 
     Raises:
         DataError: No view lies within the stream.
-        DegenerateError: The motion does not tell the offset, it is not stated, and too few views
-            were taken at rest.
+        DegenerateError: The motion does not determine the offset, it is not stated, and too few
+            views were taken at rest.
     """
     motion = sweep.motion
     views = [view for view in sweep.views if is_open(view) and view.number in poses]
@@ -152,7 +152,7 @@ def set_clock(sweep: Sweep, poses: Mapping[int, ViewPoses]) -> Clocked:
         return _by_motion(sweep, views, (fit, match), frames, poses)
     if len(sound) == 1 and frames.are_dense and sound[0].sigma_s <= LARGEST_SIGMA_S:
         return _by_turning(sweep, views, sound[0])
-    return _untold(sweep, views, (fits, matches))
+    return _undetermined(sweep, views, (fits, matches))
 
 
 def _frames(sweep: Sweep, views: Sequence[View], poses: Mapping[int, ViewPoses]) -> Frames:
@@ -168,11 +168,11 @@ def _frames(sweep: Sweep, views: Sequence[View], poses: Mapping[int, ViewPoses])
 def _by_motion(
     sweep: Sweep,
     views: Sequence[View],
-    told: tuple[ClockFit, Match],
+    found: tuple[ClockFit, Match],
     frames: Frames,
     poses: Mapping[int, ViewPoses],
 ) -> Clocked:
-    fit, match = told
+    fit, match = found
     late, delays = find_delays(sweep.motion.flange, frames, sweep.camera, fit)
     fit = fit if late is None else late.clock
     clock = Clock(
@@ -185,7 +185,7 @@ def _by_motion(
         speeds={},
         delays=delays,
     )
-    words, warnings = told_words(fit, match, sweep.motion.name), list(stated_doubts(clock, views))
+    words, warnings = clock_words(fit, match, sweep.motion.name), list(stated_doubts(clock, views))
     notes = [words, *(it.words for it in delays if it.is_clear)]
     placed = _placed(sweep, views, clock, warnings, notes)
     return placed if late is None else _straightened(sweep, placed, views, poses, late)
@@ -233,13 +233,13 @@ def _by_turning(sweep: Sweep, views: Sequence[View], match: Match) -> Clocked:
     return _placed(sweep, views, clock, warnings, [])
 
 
-def _untold(
+def _undetermined(
     sweep: Sweep,
     views: Sequence[View],
     tried: tuple[Sequence[ClockFit], Sequence[Match]],
 ) -> Clocked:
     """Does without an estimate: by what is stated, or with views at rest."""
-    why, stated_s = why_untold(*tried), sweep.stated_s
+    why, stated_s = why_undetermined(*tried), sweep.stated_s
     offset_s = stated_s or 0.0
     correlation = max((it.correlation for it in tried[1]), default=None)
     stamps_s = np.array([view.stamp_s for view in views], dtype=float)

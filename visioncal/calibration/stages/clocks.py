@@ -1,4 +1,4 @@
-"""Rows that have a time and no pose of a robot: its stream tells them where it was.
+"""Rows that have a time and no pose of a robot: its stream gives them the pose.
 
 Every pair of a camera and a robot has clocks of its own, whose offset is estimated from the motion
 that both have seen.
@@ -40,8 +40,8 @@ def set_clocks(seen: T) -> T:
     Raises:
         DataError: The stream of an only robot has no poses, and no joints that its model knows, or
             no view of its only camera lies within it.
-        DegenerateError: The motion of an only pair does not tell the offset, it is not stated, and
-            too few views were taken at rest.
+        DegenerateError: The motion of an only pair does not determine the offset, it is not stated,
+            and too few views were taken at rest.
     """
     for pair, rows in _waiting(seen.session).items():
         seen = _with_pair(seen, pair, rows)

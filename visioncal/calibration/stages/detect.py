@@ -33,7 +33,7 @@ from visioncal.vision.targets import corner_positions, point_numbers
 _FEWEST_GIVEN = 4
 # Corners that others have found may lie outside the image by this share of it.
 _OUTSIDE = 0.1
-# Images with corners that tell which layout was printed, or how they were turned; of so many.
+# Images with corners that show which layout was printed, or how they were turned; of so many.
 _LAYOUT_SAMPLE, _MOST_LOOKED_AT = 3, 12
 
 

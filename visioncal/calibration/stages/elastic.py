@@ -22,8 +22,8 @@ from visioncal.estimation.bending import (
 from visioncal.results.arm import ElasticResult, JointSpring, LoadedStop, Sag
 from visioncal.robot import Loads, Robot
 
-# A joint is told where the stops leave less than this share of what was open about it.
-_TOLD = 0.5
+# A joint is determined where the stops leave less than this share of its prior sigma.
+_DETERMINED = 0.5
 # Torque on a joint from which on it counts as loaded [N m].
 _LOADED_NM = 0.05
 _SURE = 2.0
@@ -41,7 +41,7 @@ class Elastic:
         payload_kg: (m,) what it carried [kg].
         payload: By which factor payload and force bend the arm beyond what is stated; None where
             nothing hung on the flange.
-        weighs: Whether the model of the arm tells the masses of its links.
+        weighs: Whether the model of the arm states the masses of its links.
         weight_moments: (n, 4 n) how the joints yield to the weight of links whose masses are not
             known (see `bent_joints`); None where they are, or where they hardly yield.
     """
@@ -56,9 +56,9 @@ class Elastic:
     weight_moments: FloatArray | None
 
     @property
-    def untold(self) -> tuple[str, ...]:
-        """The joints that the loads do not tell."""
-        return tuple(it.joint for it in self.springs if not it.told)
+    def rigid(self) -> tuple[str, ...]:
+        """The joints whose compliance the loads do not determine."""
+        return tuple(it.joint for it in self.springs if not it.determined)
 
     def result(self, views: Sequence[int]) -> ElasticResult:
         """It as a section of a calibration.
@@ -68,7 +68,7 @@ class Elastic:
         """
         return ElasticResult(
             joints=self.springs,
-            not_told=self.untold,
+            not_determined=self.rigid,
             weight="of the model's masses" if self.weighs else "unknown",
             payload_kg=(float(self.payload_kg.min()), float(self.payload_kg.max())),
             sag_mm=Sag(float(np.median(self.sag_mm)), float(self.sag_mm.max())),
@@ -78,7 +78,7 @@ class Elastic:
         )
 
     def _stop(self, at: int, view: int) -> LoadedStop:
-        """Torques and bends of a stop; a bend that is not told is left out."""
+        """Torques and bends of a stop; a bend that is not determined is left out."""
         joints = (it.joint for it in self.springs)
         bends = zip(joints, self.bends_rad[at].tolist(), strict=True)
         return LoadedStop(
@@ -108,9 +108,9 @@ def springs_of(arm: ArmData, errors: Mapping[str, ArmErrors]) -> Elastic | None:
         variances = np.diag(arm.arm_covariance)[model.place_of(COMPLIANCE)]
         sigmas = compliance_unit(model) * np.sqrt(variances)
         bends_rad = bends_seen(arm, torques)
-    told = (np.abs(torques).max(axis=0) > _LOADED_NM) & (sigmas < _TOLD * prior)
+    determined = (np.abs(torques).max(axis=0) > _LOADED_NM) & (sigmas < _DETERMINED * prior)
     return Elastic(
-        tuple(_springs(model, np.minimum(sigmas, prior), told, torques)),
+        tuple(_springs(model, np.minimum(sigmas, prior), determined, torques)),
         torques,
         bends_rad,
         1e3 * flange_bends(model, q, loads),
@@ -122,16 +122,17 @@ def springs_of(arm: ArmData, errors: Mapping[str, ArmErrors]) -> Elastic | None:
 
 
 def _springs(
-    model: ArmModel, sigmas: FloatArray, told: Mask, torques: FloatArray
+    model: ArmModel, sigmas: FloatArray, determined: Mask, torques: FloatArray
 ) -> Iterator[JointSpring]:
-    columns = (model.nominal.joint_names, model.compliance.tolist(), sigmas.tolist(), told.tolist())
-    for at, (name, compliance, sigma, is_told) in enumerate(zip(*columns, strict=True)):
-        stiff = 1.0 / compliance if is_told and compliance >= _SURE * sigma else None
+    names, compliances = model.nominal.joint_names, model.compliance.tolist()
+    columns = (names, compliances, sigmas.tolist(), determined.tolist())
+    for at, (name, compliance, sigma, is_determined) in enumerate(zip(*columns, strict=True)):
+        stiff = 1.0 / compliance if is_determined and compliance >= _SURE * sigma else None
         yield JointSpring(
             joint=name,
             compliance_rad_per_nm=compliance,
             sigma_rad_per_nm=sigma,
-            told=is_told,
+            determined=is_determined,
             torque_nm=(float(torques[:, at].min()), float(torques[:, at].max())),
             stiffness_nm_per_rad=stiff,
             stiffness_sigma_nm_per_rad=None if stiff is None else sigma * stiff**2,
@@ -156,16 +157,16 @@ def remarks(elastic: Elastic) -> Iterator[str]:
         )
     if elastic.weight_moments is not None:
         yield (
-            "The arm yields to its own weight, of which its model tells nothing: how far, is told "
-            "at every posture, and counted. Stiffness is told by payload_kg that changes, or by "
-            "mass_kg and com_m in the joints' table."
+            "The arm yields to its own weight, of which its model states nothing: how far is "
+            "estimated at every posture, and counted. A payload_kg that changes, or mass_kg and "
+            "com_m in the joints' table, determine the stiffness."
         )
-    elif elastic.untold:
-        several = len(elastic.untold) > 1
+    elif elastic.rigid:
+        several = len(elastic.rigid) > 1
         yield (
-            f"{some_of(elastic.untold)} {'are' if several else 'is'} not seen to bend under the "
+            f"{some_of(elastic.rigid)} {'are' if several else 'is'} not seen to bend under the "
             f"loads of these stops, and {'are' if several else 'is'} taken for rigid. A load of "
-            "another direction, or farther out, would tell."
+            "another direction, or farther out, would show it."
         )
 
 

@@ -25,7 +25,7 @@ from visioncal.estimation.solve import covariance_of, held_shift
 
 # A rig that is as stated seems not to be in one session of ten thousand.
 _FALSE_ALARM = 1e-4
-# Intrinsics that would move by less move no corner that anybody could tell [px].
+# Intrinsics that would move by less move no corner visibly [px].
 _LEAST_MOVE_PX = 0.05
 _NEW_LENS = Step(
     "In session.toml, delete matrix and distortion, so that they are estimated, or calibrate "

@@ -1,7 +1,7 @@
 """Where all frames are to begin with, and by which of its poses each view goes.
 
 The mirrored solutions of a planar target, and the turns of a board with a rotational symmetry, look
-alike in one image; the robots' motion tells them apart.
+alike in one image; the robots' motion separates them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -69,7 +69,7 @@ def init_frames(
     if unclear.sum() > len(views) / 2:
         raise DegenerateError(
             f"pnp: {unclear.sum()} of {len(views)} views allow two poses of the target that the "
-            "robot's motion cannot tell apart.",
+            "robot's motion cannot distinguish.",
             culprits=[f"view {view.view}" for view, it in zip(views, unclear, strict=True) if it],
             next_step="Add views tilted about different axes, or use a board without symmetry "
             "(ChArUco, or an odd sum of columns and rows).",

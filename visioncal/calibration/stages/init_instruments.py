@@ -16,8 +16,8 @@ from visioncal.core.types import FloatArray
 from visioncal.estimation.positions import Places, find_mounting
 from visioncal.estimation.procrustes import align, apply, spreads
 
-# Stops at which points must have been read before they tell where both they and their instrument
-# are; points by which an instrument is placed, and how far they must reach to both sides [m].
+# Stops at which points must have been read before they determine their and the instrument's
+# place; points by which an instrument is placed, and how far they must reach to both sides [m].
 _FEWEST_STOPS, _FEWEST_POINTS, _SPREAD_M = 4, 3, 0.02
 # What starts are known to, for want of better [m].
 _ROUGH_M = 1e-2

@@ -3,7 +3,7 @@
 Each body of frames (what stands in the cell, what a flange carries) is grown by the best transforms
 first (Prim 1957). What these do not reach is placed by views of which all else is known. A board
 that looks the same turned does not say which way round it was seen: what is placed by way of such
-a board is tried every way round, and all views together tell which it was.
+a board is tried every way round, and all views together decide which it was.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -40,7 +40,7 @@ def spanning_tree(growth: Growth) -> tuple[dict[str, FloatArray], tuple[str, ...
 
     Returns:
         (4, 4) `body_from_frame` by name, and the frames that might as well be elsewhere, because
-        nothing tells which way round a board was seen.
+        it is not known which way round a board was seen.
     """
     first = _grown(growth, ())
     if not first.by_turn:
@@ -138,7 +138,7 @@ def _parted(
         open_ones = [at for at, it in enumerate(factors) if it.frame and it.frame not in placed]
         if len(rows) < FEWEST or len(open_ones) not in (2, 3):
             continue
-        # What no robot parts cannot be told apart.
+        # What no robot separates cannot be distinguished.
         inner = [factors[begin + 1 : end] for begin, end in pairwise(open_ones)]
         if not all(any(not it.frame for it in part) for part in inner):
             continue

@@ -1,4 +1,4 @@
-"""One arm looks at a board in the hand of another: how the bases lie, when nothing else tells.
+"""One arm looks at a board in the hand of another: how the bases lie, else unknown.
 
 Views say `u * first * v * second * w = seen`, with both arms' poses for first and second, and three
 transforms unknown. Were one of them known, the two others would be a hand-eye calibration: each is

@@ -32,7 +32,7 @@ def guess_seen_joints(
         mount: What holds the camera.
 
     Returns:
-        How the angles are to be taken; None where too few views tell.
+        How the angles are to be taken; None where too few views show it.
     """
     if len(q) < FEWEST_JOINT_ROWS:
         return None
@@ -51,14 +51,14 @@ def contradicted_joints(
 
     Args:
         matched: The joints beside the poses.
-        guess: How the other views' angles fit the camera; None where nothing tells.
+        guess: How the other views' angles fit the camera; None where that is not known.
         seen: `base_from_flange` as reported, and `cam_from_target`, of these views.
         mount: What holds the camera.
     """
     for view, (pose, cam_from_target) in seen.items():
         reason = matched.contradicting[view]
         if guess is None:
-            yield Rejection(view, f"{reason}, and too few views tell which of them is right")
+            yield Rejection(view, f"{reason}, and too few views show which of them is right")
             continue
         model = guess.best.reading.poses(matched.joints_rad[view][None])[0]
         both = np.array([model, pose @ invert(matched.flange_from_reported)])
@@ -84,7 +84,7 @@ def misread_joints(guess: JointGuess, robot: Robot, *, has_poses: bool) -> DataE
     also = " The reported poses are those of the same angles, and as wrong." if has_poses else ""
     columns = guess.best.reading.columns or range(robot.joint_count)
     return DataError(
-        f"views.csv: the joint angles are not those of {robot.name} as they are told. "
+        f"views.csv: the joint angles are not those of {robot.name} as they are recorded. "
         f"{sentence}{also}",
         culprits=[f"views.csv: q{at + 1}_rad" for at in columns],
         next_step=guess.fix,

@@ -46,7 +46,7 @@ class Matched:
         robot: The model, its base in the frame of the poses.
         joints_rad: (n,) by view, those that belong to it [rad].
         flange_from_reported: (4, 4) the frame of the poses in the model's flange.
-        zero: The joint whose zero is elsewhere, as the poses tell; None for none.
+        zero: The joint whose zero is elsewhere, as the poses show; None for none.
         misread: What is wrong with the angles or the model, and the fix; empty where nothing is.
         contradicting: What is wrong with the angles, if it is not the pose, by view.
         warnings: What to mend.
@@ -120,7 +120,7 @@ def match_joints(rows: Sequence[View], robot: Robot) -> Matched:
     constants: another base than the model's and a tool on its flange are no mistakes.
 
     Args:
-        rows: The views that tell where it stood.
+        rows: The views with its pose.
         robot: Its model, as the session names it.
 
     Returns:
@@ -177,7 +177,7 @@ def _compared(matched: Matched, views: Sequence[int], q: FloatArray, poses: Floa
         matched = replace(_based(matched, found), robot=placed_at(robot, found.fit.x))
     sound = ~found.out
     tool = mean_transform(invert(matched.arm.base_from_flange(q[sound])) @ poses[sound])
-    return _told(replace(matched, flange_from_reported=tool), found)
+    return _described(replace(matched, flange_from_reported=tool), found)
 
 
 def _constants(model: FloatArray, poses: FloatArray, guess: JointGuess | None) -> _Constants:
@@ -285,7 +285,7 @@ def _based(matched: Matched, found: _Constants) -> Matched:
     return replace(matched, notes=(*matched.notes, words))
 
 
-def _told(matched: Matched, found: _Constants) -> Matched:
+def _described(matched: Matched, found: _Constants) -> Matched:
     """Says of which frame the poses are, and how well the model predicts them."""
     robot, tool = matched.robot, matched.flange_from_reported
     warnings, notes = list(matched.warnings), list(matched.notes)

@@ -92,7 +92,7 @@ class Arm:
 
     Attributes:
         stops: At how many stops it has a part in the fit.
-        away_mm: Noise of its flange; None where that cannot be told from the cameras' [mm].
+        away_mm: Noise of its flange; None where that cannot be separated from the cameras' [mm].
         away_deg: The same in rotation [deg].
         errs: Whether its errors follow its posture, which is said elsewhere.
         workspace_mm: Predicted sigma of a tool's place all over a calibrated arm's workspace, in
@@ -135,7 +135,7 @@ class Findings:
         pairs: What each camera saw of each target.
         sensors: The cameras and instruments.
         arms: The robots.
-        worst: The worst directions of all unknown edges; the first is told of in a good verdict.
+        worst: The worst directions of all unknown edges; the first is named in a good verdict.
         places: How well places are known.
         warnings: What earlier stages had to say.
         notes: What of it is no reason for doubt.
@@ -209,7 +209,7 @@ def judge(findings: Findings, limits: CalibrationLimits | None = None) -> Verdic
         *(doubt for it in pairs for doubt in _disagreement_doubts(it)),
         *_outlier_doubts(findings, limits),
         *(doubt for it in pairs for doubt in _holdout_doubts(it, findings.mount, limits)),
-        # Views that disagree wildly have no sigma worth a word about the motion.
+        # Sigmas of views that disagree wildly say nothing about the motion.
         *([] if any(it.is_fatal for it in scatter) else _worth_doubts(findings, limits)),
         *_stop_doubts(findings, limits),
         *(doubt for it in sensors for doubt in _lost_doubts(it, limits)),
@@ -446,7 +446,7 @@ def _run(pair: Pair) -> str:
 def _outlier_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
     """Names single views whose residual stands out from the others'.
 
-    Where the corners tell how well each view sees the board, the consensus has judged them better.
+    Where the corners show how well each view sees the board, the consensus has judged them better.
     """
     if any(it.away_mm is not None for it in findings.arms):
         return
@@ -511,7 +511,7 @@ def _worth_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Fin
         if it.workspace_mm is not None and it.workspace_mm > limits.sigma_mm[0]:
             seen = any(sensor.pixel_px is not None for sensor in findings.sensors)
             board = (
-                " The board's size counts in it, as no view can tell an arm and a board that are "
+                " The board's size counts in it, as no view shows when an arm and a board are "
                 "both too large: measure its squares, and state square_sigma_m."
             )
             words = (
@@ -603,15 +603,15 @@ def _lost_doubts(sensor: Sensor, limits: CalibrationLimits) -> Iterator[Finding]
     lost, used = sensor.lost, sensor.used
     share = len(lost) / max(used + len(lost), 1)
     if share > limits.lost_share[0]:
-        told, disagree = "", {*sensor.disagreeing}
+        details, disagree = "", {*sensor.disagreeing}
         others = [it for it in lost if it.view not in disagree]
         if disagree:
             count = len(disagree) if others else "all"
-            told = f"; {count} of them disagree with the others"
+            details = f"; {count} of them disagree with the others"
         if others:
-            told += f"; the first{' but for these' if disagree else ''}: view {others[0].view}, "
-            told += others[0].reason
-        words = f"{len(lost)} of {used + len(lost)} views are not used{told}."
+            details += f"; the first{' but for these' if disagree else ''}: view {others[0].view}, "
+            details += others[0].reason
+        words = f"{len(lost)} of {used + len(lost)} views are not used{details}."
         words_do = "Look at the first of them, and repeat what is missing."
         step = Step(words_do, look_at(others[0].view)) if others else None
         views, is_fatal = tuple(it.view for it in lost), share > limits.lost_share[1]

@@ -1,4 +1,4 @@
-"""Which errors of the arm the data tell: none, offsets, links, eccentric gears, any functions."""
+"""The arm's errors that data determine: none, offsets, links, eccentric gears, any functions."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -35,7 +35,7 @@ from visioncal.robot import Loads
 # What a zero that was found from the target's poses is still off by, before the corners are asked,
 # and the zeros of the other joints with it [rad].
 _ZERO_SIGMA_RAD = 5e-4
-# What may be asked for: the quick one after a lost encoder, or all that the data tell.
+# What may be asked for: the quick one after a lost encoder, or all that the data determine.
 ASKED: Mapping[str, tuple[str, ...]] = {
     "offsets": ("offsets",),
     "kinematics": ("geometry", "eccentricity"),
@@ -292,8 +292,8 @@ def _rms(residuals: FloatArray, turned: Mask) -> Rms:
     return Rms(mm=1e3 * float(np.sqrt(np.mean(shifts))), deg=deg)
 
 
-def tells_functions(asked: str, stops: int) -> bool:
-    """Whether so many stops may tell functions of the joints at a level that is asked for."""
+def allows_functions(asked: str, stops: int) -> bool:
+    """Whether so many stops may determine functions of the joints at a level that is asked for."""
     return asked not in ("offsets", "hand-eye") and stops >= _FEWEST_STOPS
 
 
@@ -347,7 +347,7 @@ def findings(kinematics: Kinematics) -> Iterator[str]:
     if kinematics.level == NOMINAL and kinematics.was_asked:
         yield (
             "The arm stays as stated: what was asked to be found of it explains the views no "
-            "better than chance, or there are too few stops to tell."
+            "better than chance, or there are too few stops to show it."
         )
     nominal = kinematics.levels[0]
     chosen = kinematics.chosen

@@ -1,4 +1,4 @@
-"""Whether what a session says of loads can tell anything."""
+"""Whether what a session says of loads can determine anything."""
 
 from collections.abc import Sequence
 
@@ -62,7 +62,7 @@ def check_poses(loads: Loads, poses: FloatArray) -> None:
     changed = f"{kg.min():g} to {kg.max():g} kg" if np.ptp(kg) else f"0 to {force.max():g} N"
     raise DegenerateError(
         f"the load changes ({changed}), and all {len(poses)} views are of one pose of the arm: "
-        "where the frames are cannot be told from how far the joints bend.",
+        "where the frames are cannot be separated from how far the joints bend.",
         culprits=["payload_kg" if np.ptp(kg) else "force_x_n"],
         next_step="Take the same loads to other poses, all over the workspace: ten or more.",
     )
@@ -78,7 +78,7 @@ def check_elastic(asked: str, robot: Robot | None, loads: Loads) -> None:
         return
     raise DataError(
         f"level 'elastic' needs to know what bends the arm: the model of {robot.name} does not "
-        "tell the masses of its links, and no view has a payload_kg or a force.",
+        "state the masses of its links, and no view has a payload_kg or a force.",
         culprits=["level", robot.name],
         next_step="Add mass_kg and com_m to each [[joint]] of its table, take its URDF, or record "
         "payload_kg (with payload_x_m, payload_y_m, payload_z_m) with every view.",

@@ -43,14 +43,14 @@ class Component:
     seen_sigma_m: float
 
     @property
-    def is_told(self) -> bool:
+    def is_redundant(self) -> bool:
         """Whether the views would do without."""
         return self.seen_sigma_m < SIGMA_LIMIT_M
 
     @property
     def is_contradicted(self) -> bool:
         """Whether the views say otherwise, by more than both may be off."""
-        return self.is_told and self.contradiction > _CONTRADICTION
+        return self.is_redundant and self.contradiction > _CONTRADICTION
 
     @property
     def contradiction(self) -> float:
@@ -62,8 +62,8 @@ class Component:
     def remark(self) -> str:
         """Says that the answer rests on it."""
         alone = "leave it open"
-        if self.is_told:
-            alone = f"tell it to {figure(1e3 * self.seen_sigma_m)} mm"
+        if self.is_redundant:
+            alone = f"determine it to {figure(1e3 * self.seen_sigma_m)} mm"
         return (
             f"The measured {self.label} = {1e3 * self.stated_m:g} mm was used, known to "
             f"{figure(1e3 * self.sigma_m)} mm; the views alone {alone}."

@@ -92,7 +92,7 @@ def need_met(need: Need | None, picks: Sequence[Picks], *, whole: bool = False) 
     Args:
         need: What the task needs.
         picks: Those of each camera and robot.
-        whole: Whether pairs are told apart.
+        whole: Whether pairs are distinguished.
     """
     if need is None or not picks:
         return None
@@ -154,7 +154,7 @@ def picks_of(fitted: Fitted, need: Need | None = None) -> tuple[Picks, ...]:
 
 
 def _part(fitted: Fitted, rows: Sequence[int]) -> Fitted:
-    """What some of the observations tell of picks."""
+    """The information of some of the observations on picks."""
     chosen = np.isin(np.arange(len(fitted.problem)), rows)
     held = fitted.held_out
     kept = replace(held, away_m=held.away_m[chosen], away_rad=held.away_rad[chosen])
@@ -294,7 +294,7 @@ def _left_by_arm(fitted: Fitted, robot: str, errors: ArmErrors, off: FloatArray)
     Args:
         fitted: The fit.
         robot: Whose they are.
-        errors: They.
+        errors: The errors.
         off: (p, q) by how much the fit is off with each of them, in its own size.
     """
     problem, state = fitted.problem, fitted.state

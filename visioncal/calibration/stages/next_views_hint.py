@@ -17,8 +17,8 @@ def with_proposal(sentences: Sequence[str], *, modelled: bool) -> tuple[str, ...
     """
     for at, sentence in enumerate(sentences):
         if _ADD.search(sentence):
-            told = f"{sentence} {_proposal(' '.join(sentences), modelled)}"
-            return (*sentences[:at], told, *sentences[at + 1 :])
+            pointed = f"{sentence} {_proposal(' '.join(sentences), modelled)}"
+            return (*sentences[:at], pointed, *sentences[at + 1 :])
     return tuple(sentences)
 
 

@@ -63,8 +63,8 @@ class Observed:
         warnings: What the user should know.
         notes: What is good to know and no reason for doubt.
         dense: How corners are fitted by all pixels around them; None for the template's.
-        is_misread: Whether robots' poses are clearly misread, so that they tell nothing of lenses
-            and boards.
+        is_misread: Whether robots' poses are clearly misread, so that they determine nothing of
+            lenses and boards.
     """
 
     session: Session

@@ -21,7 +21,7 @@ from visioncal.session import View
 LEAST_CORRELATION, LARGEST_SIGMA_S, _ANY_SIGMA_S = 0.5, 0.01, 1.0
 # Fewer views at rest make no calibration.
 FEWEST_VIEWS = 3
-# A stated offset that is off by so many sigmas, and by this share of a frame, is told.
+# A stated offset that is off by so many sigmas, and by this share of a frame, is reported.
 _STATED_SIGMAS, _STATED_SHARE = 3.0, 0.1
 
 ClockMethod: TypeAlias = Literal["motion", "turning", "stated", "rest"]
@@ -37,7 +37,7 @@ class Clock:
         method: Told by the motion, or by its turning alone; stated by the session; of no
             consequence, for views at rest.
         stated_s: What the session states [s]; None where it states nothing.
-        frames: How many frames in motion told it.
+        frames: How many frames in motion determined it.
         correlation: Of the angles by which camera and robot turned; None where none was found.
         speeds: (6,) how fast the flange moved, by view, in its own frame [rad/s, m/s].
         delays: Times within the images that were looked for.
@@ -56,11 +56,11 @@ class Clock:
         """How well the offset is known beside the views that are used [s].
 
         These are in the fit themselves: of the motion, the share of frames that are no such views
-        tells besides.
+        determines besides.
 
         Args:
-            erring: Whether errors of the arm are unknowns of that fit. The motion told the offset
-                of an arm as stated, whose errors are the same ones in all frames.
+            erring: Whether errors of the arm are unknowns of that fit. The motion determined the
+                offset of an arm as stated, whose errors are the same ones in all frames.
         """
         if self.method != "motion":
             return self.sigma_s
@@ -80,22 +80,22 @@ class Clock:
         )
 
 
-def told_words(fit: ClockFit, match: Match, stream: str) -> str:
-    """Says what the motion tells."""
+def clock_words(fit: ClockFit, match: Match, stream: str) -> str:
+    """Says what the motion determines."""
     return (
         f"The camera's clock is {1e3 * fit.offset_s:+.2f} ms ahead of the robot's (sigma "
-        f"{figure(1e3 * fit.sigma_s)} ms), as {fit.frames} frames and streams/{stream}.csv tell by "
-        "their motion (the turning of both goes along with a correlation of "
+        f"{figure(1e3 * fit.sigma_s)} ms), by the motion in {fit.frames} frames and "
+        f"streams/{stream}.csv (the turning of both goes along with a correlation of "
         f"{match.correlation:.2f})."
     )
 
 
 def turning_doubt(match: Match) -> Finding:
-    """Says what the turning alone tells."""
+    """Says what the turning alone determines."""
     return Finding(
         "clock",
         f"The camera's clock is {1e3 * match.offset_s:+.1f} ms ahead of the robot's (sigma "
-        f"{figure(1e3 * match.sigma_s)} ms), as the turning of both tells (correlation "
+        f"{figure(1e3 * match.sigma_s)} ms), by the turning of both (correlation "
         f"{match.correlation:.2f}). It is known no better, because the chain of frames does not "
         "close over the motion.",
         Step("Try other conventions of the poses.", GUESS),
@@ -103,7 +103,7 @@ def turning_doubt(match: Match) -> Finding:
 
 
 def stated_doubts(clock: Clock, views: Sequence[View]) -> Iterator[Finding]:
-    """Says so where what the session states is not what the motion tells."""
+    """Says so where what the session states is not what the motion gives."""
     if clock.stated_s is None:
         return
     away_s = abs(clock.stated_s - clock.camera_minus_robot_s)
@@ -112,14 +112,14 @@ def stated_doubts(clock: Clock, views: Sequence[View]) -> Iterator[Finding]:
         yield Finding(
             "clock",
             f"[clock] camera_minus_robot_s is stated as {1e3 * clock.stated_s:+.2f} ms, but the "
-            f"motion tells {1e3 * clock.camera_minus_robot_s:+.2f} ms (sigma "
+            f"motion gives {1e3 * clock.camera_minus_robot_s:+.2f} ms (sigma "
             f"{figure(1e3 * clock.sigma_s)} ms), which was taken.",
             Step("Correct [clock] in session.toml, or look at how the stamps are made."),
         )
 
 
-def why_untold(fits: Sequence[ClockFit], matches: Sequence[Match]) -> str:
-    """Says why the motion does not tell the offset."""
+def why_undetermined(fits: Sequence[ClockFit], matches: Sequence[Match]) -> str:
+    """Says why the motion does not determine the offset."""
     best = max(matches, key=lambda it: it.correlation, default=None)
     if best is None:
         return "camera and robot are not seen to turn together for long enough"
@@ -138,7 +138,7 @@ def why_untold(fits: Sequence[ClockFit], matches: Sequence[Match]) -> str:
         return "the motion is too even: any offset explains it"
     if fits[0].sigma_s > LARGEST_SIGMA_S:
         return (
-            f"the motion tells the offset to {figure(1e3 * fits[0].sigma_s)} ms only "
+            f"the motion determines the offset to {figure(1e3 * fits[0].sigma_s)} ms only "
             f"({1e3 * LARGEST_SIGMA_S:g} ms are needed)"
         )
     several = " and ".join(f"{1e3 * it.offset_s:+.0f}" for it in fits)
@@ -166,7 +166,7 @@ def no_offset(
             "they differ by: [clock] camera_minus_robot_s.",
         )
     return DegenerateError(
-        f"clock: the offset between the clocks of camera and robot is not told by {len(views)} "
+        f"clock: the offset between the clocks of camera and robot is left open by {len(views)} "
         f"views, of which {int(resting.sum())} were taken at rest: {why}.",
         culprits=[f"streams/{motion.name}.csv", "views.csv: stamp_s"],
         next_step="Sweep the robot to and fro, about different axes, with the target in view; or "

@@ -176,7 +176,7 @@ def hand_eye(
         return None
     variances = np.diag(covariance_from(information)).reshape(4, 3).sum(axis=1)
     x, z = np.sqrt(variances[1::2]) + LEVER_M * np.sqrt(variances[::2])
-    # Views that agree badly tell less than their motion would.
+    # Views that agree badly determine less than their motion would.
     worse = max(typical / _USUAL.robots[0, 1], 1.0)
     known = worse * float(x), worse * float(z)
     return None if max(x, z) > _WORST_M else ((found.x, found.z), known)

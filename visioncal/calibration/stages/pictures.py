@@ -23,7 +23,7 @@ _LISTED, _LOOKED_AT = 6, 3
 # No need is as small [mm]: what is left out of a result takes nothing from it.
 _LEAST_NEED_MM = 1e-3
 _ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
-# What a photograph tells of a board, beside the dictionary of its markers.
+# What a photograph shows of a board, beside the dictionary of its markers.
 _SEEN = ("kind", "columns", "rows", "legacy", "marker_id", "asymmetric")
 # A board is named by an image that shows so much of it.
 _CLEARLY = 0.2

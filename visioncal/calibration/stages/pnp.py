@@ -27,7 +27,7 @@ from visioncal.vision.targets import first_corners, numbered_positions, rotation
 _RIVAL_RATIO = 2.0
 # ... or while the difference in squared error is no surprise: 6 sigma.
 _RIVAL_CHI2 = 36.0
-# The closed form's guess is worth refining while its rms [px] is under this many times the better
+# The closed form's guess is refined while its rms [px] is under this many times the better
 # pose's, or about a pixel: the fit brings it down by two at most.
 _PROMISING_RATIO = 5.0
 _ROUNDS = 3
@@ -77,8 +77,8 @@ def estimate_poses(
 ) -> Poses:
     """Estimates `cam_from_target` of each view.
 
-    Both solutions of the planar problem are refined and kept while they cannot be told apart, and
-    a board that looks the same after a turn gives each of them once a turn.
+    Both solutions of the planar problem are refined and kept while they cannot be distinguished,
+    and a board that looks the same after a turn gives each of them once a turn.
 
     Args:
         corners: The corners by view; at least one view.

@@ -221,7 +221,7 @@ def _are_poses(rows: Sequence[View]) -> bool:
 
 
 def _names(rows: Sequence[View], *, are_poses: bool) -> tuple[tuple[str, ...], list[Rejection]]:
-    """The points' names, and rows whose point tells nothing.
+    """The points' names, and rows whose point determines nothing.
 
     Raises:
         DataError: A name is missing or misspelt, or several probes were read.
@@ -263,11 +263,11 @@ def _alone(name: str, view: int, others: Mapping[str, Sequence[int]]) -> Rejecti
             culprits=[f"views.csv: view {view}, point"],
             next_step=hint,
         )
-    return Rejection(view, f"its point {name!r} was read once, which tells nothing of the chain")
+    return Rejection(view, f"its point {name!r} was read once, and so determines nothing")
 
 
 def _check_stops(readings: Readings, stops: IntArray) -> None:
-    """Refuses fewer stops than tell where instrument and points are, with any to spare."""
+    """Refuses fewer stops than determine where instrument and points are, with any to spare."""
     count, points = len(np.unique(stops)), len(readings.names)
     needed = 4 if points == 1 else 3
     if count >= needed:
@@ -275,7 +275,7 @@ def _check_stops(readings: Readings, stops: IntArray) -> None:
     what = "point on the flange" if points == 1 else f"{points} points on the flange"
     raise DegenerateError(
         f"instrument: {count} usable stop{'s' if count != 1 else ''} of the robot; at least "
-        f"{needed} are needed to tell where the instrument stands and where the {what} "
+        f"{needed} are needed to determine where the instrument stands and where the {what} "
         f"{'is' if points == 1 else 'are'}.",
         culprits=["the instrument's place", f"the {what}"],
         next_step="Read at more stops, with the flange turned about different axes; 20 to 30 "

@@ -62,8 +62,8 @@ def refined(
 ) -> tuple[Fitted, FramesSide]:
     """Fits lenses, boards and frames to all corners together; see `chosen`.
 
-    Once these are as the corners ask for, the residuals tell the noise of each view, and all is
-    fitted once more by it.
+    Once these are as the corners ask for, the residuals determine the noise of each view, and all
+    is fitted once more by it.
 
     Args:
         side: The frames' side.
@@ -115,7 +115,7 @@ def _equally_weighed(
 
     Errors of an arm are sought once lenses and boards are as the corners ask for. They may have
     passed for another lens or board: all is then chosen once more with them free. Errors of any
-    arm's shape tell which values are free, but are not estimated. Their size is that under the
+    arm's shape decide which values are free, but are not estimated. Their size is that under the
     stated lenses and boards: a board that changes its size with the arm hides a part of it.
     """
     stated = settle(looks, side, looks.first, frames)
@@ -278,7 +278,7 @@ def _wrongly_sized(side: Side, answer: Fitted) -> MeasuredScale | None:
     looks = answer.looks
     held = [it for it in looks.printed if looks.scale_of(it)[0] not in answer.moving]
     measured = [measured_scale(side, answer, board) for board in held]
-    # An arm whose links may all be too long is hard to tell from a board that is too large.
+    # An arm whose links may all be too long is hard to distinguish from a board that is too large.
     other = [it for it in measured if (it.contradicts if side.has_errors else it.is_another)]
     return max(other, key=lambda it: abs(it.scale) / it.sigma, default=None)
 

@@ -102,8 +102,8 @@ def reported_poses(session: Session, robot: Robot | None) -> Reported:
     if not session.is_network:
         # Of a whole cell, such rows are of a state of their own.
         _check_stops(session, poses)
-    told = ((), ()) if matched is None else (matched.warnings, matched.notes)
-    return Reported(poses, tuple(rejections), *told, matched)
+    remarks = ((), ()) if matched is None else (matched.warnings, matched.notes)
+    return Reported(poses, tuple(rejections), *remarks, matched)
 
 
 def _no_pose(joints: FloatArray | None, matched: Matched | None) -> str:

@@ -53,7 +53,7 @@ def read_robots(seen: T) -> T:
 
 
 def _with_stops(session: Session, name: str, reported: Reported) -> Reported:
-    """Fills in, where a row does not tell where its robot stood, what another of its stop tells."""
+    """Fills in, where a row has no pose of its robot, that of another row of its stop."""
     poses, matched = dict(reported.base_from_flange), reported.matched
     joints = {} if matched is None else dict(matched.joints_rad)
     for it in session.observations:
@@ -78,7 +78,7 @@ def _lost(
             why = reasons[name].get(row.robots.get(name, row.view).number, "")
             of = f" ({name})" if len(session.robots) > 1 else ""
             if not why or (name in row.lacks and row.view.stop is not None):
-                why, of = f"no row of its stop tells where {name or 'the robot'} stood", ""
+                why, of = f"no row of its stop has a pose of {name or 'the robot'}", ""
             yield Rejection(row.view.number, f"{why}{of}")
 
 

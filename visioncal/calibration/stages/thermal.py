@@ -37,7 +37,7 @@ NO_JOINTS = "the joint angles of every view, a known model of the robot and the 
 _BEYOND_S = 300.0
 # Joints that are within this of a posture are in it [rad].
 _SAME_RAD = 1e-3
-# The course that is told is drawn by so many points.
+# The reported course is drawn by so many points.
 _DRAWN = 200
 _ADVICE = (
     "Begin with a cold robot, let it work for an hour or more, and look at the same few reference "
@@ -74,10 +74,10 @@ class Heat:
     @property
     def inputs(self) -> Inputs | None:
         """Temperatures or currents; None where they were not recorded at all of the stops."""
-        return None if self.lacking else self._read[0]
+        return None if self.missing else self._read[0]
 
     @property
-    def lacking(self) -> str:
+    def missing(self) -> str:
         """What is missing, in words; empty where nothing is."""
         inputs, missing = self._read
         if inputs is None:
@@ -89,14 +89,14 @@ class Heat:
         stamps = self.stamps_s
         if stamps.min() < first_s - _BEYOND_S or stamps.max() > last_s + _BEYOND_S:
             return (
-                f"{inputs.kind} are told from {first_s:.10g} to {last_s:.10g} s, and views were "
+                f"{inputs.kind} were read from {first_s:.10g} to {last_s:.10g} s, and views were "
                 f"taken from {stamps.min():.10g} to {stamps.max():.10g} s"
             )
         return ""
 
 
 def heating(heat: Heat | None, asked: str) -> Inputs | None:
-    """What heats an arm; None where that is not asked for, or the session does not tell.
+    """What heats an arm; None where that is not asked for, or the session does not determine it.
 
     Args:
         heat: What is known of it; None where the arm's joints are not known.
@@ -111,12 +111,12 @@ def heating(heat: Heat | None, asked: str) -> Inputs | None:
     inputs = None if heat is None else heat.inputs
     if heat is None or inputs is None:
         if asked == LEVEL:
-            raise _missing(NO_JOINTS if heat is None else heat.lacking)
+            raise _missing(NO_JOINTS if heat is None else heat.missing)
         return None
     why = uninformative(inputs, heat.stamps_s)
     if why and asked == LEVEL:
         raise DegenerateError(
-            f"thermal: {why}: the views do not tell how the arm drifts.",
+            f"thermal: {why}: the views do not show how the arm drifts.",
             culprits=["temperatures"],
             next_step=_ADVICE,
         )
@@ -174,13 +174,13 @@ def findings(fit: ThermalFit) -> Iterator[str]:
         f"{figure(1e3 * fit.after_m)} mm. Its transforms are those of the arm as it was at the "
         "start; give temperatures to calibration.base_from_flange and to visioncal correct."
     )
-    # Currents tell a gain and a growth by their product alone.
+    # Currents determine a gain and a growth by their product alone.
     measured = fit.model.heating.kind == "temperatures"
     counted = ("growth", "drift") if measured else ("drift",)
-    names = [it for it in fit.not_told if it.startswith(counted)]
+    names = [it for it in fit.not_determined if it.startswith(counted)]
     if names:
         yield (
-            f"The views do not tell {some_of(names, 6)}: what is known of arms, steel and "
+            f"The views do not determine {some_of(names, 6)}: what is known of arms, steel and "
             "aluminium stands for these."
         )
 
@@ -203,7 +203,7 @@ def drift_result(
         joints=_joints(model),
         covariance=model.covariance,
         lengths_m=model.lengths,
-        not_told=tuple(fit.not_told),
+        not_determined=tuple(fit.not_determined),
         residual_mm=DriftResidual(without=1e3 * fit.before_m, with_drift=1e3 * fit.after_m),
         likelihood_ratio=fit.gain,
         rises_k=tuple(fit.rises_k.tolist()),

@@ -2,7 +2,7 @@
 
 The coefficients are more unknowns that all views share, beside both edges and the arm's errors: one
 closure, one fit. What is known of steel and aluminium, and of how fast arms warm up, is a prior;
-what the views do not tell stays there.
+what the views do not determine stays there.
 """
 
 from collections.abc import Mapping
@@ -40,10 +40,10 @@ _TAU_S: Mapping[Kind, float] = {"currents": 2400.0, "temperatures": 120.0}
 _TAU_SIGMA: Mapping[Kind, float] = {"currents": 0.6, "temperatures": 1.0}
 # Joints at work get warmer than the air by so much, give or take a factor [K].
 RISE_K, _GAIN_SIGMA = 20.0, 0.8
-# Rises of all joints below these tell nothing: temperatures [K], and shares of the rise at rest.
+# Smaller rises of all joints determine nothing: temperatures [K], and shares of the rise at rest.
 LEAST_RISE_K, LEAST_SHARE = 3.0, 0.15
-# A parameter counts as told where its sigma is at most this share of its prior's.
-_TOLD = 0.8
+# A parameter counts as determined where its sigma is at most this share of its prior's.
+_LITTLE = 0.8
 _ROUNDS, _SETTLED = 5, 1e-6
 
 
@@ -73,7 +73,7 @@ class ThermalFit:
         values: (p,) how far its parameters are from what was known beforehand, in units of (p,)
             `sigmas`.
         sigmas: To what they were known beforehand.
-        told: (p,) sigma of each parameter as a share of its prior's.
+        shares: (p,) sigma of each parameter as a share of its prior's.
         gain: Twice the gain in log-likelihood over an arm that does not drift.
         before_m: Residual of the views without drift, as a root mean square [m].
         after_m: The same with it [m].
@@ -84,7 +84,7 @@ class ThermalFit:
     model: ThermalModel
     values: FloatArray
     sigmas: FloatArray
-    told: FloatArray
+    shares: FloatArray
     gain: float
     before_m: float
     after_m: float
@@ -92,10 +92,10 @@ class ThermalFit:
     inputs: Inputs
 
     @property
-    def not_told(self) -> tuple[str, ...]:
+    def not_determined(self) -> tuple[str, ...]:
         """The parameters that stay at what was known before, by joint."""
         names = parameter_names(self.model)
-        return tuple(it for it, share in zip(names, self.told, strict=True) if share > _TOLD)
+        return tuple(it for it, share in zip(names, self.shares, strict=True) if share > _LITTLE)
 
     def links_c(self, stops: Stops) -> FloatArray:
         """(m, n) temperatures of the links at some stops [deg C]."""
@@ -109,7 +109,7 @@ class ThermalFit:
         """What is open about the parameters, as unknowns of the chain at all of so many stops.
 
         They stay where they were found, and count in the covariance with what was known of them
-        beforehand: what the stops tell of them the chain says itself.
+        beforehand: what the stops determine of them the chain says itself.
         """
         free = _effect(self.model, self.values, self.sigmas, stops, self.inputs, count)
         nothing = np.zeros(len(self.values))

@@ -1,4 +1,4 @@
-"""What a session tells of temperatures: its streams, or else columns of its views."""
+"""Temperatures of a session: its streams, or else columns of its views."""
 
 from collections.abc import Mapping, Sequence
 
@@ -12,7 +12,7 @@ from visioncal.session.kinds import name_of
 from visioncal.session.selecting import streams_of
 from visioncal.session.streams import STAMP, Stream
 
-# More samples than this tell warm-up no better: they are averaged in bunches.
+# More samples than this determine warm-up no better: they are averaged in bunches.
 _MOST_SAMPLES = 8192
 _FEWEST_SAMPLES = 3
 _AMBIENT = "ambient_c"
@@ -34,21 +34,21 @@ def inputs_of(session: Session, joints: int, robot: str = "") -> tuple[Inputs | 
     for kind, form in _FORMS.items():
         names = [form.format(at + 1) for at in range(joints)]
         for table in tables:
-            stamps_s, told = table.group(names)
+            stamps_s, heat = table.group(names)
             if len(stamps_s) >= _FEWEST_SAMPLES:
-                return _inputs(kind, stamps_s, told, tables), ""
+                return _inputs(kind, stamps_s, heat, tables), ""
     return None, _missing(tables, joints)
 
 
-def _inputs(kind: Kind, stamps_s: FloatArray, told: FloatArray, tables: Sequence[Stream]) -> Inputs:
+def _inputs(kind: Kind, stamps_s: FloatArray, heat: FloatArray, tables: Sequence[Stream]) -> Inputs:
     ambient = np.zeros(len(stamps_s))
     for table in tables:
         at_s, air = table.group((_AMBIENT,))
         if len(at_s):
             ambient = np.interp(stamps_s, at_s, air[:, 0])
             break
-    told = told if kind == "temperatures" else told**2
-    return _bunched(Inputs(kind, stamps_s, told, ambient))
+    heat = heat if kind == "temperatures" else heat**2
+    return _bunched(Inputs(kind, stamps_s, heat, ambient))
 
 
 def _bunched(inputs: Inputs) -> Inputs:

@@ -53,7 +53,7 @@ def causes_of(
             _jointly(REPLACED, moved, replace(size, units=np.array([_OTHER_SIZE_PER_M])))
             for moved, size in zip(boards, sizes, strict=False)
         ),
-        *(_jointly(BOTH, camera, it) for it in boards if _tell_both(seen, prior_calibration)),
+        *(_jointly(BOTH, camera, it) for it in boards if _both_possible(seen, prior_calibration)),
         *_joints(seen, prior_calibration),
         _noise(seen),
         *_views(seen, prior_calibration),
@@ -82,8 +82,8 @@ def _boards(seen: PredictedStops, prior_calibration: CalibrationPrior) -> Iterat
         yield _cause(f"{BOARD} {names[board]}".strip(), seen, _KNOCK, by_sensor, start=start)
 
 
-def _tell_both(seen: PredictedStops, prior_calibration: CalibrationPrior) -> bool:
-    """Whether camera and board at once are worth a thought: they fit any two stops."""
+def _both_possible(seen: PredictedStops, prior_calibration: CalibrationPrior) -> bool:
+    """Whether camera and board at once are tried: they fit any two stops."""
     return len(prior_calibration.boards) == 1 and len(seen.problem) >= FEWEST_VIEWS
 
 

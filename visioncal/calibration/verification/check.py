@@ -78,8 +78,8 @@ class Check:
         freedom: What that is on average where nothing has changed.
         p_value: How often chance makes it at least as large.
         suspects: All changes that were compared, the likeliest first.
-        named: Those that cannot be told from the likeliest, itself the first; empty where nothing
-            has changed.
+        named: Those that cannot be distinguished from the likeliest, itself the first; empty where
+            nothing has changed.
         explained: Whether the likeliest leaves no more unexplained than noise does.
         camera_sigma: (6,) standard deviations to which a moved camera would be seen, all about the
             camera's axes [rad, m].
@@ -101,7 +101,7 @@ class Check:
 
     @property
     def passed(self) -> bool:
-        """Whether the calibration still holds as far as the stops tell."""
+        """Whether the calibration still holds as far as the stops show."""
         return bool(self.log_evidence < np.log(_LIMITS.likelihood_ratio))
 
 
@@ -126,7 +126,7 @@ def verify(
         camera: Which camera is meant, where session or calibration is of a whole cell.
         robot: Which robot, likewise.
         target: Which target, likewise.
-        board_placed_anew: Whether the board was put elsewhere meanwhile, so that its place tells
+        board_placed_anew: Whether the board was put elsewhere meanwhile, so that its place says
             nothing.
         progress: Told of long work.
 
@@ -177,7 +177,7 @@ def check(
     shares = np.exp(scores - evidence)
     suspects = tuple(Suspect(causes[it].name, float(shares[it]), found[it]) for it in order)
     log_evidence = evidence - nothing.likelihood
-    named = () if log_evidence < np.log(_LIMITS.likelihood_ratio) else _not_told_apart(suspects)
+    named = () if log_evidence < np.log(_LIMITS.likelihood_ratio) else _not_separated(suspects)
     camera = next(it for it in suspects if it.name == CAMERA)
     away = log(seen.away(prior_calibration))
     left = _left(seen, belief, causes[order[0]], suspects[0].explained) if named else away
@@ -210,7 +210,7 @@ def _shares(causes: Sequence[Cause]) -> FloatArray:
     return np.array([1.0 / (len(set(kinds)) * kinds.count(it)) for it in kinds])
 
 
-def _not_told_apart(suspects: Sequence[Suspect]) -> tuple[Suspect, ...]:
+def _not_separated(suspects: Sequence[Suspect]) -> tuple[Suspect, ...]:
     """The likeliest, and what explains the stops about as well.
 
     That is what is about as likely, and what could explain them but for its more unknowns: a
@@ -219,7 +219,7 @@ def _not_told_apart(suspects: Sequence[Suspect]) -> tuple[Suspect, ...]:
     best, *others = suspects
     if kind_of(best.name) in (NOISE, *_PAIRS):
         return (best,)
-    margin = 2.0 * np.log(_LIMITS.told_apart)
+    margin = 2.0 * np.log(_LIMITS.ruled_out)
 
     def price(it: Suspect) -> float:
         return it.explained.misfit + len(it.explained.values)
@@ -230,7 +230,7 @@ def _not_told_apart(suspects: Sequence[Suspect]) -> tuple[Suspect, ...]:
         # Two changes at once imitate either: that says nothing against it.
         if kind_of(it.name) not in _PAIRS
         and (
-            it.probability * _LIMITS.told_apart > best.probability
+            it.probability * _LIMITS.ruled_out > best.probability
             or (it.name != NOISE and price(it) < price(best) + margin)
         )
     ]

@@ -11,7 +11,7 @@ from visioncal.calibration.verification.policy import Outcome
 from visioncal.core.verdict import Verdict
 
 SCHEMA = 1
-# Changes that are less likely than this share are not worth a line.
+# Changes that are less likely than this share get no line.
 _LISTED_SHARE = 1e-3
 
 
@@ -68,7 +68,7 @@ def to_document(
 
 
 def listed_suspects(check: Check) -> tuple[Suspect, ...]:
-    """The changes that are worth a line: those that are named, and others that are not unlikely."""
+    """The changes that are listed: those that are named, and others that are not unlikely."""
     others = (it for it in check.suspects if it not in check.named)
     return (*check.named, *(it for it in others if it.probability > _LISTED_SHARE))
 

@@ -35,11 +35,11 @@ from visioncal.estimation.null_space import joint_words, listed
 from visioncal.estimation.observability import axis_words
 from visioncal.vision.targets import corner_positions
 
-# A part of a motion that is less than so many sigmas is not worth a word.
+# A part of a motion that is less than so many sigmas is not mentioned.
 _WORTH_A_WORD = 3.0
 # So many stops say roughly where camera and board are, by which more are planned.
 _LEAST_STOPS = 3
-# A camera that moves by so many sigmas is told from none in nearly every check.
+# A camera that moves by so many sigmas is detected in nearly every check.
 _SURE = 6.0
 _ALUMINIUM, _STEEL = 23e-6, 12e-6
 _ANEW = "calibrate again; these stops make a first result, and more a good one."
@@ -102,7 +102,7 @@ class MeasuredMove:
         """What of it is beyond noise, in words."""
         shift = f"by {figure(self.mm)} mm (sigma {figure(self.sigma_mm)}) along {self.along}"
         turn = f"by {figure(self.deg)} deg (sigma {figure(self.sigma_deg)}) about {self.about}"
-        told = [
+        parts = [
             text
             for text, value, sigma in (
                 (f"moved {shift}", self.mm, self.sigma_mm),
@@ -110,7 +110,7 @@ class MeasuredMove:
             )
             if value > _WORTH_A_WORD * sigma
         ]
-        return " and ".join(told) or f"moved {shift}"
+        return " and ".join(parts) or f"moved {shift}"
 
 
 def verdict_of(check: Check) -> Verdict:
@@ -126,14 +126,14 @@ def verdict_of(check: Check) -> Verdict:
         _runnable(check, _NEXT.get(kind_of(best.name), _WRONG_VIEW)),
         probability=best.probability,
     )
-    told = [changed]
+    reasons = [changed]
     if others:
-        told.append(_rivals(check, best, others))
+        reasons.append(_rivals(check, best, others))
     if not check.explained:
         words = "Alone it does not explain the stops: something else has changed too."
         anew = _runnable(check, Step(_capital(_ANEW), CALIBRATE_ANEW))
-        told.append(Finding("unexplained", words, anew))
-    return Verdict("bad", (*told, *(doubts if others else ())))
+        reasons.append(Finding("unexplained", words, anew))
+    return Verdict("bad", (*reasons, *(doubts if others else ())))
 
 
 def _runnable(check: Check, step: Step) -> Step:
@@ -152,13 +152,13 @@ def _runnable(check: Check, step: Step) -> Step:
 
 
 def _rivals(check: Check, best: Suspect, others: Sequence[Suspect]) -> Finding:
-    """What the likeliest change cannot be told from."""
+    """What the likeliest change cannot be distinguished from."""
     named = listed([thing(check, it) for it in others])
     robot = check.calibration.calibrated_robot
     if robot is not None and best.name in (f"{JOINT} 1", f"{JOINT} {robot.joint_count}"):
         # A base that turns about the first axis, or a tool about the last, looks the same anywhere.
-        return Finding("rivals", f"No stops can tell that from {named}.", Step("Look at both."))
-    words = f"These {_stops(check)} cannot tell that from {named}."
+        return Finding("rivals", f"No stops separate that from {named}.", Step("Look at both."))
+    words = f"These {_stops(check)} do not separate that from {named}."
     step = _runnable(check, Step("Verify with stops all over the workspace.", PLAN))
     return Finding("rivals", words, step)
 
@@ -357,7 +357,7 @@ def _agreement(check: Check) -> str:
 
 def _doubts(check: Check) -> Iterator[Finding]:
     if check.seen.stops < CheckLimits.stops:
-        words = f"{_capital(_stops(check))} hardly tell one change from another."
+        words = f"{_capital(_stops(check))} hardly distinguish one change from another."
         step = _runnable(check, Step(f"Take {CheckLimits.stops} stops or more.", PLAN))
         yield Finding("few_stops", words, step)
 

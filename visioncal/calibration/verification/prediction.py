@@ -31,7 +31,7 @@ from visioncal.vision.targets import target_document
 _ONE_ROBOT_MM, _ONE_ROBOT_DEG = 0.01, 0.001
 _POSTURES = 5
 _STAGES = {it.name: it.run for it in STAGES}
-# Corners that scatter by so many times as much as when they were calibrated with are worth a word.
+# Corners that scatter by so many times as much as when they were calibrated with are mentioned.
 _WORTH_A_WORD = 2.0
 
 

@@ -2,7 +2,7 @@
 
 By its marks: URScript's `p[..]`, Doosan's `posx(..)`, RAPID's `[[..],[..]]` and robtargets, and
 values with names before them: X, Y, Z and A, B, C (KUKA), W, P, R (FANUC), q1 to q4 (ABB), Rx, Ry,
-Rz (several makers), qx to qw. Bare numbers tell nothing but their count.
+Rz (several makers), qx to qw. Bare numbers show nothing but their count.
 """
 
 import re
@@ -127,7 +127,7 @@ def _written(line: str) -> _Written | None:
 def _marked(line: str) -> _Written | None:
     for form, pattern in _MARKED:
         found = pattern.findall(line)
-        # Of two poses in a line nobody tells which is meant.
+        # Of two poses in a line it is not known which is meant.
         if len(found) == 1:
             words = re.split(r"[\s,\[\]]+", found[0].strip())
             if all(re.fullmatch(_NUMBER, it) for it in words):

@@ -112,7 +112,7 @@ def _calibrated(job: Job, session: Session) -> tuple[Calibration, Written]:
 
 
 def _draw(folder: Path, session: Session, found: Calibration) -> bool:
-    """Writes a small picture of the first view that was used; tells whether there is one."""
+    """Writes a small picture of the first view that was used; returns whether there is one."""
     from visioncal.present.report.thumbnails import small_picture
 
     used = {it.view for it in found.views if it.used}

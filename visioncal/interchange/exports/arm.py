@@ -91,14 +91,14 @@ class ArmContent:
 
     @property
     def notes(self) -> list[str]:
-        """Lines for a comment: where it comes from, its worth, and what it goes with."""
-        worth = f"verdict {self.verdict.status}"
+        """Lines for a comment: where it comes from, its quality, and what it goes with."""
+        quality = f"verdict {self.verdict.status}"
         if self.sigma_mm is not None:
             median, high = self.sigma_mm.median, self.sigma_mm.p95
-            worth += f"; sigma over the workspace {median:.2g} mm, at 95 % of it under {high:.2g}"
+            quality += f"; sigma over the workspace {median:.2g} mm, at 95 % of it under {high:.2g}"
         return [
             self.origin,
-            worth,
+            quality,
             f"{self.robot.name}, calibrated: base_from_flange, the pose of {self.robot.tip} in the "
             "base; the calibration's transforms go with this arm, not with the nominal one",
             *self.omitted,
@@ -142,7 +142,7 @@ class ArmFormat:
         name: As the command line has it.
         words: What it is and who reads it, with its units, in one line.
         write: Builds the document.
-        takes: What it can be told beside.
+        takes: Its further options.
         warn: Words what the user should know before the document serves; empty for nothing.
     """
 

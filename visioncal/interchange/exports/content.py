@@ -10,7 +10,7 @@ _OF_LENS = "it goes with the lens of that calibration: with other intrinsics, us
 
 @dataclass(frozen=True)
 class Load:
-    """What a tool weighs, which no calibration tells.
+    """What a tool weighs, which no calibration determines.
 
     Attributes:
         mass_kg: Its mass.
@@ -96,7 +96,7 @@ class Content:
         return self.edge.matrix
 
     @property
-    def worth(self) -> str:
+    def quality(self) -> str:
         """The verdict and the sigma of the transform, in one line."""
         position = f"verdict {self.verdict.status}; sigma {self.edge.sigma_mm:.2g} mm"
         if self.rotation_of is None:
@@ -110,6 +110,6 @@ class Content:
 
     @property
     def notes(self) -> list[str]:
-        """Lines for a comment: where it comes from, its worth, and what it does."""
+        """Lines for a comment: where it comes from, its quality, and what it does."""
         is_of_lens = self.lens is not None and any(it.startswith("cam") for it in self.frames)
-        return [self.origin, self.worth, self.direction, *([_OF_LENS] if is_of_lens else [])]
+        return [self.origin, self.quality, self.direction, *([_OF_LENS] if is_of_lens else [])]

@@ -59,7 +59,7 @@ def _warn_of_load(content: Content) -> str:
     if content.load is not None:
         return ""
     return (
-        "touches tell no load: the tool's mass is written as -1, ABB's mark of a load that is "
+        "touches determine no load: the tool's mass is written as -1, ABB's mark of a load that is "
         "still to be given. Give it with --mass-kg and --cog-mm, or run LoadIdentify before the "
         "robot moves with this tool."
     )

@@ -27,7 +27,7 @@ class ExportFormat:
         write: Builds the document.
         holds: What of a result it can hold.
         frames: What its readers call our frames; ours keep their names where it says nothing.
-        takes: What it can be told beside.
+        takes: Its further options.
         counterpart: The maker's format of fixtures, for one of tools; and the other way round.
         write_all: Builds the document of all transforms of a cell; None where it holds one.
         warn: Words what the user must still do before the document serves; empty for nothing.

@@ -30,7 +30,7 @@ _MEANINGS: Mapping[str, str] = {
 
 
 def ros_notes(content: Content) -> list[str]:
-    """Says in lines for a comment what the transform is, its worth, and what its frames are."""
+    """Says in lines for a comment what the transform is, its quality, and what its frames are."""
     names = zip((content.parent, content.child), content.frames, strict=True)
     meanings = [f"{name}: {_MEANINGS[own]}" for name, own in names if own in _MEANINGS]
     return [*content.notes, *meanings]

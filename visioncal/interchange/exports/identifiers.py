@@ -15,7 +15,7 @@ class Language:
         shape: What a name looks like.
         needed: The same in words.
         taken: Names that it keeps for itself; in small letters where capitals are alike.
-        cased: Whether it tells capitals from small letters.
+        cased: Whether it distinguishes capitals from small letters.
     """
 
     name: str

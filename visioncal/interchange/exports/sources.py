@@ -144,7 +144,7 @@ class Placements:
 
 
 def ends_of(name: str) -> tuple[str, str]:
-    """Gives our names of a transform's parent and child; empty where the name tells none."""
+    """Gives our names of a transform's parent and child; empty where the name has none."""
     parent, _, child = name.partition("_from_")
     return parent, child
 

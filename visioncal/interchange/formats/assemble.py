@@ -211,7 +211,7 @@ def _with_one_witness(foreign: Foreign, notes: list[str]) -> Foreign:
     if foreign.target is not None:
         if foreign.camera is not None:
             notes.append(
-                "The stored poses of the target are left aside: the images tell them better."
+                "The stored poses of the target are left aside: the images determine them better."
             )
         return replace(foreign, camera=None)
     if foreign.camera is None:
@@ -307,7 +307,7 @@ def _image_paths(foreign: Foreign) -> list[tuple[str, Path] | None]:
         if file is None or file in paths:
             continue
         names = chain([file.name], (f"{number}_{file.name}" for number in count(at)))
-        # Not every file system tells capitals from small letters.
+        # Not every file system distinguishes capitals from small letters.
         paths[file] = next(it for it in names if it.casefold() not in taken)
         taken.add(paths[file].casefold())
     return [None if it is None else (f"images/{paths[it]}", it) for it in foreign.images]

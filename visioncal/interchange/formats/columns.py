@@ -146,7 +146,7 @@ def _pose_file(path: Path) -> Path | None:
     if path.is_file():
         return path if path.suffix.lower() in ENDINGS else None
     files = [it for it in listed(path) if it.suffix.lower() in ENDINGS]
-    # Beside a file of intrinsics or notes, the name tells.
+    # Beside a file of intrinsics or notes, the name decides.
     named = [it for it in files if re.search("pose|robot", it.stem.lower())]
     return next((it[0] for it in (files, named) if len(it) == 1), None)
 

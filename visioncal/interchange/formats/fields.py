@@ -95,8 +95,8 @@ class Fields:
         if full in self.ragged:
             raise DataError(self.ragged[full], culprits=[full])
         if full not in self.numbers:
-            told = zip(self.places, self.texts[full], strict=True)
-            odd = ((place, it) for place, it in told if it and not is_number(it))
+            cells = zip(self.places, self.texts[full], strict=True)
+            odd = ((place, it) for place, it in cells if it and not is_number(it))
             # JSON has numbers in quotes as well.
             place, text = next(odd, (self.places[0], self.texts[full][0]))
             raise DataError(

@@ -9,7 +9,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import is_inside, natural
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
-# Enough to tell what a text file is about.
+# Enough to recognise a text file.
 _HEAD_BYTES = 16_384
 
 
@@ -93,7 +93,7 @@ def _found(names: Sequence[str | None], folder: Path) -> list[Path | None]:
     by_name = {it.stem: it for it in there} | {it.name: it for it in there}
     by_number = _unique_numbers(there)
     wanted = [number_in(it) for it in names if it]
-    numbers_tell = len(set(wanted)) == len(wanted) and None not in wanted
+    is_unique = len(set(wanted)) == len(wanted) and None not in wanted
     found: list[Path | None] = []
     for name in names:
         if not name:
@@ -102,7 +102,7 @@ def _found(names: Sequence[str | None], folder: Path) -> list[Path | None]:
         plain = name.replace("\\", "/").rsplit("/", 1)[-1]
         number = number_in(plain)
         match = by_name.get(plain)
-        if match is None and numbers_tell and number is not None:
+        if match is None and is_unique and number is not None:
             match = by_number.get(number)
         found.append(match or below(folder, plain))
     return found
@@ -152,7 +152,7 @@ def _images_of(
         )
     return there, (
         f"Rows and images are paired in order, {labels[0]} with {there[0].name}, {labels[-1]} with "
-        f"{there[-1].name}; --image-column names a column that tells each row's image.",
+        f"{there[-1].name}; --image-column names a column that names each row's image.",
     )
 
 

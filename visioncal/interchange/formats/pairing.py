@@ -89,7 +89,7 @@ def _by_time(
             *notes,
             f"The camera's clock is about {1e3 * paired.match.offset_s:+.0f} ms ahead of the "
             "robot's, as both turn alike there with a correlation of "
-            f"{paired.match.correlation:.2f}; calibrate tells it finer.",
+            f"{paired.match.correlation:.2f}; calibrate estimates it finer.",
             f"All {len(seen)} samples of the camera are kept as views, and the robot's as a stream "
             "beside them: calibrate takes the robot's poses from there.",
         ),

@@ -15,7 +15,7 @@ from visioncal.interchange.formats.fields import Fields
 from visioncal.interchange.formats.import_options import PoseImportOptions
 from visioncal.session.columns import SELECTORS
 
-# Names under which pose pairs are commonly stored, the most telling first.
+# Names under which pose pairs are commonly stored, the most specific first.
 ROBOT_KEYS: tuple[tuple[str, ...], ...] = (
     ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"),
     ("effector_wrt_world",),
@@ -68,12 +68,12 @@ def known_names(
 ) -> tuple[str, ...]:
     """Finds the first of several sets of names that are all there and free, in any case of letters.
 
-    What holds no numbers counts where its name tells enough, so that it is refused by its place.
+    What holds no numbers counts where its name is clear, so that it is refused by its place.
 
     Returns:
         The fields' full names; empty where no set is whole.
     """
-    # One number in a field called `robot` or `camera` tells which of several it is.
+    # One number in a field called `robot` or `camera` says which of several it is.
     numbers = (it for it, them in fields.numbers.items() if them.ndim > 1 or it not in SELECTORS)
     holding = [*numbers, *fields.ragged]
     worded = (it for it, cells in fields.texts.items() if any(cells) and it not in SELECTORS)
@@ -115,7 +115,7 @@ def pose_names(
         taken: Full names of those that hold something else.
 
     Returns:
-        Full names; empty where nothing tells.
+        Full names; empty where nothing says it.
 
     Raises:
         DataError: The user names what is not there.
@@ -132,7 +132,7 @@ def poses_from(
 
     16 numbers are a matrix, by rows or by columns as its last row of 0, 0, 0, 1 shows; 12 its upper
     three rows; else three of position and those of a rotation, in whichever order names such as
-    rvec and tvec tell.
+    rvec and tvec say it.
 
     Args:
         fields: The fields.

@@ -117,7 +117,7 @@ def read_foreign(source: Path, requested: ImportOptions, form: str | None = None
 
 
 def write_session(session: Session, dest: Path) -> None:
-    """Writes a session in the form that the suffix of `dest` tells, and reads it again.
+    """Writes a session in the form that the suffix of `dest` names, and reads it again.
 
     Raises:
         DataError: There is nothing in the session, `dest` cannot be written, or does not hold it.

@@ -12,8 +12,8 @@ from visioncal.calibration.guess.hypothesis import Hypothesis
 from visioncal.calibration.pipeline.guess_inputs import (
     chain_poses,
     numbers_in,
+    reported_or_chained,
     seen_poses,
-    told_or_chained,
 )
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.documents.tables import is_number
@@ -49,7 +49,7 @@ def guess_foreign(foreign: Foreign, *, progress: Progress | None = None) -> Gues
     """Tries every plausible reading of somebody else's poses, and both mounts where none is known.
 
     Raises:
-        DataError: There is nothing to read, the target is in no view, or nothing tells the mount.
+        DataError: There is nothing to read, the target is in no view, or nothing shows the mount.
         DegenerateError: Too few views have both poses.
         ConvergenceError: The intrinsics do not come to rest.
     """
@@ -61,7 +61,7 @@ def guess_foreign(foreign: Foreign, *, progress: Progress | None = None) -> Gues
     if camera is None:
         camera = seen_poses(session, progress=progress)
     return guess_reading(
-        told_or_chained(foreign.robot, chain),
+        reported_or_chained(foreign.robot, chain),
         camera,
         foreign.mount,
         chain=chain,
@@ -268,11 +268,11 @@ def _check_applies(candidate: Candidate, robot: PoseNumbers) -> None:
 def _go_together(chain: FloatArray | None, robot: PoseNumbers) -> bool:
     """Whether each row's joint angles are of its pose: they then change rows with it.
 
-    Without a model of the robot nobody can tell, and one log is the likelier.
+    Without a model of the robot this stays open, and one log is the likelier.
     """
     if chain is None or not robot.there.any():
         return True
-    # Other units or frames move all rows alike: what differs from row to row tells.
+    # Other units or frames move all rows alike: what differs from row to row shows it.
     steps = [
         np.linalg.norm(np.diff(it, axis=0), axis=1) for it in (chain[:, :3, 3], robot.positions)
     ]

@@ -12,7 +12,7 @@ from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.clock_correlation import WIDEST_OFFSET_S, Frames, Match, turning_matches
 from visioncal.estimation.trajectory import LONGEST_GAP_S, Trajectory
 
-# Less in common tells no offset; more is a recording of work, not of a calibration.
+# Less in common determines no offset; more is a recording of work, not of a calibration.
 _SHORTEST_S, _LONGEST_S = 2.0, 3600.0
 # Epochs of our days count 1e9 seconds: (larger than, seconds).
 _EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
@@ -54,7 +54,7 @@ def seconds(stamps: FloatArray, places: Sequence[str]) -> FloatArray:
 
 
 def in_seconds(stamps: FloatArray) -> FloatArray:
-    """Reads stamps as seconds; an epoch in milli-, micro- or nanoseconds tells by its size."""
+    """Reads stamps as seconds; an epoch's size shows milli-, micro- or nanoseconds."""
     known = np.abs(stamps[np.isfinite(stamps)])
     largest = float(known.max()) if len(known) else 0.0
     return stamps * next((it for limit, it in _EPOCHS if largest > limit), 1.0)

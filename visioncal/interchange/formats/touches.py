@@ -58,7 +58,7 @@ def read_touches(
 
 
 def _of_robot(fields: Fields, robot: str | None) -> Fields:
-    """The rows of one robot, where a column tells whose each is."""
+    """The rows of one robot, where a column names it."""
     named = fields.texts.get("robot", ())
     known = list(dict.fromkeys(named))
     if len(known) < 2:

@@ -157,8 +157,8 @@ def _told(found: ArmResult) -> Iterator[str]:
     known = found.observability
     if known is not None:
         yield from ("", "## What the stops tell", "")
-        yield f"{known.told} of {known.identifiable} directions that any stops could tell."
-    for it in found.not_told or ():
+        yield f"{known.determined} of {known.identifiable} directions that stops can determine."
+    for it in found.not_determined or ():
         yield f"- {plain(it)}"
 
 
@@ -168,4 +168,4 @@ def _stops(found: ArmResult) -> Iterator[str]:
         yield "By how much the mean variance over the workspace would grow without it:"
         yield ""
     for it in (*found.stops[:_MOST_WORTH], *found.stops[_MOST_WORTH:][-1:]):
-        yield f"- view {it.view}: {100 * it.worth:.2g} %"
+        yield f"- view {it.view}: {100 * it.influence:.2g} %"

@@ -89,7 +89,7 @@ def arm_card(found: ArmResult) -> ArmCard:
         )
     if found.carries_over is not None:
         sentences.append(found.carries_over.words)
-    worth = [WorthRow(f"view {it.view}", _percent(it.worth)) for it in found.stops]
+    worth = [WorthRow(f"view {it.view}", _percent(it.influence)) for it in found.stops]
     return ArmCard(
         tuple(sentences),
         tuple(_level(it, it.level == found.level) for it in found.levels[: _tried(found)]),
@@ -99,7 +99,7 @@ def arm_card(found: ArmResult) -> ArmCard:
         _columns(found),
         _told(found),
         tuple(_details(found)),
-        found.not_told or (),
+        found.not_determined or (),
         tuple(worth[:_MOST_WORTH]),
         tuple(worth[_MOST_WORTH:][-1:]),
     )
@@ -144,7 +144,7 @@ def _told(found: ArmResult) -> tuple[Fact, ...]:
     known = found.observability
     if known is None:
         return ()
-    told = f"{known.told} of {known.identifiable}"
+    told = f"{known.determined} of {known.identifiable}"
     facts = [Fact("directions told", told, "that any stops could tell")]
     if known.condition is not None:
         note = "best over worst told, scaled"

@@ -45,17 +45,17 @@ def drift_card(found: ThermalResult) -> DriftCard:
         f"{significant(_hours(found, last.stamp_s))} h after the start. Counted with, it takes the "
         f"views' residuals from {significant(residual.without)} to "
         f"{significant(residual.with_drift)} mm.",
-        tuple(_row(it, found.not_told) for it in found.joints),
+        tuple(_row(it, found.not_determined) for it in found.joints),
     )
 
 
-def _row(it: JointDrift, not_told: Sequence[str]) -> JointRow:
+def _row(it: JointDrift, names: Sequence[str]) -> JointRow:
     return JointRow(
         it.joint,
         _with_sigma(1e6 * it.growth_per_k, 1e6 * it.growth_sigma_per_k),
         _with_sigma(1e6 * it.drift_rad_per_k, 1e6 * it.drift_sigma_rad_per_k),
         significant(it.tau_s / 60.0),
-        "growth as known before" if f"growth of {it.joint}" in not_told else "",
+        "growth as known before" if f"growth of {it.joint}" in names else "",
     )
 
 

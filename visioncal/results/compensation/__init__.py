@@ -1,4 +1,4 @@
-"""Compensation: what to tell a nominal controller so that the real arm goes where it is wanted."""
+"""Compensation: what to command a nominal controller so that the real arm goes where wanted."""
 
 from visioncal.results.compensation.arms import CalibratedArm
 from visioncal.results.compensation.correction import WIDEST_RAD, Corrected, correct

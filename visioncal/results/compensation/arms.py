@@ -64,7 +64,7 @@ class CalibratedArm:
             loads: What the flange carries; the arm's own weight alone where None.
 
         Returns:
-            (m, n) what their encoders have to tell [rad].
+            (m, n) what their encoders have to report [rad].
         """
         if not self.compliance.any() and self.weight_moments is None:
             return q
@@ -95,7 +95,7 @@ def _without_arm(calibration: Calibration) -> DataError:
         )
     return DataError(
         f"calibration {name!r} has no calibrated arm (level {calibration.arm.level}): its "
-        "views do not tell the arm from its nominal model, so there is nothing to correct.",
+        "views do not distinguish the arm from its nominal model, so there is nothing to correct.",
         next_step="Send the targets as they are; or calibrate with more views, all over the "
         "workspace.",
     )

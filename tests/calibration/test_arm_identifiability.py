@@ -1,4 +1,4 @@
-"""What stops tell of an arm: ranks, names of what they do not, indices, sigmas, and worth."""
+"""Identifiability of an arm at its stops: ranks, null space in words, indices, sigmas."""
 
 import json
 from dataclasses import replace
@@ -126,12 +126,13 @@ def test_ranks_are_those_of_theory(name, mount):
     robot = robot_of(name)
     rails = int(robot.chain.prismatic.sum())
     turning = robot.joint_count - rails
-    told = identify_arm(arm_data(robot, postures(robot)[:40], mount)).told
+    counts = identify_arm(arm_data(robot, postures(robot)[:40], mount)).counts
     expected = 4 * turning + 2 * rails + 6
-    assert told.columns == 12 + 6 * robot.joint_count
-    assert (told.identifiable, told.told, told.missing.shape[1]) == (expected, expected, 0)
+    assert counts.columns == 12 + 6 * robot.joint_count
+    assert (counts.identifiable, counts.determined) == (expected, expected)
+    assert counts.missing.shape[1] == 0
     # Forty stops all over the workspace tell all of it well.
-    assert len(told.values) == expected - 12
+    assert len(counts.values) == expected - 12
 
 
 @pytest.mark.parametrize("name", ["ur5e", "irb120", "panda"])
@@ -140,10 +141,10 @@ def test_readings_of_one_point_tell_three_values_less(name):
     robot = load_robot(name)
     arm = arm_data(robot, postures(robot)[:60], "eye-to-hand")
     whole, point = (
-        identify_arm(arm).told,
-        identify_arm(replace(arm, measured=np.arange(6) > 2)).told,
+        identify_arm(arm).counts,
+        identify_arm(replace(arm, measured=np.arange(6) > 2)).counts,
     )
-    assert (point.identifiable, point.told) == (whole.identifiable - 3, whole.told - 3)
+    assert (point.identifiable, point.determined) == (whole.identifiable - 3, whole.determined - 3)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
@@ -156,28 +157,28 @@ def test_a_second_board_adds_six_values(mount):
     state = replace(arm.state, values=problem.start_values)
     covariance = covariance_from(fisher_information(problem, state, arm.noise))
     further = {"frames": np.arange(18), "columns": 6 + arm.columns}
-    telling = identify_arm(
+    numbers = identify_arm(
         replace(arm, problem=problem, state=state, covariance=covariance, **further)
     )
-    told = telling.told
-    assert (told.columns, told.identifiable, told.told) == (54, 36, 36)
+    counts = numbers.counts
+    assert (counts.columns, counts.identifiable, counts.determined) == (54, 36, 36)
     # Half of the stops have a board of their own to place: they tell less of the arm.
-    assert np.median(telling.sigmas_m) > np.median(identify_arm(arm).sigmas_m)
+    assert np.median(numbers.sigmas_m) > np.median(identify_arm(arm).sigmas_m)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_offsets_of_the_first_and_the_last_joint_are_never_told(mount):
     robot = load_robot("ur5e")
-    telling = identify_arm(arm_data(robot, postures(robot)[:40], mount, ("offsets",)))
-    assert (telling.told.identifiable, telling.told.told) == (16, 16)
-    assert telling.not_told == (
-        "the offset of joint 1 (shoulder_pan_joint) cannot be told from the base frame",
-        "the offset of joint 6 (wrist_3_joint) cannot be told from the tool frame",
+    numbers = identify_arm(arm_data(robot, postures(robot)[:40], mount, ("offsets",)))
+    assert (numbers.counts.identifiable, numbers.counts.determined) == (16, 16)
+    assert numbers.not_determined == (
+        "the offset of joint 1 (shoulder_pan_joint) cannot be separated from the base frame",
+        "the offset of joint 6 (wrist_3_joint) cannot be separated from the tool frame",
     )
-    assert telling.advice == ""
-    # Both sines of each encoder are told, however the arm is mounted.
+    assert numbers.advice == ""
+    # Both sines of each encoder are determined, however the arm is mounted.
     both = identify_arm(arm_data(robot, postures(robot)[:60], mount, ("links", "eccentricity")))
-    assert (both.told.identifiable, both.told.told) == (42, 42)
+    assert (both.counts.identifiable, both.counts.determined) == (42, 42)
 
 
 @pytest.mark.parametrize("name", ["ur3e", "ur5", "ur5e", "ur10", "ur10e", "ur16e"])
@@ -190,16 +191,16 @@ def test_beta_is_chosen_for_parallel_axes(name):
     assert betas == [1, 2]
     # Four numbers a joint, six of which hide in the frames at both ends.
     assert len(by_default.estimates) == 24
-    assert len(by_default.not_told) == 6
-    summed = "the lengths d of joints 2, 3, 4 (parallel axes): only their sum is told"
-    assert summed in standard.not_told
-    assert summed not in by_default.not_told
+    assert len(by_default.not_determined) == 6
+    summed = "the lengths d of joints 2, 3, 4 (parallel axes): only their sum is determined"
+    assert summed in standard.not_determined
+    assert summed not in by_default.not_determined
 
 
 def test_what_hides_in_the_frames_depends_on_the_convention():
     robot = load_robot("panda")
     data = arm_data(robot, postures(robot)[:40])
-    lost = {it: identify_arm(data, it).not_told for it in CONVENTIONS}
+    lost = {it: identify_arm(data, it).not_determined for it in CONVENTIONS}
     # Craig's first row lies before the first axis; Denavit and Hartenberg's last behind the last.
     assert any(it.startswith("the twist alpha of joint 1 ") for it in lost["modified"])
     assert any(it.startswith("the twist alpha of joint 7 ") for it in lost["standard"])
@@ -210,39 +211,39 @@ def test_a_joint_that_hardly_moved_is_named():
     robot = load_robot("ur5e")
     q = postures(robot)[:40].copy()
     q[:, 4] = 1.2 + np.deg2rad(np.linspace(-1.0, 1.0, len(q)))
-    telling = identify_arm(arm_data(robot, q))
-    assert telling.told.identifiable == 30
-    assert 26 <= telling.told.told < 30
-    assert len(telling.not_told) == 7
-    assert "joint 5 (wrist_2_joint) moved by 2 deg only" in telling.not_told[-1]
-    assert "joint 5 by" in telling.advice
-    assert f"tell {telling.told.told} of the 30" in telling.advice
-    # Done as advised, all is told.
-    wanted = float(telling.advice.split("joint 5 by ")[1].split(" deg")[0])
+    numbers = identify_arm(arm_data(robot, q))
+    assert numbers.counts.identifiable == 30
+    assert 26 <= numbers.counts.determined < 30
+    assert len(numbers.not_determined) == 7
+    assert "joint 5 (wrist_2_joint) moved by 2 deg only" in numbers.not_determined[-1]
+    assert "joint 5 by" in numbers.advice
+    assert f"determine {numbers.counts.determined} of the 30" in numbers.advice
+    # Done as advised, all is determined.
+    wanted = float(numbers.advice.split("joint 5 by ")[1].split(" deg")[0])
     q[:, 4] += np.deg2rad(np.random.default_rng(1).uniform(-0.5, 0.5, len(q)) * wanted)
-    assert identify_arm(arm_data(robot, q)).told.told == 30
+    assert identify_arm(arm_data(robot, q)).counts.determined == 30
 
 
 def test_two_joints_that_stood_still_are_named():
     robot = load_robot("irb120")
     q = postures(robot)[:40].copy()
     q[:, [2, 3]] = [0.2, 0.4]
-    telling = identify_arm(arm_data(robot, q))
-    assert telling.told.told < 30
+    numbers = identify_arm(arm_data(robot, q))
+    assert numbers.counts.determined < 30
     named = {"joint 3 (joint_3)", "joint 4 (joint_4)"}
-    assert {it for it in named if it in telling.not_told[-1]} == named
-    assert telling.not_told[-1].count("by 0 deg") == 2
-    assert telling.not_told[-1].endswith(" and others")
+    assert {it for it in named if it in numbers.not_determined[-1]} == named
+    assert numbers.not_determined[-1].count("by 0 deg") == 2
+    assert numbers.not_determined[-1].endswith(" and others")
 
 
 def test_a_rail_that_stood_still_is_named_in_millimetres():
     robot = robot_of("crane")
     q = postures(robot)[:40].copy()
     q[:, 2] = 0.1
-    telling = identify_arm(arm_data(robot, q))
-    assert telling.told.told < telling.told.identifiable
-    assert "joint 3 (joint_3) moved by 0 mm only" in telling.not_told[-1]
-    assert "mm or more" in telling.advice
+    numbers = identify_arm(arm_data(robot, q))
+    assert numbers.counts.determined < numbers.counts.identifiable
+    assert "joint 3 (joint_3) moved by 0 mm only" in numbers.not_determined[-1]
+    assert "mm or more" in numbers.advice
 
 
 def test_the_indices_are_as_published():
@@ -267,7 +268,7 @@ def test_better_stops_have_better_indices():
 def test_the_worth_of_a_stop_is_that_of_a_fit_without_it(mount):
     robot = load_robot("ur5e")
     arm = arm_data(robot, postures(robot)[:15], mount)
-    telling = identify_arm(arm)
+    numbers = identify_arm(arm)
     anywhere = postures(arm.model.robot)
     flange = arm.model.base_from_flange(anywhere)
     poses, jacobian = arm.pair.jacobian(flange, arm.basis(anywhere))
@@ -281,9 +282,9 @@ def test_the_worth_of_a_stop_is_that_of_a_fit_without_it(mount):
     for stop in range(15):
         rest = arm.problem.subset(np.arange(15) != stop)
         # Exact but for rounding.
-        assert telling.worth[stop] == pytest.approx(variance(rest) / whole - 1.0, rel=1e-6)
-    assert telling.worth.min() > 0.0
-    assert telling.sigmas_m == pytest.approx(
+        assert numbers.influence[stop] == pytest.approx(variance(rest) / whole - 1.0, rel=1e-6)
+    assert numbers.influence.min() > 0.0
+    assert numbers.sigmas_m == pytest.approx(
         np.sqrt(np.einsum("mij,jk,mik->m", place, arm.covariance, place))
     )
 
@@ -309,12 +310,12 @@ def test_sigmas_hold_the_errors_of_the_numbers(name, convention):
             covariance=result.covariance,
             model=found,
         )
-        telling = identify_arm(arm, convention)
+        numbers = identify_arm(arm, convention)
         like = convert_table(table_from_document(robot.document), convention)
         wanted = table_of(true.bare, convention, like=like)
         # What the frames hide keeps what was stated, which says nothing of the sigma.
-        told = [it for it in telling.estimates if it.sigma < 0.4 * ERROR_RAD * it.parameter.unit]
-        surprises += [(it.identified - it.parameter.value(wanted)) / it.sigma for it in told]
+        counts = [it for it in numbers.estimates if it.sigma < 0.4 * ERROR_RAD * it.parameter.unit]
+        surprises += [(it.identified - it.parameter.value(wanted)) / it.sigma for it in counts]
     assert len(surprises) > 20 * 14
     # Some four hundred squares, of which a few numbers of each arm hang together: 10 % each.
     assert np.mean(np.square(surprises)) == pytest.approx(1.0, abs=0.25)
@@ -339,7 +340,7 @@ def calibrated_cell():
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_the_result_is_in_the_convention_that_is_asked_for(calibrated_cell, convention):
     cell, known = calibrated_cell
-    assert known.arm_found.telling.convention == "hayati"
+    assert known.arm_found.numbers.convention == "hayati"
     asked = replace(known, convention=convention)
     (examine_again,) = (it for it in STAGES if it.name == "examine")
     known = examine_again.run(asked)
@@ -358,28 +359,28 @@ def test_the_result_is_in_the_convention_that_is_asked_for(calibrated_cell, conv
     worths = [it["worth"] for it in found["stops"]]
     assert worths == sorted(worths, reverse=True)
     assert {it["view"] for it in found["stops"]} == set(known.used)
-    told = found["observability"]
-    assert (told["columns"], told["identifiable"], told["told"]) == (48, 30, 30)
-    assert told["condition"] == pytest.approx(1.0 / told["o2"])
+    counts = found["observability"]
+    assert (counts["columns"], counts["identifiable"], counts["told"]) == (48, 30, 30)
+    assert counts["condition"] == pytest.approx(1.0 / counts["o2"])
 
 
 def test_a_tool_on_the_flange_is_no_change_of_the_arm():
     model = erring(load_robot("ur5e"))
     assert np.abs(TOOL - np.eye(4)).max() > 0.05
-    telling = identify_arm(arm_data(model.nominal, postures(model.nominal)[:40]))
-    assert max(abs(it.identified - it.nominal) for it in telling.estimates) < 1e-12
+    numbers = identify_arm(arm_data(model.nominal, postures(model.nominal)[:40]))
+    assert max(abs(it.identified - it.nominal) for it in numbers.estimates) < 1e-12
 
 
 def test_a_missing_direction_is_in_the_verdict():
     """Looking straight at a board leaves the fifth joint of a UR almost where it is."""
     options = replace(WRONG_LINKS, seed=9, tilt_rad=(0.0, 0.03), roll_rad=0.4, views=40)
     known = calibrated(simulate(options))
-    assert known.arm_found.telling.told.told < 30
-    assert known.arm_found.telling.advice in known.verdict.reasons
-    assert "joint 5 (wrist_2_joint) moved by 3.9 deg only" in known.arm_found.telling.advice
+    assert known.arm_found.numbers.counts.determined < 30
+    assert known.arm_found.numbers.advice in known.verdict.reasons
+    assert "joint 5 (wrist_2_joint) moved by 3.9 deg only" in known.arm_found.numbers.advice
     rich = calibrated(simulate(replace(WRONG_LINKS, seed=9, views=40)))
-    assert rich.arm_found.telling.told.told == 30
-    assert not any("that can be told of this arm" in it for it in rich.verdict.reasons)
+    assert rich.arm_found.numbers.counts.determined == 30
+    assert not any("identifiable values" in it for it in rich.verdict.reasons)
 
 
 def test_an_unknown_convention_is_refused(rendered):
