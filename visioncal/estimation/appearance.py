@@ -225,7 +225,7 @@ def compress(
         appearance: Where to linearise.
         starts: (v, 4, 4) `cam_from_target` to start from.
         scales: Places of the boards' scales among the appearance's values, which views alone do
-            not tell.
+            not show.
         shares: (v,) as how much of a view each counts for the appearance: of those that show the
             same as others, whatever is wrong with one is wrong with all.
         levels: Sizes of what the lens does beyond its model; nothing where None.

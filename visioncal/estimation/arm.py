@@ -2,8 +2,8 @@
 
 Real arms repeat to some hundredths of a millimetre and are off by several tenths, and by how much
 depends on the posture. Small twists of all links, drawn from one distribution, are random effects
-beside the edges; restricted likelihood tells their size from the residuals, and tells them from
-white noise. What of them looks the same in all views hides in the edges: its share of the
+beside the edges; restricted likelihood determines their size from the residuals, and separates them
+from white noise. What of them looks the same in all views hides in the edges: its share of the
 covariance is the price of an uncalibrated arm.
 """
 
@@ -50,7 +50,7 @@ class ArmErrors:
         sigma: Their standard deviation [rad]; lengths are off by 0.5 m times as much.
         gain: Twice the gain in log-likelihood over white noise alone.
         of_links: Whether they are errors of this arm's links, which can be estimated along; else
-            they have the shape of any arm's, and only their size is worth something.
+            they have the shape of any arm's, and only their size means something.
         white: (2,) the noise that is left beside them, of rotation [rad] and place [m]; None where
             that is the noise of the fit.
         look: (2,) both together as single stops show them, which is the noise of the fit; of the
@@ -246,9 +246,9 @@ def covariance_of_size(
 ) -> FloatArray:
     """What it adds to a fit's covariance that the size of an arm's errors was estimated, too.
 
-    What the observations do not tell of the errors is drawn from a distribution whose variance was
-    found from the k that they do tell: it follows Student's t, whose variance is k / (k - 2) times
-    that. To first order in the variance of the errors, for all unknowns.
+    What the observations do not determine of the errors is drawn from a distribution whose variance
+    was found from the k that they do determine: it follows Student's t, whose variance is k / (k -
+    2) times that. To first order in the variance of the errors, for all unknowns.
 
     Args:
         problem: The observations, with these errors among the unknowns.
@@ -261,9 +261,9 @@ def covariance_of_size(
     """
     arm, variance = problem.effect_columns[f"arm of {robot}"], errors.sigma**2
     with_arm = covariance[arm]
-    told = len(with_arm) - float(np.trace(with_arm[:, arm])) / variance
+    determined = len(with_arm) - float(np.trace(with_arm[:, arm])) / variance
     # Two or fewer would leave it without bound.
-    return np.asarray(2.0 / (max(told - 2.0, 1.0) * variance) * with_arm.T @ with_arm)
+    return np.asarray(2.0 / (max(determined - 2.0, 1.0) * variance) * with_arm.T @ with_arm)
 
 
 def misfit_jacobian(

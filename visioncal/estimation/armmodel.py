@@ -161,7 +161,7 @@ class ArmModel:
         return kept
 
     def left_open(self, q: FloatArray) -> FloatArray:
-        """(m, 6, 6) covariance of the flange by functions of the joints of which no stop tells.
+        """(m, 6, 6) covariance of the flange by functions of the joints that no stop determines.
 
         It is that for errors of unit size.
         """
@@ -169,8 +169,8 @@ class ArmModel:
             return np.zeros((len(q), 6, 6))
         orders = len(self.harmonic_sizes) // (2 * self.nominal.joint_count)
         moved = self.weights[HARMONICS] * self.robot.harmonic_jacobian(q, orders)
-        whole, told = moved * self.harmonic_sizes, moved @ self.harmonic_directions
-        return np.asarray(whole @ np.swapaxes(whole, 1, 2) - told @ np.swapaxes(told, 1, 2))
+        whole, known = moved * self.harmonic_sizes, moved @ self.harmonic_directions
+        return np.asarray(whole @ np.swapaxes(whole, 1, 2) - known @ np.swapaxes(known, 1, 2))
 
     def _joint_values(self, name: str) -> FloatArray:
         """The values (n,) of a block that has one a joint; zeros where it is not there."""
@@ -258,7 +258,7 @@ class ArmModel:
 
 
 def blocks_of(robot: Robot, loads: Loads) -> tuple[str, ...]:
-    """The blocks of which stops with such loads can tell something."""
+    """The blocks of which stops with such loads can determine something."""
     springs = (COMPLIANCE,) if robot.masses is not None or loads.any else ()
     weighs = () if robot.masses is not None else (WEIGHT,)
     plays = (BACKLASH,) if loads.from_both_sides else ()

@@ -253,11 +253,11 @@ class ArmData:
         variances = np.zeros((count, len(angles)))
         for joint in range(count):
             rows = slice(2 * orders * joint, 2 * orders * (joint + 1))
-            told = higher @ model.harmonic_directions[rows]
+            known = higher @ model.harmonic_directions[rows]
             slopes = np.zeros((len(angles), len(model.values)))
-            slopes[:, harmonic] = told
+            slopes[:, harmonic] = known
             slopes[:, [eccentric.start + joint, eccentric.start + count + joint]] = first
             whole = np.sum((higher * model.harmonic_sizes[rows]) ** 2, axis=1)
             variances[joint] = np.einsum("kp,pq,kq->k", slopes, self.arm_covariance, slopes)
-            variances[joint] += self.error_rad**2 * (whole - np.sum(told**2, axis=1))
+            variances[joint] += self.error_rad**2 * (whole - np.sum(known**2, axis=1))
         return errors.T, np.sqrt(np.maximum(variances, 0.0))

@@ -13,7 +13,7 @@ from visioncal.estimation.solve import normal_equations, whitened
 from visioncal.estimation.variance import Knowledge
 from visioncal.robot import Loads
 
-# A spring's bend is told by a stop where its torque is at least this, and this share of the
+# A stop determines a spring's bend where its torque is at least this, and this share of the
 # greatest [N m].
 _LEAST_NM, _LEAST_SHARE = 0.05, 0.05
 
@@ -47,7 +47,7 @@ def bends_seen(arm: ArmData, torques: FloatArray) -> FloatArray:
         torques: (m, n) on the joints [N m].
 
     Returns:
-        (m, n) [rad]; NaN where the torque is too small to tell.
+        (m, n) [rad]; NaN where the torque is too small to show it.
     """
     model, problem = arm.model, arm.problem
     residuals, jacobian = whitened(problem, arm.state, arm.noise, ideal=False)
@@ -56,17 +56,17 @@ def bends_seen(arm: ArmData, torques: FloatArray) -> FloatArray:
     pulled = np.array([np.einsum("mij,mi->j", springs[it], residuals[it]) for it in of])
     square = np.array([np.einsum("mij,mij->j", springs[it], springs[it]) for it in of])
     least = np.maximum(_LEAST_NM, _LEAST_SHARE * np.abs(torques).max(axis=0))
-    told = (np.abs(torques) > least) & (square > 0.0)
+    determined = (np.abs(torques) > least) & (square > 0.0)
     more = np.full(torques.shape, np.nan)
-    more[told] = -pulled[told] / square[told]
+    more[determined] = -pulled[determined] / square[determined]
     return torques * (model.compliance + compliance_unit(model) * more)
 
 
 def payload_factor(arm: ArmData) -> Factor | None:
     """By which factor payload and force bend the arm beyond what is stated of them.
 
-    One more unknown beside all others, tried at the answer (Rao's score test). The springs are told
-    by the arm's own weight, and by the loads' differences between postures.
+    One more unknown beside all others, tried at the answer (Rao's score test). The springs are
+    determined by the arm's own weight, and by the loads' differences between postures.
 
     Args:
         arm: What was seen of it.

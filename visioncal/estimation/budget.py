@@ -48,7 +48,7 @@ def covariance_by_source(
         problem: The observations.
         state: The answer.
         noise: Its levels.
-        sources: What is to be told apart.
+        sources: What is to be distinguished.
 
     Returns:
         (6 e, 6 e) by source.
@@ -130,10 +130,10 @@ def weighted_jacobian(
     turned = np.swapaxes(jacobian, 1, 2)
     weighted = weights[of[rest] >= 0] @ jacobian
     shape = errors.shape
-    told, asked = np.zeros(shape), np.zeros((len(errors), shape[1], linear.size))
-    np.add.at(told, units, turned @ weighted)
+    known, asked = np.zeros(shape), np.zeros((len(errors), shape[1], linear.size))
+    np.add.at(known, units, turned @ weighted)
     np.add.at(asked, units, turned @ found[joined])
-    taken = np.linalg.solve(np.eye(shape[1]) + errors @ told, errors @ asked)
+    taken = np.linalg.solve(np.eye(shape[1]) + errors @ known, errors @ asked)
     found[joined] -= weighted @ taken[units]
     return found
 

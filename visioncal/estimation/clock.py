@@ -27,14 +27,14 @@ from visioncal.estimation.variance import Knowledge
 
 # A start from more frames is no better; a fit of more takes long.
 _START_FRAMES, _MOST_FRAMES, _FEWEST_FRAMES = 60, 1200, 4
-# So many tell times within images well enough: each has dozens of corners.
+# So many determine times within images well enough: each has dozens of corners.
 _MOST_DELAYED = 400
 # Times within images are there by chance in one sweep of ten thousand.
 _FALSE_ALARM = 1e-4
 _ROUNDS, _SETTLED_S = 12, 1e-7
 # Frames that are off by so many times what is typical are wrong ones.
 _OUTLYING = 4.0
-# Errors of frames within this time of each other may be alike [s]; fewer stretches tell nothing.
+# Errors of frames within this time of each other may be alike [s]; so many stretches suffice.
 _STRETCH_S, _FEWEST_STRETCHES = 1.0, 6
 # Fits that leave so many times the least, of rotations times positions, are no worse.
 _ALIKE = 1.2
@@ -46,7 +46,7 @@ class ClockFit:
 
     Attributes:
         offset_s: What the camera's clock is ahead of the robot's [s].
-        sigma_s: Its standard deviation [s]; very large where the motion does not tell it.
+        sigma_s: Its standard deviation [s]; very large where the motion does not determine it.
         fit: Both edges, as the moving frames have them, and the noise.
         frames: How many frames it rests on.
     """

@@ -16,8 +16,8 @@ from visioncal.estimation.trajectory import Trajectory
 
 # Clocks that are farther apart are not on one network [s].
 WIDEST_OFFSET_S = 5.0
-# Angles are compared over at least this time, on a grid of such a step [s]; what an offset can be
-# told to on it, after interpolation [s].
+# Angles are compared over at least this time, on a grid of such a step [s]; the resolution
+# of an offset on it, after interpolation [s].
 WINDOW_S, _STEP_S, _LEAST_SIGMA_S = 0.2, 0.005, 1e-3
 # Peaks of the comparison that stay within so much of the best are rivals, so many at most; nearer
 # than this to each other [s] they are one.
@@ -70,7 +70,7 @@ class Match:
 
     Attributes:
         offset_s: What the camera's clock is ahead of the robot's [s].
-        sigma_s: How well the angles tell it [s]; infinite where they do not change with it.
+        sigma_s: How well the angles determine it [s]; infinite where they do not change with it.
         correlation: Of their angles there.
         at_end: Whether the search ends there.
     """
@@ -158,19 +158,19 @@ class _Turning:
         return inside, 2.0 * np.arccos(np.minimum(np.abs(products.sum(axis=1)), 1.0))
 
     def sigma_s(self, lag: int) -> float:
-        """How well the angles tell an offset [s]: they are off by noise, and change with it."""
+        """Standard deviation of an offset [s]: angles are off by noise, and change with it."""
         inside, turned = self.by_robot(lag)
         sides = [self.by_robot(lag + it) for it in (-1, 1)]
         both = sides[0][0] & sides[1][0] & inside
         early, late = (it[both[there]] for there, it in sides)
         slope = (late - early) / (2.0 * _STEP_S)
         off = self.by_camera[both] - turned[both[inside]]
-        told = float(np.sum((slope - slope.mean()) ** 2)) if len(slope) else 0.0
-        if not told > 0.0:
+        information = float(np.sum((slope - slope.mean()) ** 2)) if len(slope) else 0.0
+        if not information > 0.0:
             return np.inf
         # Pairs that share a stretch of time err alike.
         covariance = float(
-            np.sqrt(np.mean((off - off.mean()) ** 2) * max(self.per_window, 1.0) / told)
+            np.sqrt(np.mean((off - off.mean()) ** 2) * max(self.per_window, 1.0) / information)
         )
         return float(np.hypot(covariance, _LEAST_SIGMA_S))
 

@@ -1,4 +1,4 @@
-"""Why stops do not tell what others would: which joints would have to move, and how far."""
+"""Why stops do not determine what others would: which joints would have to move, and how far."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,28 +29,28 @@ class Move:
 
 
 def joints_to_move(
-    robot: Robot, q: FloatArray, told: Callable[[FloatArray], int], missing: int
+    robot: Robot, q: FloatArray, count: Callable[[FloatArray], int], missing: int
 ) -> tuple[Move, ...]:
-    """Finds joints that tell what is missing when they move farther.
+    """Finds joints that determine what is missing when they move farther.
 
     A joint is moved evenly over a wider range, in no order that has to do with the others. The one
-    is taken that tells all with the least range; else the one that tells most, and another besides.
+    is taken that determines all with the least range; else the best, and another.
 
     Args:
         robot: The arm.
         q: (m, n) joint angles of the stops [rad].
-        told: Counts what stops with other joint angles tell.
-        missing: How much more is to be told.
+        count: Counts what stops with other joint angles determine.
+        missing: How much more is to be determined.
 
     Returns:
         The joints; none where no joint alone would help.
     """
     found: list[Move] = []
-    now = told(q)
+    now = count(q)
     wanted = now + missing
     while now < wanted:
-        tried = _tried(robot, q, told, wanted)
-        # Of joints that tell as much, the one that has to move least, and then that moved least.
+        tried = _tried(robot, q, count, wanted)
+        # Of equal joints, the one that has to move least, and then that moved least.
         best = max(tried, key=lambda it: (tried[it], -it.wanted, -it.moved), default=None)
         if best is None or tried[best] <= now:
             break
@@ -60,15 +60,15 @@ def joints_to_move(
 
 
 def _tried(
-    robot: Robot, q: FloatArray, told: Callable[[FloatArray], int], wanted: int
+    robot: Robot, q: FloatArray, count: Callable[[FloatArray], int], wanted: int
 ) -> dict[Move, int]:
-    """What would be told if one joint moved farther, by ranges up to one that tells all."""
+    """What one joint determines if it moves farther, by ranges up to one that determines all."""
     moved = np.ptp(q, axis=0)
     tried: dict[Move, int] = {}
     for span in _SPANS_RAD:
         for joint in np.flatnonzero(moved < span).tolist():
             move = Move(joint, float(moved[joint]), span)
-            tried[move] = told(_range_of(robot, q, joint, span))
+            tried[move] = count(_range_of(robot, q, joint, span))
         if max(tried.values(), default=0) >= wanted:
             break
     return tried

@@ -79,9 +79,9 @@ class FeatureFit:
             zero where a touch says nothing.
         noise_m: Noise of a touch per axis, beyond what is known of each [m]: estimated where there
             are touches to spare, else the expected one, else zero where each touch's own is known;
-            None where nothing tells it.
-        worst: The worst known offset, and the worst known rotation. Where nothing tells the noise
-            they are those of a careful touch.
+            None where nothing determines it.
+        worst: The worst known offset, and the worst known rotation. Where nothing determines the
+            noise they are those of a careful touch.
     """
 
     agreement: GroupInliers[FloatArray]
@@ -97,7 +97,7 @@ class FeatureFit:
     def covariance(self) -> FloatArray | None:
         """(6, 6) of the frame's right perturbation (rotation [rad], translation [m]).
 
-        None where nothing tells the noise; `covariance_at` says what a noise would mean.
+        None where nothing determines the noise; `covariance_at` says what a noise would mean.
         """
         return None if self.noise_m is None else self.agreement.fit.covariance
 

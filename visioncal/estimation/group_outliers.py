@@ -1,4 +1,4 @@
-"""Which groups of residuals are outliers: wrong touches and points, told from noise."""
+"""Which groups of residuals are outliers: wrong touches and points, separated from noise."""
 
 from dataclasses import dataclass, replace
 from math import comb
@@ -14,7 +14,7 @@ from visioncal.estimation.robust import Distances, half_of, settled, trimmed_sta
 
 # Noise leaves sound groups out in one set of a thousand.
 _FALSE_ALARM = 1e-3
-# Where fewer than this share of the groups agree, nothing tells which of them are right.
+# Where fewer than this share of the groups agree, which of them are right is unknown.
 _LEAST_SHARE = 0.5
 # One group is called wrong when that is so many times as likely as any other being it.
 _ODDS = 100.0
@@ -31,7 +31,7 @@ class GroupInliers(Generic[State]):
             predict, over the number of directions in which they predict it: one on average where
             it is noise.
         limit: (m,) what it may be; infinite where the others do not predict the group at all.
-        doubtful: (m,) groups of which some are wrong, while nothing tells which: all of them stay.
+        doubtful: (m,) groups of which some are wrong, not known which: all of them stay.
         explained: Whether noise explains the groups that stay: none is doubtful, and their misfit
             is within the chi-square limit of the expected level, where one was given.
     """
@@ -59,7 +59,7 @@ def agreeing_groups(
             for a search without any idea.
 
     Returns:
-        The groups that agree. Where fewer than half do, nothing tells which are right: all stay.
+        The groups that agree. Where fewer than half do, the right ones are unknown: all stay.
     """
     expected = 0.0 if expected_sigma is None else expected_sigma
     guess = None if start is None else start[1]
@@ -138,7 +138,7 @@ def _core(problem: GroupProblem[State], count: int) -> GroupFit[State]:
 
 
 def _doubtful(fit: GroupFit[State]) -> Mask:
-    """Groups that disagree while nothing tells which of them is wrong.
+    """Groups that disagree, of which the wrong ones are unknown.
 
     Each excluded group is set against each that stays: under the mean-shift model, with a level of
     noise that is unknown, the odds of the one being wrong rather than the other are those of what

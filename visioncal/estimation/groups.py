@@ -178,7 +178,7 @@ def fit_groups(
         problem: What is to be fitted.
         used: (m,) mask of the groups to use; all where None.
         start: Where to start; the problem's first guess where None.
-        expected_sigma: Level of noise that is taken where the groups leave no freedom to tell [m].
+        expected_sigma: Level of noise that is taken where the groups leave no freedom for it [m].
     """
     state = next(iter(problem.guesses())) if start is None else start
     groups = problem.linearise(state)

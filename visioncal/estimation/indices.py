@@ -1,4 +1,4 @@
-"""Indices of how well stops of an arm tell its errors, from the singular values of the slopes."""
+"""Observability indices of an arm's errors at its stops, from singular values of the Jacobian."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from visioncal.core.types import FloatArray
 class Indices:
     """What has been proposed to compare sets of stops by; all are larger where stops are better.
 
-    With the singular values s_1 >= ... >= s_L of the slopes by what is told, over m stops:
+    With the singular values s_1 >= ... >= s_L of the slopes by what is determined, over m stops:
 
     Attributes:
         o1: `(s_1 ... s_L)^(1/L) / sqrt(m)` (Borm and Menq 1991, eq. 14): the volume that noise
@@ -38,7 +38,7 @@ class Indices:
         """Computes the indices.
 
         Args:
-            values: (L,) singular values of what is told, none of them zero.
+            values: (L,) singular values of what is determined, none of them zero.
             stops: How many stops of the arm they are of.
         """
         least, greatest = float(values.min()), float(values.max())

@@ -16,7 +16,7 @@ from visioncal.estimation.variance import profile_interval
 _TWO_SIDED_95 = 1.96
 # Steps of the other levels' logarithms after which an interval's end moves by less than 1 %.
 _SETTLED = 1e-2
-# Noise that cannot be told from none is known as well as by a handful of stops, at the least.
+# Noise that does not differ from none is known as well as by a handful of stops, at the least.
 _LEAST_FREEDOM = 8.0
 
 

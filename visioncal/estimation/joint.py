@@ -40,7 +40,7 @@ _CONTRADICTION = 3.0
 # Errors of an arm's links are taken to be of one size; those few that a board's scale looks like
 # may well be so much larger.
 _UNEVEN = 2.0
-# A motion that tells so little of a size, beside what is stated, tells nothing: it is rounding.
+# A motion with so little information on a size, beside what is stated, has none: it is rounding.
 _UNMEASURED = 1e-6
 
 

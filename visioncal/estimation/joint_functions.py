@@ -49,9 +49,9 @@ _TYPICAL = {
 _TORQUE_NM, _SPREAD, _START_RAD = 10.0, 1.0, 2e-4
 _ITERATIONS, _SETTLED, _LONGEST_STEP = 30, 1e-2, 1.0
 _WORST_DAMPING, _RIDGE = 1e4, 1e-12
-# Combinations of harmonics of which residuals tell by less than this share of what is known of them
-# beforehand are no unknowns: they stay as open as they were.
-_TELLING = 0.05
+# Combinations of harmonics that residuals determine by less than this share of what is known of
+# them beforehand are no unknowns: they stay as open as they were.
+_INFORMATIVE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class JointFunctions:
         sizes: (2 n k,) of sine and cosine of each joint and order from 2 on, relative to that of
             their block.
         directions: (2 n k, r) what each value of their block makes of these: combinations that the
-            observations tell something of.
+            observations determine.
         sigma_rad: Their size s [rad].
         length_rad: Over which change of its angle a joint's error changes [rad].
         gain: Twice the gain in log-likelihood over the arm as stated.
@@ -347,27 +347,27 @@ class _Arm:
             errors[name] = ArmErrors(basis, size_rad, share, of_links=True)
             at += basis.shape[2]
         own, waves = np.sqrt(variances[at:]), self.waves
-        told = own[:, None] * self._told(step.logs, own) / sigma
-        errors[HARMONICS] = ArmErrors(waves.columns @ told, sigma, share, of_links=True)
+        known = own[:, None] * self._determined(step.logs, own) / sigma
+        errors[HARMONICS] = ArmErrors(waves.columns @ known, sigma, share, of_links=True)
         of_orders = np.sqrt(waves.series[1:])
         of_orders[0] = own[0] / sigma
         return JointFunctions(
             errors,
             np.exp(step.logs[: -len(self.names)]).reshape(-1, 2),
             np.tile(np.repeat(of_orders, 2), waves.seconds // 2),
-            waves.expanded @ told,
+            waves.expanded @ known,
             sigma,
             waves.length_rad,
             gain,
         )
 
-    def _told(self, logs: FloatArray, sizes: FloatArray) -> FloatArray:
-        """(q, r) unit vectors, in units of (q,) sizes, of harmonics that residuals tell of."""
+    def _determined(self, logs: FloatArray, sizes: FloatArray) -> FloatArray:
+        """(q, r) unit vectors, in units of (q,) sizes, of harmonics that residuals determine."""
         components = self.likelihood.components
         weights = np.linalg.inv(components.total(np.exp(logs[: len(components.parts)])))
         jacobian = self.likelihood.jacobian[:, :, self.random[-len(sizes) :]] * sizes
         values, vectors = np.linalg.eigh(gram(jacobian, weights @ jacobian))
-        return np.asarray(vectors[:, values > _TELLING])
+        return np.asarray(vectors[:, values > _INFORMATIVE])
 
 
 @dataclass(frozen=True, eq=False)

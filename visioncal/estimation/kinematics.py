@@ -2,7 +2,7 @@
 
 Every effect is a set of columns: how the flange moves with it at each stop. All columns are
 carried, however redundant, as random effects of one size a block, which restricted likelihood
-estimates: what the data cannot tell stays where it was stated, and what they can is told at its
+estimates: what the data cannot determine stays as stated, and what they can is estimated at its
 bound (Harville 1977, section 4, for the linear mixed model).
 """
 

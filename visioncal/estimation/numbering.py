@@ -1,8 +1,8 @@
-"""Which measured point is which of the drawing: exchanged and shifted numbers, told by geometry.
+"""Which measured point is which of the drawing: exchanged and shifted numbers, found by geometry.
 
 Distances between points do not depend on where the part stands. Where the points as they are
 numbered do not fit the drawing, and in another order they fit far better, the order is wrong. A
-pattern that looks the same from several sides fits in several orders: then geometry cannot tell.
+pattern that looks the same from several sides fits in several orders: then geometry leaves it open.
 """
 
 from collections.abc import Sequence
@@ -56,7 +56,7 @@ class Numbering:
 
     @property
     def is_unique(self) -> bool:
-        """Whether geometry tells the order."""
+        """Whether geometry determines the order."""
         return self.equally_good == 1
 
     @property

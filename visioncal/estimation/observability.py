@@ -1,4 +1,4 @@
-"""What the motion can tell about the two unknown edges, and what it leaves open, in words."""
+"""Observability of the two unknown edges: what the motion leaves undetermined, in words."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -28,8 +28,8 @@ TYPICAL_NOISE, TYPICAL_PX = Noise.of_robot(float(np.deg2rad(0.05)), 1e-4), 0.2
 _NEARLY_AXIS = 0.95
 FEWEST_VIEWS = 3
 _PAIRED = 300
-# What is wrong where unknowns that all views share are not told, and what to do.
-_UNTOLD = {
+# What is wrong where unknowns that all views share are not determined, and what to do.
+_UNDETERMINED = {
     "camera": (
         "the views do not determine lens and board well enough",
         "Give matrix and distortion in [camera], state the board's size with its sigma, or add "
@@ -109,14 +109,14 @@ class Scene:
         motion: Says what is wrong with the motion, given the frame that it leaves open.
         advice: Says what to do, given that frame and what of it is not determined at all, in words;
             that may be nothing.
-        untold: What is wrong where the first effect is not determined, and what to do.
+        undetermined: What is wrong where the first effect is not determined, and what to do.
     """
 
     title: str
     names: Mapping[str, tuple[str, str]]
     motion: Callable[[str], str]
     advice: Callable[[str, str], str]
-    untold: tuple[str, str] = _UNTOLD["camera"]
+    undetermined: tuple[str, str] = _UNDETERMINED["camera"]
 
 
 def check_determined(
@@ -144,7 +144,7 @@ def check_determined(
     problem, noise = _at_typical_noise(problem, noise, pixel_px)
     _refuse_open(problem.with_effects(()), State(state.edges, np.zeros(0)), noise, scene)
     if looks and problem.effects:
-        cause, advice = scene.untold
+        cause, advice = scene.undetermined
         first = problem.effects[0].determined
         _refuse_vague(
             problem.with_effects([first]),
@@ -245,7 +245,7 @@ def _scene(problem: Problem, mount: Mount) -> Scene:
             return f"Add views of {names[frame][0][4:]}, or take it out of the session."
         return f"{_or_measured(mount, open_part)}{_advice(mount)}"
 
-    return Scene(title(mount), names, motion, advice, _UNTOLD[_sensor(mount)])
+    return Scene(title(mount), names, motion, advice, _UNDETERMINED[_sensor(mount)])
 
 
 def directions(
@@ -289,7 +289,7 @@ def edge_directions(
 
 
 def refuse_too_few(problem: Problem, mount: Mount, views: int = 1) -> None:
-    """Refuses stops that cannot tell anything, however they lie.
+    """Refuses stops that cannot determine anything, however they lie.
 
     Args:
         problem: What the used views measured.

@@ -63,9 +63,9 @@ _GROSS = 20.0
 _MOST_NOISE = np.array([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M])
 # The noise of measured poses differs by so much from view to view: with tilt and distance.
 _UNEVEN = 3.0
-# Where fewer than this share of the observations agree, nothing tells which of them are right.
+# Where fewer than this share of the observations agree, which of them are right is unknown.
 _LEAST_SHARE = 0.5
-# Inliers, at the least: with fewer, outliers cannot be told from noise.
+# Inliers, at the least: with fewer, outliers cannot be separated from noise.
 LEAST_VIEWS = 5
 # Distances are compared with the limit once more, without the observation's own say in the noise,
 # when they come this near.
@@ -183,7 +183,7 @@ def _without_needless(found: Agreed) -> Agreed:
 
 
 def settle(agreed: Agreed, movable: Sequence[str] = ()) -> Agreed:
-    """Settles what agrees one by one, and what moved by less than single observations tell."""
+    """Settles what agrees one by one, and what moved by less than single observations show."""
     problem, moves = agreed.problem, list(agreed.moves)
     if not movable:
         return inliers(problem, agreed.fit.state, agreed.used)
@@ -209,7 +209,7 @@ def inliers(problem: Problem, state: State | None = None, used: Mask | None = No
 
     Returns:
         Those that agree. Where fewer than half do, or those only to within more than any result
-        may be off, nothing tells which are right: all stay but what lies many times farther off
+        may be off, the right ones are unknown: all stay but what lies many times farther off
         than most.
     """
     every = np.ones(len(problem), dtype=bool)

@@ -37,7 +37,7 @@ class PivotFit:
         points: (k, 3) the touched points in the base [m].
         points_covariance: (k, 3, 3) of them [m^2].
         agrees: (n,) touches that the answer was made from.
-        doubtful: (n,) touches of which some are wrong, while nothing tells which: all are used.
+        doubtful: (n,) touches of which some are wrong, not known which: all are used.
         explained: Whether noise explains the used touches (see `group_outliers.GroupInliers`).
         mahalanobis_sq: (n,) squared Mahalanobis distance of each touch from what the others
             predict, one on average where it is noise.
@@ -76,7 +76,7 @@ class PivotFit:
         """Whether the poses may be `flange_from_base`: the tip and the one point exchange then.
 
         Touches of one point close both ways alike; a tip that is farther from the flange than the
-        point is from the base tells.
+        point is from the base determines.
         """
         reach = float(np.linalg.norm(self.flange_from_tool[:3, 3]))
         return len(self.points) == 1 and reach > float(np.linalg.norm(self.points[0]))
@@ -99,7 +99,7 @@ def fit_pivot(
 
     Raises:
         DataError: Touches are missing, or contradict each other: about the side of an axis, or
-            grossly while nothing tells which is wrong.
+            grossly and which is wrong is unknown.
         DegenerateError: They leave a direction open; named with its predicted sigma.
     """
     check_counts(touches)
@@ -126,7 +126,7 @@ def _fitted(touches: Touches, noise: Noise, expected: float | None) -> PivotFit:
 
 
 def _check_doubt(problem: TouchProblem, found: GroupInliers[Placed]) -> None:
-    """Refuses touches that contradict each other grossly where nothing tells which is wrong."""
+    """Refuses touches that contradict each other grossly where it is unknown which is wrong."""
     if not found.doubtful.any() or found.fit.sigma < CARELESS_M:
         return
     touches, rows = problem.touches, np.flatnonzero(found.doubtful)
@@ -137,10 +137,10 @@ def _check_doubt(problem: TouchProblem, found: GroupInliers[Placed]) -> None:
         for it, at in enumerate(belongs)
         if found.doubtful[it] and at is not None
     ]
-    told = f" ({', '.join(fitting)})" if fitting else ""
+    matches = f" ({', '.join(fitting)})" if fitting else ""
     raise DataError(
         f"tcp: touches {', '.join(labels)} contradict each other, at a scatter of "
-        f"{1e3 * found.fit.sigma:.3g} mm, and nothing tells which of them is wrong{told}.",
+        f"{1e3 * found.fit.sigma:.3g} mm, and which of them is wrong is not known{matches}.",
         culprits=labels,
         next_step="Touch their point once or twice more, or correct its name.",
     )

@@ -20,7 +20,7 @@ from visioncal.estimation.observability import (
 
 # No instrument of a cell is better [m]: exact coordinates would otherwise be judged by rounding.
 LEAST_NOISE_M = 1e-6
-# A careful touch by hand [m]: geometry is judged by it where nothing tells the noise.
+# A careful touch by hand [m]: geometry is judged by it where nothing determines the noise.
 TOUCH_NOISE_M = 1e-4
 # Squared extents of points whose ratio is under this are a line.
 LEAST_RATIO = 1e-8
@@ -29,7 +29,7 @@ LEAST_RATIO = 1e-8
 def noise_words(sigma_m: float | None) -> str:
     """Says by which noise geometry was judged: `a noise of 0.1 mm, which nothing contradicts`."""
     if sigma_m is None:
-        return f"at a noise of {1e3 * TOUCH_NOISE_M:g} mm, taken because nothing tells it"
+        return f"at a noise of {1e3 * TOUCH_NOISE_M:g} mm, taken because nothing determines it"
     return f"at a noise of {figure(1e3 * sigma_m)} mm"
 
 
@@ -54,7 +54,7 @@ def worst_directions(
         centre: (3,) where the offset counts, in the fixture's frame [m]: amid the points, since a
             drawing's origin may be far away.
         sigma_m: Noise of one coordinate [m], beyond what is known beforehand; None where nothing
-            tells it.
+            determines it.
 
     Returns:
         The offset's worst direction in the base, and the rotation's in the fixture.

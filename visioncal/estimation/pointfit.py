@@ -24,8 +24,8 @@ from visioncal.estimation.pointpairs import (
     PointPairs,
     check_hand,
     check_pairs,
+    determines_hand,
     line_words,
-    tells_hand,
 )
 from visioncal.estimation.procrustes import (
     align,
@@ -75,7 +75,7 @@ class PointFit:
         scale: What the scale would be.
         numbering: In which order the points fit the drawing; one that was measured several times
             counts once, at its first place.
-        hand_known: Whether mirrored points would have been told: else they lie in one plane, and
+        hand_known: Whether mirrored points would have been found: else they lie in one plane, and
             the fixture's z axis may as well point the other way.
         worst: The worst known offset, amid the points, and the worst known rotation.
     """
@@ -167,7 +167,7 @@ def fit_points(pairs: PointPairs, expected_noise_m: float | None = None) -> Poin
             point [m]; None where nobody knows.
 
     Returns:
-        The frame, and what else the points tell.
+        The frame, and what else the points determine.
 
     Raises:
         DataError: Too few points, another unit, mirrored or wrongly numbered points, or points that
@@ -194,7 +194,7 @@ def fit_points(pairs: PointPairs, expected_noise_m: float | None = None) -> Poin
         pairs.labels,
         "Measure points that are farther apart and not nearly on one line, or measure them better.",
     )
-    hand_known = tells_hand(pairs.measured[agrees], pairs.nominal[agrees], noise)
+    hand_known = determines_hand(pairs.measured[agrees], pairs.nominal[agrees], noise)
     return PointFit(agreement, scale, numbering, hand_known, worst)
 
 

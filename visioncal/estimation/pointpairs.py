@@ -1,6 +1,6 @@
 """Measured points beside a drawing's coordinates of them, and what is wrong with them as a whole.
 
-A line of points, another unit and a left-handed drawing are told before anything is fitted: no
+A line of points, another unit and a left-handed drawing are found before anything is fitted: no
 choice of points would mend them.
 """
 
@@ -129,11 +129,11 @@ def check_pairs(pairs: PointPairs) -> None:
     _check_units(pairs)
 
 
-def tells_hand(measured: FloatArray, nominal: FloatArray, noise_m: float) -> bool:
-    """Whether points (n, 3) tell a drawing of them (n, 3) from its mirror image.
+def determines_hand(measured: FloatArray, nominal: FloatArray, noise_m: float) -> bool:
+    """Whether points (n, 3) distinguish a drawing of them (n, 3) from its mirror image.
 
     Points in one plane have no hand: mirrored they are the same points seen from behind, and the
-    frame's z axis points the other way. That cannot be told from them.
+    frame's z axis points the other way. They do not show that.
 
     Args:
         measured: In the base [m].

@@ -40,7 +40,7 @@ _NO_WEIGHT = 1e-4
 _FEWEST_STOPS = 6
 # Unknowns of stops whose errors are weighed together: the work grows with their cube.
 _MOST_ROWS = 360
-# So many blocks, spread over the session, tell the sizes: the rest counts as noise as it is known.
+# So many blocks, spread over the session, determine the sizes: the rest counts as known noise.
 _MOST_BLOCKS = 5
 # Columns that stand for the errors of all stops; what they leave counts as noise.
 _MOST_COLUMNS = 360
@@ -177,7 +177,7 @@ def _columns(
     """Factors the covariance of processes by blocks of stops, those that leave most first.
 
     Args:
-        processes: They.
+        processes: The processes.
         count: How many stops s there are.
         observed: (m,) those that were observed.
 

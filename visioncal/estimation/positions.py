@@ -1,9 +1,9 @@
 """Places of points on the flange, read by an instrument: a start, and the poses they stand for.
 
-A reading of a place is a pose of the instrument's probe whose rotation is told by nothing: it is
+A reading of a place is a pose of the instrument's probe whose rotation is not measured: it is
 supplied as the chain predicts it, with the variance of a rotation that is not known at all. So
-supplied, readings of points are weighed and merged as poses are. Several points of one stop tell
-the rotation too, once their places on the flange are unknowns that all readings share.
+supplied, readings of points are weighed and merged as poses are. Several points of one stop
+determine the rotation too, once their places on the flange are unknowns that all readings share.
 """
 
 from collections.abc import Iterator
@@ -18,8 +18,8 @@ from visioncal.estimation.linalg import damped_step
 from visioncal.estimation.procrustes import align
 from visioncal.estimation.robust import half_of, small_sets, trimmed_start
 
-# Variance about each axis of a rotation that is not told [rad^2].
-UNTOLD = 1.0
+# Variance about each axis of a rotation that is not measured [rad^2].
+UNMEASURED = 1.0
 # A cost [m^2] that changes by less than this share of itself and of a square metre is at rest.
 _SETTLED = 1e-14
 # Sets of stops to start from: with 30 % of the stops wrong, all sixty contain a wrong one with

@@ -131,7 +131,7 @@ class Problem:
     def of_one_stop(self) -> IntArray:
         """(n,) what is of the same frames at one stop, numbered in the order of appearance.
 
-        What several effects on sensors move stays apart: merged, it would tell of them together.
+        What several effects on sensors move stays apart: merged, it would mix them.
         """
         seen, keys = self.observations, dict[tuple[int, str, str, int], int]()
         moved = [it.by_sensor.any(axis=(1, 2)) for it in self.effects if it.by_sensor is not None]
@@ -142,7 +142,7 @@ class Problem:
     def merged(self, units: IntArray | None = None) -> "Problem":
         """Makes one observation of all of one unit.
 
-        Their poses are averaged with their information, and by how much they disagree they tell of
+        Their poses are averaged with their information, and by how much they disagree they show
         the effect on sensors: nothing is lost. Where nothing is known of their noise, they are
         averaged evenly.
 

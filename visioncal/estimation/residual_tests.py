@@ -22,7 +22,7 @@ _BLOCKS = 10
 _CELLS, _FEWEST_CORNERS = 6, 4
 # What a lens's own parameters and a plane's pose take out of the cells' means.
 _ABSORBED = 12
-# Of smaller chances there is no telling.
+# Smaller probabilities are not resolved.
 _LEAST_CHANCE = 1e-300
 
 

@@ -179,15 +179,15 @@ class CornerProblem:
         return residuals >= _SPARE * (len(self.lens) + len(BOARD_NAMES) * len(self.printed))
 
     def unknowns(self, compressed: Compressed, moving: IntArray) -> int:
-        """How many unknowns the corners have told, the poses among them.
+        """How many unknowns the corners have determined, the poses among them.
 
-        Where a rig's points are known well beforehand, corners tell little of them, and residuals
-        are no smaller for their sake.
+        Where a rig's points are known well beforehand, corners determine little of them, and
+        residuals are no smaller for their sake.
         """
         rigs = np.intersect1d(self.points, moving)
         sigma_px = self.stack.shown_px(compressed.residuals, 6 * len(compressed.information))
-        told = np.diag(compressed.shared_information)[rigs] * self.prior_sigma[rigs] ** 2
-        share = told / (told + floored_sigma_px(sigma_px) ** 2)
+        information = np.diag(compressed.shared_information)[rigs] * self.prior_sigma[rigs] ** 2
+        share = information / (information + floored_sigma_px(sigma_px) ** 2)
         exact = len(moving) - len(rigs) + round(compressed.field_freedom)
         return 6 * len(compressed.information) + exact + round(float(share.sum()))
 

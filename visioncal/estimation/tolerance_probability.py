@@ -16,7 +16,7 @@ from scipy.special import fdtr, ndtri
 from visioncal.core.types import FloatArray
 
 _POINTS, _SIZE = 4096, 6
-# Beyond, F cannot be told from chi-square, and its series lose digits.
+# Beyond, F does not differ from chi-square, and its series lose digits.
 _MOST_FREEDOM = 1e6
 # Radii are sought within this factor about a first guess, to this share of them.
 _FAR, _TOLERANCE = 1e3, 1e-9

@@ -1,4 +1,4 @@
-"""Whether touches turn enough to tell a tool's tip and rotation, and what they leave open."""
+"""Whether touches turn enough to determine a tool's tip and rotation, and what they leave open."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -41,11 +41,11 @@ def check_counts(touches: Touches) -> None:
     tips = touches.points[touches.are("point")]
     counts = np.bincount(tips, minlength=len(touches.names))
     if np.maximum(counts - 1, 0).sum() < FEWEST_TOUCHES - 1:
-        told = ", ".join(
+        counted = ", ".join(
             f"{n} of {it or 'one point'}" for it, n in zip(touches.names, counts, strict=True)
         )
         raise DataError(
-            f"tcp: {len(tips)} touches of kind point ({told}): at least {FEWEST_TOUCHES} of one "
+            f"tcp: {len(tips)} touches of kind point ({counted}): at least {FEWEST_TOUCHES} of one "
             "point, or 2 each of two points, are needed.",
             culprits=touches.names,
             next_step=_ADVICE,
@@ -73,7 +73,7 @@ def check_counts(touches: Touches) -> None:
 
 
 def check_turning(problem: TouchProblem, fit: GroupFit[Placed]) -> tuple[Direction, ...]:
-    """Refuses touches that leave a direction open; otherwise tells the worst ones.
+    """Refuses touches that leave a direction open; otherwise returns the worst ones.
 
     Touches that disagree wildly are no fault of the motion: it is judged by a noise of at most the
     limit, and what is beyond is the verdict's business.
@@ -125,7 +125,7 @@ def _direction(words: str, variance: float, limit: float, *, is_rotation: bool) 
 
 
 def _cause(problem: TouchProblem, fit: GroupFit[Placed], culprit: Direction) -> tuple[str, str]:
-    """Why a direction is open, and what to do about it."""
+    """Why a direction is undetermined, and what to do about it."""
     used = problem.touches.subset(fit.used)
     careful = [it for it in _worst(problem, fit, CARELESS_M) if it.words == culprit.words]
     if fit.sigma > CARELESS_M and all(it.sigma < it.limit for it in careful):

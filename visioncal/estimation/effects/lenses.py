@@ -234,7 +234,7 @@ class CameraParameters:
         return slice(first, first + counts[names.index(name)])
 
     def places(self, name: str) -> IntArray:
-        """Places of what one camera's corners tell of: its lens and all boards."""
+        """Places of what one camera's corners determine: its lens and all boards."""
         lens, boards = self.lenses[name], self.boards
         return np.concatenate(
             [np.arange(lens.start, lens.stop), np.arange(boards.start, boards.stop)]
