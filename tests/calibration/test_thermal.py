@@ -206,7 +206,7 @@ def test_the_flange_moves_with_the_parameters_as_it_is_told():
 def test_the_compensator_follows_what_the_fit_computes(kind):
     heat, drifting = inputs(kind), model(kind)
     following = OnlineCompensator(drifting)
-    given = heat.signal if kind == "temperatures" else np.sqrt(heat.measured)
+    given = heat.signal if kind == "temperatures" else np.sqrt(heat.signal)
     name = "temperatures_c" if kind == "temperatures" else "currents_a"
     for stamp_s, row, air in zip(heat.stamps_s, given, heat.ambient_c, strict=True):
         following.feed(stamp_s, **{name: row}, ambient_c=air)
@@ -341,7 +341,7 @@ def test_samples_that_are_many_are_averaged():
     found, _ = inputs_of(session, 6)
     assert found.kind == "currents"
     assert len(found.stamps_s) <= 8192
-    assert found.told == pytest.approx(4.0)
+    assert found.signal == pytest.approx(4.0)
 
 
 def test_report_and_recording_show_the_drift(learnt, tmp_path):
