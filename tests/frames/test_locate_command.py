@@ -154,7 +154,7 @@ def test_pixels_are_placed_on_planes(cell, capsys):
         ({"source": "part/views.csv", "target": "charuco_9x6_30mm"}, "not an image"),
         ({"pixel": ["1,2"], "view": 3}, "--view: only a session has views"),
         ({"pixel": ["1,2"], "point": "1,2,3"}, "--point-mm: a pixel is placed by its plane"),
-        ({"pixel": ["1,2"]}, r"tells no depth: the plane \(--plane\)"),
+        ({"pixel": ["1,2"]}, r"shows no depth: the plane \(--plane\)"),
         ({"pixel": ["1"], "plane": "z=0"}, "--pixel is '1'; u,v is needed"),
         ({"pixel": ["1,nan"], "plane": "z=0"}, "--pixel is '1,nan'"),
         ({"pixel": ["1,2"], "plane": "z=low"}, "--plane z is 'low'"),

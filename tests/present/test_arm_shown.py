@@ -97,7 +97,7 @@ def test_no_key_of_the_document_stands_in_the_section(page):
 
 def test_what_the_stops_tell_and_what_not(page, rows):
     words = of_arm(page)
-    assert "directions told 29 of 30" in words
+    assert "directions determined 29 of 30" in words
     assert "condition 54" in words
     assert NOT_TOLD in words
     assert "O4 6e-05" in words
@@ -167,7 +167,7 @@ def test_five_stops_have_no_least_one(sample):
     document["stops"] = document["stops"][:5]
     found = with_arm(sample, document).arm
     card = arm_card(found)
-    assert (len(card.most_worth), card.least_worth) == (5, ())
+    assert (len(card.most_influential), card.least_influential) == (5, ())
 
 
 def test_a_recording_tells_and_draws_the_arm(sample, tmp_path):

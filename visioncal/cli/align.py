@@ -10,7 +10,7 @@ import typer
 from rich.markup import escape
 
 from visioncal.calibration.pipeline import align
-from visioncal.cli.console import messages, tell_written
+from visioncal.cli.console import messages, report_written
 from visioncal.cli.options import AsJson, NeedOptions, OutFolder, SessionArgument
 from visioncal.cli.pointing import naming
 from visioncal.cli.progress import shown_progress
@@ -22,7 +22,7 @@ from visioncal.interchange.outputs import write_alignment
 from visioncal.results import Alignment
 from visioncal.session import Session
 
-# Levels of noise that are nearer to what is said are not worth a word.
+# Levels of noise that are nearer to what is said are not mentioned.
 _SHOWN_LEVEL = 1.2
 
 
@@ -67,7 +67,7 @@ def align_into(
     threads: int | None = None,
     keep_corners: bool = False,
 ) -> Alignment:
-    """Aligns the cell of a session from some path, writes the result and tells of it."""
+    """Aligns the cell of a session from some path, writes the result and reports it."""
     left = leftover(out)
     with naming(path, out), shown_progress(quiet=quiet) as progress:
         result = align(
@@ -83,14 +83,14 @@ def align_into(
         left.keep()
     written = write_alignment(out, session, result, without=without, images=images)
     if not quiet:
-        _tell(result)
+        _report(result)
     if left is not None:
         messages().print(escape(left.words))
-    tell_written(written, quiet=quiet)
+    report_written(written, quiet=quiet)
     return result
 
 
-def _tell(result: Alignment) -> None:
+def _report(result: Alignment) -> None:
     console = messages()
     print_verdict(result.verdict, result.session_name)
     console.print(f"the cell's frame is that of {result.reference}")

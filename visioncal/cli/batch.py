@@ -57,7 +57,7 @@ def batch_command(
         bool, typer.Option("--recordings", help="Also write each recording, with all images.")
     ] = False,
 ) -> None:
-    """Calibrate many sessions at once, and tell which stand out of their fleet.
+    """Calibrate many sessions at once, and report which stand out of their fleet.
 
     Each result goes into a folder of its own; batch.parquet has a row a session, index.html shows
     them, those first that stand out among robots of the same model. What is done already is kept:
@@ -78,12 +78,12 @@ def batch_command(
             cells=cells,
             progress=progress,
         )
-    _tell(found)
+    _report(found)
     if all(it.state == "failed" for it in found.rows):
         raise typer.Exit(EXIT_NO_RESULT)
 
 
-def _tell(found: Batch) -> None:
+def _report(found: Batch) -> None:
     console, counts = messages(), found.counts
     named = ("good", "check", "bad", "failed", "kept", "changed", "standing out")
     words = ", ".join(f"{counts[it]} {it}" for it in named if counts[it])

@@ -85,7 +85,7 @@ def calibrate_command(
     from visioncal.calibration.pipeline.run_state import RunState
     from visioncal.calibration.pipeline.running import check_dense, check_solver
     from visioncal.cli.align import align_into
-    from visioncal.cli.console import messages, tell_written
+    from visioncal.cli.console import messages, report_written
     from visioncal.cli.pointing import naming
     from visioncal.cli.progress import shown_progress
     from visioncal.cli.summary import print_summary
@@ -143,7 +143,7 @@ def calibrate_command(
         print_summary(result.calibration, verbose=verbose)
     if left is not None:
         messages().print(escape(left.words))
-    tell_written(written, quiet=as_json)
+    report_written(written, quiet=as_json)
 
 
 def _joined(sessions: Sequence["Session"], *, shared: bool) -> "Session":

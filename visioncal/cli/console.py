@@ -61,7 +61,7 @@ def report_error(error: VisioncalError, *, as_json: bool) -> None:
         console.print(escape(error.next_step))
 
 
-def tell_written(written: "Written", *, quiet: bool = False, status: int = 0) -> None:
+def report_written(written: "Written", *, quiet: bool = False, status: int = 0) -> None:
     """Says which files were written, and ends the command where there is more to say than that.
 
     Args:

@@ -147,7 +147,7 @@ def correct_command(
         return
     if written_to is None:
         typer.echo(table_to_send(wanted, columns, rows), nl=False)
-    _tell(columns, rows, lost, warnings)
+    _report(columns, rows, lost, warnings)
     if np.isnan(wanted.q_seed).all() and seed_joints is None:
         messages().print(escape(_posture(arm, corrected.q[rows[0]])))
     if written_to is not None:
@@ -155,16 +155,16 @@ def correct_command(
 
 
 def _warm(calibration: Calibration, words: str | None) -> Calibration:
-    """The calibration of the arm as warm as is told."""
+    """The calibration of the arm as warm as is stated."""
     if words is None:
         return calibration
     count = calibration.drift.joint_count
     form = ",".join(f"T{it}" for it in range(1, count + 1))
-    told = np.array(numbers_in(words, "--temperatures", form))
-    wrong = no_celsius(told)
+    temperatures = np.array(numbers_in(words, "--temperatures", form))
+    wrong = no_celsius(temperatures)
     if wrong:
         raise DataError(f"--temperatures: {wrong}.", culprits=["--temperatures"])
-    return calibration.at_temperatures(told)
+    return calibration.at_temperatures(temperatures)
 
 
 def _widest(degrees: float) -> float:
@@ -299,7 +299,7 @@ def _posture(arm: CalibratedArm, q: FloatArray) -> str:
     )
 
 
-def _tell(
+def _report(
     columns: Mapping[str, FloatArray],
     rows: IntArray,
     lost: Sequence[tuple[str, str]],
@@ -307,14 +307,14 @@ def _tell(
 ) -> None:
     console = messages()
     mm, deg = columns["moved_mm"][rows], columns["moved_deg"][rows]
-    told = (
+    words = (
         f"{len(rows)} of {len(rows) + len(lost)} targets corrected: moved by "
         f"{figure(float(np.median(mm)))} mm and {figure(float(np.median(deg)))} deg (median), by "
         f"up to {figure(float(mm.max()))} mm and {figure(float(deg.max()))} deg"
     )
     if "sigma_mm" in columns:
-        told += f"; predicted sigma {figure(float(np.median(columns['sigma_mm'][rows])))} mm"
-    console.print(escape(told))
+        words += f"; predicted sigma {figure(float(np.median(columns['sigma_mm'][rows])))} mm"
+    console.print(escape(words))
     for place, why in lost[:_SHOWN]:
         console.print(f"[bold yellow]left out:[/] {escape(f'{place}: {why}')}")
     if len(lost) > _SHOWN:

@@ -10,7 +10,7 @@ from rich.markup import escape
 
 from visioncal.calibration.pipeline import run
 from visioncal.cli.against_truth import truth_table
-from visioncal.cli.console import messages, tell_written
+from visioncal.cli.console import messages, report_written
 from visioncal.cli.options import OutFolder, Seed
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.summary import print_summary
@@ -43,7 +43,7 @@ def demo_command(
     messages().print(truth_table(done.calibration, truth.transforms, truth.camera))
     for file in (session, truth_path(session)):
         messages().print(escape(f"wrote {file}"))
-    tell_written(written)
+    report_written(written)
     messages().print(escape(f"Open {result / 'report.html'} in a browser to see it all."))
 
 

@@ -12,7 +12,7 @@ class _Commands(LazyGroup):
 
     prefix = "dynamics_"
     listed: ClassVar = {
-        "plan": "Plan the motions that tell an arm's inertias and friction.",
+        "plan": "Plan the motions that determine an arm's inertias and friction.",
         "record": "Record angles, speeds and motor currents at the controller's full rate.",
         "identify": "Identify an arm's inertias and friction from the torques of its motions.",
         "validate": "Predict the torques of other motions, and say how near that comes.",

@@ -62,7 +62,7 @@ def dynamics_gains_command(
         document = [_row(name, found, at) for at, name in enumerate(robot.joint_names)]
         typer.echo(json.dumps(document, indent=2))
         return
-    _tell(robot.joint_names, found)
+    _report(robot.joint_names, found)
 
 
 def _body(mass_kg: float, com_mm: str, inertia: str) -> FloatArray:
@@ -85,19 +85,19 @@ def _body(mass_kg: float, com_mm: str, inertia: str) -> FloatArray:
 
 
 def _row(name: str, found: Gains, at: int) -> dict[str, str | float]:
-    """What is told of a drive; nothing where that is not told."""
+    """The gain of a drive; the joint alone where it is not determined."""
     if not found.determined[at]:
         return {"joint": name}
     gain, sigma = float(found.nm_per_a[at]), float(found.sigma[at])
     return {"joint": name, "nm_per_a": gain, "sigma_nm_per_a": sigma}
 
 
-def _tell(names: tuple[str, ...], found: Gains) -> None:
-    for name, gain, sigma, told in zip(
+def _report(names: tuple[str, ...], found: Gains) -> None:
+    for name, gain, sigma, determined in zip(
         names, found.nm_per_a.tolist(), found.sigma.tolist(), found.determined, strict=True
     ):
-        words = "not told: the body hardly moves it"
-        if told:
+        words = "not determined: the body hardly moves it"
+        if determined:
             words = f"{matched(gain, sigma)} N m/A (sigma {significant(sigma)})"
         messages().print(escape(f"{name}: {words}"))
     if found.determined.all():

@@ -9,7 +9,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from visioncal.cli.console import messages, tell_written
+from visioncal.cli.console import messages, report_written
 from visioncal.cli.dynamics_options import MotionsArgument, StreamOptions
 from visioncal.cli.options import AsJson
 from visioncal.cli.summary import print_verdict
@@ -73,9 +73,9 @@ def dynamics_identify_command(
     if as_json:
         typer.echo(json.dumps(to_document(identified), indent=2, allow_nan=False))
     else:
-        _tell(identified)
+        _report(identified)
     if written is not None:
-        tell_written(written, quiet=as_json)
+        report_written(written, quiet=as_json)
     elif not as_json:
         messages().print("nothing was written: -o names a folder for it")
 
@@ -97,7 +97,7 @@ def _terms(words: str) -> FrictionTerms:
     return FrictionTerms(coulomb, viscous, offset, slow_rad_s=SLOW_RAD_S)
 
 
-def _tell(identified: Identified) -> None:
+def _report(identified: Identified) -> None:
     console = messages()
     print_verdict(judge(identified), f"dynamics of {identified.robot.name}")
     for stream in identified.streams:
@@ -111,9 +111,9 @@ def _tell(identified: Identified) -> None:
         for note in stream.notes:
             console.print(f"  - {escape(note)}")
     counts = [(word, identified.determined.count(word)) for _, word in CLASSES]
-    told = ", ".join(f"{count} to {word}" for word, count in counts[:-1])
+    shares = ", ".join(f"{count} to {word}" for word, count in counts[:-1])
     console.print(
-        f"{identified.base.rank} base parameters: {told}, {counts[-1][1]} {counts[-1][0]}, "
+        f"{identified.base.rank} base parameters: {shares}, {counts[-1][1]} {counts[-1][0]}, "
         f"{identified.determined.count(UNKNOWN)} {UNKNOWN}"
     )
     console.print(_joint_table(identified))
@@ -137,9 +137,9 @@ def _joint_table(identified: Identified) -> Table:
         columns[symbol] = [values.get(f"{symbol}{it}") for it in joints]
     columns["Fs/Fc"] = [humps.get(it, {}).get("static_over_coulomb") for it in joints]
     columns["vs"] = [humps.get(it, {}).get("speed_rad_s") for it in joints]
-    told = {name: it for name, it in columns.items() if any(value is not None for value in it)}
-    table = Table("joint", *told, box=None)
+    known = {name: it for name, it in columns.items() if any(value is not None for value in it)}
+    table = Table("joint", *known, box=None)
     for at, joint in enumerate(joints):
-        row = [None if it[at] is None else figure(float(it[at] or 0.0)) for it in told.values()]
+        row = [None if it[at] is None else figure(float(it[at] or 0.0)) for it in known.values()]
         table.add_row(str(joint), *row)
     return table

@@ -80,8 +80,8 @@ def _of_gains(found: Payload) -> str:
 
 
 def _listed(values: FloatArray, sigmas: FloatArray) -> str:
-    told = zip(values.tolist(), sigmas.tolist(), strict=True)
-    return ", ".join(f"{matched(it, sigma)} (sigma {significant(sigma)})" for it, sigma in told)
+    pairs = zip(values.tolist(), sigmas.tolist(), strict=True)
+    return ", ".join(f"{matched(it, sigma)} (sigma {significant(sigma)})" for it, sigma in pairs)
 
 
 def _ur_words(found: Payload) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import messages, tell_written
+from visioncal.cli.console import messages, report_written
 from visioncal.cli.numbers import numbers_in
 from visioncal.cli.options import AsJson, OutFolder
 from visioncal.cli.plan_options import ClearanceOptions
@@ -50,7 +50,7 @@ class ExcitationOptions:
         str,
         _motion(
             "--friction",
-            help=f"What is to be told besides inertias: {', '.join(_FRICTION)}; or none.",
+            help=f"What is to be identified besides inertias: {', '.join(_FRICTION)}; or none.",
         ),
     ] = "coulomb,viscous,offset"
     sweep_speeds: Annotated[
@@ -138,7 +138,7 @@ def dynamics_plan_command(
     out: OutFolder = Path("motions"),
     as_json: AsJson = False,
 ) -> None:
-    """Plan the motions that tell an arm's inertias and friction.
+    """Plan the motions that determine an arm's inertias and friction.
 
     Writes an exciting motion and sweeps as tables (.csv), programs for a UR (.script), plan.json
     and plan.rrd to look at. Nothing is sent to a robot. Exit status 2: the limits allow none.
@@ -177,11 +177,11 @@ def dynamics_plan_command(
     if as_json:
         typer.echo(json.dumps(document, indent=2, allow_nan=False))
     else:
-        _tell(plan)
-    tell_written(written, quiet=as_json)
+        _report(plan)
+    report_written(written, quiet=as_json)
 
 
-def _tell(plan: MotionPlan) -> None:
+def _report(plan: MotionPlan) -> None:
     console = messages()
     for words in plan_words(plan):
         console.print(escape(words))

@@ -39,10 +39,10 @@ def dynamics_validate_command(
         return
     for prediction in predictions:
         messages().print(escape(prediction.label))
-        _tell_prediction(identified, prediction)
+        _report_prediction(identified, prediction)
 
 
-def _tell_prediction(identified: Identified, prediction: Prediction) -> None:
+def _report_prediction(identified: Identified, prediction: Prediction) -> None:
     found = validate(identified, prediction)
     fitted = identified.fitted_rms_nm
     table = Table("joint", "predicted to [N m]", "of its range", "fitted to [N m]", box=None)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from visioncal.cli.framing import FrameOptions, Place, TouchOptions, keep_and_tell
+from visioncal.cli.framing import FrameOptions, Place, TouchOptions, keep_and_report
 from visioncal.cli.options import AsJson, PartOptions
 from visioncal.cli.refusing import refuse_given
 from visioncal.cli.target_in_images import PointOption, frame_by_images, image_session
@@ -68,7 +68,7 @@ def fixture_command(
         frame = frame_by_images(
             session, place, "fixture", point, drawing, choice=choice, quiet=as_json
         )
-        keep_and_tell(place, frame, touches, as_json=as_json)
+        keep_and_report(place, frame, touches, as_json=as_json)
         return
     refuse_given({"--point-mm": point}, "touches say where the fixture's origin is")
     refuse_given({"--camera": part.camera, "--target": part.target}, "touches need no camera")
@@ -83,7 +83,7 @@ def fixture_command(
         written.model,
         touch_noise_m=written.noise_m,
     )
-    keep_and_tell(place, frame, touches, as_json=as_json)
+    keep_and_report(place, frame, touches, as_json=as_json)
 
 
 def _tool(said: str | None, calibration: Calibration | None, robot: str | None) -> Tool | None:

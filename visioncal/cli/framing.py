@@ -1,4 +1,4 @@
-"""What the commands that place a frame share: options, where the frame goes, how it is told."""
+"""What the commands that place a frame share: options, where the frame goes, how it is reported."""
 
 import json
 import sys
@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import messages, tell_written
+from visioncal.cli.console import messages, report_written
 from visioncal.cli.options import Force
 from visioncal.cli.pose_options import RobotPoseOptions
 from visioncal.cli.summary import print_verdict
@@ -194,7 +194,7 @@ def _folder(known: Path) -> Path:
     return folder
 
 
-def keep_and_tell(place: Place, frame: Frame, source: Path, *, as_json: bool) -> None:
+def keep_and_report(place: Place, frame: Frame, source: Path, *, as_json: bool) -> None:
     """Writes a frame where it goes, and prints it for people, or as JSON.
 
     Args:
@@ -207,14 +207,14 @@ def keep_and_tell(place: Place, frame: Frame, source: Path, *, as_json: bool) ->
     again = [*sys.argv, *([] if "--force" in sys.argv else ["--force"])]
     out = place.file or place.folder or ""
     frame = replace(frame, verdict=frame.verdict.with_paths(source, out, ["visioncal", *again[1:]]))
-    tell(place, frame, place.keep(frame), as_json=as_json)
+    report(place, frame, place.keep(frame), as_json=as_json)
 
 
-def tell(place: Place, frame: Frame, written: Written, *, as_json: bool) -> None:
+def report(place: Place, frame: Frame, written: Written, *, as_json: bool) -> None:
     """Prints a frame for people, or as JSON."""
     if as_json:
         typer.echo(json.dumps(frames_document({place.name: frame}), indent=2))
-        tell_written(written, quiet=True)
+        report_written(written, quiet=True)
         return
     console = messages()
     print_verdict(frame.verdict, place.name)
@@ -235,7 +235,7 @@ def tell(place: Place, frame: Frame, written: Written, *, as_json: bool) -> None
             "axis"
         )
     )
-    _tell_before(place, frame)
+    _report_before(place, frame)
     undrawn = [it.file for it in written.undrawn]
     if place.folder is not None and place.folder / RECORDING not in (*written.files, *undrawn):
         console.print(
@@ -245,10 +245,10 @@ def tell(place: Place, frame: Frame, written: Written, *, as_json: bool) -> None
         )
     if not written.files:
         console.print("nothing was written: -c joins it to a calibration, -o puts it into a file")
-    tell_written(written)
+    report_written(written)
 
 
-def _tell_before(place: Place, frame: Frame) -> None:
+def _report_before(place: Place, frame: Frame) -> None:
     before = None if place.result is None else place.result.frames.get(place.name)
     if before is not None:
         mm, deg = pose_difference(before.edge.matrix, frame.edge.matrix)

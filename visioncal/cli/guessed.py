@@ -8,7 +8,7 @@ from visioncal.cli.console import messages
 
 
 def print_guess(guess: Guess) -> None:
-    """Prints the readings, the best first, what was found, and what the views cannot tell."""
+    """Prints the readings, the best first, what was found, and what the views leave open."""
     console = messages()
     table = Table("reading", "chain closes to", "views that agree", box=None, pad_edge=False)
     for it in guess.candidates:

@@ -153,7 +153,7 @@ def locate_command(
             found = _by_views(session, shown, known, origin_m, sigma_px, quiet=as_json)
         else:
             found = _by_image(source, known, wanted, origin_m, flange, sigma_px)
-    _tell(found, as_json=as_json)
+    _report(found, as_json=as_json)
 
 
 def _result(path: Path | None) -> Calibration:
@@ -239,7 +239,7 @@ def _by_plane(
 ) -> tuple[_Found, ...]:
     if plane is None:
         raise DataError(
-            "One image tells no depth: the plane (--plane) that the feature lies in is needed.",
+            "One image shows no depth: the plane (--plane) that the feature lies in is needed.",
             culprits=["--plane"],
             next_step=f"It is {FORMS}.",
         )
@@ -273,8 +273,8 @@ def _by_views(
         picks = locate_views(
             session, calibration, point_m, among=views, sigma_px=sigma_px, progress=progress
         )
-    for told_of in (*by_reason(picks.lost), *picks.warnings):
-        messages().print(escape(told_of))
+    for words in (*by_reason(picks.lost), *picks.warnings):
+        messages().print(escape(words))
     return tuple(
         _Found(f"view {view}", {"view": view}, located) for view, located in picks.found.items()
     )
@@ -314,7 +314,7 @@ def _target(words: str, result: Calibration) -> Target:
     return target_from_document(described_target(words), Path(words).stem)
 
 
-def _tell(found: Sequence[_Found], *, as_json: bool) -> None:
+def _report(found: Sequence[_Found], *, as_json: bool) -> None:
     if as_json:
         typer.echo(json.dumps([_document(it) for it in found], indent=2))
         return

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import messages, tell_written
+from visioncal.cli.console import messages, report_written
 from visioncal.cli.options import AsJson, OutFolder
 from visioncal.cli.plan_options import CellOptions, ClearanceOptions, PlanOptions, SightOptions
 from visioncal.cli.planned_cell import (
@@ -50,7 +50,7 @@ def plan_command(
     out: OutFolder = Path("plan"),
     as_json: AsJson = False,
 ) -> None:
-    """Propose the robot stops that tell most, or those to add to a session.
+    """Propose the most informative robot stops, or those to add to a session.
 
     Writes stops.csv, plan.json, plan.rrd to look at, and plan.script for a UR. Nothing is sent to
     a robot. Exit status 2: the cell or the session allows no plan, for the reason given.
@@ -72,8 +72,8 @@ def plan_command(
     if as_json:
         typer.echo(json.dumps(document, indent=2, allow_nan=False))
     else:
-        _tell(plan)
-    tell_written(written, quiet=as_json)
+        _report(plan)
+    report_written(written, quiet=as_json)
 
 
 def _begin(
@@ -93,7 +93,7 @@ def _begin(
     return begun.cell, begun if wanted.add is not None else None
 
 
-def _tell(plan: Plan) -> None:
+def _report(plan: Plan) -> None:
     console = messages()
     console.print(escape(f"{plan.request.purpose.name}: {summary_of(plan)}"))
     if plan.begun is not None and plan.begun.refusal:

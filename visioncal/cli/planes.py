@@ -66,10 +66,10 @@ def _of_frame(
             next_step=did_you_mean(f"{_LEAD}{words.removeprefix(_LEAD)}", planes)
             or f"A plane is {FORMS}.",
         )
-    told = ""
+    warning = ""
     if name in calibration.frames and calibration.frames[name].verdict.status == "bad":
-        told = f"The verdict of {name} is bad: {calibration.frames[name].verdict.reasons[0]}"
-    return Plane.of_frame(placed[name], z_m, 1e-3 * sigma_mm), told
+        warning = f"The verdict of {name} is bad: {calibration.frames[name].verdict.reasons[0]}"
+    return Plane.of_frame(placed[name], z_m, 1e-3 * sigma_mm), warning
 
 
 def _height_m(words: str) -> float:

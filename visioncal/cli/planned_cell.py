@@ -105,7 +105,7 @@ def begun_session(source: Source, words: CellOptions, kept: Kept, progress: Prog
     """The session to which stops are added.
 
     Raises:
-        DataError: There is none, or it tells too little to begin.
+        DataError: There is none, or it has too few views to begin.
     """
     session = source.session
     if session is None:
@@ -134,7 +134,7 @@ def cell_of(source: Source, words: CellOptions, kept: Kept) -> PlanCell:
     if source.calibration is not None:
         refuse_given(words.options("camera", "resolution", "mount"), "the calibration has its own")
         return _with_noise(_calibrated(source.calibration, source.session, words, kept), words)
-    # What is written wrongly is told before what is missing.
+    # What is written wrongly is reported before what is missing.
     numbers = _camera_numbers(words.camera)
     for option, said in (("--cam", words.cam), ("--board", words.board)):
         if said is not None:

@@ -102,10 +102,10 @@ def _lines(steps: Steps) -> Iterator[Callable[[str, int, int], None]]:
                 last = steps.line
                 messages().print(f"{last} ({time.monotonic() - begun:.0f} s)", markup=False)
 
-    teller = Thread(target=say, daemon=True)
-    teller.start()
+    printer = Thread(target=say, daemon=True)
+    printer.start()
     try:
         yield steps.report
     finally:
         over.set()
-        teller.join()
+        printer.join()

@@ -104,7 +104,7 @@ class DeviceOptions:
         int | None, _camera("--focus", help="Lens position, in the device's own unit.")
     ] = None
 
-    def wishes(self) -> DeviceSetup:
+    def setup(self) -> DeviceSetup:
         """The same, as drivers take it.
 
         Raises:
@@ -177,13 +177,13 @@ def record_command(
     if drives or dry_run:
         _check_driven(scene, drives=drives)
     taking = takes.options(single=is_folder(camera), lost=CaptureOptions.lost if drives else 0)
-    requested = device.wishes()
+    requested = device.setup()
     answers = sys.stdin.isatty()
     wish = ArmWish("", not drives or dry_run, asked, described.pose_form, answers)
     with ended_like_ctrl_c(), _opened(arm, wish, camera, requested) as cell:
         scene.check(cell.camera.resolution, drives=drives)
         if dry_run:
-            _tell(departure(cell, scene.planned, (), taking), cell, taking)
+            _report(departure(cell, scene.planned, (), taking), cell, taking)
             messages().print("Nothing was moved (--dry-run).")
             return
         start = Journal.resume if resume else Journal.begin
@@ -237,7 +237,7 @@ def driven(
 ) -> list[Step]:
     """Drives the plan's stops, after a word of the user."""
     leaving = departure(cell, scene.planned, [it.number for it in journal.views], taking)
-    _tell(leaving, cell, taking)
+    _report(leaving, cell, taking)
     if not leaving.stops:
         return []
     if asks:
@@ -245,7 +245,7 @@ def driven(
     return record(cell, scene.planned, journal, taking, watchers, lens=cell.camera.factory)
 
 
-def _tell(leaving: Departure, cell: LiveCell, taking: CaptureOptions) -> None:
+def _report(leaving: Departure, cell: LiveCell, taking: CaptureOptions) -> None:
     """Says what is about to happen."""
     say, count = messages().print, len(leaving.stops)
     if not count:

@@ -14,7 +14,7 @@ import typer
 from rich.markup import escape
 
 from visioncal.cli.against_truth import truth_table
-from visioncal.cli.console import messages, tell_written
+from visioncal.cli.console import messages, report_written
 from visioncal.cli.options import AsJson, OutFolder, Seed, View
 from visioncal.cli.rehearsed import TAKING, Recorded, calibrated, planned, recorded, touched
 from visioncal.cli.summary import print_summary
@@ -72,10 +72,10 @@ def rehearse_command(
     whole = _rehearse(RehearsalOptions(robot, mount, views, seed), out, fault, view=view)
     document = whole.document()
     write_atomically(out / _SUMMARY, json.dumps(document, indent=2, allow_nan=False) + "\n")
-    whole.tell(out)
+    whole.report(out)
     if as_json:
         typer.echo(json.dumps(document, indent=2, allow_nan=False))
-    tell_written(whole.written, quiet=True, status=0 if whole.error.passed else EXIT_WRONG)
+    report_written(whole.written, quiet=True, status=0 if whole.error.passed else EXIT_WRONG)
 
 
 def _rehearse(
@@ -90,7 +90,7 @@ def _rehearse(
     start_q = scene.planned.stops[0].q + _NEAR_RAD
     with closing(Bench(cell, start_q)) as bench:
         witness = Witness(bench)
-        _tell_devices(bench)
+        _report_devices(bench)
         taken = recorded(bench, scene, out / "session", [witness], fault, view=view)
     captured = time.monotonic()
     run, written = calibrated(out / "session", out / "result")
@@ -183,7 +183,7 @@ class _Rehearsal:
             document["fault"] = {key: it for key, it in suffered.items() if it is not None}
         return document
 
-    def tell(self, out: Path) -> None:
+    def report(self, out: Path) -> None:
         """Says it in words."""
         say, times = messages().print, self.times_s
         print_summary(self.calibration, verbose=False)
@@ -212,7 +212,7 @@ class _Rehearsal:
         say(escape(f"wrote {out / _SUMMARY}; look: visioncal review {out / 'result'}"))
 
 
-def _tell_devices(bench: Bench) -> None:
+def _report_devices(bench: Bench) -> None:
     host = bench.controller.host
     messages().print(f"simulated controller at {host}, driven by ur-rtde {version('ur-rtde')}")
     if bench.through_depthai:

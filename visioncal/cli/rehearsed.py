@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from visioncal.calibration.pipeline import Run, run
-from visioncal.cli.console import messages, report_error, tell_written
+from visioncal.cli.console import messages, report_error, report_written
 from visioncal.cli.interrupts import ended_like_ctrl_c
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.record import ViewLines, driven
@@ -80,7 +80,7 @@ class Suffered:
         message: What was said.
         next_step: And what to do.
         told_after_s: How long after the fault [s].
-        stood_after_s: How long after it the arm stood [s]; None where nobody can tell, or
+        stood_after_s: How long after it the arm stood [s]; None where that is not known, or
             where it goes on.
         views_kept: How many views the session had then, every acknowledged one among them.
     """
@@ -101,7 +101,7 @@ def planned(cell: RehearsedCell, options: RehearsalOptions, folder: Path) -> Sce
     with shown_progress(quiet=False) as progress:
         plan = make_plan(cell.known, request, progress=progress)
         written = write_plan(folder, plan, plan_document(plan, {"kind": "rehearsal"}))
-    tell_written(written, quiet=True)
+    report_written(written, quiet=True)
     messages().print(f"plan: {summary_of(plan)}")
     return scene_of(folder)
 
@@ -131,7 +131,7 @@ def recorded(
     try:
         _check_all_seen(_drive(bench, scene, folder, every, resume=False, view=view))
     except VisioncalError as error:
-        told_s = kept.missed_s or time.monotonic()
+        reported_s = kept.missed_s or time.monotonic()
         if befalling.befell_s is None:
             raise
         report_error(error, as_json=False)
@@ -139,7 +139,7 @@ def recorded(
             fault,
             error.message,
             error.next_step,
-            told_s - befalling.befell_s,
+            reported_s - befalling.befell_s,
             befalling.stood_after_s(),
             len(Session.load(folder).views),
         )
@@ -185,7 +185,7 @@ class _Kept:
 
     Attributes:
         steps: Those that there are.
-        missed_s: When the first stop without one was told, on the monotonic clock [s].
+        missed_s: When the first stop without one was reported, on the monotonic clock [s].
     """
 
     def __init__(self) -> None:

@@ -94,7 +94,7 @@ def find_recording(path: Path) -> Path:
         path: An `.rrd`, or a folder that holds recording.rrd, or else plan.rrd.
 
     Raises:
-        DataError: There is none, or it is no recording; a session's folder is told from others.
+        DataError: There is none, or it is no recording, as a session's folder.
     """
     file = path / RECORDING if path.is_dir() else path
     if path.is_dir() and not file.is_file() and (path / PREVIEW).is_file():

@@ -219,7 +219,7 @@ def check_command(
         bool, typer.Option("--force", help="Replace a description that is there.")
     ] = False,
 ) -> None:
-    """Name the board in a photograph without being told, and print its description.
+    """Name the board in a photograph without further options, and print its description.
 
     Only the size of its squares cannot be seen. Exit status 0: it is named; 2: no board is seen.
     """

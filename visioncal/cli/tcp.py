@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from visioncal.cli.framing import FrameOptions, Place, TouchOptions, keep_and_tell
+from visioncal.cli.framing import FrameOptions, Place, TouchOptions, keep_and_report
 from visioncal.cli.options import AsJson, PartOptions
 from visioncal.cli.refusing import refuse_given
 from visioncal.cli.target_in_images import PointOption, frame_by_images, image_session
@@ -41,7 +41,7 @@ def tcp_command(
         choice = part.choice
         place = Place.of(goes, "tool", replace(choice, target=None), EYE)
         frame = frame_by_images(session, place, "tool", point, choice=choice, quiet=as_json)
-        keep_and_tell(place, frame, touches, as_json=as_json)
+        keep_and_report(place, frame, touches, as_json=as_json)
         return
     refuse_given({"--camera": part.camera, "--target": part.target}, "touches need no camera")
     refuse_given({"--point-mm": point}, "touches say where the tool's point is")
@@ -54,4 +54,4 @@ def tcp_command(
         written.model,
         touch_noise_m=written.noise_m,
     )
-    keep_and_tell(place, frame, touches, as_json=as_json)
+    keep_and_report(place, frame, touches, as_json=as_json)

@@ -13,7 +13,7 @@ import typer
 from rich.markup import escape
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from visioncal.cli.console import asked, messages, report_error, tell_written
+from visioncal.cli.console import asked, messages, report_error, report_written
 from visioncal.cli.numbers import numbers_in
 from visioncal.cli.options import AsJson, SessionArgument
 from visioncal.cli.progress import shown_progress
@@ -94,7 +94,7 @@ def touch_test_command(
     elif sys.stdin.isatty() and not as_json:
         gaps = _asked(points, targets)
     else:
-        _tell(points, targets, as_json=as_json)
+        _report(points, targets, as_json=as_json)
         return
     test = judged(points, gaps, tool)
     proved = replace(known, touch_test=test)
@@ -104,11 +104,11 @@ def touch_test_command(
         typer.echo(json.dumps(document, indent=2))
     else:
         messages().print(escape(finding_of(test).reason))
-    tell_written(written, quiet=as_json, status=0 if test.passed else _EXIT_LARGER)
+    report_written(written, quiet=as_json, status=0 if test.passed else _EXIT_LARGER)
 
 
 def _target(known: Calibration, point: TouchPoint, height_m: float) -> dict[str, Any]:
-    """Where to send the robot: as its own controller has to be told."""
+    """Where to send the robot: as its own controller needs it."""
     touch, hover = point.base_from_flange, point.above(height_m)
     found: dict[str, Any] = {
         "name": point.name,
@@ -126,7 +126,7 @@ def _numbers(pose: FloatArray) -> list[float]:
     return [*transform.translation.tolist(), *transform.rotation.as_rotvec().tolist()]
 
 
-def _tell(
+def _report(
     points: Sequence[TouchPoint], targets: Sequence[dict[str, Any]], *, as_json: bool
 ) -> None:
     if as_json:
@@ -135,11 +135,11 @@ def _tell(
     console = messages()
     console.print(_FORM)
     for point, target in zip(points, targets, strict=True):
-        _tell_point(point, target)
+        _report_point(point, target)
     console.print("Enter the gaps with --gaps-mm, in this order.")
 
 
-def _tell_point(point: TouchPoint, target: dict[str, Any]) -> None:
+def _report_point(point: TouchPoint, target: dict[str, Any]) -> None:
     """Says where a point is, and where to send the robot."""
     console, (x, y, z) = messages(), 1e3 * point.base_m
     console.print(
@@ -161,7 +161,7 @@ def _asked(points: Sequence[TouchPoint], targets: Sequence[dict[str, Any]]) -> l
     messages().print(_FORM)
     gaps = []
     for point, target in zip(points, targets, strict=True):
-        _tell_point(point, target)
+        _report_point(point, target)
         gaps.append(_gap())
     return gaps
 
@@ -197,7 +197,7 @@ def _driven(
             tip_m = (invert(point.base_from_flange) @ [*point.base_m, 1.0])[:3]
             hovering = Hovering(arm, known.robot, tip_m, point.base_m, point.normal, height_m)
             _brought(hovering, _pose(target["hover"]))
-            _tell_point(point, target)
+            _report_point(point, target)
             gaps.append(_gap())
     return gaps
 

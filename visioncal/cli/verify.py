@@ -18,7 +18,7 @@ from visioncal.calibration.verification import (
     verdict_of,
     verify,
 )
-from visioncal.cli.console import messages, tell_written
+from visioncal.cli.console import messages, report_written
 from visioncal.cli.options import AsJson, PartOptions
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.summary import print_steps
@@ -63,9 +63,9 @@ def verify_command(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Tell whether a calibration still holds, and what has changed if it does not.
+    """Check whether a calibration still holds, and what has changed if it does not.
 
-    Exit status 0: it holds; 3: it does not; 2: that cannot be told, for the reason given.
+    Exit status 0: it holds; 3: it does not; 2: that cannot be decided, for the reason given.
     """
     if against is None:
         raise DataError(
@@ -90,11 +90,11 @@ def verify_command(
     if as_json:
         typer.echo(document, nl=False)
     else:
-        _tell(check, fired, verdict)
-    tell_written(written, quiet=True, status=0 if check.passed else _EXIT_FAILED)
+        _report(check, fired, verdict)
+    report_written(written, quiet=True, status=0 if check.passed else _EXIT_FAILED)
 
 
-def _tell(check: Check, triggers: Sequence[Outcome], verdict: Verdict) -> None:
+def _report(check: Check, triggers: Sequence[Outcome], verdict: Verdict) -> None:
     console = messages()
     word, colour = ("pass", "green") if check.passed else ("fail", "red")
     name = escape(check.seen.known.session.name)

@@ -22,7 +22,7 @@ _STEP, _STEP_CLEAR = 1e-6, 1e-5
 # Peaks lie between samples: limits end earlier by this share, distances by this [m].
 _EARLIER, _BUFFER_M = 0.03, 0.03
 # A distance that lacks this much costs as much as a limit that is exceeded by its own size [m].
-_LACKING_M = 0.1
+_SHORT_M = 0.1
 
 
 class Objective:
@@ -123,24 +123,24 @@ class Objective:
         return position + speed + hard + near, [by_q + by_near, by_dq, by_ddq]
 
     def _near(self, q: FloatArray) -> tuple[float, FloatArray]:
-        """What the distances lack, squared, with derivatives (m, n) by the positions."""
+        """What the distances fall short, squared, with derivatives (m, n) by the positions."""
         value, jacobian = 0.0, np.zeros_like(q)
         for row, posture in enumerate(q):
-            lacks = self._lacking(posture)
-            if not lacks.any():
+            short = self._shortfall(posture)
+            if not short.any():
                 continue
-            value += float(lacks @ lacks)
+            value += float(short @ short)
             for joint in range(len(posture)):
                 moved = posture.copy()
                 moved[joint] += _STEP_CLEAR
-                jacobian[row, joint] = 2.0 * lacks @ (self._lacking(moved) - lacks) / _STEP_CLEAR
+                jacobian[row, joint] = 2.0 * short @ (self._shortfall(moved) - short) / _STEP_CLEAR
         return value, jacobian
 
-    def _lacking(self, posture: FloatArray) -> FloatArray:
+    def _shortfall(self, posture: FloatArray) -> FloatArray:
         """(k,) how much each pair's distance lacks, in its unit; zero for those far apart."""
         collisions = self._allowed.collisions
         left = collisions.distances(posture) - collisions.needed_m() - _BUFFER_M
-        return np.maximum(-left / _LACKING_M, 0.0)
+        return np.maximum(-left / _SHORT_M, 0.0)
 
 
 def _hinge(values: FloatArray, limits: FloatArray) -> tuple[float, FloatArray]:

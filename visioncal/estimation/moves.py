@@ -36,7 +36,7 @@ _MARGIN = 2.0
 _RIVAL_SHARE = 0.9
 # Moves that explain such a share of the most are followed up by one more, not more than so many;
 # of each frame so many different ones.
-_WORTH_TRYING, _MOST_TRIED, _STEPS_EACH = 0.6, 6, 2
+_RIVAL_GAIN, _MOST_TRIED, _STEPS_EACH = 0.6, 6, 2
 # A step that the other unknowns take up to this share of its information is no step of its own.
 _TAKEN = 1e-6
 
@@ -190,7 +190,7 @@ def gross_move(
     steps = _steps(problem, fit, agrees, movable)
     if not steps:
         return None
-    rivals = [it for it in steps if it.gain >= _WORTH_TRYING * steps[0].gain][:_MOST_TRIED]
+    rivals = [it for it in steps if it.gain >= _RIVAL_GAIN * steps[0].gain][:_MOST_TRIED]
     moves = [_move(problem, it) for it in rivals]
     if len(rivals) == 1:
         return moves[0]

@@ -32,7 +32,7 @@ from visioncal.vision.targets import corner_positions, rotations
 _FALSE_ALARM = 1e-4
 # Less than so many times the noise that was to be expected is counted without a word: light and
 # distance do that.
-_WORTH_A_WORD = 2.0
+_MENTIONED = 2.0
 # Wrong corners spoil the pose that they are judged by: so often it is made anew without them.
 _ROUNDS = 3
 
@@ -242,7 +242,7 @@ def _noise(
     # Rounding of exact corners is no scatter.
     if squares <= limit or shown < 1e-6:
         return noise_px, ()
-    if shown < _WORTH_A_WORD * noise_px:
+    if shown < _MENTIONED * noise_px:
         return shown, ()
     return shown, (
         f"{label}: the corners scatter by {figure(shown)} px around the target's pose, and "

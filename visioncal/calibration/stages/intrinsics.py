@@ -27,7 +27,7 @@ _ROUNDS = 3
 # Starts for the focal length, in image widths, where Zhang's own start does not converge.
 _FOCAL_WIDTHS = (0.3, 0.6, 1.0, 2.0)
 # The rational model has to explain this share more, of views in the fit and of views left out.
-_WORTH_COMPARING = 0.02
+_LEAST_GAIN = 0.02
 _FOLDS = 5
 # Limits of the warnings: the focal length as a share, the principal point in pixels.
 _FOCAL_LIMIT, _CENTRE_LIMIT_PX = 0.005, 5.0
@@ -171,12 +171,12 @@ def _with_rational_terms(stack: CornerStack, fit: BundleFit) -> BundleFit:
     """Takes 8 coefficients instead of 5 where views that were left out are predicted better."""
     wider = _fit(stack, _padded(fit.camera), fit.cam_from_target)
     gain = 1.0 - float(np.sum(wider.residuals**2) / np.sum(fit.residuals**2))
-    if not wider.settled or gain < _WORTH_COMPARING or len(stack.views) < 2 * _FOLDS:
+    if not wider.settled or gain < _LEAST_GAIN or len(stack.views) < 2 * _FOLDS:
         return fit
     # By the typical view: where a fold leaves out an edge of the image, the wider model may run
     # away there, and with all views it does not.
     ratio = float(np.median(_held_out(stack, wider) / _held_out(stack, fit)))
-    return wider if ratio < 1.0 - _WORTH_COMPARING else fit
+    return wider if ratio < 1.0 - _LEAST_GAIN else fit
 
 
 def _padded(camera: Camera) -> Camera:

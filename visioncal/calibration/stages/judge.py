@@ -210,7 +210,7 @@ def judge(findings: Findings, limits: CalibrationLimits | None = None) -> Verdic
         *_outlier_doubts(findings, limits),
         *(doubt for it in pairs for doubt in _holdout_doubts(it, findings.mount, limits)),
         # Sigmas of views that disagree wildly say nothing about the motion.
-        *([] if any(it.is_fatal for it in scatter) else _worth_doubts(findings, limits)),
+        *([] if any(it.is_fatal for it in scatter) else _accuracy_doubts(findings, limits)),
         *_stop_doubts(findings, limits),
         *(doubt for it in sensors for doubt in _lost_doubts(it, limits)),
         *(doubt for it in sensors for doubt in _noise_doubts(it, limits)),
@@ -498,7 +498,7 @@ def _holdout_doubts(pair: Pair, mount: Mount, limits: CalibrationLimits) -> Iter
         yield Finding("holdout", words, step).of(pair.name)
 
 
-def _worth_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
+def _accuracy_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
     """Judges the answer where it counts.
 
     Edges are known in the arm's own frames. Those of a calibrated arm are as open as the errors of

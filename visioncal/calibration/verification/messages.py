@@ -36,7 +36,7 @@ from visioncal.estimation.observability import axis_words
 from visioncal.vision.targets import corner_positions
 
 # A part of a motion that is less than so many sigmas is not mentioned.
-_WORTH_A_WORD = 3.0
+_MENTIONED = 3.0
 # So many stops say roughly where camera and board are, by which more are planned.
 _LEAST_STOPS = 3
 # A camera that moves by so many sigmas is detected in nearly every check.
@@ -108,7 +108,7 @@ class MeasuredMove:
                 (f"moved {shift}", self.mm, self.sigma_mm),
                 (f"turned {turn}", self.deg, self.sigma_deg),
             )
-            if value > _WORTH_A_WORD * sigma
+            if value > _MENTIONED * sigma
         ]
         return " and ".join(parts) or f"moved {shift}"
 

@@ -32,7 +32,7 @@ _ONE_ROBOT_MM, _ONE_ROBOT_DEG = 0.01, 0.001
 _POSTURES = 5
 _STAGES = {it.name: it.run for it in STAGES}
 # Corners that scatter by so many times as much as when they were calibrated with are mentioned.
-_WORTH_A_WORD = 2.0
+_MENTIONED = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -340,7 +340,7 @@ def _warnings(known: ObservedPoses, prior_calibration: CalibrationPrior) -> Iter
             "its joints had slipped. Verify with the arm as warm as then."
         )
     before, now = prior_calibration.calibration.noise.get("pixel_px"), known.pixel_px
-    if before is not None and now is not None and now > _WORTH_A_WORD * max(before, 1e-3):
+    if before is not None and now is not None and now > _MENTIONED * max(before, 1e-3):
         yield (
             f"The corners scatter by {figure(now)} px around the target's poses, and by "
             f"{figure(before)} "

@@ -39,7 +39,7 @@ FOREIGN_FORMATS: tuple[ForeignFormat, ...] = (
     TABLE,
 )
 
-_NO_WISHES = ImportOptions()
+_DEFAULTS = ImportOptions()
 
 # Tries other readings of the poses, and settles which is right.
 Choose: TypeAlias = Callable[[InDoubt | Foreign], Candidate]
@@ -49,7 +49,7 @@ def convert(
     source: Path,
     dest: Path,
     *,
-    requested: ImportOptions = _NO_WISHES,
+    requested: ImportOptions = _DEFAULTS,
     form: str | None = None,
     force: bool = False,
     choose: Choose | None = None,
@@ -83,7 +83,7 @@ def convert(
             if foreign.camera is not None:
                 check_radians(foreign.camera, requested.camera, "camera")
         session = assemble(foreign if choose is None else reread(foreign, choose(foreign)))
-    elif requested != _NO_WISHES:
+    elif requested != _DEFAULTS:
         raise DataError(
             f"{source} is a session already; what describes poses and cameras is for somebody "
             "else's recording.",

@@ -72,9 +72,9 @@ class Coach:
 
     def advice(self) -> str:
         """What the next view should be, where a person chooses it; empty where all is there."""
-        return next(self._wishes(), "")
+        return next(self._advice(), "")
 
-    def _wishes(self) -> Iterator[str]:
+    def _advice(self) -> Iterator[str]:
         if self._views < _FIRST:
             yield "another place, with the board large in the image"
             return

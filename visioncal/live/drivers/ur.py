@@ -299,7 +299,7 @@ def check_controller(host: str, *, moves: bool) -> Condition:
         condition.check_moves()
         connect(host, SCRIPT_PORT, "programs").close()
     else:
-        condition.check_tells()
+        condition.check_reports()
     check_states_come(host)
     return condition
 

@@ -11,7 +11,7 @@ _VERSION = re.compile(r"(\d+)\.(\d+)\.(\d+)\.\d+")
 # What ur-rtde's control script needs: registers of floating-point numbers for programs.
 _LEAST = {3: (3, 4), 5: (5, 4)}
 # From here on, the controller reports whether it is in remote control.
-_TELLS_REMOTE = (5, 6)
+_SAYS_REMOTE = (5, 6)
 _RUNNING = "RUNNING"
 # The dashboard reports the size alone of arms that there are, or could be, in two series.
 _BOTH_SERIES = ("UR3", "UR5", "UR10", "UR16")
@@ -79,7 +79,7 @@ class Condition:
                 f"is stopped by its safety system: {self.safety}",
                 _SAFETY_STEPS.get(self.safety, _FAULT_STEP),
             )
-        self.check_tells()
+        self.check_reports()
         if self.mode != _RUNNING:
             raise self._refuse(f"is not ready to move: its mode is {self.mode}", self._mode_step)
         if not self.remote:
@@ -89,7 +89,7 @@ class Condition:
                 "once it is enabled under Settings > System > Remote Control.",
             )
 
-    def check_tells(self) -> None:
+    def check_reports(self) -> None:
         """Checks that it reports where its joints are.
 
         Raises:
@@ -122,7 +122,7 @@ def read_condition(host: str) -> Condition:
         mode = dashboard.ask("robotmode").rpartition(":")[2].strip()
         word = "safetystatus" if version >= (5, 4, 0) else "safetymode"
         safety = dashboard.ask(word).rpartition(":")[2].strip()
-        remote = version < _TELLS_REMOTE or "true" in dashboard.ask("is in remote control").lower()
+        remote = version < _SAYS_REMOTE or "true" in dashboard.ask("is in remote control").lower()
     series = "e" if version[0] == 5 and model in _BOTH_SERIES else ""
     return Condition(host, version, f"{model}{series}", mode, safety, remote)
 

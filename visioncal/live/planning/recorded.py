@@ -131,7 +131,7 @@ def begin(
     known = found.known
     robot, targets = known.robot, tuple(known.session.boards.values())
     if robot is None or not targets or known.pixel_px is None or not known.scenes:
-        raise _lacking(known)
+        raise _missing(known)
     with one_blas_thread():
         begun = _guessed(known, guess) if known.fit is None else _fitted(known, known.fit)
         edges, covariance = _nearest(
@@ -197,7 +197,7 @@ class _Start:
 def _fitted(known: RunState, solved: Solved) -> _Start:
     """What the fit of a session determines, even where that leaves a direction open."""
     if solved.seen is None:
-        raise _lacking(known)
+        raise _missing(known)
     part, arm = solved.part, known.robot_arm
     observed = part.observations.observed
     most = max(dict.fromkeys(observed), key=observed.count)
@@ -320,7 +320,7 @@ def _away(edges: FloatArray, guess: Guess | None) -> FloatArray:
     return np.concatenate([np.zeros(3), local[0], np.zeros(3), local[1]])
 
 
-def _lacking(known: RunState) -> DataError:
+def _missing(known: RunState) -> DataError:
     session, missing = known.session, []
     if known.robot is None:
         missing.append("a model of its robot ([robot] model)")

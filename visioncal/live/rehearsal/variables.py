@@ -89,7 +89,7 @@ class Moment:
 
 
 _NOTHING = (0.0,) * 6
-_Tell = Callable[[Moment], Value]
+_Reader = Callable[[Moment], Value]
 
 
 def _zeros(_: Moment) -> Value:
@@ -112,22 +112,22 @@ def _speeds(moment: Moment) -> Value:
     return tuple(moment.joints[1].tolist())
 
 
-def _constant(value: Value) -> _Tell:
+def _constant(value: Value) -> _Reader:
     return lambda _: value
 
 
-def _int_register(place: int) -> _Tell:
+def _int_register(place: int) -> _Reader:
     return lambda moment: moment.registers.int_out[place]
 
 
-def _double_register(place: int) -> _Tell:
+def _double_register(place: int) -> _Reader:
     return lambda moment: moment.registers.double_out[place]
 
 
-def _table() -> dict[str, tuple[str, _Tell]]:
+def _table() -> dict[str, tuple[str, _Reader]]:
     """The variables by name: type, and how the value is had."""
     six, three = "VECTOR6D", "VECTOR3D"
-    table: dict[str, tuple[str, _Tell]] = {
+    table: dict[str, tuple[str, _Reader]] = {
         "timestamp": ("DOUBLE", lambda it: it.up_s),
         "actual_q": (six, _angles),
         "target_q": (six, _angles),
@@ -166,7 +166,7 @@ def _table() -> dict[str, tuple[str, _Tell]]:
     return table
 
 
-VARIABLES: Mapping[str, tuple[str, _Tell]] = _table()
+VARIABLES: Mapping[str, tuple[str, _Reader]] = _table()
 
 
 def input_type(name: str) -> str:

@@ -1,4 +1,4 @@
-"""The calibrated arm, as text: its levels, its parameters, and what the stops tell of it."""
+"""The calibrated arm, as text: its levels, its parameters, and what the stops determine of it."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from visioncal.present.recording.words import (
 from visioncal.results import Calibration
 from visioncal.results.arm import ArmLevel, ArmParameter, ArmResult, ElasticResult, JointSpring
 
-_MOST_WORTH = 5
+_MOST_INFLUENTIAL = 5
 # Without a sigma: about a hundredth of what an arm repeats to.
 _DECIMALS = {"mm": 3, "\N{DEGREE SIGN}": 4}
 
@@ -54,9 +54,9 @@ def markdown(found: ArmResult) -> str:
             plain(level_reason(found)),
             "",
             *_levels(found),
-            *_worth_over_workspace(found),
+            *_accuracy_over_workspace(found),
             *_parameters(found),
-            *_told(found),
+            *_identifiability(found),
             *_stops(found),
         ]
     )
@@ -109,7 +109,7 @@ def spring_words(spring: JointSpring) -> tuple[str, str, str]:
     )
 
 
-def _worth_over_workspace(found: ArmResult) -> Iterator[str]:
+def _accuracy_over_workspace(found: ArmResult) -> Iterator[str]:
     sigma = found.workspace_sigma_mm
     if sigma is not None:
         yield ""
@@ -153,10 +153,10 @@ def _parameter_line(joint: str, row: ParameterRow) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def _told(found: ArmResult) -> Iterator[str]:
+def _identifiability(found: ArmResult) -> Iterator[str]:
     known = found.observability
     if known is not None:
-        yield from ("", "## What the stops tell", "")
+        yield from ("", "## What the stops determine", "")
         yield f"{known.determined} of {known.identifiable} directions that stops can determine."
     for it in found.not_determined or ():
         yield f"- {plain(it)}"
@@ -164,8 +164,8 @@ def _told(found: ArmResult) -> Iterator[str]:
 
 def _stops(found: ArmResult) -> Iterator[str]:
     if found.stops:
-        yield from ("", "## What each stop is worth", "")
+        yield from ("", "## Influence of each stop", "")
         yield "By how much the mean variance over the workspace would grow without it:"
         yield ""
-    for it in (*found.stops[:_MOST_WORTH], *found.stops[_MOST_WORTH:][-1:]):
+    for it in (*found.stops[:_MOST_INFLUENTIAL], *found.stops[_MOST_INFLUENTIAL:][-1:]):
         yield f"- view {it.view}: {100 * it.influence:.2g} %"

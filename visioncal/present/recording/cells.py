@@ -56,8 +56,8 @@ class CellScene:
         return {frame_name("flange", it): Robot.from_document(one) for it, one in documents}
 
     @cached_property
-    def told(self) -> Mapping[int, Mapping[str, View]]:
-        """By view and by flange, the row that tells where the robot stood."""
+    def robot_rows(self) -> Mapping[int, Mapping[str, View]]:
+        """By view and by flange, the row with the robot's pose."""
         rows = standing(self.session.declaration, self.session.views)
         return {
             view: {frame_name("flange", name): row for name, row in them.items()}
@@ -83,8 +83,8 @@ class CellScene:
         return max(float(np.linalg.norm(extent)), 0.5)
 
     def flange(self, frame: str, view: int) -> FloatArray | None:
-        """(4, 4) `base_from_flange` at the stop of a view; None where nothing tells it."""
-        row = self.told.get(view, {}).get(frame)
+        """(4, 4) `base_from_flange` at the stop of a view; None where it is unknown."""
+        row = self.robot_rows.get(view, {}).get(frame)
         if row is None:
             return None
         pose, q, robot = row.base_from_flange(), row.joints_rad, self.robots.get(frame)
@@ -98,22 +98,22 @@ class CellScene:
     def shown(self) -> Mapping[int, Mapping[str, int]]:
         """By view and by flange, the view by which it is drawn: its own stop's, or the last before.
 
-        A robot that is not told of yet is drawn as it is told of first.
+        A robot without a pose yet is drawn at its first one.
         """
         drawn: dict[int, dict[str, int]] = {}
         last: dict[str, int] = {}
         for view in reversed(self.session.views):
-            last |= self._telling(view.number)
+            last |= self._posed(view.number)
         for view in self.session.views:
-            last |= self._telling(view.number)
+            last |= self._posed(view.number)
             drawn[view.number] = dict(last)
         return drawn
 
-    def _telling(self, view: int) -> dict[str, int]:
+    def _posed(self, view: int) -> dict[str, int]:
         return {it: view for it in self.found.robots if self.flange(it, view) is not None}
 
-    def untold(self, view: int) -> list[str]:
-        """The robots of which nothing tells where they stood at the stop of a view."""
+    def unposed(self, view: int) -> list[str]:
+        """The robots without a pose at the stop of a view."""
         return [it for flange, it in self.found.robots.items() if self.flange(flange, view) is None]
 
     def in_cell(self, frame: str, view: int) -> FloatArray | None:
@@ -272,7 +272,7 @@ def _log_network(stream: rr.RecordingStream, found: Alignment) -> None:
     for body, (left, right) in spans(found).items():
         nodes[body] = (0.5 * (left + right), _BODY_HEIGHT)
     nodes |= places(found)
-    labels = [f"{it}\n{_worth(found, it)}" for it in nodes]
+    labels = [f"{it}\n{_sigma(found, it)}" for it in nodes]
     bodies = {paths.CELL_FRAME, *found.robots}
     seen = [(it.seer, it.seen) for it in pairs(found) if it.used]
     hangs = [(found.frames[it], it) for it in nodes if it != paths.CELL_FRAME]
@@ -289,7 +289,7 @@ def _log_network(stream: rr.RecordingStream, found: Alignment) -> None:
     )
 
 
-def _worth(found: Alignment, frame: str) -> str:
+def _sigma(found: Alignment, frame: str) -> str:
     if frame in found.robots:
         return f"robot {found.robots[frame]}"
     if frame in (paths.CELL_FRAME, found.reference):
@@ -317,7 +317,7 @@ def _log_view(
     # Without a strip, this takes that of the view before off the screen.
     size_m = 2.0 * scene.size_m
     _log_lines(stream, paths.SIGHT_LINE, paths.CELL_FRAME, strips, colour, size_m, static=False)
-    note = sight_markdown(view, sight, scene.untold(view.number))
+    note = sight_markdown(view, sight, scene.unposed(view.number))
     stream.log(paths.VIEW_NOTE, _markdown(note))
 
 
@@ -329,7 +329,7 @@ def _middle(scene: CellScene, frame: str, cell_from_frame: FloatArray) -> FloatA
 
 
 def _log_robot(stream: rr.RecordingStream, scene: CellScene, flange: str, view: View) -> None:
-    """Places a flange and draws its arm, as its stop tells it or the last one that did."""
+    """Places a flange and draws its arm, as of its stop, or of the last one with its pose."""
     by = scene.shown[view.number].get(flange, view.number)
     pose, base = scene.flange(flange, by), scene.found.frames[flange]
     if pose is None:
@@ -340,7 +340,7 @@ def _log_robot(stream: rr.RecordingStream, scene: CellScene, flange: str, view: 
         translation=pose[:3, 3], mat3x3=pose[:3, :3], parent_frame=base, child_frame=flange
     )
     stream.log(frame_entity(flange), placed)
-    robot, q = scene.robots.get(flange), scene.told[by][flange].joints_rad
+    robot, q = scene.robots.get(flange), scene.robot_rows[by][flange].joints_rad
     if robot is not None and q is not None and len(q) == robot.joint_count:
         log_arm(stream, robot.link_frames(q), arm_entity(flange))
         return

@@ -32,16 +32,16 @@ def verdict_markdown(found: Alignment) -> str:
     return "\n".join(lines)
 
 
-def sight_markdown(view: View, sight: Sight | None, untold: Sequence[str]) -> str:
+def sight_markdown(view: View, sight: Sight | None, unposed: Sequence[str]) -> str:
     """One view: who saw whom, and what became of it.
 
     Args:
         view: The view.
-        sight: What it observed; None where it tells of the lens or of a robot alone.
-        untold: The robots of which nothing tells where they stood.
+        sight: What it observed; None where it is of the lens or of a robot alone.
+        unposed: The robots without a pose at its stop.
     """
     if sight is None:
-        what = "for the lens alone" if view.is_of_lens else "it tells where a robot stood"
+        what = "for the lens alone" if view.is_of_lens else "it has a robot's pose alone"
         return f"**View {view.number}**: {what}."
     lines = [
         f"**View {sight.view}**, stop {sight.stop}: {plain(sight.seer)} saw {plain(sight.seen)}"
@@ -51,7 +51,7 @@ def sight_markdown(view: View, sight: Sight | None, untold: Sequence[str]) -> st
         turned = "" if sight.residual_deg is None else f", {significant(sight.residual_deg)} deg"
         off = f"Off by {significant(sight.residual_mm)} mm{turned}. "
     lines.append(off + ("Used." if sight.used else f"Not used: {plain(sight.reason)}"))
-    if untold and not view.is_of_lens:
-        names = ", ".join(map(plain, untold))
-        lines.append(f"Where {names} stood is not told at this stop: drawn as it was last.")
+    if unposed and not view.is_of_lens:
+        names = ", ".join(map(plain, unposed))
+        lines.append(f"The pose of {names} is not known at this stop: drawn as it was last.")
     return "\n\n".join(lines)

@@ -27,7 +27,7 @@ _LINES = (
 
 
 def write_dynamics_recording(path: Path, run: Run, blueprint: BlueprintLike | None = None) -> None:
-    """Writes a session with what its torques told: measured and predicted over time.
+    """Writes a session with what its torques determined: measured and predicted over time.
 
     One motion follows the other on the timeline.
 
@@ -148,9 +148,9 @@ def _torque_lines(identified: Identified) -> Iterator[str]:
 
 def _parameter_lines(identified: Identified) -> Iterator[str]:
     """The base parameters, in Markdown."""
-    yield "| base parameter | value | sigma | told to |"
+    yield "| base parameter | value | sigma | known to |"
     yield "| --- | --- | --- | --- |"
-    for name, value, sigma, told in zip(
+    for name, value, sigma, share in zip(
         identified.base.names,
         identified.values.tolist(),
         identified.sigmas.tolist(),
@@ -159,4 +159,4 @@ def _parameter_lines(identified: Identified) -> Iterator[str]:
     ):
         # A star is Markdown's own.
         plain = name.replace("*", r"\*")
-        yield f"| {plain} | {matched(value, sigma)} | {significant(sigma)} | {told} |"
+        yield f"| {plain} | {matched(value, sigma)} | {significant(sigma)} | {share} |"

@@ -1,8 +1,8 @@
 """The messages of an `.rrd` file, found without reading what is in them.
 
 An `.rrd` is a header of 12 bytes and then messages: kind and length, 8 bytes each with the lowest
-first, and a payload. A finished file ends with a message of kind LAST, which tells rerun where its
-chunks are, and 32 bytes that tell where that message is. A writer that was killed leaves none of
+first, and a payload. A finished file ends with a message of kind LAST, which shows rerun where its
+chunks are, and 32 bytes that say where that message is. A writer that was killed leaves none of
 these; a file that was cut ends within a message.
 """
 

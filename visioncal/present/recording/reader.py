@@ -322,14 +322,14 @@ def _complete_rows(path: Path, records: _Records) -> list[int]:
         )
     if records.header.images:
         return sorted(rows)
-    lacking = [row for row in rows if rows[row].image_sha256 and row not in images]
+    absent = [row for row in rows if rows[row].image_sha256 and row not in images]
     changed = [
         row for row in rows if row in images and images[row].digest != rows[row].image_sha256
     ]
-    changed += [row for row in lacking if row < sure]
+    changed += [row for row in absent if row < sure]
     if changed:
         raise _changed_images(path, [records.image_name(row) for row in sorted(changed)])
-    return sorted(set(rows) - set(lacking))
+    return sorted(set(rows) - set(absent))
 
 
 def _changed_images(path: Path, names: Sequence[str]) -> DataError:

@@ -1,7 +1,7 @@
 """How well the edges are known, in the cell: ellipsoids, and where each view puts the target.
 
 Both are far too small to be seen at their true size, so both are drawn larger by one factor,
-which their names tell.
+which their names say.
 """
 
 from collections.abc import Iterable, Mapping, Sequence

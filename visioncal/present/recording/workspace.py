@@ -1,4 +1,4 @@
-"""The calibrated arm in the cell: what it is worth over the workspace, and what changed."""
+"""The calibrated arm in the cell: its accuracy over the workspace, and what changed."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

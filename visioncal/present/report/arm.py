@@ -10,7 +10,7 @@ from visioncal.present.report.content import Fact
 from visioncal.results.arm import NOMINAL, ArmLevel, ArmResult
 
 _COLUMNS = 2
-_MOST_WORTH = 5
+_MOST_INFLUENTIAL = 5
 _CONVENTIONS = {
     "standard": "Denavit and Hartenberg's form, each joint's link behind it",
     "modified": "Craig's modified form, each joint's link before it",
@@ -40,7 +40,7 @@ class LevelRow:
 
 
 @dataclass(frozen=True)
-class WorthRow:
+class InfluenceRow:
     """A stop, and by how much the variance over the workspace would grow without it, in words."""
 
     view: str
@@ -52,17 +52,17 @@ class ArmCard:
     """All that is said of the arm.
 
     Attributes:
-        sentences: Which level was taken and why, and what the arm is worth.
+        sentences: Which level was taken and why, and how accurate the arm is.
         levels: What was tried; empty where that was the arm as stated alone.
         significant: What the likelihood ratio stays under by chance.
         convention: The form of the parameters, in words.
         sure: How many changes are beyond chance, in words; empty where no sigma is known.
         joints: The parameters by joint, in columns that stand side by side.
-        told: What the stops tell.
+        identifiability: What the stops determine.
         details: Further figures of that.
-        not_told: What they cannot tell.
-        most_worth: The stops that tell most.
-        least_worth: The one that tells least; empty where all are among the former.
+        not_determined: What they do not determine.
+        most_influential: The most influential stops.
+        least_influential: The least influential one; empty where all are among the former.
     """
 
     sentences: tuple[str, ...]
@@ -71,11 +71,11 @@ class ArmCard:
     convention: str
     sure: str
     joints: tuple[tuple[tuple[str, tuple[ParameterRow, ...]], ...], ...]
-    told: tuple[Fact, ...]
+    identifiability: tuple[Fact, ...]
     details: tuple[Fact, ...]
-    not_told: tuple[str, ...]
-    most_worth: tuple[WorthRow, ...]
-    least_worth: tuple[WorthRow, ...]
+    not_determined: tuple[str, ...]
+    most_influential: tuple[InfluenceRow, ...]
+    least_influential: tuple[InfluenceRow, ...]
 
 
 def arm_card(found: ArmResult) -> ArmCard:
@@ -89,7 +89,7 @@ def arm_card(found: ArmResult) -> ArmCard:
         )
     if found.carries_over is not None:
         sentences.append(found.carries_over.words)
-    worth = [WorthRow(f"view {it.view}", _percent(it.influence)) for it in found.stops]
+    stops = [InfluenceRow(f"view {it.view}", _percent(it.influence)) for it in found.stops]
     return ArmCard(
         tuple(sentences),
         tuple(_level(it, it.level == found.level) for it in found.levels[: _tried(found)]),
@@ -97,11 +97,11 @@ def arm_card(found: ArmResult) -> ArmCard:
         _CONVENTIONS.get(found.convention or "", ""),
         _sure(found),
         _columns(found),
-        _told(found),
+        _identifiability(found),
         tuple(_details(found)),
         found.not_determined or (),
-        tuple(worth[:_MOST_WORTH]),
-        tuple(worth[_MOST_WORTH:][-1:]),
+        tuple(stops[:_MOST_INFLUENTIAL]),
+        tuple(stops[_MOST_INFLUENTIAL:][-1:]),
     )
 
 
@@ -140,14 +140,14 @@ def _columns(
     return tuple(tuple(joints[start : start + height]) for start in range(0, len(joints), height))
 
 
-def _told(found: ArmResult) -> tuple[Fact, ...]:
+def _identifiability(found: ArmResult) -> tuple[Fact, ...]:
     known = found.observability
     if known is None:
         return ()
-    told = f"{known.determined} of {known.identifiable}"
-    facts = [Fact("directions told", told, "that any stops could tell")]
+    count = f"{known.determined} of {known.identifiable}"
+    facts = [Fact("directions determined", count, "that any stops could determine")]
     if known.condition is not None:
-        note = "best over worst told, scaled"
+        note = "best over worst determined, scaled"
         facts.append(Fact("condition", significant(known.condition), note))
     return tuple(facts)
 

@@ -47,7 +47,7 @@ class PairTable:
     Attributes:
         title: What carries them.
         columns: The frames.
-        rows: One for each frame in which the others are told.
+        rows: One for each frame in which the others are given.
     """
 
     title: str
@@ -120,9 +120,9 @@ def _key_figures(found: Alignment) -> list[Fact]:
     bases = [it for it in found.frames if it.startswith("base") and found.frames[it] == "cell"]
     for base in [it for it in bases if it != bases[0]]:
         edge = found.between(bases[0], base)
-        worth = f"{significant(edge.sigma_mm)} mm"
+        sigma = f"{significant(edge.sigma_mm)} mm"
         facts.append(
-            Fact(f"{base} in {bases[0]}, sigma", worth, f"{significant(edge.sigma_deg)}{_DEG}")
+            Fact(f"{base} in {bases[0]}, sigma", sigma, f"{significant(edge.sigma_deg)}{_DEG}")
         )
     worst = cellmap.weakest_frame(found)
     if worst:
@@ -171,7 +171,7 @@ def _between(found: Alignment, first: str, second: str) -> str:
 
 
 def _is_turned(found: Alignment, frame: str) -> bool:
-    """Whether a frame's rotation was measured, or is what others are told in."""
+    """Whether a frame's rotation was measured, or is what others are given in."""
     return frame in (*found.robots, found.reference) or found.edge_of(frame).oriented
 
 

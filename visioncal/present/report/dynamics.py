@@ -51,7 +51,7 @@ class ParameterRow:
     value: str
     sigma: str
     unit: str
-    told: str
+    share: str
     mark: str
 
 
@@ -115,8 +115,8 @@ def _plots(shown: Sequence[tuple[Prediction, str]]) -> Iterator[tuple[str, Marku
 def _key_figures(identified: Identified) -> Iterator[Fact]:
     base, found = identified.base, identified.validation
     yield Fact("base parameters", str(base.rank), f"of {len(base.model.names)}")
-    told = identified.determined
-    yield Fact("told to 2 %", str(told.count("2 %")), f"to 10 %: {told.count('10 %')} more")
+    shares = identified.determined
+    yield Fact("known to 2 %", str(shares.count("2 %")), f"to 10 %: {shares.count('10 %')} more")
     if found is not None:
         worst = int(np.argmax(found.shares))
         median = significant(100.0 * float(np.median(found.shares)))
@@ -156,7 +156,7 @@ def _at(values: FloatArray | None, place: int) -> str:
 def _parameter_rows(identified: Identified) -> Iterator[ParameterRow]:
     marks = {"2 %": "sure", "10 %": "used"}
     base = identified.base
-    for name, own, value, sigma, told in zip(
+    for name, own, value, sigma, share in zip(
         base.names,
         base.independent,
         identified.values,
@@ -169,8 +169,8 @@ def _parameter_rows(identified: Identified) -> Iterator[ParameterRow]:
             matched(float(value), float(sigma)),
             significant(float(sigma)),
             unit_of(base.model.names[own]),
-            told,
-            marks.get(told, "rejected"),
+            share,
+            marks.get(share, "rejected"),
         )
 
 
@@ -182,9 +182,9 @@ def unit_of(name: str) -> str:
 
 
 def _counts(identified: Identified) -> str:
-    told = identified.determined
-    kinds = dict.fromkeys(("2 %", "10 %", *told))
-    return "; ".join(f"{it}: {told.count(it)}" for it in kinds)
+    shares = identified.determined
+    kinds = dict.fromkeys(("2 %", "10 %", *shares))
+    return "; ".join(f"{it}: {shares.count(it)}" for it in kinds)
 
 
 def _link_rows(identified: Identified) -> Iterator[LinkRow]:

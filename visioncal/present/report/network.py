@@ -75,14 +75,14 @@ def _draw_frame(
     outline = _box(panel, x - half_w, y - half_h, x + half_w, y + half_h, 0.02)
     panel.figure.path(outline, fill=svg.CARD, stroke=colour, width=1.8 if is_worst else 0.9)
     size = min(_NAME_SIZE, _NAME_SIZE * _NAME_LENGTH / len(name))
-    worth = "the reference"
+    sigma = "the reference"
     if name != found.reference:
         edge = found.edge_of(name)
-        worth = f"{significant(edge.sigma_mm)} mm"
+        sigma = f"{significant(edge.sigma_mm)} mm"
         if edge.oriented:
-            worth += f", {significant(edge.sigma_deg)}\N{DEGREE SIGN}"
+            sigma += f", {significant(edge.sigma_deg)}\N{DEGREE SIGN}"
     at = float(panel.x_at(x))
-    lines = ((0.1, name, size, svg.INK), (-0.1, worth, _SMALL, colour))
+    lines = ((0.1, name, size, svg.INK), (-0.1, sigma, _SMALL, colour))
     for rise, words, letters, ink in lines:
         height = float(panel.y_at(y + rise))
         panel.figure.text(at, height, words, size=letters, colour=ink, anchor="middle",

@@ -53,24 +53,24 @@ def _facts(elastic: ElasticResult) -> Iterator[Fact]:
 
 
 def deflection_against_load(elastic: ElasticResult) -> Markup:
-    """How far each stop sees each told joint bend, over the torque on it.
+    """How far each stop sees each determined joint bend, over the torque on it.
 
     Returns:
-        The figure; empty where no joint is told.
+        The figure; empty where no joint is determined.
     """
-    told = {
+    bending = {
         spring: np.array(seen)
         for at, spring in enumerate(elastic.joints)
         if spring.stiffness_nm_per_rad is not None and (seen := elastic.bends(at))
     }
-    if not told:
+    if not bending:
         return Markup("")
-    rows = -(-len(told) // _COLUMNS)
+    rows = -(-len(bending) // _COLUMNS)
     figure = Figure(_WIDE_IN, _HIGH_IN * rows)
     gaps_in = (_ACROSS_IN, _DOWN_IN)
     grid = boxes(figure, rows, _COLUMNS, Margins(top=0.25), gaps_in)
     panels = (box for row in grid for box in row)
-    for box, (spring, points) in zip(panels, told.items(), strict=False):
+    for box, (spring, points) in zip(panels, bending.items(), strict=False):
         torques_nm, bends_mrad = points.T
         ends = np.array([min(torques_nm.min(), 0.0), max(torques_nm.max(), 0.0)])
         line = 1e3 * spring.compliance_rad_per_nm * ends

@@ -38,10 +38,10 @@ class DriftCard:
 
 def drift_card(found: ThermalResult) -> DriftCard:
     """Writes what was found."""
-    told = "measured temperatures" if found.heated_by == "temperatures" else "motor currents"
+    source = "measured temperatures" if found.heated_by == "temperatures" else "motor currents"
     last, residual = found.course[-1], found.residual_mm
     return DriftCard(
-        f"By {told}, the flange had moved by {significant(last.drift_mm)} mm at the end, "
+        f"By {source}, the flange had moved by {significant(last.drift_mm)} mm at the end, "
         f"{significant(_hours(found, last.stamp_s))} h after the start. Counted with, it takes the "
         f"views' residuals from {significant(residual.without)} to "
         f"{significant(residual.with_drift)} mm.",

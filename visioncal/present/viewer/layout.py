@@ -131,7 +131,7 @@ def _warming() -> rrb.Container:
 
 
 def _arm(found: ArmResult, eye: rrb.EyeControls3D | None) -> rrb.Container:
-    """What the calibrated arm is worth, how views left out speak for it, and its parameters."""
+    """The accuracy of the calibrated arm, how views left out speak for it, and its parameters."""
     # The places are all around the base, farther out than the views.
     wider = eye_on(found.map_places_m, MAP_DISTANCE) if found.workspace_map else eye
     cell = rrb.Spatial3DView(

@@ -89,7 +89,7 @@ def _coverage() -> rrb.Container:
         contents=["$origin/**"],
     )
     sigma = rrb.BarChartView(
-        name="Predicted sigma [mm] after so many stops, the most telling first",
+        name="Predicted sigma [mm] after so many stops, the most informative first",
         origin=paths.PREDICTED_SIGMA,
         plot_legend=rrb.PlotLegend(visible=False),
     )
