@@ -29,7 +29,7 @@ from visioncal.live.planning.purposes import purpose_of
 from visioncal.live.planning.written import plan_document
 from visioncal.live.rehearsal.bench import Bench
 from visioncal.live.rehearsal.cell import RehearsalOptions, RehearsedCell
-from visioncal.live.rehearsal.fault_injection import Befalling, Faults
+from visioncal.live.rehearsal.fault_injection import FaultInjection, Faults
 from visioncal.results import Calibration
 from visioncal.results.sections import TouchTest
 from visioncal.session import Session
@@ -125,28 +125,28 @@ def recorded(
     if fault is None:
         steps = _drive(bench, scene, folder, watchers, resume=resume, view=view)
         return Recorded(tuple(steps), None)
-    befalling = Befalling(bench, fault, after=max(1, len(scene.planned.stops) // 2))
+    injection = FaultInjection(bench, fault, after=max(1, len(scene.planned.stops) // 2))
     kept = _Kept()
-    every = (*watchers, kept, befalling)
+    every = (*watchers, kept, injection)
     try:
         _check_all_seen(_drive(bench, scene, folder, every, resume=False, view=view))
     except VisioncalError as error:
         reported_s = kept.missed_s or time.monotonic()
-        if befalling.befell_s is None:
+        if injection.injected_s is None:
             raise
         report_error(error, as_json=False)
         suffered = Suffered(
             fault,
             error.message,
             error.next_step,
-            reported_s - befalling.befell_s,
-            befalling.stood_after_s(),
+            reported_s - injection.injected_s,
+            injection.stood_after_s(),
             len(Session.load(folder).views),
         )
     else:
         raise DriverError(f"rehearse: {fault} did not happen before all views were taken.")
     messages().print(f"  ({fault} is mended; on with --resume)")
-    befalling.mend()
+    injection.mend()
     rest = _drive(bench, scene, folder, watchers, resume=True, view=view)
     return Recorded((*kept.steps, *rest), suffered)
 

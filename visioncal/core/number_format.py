@@ -2,7 +2,7 @@
 
 import math
 
-# Nobody acts on less, be it millimetres, degrees or pixels: in sentences, and in tables.
+# Nobody acts on less, in millimetres, degrees or pixels: in sentences, and in tables.
 _LEAST, _SMALLEST = 1e-3, 1e-4
 _MAX_DECIMALS = 6
 

@@ -183,7 +183,7 @@ class Compressed:
         shared_information: (k, k) on the appearance, the poses being free.
         shared_pulls: (v, k) half the gradient of the squared error by the appearance.
         residuals: (n, 2) [px].
-        by_field: (v, 6, m) how each pose moves with what is open of the lens beyond its model, by
+        by_field: (v, 6, m) how each pose moves with the lens beyond its model, by
             coefficients as large as the corners' noise; see `lens_field`.
         coefficients: What corners say of these coefficients; None where there are none.
     """

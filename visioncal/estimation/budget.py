@@ -22,7 +22,7 @@ class Sources:
     Attributes:
         sensors: The noise of what each frame observed, by the frame.
         robots: The error of each robot's flange from stop to stop, by the robot.
-        columns: What is open about effects beforehand, by the source: which of the problem's
+        columns: The prior uncertainty of effects, by the source: which of the problem's
             columns these are. Those of no source count for nothing.
         priors: What was measured of frames by hand.
     """

@@ -448,7 +448,7 @@ def motion_words(robot: FloatArray, flange: FloatArray, stops: str, frame: str) 
 
 
 def _or_measured(mount: Mount, culprit: str) -> str:
-    """What else there is where the arm cannot tilt, as with four axes, and one offset is open."""
+    """A further advice for an arm that cannot tilt, as with four axes, and an open offset."""
     if mount == "instrument" or "offset along" not in culprit:
         return ""
     return f"Where the arm cannot tilt, measure that offset for [prior.{edge_names(mount)[0]}]. "

@@ -44,7 +44,7 @@ class Observations:
 
     @cached_property
     def directions(self) -> IntArray:
-        """(n,) in how many directions each was measured: six, or fewer where some are open."""
+        """(n,) in how many directions each was measured: six at most."""
         found = np.sum(np.linalg.eigvalsh(self.covariance) < _OPEN, axis=1)
         return np.asarray(np.where(self.has_rotation, found, 3))
 

@@ -3,7 +3,7 @@
 It starts from the state under which the nearest half of all units is nearest (least trimmed
 squares: Rousseeuw 1984), found by concentration steps (Rousseeuw and Van Driessen 1999). Then units
 go in and out one at a time, by their deletion residuals (Cook and Weisberg 1982, section 2.2). A
-unit is what is right or wrong as a whole: a view, a touch, a point, an image.
+unit is right or wrong as a whole: a view, a touch, a point, an image.
 """
 
 from collections.abc import Callable, Iterable, Iterator

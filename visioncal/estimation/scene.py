@@ -206,7 +206,7 @@ class CornerProblem:
 
     @property
     def counted(self) -> IntArray:
-        """What is open and counts in the covariance, whether it is free or not."""
+        """What is uncertain and counts in the covariance, whether it is free or not."""
         if self.scene.estimated or self.contested:
             return np.concatenate([self.lens, np.union1d(self.scale, self.points)])
         stated = self.scene.matrix_sigma_px is not None

@@ -276,7 +276,7 @@ def reduce(problem: Problem, state: State, linear: Linear, covariance: FloatArra
 
 
 def _pseudo_inverse(information: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Inverses (u, w, w) where there is information, and what is open where there is none."""
+    """Inverses (u, w, w) where there is information, and the prior where there is none."""
     values, vectors = np.linalg.eigh(information)
     most = values[:, -1:] if values.shape[1] else values
     seen = values > _NULL * np.maximum(most, np.finfo(float).tiny)
@@ -340,7 +340,7 @@ def fitted_covariance(problem: Problem, state: State, noise: Noise) -> FloatArra
 def held_shift(problem: Problem, solution: Solution) -> FloatArray:
     """How far the unknowns (p,) would move if what is held moved as well, to first order.
 
-    What is held is wrong by what is open about it, and by how far the observations pull at it:
+    What is held is wrong by its uncertainty, and by how far the observations pull at it:
     beside the covariance, which counts the former, the square of this shift is the error of
     holding.
     """

@@ -21,8 +21,8 @@ from visioncal.estimation.touching import Placed, Touches, TouchProblem, in_tool
 
 # Under this scaled eigenvalue ratio the touches do not determine a direction at all.
 _NULL_RATIO = 1e-8
-# Touches that scatter more than this are not careful ones [m]: what is open is not the motion's
-# fault alone.
+# Touches that scatter more than this are not careful ones [m]: what is undetermined is not the
+# motion's fault alone.
 CARELESS_M = 1e-3
 _STILL_RAD = float(np.deg2rad(0.5))
 FEWEST_TOUCHES = 3

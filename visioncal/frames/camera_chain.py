@@ -1,4 +1,4 @@
-"""The calibrated chain from the base to the camera, and what of it is open at one stop.
+"""The calibrated chain from the base to the camera, and its uncertainty at one stop.
 
 Eye-in-hand, `base_from_cam = base_from_flange * flange_from_cam`: the robot's noise at the stop
 where the image was taken is new, and adds to the camera's transform. Eye-to-hand,
@@ -28,7 +28,7 @@ FAR_M = 20.0
 
 @dataclass(frozen=True, eq=False)
 class Eye:
-    """A calibrated camera as it is used: its lens, its place, and what is open about both.
+    """A calibrated camera as it is used: its lens, its place, and the covariance of both.
 
     Attributes:
         mount: Where it is mounted.

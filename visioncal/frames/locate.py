@@ -110,7 +110,7 @@ def _depth(stop: Stop, plane: Plane, ray: FloatArray, label: str) -> float:
 def _on_plane(
     eye: Eye, stop: Stop, plane: Plane, ray: FloatArray, px: FloatArray, noise_px: float
 ) -> Located:
-    """Cuts a pixel's ray with the plane, and carries all that is open about both to the cut."""
+    """Cuts a pixel's ray with the plane, and carries the covariance of both to the cut."""
     label = f"pixel ({px[0]:.1f}, {px[1]:.1f})"
     depth = _depth(stop, plane, ray, label)
     # The ray is that of the mean distance: where the lens breathes, there is another one.

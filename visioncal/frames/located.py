@@ -71,7 +71,7 @@ class Located:
         """Whether the 95 % region, an ellipsoid around the place, holds a point.
 
         Its semi-axes are the covariance's, times the root of `n F(n, freedom)`'s 95 % quantile over
-        the n directions that are open: a point of an exactly known plane has two.
+        the n directions that are uncertain: a point of an exactly known plane has two.
 
         Args:
             p_base: (3,) [m].

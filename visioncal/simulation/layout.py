@@ -1,4 +1,4 @@
-"""What a simulated cell of several robots, cameras and boards is made of, and what befalls it."""
+"""What a simulated cell of several robots, cameras and boards is made of, and its faults."""
 
 from dataclasses import dataclass, field
 

@@ -1,4 +1,4 @@
-"""What was seen in a simulated cell of several robots, and what befalls the images."""
+"""What was seen in a simulated cell of several robots, and the faults of images."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

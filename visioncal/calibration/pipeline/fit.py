@@ -19,8 +19,8 @@ def joint_fit_of(known: RunState) -> JointFit | None:
     """All unknowns of the fit with their covariance; None where an instrument read them.
 
     The unknowns are, in this order: both edges of the chain, lens and board as far as something is
-    open about them, where further boards lie from the first, and the arm's errors. What is open
-    about clocks and about drift with temperature counts in their covariance.
+    open about them, where further boards lie from the first, and the arm's errors. The uncertainty
+    of clocks and of drift with temperature counts in their covariance.
     """
     if known.mount == "instrument":
         return None

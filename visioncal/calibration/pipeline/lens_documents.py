@@ -16,11 +16,11 @@ from visioncal.session.frames import thing_name
 
 
 def cameras_of(known: RunState) -> dict[str, CameraResult]:
-    """The cameras by their frames, as the fit has them, with what is open about them.
+    """The cameras by their frames, as the fit has them, with their covariance.
 
     A camera's covariance, the edges', and that of both together are blocks of one matrix. Given
-    intrinsics of which only a part is open, the matrix and not the distortion, have zeros for the
-    rest.
+    intrinsics of which only a part is uncertain, the matrix and not the distortion, have zeros for
+    the rest.
     """
     solved, covariance, edges = known.fitted, known.solved.covariance, 6 * len(known.solved.edges)
     seen, looks = solved.seen, solved.looks

@@ -27,7 +27,7 @@ class ObservedPoses(Observed):
         boards: Which of the session's boards the chain holds: the one it ends at, and others.
         frames: (4, 4) where the camera and the boards are, by the frame.
         used: The views in the problem, in the session's order.
-        free: Lens and board, and what is open about them; None without corners.
+        free: Lens and board, and their covariance; None without corners.
         calibrated: The robot's arm, as far as it was calibrated; None for not at all.
     """
 

@@ -622,7 +622,7 @@ def is_sensed(seer: str, view: ViewPoses) -> bool:
 def sensors_of(cell: Cell, views: Sequence[ViewPoses]) -> tuple[str, ...]:
     """The frames whose observations' noise is known up to a level; other cameras come behind.
 
-    Of one camera or instrument with one robot it is what is stated: the rest is the robot's.
+    Of one camera or instrument with one robot it is the stated noise: the rest is the robot's.
     """
     if cell.mount is not None:
         return ()

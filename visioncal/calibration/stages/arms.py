@@ -221,7 +221,7 @@ class RobotArm:
         return self.errors is not None and (freely or self.errors.is_estimated)
 
     def effects(self, *, freely: bool = False) -> tuple[Effect, ...]:
-        """What moves its flange at all stops: what is open about its drift, and its errors."""
+        """What moves its flange at all stops: the uncertainty of its drift, and its errors."""
         drift, found = self.drift, []
         if drift is not None:
             found.append(drift.effect(self.warming, len(self.stood)))

@@ -4,7 +4,7 @@ A pick: the camera sees a thing as the views saw their target, and the robot goe
 Where the robot arrives differs from the thing by
 
     calibration   the chain from the robot's base to the camera and the lens: the errors of all
-                  unknowns together, through the same slopes that the fit has. What is open about
+                  unknowns together, through the same slopes that the fit has. The uncertainty of
                   the board counts by what it did to these; the thing is another
     look          the robot's noise at the look, where it carries the camera
     arm           errors that follow the arm's posture and were not calibrated

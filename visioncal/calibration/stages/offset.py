@@ -184,7 +184,7 @@ def speed_words(clock: Clock, speeds: FloatArray, inside: int) -> str:
     )
     return (
         f"{len(speeds)} of {inside} views with a time are used, taken while the flange moved by up "
-        f"to {figure(fastest_mm)} mm/s and {figure(fastest_deg)} deg/s: what is open about the "
+        f"to {figure(fastest_mm)} mm/s and {figure(fastest_deg)} deg/s: the uncertainty of the "
         f"clocks makes {figure(clock.sigma_s * fastest_mm)} mm and "
         f"{figure(clock.sigma_s * fastest_deg)} deg of it, and counts in the covariance."
     )

@@ -43,7 +43,7 @@ _FAR = 2e-3
 
 
 def free_of(seen: LinearisedCorners) -> LensBoardParameters:
-    """Lens and boards of the only camera, and what is open about them."""
+    """Lens and boards of the only camera, and their covariance."""
     looks, known = seen.looks, seen.known
     ((name, problem),) = looks.problems.items()
     return LensBoardParameters(

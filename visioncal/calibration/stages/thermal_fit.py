@@ -106,7 +106,7 @@ class ThermalFit:
         return self.model.motion(stops.q, self.links_c(stops))
 
     def effect(self, stops: Stops, count: int) -> Effect:
-        """What is open about the parameters, as unknowns of the chain at all of so many stops.
+        """The uncertainty of the parameters, as unknowns of the chain at all of so many stops.
 
         They stay where they were found, and count in the covariance with what was known of them
         beforehand: what the stops determine of them the chain says itself.

@@ -125,7 +125,7 @@ class CameraParameters:
 
     @property
     def counted(self) -> IntArray:
-        """What is open and counts in the covariance, whether it is free or not."""
+        """What is uncertain and counts in the covariance, whether it is free or not."""
         found = (self.places(name)[it.counted] for name, it in self.problems.items())
         return np.unique(np.concatenate([*found]))
 
@@ -261,7 +261,7 @@ class LinearisedCorners:
 
     @cached_property
     def free(self) -> IntArray:
-        """(f,) places of the values that are open: those that move, and others that count."""
+        """(f,) places of the values that are uncertain: those that move, and others that count."""
         return np.union1d(self.moving, self.looks.counted)
 
     @property
@@ -314,7 +314,7 @@ class LinearisedCorners:
 
     @cached_property
     def by_field(self) -> FloatArray:
-        """How all views' poses (v, 6, m) move with what is open of lenses beyond their models."""
+        """How all views' poses (v, 6, m) move with the lenses beyond their models."""
         sizes = [it.by_field.shape[2] for it in self.compressed]
         found = np.zeros((len(self.views), 6, sum(sizes)))
         view = at = 0

@@ -35,7 +35,7 @@ class Step:
 
     Attributes:
         view: Its number.
-        place: Which of the stops it is, from 1 on; of `count`, 0 where that is open.
+        place: Which of the stops it is, from 1 on; of `count`, 0 where that is not known.
         count: How many there are.
         found: What was taken, or why nothing was.
         covered: What is covered so far, in words.
@@ -111,7 +111,7 @@ class Capture:
         Args:
             number: The view's number.
             place: Which of the stops it is, from 1 on.
-            count: How many there are; 0 where that is open.
+            count: How many there are; 0 where that is not known.
             moved_s: How long the arm was on its way here [s].
             advise: Says what comes next, once the view is there.
 

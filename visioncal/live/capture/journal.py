@@ -1,4 +1,4 @@
-"""Views on disk as they come: each is whole and flushed before the next one is taken."""
+"""Views on disk, one at a time: each is whole and flushed before the next one is taken."""
 
 import errno
 import json
@@ -63,7 +63,7 @@ class Journal:
             folder: Where; it must be new, or empty.
             facts: What is recorded of.
             unix_offset_s: What makes the host's monotonic clock UNIX time [s].
-            views: How many views are to come; 0 where that is open.
+            views: How many views are to come; 0 where that is not known.
 
         Raises:
             DataError: The folder holds something, cannot be written, or has no room for the views.
@@ -100,7 +100,7 @@ class Journal:
             folder: Where.
             facts: What is recorded of; the same as before.
             unix_offset_s: What makes the host's monotonic clock UNIX time [s].
-            views: How many views there are to be in all; 0 where that is open.
+            views: How many views there are to be in all; 0 where that is not known.
 
         Raises:
             DataError: The folder holds another recording, or something else.

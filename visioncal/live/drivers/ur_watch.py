@@ -37,7 +37,7 @@ _DELAYS_S = 10.0
 
 
 class StateStream:
-    """States as they come in.
+    """States in the order of their arrival.
 
     Args:
         library: The module `rtde_receive`.

@@ -110,7 +110,7 @@ def shortfall(design: Design, wish: Wish, count: int) -> str:
     cause = "A larger board, a nearer camera or more room to move would give more."
     if design.best_look.meets(wish):
         cause = (
-            "What is open about the board's size and the lens is in the way: measure the print, "
+            "The uncertainty of the board's size and the lens is in the way: measure the print, "
             "and state its square_sigma_m."
         )
     elif design.best_arm.meets(wish):

@@ -200,7 +200,7 @@ def _change(what: str, then: float, now: float, *, is_rotation: bool) -> str:
     """Says how a sigma [m or rad] falls."""
     unit, scale = ("deg", float(np.rad2deg(1.0))) if is_rotation else ("mm", 1e3)
     if now > OPEN_SIGMA:
-        return f"a beginning; {what} is open yet"
+        return f"a beginning; {what} is not determined yet"
     if then > OPEN_SIGMA:
         return f"determines what was open; {what} is now {figure(now * scale)} {unit}"
     figures = f"({figure(then * scale)} -> {figure(now * scale)} {unit})"

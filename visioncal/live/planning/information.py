@@ -96,7 +96,7 @@ class Recorded:
 class World:
     """The information of k candidates on p unknowns if a cell is as it is guessed to be.
 
-    Unknown are x, z, what is open about lens and board, and the arm's errors, in this order.
+    Unknown are x, z, uncertain values of lens and board, and the arm's errors, in this order.
 
     Attributes:
         factors: (k, 6, p) the squares of each stop's are its information.

@@ -25,7 +25,7 @@ class Route:
     """The way through the stops. Between two postures all joints move evenly, in a straight line.
 
     Attributes:
-        order: (k,) rows of the stops as they come.
+        order: (k,) rows of the stops in their given order.
         segments: The postures (j, n) that are passed on the way to each stop, j often 0; the first
             is from the start where one was given, and absent otherwise.
         length_rad: How far the joints travel altogether, as the sum of the ways' norms.

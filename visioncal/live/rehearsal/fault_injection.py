@@ -1,4 +1,4 @@
-"""Faults that befall a rehearsal on its way, as they befall a real cell."""
+"""Fault injection: a rehearsal with the faults of a real cell."""
 
 import threading
 import time
@@ -14,7 +14,7 @@ from visioncal.live.rehearsal.bench import Bench
 from visioncal.live.rehearsal.camera import Fault as CameraFault
 from visioncal.live.rehearsal.truth import Fault, TruthClient
 
-# What can be rehearsed; the last two befall the camera, at a stop.
+# What can be rehearsed; the last two are the camera's, at a stop.
 Faults: TypeAlias = Literal[
     "protective-stop",
     "emergency-stop",
@@ -49,34 +49,34 @@ _PATIENCE_S = 60.0
 _LOOKED_S, _FINE_S = 2.0, 0.01
 
 
-class Befalling:
+class FaultInjection:
     """A watcher that lets a fault happen after so many views.
 
     Those of the controller come while the arm moves, those of the camera when it stands at a stop.
 
     Attributes:
-        befell_s: When it happened, on the monotonic clock [s]; None before.
+        injected_s: When it happened, on the monotonic clock [s]; None before.
         q: (n,) where the arm was then [rad]; empty before.
     """
 
     def __init__(self, bench: Bench, fault: Faults, after: int) -> None:
         self._bench, self._fault, self._after = bench, fault, after
-        self.befell_s: float | None = None
+        self.injected_s: float | None = None
         self.q: FloatArray = np.zeros(0)
 
     def stepped(self, step: Step) -> None:
         """Prepares the fault once so many views were tried."""
         if step.place == self._after:
-            threading.Thread(target=self._befall, daemon=True).start()
+            threading.Thread(target=self._inject, daemon=True).start()
 
     def stood_after_s(self) -> float | None:
         """How long the arm still moved after the fault [s].
 
         None where the simulated arm is gone with its controller, or goes on to the next stop.
         """
-        if self.befell_s is None or self._fault in ("link-lost", "covered"):
+        if self.injected_s is None or self._fault in ("link-lost", "covered"):
             return None
-        times = self.befell_s + np.arange(0.0, _LOOKED_S, _FINE_S)
+        times = self.injected_s + np.arange(0.0, _LOOKED_S, _FINE_S)
         time.sleep(max(0.0, float(times[-1]) - time.monotonic()))
         with closing(TruthClient(self._bench.controller.host)) as truth:
             speeds = np.abs(truth.state(times.tolist()).dq).max(axis=1)
@@ -92,16 +92,16 @@ class Befalling:
         else:
             self._bench.camera.fault = "none"
 
-    def _befall(self) -> None:
+    def _inject(self) -> None:
         with closing(TruthClient(self._bench.controller.host)) as truth:
             _wait(truth, moving=True)
             if self._fault in _AT_CONTROLLER:
                 time.sleep(_UNDER_WAY_S)
-                self.q, self.befell_s = truth.state([time.monotonic()]).q[0], time.monotonic()
+                self.q, self.injected_s = truth.state([time.monotonic()]).q[0], time.monotonic()
                 truth.inject(_AT_CONTROLLER[self._fault])
                 return
             _wait(truth, moving=False)
-        self.befell_s = time.monotonic()
+        self.injected_s = time.monotonic()
         self._bench.camera.fault = _AT_CAMERA[self._fault]
 
 

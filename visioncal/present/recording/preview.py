@@ -60,7 +60,7 @@ class Preview:
         x: (4, 4) where the camera is guessed to be, on the flange or in the base [m].
         z: (4, 4) where the board is guessed to be, in the base or on the flange [m].
         stops: In the order in which the robot drives to them.
-        sigmas_mm: Predicted after so many stops; NaN where something is open [mm].
+        sigmas_mm: Predicted after so many stops; NaN where something is undetermined [mm].
         obstacles: What is in the way.
         floor_m: Height of the floor in the base [m]; None for none.
         places_m: (w, 3) places of the workspace [m], may be empty.
