@@ -78,7 +78,7 @@ def _lost(
             why = reasons[name].get(row.robots.get(name, row.view).number, "")
             of = f" ({name})" if len(session.robots) > 1 else ""
             if not why or (name in row.lacks and row.view.stop is not None):
-                why, of = f"no row of its stop has a pose of {name or 'the robot'}", ""
+                why, of = f"no row of its stop has the pose of {name or 'the robot'}", ""
             yield Rejection(row.view.number, f"{why}{of}")
 
 
