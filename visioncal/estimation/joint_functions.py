@@ -195,7 +195,7 @@ class _Arm:
         shares: (q, g) which share of the variance of each error a group's is.
         random: (q,) their places among the unknowns that move.
         bases: The columns of each block but the harmonics.
-        waves: These.
+        waves: The harmonics.
         torque_nm: The torque that a unit of a compliance is for [N m].
     """
 
@@ -375,7 +375,7 @@ class _Step:
     """What is found at some logarithms of levels and sizes.
 
     Attributes:
-        logs: These.
+        logs: The logarithms.
         value: The negative log-likelihood.
         slope: Its slope by them.
         curvature: Its average information.

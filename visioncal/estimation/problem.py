@@ -436,7 +436,7 @@ class Problem:
         """Linearises all residuals.
 
         Args:
-            state: Where.
+            state: The point of linearisation.
             ideal: As if all that was measured were what is predicted: noise then does not pass for
                 information about directions that are not determined.
         """

@@ -314,7 +314,7 @@ def normal_equations(
 
     Args:
         problem: The observations.
-        state: Where.
+        state: The point of linearisation.
         noise: Its levels.
         ideal: See `Problem.linear`.
     """
@@ -590,7 +590,7 @@ def whitened(
 
     Args:
         problem: The observations.
-        state: Where.
+        state: The point of linearisation.
         noise: Its levels.
         measured: (6,) the d components of the poses that count; None for all.
         ideal: See `Problem.linear`.

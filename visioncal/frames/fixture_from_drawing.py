@@ -27,7 +27,7 @@ def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Set
 
     Args:
         measured: The points; each has the name of a drawn one.
-        drawing: These.
+        drawing: The drawn points.
         setting: What is known beside.
 
     Returns:

@@ -128,7 +128,7 @@ class _Tree:
         return {frame_name(kind, name): (kind, name) for kind, name in listed}
 
     def _names(self, kind: Kind) -> tuple[str, ...]:
-        """Those of a kind; one without a name where rows are of it and none is declared."""
+        """Names of a kind; one without a name where rows are of it and none is declared."""
         test = is_read if kind == "instrument" else is_seen
         declared = tuple(self.declaration.named(kind))
         return declared or (("",) if any(test(view) for view in self.views) else ())

@@ -101,7 +101,7 @@ class Answer:
 
     @property
     def last_edges(self) -> dict[str, Edge]:
-        """Those of frames where they stood last."""
+        """The edges of frames at their last places."""
         named = self.versions.values()
         return {it.frame: self.edges[it.frame] for it in named if it.name == it.frame}
 

@@ -41,7 +41,7 @@ def check_numbers(views: Sequence[Corners], target: Target, name: str = "") -> l
 
     Args:
         views: The corners of each view of the target.
-        target: It.
+        target: The target.
         name: What the session calls it, where it has several.
 
     Returns:

@@ -61,7 +61,7 @@ class Elastic:
         return tuple(it.joint for it in self.springs if not it.determined)
 
     def result(self, views: Sequence[int]) -> ElasticResult:
-        """It as a section of a calibration.
+        """The springs as a section of a calibration.
 
         Args:
             views: (m,) by which views the stops go.

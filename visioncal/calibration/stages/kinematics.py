@@ -70,7 +70,7 @@ class Level:
     sizes: int
 
     def result(self) -> ArmLevel:
-        """It as a calibration has it."""
+        """The level as a section of a calibration."""
         return ArmLevel(
             level=self.name,
             unknowns=self.unknowns,

@@ -68,7 +68,7 @@ class Clock:
         return 1.0 / max(1.0 / LARGEST_SIGMA_S, float(np.sqrt(share)) / self.sigma_s)
 
     def result(self) -> ClockResult:
-        """It as a section of a calibration."""
+        """The clock as a section of a calibration."""
         return ClockResult(
             camera_minus_robot_s=self.camera_minus_robot_s,
             method=self.method,

@@ -97,7 +97,7 @@ class Journal:
         What a killed process left half written is removed.
 
         Args:
-            folder: Where.
+            folder: The session's folder.
             facts: What is recorded of; the same as before.
             unix_offset_s: What makes the host's monotonic clock UNIX time [s].
             views: How many views there are to be in all; 0 where that is not known.

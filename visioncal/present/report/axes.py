@@ -310,7 +310,7 @@ class Panel:
         """Draws a mark at each place, all as one path.
 
         Args:
-            x: Where.
+            x: The places' coordinates.
             y: Likewise.
             shape: `dot`, `ring`, `x`, `^`, `square`, `|` or `-`.
             colour: Theirs.
