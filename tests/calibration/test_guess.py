@@ -169,7 +169,7 @@ def test_motion_about_one_axis_is_said_to_tell_nothing():
     poses = seen_in(simulate(CellOptions(motion="one_axis", seed=2)))
     guess = guessed(MISTAKES["inverse poses"](poses, np.random.default_rng(0)))
     assert not guess.stands_out
-    assert "cannot tell readings apart" in guess.sentence
+    assert "cannot distinguish readings" in guess.sentence
 
 
 def test_several_mistakes_at_once_are_named():

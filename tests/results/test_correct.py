@@ -385,11 +385,11 @@ def test_what_is_no_table_of_targets_is_named(stored, result):
 
 
 def test_a_payload_is_counted_where_joints_bend(stored, result):
-    spring = {"compliance_rad_per_nm": 1e-4, "sigma_rad_per_nm": 1e-6, "told": True}
+    spring = {"compliance_rad_per_nm": 1e-4, "sigma_rad_per_nm": 1e-6, "determined": True}
     springs = tuple(
         JointSpring(joint=it, torque_nm=(0.0, 9.0), **spring) for it in result.robot.joint_names
     )
-    sagging = {"not_told": (), "weight": "unknown", "payload_kg": (0.0, 0.0), "stops": ()}
+    sagging = {"not_determined": (), "weight": "unknown", "payload_kg": (0.0, 0.0), "stops": ()}
     elastic = ElasticResult(joints=springs, sag_mm=Sag(0.1, 0.2), **sagging)
     bending = replace(result, elastic=elastic)
     poses = targets_near(2, result)
