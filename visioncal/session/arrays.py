@@ -136,8 +136,8 @@ def _matrices(poses: Poses, what: str, count: int) -> FloatArray:
             culprits=[what, "base_from_flange"],
             next_step=_KEPT_PLACE if what == "corners" else "",
         )
-    told = enumerate(rigid_fault(it, _ROUGH) for it in matrices)
-    faults = {at: it for at, it in told if it[0]}
+    faulty = enumerate(rigid_fault(it, _ROUGH) for it in matrices)
+    faults = {at: it for at, it in faulty if it[0]}
     if faults:
         at, (fault, step) = next(iter(faults.items()))
         more = f" So are {len(faults) - 1} more of {count}." if len(faults) > 1 else ""
