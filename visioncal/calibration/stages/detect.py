@@ -303,7 +303,7 @@ def _common_resolution(
         if stated is None:
             raise DataError(
                 f"session {session.name!r}: the camera's resolution is missing, and no image that "
-                "is searched tells it.",
+                "is searched shows it.",
                 culprits=["session.toml: camera.resolution"],
                 next_step="Add resolution = [width, height] to [camera]: the size of the images "
                 "in which the corners were found.",
