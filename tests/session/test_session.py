@@ -508,6 +508,14 @@ def test_the_separators_and_commas_of_spreadsheets_are_read(folder: Path, separa
     assert Session.load(folder).digest() == digest
 
 
+def test_a_robot_whose_tip_alone_is_named_goes_by_its_poses(folder: Path) -> None:
+    edit(folder, "session.toml", 'model = "ur10e"\n', "")
+    session = Session.load(folder)
+    assert (session.robot_name, session.robot_document, session.robot_tip) == (None, None, "tool0")
+    assert session.views[0].base_from_flange() is not None
+    assert not session.warnings
+
+
 def test_what_is_no_session_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="is no session: a folder"):
         Session.load(tmp_path / "nowhere")

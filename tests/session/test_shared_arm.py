@@ -119,7 +119,7 @@ def test_images_are_read_from_their_own_session(tmp_path):
     ("changed", "words"),
     [
         ({"robot": "ur5e"}, "the robots of 'week 0' and 'other' differ"),
-        ({"robot": None}, "'other' names no robot"),
+        ({"robot": None}, "'other' names no known robot"),
         ({"frames": {"cam": "flange", "target": "base"}}, "one camera and one board each"),
     ],
 )

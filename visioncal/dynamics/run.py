@@ -202,9 +202,11 @@ def robot_of(session: Session) -> Robot:
     check_one_of_each(session)
     if session.robot_document is None:
         raise DataError(
-            f"session {session.name!r} names no known robot.",
-            culprits=["session.toml: robot"],
-            next_step=" ".join(session.warnings) or 'Add [robot] with model = "ur10e", or a path.',
+            f"session {session.name!r} names no known robot, and torques are its links'.",
+            culprits=["session.toml: robot.model"],
+            next_step=" ".join(session.warnings)
+            or 'Add model = "ur10e", or a path, to [robot], of a whole cell to its table, as '
+            "[robots.a].",
         )
     return Robot.from_document(session.robot_document)
 

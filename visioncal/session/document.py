@@ -189,8 +189,6 @@ def _contradictions(declaration: Declaration, observed: bool) -> Iterator[tuple[
         yield from _camera_contradictions(camera, "camera")
     for name, one in declaration.cameras.items():
         yield from _camera_contradictions(one, f"cameras.{name}")
-    if declaration.robot is not None and declaration.robot.model is None:
-        yield "robot.model", "is missing"
     for kind in KINDS:
         yield from _several_contradictions(declaration, kind)
     yield from _prior_contradictions(declaration)

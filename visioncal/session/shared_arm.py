@@ -140,9 +140,9 @@ def _check(session: Session, first: Session) -> None:
         )
     if session.robot_document is None:
         raise DataError(
-            f"{label} names no robot, and the arm is what the sessions share.",
-            culprits=["session.toml"],
-            next_step="Name it as [robot] model, and record its joint angles.",
+            f"{label} names no known robot, and the arm is what the sessions share.",
+            culprits=["session.toml: robot.model"],
+            next_step='Add model = "ur10e", or a path, to [robot], and record its joint angles.',
         )
     if session.robot_document != first.robot_document:
         raise DataError(

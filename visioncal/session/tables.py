@@ -59,8 +59,8 @@ class CameraTable(TableModel):
 class RobotTable(TableModel):
     """`[robot]`. model: a built-in name, or the path of a .urdf, a DH .toml or an arm's .json.
 
-    One of several may go without, where its poses are enough. gravity_m_s2: its acceleration in the
-    robot's base, for a base that does not stand upright.
+    It may go without, where its poses are enough. gravity_m_s2: its acceleration in the robot's
+    base, for a base that does not stand upright.
     """
 
     model: str | None = None

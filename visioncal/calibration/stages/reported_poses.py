@@ -110,7 +110,10 @@ def _no_pose(joints: FloatArray | None, matched: Matched | None) -> str:
     if joints is None:
         return "no pose of the robot: x_m to qw are empty"
     if matched is None:
-        return "no pose of the robot: it has joint angles, but the session names no known robot"
+        return (
+            "no pose of the robot: x_m to qw are empty, joint angles need its model, and the "
+            "session names no known robot: [robot] model is missing, or that of [robots.NAME]"
+        )
     return "no pose of the robot: its joint angles are misread, as those of views with poses show"
 
 
