@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from support import placed
 from support.aligned_cells import made_up_cell
 
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import invert
+from visioncal.core.transforms import adjoint, invert
 from visioncal.interchange.exports import Selection, document, export
 from visioncal.interchange.result_files import load_calibration, load_exportable
-from visioncal.results import CameraResult
+from visioncal.results import CameraResult, Verdict
 from visioncal.session.choosing import Choice
 from visioncal.simulation import fisheye_camera, wide_camera
 
@@ -33,6 +34,37 @@ def test_any_frame_is_written_in_any_other(tmp_path):
     assert "aligned by visioncal from 'made up'" in text
     turned = export(source, "text", Selection("base_b_from_cam_top", inverse=True))
     assert np.allclose(np.loadtxt(io.StringIO(turned)) @ expected, np.eye(4), atol=1e-12)
+
+
+FIXTURE = "base_b_from_jig"
+
+
+@pytest.mark.parametrize(("name", "sign"), [("base_a_from_jig", 1), ("jig_from_base_a", -1)])
+def test_a_fixture_of_one_robot_is_written_in_the_base_of_another(name, sign):
+    jig = placed.frame(placed.BASE_FROM_FIXTURE, verdict=Verdict.of("bad", "It slips."))
+    cell = replace(CELL, placed={FIXTURE: jig})
+    far = CELL.between("base_a", "base_b").matrix @ jig.edge.matrix
+    # The pieces are independent: each covariance goes through its own derivative.
+    whole = np.zeros((6, 6))
+    for edge, after in ((CELL.between("base_a", "base_b"), jig.edge.matrix), (jig.edge, np.eye(4))):
+        slope = adjoint(invert(after) if sign > 0 else far @ invert(after))
+        whole += slope @ edge.covariance @ slope.T
+    found = cell.between(*name.split("_from_"))
+    np.testing.assert_allclose(found.matrix, far if sign > 0 else invert(far), atol=1e-12)
+    np.testing.assert_allclose(found.covariance, whole, atol=1e-12)
+    text = export(cell, "text", Selection(name))
+    assert np.allclose(np.loadtxt(io.StringIO(text)), found.matrix, atol=1e-12)
+    assert "# verdict bad" in text
+
+
+def test_a_fixture_without_rotation_says_whose_it_has_and_unknown_frames_list_it():
+    jig = placed.frame(placed.BASE_FROM_FIXTURE, oriented=False)
+    cell = replace(CELL, placed={FIXTURE: jig})
+    text = export(cell, "text", Selection("cam_top_from_jig"))
+    assert "rotation taken from the base_b, not measured" in text
+    with pytest.raises(DataError, match=r"no frame 'jog'.* jig") as caught:
+        export(cell, "text", Selection("base_a_from_jog"))
+    assert "Did you mean jig" in caught.value.next_step
 
 
 def test_all_frames_are_one_tree():

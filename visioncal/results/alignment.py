@@ -161,9 +161,12 @@ class Alignment(CellSections):
     ) -> Edge:
         """Places any frame in any other, with the covariance that the whole cell gives it.
 
+        That of tools and fixtures counts as independent of it; one whose rotation was not measured
+        has that of what it was placed in, without covariance.
+
         Args:
-            first: The one.
-            second: The other.
+            first: The one: a frame of the cell, a tool or a fixture.
+            second: The other; likewise.
             poses: (4, 4) `base_from_flange` by robot, where the two move before each other by it;
                 they count as exact.
 
@@ -173,8 +176,28 @@ class Alignment(CellSections):
         Raises:
             DataError: There is no such frame, or a robot's pose is needed.
         """
-        matrix, slope = self.way(first, second, poses)
-        return Edge(matrix, slope @ self.joint_covariance @ slope.T)
+        near, far = self.placement(first), self.placement(second)
+        matrix, slope = self.way(near[0] if near else first, far[0] if far else second, poses)
+        covariance = slope @ self.joint_covariance @ slope.T
+        if far:
+            carry = adjoint(invert(far[1].edge.matrix))
+            matrix = matrix @ far[1].edge.matrix
+            covariance = carry @ covariance @ carry.T + far[1].edge.covariance
+        if near:
+            matrix = invert(near[1].edge.matrix) @ matrix
+            carry = adjoint(invert(matrix))
+            covariance = covariance + carry @ near[1].edge.covariance @ carry.T
+        if not all(it[1].oriented for it in (near, far) if it):
+            covariance[:3], covariance[:, :3] = 0.0, 0.0
+        return Edge(matrix, covariance)
+
+    def placement(self, name: str) -> tuple[str, Frame] | None:
+        """The frame in which a tool or a fixture was placed, and its place; None for no such."""
+        for transform, frame in self.placed.items():
+            parent, _, child = transform.partition("_from_")
+            if child == name:
+                return parent, frame
+        return None
 
     def way(
         self, first: str, second: str, poses: Mapping[str, FloatArray] | None = None
@@ -183,7 +206,8 @@ class Alignment(CellSections):
         tree, poses = self._tree, poses or {}
         for frame in (first, second):
             if frame != tree.root and frame not in tree.branches:
-                known = [tree.root, *tree.branches]
+                placed = (it.partition("_from_")[2] for it in self.placed)
+                known = [tree.root, *tree.branches, *placed]
                 raise DataError(
                     f"no frame {frame!r}: this alignment has {', '.join(known)}.",
                     culprits=[frame],

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 
-from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Finding, Verdict
 from visioncal.results.alignment import Alignment, Sight
@@ -179,10 +178,7 @@ def _verdict(cell: Alignment) -> Verdict:
 
 
 def _placed(cell: Alignment, chosen: Chosen) -> dict[str, Frame]:
-    """Tools and fixtures of the robot, and in its base the fixtures of others beside it.
-
-    Of these, the way between both bases counts as independent of how the fixture was placed.
-    """
+    """Tools and fixtures of the robot, and in its base the fixtures of others beside it."""
     found: dict[str, Frame] = {}
     for name, frame in cell.placed.items():
         parent, _, child = name.partition("_from_")
@@ -191,13 +187,7 @@ def _placed(cell: Alignment, chosen: Chosen) -> dict[str, Frame]:
         elif parent == chosen.base:
             found[f"base_from_{child}"] = frame
         elif parent.startswith("base") and not robots_between(cell.frames, chosen.base, parent):
-            way, placed = cell.between(chosen.base, parent), frame.edge
-            carry = adjoint(invert(placed.matrix))
-            covariance = carry @ way.covariance @ carry.T + placed.covariance
-            if not placed.oriented:
-                covariance[:3], covariance[:, :3] = 0.0, 0.0
-            edge = Edge(way.matrix @ placed.matrix, covariance)
-            found[f"base_from_{child}"] = replace(frame, edge=edge)
+            found[f"base_from_{child}"] = replace(frame, edge=cell.between(chosen.base, child))
     return found
 
 

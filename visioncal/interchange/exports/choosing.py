@@ -69,7 +69,7 @@ def select_all(source: Source, selection: Selection, form: ExportFormat) -> tupl
 
 def _content(form: ExportFormat, selection: Selection, there: Placements, name: str) -> Content:
     placed, frames = there.find(name)
-    rotation_of = None if placed.oriented else frames[0]
+    rotation_of = None if placed.oriented else placed.turned_as or frames[0]
     edge = placed.edge
     if selection.inverse:
         edge, frames = _inverted(edge), (frames[1], frames[0])

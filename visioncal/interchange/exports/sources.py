@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
 from visioncal.core.errors import DataError
@@ -32,6 +32,7 @@ _PARENTS: Mapping[Kind, re.Pattern[str]] = {
     "tool": re.compile(r"flange(_\w+)?", re.ASCII),
     "fixture": re.compile(r"base(_\w+)?", re.ASCII),
 }
+_WORST_FIRST = ("bad", "check", "good")
 _COMMANDS: Mapping[Kind, str] = {"tool": "visioncal tcp", "fixture": "visioncal fixture"}
 
 
@@ -44,12 +45,14 @@ class Placement:
         origin: Where it comes from, in one line.
         verdict: Whether to trust it.
         oriented: Whether its rotation was measured.
+        turned_as: Whose rotation it has otherwise; empty for its parent's.
     """
 
     edge: Edge
     origin: str
     verdict: Verdict
     oriented: bool = True
+    turned_as: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +87,7 @@ class Placements:
         if name in self.by_name and all(ends):
             return self.by_name[name], ends
         if self.cell is not None and all(ends):
-            return _of_cell(self.cell, self.cell.between(*ends)), ends
+            return _between(self.cell, *ends), ends
         turned = f"{ends[1]}_from_{ends[0]}"
         hint = did_you_mean(name, self.by_name)
         if turned in self.by_name:
@@ -218,6 +221,19 @@ def _camera(cell: Alignment, camera: str | None) -> str:
 def _of_cell(cell: Alignment, edge: Edge) -> Placement:
     origin = f"aligned by visioncal from {cell.session_name!r}, {cell.created}"
     return Placement(edge, origin, cell.verdict)
+
+
+def _between(cell: Alignment, first: str, second: str) -> Placement:
+    """Any frame in any other; trusted as the cell is, and the tool or the fixture that it has."""
+    whole = _of_cell(cell, cell.between(first, second))
+    for parent, frame in filter(None, (cell.placement(first), cell.placement(second))):
+        if _WORST_FIRST.index(frame.verdict.status) < _WORST_FIRST.index(whole.verdict.status):
+            whole = replace(whole, verdict=frame.verdict)
+        origin = f"{whole.origin}; {_of_frame(frame).origin}"
+        whole = replace(whole, origin=origin)
+        if not frame.oriented:
+            whole = replace(whole, oriented=False, turned_as=parent)
+    return whole
 
 
 def _of_frame(frame: Frame) -> Placement:
