@@ -14,7 +14,13 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
 from visioncal.interchange.formats.boards import described_target
 from visioncal.session import Session
-from visioncal.simulation import CellOptions, aprilgrid_target, simulate, write_session
+from visioncal.simulation import (
+    CellOptions,
+    aprilgrid_target,
+    simulate,
+    tags_target,
+    write_session,
+)
 from visioncal.vision.finders import DetectedCorners, NotFound, find_target
 from visioncal.vision.finders.identify import identify
 from visioncal.vision.targets import corner_positions, target_document, target_from_document
@@ -138,6 +144,33 @@ def test_a_session_of_another_page_is_refused(tmp_path):
     path.write_text(path.read_text().replace("spacing = 0.3", "spacing = 0.2"))
     with pytest.raises(DataError, match=r"another board is seen: the tags are 0\.30 of their side"):
         run(Session.load(tmp_path / "s"))
+
+
+def test_a_grid_without_squares_is_to_be_described_as_free_tags(tmp_path):
+    side, pitch = 0.03, 0.04
+    tags = [(5 + 4 * row + column, column, 3 - row) for row in range(4) for column in range(4)]
+    around = side * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    points = np.concatenate([pitch * np.array(it[1:]) + around for it in tags])
+    board = replace(
+        tags_target(),
+        points_m=tuple((x, y, 0.0) for x, y in points.tolist()),
+        point_numbers=tuple(range(len(points))),
+        point_sigmas_m=(),
+        point_tags=tuple((it[0], corner) for it in tags for corner in range(4)),
+    )
+    write_session(simulate(CellOptions(target=board, views=4)), tmp_path / "s")
+    path = tmp_path / "s" / "target.toml"
+    as_printed = path.read_text()
+    path.write_text(
+        'kind = "aprilgrid"\ncolumns = 4\nrows = 4\nsize_m = 0.03\nspacing = 0.3333\nid = 5\n'
+        f'border = 1\ndictionary = "{board.dictionary}"\n'
+    )
+    with pytest.raises(DataError, match="lack the small dark squares") as caught:
+        run(Session.load(tmp_path / "s"))
+    assert "marker" not in caught.value.message
+    assert all(it in caught.value.next_step for it in ('kind = "points"', "0,0,0,0,5,0"))
+    # What is advised is how such a board is described.
+    assert all(it in as_printed for it in ('kind = "points"', f'dictionary = "{board.dictionary}"'))
 
 
 def test_kalibrs_files_are_read(tmp_path):

@@ -24,6 +24,7 @@ from visioncal.estimation.planar import determines_pose
 from visioncal.session import Session, View
 from visioncal.session.kinds import name_of
 from visioncal.vision.finders import NotFound, find_target, fitting_layouts
+from visioncal.vision.finders.aprilgrid import LACKS_SQUARES, free_tags_step
 from visioncal.vision.finders.checkerboard import MOST_PIXELS as MOST_CHECKERBOARD_PIXELS
 from visioncal.vision.finders.headers import MOST_PIXELS, claimed_size
 from visioncal.vision.finders.imaging import blur_at_corners, decode_image, why_hard_to_see
@@ -398,12 +399,15 @@ def _check_layout(
     culprits = [f"view {it.number}" for it in misfits]
     if target.kind != "charuco":
         reasons = [it.reason for it in _rejections([look for _, look in mine if look.misfit])]
+        usual = max(set(reasons), key=reasons.count)
         raise DataError(
             f"target {target.name!r}: in {len(misfits)} of {len(misfits) + shown} views another "
-            f"board is seen: {max(set(reasons), key=reasons.count)}.",
+            f"board is seen: {usual}.",
             culprits=culprits,
-            next_step="Mend the target's .toml, or name another: visioncal target check IMAGE says "
-            "what is printed.",
+            next_step=free_tags_step(target)
+            if usual.startswith(LACKS_SQUARES)
+            else "Mend the target's .toml, or name another: visioncal target check IMAGE says what "
+            "is printed.",
         )
     images = [decode_image(session.images.read(it.image)) for it in misfits[:_LAYOUT_SAMPLE]]
     fitting = [fitting_layouts(it, target) for it in images if not isinstance(it, str)]

@@ -157,6 +157,10 @@ def other_board(session: Session, unseen: Sequence[View]) -> Finding | None:
     if shown is None:
         return hard
     view, found = shown
+    # Of a grid or a rig of tags, one alone names no board: the finder says what it lacks.
+    is_its_tag = found.kind == "marker" and declared.kind in ("aprilgrid", "points")
+    if is_its_tag and declared.dictionary in (found.dictionary, *found.larger):
+        return None
     return None if _is(found, declared) else _another(view, found, declared)
 
 

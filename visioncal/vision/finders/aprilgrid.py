@@ -11,6 +11,7 @@ from visioncal.vision.finders.layout import LAYOUT_MISFIT, layout_misfit
 from visioncal.vision.finders.result import DetectedCorners, NotFound
 from visioncal.vision.targets import aruco_dictionary
 
+LACKS_SQUARES = "the tags lack the small dark squares at their corners that an AprilGrid has"
 # The squares at a tag's corners touch it, and OpenCV sees a tag only where white surrounds it.
 # Where two dark corners meet, the image is grey: counted as white where dark has to be darker than
 # its surroundings by so many levels, and in twice as many pixels, of which grey gets enough. The
@@ -73,11 +74,7 @@ def find_aprilgrid(image: Image, target: Target) -> DetectedCorners | NotFound:
     if lacks_a_line(image, target, numbers, px):
         return NotFound(f"the grid ends before {size} tags: an outer line is missing", misfit=True)
     if not _has_squares(image, px, target.spacing):
-        return NotFound(
-            "the tags lack the small dark squares at their corners; such a board is described as "
-            'kind = "points" with a table of its tags',
-            misfit=True,
-        )
+        return NotFound(LACKS_SQUARES, misfit=True)
     px = refined_tags(image, px, target.spacing)
     spacing = seen_spacing(target, numbers, px)
     if abs(spacing - target.spacing) > _SPACING:
@@ -89,6 +86,18 @@ def find_aprilgrid(image: Image, target: Target) -> DetectedCorners | NotFound:
             misfit=True,
         )
     return DetectedCorners((4 * numbers[:, None] + np.arange(4)).ravel(), px.reshape(-1, 2))
+
+
+def free_tags_step(target: Target) -> str:
+    """What to type for a grid of tags without squares: they are free tags."""
+    side = f"{target.square_m:g}"
+    return (
+        f'Describe it as free tags: in its .toml, kind = "points", points = "tags.csv", dictionary '
+        f'= "{target.dictionary}" and nothing else; tags.csv beside it has the header '
+        "point,x_m,y_m,z_m,tag,corner and a row for each corner of a tag, 0 to 3 clockwise from "
+        f"the upper left, such as 0,0,0,0,{target.marker_id},0 and then "
+        f"1,{side},0,0,{target.marker_id},1 (x to the right, y down, measured on the print)."
+    )
 
 
 def grid_tags(
