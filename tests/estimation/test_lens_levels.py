@@ -11,7 +11,7 @@ from visioncal.core.errors import ConvergenceError
 from visioncal.estimation import lens_levels
 from visioncal.estimation.appearance import Appearance, compress
 from visioncal.estimation.corners import reproject
-from visioncal.estimation.lens_field import LensLevels, field_columns, mode_columns
+from visioncal.estimation.lens_field import LensLevels, displacements, distances, field_modes
 from visioncal.simulation import CellOptions, fine_camera, simulate
 
 FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1, views=8, seed=1)
@@ -29,7 +29,7 @@ def corners():
 def test_a_field_of_size_one_has_it_all_over_the_image():
     px = np.random.default_rng(0).uniform(0, [1280, 1024], (500, 2))
     for length in (0.07, 0.2, 0.35):
-        variances = np.sum(field_columns(px, (1280, 1024), length)[:, 0] ** 2, axis=1)
+        variances = np.sum(field_modes(px, (1280, 1024), length) ** 2, axis=1)
         # A hundredth of the variance is left out, most of it at the edges.
         assert np.mean(variances) == pytest.approx(1.0, abs=0.02)
         assert np.min(variances) > 0.8
@@ -44,7 +44,9 @@ def test_what_is_eliminated_is_noise_that_corners_share(corners):
     bare = replace(stack, zooms=None)
     now = reproject(bare, appearance.camera, poses)
     shared = np.concatenate([now.by_intrinsics, now.by_point @ problem.basis[stack.ids]], axis=2)
-    beyond = mode_columns(bare, appearance.camera, poses, LEVELS)
+    far = distances(bare, poses)[bare.view_of]
+    beyond = displacements(bare.px, appearance.camera, far, LEVELS)
+    bare.weigh(beyond)
     beyond = beyond.reshape(2 * len(stack.px), -1)
     views = len(stack.views)
     by_poses = np.zeros((len(stack.px), 2, 6 * views))
@@ -86,9 +88,9 @@ def test_the_slope_of_the_likelihood_is_that_of_its_differences(monkeypatch, sti
     found = []
     original = lens_levels._Likelihood.minimised
 
-    def kept(self, logs, closed):
+    def kept(self, logs, closed, *enough):
         found.append((self, logs))
-        return original(self, logs, closed)
+        return original(self, logs, closed, *enough)
 
     monkeypatch.setattr(lens_levels._Likelihood, "minimised", kept)
     calibrated(simulate(replace(FINE, views=12)), joints=False)
@@ -99,11 +101,16 @@ def test_the_slope_of_the_likelihood_is_that_of_its_differences(monkeypatch, sti
         likelihood.local[:3, :, :6] = 0.0
         likelihood.kinds[:3, :6] = -1
     logs = np.clip(logs, *likelihood.limits(())) + 0.2
-    _, slope = likelihood(logs)
+    here = likelihood(logs)
     for level, step in enumerate(1e-4 * np.eye(len(logs))):
-        difference = (likelihood(logs + step)[0] - likelihood(logs - step)[0]) / 2e-4
+        ahead, behind = likelihood(logs + step), likelihood(logs - step)
         # The third order of the step, and rounding of values of some thousands.
-        assert slope[level] == pytest.approx(difference, rel=1e-3, abs=1e-3)
+        difference = (ahead.value - behind.value) / 2e-4
+        assert here.slope[level] == pytest.approx(difference, rel=1e-3, abs=1e-3)
+        # Where it is not convex, the average information takes the place of the second derivative.
+        if not still:
+            curved = (ahead.slope - behind.slope) / 2e-4
+            np.testing.assert_allclose(here.curvature[level], curved, rtol=1e-3, atol=2e-2)
 
 
 def test_a_focus_that_is_fixed_neither_breathes_nor_jitters(monkeypatch):

@@ -17,9 +17,13 @@ from scipy.linalg import block_diag
 
 from visioncal.core.transforms import exp
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Target
-from visioncal.estimation.corners import CornerStack, reproject
-from visioncal.estimation.lens_field import Coefficients, LensLevels, mode_columns
-from visioncal.estimation.linalg import covariance_from
+from visioncal.estimation.corners import CornerStack, WithoutPoses, reproject
+from visioncal.estimation.lens_field import (
+    Coefficients,
+    LensLevels,
+    breathing_columns,
+    field_modes,
+)
 from visioncal.estimation.parts import Effect
 from visioncal.estimation.poses import fit_poses
 from visioncal.estimation.variance import Knowledge
@@ -265,40 +269,47 @@ def compress_points(
     now = reproject(stack, camera, fit.cam_from_target, lens=lens)
     moved = now.by_point @ by_values
     stack.weigh(moved)
-    by_shared = np.concatenate([now.by_intrinsics, moved], axis=2)
-    shared = by_shared.shape[2]
+    columns = [now.by_intrinsics, moved]
+    shared = now.by_intrinsics.shape[2] + moved.shape[2]
     if levels is not None:
-        beyond = mode_columns(stack, camera, fit.cam_from_target, levels)
-        stack.weigh(beyond)
-        by_shared = np.concatenate([by_shared, beyond], axis=2)
-    between = stack.products_by_view(now.by_pose, by_shared)
-    answer = -covariance_from(fit.information) @ between
-    # What is left once the poses have followed, squared: never less than none, and as exact as the
-    # square of their error. A difference of two squares would magnify it a millionfold.
-    left = by_shared + stack.products_with_views(now.by_pose, answer)
-    residuals = now.residuals
-    if shares is not None:
-        roots = np.sqrt(shares)[stack.view_of, None]
-        left, residuals = roots[..., None] * left, roots * residuals
-    flat = left.reshape(-1, left.shape[2])
-    information = flat.T @ flat
+        breath = breathing_columns(stack, camera, fit.cam_from_target, levels.breathing)
+        stack.weigh(breath)
+        columns += [breath, now.residuals[:, :, None]]
+    every = np.concatenate(columns, axis=2)
+    without = WithoutPoses.of(stack, now.by_pose, fit.information, every, shares)
+    left, answer = without.left[:, :, :shared], without.answer[:, :, :shared]
+    information = without.products[:shared, :shared]
+    roots = without.roots[stack.view_of, None]
+    residuals = roots * now.residuals
     poses, own, found = fit.cam_from_target, now.residuals, None
-    answer, by_field = answer[:, :, :shared], answer[:, :, shared:]
-    if by_field.shape[2]:
+    by_field = np.zeros((len(poses), 6, 0))
+    if levels is not None and levels.field + levels.breathing > 0.0:
+        modes = np.zeros((len(stack.px), 0))
+        if levels.field > 0.0:
+            modes = levels.field * field_modes(stack.px, camera.resolution, levels.length)
+        following, products = without.with_modes(modes)
+        # The residuals stand between breathing, which comes last, and the field.
+        last = every.shape[2] - 1
+        beyond = np.r_[last + 1 : len(products), shared:last]
+        by_field = following[:, :, beyond]
         found = Coefficients.of(
-            information[shared:, shared:],
-            information[shared:, :shared],
-            flat[:, shared:].T @ residuals.ravel(),
+            products[np.ix_(beyond, beyond)],
+            products[np.ix_(beyond, np.arange(shared))],
+            products[beyond, last],
             by_field,
             fit.information,
         )
         # Coefficients follow what is shared: that then says nothing of them, nor they of it.
-        information = information[:shared, :shared] + information[:shared, shared:] @ found.slope
+        information = information + products[:shared, beyond] @ found.slope
         answer = answer + by_field @ found.slope
-        poses = poses @ exp(by_field @ found.mean)
-        away = left[:, :, shared:] @ found.mean
-        residuals, left = residuals + away, left[:, :, :shared]
-        own = residuals if shares is None else now.residuals + away / roots
+        moved_poses = by_field @ found.mean
+        poses = poses @ exp(moved_poses)
+        of_modes = found.mean[: 2 * modes.shape[1]].reshape(2, -1)
+        away = modes @ of_modes.T
+        stack.weigh(away)
+        away += every[:, :, shared:last] @ found.mean[2 * modes.shape[1] :]
+        away += stack.products_with_views(now.by_pose, moved_poses[:, :, None])[:, :, 0]
+        residuals, own = residuals + roots * away, own + away
         by_field = by_field @ found.open
     pulls = stack.sum_by_view(np.einsum("nij,ni->nj", left, residuals))
     return Compressed(poses, fit.information, answer, information, pulls, own, by_field, found)

@@ -160,17 +160,18 @@ def find_arm_errors(
     widened = problem.with_effects([*problem.effects, effect])
     still = State(state.edges, np.concatenate([state.values, np.zeros(size)]))
     likelihood = robot_likelihood(widened, still, noise)
-    sigma, value = _most_likely_size(likelihood, size, levels)
+    sigma, value = _most_likely_size(likelihood, size, levels, unlikely - 0.5 * _LIKELY)
     gain = 2.0 * (unlikely - value)
     return ArmErrors(basis, sigma, gain, of_links) if gain > _LIKELY else None
 
 
 def _most_likely_size(
-    likelihood: RobotLikelihood, size: int, levels: FloatArray
+    likelihood: RobotLikelihood, size: int, levels: FloatArray, enough: float
 ) -> tuple[float, float]:
     """The most likely size of the last unknowns as random effects, beside the robots' levels.
 
     They are observed to be zero, in units of their own, as one more component of the variance.
+    Where that does not seem to be likely enough, the search ends before.
 
     Returns:
         The size, and the negative logarithm of its restricted likelihood.
@@ -199,6 +200,7 @@ def _most_likely_size(
         np.append(levels, _START),
         np.append(np.repeat(likelihood.seen, 2), True),
         np.append(np.full(levels.size, LEAST_SIGMA), _NOTHING),
+        enough=enough,
     )
     return float(sigmas[-1]), value
 

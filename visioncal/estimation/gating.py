@@ -56,14 +56,15 @@ def gate(stack: CornerStack, residuals: FloatArray) -> Gate:
     # A few wrong corners spoil a view's rms without spoiling the view.
     inner = np.sqrt(mean_square_by_view(stack, residuals * passes[:, None]))
     reasons = {}
+    ends = stack.starts + stack.counts
     for at, view in enumerate(stack.views):
-        places = stack.points[(stack.view_of == at) & passes]
+        mine = slice(stack.starts[at], ends[at])
         if (rms[at] > limit) & (inner[at] > limit):
             reasons[view] = (
                 f"residual too large: {rms[at]:.2f} px (limit {limit:.2f}, set by the other views)"
             )
         elif kept[at] < (1 - _CORNER_SHARE) * stack.counts[at] or (
-            kept[at] < stack.counts[at] and not determines_pose(places)
+            kept[at] < stack.counts[at] and not determines_pose(stack.points[mine][passes[mine]])
         ):
             reasons[view] = (
                 f"residual too large: only {kept[at]:.0f} of {stack.counts[at]} corners fit one "

@@ -10,7 +10,6 @@ restricted likelihood with log-normal priors, the length on a grid (Gilmour, Tho
 """
 
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,7 +23,13 @@ from visioncal.estimation.linalg import gram, weighted_gram
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import RATIO_PRIOR, RobotLikelihood, robot_levels, robot_likelihood
-from visioncal.estimation.variance import LEAST_SIGMA, MOST_SIGMA, Knowledge
+from visioncal.estimation.variance import (
+    LEAST_SIGMA,
+    MOST_SIGMA,
+    Knowledge,
+    Likely,
+    most_likely,
+)
 
 # Twice the gain in log-likelihood over the same arm without them.
 SIGNIFICANT = 20.0
@@ -47,8 +52,8 @@ _TYPICAL = {
     HARMONICS: 2e-4,
 }
 _TORQUE_NM, _SPREAD, _START_RAD = 10.0, 1.0, 2e-4
-_ITERATIONS, _SETTLED, _LONGEST_STEP = 30, 1e-2, 1.0
-_WORST_DAMPING, _RIDGE = 1e4, 1e-12
+# A step that gains less of the log-likelihood is none.
+_LITTLE, _RIDGE = 1e-2, 1e-12
 # Combinations of harmonics that residuals determine by less than this share of what is known of
 # them beforehand are no unknowns: they stay as open as they were.
 _INFORMATIVE = 0.05
@@ -125,7 +130,11 @@ def find_joint_functions(
     chosen, best, worse = None, without, 0
     for length in _LENGTHS_RAD:
         arm = _Arm.of(*rest, bases, _Waves.of(harmonics, length), torque_nm)
-        found = arm.most_likely(np.append(best.logs[: len(without.logs)], np.log(_START_RAD)))
+        # Of what seems not to gain enough, the rest of the way does not matter.
+        found = arm.most_likely(
+            np.append(best.logs[: len(without.logs)], np.log(_START_RAD)),
+            without.value - 0.5 * SIGNIFICANT,
+        )
         if found is None or (chosen is not None and found.value > best.value):
             worse += 1
         else:
@@ -260,30 +269,18 @@ class _Arm:
         factor = {COMPLIANCE: self.torque_nm / _TORQUE_NM}
         return np.log([_TYPICAL[it] * factor.get(it, 1.0) for it in self.names])
 
-    def most_likely(self, start: FloatArray) -> "_Step | None":
-        """Finds the most likely levels and sizes; None where there are none to start from."""
-        damping = 1e-3
+    def most_likely(self, start: FloatArray, enough: float = np.inf) -> "_Step | None":
+        """Finds the most likely levels and sizes; None where there are none to start from.
+
+        Args:
+            start: Their logarithms to start from.
+            enough: See `variance.most_likely`.
+        """
+        low, high = (np.full(len(start), np.log(it)) for it in (LEAST_SIGMA, MOST_SIGMA))
         try:
-            now = self._likelihood(start)
+            return most_likely(self._likelihood, start, low, high, 0.0, enough, little=_LITTLE)[1]
         except LinAlgError:
             return None
-        for _ in range(_ITERATIONS):
-            curvature = now.curvature + damping * np.diag(np.diag(now.curvature))
-            step = np.clip(-np.linalg.solve(curvature, now.slope), -_LONGEST_STEP, _LONGEST_STEP)
-            candidate = np.clip(now.logs + step, np.log(LEAST_SIGMA), np.log(MOST_SIGMA))
-            then = None
-            with suppress(LinAlgError):
-                then = self._likelihood(candidate)
-            if then is not None and then.value <= now.value:
-                gained, now = now.value - then.value, then
-                damping = max(damping / 10, 1e-6)
-                if gained < _SETTLED:
-                    break
-            else:
-                damping *= 10
-            if damping > _WORST_DAMPING:
-                break
-        return now
 
     def _likelihood(self, logs: FloatArray) -> "_Step":
         reduced, components = self.likelihood.reduced, self.likelihood.components
@@ -335,7 +332,7 @@ class _Arm:
             value, slope = value + 0.5 * float(offset**2), slope + offset * lean
             curvature = curvature + np.outer(lean, lean)
         # Residuals fall as errors that are left out of the prediction grow.
-        return _Step(logs, value, slope, curvature, -effects)
+        return _Step(value, slope, curvature, logs, -effects)
 
     def found(self, step: "_Step", gain: float) -> JointFunctions:
         """The errors of all blocks with the sizes at some step."""
@@ -371,21 +368,15 @@ class _Arm:
 
 
 @dataclass(frozen=True, eq=False)
-class _Step:
-    """What is found at some logarithms of levels and sizes.
+class _Step(Likely):
+    """What is found at some logarithms of levels and sizes; its curvature is average information.
 
     Attributes:
         logs: The logarithms.
-        value: The negative log-likelihood.
-        slope: Its slope by them.
-        curvature: Its average information.
         effects: (q,) the most likely errors of the arm.
     """
 
     logs: FloatArray
-    value: float
-    slope: FloatArray
-    curvature: FloatArray
     effects: FloatArray
 
 

@@ -41,8 +41,8 @@ class LensLevels:
     gains: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
-def field_columns(px: FloatArray, resolution: tuple[int, int], length: float) -> FloatArray:
-    """The modes of a field of size one: what they displace.
+def field_modes(px: FloatArray, resolution: tuple[int, int], length: float) -> FloatArray:
+    """The modes of a field of size one, along one axis of the image: those of the other are alike.
 
     Args:
         px: (n, 2) corners [px].
@@ -50,7 +50,7 @@ def field_columns(px: FloatArray, resolution: tuple[int, int], length: float) ->
         length: The field's length, as a share of the width.
 
     Returns:
-        (n, 2, 2 m) displacements by coefficients of variance one.
+        (n, e) displacements by coefficients of variance one.
     """
     scale = length * resolution[0]
     (by_x, size_x), (by_y, size_y) = (
@@ -60,10 +60,7 @@ def field_columns(px: FloatArray, resolution: tuple[int, int], length: float) ->
     order = np.argsort(-sizes, axis=None, kind="stable")
     enough = int(np.searchsorted(np.cumsum(sizes.ravel()[order]), _KEPT * sizes.sum())) + 1
     at_x, at_y = np.unravel_index(order[:enough], sizes.shape)
-    one = by_x[:, at_x] * by_y[:, at_y]
-    found = np.zeros((len(px), 2, 2 * enough))
-    found[:, 0, :enough] = found[:, 1, enough:] = one
-    return found
+    return np.asarray(by_x[:, at_x] * by_y[:, at_y])
 
 
 def _modes(at: FloatArray, extent: float) -> tuple[FloatArray, FloatArray]:
@@ -100,12 +97,14 @@ def distances(stack: CornerStack, cam_from_target: FloatArray) -> FloatArray:
     return np.asarray(far / far.mean() - 1.0)
 
 
-def mode_columns(
-    stack: CornerStack, camera: Camera, cam_from_target: FloatArray, levels: LensLevels
+def breathing_columns(
+    stack: CornerStack, camera: Camera, cam_from_target: FloatArray, size: float
 ) -> FloatArray:
-    """(n, 2, m) what field and breathing displace, by coefficients as large as corners' noise."""
-    far = distances(stack, cam_from_target)[stack.view_of] if levels.breathing > 0.0 else 0.0
-    return displacements(stack.px, camera, far, levels)
+    """(n, 2, 1) what breathing of some size displaces; (n, 2, 0) where it has none."""
+    if size == 0.0:
+        return np.zeros((len(stack.px), 2, 0))
+    far = distances(stack, cam_from_target)[stack.view_of]
+    return (size * far[:, None] * zooms(stack, camera))[:, :, None]
 
 
 def displacements(
@@ -124,7 +123,8 @@ def displacements(
     """
     found = np.zeros((len(px), 2, 0))
     if levels.field > 0.0:
-        found = levels.field * field_columns(px, camera.resolution, levels.length)
+        modes = levels.field * field_modes(px, camera.resolution, levels.length)
+        found = np.einsum("ij,ne->nije", np.eye(2), modes).reshape(len(px), 2, -1)
     if levels.breathing > 0.0:
         share = levels.breathing * np.broadcast_to(far, len(px))
         breath = share[:, None] * (px - camera.matrix[2:])

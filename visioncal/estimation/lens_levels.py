@@ -3,7 +3,9 @@
 The corners of one camera and the chains of frames through it are linearised once. Random are the
 field's modes, breathing, one change of focus a view, and one error of each flange a stop; free are
 frames, lens, board and whatever else the fit moves. Errors of single views are eliminated view by
-view, so that an evaluation of the likelihood costs one Cholesky of some hundred unknowns.
+view, so that an evaluation of the likelihood costs one Cholesky of some hundred unknowns. Steps are
+Newton's: the likelihood is flat where a level is small, and a search by slopes alone would rest
+wherever rounding stops it.
 """
 
 from dataclasses import dataclass, replace
@@ -15,20 +17,26 @@ from scipy.linalg import cho_factor, cho_solve
 from visioncal.core.errors import ConvergenceError
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask
-from visioncal.estimation.corners import CornerStack, floored_sigma_px, reproject
+from visioncal.estimation.corners import (
+    CornerStack,
+    WithoutPoses,
+    floored_sigma_px,
+    reproject,
+)
 from visioncal.estimation.effects.lenses import LENSES, LinearisedCorners
-from visioncal.estimation.lens_field import LensLevels, distances, field_columns, zooms
+from visioncal.estimation.lens_field import LensLevels, distances, field_modes, zooms
 from visioncal.estimation.linalg import covariance_from, gram
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import RATIO_PRIOR, normal_equations
+from visioncal.estimation.variance import Likely, most_likely
 
 # Lengths of the field that are tried, as shares of the image's width, from the third on; another
 # one has to gain so much.
 _LENGTHS, _FIRST, _GAIN = (0.07, 0.12, 0.2), 2, 0.5
 # A field is no larger [px], and no change of focus with the distance or from view to view, as a
-# share: autofocus repeats to some 0.1 %. The noise of corners is about what lens, board and field,
-# all free, leave of them.
+# share: autofocus repeats to some 0.1 %. The noise of corners is no less than what lens, board and
+# field, all free, leave of them, and no more than what lens and board alone do, give or take these.
 _MOST = (1.0, 0.02, 5e-3)
 _NOISE_RANGE = (0.7, 3.0)
 # Corners of which lens, board and field, all free, leave more [px] are wrong, and no noise.
@@ -45,7 +53,6 @@ _FEWEST_STOPS = 6
 # Places of the levels: of corners, field, breathing and jitter, and then of the flanges, two each.
 _NOISE, _FIELD, _BREATHING, _JITTER, _FLANGES = range(5)
 _RIDGE = 1e-9
-_ROUNDS, _LONGEST_STEP = 8, 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,11 +62,9 @@ class _Rows:
     Attributes:
         stack: The corners, without effects of the focus.
         camera: The lens.
-        columns: (n, 2, c) by lens, board and breathing.
-        by_pose: (n, 2, 6).
-        residuals: (n, 2).
+        without: (n, 2, c + 2) columns by lens, board and breathing, by a change of focus, and the
+            residuals, once the poses have followed.
         information: (v, 6, 6) on the poses.
-        roots: (v,) by which share of a view each counts, as a root.
         chained: (o,) the view of each chain.
         jacobian: (o, 6, t) of the chains' residuals by the unknowns.
         by_errors: (o, 6, 6 w) by the flanges' errors.
@@ -72,11 +77,8 @@ class _Rows:
 
     stack: CornerStack
     camera: Camera
-    columns: FloatArray
-    by_pose: FloatArray
-    residuals: FloatArray
+    without: WithoutPoses
     information: FloatArray
-    roots: FloatArray
     chained: IntArray
     jacobian: FloatArray
     by_errors: FloatArray
@@ -105,7 +107,8 @@ class _Likelihood:
         kinds: (v, l) the level of each; -1 for none.
         known: (t, t) what all else says of the chains' unknowns.
         known_gradient: (t,).
-        noise_px: What lens, board and field leave of the corners, all free.
+        noise_px: (2,) what lens, board and field leave of the corners, all free, and what lens and
+            board alone do.
         flanges: How many robots there are.
     """
 
@@ -119,7 +122,7 @@ class _Likelihood:
     kinds: IntArray
     known: FloatArray
     known_gradient: FloatArray
-    noise_px: float
+    noise_px: tuple[float, float]
     flanges: int
 
     @cached_property
@@ -135,21 +138,29 @@ class _Likelihood:
         every = np.concatenate([self.kinds[self.kinds >= 0], self.modes])
         return np.bincount(every, minlength=_FLANGES + 2 * self.flanges).astype(float)
 
-    def __call__(self, logs: FloatArray) -> tuple[float, FloatArray]:
-        """The negative logarithm, and its slope."""
+    def __call__(self, logs: FloatArray) -> Likely:
+        """The negative logarithm, its slope, and its second derivative.
+
+        Where that is not positive, the average information takes its place (Gilmour, Thompson and
+        Cullis 1995): it never is negative.
+        """
         t, variances, is_random = len(self.known), np.exp(2.0 * logs), self.kinds >= 0
         weight, behind = 1.0 / variances[_NOISE], np.arange(t, len(self.gradient))
         precision = np.where(is_random, 1.0 / variances[self.kinds], 1.0)
         prior = 1.0 / variances[self.modes]
-        local = weight * self.local
+        local, cross = weight * self.local, weight * self.cross
         diagonal = np.arange(local.shape[1])
         local[:, diagonal, diagonal] += precision
-        inverse = np.linalg.inv(local)
-        taken = inverse @ (weight * self.cross)
-        information = weight * (self.information - gram(self.cross, taken))
+        root = np.linalg.cholesky(local)
+        outward = np.linalg.inv(root)
+        half = outward @ cross
+        inward = np.swapaxes(outward, 1, 2)
+        inverse, taken = inward @ outward, inward @ half
+        information = weight * self.information - gram(half, half)
         information[:t, :t] += self.known
         information[behind, behind] += prior
-        gradient = weight * (self.gradient - gram(taken, self.pulls))
+        pulls = weight * self.pulls
+        gradient = weight * self.gradient - gram(taken, pulls)
         gradient[:t] += self.known_gradient
         known = np.diag(information)
         # Of what nothing is known, the ridge below is.
@@ -157,56 +168,148 @@ class _Likelihood:
         factor = _factor(information * np.outer(scale, scale))
         covariance = cho_solve(factor, np.diag(scale), check_finite=False) * scale[:, None]
         best = -covariance @ gradient
-        pulled = (inverse @ self.pulls[:, :, None])[:, :, 0]
-        single = -weight * pulled - taken @ best
-        squared = weight * self.cost + gradient @ best
-        squared -= weight**2 * float(np.sum(self.pulls * pulled))
+        pulled = (inverse @ pulls[:, :, None])[:, :, 0]
+        single = -pulled - taken @ best
+        squared = weight * self.cost + gradient @ best - float(np.sum(pulls * pulled))
         determinants = 2.0 * float(np.log(np.diag(factor[0])).sum() - np.log(scale).sum())
-        determinants += float(np.linalg.slogdet(local)[1].sum() + 2.0 * self.counts @ logs)
+        determinants += 2.0 * float(np.log(root[:, diagonal, diagonal]).sum() + self.counts @ logs)
         # Where a level's values are, and how well they are known: in units of the level.
-        flat = taken.reshape(-1, len(best))
-        spread = np.einsum("np,np->n", flat @ covariance, flat).reshape(single.shape)
-        spread += np.diagonal(inverse, axis1=1, axis2=2)
-        of_single, of_modes = precision * single**2, prior * best[t:] ** 2
-        open_single, open_modes = precision * spread, prior * np.diag(covariance)[t:]
+        levels = np.flatnonzero(self.counts)
+        of_single = np.where(levels == self.kinds[:, :, None], single[:, :, None], 0.0)
+        of_modes = np.zeros((len(best), len(levels)))
+        of_modes[t:] = np.where(levels == self.modes[:, None], best[t:, None], 0.0)
+        sizes = np.sum(of_single**2, axis=(0, 1)) + np.sum(of_modes**2, axis=0)
+        in_common = taken @ covariance @ np.swapaxes(taken, 1, 2)
+        own = np.diagonal(inverse + in_common, axis1=1, axis2=2)
+        masks = [self.kinds == it for it in levels.tolist()]
+        of_field = [np.flatnonzero(self.modes == it) + t for it in levels.tolist()]
+        spread = np.array(
+            [
+                own[mine].sum() + np.diag(covariance)[at].sum()
+                for mine, at in zip(masks, of_field, strict=True)
+            ]
+        )
+        sizes, spread = sizes / variances[levels], spread / variances[levels]
         slope = self.counts.copy()
-        np.subtract.at(slope, self.kinds[is_random], (of_single + open_single)[is_random])
-        np.subtract.at(slope, self.modes, of_modes + open_modes)
+        slope[levels] -= sizes + spread
         # The rest of the squared error and of the freedom is the corners'.
         stated = best[:t] @ (self.known @ best[:t] + 2.0 * self.known_gradient)
-        left = squared - of_single[is_random].sum() - of_modes.sum() - stated
+        left = squared - sizes.sum() - stated
         freedom = len(best) + is_random.sum() - np.sum(self.known * covariance[:t, :t])
-        freedom -= open_single[is_random].sum() + open_modes.sum()
-        slope[_NOISE] = self.rows - left - freedom
+        slope[_NOISE] = self.rows - left - freedom + spread.sum()
+        # What the residuals move with each level, that of the corners being what is left of them.
+        by_single = (weight * self.local) @ of_single + cross @ of_modes
+        by_modes = weight * (self.information @ of_modes) + gram(cross, of_single)
+        products = np.tensordot(of_single, by_single, axes=([0, 1], [0, 1])) + of_modes.T @ by_modes
+        rest = pulls + ((weight * self.local) @ single[:, :, None])[:, :, 0] + cross @ best
+        rest_modes = weight * (self.gradient + self.information @ best) + gram(cross, single)
+        by_single = np.concatenate([rest[:, :, None], -by_single], axis=2)
+        by_modes = np.column_stack([rest_modes, -by_modes])
+        crossed = np.tensordot(rest, of_single, axes=([0, 1], [0, 1])) + rest_modes @ of_modes
+        moved = np.block([[np.atleast_2d(left), -crossed], [-crossed[:, None], products]])
+        followed = inverse @ by_single
+        by_modes -= gram(cross, followed)
+        moved -= gram(by_single, followed) + by_modes.T @ covariance @ by_modes
+        expected = self._expected(
+            covariance, taken, inverse, in_common, spread, self.rows - freedom + spread.sum(), logs
+        )
+        places = np.append(_NOISE, levels)
+        second = 4.0 * moved - expected + 2.0 * np.diag(slope[places])
+        if np.linalg.eigvalsh(second)[0] <= 0.0:
+            second = 2.0 * moved
+        curvature = np.zeros((len(logs),) * 2)
+        curvature[np.ix_(places, places)] = second
         lean = (np.diff(logs[_FLANGES:])[::2] - np.log(RATIO_PRIOR.ratio)) / RATIO_PRIOR.log_sigma
-        slope[_FLANGES:] += np.outer(lean, [-1.0, 1.0]).ravel() / RATIO_PRIOR.log_sigma
+        by_logs = np.kron(np.eye(self.flanges), [-1.0, 1.0]) / RATIO_PRIOR.log_sigma
+        slope[_FLANGES:] += lean @ by_logs
+        curvature[_FLANGES:, _FLANGES:] += by_logs.T @ by_logs
         value = 0.5 * (self.rows * 2.0 * logs[_NOISE] + determinants + squared + lean @ lean)
-        return float(value), slope
+        return Likely(float(value), slope, curvature)
 
-    def minimised(self, logs: FloatArray, closed: tuple[int, ...]) -> tuple[float, FloatArray]:
-        """The most likely logarithms, some of them closed to what is least; the value first."""
-        from scipy.optimize import minimize
+    def _expected(
+        self,
+        covariance: FloatArray,
+        taken: FloatArray,
+        inverse: FloatArray,
+        in_common: FloatArray,
+        spread: FloatArray,
+        of_corners: float,
+        logs: FloatArray,
+    ) -> FloatArray:
+        """What is expected of the second derivative: half the traces of P V_k P V_l.
 
+        Those with the corners' noise follow from P V P = P.
+
+        Args:
+            covariance: (q, q) of the unknowns.
+            taken: (v, l, q) how errors of single views follow them.
+            inverse: (v, l, l) the covariance of these errors, the unknowns being known.
+            in_common: (v, l, l) what the unknowns add to it.
+            spread: (k,) the levels' covariances over their variances.
+            of_corners: The same of the corners' freedom.
+            logs: The logarithms of the levels.
+
+        Returns:
+            (1 + k, 1 + k) of the corners' noise, and of the levels that anything has.
+        """
+        t, levels, variances = len(self.known), np.flatnonzero(self.counts), np.exp(2.0 * logs)
+        of_field = [np.flatnonzero(self.modes == it) + t for it in levels.tolist()]
+        turned = []
+        for it in levels.tolist():
+            rows = taken[self.kinds == it]
+            turned.append(covariance @ (rows.T @ rows))
+        chosen = (self.kinds[:, :, None] == levels).astype(float)
+        of_one_view = (inverse * (inverse + 2.0 * in_common)) @ chosen
+        both = np.tensordot(chosen, of_one_view, axes=([0, 1], [0, 1]))
+        for one, at in enumerate(of_field):
+            for two, there in enumerate(of_field):
+                both[one, two] += np.sum(turned[one] * turned[two].T)
+                both[one, two] += np.sum(turned[one][there] * covariance[there])
+                both[one, two] += np.sum(turned[two][at] * covariance[at])
+                both[one, two] += np.sum(covariance[np.ix_(at, there)] ** 2)
+        among = np.diag(self.counts[levels] - 2.0 * spread)
+        among += both / np.outer(variances[levels], variances[levels])
+        held = self.known @ covariance[:t]
+        by_held = np.array([
+            np.sum(held * it[:t]) + np.sum(held[:, at] * covariance[:t, at])
+            for it, at in zip(turned, of_field, strict=True)
+        ]) / variances[levels]  # fmt: skip
+        of_noise = 2.0 * (self.counts[levels] - spread - among.sum(axis=0) - by_held)
+        inner = held[:, :t]
+        of_held = np.trace(inner) - np.sum(inner * inner.T) - by_held.sum()
+        alone = 2.0 * of_corners - of_noise.sum() - of_held
+        return np.block([[np.atleast_2d(alone), of_noise], [of_noise[:, None], 2.0 * among]])
+
+    def minimised(
+        self, logs: FloatArray, closed: tuple[int, ...], enough: float = np.inf
+    ) -> tuple[float, FloatArray]:
+        """The most likely logarithms, some of them closed to what is least; the value first.
+
+        Args:
+            logs: Where to start.
+            closed: The levels that are none.
+            enough: See `most_likely`.
+        """
         low, high = self.limits(closed)
-        options = {"maxiter": 40, "ftol": 1e-8}
-        logs = np.clip(logs, low, high)
-        for _ in range(_ROUNDS):
-            # A long step up may end where all is noise of the focus, and stay there.
-            most = np.minimum(logs + _LONGEST_STEP, high)
-            bounds = list(zip(low, most, strict=True))
-            found = minimize(
-                self, logs, jac=True, method="L-BFGS-B", bounds=bounds, options=options
-            )
-            logs = np.asarray(found.x)
-            if not np.any((logs >= most) & (most < high)):
-                break
-        return float(found.fun), logs
+        logs, found = most_likely(self, np.clip(logs, low, high), low, high, enough=enough)
+        # Levels that hardly count still fall, by ever smaller gains: to nothing at once.
+        for level in (_FIELD, _BREATHING, _JITTER):
+            if found.slope[level] <= 0.0 or logs[level] <= low[level]:
+                continue
+            without = logs.copy()
+            without[level] = low[level]
+            other = self(without)
+            if other.value <= found.value:
+                logs, found = without, other
+        return found.value, logs
 
     def gain(self, logs: FloatArray, value: float, closed: tuple[int, ...], level: int) -> float:
         """By how much twice the logarithm falls from a value without a level."""
-        without = logs.copy()
-        without[level] = self.limits((*closed, level))[0][level]
-        most = 2.0 * (self(without)[0] - value)
+        without, least = logs.copy(), self.limits((*closed, level))[0][level]
+        if logs[level] <= least:
+            return 0.0
+        without[level] = least
+        most = 2.0 * (self(without).value - value)
         # What the others can take over is asked only where it matters.
         if most < SIGNIFICANT:
             return most
@@ -217,7 +320,7 @@ class _Likelihood:
         low = np.repeat([_FLANGE_RANGE[0]], _FLANGES + 2 * self.flanges)
         high = np.repeat([_FLANGE_RANGE[1]], len(low))
         low[_NOISE], high[_NOISE] = np.multiply(_NOISE_RANGE, self.noise_px)
-        low[_FIELD : _JITTER + 1] = np.multiply(_LEAST, (self.noise_px, 1.0, 1.0))
+        low[_FIELD : _JITTER + 1] = np.multiply(_LEAST, (self.noise_px[0], 1.0, 1.0))
         high[_FIELD : _JITTER + 1] = _MOST
         high[[*closed]] = low[[*closed]]
         return np.log(low), np.log(high)
@@ -257,22 +360,22 @@ def estimate_levels(
     found = _rows(seen, problem, rows, state, noise, camera)
     is_open = len(np.unique(found.chained)) >= _FEWEST_STOPS and not mine.scene.is_focus_fixed
     closed = () if is_open else (_BREATHING, _JITTER)
-    at, before = _FIRST, mine.levels
+    before = mine.levels
+    at = _FIRST if before is None else _LENGTHS.index(before.length)
     likelihood = _assembled(found, _LENGTHS[at], len(noise.robots))
-    if likelihood.noise_px > _WRONG_PX:
+    left_px, noise_px = likelihood.noise_px
+    if left_px > _WRONG_PX:
         return LensLevels()
-    sizes = np.array([1.0, _START[0], 0.0, 0.0]) * likelihood.noise_px + [0.0, 0.0, *_START[1:]]
+    sizes = np.array([noise_px, _START[0] * left_px, *_START[1:]])
     if before is not None:
-        at = _LENGTHS.index(before.length)
-        likelihood = _assembled(found, _LENGTHS[at], len(noise.robots))
-        sizes = likelihood.noise_px * np.array([1.0, before.field, before.breathing, before.jitter])
-        sizes = np.maximum(sizes, 0.1 * np.array([0.0, _START[0] * sizes[0], *_START[1:]]))
+        stated = [1.0, before.field, before.breathing, before.jitter]
+        sizes = np.maximum(noise_px * np.array(stated), np.array([0.0, 0.1, 0.1, 0.1]) * sizes)
     logs = np.log(np.concatenate([sizes, np.maximum(noise.robots, 1e-6).ravel()]))
     best = (*likelihood.minimised(logs, closed), at, likelihood)
     for step in (1, -1):
         while 0 <= best[2] + step < len(_LENGTHS):
             other = _assembled(found, _LENGTHS[best[2] + step], len(noise.robots))
-            value, there = other.minimised(best[1], closed)
+            value, there = other.minimised(best[1], closed, best[0] - _GAIN)
             if value > best[0] - _GAIN:
                 break
             best = value, there, best[2] + step, other
@@ -280,10 +383,7 @@ def estimate_levels(
     sizes = np.exp(logs[: _JITTER + 1])
     low = np.exp(likelihood.limits(closed)[0][: _JITTER + 1])
     field, breathing, jitter = np.where(sizes > 2.0 * low, sizes, 0.0)[1:] / sizes[_NOISE]
-    gains = [
-        0.0 if it in closed else likelihood.gain(logs, best[0], closed, it)
-        for it in (_FIELD, _BREATHING, _JITTER)
-    ]
+    gains = [likelihood.gain(logs, best[0], closed, it) for it in (_FIELD, _BREATHING, _JITTER)]
     return LensLevels(
         float(field), _LENGTHS[at], float(breathing), float(jitter), (gains[0], gains[1], gains[2])
     )
@@ -327,12 +427,18 @@ def _rows(
     stack = mine.stack.with_points(mine.stack.points + shape @ looks.values[looks.boards])
     stack, lens = replace(stack, zooms=None), looks.camera(camera)
     now = reproject(stack, lens, poses)
-    breath = distances(stack, poses)[stack.view_of][:, None] * zooms(stack, lens)
+    focus = zooms(stack, lens)
+    breath = distances(stack, poses)[stack.view_of][:, None] * focus
     by_board = now.by_point @ shape
-    stack.weigh(breath, by_board)
+    stack.weigh(focus, breath, by_board)
+    columns = [now.by_intrinsics, by_board, *(
+        it[:, :, None] for it in (breath, focus, now.residuals)
+    )]  # fmt: skip
+    information = stack.products_by_view(now.by_pose, now.by_pose)
+    every = np.concatenate(columns, axis=2)
     here = np.flatnonzero((rows >= of_camera.start) & (rows < of_camera.stop))
     linear, (of, members) = problem.linear(state), problem.units
-    jacobian = linear.jacobian[here]
+    jacobian = linear.jacobian_of(here)
     places = problem.effect_columns[LENSES].start + np.searchsorted(seen.free, looks.places(camera))
     known, gradient = _by_others(problem, here, state, noise)
     weight = floored_sigma_px(seen.sigmas_px[which]) ** -2.0
@@ -344,11 +450,8 @@ def _rows(
     return _Rows(
         stack,
         lens,
-        np.concatenate([now.by_intrinsics, by_board, breath[:, :, None]], axis=2),
-        now.by_pose,
-        now.residuals,
-        stack.products_by_view(now.by_pose, now.by_pose),
-        np.sqrt(mine.shares),
+        WithoutPoses.of(stack, now.by_pose, information, every, mine.shares),
+        information,
         rows[here] - of_camera.start,
         jacobian[:, :, kept],
         linear.by_errors[here],
@@ -388,41 +491,36 @@ def _without(
 
 def _assembled(rows: _Rows, length: float, robots: int) -> _Likelihood:
     """The likelihood at one length of the field."""
-    stack, own = rows.stack, len(rows.places)
-    modes = field_columns(stack.px, rows.camera.resolution, length)
-    focus = zooms(stack, rows.camera)
-    stack.weigh(modes, focus)
-    every = np.concatenate(
-        [rows.columns, modes, focus[:, :, None], rows.residuals[:, :, None]], axis=2
-    )
-    answer = -covariance_from(rows.information) @ stack.products_by_view(rows.by_pose, every)
-    left = every + stack.products_with_views(rows.by_pose, answer)
-    left *= rows.roots[stack.view_of, None, None]
-    flat = left.reshape(-1, left.shape[2])
-    products = flat.T @ flat
-    by_focus = stack.products_by_view(left[:, :, -2:-1], left)[:, 0]
-    views, chained, t, q = len(stack.views), rows.chained, len(rows.known), every.shape[2] - 2
-    size = t + q - own
+    stack, without = rows.stack, rows.without
+    modes = field_modes(stack.px, rows.camera.resolution, length)
+    answer, products = without.with_modes(modes)
+    # Behind lens, board and breathing stand a change of the focus and the residuals.
+    focus = without.left.shape[2] - 2
+    residual, shared = focus + 1, np.r_[:focus, focus + 2 : len(products)]
+    by_focus = without.by_view(focus, modes)
+    views, chained, t, q = len(stack.views), rows.chained, len(rows.known), len(shared)
+    size = t + q - len(rows.places)
     columns = np.concatenate([rows.places, np.arange(t, size)])
+    among, pulled = products[np.ix_(shared, shared)], products[shared, residual]
     information, gradient = np.zeros((size, size)), np.zeros(size)
-    information[np.ix_(columns, columns)] = products[:q, :q]
-    gradient[columns] = products[:q, -1]
+    information[np.ix_(columns, columns)], gradient[columns] = among, pulled
     # Chains: poses follow lens, board, field and focus, and are the best ones.
+    following = answer[chained]
     jacobian = np.zeros((len(chained), 6, size))
     jacobian[:, :, :t] = rows.jacobian
-    jacobian[:, :, columns] = answer[chained][:, :, :q]
-    away = rows.away + answer[chained][:, :, -1]
+    jacobian[:, :, columns] = following[:, :, shared]
+    away = rows.away + following[:, :, residual]
     # Repeats of still frames share an error, too: here each counts by itself.
     by_flanges = np.repeat(rows.robots, 6, axis=1)
     of_flanges = np.where(by_flanges[:, None] < 0, 0.0, rows.by_errors)
-    errors = np.concatenate([of_flanges, answer[chained][:, :, q : q + 1]], axis=2)
+    errors = np.concatenate([of_flanges, following[:, :, focus : focus + 1]], axis=2)
     weights = rows.information[chained]
     turned = np.swapaxes(errors, 1, 2) @ weights
     width = errors.shape[2]
     local, cross = np.zeros((views, width, width)), np.zeros((views, width, size))
     pulls, kinds = np.zeros((views, width)), np.full((views, width), -1)
-    local[:, -1, -1], cross[:, -1, columns] = by_focus[:, q], by_focus[:, :q]
-    pulls[:, -1], kinds[:, -1] = by_focus[:, -1], _JITTER
+    local[:, -1, -1], cross[:, -1, columns] = by_focus[:, focus], by_focus[:, shared]
+    pulls[:, -1], kinds[:, -1] = by_focus[:, residual], _JITTER
     local[chained] += turned @ errors
     cross[chained] += turned @ jacobian
     pulls[chained] += (turned @ away[:, :, None])[:, :, 0]
@@ -430,21 +528,25 @@ def _assembled(rows: _Rows, length: float, robots: int) -> _Likelihood:
         np.repeat([0, 1], 3), rows.robots.shape[1]
     )
     kinds[chained, :-1] = np.where(by_flanges < 0, -1, flanges)
-    inner = products[:q, :q] + np.diag(_RIDGE + 1e-6 * np.diag(products)[:q])
-    rest = products[-1, -1] - products[:q, -1] @ np.linalg.solve(inner, products[:q, -1])
+    inner, cost = among + np.diag(_RIDGE + 1e-6 * np.diag(among)), products[residual, residual]
     # Of images that show the same, all count as one.
-    freedom = float(rows.roots**2 @ (2 * stack.counts - 6))
+    freedom = float(without.roots**2 @ (2 * stack.counts - 6))
+
+    def left_px(of: int) -> float:
+        rest = cost - pulled[:of] @ np.linalg.solve(inner[:of, :of], pulled[:of])
+        return floored_sigma_px(float(np.sqrt(max(rest, 0.0) / max(freedom - of, 1.0))))
+
     return _Likelihood(
         freedom + 6 * len(chained),
         information + gram(jacobian, weights @ jacobian),
         gradient + gram(jacobian, (weights @ away[:, :, None])[:, :, 0]),
-        float(products[-1, -1] + np.einsum("oi,oij,oj->", away, weights, away)),
+        float(cost + np.einsum("oi,oij,oj->", away, weights, away)),
         local,
         cross,
         pulls,
         kinds,
         rows.known,
         rows.gradient,
-        floored_sigma_px(float(np.sqrt(rest / max(freedom - q, 1.0)))),
+        (left_px(q), left_px(focus)),
         robots,
     )

@@ -89,13 +89,11 @@ def determines_pose(points: FloatArray) -> bool:
     """
     if len(points) < _FEWEST:
         return False
-    a, b, c = points[:3]
-    span = float(np.ptp(points, axis=0).max())
-    for start, end in ((a, b), (a, c), (b, c)):
-        away = np.linalg.norm(np.cross(points - start, end - start), axis=1)
-        if np.sum(away > _ON_LINE * span * np.linalg.norm(end - start)) < 2:
-            return False
-    return True
+    starts, span = points[[0, 0, 1]], float(np.ptp(points, axis=0).max())
+    along = points[[1, 2, 2]] - starts
+    away = np.linalg.norm(np.cross(points - starts[:, None], along[:, None]), axis=2)
+    is_off = away > _ON_LINE * span * np.linalg.norm(along, axis=1)[:, None]
+    return bool(np.all(is_off.sum(axis=1) >= 2))
 
 
 def _pose(rotation_vector: FloatArray, translation: FloatArray) -> FloatArray:

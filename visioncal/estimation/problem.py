@@ -14,6 +14,8 @@ free, or held: it then stays where it is, has no column in the solver, and count
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
+from typing import TypeAlias
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -24,6 +26,7 @@ from visioncal.core.transforms import adjoint, exp, inverse_right_jacobian, inve
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.parts import Effect, FramePrior, Noise, Observations, State
+from visioncal.estimation.paths import Stride, Ways
 from visioncal.estimation.tree import Step, Tree
 from visioncal.estimation.variance import Knowledge
 
@@ -39,6 +42,11 @@ class _Group:
 
     rows: IntArray
     path: tuple[Step, ...]
+
+
+# Places of the c values that move a group, by (m, 6, c) how they move what was measured, and how
+# the flange of each step of its path.
+_MovedGroup: TypeAlias = tuple[IntArray, FloatArray, tuple[FloatArray | None, ...]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,9 +78,17 @@ class Linear:
     @property
     def jacobian(self) -> FloatArray:
         """(n, 6, p) the Jacobian as one."""
-        found = np.zeros((len(self.residuals), 6, self.size))
+        return self.jacobian_of(np.arange(len(self.residuals)))
+
+    def jacobian_of(self, rows: IntArray) -> FloatArray:
+        """(m, 6, p) the Jacobian of some rows."""
+        places = np.full(len(self.residuals), -1)
+        places[rows] = np.arange(len(rows))
+        found = np.zeros((len(rows), 6, self.size))
         for it in self.blocks:
-            found[np.ix_(it.rows, np.arange(6), it.columns)] = it.jacobian
+            mine = places[it.rows]
+            chosen = mine >= 0
+            found[np.ix_(mine[chosen], np.arange(6), it.columns)] = it.jacobian[chosen]
         return found
 
     def covariance(self, covariance: FloatArray) -> FloatArray:
@@ -114,6 +130,9 @@ class Problem:
     is_combined: bool = False
     # The last of `linear`, ideal or not: a fit, its noise and its tests ask for the same one.
     _last: dict[bool, tuple[State, Linear]] = field(default_factory=dict, init=False, repr=False)
+    _last_moved: list[tuple[State, tuple[FloatArray, FloatArray, tuple[Block, ...]]]] = field(
+        default_factory=list, init=False, repr=False
+    )
 
     def __len__(self) -> int:
         return len(self.observations)
@@ -420,9 +439,9 @@ class Problem:
 
     def predicted(self, state: State) -> FloatArray:
         """The (n, 4, 4) `observer_from_observed` that the unknowns and the robots predict."""
-        found = np.zeros((len(self), 4, 4))
-        for group in self.groups:
-            found[group.rows] = self.product(group.path, state, group.rows)
+        found, change = np.empty((len(self), 4, 4)), state.values - self.start_values
+        for ways in self._ways:
+            found[ways.rows] = invert(ways.backward(state.edges, change))
         return found
 
     def measured(self, state: State) -> FloatArray:
@@ -445,91 +464,141 @@ class Problem:
             before = self._last[ideal] = state, self._linearised(state, ideal=ideal)
         return before[1]
 
-    def _linearised(self, state: State, *, ideal: bool) -> Linear:
-        rotation, predicted = self.observations.has_rotation, self.predicted(state)
-        error = np.broadcast_to(np.eye(4), predicted.shape)
-        if not ideal:
-            error = invert(predicted) @ self.measured(state)
-        residuals = np.where(rotation[:, None], log(error), _places(error))
-        by_measured = np.where(
-            rotation[:, None, None], inverse_right_jacobian(residuals), _place_slope(error)
-        )
-        by_predicted = -np.where(
-            rotation[:, None, None],
-            by_measured @ adjoint(invert(error)),
-            _place_slope(np.broadcast_to(np.eye(4), error.shape)),
-        )
-        _, members = self.units
-        errors = np.zeros((len(self), 6, 6 * members.shape[1]))
-        blocks = []
-        for group, (values, by_sensor) in zip(self.groups, self._moved_groups, strict=True):
-            rows = group.rows
-            edges, effects = self._jacobian(group, values, state, errors)
-            moved = by_measured[rows] @ by_sensor + by_predicted[rows] @ effects
-            jacobian = [by_predicted[rows] @ it for it in edges.values()]
-            columns = [np.arange(self.size)[self.edge_columns(it)] for it in edges]
-            blocks.append(
-                Block(
-                    rows,
-                    np.concatenate([*columns, 6 * len(self.unknown) + values]),
-                    np.concatenate([*jacobian, moved], axis=2),
+    @cached_property
+    def _ways(self) -> tuple[Ways, ...]:
+        """The observations' ways through the tree, those of one kind together."""
+        alike: dict[tuple[tuple[bool, ...], ...], list[int]] = {}
+        for at, group in enumerate(self.groups):
+            kind = [
+                (it.is_up, it.frame in self.unknown, it.robot in self.flange_jacobian)
+                for it in group.path
+            ]
+            alike.setdefault(tuple(kind), []).append(at)
+        return tuple(self._ways_of(mine) for mine in alike.values())
+
+    def _ways_of(self, mine: list[int]) -> Ways:
+        """The ways of some groups whose steps are of the same kinds."""
+        groups, (of, members) = [self.groups[it] for it in mine], self.units
+        ends = np.cumsum([0, *(len(it.rows) for it in groups)]).tolist()
+        rows = np.concatenate([it.rows for it in groups])
+        strides = []
+        for steps in zip(*(it.path for it in groups), strict=True):
+            edges, poses, moves, slots = [], [], [], []
+            for step, group in zip(steps, groups, strict=True):
+                count = len(group.rows)
+                slot = np.full(count, -1)
+                if step.frame in self.unknown:
+                    edges.append(np.full(count, self.unknown[step.frame]))
+                elif step.robot:
+                    poses.append(self.poses[step.robot][self.observations.stops[group.rows]])
+                    robots = members[of[group.rows]] == self.robots.index(step.robot)
+                    slot = np.where(robots.any(axis=1), robots.argmax(axis=1), -1)
+                    if step.robot in self.flange_jacobian:
+                        moves.append(self.flange_jacobian[step.robot][group.rows])
+                elif (known := self.tree.branches[step.frame].known) is not None:
+                    poses.append(np.broadcast_to(known, (count, 4, 4)))
+                slots.append(slot)
+            found = np.concatenate(poses) if poses else np.zeros((0, 4, 4))
+            strides.append(
+                Stride(
+                    steps[0].is_up,
+                    np.concatenate(edges) if edges else np.zeros(0, dtype=np.int64),
+                    found if steps[0].is_up else invert(found),
+                    np.concatenate(moves) if moves else None,
+                    np.concatenate(slots),
                 )
             )
+        places = tuple((at, slice(*it)) for at, it in zip(mine, pairwise(ends), strict=True))
+        return Ways(rows, places, tuple(strides))
+
+    @cached_property
+    def _moved_groups(self) -> tuple[_MovedGroup, ...]:
+        """What of the effects moves each group."""
+        found = []
+        for group in self.groups:
+            by_sensor = self.by_sensor[group.rows]
+            flanges = [self.flange_jacobian.get(step.robot) for step in group.path]
+            by_steps = [None if it is None else it[group.rows] for it in flanges]
+            moved = by_sensor.any(axis=(0, 1))
+            for it in by_steps:
+                if it is not None:
+                    moved |= it.any(axis=(0, 1))
+            values = np.flatnonzero(moved)
+            steps = tuple(None if it is None else it[:, :, values] for it in by_steps)
+            found.append((values, by_sensor[:, :, values], steps))
+        return tuple(found)
+
+    def _moved(self, state: State) -> tuple[FloatArray, FloatArray, tuple[Block, ...]]:
+        """How the predicted poses move, on their right.
+
+        Returns:
+            (n, 4, 4) their inverses, (n, 6, 6 w) how they move with the flanges' errors, and by
+            groups, as they are ordered, how with the unknowns.
+        """
+        if self._last_moved and self._last_moved[0][0] is state:
+            return self._last_moved[0][1]
+        change, width = state.values - self.start_values, self.units[1].shape[1]
+        back, errors = np.empty((len(self), 4, 4)), np.zeros((len(self), 6, width, 6))
+        blocks: dict[int, Block] = {}
+        for ways in self._ways:
+            inverse, moved = ways.moved(state.edges, change)
+            back[ways.rows] = inverse
+            for it, step in zip(ways.strides, moved, strict=True):
+                erring = np.flatnonzero(it.slots >= 0)
+                if len(erring):
+                    errors[ways.rows[erring], :, it.slots[erring]] += step[erring]
+            unknown = [at for at, it in enumerate(ways.strides) if len(it.edges)]
+            for at, place in ways.groups:
+                values, _, by_steps = self._moved_groups[at]
+                effects = np.zeros((place.stop - place.start, 6, len(values)))
+                for step, by_flange in zip(moved, by_steps, strict=True):
+                    if by_flange is not None:
+                        effects += step[place] @ by_flange
+                edges = [6 * ways.strides[it].edges[place.start] + np.arange(6) for it in unknown]
+                blocks[at] = Block(
+                    ways.rows[place],
+                    np.concatenate([*edges, 6 * len(self.unknown) + values]),
+                    np.concatenate([*(moved[it][place] for it in unknown), effects], axis=2),
+                )
         for rows in self.repeats:
-            errors[rows, :, :6] = np.eye(6)
+            errors[rows, :, 0] = np.eye(6)
+        by_flanges = errors.reshape(len(self), 6, 6 * width)
+        found = back, by_flanges, tuple(blocks[it] for it in range(len(self.groups)))
+        self._last_moved[:] = [(state, found)]
+        return found
+
+    def ideal_errors(self, state: State) -> FloatArray:
+        """(n, 6, 6 w) the residuals by the flanges' errors, as an ideal `linear` has them."""
+        found = -self._moved(state)[1]
+        found[~self.observations.has_rotation, :3] = 0.0
+        if self.is_combined:
+            return np.broadcast_to(np.eye(6), found.shape)
+        return found
+
+    def _linearised(self, state: State, *, ideal: bool) -> Linear:
+        rotation, (back, errors, moved) = self.observations.has_rotation, self._moved(state)
+        error = np.broadcast_to(np.eye(4), back.shape)
+        if not ideal:
+            error = back @ self.measured(state)
+        places = ~rotation
+        residuals, by_measured = np.zeros((len(self), 6)), np.empty((len(self), 6, 6))
+        residuals[rotation], residuals[places] = log(error[rotation]), _places(error[places])
+        by_measured[rotation] = inverse_right_jacobian(residuals[rotation])
+        by_measured[places] = _place_slope(error[places])
+        by_predicted = np.empty_like(by_measured)
+        by_predicted[rotation] = -by_measured[rotation] @ adjoint(invert(error[rotation]))
+        by_predicted[places] = -_place_slope(np.broadcast_to(np.eye(4), error[places].shape))
+        blocks = []
+        for block, (_, by_sensor, _) in zip(moved, self._moved_groups, strict=True):
+            jacobian = by_predicted[block.rows] @ block.jacobian
+            if by_sensor.shape[2]:
+                behind = jacobian[:, :, -by_sensor.shape[2] :]
+                behind += by_measured[block.rows] @ by_sensor
+            blocks.append(replace(block, jacobian=jacobian))
         by_errors = by_predicted @ errors
         if self.is_combined:
             by_errors = np.broadcast_to(np.eye(6), errors.shape)
         return Linear(residuals, tuple(blocks), by_errors, self.size)
-
-    @cached_property
-    def _moved_groups(self) -> tuple[tuple[IntArray, FloatArray], ...]:
-        """Of each group, the places of the effects' values that move it, and by (m, 6, c) how."""
-        found = []
-        for group in self.groups:
-            by_sensor = self.by_sensor[group.rows]
-            moved = by_sensor.any(axis=(0, 1))
-            for step in group.path:
-                if step.robot in self.flange_jacobian:
-                    moved |= self.flange_jacobian[step.robot][group.rows].any(axis=(0, 1))
-            values = np.flatnonzero(moved)
-            found.append((values, by_sensor[:, :, values]))
-        return tuple(found)
-
-    def _jacobian(
-        self, group: _Group, values: IntArray, state: State, errors: FloatArray
-    ) -> tuple[dict[str, FloatArray], FloatArray]:
-        """How the predicted poses of a group move, on their right.
-
-        Args:
-            group: The group of m observations.
-            values: (c,) places of the effects' values that move it.
-            state: The unknowns.
-            errors: (n, 6, 6 w) of all observations, to which its own by flanges' errors are added.
-
-        Returns:
-            (m, 6, 6) by the edge of each unknown frame, and (m, 6, c) by the effects on flanges.
-        """
-        of, members = self.units
-        edges: dict[str, FloatArray] = {}
-        effects = np.zeros((len(group.rows), 6, len(values)))
-        rest = np.broadcast_to(np.eye(4), (len(group.rows), 4, 4))
-        for step in reversed(group.path):
-            edge = self._edge(step, state, group.rows)
-            # An edge moves on its right: at its end, or at its start where it is gone up.
-            before = invert(edge) @ rest if step.is_up else edge @ rest
-            moved = -adjoint(invert(before)) if step.is_up else adjoint(invert(rest))
-            if step.frame in self.unknown:
-                edges[step.frame] = edges.get(step.frame, 0.0) + moved
-            if step.robot:
-                mine = members[of[group.rows]] == self.robots.index(step.robot)
-                for slot in range(members.shape[1]):
-                    rows = group.rows[mine[:, slot]]
-                    errors[rows, :, 6 * slot : 6 * slot + 6] += moved[mine[:, slot]]
-            if step.robot in self.flange_jacobian:
-                effects += moved @ self.flange_jacobian[step.robot][group.rows][:, :, values]
-            rest = before
-        return edges, effects
 
     def change_of(self, frame: str, state: State) -> FloatArray:
         """The change of a frame's edge that each observation asks for, were all else right.

@@ -39,7 +39,7 @@ RATIO_PRIOR = RatioPrior(ratio=0.6, log_sigma=1.5)
 # Robots' noise levels are started from above: at least here [rad and m].
 _START_SIGMA = 5e-4
 # Where they are sought again, it is from so much above where they were.
-_ABOVE = 1.5
+_ABOVE = 1.1
 # ... and never from nothing, which no residuals would lift them from.
 _ABOVE_NOTHING = 2e-5
 # A sensor may be this much better or worse than is said of it, at the most.
@@ -125,7 +125,7 @@ def solve_problem(
     """
     moving = problem.moving
     # Held at the start: weights that follow the unknowns would reward those with large noise.
-    whitening = _Whitening.of(problem, noise, problem.linear(state, ideal=True).by_errors)
+    whitening = _Whitening.of(problem, noise, problem.ideal_errors(state))
 
     def linearise(at: State) -> Linearised[State]:
         information, gradient, cost = whitening.equations(problem, at, problem.linear(at))
@@ -445,6 +445,7 @@ class RobotLikelihood:
         free: Mask,
         least: FloatArray | float = LEAST_SIGMA,
         settled: float = SETTLED,
+        enough: float = np.inf,
     ) -> tuple[FloatArray, float]:
         """The most likely levels, and the negative logarithm of their likelihood.
 
@@ -453,6 +454,7 @@ class RobotLikelihood:
             free: (2 r + k,) which of them are sought, robot by robot.
             least: Below which they are not sought.
             settled: See `estimate_sigmas`.
+            enough: See `variance.most_likely`.
         """
         seen = np.flatnonzero(self.seen).tolist()
         sigmas, value = estimate_sigmas(
@@ -465,6 +467,7 @@ class RobotLikelihood:
             free,
             least,
             settled,
+            enough,
         )
         return sigmas.reshape(start.shape), value
 
@@ -506,20 +509,22 @@ def posterior(problem: Problem, state: State, noise: Noise) -> tuple[FloatArray,
     errors = problem.error_covariance(noise)
     known = covariance_among(_whole(reduced, errors)[0], problem.moving)
     of, _ = problem.units
-    residuals, jacobian = linear.residuals.copy(), linear.jacobian
-    gone = np.zeros_like(weights)
-    rows = of >= 0
-    if rows.any():
-        # The flanges' errors as their prior and their observations have them together.
-        gain = errors @ np.linalg.inv(reduced.covariance + errors)
-        left = errors - gain @ errors
-        by_errors = linear.by_errors[rows]
-        flange = (gain @ reduced.errors[:, :, None])[of[rows]]
-        residuals[rows] -= (by_errors @ flange)[:, :, 0]
-        jacobian[rows] -= by_errors @ (gain @ reduced.jacobian)[of[rows]]
-        gone[rows] = by_errors @ left[of[rows]] @ np.swapaxes(by_errors, 1, 2)
-    spread = (jacobian.reshape(-1, jacobian.shape[2]) @ known).reshape(jacobian.shape)
-    gone = gone + spread @ np.swapaxes(jacobian, 1, 2)
+    residuals, gone = linear.residuals.copy(), np.zeros_like(weights)
+    # The flanges' errors as their prior and their observations have them together.
+    gain = errors @ np.linalg.inv(reduced.covariance + errors)
+    left, taken = errors - gain @ errors, gain @ reduced.jacobian
+    flange = (gain @ reduced.errors[:, :, None])[:, :, 0]
+    # Block by block: all unknowns move the errors, and of whole cells there are many.
+    for block in linear.blocks:
+        jacobian = linear.jacobian_of(block.rows)
+        inside = of[block.rows] >= 0
+        rows = block.rows[inside]
+        by_errors, units = linear.by_errors[rows], of[rows]
+        residuals[rows] -= (by_errors @ flange[units][:, :, None])[:, :, 0]
+        jacobian[inside] -= by_errors @ taken[units]
+        gone[rows] = by_errors @ left[units] @ np.swapaxes(by_errors, 1, 2)
+        spread = (jacobian.reshape(-1, jacobian.shape[2]) @ known).reshape(jacobian.shape)
+        gone[block.rows] += spread @ np.swapaxes(jacobian, 1, 2)
     squares = np.einsum("ni,nij,nj->n", residuals, weights, residuals)
     directions = np.where(problem.observations.has_rotation, 6.0, 3.0)
     return squares, directions - np.einsum("nij,nji->n", weights, gone)

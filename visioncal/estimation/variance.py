@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -15,6 +16,12 @@ _ITERATIONS = 60
 # A step changes a sigma by a factor of e at most; 1e-4 of it is far below its own uncertainty.
 _LONGEST_STEP, SETTLED = 1.0, 1e-4
 _WORST_DAMPING = 1e6
+# A step that gains less of the log-likelihood is a thousandth of the levels' own uncertainty.
+_LITTLE = 1e-6
+# Levels that all but vanish gain less than this by falling on, and fall by longer steps.
+_HARDLY, _LONGEST_FALL = 0.1, 2.0
+# A gain is rarely so many times as large as the second order has it.
+_SURELY = 3.0
 # The root of twice the log-likelihood that a 95 % interval of one unknown gives away (chi-square),
 # and how far and how exactly it is followed, in logarithms.
 _SURPRISE_95, _FIRST_WIDTH, _WIDEST, _EXACT = 1.96, 0.125, 4.0, 0.02
@@ -51,6 +58,18 @@ class Knowledge:
     gradient: FloatArray
 
 
+@dataclass(frozen=True, eq=False)
+class Likely:
+    """Negative log-likelihood at some logarithms of the sigmas, its slope and its curvature."""
+
+    value: float
+    slope: FloatArray
+    curvature: FloatArray
+
+
+Found = TypeVar("Found", bound=Likely)
+
+
 @dataclass(frozen=True)
 class RatioPrior:
     """What is known beforehand of the ratio of two sigmas, as a log-normal.
@@ -76,6 +95,7 @@ def estimate_sigmas(
     free: Mask | None = None,
     least: FloatArray | float = LEAST_SIGMA,
     settled: float = SETTLED,
+    enough: float = np.inf,
 ) -> tuple[FloatArray, float]:
     """Estimates the standard deviations of variance components.
 
@@ -96,37 +116,97 @@ def estimate_sigmas(
         free: (k,) which sigmas to estimate; the others stay at their start. All where None.
         least: Below which they are not sought: one for all, or (k,).
         settled: The step of the logarithms under which they have come to rest.
+        enough: See `most_likely`.
 
     Returns:
         (k,) standard deviations, and the negative log-likelihood there.
     """
-    limits = np.log(least), np.log(MOST_SIGMA)
-    logs = np.clip(np.log(np.maximum(start, LEAST_SIGMA)), *limits)
-    now, damping = _likelihood(residuals, jacobian, components, known, logs, prior), 1e-3
+    low = np.broadcast_to(np.log(least), start.shape)
+    logs = np.clip(np.log(np.maximum(start, LEAST_SIGMA)), low, np.log(MOST_SIGMA))
+    high = np.full(len(logs), np.log(MOST_SIGMA))
+    if free is not None:
+        low, high = np.where(free, low, logs), np.where(free, high, logs)
+
+    def at(there: FloatArray) -> Likely:
+        return _likelihood(residuals, jacobian, components, known, there, prior)
+
+    logs, found = most_likely(at, logs, low, high, settled, enough)
+    return np.asarray(np.exp(logs), dtype=float), found.value
+
+
+def most_likely(
+    at: Callable[[FloatArray], Found],
+    logs: FloatArray,
+    low: FloatArray,
+    high: FloatArray,
+    settled: float = SETTLED,
+    enough: float = np.inf,
+    little: float = _LITTLE,
+) -> tuple[FloatArray, Found]:
+    """Finds the most likely logarithms of levels, by damped steps of Newton.
+
+    Args:
+        at: The likelihood at some (k,) logarithms.
+        logs: Where to start, within the limits.
+        low: (k,) the least logarithms; what is closed is no less than its `high`.
+        high: (k,) the largest ones.
+        settled: The step under which they have come to rest, too.
+        enough: Where steps do not seem to lead below this value, the search ends.
+        little: What a step gains of the log-likelihood once they have come to rest.
+
+    Returns:
+        The logarithms, and what is found there.
+    """
+    now, damping = at(logs), 1e-3
     for _ in range(_ITERATIONS):
-        curvature = now.curvature + damping * np.eye(len(logs))
-        slope = now.slope
-        if free is not None:
-            curvature = np.where(np.outer(free, free), curvature, np.eye(len(logs)))
-            slope = np.where(free, slope, 0.0)
-        step = np.clip(-np.linalg.solve(curvature, slope), -_LONGEST_STEP, _LONGEST_STEP)
-        candidate = np.clip(logs + step, *limits)
-        moved = np.abs(candidate - logs).max()
-        if moved < settled and damping < 1.0:
-            logs = candidate
-            break
+        # What is at a limit and would go on is held there.
+        free = np.where(now.slope > 0.0, logs > low, logs < high) & (low < high)
+        curvature = now.curvature + damping * np.diag(np.maximum(np.diag(now.curvature), 1.0))
+        hardly = (now.slope > 0.0) & (now.slope < _HARDLY)
+        falling = free & hardly & (np.diag(now.curvature) < 2.5 * now.slope) & (damping < 1.0)
+        least = np.maximum(low - logs, np.where(falling, -_LONGEST_FALL, -_LONGEST_STEP))
+        step = _bounded_step(
+            now.slope, curvature, np.where(free, least, 0.0),
+            np.where(free, np.minimum(high - logs, _LONGEST_STEP), 0.0), falling,
+        )  # fmt: skip
+        candidate, moved = logs + step, np.abs(step).max(initial=0.0)
+        near = np.where(falling, 0.0, step)
+        gained = -float(near @ (now.slope + 0.5 * now.curvature @ near))
+        gained += 0.5 * float(now.slope[falling].sum())
+        if damping < 1.0:
+            if moved < settled or gained < little:
+                logs = candidate
+                break
+            if now.value - _SURELY * gained > enough:
+                break
         then = None
         # Of levels too far apart, one is lost in the rounding of the other.
         with suppress(np.linalg.LinAlgError):
-            then = _likelihood(residuals, jacobian, components, known, candidate, prior)
+            then = at(candidate)
         if then is not None and then.value <= now.value:
             logs, now, damping = candidate, then, max(damping / 10, 1e-6)
-        else:
-            damping *= 10
+        else:  # Half a step at most is next.
+            damping = max(10.0 * damping, 1.0)
         # Where no step goes down any more, rounding is all that is left.
         if moved < settled or damping > _WORST_DAMPING:
             break
-    return np.asarray(np.exp(logs), dtype=float), now.value
+    return logs, now
+
+
+def _bounded_step(
+    slope: FloatArray, curvature: FloatArray, least: FloatArray, most: FloatArray, falling: Mask
+) -> FloatArray:
+    """Newton's step (k,) within bounds: where some of it would leave them, the rest follows."""
+    step, bound = np.where(falling, least, 0.0), falling | (least == most)
+    for _ in range(len(slope)):
+        rest = ~bound
+        left = -(slope + curvature @ np.where(bound, step, 0.0))[rest]
+        step[rest] = np.linalg.solve(curvature[np.ix_(rest, rest)], left)
+        beyond = rest & ((step < least) | (step > most))
+        if not beyond.any():
+            break
+        step, bound = np.clip(step, least, most), bound | beyond
+    return step
 
 
 def profile_interval(
@@ -172,15 +252,6 @@ def profile_interval(
     return crossing(-1.0, 0.0), crossing(1.0, float(np.exp(middle + _WIDEST)))
 
 
-@dataclass(frozen=True, eq=False)
-class _Likelihood:
-    """Negative log-likelihood at some logarithms of the sigmas, its slope and its curvature."""
-
-    value: float
-    slope: FloatArray
-    curvature: FloatArray
-
-
 def _likelihood(
     residuals: FloatArray,
     jacobian: FloatArray,
@@ -188,7 +259,7 @@ def _likelihood(
     known: Knowledge,
     logs: FloatArray,
     prior: RatioPrior | None,
-) -> _Likelihood:
+) -> Likely:
     sigmas, columns = np.exp(logs), jacobian.shape[-1]
     total = components.total(sigmas)
     weights = np.linalg.inv(total)
@@ -225,11 +296,11 @@ def _likelihood(
     if np.linalg.eigvalsh(curvature)[0] <= 0.0:
         curvature = expected
     if prior is None:
-        return _Likelihood(value, slope, curvature)
+        return Likely(value, slope, curvature)
     lean = np.zeros((len(prior.places), len(logs)))
     for row, (first, second) in zip(lean, prior.places, strict=True):
         row[first], row[second] = -1.0 / prior.log_sigma, 1.0 / prior.log_sigma
     offset = lean @ logs - np.log(prior.ratio) / prior.log_sigma
-    return _Likelihood(
+    return Likely(
         value + 0.5 * float(offset @ offset), slope + offset @ lean, curvature + lean.T @ lean
     )
