@@ -27,7 +27,7 @@ def diff_command(
     part: PartOptions,
     as_json: AsJson = False,
 ) -> None:
-    """Tell what changed between two calibrations, and what is only noise.
+    """Show what changed between two calibrations, and what is only noise.
 
     Exit status 0, changed or not: `is_change` in the JSON says which; 2: one cannot be read.
     """

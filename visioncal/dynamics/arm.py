@@ -39,7 +39,7 @@ class ArmDynamics:
                 f"dynamics: nothing was known of the inertias of {robot.name}, so there are no "
                 "links that are bodies.",
                 culprits=[robot.name],
-                next_step="Tell mass_kg, com_m and inertia_kg_m2 of its joints, and identify "
+                next_step="State mass_kg, com_m and inertia_kg_m2 of its joints, and identify "
                 "again.",
             )
         standard = identified.consistent.values

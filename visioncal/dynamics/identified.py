@@ -175,7 +175,7 @@ class Identified:
                 f"dynamics: nothing was known of the inertias of {self.robot.name}, so there are "
                 "no standard parameters.",
                 culprits=[self.robot.name],
-                next_step="Tell mass_kg, com_m and inertia_kg_m2 of its joints.",
+                next_step="State mass_kg, com_m and inertia_kg_m2 of its joints.",
             )
         values = self.base.of(self.consistent.values)
         return np.asarray(self.base.regressor(motion) @ values + self.stribeck.torques(motion))
