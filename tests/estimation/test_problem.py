@@ -9,9 +9,11 @@ from support.problems import ROBOT_SIGMAS, away, moved, observed, pose, true_sta
 from visioncal.calibration.stages.init_network import init_network
 from visioncal.calibration.stages.pair_observations import Sighted
 from visioncal.calibration.stages.pairwise import Candidates
+from visioncal.estimation.moves import slight_move
 from visioncal.estimation.outliers import agree, settle
 from visioncal.estimation.parts import Effect, FramePrior, Noise, State
 from visioncal.estimation.solve import (
+    RepeatErrors,
     Solution,
     covariance_of,
     equations_from,
@@ -148,12 +150,35 @@ def test_equations_from_a_stop_on_are_those_of_its_observations_alone():
     cell, problem = problem_of(4, stops=6)
     fit = fit_problem(problem, true_state(cell, problem.tree))
     stops = []
-    for stop, *parts in equations_from(problem, fit):
+    for stop, *parts in equations_from(problem, fit, RepeatErrors.of(problem, fit)):
         later = problem.subset(problem.observations.stops >= stop)
         for part, whole in zip(parts, normal_equations(later, fit.state, fit.noise), strict=True):
             np.testing.assert_allclose(part, whole, atol=1e-9 * np.abs(parts[0]).max())
         stops.append(stop)
     assert stops == [5, 4, 3, 2, 1, 0]
+
+
+def still_cell(seed):
+    """A cell whose fixed cameras see fixed boards again and again, at rest."""
+    cell, problem = problem_of(seed, stops=16)
+    problem = replace(problem, with_repeats=True)
+    assert problem.repeats
+    return problem, fit_problem(problem, true_state(cell, problem.tree))
+
+
+def test_repeats_share_errors_that_a_step_does_not_pass_for():
+    problem, fit = still_cell(5)
+    errors = RepeatErrors.of(problem, fit)
+    *_, (_, information, gradient) = equations_from(problem, fit, errors)
+    size = problem.size
+    # All stops together say what the fit does: at rest, nothing of the frames pulls.
+    scale = np.sqrt(np.diag(information)[:size])
+    assert np.abs(gradient[:size] / scale).max() < 0.05
+    # With what is known of the errors, it is all the information that there is.
+    known = np.linalg.inv(errors.covariance) - information
+    np.testing.assert_allclose(known[:size], 0.0, atol=1e-6 * np.abs(information).max())
+    frames = tuple(problem.unknown)
+    assert all(slight_move(*still_cell(seed), frames) is None for seed in range(6))
 
 
 def test_the_fit_is_as_good_as_its_covariance_says():

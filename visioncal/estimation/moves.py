@@ -17,6 +17,7 @@ from visioncal.estimation.linalg import covariance_from, spectrum
 from visioncal.estimation.parts import State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import (
+    RepeatErrors,
     Solution,
     by_noise_alone,
     equations_from,
@@ -305,18 +306,17 @@ def slight_move(problem: Problem, fit: Solution, movable: Sequence[str]) -> Move
         fit: The unknowns and the noise.
         movable: Frames that may have moved.
     """
-    known = fitted_covariance(problem, fit.state, fit.noise)
-    seen = {}
+    errors, seen = RepeatErrors.of(problem, fit), {}
     for frame in movable:
         stops = np.unique(problem.observations.stops[problem.observations.involves(frame)])
         seen[frame] = set(stops[_FEWEST : 1 - _FEWEST].tolist())
     tried = int(problem.observations.stops.max()) + 1
     best, limit = None, _move_limit(problem, len(movable) * tried)
-    for stop, information, gradient in equations_from(problem, fit):
+    for stop, information, gradient in equations_from(problem, fit, errors):
         for frame in (it for it in movable if stop in seen[it]):
             at = problem.edge_columns(frame)
             across = information[at]
-            own = across[:, at] - across @ known @ across.T
+            own = across[:, at] - across @ errors.covariance @ across.T
             if spectrum(across[:, at]).ratio < _TAKEN or spectrum(own).values[0] < _TAKEN:
                 continue
             step = -covariance_from(own) @ gradient[at]

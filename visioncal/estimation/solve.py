@@ -624,23 +624,63 @@ def by_noise_alone(problem: Problem, solution: Solution) -> FloatArray:
     return np.asarray(np.sum(linear.residuals * white, axis=1))
 
 
+@dataclass(frozen=True, eq=False)
+class RepeatErrors:
+    """The errors that repeats of one still frame by another share, as q more unknowns.
+
+    Attributes:
+        jacobian: (n, 6, q) by them.
+        values: (q,) the most likely ones.
+        covariance: (p + q, p + q) of all unknowns, these last.
+    """
+
+    jacobian: FloatArray
+    values: FloatArray
+    covariance: FloatArray
+
+    @classmethod
+    def of(cls, problem: Problem, solution: Solution) -> "RepeatErrors":
+        """Finds them beside a fit at rest."""
+        state, noise, (of, members) = solution.state, solution.noise, problem.units
+        known = fitted_covariance(problem, state, noise)
+        linear, count = problem.linear(state), len(problem.repeats)
+        rows = np.flatnonzero(of >= len(members) - count) if count else np.zeros(0, np.int64)
+        places = 6 * (of[rows] - len(members) + count)[:, None] + np.arange(6)
+        jacobian = np.zeros((len(problem), 6, 6 * count))
+        jacobian[rows[:, None, None], np.arange(6)[:, None], places[:, None]] = linear.by_errors[
+            rows, :, :6
+        ]
+        weighted = np.linalg.solve(problem.covariance(noise)[rows], jacobian[rows])
+        prior = problem.error_covariance(noise)[len(members) - count :, :6, :6]
+        among = block_diag(*np.linalg.inv(prior)) if count else np.zeros((0, 0))
+        inverse = np.linalg.inv(among + np.einsum("nip,niq->pq", weighted, jacobian[rows]))
+        values = -inverse @ np.einsum("nip,ni->p", weighted, linear.residuals[rows])
+        follow = -inverse @ np.einsum("nip,niq->pq", weighted, linear.jacobian[rows])
+        beside = known @ follow.T
+        whole = np.block([[known, beside], [beside.T, inverse + follow @ beside]])
+        return cls(jacobian, values, whole)
+
+
 def equations_from(
-    problem: Problem, solution: Solution
+    problem: Problem, solution: Solution, errors: RepeatErrors
 ) -> Iterator[tuple[int, FloatArray, FloatArray]]:
-    """Information (p, p) and gradient (p,) of the observations from each stop on, the last first.
+    """Information and gradient of the observations from each stop on, the last first.
 
     Args:
-        problem: The observations, without errors that repeats share over stops.
+        problem: The observations.
         solution: The unknowns and the noise.
+        errors: What repeats share, which come last among the unknowns.
 
     Yields:
-        Each stop with what it and all after it say: what is known besides does not count.
+        Each stop with what it and all after it say, (p + q, p + q) and (p + q,): what is known
+        besides does not count.
     """
     state, noise = solution.state, solution.noise
     alone, shared = problem.covariance(noise), problem.error_covariance(noise)
-    linear = problem.linear(state)
-    stops, of = problem.observations.stops, problem.units[0]
-    every = np.concatenate([linear.jacobian, linear.residuals[:, :, None]], axis=2)
+    linear, stops = problem.linear(state), problem.observations.stops
+    of = np.where(errors.jacobian.any(axis=(1, 2)), -1, problem.units[0])
+    residuals = linear.residuals + errors.jacobian @ errors.values
+    every = np.concatenate([linear.jacobian, errors.jacobian, residuals[:, :, None]], axis=2)
     total = np.zeros((every.shape[2], every.shape[2]))
     for stop in np.unique(stops)[::-1].tolist():
         mine = np.flatnonzero(stops == stop)
