@@ -55,6 +55,9 @@ class ArmErrors:
             that is the noise of the fit.
         look: (2,) both together as single stops show them, which is the noise of the fit; of the
             errors, what looks the same at all stops is not in it. None of links.
+        away: (2, 2) what postures err by of which the fit has seen none near: of rotation [rad] and
+            place [m], as found and as predicted; see `pose_errors.left_out_clusters`. None where
+            that is not known.
     """
 
     basis: FloatArray
@@ -63,6 +66,7 @@ class ArmErrors:
     of_links: bool
     white: FloatArray | None = None
     look: FloatArray | None = None
+    away: FloatArray | None = None
 
     @property
     def is_significant(self) -> bool:

@@ -22,11 +22,12 @@ from scipy.linalg import lapack
 
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.estimation.arm import TWIST_UNITS, ArmErrors, pose_basis, stops_of
-from visioncal.estimation.linalg import covariance_root
+from visioncal.estimation.arm import TWIST_UNITS, ArmErrors, pose_basis, rows_of, stops_of
+from visioncal.estimation.budget import less_noise
+from visioncal.estimation.linalg import covariance_among, covariance_root
 from visioncal.estimation.parts import Effect, Noise, State
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.solve import RATIO_PRIOR, robot_likelihood
+from visioncal.estimation.solve import RATIO_PRIOR, normal_equations, robot_likelihood
 from visioncal.estimation.variance import LEAST_SIGMA, MOST_SIGMA, Knowledge
 
 # Postures are as far apart by so much of a place as by a radian of a direction [m].
@@ -44,6 +45,8 @@ _MOST_ROWS = 360
 _MOST_BLOCKS = 5
 # Columns that stand for the errors of all stops; what they leave counts as noise.
 _MOST_COLUMNS = 360
+# Parts of the postures that are left out in turn.
+_CLUSTERS = 5
 # Variances of so little of the whole are rounding.
 _FACTORED = 1e-6
 # A process begins at such a share of the noise, and is none at the other.
@@ -136,7 +139,71 @@ def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -
     squares = sum((weight * model.white**2 for model, weight in pairs), left)
     basis = np.zeros((len(poses), 6, columns.shape[2]))
     basis[stood] = columns
-    return ArmErrors(basis, 1.0, gain, of_links=False, white=np.sqrt(squares), look=levels)
+    found = ArmErrors(basis, 1.0, gain, of_links=False, white=np.sqrt(squares), look=levels)
+    return replace(found, away=left_out_clusters(problem, state, noise, robot, found))
+
+
+def left_out_clusters(
+    problem: Problem, state: State, noise: Noise, robot: str, errors: ArmErrors
+) -> FloatArray | None:
+    """What looks err by whose postures are far from those in the fit.
+
+    The stops are parted by posture, and each part is predicted from a fit to the others: to first
+    order, and with the noise and the errors as they were found from all.
+
+    Args:
+        problem: The observations.
+        state: The answer under white noise.
+        noise: Its levels.
+        robot: The robot.
+        errors: Its errors.
+
+    Returns:
+        (2, 2) roots of mean squares of rotation [rad] and place [m], as found and as predicted;
+        None of too few stops.
+    """
+    stops, rows = stops_of(problem, robot), np.flatnonzero(rows_of(problem, robot))
+    if len(stops) < 2 * _CLUSTERS:
+        return None
+    of_stop = posture_clusters(problem.poses[robot][stops])
+    clusters = of_stop[np.searchsorted(stops, problem.observations.stops[rows])]
+    widened = problem.with_effects([*problem.effects, errors.effect(robot)])
+    there = State(state.edges, np.append(state.values, np.zeros(errors.basis.shape[2])))
+    size, squares = problem.size, np.zeros((2, 2, 3))
+    place, white = problem.robots.index(robot), errors.white
+    beside = noise if white is None else replace(noise, robots=noise.robots.copy())
+    if white is not None:
+        beside.robots[place] = white
+    for cluster in range(_CLUSTERS):
+        held = np.zeros(len(problem), dtype=bool)
+        held[rows[clusters == cluster]] = True
+        rest, left_out = widened.subset(~held), widened.subset(held)
+        information, gradient = normal_equations(rest, there, noise)
+        fitted = covariance_among(information[:size, :size], problem.moving)
+        linear = left_out.linear(there)
+        jacobian, by_arm = np.split(linear.jacobian, [size], axis=2)
+        residuals = linear.residuals - jacobian @ (fitted @ gradient[:size])
+        by_arm = errors.sigma * (by_arm - jacobian @ (fitted @ information[:size, size:]))
+        if white is not None:
+            fitted = fitted + less_noise(problem.subset(~held), state, noise, robot, white)
+        predicted = left_out.total_covariance(linear, beside)
+        predicted += by_arm @ np.swapaxes(by_arm, 1, 2)
+        predicted += jacobian @ fitted @ np.swapaxes(jacobian, 1, 2)
+        squares[0] += np.sum(residuals**2, axis=0).reshape(2, 3)
+        squares[1] += np.sum(np.diagonal(predicted, axis1=1, axis2=2), axis=0).reshape(2, 3)
+    return np.asarray(np.sqrt(squares.sum(axis=2) / len(rows)))
+
+
+def posture_clusters(poses: FloatArray) -> IntArray:
+    """(s,) parts of (s, 4, 4) postures: each belongs to the nearest of five that are far apart.
+
+    These are chosen by farthest-point clustering (Gonzalez 1985).
+    """
+    away = _squared_distances(poses)
+    seeds = [int(np.argmax(away.sum(axis=1)))]
+    for _ in range(_CLUSTERS - 1):
+        seeds.append(int(np.argmax(away[seeds].min(axis=0))))
+    return np.asarray(np.argmin(away[seeds], axis=0))
 
 
 def _models(poses: FloatArray, white: FloatArray) -> Iterator[_Model]:

@@ -239,7 +239,8 @@ class Alignment(CellSections):
             raise DataError(
                 f"{step.frame} moves with robot {step.robot!r}: its pose is needed.",
                 culprits=[step.frame],
-                next_step=f'Give poses={{"{step.robot}": base_from_flange}}.',
+                next_step="Name frames that no robot moves against each other; or in Python, give "
+                f'poses={{"{step.robot}": base_from_flange}}.',
             )
         return np.asarray(poses[step.robot], dtype=float)
 

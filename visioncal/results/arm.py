@@ -348,6 +348,11 @@ class ArmErrorsResult(Section):
         estimated: Whether they were estimated along with the transforms.
         of: The `flange` where joints are not known: by so much, beside its noise, it errs from
             posture to posture. None where the sizes are those of links.
+        away_mm: What looks at postures away from the views err by, in place (rms), as parts of the
+            postures that were left out in turn show it; None where that is not known [mm].
+        away_deg: The same in rotation [deg].
+        away_predicted_mm: What was predicted of that [mm].
+        away_predicted_deg: The same in rotation [deg].
     """
 
     sigma_mm: float
@@ -355,6 +360,10 @@ class ArmErrorsResult(Section):
     likelihood_ratio: float
     estimated: bool
     of: Literal["flange"] | None = None
+    away_mm: float | None = None
+    away_deg: float | None = None
+    away_predicted_mm: float | None = None
+    away_predicted_deg: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -520,12 +520,22 @@ def _size_of(errors: ArmErrors) -> ArmErrorsResult:
     """The size of errors, as a section of a calibration."""
     if errors.look is not None and errors.white is not None:
         turned, shifted = np.sqrt(np.maximum(errors.look**2 - errors.white**2, 0.0))
-        return ArmErrorsResult(
+        found = ArmErrorsResult(
             sigma_mm=1e3 * float(shifted),
             sigma_deg=float(np.rad2deg(turned)),
             likelihood_ratio=errors.gain,
             estimated=False,
             of="flange",
+        )
+        if errors.away is None:
+            return found
+        (deg, mm), (predicted_deg, predicted_mm) = (errors.away * [np.rad2deg(1.0), 1e3]).tolist()
+        return replace(
+            found,
+            away_mm=mm,
+            away_deg=deg,
+            away_predicted_mm=predicted_mm,
+            away_predicted_deg=predicted_deg,
         )
     return ArmErrorsResult(
         sigma_mm=1e3 * LEVER_M * errors.sigma,

@@ -203,8 +203,9 @@ def _board_line(board: BoardResult) -> str:
 
 def _arm_line(arm: ArmErrorsResult) -> str:
     treated = "were estimated along" if arm.estimated else "could not be estimated along"
+    what = "its links are" if arm.of is None else "its flange is"
     return (
-        f"Residuals follow the arm's posture: its links are typically off by {arm.sigma_mm:.2g} mm "
+        f"Residuals follow the arm's posture: {what} typically off by {arm.sigma_mm:.2g} mm "
         f"and {arm.sigma_deg:.2g} deg (likelihood ratio {arm.likelihood_ratio:.0f}, noise stays "
         f"under 15). These errors {treated}."
     )

@@ -110,11 +110,24 @@ def arm_facts(arm: ArmErrorsResult) -> tuple[Fact, ...]:
         if arm.estimated
         else ("not taken out", "no joint angles with a known robot model: only their size is known")
     )
+    away = ()
+    if arm.away_mm is not None and arm.away_deg is not None:
+        predicted = (
+            f"{significant(arm.away_predicted_mm)} mm, {significant(arm.away_predicted_deg)} deg"
+        )
+        away = (
+            Fact(
+                "at postures away from the views it errs by",
+                f"{significant(arm.away_mm)} mm, {significant(arm.away_deg)} deg",
+                f"parts of the postures left out in turn; predicted {predicted}",
+            ),
+        )
     return (
         Fact(
-            "a link is typically off by",
+            f"{'the flange' if arm.of else 'a link'} is typically off by",
             f"{significant(arm.sigma_mm)} mm, {significant(arm.sigma_deg)} deg",
         ),
+        *away,
         Fact("likelihood ratio", f"{arm.likelihood_ratio:.0f}", "noise alone stays under 15"),
         Fact("its errors were", *treated),
     )
