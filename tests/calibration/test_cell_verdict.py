@@ -9,6 +9,7 @@ from support.problems import observed, pose, world
 from support.whole_cells import FLOOR, OPTIONS, PLATE, part, recorded
 
 from visioncal.calibration.pipeline import align
+from visioncal.calibration.pipeline.checkup import doctor
 from visioncal.core.errors import DegenerateError
 from visioncal.session import MemoryImages, Session
 from visioncal.simulation import (
@@ -110,6 +111,23 @@ def test_one_wrong_pose_of_a_robot_is_named(session):
     why = {it.view: it.reason for it in found.sights if not it.used}
     assert sorted(why) == mine
     assert all(f"the pose of robot b at stop {stop} is wrong" in it for it in why.values())
+
+
+def test_a_robot_whose_poses_are_misread_is_named_first(session):
+    def turn(view, row):
+        # w first: what other programs write into the same columns.
+        if view.text.get("robot") == "b" and row["qx"]:
+            turned = [row[it] for it in ("qw", "qx", "qy", "qz")]
+            row.update(zip(POSE[3:], turned, strict=True))
+        row.update({it: "" for it in row if it.endswith("_rad")})
+
+    misread = rewritten(session, turn)
+    with pytest.raises(DegenerateError) as refused:
+        align(misread)
+    words = "Robot b: With the robot's rotations as a quaternion w, x, y, z, the chain closes"
+    assert str(refused.value).startswith(words)
+    assert "rows of robot b in views.csv" in refused.value.next_step
+    assert words in doctor(misread).findings[0].words
 
 
 def test_poses_of_a_robot_that_are_exchanged_are_named(session):

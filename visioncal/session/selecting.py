@@ -117,7 +117,7 @@ def _document(session: "Session", chosen: Chosen) -> dict[str, Any]:
         ("target", chosen.target.partition("_")[2]),
     ):
         table = _table(session.document, kind, name)
-        if table is not None:
+        if table:
             given[kind] = table
     clock = declaration.clocks.get(chosen.camera.partition("_")[2])
     if clock is not None:

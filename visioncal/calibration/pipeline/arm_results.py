@@ -85,7 +85,7 @@ def doubts_of_arms(
     """Finds what speaks against the robots."""
     for robot, arm in arms.items():
         for it in (*_doubts(arm, found.get(robot), asked), *results[robot].doubts()):
-            yield it.of(_called(arms, robot))
+            yield it if it.kind == "moved_at_once" else it.of(_called(arms, robot))
 
 
 def notes_on_arms(arms: Mapping[str, RobotArm], results: Mapping[str, ArmFound]) -> Iterator[str]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from visioncal.calibration.pipeline.guess_inputs import reading_hint
+from visioncal.calibration.pipeline.guess_inputs import reading_hint, readings_in_cell
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.running import known_at_first, unseen_cause
 from visioncal.calibration.pipeline.solving import first_agreement
@@ -127,6 +127,8 @@ def _findings(known: RunState, error: VisioncalError | None) -> Iterator[Finding
     hint = reading_hint(known) if error is None and known.mount is not None else None
     if hint is not None:
         yield hint
+    if error is None and known.mount is None:
+        yield from readings_in_cell(known)
     if error is not None and cause is None:
         yield _refused("refused", error)
     said = () if cause is None else (cause.kind,)
@@ -253,10 +255,10 @@ def _seen(known: RunState) -> Iterator[str]:
         there = sum(session.images.exists(it) for it in images)
         yield f"{there} of {len(images)} images"
     for look in known.cameras.values():
-        blur = [it.blur_px for it in look.corners.values() if np.isfinite(it.blur_px)]
+        blur = [it.blur_px for it in look.corners.values() if it.blur_px > 0.0]
         size = "" if look.resolution is None else " of {} x {} px".format(*look.resolution)
         edges = f", edges {np.median(blur):.1f} px wide" if blur else ""
-        yield f"the board in {len(look.corners)} images{size}{edges}"
+        yield f"the board in {len(look.corners)} {'images' if images else 'views'}{size}{edges}"
     if known.base_from_flange:
         yield f"{len(known.base_from_flange)} poses of the robot"
     if session.streams:

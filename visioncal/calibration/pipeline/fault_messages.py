@@ -11,7 +11,7 @@ from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
 from visioncal.calibration.stages.validate import apart
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
-from visioncal.core.transforms import distances, mean_transform, pose_difference
+from visioncal.core.transforms import distances, invert, mean_transform, pose_difference
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.core.verdict import CALIBRATE, Finding, Step, look_at
 from visioncal.estimation.problem import Problem
@@ -209,9 +209,18 @@ def _pushed_bases(solved: Solved) -> list[PoseFault]:
     return found
 
 
-def _moved_by(solved: Solved, base: str, rows: IntArray) -> str:
-    """By how much observations ask for a base elsewhere, in words; empty where they disagree."""
+def _moved_by(solved: Solved, base: str, rows: IntArray, of: FloatArray | None = None) -> str:
+    """By how much observations ask for a base elsewhere, in words; empty where they disagree.
+
+    Args:
+        solved: The fit.
+        base: The frame of the base.
+        rows: (m,) the observations.
+        of: (4, 4) what of the base is meant, in its frame; its own origin where None.
+    """
     asked = solved.agreed.problem.change_of(base, solved.agreed.fit.state)[rows]
+    if of is not None:
+        asked = invert(of) @ asked @ of
     mean = mean_transform(asked)
     shift_mm, turn_deg = pose_difference(np.eye(4), mean)
     scatter_mm = 1e3 * float(np.median(distances(asked, mean)[0]))
@@ -230,12 +239,13 @@ def _wrong_poses(solved: Solved, explained: set[int]) -> Iterator[PoseFault]:
             rows = np.flatnonzero(mine & (stops == stop))
             if len(rows) < _FEWEST or used[rows].any() or not explained.isdisjoint(rows.tolist()):
                 continue
-            moved = _moved_by(solved, branch.parent, rows)
+            flange = problem.poses[branch.robot][stop]
+            moved = _moved_by(solved, branch.parent, rows, flange)
             if moved:
                 words = (
                     f"Robot {branch.robot} did not stand at stop {solved.cell.stops[stop]} where "
                     f"its pose says: all {len(rows)} views by way of it disagree with the others, "
-                    f"as if it had been moved by {moved}, and were left out "
+                    f"as if the flange had been moved by {moved}, and were left out "
                     f"({_views(solved, rows.tolist())})."
                 )
                 views = _numbers(solved, rows.tolist())

@@ -1,5 +1,6 @@
 """Which reading of a session's poses is right: measured from its images, without its robot."""
 
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -18,7 +19,7 @@ from visioncal.calibration.stages.judge import is_scattered
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.errors import VisioncalError
 from visioncal.core.types import FloatArray, Progress
-from visioncal.core.verdict import Finding
+from visioncal.core.verdict import Finding, Step
 from visioncal.estimation.chain import chain
 from visioncal.robot import Robot
 from visioncal.session import Session
@@ -144,6 +145,33 @@ def reading_hint(seen: RunState) -> Finding | None:
         return None
     is_mirrored = guess.best.hypothesis.robot.signs == "mirror"
     return read_otherwise(guess.sentence, is_mirrored=is_mirrored)
+
+
+def readings_in_cell(known: RunState) -> Iterator[Finding]:
+    """Says which robots of a whole cell have poses that only another reading explains.
+
+    Each is looked at with one camera and target alone, those of most views first.
+
+    Args:
+        known: What is known of the cell; its lenses and corners are not used.
+    """
+    session = known.session
+    views = Counter((it.seer, it.seen) for it in session.observations)
+    for robot in session.robots:
+        for (camera, target), _ in views.most_common():
+            try:
+                part = RunState(session.of(camera, robot, target), None, known.threads)
+                for stage in STAGES[: [it.name for it in STAGES].index("joints") + 1]:
+                    part = stage.run(part)
+            except VisioncalError:
+                # This robot does not part them, or there is too little to see.
+                continue
+            hint = None if closes_as_declared(part) else reading_hint(part)
+            if hint is not None:
+                words = f"Robot {robot}: {hint.words}"
+                do = Step(f"Correct the rows of robot {robot} in views.csv, and calibrate again.")
+                yield replace(hint, words=words, do=do)
+            break
 
 
 def closes_as_declared(seen: RunState) -> bool:

@@ -258,7 +258,7 @@ def check_answer(known: RunState) -> None:
             "belong together."
         )
 
-    scene = Scene("align", names, motion, advice)
+    scene = Scene("cell", names, motion, advice)
     check_determined(part, fit.state, fit.noise, scene, pixel_px, looks=looks)
 
 

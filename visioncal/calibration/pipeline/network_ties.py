@@ -52,7 +52,7 @@ def untied_robots(cell: Cell, lost: Collection[str], *, seen: bool = False) -> N
                 for it in flanges
             ]
     raise DegenerateError(
-        f"align: nothing ties {some_of(untied)} to {cell.reference}: {why}.",
+        f"cell: nothing ties {some_of(untied)} to {cell.reference}: {why}.",
         culprits=parts or untied,
         next_step=" ".join(words),
     )
@@ -134,7 +134,7 @@ def ambiguous_error(cell: Cell, frames: Sequence[str]) -> DegenerateError:
     """Words that frames are tied by boards alone that look the same when turned."""
     boards = sorted({it.seen for it in cell.rows if it.seer in frames or it.seen in frames})
     return DegenerateError(
-        f"align: {some_of(frames)} may be in two places: {some_of(boards)} looks the same after "
+        f"cell: {some_of(frames)} may be in two places: {some_of(boards)} looks the same after "
         "half a turn, and no other observation shows which way round it was seen.",
         culprits=list(frames),
         next_step=f"Let {some_of(frames)} see a second board as well, or use a ChArUco board or a "

@@ -4,7 +4,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from visioncal.calibration.pipeline.guess_inputs import closes_as_declared, is_suspect, reading_hint
+from visioncal.calibration.pipeline.guess_inputs import (
+    closes_as_declared,
+    is_suspect,
+    reading_hint,
+    readings_in_cell,
+)
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
@@ -153,7 +158,10 @@ def run_steps(known: RunState) -> RunState:
                 if cause is not None:
                     raise _because(error.with_culprits(more), cause) from error
                 if known.mount is None:
-                    raise
+                    hint = next(readings_in_cell(known), None)
+                    if hint is None:
+                        raise
+                    raise _because(error, hint) from error
                 raise _with_hint(error.with_culprits(more), seen) from error
             # Joints that are misread explain themselves, and would mislead a guess about poses.
             if stage.name == "joints" and known.mount is not None:

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from visioncal.calibration.stages.need import Picks
-from visioncal.core.limits import NeedLimits
+from visioncal.core.limits import CalibrationLimits, NeedLimits
 from visioncal.core.number_format import figure, percent
 from visioncal.core.verdict import (
     GOOD_FOR,
@@ -180,8 +180,8 @@ def ranked(
     """
     found = _tested(doubts, left_out_mm)
     unmet = met is not None and met.probability < NeedLimits.probability[0]
-    too_large = unmet or (met is None and any(it.until_mm == 0.0 for it in doubts))
-    if too_large and picks:
+    too_large = met is None and any(it.good_for_mm > CalibrationLimits.sigma_mm[0] for it in picks)
+    if picks and (unmet or (too_large and any(it.until_mm == 0.0 for it in doubts))):
         known = {it.kind for it in found if it.probability}
         # What moved is in the arm's errors by posture and time, too, which are no cause then.
         known |= {"arm_errors"} if known & {*_MOVED} else set()

@@ -60,7 +60,13 @@ def misfits(
                 step = None
             if arm and crept and crept.mahalanobis_sq < arm.gain:
                 crept = None
-            found[robot] = ResidualTest(alike, None if step else crept, step)
+            if step:
+                # Before and after it, neighbours err alike because of it. Frames are those of all
+                # robots: what moved is said once.
+                known = any(it.step for it in found.values())
+                found[robot] = ResidualTest(None, None, None if known else step)
+            else:
+                found[robot] = ResidualTest(alike, crept)
     return found
 
 
@@ -120,8 +126,7 @@ def doubts(found: ResidualTest, arm: ArmErrors | None, *, calibrated: bool) -> I
             f"{_size(moved.moved_m, moved.moved_rad)}.",
             Step("Fasten base and target, let the arm warm up, and record again."),
         )
-    # Before and after a step, neighbours err alike because of it.
-    if alike is not None and alike.is_significant and found.step is None:
+    if alike is not None and alike.is_significant:
         yield Finding(
             "correlated_errors",
             f"Neighbouring stops err alike: leaving them out in blocks moves the answer "
@@ -137,13 +142,17 @@ def _size(shift_m: float, turn_rad: float) -> str:
 
 def _of_looks(arm: ArmErrors, turned: float, shifted: float) -> Finding:
     """What an arm does wrong whose joints are not known, by how far [rad, m] a look errs."""
+    away = ""
+    if arm.away is not None:
+        there, predicted = (_size(float(place), float(turn)) for turn, place in arm.away)
+        away = f", at postures away from them by {there} (left out in turn; predicted {predicted})"
     return Finding(
         "arm_errors",
         "Residuals follow the arm's posture, or last from stop to stop (likelihood ratio "
         f"{arm.gain:.0f}, noise stays under {SIGNIFICANT:.0f}): a look near the views errs by "
-        f"{_size(shifted, turned)} (rms). More views will not help: joint angles or a kinematic "
-        "calibration of the arm will. What of its errors looks the same in all views is in no "
-        "residual, and counts in the covariance.",
+        f"{_size(shifted, turned)} (rms){away}. More views will not help: joint angles or a "
+        "kinematic calibration of the arm will. What of its errors looks the same in all views is "
+        "in no residual, and counts in the covariance.",
         NO_JOINTS,
         until_mm=0.0,
         mahalanobis_sq=arm.gain,

@@ -342,5 +342,6 @@ def _too_vague(known: RunState, stops: int) -> DataError:
         f"session {known.session.name!r}: its {stops} usable stop{'s' if stops != 1 else ''} "
         "of the robot do not show where camera and board are, not even roughly.",
         culprits=[f"session {known.session.name!r}"],
-        next_step="Give rough guesses of both transforms.",
+        next_step="Give rough guesses of both, in mm and degrees: --cam 'X Y Z RX RY RZ' --board "
+        "'X Y Z RX RY RZ'.",
     )
