@@ -48,7 +48,7 @@ def misfits(
         fit: Their fit, at rest.
         errors: Those of arms whose joints are not known, by the robot.
     """
-    found = {}
+    found: dict[str, ResidualTest] = {}
     for robot in problem.robots:
         if len(stops_of(problem, robot)) >= _FEWEST_STOPS:
             fitted = (problem, fit.state, fit.noise, robot)

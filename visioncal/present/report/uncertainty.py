@@ -110,7 +110,7 @@ def arm_facts(arm: ArmErrorsResult) -> tuple[Fact, ...]:
         if arm.estimated
         else ("not taken out", "no joint angles with a known robot model: only their size is known")
     )
-    away = ()
+    away: tuple[Fact, ...] = ()
     if arm.away_mm is not None and arm.away_deg is not None:
         predicted = (
             f"{significant(arm.away_predicted_mm)} mm, {significant(arm.away_predicted_deg)} deg"
