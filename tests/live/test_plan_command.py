@@ -284,6 +284,7 @@ def test_advice_names_no_command_that_refuses_for_want_of_a_robot(one_axis, tmp_
     planned = visioncal("plan", bare, "--add", 5, "-o", tmp_path / "plan")
     assert planned.status == 2
     assert "([robot] model), or by --robot" in planned.err
+    assert "model in [robots.a]" in planned.err
 
 
 def test_a_folder_without_any_recording_is_refused_by_review(tmp_path):

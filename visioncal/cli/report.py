@@ -93,9 +93,9 @@ def _recompute(stored: Stored) -> None:
     """Calibrates once more, and ends with what came out."""
     from visioncal.calibration.verification.recompute import recompute
 
-    if stored.session is None or stored.calibration.cell is not None:
+    if stored.session is None:
         raise DataError(
-            stored.note or "A whole cell cannot be recomputed here.",
+            stored.note,
             culprits=["--recompute"],
             next_step="Name an output folder of visioncal calibrate, with its recording.rrd.",
         )

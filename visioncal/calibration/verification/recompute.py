@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from visioncal.calibration.pipeline import run
+from visioncal.calibration.pipeline import calibrate
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import pose_difference
 from visioncal.core.types import Progress
@@ -10,7 +10,16 @@ from visioncal.results import Calibration, to_document
 from visioncal.session import Session
 
 # What is computed; the rest is when, by which version, and in which words.
-_NUMBERS = ("transforms", "joint_covariance", "camera", "noise", "views", "rms", "validation")
+_NUMBERS = (
+    "transforms",
+    "joint_covariance",
+    "camera",
+    "cameras",
+    "noise",
+    "views",
+    "rms",
+    "validation",
+)
 
 
 @dataclass(frozen=True)
@@ -33,13 +42,13 @@ def recompute(
 
     Args:
         calibration: The result.
-        session: What was recorded; of one camera and one robot.
+        session: What was recorded.
         progress: Told of long work.
 
     Raises:
         VisioncalError: It cannot be calibrated.
     """
-    again = run(session, progress=progress).calibration
+    again = calibrate(session, progress=progress)
     before, after = to_document(calibration), to_document(again)
     differing = [it for it in _NUMBERS if before.get(it) != after.get(it)]
     if not differing:

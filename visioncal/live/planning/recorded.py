@@ -323,7 +323,7 @@ def _away(edges: FloatArray, guess: Guess | None) -> FloatArray:
 def _missing(known: RunState) -> DataError:
     session, missing = known.session, []
     if known.robot is None:
-        missing.append("a model of its robot ([robot] model)")
+        missing.append("a model of its robot, which says where the arm reaches")
     if not session.boards:
         missing.append("a board (target)")
     if known.pixel_px is None or not known.scenes:
@@ -331,7 +331,8 @@ def _missing(known: RunState) -> DataError:
     return DataError(
         f"session {session.name!r}: stops cannot be added to it without {' and '.join(missing)}.",
         culprits=[f"session {session.name!r}"],
-        next_step="Name the arm in session.toml ([robot] model), or by --robot."
+        next_step="Name the arm in session.toml ([robot] model), or by --robot; that of a whole "
+        "cell in its own table, as model in [robots.a]."
         if known.robot is None
         else "",
     )
