@@ -99,8 +99,10 @@ def estimate_intrinsics(
         )
     stack = CornerStack.of(corners, numbered_positions(targets))
     with one_blas_thread():
-        coefficients = 4 if model == "fisheye" else 8 if options.coefficients == 8 else 5
-        fit = _first_fit(stack, model, resolution, coefficients)
+        fit = _first_fit(stack, model, resolution)
+        if model == "brown" and options.coefficients == 8:
+            # From the polynomial: from nowhere, a pole and a zero may cancel inside the image.
+            fit = _fit(stack, _padded(fit.camera), fit.cam_from_target)
         reasons: dict[int, str] = {}
         for _ in range(_ROUNDS):
             passed = gate(stack, fit.residuals)
@@ -129,11 +131,10 @@ def _fit(stack: CornerStack, camera: Camera, poses: FloatArray) -> BundleFit:
     return fit_bundle(stack, camera, poses, sigma)
 
 
-def _first_fit(
-    stack: CornerStack, model: CameraKind, resolution: tuple[int, int], coefficients: int
-) -> BundleFit:
+def _first_fit(stack: CornerStack, model: CameraKind, resolution: tuple[int, int]) -> BundleFit:
     """Fits from Zhang's start and from a row of focal lengths; the first good one wins."""
     best: BundleFit | None = None
+    coefficients = 4 if model == "fisheye" else 5
     for focal in _focal_starts(stack, resolution):
         width, height = resolution
         matrix = np.array([focal, focal, (width - 1) / 2, (height - 1) / 2])
