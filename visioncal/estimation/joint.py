@@ -168,7 +168,11 @@ def _settled(side: Side, fitted: Fitted) -> Fitted:
         sigma = np.sqrt(np.diag(fitted.covariance())[fitted.columns])
         if np.all(np.abs(fitted.change) <= _SETTLED * sigma):
             break
-        fitted = _fitted(side, _stepped(fitted), fitted.frames, fitted.others)
+        seen = _stepped(fitted)
+        if seen is fitted.seen:
+            # The corners follow no part of the step: another round would ask for the same.
+            break
+        fitted = _fitted(side, seen, fitted.frames, fitted.others)
     return fitted
 
 

@@ -12,6 +12,8 @@ from visioncal.estimation.linalg import damped_step
 _ITERATIONS = 30
 # A step [rad or m] so small that the next, some hundred times smaller, is nothing beside any noise.
 _SETTLED = 1e-6
+# Views whose step is of rounding no longer go along with others.
+_AT_REST = 1e-8
 _START_DAMPING = 1e-6
 # At rest, costs differ by rounding: that is no reason to stay.
 _ROUNDING = 1e-12
@@ -43,17 +45,33 @@ def fit_poses(stack: CornerStack, camera: Camera, cam_from_target: FloatArray) -
     Returns:
         The poses with their information.
     """
-    poses = cam_from_target
-    damping = np.full(len(poses), _START_DAMPING)
+    damping = np.full(len(cam_from_target), _START_DAMPING)
+    return _descended(stack, camera, cam_from_target, damping, _ITERATIONS)
+
+
+def _descended(
+    stack: CornerStack, camera: Camera, poses: FloatArray, damping: FloatArray, iterations: int
+) -> PoseFit:
+    """Takes so many steps at most; few views that go on longer than the others go on alone."""
     now = reproject(stack, camera, poses, lens=False)
     cost = stack.sum_by_view(np.sum(now.residuals**2, axis=1))
     information, gradient = _normal_equations(stack, now)
-    for _ in range(_ITERATIONS):
+    for done in range(iterations):
         step = damped_step(information, gradient, damping[:, None])
         candidate = poses @ exp(step)
         if np.all(np.abs(step) < _SETTLED):
             poses = candidate
             break
+        moving = np.any(np.abs(step) >= _AT_REST, axis=1)
+        if 2 * moving.sum() <= len(moving):
+            corners, residuals = moving[stack.view_of], now.residuals.copy()
+            rest = _descended(
+                stack.keep(corners), camera, poses[moving], damping[moving], iterations - done
+            )
+            poses = candidate
+            poses[moving], information[moving] = rest.cam_from_target, rest.information
+            residuals[corners] = rest.residuals
+            return PoseFit(poses, information, residuals)
         then = reproject(stack, camera, candidate, lens=False)
         cost_then = stack.sum_by_view(np.sum(then.residuals**2, axis=1))
         better = cost_then <= cost * (1.0 + _ROUNDING)
