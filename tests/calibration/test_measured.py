@@ -133,7 +133,7 @@ def test_a_measurement_that_good_data_contradict_is_told_and_left_out():
     right = run(cell, {"flange_from_cam": {"z_m": true + 2e-4, "sigma_m": SIGMA_M}})
     assert not any(it.kind == "prior" for it in right.warnings)
     (note,) = (it for it in right.notes if "was used" in it)
-    assert "the views alone tell it to" in note
+    assert "the views alone determine it to" in note
 
 
 # Ten sigma, and so many that noise beside the priors would explain them.

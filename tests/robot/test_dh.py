@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from visioncal.core.choices import CONVENTIONS
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp
 from visioncal.robot import (
-    CONVENTIONS,
     DHTable,
     Robot,
     convert_table,

@@ -140,7 +140,9 @@ class CameraResult:
             return self
         edges, field = self.edge_covariance, self.field
         if field is not None:
-            field = replace(field, edge_covariance=field.edge_covariance @ jacobian.T)
+            # Of no coefficients, a file does not say how many edges there were.
+            beside = field.edge_covariance.reshape(-1, jacobian.shape[1])
+            field = replace(field, edge_covariance=beside @ jacobian.T)
         edges = None if edges is None else edges @ jacobian.T
         return replace(self, edge_covariance=edges, field=field)
 
