@@ -169,11 +169,10 @@ def left_out_clusters(
     clusters = of_stop[np.searchsorted(stops, problem.observations.stops[rows])]
     widened = problem.with_effects([*problem.effects, errors.effect(robot)])
     there = State(state.edges, np.append(state.values, np.zeros(errors.basis.shape[2])))
-    size, squares = problem.size, np.zeros((2, 2, 3))
-    place, white = problem.robots.index(robot), errors.white
-    beside = noise if white is None else replace(noise, robots=noise.robots.copy())
-    if white is not None:
-        beside.robots[place] = white
+    size, squares, levels = problem.size, np.zeros((2, 2, 3)), noise.robots.copy()
+    white = levels[problem.robots.index(robot)] if errors.white is None else errors.white
+    levels[problem.robots.index(robot)] = white
+    beside = replace(noise, robots=levels)
     for cluster in range(_CLUSTERS):
         held = np.zeros(len(problem), dtype=bool)
         held[rows[clusters == cluster]] = True
@@ -184,8 +183,7 @@ def left_out_clusters(
         jacobian, by_arm = np.split(linear.jacobian, [size], axis=2)
         residuals = linear.residuals - jacobian @ (fitted @ gradient[:size])
         by_arm = errors.sigma * (by_arm - jacobian @ (fitted @ information[:size, size:]))
-        if white is not None:
-            fitted = fitted + less_noise(problem.subset(~held), state, noise, robot, white)
+        fitted = fitted + less_noise(problem.subset(~held), state, noise, robot, white)
         predicted = left_out.total_covariance(linear, beside)
         predicted += by_arm @ np.swapaxes(by_arm, 1, 2)
         predicted += jacobian @ fitted @ np.swapaxes(jacobian, 1, 2)

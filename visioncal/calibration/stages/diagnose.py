@@ -48,36 +48,35 @@ def misfits(
         fit: Their fit, at rest.
         errors: Those of arms whose joints are not known, by the robot.
     """
+    robots = [it for it in problem.robots if len(stops_of(problem, it)) >= _FEWEST_STOPS]
+    # Frames are those of all robots: what moved is sought once, and said once.
+    slight = slight_move(problem, fit, tuple(problem.unknown)) if robots else None
     found: dict[str, ResidualTest] = {}
-    for robot in problem.robots:
-        if len(stops_of(problem, robot)) >= _FEWEST_STOPS:
-            fitted = (problem, fit.state, fit.noise, robot)
-            crept, arm = drift(*fitted), errors.get(robot)
-            alike = None if arm else neighbours(*fitted)
-            step = _step(problem, fit, crept)
-            # What a process over postures or time explains as well is no motion.
-            if arm and step and step.mahalanobis_sq < arm.gain:
-                step = None
-            if arm and crept and crept.mahalanobis_sq < arm.gain:
-                crept = None
-            if step:
-                # Before and after it, neighbours err alike because of it. Frames are those of all
-                # robots: what moved is said once.
-                known = any(it.step for it in found.values())
-                found[robot] = ResidualTest(None, None, None if known else step)
-            else:
-                found[robot] = ResidualTest(alike, crept)
+    for robot in robots:
+        fitted = (problem, fit.state, fit.noise, robot)
+        crept, arm = drift(*fitted), errors.get(robot)
+        alike = None if arm else neighbours(*fitted)
+        step = _step(problem, slight, crept)
+        # What a process over postures or time explains as well is no motion.
+        if arm and step and step.mahalanobis_sq < arm.gain:
+            step = None
+        if arm and crept and crept.mahalanobis_sq < arm.gain:
+            crept = None
+        if step:
+            # Before and after it, neighbours err alike because of it.
+            known = any(it.step for it in found.values())
+            found[robot] = ResidualTest(None, None, None if known else step)
+        else:
+            found[robot] = ResidualTest(alike, crept)
     return found
 
 
-def _step(problem: Problem, fit: Solution, crept: Drift | None) -> Move | None:
+def _step(problem: Problem, found: Move | None, crept: Drift | None) -> Move | None:
     """What moved at once, where that explains the residuals better than a creep from end to end.
 
     A step may be at any stop and of any frame: it must gain by twice the logarithm of these.
     """
-    frames = tuple(problem.unknown)
-    found = slight_move(problem, fit, frames)
-    price = 2.0 * np.log(len(frames) * (1 + int(problem.observations.stops.max())))
+    price = 2.0 * np.log(len(problem.unknown) * (1 + int(problem.observations.stops.max())))
     if found is None or (crept and found.mahalanobis_sq < crept.mahalanobis_sq + price):
         return None
     # The noise is that of a fit without the step: with it, twice the logarithm gains more.
