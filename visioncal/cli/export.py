@@ -87,6 +87,14 @@ def export_command(
             "--onto", help="oak: the device's own calibration JSON, of which all else is kept."
         ),
     ] = None,
+    with_corrections: Annotated[
+        bool,
+        typer.Option(
+            "--with-corrections",
+            help="robot-urdf, robot-dh, ur-kinematics: links for use with the table of "
+            "joint-corrections; without it, those that leave the least alone.",
+        ),
+    ] = False,
     force: Force = False,
     _list: Annotated[
         bool,
@@ -113,6 +121,7 @@ def export_command(
         part.camera,
         part.robot,
         part.target,
+        with_corrections,
     )
     written = document(load_exportable(source), to, selection)
     for it in written.warnings:

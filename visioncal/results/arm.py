@@ -208,6 +208,21 @@ class CarriesOver:
         )
 
 
+@dataclass(frozen=True)
+class JointRange:
+    """Between which positions a joint stood at the stops of the fit.
+
+    Attributes:
+        joint: Its name.
+        lower: The least [rad or m].
+        upper: The greatest [rad or m].
+    """
+
+    joint: str
+    lower: float
+    upper: float
+
+
 @dataclass(frozen=True, kw_only=True)
 class Observability:
     """How well the stops determine the arm.
@@ -279,6 +294,7 @@ class ArmResult(Section):
         workspace_map: The same, place by place.
         carries_over: Where it is better than the arm as stated.
         functions: Repeatable errors of its joints by their angles, at level `functions`.
+        measured: Over which ranges of its joints it was measured.
         observability: How well the stops determine the arm.
         not_determined: What they do not determine, in words.
         stops: The stops by their influence, most first.
@@ -296,6 +312,7 @@ class ArmResult(Section):
     workspace_map: tuple[WorkspacePlace, ...] = ()
     carries_over: CarriesOver | None = None
     functions: JointFunctions | None = None
+    measured: tuple[JointRange, ...] = ()
     observability: Observability | None = None
     not_determined: Annotated[tuple[str, ...] | None, Key("not_told")] = None
     stops: tuple[StopInfluence, ...] = ()

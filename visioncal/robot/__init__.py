@@ -4,6 +4,7 @@ This is the only package that knows Pinocchio, and it imports it where a model i
 """
 
 from visioncal.robot.chain import FUNCTION_NAMES, Chain
+from visioncal.robot.constant_part import fit_links, without_functions
 from visioncal.robot.conversion import (
     PARALLEL_RAD,
     convert_table,
@@ -80,6 +81,7 @@ __all__ = [
     "corrected_tip",
     "corrected_urdf",
     "entries",
+    "fit_links",
     "joint_torques",
     "load_robot",
     "mass_matrices",
@@ -107,4 +109,5 @@ __all__ = [
     "weighed_urdf",
     "with_inertias",
     "with_zeros",
+    "without_functions",
 ]

@@ -51,6 +51,7 @@ from visioncal.results.arm import (
     CarriesOver,
     JointBacklash,
     JointFunctions,
+    JointRange,
     ThermalResult,
 )
 from visioncal.robot import Loads
@@ -72,6 +73,7 @@ class ArmFound:
         drift: Its drift with temperature; None for none.
         carries: Where it is better than as stated; None where it stands as stated.
         functions: Of its joints; None without any.
+        measured: Over which ranges of its joints that is.
     """
 
     numbers: ArmIdentifiability | None = None
@@ -80,6 +82,7 @@ class ArmFound:
     drift: ThermalResult | None = None
     carries: CarriesOver | None = None
     functions: JointFunctions | None = None
+    measured: tuple[JointRange, ...] = ()
 
     def notes(self) -> Iterator[str]:
         """Words what is no reason for doubt."""
@@ -376,6 +379,10 @@ class RobotArm:
             drift,
             carries_over(data, self.kinematics) if erring else None,
             functions_of(data, self.kinematics),
+            tuple(
+                JointRange(name, float(it.min()), float(it.max()))
+                for name, it in zip(data.model.nominal.joint_names, data.q.T, strict=True)
+            ),
         )
 
     def result(self, found: ArmFound, views: Sequence[int]) -> ArmSections:
@@ -397,6 +404,7 @@ class RobotArm:
             robot=self.model.robot,
             backlash=found.plays,
             functions=found.functions,
+            measured=found.measured,
         )
         if found.numbers is not None:
             zero = None if self.matched is None else self.matched.zero

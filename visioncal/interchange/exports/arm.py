@@ -1,31 +1,77 @@
 """What there is to export of a calibrated arm, and what a file of others cannot hold of it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
 from visioncal.core.choices import CONVENTIONS, Convention
 from visioncal.core.errors import DataError
+from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray
 from visioncal.estimation.workspace import postures
 from visioncal.interchange.exports.content import Selection
 from visioncal.interchange.exports.format import Takes
 from visioncal.interchange.exports.sources import Source
 from visioncal.results import Calibration, Verdict
-from visioncal.results.arm import JointFunctions, WorkspaceSigma
+from visioncal.results.arm import JointFunctions, JointRange, WorkspaceSigma
 from visioncal.robot import (
     DHTable,
     Robot,
+    fit_links,
     parallel_axes,
     table_from_document,
     table_of,
     unwritten,
+    without_functions,
 )
-from visioncal.robot.chain import IDENTITY_FUNCTION
 
-# Postures over which the worst error is looked for.
-_POSTURES = 4000
+# Postures over which the worst error is looked for, and to which constant links are fitted.
+_POSTURES, _FITTED = 4000, 800
+# What all the workspace counts beside where the arm was measured: links that leave the least in a
+# small box alone would lead far astray beyond it.
+_ELSEWHERE = 0.1
+
+
+@dataclass(frozen=True)
+class LeftBehind:
+    """How far constant links are off from the arm that was found: rms and at the most [mm]."""
+
+    rms_mm: float
+    most_mm: float
+
+    @classmethod
+    def of(cls, away: FloatArray) -> "LeftBehind":
+        """Of (m, 3) distances [m]."""
+        distances_mm = 1e3 * np.linalg.norm(away, axis=1)
+        return cls(float(np.sqrt(np.mean(distances_mm**2))), float(distances_mm.max()))
+
+    def __str__(self) -> str:
+        return f"{figure(self.rms_mm)} mm rms, {figure(self.most_mm)} mm at the most"
+
+
+@dataclass(frozen=True, eq=False)
+class FittedLinks:
+    """Links and offsets that leave the least of what a file cannot hold of an arm.
+
+    Attributes:
+        robot: The arm of these, with the functions that go with them.
+        measured: What it leaves over the ranges in which joints stood at the stops; None where
+            these are not known.
+        workspace: The same all over the workspace.
+    """
+
+    robot: Robot
+    measured: LeftBehind | None
+    workspace: LeftBehind
+
+    @property
+    def words(self) -> str:
+        """What it leaves behind."""
+        if self.measured is None:
+            return f"{self.workspace} over the workspace"
+        return f"{self.measured} where the arm was measured, {self.workspace} over the workspace"
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +92,9 @@ class ArmContent:
             weight [mm]; zero for a rigid one.
         cold_c: Least and greatest temperature of its links [deg C], for one that drifts with it.
         drift_mm: How far that moved its flange at the most, in one posture of the session [mm].
+        links: Links and offsets in which what a form cannot hold is as far as it can be; None where
+            it holds all, or the arm stands for itself.
+        with_corrections: Whether links and the table of joints' corrections go together.
     """
 
     nominal: Robot
@@ -59,6 +108,13 @@ class ArmContent:
     sag_mm: float = 0.0
     cold_c: tuple[float, float] | None = None
     drift_mm: float = 0.0
+    links: FittedLinks | None = None
+    with_corrections: bool = False
+
+    @property
+    def written(self) -> Robot:
+        """The arm whose links and offsets are written."""
+        return self.robot if self.links is None else self.links.robot
 
     @property
     def omitted(self) -> tuple[str, ...]:
@@ -68,7 +124,7 @@ class ArmContent:
     @property
     def sagging(self) -> str:
         """What no file holds of an arm whose joints bend, and what that costs; else empty."""
-        if not self.sag_mm:
+        if not self.sag_mm or self.links is not None:
             return ""
         return (
             "its joints bend under load, which has no place in it: this is the arm without weight. "
@@ -117,20 +173,32 @@ class ArmContent:
         nominal, form = self.nominal_table, self.convention
         if form is None:
             form = "hayati" if parallel_axes(self.nominal).any() else nominal.convention
-        return table_of(self.robot, form, like=nominal)
+        return table_of(without_functions(self.written), form, like=nominal)
 
     @property
     def left_out(self) -> str:
-        """What a URDF or a table of others leaves out, and what that costs; empty for nothing."""
-        missing = unwritten(self.robot)
+        """What links and offsets alone leave out, and what that costs; empty for nothing."""
+        bending = ("its joints bend under its own weight",) if self.sag_mm else ()
+        missing = (*unwritten(self.robot), *bending)
         if not missing:
             return ""
-        what = "gear ratio and eccentricity"
-        if self.robot.chain.harmonics is not None:
-            what = "gear ratio, eccentricity and harmonics of the joints"
+        said = f"what is not constant about its joints ({'; '.join(missing)}) has no place in it. "
+        if not self.with_corrections:
+            said += "Its links and offsets are those that leave the least of that"
+            return said if self.links is None else f"{said}: {self.links.words}"
         return (
-            f"{what} ({'; '.join(missing)}) have no place in it. A reader "
-            f"without them is off by up to {omission_mm(self.robot):.2g} mm"
+            f"{said}The table of joint-corrections goes with it: a reader without that is off by "
+            f"up to {omission_mm(self.written):.2g} mm{self.still_bent}"
+        )
+
+    @property
+    def still_bent(self) -> str:
+        """What links and the table of joints' corrections together leave of an arm that bends."""
+        if self.links is None:
+            return ""
+        return (
+            ". Its links hold what they can of how it bends under its own weight; with both that "
+            f"leaves {self.links.words}"
         )
 
 
@@ -144,6 +212,7 @@ class ArmFormat:
         write: Builds the document.
         takes: Its further options.
         warn: Words what the user should know before the document serves; empty for nothing.
+        holds: All that was found; links and offsets alone; or joints' functions beside such links.
     """
 
     name: str
@@ -151,6 +220,7 @@ class ArmFormat:
     write: Callable[[ArmContent], str]
     takes: frozenset[Takes] = frozenset()
     warn: Callable[[ArmContent], tuple[str, ...]] = field(default=lambda _: ())
+    holds: Literal["all", "links", "functions"] = "all"
 
 
 def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmContent:
@@ -170,6 +240,11 @@ def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmCont
     arm = source.arm if isinstance(source, Calibration) else None
     if not isinstance(source, Calibration) or nominal is None or arm is None or arm.robot is None:
         raise _without_arm(source, form)
+    sag_mm = _sag_mm(source)
+    together = form.holds == "functions" or selection.with_corrections
+    robot = arm.robot if together else without_functions(arm.robot)
+    loses = sag_mm > 0.0 or (not together and bool(unwritten(arm.robot)))
+    links = _fitted(source, robot, arm.measured) if form.holds != "all" and loses else None
     return ArmContent(
         nominal,
         arm.robot,
@@ -179,9 +254,29 @@ def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmCont
         arm.functions,
         None if selection.convention is None else _convention(selection.convention),
         selection.calibration_hash,
-        _sag_mm(source),
+        sag_mm,
         *_drift(source),
+        links,
+        together,
     )
+
+
+def _fitted(calibration: Calibration, robot: Robot, measured: Sequence[JointRange]) -> FittedLinks:
+    """Fits links to where the calibrated arm stands, where it was measured and all over."""
+    drawn = [(postures(robot, 2 * _FITTED), _ELSEWHERE)]
+    if measured:
+        lower, upper = np.array([(it.lower, it.upper) for it in measured]).T
+        rng = np.random.default_rng(0)
+        drawn = [(rng.uniform(lower, upper, (2 * _FITTED, len(lower))), 1.0), *drawn]
+    # One half is fitted, the other one shows what that leaves.
+    q = np.concatenate([it[::2] for it, _ in drawn])
+    weights = np.concatenate([np.full(len(it[::2]), share / len(it)) for it, share in drawn])
+    found = fit_links(robot, q, calibration.standing(q), weights)
+    left = [
+        LeftBehind.of((calibration.standing(it[1::2]) - found.base_from_flange(it[1::2]))[:, :3, 3])
+        for it, _ in drawn
+    ]
+    return FittedLinks(found, left[0] if measured else None, left[-1])
 
 
 def _sag_mm(calibration: Calibration) -> float:
@@ -208,12 +303,9 @@ def omission_mm(robot: Robot) -> float:
 
     Over random postures within the joints' limits, at most a turn from zero.
     """
-    none = np.array(IDENTITY_FUNCTION) - robot.chain.functions
-    none[:, 0] = 0.0
-    q, harmonics = postures(robot, _POSTURES), robot.chain.harmonics
-    plain = robot.corrected(functions=none, harmonics=None if harmonics is None else -harmonics)
-    away: FloatArray = robot.base_from_flange(q) - plain.base_from_flange(q)
-    return 1e3 * float(np.linalg.norm(away[:, :3, 3], axis=1).max())
+    q = postures(robot, _POSTURES)
+    away = robot.base_from_flange(q) - without_functions(robot).base_from_flange(q)
+    return LeftBehind.of(away[:, :3, 3]).most_mm
 
 
 def check_said(selection: Selection, form: ArmFormat) -> None:
@@ -232,6 +324,7 @@ def check_said(selection: Selection, form: ArmFormat) -> None:
         "--convention": selection.convention is not None and "convention" not in form.takes,
         "--hash": selection.calibration_hash is not None and "hash" not in form.takes,
         "--onto": selection.onto is not None,
+        "--with-corrections": selection.with_corrections and form.holds != "links",
     }
     said = [option for option, there in given.items() if there]
     if said:

@@ -9,12 +9,14 @@ from visioncal.core.types import IntArray
 from visioncal.interchange.exports.arm import ArmContent, ArmFormat, omission_mm
 from visioncal.robot import (
     DHTable,
+    Robot,
     corrected_tip,
     corrected_urdf,
     small_urdf,
     table_toml,
     ur_flange,
     ur_kinematics_yaml,
+    without_functions,
 )
 
 # Such a way along an axis is no part of an arm: it leads to the common normal of two axes that are
@@ -22,6 +24,8 @@ from visioncal.robot import (
 _FAR_M = 10.0
 # A flange is in its place within this, which no tool is mounted to [mm, deg].
 _EXACT = 1e-4
+# Joints without limits have corrections so far either way [deg].
+_WIDEST_DEG = 360.0
 # What stands in a file for an arm whose hash is not known: no controller has it.
 _NO_HASH = "calib_visioncal"
 
@@ -32,15 +36,15 @@ def _notes(content: ArmContent) -> list[str]:
 
 def _write_urdf(content: ArmContent) -> str:
     if "urdf" in content.nominal.document:
-        return corrected_urdf(content.nominal, content.robot, _notes(content))
-    return small_urdf(content.robot, _notes(content))
+        return corrected_urdf(content.nominal, without_functions(content.written), _notes(content))
+    return small_urdf(without_functions(content.written), _notes(content))
 
 
 def _warn_urdf(content: ArmContent) -> tuple[str, ...]:
     said = _left_out(content)
     if "urdf" not in content.nominal.document:
         return said
-    tip = corrected_tip(content.nominal, content.robot)
+    tip = corrected_tip(content.nominal, content.written)
     if tip != content.robot.tip:
         said += (
             f"no fixed joint places {content.robot.tip}, so that the calibrated one is a link of "
@@ -50,13 +54,7 @@ def _warn_urdf(content: ArmContent) -> tuple[str, ...]:
 
 
 def _write_table(content: ArmContent) -> str:
-    notes = content.notes
-    if content.left_out:
-        notes.append(
-            "gear_ratio, sine_rad and cosine_rad are visioncal's own keys, for a table of others "
-            f"has none: {content.left_out}"
-        )
-    return table_toml(content.table, "visioncal", notes)
+    return table_toml(content.table, "visioncal", _notes(content))
 
 
 def _warn_table(content: ArmContent) -> tuple[str, ...]:
@@ -76,7 +74,7 @@ def _far(table: DHTable) -> tuple[str, ...]:
 
 def _write_ur(content: ArmContent) -> str:
     return ur_kinematics_yaml(
-        content.robot,
+        without_functions(content.written),
         calibration_hash=content.calibration_hash or _NO_HASH,
         like=content.nominal_table,
         notes=_notes(content),
@@ -85,7 +83,7 @@ def _write_ur(content: ArmContent) -> str:
 
 def _warn_ur(content: ArmContent) -> tuple[str, ...]:
     said = _left_out(content)
-    away = log(ur_flange(content.robot, content.nominal_table))
+    away = log(ur_flange(content.written, content.nominal_table))
     turned, moved = np.rad2deg(np.linalg.norm(away[:3])), 1e3 * np.linalg.norm(away[3:])
     if max(turned, moved) > _EXACT:
         said += (
@@ -108,20 +106,30 @@ def _write_chain(content: ArmContent) -> str:
 
 def _write_corrections(content: ArmContent) -> str:
     """A table of corrections: a line for each joint and degree."""
-    robot, degrees = content.robot, np.arange(-180, 180)
-    angles = np.repeat(np.deg2rad(degrees)[:, None], robot.joint_count, axis=1)
-    chain = robot.chain
-    wanted = chain.functions[:, 0] + chain.functions[:, 1] * angles
-    corrections = np.rad2deg(chain.encoded(wanted) - angles)
+    robot = content.written
     lines = [f"# {it}" for it in content.notes]
     lines.append("joint,angle_deg,correction_deg,sigma_deg")
     for at, joint in enumerate(robot.joint_names):
-        if chain.prismatic[at]:
+        if robot.chain.prismatic[at]:
             continue
+        degrees = _degrees(robot, at)
+        angles = np.repeat(np.deg2rad(degrees)[:, None], robot.joint_count, axis=1)
+        # The joint as links alone have it: with its offset, and of ratio 1.
+        sent = robot.chain.encoded(robot.chain.functions[:, 0] + angles)
+        corrections = np.rad2deg(sent - angles)[:, at]
         sigmas = _sigmas_deg(content, at, degrees)
-        rows = zip(degrees.tolist(), corrections[:, at].tolist(), sigmas, strict=True)
+        rows = zip(degrees.tolist(), corrections.tolist(), sigmas, strict=True)
         lines += [f"{joint},{angle},{more:.6f},{sigma}" for angle, more, sigma in rows]
     return "\n".join([*lines, ""])
+
+
+def _degrees(robot: Robot, joint: int) -> IntArray:
+    """Angles of a joint's corrections: a turn, or all its range where gears err turn after turn."""
+    if robot.chain.functions[joint, 1] == 1.0:
+        return np.arange(-180, 180)
+    limits = np.rad2deg([robot.lower_rad[joint], robot.upper_rad[joint]])
+    low, high = np.clip(limits, -_WIDEST_DEG, _WIDEST_DEG)
+    return np.arange(int(np.floor(low)), int(np.ceil(high)) + 1)
 
 
 def _sigmas_deg(content: ArmContent, joint: int, degrees: IntArray) -> list[str]:
@@ -135,9 +143,10 @@ def _sigmas_deg(content: ArmContent, joint: int, degrees: IntArray) -> list[str]
 
 def _warn_corrections(content: ArmContent) -> tuple[str, ...]:
     return (
-        "It corrects what joints err by as functions of their angles, for links and offsets as "
-        "--to robot-dh or robot-urdf has them: send each joint to its angle and the correction "
-        f"there. Without it the flange is off by up to {omission_mm(content.robot):.2g} mm.",
+        "It corrects what joints err by as functions of their angles, for the links and offsets "
+        "that --to robot-urdf, robot-dh or ur-kinematics writes --with-corrections: send each "
+        "joint to its angle and the correction there. Without it the flange of that arm is off by "
+        f"up to {omission_mm(content.written):.2g} mm{content.still_bent}.",
         *(f"{it}." for it in content.omitted),
     )
 
@@ -151,6 +160,7 @@ ROBOT_URDF = ArmFormat(
     "the calibrated arm as a URDF: the session's own with other origins, or a small one [m, rad]",
     _write_urdf,
     warn=_warn_urdf,
+    holds="links",
 )
 ROBOT_DH = ArmFormat(
     "robot-dh",
@@ -158,6 +168,7 @@ ROBOT_DH = ArmFormat(
     _write_table,
     takes=frozenset({"convention"}),
     warn=_warn_table,
+    holds="links",
 )
 UR_KINEMATICS = ArmFormat(
     "ur-kinematics",
@@ -165,6 +176,7 @@ UR_KINEMATICS = ArmFormat(
     _write_ur,
     takes=frozenset({"hash"}),
     warn=_warn_ur,
+    holds="links",
 )
 ROBOT_JSON = ArmFormat(
     "robot-json",
@@ -177,6 +189,7 @@ JOINT_CORRECTIONS = ArmFormat(
     "what to add to each joint's angle, degree by degree, for encoders that err (CSV) [deg]",
     _write_corrections,
     warn=_warn_corrections,
+    holds="functions",
 )
 
 ARMS = (ROBOT_URDF, ROBOT_DH, UR_KINEMATICS, ROBOT_JSON, JOINT_CORRECTIONS)

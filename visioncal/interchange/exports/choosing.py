@@ -142,6 +142,7 @@ def _check_takes(form: ExportFormat, selection: Selection) -> None:
         "convention": selection.convention is not None,
         "hash": selection.calibration_hash is not None,
         "onto": selection.onto is not None,
+        "with-corrections": selection.with_corrections,
     }
     for what in sorted(it for it, there in given.items() if there and it not in form.takes):
         raise DataError(

@@ -39,6 +39,7 @@ class Selection:
         camera: Which camera of a whole cell is meant, in a format of lenses.
         robot: Which robot of a whole cell: its part of it is exported as of one camera and robot.
         target: Which target of a whole cell; likewise.
+        with_corrections: Whether the table of joints' corrections goes with the arm.
     """
 
     edge: str | None = None
@@ -53,6 +54,7 @@ class Selection:
     camera: str | None = None
     robot: str | None = None
     target: str | None = None
+    with_corrections: bool = False
 
 
 @dataclass(frozen=True, eq=False)
