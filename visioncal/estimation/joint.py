@@ -172,7 +172,9 @@ def _settled(side: Side, fitted: Fitted) -> Fitted:
         if seen is fitted.seen:
             # The corners follow no part of the step: another round would ask for the same.
             break
-        fitted = _fitted(side, seen, fitted.frames, fitted.others)
+        before, fitted = fitted, _fitted(side, seen, fitted.frames, fitted.others)
+        if not (before.fit.settled or fitted.fit.settled):
+            break
     return fitted
 
 

@@ -7,8 +7,10 @@ from typing import Generic, TypeVar
 State = TypeVar("State")
 
 # Far more than a healthy problem takes: flat valleys of rational lenses take two hundred.
-_ITERATIONS = 400
-_START_DAMPING, _LEAST_DAMPING, _WORST_DAMPING = 1e-4, 1e-12, 1e9
+ITERATIONS = 400
+START_DAMPING, _LEAST_DAMPING, _WORST_DAMPING = 1e-4, 1e-12, 1e9
+# Damping falls after a step that lowered the cost by more than this share of what it promised.
+_KEPT = 0.25
 # Near the answer, where directions that are hardly determined would need many damped steps.
 NEAR_DAMPING = 1e-9
 
@@ -34,7 +36,8 @@ def levenberg_marquardt(
     start: State,
     linearise: Callable[[State], Linearised[State]],
     settled: float,
-    damping: float = _START_DAMPING,
+    damping: float = START_DAMPING,
+    most: int = ITERATIONS,
 ) -> tuple[State, bool]:
     """Minimises a sum of squares (Levenberg 1944; Marquardt 1963).
 
@@ -44,18 +47,23 @@ def levenberg_marquardt(
         settled: Decrease of the cost under which the state has come to rest, relative to the
             cost and one: in units of the noise, less than one is no difference.
         damping: Of the first step.
+        most: So many steps.
 
     Returns:
         The state of the least cost, and whether it came to rest there.
     """
     now = linearise(start)
-    for _ in range(_ITERATIONS):
+    for _ in range(most):
         if now.fall is not None and 0.0 <= now.fall(damping) <= settled * (abs(now.cost) + 1.0):
             return now.step(damping), True
         then = linearise(now.step(damping))
         if then.cost <= now.cost:
-            rested = now.cost - then.cost <= settled * (abs(now.cost) + 1.0)
-            now, damping = then, max(damping / 10, _LEAST_DAMPING)
+            fell = now.cost - then.cost
+            rested = fell <= settled * (abs(now.cost) + 1.0)
+            # A longer step than one that falls short of its promise would go up.
+            if now.fall is None or fell > _KEPT * now.fall(damping):
+                damping = max(damping / 10, _LEAST_DAMPING)
+            now = then
             if rested:
                 return now.state, True
         else:
