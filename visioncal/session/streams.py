@@ -24,6 +24,8 @@ _NORM_TOLERANCE = 1e-3
 # between them.
 _GAP_RATIO, _GAP_S = 2.5, 0.02
 _SHOWN_PROBLEMS = 10
+# What stands for no number in other programs' tables.
+_NONE = frozenset({"nan", "-nan", "+nan", "na", "n/a", "null", "none", "inf", "-inf", "+inf", "-"})
 # Half an hour of twenty columns at 500 Hz, of all streams together.
 _MOST_BYTES = 300_000_000
 
@@ -35,10 +37,12 @@ class Stream:
     Attributes:
         columns: Their names; `stamp_s` is one of them.
         values: (n, c) their numbers, in their columns' units; NaN where a cell is empty.
+        lines: (n,) in which line of its file each row stands; None where they follow the header.
     """
 
     columns: tuple[str, ...]
     values: FloatArray
+    lines: IntArray | None = None
 
     def __len__(self) -> int:
         return len(self.values)
@@ -132,16 +136,17 @@ def parse_stream(text: str, label: str) -> Stream:
     head, _, body = text.partition("\n")
     _, names = next(numbered_rows(head, label, 1), (1, []))
     columns = tuple(name.strip() for name in names)
-    values = _plain_numbers(body, len(columns))
+    values, lines = _plain_numbers(body, len(columns)), None
     if values is None:
-        values = _numbers(body, columns, label)
+        values, lines = _numbers(body, columns, label)
     values.setflags(write=False)
-    return Stream(columns, values)
+    return Stream(columns, values, lines)
 
 
 def _plain_numbers(body: str, count: int) -> FloatArray | None:
     """Reads rows without empty cells, fast; None for what has to be looked at cell by cell."""
-    if not body.strip():
+    body = body.replace("\r\n", "\n").strip("\n")
+    if not body.strip() or "\n\n" in body:
         return None
     try:
         values = np.loadtxt(io.StringIO(body), delimiter=",", ndmin=2, comments=None)
@@ -150,34 +155,50 @@ def _plain_numbers(body: str, count: int) -> FloatArray | None:
     return values if values.shape[1] == count and np.isfinite(values).all() else None
 
 
-def _numbers(body: str, columns: Sequence[str], label: str) -> FloatArray:
-    """Reads rows cell by cell, and names those that are wrong."""
+def _numbers(body: str, columns: Sequence[str], label: str) -> tuple[FloatArray, IntArray]:
+    """Reads rows cell by cell with their lines, and names those that are wrong."""
     rows: list[list[float]] = []
+    lines: list[int] = []
     problems: list[str] = []
+    wrong: dict[str, list[tuple[int, str]]] = {}
     for line, cells in numbered_rows(body, label, 2):
-        place = f"{label}, line {line}"
         if not any(cell.strip() for cell in cells):
             continue
         if len(problems) >= _SHOWN_PROBLEMS:
             break
         if len(cells) != len(columns):
             problems.append(
-                f"{place}: it has {len(cells)} fields, but the header has {len(columns)} columns"
+                f"{label}, line {line}: it has {len(cells)} fields, but the header has "
+                f"{len(columns)} columns"
             )
             continue
         rows.append([_number(cell.strip()) for cell in cells])
-        problems += [
-            f"{place}, column {name}: {cell.strip()!r} is no finite number"
-            for name, cell, value in zip(columns, cells, rows[-1], strict=True)
-            if cell.strip() and not np.isfinite(value)
-        ]
-    if problems:
+        lines.append(line)
+        for name, cell, value in zip(columns, cells, rows[-1], strict=True):
+            if cell.strip() and not np.isfinite(value):
+                wrong.setdefault(name, []).append((line, cell.strip()))
+    if problems or wrong:
+        shown = [*problems, *_wrong_cells(wrong, label)][:_SHOWN_PROBLEMS]
+        missing = all(cell.lower() in _NONE for of in wrong.values() for _, cell in of)
         raise DataError(
-            ".\n".join(problems) + ".",
-            culprits=[it.partition(": ")[0] for it in problems],
-            next_step="A stream holds numbers alone; leave other columns out.",
+            ".\n".join(shown) + ".",
+            culprits=[it.partition(": ")[0] for it in shown],
+            next_step="Leave a cell empty where there is no number; its row then does not count."
+            if wrong and missing
+            else "A stream holds numbers alone; leave other columns out.",
         )
-    return np.array(rows, dtype=float).reshape(len(rows), len(columns))
+    values = np.array(rows, dtype=float).reshape(len(rows), len(columns))
+    return values, np.array(lines, dtype=np.int64)
+
+
+def _wrong_cells(wrong: Mapping[str, Sequence[tuple[int, str]]], label: str) -> Iterator[str]:
+    """A sentence for each column that holds what is no number."""
+    for name, ((line, cell), *others) in wrong.items():
+        more = ""
+        if others:
+            verb = "is" if len(others) == 1 else "are"
+            more = f", nor {verb} {len(others)} more of the column, up to line {others[-1][0]}"
+        yield f"{label}, line {line}, column {name}: {cell!r} is no finite number{more}"
 
 
 def numbered_rows(text: str, label: str, first: int) -> Iterator[tuple[int, list[str]]]:
@@ -245,17 +266,25 @@ def check_stream(name: str, stream: Stream) -> None:
     for group in known.QUATERNION_GROUPS:
         rows = np.flatnonzero(_are_no_quaternions(stream, group))
         if len(rows):
-            raise _wrong_rows(label, rows, f"{group[0]} ... {group[-1]} is no unit quaternion")
+            raise _wrong_rows(
+                stream, label, rows, f"{group[0]} ... {group[-1]} is no unit quaternion"
+            )
 
 
 def _check_times(stream: Stream, label: str) -> None:
     stamps_s = stream.stamps_s
     missing = np.flatnonzero(~np.isfinite(stamps_s))
     if len(missing):
-        raise _wrong_rows(label, missing, f"{STAMP} is empty")
+        raise _wrong_rows(stream, label, missing, f"{STAMP} is empty")
     falls = np.flatnonzero(np.diff(stamps_s) <= 0) + 1
     if len(falls):
-        raise _wrong_rows(label, falls, f"{STAMP} does not ascend from the row before")
+        raise _wrong_rows(
+            stream,
+            label,
+            falls,
+            f"{STAMP} does not ascend from the row before",
+            f"Sort the rows by {STAMP}, and leave out what was recorded twice.",
+        )
 
 
 def _check_whole(stream: Stream, group: Sequence[str], label: str) -> None:
@@ -264,7 +293,7 @@ def _check_whole(stream: Stream, group: Sequence[str], label: str) -> None:
     there = np.isfinite(np.stack([stream[name] for name in group], axis=1))
     rows = np.flatnonzero(there.any(axis=1) & ~there.all(axis=1))
     if len(rows):
-        raise _wrong_rows(label, rows, f"{group[0]} ... {group[-1]} are filled in part")
+        raise _wrong_rows(stream, label, rows, f"{group[0]} ... {group[-1]} are filled in part")
 
 
 def _are_no_quaternions(stream: Stream, group: Sequence[str]) -> Mask:
@@ -274,11 +303,15 @@ def _are_no_quaternions(stream: Stream, group: Sequence[str]) -> Mask:
     return np.asarray(np.abs(norms - 1.0) > _NORM_TOLERANCE)
 
 
-def _wrong_rows(label: str, rows: IntArray, words: str) -> DataError:
-    named = [f"sample {row + 1}" for row in rows[:_SHOWN_PROBLEMS].tolist()]
+def _wrong_rows(
+    stream: Stream, label: str, rows: IntArray, words: str, next_step: str = ""
+) -> DataError:
+    lines = rows + 2 if stream.lines is None else stream.lines[rows]
+    named = [f"line {it}" for it in lines.tolist()]
     return DataError(
-        f"{label}: {words} in {some_of(named, 3)}{', ...' if len(rows) > len(named) else ''}.",
-        culprits=[f"{label}, {it}" for it in named],
+        f"{label}: {words} in {some_of(named, 3)}.",
+        culprits=[f"{label}, {it}" for it in named[:_SHOWN_PROBLEMS]],
+        next_step=next_step,
     )
 
 
