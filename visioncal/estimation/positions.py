@@ -18,8 +18,6 @@ from visioncal.estimation.linalg import damped_step
 from visioncal.estimation.procrustes import align
 from visioncal.estimation.robust import half_of, small_sets, trimmed_start
 
-# Variance about each axis of a rotation that is not measured [rad^2].
-UNMEASURED = 1.0
 # A cost [m^2] that changes by less than this share of itself and of a square metre is at rest.
 _SETTLED = 1e-14
 # Sets of stops to start from: with 30 % of the stops wrong, all sixty contain a wrong one with

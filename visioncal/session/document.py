@@ -87,12 +87,6 @@ class Declaration(TableModel):
         """The robot where there is one; None without, or with several."""
         return self.robot if len(self.robots) != 1 else next(iter(self.robots.values()))
 
-    @property
-    def only_instrument(self) -> InstrumentTable | None:
-        """The instrument where there is one; None without, or with several."""
-        several = self.instruments
-        return self.instrument if len(several) != 1 else next(iter(several.values()))
-
 
 def read_declaration(
     document: Mapping[str, Any], label: str, *, observed: bool = True

@@ -293,15 +293,6 @@ class LinearisedCorners:
             ]
         )
 
-    def information_of(self, camera: str) -> FloatArray:
-        """(f, f) what one camera's corners say of the free values, the poses being free."""
-        at = list(self.looks.problems).index(camera)
-        every = np.zeros((len(self.looks.values),) * 2)
-        places = self.looks.places(camera)
-        weight = floored_sigma_px(self.sigmas_px[at]) ** -2.0
-        every[np.ix_(places, places)] = weight * self.compressed[at].shared_information
-        return every[np.ix_(self.free, self.free)]
-
     @property
     def by_free(self) -> FloatArray:
         """How all views' poses (v, 6, f) move with the free values."""
