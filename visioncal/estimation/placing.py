@@ -83,11 +83,11 @@ def worst_of(
     Returns:
         The offset's worst direction in the parent, and the rotation's in the frame itself.
     """
-    point = np.zeros(3) if centre is None else centre
+    point, where = (np.zeros(3), "") if centre is None else (centre, " amid the points")
     at_centre = matrix[:3, :3] @ np.hstack([-skew(point), np.eye(3)])
     values, vectors = np.linalg.eigh(at_centre @ covariance @ at_centre.T)
     offset = Direction(
-        f"the {thing}'s offset along the {parent}'s {axis_words(vectors[:, -1])}",
+        f"the {thing}'s offset{where} along the {parent}'s {axis_words(vectors[:, -1])}",
         float(np.sqrt(values[-1])),
         SIGMA_LIMIT_M,
         is_rotation=False,
