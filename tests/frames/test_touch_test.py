@@ -2,6 +2,7 @@
 
 import io
 import json
+import shutil
 from contextlib import closing
 from dataclasses import replace
 
@@ -11,13 +12,15 @@ from support.commands import visioncal
 from support.pages import Page
 
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import invert
+from visioncal.core.transforms import compose, invert
 from visioncal.frames.touch_test import judged, touch_points
+from visioncal.interchange.merge_results import rewrite
 from visioncal.live.capture.hover import Hovering
 from visioncal.live.drivers.ur import UrArm
 from visioncal.live.rehearsal.controller import spawn
 from visioncal.live.rehearsal.options import ControllerOptions
-from visioncal.results import Calibration
+from visioncal.results import Calibration, Edge
+from visioncal.results.frame import Frame
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate, write_session
 from visioncal.vision.targets import corner_positions
@@ -40,7 +43,7 @@ def proved(tmp_path_factory):
 
 def test_the_tip_comes_as_near_as_predicted(proved):
     folder, look, corners = proved
-    points = touch_points(Session.load(look), Calibration.load(folder / "out"), "")
+    points = touch_points(Session.load(look), Calibration.load(folder / "out"))
     assert len(points) == 5
     away_mm = [1e3 * np.linalg.norm(it.base_m - corners[int(it.name.split()[1])]) for it in points]
     # A ball of 95 % holds five points that share the camera's error, nineteen times of twenty.
@@ -50,10 +53,10 @@ def test_the_tip_comes_as_near_as_predicted(proved):
         np.testing.assert_allclose(it.base_from_flange[:3, 3], it.base_m)
         step = invert(it.base_from_flange) @ it.above(0.05)
         np.testing.assert_allclose(step[:3, 3], [0.0, 0.0, -0.05], atol=1e-12)
-    assert judged(points, away_mm, "").passed
-    assert not judged(points, [5.0] * 5, "").passed
+    assert judged(points, away_mm).passed
+    assert not judged(points, [5.0] * 5).passed
     with pytest.raises(DataError, match="5 of 0 mm and more"):
-        judged(points, [0.1], "")
+        judged(points, [0.1])
 
 
 @pytest.mark.usefixtures("patient")
@@ -62,7 +65,7 @@ def test_a_driven_arm_hovers_above_each_point(proved, monkeypatch):
     folder, look, _ = proved
     known, session = Calibration.load(folder / "out"), Session.load(folder / "session")
     start = session.views[0].joints_rad
-    points = touch_points(Session.load(look), known, "")
+    points = touch_points(Session.load(look), known)
     # The controller believes in the data sheet, as the calibration's nominal arm does.
     with spawn(ControllerOptions(q=tuple(start), tcp=(0.0,) * 6)) as controller:
         with closing(UrArm(controller.host)) as arm:
@@ -108,6 +111,7 @@ def test_targets_are_printed_and_gaps_join_the_result(proved, monkeypatch):
     assert [it.gap_mm for it in known.touch_test.points] == [0.1, 0.0, 0.1, 0.1, 0.05]
     words = Page((out / "report.html").read_text("utf-8")).words
     assert "Touch test Passed, with flange" in words
+
     done = visioncal("touch-test", look, "-c", out, "--gaps-mm", "3,3,3,3,3")
     assert done.status == 3
     assert "Measure the tool's tip anew" in done.err
@@ -126,4 +130,25 @@ def test_targets_are_printed_and_gaps_join_the_result(proved, monkeypatch):
     assert "nothing was kept" in ended.err
     done = visioncal("touch-test", look, "-c", out, "--tool", "gripper")
     assert done.status == 2
-    assert "flange_from_gripper" in done.err
+    assert "The calibration has no tool" in done.err
+
+
+def test_what_touches_is_the_only_tool_or_the_flange(proved):
+    folder, look, _ = proved
+    known = Calibration.load(folder / "out")
+    grip = compose(np.eye(3), np.array([0.0, 0.0, 0.12]))
+    edge = Edge(grip, np.diag([1e-6] * 3 + [1e-9] * 3))
+    tool = Frame(edge, True, "stated", "", known.created, 0.0, 0.0, (), known.verdict)
+    held = folder / "held"
+    shutil.copytree(folder / "out", held)
+    rewrite(held, replace(known, frames={"flange_from_grip": tool}))
+
+    def first(*said):
+        done = visioncal("touch-test", look, "-c", held, "--json", *said)
+        return np.array(json.loads(done.out)["points"][0]["touch"][:3])
+
+    # The flange stays behind by the tool's length.
+    assert np.linalg.norm(first() - first("--tool", "none")) == pytest.approx(0.12)
+    np.testing.assert_array_equal(first(), first("--tool", "grip"))
+    refused = visioncal("touch-test", look, "-c", held, "--tool", "grib")
+    assert "no tool 'grib'; it has flange_from_grip" in refused.err

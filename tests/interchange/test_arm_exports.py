@@ -255,6 +255,11 @@ def test_links_and_corrections_together_are_the_arm():
     np.testing.assert_allclose(reached, wanted, atol=1e-7)
 
 
+def test_corrections_of_joints_that_need_none_are_refused():
+    with pytest.raises(DataError, match="there is nothing to correct"):
+        export(calibrated(load_robot("ur5e")), "joint-corrections")
+
+
 @pytest.mark.parametrize("name", ARM_FORMATS)
 def test_the_file_says_where_it_comes_from(name):
     result = calibrated(load_robot("ur5e"), session_name="a -- b --- c\n</robot>\nhash: x")

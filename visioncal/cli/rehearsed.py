@@ -50,12 +50,12 @@ def touched(folder: Path, calibration: Calibration, base_from_target: FloatArray
         calibration: Its result.
         base_from_target: (4, 4) the truth.
     """
-    points = touch_points(Session.load(folder), calibration, "")
+    points = touch_points(Session.load(folder), calibration)
     true = [base_from_target[:3, :3] @ it.board_m + base_from_target[:3, 3] for it in points]
     gaps = [
         1e3 * float(np.linalg.norm(it.base_m - at)) for it, at in zip(points, true, strict=True)
     ]
-    return judged(points, gaps, "")
+    return judged(points, gaps)
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,6 +21,7 @@ from visioncal.core.errors import DataError, DriverError
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray
+from visioncal.frames.measured import Tool
 from visioncal.frames.touch_test import TouchPoint, finding_of, judged, touch_points
 from visioncal.interchange.merge_results import rewrite
 from visioncal.interchange.result_files import load_result
@@ -42,8 +43,13 @@ def touch_test_command(
         Path | None, typer.Option("-c", "--calibration", help="An output folder of calibrate.")
     ] = None,
     tool: Annotated[
-        str, typer.Option("--tool", help="Which tool of the calibration has the tip; see tcp.")
-    ] = "",
+        str | None,
+        typer.Option(
+            "--tool",
+            help="Which tool of the calibration has the tip, see tcp; none: the flange itself. "
+            "Without this its only tool, or the flange where it has none.",
+        ),
+    ] = None,
     height_mm: Annotated[
         float, typer.Option("--height-mm", min=1.0, max=1000.0, help="To hover at, first.")
     ] = 50.0,
@@ -83,8 +89,11 @@ def touch_test_command(
     known = load_result(calibration)
     if known.cell is not None:
         raise DataError("touch-test is for one camera and one robot.", culprits=["-c"])
+    has_tools = any(it.startswith("flange_from_") for it in known.frames)
+    is_bare = tool == "none" or (tool is None and not has_tools)
+    touching = None if is_bare else Tool.among(known.frames, "The calibration", tool)
     with shown_progress(quiet=as_json):
-        points = touch_points(loaded, known, tool)
+        points = touch_points(loaded, known, touching)
     targets = [_target(known, it, 1e-3 * height_mm) for it in points]
     if gaps_mm is not None:
         count = gaps_mm.count(",") + 1
@@ -96,7 +105,7 @@ def touch_test_command(
     else:
         _report(points, targets, as_json=as_json)
         return
-    test = judged(points, gaps, tool)
+    test = judged(points, gaps, touching)
     proved = replace(known, touch_test=test)
     written = rewrite(calibration if calibration.is_dir() else calibration.parent, proved)
     if as_json:

@@ -16,7 +16,7 @@ from visioncal.core.types import FloatArray, Target
 from visioncal.core.verdict import Finding, Step
 from visioncal.estimation.budget import point_covariance, radius95
 from visioncal.frames.frame_from_images import seen_frame
-from visioncal.frames.naming import transform_name
+from visioncal.frames.measured import Tool
 from visioncal.results import Calibration, Edge
 from visioncal.results.sections import TouchedPoint, TouchTest
 from visioncal.session import Session
@@ -55,16 +55,18 @@ class TouchPoint:
         return lifted
 
 
-def touch_points(session: Session, calibration: Calibration, tool: str) -> tuple[TouchPoint, ...]:
+def touch_points(
+    session: Session, calibration: Calibration, tool: Tool | None = None
+) -> tuple[TouchPoint, ...]:
     """Locates five points of a board, and says where the flange brings the tip onto each.
 
     Args:
         session: Images of the board by the calibrated camera, where it lies now; one will do.
-        calibration: The camera's; a tool in it has the tip.
-        tool: The tool's name; empty for the flange itself.
+        calibration: The camera's.
+        tool: What has the tip; None for the flange itself.
 
     Raises:
-        DataError: No image serves, or there is no such tool.
+        DataError: No image serves.
     """
     board = next(iter(session.boards.values()), None)
     if board is None:
@@ -74,7 +76,7 @@ def touch_points(session: Session, calibration: Calibration, tool: str) -> tuple
             next_step="Name it in session.toml.",
         )
     frame = seen_frame(session, calibration, "fixture")
-    tip = _tip(calibration, tool)
+    tip = Edge(np.eye(4), np.zeros((6, 6))) if tool is None else tool.edge
     noise = calibration.noise
     turned = np.deg2rad(noise.get("robot_rotation_deg", 0.0)) * np.linalg.norm(tip.matrix[:3, 3])
     shifted = 1e-3 * noise.get("robot_translation_mm", 0.0)
@@ -92,13 +94,15 @@ def touch_points(session: Session, calibration: Calibration, tool: str) -> tuple
     return tuple(points)
 
 
-def judged(points: Sequence[TouchPoint], gaps_mm: Sequence[float], tool: str) -> TouchTest:
+def judged(
+    points: Sequence[TouchPoint], gaps_mm: Sequence[float], tool: Tool | None = None
+) -> TouchTest:
     """Compares the gaps that were measured with what was predicted.
 
     Args:
         points: The points, in order.
         gaps_mm: The distance from tip to point at each [mm].
-        tool: The tool's name.
+        tool: What touched; None for the flange itself.
 
     Raises:
         DataError: There are as many gaps as points in no way, or one is no length.
@@ -117,7 +121,10 @@ def judged(points: Sequence[TouchPoint], gaps_mm: Sequence[float], tool: str) ->
     beyond = sum(it.gap_mm > it.radius95_mm for it in touched)
     created = datetime.now(UTC).isoformat(timespec="seconds")
     return TouchTest(
-        created=created, tool=tool or "flange", passed=beyond <= _BY_CHANCE, points=touched
+        created=created,
+        tool="flange" if tool is None else tool.name.removeprefix("flange_from_"),
+        passed=beyond <= _BY_CHANCE,
+        points=touched,
     )
 
 
@@ -133,12 +140,6 @@ def finding_of(test: TouchTest) -> Finding:
         return Finding("touch_test", words)
     step = Step("Measure the tool's tip anew, then look whether the camera or the robot was moved.")
     return Finding("touch_test", f"{words} That is more than predicted.", step, is_fatal=True)
-
-
-def _tip(calibration: Calibration, tool: str) -> Edge:
-    if not tool:
-        return Edge(np.eye(4), np.zeros((6, 6)))
-    return calibration.placed[transform_name("tool", tool)]
 
 
 def _five(board: Target) -> dict[str, FloatArray]:

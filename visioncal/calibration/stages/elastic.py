@@ -161,6 +161,11 @@ def remarks(elastic: Elastic) -> Iterator[str]:
             "estimated at every posture, and counted. A payload_kg that changes, or mass_kg and "
             "com_m in the joints' table, determine the stiffness."
         )
+    elif elastic.rigid and len(elastic.rigid) == len(elastic.springs):
+        yield (
+            "Of this level no joint is seen to bend under the loads of these stops: all are taken "
+            "for rigid, and what was estimated is links, offsets and gears."
+        )
     elif elastic.rigid:
         several = len(elastic.rigid) > 1
         yield (

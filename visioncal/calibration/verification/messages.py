@@ -345,10 +345,10 @@ def _joint_figures(check: Check, suspect: Suspect) -> tuple[float, float, str]:
 def _agreement(check: Check) -> str:
     turn, shift = np.sqrt(np.mean(np.sum(check.away.reshape(-1, 2, 3) ** 2, axis=2), axis=0))
     chance = f"{figure(100 * check.p_value)} %"
-    sure = _SURE * check.camera_sigma
+    sure, verb = _SURE * check.camera_sigma, "agrees" if check.seen.stops == 1 else "agree"
     off_deg, off_mm = figure(float(np.rad2deg(turn))), figure(1e3 * float(shift))
     return (
-        f"{_capital(_stops(check))} agree with the calibration: off by {off_mm} mm "
+        f"{_stops(check)} {verb} with the calibration: off by {off_mm} mm "
         f"and {off_deg} deg (rms); chance makes it more in {chance} "
         f"of checks. A camera that had moved by {figure(1e3 * float(sure[3:].max()))} mm or "
         f"{figure(float(np.rad2deg(sure[:3].max())))} deg would have shown."
@@ -357,7 +357,8 @@ def _agreement(check: Check) -> str:
 
 def _doubts(check: Check) -> Iterator[Finding]:
     if check.seen.stops < CheckLimits.stops:
-        words = f"{_capital(_stops(check))} hardly distinguish one change from another."
+        verb = "distinguishes" if check.seen.stops == 1 else "distinguish"
+        words = f"{_stops(check)} hardly {verb} one change from another."
         step = _runnable(check, Step(f"Take {CheckLimits.stops} stops or more.", PLAN))
         yield Finding("few_stops", words, step)
 

@@ -240,6 +240,13 @@ def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmCont
     arm = source.arm if isinstance(source, Calibration) else None
     if not isinstance(source, Calibration) or nominal is None or arm is None or arm.robot is None:
         raise _without_arm(source, form)
+    if form.holds == "functions" and not unwritten(arm.robot):
+        raise DataError(
+            f"--to {form.name}: nothing was found of this arm's joints that is a function of "
+            "their angles: there is nothing to correct.",
+            culprits=[source.session_name],
+            next_step="--to robot-urdf and --to robot-dh hold all of its links and offsets.",
+        )
     sag_mm = _sag_mm(source)
     together = form.holds == "functions" or selection.with_corrections
     robot = arm.robot if together else without_functions(arm.robot)
