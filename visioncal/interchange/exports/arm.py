@@ -178,7 +178,7 @@ class ArmContent:
     @property
     def left_out(self) -> str:
         """What links and offsets alone leave out, and what that costs; empty for nothing."""
-        bending = ("its joints bend under its own weight",) if self.sag_mm else ()
+        bending = ("its joints bend under its own weight, and under a load",) if self.sag_mm else ()
         missing = (*unwritten(self.robot), *bending)
         if not missing:
             return ""
