@@ -9,8 +9,8 @@ from visioncal.dynamics.conditioning import condition
 from visioncal.dynamics.lowpass import LowPass
 from visioncal.dynamics.reading import read_recorded
 from visioncal.session import Stream
-from visioncal.simulation.dynamics import real_dynamics
-from visioncal.simulation.exercise import Senses, multi_sine, record
+from visioncal.simulation.dynamics import drive_torques, real_dynamics
+from visioncal.simulation.exercise import Senses, multi_sine, record, slow_sweep
 
 RATE_HZ = 500.0
 
@@ -103,6 +103,61 @@ def test_nothing_is_interpolated_across_gaps(moved):
     assert "samples are missing for up to 0.402 s behind 8.00 s" in found.notes[0]
     gap = (found.times_s > 7.998) & (found.times_s < 8.4)
     assert not gap.any()
+
+
+@pytest.mark.parametrize("rate_hz", [100.0, 500.0])
+def test_angles_are_interpolated_where_few_samples_are_lost_and_torques_are_not(rate_hz):
+    rng = np.random.default_rng(11)
+    built, done = real_dynamics("ur5e", rng), multi_sine(6, rng, rate_hz=rate_hz)
+    stream = record(built, done, rng, Senses(q_rad=0.0, torque_share=0.0, dq_rad_s=None))
+    kept = np.sort(rng.permutation(len(stream))[: 4 * len(stream) // 5])
+    whole, found = conditioned(stream), conditioned(Stream(stream.columns, stream.values[kept]))
+    (note,) = found.notes
+    assert "20 % of its samples are missing here and there" in note
+    assert found.band_hz == pytest.approx(whole.band_hz, abs=0.06)
+    assert len(found.pieces) == 1
+    assert found.used.all()
+    assert found.rate_hz == pytest.approx(rate_hz)
+
+    def true(motion):
+        return drive_torques(built, motion.q, motion.dq, motion.ddq)
+
+    away = np.sqrt(np.mean((found.torques_nm - found.filtered(true)) ** 2, axis=0))
+    # Both are sums over the same samples. What is left is of speeds that turn their sign a little
+    # early or late, in the whole stream as in this one.
+    before = np.sqrt(np.mean((whole.torques_nm - whole.filtered(true)) ** 2, axis=0))
+    assert (away < 1.5 * before + 1e-3 * np.std(found.torques_nm, axis=0)).all()
+
+
+def test_rows_with_frozen_angles_are_named_and_left_out(moved):
+    _, stream = moved
+
+    def freeze(columns):
+        for joint in (2, 5):
+            columns[f"q{joint}_rad"][4000:4300] = columns[f"q{joint}_rad"][4000]
+
+    found = conditioned(changed(stream, freeze))
+    assert "angles are frozen for up to 0.6 s behind 8.00 s" in found.notes[0]
+    assert "these 299 rows are left out" in found.notes[0]
+    assert len(found.pieces) == 2
+    assert not ((found.times_s > 8.0) & (found.times_s < 8.6)).any()
+
+
+@pytest.mark.parametrize("resolved_rad", [1e-6, 1e-4, 1e-3])
+def test_joints_that_turn_round_or_rest_are_not_frozen(resolved_rad):
+    rng = np.random.default_rng(12)
+    built, done = real_dynamics("ur5e", rng), slow_sweep(6, rng)
+    # To rest and off again, from 20 s to 23 s, with as much as a controller's own ramps take.
+    way = np.interp(done.times_s, [0.0, 20.0, 23.0, 60.0], [0.0, 20.0, 20.0, 57.0])
+    way = np.convolve(np.pad(way, 50, mode="edge"), np.ones(101) / 101.0, mode="valid")
+
+    def round_off(columns):
+        for joint in range(1, 7):
+            angles = np.interp(way, done.times_s, columns[f"q{joint}_rad"])
+            columns[f"q{joint}_rad"] = np.round(angles / resolved_rad) * resolved_rad
+
+    stream = record(built, done, rng, Senses(q_rad=0.0, dq_rad_s=None))
+    assert not any("frozen" in it for it in conditioned(changed(stream, round_off)).notes)
 
 
 def test_saturated_torques_are_named_and_left_out(moved):

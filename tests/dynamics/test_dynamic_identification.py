@@ -22,6 +22,7 @@ from visioncal.dynamics.reading import Recorded, read_recorded
 from visioncal.dynamics.sweeps import SweepRequest, plan_sweeps
 from visioncal.dynamics.validate import friction_of_known, predict, validate
 from visioncal.robot import load_robot
+from visioncal.session import Stream
 from visioncal.simulation.dynamics import drive_torques, nominal_dynamics, real_dynamics
 from visioncal.simulation.exercise import Exercise, Senses, multi_sine, record, slow_sweep
 
@@ -58,6 +59,25 @@ def test_parameters_are_within_their_sigmas(worlds):
     # one of 0.08; and that noise is estimated, too, adds 0.03. Sigmas off by a fifth would show.
     assert np.mean(shares) == pytest.approx(1.03, abs=0.3)
     assert max(shares) < 1.9
+
+
+def test_parameters_are_within_their_sigmas_where_samples_are_lost():
+    shares, wider = [], []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        built = real_dynamics("ur5e", rng)
+        stream = record(built, multi_sine(6, rng, rate_hz=100.0), rng)
+        sigmas = []
+        for kept in (np.arange(len(stream)), np.sort(rng.permutation(len(stream))[:1600])):
+            rows = read_recorded(Stream(stream.columns, stream.values[kept]), "robot.csv", 6)
+            result = identify(known_arm(), [condition(rows)], PLAIN).identified
+            away = result.values - true_base(result.base, built)
+            shares.append(away @ np.linalg.solve(result.covariance, away) / len(away))
+            sigmas.append(result.sigmas)
+        wider.append(float(np.median(sigmas[1] / sigmas[0])))
+    # As without losses; and four samples in five tell by 12 % less.
+    assert np.mean(shares[1::2]) == pytest.approx(np.mean(shares[::2]), abs=0.3)
+    assert np.mean(wider) == pytest.approx(1.12, abs=0.1)
 
 
 def test_torques_of_another_motion_are_predicted_to_their_noise(worlds):

@@ -1,8 +1,7 @@
 """From what a controller recorded to motions and torques that a regression can take."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Self
 
 import numpy as np
@@ -11,6 +10,7 @@ from scipy.ndimage import binary_opening, median_filter, uniform_filter1d
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.types import FloatArray, Mask
+from visioncal.dynamics.clock import Clock, clock_notes, even_parts, without_frozen
 from visioncal.dynamics.lowpass import LowPass
 from visioncal.dynamics.motion import Measured, Motion
 from visioncal.dynamics.reading import Recorded
@@ -20,9 +20,9 @@ from visioncal.dynamics.smoothing import WIDER, band_of, smoothed_motion, window
 # motion; below so many a second there is little to estimate noise from, and beyond the other gears
 # and links swing by themselves [Hz]. Motions are smoothed no less than so many times wider.
 _TORQUE_BAND, _LEAST_HZ, _MOST_HZ, _WIDEST = 10.0, 4.0, 10.0, 3.0
-# Samples farther apart than so many times the usual, and than so much [s], have others missing
-# between them; steps that differ by more than this share of the usual are resampled.
-_GAP, _GAP_S, _JITTER = 2.5, 0.02, 0.02
+# Angles are interpolated where no more than this share of a smoothing polynomial's samples is
+# missing on end: there the others determine it.
+_BRIDGED = 0.25
 # Torques at rest on an extreme for so many samples on end, within this share of it, are cut off.
 _FLAT_SAMPLES, _FLAT = 5, 1e-6
 _MOST_AT_LIMIT = 0.2
@@ -35,6 +35,8 @@ _SPIKE, _SPIKE_SHARE, _NEIGHBOURS = 10.0, 0.02, 5
 _SAMPLES_AT_ONCE = 20_000
 # An output that rests on bad samples by more than this share is not used.
 _TOUCHED = 0.02
+# Nor is one for which more than this share of its samples is missing.
+_LACKING = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,11 +46,14 @@ class Piece:
     Attributes:
         measured: The samples.
         bad: (m, n) torques without information: cut off, or of a joint that stands still.
+        there: (m,) where torques were recorded; the filter takes the regressor's rows from there,
+            too, so that both are sums over the same samples.
         lowpass: For torques and regressor alike.
     """
 
     measured: Measured
     bad: Mask
+    there: Mask
     lowpass: LowPass
 
     @property
@@ -60,7 +65,7 @@ class Piece:
     @property
     def torques_nm(self) -> FloatArray:
         """(k, n) filtered torques [N m]."""
-        return self.lowpass(self.measured.torques_nm)
+        return self.lowpass(self.measured.torques_nm, self.there)
 
     def filtered(self, columns: Callable[[Motion], FloatArray]) -> FloatArray:
         """Filters what is computed of a motion (m, ...), a part of it at a time: (k, ...)."""
@@ -70,15 +75,19 @@ class Piece:
         for begin in range(0, total, at_once):
             end = min(begin + at_once, total)
             rows = slice(begin * step, (end - 1) * step + width)
-            parts.append(self.lowpass(columns(self.measured.motion.chosen(rows))))
+            values = columns(self.measured.motion.chosen(rows))
+            parts.append(self.lowpass(values, self.there[rows]))
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     @property
     def used(self) -> Mask:
         """(k, n) which of the filtered torques rest on good samples."""
-        if not self.bad.any():
-            return np.ones((len(self.times_s), self.bad.shape[1]), dtype=bool)
-        return np.asarray(self.lowpass.touched(self.bad) <= _TOUCHED)
+        used = np.ones((len(self.times_s), self.bad.shape[1]), dtype=bool)
+        if self.bad.any():
+            used &= self.lowpass.touched(self.bad) <= _TOUCHED
+        if not self.there.all():
+            used &= self.lowpass.touched(~self.there)[:, None] <= _LACKING
+        return used
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,12 +148,15 @@ class Conditioned:
         steps = np.diff(measured.motion.times_s)
         rate_hz = 1.0 / float(np.median(steps))
         bad = np.zeros(measured.torques_nm.shape, dtype=bool)
-        piece = Piece(measured, bad, LowPass.none())
+        piece = Piece(measured, bad, np.ones(len(measured), dtype=bool), LowPass.none())
         return cls(label, (piece,), 0.5 * rate_hz, 0.5 * rate_hz, rate_hz, ())
 
 
 def condition(
-    recorded: Recorded, cutoff_hz: float | None = None, limits_nm: FloatArray | None = None
+    recorded: Recorded,
+    cutoff_hz: float | None = None,
+    limits_nm: FloatArray | None = None,
+    lag_s: float = 0.0,
 ) -> Conditioned:
     """Resamples, differentiates and filters a stream.
 
@@ -156,32 +168,44 @@ def condition(
         cutoff_hz: Where the low-pass is 6 dB down [Hz]; ten times the motion's band, 4 to 10 Hz,
             where None.
         limits_nm: (n,) torques beyond which the drives give none [N m], where known.
+        lag_s: Torques belong to angles so much earlier [s].
 
     Raises:
         DataError: No part without gaps is as long as the filters.
     """
     notes: list[str] = []
+    recorded = without_frozen(recorded, notes)
     torques, bad = _cleaned(recorded, limits_nm, notes)
     recorded = replace(recorded, torques_nm=torques)
-    parts = list(_even_parts(recorded, bad, notes))
-    longest = max(parts, key=lambda it: len(it[0]))[0]
-    rate_hz = (len(longest) - 1) / float(longest.times_s[-1] - longest.times_s[0])
-    band_hz = band_of(longest.q, rate_hz)
+    clock = Clock.of(recorded.times_s)
+    # Of how slow a motion may be, until its band is known.
+    slowest = min(_LEAST_HZ if cutoff_hz is None else cutoff_hz, 0.25 / clock.usual_s)
+    widest_s = _widest(slowest, 1.0 / clock.usual_s, clock.usual_s)
+    parts = even_parts(recorded, bad, clock, widest_s, lag_s)
+    longest = max(parts, key=len)
+    rate_hz = longest.rate_hz
+    band_hz = band_of(longest.recorded.q, rate_hz)
     usual = min(max(_TORQUE_BAND * band_hz, _LEAST_HZ), _MOST_HZ)
     cutoff = min(usual if cutoff_hz is None else cutoff_hz, 0.25 * rate_hz)
     lowpass = LowPass.of(cutoff, rate_hz)
     smoothing = min(max(WIDER * band_hz, cutoff), _WIDEST * cutoff)
+    if _widest(smoothing, rate_hz, clock.usual_s) < widest_s:
+        widest_s = _widest(smoothing, rate_hz, clock.usual_s)
+        parts = even_parts(recorded, bad, clock, widest_s, lag_s)
+        longest = max(parts, key=len)
+    notes += clock_notes(recorded, clock, widest_s)
     window = window_of(smoothing, rate_hz, len(longest))
     pieces, good = [], True
-    for part, wrong in parts:
+    for part in parts:
         if len(part) < len(lowpass.taps) + 2 * window:
             continue
-        motion, agree = smoothed_motion(part.times_s, part.q, part.dq, window)
+        whole = part.recorded
+        motion, agree = smoothed_motion(whole.times_s, whole.q, whole.dq, window)
         good &= agree
         inner = slice(window // 2, -(window // 2))
-        measured = Measured(motion.chosen(inner), part.torques_nm[inner])
+        measured = Measured(motion.chosen(inner), whole.torques_nm[inner])
         resting = _resting(measured.motion, rate_hz)
-        pieces.append(Piece(measured, wrong[inner] | resting, lowpass))
+        pieces.append(Piece(measured, part.bad[inner] | resting, part.there[inner], lowpass))
     if not pieces:
         span_s = (len(lowpass.taps) + 2 * window) / rate_hz
         raise DataError(
@@ -213,48 +237,9 @@ def _resting(motion: Motion, rate_hz: float) -> Mask:
     return np.asarray(binary_opening(slow, np.ones((samples, 1), dtype=bool)))
 
 
-def _even_parts(recorded: Recorded, bad: Mask, notes: list[str]) -> Iterator[tuple[Recorded, Mask]]:
-    """The parts between gaps, each on an even clock."""
-    steps = np.diff(recorded.times_s)
-    usual = float(np.median(steps))
-    gaps = np.flatnonzero(steps > max(_GAP * usual, _GAP_S))
-    if len(gaps):
-        places = [f"{recorded.times_s[it] - recorded.times_s[0]:.2f} s" for it in gaps]
-        notes.append(
-            f"{recorded.label}: samples are missing for up to {steps[gaps].max():.3g} s behind "
-            f"{some_of(places, 3)}; nothing is interpolated there."
-        )
-    inner = np.delete(steps, gaps)
-    jitter = float(np.std(inner)) / usual
-    if jitter > _JITTER:
-        notes.append(
-            f"{recorded.label}: steps of its clock differ by {100.0 * jitter:.0f} % (from "
-            f"{1e3 * inner.min():.3g} to {1e3 * inner.max():.3g} ms); it was resampled evenly."
-        )
-    bounds = [0, *(gaps + 1), len(recorded)]
-    for begin, end in pairwise(bounds):
-        if end - begin > 2:
-            yield _even(recorded, bad, slice(begin, end), jitter > _JITTER)
-
-
-def _even(recorded: Recorded, bad: Mask, rows: slice, resampled: bool) -> tuple[Recorded, Mask]:
-    """A part, brought to a clock with even steps where it has none."""
-    times_s = recorded.times_s[rows]
-    even = np.linspace(times_s[0], times_s[-1], len(times_s))
-
-    def at(values: FloatArray) -> FloatArray:
-        if not resampled:
-            return values[rows]
-        return np.stack([np.interp(even, times_s, it) for it in values[rows].T], axis=1)
-
-    part = replace(
-        recorded,
-        times_s=even,
-        q=at(recorded.q),
-        dq=None if recorded.dq is None else at(recorded.dq),
-        torques_nm=at(recorded.torques_nm),
-    )
-    return part, np.asarray(at(bad.astype(float)) > 0.0)
+def _widest(smoothing_hz: float, rate_hz: float, usual_s: float) -> float:
+    """For how long samples may be missing where polynomials of that cut-off smooth angles [s]."""
+    return _BRIDGED * usual_s * window_of(smoothing_hz, rate_hz, _SAMPLES_AT_ONCE)
 
 
 def _cleaned(

@@ -82,7 +82,7 @@ def check_mistakes(base: BaseModel, streams: Sequence[Conditioned]) -> None:
 def _some(stream: Conditioned) -> Measured:
     """Samples from all over a stream at which all joints move, as they were before the filter."""
     piece = max(stream.pieces, key=lambda it: len(it.measured))
-    good = np.flatnonzero(~piece.bad.any(axis=1))
+    good = np.flatnonzero(piece.there & ~piece.bad.any(axis=1))
     return piece.measured.chosen(good[:: max(len(good) // _SAMPLES, 1)])
 
 

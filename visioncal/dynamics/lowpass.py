@@ -9,6 +9,8 @@ from visioncal.core.types import FloatArray, Mask
 
 # Kaiser's design (1974): 60 dB of attenuation from 1.5 times the cut-off on.
 _BETA, _SPAN = 5.65, 1.81
+# Outputs of which no more than this share is there are not made whole.
+_LEAST_WEIGHT = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,9 +58,20 @@ class LowPass:
         """How many outputs so many samples give."""
         return max((samples - len(self.taps)) // self.step + 1, 0)
 
-    def __call__(self, values: FloatArray) -> FloatArray:
-        """Filters (m, ...) values along their first axis: (k, ...), the first at `half`."""
-        return self._summed(values, self.taps)
+    def __call__(self, values: FloatArray, there: Mask | None = None) -> FloatArray:
+        """Filters (m, ...) values along their first axis: (k, ...), the first at `half`.
+
+        Args:
+            values: What is filtered.
+            there: (m,) which of them count, all where None. Outputs are means over these; those
+                for which hardly any is there are of no use.
+        """
+        if there is None or there.all():
+            return self._summed(values, self.taps)
+        axes = (-1,) + (1,) * (values.ndim - 1)
+        weights = self._summed(there.astype(float), self.taps)
+        weights = np.where(np.abs(weights) < _LEAST_WEIGHT, 1.0, weights)
+        return self._summed(values * there.reshape(axes), self.taps) / weights.reshape(axes)
 
     def touched(self, bad: Mask) -> FloatArray:
         """(k, ...) what share of each output's weights rests on bad samples (m, ...)."""
