@@ -226,6 +226,24 @@ def test_missing_and_surplus_joints_are_named(moved, change, words):
         conditioned(changed(moved[1], change))
 
 
+@pytest.mark.parametrize(
+    ("per_s", "words", "step"),
+    [
+        (1e3, r"2 s apart, which looks like milliseconds \(500 samples a second\)", "by 1000."),
+        (1e6, r"2000 s apart, which looks like microseconds \(500 samples", "by 1000000."),
+        (1e9, r"2e\+06 s apart, which looks like nanoseconds \(500 samples", "by 1000000000."),
+        (1e15, r"which looks like no time in seconds", "stamp_s is in seconds."),
+    ],
+)
+def test_stamps_of_another_unit_are_named(moved, per_s, words, step):
+    def scale(columns):
+        columns["stamp_s"] *= per_s
+
+    with pytest.raises(DataError, match=words) as told:
+        conditioned(changed(moved[1], scale))
+    assert told.value.next_step.endswith(step)
+
+
 def test_currents_need_gains():
     rng = np.random.default_rng(8)
     built, done = real_dynamics("ur5e", rng), multi_sine(6, rng)
