@@ -445,3 +445,16 @@ def test_corners_outside_of_the_folder_are_not_read(tmp_path):
     (tmp_path / "session" / "corners.csv").symlink_to(elsewhere)
     with pytest.raises(DataError, match="leads out of its folder"):
         corners.read_corners(tmp_path / "session")
+
+
+def test_a_deleted_row_takes_its_corners_along(cube):
+    lines = (cube / "views.csv").read_text().splitlines()
+    (cube / "views.csv").write_text("\n".join([*lines[:3], *lines[4:]]) + "\n")
+    session = Session.load(cube)
+    assert len(session.views) == len(lines) - 2
+    assert set(session.corner_table.views.tolist()) == {it.number for it in session.views}
+    # A row without corners instead: views are numbered otherwise.
+    moved = [*lines[:3], lines[3].replace("2,", "77,", 1), *lines[4:]]
+    (cube / "views.csv").write_text("\n".join(moved) + "\n")
+    with pytest.raises(DataError, match="views\\.csv has no view 2"):
+        Session.load(cube)

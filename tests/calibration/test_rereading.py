@@ -10,6 +10,7 @@ import pytest
 from support.foreign_samples import easy_handeye_file
 from typer.testing import CliRunner
 
+import visioncal
 from visioncal.calibration.pipeline.guess_inputs import guess_session
 from visioncal.cli.app import app
 from visioncal.core.errors import DataError
@@ -223,3 +224,22 @@ def test_poses_that_close_under_no_reading_are_not_written(cell, tmp_path):
     assert isinstance(done.exception, DataError)
     assert "no other reading stands out" in str(done.exception)
     assert not (tmp_path / "fixed").exists()
+
+
+def test_poses_that_no_reading_explains_are_wrong_where_the_joints_agree(cell):
+    def exchanged(rows):
+        for row in rows:
+            row["x_m"], row["y_m"] = row["y_m"], row["x_m"]
+
+    def without(rows):
+        for row in rows:
+            row.update(dict.fromkeys(POSE, ""))
+
+    rewritten(cell, exchanged)
+    first = visioncal.calibrate(cell).verdict.findings[0]
+    assert first.kind == "misread_poses"
+    assert first.words.startswith("The reported poses are wrong: with them the chain closes to ")
+    assert visioncal.doctor(cell).findings[0].kind == "misread_poses"
+    # As the step says: the joint angles alone.
+    rewritten(cell, without)
+    assert visioncal.calibrate(cell).verdict.status == "good"

@@ -225,7 +225,7 @@ def save_as_utf8(encoding: str) -> str:
     """Words how a text file in another encoding is saved as UTF-8."""
     return (
         "Save the file as UTF-8: in Excel as the type `CSV UTF-8`, in an editor with that encoding "
-        f"under `Save as`, or with `iconv -f {encoding} -t UTF-8 OLD > NEW`."
+        f"under `Save as`, or with `iconv -f {encoding} -t UTF-8 FILE > COPY`."
     )
 
 

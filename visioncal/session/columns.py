@@ -159,7 +159,8 @@ def _header_problems(columns: Sequence[str]) -> Iterator[str]:
         if not name:
             yield f"column {place} has no name"
         elif name in columns[: place - 1]:
-            yield f"column {name} is there twice (columns {columns.index(name) + 1} and {place})"
+            first = columns.index(name) + 1
+            yield f"column {name} is there twice (columns {first} and {place}): delete one"
     if "view" not in columns:
         yield "the column view, a whole number that names each row, is missing"
     joints = joint_columns(columns)

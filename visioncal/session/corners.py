@@ -21,6 +21,8 @@ _NEEDED = ("view", "point", "u_px", "v_px")
 _SIGMA = "sigma_px"
 # Five hundred corners of each of two thousand views: a gigabyte of memory.
 _MOST_CORNERS = 1_000_000
+# Fewer corners show no pose.
+_FEWEST = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,13 +204,15 @@ def with_corners(
 
     Returns:
         Columns and rows, with further rows behind the others, and the corners as they belong to
-        them. Rows that one was made into share its stop.
+        them. Rows that one was made into share its stop. Corners of a view whose row was deleted
+        are left aside.
 
     Raises:
         DataError: A view is unknown, or the target of a row is unknown, not said, or another than
             its view shows.
     """
     rows = {view.number: view for view in views}
+    table = _of_rows(table, rows)
     own = [rows[it].text.get(COLUMN, "").strip() if it in rows else "" for it in table.views]
     problems = list(_target_problems(table, rows, own, names))
     if problems:
@@ -245,16 +249,35 @@ def _showing(view: View, board: str) -> View:
     return replace(view, has_corners=True, text={**view.text, COLUMN: board})
 
 
+def _of_rows(table: CornerTable, rows: Mapping[int, View]) -> CornerTable:
+    """The corners without those of views whose rows were deleted; as they are where some lack.
+
+    Where a row has neither corners nor an image, views are numbered otherwise, not deleted; and a
+    number with fewer corners than show a pose is a mistyped one.
+    """
+    there, counts = np.unique(table.views, return_counts=True)
+    others = {it for it in there.tolist() if it not in rows}
+    few = {*there[counts < _FEWEST].tolist()}
+    if not others or others & few or any(it not in there and not rows[it].image for it in rows):
+        return table
+    return table.of_views(list(rows))
+
+
 def _target_problems(
     table: CornerTable, rows: Mapping[int, View], own: Sequence[str], names: Sequence[str]
 ) -> Iterator[Problem]:
     """What is wrong with the rows' views and targets."""
     first = next((it for it in table.targets if it), "")
+    for view in dict.fromkeys(it for it in table.views.tolist() if it not in rows):
+        mine = np.flatnonzero(table.views == view)
+        more = f" and {len(mine) - 1} more" if len(mine) > 1 else ""
+        place = f"{table.place(int(mine[0]))}{more}, column view"
+        yield Problem(place, f"views.csv has no view {view}")
     for at, (view, target) in enumerate(zip(table.views.tolist(), table.targets, strict=True)):
         place = f"{FILE}, line {at + 2}"
         if view not in rows:
-            yield Problem(f"{place}, column view", f"views.csv has no view {view}")
-        elif not names and target not in ("", first):
+            continue
+        if not names and target not in ("", first):
             words = f"{target!r} beside {first!r}, but session.toml declares one target"
             yield Problem(f"{place}, column {COLUMN}", words)
         elif names and not (target or own[at]):

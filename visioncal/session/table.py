@@ -242,7 +242,12 @@ def problems_error(problems: Sequence[Problem]) -> DataError:
             next_step=f"The images show which. {READ_AGAIN}",
         )
     where = ", ".join(problems[0].place.split(", ")[:2])
-    step = f"Correct it, or delete {where}." if len(problems) == 1 else ""
+    step = f"Correct it, or delete {where}."
+    if len(problems) > 1:
+        columns = dict.fromkeys(it.place.partition(", column ")[2] for it in problems)
+        step = ""
+        if len(columns) == 1 and "" not in columns:
+            step = f"Correct column {', '.join(columns)} of {where.partition(',')[0]}."
     shown = problems[:_SHOWN_PROBLEMS]
     more = len(problems) - len(shown)
     lines = [f"{problem.place}: {problem.words}." for problem in shown]
@@ -387,11 +392,12 @@ def read_number(cell: str) -> float:
 
 
 def read_integer(cell: str) -> int:
-    """Reads a whole number.
+    """Reads a whole number; `3.0` is one, as programs write those of a table with gaps.
 
     Raises:
         DataError: It is none.
     """
+    cell = cell.removesuffix(".0")
     if not _INTEGER.fullmatch(cell) or len(cell) > 18:
         raise DataError(f"{cell!r} is no whole number")
     return int(cell)

@@ -204,6 +204,17 @@ def _motion(known: RunState, mount: Mount) -> Iterator[Finding]:
             ),
             tuple(out),
         )
+    used, (enough, _) = int(agreed.used.sum()), CalibrationLimits().stops
+    if used < enough:
+        yield Finding(
+            "few_stops",
+            f"Only {used} views can be used; {enough} or more give a result something to be "
+            "checked with.",
+            Step(
+                f"Add {enough - used} views or more, tilted by 20 to 40 degrees about different "
+                "axes."
+            ),
+        )
     rad, metres = agreed.fit.noise.robots[0].tolist()
     if 1e3 * metres > _MOST_MM:
         yield Finding(

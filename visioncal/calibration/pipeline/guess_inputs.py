@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from visioncal.calibration.guess import Guess, guess_reading
+from visioncal.calibration.guess import Candidate, Guess, guess_reading
 from visioncal.calibration.guess.given import Recording, closes
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
-from visioncal.calibration.stages.cause_ranking import read_otherwise
+from visioncal.calibration.stages.cause_ranking import read_otherwise, wrong_poses
 from visioncal.calibration.stages.clocks import waits_for_clock
 from visioncal.calibration.stages.init_frames import init_frames
 from visioncal.calibration.stages.judge import is_scattered
@@ -142,9 +142,25 @@ def reading_hint(seen: RunState) -> Finding | None:
         # Too little to guess from: what failed has been said already.
         return None
     if not guess.stands_out:
-        return None
+        return None if guess.declared.closes else _poses_beside_joints(seen, guess.declared)
     is_mirrored = guess.best.hypothesis.robot.signs == "mirror"
     return read_otherwise(guess.sentence, is_mirrored=is_mirrored)
+
+
+def _poses_beside_joints(seen: RunState, declared: Candidate) -> Finding | None:
+    """Says that poses are wrong which no reading explains, where the joint angles agree."""
+    chain = chain_poses(seen.session)
+    if chain is None or not numbers_in(seen.session, POSE).there.any():
+        return None
+    robot = PoseNumbers.of_poses(chain, _places(seen.session))
+    one_board = replace(seen, poses=seen.poses_of_one_board)
+    for camera in _seen_ways(one_board, robot):
+        by_joints = guess_reading(
+            robot, camera, seen.session.mount, is_measured=bool(seen.corners)
+        ).declared
+        if by_joints.closes:
+            return wrong_poses(declared.figures, by_joints.figures)
+    return None
 
 
 def readings_in_cell(known: RunState) -> Iterator[Finding]:

@@ -23,6 +23,7 @@ from visioncal.calibration.stages.need import Picks
 from visioncal.core.limits import CalibrationLimits, NeedLimits
 from visioncal.core.number_format import figure, percent
 from visioncal.core.verdict import (
+    CALIBRATE,
     GOOD_FOR,
     GUESS_AND_CALIBRATE,
     PLAN,
@@ -124,6 +125,25 @@ def read_otherwise(sentence: str, *, is_mirrored: bool = False) -> Finding:
         is_mirrored: Whether mirrored images are as good an explanation.
     """
     return Finding("misread_poses", sentence, _MIRRORED if is_mirrored else READ_AGAIN)
+
+
+def wrong_poses(by_poses: str, by_joints: str) -> Finding:
+    """The finding that poses are wrong, in whatever way, beside joint angles that are right.
+
+    Args:
+        by_poses: What the chain closes to with the poses, in words.
+        by_joints: The same with the joint angles and the robot's model.
+    """
+    return Finding(
+        "misread_poses",
+        f"The reported poses are wrong: with them the chain closes to {by_poses} only, with the "
+        f"joint angles and the robot's model to {by_joints}.",
+        Step(
+            "Look for exchanged columns and shifted rows among x_m to qw in views.csv; or delete "
+            "these columns, and the poses are those of the joint angles.",
+            CALIBRATE,
+        ),
+    )
 
 
 def with_misread(verdict: Verdict, found: Finding) -> Verdict:

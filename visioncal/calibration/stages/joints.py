@@ -307,7 +307,11 @@ def _described(matched: Matched, found: _Constants) -> Matched:
             f"The reported poses are of a tool frame, {offset_mm:.1f} mm and {turn_deg:.1f} deg "
             f"from the flange of {robot.name}: the camera's transform is to that frame."
         )
-        warnings.append(Finding("tool_frame", words))
+        step = Step(
+            "If the flange itself is meant, set the controller's tool to zero and record again, or "
+            "delete x_m to qw in views.csv: the poses are then those of the joint angles."
+        )
+        warnings.append(Finding("tool_frame", words, step))
     return replace(matched, warnings=tuple(warnings), notes=tuple(notes))
 
 

@@ -244,7 +244,7 @@ def judge(findings: Findings, limits: CalibrationLimits | None = None) -> Verdic
             len(said) * (met.probability >= NeedLimits.probability[0]),
             Finding(NEED, met_words(findings, met)),
         )
-    said += [] if doubts else [_praise(findings)]
+    said += [] if doubts else [_praise(findings, is_enough=status == "good")]
     said += [it for it in findings.warnings if it.kind == MISSING]
     return Verdict(status, (*said, *remarks(findings.notes, NOTE)), good_for_mm)
 
@@ -298,7 +298,11 @@ def is_scattered(findings: Findings, limits: CalibrationLimits | None = None) ->
     return any(_scatter_doubts(findings, limits or CalibrationLimits()))
 
 
-def _praise(findings: Findings) -> Finding:
+def _praise(findings: Findings, *, is_enough: bool) -> Finding:
+    keep = Step(
+        "Use the result with its covariance, and keep it: visioncal verify and visioncal diff "
+        "compare later stops with it."
+    )
     used = sum(view.used for it in findings.pairs for view in it.views)
     worst = findings.worst[0]
     return Finding(
@@ -306,10 +310,7 @@ def _praise(findings: Findings) -> Finding:
         f"All {used} used views agree: left out of the fit, they are predicted to "
         f"{_both(findings.held_out)} (rms), and "
         f"{worst.words}, its worst direction, is known to {figure(1e3 * worst.sigma)} mm.",
-        Step(
-            "Use the result with its covariance, and keep it: visioncal verify and visioncal diff "
-            "compare later stops with it."
-        ),
+        keep if is_enough else None,
     )
 
 
