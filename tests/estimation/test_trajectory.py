@@ -6,7 +6,7 @@ import pytest
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import FloatArray
 from visioncal.estimation.clock import clock_problem
-from visioncal.estimation.clock_correlation import Frames
+from visioncal.estimation.clock_correlation import Frames, turning_matches
 from visioncal.estimation.parts import State
 from visioncal.estimation.trajectory import Samples, Trajectory
 
@@ -86,3 +86,15 @@ def test_the_offset_moves_the_chain_as_its_column_says(mount) -> None:
     difference = (residuals[1] - residuals[0]) / (2 * step_s)
     # Speeds are means over 0.04 s: 2e-3 of the fastest, which a lever of metres enlarges.
     np.testing.assert_allclose(column, difference, atol=4e-3 * np.abs(difference).max())
+
+
+@pytest.mark.parametrize("rate_hz", [10, 30, 50, 100])
+def test_stamps_since_1970_are_matched_as_those_near_zero(rate_hz) -> None:
+    begin_s = 1_700_000_000.0
+    times_s = np.arange(0.0, 9.95, 1.0 / rate_hz)
+    robot = Trajectory(begin_s + times_s, swung(times_s))
+    at_s = np.arange(0.5, 9.0, 1.0 / 30.0)
+    frames = Frames("eye-in-hand", begin_s + at_s + 0.03, invert(swung(at_s)))
+    best = turning_matches(robot, frames)[0]
+    # Half a step of the search; a robot of 10 Hz is interpolated over 0.1 s.
+    assert best.offset_s == pytest.approx(0.03, abs=0.006)

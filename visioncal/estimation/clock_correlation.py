@@ -137,7 +137,9 @@ class _Turning:
     def of(cls, robot: Trajectory, frames: Frames, first: IntArray, second: IntArray) -> "_Turning":
         """Compares some frames with others behind them."""
         seen = frames.cam_from_target
-        grid_s = np.arange(robot.stamps_s[0], robot.stamps_s[-1], _STEP_S)
+        begin_s, end_s = robot.stamps_s[[0, -1]]
+        # Stamps since 1970 are rounded to 0.2 us: a step may end behind the last of them.
+        grid_s = np.minimum(begin_s + np.arange(0.0, end_s - begin_s, _STEP_S), end_s)
         turned = Slerp(robot.stamps_s, Rotation.from_matrix(robot.poses[:, :3, :3]))
         places = np.rint((frames.stamps_s - grid_s[0]) / _STEP_S).astype(np.int64)
         return cls(
