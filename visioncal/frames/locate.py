@@ -137,7 +137,8 @@ def _on_plane(
 
 
 _LOOK_AT_PLANE = (
-    "Check the plane (metres, in the base) and the robot's pose (base_from_flange, no inverse)."
+    "Check the plane (in the base; --plane is in mm) and the robot's pose (base_from_flange, no "
+    "inverse)."
 )
 
 

@@ -17,21 +17,21 @@ HIDDEN, BEHIND_ARM = "a free line of sight", "a line of sight past the arm"
 AWAY, REACH = "the arm's length", "the arm's reach"
 LIMITS, CLEARANCE = "the joints' limits", "the clearance"
 _ADVICE = {
-    IMAGE: "Look whether guesses, board and camera are the cell's; widen distance_m.",
+    IMAGE: "Look whether guesses, board and camera are the cell's; widen --distance-mm.",
     GUESS: "Measure more closely where camera and board are, or allow a greater distance.",
-    FOCUS: "Widen focus_m, or set distance_m to where the image is sharp.",
+    FOCUS: "Widen --focus-mm, or set --distance-mm to where the image is sharp.",
     HIDDEN: "Look whether the boxes are where they stand, or put the board elsewhere.",
     BEHIND_ARM: "Put the camera where the arm comes less between it and the board, or hold the "
     "board farther away from the arm.",
-    TILT: "Widen tilt_rad, or turn the board towards the camera.",
-    DISTANCE: "Widen distance_m, or put the board elsewhere.",
+    TILT: "Widen --tilt-deg, or turn the board towards the camera.",
+    DISTANCE: "Widen --distance-mm, or put the board elsewhere.",
     AWAY: "Put the board nearer to the arm, allow smaller distances, or look whether the guesses "
     "are right.",
     REACH: "Put the board where the arm can look at it from all sides, or look whether the guesses "
     "are right.",
     LIMITS: "Put the board elsewhere, or look whether the limits are the robot's.",
-    CLEARANCE: "Move one of the two, lower clearance_m, or look whether boxes, floor_m and guesses "
-    "are right.",
+    CLEARANCE: "Move one of the two, lower --clearance-mm, or look whether --box, --floor and "
+    "guesses are right.",
 }
 
 
