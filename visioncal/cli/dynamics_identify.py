@@ -1,6 +1,7 @@
 """`visioncal dynamics identify`."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -73,7 +74,7 @@ def dynamics_identify_command(
     if as_json:
         typer.echo(json.dumps(to_document(identified), indent=2, allow_nan=False))
     else:
-        _report(identified)
+        _report(identified, () if run.predicted is None else run.predicted.notes)
     if written is not None:
         report_written(written, quiet=as_json)
     elif not as_json:
@@ -97,7 +98,8 @@ def _terms(words: str) -> FrictionTerms:
     return FrictionTerms(coulomb, viscous, offset, slow_rad_s=SLOW_RAD_S)
 
 
-def _report(identified: Identified) -> None:
+def _report(identified: Identified, proof: Sequence[str]) -> None:
+    """Prints the verdict, what was fitted, and what was found in the samples of the proof."""
     console = messages()
     print_verdict(judge(identified), f"dynamics of {identified.robot.name}")
     for stream in identified.streams:
@@ -110,6 +112,9 @@ def _report(identified: Identified) -> None:
         )
         for note in stream.notes:
             console.print(f"  - {escape(note)}")
+    fitted = {note for stream in identified.streams for note in stream.notes}
+    for note in (it for it in proof if it not in fitted):
+        console.print(f"  - {escape(note)}")
     counts = [(word, identified.determined.count(word)) for _, word in CLASSES]
     shares = ", ".join(f"{count} to {word}" for word, count in counts[:-1])
     console.print(

@@ -4,7 +4,9 @@ import json
 from typing import Annotated
 
 import typer
+from rich.markup import escape
 
+from visioncal.cli.console import messages
 from visioncal.cli.dynamics_options import (
     AgainstOption,
     MotionsArgument,
@@ -52,6 +54,8 @@ def dynamics_payload_command(
     if as_json:
         typer.echo(json.dumps(found.document(), indent=2))
         return
+    for note in (note for it in loaded for note in it.notes):
+        messages().print(escape(note))
     typer.echo("\n".join(_lines(found)))
 
 

@@ -38,7 +38,7 @@ def dynamics_validate_command(
         typer.echo(json.dumps([_figures(it) for it in predictions], indent=2))
         return
     for prediction in predictions:
-        messages().print(escape(prediction.label))
+        messages().print(escape("\n".join([prediction.label, *prediction.notes])))
         _report_prediction(identified, prediction)
 
 

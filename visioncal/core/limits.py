@@ -142,6 +142,7 @@ class DynamicsLimits:
         slight_share: An error under this share of a torque's range is no reason for doubt.
         range_share: Error of a prediction as a share of the torque's range.
         known_share: Known inertias that leave more of the range are another robot's.
+        lag_share: A lag of the torques that changes them by less of their range is a note.
         undetermined_share: So many of the base parameters may be noise: those of the wrist weigh
             little.
     """
@@ -151,6 +152,7 @@ class DynamicsLimits:
     slight_share: float = 0.02
     range_share: Pair = (0.2, 0.6)
     known_share: float = 0.5
+    lag_share: float = 0.1
     undetermined_share: float = 0.5
 
 

@@ -78,9 +78,7 @@ class Even:
         return (len(times_s) - 1) / float(times_s[-1] - times_s[0])
 
 
-def even_parts(
-    recorded: Recorded, bad: Mask, clock: Clock, widest_s: float, lag_s: float = 0.0
-) -> list[Even]:
+def even_parts(recorded: Recorded, bad: Mask, clock: Clock, widest_s: float) -> list[Even]:
     """The parts between gaps, each on an even clock.
 
     Args:
@@ -88,11 +86,10 @@ def even_parts(
         bad: (m, n) torques without information.
         clock: Of their stamps.
         widest_s: Angles are interpolated where samples are missing for no longer [s].
-        lag_s: Torques belong to angles so much earlier [s].
     """
     bounds = [0, *(gaps_of(clock, widest_s) + 1), len(recorded)]
     return [
-        _even(recorded, bad, clock, slice(begin, end), lag_s)
+        _even(recorded, bad, clock, slice(begin, end))
         for begin, end in pairwise(bounds)
         if end - begin > 2
     ]
@@ -135,37 +132,28 @@ def _jitter(steps: FloatArray, counts: FloatArray, usual: float) -> float:
     return float(np.std((steps - counts * usual)[near])) / usual
 
 
-def _even(recorded: Recorded, bad: Mask, clock: Clock, rows: slice, lag_s: float) -> Even:
+def _even(recorded: Recorded, bad: Mask, clock: Clock, rows: slice) -> Even:
     """A part with a sample at every usual step."""
     times_s, counts = recorded.times_s[rows], clock.counts[rows.start : rows.stop - 1]
     places = np.concatenate([[0], np.cumsum(counts)])
     even = np.linspace(times_s[0], times_s[-1], places[-1] + 1)
     if clock.even:
         times_s = even[places]
-    seen = _seen(even, times_s, counts, clock.usual_s)
+    behind = np.clip(np.searchsorted(times_s, even, "right") - 1, 0, len(counts) - 1)
+    near = np.minimum(np.abs(even - times_s[behind]), np.abs(times_s[behind + 1] - even))
+    seen = (counts[behind] == 1) | (near < _JITTER * clock.usual_s)
 
-    def at(values: FloatArray, when: FloatArray) -> FloatArray:
-        return np.stack([np.interp(when, times_s, it) for it in values[rows].T], axis=1)
+    def at(values: FloatArray) -> FloatArray:
+        return np.stack([np.interp(even, times_s, it) for it in values[rows].T], axis=1)
 
     part = replace(
         recorded,
         times_s=even,
-        q=_bridged(even, at(recorded.q, even), seen),
-        dq=None if recorded.dq is None else _bridged(even, at(recorded.dq, even), seen),
-        torques_nm=at(recorded.torques_nm, even + lag_s),
+        q=_bridged(even, at(recorded.q), seen),
+        dq=None if recorded.dq is None else _bridged(even, at(recorded.dq), seen),
+        torques_nm=at(recorded.torques_nm),
     )
-    wrong = np.asarray(at(bad.astype(float), even + lag_s) > 0.0)
-    if lag_s:
-        seen = _seen(even + lag_s, times_s, counts, clock.usual_s)
-    return Even(part, wrong, seen)
-
-
-def _seen(when: FloatArray, times_s: FloatArray, counts: IntArray, usual_s: float) -> Mask:
-    """Which of the times (k,) are not where samples of (m,) times are missing [s]."""
-    behind = np.clip(np.searchsorted(times_s, when, "right") - 1, 0, len(counts) - 1)
-    near = np.minimum(np.abs(when - times_s[behind]), np.abs(times_s[behind + 1] - when))
-    inside = (when > times_s[0] - usual_s) & (when < times_s[-1] + usual_s)
-    return np.asarray(inside & ((counts[behind] == 1) | (near < _JITTER * usual_s)))
+    return Even(part, np.asarray(at(bad.astype(float)) > 0.0), seen)
 
 
 def _bridged(times_s: FloatArray, values: FloatArray, seen: Mask) -> FloatArray:

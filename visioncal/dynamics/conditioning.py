@@ -89,6 +89,21 @@ class Piece:
             used &= self.lowpass.touched(~self.there)[:, None] <= _LACKING
         return used
 
+    def advanced(self, lag_s: float) -> Self:
+        """The same with torques of so much later in the place of theirs [s]."""
+        times_s = self.measured.motion.times_s
+        later = times_s + lag_s
+
+        def at(values: FloatArray) -> FloatArray:
+            return np.stack([np.interp(later, times_s, it) for it in values.T], axis=1)
+
+        lost = at((~self.there)[:, None].astype(float))[:, 0] > 0.0
+        there = ~lost & (later >= times_s[0]) & (later <= times_s[-1])
+        measured = replace(self.measured, torques_nm=at(self.measured.torques_nm))
+        # Of joints at rest both what was recorded then and what stands there now says nothing.
+        bad = self.bad | (at(self.bad.astype(float)) > 0.0)
+        return replace(self, measured=measured, bad=np.asarray(bad), there=np.asarray(there))
+
 
 @dataclass(frozen=True, eq=False)
 class Conditioned:
@@ -142,6 +157,10 @@ class Conditioned:
         parts = [it.filtered(columns) for it in self.pieces]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
+    def advanced(self, lag_s: float) -> Self:
+        """The same with torques of so much later in the place of theirs [s]."""
+        return replace(self, pieces=tuple(it.advanced(lag_s) for it in self.pieces))
+
     @classmethod
     def unfiltered(cls, measured: Measured, label: str = "samples") -> Self:
         """Takes samples that need no filter as they are."""
@@ -153,10 +172,7 @@ class Conditioned:
 
 
 def condition(
-    recorded: Recorded,
-    cutoff_hz: float | None = None,
-    limits_nm: FloatArray | None = None,
-    lag_s: float = 0.0,
+    recorded: Recorded, cutoff_hz: float | None = None, limits_nm: FloatArray | None = None
 ) -> Conditioned:
     """Resamples, differentiates and filters a stream.
 
@@ -168,7 +184,6 @@ def condition(
         cutoff_hz: Where the low-pass is 6 dB down [Hz]; ten times the motion's band, 4 to 10 Hz,
             where None.
         limits_nm: (n,) torques beyond which the drives give none [N m], where known.
-        lag_s: Torques belong to angles so much earlier [s].
 
     Raises:
         DataError: No part without gaps is as long as the filters.
@@ -181,7 +196,7 @@ def condition(
     # Of how slow a motion may be, until its band is known.
     slowest = min(_LEAST_HZ if cutoff_hz is None else cutoff_hz, 0.25 / clock.usual_s)
     widest_s = _widest(slowest, 1.0 / clock.usual_s, clock.usual_s)
-    parts = even_parts(recorded, bad, clock, widest_s, lag_s)
+    parts = even_parts(recorded, bad, clock, widest_s)
     longest = max(parts, key=len)
     rate_hz = longest.rate_hz
     band_hz = band_of(longest.recorded.q, rate_hz)
@@ -191,7 +206,7 @@ def condition(
     smoothing = min(max(WIDER * band_hz, cutoff), _WIDEST * cutoff)
     if _widest(smoothing, rate_hz, clock.usual_s) < widest_s:
         widest_s = _widest(smoothing, rate_hz, clock.usual_s)
-        parts = even_parts(recorded, bad, clock, widest_s, lag_s)
+        parts = even_parts(recorded, bad, clock, widest_s)
         longest = max(parts, key=len)
     notes += clock_notes(recorded, clock, widest_s)
     window = window_of(smoothing, rate_hz, len(longest))

@@ -10,7 +10,7 @@ from visioncal.core.version import __version__
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.consistent import Consistent
 from visioncal.dynamics.friction import FrictionTerms
-from visioncal.dynamics.identified import Identified, StreamFacts, Validation
+from visioncal.dynamics.identified import Identified, Lag, StreamFacts, Validation
 from visioncal.dynamics.judge import judge
 from visioncal.dynamics.model import DynamicModel
 from visioncal.dynamics.stribeck import Stribeck
@@ -45,6 +45,8 @@ def to_document(identified: Identified) -> dict[str, Any]:
     }
     if identified.consistent is not None:
         document["standard"] = _standard_document(identified, identified.consistent)
+    if identified.lag is not None:
+        document["lag"] = vars(identified.lag)
     if identified.validation is not None:
         document["validation"] = _validation_document(identified.validation)
     verdict = judge(identified)
@@ -119,7 +121,7 @@ def _validation_document(validation: Validation) -> dict[str, Any]:
 
 _OWN_KEYS = frozenset(
     {"schema", "visioncal", "robot", "friction", "base", "covariance", "stribeck", "streams"}
-    | {"standard", "validation", "verdict"}
+    | {"standard", "lag", "validation", "verdict"}
 )
 
 
@@ -136,7 +138,7 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
     base = _base(DynamicModel(robot, terms), [str(row["name"]) for row in document["base"]])
     size = base.rank + 2 * len(document["stribeck"])
     standard = document.get("standard")
-    validation = document.get("validation")
+    validation, lag = document.get("validation"), document.get("lag")
     return {
         "robot": robot,
         "base": base,
@@ -146,6 +148,7 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
         "consistent": None if standard is None else _consistent(standard, len(base.model.names)),
         "streams": tuple(_stream_facts(it, robot.joint_count) for it in document["streams"]),
         "validation": None if validation is None else _validation(validation, robot.joint_count),
+        "lag": None if lag is None else Lag(**{name: float(it) for name, it in lag.items()}),
         "facts": {name: value for name, value in document.items() if name not in _OWN_KEYS},
     }
 

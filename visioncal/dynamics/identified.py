@@ -12,6 +12,7 @@ import numpy as np
 from visioncal.core.documents import parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, write_atomically
+from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.consistent import Consistent
@@ -81,6 +82,31 @@ class Validation:
         return np.asarray(self.rms_nm / np.maximum(self.torque_nm, 1e-12))
 
 
+@dataclass(frozen=True)
+class Lag:
+    """How much later torques come than their angles.
+
+    Attributes:
+        seconds: Their lag; below zero where they come earlier [s].
+        sigma_s: Its standard deviation [s].
+        share: What it changes of a joint's torques, over their range, where it changes most.
+    """
+
+    seconds: float
+    sigma_s: float
+    share: float
+
+    @property
+    def words(self) -> str:
+        """The lag, and what was done about it."""
+        late = self.seconds > 0.0
+        return (
+            f"The torques {'lag' if late else 'are ahead of'} the angles by "
+            f"{figure(1e3 * abs(self.seconds))} ms (sigma {figure(1e3 * self.sigma_s)}): they were "
+            f"taken so much {'earlier' if late else 'later'}."
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class Identified:
     """What torques say of an arm; `save` writes it as dynamics.json.
@@ -96,6 +122,8 @@ class Identified:
         streams: What was fitted.
         validation: How torques are predicted that were not fitted; None where there were none.
         facts: Whence it comes: session, digest, when.
+        lag: By how much the torques were later than their angles, as it was undone; None where that
+            is not clear, or does not matter.
     """
 
     robot: Robot
@@ -107,6 +135,7 @@ class Identified:
     streams: tuple[StreamFacts, ...]
     validation: Validation | None = None
     facts: Mapping[str, Any] = field(default_factory=dict)
+    lag: Lag | None = None
 
     @classmethod
     def load(cls, path: Path | str) -> Self:

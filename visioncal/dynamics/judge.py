@@ -27,6 +27,7 @@ def _plan(identified: Identified, words: str) -> Step:
 def judge(identified: Identified) -> Verdict:
     """Judges a result by what it predicts, and by what the motion determined."""
     found = [
+        *_of_lag(identified),
         *_of_prediction(identified),
         *_of_range(identified),
         *_of_parameters(identified),
@@ -36,6 +37,22 @@ def judge(identified: Identified) -> Verdict:
         "bad" if "bad" in statuses else "check" if "check" in statuses else "good"
     )
     return Verdict(worst, tuple(it for _, it in found))
+
+
+def _of_lag(identified: Identified) -> Iterator[tuple[VerdictStatus, Finding]]:
+    lag = identified.lag
+    if lag is None:
+        return
+    share = figure(100.0 * lag.share)
+    words = f"{lag.words} As they stood, that was up to {share} % of a joint's range."
+    if lag.share < _LIMITS.lag_share:
+        yield "good", Finding(NOTE, words)
+        return
+    step = Step(
+        "Record angles and torques by one clock, and filter neither of them, or both alike: a lag "
+        "that changes is undone in the mean alone."
+    )
+    yield "check", Finding("lag", words, step)
 
 
 def _of_prediction(identified: Identified) -> Iterator[tuple[VerdictStatus, Finding]]:

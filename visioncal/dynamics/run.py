@@ -10,8 +10,9 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.files import did_you_mean
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.conditioning import Conditioned, condition
-from visioncal.dynamics.identified import Identified
+from visioncal.dynamics.identified import Identified, Lag
 from visioncal.dynamics.identify import Identification, Options, identify
+from visioncal.dynamics.lag import find_lag
 from visioncal.dynamics.reading import Recorded, read_recorded
 from visioncal.dynamics.validate import Prediction, friction_of_known, predict, validate
 from visioncal.robot import Robot
@@ -39,6 +40,7 @@ class Request:
         rotors: Whether rotors' inertias are estimated; None to let the torques decide: those behind
             the gears have none in them.
         robot: Which robot of a whole cell; its streams are those that have or begin with its name.
+        lag_s: How much later torques come than their angles; sought where None [s].
     """
 
     streams: tuple[str, ...] = ()
@@ -48,6 +50,7 @@ class Request:
     options: Options = field(default_factory=Options)
     rotors: bool | None = None
     robot: str | None = None
+    lag_s: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +108,8 @@ def identify_session(session: Session, request: Request | None = None) -> Run:
             next_step="Leave --validate-on out: then the end of the motion is predicted.",
         )
     recorded = [_read(session, robot, it, request) for it in names]
-    streams = [_conditioned(robot, it, request) for it in recorded]
+    streams, lag = _lagging(robot, [_conditioned(robot, it, request) for it in recorded], request)
+    request = replace(request, lag_s=request.lag_s if lag is None else lag.seconds)
     split = _split(robot, recorded, streams, request)
     options = _with_rotors(robot, split, request)
     whole = identify(robot, streams, options)
@@ -119,6 +123,7 @@ def identify_session(session: Session, request: Request | None = None) -> Run:
     identified = replace(
         whole.identified,
         validation=None if proof is None else validate(whole.identified, proof),
+        lag=lag,
         facts={
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
             "session": {"name": session.name, "sha256": session.digest()},
@@ -153,7 +158,11 @@ def conditioned_streams(
     recorded = [_read(session, robot, it, request) for it in names]
     cutoff_hz = request.cutoff_hz or identified.streams[0].cutoff_hz
     filtered = replace(request, cutoff_hz=cutoff_hz)
-    return [_conditioned(robot, it, filtered) for it in recorded]
+    streams = [_conditioned(robot, it, filtered) for it in recorded]
+    streams, lag = _lagging(robot, streams, request)
+    if lag is None:
+        return streams
+    return [replace(it, notes=(*it.notes, f"{it.label}: {lag.words}")) for it in streams]
 
 
 def current_streams(
@@ -247,7 +256,18 @@ def _read(session: Session, robot: Robot, name: str, request: Request) -> Record
 
 
 def _conditioned(robot: Robot, recorded: Recorded, request: Request) -> Conditioned:
-    return condition(recorded, request.cutoff_hz, robot.torque_nm)
+    found = condition(recorded, request.cutoff_hz, robot.torque_nm)
+    return found.advanced(request.lag_s) if request.lag_s else found
+
+
+def _lagging(
+    robot: Robot, streams: list[Conditioned], request: Request
+) -> tuple[list[Conditioned], Lag | None]:
+    """The streams with their torques at the angles' times, and by how much they were later."""
+    lag = None
+    if request.lag_s is None:
+        lag = find_lag(robot, streams, request.options.terms)
+    return streams if lag is None else [it.advanced(lag.seconds) for it in streams], lag
 
 
 def _split(

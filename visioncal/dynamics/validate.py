@@ -31,6 +31,7 @@ class Prediction:
         used: (k, n) which of the torques count.
         q: (k, n) joint angles, filtered likewise [rad].
         dq: (k, n) their speeds [rad/s].
+        notes: What was found in the samples and done about it, in words.
     """
 
     label: str
@@ -42,6 +43,7 @@ class Prediction:
     used: Mask
     q: FloatArray
     dq: FloatArray
+    notes: tuple[str, ...] = ()
 
     def rms_nm(self, predicted_nm: FloatArray) -> FloatArray:
         """(n,) root mean square error of a prediction [N m]."""
@@ -78,6 +80,7 @@ def predict(
         stream.used,
         stream.filtered(lambda motion: motion.q),
         stream.filtered(lambda motion: motion.dq),
+        stream.notes,
     )
 
 

@@ -1,0 +1,143 @@
+"""By how much a stream's torques come later than the angles that they belong to.
+
+Torques that are filtered, or stamped by another clock, lag the angles. One number for all streams
+is sought by what the best fit leaves, and made exact by Gauss and Newton's steps, with the torques'
+derivative as one more column.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from visioncal.core.limits import DynamicsLimits
+from visioncal.core.types import FloatArray, Mask
+from visioncal.dynamics.base import BaseModel
+from visioncal.dynamics.conditioning import Conditioned
+from visioncal.dynamics.friction import FrictionTerms
+from visioncal.dynamics.identified import Lag
+from visioncal.dynamics.identify import block_of
+from visioncal.dynamics.model import DynamicModel
+from visioncal.dynamics.null_space import null_space
+from visioncal.dynamics.regression import Block, Regression, regress, rms_of, spread_of
+from visioncal.robot import Robot
+
+_LIMITS = DynamicsLimits()
+# Lags are sought up to this one, so many to a period of the cut-off, by so many torques [s].
+_LARGEST_S, _PER_PERIOD, _ROWS = 0.25, 16, 20_000
+# A lag is one that differs from zero by so many sigmas, where the fit leaves of the torques' range
+# no more than this share in the median of the joints: no lag mends what else is wrong.
+_SIGMAS, _LEFT = 5.0, 0.3
+_ROUNDS, _SETTLED = 5, 0.1
+
+
+def find_lag(robot: Robot, streams: Sequence[Conditioned], terms: FrictionTerms) -> Lag | None:
+    """Estimates the lag of the torques of an arm's motions.
+
+    Args:
+        robot: The arm.
+        streams: Its motions, with torques that lag alike.
+        terms: What joints have of their own. Rotors count, too, where the motion allows: a lag of
+            viscous friction would else stand for them.
+
+    Returns:
+        The lag; None where there is none that is clear and matters, or the motion tells none.
+    """
+    for rotors in (True, terms.motor_inertia):
+        model = DynamicModel(robot, replace(terms, motor_inertia=rotors))
+        base = BaseModel.reduce(model)
+        blocks = [block_of(base, it) for it in streams]
+        if not null_space(base, blocks):
+            break
+    else:
+        return None
+    try:
+        return _found(streams, blocks)
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _found(streams: Sequence[Conditioned], blocks: Sequence[Block]) -> Lag | None:
+    lag_s = _nearest(streams, blocks)
+    if lag_s is None:
+        return None
+    for _ in range(_ROUNDS):
+        lagged = [_lagged(*it, lag_s) for it in zip(streams, blocks, strict=True)]
+        fit = regress(lagged)
+        change, sigma = float(fit.values[-1]), float(np.sqrt(fit.covariance[-1, -1]))
+        lag_s -= change
+        if abs(change) < _SETTLED * sigma or abs(lag_s) > _LARGEST_S:
+            break
+    found = Lag(lag_s, sigma, _share(fit, lag_s))
+    left = [
+        rms_of(it, block.used) / spread_of(block.y, block.used)
+        for it, block in zip(fit.residuals, fit.blocks, strict=True)
+    ]
+    clear = _SIGMAS * sigma < abs(lag_s) <= _LARGEST_S and found.share > _LIMITS.slight_share
+    return found if clear and np.median(left) < _LEFT else None
+
+
+def _nearest(streams: Sequence[Conditioned], blocks: Sequence[Block]) -> float | None:
+    """The lag on a grid by which the best fit leaves least [s]; None where samples are too few."""
+    step_s = 1.0 / (_PER_PERIOD * max(it.cutoff_hz for it in streams))
+    many = int(_LARGEST_S / step_s)
+    lags = step_s * np.arange(-many, many + 1)
+    rows, torques, joints = [], [], []
+    total = sum(it.y.size for it in blocks)
+    for stream, block in zip(streams, blocks, strict=True):
+        used = block.used & _inside(stream, _LARGEST_S)[:, None]
+        used[np.arange(len(used)) % max(total // _ROWS, 1) > 0] = False
+        sizes = np.maximum(spread_of(block.y, used), 1e-12)
+        rows.append((block.x / sizes[:, None])[used])
+        torques.append(np.stack([(_torques(stream, it) / sizes)[used] for it in lags], axis=1))
+        joints.append(np.nonzero(used)[1])
+    x, y, joint = np.concatenate(rows), np.concatenate(torques), np.concatenate(joints)
+    if len(x) < 2 * x.shape[1]:
+        return None
+    directions = np.linalg.qr(x / np.maximum(np.linalg.norm(x, axis=0), 1e-12))[0]
+    left = (y - directions @ (directions.T @ y)) ** 2
+    # The likelihood of joints each with a noise of its own.
+    cost = np.zeros(len(lags))
+    for one in np.unique(joint):
+        of = joint == one
+        cost += of.sum() * np.log(np.maximum(left[of].sum(axis=0), 1e-12))
+    return float(lags[np.argmin(cost)])
+
+
+def _lagged(stream: Conditioned, block: Block, lag_s: float) -> Block:
+    """The block with its torques taken so much later, and their derivative as one more column."""
+    step_s = 1.0 / stream.rate_hz
+    y, before, after = (_torques(stream, it) for it in (lag_s, lag_s - step_s, lag_s + step_s))
+    slope = (after - before) / (2.0 * step_s)
+    used = block.used & _inside(stream, abs(lag_s) + step_s)[:, None]
+    return Block(np.concatenate([block.x, slope[:, :, None]], axis=2), y, used, block.correlation)
+
+
+def _torques(stream: Conditioned, lag_s: float) -> FloatArray:
+    """(k, n) filtered torques of so much later, summed over the samples that count now [N m]."""
+    parts = []
+    for piece in stream.pieces:
+        times_s = piece.measured.motion.times_s
+        later = [np.interp(times_s + lag_s, times_s, it) for it in piece.measured.torques_nm.T]
+        parts.append(piece.lowpass(np.stack(later, axis=1), piece.there))
+    return np.concatenate(parts)
+
+
+def _inside(stream: Conditioned, lag_s: float) -> Mask:
+    """(k,) which filtered samples rest on recorded torques, whichever way they lag [s]."""
+    parts = []
+    for piece in stream.pieces:
+        ends_s = piece.measured.motion.times_s[[0, -1]] + np.array([1.0, -1.0]) * (
+            piece.lowpass.half / stream.rate_hz + lag_s
+        )
+        parts.append((piece.times_s >= ends_s[0]) & (piece.times_s <= ends_s[1]))
+    return np.concatenate(parts)
+
+
+def _share(fit: Regression, lag_s: float) -> float:
+    """The most that a lag changes of a joint's torques, over their range."""
+    shares = [
+        rms_of(lag_s * it.x[:, :, -1], it.used) / np.maximum(spread_of(it.y, it.used), 1e-12)
+        for it in fit.blocks
+    ]
+    return float(np.max(shares))
