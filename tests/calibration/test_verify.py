@@ -6,6 +6,7 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
+from support.beyond import with_field
 from support.cells import calibrated, known_of, session_of
 from support.commands import visioncal
 from support.later import ANYHOW, FITTED, Change, again, knock, known_again, part, usual
@@ -35,6 +36,7 @@ from visioncal.session import Session
 from visioncal.simulation import CellOptions, Payload, simulate, write_session
 from visioncal.simulation.boards import centre_m
 from visioncal.simulation.second import Second
+from visioncal.vision.targets import numbered_positions
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
 
@@ -70,6 +72,33 @@ def test_an_unchanged_cell_passes_as_often_as_it_should(place):
     # Chi-square of thirty directions; the mean of eight is known to 2.7, and the noise's scale to
     # a tenth, which is three more.
     assert np.mean([it.misfit for it in found]) == pytest.approx(30.0, abs=12.0)
+
+
+def test_a_lens_that_departs_from_its_model_is_seen_with_its_field(place):
+    plain = seen_by(
+        known_again(place.cell, np.random.default_rng(0)), CalibrationPrior.of(place.calibration)
+    )
+    result = with_field(place.calibration)
+    lens, known = result.camera, known_again(place.cell, np.random.default_rng(0))
+    ((frame, look),) = known.cameras.items()
+    poses = {view: it.cam_from_target[0] for view, it in plain.known.poses.items()}
+    displaced = {}
+    for view, it in look.corners.items():
+        points = numbered_positions(tuple(plain.known.session.boards.values()))[it.ids]
+        far_m = float(np.mean(points @ poses[view][2, :3] + poses[view][2, 3]))
+        px = it.px + lens.displacements(it.px, far_m) @ lens.field.coefficients
+        displaced[view] = replace(it, px=px)
+    known = known.with_camera(frame, replace(look, corners=displaced))
+    expected = plain.away(CalibrationPrior.of(place.calibration))
+
+    def off_mm(calibration):
+        prior_calibration = CalibrationPrior.of(calibration)
+        away = seen_by(known, prior_calibration).away(prior_calibration)
+        return 1e3 * np.abs(away - expected)[:, :3, 3].max()
+
+    # A field of 0.3 px changes by some thousandths of that over itself.
+    assert off_mm(result) < 0.02
+    assert off_mm(place.calibration) > 0.2
 
 
 def test_a_bumped_camera_is_told_with_its_size_and_direction(place):

@@ -1,6 +1,7 @@
 """Exports: what others read is the transform that was calibrated, whoever reads it."""
 
 import json
+import re
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from support import readers
+from support.beyond import with_field
 from support.commands import started, visioncal
 from support.placed import fixture, tool
 from support.readers import FIXTURE_READERS, READERS, TOOL_READERS
@@ -19,8 +21,9 @@ from support.samples import made_up
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.core.types import Camera
-from visioncal.interchange.exports import EXPORT_FORMATS, Selection, export
+from visioncal.interchange.exports import EXPORT_FORMATS, Selection, document, export
 from visioncal.results import CameraResult, Edge, Verdict
+from visioncal.vision.camera import matrix_3x3, normalise
 
 NAMES = [it.name for it in EXPORT_FORMATS]
 EDGE_NAMES = [it for it in NAMES if it not in (*readers.ARM_FORMATS, "joint-corrections")]
@@ -289,6 +292,49 @@ def test_opencv_holds_the_lens_beside_the_transform(model, distortion):
     assert storage.getNode("camera_matrix").mat()[1, 2] == 1 / 3
     assert storage.getNode("distortion_model").string() == model
     assert storage.getNode("image_width").real() == 1280
+
+
+def test_a_field_goes_into_the_coefficients_as_far_as_these_can_say_it():
+    camera = replace(SAMPLE.camera.camera, distortion=np.array([-0.1, 0.05, 1e-3, 1e-3, 0.0]))
+    result = with_field(replace(SAMPLE, camera=CameraResult(camera, estimated=False)))
+    found = document(result, "opencv")
+    said = found.warnings[0]
+    assert said.startswith("the lens departs from its model")
+    assert said.rstrip(".") in found.text
+    storage = cv2.FileStorage(found.text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    matrix = storage.getNode("camera_matrix").mat()
+    coefficients = storage.getNode("distortion_coefficients").mat()
+    # What has no place in the model of others, as Kalibr's, stays without.
+    assert coefficients[0, 4] == 0.0
+    assert export(result, "kalibr")
+    axes = (np.linspace(20.0, it - 20.0, 15) for it in result.camera.camera.resolution)
+    px = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    rays = normalise(result.camera.camera, result.camera.in_model(px))
+
+    def left_px(matrix, coefficients):
+        points = np.column_stack([rays, np.ones(len(rays))])
+        shown, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, coefficients)
+        return np.sqrt(np.mean((shown[:, 0] - px) ** 2))
+
+    before, after = (
+        left_px(matrix_3x3(camera), camera.distortion),
+        left_px(matrix, coefficients),
+    )
+    figures = [float(it) for it in re.findall(r"([\d.]+) px", said)]
+    # The weights are those of what is known, a little larger in the middle.
+    assert figures[0] == pytest.approx(after, rel=0.15)
+    assert figures[0] < figures[1] < 5 * figures[0]
+    # Fields of a fifth of the width have more waves than five coefficients.
+    assert after < 0.97 * before
+
+
+def test_a_field_that_nobody_notices_leaves_the_lens_as_it_was_given():
+    result = with_field(SAMPLE)
+    field = replace(result.camera.field, field_px=1e-3, breathing=0.0)
+    count = field.columns(result.camera.camera, np.zeros((1, 2)), None).shape[2]
+    field = replace(field, coefficients=field.coefficients[:count], root=field.root[:count])
+    small = replace(result, camera=replace(result.camera, field=field))
+    assert export(small, "camera-info") == export(SAMPLE, "camera-info")
 
 
 def test_a_lens_that_is_not_there_is_refused_and_the_transform_still_goes_out():

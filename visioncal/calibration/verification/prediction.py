@@ -9,15 +9,17 @@ import numpy as np
 from visioncal.calibration.pipeline import STAGES
 from visioncal.calibration.pipeline.observed_poses import ObservedPoses
 from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.stages.observed import CameraLook
 from visioncal.calibration.stages.pose_ambiguity import choose_by
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import invert, pose_difference
-from visioncal.core.types import FloatArray, IntArray, Progress, Rejection, Target
+from visioncal.core.types import Corners, FloatArray, IntArray, Progress, Rejection, Target
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.chain import robot_part
 from visioncal.estimation.corners import CornerStack, reproject
+from visioncal.estimation.lens_field import depths_m
 from visioncal.estimation.parts import ROBOT, State
 from visioncal.estimation.problem import Problem
 from visioncal.results import CameraResult
@@ -25,7 +27,7 @@ from visioncal.results.session_match import check_mount, check_resolution
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.boards import COLUMN
-from visioncal.vision.targets import target_document
+from visioncal.vision.targets import numbered_positions, target_document
 
 # Models that place the flange alike to this are of one robot; tables are written with six digits.
 _ONE_ROBOT_MM, _ONE_ROBOT_DEG = 0.01, 0.001
@@ -122,7 +124,7 @@ def known_before(
 
 def seen_by(known: RunState, prior_calibration: CalibrationPrior) -> PredictedStops:
     """Carries on where targets have been detected; see `predict_stops`."""
-    calibration = prior_calibration.calibration
+    calibration, detected = prior_calibration.calibration, known.cameras
     for frame, look in known.cameras.items():
         if look.resolution is None:
             continue
@@ -134,7 +136,9 @@ def seen_by(known: RunState, prior_calibration: CalibrationPrior) -> PredictedSt
             )
         check_resolution(known.session, calibration, look.resolution)
         lens = CameraResult(calibration.camera.camera, estimated=False)
-        known = known.with_camera(frame, replace(look, lens=lens))
+        straight = _straightened(look.corners, calibration.camera, {})
+        known = known.with_camera(frame, replace(look, lens=lens, corners=straight))
+    known = _breathed(known, detected, calibration.camera)
     # Of a sweep the slower views are taken, in which the offset's error is lost in the robot's.
     known = replace(_STAGES["clock"](_STAGES["pnp"](known)), clocks={})
     looked = _posed(_with_arm(ObservedPoses.of(known), prior_calibration), prior_calibration)
@@ -148,6 +152,41 @@ def seen_by(known: RunState, prior_calibration: CalibrationPrior) -> PredictedSt
         ),
         tuple(_warnings(looked, prior_calibration)),
     )
+
+
+def _breathed(
+    known: RunState, detected: Mapping[str, CameraLook], lens: CameraResult | None
+) -> RunState:
+    """Corners where a lens that breathes would show them at the views' mean distance."""
+    if lens is None or lens.field is None or lens.field.breathing == 0.0:
+        return known
+    targets = tuple(known.session.boards.values())
+    placed = _STAGES["pnp"](known).poses
+    for frame, look in detected.items():
+        shown = {view: it for view, it in look.corners.items() if view in placed}
+        if not shown:
+            continue
+        stack = CornerStack.of(shown, numbered_positions(targets))
+        poses = np.array([placed[view].cam_from_target[0] for view in stack.views])
+        far = dict(zip(stack.views, depths_m(stack, poses).tolist(), strict=True))
+        straight = _straightened(look.corners, lens, far)
+        known = known.with_camera(frame, replace(known.cameras[frame], corners=straight))
+    return known
+
+
+def _straightened(
+    corners: Mapping[int, Corners], lens: CameraResult, depths: Mapping[int, float]
+) -> dict[int, Corners]:
+    """Corners by view where the lens would show them, were it what its model says.
+
+    Args:
+        corners: As they were detected.
+        lens: With its field.
+        depths: How far along the camera's axis they are, where that is known [m].
+    """
+    return {
+        view: replace(it, px=lens.in_model(it.px, depths.get(view))) for view, it in corners.items()
+    }
 
 
 def asked_of_boards(problem: Problem, state: State) -> FloatArray:

@@ -1,9 +1,12 @@
 """What is asked for of a result, and what a format then writes."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
+from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray, Mount
 from visioncal.results import CameraResult, Edge, Verdict
+from visioncal.results.refitted_lens import RefittedLens, refitted
 
 _OF_LENS = "it goes with the lens of that calibration: with other intrinsics, use its ray_frame"
 
@@ -96,6 +99,23 @@ class Content:
     def matrix(self) -> FloatArray:
         """(4, 4) `parent_from_child` [m]."""
         return self.edge.matrix
+
+    @cached_property
+    def plain_lens(self) -> RefittedLens | None:
+        """The lens as matrix and coefficients say it; None where there is no camera."""
+        return None if self.lens is None else refitted(self.lens)
+
+    @property
+    def left_of_field(self) -> str:
+        """What matrix and coefficients leave of what the lens does beyond them; else empty."""
+        lens = self.plain_lens
+        if lens is None or lens.rms_px == 0.0:
+            return ""
+        return (
+            "the lens departs from its model, and matrix and coefficients are those that come "
+            f"nearest to it: they leave {figure(lens.rms_px)} px rms where it was seen, "
+            f"{figure(lens.most_px)} px at the most (visioncal locate corrects that)"
+        )
 
     @property
     def quality(self) -> str:

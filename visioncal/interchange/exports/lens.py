@@ -15,18 +15,18 @@ _ROS_MODELS = {5: "plumb_bob", 8: "rational_polynomial", 4: "equidistant"}
 
 
 def camera_of(content: Content) -> Camera:
-    """Gives the camera, whose lens is one of `_ROS_MODELS`.
+    """Gives the camera, whose lens is one of `_ROS_MODELS`, with its field in its coefficients.
 
     Raises:
         DataError: There is none, or it has another number of coefficients.
     """
-    if content.lens is None:
+    if content.plain_lens is None:
         raise DataError(
             "This calibration has no camera: its session brought measured poses of the target, "
             "and no images.",
             next_step="Export its transform, as with --to ros.",
         )
-    camera = content.lens.camera
+    camera = content.plain_lens.camera
     if len(camera.distortion) not in _ROS_MODELS:
         raise DataError(
             f"The lens has {len(camera.distortion)} coefficients; 4 (fisheye), 5 or 8 (brown) are "
@@ -39,7 +39,13 @@ def camera_of(content: Content) -> Camera:
 def _notes(content: Content) -> list[str]:
     estimated = content.lens is not None and content.lens.estimated
     how = "estimated from the session's images" if estimated else "as the session gave it"
-    return [content.origin, f"verdict {content.verdict.status}; the lens is {how}"]
+    said = [content.left_of_field] if content.left_of_field else []
+    return [content.origin, f"verdict {content.verdict.status}; the lens is {how}", *said]
+
+
+def warn_of_field(content: Content) -> str:
+    """Says what coefficients leave of the lens's field; empty for nothing."""
+    return f"{content.left_of_field}." if content.left_of_field else ""
 
 
 def _array(matrix: FloatArray) -> dict[str, int | list[float]]:
@@ -104,8 +110,18 @@ def _radtan(coefficients: list[float]) -> list[float]:
 
 
 CAMERA_INFO = ExportFormat(
-    "camera-info", "the lens as ROS's camera_info YAML [px]", _write_camera_info, "lens", _CAMERA
+    "camera-info",
+    "the lens as ROS's camera_info YAML [px]",
+    _write_camera_info,
+    "lens",
+    _CAMERA,
+    warn=warn_of_field,
 )
 KALIBR = ExportFormat(
-    "kalibr", "the lens as Kalibr's camchain.yaml [px]", _write_kalibr, "lens", _CAMERA
+    "kalibr",
+    "the lens as Kalibr's camchain.yaml [px]",
+    _write_kalibr,
+    "lens",
+    _CAMERA,
+    warn=warn_of_field,
 )

@@ -8,6 +8,7 @@ from visioncal.core.files import one_line
 from visioncal.core.types import FloatArray
 from visioncal.interchange.exports.content import Content
 from visioncal.interchange.exports.format import ExportFormat
+from visioncal.interchange.exports.lens import warn_of_field
 from visioncal.interchange.exports.writing import comments, rows, yaml_text
 from visioncal.vision.camera import matrix_3x3
 
@@ -28,15 +29,15 @@ def _write_opencv(content: Content) -> str:
     The lens goes under the names of OpenCV's own calibration (samples/cpp/calibration.cpp).
     """
     storage = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
-    for line in content.notes:
+    for line in (*content.notes, *([content.left_of_field] if content.left_of_field else [])):
         storage.writeComment(one_line(line), append=False)
     storage.write("parent", content.parent)
     storage.write("child", content.child)
     storage.write("transform", content.matrix)
     storage.write("R", content.matrix[:3, :3].copy())
     storage.write("t", content.matrix[:3, 3:].copy())
-    if content.lens is not None:
-        camera = content.lens.camera
+    if content.plain_lens is not None:
+        camera = content.plain_lens.camera
         storage.write("image_width", camera.resolution[0])
         storage.write("image_height", camera.resolution[1])
         storage.write("distortion_model", camera.model)
@@ -67,5 +68,6 @@ OPENCV = ExportFormat(
     "opencv",
     "OpenCV's FileStorage: transform, R, t and any lens [m]",
     _write_opencv,
+    warn=warn_of_field,
 )
 ZIVID = ExportFormat("zivid", "a Matrix4x4 of Zivid's SDK as YAML [mm]", _write_zivid)

@@ -2,7 +2,7 @@
 
 from visioncal.interchange.exports.content import Content
 from visioncal.interchange.exports.format import ExportFormat
-from visioncal.interchange.exports.lens import camera_of
+from visioncal.interchange.exports.lens import camera_of, warn_of_field
 from visioncal.live.drivers.oak_calibration import calibration_json
 
 
@@ -12,13 +12,15 @@ def _write(content: Content) -> str:
 
 
 def _warn(content: Content) -> str:
+    said = warn_of_field(content)
     if content.onto is not None:
-        return ""
-    return (
+        return said
+    board = (
         "this calibration holds one camera and nothing of its board. Before a device is given it, "
         "write it onto the device's own: --onto FILE, as CalibrationHandler.eepromToJsonFile saves "
         "it."
     )
+    return f"{said} {board}".strip()
 
 
 OAK = ExportFormat(
