@@ -87,7 +87,7 @@ def _known(lens: CameraResult, px: FloatArray) -> FloatArray:
     columns = lens.displacements(px)
     before = np.sum(columns**2, axis=(1, 2))
     after = np.sum((columns @ lens.field.root) ** 2, axis=(1, 2))
-    return np.clip(1.0 - after / np.where(before > 0.0, before, np.inf), 0.0, 1.0)
+    return np.asarray(np.clip(1.0 - after / np.where(before > 0.0, before, np.inf), 0.0, 1.0))
 
 
 def _rms(px: FloatArray, weights: FloatArray) -> float:
