@@ -91,6 +91,18 @@ def test_a_mount_that_nothing_tells_is_asked_for():
     assert guess.best.hypothesis.mount == "eye-in-hand"
 
 
+@pytest.mark.parametrize(("written", "read"), [("ZYX", "xyz"), ("xyz", "ZYX")])
+def test_readings_with_the_same_poses_leave_nothing_open(written, read):
+    # Angles of a KUKA read as those of a FANUC: several orders of turns undo that.
+    poses = cell_poses("eye-in-hand")
+    angles = Rotation.from_matrix(poses.true_robot[:, :3, :3]).as_euler(written)
+    wrong = compose(Rotation.from_euler(read, angles).as_matrix(), poses.true_robot[:, :3, 3])
+    guess = guess_reading(numbers(wrong), poses.camera, "eye-in-hand", is_measured=True)
+    assert guess.stands_out, guess.sentence
+    found, _ = guess.best.hypothesis.chain(numbers(wrong), poses.camera)
+    np.testing.assert_allclose(found, poses.true_robot, atol=1e-9)
+
+
 def test_mirrored_images_are_named_before_a_left_handed_frame():
     poses = MISTAKES["one axis left-handed"](cell_poses("eye-in-hand"), np.random.default_rng(0))
     guess = guessed(poses)

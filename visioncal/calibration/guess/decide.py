@@ -24,6 +24,7 @@ from visioncal.calibration.guess.search import search
 from visioncal.core.conventions import ROTATION_FORMS, PoseNumbers
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.threads import one_blas_thread
+from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import MOUNTS, FloatArray, Mount
 
 # Readings this near to the best are as good; of them, the one with the fewest changes is meant.
@@ -33,6 +34,8 @@ _RIVALS = 1.5
 # Views beyond this many typical distances do not agree with the others.
 _AGREES = 5.0
 _LISTED = 12
+# Poses of two readings that differ by less than this share of what is left are the same.
+_SAME = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,8 +195,27 @@ def _decided(recording: Recording, scored: Sequence[Scored]) -> Scored:
     is_likely = is_likely_unit(recording, declared.hypothesis.camera.unit)
     if is_likely and declared.score <= STANDS_OUT * best.score:
         return declared
-    is_open = any(it.cost == best.cost and it.score < _RIVALS * best.score for it in rivals)
+    is_open = any(
+        it.cost == best.cost
+        and it.score < _RIVALS * best.score
+        and not _are_same(recording, it, best)
+        for it in rivals
+    )
     return declared if is_open or _is_poor(recording, best) else best
+
+
+def _are_same(recording: Recording, one: Scored, other: Scored) -> bool:
+    """Whether two readings have the same poses, so that it does not matter which is meant."""
+    rows = np.intersect1d(one.rows, other.rows)
+    (first, _), (second, _) = (
+        it.hypothesis.chain(recording.robot, recording.camera) for it in (one, other)
+    )
+    away = invert(first[rows]) @ second[rows]
+    shift, angle = one.fit.rms
+    return bool(
+        np.sqrt(np.mean(rotation_angle(away) ** 2)) <= _SAME * angle
+        and np.sqrt(np.mean(np.sum(away[:, :3, 3] ** 2, axis=1))) <= _SAME * shift
+    )
 
 
 def _guess(found: _Found, chain: FloatArray | None, mount_note: str = "") -> Guess:
