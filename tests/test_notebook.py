@@ -105,6 +105,11 @@ def test_arrays_that_do_not_match_are_refused():
         visioncal.Session.from_arrays([image] * 2, poses, "charuco_9x6_30mm")
     with pytest.raises(DataError, match=r"type float64; .* uint8"):
         visioncal.Session.from_arrays([0.5 * image] * 3, poses, "charuco_9x6_30mm")
+    with pytest.raises(DataError, match=r"^robott is nothing that is known") as caught:
+        visioncal.Session.from_arrays([image] * 3, poses, "charuco_9x6_30mm", robott="ur5e")
+    assert caught.value.next_step == "Did you mean robot?"
+    with pytest.raises(DataError, match="There are no views"):
+        visioncal.Session.from_arrays([], np.zeros((0, 4, 4)), "charuco_9x6_30mm")
 
 
 BOARD = "charuco_9x6_30mm"

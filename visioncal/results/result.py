@@ -259,10 +259,13 @@ class Calibration(CalibrationSections):
             m transforms, as one batched RigidTransform.
 
         Raises:
-            DataError: The session named no known robot, q has another number of joints, a load is
-                none, or temperatures are given and none were calibrated.
+            DataError: The session named no known robot, q has another number of joints or is not
+                finite, a load is none, or temperatures are given and none were calibrated.
         """
-        q = np.atleast_2d(q)
+        q = np.atleast_2d(np.asarray(q, dtype=float))
+        wrong = np.flatnonzero(~np.isfinite(q).all(axis=1))
+        if wrong.size:
+            raise DataError(f"q[{wrong[0]}] is not finite.", culprits=[f"q[{wrong[0]}]"])
         loads = Loads.alike(len(q), payload_kg, payload_m, force_n)
         standing = self.standing(q, loads)
         if temperatures_c is not None:

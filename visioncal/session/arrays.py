@@ -8,6 +8,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from visioncal.core.errors import DataError
+from visioncal.core.files import did_you_mean
 from visioncal.core.transforms import LAST_ROW, rigid_fault
 from visioncal.core.types import Camera, FloatArray, Image, IntArray, Mount, Target
 from visioncal.session.columns import POSE
@@ -159,7 +160,16 @@ def _facts(
     images: MemoryImages,
     resolution: tuple[int, int] | None = None,
 ) -> Facts:
-    count = len(matrices)
+    count, known = len(matrices), [*Cell.__annotations__]
+    for name in cell:
+        if name not in known:
+            raise DataError(
+                f"{name} is nothing that is known of a cell; that is {', '.join(known)}.",
+                culprits=[name],
+                next_step=did_you_mean(name, known),
+            )
+    if not count:
+        raise DataError("There are no views.", culprits=["base_from_flange"])
     q = np.asarray(cell.get("q", np.zeros((count, 0))), dtype=float)
     if q.ndim != 2 or len(q) != count:
         raise DataError(
