@@ -21,11 +21,14 @@ class Reading:
         words: What it is: `with quaternions as w, x, y, z`.
         rms_m: Root mean square distance of the touches then [m].
         as_read_m: The same as they were read [m].
+        options: Those of commands by which columns of their usual names are read so; empty where
+            none are known.
     """
 
     words: str
     rms_m: float
     as_read_m: float
+    options: str = ""
 
 
 def readings_that_close(touches: Touches) -> tuple[Reading, ...]:
@@ -43,16 +46,25 @@ def readings_that_close(touches: Touches) -> tuple[Reading, ...]:
     there = touches.subset(touches.are("point"))
     poses = there.base_from_flange
     as_read = _linear_rms(there)
+    first = "with quaternions as w, x, y, z"
     others = {
-        "with quaternions as w, x, y, z": _reordered(poses, -1),
+        first: _reordered(poses, -1),
         "with quaternions as x, y, z, w": _reordered(poses, 1),
     }
+    options = {first: "--robot-columns x_m,y_m,z_m,qy,qz,qw,qx"}
     if len(np.unique(there.points)) > 1:
         inverse = "the other way round, as flange_from_base"
         others |= {f"{words} and {inverse}": invert(it) for words, it in others.items()}
         others[inverse] = invert(poses)
+        options |= {inverse: "--robot-inverse"}
+        options |= {f"{first} and {inverse}": f"{options[first]} --robot-inverse"}
     found = [
-        Reading(words, _linear_rms(replace(there, base_from_flange=other)), as_read)
+        Reading(
+            words,
+            _linear_rms(replace(there, base_from_flange=other)),
+            as_read,
+            options.get(words, ""),
+        )
         for words, other in others.items()
     ]
     closing = [it for it in found if it.rms_m < min(as_read / _MUCH_BETTER, _CLOSED_M)]
