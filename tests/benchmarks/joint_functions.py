@@ -1,6 +1,6 @@
 """Arms whose joints err by functions of their angles: real ones from session to session, simulated.
 
-    PYTHONPATH=tests python tests/benchmarks/joint_functions.py [WORLDS]
+    PYTHONPATH=tests python tests/benchmarks/joint_functions.py [WORLDS [WORLDS OF SIGMAS]]
 
 An arm is calibrated on one recording and judged on another, whose frames (instrument and probe)
 are fitted anew on twelve of its stops; the others are predicted. By stop, the squared error over
@@ -33,6 +33,7 @@ from visioncal.estimation import joint_functions
 from visioncal.estimation.armmodel import HARMONICS
 from visioncal.estimation.solve import Solution
 from visioncal.interchange.exports import Selection, document
+from visioncal.results.compensation.arms import predicted_sigma_mm
 from visioncal.robot import Robot
 from visioncal.robot.inverse import Inverse
 from visioncal.session import Session
@@ -146,12 +147,17 @@ def residuals(flange: FloatArray, other: Recording, x: FloatArray, z: FloatArray
 
 @dataclass(frozen=True)
 class Carried:
-    """Errors of places [mm] by the arm as stated and as calibrated, and over what is predicted."""
+    """Errors of places [mm] by the arm as stated and as calibrated, and over what is predicted.
+
+    The last is by the arm as calibrated with frames fitted on all stops: what frames of few stops
+    add is not in it.
+    """
 
     nominal_mm: float
     mm: float
     ratio: float
     predicted_mm: float
+    framed_mm: float
 
 
 def carried_over(known: RunState, other: Recording) -> Carried:
@@ -183,11 +189,16 @@ def carried_over(known: RunState, other: Recording) -> Carried:
         predicted.append(variances.reshape(-1, 3).sum(axis=1) + session)
     found = {name: np.concatenate(it) for name, it in squares.items()}
     rms = {name: 1e3 * float(np.sqrt(it.mean())) for name, it in found.items()}
+    every = np.arange(len(other.q))
+    x, z, _ = placed(calibrated, other, every, (edges[0], edges[1]))
+    left = residuals(calibrated, other, x, z)[:, 3:]
+    framed_mm = 1e3 * float(np.sqrt(np.mean(np.sum(left**2, axis=1))))
     if not predicted:
-        return Carried(rms["stated"], rms["calibrated"], np.nan, np.nan)
+        return Carried(rms["stated"], rms["calibrated"], np.nan, np.nan, framed_mm)
     variance = np.concatenate(predicted)
     ratio = float(found["calibrated"].mean() / variance.mean())
-    return Carried(rms["stated"], rms["calibrated"], ratio, 1e3 * float(np.sqrt(variance.mean())))
+    predicted_mm = 1e3 * float(np.sqrt(variance.mean()))
+    return Carried(rms["stated"], rms["calibrated"], ratio, predicted_mm, framed_mm)
 
 
 def without_functions(session: Session) -> RunState:
@@ -210,7 +221,7 @@ def cross_row(words: str, session: Session, other: Recording) -> str:
         f"| {words} | {levels[1].level} "
         f"| {levels[0].chosen.left_out.mm:.3f}, {levels[1].chosen.left_out.mm:.3f} "
         f"| {found.nominal_mm:.2f} | {was.mm:.3f} | {was.ratio:.1f} | {found.mm:.3f} "
-        f"| {found.ratio:.2f} | {seconds:.0f} |"
+        f"| {found.ratio:.2f} | {found.framed_mm:.3f} | {seconds:.0f} |"
     )
 
 
@@ -385,6 +396,36 @@ class World:
             )
         ]
 
+    def stated(self, seed: int) -> list[list[float]]:
+        """Errors [mm], and squared over predicted by posture, and by the maps of the result."""
+        shop, *regions = self.drawn(seed)
+        known = known_of(session_of(shop))
+        answer, arm = known.solved, known.robot_arm
+        x, z = answer.state.edges[:2]
+        data = arm.data(answer.problem, Solution(answer.state, answer.noise), answer.covariance, {})
+        rows = []
+        for q in regions:
+            flange = arm.model.base_from_flange(q)
+            true = forward(shop.true_arm, q) @ shop.flange_from_probe
+            error = invert(invert(x) @ flange @ z) @ invert(shop.base_from_instrument) @ true
+            squared = 1e6 * np.mean(np.sum(error[:, :3, 3] ** 2, axis=1))
+            by_posture = 1e6 * np.mean(data.place_sigmas_m(q) ** 2)
+            mapped = predicted_sigma_mm(result_of(known), flange[:, :3, 3], q)
+            by_map = np.mean(mapped**2)
+            rows.append([np.sqrt(squared), squared / by_posture, squared / by_map])
+        return rows
+
+    def sigmas(self, worlds: int) -> str:
+        """One line of the fifth table."""
+        found = np.array([self.stated(seed) for seed in range(100, 100 + worlds)])
+        near, far = found[:, 0].T, found[:, 1].T
+        functions = f"{1e3 * self.function_rad:.1f}, {self.length_rad:.2f}"
+        return (
+            f"| {self.stops} | {self.range_rad:.1f} | {functions if self.function_rad else 'none'} "
+            f"| {np.median(near[0]):.3f} | {near[1].mean():.2f} | {near[2].mean():.2f} "
+            f"| {np.median(far[0]):.3f} | {far[1].mean():.2f} | {far[2].mean():.2f} |"
+        )
+
     def row(self, worlds: int) -> str:
         """One line of the third table."""
         found = np.array([self.tried(seed) for seed in range(worlds)], dtype=float)
@@ -404,6 +445,13 @@ USED_ROWS = (
     World(60, 0.4, 3e-4, 0.25),
     World(60, 2.5, 3e-4, 0.06),
     World(60, 2.5, 3e-4, 0.25),
+)
+SIGMA_ROWS = (
+    *USED_ROWS,
+    World(30, 0.4, 3e-4, 0.06),
+    World(60, 0.4, 0.0, 0.06),
+    World(60, 2.5, 0.0, 0.06),
+    World(30, 2.5, 0.0, 0.06),
 )
 WORLD_ROWS = (
     World(30, 0.4, 3e-4, 0.06),
@@ -426,16 +474,18 @@ def main(worlds: int) -> None:
     if QUICK:
         rows = [replace(rows[0], length_rad=0.25)]
     simulated = [it.row(worlds) for it in rows]
+    surely = [it.sigmas(wished(20, place=1)) for it in first(SIGMA_ROWS)]
     uses = [line for it in first(USED_ROWS) for line in it.uses(worlds)]
     text = "\n".join(
         [
             "One recording by another: RMS of places [mm], the frames fitted on 12 stops. Left",
             "out: at stops left out of the fit, by the levels before and by the one that was",
-            "taken. Over predicted: mean squared error over what is predicted.",
+            "taken. Over predicted: mean squared error over what is predicted. Framed: with the",
+            "frames fitted on all stops of the other recording.",
             "",
             "| recordings | taken | left out | as stated | levels before | over predicted "
-            "| now | over predicted | s |",
-            "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+            "| now | over predicted | framed | s |",
+            "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
             *crossed,
             "",
             "Other arms: RMS at stops left out of the fit [mm].",
@@ -463,6 +513,13 @@ def main(worlds: int) -> None:
             "| by the table | apart |",
             "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
             *uses,
+            "",
+            "Errors of places [mm] (median), and mean squared error over what is predicted, by",
+            "posture and by the maps of a result (as `correct` has it), in the range and all over.",
+            "",
+            "| stops | range | functions | in it | posture | map | all over | posture | map |",
+            "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+            *surely,
         ]
     )
     command = f"PYTHONPATH=tests python tests/benchmarks/joint_functions.py {worlds}"

@@ -19,6 +19,7 @@ from visioncal.results import Calibration
 from visioncal.results.arm import (
     ArmResult,
     ElasticResult,
+    JointRange,
     JointSpring,
     Sag,
     WorkspacePlace,
@@ -218,6 +219,20 @@ def test_sigmas_come_from_the_map_or_else_from_the_median(result):
     ):
         found = predicted_sigma_mm(replace(result, arm=arm), places)
         assert found == pytest.approx(np.array(sigmas), abs=0.01, nan_ok=True)
+
+
+def test_postures_as_they_were_measured_have_a_map_of_their_own(result):
+    names = result.robot.joint_names
+    arm = replace(
+        result.arm,
+        workspace_map=(WorkspacePlace(0.4, 0.0, 0.2, 0.9),),
+        measured_map=(WorkspacePlace(0.5, 0.0, 0.2, 0.1),),
+        measured=tuple(JointRange(it, -1.0, 1.0) for it in names),
+    )
+    q = np.zeros((3, len(names)))
+    q[1, 2], q[2] = 1.2, -1.0
+    found = predicted_sigma_mm(replace(result, arm=arm), np.full((3, 3), 0.4), q)
+    assert found == pytest.approx(np.array([0.1, 0.9, 0.1]))
 
 
 # --- The command.

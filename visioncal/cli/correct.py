@@ -130,7 +130,7 @@ def correct_command(
     rows = np.flatnonzero(corrected.reached)
     if lost and (not skip or not len(rows)):
         raise _refusal(lost, len(wanted))
-    sigma_mm = predicted_sigma_mm(known, base_from_flange[:, :3, 3])
+    sigma_mm = predicted_sigma_mm(known, base_from_flange[:, :3, 3], corrected.q)
     base_from_tool = corrected.base_from_flange @ flange_from_tool
     columns = columns_to_send(wanted, corrected, base_from_tool, sigma_mm)
     warnings = [

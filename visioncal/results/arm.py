@@ -292,6 +292,8 @@ class ArmResult(Section):
         parameters: The table's numbers that were free.
         workspace_sigma_mm: The predicted sigma of a tool's place over the workspace.
         workspace_map: The same, place by place.
+        measured_map: The same at postures within the ranges of the joints at the stops, where the
+            stops determine more than at other postures of the same places.
         carries_over: Where it is better than the arm as stated.
         functions: Repeatable errors of its joints by their angles, at level `functions`.
         measured: Over which ranges of its joints it was measured.
@@ -310,6 +312,7 @@ class ArmResult(Section):
     parameters: tuple[ArmParameter, ...] = ()
     workspace_sigma_mm: WorkspaceSigma | None = None
     workspace_map: tuple[WorkspacePlace, ...] = ()
+    measured_map: tuple[WorkspacePlace, ...] = ()
     carries_over: CarriesOver | None = None
     functions: JointFunctions | None = None
     measured: tuple[JointRange, ...] = ()

@@ -91,6 +91,8 @@ class ArmIdentifiability:
             without each stop, lens and board as they are.
         places: (k, 3) of the flange all over the workspace, in the base's frame [m].
         sigmas_m: (k,) predicted sigma of the place of what the flange carries there [m].
+        near: (l, 3) of the flange at random postures in the ranges of the stops' joints [m].
+        near_sigmas_m: (l,) the same sigma there [m].
     """
 
     convention: Convention
@@ -102,6 +104,8 @@ class ArmIdentifiability:
     influence: FloatArray
     places: FloatArray
     sigmas_m: FloatArray
+    near: FloatArray
+    near_sigmas_m: FloatArray
 
     def in_result(
         self, result: ArmResult, robot: Robot, views: Sequence[int], lost: JointReading | None
@@ -115,7 +119,6 @@ class ArmIdentifiability:
             lost: A joint whose zero was found far from where it was stated.
         """
         ordered = sorted(zip(self.influence.tolist(), views, strict=True), key=lambda it: -it[0])
-        rows = np.column_stack([self.places, 1e3 * self.sigmas_m])[:_PLACES]
         return replace(
             result,
             convention=self.convention,
@@ -124,7 +127,8 @@ class ArmIdentifiability:
                 1e3 * float(np.median(self.sigmas_m)),
                 1e3 * float(np.quantile(self.sigmas_m, 0.95)),
             ),
-            workspace_map=tuple(WorkspacePlace(*row) for row in rows.tolist()),
+            workspace_map=_map(self.places, self.sigmas_m),
+            measured_map=_map(self.near, self.near_sigmas_m),
             observability=self._observability(),
             not_determined=self.not_determined,
             stops=tuple(StopInfluence(view, share) for share, view in ordered),
@@ -139,6 +143,11 @@ class ArmIdentifiability:
             determined=self.counts.determined,
             **figures,
         )
+
+
+def _map(places: FloatArray, sigmas_m: FloatArray) -> tuple[WorkspacePlace, ...]:
+    rows = np.column_stack([places, 1e3 * sigmas_m])[:_PLACES]
+    return tuple(WorkspacePlace(*row) for row in rows.tolist())
 
 
 def _number(estimate: Estimate, robot: Robot, lost: JointReading | None) -> ArmParameter:
@@ -165,6 +174,8 @@ def identify_arm(arm: ArmData, convention: Convention | None = None) -> ArmIdent
             nearly parallel, which has no leap there.
     """
     anywhere = postures(arm.model.robot)
+    shares = np.random.default_rng(0).uniform(size=(_PLACES, arm.q.shape[1]))
+    near = arm.q.min(axis=0) + shares * np.ptp(arm.q, axis=0)
     with one_blas_thread():
         numbers = _numbers(arm.model, convention)
         weight = arm.pair.weight(arm.noise, arm.measured)
@@ -176,7 +187,7 @@ def identify_arm(arm: ArmData, convention: Convention | None = None) -> ArmIdent
                 imitated(by_numbers, by_arm, counts.missing), _moves(arm, counts, weight)
             )
         place = arm.place_jacobian(anywhere)[0]
-        sigmas_m = arm.place_sigmas_m(anywhere)
+        sigmas_m, near_sigmas_m = (arm.place_sigmas_m(it) for it in (anywhere, near))
         fitted = (arm.problem, arm.state, arm.noise)
         influence = stop_influence(*fitted, arm.stops, place, arm.chain)
     nominal = arm.model.nominal
@@ -193,6 +204,8 @@ def identify_arm(arm: ArmData, convention: Convention | None = None) -> ArmIdent
         influence=influence,
         places=arm.model.robot.base_from_flange(anywhere)[:, :3, 3],
         sigmas_m=sigmas_m,
+        near=arm.model.robot.base_from_flange(near)[:, :3, 3],
+        near_sigmas_m=near_sigmas_m,
     )
 
 

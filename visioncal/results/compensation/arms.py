@@ -1,5 +1,6 @@
 """The two models of one arm that a calibration holds, and what it says of their use."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -8,11 +9,15 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.results import Calibration
+from visioncal.results.arm import WorkspacePlace
 from visioncal.robot import Loads, Robot, bends
 from visioncal.robot.inverse import Inverse
 
 # A place's sigma is that of so many places of the map around it.
 _AROUND = 4
+# Postures count as measured beyond the ranges of the stops by such a share of these: ends of a
+# range are seldom among random stops.
+_MARGIN = 0.05
 # Fewer joints reach no position at will.
 _LEAST_JOINTS = 3
 
@@ -101,24 +106,40 @@ def _without_arm(calibration: Calibration) -> DataError:
     )
 
 
-def predicted_sigma_mm(calibration: Calibration, p_base: FloatArray) -> FloatArray:
+def predicted_sigma_mm(
+    calibration: Calibration, p_base: FloatArray, q: FloatArray | None = None
+) -> FloatArray:
     """How surely the calibrated arm reaches places, as its calibration predicts.
 
     Args:
         calibration: Of a calibrated arm.
         p_base: (m, 3) places of the flange [m].
+        q: (m, n) with which joints it reaches them [rad or m]; None where that is open.
 
     Returns:
-        (m,) root of the trace of a place's covariance [mm]: of the map of the workspace around each
-        place, or else the median over the workspace; NaN where the calibration says neither.
+        (m,) root of the trace of a place's covariance [mm]: of the map around each place, that of
+        postures as they were measured or of all the workspace; or else the median over the
+        workspace; NaN where the calibration says none of them.
     """
     arm = calibration.arm
     if arm is None or not arm.workspace_map:
         known = None if arm is None else arm.workspace_sigma_mm
         return np.full(len(p_base), np.nan if known is None else known.median)
-    places, sigmas = arm.map_places_m, arm.map_sigmas_mm
+    found = _around(p_base, arm.workspace_map)
+    if q is None or not arm.measured_map:
+        return found
+    lower, upper = np.array([(it.lower, it.upper) for it in arm.measured]).T
+    margin = _MARGIN * (upper - lower)
+    measured = np.all((lower - margin <= q) & (q <= upper + margin), axis=1)
+    return np.where(measured, _around(p_base, arm.measured_map), found)
+
+
+def _around(p_base: FloatArray, rows: Sequence[WorkspacePlace]) -> FloatArray:
+    """(m,) sigmas [mm] of a map at (m, 3) places [m], by the places of the map around each."""
+    places = np.array([(it.x_m, it.y_m, it.z_m) for it in rows])
     away = np.linalg.norm(p_base[:, None] - places, axis=2)
     near = np.argsort(away, axis=1)[:, :_AROUND]
     # A place of the map itself would have all the weight there is.
     weights = 1.0 / np.maximum(np.take_along_axis(away, near, axis=1), 1e-6) ** 2
-    return np.asarray((weights * sigmas[near]).sum(axis=1) / weights.sum(axis=1))
+    sigmas = np.array([it.sigma_mm for it in rows])[near]
+    return np.asarray((weights * sigmas).sum(axis=1) / weights.sum(axis=1))
