@@ -36,7 +36,7 @@ _SAMPLES_AT_ONCE = 20_000
 # An output that rests on bad samples by more than this share is not used.
 _TOUCHED = 0.02
 # Nor is one for which more than this share of its samples is missing.
-_LACKING = 0.5
+_MOST_MISSING = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ class Piece:
         if self.bad.any():
             used &= self.lowpass.touched(self.bad) <= _TOUCHED
         if not self.there.all():
-            used &= self.lowpass.touched(~self.there)[:, None] <= _LACKING
+            used &= self.lowpass.touched(~self.there)[:, None] <= _MOST_MISSING
         return used
 
     def advanced(self, lag_s: float) -> Self:
