@@ -10,7 +10,7 @@ from support.marks import slow
 from support.rendered import Shot, photograph
 
 from visioncal.core.types import Target
-from visioncal.vision.finders import DetectedCorners, blur_of, board, find_target
+from visioncal.vision.finders import DetectedCorners, NotFound, blur_of, board, find_target
 from visioncal.vision.finders.charuco import find_charuco
 from visioncal.vision.finders.checkerboard import find_checkerboard
 from visioncal.vision.finders.template import refine, refine_tags
@@ -182,10 +182,10 @@ def large():
 
 
 def searched(monkeypatch):
-    """The sizes of the images that the detector is given."""
-    sizes, plain = [], board.FINDERS["charuco"]
+    """The sizes of the images that the quick search is given."""
+    sizes, plain = [], board.QUICK["charuco"]
     monkeypatch.setitem(
-        board.FINDERS, "charuco", lambda im, it: sizes.append(im.shape) or plain(im, it)
+        board.QUICK, "charuco", lambda im, it: sizes.append(im.shape) or plain(im, it)
     )
     return sizes
 
@@ -218,6 +218,31 @@ def test_what_the_small_copy_misses_is_searched_in_the_image_itself(large, monke
     seen = find_target(part, CHARUCO)
     assert sizes == [(500, part.shape[1] // 2)]
     assert 4 <= len(seen.ids) < len(truth)
+
+
+@pytest.mark.parametrize("target", [CHECKERBOARD, CHARUCO])
+def test_what_a_quick_search_misses_is_searched_thoroughly(target, monkeypatch):
+    image, truth = photograph(target, replace(SMALL, square_px=40), 1)
+    plain, quick = board.FINDERS[target.kind], board.QUICK[target.kind]
+    seen = quick(image, target)
+    assert len(seen.ids) == len(truth)
+    assert rms(seen.px - truth) < 0.3
+    parts = (
+        NotFound("not seen"),
+        # One corner is missing, and all are where the template fits none.
+        DetectedCorners(seen.ids[1:], seen.px[1:]),
+        DetectedCorners(seen.ids, seen.px + 15.0),
+    )
+    for part in parts:
+        asked = []
+        monkeypatch.setitem(board.QUICK, target.kind, lambda *_, part=part: part)
+        monkeypatch.setitem(
+            board.FINDERS, target.kind, lambda *it, asked=asked: asked.append(1) or plain(*it)
+        )
+        found = find_target(image, target)
+        assert asked == [1]
+        assert found.ids.tolist() == seen.ids.tolist()
+        assert rms(found.px - truth) < 0.02
 
 
 @pytest.mark.parametrize("target", [CHECKERBOARD, CHARUCO])

@@ -33,6 +33,7 @@ the centre is the circle's own, and not that of the ellipse in the image. The ra
 along with the blur, because ink spreads.
 """
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from typing import Self, TypeAlias
@@ -78,19 +79,25 @@ _MOST_RADIUS_PX = 20.0
 _MOST_PIXELS = 600_000
 # Corners that measure the blur, and what it starts from and stays above [px].
 _BLUR_SAMPLE, _BLUR_START_PX, _BLUR_LEAST_PX = 30, 1.5, 0.5
-# Most turns, for the blur and for the corners, and the step that ends them [px].
-_BLUR_TURNS, _MOST_TURNS, _STILL_PX = 8, 8, 0.004
+# Most turns, for the blur and for the corners, the change of the blur that ends them, as a
+# logarithm, and the steps that do, of corners that make maps and of the result [px]: of a board's
+# corners the next one is a hundredth of that. Lone corners come to rest slowly or not at all, and
+# blur moves them.
+_BLUR_TURNS, _MOST_TURNS = 8, 8
+_STEADY, _LONE_STEADY = 0.03, 0.01
+_STILL_PX, _LONE_STILL_PX = (0.1, 0.02), (0.004, 0.004)
 # Beyond this share of a square, blur brings in the next lines.
 _WIDE = 0.16
 # Pixels nearer to a ChArUco board's marker than this many widths of an edge are left out.
 _CLEAR = 1.5
 # No step is longer [squares].
 _MOST_STEP = 0.25
-# What a fit has to show: a last step [px], a shift from the detector's corner [squares], a part of
-# its patch inside the image, a part of the median contrast, and residuals by the contrast of at
-# most so many times their median and so much more, and never of so much: heavy noise and ink leave
-# half of that, other things than a corner twice as much.
-_LAST_STEP_PX, _MOST_SHIFT, _LEAST_INSIDE, _LEAST_CONTRAST = 0.02, 0.3, 0.6, 0.1
+# What a fit has to show: a last step, likewise [px], a shift from the corner found [squares], a
+# part of its patch inside the image, a part of the median contrast, and residuals by the contrast
+# of at most so many times their median and so much more, and never of so much: heavy noise and ink
+# leave half of that, other things than a corner twice as much.
+_LAST_STEP_PX, _LONE_LAST_STEP_PX = (0.1, 0.02), (0.02, 0.02)
+_MOST_SHIFT, _LEAST_INSIDE, _LEAST_CONTRAST = 0.3, 0.6, 0.1
 _MISFIT_TIMES, _MISFIT_MORE, _MOST_MISFIT = 3.0, 0.05, 0.6
 
 
@@ -231,8 +238,9 @@ class _Windows:
         # A map is smooth: cubics through 4 x 4 of its values are as good as all.
         nodes = np.cos(np.pi * (np.arange(4) + 0.5) / 4)
         spread = np.vander(steps / reach, 4) @ np.linalg.inv(np.vander(nodes, 4))
+        spread = spread.astype(np.float32)
         grid = np.stack(np.meshgrid(reach * nodes, reach * nodes), axis=-1).reshape(-1, 2)
-        values = on_own(centre[:, None] + grid).reshape(-1, 4, 4, 2)
+        values = on_own(centre[:, None] + grid).reshape(-1, 4, 4, 2).astype(np.float32)
         x, y = (np.asarray(spread @ values[..., axis] @ spread.T, np.float32) for axis in (0, 1))
         height, width = smooth.shape
         rows, columns = centre[:, 1, None] + steps, centre[:, 0, None] + steps
@@ -250,7 +258,7 @@ class _Windows:
             x,
             y,
             # About the middle of the scale, single precision suffices.
-            smooth[rows[:, :, None], columns[:, None, :]] - np.float32(128.0),
+            np.take(smooth, rows[:, :, None] * width + columns[:, None, :]) - np.float32(128.0),
             within,
             inside,
             around,
@@ -293,6 +301,38 @@ class _Step:
     blur: FloatArray
     covariance: FloatArray
     misfit: FloatArray
+
+    @classmethod
+    def solved(cls, sums: FloatArray, *, blurs: int) -> Self:
+        """The step by least squares.
+
+        Args:
+            sums: (n, k + 1, k + 1) products of the columns, the last of them what the others are
+                to make up.
+            blurs: How many columns are of the blur.
+        """
+        unknowns = sums.shape[1] - 1
+        # In units of the columns, and with a trace more, every corner has an inverse.
+        scale = np.sqrt(np.einsum("nii->ni", sums)[:, :unknowns]) + 1e-9
+        scales = scale[:, :, None] * scale[:, None, :]
+        inverse = np.linalg.inv(sums[:, :unknowns, :unknowns] / scales + 1e-7 * np.eye(unknowns))
+        inverse /= scales
+        found = (inverse @ sums[:, :unknowns, unknowns:])[..., 0]
+        rest = sums[:, unknowns, unknowns] - np.sum(found * sums[:, :unknowns, unknowns], axis=1)
+        variance = np.maximum(rest, 0.0) / np.maximum(sums[:, 0, 0] - unknowns, 1.0)
+        contrast = found[:, 1, None]
+        spread = (variance / _NOISE_LEFT)[:, None, None] / contrast[:, :, None] ** 2
+        return cls(
+            found[:, :2],
+            -found[:, 2:4] / contrast,
+            found[:, 4 : 4 + blurs] / contrast,
+            inverse[:, 2:4, 2:4] * spread,
+            np.sqrt(variance) / np.abs(contrast[:, 0]),
+        )
+
+    def at(self, chosen: IntArray) -> Self:
+        """The steps of some corners."""
+        return replace(self, **{it.name: getattr(self, it.name)[chosen] for it in fields(self)})
 
     def replace(self, chosen: IntArray, others: Self) -> None:
         """Takes the steps of some corners from elsewhere."""
@@ -406,31 +446,30 @@ def _refined(image: Image, pattern: _Pattern, board: FloatArray, px: FloatArray)
     smooth = np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, _KERNEL, _KERNEL), np.float32)
     every, all_good = np.arange(len(px)), np.ones(len(px), bool)
     some = every[:: -(-len(px) // _BLUR_SAMPLE)]
-    windows = _Windows.cut(smooth, board, px, all_good, some, pattern)
-    blur_px, radius = _measured_blur(windows, pattern.at(some))
-    pattern = replace(pattern, radius=radius)
     windows = _Windows.cut(smooth, board, px, all_good, every, pattern)
-    level = np.zeros((len(px), 2, 2))
-    first = _step(windows, pattern, np.zeros_like(px), blur_px, level)
-    shift, step = _fitted(windows, pattern, blur_px, level, first)
+    blur_px, radius = _measured_blur(windows.at(some), pattern.at(some))
+    if pattern.radius:
+        pattern = replace(pattern, radius=radius)
+        windows = _Windows.cut(smooth, board, px, all_good, every, pattern)
+    is_lone = pattern.lone is not None
+    still_px, last_px = (
+        (_LONE_STILL_PX, _LONE_LAST_STEP_PX) if is_lone else (_STILL_PX, _LAST_STEP_PX)
+    )
+    none = np.zeros_like(px)
+    first = _step(windows, pattern, none, blur_px)
+    shift, step = _fitted(windows, pattern, blur_px, None, first, still_px[0])
     better = windows.moved(shift)
-    good = np.array([not it for it in _reasons(windows, step, better - px)])
+    good = np.array([not it for it in _reasons(windows, step, better - px, last_px[0])])
     windows = _Windows.cut(smooth, board, np.where(good[:, None], better, px), good, every, pattern)
     slopes = windows.slopes(step.levels)
     # Glare and shadows have edges: where slopes do not explain more of a corner, it has none.
-    none = np.zeros_like(px)
-    first = _step(windows, pattern, none, blur_px, slopes)
-    even = np.flatnonzero(~(first.misfit < step.misfit))
+    first, plain = _steps(windows, pattern, none, blur_px, (slopes, None))
+    even = np.flatnonzero(~(first.misfit < plain.misfit))
     slopes[even] = 0.0
-    # What a lone corner's unknowns are depends on all of them.
-    again = even if pattern.lone is None else every
-    if even.size:
-        other = _step(windows.at(again), pattern.at(again), none[again], blur_px, slopes[again],
-                      wide=_is_wide(windows, blur_px))  # fmt: skip
-        first.replace(again, other)
-    shift, step = _fitted(windows, pattern, blur_px, slopes, first)
+    first.replace(even, plain.at(even))
+    shift, step = _fitted(windows, pattern, blur_px, slopes, first, still_px[1])
     better = windows.moved(shift)
-    reasons = _reasons(windows, step, better - px)
+    reasons = _reasons(windows, step, better - px, last_px[1])
     good = np.array([not it for it in reasons])
     spread = windows.by_board @ step.covariance @ windows.by_board.transpose(0, 2, 1)
     sigma_px = np.sqrt(np.trace(spread, axis1=1, axis2=2) / 2)
@@ -449,20 +488,28 @@ def _measured_blur(windows: _Windows, pattern: _Pattern) -> tuple[FloatArray, fl
     blur_px = np.full(2, min(_BLUR_START_PX, 0.2 * min(pattern.outside, 1.0) * side_px))
     shift = np.zeros((len(windows.px), 2))
     for _ in range(_BLUR_TURNS):
-        step = _step(windows, pattern, shift, blur_px, np.zeros((len(shift), 2, 2)), blurs=True)
+        step = _step(windows, pattern, shift, blur_px, blurs=True)
         shift = shift + _bounded(step.shift)
-        changes = np.clip(np.nan_to_num([_median(it) for it in step.blur.T]), -0.5, 0.5)
+        medians = np.array([_median(it) for it in step.blur.T])
+        changes = np.clip(np.nan_to_num(medians), -0.5, 0.5)
         change, grown = changes[:2], float(changes[2]) if pattern.radius else 0.0
         radius = np.clip(pattern.radius + grown, 0.5 * pattern.radius, 1.5 * pattern.radius)
         pattern = replace(pattern, radius=float(radius))
         blur_px = np.clip(blur_px * np.exp(change), _BLUR_LEAST_PX, 0.5 * side_px)
-        if np.abs(change).max() < 0.01:
+        if np.abs(change).max() < (_STEADY if pattern.lone is None else _LONE_STEADY):
             break
-    return blur_px, pattern.radius
+    # Few pixels around a lone corner determine nothing, and then blur comes to rest nowhere.
+    steady = pattern.lone is None or np.abs(medians).max() < _LONE_STEADY
+    return blur_px if steady else np.full(2, np.nan), pattern.radius
 
 
 def _fitted(
-    windows: _Windows, pattern: _Pattern, blur_px: FloatArray, slopes: FloatArray, first: _Step
+    windows: _Windows,
+    pattern: _Pattern,
+    blur_px: FloatArray,
+    slopes: FloatArray | None,
+    first: _Step,
+    still_px: float,
 ) -> tuple[FloatArray, _Step]:
     """Where the corners are from where they were (n, 2) [squares], and their last steps."""
     shift = np.zeros((len(windows.px), 2))
@@ -470,11 +517,12 @@ def _fitted(
     last = step = first
     for _ in range(_MOST_TURNS):
         shift[moving] += _bounded(step.shift)
-        still = windows.length_px(last.shift)[moving] < _STILL_PX
+        still = windows.length_px(last.shift)[moving] < still_px
         moving = moving[~still]
         if not moving.size:
             break
-        step = _step(windows.at(moving), pattern.at(moving), shift[moving], blur_px, slopes[moving])
+        of_light = None if slopes is None else slopes[moving]
+        step = _step(windows.at(moving), pattern.at(moving), shift[moving], blur_px, of_light)
         last.replace(moving, step)
     return shift, last
 
@@ -490,23 +538,28 @@ def _step(
     pattern: _Pattern,
     shift: FloatArray,
     blur_px: FloatArray,
-    slopes: FloatArray,
+    slopes: FloatArray | None = None,
     *,
     blurs: bool = False,
-    wide: bool | None = None,
 ) -> _Step:
     """One Gauss-Newton step; `slopes` (n, 2, 2) of offset and contrast by x and y."""
-    wide = _is_wide(windows, blur_px) if wide is None else wide
+    return _steps(windows, pattern, shift, blur_px, (slopes,), blurs=blurs)[0]
+
+
+def _steps(
+    windows: _Windows,
+    pattern: _Pattern,
+    shift: FloatArray,
+    blur_px: FloatArray,
+    lights: Sequence[FloatArray | None],
+    *,
+    blurs: bool = False,
+) -> list[_Step]:
+    """One Gauss-Newton step by each of some slopes, None of even light."""
     count = len(shift)
-    sx, sy, dx, dy, signs, ox, oy, gx, gy = (
+    sx, sy, dx, dy, signs = (
         np.asarray(it, np.float32)[:, None, None]
-        for it in (
-            *(blur_px * windows.widths).T,
-            *shift.T,
-            pattern.signs,
-            *slopes[:, :, 0].T,
-            *slopes[:, :, 1].T,
-        )
+        for it in (*(blur_px * windows.widths).T, *shift.T, pattern.signs)
     )
     x, y = windows.x - dx, windows.y - dy
     used = windows.within & windows.inside
@@ -518,23 +571,22 @@ def _step(
         light = np.logical_xor(np.logical_xor(x > 0, y > 0), signs > 0)
         light &= np.abs(x) > clear_x
         light &= np.abs(y) > clear_y
-        used = used & ~light
+        used &= ~light
     if pattern.lone is not None:
         lone_x, lone_y = np.asarray(pattern.lone.T, np.float32)[:, :, None, None]
         far_x, far_y = (
             np.float32(pattern.clear) * it - np.float32(pattern.outside) for it in (sx, sy)
         )
-        used = used & (lone_x * x > far_x) & (lone_y * y > far_y)
+        used &= (lone_x * x > far_x) & (lone_y * y > far_y)
         # Where a view slants the corner, its blur is not the product of two.
-        used = used & (
-            (np.abs(x) > np.float32(_SLANT) * sx) | (np.abs(y) > np.float32(_SLANT) * sy)
-        )
+        used &= (np.abs(x) > np.float32(_SLANT) * sx) | (np.abs(y) > np.float32(_SLANT) * sy)
     if pattern.radius:
         product, *slopes_of = _circle(pattern, x, y, sx, sy)[: None if blurs else 3]
     else:
+        # Blur may bring in the next lines of some corner.
+        wide = bool(max(sx.max(), sy.max()) > _WIDE)
         product, *slopes_of = _crossing(pattern, x, y, sx, sy, blurs=blurs, wide=wide)
     columns: list[npt.NDArray[np.floating]] = [product, *slopes_of]
-    widened = len(columns) + 1
     if pattern.lone is not None:
         # Light slopes where it is white, and there the product is 0; in the dark it is 4.
         columns += [(1 - product / 4) * it for it in (x, y)]
@@ -542,33 +594,29 @@ def _step(
         if windows.around.shape[1] == _FEWEST and np.median(windows.widths) * _BENT_PX < 1.0:
             columns += [y * slopes_of[0], x * slopes_of[1]]
     unknowns = len(columns) + 1
-    if slopes.any():
-        columns.append(windows.grey - ox * x - oy * y - (gx * x + gy * y) * product)
-    else:
-        columns.append(windows.grey)
-    stack = np.empty((count, unknowns + 1, *x.shape[1:]), np.float32)
+    for slopes in lights:
+        if slopes is None:
+            columns.append(windows.grey)
+        else:
+            ox, oy, gx, gy = (
+                np.asarray(slopes, np.float32).transpose(2, 1, 0).reshape(4, count, 1, 1)
+            )
+            columns.append(windows.grey - ox * x - oy * y - (gx * x + gy * y) * product)
+    stack = np.empty((count, len(columns) + 1, *x.shape[1:]), np.float32)
     stack[:, 0] = used
     for at, column in enumerate(columns, start=1):
         np.multiply(column, stack[:, 0], out=stack[:, at])
-    stack = stack.reshape(count, unknowns + 1, -1)
-    sums = np.asarray(stack @ stack.transpose(0, 2, 1), float)
-    pixels = sums[:, 0, 0]
-    # In units of the columns, and with a trace more, every corner has an inverse.
-    scale = np.sqrt(np.einsum("nii->ni", sums)[:, :unknowns]) + 1e-9
-    scales = scale[:, :, None] * scale[:, None, :]
-    inverse = np.linalg.inv(sums[:, :unknowns, :unknowns] / scales + 1e-7 * np.eye(unknowns))
-    inverse /= scales
-    found = (inverse @ sums[:, :unknowns, unknowns:])[..., 0]
-    rest = sums[:, unknowns, unknowns] - np.sum(found * sums[:, :unknowns, unknowns], axis=1)
-    variance = np.maximum(rest, 0.0) / np.maximum(pixels - unknowns, 1.0)
-    contrast = found[:, 1, None]
-    return _Step(
-        found[:, :2],
-        -found[:, 2:4] / contrast,
-        found[:, 4:widened] / contrast,
-        inverse[:, 2:4, 2:4] * (variance / _NOISE_LEFT)[:, None, None] / contrast[:, :, None] ** 2,
-        np.sqrt(variance) / np.abs(contrast[:, 0]),
-    )
+    stack = stack.reshape(count, len(columns) + 1, -1)
+    # Of a matrix with itself numpy takes BLAS's syrk, which is slower for so few rows.
+    sums = np.empty((count, len(columns) + 1, len(columns) + 1))
+    sums[:, 1:] = stack[:, 1:] @ stack.transpose(0, 2, 1)
+    sums[:, 0, 1:] = sums[:, 1:, 0]
+    sums[:, 0, 0] = np.count_nonzero(used, axis=(1, 2))
+    own = [*range(unknowns)]
+    return [
+        _Step.solved(sums[:, [*own, at]][:, :, [*own, at]], blurs=len(slopes_of) - 2)
+        for at in range(unknowns, len(columns) + 1)
+    ]
 
 
 def _crossing(
@@ -625,11 +673,6 @@ def _turned(smoother: FloatArray, axes: FloatArray) -> FloatArray:
     return np.concatenate([smoother[:, :1], slopes, smoother[:, 3:]], axis=1)
 
 
-def _is_wide(windows: _Windows, blur_px: FloatArray) -> bool:
-    """Whether blur brings in the next lines of some corner."""
-    return bool(np.asarray(blur_px * windows.widths, np.float32).max() > _WIDE)
-
-
 def _edges(
     at: _Float32Array, sigma: _Float32Array, *, blurs: bool, wide: bool
 ) -> tuple[_Float32Array, ...]:
@@ -673,7 +716,9 @@ def _erf(t: _Float32Array, bell: _Float32Array) -> _Float32Array:
     return np.copysign(total, t, out=total)
 
 
-def _reasons(windows: _Windows, step: _Step, moved_px: FloatArray) -> tuple[str, ...]:
+def _reasons(
+    windows: _Windows, step: _Step, moved_px: FloatArray, last_px: float
+) -> tuple[str, ...]:
     """(n,) why corners cannot be used, in words; empty where they can."""
     last = windows.length_px(step.shift)
     moved = np.linalg.norm(moved_px, axis=1) * windows.widths.max(axis=1)
@@ -688,7 +733,7 @@ def _reasons(windows: _Windows, step: _Step, moved_px: FloatArray) -> tuple[str,
             "without the board's contrast",
             contrast > _LEAST_CONTRAST * _median(contrast),
         ),
-        ("no place fits best", last < _LAST_STEP_PX),
+        ("no place fits best", last < last_px),
         ("the place that fits best is far from where it was found", moved < _MOST_SHIFT),
         (
             "unlike the print",
