@@ -19,7 +19,7 @@ from visioncal.estimation.solve import (
     robot_likelihood,
     solve_problem,
 )
-from visioncal.estimation.variance import Components, Knowledge, _likelihood, estimate_sigmas
+from visioncal.estimation.variance import Components, Knowledge, estimate_sigmas, likelihood
 from visioncal.simulation import CellOptions, fine_camera, simulate
 
 FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
@@ -105,7 +105,7 @@ def test_the_likelihood_jacobian_as_its_differences_say(given):
     errors, jacobian = found.reduced.errors, found.reduced.jacobian[:, :, found.moving]
 
     def at(logs):
-        return _likelihood(errors, jacobian, found.components, found.known, logs, RATIO_PRIOR)
+        return likelihood(errors, jacobian, found.components, found.known, logs, RATIO_PRIOR)
 
     logs, step = np.log(2.0 * fit.noise.robots[0]), 1e-4
     for level in range(2):

@@ -9,15 +9,64 @@ import numpy as np
 from visioncal.core.types import FloatArray
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.solve import robot_levels, robot_likelihood, starting_noise
+from visioncal.estimation.solve import (
+    RATIO_PRIOR,
+    robot_levels,
+    robot_likelihood,
+    starting_noise,
+)
 from visioncal.estimation.variance import profile_interval
 
+# Scales at which levels are weighed; what is below adds nothing to a variance.
+_SCALES = np.geomspace(1e-2, 8.0, 25)
+# Levels under a tenth of a micrometre or microradian are none. They are then weighed about this
+# one: arms repeat to some hundredths of a millimetre [m].
+_NOTHING, _LEAST_MIDDLE_M = 1e-7, 5e-5
 # The normal quantile that a 95 % interval reaches to.
 _TWO_SIDED_95 = 1.96
 # Steps of the other levels' logarithms after which an interval's end moves by less than 1 %.
 _SETTLED = 1e-2
 # Noise that does not differ from none is known as well as by a handful of stops, at the least.
 _LEAST_FREEDOM = 8.0
+
+
+def expected_levels(problem: Problem, state: State, noise: Noise) -> FloatArray:
+    """Roots of the variances to be expected of the robots' noise, by its levels' likelihood.
+
+    The most likely level of a few stops is too low as often as too high, and may be zero; what it
+    is too low by counts more in a covariance. The mean of the variance over the likelihood, with
+    the logarithm of the level as likely everywhere (Jeffreys 1946), is what a covariance grows
+    with: of a level with n degrees of freedom n / (n - 2) times the most likely one.
+
+    Args:
+        problem: The observations.
+        state: The answer.
+        noise: The most likely levels.
+
+    Returns:
+        (r, 2) by robot: the rotation's [rad] and the translation's [m], no lower than in `noise`.
+        A robot's two levels are scaled together, the others' being as they are.
+    """
+    robots = noise.robots.copy()
+    if not len(problem.units[1]):
+        return robots
+    robots_likelihood = robot_likelihood(problem, state, noise)
+    for robot in np.flatnonzero(robots_likelihood.seen).tolist():
+        turn, shift = noise.robots[robot]
+        ratio = shift / turn
+        if min(turn, shift) < _NOTHING:
+            typical, width = RATIO_PRIOR.ratio, np.exp(RATIO_PRIOR.log_sigma)
+            ratio = np.clip(ratio, typical / width, typical * width)
+        shifts = max(float(shift), _LEAST_MIDDLE_M) * _SCALES
+        values = np.empty(len(shifts))
+        for at, it in enumerate(shifts.tolist()):
+            levels = noise.robots.copy()
+            levels[robot] = it / ratio, it
+            values[at] = robots_likelihood.value(levels)
+        weights = np.exp(values.min() - values)
+        expected = float(np.sqrt(weights @ shifts**2 / weights.sum()))
+        robots[robot] = np.maximum(robots[robot], [expected / ratio, expected])
+    return robots
 
 
 def noise_intervals(problem: Problem, state: State, noise: Noise) -> FloatArray:

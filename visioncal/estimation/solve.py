@@ -31,6 +31,7 @@ from visioncal.estimation.variance import (
     Knowledge,
     RatioPrior,
     estimate_sigmas,
+    likelihood,
 )
 
 _ROUNDS, _SETTLED = 20, 1e-10
@@ -469,20 +470,31 @@ class RobotLikelihood:
             settled: See `estimate_sigmas`.
             enough: See `variance.most_likely`.
         """
-        seen = np.flatnonzero(self.seen).tolist()
         sigmas, value = estimate_sigmas(
             self.reduced.errors,
             self.jacobian,
             self.components,
             self.known,
             start.ravel(),
-            replace(RATIO_PRIOR, places=tuple((2 * it, 2 * it + 1) for it in seen)),
+            self._ratios,
             free,
             least,
             settled,
             enough,
         )
         return sigmas.reshape(start.shape), value
+
+    def value(self, levels: FloatArray) -> float:
+        """The negative logarithm of the likelihood of (r, 2) levels."""
+        logs = np.log(np.maximum(levels.ravel(), LEAST_SIGMA))
+        return likelihood(
+            self.reduced.errors, self.jacobian, self.components, self.known, logs, self._ratios
+        ).value
+
+    @property
+    def _ratios(self) -> RatioPrior:
+        seen = np.flatnonzero(self.seen).tolist()
+        return replace(RATIO_PRIOR, places=tuple((2 * it, 2 * it + 1) for it in seen))
 
 
 def robot_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLikelihood:

@@ -128,7 +128,7 @@ def estimate_sigmas(
         low, high = np.where(free, low, logs), np.where(free, high, logs)
 
     def at(there: FloatArray) -> Likely:
-        return _likelihood(residuals, jacobian, components, known, there, prior)
+        return likelihood(residuals, jacobian, components, known, there, prior)
 
     logs, found = most_likely(at, logs, low, high, settled, enough)
     return np.asarray(np.exp(logs), dtype=float), found.value
@@ -252,7 +252,7 @@ def profile_interval(
     return crossing(-1.0, 0.0), crossing(1.0, float(np.exp(middle + _WIDEST)))
 
 
-def _likelihood(
+def likelihood(
     residuals: FloatArray,
     jacobian: FloatArray,
     components: Components,
@@ -260,6 +260,7 @@ def _likelihood(
     logs: FloatArray,
     prior: RatioPrior | None,
 ) -> Likely:
+    """The restricted likelihood of some logarithms of the sigmas; see `estimate_sigmas`."""
     sigmas, columns = np.exp(logs), jacobian.shape[-1]
     total = components.total(sigmas)
     weights = np.linalg.inv(total)

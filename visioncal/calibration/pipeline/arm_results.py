@@ -15,6 +15,7 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import NOTE, Finding, remarks
 from visioncal.estimation.arm import covariance_of_size, misfit_covariance
+from visioncal.estimation.intervals import expected_levels
 from visioncal.estimation.parts import State
 from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
@@ -52,7 +53,17 @@ def covariance_beside_noise(
         found: What their residuals show.
         is_fit: Whether it is at rest: a closed form is pulled by more than what is held.
     """
-    parts, shift = {}, held_shift(problem, fit) * float(is_fit)
+    parts: dict[str, FloatArray] = {}
+    if len(problem.units[1]):
+        levels = expected_levels(problem, fit.state, fit.noise)
+        for robot, arm in arms.items():
+            # What an arm errs by that is no unknown is apart from the noise, and from its levels.
+            if arm.errors is not None and not arm.errors.is_estimated:
+                at = problem.robots.index(robot)
+                levels[at] = fit.noise.robots[at]
+        more = covariance_of(problem, replace(fit, noise=replace(fit.noise, robots=levels)))
+        parts["noise_level"] = more - covariance_of(problem, fit)
+    shift = held_shift(problem, fit) * float(is_fit)
     if shift.any():
         parts["held_values"] = np.outer(shift, shift)
     for robot, arm in arms.items():

@@ -16,6 +16,7 @@ SOURCES = {
     "temperature": "uncertainty of the arm's drift with temperature",
     "priors": "what was measured by hand",
     "held_values": "values that are held",
+    "noise_level": "how well the robot's noise is known",
     "lens_field": "the lens beyond its model",
     "misfit": "neighbouring stops that err alike",
 }

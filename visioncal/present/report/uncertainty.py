@@ -21,6 +21,7 @@ _REMEDIES = {
     "temperature": "more views while the arm warms up would lower it",
     "priors": "measuring more exactly by hand would lower it",
     "held_values": "stating lens and board better, or letting them move, would lower it",
+    "noise_level": "more stops would lower it",
     "lens_field": "a model that fits the lens would lower it, more views would not",
     "misfit": "a cell that has warmed up and settled would lower it",
 }
