@@ -9,6 +9,7 @@ from support.cells import calibrated
 
 from visioncal.core.errors import ConvergenceError
 from visioncal.estimation import joint
+from visioncal.estimation.intervals import expected_levels
 from visioncal.estimation.parts import ROBOT, Effect
 from visioncal.estimation.solve import (
     RATIO_PRIOR,
@@ -95,6 +96,24 @@ def test_views_of_a_stop_move_with_the_lens_by_their_information():
     np.testing.assert_allclose(lopsided.by_sensor, problem.by_sensor, rtol=1e-6, atol=1e-12)
     before = problem.observations.covariance
     np.testing.assert_allclose(lopsided.observations.covariance, 2 * before, rtol=1e-6)
+
+
+@pytest.mark.parametrize("views", [6, 20])
+def test_the_variance_to_be_expected_is_that_of_a_level_with_its_degrees_of_freedom(views):
+    # Corners know poses far better than the robot stands.
+    problem, fit = answered(True, views=views, seed=5, robot_sigma_m=1e-3, robot_sigma_rad=1e-3)
+    expected = expected_levels(problem, fit.state, fit.noise)
+    freedom = 6 * views - 12
+    # Corners' own noise takes some of the freedom; the sum over the scales is right to 1e-3.
+    ratio = (expected / fit.noise.robots) ** 2
+    np.testing.assert_allclose(ratio - 1.0, 2.0 / (freedom - 2.0), rtol=0.15)
+
+
+def test_a_level_that_may_be_zero_is_expected_to_be_what_the_corners_hide():
+    problem, fit = answered(True, views=6, seed=1, robot_sigma_m=0.0, robot_sigma_rad=0.0)
+    at = replace(fit.noise, robots=np.full((1, 2), 1e-9))
+    expected = expected_levels(problem, fit.state, at)[0, 1]
+    assert 1e-6 < expected < 1e-4
 
 
 @LENS

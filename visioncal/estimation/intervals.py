@@ -17,8 +17,9 @@ from visioncal.estimation.solve import (
 )
 from visioncal.estimation.variance import profile_interval
 
-# Scales at which levels are weighed; what is below adds nothing to a variance.
-_SCALES = np.geomspace(1e-2, 8.0, 25)
+# Logarithms of the scales at which levels are weighed, from a hundredth, under which they add
+# nothing to a variance, to nine: dense at one, as a level of thousands of stops is known to 1 %.
+_SCALES = 0.02 * np.sinh(np.linspace(-6.2, 5.4, 59))
 # Levels under a tenth of a micrometre or microradian are none. They are then weighed about this
 # one: arms repeat to some hundredths of a millimetre [m].
 _NOTHING, _LEAST_MIDDLE_M = 1e-7, 5e-5
@@ -57,13 +58,13 @@ def expected_levels(problem: Problem, state: State, noise: Noise) -> FloatArray:
         if min(turn, shift) < _NOTHING:
             typical, width = RATIO_PRIOR.ratio, np.exp(RATIO_PRIOR.log_sigma)
             ratio = np.clip(ratio, typical / width, typical * width)
-        shifts = max(float(shift), _LEAST_MIDDLE_M) * _SCALES
+        shifts = max(float(shift), _LEAST_MIDDLE_M) * np.exp(_SCALES)
         values = np.empty(len(shifts))
         for at, it in enumerate(shifts.tolist()):
             levels = noise.robots.copy()
             levels[robot] = it / ratio, it
             values[at] = robots_likelihood.value(levels)
-        weights = np.exp(values.min() - values)
+        weights = np.exp(values.min() - values) * np.gradient(_SCALES)
         expected = float(np.sqrt(weights @ shifts**2 / weights.sum()))
         robots[robot] = np.maximum(robots[robot], [expected / ratio, expected])
     return robots
