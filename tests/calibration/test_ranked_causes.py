@@ -10,7 +10,7 @@ from scipy.special import chdtrc
 from support.sound_findings import SOUND, changed, directions, left_out
 
 from visioncal.calibration.pipeline import calibrate
-from visioncal.calibration.stages.cause_ranking import read_otherwise, with_misread
+from visioncal.calibration.stages.cause_ranking import NO_JOINTS, read_otherwise, with_misread
 from visioncal.calibration.stages.fit_messages import scale_found
 from visioncal.calibration.stages.judge import judge
 from visioncal.calibration.stages.need import Picks
@@ -151,6 +151,17 @@ def test_poses_that_are_misread_explain_the_rest() -> None:
     # Mirrored images fit as well, and no reading of the poses helps these.
     mirrored = with_misread(before, read_otherwise("One axis is mirrored.", is_mirrored=True))
     assert mirrored.causes[0].do.words.startswith("Look at an image first: where it is mirrored")
+
+
+def test_joints_that_are_there_but_misread_come_before_the_errors_they_would_explain() -> None:
+    step = Step('Write model = "ur5e".')
+    misread = Finding("misread_joints", "With the arm a ur5e and not a ur3e, they fit.", step)
+    warnings = (replace(POSTURE, do=NO_JOINTS), misread)
+    verdict = judge(changed(SOUND, warnings=warnings))
+    assert ids(verdict)[:2] == ["misread_joints", "arm_errors"]
+    # To record what is there already is no advice.
+    assert verdict.next_steps[0] == step
+    assert NO_JOINTS not in verdict.next_steps
 
 
 def test_the_cause_its_cost_and_what_to_do_come_first() -> None:

@@ -243,3 +243,12 @@ def test_poses_that_no_reading_explains_are_wrong_where_the_joints_agree(cell):
     # As the step says: the joint angles alone.
     rewritten(cell, without)
     assert visioncal.calibrate(cell).verdict.status == "good"
+
+
+def test_a_robot_that_nobody_knows_is_named_with_what_to_correct(cell):
+    document = cell / "session.toml"
+    document.write_text(document.read_text("utf-8").replace('"ur10e"', '"ur10ee"'), "utf-8")
+    found = visioncal.doctor(cell).findings[0]
+    assert found.kind == "misread_joints"
+    assert "There is no robot named 'ur10ee'. Did you mean ur10e" in found.words
+    assert found.do.words == "Correct [robot] model in session.toml."

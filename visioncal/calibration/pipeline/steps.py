@@ -27,7 +27,7 @@ from visioncal.calibration.stages.readings import (
 from visioncal.calibration.stages.robots import check_joints, read_robots
 from visioncal.core.errors import DataError
 from visioncal.core.types import Rejection
-from visioncal.core.verdict import remarks
+from visioncal.core.verdict import Finding, Step
 from visioncal.session import STREAMS
 
 
@@ -37,6 +37,10 @@ class Stage:
 
     name: str
     run: Callable[[RunState], RunState]
+
+
+# How warnings about the robot's model begin.
+_OF_MODEL = "session.toml: robot.model:"
 
 
 def _read_robot(known: RunState) -> RunState:
@@ -49,11 +53,19 @@ def _read_robot(known: RunState) -> RunState:
             next_step="Calibration needs views.csv; streams of torques alone are for visioncal "
             "dynamics identify.",
         )
-    known = known.noting((), (*pairing(session), *remarks(session.warnings), *not_used(known)))
+    said = map(_suspicious, session.warnings)
+    known = known.noting((), (*pairing(session), *said, *not_used(known)))
     if len(known.held_back) == len(session.views):
         raise all_held_back(known)
     # Views that have a time alone get their poses once the camera's are known.
     return known if waits_for_clock(session) else _reported(known)
+
+
+def _suspicious(warning: str) -> Finding:
+    """What is suspicious about a session; a robot that nobody knows costs its joint angles."""
+    if not warning.startswith(_OF_MODEL):
+        return Finding("remark", warning)
+    return Finding("misread_joints", warning, Step("Correct [robot] model in session.toml."))
 
 
 def _reported(known: RunState) -> RunState:

@@ -90,6 +90,7 @@ EVIDENCE: Mapping[str, Evidence] = {
     "unexplained": Evidence(_REMARK, _CHAIN),
 }
 _MOVED = ("moved_slowly", "moved_at_once")
+_UNUSED_JOINTS = ("misread_joints", "other_arm")
 # What is measured by way of the robot says nothing where its poses are misread.
 _BY_THE_CHAIN = ("board_size", "board_shape", "lens", "lens_field", "corner_noise", "arm_errors")
 LOOK = Step(
@@ -207,7 +208,18 @@ def ranked(
         known |= {"arm_errors"} if known & {*_MOVED} else set()
         more = None if any(it.do is NO_JOINTS for it in found) else adding(_MORE, modelled=modelled)
         found += [it for it in _sources(picks, met, more) if it.kind not in known]
-    return tuple(found)
+    return tuple(_with_joints_at_hand(found))
+
+
+def _with_joints_at_hand(found: Sequence[Finding]) -> Sequence[Finding]:
+    """The same where joint angles that would explain an arm's errors are there, but misread."""
+    unused = next((it for it in found if it.kind in _UNUSED_JOINTS and it.do is not None), None)
+    errors = [it for it in found if it.do is NO_JOINTS]
+    if unused is None or not errors:
+        return found
+    first = replace(unused, probability=max(it.probability for it in errors))
+    rest = [it for it in found if it is not unused]
+    return [first, *(replace(it, do=first.do) if it.do is NO_JOINTS else it for it in rest)]
 
 
 def _tested(doubts: Sequence[Finding], left_out_mm: float) -> list[Finding]:
