@@ -57,8 +57,9 @@ def covariance_beside_noise(
     if len(problem.units[1]):
         levels = expected_levels(problem, fit.state, fit.noise)
         for robot, arm in arms.items():
-            # What an arm errs by that is no unknown is apart from the noise, and from its levels.
-            if arm.errors is not None and not arm.errors.is_estimated:
+            # Where an arm errs by what is no unknown, the noise is what stays beside that, and not
+            # the most likely one of a fit without these errors.
+            if arm.errors is not None and arm.errors.is_significant and not arm.errors.is_estimated:
                 at = problem.robots.index(robot)
                 levels[at] = fit.noise.robots[at]
         more = covariance_of(problem, replace(fit, noise=replace(fit.noise, robots=levels)))
