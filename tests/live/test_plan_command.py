@@ -17,7 +17,7 @@ from visioncal.cli.review import find_recording
 from visioncal.core.errors import DataError
 from visioncal.present.recording import paths
 from visioncal.results import Calibration
-from visioncal.robot import load_robot
+from visioncal.robot import has_ur_axes, load_robot
 from visioncal.session import Session
 from visioncal.session.table import parse_csv, read_views
 from visioncal.simulation import CellOptions, simulate, write_session
@@ -248,6 +248,13 @@ def test_a_wish_beyond_the_candidates_is_told_and_the_plan_written(tmp_path):
     assert done.status == 0, done.err
     assert "cannot be reached from these candidates" in done.err
     assert json.loads((out / "plan.json").read_text())["wish_met"] is False
+
+
+@pytest.mark.parametrize(
+    ("name", "is_ur"), [("ur3", True), ("ur16e", True), ("irb120", False), ("panda", False)]
+)
+def test_only_arms_with_the_axes_of_a_ur_get_its_program(name, is_ur):
+    assert has_ur_axes(load_robot(name)) == is_ur
 
 
 def test_arms_that_no_ur_program_drives_get_none(tmp_path):

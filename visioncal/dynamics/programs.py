@@ -11,16 +11,10 @@ from visioncal.dynamics.fourier import Series
 from visioncal.dynamics.sweeps import REST_S, Stroke, Sweeps
 from visioncal.robot import Robot
 
-_UR_JOINTS = 6
 # To where a motion begins the arm drives slowly, and rests there before it begins [rad/s, rad/s^2].
 _SPEED, _ACCELERATION, _SETTLING_S = 0.4, 0.6, 1.0
 # Of servoj: it looks ahead so far [s], and follows as stiffly as the controller allows by default.
 _LOOKAHEAD_S, _GAIN = 0.1, 300
-
-
-def is_programmed(robot: Robot) -> bool:
-    """Whether a robot is programmed like a UR, by its joints."""
-    return robot.joint_count == _UR_JOINTS and not robot.chain.prismatic.any()
 
 
 def excitation_program(robot: Robot, series: Series) -> str:

@@ -13,8 +13,9 @@ from visioncal.dynamics.limit_check import CHECK_HZ, Kept
 from visioncal.dynamics.limits import Allowed
 from visioncal.dynamics.motion import Motion
 from visioncal.dynamics.planned import MotionPlan
-from visioncal.dynamics.programs import excitation_program, is_programmed, sweeps_program
+from visioncal.dynamics.programs import excitation_program, sweeps_program
 from visioncal.dynamics.sweeps import Sweeps
+from visioncal.robot import has_ur_axes
 
 SCHEMA = 1
 MOTION_FILES = ("sweeps.script", "sweeps.csv", "excitation.script", "excitation.csv")
@@ -23,7 +24,7 @@ MOTION_FILES = ("sweeps.script", "sweeps.csv", "excitation.script", "excitation.
 def motion_files(plan: MotionPlan, rate_hz: float) -> dict[str, str]:
     """Writes tables, and programs where the robot is one that takes them: content by file name."""
     robot, found = plan.allowed.robot, {}
-    programmed = is_programmed(robot)
+    programmed = has_ur_axes(robot)
     if plan.sweeps is not None:
         found["sweeps.csv"] = motion_table(plan.sweeps.sampled(rate_hz))
         if programmed:

@@ -8,6 +8,7 @@ from visioncal.robot.constant_part import fit_links, without_functions
 from visioncal.robot.conversion import (
     PARALLEL_RAD,
     convert_table,
+    has_ur_axes,
     parallel_axes,
     placed_at,
     table_of,
@@ -82,6 +83,7 @@ __all__ = [
     "corrected_urdf",
     "entries",
     "fit_links",
+    "has_ur_axes",
     "joint_torques",
     "load_robot",
     "mass_matrices",

@@ -28,6 +28,7 @@ from visioncal.robot.tables import (
 # Consecutive axes closer than this to parallel get Hayati's beta [rad]. Their common normal lies
 # at a distance of their offset over the angle, and so do the errors of d grow against those of a.
 PARALLEL_RAD = float(np.deg2rad(5.0))
+_UR_JOINTS = 6
 # Axes closer than this are parallel [rad], and meet when they pass so close [m]: a common normal at
 # 1e8 times their offset has lost as many digits as the angle that is neglected.
 EXACTLY = 1e-8
@@ -207,6 +208,16 @@ def parallel_axes(robot: Robot, parallel_rad: float = PARALLEL_RAD) -> Mask:
     """(n - 1,) which consecutive axes of a robot are closer than an angle to parallel."""
     links = _about_z(robot.chain).placements[1:-1]
     return np.asarray(_off_parallel(links[:, :3, 2]) < parallel_rad)
+
+
+def has_ur_axes(robot: Robot) -> bool:
+    """Whether a robot's axes are laid out as a UR's: six that turn, the middle three parallel.
+
+    Other arms of six joints take no program of a UR.
+    """
+    if robot.joint_count != _UR_JOINTS or robot.chain.prismatic.any():
+        return False
+    return parallel_axes(robot).tolist() == [False, True, True, False, False]
 
 
 def _rows(table: DHTable) -> list[_Row]:

@@ -16,6 +16,7 @@ from visioncal.core.version import __version__
 from visioncal.live.planning.accuracy import Accuracy
 from visioncal.live.planning.cell import Box, Limits, PlanCell
 from visioncal.live.planning.plan import Plan, PlannedStop, Request
+from visioncal.robot import has_ur_axes
 from visioncal.session.columns import POSE
 from visioncal.vision.targets import target_document
 
@@ -25,7 +26,6 @@ SCHEMA = 1
 SPEED, ACCELERATION = 0.4, 0.6
 # The arm has stopped to tremble before an image is taken [s].
 _SETTLING_S = 0.5
-_UR_JOINTS = 6
 
 
 def stops_table(plan: Plan) -> str:
@@ -105,7 +105,7 @@ def program_of(plan: Plan) -> str:
     looked at; corners are not rounded.
     """
     robot = plan.cell.robot
-    if robot.joint_count != _UR_JOINTS or robot.chain.prismatic.any():
+    if not has_ur_axes(robot):
         return ""
     lines = [
         *(f"# {it}" for it in _heading(plan)),
