@@ -217,7 +217,7 @@ def has_ur_axes(robot: Robot) -> bool:
     """
     if robot.joint_count != _UR_JOINTS or robot.chain.prismatic.any():
         return False
-    return parallel_axes(robot).tolist() == [False, True, True, False, False]
+    return np.array_equal(parallel_axes(robot), [False, True, True, False, False])
 
 
 def _rows(table: DHTable) -> list[_Row]:
