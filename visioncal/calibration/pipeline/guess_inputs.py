@@ -15,6 +15,7 @@ from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.cause_ranking import read_otherwise, wrong_poses
 from visioncal.calibration.stages.clocks import waits_for_clock
 from visioncal.calibration.stages.init_frames import init_frames
+from visioncal.calibration.stages.joints import match_joints
 from visioncal.calibration.stages.judge import is_scattered
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.errors import VisioncalError
@@ -149,14 +150,20 @@ def reading_hint(seen: RunState) -> Finding | None:
 
 def _poses_beside_joints(seen: RunState, declared: Candidate) -> Finding | None:
     """Says that poses are wrong which no reading explains, where the joint angles agree."""
-    chain = chain_poses(seen.session)
-    if chain is None or not numbers_in(seen.session, POSE).there.any():
+    session = seen.session
+    chain, document = chain_poses(session), session.robot_document
+    if chain is None or document is None or not numbers_in(session, POSE).there.any():
         return None
-    robot = PoseNumbers.of_poses(chain, _places(seen.session))
+    matched = match_joints(session.views, Robot.from_document(document))
+    if matched.joints_rad and not matched.contradicting:
+        # They are the poses of the joint angles: where the motion determines little, one chain
+        # closes and the other does not by rounding alone.
+        return None
+    robot = PoseNumbers.of_poses(chain, _places(session))
     one_board = replace(seen, poses=seen.poses_of_one_board)
     for camera in _seen_ways(one_board, robot):
         by_joints = guess_reading(
-            robot, camera, seen.session.mount, is_measured=bool(seen.corners)
+            robot, camera, session.mount, is_measured=bool(seen.corners)
         ).declared
         if by_joints.closes:
             return wrong_poses(declared.figures, by_joints.figures)
