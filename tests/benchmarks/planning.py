@@ -14,7 +14,7 @@ from multiprocessing import Pool
 import numpy as np
 from results import few, first, wished, write_section
 from support.cells import calibrated, error_of
-from support.planned import cell_of, plan_cell, so_far_of, true_cell, whole
+from support.planned import cell_of, next_best, plan_cell, so_far_of, true_cell, whole
 from support.wrong_arms import WRONG_LINKS, error_m
 
 from visioncal.calibration.pipeline.run_state import RunState
@@ -23,7 +23,6 @@ from visioncal.core.transforms import exp
 from visioncal.core.types import FloatArray
 from visioncal.live.planning.candidates import candidates
 from visioncal.live.planning.design import chosen
-from visioncal.live.planning.improving import next_best
 from visioncal.live.planning.information import WORLDS as SAMPLE
 from visioncal.live.planning.information import World, worlds_of
 from visioncal.live.planning.purposes import PURPOSES

@@ -27,7 +27,6 @@ from visioncal.robot import (
     body_regressor,
     joint_torques,
     load_robot,
-    mass_matrices,
     momenta,
     parameters_of,
     pseudo_inertias,
@@ -86,11 +85,11 @@ def test_encoders_may_be_eccentric():
     def energy(t):
         q, dq, _ = course(t)
         speeds = robot.chain.jacobian(q) * dq
-        (mass,) = mass_matrices(robot, robot.inertias, q)
+        momentum, _ = momenta(robot, robot.inertias, q, dq)
         frames = robot.link_frames(q[0])[:-1]
         masses = robot.masses
         centres = np.einsum("nij,nj->ni", frames[:, :3, :3], masses.centres_m) + frames[:, :3, 3]
-        return 0.5 * speeds[0] @ mass @ speeds[0] - masses.kg @ centres @ robot.gravity
+        return 0.5 * speeds[0] @ momentum[0] - masses.kg @ centres @ robot.gravity
 
     q, dq, ddq = course(0.7)
     torques = joint_torques(robot, robot.inertias, q, dq, ddq)

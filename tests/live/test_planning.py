@@ -6,7 +6,7 @@ from itertools import combinations, pairwise
 import numpy as np
 import pytest
 from support.cells import calibrated
-from support.planned import plan_cell, postures_in_view, so_far_of, true_cell
+from support.planned import next_best, plan_cell, postures_in_view, so_far_of, true_cell
 
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp
@@ -16,7 +16,6 @@ from visioncal.estimation.solve import fisher_information
 from visioncal.live.planning.accuracy import Wish
 from visioncal.live.planning.cell import Box
 from visioncal.live.planning.design import chosen, shortfall
-from visioncal.live.planning.improving import next_best
 from visioncal.live.planning.information import stop_factors, worlds_of
 from visioncal.live.planning.purposes import PURPOSES, purpose_of
 from visioncal.live.planning.recorded import Guess, begin

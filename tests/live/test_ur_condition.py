@@ -1,31 +1,26 @@
-"""What a UR controller tells over plain connections: condition, tool, maker's calibration."""
+"""What a UR controller tells over plain connections: its condition and its tool."""
 
 import socket
 import sys
 import threading
 from contextlib import contextmanager
 
-import numpy as np
 import pytest
 
-from visioncal.core.errors import DataError, DriverError
+from visioncal.core.errors import DriverError
 from visioncal.live.drivers.ur import UrArm
-from visioncal.live.drivers.ur_factory import factory_document, read_factory_dh, read_factory_file
 from visioncal.live.drivers.ur_net import check_states_come, connect, resolve
 from visioncal.live.drivers.ur_primary import read_tool_offset
 from visioncal.live.drivers.ur_status import read_condition
 from visioncal.live.rehearsal.controller import free_host, spawn
-from visioncal.live.rehearsal.options import ControllerOptions, believed_arm
-from visioncal.robot import Robot, load_robot
-from visioncal.simulation.arms import ArmErrors, forward
+from visioncal.live.rehearsal.options import ControllerOptions
 
-MEASURED = ArmErrors(length_m=1e-3, angle_rad=1e-3, offset_rad=1e-3)
-OPTIONS = ControllerOptions(seed=3, factory=MEASURED, tcp=(0.01, -0.02, 0.15, 0.1, 0.2, -0.3))
+OPTIONS = ControllerOptions(seed=3, tcp=(0.01, -0.02, 0.15, 0.1, 0.2, -0.3))
 
 
 @pytest.fixture(scope="module")
 def controller():
-    """A controller that knows its maker's calibration. Its faults are taken back by each test."""
+    """A controller. Its faults are taken back by each test."""
     with spawn(OPTIONS) as running:
         yield running
 
@@ -141,48 +136,3 @@ def test_a_missing_client_library_is_told_with_the_command_that_installs_it(monk
     monkeypatch.setitem(sys.modules, "rtde_receive", None)
     with pytest.raises(DriverError, match=r"rtde_receive cannot be imported.*pip install 'ur-rtde"):
         UrArm("127.0.0.1")
-
-
-def test_the_makers_calibration_gives_the_controllers_own_kinematics(controller):
-    table = read_factory_dh(controller.host)
-    robot = Robot.from_document(factory_document(table, "ur10e"))
-    q = np.random.default_rng(0).uniform(-2.0, 2.0, (20, 6))
-    believed = believed_arm(OPTIONS)
-    assert robot.base_from_flange(q) == pytest.approx(forward(believed, q), abs=1e-9)
-    assert np.abs(robot.base_from_flange(q) - load_robot("ur10e").base_from_flange(q)).max() > 1e-3
-
-
-def test_the_controllers_file_tells_the_same_calibration(tmp_path):
-    path = tmp_path / "calibration.conf"
-    path.write_text(
-        "[mounting]\n"
-        "delta_theta = [ 1e-4, -0.27, 0.0, 0.0, 0.0, 0.0 ]\n"
-        "delta_a = [ 0.0, 2e-4, 0.0, 0.0, 0.0, 0.0 ]\n"
-        "delta_d = [ 1e-5, 12.5, -12.5, 0.0, 0.0, 0.0 ]\n"
-        "delta_alpha = [ 0.0, 3e-4, 0.0, 0.0, 0.0, 0.0 ]\n"
-        "# 0 == notInitialized, 1 == Linearised\n"
-        "calibration_status = 1  # Linearised\n"
-        "joint_checksum = [ 0xa1, 0xb2, 0xc3, 0xd4, 0xe5, 0xf6 ]\n",
-        encoding="utf-8",
-    )
-    table = read_factory_file(path, "ur10e")
-    assert table.theta_rad[:2] == pytest.approx([1e-4, -0.27])
-    assert table.a_m[1] == pytest.approx(-0.6127 + 2e-4)
-    assert table.d_m[:3] == pytest.approx([0.1807 + 1e-5, 12.5, -12.5])
-    assert table.alpha_rad[:2] == pytest.approx([np.pi / 2, 3e-4])
-    assert table.checksum == (0xA1, 0xB2, 0xC3, 0xD4, 0xE5, 0xF6)
-    Robot.from_document(factory_document(table, "ur10e"))
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("[other]\n", "is no calibration of a UR: 'mounting'"),
-        ("[mounting]\ndelta_theta = [ a ]\n", "could not convert"),
-    ],
-)
-def test_another_file_is_no_calibration(tmp_path, text, message):
-    path = tmp_path / "calibration.conf"
-    path.write_text(text, encoding="utf-8")
-    with pytest.raises(DataError, match=message):
-        read_factory_file(path, "ur10e")

@@ -12,11 +12,11 @@ import pytest
 from support.aligned_cells import made_up_cell
 from support.arm_documents import with_holdout
 from support.findings import sick, with_findings
+from support.made_schema import calibration_schema
 from support.result_schema import SHIPPED, faults
 from support.samples import made_up, with_frames
 
 from visioncal.results import Calibration, to_document
-from visioncal.results.schema import calibration_schema
 
 DATA = Path(__file__).parents[1] / "data"
 

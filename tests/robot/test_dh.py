@@ -1,4 +1,4 @@
-"""Joint tables: three conventions, from one to another, from any chain, and recognised by poses."""
+"""Joint tables: three conventions, from one to another, from any chain, and misread."""
 
 import json
 from dataclasses import replace
@@ -10,14 +10,14 @@ import pytest
 
 from visioncal.core.choices import CONVENTIONS
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import exp
+from visioncal.core.transforms import exp, invert, log
 from visioncal.robot import (
     DHTable,
     Robot,
     convert_table,
     load_robot,
+    other_convention,
     parallel_axes,
-    recognised_convention,
     robot_names,
     small_urdf,
     table_document,
@@ -246,24 +246,24 @@ def test_a_wrong_constant_is_refused(place: str, content: Any) -> None:
         Robot.from_document({**load_robot("ur5").document, place: content})
 
 
-def reported(robot: Robot, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Joints and the poses that go with them, between two frames of the controller's own."""
-    rng = np.random.default_rng(seed)
-    q = rng.uniform(-1.5, 1.5, (count, robot.joint_count))
-    base, tool = exp(rng.normal(size=(2, 6)))
-    return q, base @ robot.base_from_flange(q) @ tool
+def motions(robot: Robot, q: np.ndarray) -> np.ndarray:
+    """Turns [rad] and shifts along their axes [m] between poses: base and flange drop out."""
+    poses = robot.base_from_flange(q)
+    moved = log(invert(poses[:-1]) @ poses[1:])
+    turns = np.linalg.norm(moved[:, :3], axis=1)
+    return np.stack([turns, np.sum(moved[:, :3] * moved[:, 3:], axis=1) / turns])
 
 
 @pytest.mark.parametrize("name", robot_names())
-def test_the_convention_is_recognised_whatever_is_declared(name: str) -> None:
+def test_the_other_convention_is_the_arm_of_a_misread_table(name: str) -> None:
     start = table(name)
-    for seed in range(5):
-        q, seen = reported(disturbed(name, seed), 12, seed)
-        for declared in (start, _misread(start)):
-            found = recognised_convention(declared, q, seen)
-            assert found.convention == start.convention
-            # The errors of 0.5 mm and 1 mrad a link, seen by a tool one or two metres long.
-            assert min(found.misfit_m.values()) < 2e-2
+    q = np.random.default_rng(1).uniform(-1.5, 1.5, (12, len(start)))
+    seen = motions(load_robot(name), q)
+    misread = Robot.from_document(table_document(_misread(start)))
+    assert np.abs(motions(misread, q) - seen).max() > 1e-3
+    found, convention = other_convention(misread)
+    assert convention == start.convention
+    assert motions(found, q) == pytest.approx(seen, abs=1e-9)
 
 
 def _misread(it: DHTable) -> DHTable:
@@ -271,22 +271,3 @@ def _misread(it: DHTable) -> DHTable:
     document = table_document(it)
     other = "standard" if it.convention == "modified" else "modified"
     return table_from_document(document | {"convention": other})
-
-
-def test_hayatis_reading_is_told_from_the_modified_one() -> None:
-    robot = disturbed("ur10e", 3)
-    found = recognised_convention(table_of(robot, "hayati"), *reported(robot, 12, 3))
-    assert found.convention == "hayati"
-    assert set(found.misfit_m) == {"hayati", "modified"}
-
-
-def test_a_convention_that_nothing_tells_is_left_open() -> None:
-    start = table("ur5e")
-    # Another arm fits in no convention.
-    assert recognised_convention(start, *reported(load_robot("irb120"), 12, 1)).convention is None
-    # One pose again and again fits in all.
-    q, seen = reported(load_robot("ur5e"), 1, 1)
-    again = recognised_convention(start, np.repeat(q, 8, axis=0), np.repeat(seen, 8, axis=0))
-    assert again.convention is None
-    with pytest.raises(DataError, match="at least 5 rows with 6 joint angles"):
-        recognised_convention(start, *reported(load_robot("ur5e"), 4, 1))

@@ -1,6 +1,6 @@
 """Simulated cells to be planned: their guesses, and what calibrating at planned stops gives."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from support.cells import known_of
@@ -10,8 +10,13 @@ from visioncal.core.errors import DegenerateError
 from visioncal.core.transforms import exp, invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.parts import Noise
+from visioncal.live.planning.accuracy import Wish
 from visioncal.live.planning.cell import Limits, PlanCell
-from visioncal.live.planning.recorded import SoFar
+from visioncal.live.planning.design import Design, chosen
+from visioncal.live.planning.improving import Help, helps
+from visioncal.live.planning.information import WORLDS, worlds_of
+from visioncal.live.planning.purposes import Purpose
+from visioncal.live.planning.recorded import Begun, SoFar
 from visioncal.robot import load_robot
 from visioncal.simulation import Cell, CellOptions, simulate
 from visioncal.simulation.arms import forward, ur_arm
@@ -48,6 +53,26 @@ def postures_in_view(options: CellOptions, count: int) -> FloatArray:
     """(k, n) random postures from which the simulated camera sees the whole board [rad]."""
     free = replace(options, views=count, motion="free", branches=True, roll_rad=np.pi)
     return simulate(replace(free, cut_views=0.0)).joints
+
+
+@dataclass(frozen=True)
+class Additions:
+    """Stops to add to a session: which candidates, and what each of them is good for."""
+
+    design: Design
+    helps: tuple[Help, ...]
+
+
+def next_best(
+    begun: Begun, purpose: Purpose, q: FloatArray, count: int, *, wish: Wish | None = None, **draw
+) -> Additions:
+    """The stops that a plan adds to a session, wherever the arm can drive."""
+    cells = (begun.cell, *begun.cell.guesses(draw.get("worlds", WORLDS) - 1, draw.get("seed", 0)))
+    worlds = worlds_of(cells, purpose, q, recorded=begun.recorded)
+    design = chosen(worlds, count, criterion="I", wish=wish)
+    names = [f"added stop {it + 1}" for it in range(len(design.rows))]
+    said = helps(begun.cell, purpose, q, worlds[0], design, names, begun=begun)
+    return Additions(design, tuple(said))
 
 
 def so_far_of(cell: Cell, **changes) -> SoFar:

@@ -34,9 +34,9 @@ from visioncal.robot.inertia import (
 from visioncal.robot.loads import MASS_KEYS, Loads, Masses, bends, bent_joints
 from visioncal.robot.logcholesky import LogCholesky
 from visioncal.robot.model import BODY_KEYS, LINK_KEYS, Robot
-from visioncal.robot.momentum import mass_matrices, momenta
+from visioncal.robot.momentum import momenta
 from visioncal.robot.rates import RATE_KEYS, Rates
-from visioncal.robot.recognising import Recognised, other_convention, recognised_convention
+from visioncal.robot.recognising import other_convention
 from visioncal.robot.tables import (
     DHTable,
     table_document,
@@ -72,7 +72,6 @@ __all__ = [
     "LogCholesky",
     "Masses",
     "Rates",
-    "Recognised",
     "Robot",
     "WeightFunctions",
     "bends",
@@ -86,7 +85,6 @@ __all__ = [
     "has_ur_axes",
     "joint_torques",
     "load_robot",
-    "mass_matrices",
     "matrices",
     "momenta",
     "moving",
@@ -96,7 +94,6 @@ __all__ = [
     "placed_at",
     "pseudo_inertias",
     "read_robot_document",
-    "recognised_convention",
     "robot_file",
     "robot_names",
     "small_urdf",

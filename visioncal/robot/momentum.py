@@ -1,4 +1,4 @@
-"""How hard an arm is to move where it stands: its mass matrix and its momentum."""
+"""The generalised momentum of an arm."""
 
 from typing import TYPE_CHECKING
 
@@ -14,31 +14,6 @@ if TYPE_CHECKING:
     import pinocchio as pin
 
 
-def mass_matrices(robot: Robot, inertias: Inertias, q: FloatArray) -> FloatArray:
-    """Computes the mass matrices of an arm (Featherstone 2008, section 6.2).
-
-    Args:
-        robot: The arm.
-        inertias: Of its links; each has a mass above zero, or neither mass nor first moments.
-        q: (m, n) joint angles [rad].
-
-    Returns:
-        (m, n, n) [kg m^2].
-
-    Raises:
-        DataError: The number of joints differs from the robot's, or an inertia is of no mass.
-    """
-    import pinocchio as pin
-
-    still = np.zeros_like(q)
-    positions, _, _ = effective_states(robot, q, still, still)
-    model = weighed_model(robot, inertias)
-    data = model.createData()
-    found = np.array([pin.crba(model, data, it).copy() for it in positions])
-    upper = np.triu(found.reshape(len(positions), model.nv, model.nv))
-    return np.asarray(upper + np.swapaxes(np.triu(upper, 1), 1, 2))
-
-
 def momenta(
     robot: Robot, inertias: Inertias, q: FloatArray, dq: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
@@ -49,7 +24,7 @@ def momenta(
 
     Args:
         robot: The arm.
-        inertias: Of its links, as for `mass_matrices`.
+        inertias: Of its links; each has a mass above zero, or neither mass nor first moments.
         q: (m, n) joint angles [rad].
         dq: (m, n) their speeds [rad/s].
 
@@ -57,7 +32,7 @@ def momenta(
         (m, n) momenta [N m s] and (m, n) rates [N m].
 
     Raises:
-        DataError: As for `mass_matrices`.
+        DataError: The number of joints differs from the robot's, or an inertia is of no mass.
     """
     import pinocchio as pin
 

@@ -216,20 +216,6 @@ def _sigmas(solved: Solved) -> dict[str, dict[str, float]]:
     return found
 
 
-def _intervals(solved: Solved) -> dict[str, dict[str, list[float]]]:
-    """95 % intervals of the levels of robots, as `_noise` names them."""
-    agreed = solved.agreed
-    part = agreed.problem.subset(agreed.used)
-    found = noise_intervals(part, agreed.fit.state, agreed.fit.noise)
-    return {
-        robot: {
-            "translation_mm": (1e3 * shift_m).tolist(),
-            "rotation_deg": np.rad2deg(turn_rad).tolist(),
-        }
-        for robot, (turn_rad, shift_m) in zip(part.robots, found, strict=True)
-    }
-
-
 def _sights(
     looked: Observed, cell: Cell, solved: Solved, held_out: HeldOut, faults: Sequence[PoseFault]
 ) -> tuple[Sight, ...]:

@@ -20,7 +20,6 @@ from visioncal.estimation.bending import (
     payload_factor,
 )
 from visioncal.results.arm import ElasticResult, JointSpring, LoadedStop, Sag
-from visioncal.robot import Loads, Robot
 
 # A joint is determined where the stops leave less than this share of its prior sigma.
 _DETERMINED = 0.5
@@ -188,45 +187,3 @@ def doubts(elastic: Elastic) -> Iterator[Finding]:
             "(payload_kg, payload_x_m ...), or the masses of the arm's links are off.",
             Step("Weigh the load, and correct payload_kg and its centre in views.csv."),
         )
-
-
-def deflection_words(
-    robot: Robot,
-    q: FloatArray,
-    stiffness_nm_per_rad: Sequence[float],
-    loads: Loads,
-    seen_mm: float,
-    sigma_mm: float,
-) -> str:
-    """Says whether a deflection that was seen follows from stiffnesses and a load.
-
-    Args:
-        robot: The arm.
-        q: (1, n) the posture [rad].
-        stiffness_nm_per_rad: Joint by joint; inf for a rigid one.
-        loads: The one load.
-        seen_mm: By how much the flange moved when it was put on [mm].
-        sigma_mm: What that is known to [mm].
-
-    Returns:
-        A sentence; empty where they fit to within three standard deviations.
-    """
-    compliance = 1.0 / np.array(stiffness_nm_per_rad)
-    torques = robot.load_torques(q, loads) - robot.load_torques(q)
-    bends = compliance * torques
-    moved = np.einsum("mij,mj->mi", robot.axis_jacobian(q), bends)[:, 3:]
-    expected_mm = 1e3 * float(np.linalg.norm(moved))
-    if abs(seen_mm - expected_mm) <= 3.0 * sigma_mm:
-        return ""
-    joints = ", ".join(
-        f"{name} {torque:.3g} N m / {1.0 / yields:.3g} N m/rad = {figure(1e3 * bend)} mrad"
-        for name, torque, yields, bend in zip(
-            robot.joint_names, torques[0], compliance, bends[0], strict=True
-        )
-        if yields
-    )
-    return (
-        f"Load and deflection do not fit: {joints} move the flange by {figure(expected_mm)} mm, "
-        f"and {figure(seen_mm)} mm are stated. Either the joints are {seen_mm / expected_mm:.1f} "
-        "times as compliant, or what bends is not the joints."
-    )

@@ -32,8 +32,6 @@ class FrameEnd:
         pipeline: The pipeline, not yet running.
         output: The output of a node whose frames are wanted.
         name: Whose they are, for messages.
-        keeps_all: Whether the pipeline waits where nobody takes its frames; else the oldest are
-            dropped.
         raw: A file to record every frame into, and its times beside it.
 
     Raises:
@@ -48,12 +46,11 @@ class FrameEnd:
         output: Handle,
         name: str,
         *,
-        keeps_all: bool = False,
         raw: Path | None = None,
     ) -> None:
         self._dai, self._name = dai, name
         self._recorder = None if raw is None else _recorder(dai, pipeline, output, raw)
-        self._queue = output.createOutputQueue(maxSize=4, blocking=keeps_all)
+        self._queue = output.createOutputQueue(maxSize=4, blocking=False)
         with worded(dai, name, "does not start"):
             pipeline.start()
         # A pipeline that still runs when Python ends aborts the process.

@@ -1,4 +1,4 @@
-"""What only a UR's primary interface reports: its table of joints and its tool offset.
+"""What only a UR's primary interface reports: its tool offset.
 
 Source: Universal Robots, "Remote Control Via TCP/IP": a message is its size, its type and its
 content; a robot state message (16) holds packages of the same form; numbers are big-endian.
@@ -7,53 +7,18 @@ content; a robot state message (16) holds packages of the same form; numbers are
 import struct
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
-
-import numpy as np
 
 from visioncal.core.errors import DriverError
-from visioncal.core.types import FloatArray
 from visioncal.live.drivers.ur_net import connect
 
 # The first only reads, and is open where the second is not.
 _PORTS = (30011, 30001)
 _WAIT_S = 1.0
 _HEADER = struct.Struct(">IB")
-_ROBOT_STATE, _CARTESIAN, _KINEMATICS = 16, 4, 5
+_ROBOT_STATE, _CARTESIAN = 16, 4
 _TOOL = struct.Struct(">6d6d")
-_TABLE = struct.Struct(">6I24dI")
 # No message of a controller comes near it.
 _MOST_BYTES = 1 << 20
-
-
-@dataclass(frozen=True, eq=False)
-class JointTable:
-    """A controller's own table of joints, after Denavit and Hartenberg.
-
-    Attributes:
-        theta_rad: (6,) joint angles at which the encoders read zero [rad].
-        a_m: (6,) lengths [m].
-        d_m: (6,) offsets [m].
-        alpha_rad: (6,) twists [rad].
-        checksum: What identifies the arm's joints.
-    """
-
-    theta_rad: FloatArray
-    a_m: FloatArray
-    d_m: FloatArray
-    alpha_rad: FloatArray
-    checksum: tuple[int, ...]
-
-
-def read_joint_table(host: str) -> JointTable:
-    """Reads the table by which the controller reckons, the maker's calibration included.
-
-    Raises:
-        DriverError: The controller cannot be reached, or does not report it.
-    """
-    numbers = _TABLE.unpack_from(_package(host, _KINEMATICS, _TABLE.size, "its table of joints"))
-    theta, a, d, alpha = np.array(numbers[6:30]).reshape(4, 6)
-    return JointTable(theta, a, d, alpha, numbers[:6])
 
 
 def read_tool_offset(host: str) -> list[float]:

@@ -10,13 +10,12 @@ from visioncal.core.number_format import figure
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.armmodel import block_size
-from visioncal.live.planning.accuracy import OPEN_SIGMA, Accuracy, Wish
-from visioncal.live.planning.cell import Box, PlanCell
-from visioncal.live.planning.design import Design, chosen
-from visioncal.live.planning.information import WORLDS, World, worlds_of
+from visioncal.live.planning.accuracy import OPEN_SIGMA, Accuracy
+from visioncal.live.planning.cell import PlanCell
+from visioncal.live.planning.design import Design
+from visioncal.live.planning.information import World
 from visioncal.live.planning.purposes import Purpose
 from visioncal.live.planning.recorded import Begun
-from visioncal.live.planning.selection import Criterion
 from visioncal.robot import Robot
 
 # A direction this close to the optical axis is called by it; another axis is named besides where
@@ -45,58 +44,6 @@ class Help:
     words: str
     before_mm: float
     after_mm: float
-
-
-@dataclass(frozen=True, eq=False)
-class Additions:
-    """Stops to add to a session.
-
-    Attributes:
-        design: Which candidates, and what is predicted.
-        helps: One for each, in their order.
-    """
-
-    design: Design
-    helps: tuple[Help, ...]
-
-
-def next_best(
-    begun: Begun,
-    purpose: Purpose,
-    q: FloatArray,
-    count: int,
-    *,
-    criterion: Criterion = "I",
-    wish: Wish | None = None,
-    workspace: Box | None = None,
-    worlds: int = WORLDS,
-    seed: int = 0,
-) -> Additions:
-    """Chooses the stops that add most to a session.
-
-    Args:
-        begun: The session's information.
-        purpose: What the stops are for.
-        q: (k, n) joint angles of the candidates [rad].
-        count: The most stops that may be added.
-        criterion: What makes stops good.
-        wish: Where to stop before.
-        workspace: Where the arm's place counts; None for all of its reach.
-        worlds: Over how many cells the plan is made, as they may be by what is known.
-        seed: Of the cells that are drawn.
-
-    Raises:
-        DataError: There are fewer candidates than stops, or joint angles of what was recorded are
-            needed and not known.
-    """
-    cells = (begun.cell, *begun.cell.guesses(worlds - 1, seed))
-    predicted = worlds_of(cells, purpose, q, recorded=begun.recorded, workspace=workspace)
-    design = chosen(predicted, count, criterion=criterion, wish=wish)
-    names = [f"added stop {it + 1}" for it in range(len(design.rows))]
-    return Additions(
-        design,
-        tuple(helps(begun.cell, purpose, q, predicted[0], design, names, begun=begun)),
-    )
 
 
 def helps(

@@ -163,9 +163,8 @@ def _read(text: str, **more: str | int | None) -> ControllerOptions:
     try:
         table: dict[str, Any] = json.loads(text)
         table |= {key: value for key, value in more.items() if value is not None}
-        for key in ("errors", "factory"):
-            if table.get(key) is not None:
-                table[key] = ArmErrors(**table[key])
+        if table.get("errors") is not None:
+            table["errors"] = ArmErrors(**table["errors"])
         for key in ("q", "tcp", "payload_m"):
             if key in table:
                 table[key] = tuple(map(float, table[key]))

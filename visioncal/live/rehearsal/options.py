@@ -1,6 +1,6 @@
 """What a simulated controller is made of."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -18,8 +18,6 @@ class ControllerOptions:
         robot: `ur3e`, `ur5e` or `ur10e`.
         seed: Of everything random.
         errors: How the real arm departs from what its controller believes.
-        factory: How what the controller believes departs from the data sheet, as the maker measured
-            it; None for a controller that goes by the data sheet.
         q: Joint angles at the start [rad].
         tcp: The tool offset that is set: x, y, z [m] and a rotation vector [rad].
         payload_kg: The load that is set [kg].
@@ -36,7 +34,6 @@ class ControllerOptions:
     robot: str = "ur10e"
     seed: int = 0
     errors: ArmErrors = field(default_factory=lambda: ArmErrors(3e-4, 3e-4, 5e-4))
-    factory: ArmErrors | None = None
     q: tuple[float, ...] = _HOME
     tcp: tuple[float, ...] = (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)
     payload_kg: float = 0.6
@@ -50,14 +47,8 @@ class ControllerOptions:
 
 
 def believed_arm(options: ControllerOptions) -> Arm:
-    """The arm by which the controller reckons: its data sheet, or what the maker measured."""
-    nominal = ur_arm(options.robot)
-    if options.factory is None:
-        return nominal
-    rng = np.random.default_rng([options.seed, 1])
-    measured = disturb(nominal, options.factory, rng)
-    # The maker's table has four numbers a joint.
-    return replace(measured, beta=nominal.beta, waves=nominal.waves)
+    """The arm by which the controller reckons: its data sheet."""
+    return ur_arm(options.robot)
 
 
 def true_arm(options: ControllerOptions) -> Arm:

@@ -24,8 +24,6 @@ DRAWN_PX = 0.3
 _MOST_SIGMA_PX, _MOST_DISC_PX, _MOST_MOTION_PX = 8.0, 12.0, 24.0
 # Below this, functions of t / t are series.
 _TINY = 1e-4
-# Of what moves and what is out of focus, what widens edges by less than a tenth of a pixel [px].
-_LEAST_PX = 0.1
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,6 @@ _ALONG, _INSIDE = (0.06, 0.35, 0.65, 0.94), 0.06
 # An outer line of tags is missing where so many places on its near side are lighter than grey; the
 # tags of so many lines beside it show where it would be.
 _MOST_OF, _NEAR_LINES = 0.8, 2
-_SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
 
 
 def find_aprilgrid(image: Image, target: Target) -> DetectedCorners | NotFound:

@@ -63,7 +63,7 @@ class _Schemas:
         table = {"type": "object", "properties": properties, "required": required}
         return described | table | more
 
-    def of(self, kind: Any) -> dict[str, Any]:  # noqa: ANN401 - a type
+    def of(self, kind: Any) -> dict[str, Any]:
         """The schema of a type."""
         origin, args = get_origin(kind), get_args(kind)
         if origin is Annotated:
