@@ -106,6 +106,8 @@ def test_heavy_libraries_enter_in_one_place():
             "visioncal.present.report, visioncal.present.recording, visioncal.cli.record",
             {"depthai", "rtde_control", "rtde_receive", "torch", "kornia", "matplotlib"},
         ),
+        # A report by itself waits for no library of recordings.
+        ("visioncal.interchange.outputs, visioncal.present.report.page", {"rerun", "pyarrow"}),
         # Every command waits for what is loaded here, `--help` and `--version` too.
         (
             "visioncal.cli.app",

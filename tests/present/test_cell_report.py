@@ -7,7 +7,7 @@ import numpy as np
 from support.aligned_cells import made_up_cell
 
 from visioncal.core.number_format import significant
-from visioncal.present.recording.cellmap import pairs, weakest_frame
+from visioncal.present.cellmap import pairs, weakest_frame
 from visioncal.present.report.cells import pair_table, render_cell, write_cell_report
 from visioncal.results import Moved, RobotResult, Sight, Untied
 from visioncal.results.arm import ArmLevel, ArmResult

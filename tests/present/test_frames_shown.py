@@ -24,6 +24,7 @@ from support.samples import (
     with_frames,
 )
 
+from visioncal.present.details import details
 from visioncal.present.recording import (
     notes,
     paths,
@@ -32,7 +33,6 @@ from visioncal.present.recording import (
     tools,
     write_recording,
 )
-from visioncal.present.recording.details import details
 from visioncal.present.recording.uncertainty import SIGMAS_95
 from visioncal.present.report.page import render
 from visioncal.present.report.tools import frame_cards

@@ -1,39 +1,25 @@
 """The calibrated arm, as text: its levels, its parameters, and what the stops determine of it."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import rerun as rr
 
-from visioncal.core.number_format import decimals_for, fixed, signed, significant
+from visioncal.core.number_format import significant
 from visioncal.present.recording import paths
 from visioncal.present.recording.notes import plain
-from visioncal.present.recording.words import (
+from visioncal.present.words import (
+    ParameterRow,
     by_joint,
     joint_words,
     level_reason,
     level_words,
-    parameter_words,
+    parameter_row,
+    spring_words,
 )
 from visioncal.results import Calibration
-from visioncal.results.arm import ArmLevel, ArmParameter, ArmResult, ElasticResult, JointSpring
+from visioncal.results.arm import ArmLevel, ArmResult, ElasticResult
 
 _MOST_INFLUENTIAL = 5
-# Without a sigma: about a hundredth of what an arm repeats to.
-_DECIMALS = {"mm": 3, "\N{DEGREE SIGN}": 4}
-
-
-@dataclass(frozen=True)
-class ParameterRow:
-    """A number of the arm's model, as text; `sure` where its change is beyond chance."""
-
-    symbol: str
-    unit: str
-    nominal: str
-    identified: str
-    change: str
-    sigma: str
-    sure: bool
 
 
 def log_static(stream: rr.RecordingStream, calibration: Calibration) -> None:
@@ -98,17 +84,6 @@ def _springs(found: ElasticResult) -> Iterator[str]:
     yield f"The loads of the stops move the flange by {median} mm in the median, {most} mm at most."
 
 
-def spring_words(spring: JointSpring) -> tuple[str, str, str]:
-    """Writes a joint's stiffness and its sigma [kN m/rad], and the torques on it [N m]."""
-    stiffness, sigma = spring.stiffness_nm_per_rad, spring.stiffness_sigma_nm_per_rad
-    low, high = (f"{round(it, 1) + 0.0:g}" for it in spring.torque_nm)
-    return (
-        "taken for rigid" if stiffness is None else f"{1e-3 * stiffness:.4g}",
-        "" if sigma is None else significant(1e-3 * sigma),
-        f"{low} to {high}",
-    )
-
-
 def _accuracy_over_workspace(found: ArmResult) -> Iterator[str]:
     sigma = found.workspace_sigma_mm
     if sigma is not None:
@@ -128,23 +103,6 @@ def _parameters(found: ArmResult) -> Iterator[str]:
         for place, it in enumerate(rows):
             name = "" if place else plain(joint_words(joint))
             yield _parameter_line(name, parameter_row(it))
-
-
-def parameter_row(it: ArmParameter) -> ParameterRow:
-    """Writes a number of the arm's model with as many digits as its change is known to."""
-    symbol, unit, scale = parameter_words(it.name)
-    sigma = None if it.sigma is None else scale * it.sigma
-    decimals = decimals_for(sigma) if sigma else _DECIMALS.get(unit, 5)
-    return ParameterRow(
-        symbol,
-        unit,
-        # As stated, whatever is known of it now.
-        f"{scale * it.nominal + 0.0:.7g}",
-        fixed(scale * it.identified, decimals),
-        signed(scale * it.change, decimals),
-        f"\N{PLUS-MINUS SIGN} {significant(sigma)}" if sigma else "",
-        it.is_sure,
-    )
 
 
 def _parameter_line(joint: str, row: ParameterRow) -> str:

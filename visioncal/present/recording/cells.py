@@ -17,9 +17,9 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import sha256
 from visioncal.core.number_format import significant
 from visioncal.core.types import FloatArray, Target
+from visioncal.present.cellmap import pairs, places, spans
 from visioncal.present.recording import board, colours, paths
 from visioncal.present.recording.arm import log_arm
-from visioncal.present.recording.cellmap import pairs, places, spans
 from visioncal.present.recording.celltext import sight_markdown, verdict_markdown
 from visioncal.present.recording.frames import Frame, scan
 from visioncal.present.recording.reader import chunks

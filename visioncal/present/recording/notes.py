@@ -9,7 +9,7 @@ import rerun as rr
 from visioncal.core.transforms import pose_difference
 from visioncal.core.verdict import Step, Verdict
 from visioncal.present.recording import colours, paths
-from visioncal.present.recording.words import SOURCES, level_reason
+from visioncal.present.words import SOURCES, level_reason
 from visioncal.results import Calibration, Edge, Rms, ViewResult
 from visioncal.results.arm import ArmErrorsResult
 from visioncal.results.sections import BoardResult, UncertaintyResult

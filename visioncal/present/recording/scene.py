@@ -11,9 +11,9 @@ from visioncal.core.types import Camera, FloatArray, Target
 from visioncal.present.recording import board, colours, paths
 from visioncal.present.recording.arm import log_arm
 from visioncal.present.recording.charts import Charts
-from visioncal.present.recording.target_frames import target_frames
 from visioncal.present.recording.uncertainty import Uncertainty
 from visioncal.present.recording.workspace import ArmPicture
+from visioncal.present.target_frames import target_frames
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session, View

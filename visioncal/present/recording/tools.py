@@ -4,8 +4,8 @@ from collections.abc import Iterator, Sequence
 
 import rerun as rr
 
+from visioncal.present.details import details
 from visioncal.present.recording import paths
-from visioncal.present.recording.details import details
 from visioncal.present.recording.notes import edge_line, plain
 from visioncal.results import Calibration, Frame, Observation
 

@@ -4,9 +4,15 @@ from dataclasses import dataclass
 
 from visioncal.core.number_format import significant
 from visioncal.estimation.arm import SIGNIFICANT
-from visioncal.present.recording.armtext import ParameterRow, parameter_row
-from visioncal.present.recording.words import by_joint, joint_words, level_reason, level_words
 from visioncal.present.report.content import Fact
+from visioncal.present.words import (
+    ParameterRow,
+    by_joint,
+    joint_words,
+    level_reason,
+    level_words,
+    parameter_row,
+)
 from visioncal.results.arm import NOMINAL, ArmLevel, ArmResult
 
 _COLUMNS = 2

@@ -11,7 +11,7 @@ from markupsafe import Markup
 from visioncal.core.files import write_atomically
 from visioncal.core.number_format import significant
 from visioncal.core.version import __version__
-from visioncal.present.recording import cellmap
+from visioncal.present import cellmap
 from visioncal.present.report import bars, content, network, svg, tools
 from visioncal.present.report.axes import Margins, boxes
 from visioncal.present.report.bars import Bar

@@ -7,7 +7,7 @@ from markupsafe import Markup
 
 from visioncal.core.number_format import significant
 from visioncal.core.types import FloatArray
-from visioncal.present.recording.cellmap import Pair, pairs, places, spans, weakest_frame
+from visioncal.present.cellmap import Pair, pairs, places, spans, weakest_frame
 from visioncal.present.report import svg
 from visioncal.present.report.axes import Box, Panel, Scale
 from visioncal.present.report.svg import Figure

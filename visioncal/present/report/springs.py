@@ -7,12 +7,11 @@ import numpy as np
 from markupsafe import Markup
 
 from visioncal.core.number_format import significant
-from visioncal.present.recording.armtext import spring_words
-from visioncal.present.recording.words import joint_words
 from visioncal.present.report import svg
 from visioncal.present.report.axes import Margins, Panel, boxes, spanning
 from visioncal.present.report.content import Fact
 from visioncal.present.report.svg import Figure
+from visioncal.present.words import joint_words, spring_words
 from visioncal.results.arm import ElasticResult
 
 _COLUMNS, _WIDE_IN, _HIGH_IN = 3, 9.2, 2.3

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from markupsafe import Markup
 
 from visioncal.core.number_format import significant
-from visioncal.present.recording.details import details
+from visioncal.present.details import details
 from visioncal.present.report import bars, svg
 from visioncal.present.report.axes import Margins, boxes
 from visioncal.present.report.bars import Bar

@@ -7,10 +7,10 @@ from markupsafe import Markup
 
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import FloatArray
-from visioncal.present.recording.target_frames import target_frames
 from visioncal.present.report import svg
 from visioncal.present.report.axes import Margins, Panel, Scale, boxes, spanning
 from visioncal.present.report.svg import Figure
+from visioncal.present.target_frames import target_frames
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session

@@ -1,8 +1,11 @@
 """What a result is made of, in words for people."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from visioncal.results.arm import NOMINAL, ArmLevel, ArmParameter, ArmResult
+from visioncal.core.number_format import decimals_for, fixed, signed, significant
+from visioncal.results.arm import NOMINAL, ArmLevel, ArmParameter, ArmResult, JointSpring
 
 # What each source of uncertainty is, for people.
 SOURCES = {
@@ -40,6 +43,21 @@ _SYMBOLS = {
 }
 # Units on disk with those for people, and how many of these one of them is.
 _UNITS = {"_m": ("mm", 1e3), "_rad": ("\N{DEGREE SIGN}", float(np.rad2deg(1.0)))}
+# Without a sigma: about a hundredth of what an arm repeats to.
+_DECIMALS = {"mm": 3, "\N{DEGREE SIGN}": 4}
+
+
+@dataclass(frozen=True)
+class ParameterRow:
+    """A number of the arm's model, as text; `sure` where its change is beyond chance."""
+
+    symbol: str
+    unit: str
+    nominal: str
+    identified: str
+    change: str
+    sigma: str
+    sure: bool
 
 
 def joint_words(name: str) -> str:
@@ -70,7 +88,7 @@ def _held_out(level: ArmLevel) -> str:
     return f"{level.held_out_mm:.2g} mm{turned}"
 
 
-def parameter_words(name: str) -> tuple[str, str, float]:
+def _parameter_words(name: str) -> tuple[str, str, float]:
     """A parameter's symbol, its unit for people, and how many of these one on disk is."""
     suffix = next((it for it in _UNITS if name.endswith(it)), "")
     unit, scale = _UNITS.get(suffix, ("", 1.0))
@@ -84,3 +102,31 @@ def by_joint(arm: ArmResult) -> dict[str, list[ArmParameter]]:
     for it in arm.parameters:
         groups.setdefault(it.joint, []).append(it)
     return groups
+
+
+def parameter_row(it: ArmParameter) -> ParameterRow:
+    """Writes a number of the arm's model with as many digits as its change is known to."""
+    symbol, unit, scale = _parameter_words(it.name)
+    sigma = None if it.sigma is None else scale * it.sigma
+    decimals = decimals_for(sigma) if sigma else _DECIMALS.get(unit, 5)
+    return ParameterRow(
+        symbol,
+        unit,
+        # As stated, whatever is known of it now.
+        f"{scale * it.nominal + 0.0:.7g}",
+        fixed(scale * it.identified, decimals),
+        signed(scale * it.change, decimals),
+        f"\N{PLUS-MINUS SIGN} {significant(sigma)}" if sigma else "",
+        it.is_sure,
+    )
+
+
+def spring_words(spring: JointSpring) -> tuple[str, str, str]:
+    """Writes a joint's stiffness and its sigma [kN m/rad], and the torques on it [N m]."""
+    stiffness, sigma = spring.stiffness_nm_per_rad, spring.stiffness_sigma_nm_per_rad
+    low, high = (f"{round(it, 1) + 0.0:g}" for it in spring.torque_nm)
+    return (
+        "taken for rigid" if stiffness is None else f"{1e-3 * stiffness:.4g}",
+        "" if sigma is None else significant(1e-3 * sigma),
+        f"{low} to {high}",
+    )
