@@ -6,9 +6,12 @@ have: a table without joint angles, and a session.toml.
 
 import csv
 import io
+import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
@@ -42,9 +45,17 @@ class Mistake:
     is_mended: bool = True
 
 
+@cache
+def _rendered(options: CellOptions) -> TemporaryDirectory:
+    """A folder with the session of a cell: its images are rendered once a process."""
+    made = TemporaryDirectory()
+    write_session(simulate(options), Path(made.name) / "session")
+    return made
+
+
 def sound_session(folder: Path, mistake: Mistake) -> Path:
     """Writes the session into which a mistake is planted."""
-    write_session(simulate(mistake.options), folder)
+    shutil.copytree(Path(_rendered(mistake.options).name) / "session", folder)
     if not mistake.joints:
         edit(folder, lambda text: text.replace('[robot]\nmodel = "ur10e"\ntip = "flange"\n', ""))
         edit_rows(folder, lambda rows: [_without(it, "q1_rad", 6) for it in rows])

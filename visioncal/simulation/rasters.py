@@ -9,14 +9,16 @@ from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import make_interp_spline
 
-from visioncal.core.types import Camera, FloatArray
+from visioncal.core.types import Camera, FloatArray, IntArray
 from visioncal.simulation.optics import rays
 
 Float32Array: TypeAlias = npt.NDArray[np.float32]
 
 _KNOT_RAD = 0.01
+# Cubic splines that overlap.
+_TAPS = 4
 
 
 @dataclass(frozen=True)
@@ -35,20 +37,48 @@ class Patch:
 
 
 @dataclass(frozen=True, eq=False)
+class _Spline:
+    """Cubic B-splines along one side of a patch (de Boor 1978); four overlap at any place.
+
+    Attributes:
+        coefficients: (k, k) of the splines that have given values at the knots.
+        first: (n,) the first of the four splines at each sub-pixel.
+        weights: (n, 4) the values of the four there.
+    """
+
+    coefficients: FloatArray
+    first: IntArray
+    weights: Float32Array
+
+
+@dataclass(frozen=True, eq=False)
 class Raster:
     """Rays at the knots of a grid over a patch, and the way from knots to sub-pixels.
 
     Attributes:
         px: (a, b, 2) knots [px].
         directions: (a, b, 3) unit vectors in the camera frame.
-        down: (rows, a) spline weights.
-        across: (columns, b) spline weights.
+        down: Splines along columns of pixels.
+        across: Splines along rows of pixels.
     """
 
     px: FloatArray
     directions: FloatArray
-    down: Float32Array
-    across: Float32Array
+    down: _Spline
+    across: _Spline
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """Values of a grid at all columns of sub-pixels, as coefficients of the splines along them.
+
+    Attributes:
+        mean: Taken off: single precision is spent on the differences.
+        coefficients: (a, columns).
+    """
+
+    mean: np.float32
+    coefficients: Float32Array
 
 
 def trace(camera: Camera, patch: Patch, samples: int) -> Raster:
@@ -66,30 +96,42 @@ def trace(camera: Camera, patch: Patch, samples: int) -> Raster:
     return Raster(px, rays(camera, px), down, across)
 
 
-def between(raster: Raster, values: FloatArray, rows: slice = slice(None)) -> Float32Array:
-    """Interpolates values at the knots.
+def between(raster: Raster, values: FloatArray) -> Float32Array:
+    """Interpolates values (a, b) at the knots: (rows, columns) values at the sub-pixels."""
+    return between_rows(raster, columns_of(raster, values), slice(0, len(raster.down.first)))
 
-    Args:
-        raster: The grid.
-        values: (a, b) values at its knots.
-        rows: Which rows of sub-pixels are wanted.
 
-    Returns:
-        (rows, columns) values at the sub-pixels.
-    """
-    # The mean is kept apart: single precision is then spent on the differences.
+def columns_of(raster: Raster, values: FloatArray) -> Columns:
+    """Interpolates values (a, b) at the knots along the rows of knots."""
     mean = values.mean()
-    covariance = np.asarray(values - mean, np.float32)
-    found = raster.down[rows] @ (covariance @ raster.across.T)
-    found += np.float32(mean)
-    return np.asarray(found, np.float32)
+    across = raster.across
+    found = raster.down.coefficients @ (values - mean) @ across.coefficients.T
+    taps = [found.astype(np.float32)[:, across.first + it] for it in range(_TAPS)]
+    return Columns(np.float32(mean), np.einsum("tac,ct->ac", taps, across.weights))
 
 
-def _spline(first: int, end: int, knot_px: float, samples: int) -> tuple[FloatArray, Float32Array]:
-    """Knots over pixels first ... end - 1, and weights (pixels * samples, knots)."""
+def between_rows(raster: Raster, columns: Columns, rows: slice) -> Float32Array:
+    """Interpolates between knots of columns: (rows, columns) values at some rows of sub-pixels."""
+    first, weights = raster.down.first[rows], raster.down.weights[rows]
+    found = np.empty((len(first), columns.coefficients.shape[1]), np.float32)
+    starts = np.flatnonzero(np.diff(first, prepend=-1)).tolist()
+    for start, end in zip(starts, [*starts[1:], len(first)], strict=True):
+        four = columns.coefficients[first[start] : first[start] + _TAPS]
+        np.matmul(weights[start:end], four, out=found[start:end])
+    found += columns.mean
+    return found
+
+
+def _spline(first: int, end: int, knot_px: float, samples: int) -> tuple[FloatArray, _Spline]:
+    """Knots over pixels first ... end - 1, and splines through them."""
     count = max(int((end - first) / knot_px), 3) + 1
     knots = np.linspace(first - 0.5, end - 0.5, count)
     # A pixel reaches from half a pixel before its centre, the integer, to half a pixel after it.
     places = first - 0.5 + (np.arange((end - first) * samples) + 0.5) / samples
-    weights = CubicSpline(knots, np.eye(count))(places)
-    return np.asarray(knots, dtype=float), np.asarray(weights, np.float32)
+    through = make_interp_spline(knots, np.eye(count))
+    weights = through.design_matrix(places, through.t, through.k)
+    return knots, _Spline(
+        through.c,
+        weights.indices[::_TAPS].astype(np.int64),
+        weights.data.reshape(-1, _TAPS).astype(np.float32),
+    )

@@ -13,7 +13,15 @@ from visioncal.simulation.boards import bow_depth_m, outline_m, unit_m
 from visioncal.simulation.cell import Cell, Stream, stream
 from visioncal.simulation.optics import project, sees
 from visioncal.simulation.options import CellOptions
-from visioncal.simulation.rasters import Float32Array, Patch, Raster, between, trace
+from visioncal.simulation.rasters import (
+    Float32Array,
+    Patch,
+    Raster,
+    between,
+    between_rows,
+    columns_of,
+    trace,
+)
 from visioncal.simulation.silhouettes import draw_arm
 from visioncal.simulation.textures import (
     SheetTexture,
@@ -251,14 +259,15 @@ def _cover(light: Float32Array, scene: Scene, cam_from_target: FloatArray, sampl
     level = int(np.argmin(np.abs(np.log(np.array(sheet.texel_m) / spacing))))
     # Texel centres are half a texel from the texture's outer corner.
     texels = (flat - sheet.origin_m) / sheet.texel_m[level] - 0.5
+    at_x, at_y = (columns_of(raster, texels[..., it]) for it in range(2))
     width, height = patch.size
     for top in range(0, height, _BAND_PX):
         rows = min(_BAND_PX, height - top)
         band = slice(top * samples, (top + rows) * samples)
         seen = cv2.remap(
             sheet.levels[level],
-            between(raster, texels[..., 0], band),
-            between(raster, texels[..., 1], band),
+            between_rows(raster, at_x, band),
+            between_rows(raster, at_y, band),
             cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_CONSTANT,
             borderValue=(0, 0),

@@ -267,7 +267,8 @@ def _draw_scratch(canvas: _Canvas, rng: np.random.Generator) -> None:
     end = np.clip(start + rng.normal(0.0, 0.12, 2) * size, 0.03 * size, 0.97 * size)
     layer = np.zeros_like(canvas)
     cv2.line(layer, _point(start), _point(end), float(rng.uniform(-9.0, 12.0)), 1)
-    canvas += cv2.GaussianBlur(layer, (0, 0), 0.8)
+    part = _around(layer, 8)
+    canvas[part] += cv2.GaussianBlur(layer[part], (0, 0), 0.8)
 
 
 def _draw_part(canvas: _Canvas, rng: np.random.Generator) -> None:
@@ -289,10 +290,22 @@ def _draw_part(canvas: _Canvas, rng: np.random.Generator) -> None:
         path = cv2.GaussianBlur(centre + steps, (1, 5), 1.5)
         curve = np.clip(path, 0.03 * size, 0.97 * size).round().astype(np.int32)
         cv2.polylines(shape, [curve], False, 1.0, max(size // 180, 1))
+    # A shadow reaches its shift and four of its sigmas beyond a part.
+    part = _around(shape, size // 24)
+    shape, under = shape[part], canvas[part]
     shape = np.asarray(cv2.GaussianBlur(shape, (0, 0), 0.6), np.float32)
     shadow = cv2.GaussianBlur(np.roll(shape, size // 160, (0, 1)), (0, 0), 0.006 * size)
-    canvas *= 1.0 - 0.3 * shadow
-    canvas += shape * (float(rng.uniform(70.0, 150.0)) - canvas) * 0.8
+    under *= 1.0 - 0.3 * shadow
+    under += shape * (float(rng.uniform(70.0, 150.0)) - under) * 0.8
+
+
+def _around(layer: _Canvas, margin: int) -> tuple[slice, slice]:
+    """The rows and columns in which something is drawn, and so many beside them [texels]."""
+    rows, columns = (np.flatnonzero(layer.any(axis=axis)) for axis in (1, 0))
+    down, across = (
+        slice(max(int(it[0]) - margin, 0), int(it[-1]) + margin + 1) for it in (rows, columns)
+    )
+    return down, across
 
 
 def _point(place: FloatArray) -> tuple[int, int]:
