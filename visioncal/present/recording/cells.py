@@ -84,9 +84,17 @@ class CellScene:
 
     def flange(self, frame: str, view: int) -> FloatArray | None:
         """(4, 4) `base_from_flange` at the stop of a view; None where it is unknown."""
-        row = self.robot_rows.get(view, {}).get(frame)
-        if row is None:
-            return None
+        return self._flanges.get(view, {}).get(frame)
+
+    @cached_property
+    def _flanges(self) -> Mapping[int, Mapping[str, FloatArray | None]]:
+        """By view and by flange, its pose."""
+        return {
+            view: {frame: self._pose(frame, row) for frame, row in them.items()}
+            for view, them in self.robot_rows.items()
+        }
+
+    def _pose(self, frame: str, row: View) -> FloatArray | None:
         pose, q, robot = row.base_from_flange(), row.joints_rad, self.robots.get(frame)
         if pose is not None:
             return np.asarray(pose.as_matrix())
