@@ -7,7 +7,6 @@ import pytest
 from rerun.chunk import RrdReader
 from scipy.stats import chi2
 from support.cells import calibrated, error_of
-from support.marks import slow
 
 from visioncal.calibration.pipeline import run
 from visioncal.calibration.pipeline.guess_inputs import guess_session
@@ -57,9 +56,9 @@ def without(cell, views):
 
 @pytest.mark.slow
 def test_all_boards_are_placed_as_well_as_their_sigmas_say():
-    """Ten cells, each with boards whose sizes are off by what their files allow."""
+    """Six cells, each with boards whose sizes are off by what their files allow."""
     squares, count = 0.0, 0
-    for seed in range(10):
+    for seed in range(6):
         rng = np.random.default_rng(seed)
         first, further = 1.0 + 1e-3 * rng.standard_normal(2)
         second = replace(NEAR if seed % 4 < 2 else Second(), scale=further)
@@ -102,7 +101,7 @@ def test_boards_have_names_and_a_common_covariance(mount):
 def test_two_boards_tell_more_of_an_arm_than_one():
     """The same number of views, and the tool's place all over the workspace."""
     ratios = []
-    for seed in range(3):
+    for seed in range(2):
         options = replace(TWO, **WRONG_LINKS, mount="eye-to-hand", views=24, seed=seed)
         errors = []
         for second in (None, Second(target=charuco_target())):
@@ -112,13 +111,12 @@ def test_two_boards_tell_more_of_an_arm_than_one():
             errors.append(error_m(cell, known))
         ratios.append(errors[1] / errors[0])
     # Both boards are seen by most stops: 0.55 in the median of five cells.
-    assert np.median(ratios) < 0.8
+    assert max(ratios) < 0.8
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", slow("eye-to-hand")])
-def test_each_board_adds_six_values_that_are_determined(mount):
+def test_each_board_adds_six_values_that_are_determined():
     """Everett and Hsu (1988): 4 a revolute joint, 6 for the frames, and 6 a further board."""
-    cell = simulate(replace(TWO, **WRONG_LINKS, mount=mount, views=24, seed=1))
+    cell = simulate(replace(TWO, **WRONG_LINKS, views=24, seed=1))
     known = calibrated(cell)
     counts = known.arm_found.numbers.counts
     assert known.robot_arm.kinematics.level == "geometry"

@@ -7,6 +7,7 @@ import pytest
 from support.advice import failures, printed_commands
 from support.broken_sessions import BROKEN, broken_session, edit_rows
 from support.commands import turned_poses, visioncal, write_poses
+from support.marks import slow
 from support.whole_cells import OPTIONS, recorded
 
 from visioncal.core.transforms import invert
@@ -23,6 +24,8 @@ QUICK = (
     "columns rx, ry, rz",
     "another dictionary",
 )
+# Read as they are, as tests of tables show: what is then printed is that of semicolons.
+ALIKE = ("decimal commas", "a byte-order mark", "empty rows")
 
 
 @pytest.fixture
@@ -33,14 +36,15 @@ def place(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(it, marks=() if it in QUICK else pytest.mark.slow) for it in BROKEN]
+    "name",
+    [it if it in QUICK else slow(it) for it in BROKEN if it not in ALIKE],
 )
 def test_of_broken_sessions(place, name):
     broken_session(place / "session", BROKEN[name])
-    for words in (("doctor", "session"), ("calibrate", "session", "-o", "out")):
-        done = visioncal(*words)
-        assert done.status in (0, 2, 3)
-        assert list(failures(done.err)) == []
+    said = [visioncal(*it) for it in (("doctor", "session"), ("calibrate", "session", "-o", "out"))]
+    assert {it.status for it in said} <= {0, 2, 3}
+    # What both print is run once.
+    assert list(failures("".join(it.err for it in said))) == []
 
 
 @pytest.mark.parametrize("poor", [{"tilt_rad": (0.0, 0.1), "views": 8}, {"views": 5}])

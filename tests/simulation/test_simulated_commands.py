@@ -168,6 +168,7 @@ def cell(place):
     return folder, out
 
 
+@pytest.mark.slow
 def test_tools_and_fixtures_of_every_robot_of_a_cell_are_found_by_touches(cell):
     folder, out = cell
     unnamed = visioncal("tcp", folder / "touches.csv", "-o", folder / "frames.json")
@@ -191,6 +192,7 @@ def test_tools_and_fixtures_of_every_robot_of_a_cell_are_found_by_touches(cell):
     assert "set_tcp" in done("export", out, "--to", "ur-tcp", "--robot", "b")
 
 
+@pytest.mark.slow
 def test_torques_of_one_robot_of_a_cell_are_identified(cell, place):
     (folder, _), loaded, out = cell, place / "whole-loaded", place / "arm-b"
     assert "several robots (a, b)" in visioncal("dynamics", "identify", folder).err

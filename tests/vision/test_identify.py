@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from support.boards import charuco, checkerboard, printed
+from support.marks import slow
 from typer.testing import CliRunner
 
 from visioncal.cli.target import target_app
@@ -18,6 +19,7 @@ from visioncal.simulation import (
     fisheye_camera,
     prepare_scene,
     render,
+    render_view,
     simulate,
 )
 from visioncal.vision.finders.identify import identify
@@ -82,19 +84,17 @@ def test_a_print_is_named(target):
 def test_a_tilted_board_is_named(name, tilt_rad):
     target = (SHIPPED | ODD)[name]
     options = CellOptions(target=target, views=2, tilt_rad=tilt_rad, cut_views=0.0, seed=3)
-    scene = prepare_scene(simulate(options))
-    for view in range(2):
-        identity = identify(render(scene, view))
-        # The steepest rows of the checkerboard are out of the finder's reach.
-        if target.kind == "charuco" or tilt_rad[1] < 1.0:
-            assert_named(identity, target)
-        if target.kind == "charuco":
-            share = target.marker_m / target.square_m
-            # Tilted, an edge of a marker is known to a fifth of a pixel, squares have 30.
-            assert identity.marker_share == pytest.approx(share, abs=0.007)
+    identity = identify(render_view(simulate(options), 1))
+    # The steepest rows of the checkerboard are out of the finder's reach.
+    if target.kind == "charuco" or tilt_rad[1] < 1.0:
+        assert_named(identity, target)
+    if target.kind == "charuco":
+        share = target.marker_m / target.square_m
+        # Tilted, an edge of a marker is known to a fifth of a pixel, squares have 30.
+        assert identity.marker_share == pytest.approx(share, abs=0.007)
 
 
-@pytest.mark.parametrize("name", ["charuco_14x9_20mm", "checkerboard_12x7_30mm"])
+@pytest.mark.parametrize("name", [slow("charuco_14x9_20mm"), "checkerboard_12x7_30mm"])
 def test_a_lens_that_bends_lines_does_not_change_the_count(name):
     target = SHIPPED[name]
     options = CellOptions(
@@ -237,13 +237,15 @@ def test_real_photographs_are_named(real_data, pattern, expected):
     (kind, columns, rows, dictionary), share = expected
     files = sorted(real_data.glob(pattern))
     assert len(files) >= 8
+    # Neighbours in a recording look alike: every second one is named.
+    files = files[::2]
     named = [identify(decode_image(file.read_bytes())) for file in files]
     found = Counter((it.kind, it.columns, it.rows) for it in named)
     assert found == {(kind, columns, rows): len(files)}
     assert all(not dictionary or dictionary in (it.dictionary, *it.larger) for it in named)
     # Bright light takes half a pixel off markers on squares of fifty.
     assert np.median([it.marker_share for it in named]) == pytest.approx(share, abs=0.012)
-    # Two standard deviations: of 44 photographs two may be farther off.
+    # Two standard deviations: of 22 photographs one may be farther off.
     far = [it for it in named if abs(it.marker_share - share) > 2 * it.marker_share_sigma]
     assert len(far) <= 0.05 * len(named)
 
