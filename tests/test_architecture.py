@@ -114,10 +114,17 @@ def test_heavy_libraries_enter_in_one_place():
             {"numpy", "rich", "visioncal.core.types"},
         ),
         ("visioncal.cli.calibrate", {"numpy", "rich", "visioncal.core.types"}),
+        (
+            "visioncal.cli.align, visioncal.cli.batch, visioncal.cli.demo, visioncal.cli.diff, "
+            "visioncal.cli.doctor, visioncal.cli.locate, visioncal.cli.report, "
+            "visioncal.cli.review, visioncal.cli.target, visioncal.cli.touch_test, "
+            "visioncal.cli.verify",
+            {"numpy", "visioncal.core.types"},
+        ),
         ("visioncal", {"numpy", "typer", "visioncal.core.types"}),
         # A place of a pixel is a millisecond's work.
         (
-            "visioncal.cli.locate",
+            "visioncal.frames.locate, visioncal.interchange.result_files",
             {"rerun", "pinocchio", "coal", "matplotlib", "scipy.optimize", "scipy.signal"}
             | {"scipy.stats", "visioncal.calibration.pipeline", "visioncal.dynamics"},
         ),

@@ -4,23 +4,23 @@ import json
 from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
 
-from visioncal.calibration.pipeline import align
 from visioncal.cli.console import messages, report_written
 from visioncal.cli.options import AsJson, NeedOptions, OutFolder, SessionArgument
 from visioncal.cli.pointing import naming
 from visioncal.cli.progress import shown_progress
-from visioncal.cli.summary import print_verdict, unused_words
 from visioncal.core.choices import Convention, ImagesKept
 from visioncal.core.number_format import figure
-from visioncal.interchange.merge_results import leftover
 from visioncal.interchange.outputs import write_alignment
-from visioncal.results import Alignment
-from visioncal.session import Session
+
+# Help does not wait for them.
+if TYPE_CHECKING:
+    from visioncal.results import Alignment
+    from visioncal.session import Session
 
 # Levels of noise that are nearer to what is said are not mentioned.
 _SHOWN_LEVEL = 1.2
@@ -56,7 +56,7 @@ def align_command(
 
 def align_into(
     path: Path,
-    session: Session,
+    session: "Session",
     out: Path,
     *,
     level: str,
@@ -66,8 +66,11 @@ def align_into(
     images: ImagesKept = "full",
     threads: int | None = None,
     keep_corners: bool = False,
-) -> Alignment:
+) -> "Alignment":
     """Aligns the cell of a session from some path, writes the result and reports it."""
+    from visioncal.calibration.pipeline import align
+    from visioncal.interchange.merge_results import leftover
+
     left = leftover(out)
     with naming(path, out), shown_progress(quiet=quiet) as progress:
         result = align(
@@ -90,7 +93,9 @@ def align_into(
     return result
 
 
-def _report(result: Alignment) -> None:
+def _report(result: "Alignment") -> None:
+    from visioncal.cli.summary import print_verdict, unused_words
+
     console = messages()
     print_verdict(result.verdict, result.session_name)
     console.print(f"the cell's frame is that of {result.reference}")

@@ -1,7 +1,7 @@
 """`visioncal batch`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
@@ -9,8 +9,11 @@ from rich.markup import escape
 from visioncal.cli.console import EXIT_NO_RESULT, messages
 from visioncal.cli.options import NeedOptions
 from visioncal.cli.progress import shown_progress
-from visioncal.interchange.batch import Batch, batch
 from visioncal.interchange.outputs import RECORDING, REPORT
+
+# Help does not wait for them.
+if TYPE_CHECKING:
+    from visioncal.interchange.batch import Batch
 
 _MOST_NAMED = 5
 
@@ -63,6 +66,8 @@ def batch_command(
     them, those first that stand out among robots of the same model. What is done already is kept:
     started again, it goes on where it was. Exit status 0: there are results; 2: of no session.
     """
+    from visioncal.interchange.batch import batch
+
     wanted = {REPORT: not no_report, RECORDING: recordings}
     with shown_progress(quiet=False) as progress:
         found = batch(
@@ -83,7 +88,7 @@ def batch_command(
         raise typer.Exit(EXIT_NO_RESULT)
 
 
-def _report(found: Batch) -> None:
+def _report(found: "Batch") -> None:
     console, counts = messages(), found.counts
     named = ("good", "check", "bad", "failed", "kept", "changed", "standing out")
     words = ", ".join(f"{counts[it]} {it}" for it in named if counts[it])

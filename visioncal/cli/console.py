@@ -5,12 +5,13 @@ import sys
 from typing import TYPE_CHECKING
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 
 from visioncal.core.errors import VisioncalError
 
+# Help waits for neither.
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from visioncal.interchange.outputs import Written
 
 # 0: a result, with a verdict; 1: a bug of ours; 2: the input cannot give a result; 3: a check said
@@ -20,8 +21,10 @@ _LISTED_CULPRITS = 10
 _SHORT = 12  # culprits of fewer letters share a line
 
 
-def messages() -> Console:
+def messages() -> "Console":
     """The console for messages: stderr."""
+    from rich.console import Console
+
     return Console(stderr=True, highlight=False, soft_wrap=True)
 
 
@@ -31,7 +34,7 @@ def asked(question: str) -> str:
     Raises:
         EOFError: Nothing more is typed.
     """
-    messages().print(escape(question), end="")
+    messages().print(question, markup=False, end="")
     line = sys.stdin.readline()
     if not line:
         raise EOFError
@@ -40,6 +43,8 @@ def asked(question: str) -> str:
 
 def report_error(error: VisioncalError, *, as_json: bool) -> None:
     """Prints an error as one message to stderr, and where asked as a JSON object to stdout, too."""
+    from rich.markup import escape
+
     if as_json:
         document = {
             "class": type(error).__name__,
@@ -73,6 +78,8 @@ def report_written(written: "Written", *, quiet: bool = False, status: int = 0) 
     Raises:
         typer.Exit: The status is not 0.
     """
+    from rich.markup import escape
+
     console = messages()
     for file in () if quiet else written.files:
         console.print(escape(f"wrote {file}"))

@@ -3,20 +3,19 @@
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
 
-from visioncal.calibration.pipeline import run
-from visioncal.cli.against_truth import truth_table
 from visioncal.cli.console import messages, report_written
 from visioncal.cli.options import OutFolder, Seed
 from visioncal.cli.progress import shown_progress
-from visioncal.cli.summary import print_summary
 from visioncal.interchange.outputs import write_outputs
-from visioncal.session import Session
-from visioncal.simulation import CellOptions, read_truth, simulate, truth_path, write_session
+
+# Help does not wait for them.
+if TYPE_CHECKING:
+    from visioncal.simulation import CellOptions
 
 
 def demo_command(
@@ -28,6 +27,12 @@ def demo_command(
 
     The camera's intrinsics are not given: they too are estimated from the images.
     """
+    from visioncal.calibration.pipeline import run
+    from visioncal.cli.against_truth import truth_table
+    from visioncal.cli.summary import print_summary
+    from visioncal.session import Session
+    from visioncal.simulation import CellOptions, read_truth, truth_path
+
     session, result = out / "session", out / "result"
     options = CellOptions(views=views, seed=seed, state_intrinsics=False)
     with shown_progress(quiet=False) as progress:
@@ -47,8 +52,12 @@ def demo_command(
     messages().print(escape(f"Open {result / 'report.html'} in a browser to see it all."))
 
 
-def _replace_session(options: CellOptions, folder: Path, progress: Callable[[float], None]) -> None:
+def _replace_session(
+    options: "CellOptions", folder: Path, progress: Callable[[float], None]
+) -> None:
     """Simulates a session in the place of an earlier demo's; nothing else is ever removed."""
+    from visioncal.simulation import simulate, truth_path, write_session
+
     if folder.exists() and truth_path(folder).exists():
         shutil.rmtree(folder)
     write_session(simulate(options), folder, progress)

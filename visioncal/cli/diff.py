@@ -2,16 +2,18 @@
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from visioncal.cli.options import AsJson, PartOptions
 from visioncal.core.number_format import figure
-from visioncal.interchange.result_files import load_result
-from visioncal.results.compare import Comparison, LensChange, Significance, compare, to_document
+
+# Help does not wait for them.
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from visioncal.results.compare import Comparison, LensChange, Significance
 
 # Under a nanometre and a micro-degree lies rounding.
 _DECIMALS = 6
@@ -31,6 +33,9 @@ def diff_command(
 
     Exit status 0, changed or not: `is_change` in the JSON says which; 2: one cannot be read.
     """
+    from visioncal.interchange.result_files import load_result
+    from visioncal.results.compare import compare, to_document
+
     comparison = compare(
         load_result(first),
         load_result(second),
@@ -44,7 +49,9 @@ def diff_command(
     _print(comparison, (str(first), str(second)))
 
 
-def _print(comparison: Comparison, paths: tuple[str, str]) -> None:
+def _print(comparison: "Comparison", paths: tuple[str, str]) -> None:
+    from rich.console import Console
+
     console = Console(highlight=False, markup=False, soft_wrap=True)
     # Of whole cells, names are long: none is cut.
     console.width = max(console.width, _LEAST_WIDTH)
@@ -69,7 +76,7 @@ def _print(comparison: Comparison, paths: tuple[str, str]) -> None:
     console.print(_noise_table(comparison))
 
 
-def _edge_table(comparison: Comparison) -> Table:
+def _edge_table(comparison: "Comparison") -> "Table":
     table = _table("transform", "moved", "sigma", "moved / sigma", "by chance", "")
     for edge in comparison.edges:
         for moved, sigma, unit, test in (
@@ -86,7 +93,7 @@ def _edge_table(comparison: Comparison) -> Table:
     return table
 
 
-def _lens_table(lens: LensChange) -> Table:
+def _lens_table(lens: "LensChange") -> "Table":
     table = _table("lens", "first", "second", "difference", "sigma")
     sigmas = [""] * len(lens.names)
     if lens.sigmas is not None:
@@ -99,7 +106,7 @@ def _lens_table(lens: LensChange) -> Table:
     return table
 
 
-def _noise_table(comparison: Comparison) -> Table:
+def _noise_table(comparison: "Comparison") -> "Table":
     table = _table("noise, per axis", "first", "second")
     for it in comparison.noise:
         values = ("" if value is None else f"{value:.3g}" for value in (it.a, it.b))
@@ -107,7 +114,7 @@ def _noise_table(comparison: Comparison) -> Table:
     return table
 
 
-def _outcome(test: Significance) -> tuple[str, str]:
+def _outcome(test: "Significance") -> tuple[str, str]:
     percent = 100 * test.p_value
     chance = f"{percent:.0f} %" if percent > _WHOLE_PERCENT else f"{figure(percent)} %"
     return (
@@ -116,7 +123,9 @@ def _outcome(test: Significance) -> tuple[str, str]:
     )
 
 
-def _table(*columns: str) -> Table:
+def _table(*columns: str) -> "Table":
+    from rich.table import Table
+
     table = Table(box=None, pad_edge=False, caption_justify="left")
     for column in columns:
         table.add_column(column, no_wrap=True)

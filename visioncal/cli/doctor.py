@@ -2,15 +2,19 @@
 
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
 from rich.markup import escape
 
-from visioncal.calibration.pipeline.checkup import Checkup, doctor, next_command, to_document
 from visioncal.cli.console import messages
 from visioncal.cli.options import AsJson, SessionArgument
 from visioncal.cli.pointing import naming
 from visioncal.cli.progress import shown_progress
+
+# Help does not wait for them.
+if TYPE_CHECKING:
+    from visioncal.calibration.pipeline.checkup import Checkup
 
 # Something is wrong.
 _EXIT_FINDINGS = 3
@@ -26,6 +30,8 @@ def doctor_command(
     seconds, as nothing is solved. Exit status 0: nothing is wrong; 3: something is; 2: it cannot be
     read.
     """
+    from visioncal.calibration.pipeline.checkup import doctor, to_document
+
     with naming(session), shown_progress(quiet=as_json) as progress:
         found = doctor(session, progress=progress)
     if as_json:
@@ -36,7 +42,9 @@ def doctor_command(
         raise typer.Exit(_EXIT_FINDINGS)
 
 
-def _print(found: Checkup, session: Path) -> None:
+def _print(found: "Checkup", session: Path) -> None:
+    from visioncal.calibration.pipeline.checkup import next_command
+
     console = messages()
     console.print(escape(f"{found.session}: {'; '.join(found.seen)}"))
     for at, it in enumerate(found.findings, 1):

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,12 +12,11 @@ from visioncal.cli.refusing import refuse_given
 from visioncal.cli.target_in_images import PointOption, frame_by_images, image_session
 from visioncal.core.conventions import UNITS_M
 from visioncal.core.errors import DataError
-from visioncal.frames.fixture import touched_fixture
-from visioncal.frames.measured import NO_TOOL, Tool
-from visioncal.interchange.formats.touches import read_nominal, read_touches
-from visioncal.interchange.result_files import load_placed
-from visioncal.results import Calibration
-from visioncal.session.choosing import ARM, EYE, Choice
+
+# Help does not wait for them.
+if TYPE_CHECKING:
+    from visioncal.frames.measured import Tool
+    from visioncal.results import Calibration
 
 
 def fixture_command(
@@ -60,6 +59,10 @@ def fixture_command(
     with --cad several markers, by the camera that -c names. Exit status 2: nothing was written, for
     the reason given.
     """
+    from visioncal.frames.fixture import touched_fixture
+    from visioncal.interchange.formats.touches import read_nominal, read_touches
+    from visioncal.session.choosing import ARM, EYE, Choice
+
     drawing = None if cad is None else read_nominal(cad, cad_unit)
     session = image_session(touches, {"--tool": tool, **written.given()})
     if session is not None:
@@ -86,7 +89,7 @@ def fixture_command(
     keep_and_report(place, frame, touches, as_json=as_json)
 
 
-def _tool(said: str | None, calibration: Calibration | None, robot: str | None) -> Tool | None:
+def _tool(said: str | None, calibration: "Calibration | None", robot: str | None) -> "Tool | None":
     """Finds the tool that the points were touched with.
 
     Args:
@@ -100,6 +103,9 @@ def _tool(said: str | None, calibration: Calibration | None, robot: str | None) 
     Raises:
         DataError: There is no such tool, or none that could be meant.
     """
+    from visioncal.frames.measured import NO_TOOL, Tool
+    from visioncal.interchange.result_files import load_placed
+
     if said == "none":
         return None
     known = {} if calibration is None else calibration.frames

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
@@ -13,18 +13,15 @@ from rich.markup import escape
 from visioncal.cli.console import messages, report_written
 from visioncal.cli.options import Force
 from visioncal.cli.pose_options import RobotPoseOptions
-from visioncal.cli.summary import print_verdict
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
-from visioncal.core.transforms import pose_difference
 from visioncal.frames.naming import FrameKind, transform_name
-from visioncal.interchange.merge_results import rewrite
 from visioncal.interchange.outputs import RECORDING, Written
-from visioncal.interchange.result_files import load_result
-from visioncal.results import Calibration, Frame, FrameFile
-from visioncal.results.frame import frames_document
-from visioncal.results.selecting import placed_name
-from visioncal.session.choosing import PARTS, Choice, Part
+
+# Help does not wait for them.
+if TYPE_CHECKING:
+    from visioncal.results import Calibration, Frame
+    from visioncal.session.choosing import Choice, Part
 
 
 @dataclass(frozen=True)
@@ -105,8 +102,8 @@ class Place:
     """
 
     name: str
-    calibration: Calibration | None
-    result: Calibration | None
+    calibration: "Calibration | None"
+    result: "Calibration | None"
     folder: Path | None
     file: Path | None
 
@@ -115,8 +112,8 @@ class Place:
         cls,
         options: FrameOptions,
         kind: FrameKind,
-        choice: Choice,
-        needs: Sequence[Part],
+        choice: "Choice",
+        needs: "Sequence[Part]",
     ) -> "Place":
         """Finds out what is known and where the frame will go, before anything is computed.
 
@@ -129,6 +126,10 @@ class Place:
         Raises:
             DataError: A frame of that name is there, or the place cannot take one.
         """
+        from visioncal.interchange.result_files import load_result
+        from visioncal.results.selecting import placed_name
+        from visioncal.session.choosing import PARTS
+
         name, known, out = transform_name(kind, options.name), options.calibration, options.out
         result = None if known is None else load_result(known)
         calibration = None if result is None else result.chosen(choice, needs)
@@ -151,8 +152,10 @@ class Place:
             )
         return place
 
-    def _frames(self) -> dict[str, Frame]:
+    def _frames(self) -> "dict[str, Frame]":
         """The frames that are there already."""
+        from visioncal.results import FrameFile
+
         if self.file is not None:
             return dict(FrameFile.load(self.file).frames) if self.file.exists() else {}
         return {} if self.result is None else dict(self.result.frames)
@@ -172,8 +175,11 @@ class Place:
                     next_step="Give this one another name with --name.",
                 )
 
-    def keep(self, frame: Frame) -> Written:
+    def keep(self, frame: "Frame") -> Written:
         """Writes the frame where it goes; nowhere if nothing was named."""
+        from visioncal.interchange.merge_results import rewrite
+        from visioncal.results import FrameFile
+
         if self.file is not None:
             FrameFile(self._frames() | {self.name: frame}).save(self.file)
             return Written((self.file,))
@@ -194,7 +200,7 @@ def _folder(known: Path) -> Path:
     return folder
 
 
-def keep_and_report(place: Place, frame: Frame, source: Path, *, as_json: bool) -> None:
+def keep_and_report(place: Place, frame: "Frame", source: Path, *, as_json: bool) -> None:
     """Writes a frame where it goes, and prints it for people, or as JSON.
 
     Args:
@@ -210,8 +216,11 @@ def keep_and_report(place: Place, frame: Frame, source: Path, *, as_json: bool) 
     report(place, frame, place.keep(frame), as_json=as_json)
 
 
-def report(place: Place, frame: Frame, written: Written, *, as_json: bool) -> None:
+def report(place: Place, frame: "Frame", written: Written, *, as_json: bool) -> None:
     """Prints a frame for people, or as JSON."""
+    from visioncal.cli.summary import print_verdict
+    from visioncal.results.frame import frames_document
+
     if as_json:
         typer.echo(json.dumps(frames_document({place.name: frame}), indent=2))
         report_written(written, quiet=True)
@@ -248,7 +257,9 @@ def report(place: Place, frame: Frame, written: Written, *, as_json: bool) -> No
     report_written(written)
 
 
-def _report_before(place: Place, frame: Frame) -> None:
+def _report_before(place: Place, frame: "Frame") -> None:
+    from visioncal.core.transforms import pose_difference
+
     before = None if place.result is None else place.result.frames.get(place.name)
     if before is not None:
         mm, deg = pose_difference(before.edge.matrix, frame.edge.matrix)

@@ -4,12 +4,10 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 from rich.markup import escape
-from scipy.spatial.transform import RigidTransform, Rotation
 
 from visioncal.cli.console import messages
 from visioncal.cli.numbers import numbers_in
@@ -20,20 +18,13 @@ from visioncal.cli.refusing import refuse_given
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
-from visioncal.core.types import FloatArray, Target
-from visioncal.frames.camera_chain import Eye
-from visioncal.frames.locate import locate, locate_target
-from visioncal.frames.located import Located
-from visioncal.frames.target_in_image import check_size
-from visioncal.interchange.result_files import load_result
-from visioncal.results import Calibration, Edge
-from visioncal.results.selecting import boards_before
-from visioncal.results.session_match import check_mount
-from visioncal.session import Session, View
-from visioncal.session.choosing import EYE, Choice
-from visioncal.session.selecting import has_several, select
-from visioncal.vision.finders.imaging import read_image
-from visioncal.vision.targets import target_from_document
+
+# Help does not wait for them.
+if TYPE_CHECKING:
+    from visioncal.core.types import FloatArray, Target
+    from visioncal.frames.located import Located
+    from visioncal.results import Calibration, Edge
+    from visioncal.session import Session, View
 
 _POSE = "x,y,z,qx,qy,qz,qw"
 # Rounding to four digits leaves a unit quaternion's norm within this of 1.
@@ -46,7 +37,7 @@ class _Found:
 
     words: str
     document: Mapping[str, Any]
-    located: Located
+    located: "Located"
 
 
 def locate_command(
@@ -113,6 +104,15 @@ def locate_command(
     It is a target, or a pixel whose plane is known. Exit status 2: there is no place, for the
     reason given.
     """
+    import numpy as np
+
+    from visioncal.frames.camera_chain import Eye
+    from visioncal.frames.target_in_image import check_size
+    from visioncal.results.selecting import boards_before
+    from visioncal.session.choosing import EYE, Choice
+    from visioncal.session.selecting import has_several, select
+    from visioncal.vision.finders.imaging import read_image
+
     result, session = _result(calibration), _session(source)
     several = session is not None and has_several(session)
     if session is not None and several:
@@ -156,7 +156,9 @@ def locate_command(
     _report(found, as_json=as_json)
 
 
-def _result(path: Path | None) -> Calibration:
+def _result(path: Path | None) -> "Calibration":
+    from visioncal.interchange.result_files import load_result
+
     if path is None:
         raise DataError(
             "locate: the camera's calibration (-c) is needed.",
@@ -166,14 +168,16 @@ def _result(path: Path | None) -> Calibration:
     return load_result(path)
 
 
-def _session(source: Path | None) -> Session | None:
+def _session(source: Path | None) -> "Session | None":
     """The session; None where the source is none."""
+    from visioncal.session import Session
+
     if source is None or not (source.is_dir() or source.suffix.lower() == ".rrd"):
         return None
     return Session.load(source)
 
 
-def _chosen(session: Session, view: int | None) -> tuple[View, ...]:
+def _chosen(session: "Session", view: int | None) -> "tuple[View, ...]":
     """The views that are meant."""
     chosen = tuple(it for it in session.views if view in (None, it.number))
     if not chosen:
@@ -186,8 +190,11 @@ def _chosen(session: Session, view: int | None) -> tuple[View, ...]:
     return chosen
 
 
-def _flange(words: str) -> FloatArray:
+def _flange(words: str) -> "FloatArray":
     """Reads a pose of the robot, (4, 4) `base_from_flange`."""
+    import numpy as np
+    from scipy.spatial.transform import RigidTransform, Rotation
+
     values = numbers_in(words, "--pose", _POSE)
     norm = float(np.linalg.norm(values[3:]))
     if abs(norm - 1.0) > _NORM_TOLERANCE:
@@ -202,10 +209,11 @@ def _flange(words: str) -> FloatArray:
 
 
 def _flange_of(
-    session: Session, views: Sequence[View], calibration: Calibration
-) -> FloatArray | None:
+    session: "Session", views: "Sequence[View]", calibration: "Calibration"
+) -> "FloatArray | None":
     """Where the flange was at the one view that is meant; a camera that stands still needs none."""
     from visioncal.frames.session_observations import pose_of
+    from visioncal.results.session_match import check_mount
 
     check_mount(session, calibration)
     if calibration.mount == "eye-to-hand":
@@ -229,14 +237,18 @@ def _flange_of(
 
 
 def _by_plane(
-    calibration: Calibration,
-    boards: Mapping[str, Edge],
+    calibration: "Calibration",
+    boards: "Mapping[str, Edge]",
     pixels: Sequence[str],
     plane: str | None,
     sigma_mm: float,
-    flange: FloatArray | None,
+    flange: "FloatArray | None",
     sigma_px: float | None,
 ) -> tuple[_Found, ...]:
+    import numpy as np
+
+    from visioncal.frames.locate import locate
+
     if plane is None:
         raise DataError(
             "One image shows no depth: the plane (--plane) that the feature lies in is needed.",
@@ -257,10 +269,10 @@ def _by_plane(
 
 
 def _by_views(
-    session: Session,
-    views: Sequence[View],
-    calibration: Calibration,
-    point_m: FloatArray,
+    session: "Session",
+    views: "Sequence[View]",
+    calibration: "Calibration",
+    point_m: "FloatArray",
     sigma_px: float | None,
     *,
     quiet: bool,
@@ -282,12 +294,15 @@ def _by_views(
 
 def _by_image(
     source: Path | None,
-    calibration: Calibration,
-    target: Target | None,
-    point_m: FloatArray,
-    flange: FloatArray | None,
+    calibration: "Calibration",
+    target: "Target | None",
+    point_m: "FloatArray",
+    flange: "FloatArray | None",
     sigma_px: float | None,
 ) -> tuple[_Found, ...]:
+    from visioncal.frames.locate import locate_target
+    from visioncal.vision.finders.imaging import read_image
+
     if source is None:
         raise DataError(
             "locate: there is nothing to look for: a session, an image or a pixel is needed.",
@@ -306,7 +321,9 @@ def _by_image(
     return (_Found(name, {"image": name}, located),)
 
 
-def _target(words: str, result: Calibration) -> Target:
+def _target(words: str, result: "Calibration") -> "Target":
+    from visioncal.vision.targets import target_from_document
+
     if result.cell is not None and words in result.cell.targets:
         return target_from_document(result.cell.targets[words], words)
     from visioncal.interchange.formats.boards import described_target
@@ -325,7 +342,7 @@ def _report(found: Sequence[_Found], *, as_json: bool) -> None:
             messages().print(f"[bold yellow]warning:[/] {escape(words)}")
 
 
-def _line(located: Located) -> str:
+def _line(located: "Located") -> str:
     place = ", ".join(f"{it:.2f}" for it in 1e3 * located.p_base)
     sigmas = ", ".join(figure(float(it)) for it in located.sigma_mm)
     largest_mm = figure(located.budget_mm[located.largest])

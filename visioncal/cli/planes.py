@@ -1,14 +1,16 @@
 """The plane that features lie in, as an option says it."""
 
 from collections.abc import Mapping
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from visioncal.cli.numbers import numbers_in
 from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean, some_of
-from visioncal.frames.plane import Plane
-from visioncal.results import Calibration, Edge
+
+# Help does not wait for them.
+if TYPE_CHECKING:
+    from visioncal.frames.plane import Plane
+    from visioncal.results import Calibration, Edge
 
 FORMS = (
     "z=20 (of the base, in mm), base_from_fixture or base_from_fixture:z=-5 (of a frame, whose z "
@@ -19,8 +21,8 @@ _LEAD = "base_from_"
 
 
 def plane_of(
-    words: str, sigma_mm: float, calibration: Calibration, boards: Mapping[str, Edge]
-) -> tuple[Plane, str]:
+    words: str, sigma_mm: float, calibration: "Calibration", boards: "Mapping[str, Edge]"
+) -> "tuple[Plane, str]":
     """Reads a plane.
 
     Args:
@@ -35,6 +37,10 @@ def plane_of(
     Raises:
         DataError: It is none of these, or there is no such frame.
     """
+    import numpy as np
+
+    from visioncal.frames.plane import Plane
+
     frame, _, height = words.rpartition(":") if ":" in words else (words, "", "z=0")
     if words.startswith("z="):
         return Plane.horizontal(_height_m(words), 1e-3 * sigma_mm), ""
@@ -50,9 +56,11 @@ def _of_frame(
     words: str,
     z_m: float,
     sigma_mm: float,
-    calibration: Calibration,
-    boards: Mapping[str, Edge],
-) -> tuple[Plane, str]:
+    calibration: "Calibration",
+    boards: "Mapping[str, Edge]",
+) -> "tuple[Plane, str]":
+    from visioncal.frames.plane import Plane
+
     placed = {**calibration.placed, **boards}
     planes = [it for it in placed if it.startswith(_LEAD) and it != f"{_LEAD}cam"]
     names = (words, f"{_LEAD}{words}", f"{_LEAD}target_{words}")

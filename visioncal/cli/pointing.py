@@ -5,7 +5,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from visioncal.core.errors import VisioncalError
-from visioncal.core.verdict import with_paths
 
 
 @contextmanager
@@ -14,6 +13,9 @@ def naming(session: Path, out: Path | str = "") -> Iterator[None]:
     try:
         yield
     except VisioncalError as error:
+        # Help need not wait for it.
+        from visioncal.core.verdict import with_paths
+
         raise type(error)(
             error.message,
             culprits=error.culprits,

@@ -2,14 +2,17 @@
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from visioncal.core.conventions import POSE_FORMS, UNITS_M
 from visioncal.core.errors import DataError
-from visioncal.interchange.formats import ImportOptions, PoseImportOptions
-from visioncal.robot import Robot, load_robot
+
+# Help does not wait for them.
+if TYPE_CHECKING:
+    from visioncal.interchange.formats import ImportOptions
+    from visioncal.robot import Robot
 
 poses_option = partial(typer.Option, rich_help_panel="The poses of somebody else's recording")
 FORMS = f"{', '.join(POSE_FORMS)}, or a rotation such as euler-ZYX-deg, quaternion-wxyz"
@@ -55,12 +58,14 @@ class RobotPoseOptions:
         poses_option("--robot-model", help="A built-in robot, or the path of a .urdf or .toml."),
     ] = None
 
-    def requested(self) -> ImportOptions:
+    def requested(self) -> "ImportOptions":
         """The same, as files are read.
 
         Raises:
             DataError: A name is empty or there twice.
         """
+        from visioncal.interchange.formats import ImportOptions, PoseImportOptions
+
         columns = names_in(self.robot_columns, "--robot-columns")
         return ImportOptions(
             robot=PoseImportOptions(columns, self.robot_form, self.robot_unit, self.robot_inverse),
@@ -70,12 +75,14 @@ class RobotPoseOptions:
         )
 
     @property
-    def model(self) -> Robot | None:
+    def model(self) -> "Robot | None":
         """The robot that is named.
 
         Raises:
             DataError: It cannot be read.
         """
+        from visioncal.robot import load_robot
+
         return None if self.robot_model is None else load_robot(self.robot_model)
 
 

@@ -1,7 +1,7 @@
 """`visioncal report`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
@@ -10,7 +10,10 @@ from visioncal.cli.console import messages
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.refusing import refuse_given
 from visioncal.core.errors import DataError
-from visioncal.interchange.result_files import Stored, load_stored
+
+# Help does not wait for them.
+if TYPE_CHECKING:
+    from visioncal.interchange.result_files import Stored
 
 # Other numbers come out.
 _EXIT_OTHERS = 3
@@ -50,6 +53,8 @@ def report_command(
     where it is missing or belongs to another result, the report says so. Exit status of
     --recompute, which writes nothing: 0, the same numbers; 3, others.
     """
+    from visioncal.interchange.result_files import load_stored
+
     if not certificate:
         refuse_given(
             {"--operator": operator or None, "--serial": serial}, "they are for --certificate"
@@ -89,7 +94,7 @@ def report_command(
     messages().print(f"wrote {escape(str(out))}")
 
 
-def _recompute(stored: Stored) -> None:
+def _recompute(stored: "Stored") -> None:
     """Calibrates once more, and ends with what came out."""
     from visioncal.calibration.verification.recompute import recompute
 

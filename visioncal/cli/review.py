@@ -11,8 +11,6 @@ from visioncal.cli.console import messages
 from visioncal.core.errors import DataError
 from visioncal.core.files import absence, some_of
 from visioncal.interchange.outputs import PREVIEW, RECORDING
-from visioncal.interchange.result_files import load_result
-from visioncal.results.parts import worst_view
 
 # The first bytes of every recording that rerun writes.
 _MAGIC = b"RRF2"
@@ -69,7 +67,9 @@ def _row(file: Path, view: int | None) -> int | None:
     Raises:
         DataError: The session in it has no such view.
     """
+    from visioncal.interchange.result_files import load_result
     from visioncal.present.recording import read_session
+    from visioncal.results.parts import worst_view
 
     if view is None:
         # A plan, and a session that is not calibrated yet, have no worst view.

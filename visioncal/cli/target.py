@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Annotated, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 import typer
 from rich.markup import escape
@@ -12,25 +12,11 @@ from visioncal.cli.lazy import PlainCommand
 from visioncal.cli.options import AsJson
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, write_atomically
-from visioncal.core.types import Target
-from visioncal.vision.finders.identify import identify
-from visioncal.vision.finders.identify_text import describe, to_document, to_toml
-from visioncal.vision.finders.imaging import read_image
-from visioncal.vision.printing import (
-    Page,
-    Request,
-    arrange,
-    pages_named,
-    requested_target,
-    side_metres,
-    write_board,
-)
-from visioncal.vision.targets import (
-    load_target,
-    target_document,
-    target_from_document,
-    target_names,
-)
+
+# Help does not wait for them.
+if TYPE_CHECKING:
+    from visioncal.core.types import Target
+    from visioncal.vision.printing import Page
 
 target_app = typer.Typer(
     help="Print a board at its exact size, or name the one in a photograph.",
@@ -132,6 +118,9 @@ def make_command(
     Rulers along both axes show whether the printer kept the size. Exit status 0: all files are
     written; 2: none, because the board does not fit or files are there already.
     """
+    from visioncal.vision.printing import Request, arrange, requested_target, write_board
+    from visioncal.vision.targets import load_target, target_names
+
     if (target is None) == (kind is None):
         raise DataError(
             "Name a board, or describe one by --kind: one of both is needed.",
@@ -197,7 +186,9 @@ def _refuse_unused(kind: _Described | None, given: list[str]) -> None:
         )
 
 
-def _pages(page: str | None, landscape: bool | None, *, larger: bool) -> tuple[Page, ...]:
+def _pages(page: str | None, landscape: bool | None, *, larger: bool) -> "tuple[Page, ...]":
+    from visioncal.vision.printing import pages_named
+
     if page is not None:
         return pages_named(page, landscape)
     names = _PAGES if larger else _PAGES[:1]
@@ -223,6 +214,11 @@ def check_command(
 
     Only the size of its squares cannot be seen. Exit status 0: it is named; 2: no board is seen.
     """
+    from visioncal.vision.finders.identify import identify
+    from visioncal.vision.finders.identify_text import describe, to_document, to_toml
+    from visioncal.vision.finders.imaging import read_image
+    from visioncal.vision.printing import side_metres
+
     square_m = None if square_mm is None else side_metres("--square-mm", square_mm)
     if out is not None and square_m is None:
         raise DataError(
@@ -249,6 +245,8 @@ def check_command(
         messages().print(escape(f"wrote {out}"))
 
 
-def _checked(target: Target) -> None:
+def _checked(target: "Target") -> None:
     """Refuses what a session could not load, such as a size in metres given as millimetres."""
+    from visioncal.vision.targets import target_document, target_from_document
+
     target_from_document(target_document(target), target.name)

@@ -2,9 +2,8 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
-import numpy as np
 import typer
 
 from visioncal.cli.framing import Place
@@ -12,14 +11,14 @@ from visioncal.cli.numbers import numbers_in
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.refusing import refuse_given
 from visioncal.core.errors import DataError
-from visioncal.frames.drawing_points import NominalPoints
-from visioncal.frames.fixture_from_markers import marked_fixture
-from visioncal.frames.frame_from_images import seen_frame
 from visioncal.frames.naming import FrameKind
-from visioncal.results import Calibration, Frame
-from visioncal.session import Session
-from visioncal.session.choosing import Choice
-from visioncal.session.selecting import has_several, select
+
+# Help does not wait for them.
+if TYPE_CHECKING:
+    from visioncal.frames.drawing_points import NominalPoints
+    from visioncal.results import Calibration, Frame
+    from visioncal.session import Session
+    from visioncal.session.choosing import Choice
 
 PointOption: TypeAlias = Annotated[
     str | None,
@@ -31,7 +30,7 @@ PointOption: TypeAlias = Annotated[
 ]
 
 
-def image_session(source: Path, for_touches: Mapping[str, object]) -> Session | None:
+def image_session(source: Path, for_touches: Mapping[str, object]) -> "Session | None":
     """Loads a session whose images are to place something.
 
     Args:
@@ -45,6 +44,8 @@ def image_session(source: Path, for_touches: Mapping[str, object]) -> Session | 
     Raises:
         DataError: The session has both, cannot be read, or options do not fit.
     """
+    from visioncal.session import Session
+
     if not source.is_dir() and source.suffix.lower() != ".rrd":
         return None
     session = Session.load(source)
@@ -63,7 +64,7 @@ def image_session(source: Path, for_touches: Mapping[str, object]) -> Session | 
     return session
 
 
-def camera_of(place: Place, session: Session) -> Calibration:
+def camera_of(place: Place, session: "Session") -> "Calibration":
     """The calibration of the camera that took the images.
 
     Raises:
@@ -80,15 +81,15 @@ def camera_of(place: Place, session: Session) -> Calibration:
 
 
 def frame_by_images(
-    session: Session,
+    session: "Session",
     place: Place,
     kind: FrameKind,
     point_mm: str | None,
-    drawing: NominalPoints | None = None,
+    drawing: "NominalPoints | None" = None,
     *,
-    choice: Choice,
+    choice: "Choice",
     quiet: bool,
-) -> Frame:
+) -> "Frame":
     """Places a tool or a fixture by a session's images.
 
     Args:
@@ -103,6 +104,12 @@ def frame_by_images(
     Raises:
         DataError: The images do not show what is needed, or options contradict each other.
     """
+    import numpy as np
+
+    from visioncal.frames.fixture_from_markers import marked_fixture
+    from visioncal.frames.frame_from_images import seen_frame
+    from visioncal.session.selecting import has_several, select
+
     calibration = camera_of(place, session)
     if has_several(session):
         session = select(session, choice, parted=False)

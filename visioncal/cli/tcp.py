@@ -10,9 +10,6 @@ from visioncal.cli.framing import FrameOptions, Place, TouchOptions, keep_and_re
 from visioncal.cli.options import AsJson, PartOptions
 from visioncal.cli.refusing import refuse_given
 from visioncal.cli.target_in_images import PointOption, frame_by_images, image_session
-from visioncal.frames.tcp import touched_tool
-from visioncal.interchange.formats.touches import read_touches
-from visioncal.session.choosing import ARM, EYE, Choice
 
 
 def tcp_command(
@@ -36,6 +33,10 @@ def tcp_command(
     gives both, by the camera that -c names. Exit status 2: nothing was written, for the reason
     given.
     """
+    from visioncal.frames.tcp import touched_tool
+    from visioncal.interchange.formats.touches import read_touches
+    from visioncal.session.choosing import ARM, EYE, Choice
+
     session = image_session(touches, written.given())
     if session is not None:
         choice = part.choice

@@ -6,12 +6,10 @@ from collections.abc import Sequence
 from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 from rich.markup import escape
-from scipy.spatial.transform import RigidTransform, Rotation
 
 from visioncal.cli.console import asked, messages, report_error, report_written
 from visioncal.cli.numbers import numbers_in
@@ -19,18 +17,13 @@ from visioncal.cli.options import AsJson, SessionArgument
 from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.number_format import figure
-from visioncal.core.transforms import invert
-from visioncal.core.types import FloatArray
-from visioncal.frames.measured import Tool
-from visioncal.frames.touch_test import TouchPoint, finding_of, judged, touch_points
-from visioncal.interchange.merge_results import rewrite
-from visioncal.interchange.result_files import load_result
-from visioncal.live.capture.devices import ArmWish, open_arm
-from visioncal.live.capture.hover import Hovering
-from visioncal.live.drivers.protocols import MovingArm
-from visioncal.results import Calibration, to_document
-from visioncal.results.compensation import correct
-from visioncal.session import Session
+
+# Help does not wait for them.
+if TYPE_CHECKING:
+    from visioncal.core.types import FloatArray
+    from visioncal.frames.touch_test import TouchPoint
+    from visioncal.live.capture.hover import Hovering
+    from visioncal.results import Calibration
 
 # The gaps are larger than predicted.
 _EXIT_LARGER = 3
@@ -79,6 +72,13 @@ def touch_test_command(
     all gaps: compared with what was
     predicted, and kept in the result and its report. Exit status 3: they are larger.
     """
+    from visioncal.frames.measured import Tool
+    from visioncal.frames.touch_test import finding_of, judged, touch_points
+    from visioncal.interchange.merge_results import rewrite
+    from visioncal.interchange.result_files import load_result
+    from visioncal.results import to_document
+    from visioncal.session import Session
+
     loaded = Session.load(session)
     if calibration is None:
         raise DataError(
@@ -116,8 +116,10 @@ def touch_test_command(
     report_written(written, quiet=as_json, status=0 if test.passed else _EXIT_LARGER)
 
 
-def _target(known: Calibration, point: TouchPoint, height_m: float) -> dict[str, Any]:
+def _target(known: "Calibration", point: "TouchPoint", height_m: float) -> dict[str, Any]:
     """Where to send the robot: as its own controller needs it."""
+    from visioncal.results.compensation import correct
+
     touch, hover = point.base_from_flange, point.above(height_m)
     found: dict[str, Any] = {
         "name": point.name,
@@ -130,13 +132,15 @@ def _target(known: Calibration, point: TouchPoint, height_m: float) -> dict[str,
     return found | {"hover": _numbers(hover), "touch": _numbers(touch)}
 
 
-def _numbers(pose: FloatArray) -> list[float]:
+def _numbers(pose: "FloatArray") -> list[float]:
+    from scipy.spatial.transform import RigidTransform
+
     transform = RigidTransform.from_matrix(pose)
     return [*transform.translation.tolist(), *transform.rotation.as_rotvec().tolist()]
 
 
 def _report(
-    points: Sequence[TouchPoint], targets: Sequence[dict[str, Any]], *, as_json: bool
+    points: "Sequence[TouchPoint]", targets: Sequence[dict[str, Any]], *, as_json: bool
 ) -> None:
     if as_json:
         typer.echo(json.dumps({"points": targets}, indent=2))
@@ -148,7 +152,7 @@ def _report(
     console.print("Enter the gaps with --gaps-mm, in this order.")
 
 
-def _report_point(point: TouchPoint, target: dict[str, Any]) -> None:
+def _report_point(point: "TouchPoint", target: dict[str, Any]) -> None:
     """Says where a point is, and where to send the robot."""
     console, (x, y, z) = messages(), 1e3 * point.base_m
     console.print(
@@ -161,7 +165,7 @@ def _report_point(point: TouchPoint, target: dict[str, Any]) -> None:
         console.print(f"  {name}: {', '.join(numbers)}")
 
 
-def _asked(points: Sequence[TouchPoint], targets: Sequence[dict[str, Any]]) -> list[float]:
+def _asked(points: "Sequence[TouchPoint]", targets: Sequence[dict[str, Any]]) -> list[float]:
     """Asks for the gaps, one point after the other.
 
     Raises:
@@ -177,8 +181,8 @@ def _asked(points: Sequence[TouchPoint], targets: Sequence[dict[str, Any]]) -> l
 
 def _driven(
     words: str,
-    known: Calibration,
-    points: Sequence[TouchPoint],
+    known: "Calibration",
+    points: "Sequence[TouchPoint]",
     targets: Sequence[dict[str, Any]],
     height_m: float,
     *,
@@ -190,6 +194,11 @@ def _driven(
         DataError: The arm's model is not known, nobody can be asked, or no way leads there.
         DriverError: The arm cannot be driven.
     """
+    from visioncal.core.transforms import invert
+    from visioncal.live.capture.devices import ArmWish, open_arm
+    from visioncal.live.capture.hover import Hovering
+    from visioncal.live.drivers.protocols import MovingArm
+
     if known.robot is None:
         raise DataError(
             "--drive: the calibration has no model of the robot.",
@@ -211,7 +220,7 @@ def _driven(
     return gaps
 
 
-def _brought(hovering: Hovering, base_from_flange: FloatArray) -> None:
+def _brought(hovering: "Hovering", base_from_flange: "FloatArray") -> None:
     """Brings the tip there; where the arm refuses, as in local control, a person mends that."""
     while True:
         try:
@@ -224,8 +233,11 @@ def _brought(hovering: Hovering, base_from_flange: FloatArray) -> None:
             return
 
 
-def _pose(numbers: Sequence[float]) -> FloatArray:
+def _pose(numbers: Sequence[float]) -> "FloatArray":
     """(4, 4) of x, y, z [m] and a rotation vector [rad]."""
+    import numpy as np
+    from scipy.spatial.transform import RigidTransform, Rotation
+
     return np.asarray(
         RigidTransform.from_components(numbers[:3], Rotation.from_rotvec(numbers[3:])).as_matrix()
     )
@@ -233,6 +245,8 @@ def _pose(numbers: Sequence[float]) -> FloatArray:
 
 def _gap() -> float:
     """Asks until a length is typed."""
+    import numpy as np
+
     while True:
         line = _line("  gap [mm]: ")
         with suppress(ValueError):

@@ -3,31 +3,21 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
 
-from visioncal.calibration.verification import (
-    Check,
-    Outcome,
-    facts_of,
-    load_policy,
-    outcomes,
-    to_document,
-    verdict_of,
-    verify,
-)
 from visioncal.cli.console import messages, report_written
 from visioncal.cli.options import AsJson, PartOptions
 from visioncal.cli.progress import shown_progress
-from visioncal.cli.summary import print_steps
 from visioncal.core.errors import DataError
-from visioncal.core.verdict import Verdict
 from visioncal.interchange.outputs import REPORT, VERIFY, Written, refuse_calibration, write_check
-from visioncal.interchange.result_files import load_result
-from visioncal.results import picked
-from visioncal.session import Session
+
+# Help does not wait for them.
+if TYPE_CHECKING:
+    from visioncal.calibration.verification import Check, Outcome
+    from visioncal.core.verdict import Verdict
 
 # A check said no.
 _EXIT_FAILED = 3
@@ -67,6 +57,18 @@ def verify_command(
 
     Exit status 0: it holds; 3: it does not; 2: that cannot be decided, for the reason given.
     """
+    from visioncal.calibration.verification import (
+        facts_of,
+        load_policy,
+        outcomes,
+        to_document,
+        verdict_of,
+        verify,
+    )
+    from visioncal.interchange.result_files import load_result
+    from visioncal.results import picked
+    from visioncal.session import Session
+
     if against is None:
         raise DataError(
             "verify: the calibration to check (--against) is needed.",
@@ -94,7 +96,9 @@ def verify_command(
     report_written(written, quiet=True, status=0 if check.passed else _EXIT_FAILED)
 
 
-def _report(check: Check, triggers: Sequence[Outcome], verdict: Verdict) -> None:
+def _report(check: "Check", triggers: "Sequence[Outcome]", verdict: "Verdict") -> None:
+    from visioncal.cli.summary import print_steps
+
     console = messages()
     word, colour = ("pass", "green") if check.passed else ("fail", "red")
     name = escape(check.seen.known.session.name)
@@ -110,5 +114,5 @@ def _report(check: Check, triggers: Sequence[Outcome], verdict: Verdict) -> None
             console.print(f"{begin}: {escape(words)}")
 
 
-def _named(check: Check) -> str:
+def _named(check: "Check") -> str:
     return f"{check.calibration.session_name}, {check.calibration.created}"
