@@ -32,7 +32,7 @@ from visioncal.interchange.outputs import write_outputs
 from visioncal.simulation import CellOptions, fine_camera, simulate, write_session
 from visioncal.vision.targets import charuco_board
 
-VIEWS, MANY = few((40, 1000), (6, 30))
+VIEWS, MANY = few((40, 1000), (5, 10))
 # As many as are wished on the command line.
 REPEATS = wished(3)
 THREADS = [it for it in (1, 2, 4) if it <= (os.cpu_count() or 1)]
@@ -72,7 +72,8 @@ def of_program(command: list[str]) -> np.ndarray:
 
 def medians(*works: Callable[[], np.ndarray]) -> np.ndarray:
     """The medians of each over interleaved repetitions, after one that is not counted, (n, 2)."""
-    rounds = [[it() for it in works] for _ in range(REPEATS + 1)][1:]
+    warm = few(1, 0)
+    rounds = [[it() for it in works] for _ in range(REPEATS + warm)][warm:]
     return np.median(rounds, axis=0)
 
 
@@ -130,6 +131,7 @@ def small(folder: Path) -> list[list[str]]:
         "--no-report --no-recording": ["--no-report", "--no-recording"],
         "the same, corners kept": ["--no-report", "--no-recording", "--keep-corners"],
     }
+    kinds = dict(first(list(kinds.items())))
     found = medians(*(lambda it=it: of_program([*command, *it]) for it in kinds.values()))[:, 1]
     return [[name, f"{it:.2f}"] for name, it in zip(kinds, found, strict=True)]
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from multiprocessing import Pool
 
 import numpy as np
-from results import first, wished, write_section
+from results import few, wished, write_section
 
 from visioncal.calibration.pipeline import calibrate
 from visioncal.core.errors import VisioncalError
@@ -99,7 +99,7 @@ def main(sweeps: int) -> None:
     """Prints the table and keeps it."""
     rows = []
     with Pool() as pool:
-        for world in first(WORLDS):
+        for world in few(WORLDS, [it for it in WORLDS if it.words == "7 s"]):
             tasks = [(world, seed) for seed in range(sweeps)]
             rows.append(row(world, pool.map(of_one_sweep, tasks, chunksize=1)))
             print(rows[-1], flush=True)
@@ -119,5 +119,5 @@ camera's place is that of its transform (median), and chi2 / 6 is 1 where its co
 
 if __name__ == "__main__":
     started = time.perf_counter()
-    main(wished(SWEEPS, 2))
+    main(wished(SWEEPS))
     print(f"{time.perf_counter() - started:.0f} s")

@@ -25,7 +25,7 @@ from visioncal.core.types import FloatArray, Mount  # noqa: E402
 from visioncal.results.compare import EdgeChange, compare  # noqa: E402
 from visioncal.simulation import CellOptions, simulate  # noqa: E402
 
-PAIRS, SIGMAS = few(200, 2), 5.0
+PAIRS, SIGMAS = few(200, 1), 5.0
 MOUNTS: tuple[Mount, ...] = ("eye-in-hand", "eye-to-hand")
 # Repeatability of the robot [mm and mrad].
 NOISES = ((0.03, 0.05), (0.3, 0.5))
