@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.cells import exact
 
 import visioncal
 from visioncal.calibration.pipeline import run
@@ -18,7 +19,6 @@ from visioncal.session import Session
 from visioncal.simulation import (
     CellOptions,
     checkerboard_target,
-    exact,
     read_truth,
     simulate,
     write_session,

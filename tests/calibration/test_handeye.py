@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.cells import calibrated, error_of
+from support.cells import calibrated, error_of, exact
 from support.edges import solved
 from support.marks import slow
 
@@ -20,7 +20,7 @@ from visioncal.estimation.linalg import covariance_from, damped_step, spectrum
 from visioncal.estimation.parts import ROBOT, Effect, Noise, State
 from visioncal.estimation.solve import estimate_noise, fit_problem, solve_problem, starting_noise
 from visioncal.estimation.variance import Knowledge
-from visioncal.simulation import CellOptions, exact, measured_poses, simulate
+from visioncal.simulation import CellOptions, measured_poses, simulate
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
 NOISE = Noise.of_robot(1e-3, 5e-4)

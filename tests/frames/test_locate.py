@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.beyond import an_error, moved, with_error, with_field
-from support.cells import session_of
+from support.cells import exact, session_of
 from support.marks import slow
 from support.picks import (
     before_camera,
@@ -29,7 +29,6 @@ from visioncal.session import Session
 from visioncal.simulation import (
     CellOptions,
     charuco_target,
-    exact,
     project,
     read_truth,
     simulate,

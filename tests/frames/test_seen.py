@@ -5,6 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from support.cells import exact
 from support.picks import Stand, calibration_of, corners_at, really
 from support.plates import CENTRES, looking, marked_plate
 
@@ -16,7 +17,7 @@ from visioncal.frames.marker_points import seen_markers
 from visioncal.frames.single_view import Sight, places
 from visioncal.frames.target_in_image import see
 from visioncal.frames.target_pose import place_seen
-from visioncal.simulation import CellOptions, charuco_target, checkerboard_target, exact, simulate
+from visioncal.simulation import CellOptions, charuco_target, checkerboard_target, simulate
 from visioncal.vision.camera import intrinsics, with_intrinsics
 
 BOARD = charuco_target()

@@ -5,7 +5,7 @@ from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
-from support.cells import calibrated
+from support.cells import calibrated, exact
 from support.planned import next_best, plan_cell, postures_in_view, so_far_of, true_cell
 
 from visioncal.core.errors import DataError
@@ -21,7 +21,7 @@ from visioncal.live.planning.purposes import PURPOSES, purpose_of
 from visioncal.live.planning.recorded import Guess, begin
 from visioncal.live.planning.selection import CRITERIA
 from visioncal.robot import load_robot
-from visioncal.simulation import CellOptions, exact, fine_camera, simulate
+from visioncal.simulation import CellOptions, fine_camera, simulate
 from visioncal.simulation.options import Second
 from visioncal.vision.targets import corner_positions
 

@@ -5,6 +5,7 @@ import dataclasses
 import cv2
 import numpy as np
 import pytest
+from support.cells import exact
 
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log, rotation_angle
@@ -15,7 +16,6 @@ from visioncal.simulation import (
     CellOptions,
     charuco_target,
     checkerboard_target,
-    exact,
     fine_camera,
     fisheye_camera,
     forward,

@@ -12,7 +12,7 @@ from visioncal.calibration.stages.reported_poses import Reported
 from visioncal.core.transforms import invert, log
 from visioncal.robot import Robot, load_robot
 from visioncal.session import MemoryImages, Session, View
-from visioncal.simulation import Cell, Sweep
+from visioncal.simulation import Cell, CellOptions, Sweep
 from visioncal.simulation.records import approach_text, load_row, pose_row
 from visioncal.simulation.second import BOARDS
 
@@ -96,3 +96,30 @@ def error_of(cell: Cell, known: RunState) -> np.ndarray:
     """(6 + 6 b,) right perturbations of all edges, true to estimated (rotation, translation)."""
     true = np.array(list(cell.transforms.values()))
     return log(invert(true) @ known.solved.state.edges).ravel()
+
+
+def exact(options: CellOptions | None = None) -> CellOptions:
+    """A cell, the default one if none is given, without noise or error of any kind.
+
+    Its reports, its detections and its board are the truth; its images are only rounded to grey
+    levels.
+    """
+    return replace(
+        options or CellOptions(),
+        pixel_sigma_px=0.0,
+        image_noise=0.0,
+        robot_sigma_m=0.0,
+        robot_sigma_rad=0.0,
+        dh_sigma_m=0.0,
+        dh_sigma_rad=0.0,
+        offset_sigma_rad=0.0,
+        eccentricity_sigma_rad=0.0,
+        ripple_sigma_rad=0.0,
+        function_sigma_rad=0.0,
+        compliance_rad_per_nm=(),
+        backlash_rad=(),
+        lens_mismatch_px=0.0,
+        wrong_views=0,
+        board_scale=1.0,
+        board_bow_m=0.0,
+    )

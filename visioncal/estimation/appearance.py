@@ -169,10 +169,6 @@ class LensBoardParameters:
         step[self.columns] = np.where(self.anchored, 0.0, change[: len(self.columns)])
         return self.appearance.moved(step)
 
-    def corners_after(self, change: FloatArray) -> FloatArray:
-        """Where the (c, 3) corners lie on the target after a (k,) change [m]."""
-        return np.asarray(self.positions + self.basis @ self.after(change).board)
-
 
 @dataclass(frozen=True, eq=False)
 class Compressed:

@@ -20,7 +20,6 @@ from visioncal.core.transforms import compose, exp, skew
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.group_outliers import GroupInliers, agreeing_groups
 from visioncal.estimation.groups import GroupFit, Groups
-from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.observability import SIGMA_LIMIT_M, Direction
 from visioncal.estimation.placing import (
     LEAST_NOISE_M,
@@ -97,7 +96,7 @@ class FeatureFit:
     def covariance(self) -> FloatArray | None:
         """(6, 6) of the frame's right perturbation (rotation [rad], translation [m]).
 
-        None where nothing determines the noise; `covariance_at` says what a noise would mean.
+        None where nothing determines the noise.
         """
         return None if self.noise_m is None else self.agreement.fit.covariance
 
@@ -118,11 +117,6 @@ class FeatureFit:
         fit = self.agreement.fit
         observed = np.where(fit.groups.observed[:, :, None], fit.state[:3, :3].T, 0.0)
         return np.asarray(fit.gains @ observed)
-
-    def covariance_at(self, noise_m: float) -> FloatArray:
-        """(6, 6) covariance of the frame, were that the noise beyond what is known [m]."""
-        fit = self.agreement.fit
-        return covariance_from(fit.groups.subset(fit.used).information(noise_m))
 
 
 @dataclass(frozen=True, eq=False)

@@ -158,18 +158,14 @@ class Problem:
         every = zip(seen.stops.tolist(), seen.observers, seen.observed, apart, strict=True)
         return np.array([keys.setdefault(it, len(keys)) for it in every], dtype=np.int64)
 
-    def merged(self, units: IntArray | None = None) -> "Problem":
-        """Makes one observation of all of one unit.
+    def merged(self) -> "Problem":
+        """Makes one observation of all of one stop (`of_one_stop`).
 
         Their poses are averaged with their information, and by how much they disagree they show
         the effect on sensors: nothing is lost. Where nothing is known of their noise, they are
         averaged evenly.
-
-        Args:
-            units: (n,) the unit of each observation, numbered from 0 in the order of first
-                appearance; those of one are of the same frames at one stop. None for `of_one_stop`.
         """
-        units = self.of_one_stop if units is None else units
+        units = self.of_one_stop
         first = np.unique(units, return_index=True)[1]
         if len(first) == len(units):
             return self

@@ -55,9 +55,7 @@ class _Row:
         return np.asarray(about_z(np.asarray(self.theta), np.asarray(self.d)) @ self.across)
 
 
-def convert_table(
-    table: DHTable, convention: Convention, *, parallel_rad: float = PARALLEL_RAD
-) -> DHTable:
+def convert_table(table: DHTable, convention: Convention) -> DHTable:
     """Writes a table in another convention; the arm stays the same.
 
     Between standard and modified no number changes, only its row. In Hayati's form beta takes the
@@ -67,7 +65,6 @@ def convert_table(
     Args:
         table: The table.
         convention: The convention that is wanted.
-        parallel_rad: Consecutive axes closer than this to parallel count as such (`hayati`).
 
     Returns:
         The table. Poses agree to 1e-12, or 1e-8 where axes are less than 1e-4 and more than 0 rad
@@ -78,7 +75,7 @@ def convert_table(
     off = _off_parallel(table.along_x[:, :3, 2])
     # Before the first axis and behind the last there is no other to be parallel to.
     off[[0, -1]] = np.inf
-    parallel = (off < parallel_rad) & (convention == "hayati")
+    parallel = (off < PARALLEL_RAD) & (convention == "hayati")
     rows, moved = [], np.zeros(2)
     for place, row in enumerate(_rows(table)):
         link = replace(row, theta=row.theta + moved[0], d=row.d + moved[1])
@@ -93,7 +90,6 @@ def table_of(
     robot: Robot,
     convention: Convention,
     *,
-    parallel_rad: float = PARALLEL_RAD,
     like: DHTable | None = None,
 ) -> DHTable:
     """Writes any robot as a joint table.
@@ -105,7 +101,6 @@ def table_of(
     Args:
         robot: The robot, of a URDF, a table or a calibration.
         convention: The convention that is wanted.
-        parallel_rad: Consecutive axes closer than this to parallel count as such (`hayati`).
         like: A table of nearly the same arm, whose choices are kept: which way each x points, d
             between parallel axes, and the nominal base and flange. None for the x that turns least
             from the one before.
@@ -114,7 +109,7 @@ def table_of(
         The table. Offsets of the joints' functions are in its theta and d.
     """
     chain = _about_z(robot.chain.with_offsets_placed())
-    like = None if like is None else convert_table(like, convention, parallel_rad=parallel_rad)
+    like = None if like is None else convert_table(like, convention)
     hints = [_Row()] * len(chain) if like is None else _rows(like)
     first = np.eye(4) if like is None else like.along_x[0]
     base = _base(chain.placements[0], np.eye(4) if like is None else like.base, first)
@@ -122,11 +117,11 @@ def table_of(
     rest = invert(base @ first) @ chain.placements[0]
     for hint, placement in zip(hints[:-1], chain.placements[1:-1], strict=True):
         link = rest @ placement
-        near = bool(_off_parallel(link[:3, 2]) < parallel_rad)
+        near = bool(_off_parallel(link[:3, 2]) < PARALLEL_RAD)
         flats.append(near and convention == "hayati")
         rows.append(_between(link, hint, flat=flats[-1]))
         rest = invert(rows[-1].transform) @ link
-    last, flange = _last_row(rest @ chain.placements[-1], hints[-1], like, parallel_rad)
+    last, flange = _last_row(rest @ chain.placements[-1], hints[-1], like)
     count, none = len(chain), np.zeros(len(chain) + 1)
     table = DHTable(
         name=robot.name,
@@ -204,10 +199,10 @@ def _of_table(
     return Robot.from_document(document | kept | dict(gravity))
 
 
-def parallel_axes(robot: Robot, parallel_rad: float = PARALLEL_RAD) -> Mask:
-    """(n - 1,) which consecutive axes of a robot are closer than an angle to parallel."""
+def parallel_axes(robot: Robot) -> Mask:
+    """(n - 1,) which consecutive axes of a robot are nearly parallel."""
     links = _about_z(robot.chain).placements[1:-1]
-    return np.asarray(_off_parallel(links[:, :3, 2]) < parallel_rad)
+    return np.asarray(_off_parallel(links[:, :3, 2]) < PARALLEL_RAD)
 
 
 def has_ur_axes(robot: Robot) -> bool:
@@ -339,11 +334,9 @@ def _base(placement: FloatArray, nominal: FloatArray, first: FloatArray) -> Floa
     return np.asarray(nominal @ first @ tilt @ invert(first))
 
 
-def _last_row(
-    link: FloatArray, hint: _Row, like: DHTable | None, parallel_rad: float
-) -> tuple[_Row, FloatArray]:
+def _last_row(link: FloatArray, hint: _Row, like: DHTable | None) -> tuple[_Row, FloatArray]:
     """The last row, and the flange behind it."""
-    if like is None and _off_parallel(link[:3, 2]) >= parallel_rad:
+    if like is None and _off_parallel(link[:3, 2]) >= PARALLEL_RAD:
         row = _between(link, hint, flat=False)
         return row, invert(row.transform) @ link
     flange = np.eye(4) if like is None else like.flange

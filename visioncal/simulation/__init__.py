@@ -36,7 +36,6 @@ from visioncal.simulation.options import (
     charuco_target,
     checkerboard_target,
     circles_target,
-    exact,
     symmetric_circles_target,
     tags_target,
 )
@@ -95,7 +94,6 @@ __all__ = [
     "charuco_target",
     "checkerboard_target",
     "circles_target",
-    "exact",
     "fine_camera",
     "fisheye_camera",
     "forward",

@@ -14,6 +14,8 @@ from visioncal.core.types import FloatArray
 from visioncal.simulation.arms import Arm, link_frames, ur_arm
 
 _GRAVITY = np.array([0.0, 0.0, -9.80665])
+# By how much masses and inertias depart from what is published (standard deviation).
+_OFF_SHARE = 0.2
 # Mass [kg], its centre [m] and the main moments of inertia about that [kg m^2], in the frames of
 # the links: Universal Robots, "DH parameters for calculations of kinematics and dynamics", rounded.
 _BODIES: Mapping[str, Sequence[tuple[float, Sequence[float], Sequence[float]]]] = {
@@ -124,18 +126,15 @@ def nominal_dynamics(name: str) -> DynamicArm:
     return DynamicArm(ur_arm(name), bodies, Gears(still, still, still, still, still + 1.0, still))
 
 
-def real_dynamics(
-    name: str, rng: np.random.Generator, *, share: float = 0.2, stribeck: bool = False
-) -> DynamicArm:
+def real_dynamics(name: str, rng: np.random.Generator, *, stribeck: bool = False) -> DynamicArm:
     """An arm as it may have been built: off from what is published, and with friction.
 
-    Masses are off by `share`, the second moments about the centres of mass are stretched by half of
+    Masses are off by a fifth, the second moments about the centres of mass are stretched by half of
     it along and across all axes, and the centres by 1 cm: what comes out is a body always.
 
     Args:
         name: As for `nominal_dynamics`.
         rng: Source of randomness.
-        share: How far masses and inertias are off, as a standard deviation.
         stribeck: Whether breaking loose takes more than sliding.
 
     Raises:
@@ -158,7 +157,7 @@ def real_dynamics(
         around(_MOTOR_INERTIA),
     )
     return replace(
-        nominal, bodies=tuple(_off(it, share, rng) for it in nominal.bodies), gears=gears
+        nominal, bodies=tuple(_off(it, _OFF_SHARE, rng) for it in nominal.bodies), gears=gears
     )
 
 

@@ -1,7 +1,7 @@
 """What a simulated cell is made of, and how good or bad it is."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
 from visioncal.core.errors import DataError
@@ -244,30 +244,3 @@ class CellOptions:
                 f"simulation: tilt_rad is {self.tilt_rad}, an ascending range in 0 to 1.5 is "
                 "needed: beyond it the camera looks at the board's edge."
             )
-
-
-def exact(options: CellOptions | None = None) -> CellOptions:
-    """A cell, the default one if none is given, without noise or error of any kind.
-
-    Its reports, its detections and its board are the truth; its images are only rounded to grey
-    levels.
-    """
-    return replace(
-        options or CellOptions(),
-        pixel_sigma_px=0.0,
-        image_noise=0.0,
-        robot_sigma_m=0.0,
-        robot_sigma_rad=0.0,
-        dh_sigma_m=0.0,
-        dh_sigma_rad=0.0,
-        offset_sigma_rad=0.0,
-        eccentricity_sigma_rad=0.0,
-        ripple_sigma_rad=0.0,
-        function_sigma_rad=0.0,
-        compliance_rad_per_nm=(),
-        backlash_rad=(),
-        lens_mismatch_px=0.0,
-        wrong_views=0,
-        board_scale=1.0,
-        board_bow_m=0.0,
-    )

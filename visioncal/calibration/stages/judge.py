@@ -189,19 +189,18 @@ class Findings:
         return Rms(pooled([it.mm for it in each]) or 0.0, pooled([it.deg for it in each]))
 
 
-def judge(findings: Findings, limits: CalibrationLimits | None = None) -> Verdict:
+def judge(findings: Findings) -> Verdict:
     """Says whether the result can be trusted, why, and what to do next.
 
     Args:
         findings: What is known.
-        limits: Where doubt begins.
 
     Returns:
         `bad` with a reason that settles it, `check` with doubts, `good` without. Where the task
         says what it needs, the chance that picks land within it decides: good from 0.95, check from
         0.5, bad below, and never good where something is not explained.
     """
-    limits = limits or CalibrationLimits()
+    limits = CalibrationLimits()
     scatter = list(_scatter_doubts(findings, limits))
     pairs, sensors = findings.pairs, findings.sensors
     doubts = [
@@ -293,9 +292,9 @@ def met_words(findings: Findings, met: NeedMet) -> str:
     )
 
 
-def is_scattered(findings: Findings, limits: CalibrationLimits | None = None) -> bool:
+def is_scattered(findings: Findings) -> bool:
     """Whether views disagree with each other by more than a sound cell's do."""
-    return any(_scatter_doubts(findings, limits or CalibrationLimits()))
+    return any(_scatter_doubts(findings, CalibrationLimits()))
 
 
 def _praise(findings: Findings, *, is_enough: bool) -> Finding:

@@ -35,26 +35,22 @@ CameraOpener: TypeAlias = Callable[[str, DeviceSetup], CameraDevice]
 _Opener = TypeVar("_Opener")
 
 
-def open_arm(words: str, wish: ArmWish, openers: Mapping[str, ArmOpener] | None = None) -> Arm:
+def open_arm(words: str, wish: ArmWish) -> Arm:
     """Opens an arm.
 
     Args:
         words: `KIND` or `KIND:ADDRESS`.
         wish: What is asked of it; its address is replaced by that of the words.
-        openers: The kinds; `ARMS` where None.
 
     Raises:
         DataError: There is no such kind.
         DriverError: It cannot be opened.
     """
     kind, _, address = words.partition(":")
-    opener = _opener(kind, ARMS if openers is None else openers, "--arm")
-    return opener(replace(wish, address=address))
+    return _opener(kind, ARMS, "--arm")(replace(wish, address=address))
 
 
-def open_camera(
-    words: str, requested: DeviceSetup, openers: Mapping[str, CameraOpener] | None = None
-) -> CameraDevice:
+def open_camera(words: str, requested: DeviceSetup) -> CameraDevice:
     """Opens a camera; the arguments are like those of `open_arm`.
 
     Raises:
@@ -62,7 +58,7 @@ def open_camera(
         DriverError: It cannot be opened.
     """
     kind, _, address = words.partition(":")
-    return _opener(kind, CAMERAS if openers is None else openers, "--camera")(address, requested)
+    return _opener(kind, CAMERAS, "--camera")(address, requested)
 
 
 def is_folder(words: str) -> bool:

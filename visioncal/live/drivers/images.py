@@ -28,6 +28,9 @@ class FolderCamera:
         DataError: It is missing or holds no images, or the first cannot be read.
     """
 
+    # A folder knows no intrinsics.
+    factory: Camera | None = None
+
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         if not folder.is_dir():
@@ -39,29 +42,11 @@ class FolderCamera:
             raise DataError(
                 f"{folder} holds no images ({', '.join(_ENDINGS)}).", culprits=[str(folder)]
             )
+        self.name = f"images of {folder.name}"
+        self.settings: Mapping[str, str | float] = MappingProxyType({"folder": folder.name})
         self._next = 0
         height, width = read_image(self._files[0]).shape[:2]
-        self._resolution = (width, height)
-
-    @property
-    def name(self) -> str:
-        """Which folder it is."""
-        return f"images of {self._folder.name}"
-
-    @property
-    def resolution(self) -> tuple[int, int]:
-        """(width, height) of the first image [px]."""
-        return self._resolution
-
-    @property
-    def factory(self) -> Camera | None:
-        """None: a folder knows no intrinsics."""
-        return None
-
-    @property
-    def settings(self) -> Mapping[str, str | float]:
-        """Where the images come from."""
-        return MappingProxyType({"folder": self._folder.name})
+        self.resolution = (width, height)
 
     def frame(self, *, timeout_s: float = 1.0) -> Frame:
         """Returns the next image, stamped now; no time limit is needed.
@@ -80,9 +65,9 @@ class FolderCamera:
         file = self._files[self._next]
         image = read_image(file)
         height, width = image.shape[:2]
-        if (width, height) != self._resolution:
+        if (width, height) != self.resolution:
             raise DataError(
-                f"{file} has {width}x{height} pixels; {self._resolution[0]}x{self._resolution[1]} "
+                f"{file} has {width}x{height} pixels; {self.resolution[0]}x{self.resolution[1]} "
                 f"are needed, as {self._files[0].name} has.",
                 culprits=[str(file)],
             )

@@ -52,8 +52,8 @@ class OakCamera:
             closing.callback(opened.close)
             with worded(dai, "The OAK", "does not start"):
                 sensor = _sensor(opened, self._socket)
-                self._name = f"{opened.getDeviceName()} {self._socket} ({sensor.sensorName})"
-                self._resolution = requested.resolution or _fitting(sensor.width, sensor.height)
+                self.name = f"{opened.getDeviceName()} {self._socket} ({sensor.sensorName})"
+                self.resolution = requested.resolution or _fitting(sensor.width, sensor.height)
                 calibration = opened.readCalibrationOrDefault()
                 requested = _focused(requested, calibration, sensor)
                 pipeline = dai.Pipeline(opened)
@@ -62,33 +62,13 @@ class OakCamera:
                 control = node.inputControl.createInputQueue()
             raw = requested.more.get("raw")
             self._end = FrameEnd(
-                dai, pipeline, output, self._name, raw=None if raw is None else Path(raw)
+                dai, pipeline, output, self.name, raw=None if raw is None else Path(raw)
             )
             closing.callback(self._end.close)
             held = self._held(dai, requested, sensor, control)
-            self._factory, known = self._intrinsics(calibration, sensor)
-            self._settings = MappingProxyType({"rate_hz": rate_hz, **known, **held})
+            self.factory, known = self._intrinsics(calibration, sensor)
+            self.settings = MappingProxyType({"rate_hz": rate_hz, **known, **held})
             self._closing = closing.pop_all()
-
-    @property
-    def name(self) -> str:
-        """Which device, which of its cameras, and its sensor."""
-        return self._name
-
-    @property
-    def resolution(self) -> tuple[int, int]:
-        """(width, height) of its pictures [px]."""
-        return self._resolution
-
-    @property
-    def factory(self) -> Camera | None:
-        """The factory's intrinsics at this resolution; None where `settings` say why not."""
-        return self._factory
-
-    @property
-    def settings(self) -> Mapping[str, str | float]:
-        """What is held: exposure, gain, focus, rate, and where the intrinsics are from."""
-        return self._settings
 
     def frame(self, *, timeout_s: float = 1.0) -> Frame:
         """Returns a picture whose exposure began after the call.
@@ -125,7 +105,7 @@ class OakCamera:
         kind = dai.ImgFrame.Type.BGR888i if is_colour else dai.ImgFrame.Type.GRAY8
         # The factory's matrix is for pictures that are scaled and cropped, and still distorted.
         crop = dai.ImgResizeMode.CROP
-        return node.requestOutput(self._resolution, kind, crop, rate_hz, False)
+        return node.requestOutput(self.resolution, kind, crop, rate_hz, False)
 
     def _held(
         self, dai: ModuleType, requested: DeviceSetup, sensor: Handle, control_queue: Handle
@@ -159,7 +139,7 @@ class OakCamera:
     ) -> tuple[Camera | None, dict[str, str | float]]:
         """The factory's intrinsics; where they cannot be used, why, as a setting."""
         try:
-            camera = factory_intrinsics(calibration, self._socket, self._resolution)
+            camera = factory_intrinsics(calibration, self._socket, self.resolution)
         except DriverError as error:
             return None, {"factory_intrinsics": f"not used: {error.message}"}
         focus = _calibrated_focus(calibration, sensor)

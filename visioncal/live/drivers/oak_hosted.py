@@ -36,6 +36,8 @@ class HostedOak:
         DataError: Frames cannot be recorded into that file.
     """
 
+    name = "OAK pipeline without a device"
+
     def __init__(
         self,
         source: Callable[[], Frame | None],
@@ -46,32 +48,12 @@ class HostedOak:
         raw: Path | None = None,
     ) -> None:
         dai = depthai()
-        self._resolution, self._factory = resolution, factory
-        self._settings = MappingProxyType(dict(settings or {}))
+        self.resolution, self.factory = resolution, factory
+        self.settings = MappingProxyType(dict(settings or {}))
         self._feed = _Feed(source)
         pipeline = dai.Pipeline(createImplicitDevice=False)
         node = _source_node(dai, pipeline, self._feed)
         self._end = FrameEnd(dai, pipeline, node.out, self.name, raw=raw)
-
-    @property
-    def name(self) -> str:
-        """What it is."""
-        return "OAK pipeline without a device"
-
-    @property
-    def resolution(self) -> tuple[int, int]:
-        """(width, height) of its pictures [px]."""
-        return self._resolution
-
-    @property
-    def factory(self) -> Camera | None:
-        """The intrinsics that are known of it."""
-        return self._factory
-
-    @property
-    def settings(self) -> Mapping[str, str | float]:
-        """What it is set to."""
-        return self._settings
 
     def frame(self, *, timeout_s: float = 1.0) -> Frame:
         """Returns a picture whose exposure began after the call.
@@ -105,10 +87,10 @@ class HostedOak:
 
     def _checked(self, frame: Frame) -> Frame:
         height, width = frame.image.shape[:2]
-        if (width, height) != self._resolution:
+        if (width, height) != self.resolution:
             raise DriverError(
                 f"The {self.name} gave a picture of {width}x{height}; "
-                f"{self._resolution[0]}x{self._resolution[1]} was promised.",
+                f"{self.resolution[0]}x{self.resolution[1]} was promised.",
                 culprits=[self.name],
             )
         return frame

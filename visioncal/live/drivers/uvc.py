@@ -2,7 +2,6 @@
 
 import math
 import time
-from collections.abc import Mapping
 from types import MappingProxyType
 
 import cv2
@@ -47,9 +46,12 @@ class UvcCamera:
         DriverError: It cannot be opened or gives no picture, or refuses what is wished.
     """
 
+    # Such a camera does not report its intrinsics.
+    factory: Camera | None = None
+
     def __init__(self, source: int | str, requested: DeviceSetup | None = None) -> None:
         requested = requested or DeviceSetup()
-        self._name = f"camera {without_password(str(source))}"
+        self.name = f"camera {without_password(str(source))}"
         self._exposure_s = 1e-6 * (requested.exposure_us or 0)
         settings: dict[str, str | float] = {}
         self._feed: Newest[bytes] | Newest[Image] | FilePictures
@@ -66,7 +68,7 @@ class UvcCamera:
                 is_stream = _scheme(source) in _TIMED
                 grabbed = GrabbedPictures(capture, self.name, self._exposure_s, is_stream=is_stream)
                 self._feed = Newest(grabbed, self.name)
-        self._settings = MappingProxyType(settings)
+        self.settings = MappingProxyType(settings)
         try:
             first = self._frame(*self._feed.first(_OPENING_S))
             self._check_resolution(first, requested.resolution, "gives")
@@ -74,27 +76,7 @@ class UvcCamera:
             self.close()
             raise
         height, width = first.image.shape[:2]
-        self._resolution = (width, height)
-
-    @property
-    def name(self) -> str:
-        """Which camera it is."""
-        return self._name
-
-    @property
-    def resolution(self) -> tuple[int, int]:
-        """(width, height) of its pictures [px]."""
-        return self._resolution
-
-    @property
-    def factory(self) -> Camera | None:
-        """None: such a camera does not report its intrinsics."""
-        return None
-
-    @property
-    def settings(self) -> Mapping[str, str | float]:
-        """What the camera says that it is set to."""
-        return self._settings
+        self.resolution = (width, height)
 
     def frame(self, *, timeout_s: float = 1.0) -> Frame:
         """Returns a picture whose exposure began after the call, as far as can be known.
@@ -107,7 +89,7 @@ class UvcCamera:
             DriverError: None came, with for how long; or it has another resolution than before.
         """
         frame = self._frame(*self._feed.after(time.monotonic(), timeout_s))
-        self._check_resolution(frame, self._resolution, "now gives")
+        self._check_resolution(frame, self.resolution, "now gives")
         return frame
 
     def close(self) -> None:

@@ -84,18 +84,17 @@ class SoFar:
     refusal: str = field(default="")
 
 
-def so_far(session: Session, *, level: str = "hand-eye", progress: Progress | None = None) -> SoFar:
-    """Calibrates a session as far as it goes.
+def so_far(session: Session, *, progress: Progress | None = None) -> SoFar:
+    """Calibrates the hand-eye level of a session as far as it goes.
 
     Args:
         session: What was recorded.
-        level: How far to go, as `visioncal.calibrate` takes it.
         progress: Told of long work.
 
     Raises:
         DataError: The input is wrong or shows no target.
     """
-    known = RunState(session, progress, level=level)
+    known = RunState(session, progress, level="hand-eye")
     for at, stage in enumerate(STAGES):
         if progress is not None:
             progress(stage.name, at, len(STAGES))

@@ -339,9 +339,7 @@ class Panel:
             self.figure.path(data, stroke=colour, width=width, opacity=opacity,
                              cap="round" if shape == "dot" else "")  # fmt: skip
 
-    def colour_bar(
-        self, scale: Scale, colours: Sequence[tuple[int, int, int]], title: str, most: int = 5
-    ) -> None:
+    def colour_bar(self, scale: Scale, colours: Sequence[tuple[int, int, int]], title: str) -> None:
         """Draws what colours mean, at the right."""
         box, figure = self.box, self.figure
         high = _BAR_SHARE * (box.bottom - box.top)
@@ -352,7 +350,7 @@ class Panel:
             # A little longer than a step, that none shows through between them.
             size = f"h{_BAR_PT}v{part + (0.3 if step < _BAR_STEPS - 1 else 0.0):.2f}h-{_BAR_PT}z"
             figure.path(f"M{left:.1f} {top + step * part:.2f}{size}", fill=name)
-        values = scale.ticks(most)
+        values = scale.ticks(5)
         words = tick_words(values)
         for value, text in zip(values, words, strict=True):
             y = top + high * (1.0 - float(scale.shares(value)))
