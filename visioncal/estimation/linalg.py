@@ -45,6 +45,13 @@ def spectrum(information: FloatArray) -> Spectrum:
     return Spectrum(np.maximum(values, 0.0), directions / np.linalg.norm(directions, axis=0))
 
 
+def scaled_values(information: FloatArray) -> FloatArray:
+    """(..., n) eigenvalues, as `spectrum` has them, of (..., n, n) information matrices."""
+    scale = _scale(information)
+    values = np.linalg.eigvalsh(information * scale[..., :, None] * scale[..., None, :])
+    return np.asarray(np.maximum(values, 0.0))
+
+
 def covariance_from(information: FloatArray) -> FloatArray:
     """Inverts (..., n, n) information matrices, scaled first to a unit diagonal.
 

@@ -5,6 +5,7 @@ move is found by how many observations it explains that nothing else does; a sli
 in the noise of each, by Rao's score test of a step at every stop (as Page 1955 asks for a change).
 """
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -13,7 +14,7 @@ import numpy as np
 from visioncal.core.quantiles import chi2_limit, f_limit
 from visioncal.core.transforms import adjoint, exp, invert, log
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.linalg import covariance_from, spectrum
+from visioncal.estimation.linalg import covariance_from, scaled_values
 from visioncal.estimation.parts import State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import (
@@ -306,23 +307,28 @@ def slight_move(problem: Problem, fit: Solution, movable: Sequence[str]) -> Move
         fit: The unknowns and the noise.
         movable: Frames that may have moved.
     """
-    errors, seen = RepeatErrors.of(problem, fit), {}
+    errors, seen = RepeatErrors.of(problem, fit), defaultdict[int, list[str]](list)
     for frame in movable:
         stops = np.unique(problem.observations.stops[problem.observations.involves(frame)])
-        seen[frame] = set(stops[_FEWEST : 1 - _FEWEST].tolist())
+        for stop in stops[_FEWEST : 1 - _FEWEST].tolist():
+            seen[stop].append(frame)
     tried = int(problem.observations.stops.max()) + 1
     best, limit = None, _move_limit(problem, len(movable) * tried)
     for stop, information, gradient in equations_from(problem, fit, errors):
-        for frame in (it for it in movable if stop in seen[it]):
-            at = problem.edge_columns(frame)
-            across = information[at]
-            own = across[:, at] - across @ errors.covariance @ across.T
-            if spectrum(across[:, at]).ratio < _TAKEN or spectrum(own).values[0] < _TAKEN:
-                continue
-            step = -covariance_from(own) @ gradient[at]
-            mahalanobis_sq = float(-step @ gradient[at])
-            if mahalanobis_sq > limit:
-                best, limit = (frame, stop, step), mahalanobis_sq
+        if stop not in seen:
+            continue
+        at = np.array([np.r_[problem.edge_columns(it)] for it in seen[stop]])
+        across = information[at]
+        alone = np.take_along_axis(across, at[:, None], axis=2)
+        own = alone - across @ errors.covariance @ np.swapaxes(across, 1, 2)
+        values, asked = scaled_values(alone), gradient[at]
+        steps = -(covariance_from(own) @ asked[..., None])[..., 0]
+        clear = (values[:, 0] >= _TAKEN * values[:, -1]) & (values[:, -1] > 0.0)
+        clear &= scaled_values(own)[:, 0] >= _TAKEN
+        squares = np.where(clear, -np.sum(steps * asked, axis=1), 0.0)
+        if (most := float(squares.max())) > limit:
+            place = int(squares.argmax())
+            best, limit = (seen[stop][place], stop, steps[place]), most
     if best is None:
         return None
     frame, stop, step = best

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from visioncal.core.transforms import skew
 from visioncal.core.types import Camera, FloatArray, Mask
 from visioncal.estimation.corners import CornerStack
 from visioncal.vision.camera import normalise
@@ -91,7 +92,8 @@ def determines_pose(points: FloatArray) -> bool:
         return False
     starts, span = points[[0, 0, 1]], float(np.ptp(points, axis=0).max())
     along = points[[1, 2, 2]] - starts
-    away = np.linalg.norm(np.cross(points - starts[:, None], along[:, None]), axis=2)
+    # Of every view: `np.cross` takes ten times as long.
+    away = np.linalg.norm((points - starts[:, None]) @ skew(along), axis=2)
     is_off = away > _ON_LINE * span * np.linalg.norm(along, axis=1)[:, None]
     return bool(np.all(is_off.sum(axis=1) >= 2))
 

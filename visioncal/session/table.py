@@ -115,6 +115,19 @@ class View:
         return self.text.get(column, "")
 
 
+def reported_matrices(views: Sequence[View]) -> dict[int, FloatArray]:
+    """(4, 4) `base_from_flange` of each view that the controller reported one of, by its number.
+
+    All at once: one pose alone takes as long as a hundred together.
+    """
+    reported = [it for it in views if known.POSE[0] in it.numbers]
+    if not reported:
+        return {}
+    values = np.array([[it.numbers[name] for name in known.POSE] for it in reported])
+    poses = RigidTransform.from_components(values[:, :3], Rotation.from_quat(values[:, 3:]))
+    return dict(zip((it.number for it in reported), poses.as_matrix(), strict=True))
+
+
 @dataclass(frozen=True)
 class Row:
     """One row of text cells, and the words that place it in messages (`views.csv, line 3`)."""

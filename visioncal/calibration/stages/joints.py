@@ -17,6 +17,7 @@ from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.core.verdict import CALIBRATE, GUESS, Finding, Step
 from visioncal.robot import Robot, placed_at, with_zeros
 from visioncal.session import View
+from visioncal.session.table import reported_matrices
 
 # Controllers print poses to 0.01 mm or 1e-5 rad at worst; a model of another robot, another tip or
 # another convention is off by far more.
@@ -127,11 +128,7 @@ def match_joints(rows: Sequence[View], robot: Robot) -> Matched:
         The angles that belong to it, and what does not.
     """
     joints = {it.number: q for it in rows if (q := it.joints_rad) is not None}
-    poses = {
-        it.number: np.asarray(pose.as_matrix())
-        for it in rows
-        if (pose := it.base_from_flange()) is not None and it.number in joints
-    }
+    poses = reported_matrices([it for it in rows if it.number in joints])
     counts = {len(it) for it in joints.values()} - {robot.joint_count}
     if counts:
         words = (
@@ -185,8 +182,11 @@ def _constants(model: FloatArray, poses: FloatArray, guess: JointGuess | None) -
     flange_from_reported, of_poses = invert(model) @ poses, invert(poses)
     lever = max(float(np.median(np.linalg.norm(model[:, :3, 3], axis=1))), _AGREE_M)
     # The most central one, which wrong rows do not move as they would move the mean.
+    # Rows of one stop give the same.
+    first = np.unique(flange_from_reported, axis=0, return_index=True)[1]
     around = [
-        distances(of_poses, model, lever, (np.eye(4), invert(it))) for it in flange_from_reported
+        distances(of_poses, model, lever, (np.eye(4), invert(flange_from_reported[it])))
+        for it in np.sort(first)
     ]
     same = _Constants(min(around, key=lambda it: float(np.median(it.away))))
     if guess is None:

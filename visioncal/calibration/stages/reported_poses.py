@@ -16,6 +16,7 @@ from visioncal.core.types import FloatArray, Rejection
 from visioncal.core.verdict import Finding
 from visioncal.robot import Robot
 from visioncal.session import Session
+from visioncal.session.table import reported_matrices
 
 # The robot stands still while a stop's images are taken; controllers report it with some noise.
 _ONE_STOP_MM, _ONE_STOP_DEG = 1.0, 0.1
@@ -91,10 +92,11 @@ def reported_poses(session: Session, robot: Robot | None) -> Reported:
     matched = None if robot is None else match_joints(session.views, robot)
     rejections = []
     poses: dict[int, FloatArray] = {}
+    reported = reported_matrices(session.views)
     for view in session.views:
-        pose, joints = view.base_from_flange(), view.joints_rad
-        if pose is not None:
-            poses[view.number] = np.asarray(pose.as_matrix())
+        joints = view.joints_rad
+        if view.number in reported:
+            poses[view.number] = reported[view.number]
         elif joints is None or matched is None or matched.misread:
             rejections.append(Rejection(view.number, _no_pose(joints, matched)))
         else:
