@@ -31,7 +31,7 @@ from visioncal.estimation.variance import (
     Knowledge,
     RatioPrior,
     estimate_sigmas,
-    likelihood,
+    likelihood_value,
 )
 
 _ROUNDS, _SETTLED = 20, 1e-10
@@ -389,11 +389,12 @@ def estimate_noise(
         from_above: Whether robots' levels are to be sought from above what the residuals show,
             since they may be anything: a start that is too low may stay there.
     """
-    robots, _ = robot_levels(problem, state, noise, from_above=from_above)
-    noise = replace(noise, robots=robots)
+    of_robots = robot_likelihood(problem, state, noise)
+    noise = replace(noise, robots=of_robots.levels(noise, from_above=from_above)[0])
     if not len(noise.sensors):
         return noise
-    squares, left = posterior(problem, state, noise)
+    # By the sensors' noise alone, which is still the same.
+    squares, left = posterior(problem, state, noise, of_robots.reduced)
     sensors = noise.sensors.copy()
     for at in range(len(sensors)):
         mine = problem.observations.sensors == at
@@ -414,14 +415,7 @@ def robot_levels(
     Returns:
         The levels, and the negative restricted log-likelihood there.
     """
-    if not len(problem.units[1]):
-        return noise.robots, 0.0
-    likelihood = robot_likelihood(problem, state, noise)
-    start = np.maximum(_ABOVE * noise.robots, _ABOVE_NOTHING)
-    if from_above:
-        start = np.maximum(likelihood.rms, _START_SIGMA) * np.ones_like(noise.robots)
-    start = np.where(likelihood.seen[:, None], start, noise.robots)
-    return likelihood.most_likely(start, np.repeat(likelihood.seen, 2))
+    return robot_likelihood(problem, state, noise).levels(noise, from_above=from_above)
 
 
 @dataclass(frozen=True, eq=False)
@@ -484,12 +478,22 @@ class RobotLikelihood:
         )
         return sigmas.reshape(start.shape), value
 
+    def levels(self, noise: Noise, *, from_above: bool) -> tuple[FloatArray, float]:
+        """The robots' levels (r, 2) from those of some noise on, as `robot_levels` gives them."""
+        if not len(self.components.known):
+            return noise.robots, 0.0
+        start = np.maximum(_ABOVE * noise.robots, _ABOVE_NOTHING)
+        if from_above:
+            start = np.maximum(self.rms, _START_SIGMA) * np.ones_like(noise.robots)
+        start = np.where(self.seen[:, None], start, noise.robots)
+        return self.most_likely(start, np.repeat(self.seen, 2))
+
     def value(self, levels: FloatArray) -> float:
         """The negative logarithm of the likelihood of (r, 2) levels."""
         logs = np.log(np.maximum(levels.ravel(), LEAST_SIGMA))
-        return likelihood(
+        return likelihood_value(
             self.reduced.errors, self.jacobian, self.components, self.known, logs, self._ratios
-        ).value
+        )
 
     @property
     def _ratios(self) -> RatioPrior:
@@ -521,8 +525,16 @@ def robot_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLikel
     )
 
 
-def posterior(problem: Problem, state: State, noise: Noise) -> tuple[FloatArray, FloatArray]:
+def posterior(
+    problem: Problem, state: State, noise: Noise, reduced: Reduced | None = None
+) -> tuple[FloatArray, FloatArray]:
     """What the fit leaves of each observation once its flange's error is known as well as it is.
+
+    Args:
+        problem: The observations.
+        state: The unknowns.
+        noise: Its levels.
+        reduced: What `reduce` gives of these, where it is there already.
 
     Returns:
         (n,) squared residuals in units of their own noise, and (n,) the redundancy of each: how
@@ -530,7 +542,7 @@ def posterior(problem: Problem, state: State, noise: Noise) -> tuple[FloatArray,
     """
     own = problem.covariance(noise)
     weights, linear = np.linalg.inv(own), problem.linear(state)
-    reduced = reduce(problem, state, linear, own)
+    reduced = reduced or reduce(problem, state, linear, own)
     errors = problem.error_covariance(noise)
     known = covariance_among(_whole(reduced, errors)[0], problem.moving)
     of, _ = problem.units

@@ -252,6 +252,76 @@ def profile_interval(
     return crossing(-1.0, 0.0), crossing(1.0, float(np.exp(middle + _WIDEST)))
 
 
+@dataclass(frozen=True, eq=False)
+class _Weighed:
+    """Residuals (m, d) weighed by some sigmas, and what the parameters leave of them.
+
+    Attributes:
+        sigmas: (k,) the sigmas.
+        weights: (m, d, d) the inverse of the residuals' covariance.
+        weighted: (m, d, p) their Jacobian times that.
+        root: (p, p) the root of the parameters' covariance.
+        pulled: (m, d) weighted residuals at the best parameters.
+        value: The negative log-likelihood.
+    """
+
+    sigmas: FloatArray
+    weights: FloatArray
+    weighted: FloatArray
+    root: FloatArray
+    pulled: FloatArray
+    value: float
+
+    @classmethod
+    def of(
+        cls,
+        residuals: FloatArray,
+        jacobian: FloatArray,
+        components: Components,
+        known: Knowledge,
+        logs: FloatArray,
+    ) -> "_Weighed":
+        """Weighs them by some logarithms of the sigmas; see `estimate_sigmas`."""
+        sigmas = np.exp(logs)
+        total = components.total(sigmas)
+        weights = np.asarray(np.linalg.inv(total), dtype=float)
+        weighted = weights @ jacobian
+        root = covariance_root(gram(jacobian, weighted) + known.information)
+        gradient = gram(weighted, residuals) + known.gradient
+        best = root @ (root.T @ gradient)
+        left = residuals - jacobian @ best
+        pulled = (weights @ left[:, :, None])[:, :, 0]
+        value = 0.5 * float(
+            np.linalg.slogdet(total)[1].sum()
+            - 2.0 * np.linalg.slogdet(root)[1]
+            + np.einsum("mi,mi->", left, pulled)
+            + best @ (known.information @ best - 2 * known.gradient)
+        )
+        return cls(sigmas, weights, weighted, root, pulled, value)
+
+
+def likelihood_value(
+    residuals: FloatArray,
+    jacobian: FloatArray,
+    components: Components,
+    known: Knowledge,
+    logs: FloatArray,
+    prior: RatioPrior,
+) -> float:
+    """The value alone of what `likelihood` gives, which takes a third of the time."""
+    offset = _leaning(prior, logs)[1]
+    found = _Weighed.of(residuals, jacobian, components, known, logs)
+    return found.value + 0.5 * float(offset @ offset)
+
+
+def _leaning(prior: RatioPrior, logs: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """How a prior's pairs depend on the logarithms (n, k), and how far they are off it (n,)."""
+    lean = np.zeros((len(prior.places), len(logs)))
+    for row, (first, second) in zip(lean, prior.places, strict=True):
+        row[first], row[second] = -1.0 / prior.log_sigma, 1.0 / prior.log_sigma
+    return lean, lean @ logs - np.log(prior.ratio) / prior.log_sigma
+
+
 def likelihood(
     residuals: FloatArray,
     jacobian: FloatArray,
@@ -261,25 +331,12 @@ def likelihood(
     prior: RatioPrior | None,
 ) -> Likely:
     """The restricted likelihood of some logarithms of the sigmas; see `estimate_sigmas`."""
-    sigmas, columns = np.exp(logs), jacobian.shape[-1]
-    total = components.total(sigmas)
-    weights = np.linalg.inv(total)
-    weighted = weights @ jacobian
-    root = covariance_root(gram(jacobian, weighted) + known.information)
-    gradient = gram(weighted, residuals) + known.gradient
-    best = root @ (root.T @ gradient)
-    left = residuals - jacobian @ best
-    pulled = (weights @ left[:, :, None])[:, :, 0]
-    value = 0.5 * float(
-        np.linalg.slogdet(total)[1].sum()
-        - 2.0 * np.linalg.slogdet(root)[1]
-        + np.einsum("mi,mi->", left, pulled)
-        + best @ (known.information @ best - 2 * known.gradient)
-    )
+    found, columns = _Weighed.of(residuals, jacobian, components, known, logs), jacobian.shape[-1]
+    weights, weighted, pulled = found.weights, found.weighted, found.pulled
     # How the residuals' covariance grows with the logarithm of each sigma.
-    growth = 2 * sigmas[:, None, None] ** 2 * components.parts
+    growth = 2 * found.sigmas[:, None, None] ** 2 * components.parts
     # What the parameters have taken of the weights, as y y^T.
-    y = (weighted.reshape(-1, columns) @ root).reshape(weighted.shape)
+    y = (weighted.reshape(-1, columns) @ found.root).reshape(weighted.shape)
     removed = y @ np.swapaxes(y, 1, 2)
     left_over = np.diagonal(weights - removed, axis1=1, axis2=2)
     asked = growth * pulled
@@ -297,11 +354,7 @@ def likelihood(
     if np.linalg.eigvalsh(curvature)[0] <= 0.0:
         curvature = expected
     if prior is None:
-        return Likely(value, slope, curvature)
-    lean = np.zeros((len(prior.places), len(logs)))
-    for row, (first, second) in zip(lean, prior.places, strict=True):
-        row[first], row[second] = -1.0 / prior.log_sigma, 1.0 / prior.log_sigma
-    offset = lean @ logs - np.log(prior.ratio) / prior.log_sigma
-    return Likely(
-        value + 0.5 * float(offset @ offset), slope + offset @ lean, curvature + lean.T @ lean
-    )
+        return Likely(found.value, slope, curvature)
+    lean, offset = _leaning(prior, logs)
+    value = found.value + 0.5 * float(offset @ offset)
+    return Likely(value, slope + offset @ lean, curvature + lean.T @ lean)

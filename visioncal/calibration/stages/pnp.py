@@ -157,6 +157,7 @@ def _with_rivals(
     best, other = _sorted(stack, fit, _mirrored(stack, camera, fit, mirrored))
     mean_squares = [mean_square_by_view(stack, it.residuals) for it in (best, other)]
     turns_of = [rotation_transforms(it) for it in targets]
+    turned_of = [adjoint(invert(it)) for it in turns_of]
     firsts = first_corners(targets)
     boards = np.searchsorted(firsts, stack.ids[stack.starts], side="right") - 1
     spreads = [
@@ -164,8 +165,7 @@ def _with_rivals(
     ]
     views = []
     for at, (view, board) in enumerate(zip(stack.views, boards.tolist(), strict=True)):
-        turns = turns_of[board]
-        turned = adjoint(invert(turns))
+        turns, turned = turns_of[board], turned_of[board]
         rival = _is_rival(mean_squares[0][at], mean_squares[1][at], stack.counts[at], sigma_px)
         fits = (best, other) if rival else (best,)
         covariance = [turned @ it[at] @ np.swapaxes(turned, 1, 2) for it in spreads[: len(fits)]]
@@ -246,7 +246,7 @@ def _sorted(stack: CornerStack, first: PoseFit, second: PoseFit) -> tuple[PoseFi
 
 def _is_rival(best: float, other: float, corners: int, sigma_px: float) -> bool:
     """Whether the mirrored pose explains a view's corners about as well as the better one."""
-    if np.isclose(best, other, rtol=1e-6, atol=0.0):
+    if abs(best - other) <= 1e-6 * other:
         return False  # both starts ran into the same pose
     mahalanobis_sq = corners * (other - best) / floored_sigma_px(sigma_px) ** 2
     return bool(other < _RIVAL_RATIO**2 * best or mahalanobis_sq < _RIVAL_CHI2)
