@@ -371,6 +371,7 @@ def test_a_tool_on_the_flange_is_no_change_of_the_arm():
     assert max(abs(it.identified - it.nominal) for it in numbers.estimates) < 1e-12
 
 
+@pytest.mark.slow
 def test_a_missing_direction_is_in_the_verdict():
     """Looking straight at a board leaves the fifth joint of a UR almost where it is."""
     options = replace(WRONG_LINKS, seed=9, tilt_rad=(0.0, 0.03), roll_rad=0.4, views=40)

@@ -55,6 +55,7 @@ def test_an_arm_that_is_right_but_for_its_play():
     assert result.standing(q) == pytest.approx(known.robot.base_from_flange(q), abs=1e-9)
 
 
+@pytest.mark.slow
 def test_stops_from_one_side_tell_no_play():
     cell = simulate(replace(SAGGING, backlash_rad=PLAY, seed=2))
     known = calibrated(replace(cell, approach=np.ones(len(cell.approach))))

@@ -109,8 +109,9 @@ def test_many_stops_are_put_by_some_columns():
     assert np.trace(more[3:6, 3:6]) > 3.0 * np.trace(covariance[3:6, 3:6])
 
 
+@pytest.mark.slow
 def test_some_blocks_of_a_long_session_tell_the_sizes_of_all(monkeypatch):
-    problem, fit = fitted(lasting, 0, stops=480)
+    problem, fit = fitted(lasting, 0, stops=300)
     sizes = []
     for blocks in (5, 100):
         monkeypatch.setattr(pose_errors, "_MOST_BLOCKS", blocks)
