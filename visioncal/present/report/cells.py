@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from visioncal.core.files import write_atomically
@@ -17,6 +16,7 @@ from visioncal.present.report.axes import Margins, boxes
 from visioncal.present.report.bars import Bar
 from visioncal.present.report.content import Fact
 from visioncal.present.report.svg import Figure
+from visioncal.present.report.templating import template
 from visioncal.results import HELD_BACK, Alignment, Calibration, CameraResult, Sight
 
 _DEG = "\N{DEGREE SIGN}"
@@ -70,17 +70,10 @@ def write_cell_report(path: Path, found: Alignment) -> None:
 
 def render_cell(found: Alignment) -> str:
     """Renders the report as HTML text; see `write_cell_report`."""
-    environment = Environment(
-        loader=PackageLoader("visioncal", "present/report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     cards = [
         content.edge_card(name, edge, oriented=edge.oriented) for name, edge in found.edges.items()
     ]
-    return environment.get_template("cell.html.j2").render(
+    return template("cell.html.j2").render(
         found=found,
         created=content.readable_time(found.created),
         kinds=_kinds(found),
