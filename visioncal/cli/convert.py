@@ -8,11 +8,11 @@ from typing import Annotated
 
 import typer
 from rich.markup import escape
+from rich.table import Table
 
 from visioncal.calibration.guess import Candidate, Guess
 from visioncal.calibration.pipeline.guess_inputs import guess_session
 from visioncal.cli.console import messages
-from visioncal.cli.guessed import print_guess
 from visioncal.cli.numbers import size_in
 from visioncal.cli.options import Force
 from visioncal.cli.pose_options import UNITS, RobotPoseOptions, names_in, poses_option
@@ -164,7 +164,7 @@ def _chosen(recorded: InDoubt | Foreign, *, yes: bool) -> Candidate:
             guess = guess_foreign(recorded, progress=progress)
         else:
             guess = guess_session(recorded.session, recorded.robot, progress=progress)
-    print_guess(guess)
+    _print_guess(guess)
     return _confirmed(guess, yes=yes)
 
 
@@ -195,3 +195,16 @@ def _confirmed(guess: Guess, *, yes: bool) -> Candidate:
     if not agreed:
         raise DataError("Nothing was written: the reading was declined.")
     return guess.best
+
+
+def _print_guess(guess: Guess) -> None:
+    """Prints the readings, the best first, what was found, and what the views leave open."""
+    console = messages()
+    table = Table("reading", "chain closes to", "views that agree", box=None, pad_edge=False)
+    for it in guess.candidates:
+        cells = (it.words, it.figures, f"{it.agreeing} of {it.rows}")
+        table.add_row(*map(escape, cells), style="bold green" if it is guess.best else "")
+    console.print(table)
+    console.print(escape(guess.sentence))
+    for note in guess.notes:
+        console.print(escape(f"note: {note}"))

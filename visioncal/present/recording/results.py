@@ -26,7 +26,6 @@ from visioncal.present.recording import (
     notes,
     overlays,
     paths,
-    thermal,
     tools,
 )
 from visioncal.present.recording.frames import Frame, append, read_payload, scan
@@ -178,7 +177,8 @@ def _draw(
         if view.number in results:
             notes.log_view(stream, results[view.number], ends)
         if view.number in drifts:
-            thermal.log_view(stream, drifts[view.number])
+            stream.log(paths.DRIFT_MM, rr.Scalars(drifts[view.number].drift_mm))
+            stream.log(paths.RISE_K, rr.Scalars(drifts[view.number].rise_k))
     scene.log_marks(stream)
     recorder.keep()
 
