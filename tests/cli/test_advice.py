@@ -10,7 +10,9 @@ from support.commands import turned_poses, visioncal, write_poses
 from support.marks import slow
 from support.whole_cells import OPTIONS, recorded
 
+from visioncal.cli import dynamics_plan
 from visioncal.core.transforms import invert
+from visioncal.dynamics.excitation import ExcitationRequest
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate, simulate_network, write_session
 from visioncal.simulation.dynamics import real_dynamics
@@ -102,7 +104,13 @@ def test_of_a_whole_cell(place):
 
 
 @pytest.mark.slow
-def test_of_dynamics(place):
+def test_of_dynamics(place, monkeypatch):
+    # The motion that is planned need not be a good one: a short search will do.
+    monkeypatch.setattr(
+        dynamics_plan,
+        "ExcitationRequest",
+        lambda *words, **more: replace(ExcitationRequest(*words, **more), starts=1, steps=3),
+    )
     rng = np.random.default_rng(2)
     built = real_dynamics("ur5e", rng)
     streams = {"sweeps": record(built, slow_sweep(6, rng, seconds=30.0), rng)}
