@@ -8,6 +8,7 @@ import pytest
 from support.cells import calibrated, session_of
 from support.commands import visioncal
 from support.marks import slow
+from support.whole_cells import OPTIONS
 
 from visioncal.calibration.pipeline import align, calibrate
 from visioncal.core.errors import DataError, DegenerateError
@@ -182,6 +183,18 @@ def test_boards_that_look_alike_from_both_ends_are_told_apart_across_cameras():
     assert all(it.used for it in found.sights)
     for frames in (("base_a", "base_b"), ("cam_left", "cam_right")):
         assert off(cell, found, *frames)[1] < 22.0
+
+
+def test_a_board_of_a_wholly_other_size_is_found_and_the_cell_is_where_it_is():
+    """Five per cent: the chain is not linear in a size so far off, and lenses seem to breathe."""
+    floor, _, plate = OPTIONS.boards
+    target = replace(floor.target, square_sigma_m=1e-5)
+    boards = (replace(floor, target=target, scale=1.05), plate)
+    found = aligned(cell := simulate_network(replace(OPTIONS, boards=boards)))
+    (cause, *_) = found.verdict.causes
+    assert cause.kind == "board_size"
+    assert "the board floor is 5 % larger than stated" in cause.words
+    assert off(cell, found, "base_a", "base_b")[1] < 22.0
 
 
 def test_lenses_come_from_images_of_their_own():

@@ -36,10 +36,15 @@ from visioncal.estimation.lens_levels import are_beyond, estimate_levels
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.estimation.parts import State
-from visioncal.estimation.solve import covariance_of, left_out_residuals
+from visioncal.estimation.solve import covariance_of, equations_and_cost, left_out_residuals
 
 # A board that is off by so much is beyond what is linear.
 _FAR = 2e-3
+# Robots that err by more [m] may do so because of a board that is far off: it is looked for by fits
+# with other sizes, so far apart, and taken where the robots then err by much less.
+_ROUGH_M, _TRIED, _MUCH_LESS = 1e-3, 5e-3, 0.5
+# In these steps: a board is off by 15 % at most.
+_TRIED_FROM_TO = (-30.0, 30.0)
 
 
 def free_of(seen: LinearisedCorners) -> LensBoardParameters:
@@ -139,13 +144,12 @@ def _equally_weighed(
 def _sized(side: Side, fitted: Fitted) -> Fitted:
     """The fit with boards as large as the motion says, where that is far from what is stated."""
     looks = fitted.looks
-    away = [measured_scale(side, fitted, it).scale for it in looks.printed]
+    away = np.array([_measured(side, fitted, it).scale for it in looks.printed])
     if not np.any(np.abs(away) > _FAR):
         return fitted
     sizes = np.concatenate([looks.scale_of(it) for it in looks.printed])
-    return again(
-        fitted, side, np.union1d(fitted.moving, sizes), looks.without_prior(sizes.tolist())
-    )
+    looks = looks.without_prior(sizes.tolist()).with_values(sizes, away)
+    return again(fitted, side, np.union1d(fitted.moving, sizes), looks)
 
 
 def lens_levels(side: Side, fitted: Fitted) -> dict[str, LensLevels]:
@@ -215,6 +219,34 @@ def _still_other_sizes(erring: Side, wide: Fitted) -> tuple[list[IntArray], Fitt
     return [looks.scale_of(it) for it in free], wide
 
 
+def _measured(side: Side, fitted: Fitted, board: int) -> MeasuredScale:
+    """Measures a board's size by the robots' motion, also where the fit is not linear in it.
+
+    A view's line of sight is known much better than its distance. Where views and chain disagree by
+    millimetres, because a board is far off, their lines of sight do, too, and a size that is
+    linear about the views' poses is held by that. The costs of fits with other sizes say more.
+    """
+    found, looks = measured_scale(side, fitted, board), fitted.looks
+    noise, place = fitted.fit.noise, looks.scale_of(board)
+    if found.is_another or not any(it[1] > _ROUGH_M for it in noise.robots):
+        return found
+
+    def held(scale: float) -> Fitted:
+        value = looks.values[place] + scale
+        return again(fitted, side, fitted.moving, looks.with_values(place, value))
+
+    below, here, above = (
+        equations_and_cost(it.problem, it.fit.state, noise)[2]
+        for it in (held(-_TRIED), fitted, held(_TRIED))
+    )
+    bend = below + above - 2.0 * here
+    if bend <= 0.0:
+        return found
+    tried = held(_TRIED * float(np.clip(0.5 * (below - above) / bend, *_TRIED_FROM_TO)))
+    less = tried.fit.noise.robots[:, 1] < _MUCH_LESS * noise.robots[:, 1]
+    return measured_scale(side, tried, board) if less.any() else found
+
+
 def chosen(side: Side, fitted: Fitted) -> Fitted:
     """Sets free what the data speak for.
 
@@ -233,10 +265,19 @@ def chosen(side: Side, fitted: Fitted) -> Fitted:
         if _is_determined(wider, fitted) and not _predicts_worse(wider, fitted):
             answer = wider
             break
+    resized = _resized(side, _contesting(side, answer))
+    if np.array_equal(resized.moving, answer.moving):
+        return resized
+    # A board of another size speaks against lenses, too.
+    return _contesting(side, resized)
+
+
+def _contesting(side: Side, answer: Fitted) -> Fitted:
+    """The fit with the uncertainty of intrinsics that are held although corners contradict them."""
     contested = _contested(side, answer)
-    if contested:
-        answer = again(answer, side, answer.moving, answer.looks.contesting(contested))
-    return _resized(side, answer)
+    if contested == [name for name, it in answer.looks.problems.items() if it.contested]:
+        return answer
+    return again(answer, side, answer.moving, answer.looks.contesting(contested))
 
 
 def _freed(side: Side, moving: IntArray, fitted: Fitted) -> Fitted:
@@ -262,8 +303,8 @@ def _resized(side: Side, answer: Fitted) -> Fitted:
         other = _wrongly_sized(side, answer)
         if other is None:
             return answer
-        looks = answer.looks
-        place = looks.scale_of(other.board)
+        place = answer.looks.scale_of(other.board)
+        looks = answer.looks.with_values(place, np.array([other.scale]))
         if other.contradicts:
             looks = looks.without_prior(place.tolist())
         resized = again(answer, side, np.union1d(answer.moving, place), looks)
@@ -277,7 +318,7 @@ def _wrongly_sized(side: Side, answer: Fitted) -> MeasuredScale | None:
     """The board whose size is held and farthest from what the robot measures, if any is beyond."""
     looks = answer.looks
     held = [it for it in looks.printed if looks.scale_of(it)[0] not in answer.moving]
-    measured = [measured_scale(side, answer, board) for board in held]
+    measured = [_measured(side, answer, board) for board in held]
     # An arm whose links may all be too long is hard to distinguish from a board that is too large.
     other = [it for it in measured if (it.contradicts if side.has_errors else it.is_another)]
     return max(other, key=lambda it: abs(it.scale) / it.sigma, default=None)

@@ -160,8 +160,7 @@ class CameraParameters:
     def contesting(self, names: Collection[str]) -> "CameraParameters":
         """The same, the intrinsics of some cameras being held although corners contradict them."""
         problems = {
-            name: replace(it, contested=it.contested or name in names)
-            for name, it in self.problems.items()
+            name: replace(it, contested=name in names) for name, it in self.problems.items()
         }
         return replace(self, problems=problems)
 
