@@ -1,6 +1,7 @@
 """Points from elsewhere: corners that another detector found, and rigs of known points."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,10 +33,12 @@ from visioncal.calibration.verification.prediction import predict_stops
 from visioncal.core.errors import DataError
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import invert, log
+from visioncal.interchange.formats import load_in_doubt
 from visioncal.present.recording import board, write_recording
 from visioncal.present.report import write_report
 from visioncal.results import Calibration, to_document
 from visioncal.session import Session, corners
+from visioncal.simulation import CellOptions, simulate
 from visioncal.vision.targets import load_target, target_document, target_from_document
 
 IN_HAND, TO_HAND = "eye-in-hand", "eye-to-hand"
@@ -458,3 +461,84 @@ def test_a_deleted_row_takes_its_corners_along(cube):
     (cube / "views.csv").write_text("\n".join(moved) + "\n")
     with pytest.raises(DataError, match="views\\.csv has no view 2"):
         Session.load(cube)
+
+
+@pytest.fixture
+def drawn(tmp_path: Path) -> Path:
+    """A session of corners alone, whose board and lens are stated."""
+    cell = simulate(CellOptions(views=12, seed=4))
+    session = Session.from_corners(
+        [(it.ids, it.px) for it in cell.corners],
+        cell.base_from_flange,
+        cell.options.target,
+        cell.stated_camera.resolution,
+        mount=IN_HAND,
+        camera=cell.stated_camera,
+    )
+    session.save(tmp_path / "drawn")
+    return tmp_path / "drawn"
+
+
+def state(folder: Path, key: str, value: object) -> None:
+    """Replaces what session.toml says of a key."""
+    file = folder / "session.toml"
+    pattern = re.compile(rf"{key} = (\[.*?\]|[^\n]*)", re.DOTALL)
+    text, count = pattern.subn(f"{key} = {value}", file.read_text())
+    assert count == 1
+    file.write_text(text)
+
+
+@pytest.mark.parametrize(("unit", "metres"), [("mm", 1e-3), ("cm", 1e-2), ("inch", 0.0254)])
+def test_a_board_in_another_unit_is_read_as_the_chain_has_it(unit, metres, drawn):
+    board = Session.load(drawn).target
+    sides = {"square_m": board.square_m, "marker_m": board.marker_m}
+    wrong = target_document(board) | {name: side / metres for name, side in sides.items()}
+    wrong.pop("square_sigma_m")
+    state(drawn, "target", '"b.toml"')
+    (drawn / "b.toml").write_text(
+        "".join(f"{key} = {json.dumps(it)}\n" for key, it in wrong.items())
+    )
+    read = load_in_doubt(drawn).session
+    # The unit's own rounding.
+    assert read.target.square_m == pytest.approx(board.square_m, rel=1e-12)
+    assert read.target.marker_m == pytest.approx(board.marker_m, rel=1e-12)
+    assert read.warnings[0].endswith(
+        f"{wrong['square_m']:g} is read as {wrong['square_m']:g} {unit}."
+    )
+
+
+def test_a_lens_that_cannot_be_the_cameras_is_not_used_and_comes_first(drawn):
+    """As where fx, cx, fy, cy are copied, in the order of a matrix by rows."""
+    sound = calibrate(drawn)
+    camera = Session.load(drawn).declaration.camera
+    numbers = [camera.matrix[it] for it in (0, 2, 1, 3)]
+    state(drawn, "matrix", numbers)
+    found = calibrate(drawn)
+    assert found.verdict.causes[0].kind == "other_lens"
+    assert found.verdict.status == "check"
+    assert "delete matrix and distortion" in found.verdict.next_steps[0].words
+    # The lens comes from the images: a third of a thousand of the focal length is noise.
+    assert found.camera.camera.matrix[:2] == pytest.approx(sound.camera.camera.matrix[:2], rel=3e-3)
+
+
+def test_corners_of_larger_images_than_stated_name_the_resolution(drawn):
+    state(drawn, "resolution", [320, 240])
+    with pytest.raises(DataError, match=r"resolution in \[camera\] is not that of the images"):
+        calibrate(drawn)
+
+
+def test_tables_of_spreadsheets_with_decimal_commas_are_read(drawn):
+    sound = Session.load(drawn)
+    for name in ("views.csv", "corners.csv"):
+        file = drawn / name
+        file.write_text(file.read_text().replace(",", ";").replace(".", ","))
+    assert Session.load(drawn).digest() == sound.digest()
+
+
+def test_a_misspelt_key_of_a_board_is_named(drawn):
+    document = target_document(Session.load(drawn).target) | {"legacyy": True}
+    state(drawn, "target", '"b.toml"')
+    lines = (f"{key} = {json.dumps(it)}\n" for key, it in document.items())
+    (drawn / "b.toml").write_text("".join(lines))
+    words = "b.toml: legacyy is no known name and was not read. Did you mean legacy?"
+    assert words in Session.load(drawn).warnings

@@ -249,7 +249,7 @@ def test_what_was_bumped_on_the_flange_is_named_whatever_the_need(mount, bumped)
     if bumped:
         (found,) = (it for it in verdict.findings if it.kind == "moved_at_once")
         assert found.words.startswith("The camera" if mount == "eye-in-hand" else "The target")
-        assert "before stop 10" in found.words
+        assert "from view 9 on" in found.words
         # Processes over posture and time explain the same, and are not the cause.
         assert calibrate(session).verdict.causes[0].kind == "moved_at_once"
 

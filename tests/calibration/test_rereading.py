@@ -122,7 +122,9 @@ def test_a_board_in_millimetres_is_read_so_and_said(cell):
     # A factor of a thousand, and its rounding.
     assert session.target.square_m == pytest.approx(0.030, rel=1e-15)
     assert session.target.marker_m == pytest.approx(0.022, rel=1e-15)
-    assert any("board.toml can only be in millimetres" in it for it in session.warnings)
+    assert any(
+        "board.toml cannot be in metres: 30 is read as 30 mm" in it for it in session.warnings
+    )
 
 
 # A cell: what the camera is from the flange, and the target from the base; or the other way round.

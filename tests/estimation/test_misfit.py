@@ -75,7 +75,7 @@ def test_a_bump_is_told_from_a_creep(mount):
         _, known = answered(moved)
         words = [it.reason for it in known.warnings if "moved at once" in it.reason]
         assert len(words) == 1
-        assert "before stop 9 of" in words[0]
+        assert "from view 8 on" in words[0]
         assert not any("drift with time" in it.reason for it in known.warnings)
 
 

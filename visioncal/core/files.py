@@ -119,6 +119,8 @@ _LONGEST_NAME = 255
 _UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 # Matrices in lists in tables need six.
 _DEEPEST = 40
+# How tomllib says that a table, or a key, is there already.
+_TWICE = re.compile("twice|overwrite a value")
 
 
 def read_bytes(path: Path | str, most: int = MOST_BYTES) -> bytes:
@@ -251,7 +253,11 @@ def parse_toml(text: str, label: str) -> dict[str, Any]:
         raise DataError(
             f"{label} is not valid TOML: {error}.",
             culprits=[label],
-            next_step='Text is written in "double quotes", lists in [brackets, like, this].',
+            next_step=(
+                "A table and a key may be there once: join the two."
+                if _TWICE.search(str(error))
+                else 'Text is written in "double quotes", lists in [brackets, like, this].'
+            ),
         ) from error
     except RecursionError as error:
         raise _too_deep(label) from error

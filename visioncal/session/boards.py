@@ -1,6 +1,6 @@
 """The printed targets of a session: one, or several named by the column `target`."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +9,7 @@ from visioncal.core.types import Target
 from visioncal.core.verdict import READ_AGAIN
 from visioncal.session.document import Declaration
 from visioncal.session.outside import without_content
-from visioncal.vision.targets import load_target, target_from_document
+from visioncal.vision.targets import load_target, misspelt_keys, target_from_document
 
 # The column of views.csv that names the target of a row.
 COLUMN = "target"
@@ -69,6 +69,20 @@ def _load(place: str, folder: Path | None) -> tuple[Target, dict[str, Any]]:
             raise type(error)(
                 error.message, culprits=error.culprits, next_step=str(READ_AGAIN)
             ) from error
+
+
+def target_warnings(declaration: Declaration, document: Mapping[str, Any] | None) -> Iterator[str]:
+    """Words what in the targets' descriptions looks like a known key misspelt.
+
+    Args:
+        declaration: What the session declares.
+        document: The descriptions, in the form of `read_targets`.
+    """
+    places = declared_targets(declaration)
+    for name, place in places.items():
+        described = document if len(places) == 1 else (document or {}).get(name)
+        for words in misspelt_keys(described or {}):
+            yield f"{place}: {words}"
 
 
 def declared_targets(declaration: Declaration) -> dict[str, str]:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from visioncal.core.documents.tables import separator_of
 from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean, read_text_inside, sha256
 from visioncal.core.types import Corners, FloatArray, IntArray, Target
@@ -96,18 +97,19 @@ def parse_corners(text: str) -> CornerTable:
         DataError: A column is missing or a cell is wrong; it is named.
     """
     # Rows are numbered by their lines: between them no line may be blank.
-    rows = numbered_rows(text.rstrip(), FILE, 1)
-    columns = [name.strip() for name in next(rows, (1, [""]))[1]]
+    rows = numbered_rows(text.rstrip(), FILE, 1, separator_of(text.partition("\n")[0]))
+    columns = [name.strip() for name in next(rows, (1, []))[1]]
     known = (*_NEEDED, COLUMN, _SIGMA)
     missing = [name for name in _NEEDED if name not in columns]
     other = [it for it in columns if it not in known or columns.count(it) > 1]
     if missing or other:
         hints = [it for it in (did_you_mean(name, known) for name in other) if it]
+        there = f"its columns are {', '.join(columns)}" if any(columns) else "it is empty"
         raise DataError(
-            f"{FILE}, header: its columns are {', '.join(columns)}; {', '.join(_NEEDED)} are "
+            f"{FILE}, header: {there}; {', '.join(_NEEDED)} are "
             f"needed, {COLUMN} and {_SIGMA} may be there, and others are not read.",
             culprits=[f"{FILE}: {it}" for it in (*missing, *other)],
-            next_step=hints[0] if hints else "",
+            next_step=hints[0] if hints else f"Begin {FILE} with the line {','.join(_NEEDED)}.",
         )
     problems: list[Problem] = []
     lines: list[_Line] = []

@@ -105,10 +105,11 @@ def read_declaration(
     # Before the fields: those of another schema would be reported one by one, and wrongly.
     schema = document.get("schema")
     if schema is not None and schema != 1:
+        is_newer = isinstance(schema, int) and schema > 1
         raise DataError(
             f"{label}: schema is {schema!r}; this version reads schema 1.",
             culprits=[f"{label}: schema"],
-            next_step="A newer visioncal may read it.",
+            next_step="A newer visioncal may read it." if is_newer else "Write schema = 1.",
         )
     try:
         declaration = Declaration.model_validate(dict(document))

@@ -18,7 +18,7 @@ from visioncal.core.types import Camera, Corners, FloatArray, Image, Mount, Need
 from visioncal.session import columns as known
 from visioncal.session.arms import read_robots
 from visioncal.session.arrays import Cell, of_corners, of_images
-from visioncal.session.boards import COLUMN, read_targets
+from visioncal.session.boards import COLUMN, read_targets, target_warnings
 from visioncal.session.checks import check_images_can_be_used, check_times, view_warnings
 from visioncal.session.choosing import Choice
 from visioncal.session.corners import (
@@ -508,6 +508,7 @@ def _build(
         *known.column_warnings(columns, "views.csv"),
         *view_warnings(views),
         *kind_warnings(declaration, views),
+        *target_warnings(declaration, target_document),
     ]
     check_kinds_named(declaration, views)
     check_frames(declaration, views)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from visioncal.core.documents.tables import separator_of, with_points
 from visioncal.core.errors import DataError
 from visioncal.core.files import named_errors, read_text_inside, sha256, some_of, write_atomically
 from visioncal.core.types import FloatArray, IntArray, Mask
@@ -134,11 +135,12 @@ def parse_stream(text: str, label: str) -> Stream:
         DataError: A cell is no number; it is named.
     """
     head, _, body = text.partition("\n")
-    _, names = next(numbered_rows(head, label, 1), (1, []))
+    separator = separator_of(head)
+    _, names = next(numbered_rows(head, label, 1, separator), (1, []))
     columns = tuple(name.strip() for name in names)
-    values, lines = _plain_numbers(body, len(columns)), None
+    values, lines = (_plain_numbers(body, len(columns)) if separator == "," else None), None
     if values is None:
-        values, lines = _numbers(body, columns, label)
+        values, lines = _numbers(body, columns, label, separator)
     values.setflags(write=False)
     return Stream(columns, values, lines)
 
@@ -155,13 +157,15 @@ def _plain_numbers(body: str, count: int) -> FloatArray | None:
     return values if values.shape[1] == count and np.isfinite(values).all() else None
 
 
-def _numbers(body: str, columns: Sequence[str], label: str) -> tuple[FloatArray, IntArray]:
+def _numbers(
+    body: str, columns: Sequence[str], label: str, separator: str
+) -> tuple[FloatArray, IntArray]:
     """Reads rows cell by cell with their lines, and names those that are wrong."""
     rows: list[list[float]] = []
     lines: list[int] = []
     problems: list[str] = []
     wrong: dict[str, list[tuple[int, str]]] = {}
-    for line, cells in numbered_rows(body, label, 2):
+    for line, cells in numbered_rows(body, label, 2, separator):
         if not any(cell.strip() for cell in cells):
             continue
         if len(problems) >= _SHOWN_PROBLEMS:
@@ -201,12 +205,15 @@ def _wrong_cells(wrong: Mapping[str, Sequence[tuple[int, str]]], label: str) -> 
         yield f"{label}, line {line}, column {name}: {cell!r} is no finite number{more}"
 
 
-def numbered_rows(text: str, label: str, first: int) -> Iterator[tuple[int, list[str]]]:
+def numbered_rows(
+    text: str, label: str, first: int, separator: str = ","
+) -> Iterator[tuple[int, list[str]]]:
     """Yields rows with the number of the line in which they end, the text's first being `first`."""
-    reader = csv.reader(io.StringIO(text, newline=""))
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
     try:
         for cells in reader:
-            yield reader.line_num + first - 1, cells
+            read = cells if separator == "," else [*with_points(cells)]
+            yield reader.line_num + first - 1, read
     except csv.Error as error:
         place = f"{label}, line {reader.line_num + first - 1}"
         raise DataError(f"{place}: {error}.", culprits=[place]) from error

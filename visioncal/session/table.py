@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from visioncal.core.documents.tables import with_points
+from visioncal.core.documents.tables import separator_of, with_points
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import READ_AGAIN
@@ -154,8 +154,7 @@ def parse_csv(text: str, label: str) -> tuple[tuple[str, ...], tuple[Row, ...]]:
     Raises:
         DataError: It is empty, has no rows, or its quotes do not close.
     """
-    header = text.lstrip().partition("\n")[0]
-    separator = next((it for it in ";\t" if it in header and "," not in header), ",")
+    separator = separator_of(text.lstrip().partition("\n")[0])
     reader = csv.reader(io.StringIO(text, newline=""), strict=True, delimiter=separator)
     rows: list[Row] = []
     line = 1

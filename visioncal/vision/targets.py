@@ -6,7 +6,7 @@ of the tag at the upper left, for a single marker its centre; x runs along colum
 (down the printed page), and z into the board. A rig of points has the frame that its table is in.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from decimal import Decimal
 from functools import lru_cache
 from pathlib import Path
@@ -29,6 +29,10 @@ LEAST_SIGMA_M = 1e-8
 
 # No printed square is larger; a larger number is in millimetres.
 LARGEST_M = 1.0
+
+# What descriptions of targets say, of one kind or another.
+_SIZES = {"square_m", "square_sigma_m", "marker_m", "size_m", "diameter_m", "spacing", "border"}
+KEYS = _SIZES | {"kind", "columns", "rows", "dictionary", "legacy", "id", "asymmetric", "points"}
 
 # The columns of a rig's table; sigma_m may be absent, and tag and corner, together.
 RIG_COLUMNS = ("point", "x_m", "y_m", "z_m", "sigma_m", "tag", "corner")
@@ -130,6 +134,13 @@ def rig_csv(points: Mapping[str, Sequence[float]]) -> str:
     columns = [it for it in RIG_COLUMNS if it in points]
     rows = zip(*(points[it] for it in columns), strict=True)
     return "\n".join([",".join(columns), *(",".join(map(repr, row)) for row in rows), ""])
+
+
+def misspelt_keys(document: Mapping[str, Any]) -> Iterator[str]:
+    """Words a hint for every key of a target's description that looks like a known one misspelt."""
+    for key in document.keys() - KEYS:
+        if hint := did_you_mean(key, KEYS):
+            yield f"{key} is no known name and was not read. {hint}"
 
 
 def target_from_document(document: Mapping[str, Any], name: str) -> Target:

@@ -1,6 +1,6 @@
 """The robots' arms of a whole cell: read from its session, calibrated with its frames, worded."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -93,10 +93,11 @@ def doubts_of_arms(
     found: Mapping[str, ResidualTest],
     results: Mapping[str, ArmFound],
     asked: str,
+    from_when: Callable[[int], str],
 ) -> Iterator[Finding]:
-    """Finds what speaks against the robots."""
+    """Finds what speaks against the robots; `from_when` words a stop in the session's numbers."""
     for robot, arm in arms.items():
-        for it in (*_doubts(arm, found.get(robot), asked), *results[robot].doubts()):
+        for it in (*_doubts(arm, found.get(robot), asked, from_when), *results[robot].doubts()):
             yield it if it.kind == "moved_at_once" else it.of(_called(arms, robot))
 
 
@@ -109,7 +110,9 @@ def notes_on_arms(arms: Mapping[str, RobotArm], results: Mapping[str, ArmFound])
             yield it.of(_called(arms, robot)).words
 
 
-def _doubts(arm: RobotArm, found: ResidualTest | None, asked: str) -> Iterator[Finding]:
+def _doubts(
+    arm: RobotArm, found: ResidualTest | None, asked: str, from_when: Callable[[int], str]
+) -> Iterator[Finding]:
     if arm.joints_rad is None and asked not in ("auto", "hand-eye"):
         yield Finding(
             "level",
@@ -122,7 +125,7 @@ def _doubts(arm: RobotArm, found: ResidualTest | None, asked: str) -> Iterator[F
         yield from doubts(arm.kinematics)
     if found is not None:
         calibrated = arm.model is not None
-        yield from diagnose.doubts(found, arm.errors, calibrated=calibrated)
+        yield from diagnose.doubts(found, arm.errors, from_when, calibrated=calibrated)
 
 
 def _called(arms: Mapping[str, RobotArm], robot: str) -> str:

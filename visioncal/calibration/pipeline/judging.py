@@ -57,7 +57,9 @@ def findings_of(known: RunState) -> Findings:
         places,
         (
             *(it.found for it in answer.faults),
-            *doubts_of_arms(solved.arms, answer.misfits, answer.arms, solved.asked),
+            *doubts_of_arms(
+                solved.arms, answer.misfits, answer.arms, solved.asked, solved.cell.from_when
+            ),
             *errors_found(answer.lenses),
             *known.warnings,
             *(it for it in of_rest if it.kind != NOTE),

@@ -10,9 +10,11 @@ from visioncal.calibration.stages.dense import fit_densely
 from visioncal.calibration.stages.detect import DetectOptions, detect
 from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.calibration.stages.observed import CameraLook, Observed, nothing_seen
-from visioncal.calibration.stages.pnp import estimate_poses, given_poses, measure_poses
+from visioncal.calibration.stages.pnp import Poses, estimate_poses, given_poses, measure_poses
 from visioncal.core.errors import VisioncalError
+from visioncal.core.number_format import figure
 from visioncal.core.types import Corners
+from visioncal.core.verdict import Finding, Step
 from visioncal.results import CameraResult
 from visioncal.session import Session, View, frame_name
 from visioncal.session.kinds import name_of
@@ -20,6 +22,10 @@ from visioncal.session.tables import CameraTable
 from visioncal.vision.targets import first_corners
 
 T = TypeVar("T", bound=Observed)
+
+# Corners are found to a few tenths of a pixel, and a lens that once was this camera's still fits to
+# a few pixels: beyond these, where another fits this much better, it never was.
+_WRONG_LENS_PX, _MUCH_BETTER = 5.0, 0.1
 
 
 def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
@@ -90,24 +96,72 @@ def locate_targets(seen: T) -> T:
     """
     session, targets = seen.session, tuple(seen.session.boards.values())
     poses = {**seen.poses, **given_poses(session)}
-    for frame, look in seen.cameras.items():
+    for frame in seen.cameras:
+        look = seen.cameras[frame]
         corners = {view: it for view, it in look.corners.items() if view not in seen.reasons}
         fitted = {view: it for view, it in corners.items() if view not in seen.held_back}
-        if look.lens is None or not fitted:
+        lens = look.lens
+        if lens is None or not fitted:
             continue
-        camera, covariance = look.lens.camera, look.lens.covariance
         with _naming(session, frame):
             found = estimate_poses(
-                fitted, targets, camera, 0 if covariance is None else len(covariance)
+                fitted, targets, lens.camera, 0 if lens.covariance is None else len(lens.covariance)
             )
+        if found.sigma_px > _WRONG_LENS_PX and not lens.estimated:
+            other = _other_lens(seen, frame, fitted, found.sigma_px)
+            if other is not None:
+                lens, found, said = other
+                seen = seen.noting((), (said,))
         rest = {view: it for view, it in corners.items() if view in seen.held_back}
-        held = measure_poses(rest, targets, camera, found.sigma_px)
+        held = measure_poses(rest, targets, lens.camera, found.sigma_px)
         poses |= {it.view: it for it in (*found.views, *held)}
-        seen = seen.with_camera(frame, replace(look, pixel_px=found.sigma_px))
+        seen = seen.with_camera(frame, replace(look, lens=lens, pixel_px=found.sigma_px))
         seen = seen.noting(found.rejections)
     if not poses:
         raise nothing_seen(seen)
     return replace(seen, poses=poses)
+
+
+def _other_lens(
+    seen: Observed, frame: str, corners: Mapping[int, Corners], stated_px: float
+) -> tuple[CameraResult, Poses, Finding] | None:
+    """The lens by the images, where the stated one cannot be this camera's.
+
+    Args:
+        seen: What is known.
+        frame: The camera.
+        corners: Its corners by view.
+        stated_px: What corners deviate by from any pose by the stated lens [px].
+
+    Returns:
+        It, the poses by it, and what is said; None where no lens explains the corners so much
+        better.
+    """
+    look, targets = seen.cameras[frame], tuple(seen.session.boards.values())
+    if look.resolution is None:
+        return None
+    try:
+        lens = estimate_intrinsics(corners, targets, look.resolution, look.table.model)
+    except VisioncalError:
+        # The images do not determine one, or the board is not the stated one.
+        return None
+    if lens.sigma_px > _MUCH_BETTER * stated_px:
+        return None
+    poses = estimate_poses(corners, targets, lens.camera, len(lens.covariance))
+    words = (
+        f"The stated matrix and distortion are not this camera's: by them corners deviate by "
+        f"{figure(stated_px)} px from any pose of the target, by a lens estimated of these images "
+        f"by {figure(poses.sigma_px)} px. The estimated one was taken: fx, fy, cx, cy = "
+        f"{', '.join(f'{it:.1f}' for it in lens.camera.matrix)} px."
+    )
+    step = Step(
+        "In session.toml, delete matrix and distortion, or give those of this camera: matrix is "
+        "fx, fy, cx, cy in pixels."
+    )
+    found = Finding("other_lens", words, step)
+    result = CameraResult(lens.camera, estimated=True, covariance=lens.covariance)
+    several = len(seen.session.cameras) > 1
+    return result, poses, found.of(frame if several else "")
 
 
 def _images(session: Session) -> dict[str, list[View]]:

@@ -72,6 +72,7 @@ EVIDENCE: Mapping[str, Evidence] = {
     "lost_views": Evidence(_REMARK),
     "shared_image": Evidence(_FACT),
     "other_board": Evidence(_FACT),
+    "other_lens": Evidence(_FACT),
     "untied": Evidence(_FACT),
     "too_few_stops": Evidence(_FACT),
     "board_size": Evidence(2.7e-3, _CHAIN),
@@ -335,22 +336,24 @@ def _sources(picks: Sequence[Picks], met: NeedMet | None, more_views: Step | Non
         worst = max(picks, key=lambda it: it.good_for_mm)
     else:
         worst = min(picks, key=lambda it: it.probability(met.need))
-    budget, causes = worst.budget_mm, []
+    need = None if met is None else met.need
+    in_mm, causes = need is None or need.mm is not None, []
+    budget, unit = (worst.budget_mm, "mm") if in_mm else (worst.budget_deg, "deg")
     total = budget.pop("total")
-    for name, mm in budget.items():
-        if mm**2 < _LEAST_SHARE * total**2:
+    for name, size in budget.items():
+        if size**2 < _LEAST_SHARE * total**2:
             continue
         kind, words, do = _SOURCES[name]
         rest = worst.without(name)
-        without = f"Without it 95 % of picks land within {figure(rest.good_for_mm)} mm"
+        without = f"Without it 95 % of picks land within {rest.stays_within(need)}"
         if met is not None:
             without += f", and {percent(rest.probability(met.need))} within what is needed"
         found = Finding(
             kind,
-            f"Of the {figure(total)} mm that picks err by (sigma), {figure(mm)} mm come from "
-            f"{words}.",
+            f"Of the {figure(total)} {unit} that picks err by (sigma), {figure(size)} {unit} come "
+            f"from {words}.",
             do or more_views,
-            probability=mm**2 / total**2,
+            probability=size**2 / total**2,
             without_it=f"{without}.",
             until_mm=0.0,
         )

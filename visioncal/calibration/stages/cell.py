@@ -60,6 +60,12 @@ class Cell:
     priors: tuple[FramePrior, ...] = ()
     held: tuple[Row, ...] = ()
 
+    def from_when(self, station: int) -> str:
+        """From when on, in the session's own numbers."""
+        if "stop" in self.session.columns:
+            return f"from stop {self.stops[station]} on"
+        return f"from view {self.stops[station]} on"
+
     @property
     def mount(self) -> Mount | None:
         """Where the camera of one camera and one robot is; None of a whole cell."""

@@ -1,6 +1,6 @@
 """Whether the residuals are noise: what they show beyond it, in words."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -85,8 +85,21 @@ def _step(problem: Problem, found: Move | None, crept: Drift | None) -> Move | N
     return replace(found, mahalanobis_sq=-freedom * float(np.log1p(-share)) - price)
 
 
-def doubts(found: ResidualTest, arm: ArmErrors | None, *, calibrated: bool) -> Iterator[Finding]:
-    """Finds what of a robot's residuals is no noise, and what it probably is."""
+def doubts(
+    found: ResidualTest,
+    arm: ArmErrors | None,
+    from_when: Callable[[int], str],
+    *,
+    calibrated: bool,
+) -> Iterator[Finding]:
+    """Finds what of a robot's residuals is no noise, and what it probably is.
+
+    Args:
+        found: What the residuals show.
+        arm: The errors of an arm whose joints are not known.
+        from_when: Words a stop of the fit in the session's own numbers.
+        calibrated: Whether the arm was.
+    """
     alike, moved = found.alike, found.moved
     if arm is not None and arm.is_significant and not calibrated and arm.of_links:
         size = (
@@ -112,9 +125,9 @@ def doubts(found: ResidualTest, arm: ArmErrors | None, *, calibrated: bool) -> I
         frame, stop = found.step.frame, found.step.stop
         yield Finding(
             "moved_at_once",
-            f"{_THINGS.get(frame, frame)} moved at once, before stop {stop + 1} of the "
-            f"session, by {figure(shift_mm)} mm and {figure(turn_deg)} deg; the result is between "
-            "both places.",
+            f"{_THINGS.get(frame, frame)} moved at once: {from_when(stop)}, it is "
+            f"{figure(shift_mm)} mm and {figure(turn_deg)} deg from where it was; the result is "
+            "between both places.",
             Step("Fasten it, and record again; or keep only the views before or after."),
             mahalanobis_sq=found.step.mahalanobis_sq,
         )

@@ -288,7 +288,7 @@ def met_words(findings: Findings, met: NeedMet) -> str:
     who = f" by robot {worst.robot} of what {worst.camera} sees" if len(findings.picks) > 1 else ""
     return (
         f"A pick{who} {where} lands within {' and '.join(within)} with a probability of "
-        f"{percent(met.probability)}; 95 % land within {figure(worst.good_for_mm)} mm."
+        f"{percent(met.probability)}; 95 % land within {worst.stays_within(need)}."
     )
 
 

@@ -27,6 +27,7 @@ import numpy as np
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.validate import HeldOut
 from visioncal.core.limits import NeedLimits
+from visioncal.core.number_format import figure
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import adjoint, invert, skew
 from visioncal.core.types import FloatArray, IntArray, Need
@@ -78,12 +79,33 @@ class Picks:
         """The least need of places alone that would be met [mm]."""
         return 1e3 * radius_within(self.spreads, NeedLimits.probability[0], self.freedom)
 
+    @cached_property
+    def good_for_deg(self) -> float:
+        """The least need of directions alone that would be met [deg]."""
+        turned = np.roll(self.spreads, 3, axis=(1, 2))
+        return float(np.rad2deg(radius_within(turned, NeedLimits.probability[0], self.freedom)))
+
     @property
     def budget_mm(self) -> dict[str, float]:
         """Standard deviation of the place by source, and as a `total` [mm]."""
+        return {name: 1e3 * it for name, it in self._budget(slice(3, 6)).items()}
+
+    @property
+    def budget_deg(self) -> dict[str, float]:
+        """Standard deviation of the direction by source, and as a `total` [deg]."""
+        return {name: float(np.rad2deg(it)) for name, it in self._budget(slice(3)).items()}
+
+    def _budget(self, of: slice) -> dict[str, float]:
         every = {**self.parts, "total": self.spreads}
-        squares = {name: np.trace(it[:, 3:, 3:], axis1=1, axis2=2) for name, it in every.items()}
-        return {name: 1e3 * float(np.sqrt(it.mean())) for name, it in squares.items()}
+        squares = {name: np.trace(it[:, of, of], axis1=1, axis2=2) for name, it in every.items()}
+        return {name: float(np.sqrt(it.mean())) for name, it in squares.items()}
+
+    def stays_within(self, need: Need | None) -> str:
+        """Within what 95 % of picks land, in the units of a need."""
+        within = [f"{figure(self.good_for_deg)} deg"] if need and need.deg else []
+        if need is None or need.mm or not within:
+            within.insert(0, f"{figure(self.good_for_mm)} mm")
+        return " and ".join(within)
 
 
 def need_met(need: Need | None, picks: Sequence[Picks], *, whole: bool = False) -> NeedMet | None:

@@ -223,6 +223,15 @@ def nothing_seen(seen: Observed) -> DataError:
             next_step="Bring more of the board into the images; one of 4 x 4 squares or more has "
             "corners enough.",
         )
+    outside = [it for it in seen.lost_views if "lies far outside the image" in it]
+    if 2 * len(outside) > len(seen.lost_views):
+        return DataError(
+            f"session {seen.session.name!r}: the corners lie outside the image: resolution in "
+            "[camera] is not that of the images in which they were found.",
+            culprits=outside,
+            next_step="In session.toml, give the resolution of these images, with the matrix that "
+            "belongs to it.",
+        )
     return DataError(
         f"session {seen.session.name!r}: no view shows the target.",
         next_step="Look at an image: is the board in it, and is it the one that the session "

@@ -113,6 +113,14 @@ def with_points(cells: Sequence[str]) -> tuple[str, ...]:
     return tuple(it.replace(",", ".") if _DECIMAL_COMMA.fullmatch(it) else it for it in cells)
 
 
+def separator_of(header: str) -> str:
+    """The separator of a table whose columns have names without blanks: a comma where it has any.
+
+    Spreadsheets in languages with a decimal comma write semicolons.
+    """
+    return next((it for it in ";\t" if it in header and "," not in header), ",")
+
+
 def _header_in_comments(
     before: Sequence[str], separator: str, width: int
 ) -> tuple[str, ...] | None:

@@ -11,13 +11,14 @@ from visioncal.calibration.guess import Candidate, Guess, guess_reading
 from visioncal.calibration.guess.hypothesis import Hypothesis
 from visioncal.calibration.pipeline.guess_inputs import (
     chain_poses,
+    guess_session,
     numbers_in,
     reported_or_chained,
     seen_poses,
 )
-from visioncal.core.conventions import PoseNumbers, Reading
+from visioncal.core.conventions import UNITS_M, PoseNumbers, Reading
 from visioncal.core.documents.tables import is_number
-from visioncal.core.errors import DataError
+from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import read_text_inside, read_toml
 from visioncal.core.types import MOUNTS, FloatArray, IntArray, Progress
 from visioncal.interchange.formats.assemble import assemble, pose_cells, spoken
@@ -42,6 +43,8 @@ _LARGEST_MM = 1e3 * LARGEST_M
 # Rotations with larger numbers are in degrees [rad].
 _LARGEST_RAD = 7.0
 _NO_TURN = ("0.0", "0.0", "0.0", "1.0")
+# In which a board's size is written that is too large for metres; the likeliest first.
+_BOARD_UNITS = ("mm", "cm", "inch")
 _LENGTHS = ("square_m", "square_sigma_m", "marker_m", "size_m")
 
 
@@ -117,26 +120,43 @@ class InDoubt:
 def load_in_doubt(path: Path) -> InDoubt:
     """Loads a session that is to be read anew, even where it cannot be read as it stands.
 
-    A board larger than any is taken for millimetres; positions and rotations may be in other
-    columns, or of another form, than those of sessions.
+    A board larger than any is taken for the unit with which the chain closes, else for millimetres;
+    positions and rotations may be in other columns, or of another form, than those of sessions.
 
     Raises:
         DataError: It is no session.
     """
-    file, target, notes = path / "session.toml", None, []
+    table = _otherwise_written(path) if path.is_dir() else None
+    plain, robot = (None, None) if table is None else (table.plain, table.robot)
+    file = path / "session.toml"
     name = read_toml(file, file.name).get("target") if file.is_file() else None
+    stated = {}
     if isinstance(name, str) and name.endswith(".toml"):
         stated = read_toml(path / name, name)
-        sides = (stated.get(it) for it in ("square_m", "size_m"))
-        large = [it for it in sides if isinstance(it, int | float) and LARGEST_M < it < _LARGEST_MM]
-        for side in large:
-            target = _scaled(stated, 1e-3)
-            notes = [f"{name} can only be in millimetres: {side:g} is read as {side:g} mm."]
-    table = _otherwise_written(path) if path.is_dir() else None
-    plain = None if table is None else table.plain
-    session = Session.load(path, target_document=target, table=plain)
-    session = replace(session, warnings=(*notes, *session.warnings))
-    return InDoubt(session, None if table is None else table.robot)
+    sides = (stated.get(it) for it in ("square_m", "size_m"))
+    numbers = (it for it in sides if isinstance(it, int | float))
+    side = next((it for it in numbers if LARGEST_M < it < _LARGEST_MM), None)
+    if side is None:
+        return InDoubt(Session.load(path, table=plain), robot)
+    ways = {}
+    for unit in _BOARD_UNITS:
+        if UNITS_M[unit] * side <= LARGEST_M:
+            target = _scaled(stated, UNITS_M[unit])
+            ways[unit] = Session.load(path, target_document=target, table=plain)
+    scores = {unit: _closing_score(it, robot) for unit, it in ways.items()}
+    unit = min(scores, key=lambda it: scores[it])
+    note = f"{name} cannot be in metres: {side:g} is read as {side:g} {unit}."
+    return InDoubt(replace(ways[unit], warnings=(note, *ways[unit].warnings)), robot)
+
+
+def _closing_score(session: Session, robot: PoseNumbers | None) -> float:
+    """How well the chain closes as declared; infinite where it does not."""
+    try:
+        declared = guess_session(session, robot).declared
+    except VisioncalError:
+        # The reading that is then tried says why.
+        return np.inf
+    return declared.score if declared.closes else np.inf
 
 
 @dataclass(frozen=True, eq=False)
