@@ -51,7 +51,7 @@ def walked(mistake: Mistake, folder: Path) -> Walked:
     doctored = time.perf_counter()
     done = visioncal("calibrate", session, "-o", folder / "out")
     seconds = time.perf_counter() - doctored
-    said = [it.strip() for it in done.err.splitlines() if it.strip()]
+    said = [it.strip() for it in done.said.splitlines() if it.strip()]
     is_good = done.status == 0 and any(it.startswith("good ") for it in said)
     lines = [it for it in said if it.startswith(("error:", "- "))]
     sentence = re.sub(r"^(error:|- )\s*(Most likely \([^)]*\):)?\s*", "", lines[0])
@@ -61,7 +61,7 @@ def walked(mistake: Mistake, folder: Path) -> Walked:
     if nothing and mistake.names == "-":
         after = "good"
     else:
-        after = mended(session, done.err, folder / "fixed") if mistake.is_mended else ""
+        after = mended(session, done.said, folder / "fixed") if mistake.is_mended else ""
     return Walked(done.status, sentence, seconds, is_named, after, doctored - begun)
 
 

@@ -52,8 +52,8 @@ def test_nothing_is_wrong_with_a_sound_session(sound):
     assert found.is_sound
     assert "15 of 15 images" in str(found)
     done = command("doctor", sound)
-    assert (done.status, done.out) == (0, "")
-    assert f"visioncal calibrate {sound} -o out" in done.err
+    assert (done.status, done.err) == (0, "")
+    assert f"visioncal calibrate {sound} -o out" in done.out
 
 
 @pytest.mark.parametrize("name", NAMED)
@@ -73,8 +73,8 @@ def test_what_cannot_be_read_is_refused_with_what_to_type(tmp_path, name):
     folder = broken_session(tmp_path / "session", BROKEN[name])
     refused = command("doctor", folder)
     assert refused.status in (2, 3)
-    assert re.search(BROKEN[name].names, refused.err)
-    assert mended(folder, refused.err, tmp_path / "out") == "good"
+    assert re.search(BROKEN[name].names, refused.said)
+    assert mended(folder, refused.said, tmp_path / "out") == "good"
 
 
 def test_a_board_that_is_not_declared_is_named_by_calibrate(tmp_path):

@@ -413,8 +413,8 @@ def test_the_command_says_pass_or_fail_by_its_status(pairs, tmp_path):
     assert Calibration.load(out).conditions == {"ambient_c": 20.0}
     done = visioncal("verify", pairs / "later", "--against", out, "-o", tmp_path / "check")
     assert done.status == 0
-    assert done.err.startswith("pass")
-    assert "the ambient temperature's change, 0 K (limit 10)" in done.err
+    assert done.out.startswith("pass")
+    assert "the ambient temperature's change, 0 K (limit 10)" in done.out
     written = json.loads((tmp_path / "check/verify.json").read_text())
     assert written["passed"]
     assert not written["recalibrate"]

@@ -46,15 +46,15 @@ def test_of_broken_sessions(place, name):
     said = [visioncal(*it) for it in (("doctor", "session"), ("calibrate", "session", "-o", "out"))]
     assert {it.status for it in said} <= {0, 2, 3}
     # What both print is run once.
-    assert list(failures("".join(it.err for it in said))) == []
+    assert list(failures("".join(it.said for it in said))) == []
 
 
 @pytest.mark.parametrize("poor", [{"tilt_rad": (0.0, 0.1), "views": 8}, {"views": 5}])
 def test_of_poor_motion_with_a_modelled_arm(place, poor):
     write_session(simulate(CellOptions(seed=4, **poor)), place / "session")
     done = visioncal("calibrate", "session", "-o", "out", "--need-mm", "0.02")
-    assert "visioncal plan session --add 5" in done.err
-    assert list(failures(done.err)) == []
+    assert "visioncal plan session --add 5" in done.said
+    assert list(failures(done.said)) == []
 
 
 def test_of_verify(place):
@@ -68,8 +68,8 @@ def test_of_verify(place):
         replace(whole, views=whole.views[15:last]).save(place / name)
         edit_rows(place / name, lambda rows, change=change: [*map(change, rows)])
         done = visioncal("verify", name, "--against", "out")
-        assert printed_commands(done.err), name
-        assert list(failures(done.err)) == []
+        assert printed_commands(done.said), name
+        assert list(failures(done.said)) == []
 
 
 def test_of_a_tool(place):
@@ -85,8 +85,8 @@ def test_of_a_tool(place):
     ):
         done = visioncal(*words)
         assert done.status == 0
-        assert printed_commands(done.err), done.err
-        assert list(failures(done.err)) == []
+        assert printed_commands(done.said), done.said
+        assert list(failures(done.said)) == []
 
 
 def test_of_a_whole_cell(place):
@@ -99,8 +99,8 @@ def test_of_a_whole_cell(place):
     edit_rows(place / "cell", lambda rows: [*map(pushed, rows)])
     done = visioncal("align", "cell", "-o", "out")
     assert done.status == 0
-    assert printed_commands(done.err), done.err
-    assert list(failures(done.err)) == []
+    assert printed_commands(done.said), done.said
+    assert list(failures(done.said)) == []
 
 
 @pytest.mark.slow
@@ -117,5 +117,5 @@ def test_of_dynamics(place, monkeypatch):
     exercise_session("ur5e", streams).save(place / "session")
     done = visioncal("dynamics", "identify", "session", "-o", "out")
     assert done.status == 0
-    assert "visioncal dynamics plan ur5e -o motions" in printed_commands(done.err)
-    assert list(failures(done.err)) == []
+    assert "visioncal dynamics plan ur5e -o motions" in printed_commands(done.said)
+    assert list(failures(done.said)) == []

@@ -68,7 +68,7 @@ def test_a_camera_that_was_pushed_is_named_by_its_own_pair_alone(place, bumped):
     against = ("--against", place / "out")
     seen = visioncal("verify", bumped, *against, "--camera", "left", "--robot", "a")
     assert seen.status == 3
-    assert "The camera moved by" in seen.err
+    assert "The camera moved by" in seen.out
     done("verify", bumped, *against, "--camera", "hand", "--target", "floor")
 
 

@@ -52,10 +52,9 @@ def test_calibrate_writes_three_files_and_says_how_good_it_is(rendered, tmp_path
         "report.html",
         "recording.rrd",
     }
-    assert done.out == ""
-    assert "\ngood" in f"\n{done.err}"
-    assert "flange_from_cam" in done.err
-    assert "daniilidis" in done.err
+    assert "\ngood" in f"\n{done.out}"
+    assert "flange_from_cam" in done.out
+    assert "daniilidis" in done.out
 
 
 def test_json_goes_to_stdout_and_is_the_file(rendered, tmp_path):

@@ -177,7 +177,7 @@ def test_calibrate_ends_with_1_and_the_result_where_a_drawing_fails(tmp_path, mo
     if as_json:
         assert json.loads(done.out) == json.loads((out / "calibration.json").read_bytes())
     else:
-        assert "views used" in done.err
+        assert "views used" in done.out
 
 
 def test_calibrate_leaves_out_what_is_not_wanted(tmp_path):

@@ -49,8 +49,8 @@ def test_identify_and_validate(folder, tmp_path):
     asked = ("--stream", "excite", "--stream", "sweeps")
     done = run("dynamics", "identify", folder, *asked, "-o", tmp_path / "out")
     assert done.status == 0, done.err
-    assert "good" in done.err
-    assert "the last 30 % of streams/excite.csv" in done.err
+    assert "good" in done.out
+    assert "the last 30 % of streams/excite.csv" in done.out
     result = Identified.load(tmp_path / "out")
     # Drives have rotors, which torques that were left out told; and three terms of friction.
     assert "Ia4" in result.base.model.names
@@ -125,22 +125,22 @@ def told_of(tmp_path, robot, stream):
 def test_slow_motions_are_told_to_tell_nothing_of_fast_ones(folder, tmp_path):
     done = told_of(tmp_path, "ur5e", Session.load(folder).streams["sweeps"])
     assert done.status == 0
-    assert done.err.startswith("check")
-    assert "this motion was too slow, too small or too short" in done.err
-    assert "visioncal dynamics plan" in done.err
+    assert done.out.startswith("check")
+    assert "this motion was too slow, too small or too short" in done.out
+    assert "visioncal dynamics plan" in done.out
 
 
 def test_another_robot_is_doubted(folder, tmp_path):
     done = told_of(tmp_path, "ur10e", Session.load(folder).streams["excite"])
     assert done.status == 0
-    assert "Check whether it is the robot that was recorded" in done.err
+    assert "Check whether it is the robot that was recorded" in done.out
 
 
 def test_a_robot_without_inertias_gets_base_parameters(folder, tmp_path):
     done = told_of(tmp_path, "irb120", Session.load(folder).streams["excite"])
     assert done.status == 0
     # Its axes lie otherwise than those that were recorded: no inertias explain the torques.
-    assert done.err.startswith("check")
+    assert done.out.startswith("check")
 
 
 def test_torques_in_thousandths_are_named_though_beyond_all_limits(folder, tmp_path):

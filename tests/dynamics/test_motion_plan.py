@@ -169,7 +169,7 @@ def test_a_plan_has_tables_programs_a_preview_and_all_of_it_as_json(tmp_path):
     done = plan("ur5e", out, "--rate", 100, "--harmonics", 3, "--duration", 12, "--sweep-speeds", 2)
     assert done.status == 0, done.err
     assert {it.name for it in out.iterdir()} == TABLES | PROGRAMS
-    assert "for 54 base parameters (random motions:" in done.err
+    assert "for 54 base parameters (random motions:" in done.out
     assert "warning" not in done.err
     document = json.loads((out / "plan.json").read_text(encoding="utf-8"))
     found = document["excitation"]
@@ -243,7 +243,7 @@ def test_what_cannot_be_checked_is_said(tmp_path):
     path.write_text(tomli_w.dumps(document))
     done = plan(path, tmp_path / "out", "--no-sweeps", "--harmonics", 3)
     assert done.status == 0, done.err
-    assert "warning: not checked: torques: the description of small states no inertias" in done.err
+    assert "warning: not checked: torques: the description of small states no inertias" in done.out
     written = json.loads((tmp_path / "out" / "plan.json").read_text(encoding="utf-8"))
     assert "states no inertias" in written["not_checked"][0]
 

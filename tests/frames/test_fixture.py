@@ -374,7 +374,7 @@ def fixture(folder, tool_file, *more, cad=True, **changes):
 def test_the_fixture_goes_into_a_file_beside_the_tool(tmp_path, tool_file):
     done = fixture(tmp_path, tool_file, "-o", tool_file, "--name", "jig")
     assert done.status == 0
-    assert done.err.startswith("good  base_from_jig")
+    assert done.out.startswith("good  base_from_jig")
     frames = FrameFile.load(tool_file).frames
     assert list(frames) == ["flange_from_tool", "base_from_jig"]
     # The tip's sigma, 0.2 mm, is most of it.
@@ -534,7 +534,7 @@ def test_spare_points_of_the_drawing_are_kept_in_mind(tmp_path, tool_file):
     names = (*NAMES[:5], "P7")
     done = fixture(tmp_path, tool_file, points_mm=CAD_MM[:6], names=names)
     assert done.status == 0
-    assert "it is where P6 is drawn" in done.err
+    assert "it is where P6 is drawn" in done.out
 
 
 def test_which_tool_touched(tmp_path, tool_file):

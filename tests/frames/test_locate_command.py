@@ -185,7 +185,7 @@ def test_a_frame_from_images_joins_the_calibration(capsys, tmp_path):
     calibration.save(tmp_path / "calibration.json")
     session_of(cell, shots(cell, 4)).save(tmp_path / "part")
     _placed(tcp_command, tmp_path / "part", tmp_path, name="gripper", point="0,0,-120")
-    told = capsys.readouterr().err
+    told = capsys.readouterr().out
     assert told.startswith("good  flange_from_gripper")
     assert "its point (0, 0, -120) mm" in told
     kept = Calibration.load(tmp_path).frames["flange_from_gripper"]
@@ -236,7 +236,7 @@ def test_markers_place_a_fixture_from_the_command_line(capsys, tmp_path):
     lines = [f"{name},{x},{y},0.0" for name, (x, y) in CENTRES.items()]
     cad.write_text("\n".join(["point,x_m,y_m,z_m", *lines]), encoding="utf-8")
     _placed(fixture_command, tmp_path / "plate", tmp_path, cad=cad, name="plate")
-    told = capsys.readouterr().err
+    told = capsys.readouterr().out
     assert "best fit of 4 points to cad.csv" in told
     # Markers in one plane have no hand, and the drawing's z points into the plate.
     assert "the side that the camera looked from" in " ".join(told.split())

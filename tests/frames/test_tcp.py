@@ -107,8 +107,8 @@ def test_poses_in_other_forms(tmp_path):
     back = invert(poses)
     write_poses(path, back)
     done = visioncal("tcp", path)
-    assert "--robot-inverse" in done.err
-    assert done.err.startswith("check")
+    assert "--robot-inverse" in done.out
+    assert done.out.startswith("check")
     assert off_mm(found(visioncal("tcp", path, "--robot-inverse", "--json"))) < NEAR_MM
 
 
@@ -171,13 +171,13 @@ def test_an_exchanged_name_is_named(tmp_path):
 
 
 def test_few_or_noisy_touches_are_doubted(tmp_path):
-    words = tcp(tmp_path, touched(Job(tips=3), 7).touches).err
+    words = tcp(tmp_path, touched(Job(tips=3), 7).touches).out
     assert "Only 3 touches of a point are used" in words
-    noisy = tcp(tmp_path, touched(Job(tips=12, contact_m=1e-3), 8).touches).err
+    noisy = tcp(tmp_path, touched(Job(tips=12, contact_m=1e-3), 8).touches).out
     assert "mm only (per axis; doubt begins at 0.5)" in noisy
-    flat = tcp(tmp_path, touched(Job(cone_deg=4.0), 9).touches).err
+    flat = tcp(tmp_path, touched(Job(cone_deg=4.0), 9).touches).out
     assert "Add touches tilted by 30 to 45 degrees" in flat
-    stated = tcp(tmp_path, touched(Job(), 10).touches, "--touch-noise-mm", "0.02").err
+    stated = tcp(tmp_path, touched(Job(), 10).touches, "--touch-noise-mm", "0.02").out
     assert "scatter by more than they are stated to" in stated
 
 
@@ -189,13 +189,13 @@ def test_another_order_of_the_quaternion_is_guessed(tmp_path):
         tmp_path / "touches.csv", ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"), rows
     )
     done = visioncal("tcp", path)
-    assert "Read with quaternions as w, x, y, z, the touches close to 0." in done.err
-    assert done.err.index("Most likely (98 %): Read with") < done.err.index("is known to")
-    typed = next(it.strip() for it in done.err.splitlines() if "visioncal tcp" in it)
-    assert visioncal(*shlex.split(typed)[1:]).err.startswith("good")
+    assert "Read with quaternions as w, x, y, z, the touches close to 0." in done.out
+    assert done.out.index("Most likely (98 %): Read with") < done.out.index("is known to")
+    typed = next(it.strip() for it in done.out.splitlines() if "visioncal tcp" in it)
+    assert visioncal(*shlex.split(typed)[1:]).out.startswith("good")
     right = write_poses(tmp_path / "right.csv", poses)
     done = visioncal("tcp", right, "--robot-form", "quaternion-wxyz")
-    assert "Read with quaternions as x, y, z, w, the touches close to 0." in done.err
+    assert "Read with quaternions as x, y, z, w, the touches close to 0." in done.out
 
 
 # --- What cannot be is refused.

@@ -100,7 +100,7 @@ def test_targets_are_printed_and_gaps_join_the_result(proved, monkeypatch):
     out = folder / "out"
     done = visioncal("touch-test", look, "-c", out)
     assert done.status == 0
-    assert done.err.count("hover:") == done.err.count("touch:") == 5
+    assert done.out.count("hover:") == done.out.count("touch:") == 5
     targets = json.loads(visioncal("touch-test", look, "-c", out, "--json").out)["points"]
     lifted = np.array(targets[0]["hover"][:3]) - targets[0]["touch"][:3]
     assert np.linalg.norm(lifted) == pytest.approx(0.05)
@@ -114,7 +114,7 @@ def test_targets_are_printed_and_gaps_join_the_result(proved, monkeypatch):
 
     done = visioncal("touch-test", look, "-c", out, "--gaps-mm", "3,3,3,3,3")
     assert done.status == 3
-    assert "Measure the tool's tip anew" in done.err
+    assert "Measure the tool's tip anew" in done.out
     assert not Calibration.load(out).touch_test.passed
     # At a terminal each point is asked for, until a length is typed.
     typed = io.StringIO("0.1\nnothing\n0,2\n-1\n0.1\n0.1\n0.1\n")

@@ -150,13 +150,13 @@ def test_a_changed_result_is_told(fleet, tmp_path):
     replace(found, edges={**found.edges, name: replace(edge, matrix=matrix)}).save(file)
     done = visioncal("batch", fleet / "robot_0", "-o", new, "--against", old, "--workers", 1)
     assert done.status == 0
-    assert "2 sessions: 2 good, 1 changed" in done.err
-    assert f"week_0: {name} moved by" in done.err
+    assert "2 sessions: 2 good, 1 changed" in done.out
+    assert f"week_0: {name} moved by" in done.out
     assert "What changed" in (new / "index.html").read_text()
     assert (new / "week_1" / "report.html").exists()
     nothing = visioncal("batch", fleet / "empty", "-o", tmp_path / "nothing")
     assert nothing.status == 2
-    assert "session.toml does not exist" in nothing.err
+    assert "session.toml does not exist" in nothing.out
 
 
 @pytest.mark.usefixtures("processes")

@@ -186,7 +186,7 @@ def test_a_session_about_one_axis_is_pointed_here_and_gets_its_missing_stops(one
     out = tmp_path / "plan"
     done = visioncal("plan", one_axis, "--add", 2, "-o", out, "--candidates", 60)
     assert done.status == 0, done.err
-    assert "not determined before" in done.err
+    assert "not determined before" in done.out
     found = json.loads((out / "plan.json").read_text())
     assert found["predicted"]["before"] == {"open": True}
     # The noise of a sound arm, by two stops that turn the camera otherwise.
@@ -246,7 +246,7 @@ def test_a_wish_beyond_the_candidates_is_told_and_the_plan_written(tmp_path):
     out = tmp_path / "out"
     done = plan("ur5e", out, "--stops", 4, "--wish-mm", "0.0001")
     assert done.status == 0, done.err
-    assert "cannot be reached from these candidates" in done.err
+    assert "cannot be reached from these candidates" in done.out
     assert json.loads((out / "plan.json").read_text())["wish_met"] is False
 
 

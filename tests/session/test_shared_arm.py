@@ -158,4 +158,4 @@ def test_the_command_joins_only_where_it_is_asked_to(sessions, tmp_path):
         "offsets",
     )
     assert done.status == 0, done.err
-    assert "flange_from_cam_s2" in done.err
+    assert "flange_from_cam_s2" in done.out

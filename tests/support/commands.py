@@ -33,6 +33,11 @@ class Done:
     out: str
     err: str
 
+    @property
+    def said(self) -> str:
+        """Results and messages, as a terminal shows them."""
+        return self.out + self.err
+
 
 # A wide terminal, so that messages are not folded.
 _WIDE = 300

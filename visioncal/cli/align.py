@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import messages, report_written
+from visioncal.cli.console import answers, messages, report_written
 from visioncal.cli.options import AsJson, NeedOptions, OutFolder, SessionArgument
 from visioncal.cli.pointing import naming
 from visioncal.cli.progress import shown_progress
@@ -96,7 +96,7 @@ def align_into(
 def _report(result: "Alignment") -> None:
     from visioncal.cli.summary import print_verdict, unused_words
 
-    console = messages()
+    console = answers()
     print_verdict(result.verdict, result.session_name)
     console.print(f"the cell's frame is that of {result.reference}")
     for name, edge in result.edges.items():

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import EXIT_NO_RESULT, messages
+from visioncal.cli.console import EXIT_NO_RESULT, answers
 from visioncal.cli.options import NeedOptions
 from visioncal.cli.progress import shown_progress
 from visioncal.interchange.outputs import RECORDING, REPORT
@@ -89,7 +89,7 @@ def batch_command(
 
 
 def _report(found: "Batch") -> None:
-    console, counts = messages(), found.counts
+    console, counts = answers(), found.counts
     named = ("good", "check", "bad", "failed", "kept", "changed", "standing out")
     words = ", ".join(f"{counts[it]} {it}" for it in named if counts[it])
     console.print(f"{len(found.rows)} sessions: {words}")

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from visioncal.core.errors import VisioncalError
+from visioncal.core.errors import DataError, VisioncalError
 
 # Help waits for neither.
 if TYPE_CHECKING:
@@ -28,6 +28,13 @@ def messages() -> "Console":
     return Console(stderr=True, highlight=False, soft_wrap=True)
 
 
+def answers() -> "Console":
+    """The console for results as people read them: stdout."""
+    from rich.console import Console
+
+    return Console(highlight=False, soft_wrap=True)
+
+
 def asked(question: str) -> str:
     """Asks on stderr, which leaves stdout to results, and gives the line that was typed.
 
@@ -45,12 +52,16 @@ def report_error(error: VisioncalError, *, as_json: bool) -> None:
     """Prints an error as one message to stderr, and where asked as a JSON object to stdout, too."""
     from rich.markup import escape
 
+    next_step = error.next_step
+    if not next_step and error.culprits and isinstance(error, DataError):
+        # The message says what is needed there.
+        next_step = f"Correct {error.culprits[0]}, and run the command again."
     if as_json:
         document = {
             "class": type(error).__name__,
             "message": error.message,
             "culprits": list(error.culprits),
-            "next": error.next_step,
+            "next": next_step,
         }
         typer.echo(json.dumps({"error": document}, indent=2))
     console = messages()
@@ -62,8 +73,8 @@ def report_error(error: VisioncalError, *, as_json: bool) -> None:
         console.print(f"  - {escape(culprit)}")
     if len(unsaid) > _LISTED_CULPRITS:
         console.print(f"  - and {len(unsaid) - _LISTED_CULPRITS} more")
-    if error.next_step:
-        console.print(escape(error.next_step))
+    if next_step:
+        console.print(escape(next_step))
 
 
 def report_written(written: "Written", *, quiet: bool = False, status: int = 0) -> None:

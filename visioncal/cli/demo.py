@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import messages, report_written
+from visioncal.cli.console import answers, messages, report_written
 from visioncal.cli.options import OutFolder, Seed
 from visioncal.cli.progress import shown_progress
 from visioncal.interchange.outputs import write_outputs
@@ -45,7 +45,7 @@ def demo_command(
         written = write_outputs(result, loaded, done)
     print_summary(done.calibration, verbose=True)
     truth = read_truth(session)
-    messages().print(truth_table(done.calibration, truth.transforms, truth.camera))
+    answers().print(truth_table(done.calibration, truth.transforms, truth.camera))
     for file in (session, truth_path(session)):
         messages().print(escape(f"wrote {file}"))
     report_written(written)

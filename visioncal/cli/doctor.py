@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import messages
+from visioncal.cli.console import answers
 from visioncal.cli.options import AsJson, SessionArgument
 from visioncal.cli.pointing import naming
 from visioncal.cli.progress import shown_progress
@@ -45,7 +45,7 @@ def doctor_command(
 def _print(found: "Checkup", session: Path) -> None:
     from visioncal.calibration.pipeline.checkup import next_command
 
-    console = messages()
+    console = answers()
     console.print(escape(f"{found.session}: {'; '.join(found.seen)}"))
     for at, it in enumerate(found.findings, 1):
         console.print(f"[bold]{at}.[/] {escape(it.words)}")

@@ -10,7 +10,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from visioncal.cli.console import messages, report_written
+from visioncal.cli.console import answers, messages, report_written
 from visioncal.cli.dynamics_options import MotionsArgument, StreamOptions
 from visioncal.cli.options import AsJson
 from visioncal.cli.summary import print_verdict
@@ -100,7 +100,7 @@ def _terms(words: str) -> FrictionTerms:
 
 def _report(identified: Identified, proof: Sequence[str]) -> None:
     """Prints the verdict, what was fitted, and what was found in the samples of the proof."""
-    console = messages()
+    console = answers()
     print_verdict(judge(identified), f"dynamics of {identified.robot.name}")
     for stream in identified.streams:
         left = f", {stream.left_out} torques left out" if stream.left_out else ""

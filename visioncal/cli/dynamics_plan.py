@@ -11,7 +11,7 @@ import numpy as np
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import messages, report_written
+from visioncal.cli.console import answers, report_written
 from visioncal.cli.numbers import numbers_in
 from visioncal.cli.options import AsJson, OutFolder
 from visioncal.cli.plan_options import ClearanceOptions
@@ -182,7 +182,7 @@ def dynamics_plan_command(
 
 
 def _report(plan: MotionPlan) -> None:
-    console = messages()
+    console = answers()
     for words in plan_words(plan):
         console.print(escape(words))
     for words in plan_warnings(plan):

@@ -7,7 +7,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from visioncal.cli.console import messages
+from visioncal.cli.console import answers
 from visioncal.cli.dynamics_options import (
     AgainstOption,
     MotionsArgument,
@@ -38,7 +38,7 @@ def dynamics_validate_command(
         typer.echo(json.dumps([_figures(it) for it in predictions], indent=2))
         return
     for prediction in predictions:
-        messages().print(escape("\n".join([prediction.label, *prediction.notes])))
+        answers().print(escape("\n".join([prediction.label, *prediction.notes])))
         _report_prediction(identified, prediction)
 
 
@@ -53,7 +53,7 @@ def _report_prediction(identified: Identified, prediction: Prediction) -> None:
             f"{figure(100.0 * float(found.shares[joint]))} %",
             figure(float(fitted[joint])),
         )
-    messages().print(table)
+    answers().print(table)
 
 
 def _figures(prediction: Prediction) -> dict[str, str | Sequence[float]]:

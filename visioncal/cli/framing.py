@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import messages, report_written
+from visioncal.cli.console import answers, messages, report_written
 from visioncal.cli.options import Force
 from visioncal.cli.pose_options import RobotPoseOptions
 from visioncal.core.errors import DataError
@@ -225,7 +225,7 @@ def report(place: Place, frame: "Frame", written: Written, *, as_json: bool) -> 
         typer.echo(json.dumps(frames_document({place.name: frame}), indent=2))
         report_written(written, quiet=True)
         return
-    console = messages()
+    console = answers()
     print_verdict(frame.verdict, place.name)
     x, y, z = 1e3 * frame.edge.transform.translation
     turn = ", ".join(f"{it:.3f}" for it in frame.edge.transform.rotation.as_rotvec(degrees=True))
@@ -247,13 +247,15 @@ def report(place: Place, frame: "Frame", written: Written, *, as_json: bool) -> 
     _report_before(place, frame)
     undrawn = [it.file for it in written.undrawn]
     if place.folder is not None and place.folder / RECORDING not in (*written.files, *undrawn):
-        console.print(
+        messages().print(
             escape(
                 f"{place.folder / RECORDING} was not renewed: it is missing or of another result"
             )
         )
     if not written.files:
-        console.print("nothing was written: -c joins it to a calibration, -o puts it into a file")
+        messages().print(
+            "nothing was written: -c joins it to a calibration, -o puts it into a file"
+        )
     report_written(written)
 
 

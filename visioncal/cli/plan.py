@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import messages, report_written
+from visioncal.cli.console import answers, messages, report_written
 from visioncal.cli.options import AsJson, OutFolder
 from visioncal.cli.plan_options import CellOptions, ClearanceOptions, PlanOptions, SightOptions
 from visioncal.cli.planned_cell import (
@@ -94,7 +94,7 @@ def _begin(
 
 
 def _report(plan: Plan) -> None:
-    console = messages()
+    console = answers()
     console.print(escape(f"{plan.request.purpose.name}: {summary_of(plan)}"))
     if plan.begun is not None and plan.begun.refusal:
         console.print(escape(f"  so far: {plan.begun.refusal}"))

@@ -14,7 +14,7 @@ import typer
 from rich.markup import escape
 
 from visioncal.cli.against_truth import truth_table
-from visioncal.cli.console import messages, report_written
+from visioncal.cli.console import answers, messages, report_written
 from visioncal.cli.options import AsJson, OutFolder, Seed, View
 from visioncal.cli.rehearsed import TAKING, Recorded, calibrated, planned, recorded, touched
 from visioncal.cli.summary import print_summary
@@ -185,7 +185,7 @@ class _Rehearsal:
 
     def report(self, out: Path) -> None:
         """Says it in words."""
-        say, times = messages().print, self.times_s
+        say, times = answers().print, self.times_s
         print_summary(self.calibration, verbose=False)
         truth = self.cell.truth
         say(truth_table(self.calibration, truth.transforms, truth.options.camera))
@@ -209,7 +209,7 @@ class _Rehearsal:
             f"plan {times['plan']:.0f} s, capture {times['capture']:.0f} s, calibrate "
             f"{times['calibrate']:.0f} s; in all {times['all']:.0f} s"
         )
-        say(escape(f"wrote {out / _SUMMARY}; look: visioncal review {out / 'result'}"))
+        messages().print(escape(f"wrote {out / _SUMMARY}; look: visioncal review {out / 'result'}"))
 
 
 def _report_devices(bench: Bench) -> None:

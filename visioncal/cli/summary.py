@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from rich.markup import escape
 from rich.table import Table
 
-from visioncal.cli.console import messages
+from visioncal.cli.console import answers
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import pose_difference
@@ -20,7 +20,7 @@ _SAME_REASON = 20  # more views of one reason share a line
 
 def print_verdict(verdict: Verdict, name: str) -> None:
     """Prints whether something can be trusted, and why."""
-    console, colour = messages(), _COLOURS[verdict.status]
+    console, colour = answers(), _COLOURS[verdict.status]
     console.print(f"[{colour}]{verdict.status}[/]  {escape(name)}")
     for line in verdict.top:
         console.print(f"  - {escape(line)}")
@@ -33,7 +33,7 @@ def print_verdict(verdict: Verdict, name: str) -> None:
 
 def print_steps(steps: Sequence[Step]) -> None:
     """Prints what to do next, each command on a line of its own."""
-    console = messages()
+    console = answers()
     if steps:
         console.print("What to do next:")
     for at, step in enumerate(steps, 1):
@@ -44,7 +44,7 @@ def print_steps(steps: Sequence[Step]) -> None:
 
 def print_summary(calibration: Calibration, *, verbose: bool) -> None:
     """Prints a result for people: the verdict first, then the figures it rests on."""
-    console = messages()
+    console = answers()
     print_verdict(calibration.verdict, calibration.session_name)
     for name, edge in calibration.edges.items():
         x, y, z = 1e3 * edge.transform.translation

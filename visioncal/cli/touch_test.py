@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.console import Console
 from rich.markup import escape
 
-from visioncal.cli.console import asked, messages, report_error, report_written
+from visioncal.cli.console import answers, asked, messages, report_error, report_written
 from visioncal.cli.numbers import numbers_in
 from visioncal.cli.options import AsJson, SessionArgument
 from visioncal.cli.progress import shown_progress
@@ -112,7 +113,7 @@ def touch_test_command(
         document = {"points": targets, "touch_test": to_document(proved)["touch_test"]}
         typer.echo(json.dumps(document, indent=2))
     else:
-        messages().print(escape(finding_of(test).reason))
+        answers().print(escape(finding_of(test).reason))
     report_written(written, quiet=as_json, status=0 if test.passed else _EXIT_LARGER)
 
 
@@ -145,16 +146,16 @@ def _report(
     if as_json:
         typer.echo(json.dumps({"points": targets}, indent=2))
         return
-    console = messages()
+    console = answers()
     console.print(_FORM)
     for point, target in zip(points, targets, strict=True):
-        _report_point(point, target)
+        _report_point(point, target, console)
     console.print("Enter the gaps with --gaps-mm, in this order.")
 
 
-def _report_point(point: "TouchPoint", target: dict[str, Any]) -> None:
+def _report_point(point: "TouchPoint", target: dict[str, Any], console: Console) -> None:
     """Says where a point is, and where to send the robot."""
-    console, (x, y, z) = messages(), 1e3 * point.base_m
+    x, y, z = 1e3 * point.base_m
     console.print(
         f"{point.name} at ({x:.2f}, {y:.2f}, {z:.2f}) mm, 95 % within {figure(point.radius95_mm)} "
         "mm"
@@ -171,10 +172,11 @@ def _asked(points: "Sequence[TouchPoint]", targets: Sequence[dict[str, Any]]) ->
     Raises:
         DataError: Nothing more is typed.
     """
-    messages().print(_FORM)
+    console = messages()
+    console.print(_FORM)
     gaps = []
     for point, target in zip(points, targets, strict=True):
-        _report_point(point, target)
+        _report_point(point, target, console)
         gaps.append(_gap())
     return gaps
 
@@ -215,7 +217,7 @@ def _driven(
             tip_m = (invert(point.base_from_flange) @ [*point.base_m, 1.0])[:3]
             hovering = Hovering(arm, known.robot, tip_m, point.base_m, point.normal, height_m)
             _brought(hovering, _pose(target["hover"]))
-            _report_point(point, target)
+            _report_point(point, target, messages())
             gaps.append(_gap())
     return gaps
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import messages, report_written
+from visioncal.cli.console import answers, report_written
 from visioncal.cli.options import AsJson, PartOptions
 from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
@@ -99,7 +99,7 @@ def verify_command(
 def _report(check: "Check", triggers: "Sequence[Outcome]", verdict: "Verdict") -> None:
     from visioncal.cli.summary import print_steps
 
-    console = messages()
+    console = answers()
     word, colour = ("pass", "green") if check.passed else ("fail", "red")
     name = escape(check.seen.known.session.name)
     console.print(f"[bold {colour}]{word}[/]  {name} against {escape(_named(check))}")

@@ -17,7 +17,6 @@ from visioncal.present.target_frames import target_frames
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session, View
-from visioncal.session.table import reported_matrices
 from visioncal.vision.camera import matrix_3x3
 
 # Sizes of what is drawn, as shares of the cell's size: how far the flange is from the base.
@@ -57,14 +56,14 @@ class Scene:
     ) -> "Scene":
         """Collects the poses of the flange, from the evidence or else as they were recorded."""
         poses: dict[int, FloatArray] = {}
-        # Of several robots, each pose is in a base of its own, which nothing places.
-        reported = {} if session.is_network else reported_matrices(session.views)
         for view in session.views:
             seen = evidence.get(view.number)
+            reported = view.base_from_flange()
             if seen is not None and seen.base_from_flange is not None:
                 poses[view.number] = seen.base_from_flange
-            elif view.number in reported:
-                poses[view.number] = reported[view.number]
+            elif reported is not None and not session.is_network:
+                # Of several robots, each pose is in a base of its own, which nothing places.
+                poses[view.number] = reported.as_matrix()
         distances = [float(np.linalg.norm(pose[:3, 3])) for pose in poses.values()]
         size_m = float(np.median(distances)) if distances else 1.0
         if calibration is None:
