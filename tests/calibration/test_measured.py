@@ -28,6 +28,9 @@ NOISE = np.repeat([2e-4, 1e-4], 3)
 POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 
 
+PRIOR = {"z_m": float(X[2, 3]), "sigma_m": SIGMA_M}
+
+
 def scara(seed: int, prior: dict[str, dict[str, float]], views: int = 12) -> Session:
     """A session of four axes: the tool turns about z alone, and exactly so."""
     rng = np.random.default_rng(seed)
@@ -59,6 +62,20 @@ def run(cell: Cell, prior: dict[str, dict[str, float]]) -> RunState:
         if stage.name not in ("robot", "detect"):
             known = stage.run(known)
     return known
+
+
+@pytest.mark.parametrize(
+    "name", ["flange_from_cam", "flange_from_cam_hand", "flange_a_from_cam_hand"]
+)
+def test_the_one_camera_and_robot_may_have_names(name):
+    plain = calibrate(scara(0, {"flange_from_cam": PRIOR}))
+    session = scara(0, {name: PRIOR})
+    named = {"cameras": {"hand": {}}, "robots": {"a": {}}}
+    rows = [[*(view.cell(it) for it in session.columns), "a", "hand"] for view in session.views]
+    columns = [*session.columns, "robot", "camera"]
+    found = calibrate(Session.assemble(session.document | named, columns, rows, MemoryImages({})))
+    edge = next(iter(found.edges))
+    assert found.edges[edge].matrix == pytest.approx(plain.edges["flange_from_cam"].matrix)
 
 
 def test_four_axes_give_a_result_with_a_measured_height_and_none_without():

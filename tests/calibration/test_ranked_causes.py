@@ -194,6 +194,8 @@ def test_findings_are_kept_and_name_the_session(tmp_path: Path) -> None:
     assert command in named.reasons[-1]
     folder = tmp_path / "cell"
     assert with_paths(GUESS, folder) == f"visioncal convert {folder} {folder}-fixed --guess --yes"
+    again = with_paths("visioncal calibrate SESSION -o NEW", folder, tmp_path / "out.2")
+    assert again.endswith(f"-o {tmp_path}/out.2-new")
     recording = tmp_path / "cell.rrd"
     recording.touch()
     assert with_paths(GUESS, recording).endswith(f"cell.rrd {folder}-fixed --guess --yes")

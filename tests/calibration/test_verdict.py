@@ -164,6 +164,15 @@ def test_a_scatter_that_settles_it_is_not_blamed_on_the_motion():
     assert "units or conventions" in verdict.reasons[0]
 
 
+def test_what_a_sensors_noise_makes_is_not_unexplained():
+    """A small board far away scatters by 0.36 deg where its pixels do."""
+    seen = {"held_out": Rms(0.1, 0.36), "rms": Rms(0.1, 0.35)}
+    assert judge(changed(SOUND, **seen, noise=Rms(0.1, 0.33))).status == "good"
+    # Half as much again is beyond chance.
+    verdict = judge(changed(SOUND, **seen, noise=Rms(0.1, 0.2)))
+    assert verdict.findings[0].kind == "unexplained"
+
+
 def test_what_settles_it_comes_first():
     verdict = judge(changed(SOUND, pixel_px=4.0, warnings=remarks(("Something.",)), stops=8))
     assert verdict.reasons[0].startswith("Corners deviate")

@@ -233,6 +233,17 @@ def test_two_exchanged_names_are_named():
         drawn(CAD_MM[[0, 1, 5, 4]], [NAMES[it] for it in few])
 
 
+def test_exchanged_names_are_no_size_of_the_part():
+    """The five points that are left fit their drawing through its middle, too."""
+    near = [[4, 135, 15], [-107, 135, 23], [-56, -23, 7], [98, -27, 20], [15, -142, 10]]
+    points = np.array([*near, [76, 11, 13], [-51, 87, 38]])
+    names = tuple(f"P{it}" for it in range(7))
+    swapped = ("P0", "P4", "P2", "P3", "P1", "P5", "P6")
+    frame = drawn(points, swapped, cad_mm=points, cad_names=names)
+    assert "is its name exchanged?" in frame.verdict.reasons[0]
+    assert "times as large as drawn" not in " ".join(frame.verdict.reasons)
+
+
 def test_a_point_that_was_touched_several_times_counts_as_one():
     frame = drawn(np.vstack([CAD_MM, CAD_MM[:4]]), NAMES + NAMES[:4])
     assert frame.method == "best fit of 12 touches of 8 points to cad.csv"

@@ -148,6 +148,15 @@ def test_saving_keeps_everything(folder: Path, tmp_path: Path) -> None:
     assert [entry.name for entry in copy.parent.iterdir()] == ["copy"]
 
 
+def test_a_session_is_not_saved_as_a_folder_that_looks_like_a_recording(
+    folder: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(DataError, match="saved as a folder") as refused:
+        Session.load(folder).save(tmp_path / "copy.rrd")
+    assert "visioncal convert FOLDER copy.rrd" in refused.value.next_step
+    assert not (tmp_path / "copy.rrd").exists()
+
+
 def test_a_saved_session_needs_no_other_file(folder: Path, tmp_path: Path) -> None:
     shutil.move(folder / "board.toml", tmp_path / "shared board.toml")
     robot = 'schema=1\nconvention="standard"\n[[joint]]\na_m=0\nd_m=1\nalpha_rad=0.5\n'

@@ -237,7 +237,8 @@ def with_paths(
     """Fills the paths of a run into a command; see `Verdict.with_paths`."""
     folder, result = Path(session), Path(out or "out")
     fixed = _free(f"{folder.with_suffix('') if folder.is_file() else folder}-fixed")
-    new = f"{result.parent if result.suffix else result}-new"
+    is_file = result.suffix in (".json", ".rrd")
+    new = f"{result.parent if is_file else result}-new"
     paths = {"SESSION": str(session), "FIXED": fixed, "OUT": str(out) or "out", "NEW": new}
     words = {name: shlex.quote(it) for name, it in paths.items()} | {AGAIN: shlex.join(again)}
     return _PATH.sub(lambda found: words[found[0]], command)

@@ -226,7 +226,8 @@ def _as_scaled(scaled: GroupInliers[Placed], fit: GroupFit[Placed]) -> GroupInli
 def _scale_of(fit: GroupFit[Placed]) -> Scale:
     value, sigma = fit.state.scale, float(np.sqrt(fit.covariance[6, 6]))
     chance = t_chance((value - 1.0) / sigma, max(fit.freedom, 1))
-    return Scale(value, sigma, chance < _FALSE_ALARM)
+    # Points through their middle are no drawing of another size: exchanged names fit like that.
+    return Scale(value, sigma, value > 0.0 and chance < _FALSE_ALARM)
 
 
 def _check_numbering(pairs: PointPairs, numbering: Numbering, agree: Collection[str]) -> None:

@@ -78,6 +78,11 @@ class Declaration(TableModel):
         return bool(self.frames) or any(len(it) > 1 for it in several)
 
     @property
+    def has_names(self) -> bool:
+        """Whether frames have the names of cameras, robots or instruments."""
+        return bool(self.frames or self.cameras or self.robots or self.instruments)
+
+    @property
     def only_camera(self) -> CameraTable | None:
         """The camera where there is one; None without, or with several."""
         return self.camera if len(self.cameras) != 1 else next(iter(self.cameras.values()))
@@ -262,7 +267,7 @@ def declaration_warnings(declaration: Declaration, label: str) -> Iterator[str]:
     yield from _unknown_keys(declaration, "", label)
     edges = [*_EDGES, *(f"{it}_{name}" for it in _EDGES for name in declaration.targets)]
     for edge in declaration.prior:
-        if not declaration.is_network and edge not in edges:
+        if not declaration.has_names and edge not in edges:
             hint = did_you_mean(edge, edges)
             yield f"{label}: prior.{edge} is no unknown edge and is ignored. {hint}".strip()
     if declaration.camera is not None:

@@ -317,8 +317,16 @@ class Session:
         stay names. Image files are copied byte by byte; missing ones stay missing.
 
         Raises:
-            DataError: The folder exists and is not empty, or cannot be written.
+            DataError: The folder exists and is not empty, or cannot be written; or a recording is
+                named.
         """
+        if Path(folder).suffix == ".rrd":
+            raise DataError(
+                f"{folder}: a session is saved as a folder.",
+                culprits=[str(folder)],
+                next_step="Save it as a folder, and convert that: visioncal convert FOLDER "
+                f"{Path(folder).name}.",
+            )
         document, texts = placed_files(
             self.declaration, self.document, self.target_document, self.robot_document
         )

@@ -32,9 +32,10 @@ from visioncal.estimation.observability import (
     directions,
     edge_directions,
 )
+from visioncal.estimation.parts import Observations
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.tree import Tree
-from visioncal.results import HELD_BACK, Edge, Sight
+from visioncal.results import HELD_BACK, Edge, Rms, Sight
 from visioncal.results.whole import holdout_rms, left_out_rms, rms_of, view_results
 
 
@@ -50,7 +51,7 @@ def findings_of(known: RunState) -> Findings:
         *solved.found_of_looks(answer.covariance),
     ]
     return Findings(
-        _pairs(tied, explained, alone=known.mount is not None),
+        _pairs(tied, explained, answer.problem.observations, alone=known.mount is not None),
         _sensors(tied, answer.sigmas, solved.shown_px, known.spared.keys() | known.held_back),
         _arms(answer),
         worst,
@@ -149,7 +150,9 @@ def _clock_words(known: RunState) -> Iterator[str]:
             )
 
 
-def _pairs(sights: Sequence[Sight], explained: Collection[int], *, alone: bool) -> list[Pair]:
+def _pairs(
+    sights: Sequence[Sight], explained: Collection[int], used: Observations, *, alone: bool
+) -> list[Pair]:
     """What each camera saw of each target; of one camera and one robot, all that there is."""
     rows: dict[tuple[str, str], list[Sight]] = {}
     for it in sights:
@@ -166,9 +169,21 @@ def _pairs(sights: Sequence[Sight], explained: Collection[int], *, alone: bool) 
                 if _disagrees(it) and it.view not in explained
             ],
             name=f"{seer} of {seen}" if len(rows) > 1 else "",
+            noise=_noise_of(used, mine),
         )
         for (seer, seen), mine in rows.items()
     ]
+
+
+def _noise_of(used: Observations, sights: Sequence[Sight]) -> Rms:
+    """What the noise of a sensor makes of what it saw in these sights, by their covariance."""
+    seen = {(it.seer, it.seen) for it in sights}
+    mine = [it in seen for it in zip(used.observers, used.observed, strict=True)]
+    if not any(mine):
+        return Rms(0.0, 0.0)
+    squares = np.diagonal(used.covariance[mine], axis1=1, axis2=2).reshape(-1, 2, 3).sum(axis=2)
+    turned, shifted = np.median(squares, axis=0)
+    return Rms(1e3 * float(np.sqrt(shifted)), float(np.rad2deg(np.sqrt(turned))))
 
 
 def _disagrees(sight: Sight) -> bool:

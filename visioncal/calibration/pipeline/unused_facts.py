@@ -14,7 +14,8 @@ def not_used(known: RunState) -> Iterator[Finding]:
         return
     names = pair_edges(session)
     for edge in session.declaration.prior:
-        if edge in names and known.solver == "joint":
+        is_used = edge in names or session.declaration.has_names
+        if is_used and known.solver == "joint":
             continue
         reason = f"what is unknown of this session is {' and '.join(names)}"
         if known.solver != "joint":

@@ -19,6 +19,7 @@ from visioncal.results import HELD_BACK
 from visioncal.session import Observation, Session, frame_name
 from visioncal.session.kinds import is_seen
 from visioncal.session.single import is_whole_cell
+from visioncal.session.tables import PriorTable
 
 _CELL = "cell"
 
@@ -143,14 +144,28 @@ def read_cell(seen: Observed) -> Cell:
         number = it.view.number if it.view.stop is None else it.view.stop
         stations.setdefault(it.station, number)
     tree = Tree(_CELL, branches)
-    tables = session.declaration.prior
-    if not is_whole_cell(session):
-        tables = {name: it for name, it in tables.items() if name in pair_edges(session)}
-    priors = priors_of(tables, tree)
+    priors = priors_of(_tables_of_priors(session, tree), tree)
     poses = _poses(seen, observations)
     cell = Cell(session, tree, "", poses, tuple(rows), reasons, priors=priors, held=held)
     cell = replace(cell, stops=tuple(stations[it] for it in sorted(stations)))
     return cell.held_to(_reference(cell))
+
+
+def _tables_of_priors(session: Session, tree: Tree) -> dict[str, PriorTable]:
+    """What is stated beforehand, by the full names of its frames.
+
+    Of one camera and one robot that have no names, it is of an unknown edge, or not used. Where
+    they have names, flange and cam mean the only ones.
+    """
+    tables = session.declaration.prior
+    if not session.declaration.has_names:
+        return {name: it for name, it in tables.items() if name in pair_edges(session)}
+
+    def full(frame: str) -> str:
+        alike = [it for it in tree.branches if it.startswith(f"{frame}_")]
+        return alike[0] if frame not in tree.branches and len(alike) == 1 else frame
+
+    return {"_from_".join(map(full, name.split("_from_"))): it for name, it in tables.items()}
 
 
 def pair_edges(session: Session) -> tuple[str, ...]:

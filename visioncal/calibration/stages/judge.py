@@ -1,7 +1,7 @@
 """Whether a result can be trusted, in plain sentences: of one camera and robot, or of many."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -41,6 +41,9 @@ _CAUSES: Mapping[Mount, str] = {
     "conventions of the poses",
 }
 # So many views in a row are not left out by chance.
+# Views that disagree by less than so many times what their sensor's noise makes are explained: a
+# small board far away is seen no better.
+_OF_NOISE = 1.5
 _LEAST_RUN = 3
 
 
@@ -55,6 +58,7 @@ class Pair:
         holdout: Residuals of those held back by the session; None where there are none.
         disagreeing: Those whose robot pose and image do not belong together.
         name: Both, by name; empty where there are no others.
+        noise: What the sensor's own noise makes of its views.
     """
 
     views: Sequence[ViewResult]
@@ -63,6 +67,7 @@ class Pair:
     holdout: Rms | None = None
     disagreeing: Sequence[Rejection] = ()
     name: str = ""
+    noise: Rms = field(default_factory=lambda: Rms(0.0, 0.0))
 
 
 @dataclass(frozen=True)
@@ -369,13 +374,14 @@ def _pair_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Find
         held = pair.held_out
         beyond = [
             (f"{figure(value)} {unit} (doubt begins at {check:g})", value > bad)
-            for value, unit, (check, bad) in zip(
+            for value, unit, (check, bad), noise in zip(
                 (held.mm, held.deg),
                 ("mm", "deg"),
                 (limits.scatter_mm, limits.scatter_deg),
+                (pair.noise.mm, pair.noise.deg or 0.0),
                 strict=True,
             )
-            if value is not None and value > check
+            if value is not None and value > max(check, _OF_NOISE * noise)
         ]
         if beyond:
             away = " and ".join(it for it, _ in beyond)
