@@ -17,6 +17,7 @@ from visioncal.live.planning.information import worlds_of
 from visioncal.live.planning.purposes import PURPOSES
 from visioncal.live.planning.recorded import SoFar, begin
 from visioncal.results import Calibration
+from visioncal.robot import Robot
 from visioncal.session import MemoryImages, Session
 from visioncal.simulation import Cell, CellOptions, Second, simulate
 
@@ -62,6 +63,31 @@ def run(cell: Cell, prior: dict[str, dict[str, float]]) -> RunState:
         if stage.name not in ("robot", "detect"):
             known = stage.run(known)
     return known
+
+
+def test_an_arm_that_cannot_tilt_is_not_asked_to():
+    """Its model is known: parallel axes, as a SCARA's."""
+    joint = {"a_m": 0.4, "d_m": 0.1, "alpha_rad": 0.0}
+    last = {**joint, "a_m": 0.1}
+    model = {"schema": 1, "name": "scara", "convention": "standard"} | {
+        "joint": [joint, joint, last]
+    }
+    robot, plain = Robot.from_document(model), scara(0, {})
+    q = np.random.default_rng(1).uniform(-1.5, 1.5, (len(plain.views), robot.joint_count))
+    rows = []
+    for at, flange in enumerate(robot.base_from_flange(q)):
+        seen = invert(flange @ X) @ Z
+        pose = [*seen[:3, 3], *Rotation.from_matrix(seen[:3, :3]).as_quat()]
+        rows.append([str(at), *(repr(float(it)) for it in (*q[at], *pose))])
+    columns = ["view", "q1_rad", "q2_rad", "q3_rad", *(f"cft_{it}" for it in POSE)]
+    document = {**plain.document, "robot": {"model": "arm.toml"}}
+    session = Session.assemble(document, columns, rows, MemoryImages({}), robot_document=model)
+    with pytest.raises(DegenerateError) as refused:
+        calibrate(session)
+    assert refused.value.next_step == (
+        "This arm cannot tilt: measure that offset for [prior.flange_from_cam], as z_m and sigma_m "
+        "in session.toml."
+    )
 
 
 @pytest.mark.parametrize(

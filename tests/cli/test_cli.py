@@ -110,6 +110,34 @@ def test_an_error_as_json_has_its_parts(poor, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_a_result_in_the_place_of_a_session_names_its_recording(tmp_path):
+    (tmp_path / "recording.rrd").touch()
+    done = visioncal("calibrate", tmp_path, "-o", tmp_path / "out")
+    assert done.status == 2
+    assert f"name {tmp_path}/recording.rrd" in done.err
+
+
+def test_nothing_is_rendered_for_a_folder_that_is_not_empty(tmp_path, monkeypatch):
+    (tmp_path / "mine.txt").touch()
+    monkeypatch.setattr("visioncal.cli.simulate.simulate", None)
+    done = visioncal("simulate", tmp_path)
+    assert done.status == 2
+    assert "exists and is not empty" in done.err
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("--need-mm", "abc"), ("--solver", "foo"), ("--threads", "0"), ("--level", "foo")],
+)
+def test_a_wrong_option_is_an_error_as_json(option, value, poor, tmp_path):
+    done = visioncal("calibrate", poor, "-o", tmp_path / "out", "--json", option, value)
+    assert done.status == 2
+    error = json.loads(done.out)["error"]
+    assert option.strip("-") in error["message"]
+    assert option.strip("-") in error["culprits"][0]
+    assert error["next"]
+
+
 # Options that each command with --json needs before it can look for its input.
 NEEDED = {
     "correct": ["-c", "nowhere"],

@@ -14,6 +14,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command, get_group
 
+from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 
 # As a shell reports a program that SIGINT ended.
@@ -26,6 +27,21 @@ class PlainCommand(TyperCommand):
     It knows no markup, which takes `[mm]` for a style, and no columns beside each other, for which
     a terminal of 80 columns has no room.
     """
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:  # noqa: ANN401 - typer's own
+        """Reads its options; with `--json`, a wrong value is an error as all others."""
+        wants_json = "--json" in args
+        try:
+            return super().parse_args(ctx, args)
+        except typer.BadParameter as error:
+            if not wants_json:
+                raise
+            named = [*error.param.opts] if error.param else []
+            raise DataError(
+                error.format_message(),
+                culprits=named[-1:],
+                next_step=f"{ctx.command_path} --help lists what it takes.",
+            ) from None
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 - typer's own types
         """Runs it; where Ctrl-C ends it, says which files it leaves behind."""

@@ -11,6 +11,7 @@ from visioncal.cli.progress import shown_progress
 from visioncal.cli.simulated import given_for
 from visioncal.cli.simulated_cell import CENTRE_M, Along, Read, exercise_options, whole_cell
 from visioncal.core.types import CameraMount
+from visioncal.session.saving import refuse_filled
 from visioncal.simulation import (
     ARMS,
     CAMERAS,
@@ -190,6 +191,8 @@ def simulate_command(
         camera_moved_m=1e-3 * camera_moved_mm,
         seed=seed,
     )
+    # Rendering takes its time.
+    refuse_filled(folder.absolute())
     if cell is not None:
         along = Along(touches, instrument, torques, currents, payload_kg)
         whole_cell(cell, folder, options, given, along, images=images)

@@ -155,7 +155,8 @@ def find_arm_errors(
     Returns:
         The errors; None where white noise explains the residuals about as well.
     """
-    if len(stops_of(problem, robot)) < _FEWEST_STOPS:
+    # An arm whose links all look like its frames, as one with parallel axes, has no columns.
+    if len(stops_of(problem, robot)) < _FEWEST_STOPS or not basis.shape[2]:
         return None
     levels, unlikely = white or robot_levels(problem, state, noise, from_above=True)
     size = basis.shape[2]

@@ -45,6 +45,9 @@ BODY_KEYS = ("body_radius_m", "body_offset_m")
 # What a joint's table may say of its link and its drive: all that is no geometry.
 LINK_KEYS = (*BODY_KEYS, *MASS_KEYS, INERTIA_KEY, *RATE_KEYS)
 
+# Axes of a calibrated arm are parallel to this share.
+_PARALLEL = 0.05
+
 
 @dataclass(frozen=True, eq=False)
 class Robot:
@@ -216,6 +219,13 @@ class Robot:
             DataError: The number of joints differs from the robot's.
         """
         return self.axis_jacobian(q) * self.chain.jacobian(np.asarray(q, dtype=float))[:, None, :]
+
+    @property
+    def can_tilt(self) -> bool:
+        """Whether the flange turns about more than one direction: arms of four axes do not."""
+        axes = self.joint_jacobian(np.zeros((1, self.joint_count)))[0, :3]
+        largest, second, _ = np.linalg.svd(axes, compute_uv=False)
+        return bool(second > _PARALLEL * largest)
 
     def function_jacobian(self, q: FloatArray) -> FloatArray:
         """How the flange moves when the joints' functions change.

@@ -16,6 +16,20 @@ from visioncal.session.images import ImageStore, inside_path
 from visioncal.vision.targets import rig_csv
 
 
+def refuse_filled(folder: Path) -> None:
+    """Refuses a folder that a session cannot be written to.
+
+    Raises:
+        DataError: It exists and is not empty.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise DataError(
+            f"{folder} exists and is not empty; a session is written to a new folder.",
+            culprits=[str(folder)],
+            next_step="Choose another name, or remove it first.",
+        )
+
+
 def write_folder(
     folder: Path, texts: Mapping[str, str], images: ImageStore, paths: Sequence[str]
 ) -> None:
@@ -31,12 +45,7 @@ def write_folder(
         DataError: The folder exists and is not empty, or cannot be written.
     """
     folder = folder.absolute()
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise DataError(
-            f"{folder} exists and is not empty; a session is written to a new folder.",
-            culprits=[str(folder)],
-            next_step="Choose another name, or remove it first.",
-        )
+    refuse_filled(folder)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with aside_folder(folder.parent) as (aside, _):

@@ -119,6 +119,13 @@ class Session:
                 "recording, is needed.",
                 culprits=[str(path)],
             )
+        recording = path / "recording.rrd"
+        if recording.is_file() and not (path / "session.toml").exists():
+            raise DataError(
+                f"{path} is no session, but a result.",
+                culprits=[str(path)],
+                next_step=f"Its recording is the session: name {recording}.",
+            )
         document = parse_toml(
             read_text_inside(path, "session.toml", MOST_TOML_BYTES), "session.toml"
         )

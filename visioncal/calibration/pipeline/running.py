@@ -18,7 +18,7 @@ from visioncal.calibration.stages.cause_ranking import with_misread, with_other_
 from visioncal.calibration.stages.dense import Dense
 from visioncal.calibration.stages.handeye import SOLVER_NAMES
 from visioncal.calibration.stages.kinematics import check_level
-from visioncal.calibration.stages.next_views_hint import with_proposal
+from visioncal.calibration.stages.next_views_hint import of_arm_that_cannot_tilt, with_proposal
 from visioncal.calibration.stages.pictures import other_board, pairing
 from visioncal.core.choices import CONVENTIONS, Convention, SolverName
 from visioncal.core.errors import DataError, VisioncalError
@@ -94,10 +94,13 @@ def known_at_first(
     if threads is not None and threads < 1:
         raise DataError(f"threads is {threads}; at least 1 is needed.", culprits=["--threads"])
     if solver not in SOLVER_NAMES:
-        raise DataError(f"solver {solver!r} is not one of {', '.join(SOLVER_NAMES)}.")
+        raise DataError(
+            f"solver {solver!r} is not one of {', '.join(SOLVER_NAMES)}.", culprits=["solver"]
+        )
     check_level(level)
     if convention is not None and convention not in CONVENTIONS:
-        raise DataError(f"convention {convention!r} is not one of {', '.join(CONVENTIONS)}.")
+        words = f"convention {convention!r} is not one of {', '.join(CONVENTIONS)}."
+        raise DataError(words, culprits=["convention"])
     loaded = session if isinstance(session, Session) else Session.load(session)
     known = RunState(
         loaded,
@@ -207,11 +210,14 @@ def _with_hint(error: VisioncalError, seen: RunState | None) -> VisioncalError:
     if seen is None:
         return error
     hint = reading_hint(seen)
-    (planned,) = with_proposal([error.next_step], modelled=seen.robot is not None)
     if hint is not None:
         message = f"{hint.words} As declared: {error.message}"
         return type(error)(message, culprits=error.culprits, next_step=str(hint.do))
-    next_step = planned if seen.scenes else error.next_step
+    robot, next_step = seen.robot, error.next_step
+    if robot is not None and not robot.can_tilt:
+        next_step = of_arm_that_cannot_tilt(next_step)
+    elif seen.scenes:
+        (next_step,) = with_proposal([next_step], modelled=robot is not None)
     return type(error)(error.message, culprits=error.culprits, next_step=next_step)
 
 

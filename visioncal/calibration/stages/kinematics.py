@@ -305,7 +305,7 @@ def check_level(asked: str) -> None:
     """
     levels = (*ASKED, "hand-eye")
     if asked not in levels:
-        raise DataError(f"level {asked!r} is not one of {', '.join(levels)}.")
+        raise DataError(f"level {asked!r} is not one of {', '.join(levels)}.", culprits=["level"])
 
 
 def check_asked(asked: str, *, can: bool, misread: str = "") -> None:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 # Advice to add stops or views of any kind; of the first, those that are about the arm.
 _ADD = re.compile(r"\bAdd (?:stops|views|\d+ or more)\b")
+_OR_MEASURED = re.compile(r".*Where the arm cannot tilt, (measure that offset for \S+)\..*")
 _ARM = re.compile(r"\bAdd (?:stops|views in which the arm)\b")
 
 
@@ -20,6 +21,12 @@ def with_proposal(sentences: Sequence[str], *, modelled: bool) -> tuple[str, ...
             pointed = f"{sentence} {_proposal(' '.join(sentences), modelled)}"
             return (*sentences[:at], pointed, *sentences[at + 1 :])
     return tuple(sentences)
+
+
+def of_arm_that_cannot_tilt(advice: str) -> str:
+    """The same advice without views that no such arm can reach, where a measured offset helps."""
+    words = r"This arm cannot tilt: \1, as z_m and sigma_m in session.toml."
+    return _OR_MEASURED.sub(words, advice)
 
 
 def _proposal(words: str, modelled: bool) -> str:
