@@ -315,7 +315,7 @@ def test_what_is_advised_runs_as_it_is_printed_and_mends_it(name, tmp_path, monk
     pairs_session(planted).save(Path("my cell"))
     done = visioncal_command("calibrate", "my cell", "-o", "out")
     assert done.status == 0, done.err
-    first = done.err.split("What to do next:")[1].splitlines()[2].strip()
+    first = done.said.split("What to do next:")[1].splitlines()[2].strip()
     assert first == (
         "visioncal convert 'my cell' 'my cell-fixed' --guess --yes"
         " && visioncal calibrate 'my cell-fixed' -o out"

@@ -170,7 +170,7 @@ def test_a_plan_has_tables_programs_a_preview_and_all_of_it_as_json(tmp_path):
     assert done.status == 0, done.err
     assert {it.name for it in out.iterdir()} == TABLES | PROGRAMS
     assert "for 54 base parameters (random motions:" in done.out
-    assert "warning" not in done.err
+    assert "warning" not in done.out
     document = json.loads((out / "plan.json").read_text(encoding="utf-8"))
     found = document["excitation"]
     assert len(found["base_parameters"]) == 54

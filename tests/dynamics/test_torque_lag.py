@@ -101,7 +101,7 @@ def test_late_torques_are_named_and_taken_earlier(sessions, tmp_path):
         asked = ("--stream", "excite", "--validate-on", "fresh", "-o", tmp_path / str(lag_s))
         done = run("dynamics", "identify", place, *asked)
         assert done.status == 0, done.err
-        results[lag_s] = Identified.load(tmp_path / str(lag_s)), done.err
+        results[lag_s] = Identified.load(tmp_path / str(lag_s)), done.out
     assert results[0.0][0].lag is None
     assert "lag" not in json.loads((tmp_path / "0.0" / "dynamics.json").read_text())
     # Late by a little it is a note, by much a reason to look for the cause.
@@ -121,7 +121,7 @@ def test_late_torques_of_another_day_are_taken_earlier_too(sessions, tmp_path):
     asked = ("--stream", "excite", "--validate-on", "fresh", "-o", tmp_path)
     assert run("dynamics", "identify", sessions[0.0], *asked).status == 0
     told = run("dynamics", "validate", sessions[0.08], "--against", tmp_path, "--stream", "fresh")
-    assert "The torques lag the angles by 80 ms" in told.err
+    assert "The torques lag the angles by 80 ms" in told.out
     asked = ("--against", tmp_path, "--stream", "fresh", "--json")
     done = run("dynamics", "validate", sessions[0.08], *asked)
     (figures,) = json.loads(done.out)

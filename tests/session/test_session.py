@@ -148,6 +148,14 @@ def test_saving_keeps_everything(folder: Path, tmp_path: Path) -> None:
     assert [entry.name for entry in copy.parent.iterdir()] == ["copy"]
 
 
+def test_images_of_another_kind_are_to_be_converted(folder: Path) -> None:
+    views = folder / "views.csv"
+    views.write_text(views.read_text().replace(".png", ".bmp"))
+    with pytest.raises(DataError) as refused:
+        Session.load(folder)
+    assert refused.value.next_step == "Convert the images without loss, to png."
+
+
 def test_a_session_is_not_saved_as_a_folder_that_looks_like_a_recording(
     folder: Path, tmp_path: Path
 ) -> None:

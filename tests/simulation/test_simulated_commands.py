@@ -89,7 +89,7 @@ def test_a_camera_that_was_knocked_fails_the_check(seen, place):
     done("simulate", place / "later", "--views", 4, "--recording", 2, "--camera-moved-mm", 1)
     checked = visioncal("verify", place / "later", "--against", out)
     assert checked.status == 3
-    assert "The camera moved by" in checked.err
+    assert "The camera moved by" in checked.out
 
 
 def test_a_second_board_is_placed_along(place):

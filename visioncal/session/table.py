@@ -16,7 +16,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import READ_AGAIN
 from visioncal.session import columns as known
-from visioncal.session.images import image_path
+from visioncal.session.images import NOT_READ, TO_PNG, image_path
 from visioncal.session.loads import SIDES, load_problems
 
 # Two days of a stop every ten seconds, which a calibration refuses within 2 GB of memory; and more
@@ -260,6 +260,8 @@ def problems_error(problems: Sequence[Problem]) -> DataError:
         step = ""
         if len(columns) == 1 and "" not in columns:
             step = f"Correct column {', '.join(columns)} of {where.partition(',')[0]}."
+    if all(NOT_READ in it.words for it in problems):
+        step = TO_PNG
     shown = problems[:_SHOWN_PROBLEMS]
     more = len(problems) - len(shown)
     lines = [f"{problem.place}: {problem.words}." for problem in shown]

@@ -20,7 +20,7 @@ from visioncal.calibration.stages.judge import is_scattered
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.errors import VisioncalError
 from visioncal.core.types import FloatArray, Progress
-from visioncal.core.verdict import Finding, Step
+from visioncal.core.verdict import READ_AGAIN, Finding, Step
 from visioncal.estimation.chain import chain
 from visioncal.robot import Robot
 from visioncal.session import Session
@@ -191,9 +191,18 @@ def readings_in_cell(known: RunState) -> Iterator[Finding]:
                 continue
             hint = None if closes_as_declared(part) else reading_hint(part)
             if hint is not None:
-                words = f"Robot {robot}: {hint.words}"
-                do = Step(f"Correct the rows of robot {robot} in views.csv, and calibrate again.")
-                yield replace(hint, words=words, do=do)
+                if hint.do is READ_AGAIN:
+                    do = Step(
+                        f"Correct the rows of robot {robot} in views.csv, and calibrate again."
+                    )
+                    yield replace(hint, words=f"Robot {robot}: {hint.words}", do=do)
+                else:
+                    do = Step(
+                        f"Look at an image of {camera} first: where it is mirrored (a flip in the "
+                        "camera's driver, a mirror before the lens), turn its images back, and "
+                        "calibrate anew."
+                    )
+                    yield replace(hint, words=f"Camera {camera}: {hint.words}", do=do)
             break
 
 
