@@ -28,11 +28,11 @@ def messages() -> "Console":
     return Console(stderr=True, highlight=False, soft_wrap=True)
 
 
-def answers() -> "Console":
+def answers(*, markup: bool = True) -> "Console":
     """The console for results as people read them: stdout."""
     from rich.console import Console
 
-    return Console(highlight=False, soft_wrap=True)
+    return Console(highlight=False, soft_wrap=True, markup=markup)
 
 
 def asked(question: str) -> str:

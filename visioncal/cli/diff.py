@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from visioncal.cli.console import answers
 from visioncal.cli.options import AsJson, PartOptions
 from visioncal.core.number_format import figure
 
@@ -50,9 +51,7 @@ def diff_command(
 
 
 def _print(comparison: "Comparison", paths: tuple[str, str]) -> None:
-    from rich.console import Console
-
-    console = Console(highlight=False, markup=False, soft_wrap=True)
+    console = answers(markup=False)
     # Of whole cells, names are long: none is cut.
     console.width = max(console.width, _LEAST_WIDTH)
     for order, path, mount, verdict in zip(

@@ -10,7 +10,6 @@ from typing import Protocol
 from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_IMAGE_BYTES, absence, is_inside, read_bytes, sha256
 
-NOT_READ, TO_PNG = "is of a kind that is not read", "Convert the images without loss, to png."
 _ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 
 
@@ -105,9 +104,9 @@ def image_path(path: str) -> str:
     inside = inside_path(path)
     if not inside.lower().endswith(_ENDINGS):
         raise DataError(
-            f"the image {path!r} {NOT_READ}; png, jpg or tif is needed.",
+            f"the image {path!r} is of a kind that is not read; png, jpg or tif is needed.",
             culprits=[path],
-            next_step=TO_PNG,
+            next_step="Convert the images without loss, to png.",
         )
     return inside
 

@@ -16,7 +16,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import READ_AGAIN
 from visioncal.session import columns as known
-from visioncal.session.images import NOT_READ, TO_PNG, image_path
+from visioncal.session.images import image_path
 from visioncal.session.loads import SIDES, load_problems
 
 # Two days of a stop every ten seconds, which a calibration refuses within 2 GB of memory; and more
@@ -143,6 +143,7 @@ class Problem:
     place: str
     words: str
     norm: float | None = None  # of what should be a unit quaternion
+    step: str = ""  # what to do about it, where the table is not what to correct
 
 
 def parse_csv(text: str, label: str) -> tuple[tuple[str, ...], tuple[Row, ...]]:
@@ -260,8 +261,9 @@ def problems_error(problems: Sequence[Problem]) -> DataError:
         step = ""
         if len(columns) == 1 and "" not in columns:
             step = f"Correct column {', '.join(columns)} of {where.partition(',')[0]}."
-    if all(NOT_READ in it.words for it in problems):
-        step = TO_PNG
+    own = {it.step for it in problems}
+    if len(own) == 1:
+        step = own.pop() or step
     shown = problems[:_SHOWN_PROBLEMS]
     more = len(problems) - len(shown)
     lines = [f"{problem.place}: {problem.words}." for problem in shown]
@@ -281,9 +283,9 @@ class _RowReader:
     problems: list[Problem]
     with_corners: bool
 
-    def report(self, column: str, words: str, norm: float | None = None) -> None:
+    def report(self, column: str, words: str, norm: float | None = None, step: str = "") -> None:
         place = f"{self.row.where}, column {column}" if column else self.row.where
-        self.problems.append(Problem(place, words, norm))
+        self.problems.append(Problem(place, words, norm, step))
 
     def view(self) -> View | None:
         """Reads the row; None where it is so wrong that its problems are all there is."""
@@ -330,7 +332,7 @@ class _RowReader:
         try:
             return read(cell)
         except DataError as error:
-            self.report(column, error.message.rstrip("."))
+            self.report(column, error.message.rstrip("."), step=error.next_step)
             return None
 
     def _numbers(self, cells: dict[str, str]) -> dict[str, float]:

@@ -138,7 +138,7 @@ def rig_csv(points: Mapping[str, Sequence[float]]) -> str:
 
 def misspelt_keys(document: Mapping[str, Any]) -> Iterator[str]:
     """Words a hint for every key of a target's description that looks like a known one misspelt."""
-    for key in document.keys() - KEYS:
+    for key in sorted(document.keys() - KEYS):
         if hint := did_you_mean(key, KEYS):
             yield f"{key} is no known name and was not read. {hint}"
 

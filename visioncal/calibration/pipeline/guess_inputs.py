@@ -12,7 +12,7 @@ from visioncal.calibration.guess import Candidate, Guess, guess_reading
 from visioncal.calibration.guess.given import Recording, closes
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
-from visioncal.calibration.stages.cause_ranking import read_otherwise, wrong_poses
+from visioncal.calibration.stages.cause_ranking import MIRRORED, read_otherwise, wrong_poses
 from visioncal.calibration.stages.clocks import waits_for_clock
 from visioncal.calibration.stages.init_frames import init_frames
 from visioncal.calibration.stages.joints import match_joints
@@ -20,7 +20,7 @@ from visioncal.calibration.stages.judge import is_scattered
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.errors import VisioncalError
 from visioncal.core.types import FloatArray, Progress
-from visioncal.core.verdict import READ_AGAIN, Finding, Step
+from visioncal.core.verdict import Finding, Step
 from visioncal.estimation.chain import chain
 from visioncal.robot import Robot
 from visioncal.session import Session
@@ -151,10 +151,12 @@ def reading_hint(seen: RunState) -> Finding | None:
 def _poses_beside_joints(seen: RunState, declared: Candidate) -> Finding | None:
     """Says that poses are wrong which no reading explains, where the joint angles agree."""
     session = seen.session
-    chain, document = chain_poses(session), session.robot_document
-    if chain is None or document is None or not numbers_in(session, POSE).there.any():
+    if session.robot_document is None or not numbers_in(session, POSE).there.any():
         return None
-    matched = match_joints(session.views, Robot.from_document(document))
+    arm = Robot.from_document(session.robot_document)
+    chain, matched = chain_poses(session, arm), match_joints(session.views, arm)
+    if chain is None:
+        return None
     if matched.joints_rad and not matched.contradicting:
         # They are the poses of the joint angles: where the motion determines little, one chain
         # closes and the other does not by rounding alone.
@@ -191,18 +193,16 @@ def readings_in_cell(known: RunState) -> Iterator[Finding]:
                 continue
             hint = None if closes_as_declared(part) else reading_hint(part)
             if hint is not None:
-                if hint.do is READ_AGAIN:
-                    do = Step(
-                        f"Correct the rows of robot {robot} in views.csv, and calibrate again."
-                    )
-                    yield replace(hint, words=f"Robot {robot}: {hint.words}", do=do)
-                else:
-                    do = Step(
+                of = f"Robot {robot}"
+                step = f"Correct the rows of robot {robot} in views.csv, and calibrate again."
+                if hint.do is MIRRORED:
+                    of = f"Camera {camera}"
+                    step = (
                         f"Look at an image of {camera} first: where it is mirrored (a flip in the "
                         "camera's driver, a mirror before the lens), turn its images back, and "
                         "calibrate anew."
                     )
-                    yield replace(hint, words=f"Camera {camera}: {hint.words}", do=do)
+                yield replace(hint, words=f"{of}: {hint.words}", do=Step(step))
             break
 
 

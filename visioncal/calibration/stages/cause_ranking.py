@@ -39,7 +39,7 @@ from visioncal.results import NeedMet
 # The limits of tests that are passed by chance: none is behind the first, the last is a fact.
 _REMARK, _FACT = float(np.exp(-1.0)), 1e-12
 
-_MIRRORED = Step(
+MIRRORED = Step(
     "Look at an image first: where it is mirrored (a flip in the camera's driver, a mirror before "
     "the lens), turn the images back, and calibrate anew. Only where the robot's frame is "
     "left-handed, write a copy of the session that is read so, and calibrate it.",
@@ -126,7 +126,7 @@ def read_otherwise(sentence: str, *, is_mirrored: bool = False) -> Finding:
         sentence: How they are better read.
         is_mirrored: Whether mirrored images are as good an explanation.
     """
-    return Finding("misread_poses", sentence, _MIRRORED if is_mirrored else READ_AGAIN)
+    return Finding("misread_poses", sentence, MIRRORED if is_mirrored else READ_AGAIN)
 
 
 def wrong_poses(by_poses: str, by_joints: str) -> Finding:

@@ -41,10 +41,10 @@ _CAUSES: Mapping[Mount, str] = {
     "conventions of the poses",
 }
 # So many views in a row are not left out by chance.
-# Views that disagree by less than so many times what their sensor's noise makes are explained: a
-# small board far away is seen no better.
-_OF_NOISE = 1.5
 _LEAST_RUN = 3
+# Views that disagree by less than so many times what their sensor's noise makes are explained: of a
+# small board far away, nothing better is to be had.
+_OF_NOISE = 1.5
 
 
 @dataclass(frozen=True)

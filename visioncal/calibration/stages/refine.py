@@ -43,8 +43,8 @@ _FAR = 2e-3
 # Robots that err by more [m] may do so because of a board that is far off: it is looked for by fits
 # with other sizes, so far apart, and taken where the robots then err by much less.
 _ROUGH_M, _TRIED, _MUCH_LESS = 1e-3, 5e-3, 0.5
-# In these steps: a board is off by 15 % at most.
-_TRIED_FROM_TO = (-30.0, 30.0)
+# No board is off by more.
+_FARTHEST = 0.15
 
 
 def free_of(seen: LinearisedCorners) -> LensBoardParameters:
@@ -242,7 +242,8 @@ def _measured(side: Side, fitted: Fitted, board: int) -> MeasuredScale:
     bend = below + above - 2.0 * here
     if bend <= 0.0:
         return found
-    tried = held(_TRIED * float(np.clip(0.5 * (below - above) / bend, *_TRIED_FROM_TO)))
+    least = 0.5 * _TRIED * (below - above) / bend
+    tried = held(float(np.clip(least, -_FARTHEST, _FARTHEST)))
     less = tried.fit.noise.robots[:, 1] < _MUCH_LESS * noise.robots[:, 1]
     return measured_scale(side, tried, board) if less.any() else found
 
