@@ -285,6 +285,14 @@ def test_motion_that_repeats_itself_is_told_by_what_is_stated():
     assert abs(clock.camera_minus_robot_s - 2.0) < 1e-3
 
 
+def test_views_in_milliseconds_are_named(session):
+    rows = [{**it.numbers, "stamp_s": 1e3 * it.stamp_s} for it in session.views]
+    views = [replace(it, numbers=row) for it, row in zip(session.views, rows, strict=True)]
+    with pytest.raises(DataError, match="times look like milliseconds") as caught:
+        calibrate(replace(session, views=tuple(views)))
+    assert "Divide the column stamp_s" in caught.value.next_step
+
+
 def test_a_stream_of_another_time_is_named(session):
     late = session.streams["robot"].values + 1e6 * np.eye(14)[0]
     late = replace(session.streams["robot"], values=late)

@@ -141,6 +141,18 @@ def test_what_was_measured_of_the_target_helps_as_well(mount):
     assert sum("was used" in it for it in known.notes) == 3
 
 
+def test_a_rotation_may_be_known_alone():
+    cell = simulate(CellOptions(robot="ur5e", views=12, seed=3))
+    name = "base_from_target"
+    turn = Rotation.from_matrix(cell.transforms[name][:3, :3]).as_quat().tolist()
+    known = run(cell, {name: {"quaternion_xyzw": turn, "sigma_rad": 1e-6}})
+    sigmas = np.sqrt(np.diag(known.solved.covariance)[:12])
+    # Four sigma, for twelve numbers.
+    assert np.all(np.abs(error_of(cell, known)) < 4.0 * sigmas)
+    # The board is turned no farther than that is known; the views alone know it to 2e-5.
+    assert sigmas[6:9].max() < 1.001e-6 < sigmas[9:12].max()
+
+
 def test_a_board_of_several_may_be_known_whole():
     options = CellOptions(robot="ur5e", motion="one_axis", views=12, second=Second(), seed=2)
     cell = simulate(options)

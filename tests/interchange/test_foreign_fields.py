@@ -91,6 +91,27 @@ def test_a_translation_called_t_is_no_time(rows):
     assert read_foreign(timed, HAND).stamps_s[2] == 1.0
 
 
+@pytest.mark.parametrize("first", ["position", "rotation"])
+def test_twelve_numbers_are_read_in_the_order_that_makes_rotations(tmp_path, first):
+    upper = BASE_FROM_FLANGE[:, :3].reshape(-1, 12)
+    apart = np.hstack([BASE_FROM_FLANGE[:, :3, 3], BASE_FROM_FLANGE[:, :3, :3].reshape(-1, 9)])
+    robot = apart if first == "position" else upper
+    header = ",".join([*(f"a{it}" for it in range(12)), *(f"c{it}" for it in range(7))])
+    source = tmp_path / "log.csv"
+    table = np.hstack([robot, quaternions(CAM_FROM_TARGET)])
+    np.savetxt(source, table, "%.15g", delimiter=",", header=header, comments="")
+    columns = header.split(",")
+    requested = replace(
+        HAND,
+        robot=PoseImportOptions(tuple(columns[:12])),
+        camera=PoseImportOptions(tuple(columns[12:]), form="ros"),
+    )
+    # Fifteen digits are written.
+    np.testing.assert_allclose(
+        read_foreign(source, requested).robot.poses(), BASE_FROM_FLANGE, atol=1e-13
+    )
+
+
 def test_the_robots_fields_are_not_the_cameras_as_well(rows):
     alone = rows(lambda at: vector(BASE_FROM_FLANGE[at]))
     requested = replace(HAND, robot=PoseImportOptions(("tvec", "rvec")))

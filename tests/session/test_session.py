@@ -395,6 +395,11 @@ TOML_REFUSALS = [
     ("[robot]", "[prior.flange_from_cam]\nsigma_m = 1.0\n[robot]", "cam names no component"),
     (
         "[robot]",
+        "[prior.flange_from_cam]\nquaternion_xyzw = [0.0, 0.0, 0.0, 1.0]\n[robot]",
+        "cam needs quaternion_xyzw and sigma_rad together",
+    ),
+    (
+        "[robot]",
         "[prior.flange_from_cam]\nz_m = 81.2\nsigma_m = 1e-3\n[robot]",
         r"cam\.z_m is 81\.2, .* metres, at most 3 on a flange: write 0\.0812 for 81\.2 mm\.$",
     ),

@@ -174,7 +174,6 @@ _MISSING = {
     "name": ' (name = "...")',
     "mount": ' (mount = "eye-in-hand" or "eye-to-hand")',
     "target": " (target = a name in targets/, or the path of a .toml)",
-    "sigma_m": " (the standard deviation of the measured component)",
 }
 
 
@@ -204,9 +203,14 @@ def _prior_contradictions(declaration: Declaration) -> Iterator[tuple[str, str]]
         if name not in declaration.cameras:
             yield f"clocks.{name}", "is of no camera: [clocks.NAME] is for [cameras.NAME]"
     for edge, prior in declaration.prior.items():
-        if prior.x_m is None and prior.y_m is None and prior.z_m is None:
-            yield f"prior.{edge}", "names no component, but must give x_m, y_m or z_m"
-        turn = prior.quaternion_xyzw
+        turn, places = prior.quaternion_xyzw, (prior.x_m, prior.y_m, prior.z_m)
+        if not any(it is not None for it in places):
+            if turn is None:
+                needed = "x_m, y_m or z_m, or quaternion_xyzw"
+                yield f"prior.{edge}", f"names no component, but must give {needed}"
+        elif prior.sigma_m is None:
+            words = "is missing (the standard deviation of the measured components)"
+            yield f"prior.{edge}.sigma_m", words
         if (turn is None) != (prior.sigma_rad is None):
             yield f"prior.{edge}", "needs quaternion_xyzw and sigma_rad together, or neither"
         if turn is not None and not 0.9 < sum(it * it for it in turn) < 1.1:

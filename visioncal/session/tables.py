@@ -123,7 +123,7 @@ class PriorTable(TableModel):
     x_m: Number | None = None
     y_m: Number | None = None
     z_m: Number | None = None
-    sigma_m: Positive
+    sigma_m: Positive | None = None
     quaternion_xyzw: Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)] | None = None
     sigma_rad: Positive | None = None
 

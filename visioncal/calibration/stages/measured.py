@@ -1,7 +1,7 @@
 """What a session knows of frames beforehand, and what it did to the answer, in words."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -24,10 +24,11 @@ def prior_of(name: str, table: PriorTable) -> FramePrior:
     values = [getattr(table, it) for it in _COMPONENTS]
     axes = tuple(axis for axis, value in enumerate(values) if value is not None)
     places = tuple(float(values[axis]) for axis in axes)
+    found = FramePrior(first, second, axes, places, table.sigma_m or 1.0)
     if table.quaternion_xyzw is None or table.sigma_rad is None:
-        return FramePrior(first, second, axes, places, table.sigma_m)
+        return found
     rotation = Rotation.from_quat(table.quaternion_xyzw).as_matrix()
-    return FramePrior(first, second, axes, places, table.sigma_m, rotation, table.sigma_rad)
+    return replace(found, rotation=rotation, sigma_rad=table.sigma_rad)
 
 
 @dataclass(frozen=True)

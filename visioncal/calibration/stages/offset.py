@@ -157,7 +157,15 @@ def no_offset(
             culprits=["views.csv: stamp_s"],
             next_step="Fill in stamp_s where the target is in the image.",
         )
-    if not motion.flange.covers(stamps_s).any():
+    outside = not motion.flange.covers(stamps_s).any()
+    if outside and motion.flange.covers(1e-3 * stamps_s).any():
+        return DataError(
+            f"The views' times look like milliseconds: {stamps_s[0]:.6g} to {stamps_s[-1]:.6g}, "
+            f"where streams/{motion.name}.csv goes from {begin_s:.6f} to {end_s:.6f} s.",
+            culprits=["views.csv: stamp_s"],
+            next_step="Divide the column stamp_s of views.csv by 1000; it is in seconds.",
+        )
+    if outside:
         return DataError(
             f"No view lies within streams/{motion.name}.csv: it goes from {begin_s:.6f} to "
             f"{end_s:.6f} s, the views from {stamps_s[0]:.6f} to {stamps_s[-1]:.6f} s.",

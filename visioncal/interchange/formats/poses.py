@@ -131,8 +131,8 @@ def poses_from(
     """Takes poses out of fields.
 
     16 numbers are a matrix, by rows or by columns as its last row of 0, 0, 0, 1 shows; 12 its upper
-    three rows; else three of position and those of a rotation, in whichever order names such as
-    rvec and tvec say it.
+    three rows, or a position and a rotation by rows, whichever makes rotations; else three of
+    position and those of a rotation, in whichever order names such as rvec and tvec say it.
 
     Args:
         fields: The fields.
@@ -262,6 +262,10 @@ def _matrices(flat: FloatArray) -> tuple[FloatArray, FloatArray]:
     last = np.array([0.0, 0, 0, 1])
     if flat.shape[1] == 12:
         matrices = flat.reshape(-1, 3, 4)
+        behind = ROTATION_FORMS["matrix"].read(flat[:, 3:])
+        above = ROTATION_FORMS["matrix"].read(matrices[:, :, :3].reshape(-1, 9))
+        if np.isfinite(behind).all(axis=(1, 2)).sum() > np.isfinite(above).all(axis=(1, 2)).sum():
+            return flat[:, :3].copy(), flat[:, 3:].copy()
     else:
         square = flat.reshape(-1, 4, 4)
         by_columns = (square[:, :, 3] == last).all(axis=1) & ~(square[:, 3] == last).all(axis=1)
