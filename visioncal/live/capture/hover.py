@@ -140,8 +140,13 @@ class Hovering:
         expected_s = travel_s(self._joints(), goal, _SPEED, _ACCELERATION)
         ends_s = time.monotonic() + _TIMES * expected_s + _MORE_S
         self.arm.start_move(goal, speed=_SPEED, acceleration=_ACCELERATION)
-        while self.arm.moving():
-            if time.monotonic() > ends_s:
+        while True:
+            # It is late where it still moves after this moment, by a state that is newer.
+            asked_s = time.monotonic()
+            self.arm.state()
+            if not self.arm.moving():
+                return
+            if asked_s > ends_s:
                 raise DriverError(
                     f"{self.arm.name}: still moving after the {expected_s:.1f} s that were "
                     "expected.",

@@ -13,6 +13,7 @@ from itertools import pairwise
 from typing import Generic, Protocol, TypeVar
 
 from visioncal.core.errors import DriverError
+from visioncal.live.drivers.stopwatch import Stopwatch
 
 # The longest wait, in intervals between this camera's last pictures: one under way when it is
 # asked for, the one that is wanted, and one more for a network's jitter. Intervals longer than this
@@ -23,6 +24,8 @@ _INTERVALS, _LAST, _LONGEST_S = 3.0, 4, 3.0
 _PACE_S, _BURST = 10.0, 0.3
 # How long the thread may take to end; one that hangs in a driver ends with the process [s].
 _ENDING_S = 2.0
+# How often who waits looks at the time [s].
+_GLANCE_S = 0.05
 
 T_co = TypeVar("T_co", covariant=True)
 T = TypeVar("T")
@@ -116,16 +119,16 @@ class Newest(Generic[T]):
         self._thread.join(_ENDING_S)
 
     def _answered(self, request: _Request[T], timeout_s: float) -> tuple[Arrival, T]:
-        began_s = time.monotonic()
+        waiting = Stopwatch()
         with self._news:
             while request.given is None:
                 if self._error is not None:
                     raise self._error
                 patience_s = max(timeout_s, _INTERVALS * self._longest_interval_s())
-                left_s = began_s + patience_s - time.monotonic()
+                left_s = patience_s - waiting.read()
                 if left_s <= 0.0:
                     raise self._missed(request)
-                self._news.wait(left_s)
+                self._news.wait(min(left_s, _GLANCE_S))
             return request.given
 
     def _read(self) -> None:

@@ -15,6 +15,7 @@ from visioncal.live.drivers.oak_calibration import SOCKETS, factory_intrinsics
 from visioncal.live.drivers.oak_frames import FrameEnd, began_after, worded
 from visioncal.live.drivers.oak_library import Handle, depthai
 from visioncal.live.drivers.protocols import DeviceSetup, Frame
+from visioncal.live.drivers.stopwatch import Stopwatch
 
 # Where no resolution is wished the sensor's is divided by a whole number, to about this width [px].
 _WIDTH_PX = 2048
@@ -22,6 +23,8 @@ _RATE_HZ = 10.0
 # How long the camera may look for its exposure and focus before they are held, and how long the
 # first picture of all may take [s].
 _SETTLE_S, _FIRST_S = 1.5, 5.0
+# How often who waits looks at the time [s].
+_GLANCE_S = 0.05
 _UDEV_RULE = 'SUBSYSTEM=="usb", ATTRS{idVendor}=="03e7", MODE="0666"'
 _OPTIONS = ("socket", "rate_hz", "raw")
 
@@ -77,16 +80,17 @@ class OakCamera:
             DriverError: None came in time: unplugged.
         """
         asked = time.monotonic()
+        waiting = Stopwatch()
         self._end.drop_old()
         while True:
-            frame = self._end.next(asked + timeout_s - time.monotonic())
-            if frame is None:
+            frame = self._end.next(min(timeout_s, _GLANCE_S))
+            if frame is None and waiting.read() > timeout_s:
                 raise DriverError(
                     f"{self.name} gave no picture within {timeout_s:g} s.",
                     culprits=[self.name],
                     next_step="Look at its cable and its power; then go on with --resume.",
                 )
-            if began_after(frame, asked):
+            if frame is not None and began_after(frame, asked):
                 return frame
 
     def close(self) -> None:

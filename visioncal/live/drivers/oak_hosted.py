@@ -12,6 +12,7 @@ from visioncal.core.types import Camera
 from visioncal.live.drivers.oak_frames import FrameEnd, began_after
 from visioncal.live.drivers.oak_library import Handle, depthai
 from visioncal.live.drivers.protocols import Frame
+from visioncal.live.drivers.stopwatch import Stopwatch
 
 # A source that computes its pictures may take longer than a camera [s].
 _PATIENCE_S = 10.0
@@ -62,6 +63,7 @@ class HostedOak:
             DriverError: The source has none, failed, or was closed.
         """
         asked = time.monotonic()
+        waiting, quiet = Stopwatch(), Stopwatch()
         self._end.drop_old()
         self._feed.ask()
         while True:
@@ -72,13 +74,14 @@ class HostedOak:
                 # It was under way already when this one was asked for.
                 self._feed.ask()
             self._feed.raise_what_went_wrong()
-            now = time.monotonic()
-            waited = now - asked
-            # What the source has just made is still on its way through the pipeline.
-            quiet_s = now - max(asked, self._feed.rested_s)
-            if waited > _PATIENCE_S if self._feed.is_at_work else quiet_s > timeout_s:
+            waited_s = waiting.read()
+            if self._feed.is_at_work:
+                # What the source then makes is still on its way through the pipeline.
+                quiet.restart()
+            if waited_s > _PATIENCE_S or quiet.read() > timeout_s:
                 raise DriverError(
-                    f"The {self.name} gave no picture within {waited:.1f} s.", culprits=[self.name]
+                    f"The {self.name} gave no picture within {waited_s:.1f} s.",
+                    culprits=[self.name],
                 )
 
     def close(self) -> None:
@@ -104,7 +107,6 @@ class _Feed:
         self._wanted = threading.Event()
         self._error: DriverError | None = None
         self.is_at_work = False
-        self.rested_s = 0.0
 
     def ask(self) -> None:
         """Wants a picture."""
@@ -124,7 +126,6 @@ class _Feed:
             self._error = error
             return None
         finally:
-            self.rested_s = time.monotonic()
             self.is_at_work = False
         return frame
 

@@ -14,6 +14,7 @@ from visioncal.core.transforms import compose, invert
 from visioncal.core.types import FloatArray
 from visioncal.live.drivers.extras import client_library
 from visioncal.live.drivers.protocols import ArmState
+from visioncal.live.drivers.stopwatch import Stopwatch
 from visioncal.live.drivers.ur_line import Line
 from visioncal.live.drivers.ur_net import (
     SCRIPT_PORT,
@@ -67,7 +68,7 @@ class UrArm:
         self._control: Any = None
         self._line: Line | None = None
         self._moves_before: int | None = None
-        self._began_s = 0.0
+        self._begun = Stopwatch()
         self._closed = False
         if control is None:
             self._flange_from_tool = _matrix(read_tool_offset(self._host))
@@ -94,7 +95,7 @@ class UrArm:
         A stop by the safety system is reported in it, and is no error.
 
         Raises:
-            DriverError: None comes for half a second.
+            DriverError: None comes for 0.8 s.
         """
         self._check_open()
         client = self._states.client
@@ -141,7 +142,8 @@ class UrArm:
         )
         if not taken:
             raise self._explain("refused a motion")
-        self._moves_before, self._began_s = before, time.monotonic()
+        self._moves_before = before
+        self._begun.restart()
 
     def moving(self) -> bool:
         """Tells whether the last motion is still going on.
@@ -165,7 +167,7 @@ class UrArm:
         if progress.isAsyncOperationRunning():
             return True
         if progress.changeCount() == self._moves_before:
-            if time.monotonic() - self._began_s < _BEGIN_S:
+            if self._begun.read() < _BEGIN_S:
                 return True
             raise self._explain(f"did not begin a motion within {_BEGIN_S} s")
         self._moves_before = None
@@ -236,9 +238,9 @@ class UrArm:
         """Sends the control script again: at the pendant, or in a pause, it was ended."""
         read_condition(self._host).check_moves()
         line.call(self._control.reuploadScript, limit_s=_CALL_S, what="take the control script")
-        ends_s = time.monotonic() + _CALL_S
+        begun = Stopwatch()
         while not self._control.isProgramRunning():
-            if time.monotonic() > ends_s:
+            if begun.read() > _CALL_S:
                 raise self._explain("does not run the control script")
             time.sleep(0.01)
         self._watch_me(line)

@@ -7,14 +7,17 @@ may not return for minutes. One thread owns it; who calls waits no longer than t
 import queue
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from typing import TypeVar
 
 from visioncal.core.errors import DriverError
+from visioncal.live.drivers.stopwatch import Stopwatch
 
 T = TypeVar("T")
 # What the library throws, standard C++ exceptions, arrives as these.
 _THROWN = (RuntimeError, ValueError)
+# How often who waits looks at the time [s].
+_GLANCE_S = 0.05
 
 
 class Line:
@@ -53,14 +56,16 @@ class Line:
                 future.set_exception(error)
 
         self._jobs.put(run)
+        waiting = Stopwatch()
         try:
-            return future.result(limit_s)
-        except TimeoutError as error:
-            raise DriverError(
-                f"{self._name} did not {what} within {limit_s:.1f} s.",
-                culprits=[self._name],
-                next_step="Look at the pendant and at the network cable.",
-            ) from error
+            while not wait([future], _GLANCE_S).done:
+                if waiting.read() > limit_s:
+                    raise DriverError(
+                        f"{self._name} did not {what} within {limit_s:.1f} s.",
+                        culprits=[self._name],
+                        next_step="Look at the pendant and at the network cable.",
+                    )
+            return future.result()
         except _THROWN as error:
             raise DriverError(
                 f"{self._name} could not {what}: {error}.", culprits=[self._name]

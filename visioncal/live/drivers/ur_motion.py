@@ -40,7 +40,7 @@ class UrMotion:
         """Waits for the next state that the controller sends.
 
         Raises:
-            DriverError: None comes for half a second, or the arm was stopped.
+            DriverError: None comes for 0.8 s, or the arm was stopped.
         """
         client = self._states.client
         while True:

@@ -7,6 +7,7 @@ from typing import Any
 
 from visioncal.core.errors import DriverError
 from visioncal.live.drivers.protocols import Safety
+from visioncal.live.drivers.stopwatch import Stopwatch
 from visioncal.live.drivers.ur_status import safety_of
 
 # Names that the client's own table of variables has; one that it lacks would shift all that
@@ -29,7 +30,7 @@ _REPORTS_LOAD = {3: (3, 11, 0), 5: (5, 5, 1)}
 # The arm's motion is slow beside it, the computer's load is small.
 _RATE_HZ = 125.0
 # A controller sends every 8 ms; after this silence it is gone [s].
-_SILENCE_S = 0.5
+_SILENCE_S = 0.8
 _POLL_S = 0.0005
 # For how long the shortest delay between controller and here is remembered [s]: clocks drift by
 # less than a millisecond in it.
@@ -63,28 +64,28 @@ class StateStream:
                 f"The states of the controller at {host} cannot be read: {error}.", culprits=[host]
             ) from error
         self._newest = self.client.getTimestamp()
-        self._came_s = time.monotonic()
+        self._silence = Stopwatch()
         self._delays: deque[tuple[float, float]] = deque()
 
     @property
     def alive(self) -> bool:
         """Whether states come in."""
-        now = time.monotonic()
         stamp = self.client.getTimestamp()
         if stamp != self._newest:
-            self._newest, self._came_s = stamp, now
-        return bool(self.client.isConnected()) and now - self._came_s < _SILENCE_S
+            self._newest = stamp
+            self._silence.restart()
+        return bool(self.client.isConnected()) and self._silence.read() < _SILENCE_S
 
     def check(self) -> None:
         """Checks that states come in.
 
         Raises:
-            DriverError: None came for half a second, or the connection is closed.
+            DriverError: None came for 0.8 s, or the connection is closed.
         """
         if self.alive:
             return
         how = (
-            f"it has sent nothing for {time.monotonic() - self._came_s:.1f} s"
+            f"it has sent nothing for {self._silence.read():.1f} s"
             if self.client.isConnected()
             else "it closed the connection"
         )
@@ -109,7 +110,8 @@ class StateStream:
             self.check()
             time.sleep(_POLL_S)
         now = time.monotonic()
-        self._newest, self._came_s = stamp, now
+        self._newest = stamp
+        self._silence.restart()
         self._delays.append((now, now - stamp))
         while self._delays[0][0] < now - _DELAYS_S:
             self._delays.popleft()
