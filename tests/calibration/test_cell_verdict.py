@@ -260,3 +260,29 @@ def test_a_board_of_another_size_on_a_robot_is_named_with_all_views_used():
     assert found.verdict.causes[0].kind == "board_size"
     assert "the board plate_b is 1 % larger than stated" in found.verdict.causes[0].words
     assert all(it.used for it in found.sights)
+
+
+def test_a_robot_in_millimetres_is_named_with_its_reading(session):
+    def in_millimetres(_, row):
+        if row["robot"] == "a" and row["x_m"]:
+            row.update({it: repr(1e3 * float(row[it])) for it in ("x_m", "y_m", "z_m")})
+
+    misread = rewritten(session, in_millimetres)
+    with pytest.raises(DegenerateError) as caught:
+        align(misread)
+    assert caught.value.message.startswith("Robot a: With the robot's positions in mm, the chain")
+    assert "base_from_flange in metres" in caught.value.next_step
+    (found,) = [it for it in doctor(misread).findings if it.kind == "misread_poses"]
+    assert found.words.startswith("Robot a: With the robot's positions in mm")
+
+
+def test_a_mirrored_camera_beside_the_robots_is_named(session):
+    mine = [it.number for it in session.views if it.text.get("camera") == "right"]
+    table = session.corner_table
+    width = session.declaration.cameras["right"].resolution[0]
+    px, mirrored = table.px.copy(), np.isin(table.views, mine)
+    px[mirrored, 0] = width - 1 - px[mirrored, 0]
+    turned = replace(session, corner_table=replace(table, px=px))
+    (found,) = [it for it in doctor(turned).findings if it.kind == "misread_poses"]
+    assert found.words.startswith("Camera cam_right: With the images mirrored")
+    assert "Look at an image of cam_right first" in str(found.do)

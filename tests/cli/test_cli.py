@@ -272,18 +272,20 @@ def test_without_a_terminal_the_step_at_work_is_a_line(monkeypatch):
 
 @pytest.mark.parametrize("keeps", [False, True])
 def test_ctrl_c_is_status_130_and_says_what_is_left_behind(tmp_path, monkeypatch, keeps):
-    (tmp_path / "earlier.csv").touch()
-    os.utime(tmp_path / "earlier.csv", (0, 0))
+    cell = tmp_path / "cell"
 
     def interrupted(_, folder, *__, **___):
+        folder.mkdir()
+        (folder / "earlier.csv").touch()
+        os.utime(folder / "earlier.csv", (0, 0))
         if keeps:
             (folder / "views.csv").write_text("view\n")
         raise KeyboardInterrupt
 
     monkeypatch.setattr(simulate_module, "write_session", interrupted)
-    done = visioncal("simulate", tmp_path, "--views", 3)
+    done = visioncal("simulate", cell, "--views", 3)
     assert (done.status, done.out) == (130, "")
-    left = f"written so far: {tmp_path / 'views.csv'}" if keeps else "nothing was written"
+    left = f"written so far: {cell / 'views.csv'}" if keeps else "nothing was written"
     assert done.err == f"stopped by Ctrl-C; {left}\n"
 
 

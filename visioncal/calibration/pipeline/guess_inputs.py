@@ -1,6 +1,5 @@
 """Which reading of a session's poses is right: measured from its images, without its robot."""
 
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -17,6 +16,7 @@ from visioncal.calibration.stages.clocks import waits_for_clock
 from visioncal.calibration.stages.init_frames import init_frames
 from visioncal.calibration.stages.joints import match_joints
 from visioncal.calibration.stages.judge import is_scattered
+from visioncal.calibration.stages.robots import Pair, pairs_of
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.errors import VisioncalError
 from visioncal.core.types import FloatArray, Progress
@@ -173,37 +173,63 @@ def _poses_beside_joints(seen: RunState, declared: Candidate) -> Finding | None:
 
 
 def readings_in_cell(known: RunState) -> Iterator[Finding]:
-    """Says which robots of a whole cell have poses that only another reading explains.
+    """Says which robots and cameras of a whole cell only another reading of the poses explains.
 
-    Each is looked at with one camera and target alone, those of most views first.
+    Each camera is looked at with one target and by way of one robot alone, those of most views
+    first. Where no reading explains the chain, what is wrong is no reading.
 
     Args:
-        known: What is known of the cell; its lenses and corners are not used.
+        known: What is known of the cell.
     """
     session = known.session
-    views = Counter((it.seer, it.seen) for it in session.observations)
+    mirrored: set[str] = set()
     for robot in session.robots:
-        for (camera, target), _ in views.most_common():
+        looked = set(mirrored)
+        for pair in pairs_of(known, robot):
+            if pair.camera in looked or _closes(known, robot, pair):
+                continue
+            looked.add(pair.camera)
             try:
-                part = RunState(session.of(camera, robot, target), None, known.threads)
+                part = RunState(session.of(pair.camera, robot, pair.target), None, known.threads)
                 for stage in STAGES[: [it.name for it in STAGES].index("joints") + 1]:
                     part = stage.run(part)
             except VisioncalError:
-                # This robot does not part them, or there is too little to see.
+                # There is too little to see.
                 continue
             hint = None if closes_as_declared(part) else reading_hint(part)
-            if hint is not None:
-                of = f"Robot {robot}"
-                step = f"Correct the rows of robot {robot} in views.csv, and calibrate again."
-                if hint.do is MIRRORED:
-                    of = f"Camera {camera}"
-                    step = (
-                        f"Look at an image of {camera} first: where it is mirrored (a flip in the "
-                        "camera's driver, a mirror before the lens), turn its images back, and "
-                        "calibrate anew."
-                    )
-                yield replace(hint, words=f"{of}: {hint.words}", do=Step(step))
-            break
+            if hint is None:
+                continue
+            if hint.do is not MIRRORED:
+                step = (
+                    f"Correct the rows of robot {robot} in views.csv (base_from_flange in metres, "
+                    "quaternion x, y, z, w), and calibrate again."
+                )
+                yield replace(hint, words=f"Robot {robot}: {hint.words}", do=Step(step))
+                # All cameras would say so.
+                break
+            mirrored.add(pair.camera)
+            step = (
+                f"Look at an image of {pair.camera} first: where it is mirrored (a flip in the "
+                "camera's driver, a mirror before the lens), turn its images back, and calibrate "
+                "anew."
+            )
+            yield replace(hint, words=f"Camera {pair.camera}: {hint.words}", do=Step(step))
+
+
+def _closes(known: RunState, robot: str, pair: Pair) -> bool:
+    """Whether the chain of a pair closes as declared."""
+    reported = known.robots[robot].base_from_flange
+    views = [it for it in pair.poses if it in reported]
+    places = tuple(f"view {it}" for it in views)
+    robot_poses = np.array([reported[it] for it in views]).reshape(-1, 4, 4)
+    seen = np.array([pair.poses[it].cam_from_target[0] for it in views]).reshape(-1, 4, 4)
+    recording = Recording(
+        PoseNumbers.of_poses(robot_poses, places),
+        PoseNumbers.of_poses(seen, places),
+        pair.mount,
+        is_measured=True,
+    )
+    return closes(recording)
 
 
 def closes_as_declared(seen: RunState) -> bool:

@@ -161,17 +161,19 @@ def run_steps(known: RunState) -> RunState:
                 if cause is not None:
                     raise _because(error.with_culprits(more), cause) from error
                 if known.mount is None:
-                    hint = next(readings_in_cell(known), None)
+                    hint = hint or next(readings_in_cell(known), None)
                     if hint is None:
                         raise
                     raise _because(error, hint) from error
                 raise _with_hint(error.with_culprits(more), seen) from error
             # Joints that are misread explain themselves, and would mislead a guess about poses.
-            if stage.name == "joints" and known.mount is not None:
+            if stage.name == "joints":
                 seen = known
-                if not closes_as_declared(known):
+                if known.mount is None:
+                    hint = next(readings_in_cell(known), None)
+                elif not closes_as_declared(known):
                     hint = reading_hint(known)
-                    known = replace(known, is_misread=hint is not None)
+                known = replace(known, is_misread=hint is not None)
         return _with_other_board(_with_reading(known, seen, hint))
 
 
@@ -236,7 +238,8 @@ def _with_reading(known: RunState, seen: RunState | None, hint: Finding | None) 
     """Adds to a poor verdict how the poses should be read, where that explains it."""
     if known.verdict is None or seen is None or not is_suspect(known):
         return known
-    hint = hint or reading_hint(seen)
+    if hint is None and known.mount is not None:
+        hint = reading_hint(seen)
     if hint is None:
         return known
     return replace(known, verdict=with_misread(known.verdict, hint))

@@ -1,7 +1,7 @@
 """Where the robots stood: what their rows report, and whether joints belong to what is seen."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -107,7 +107,8 @@ def check_joints(seen: T, *, drops: bool, takes: bool) -> T:
 
 def _checked(seen: T, name: str, reported: Reported, matched: Matched, how: tuple[bool, bool]) -> T:
     session, joints, (drops, takes) = seen.session, reported.joints_rad or {}, how
-    mount, poses = _of_one_pair(seen, name)
+    pair = next(iter(pairs_of(seen, name)), _NO_PAIR)
+    mount, poses = pair.mount, pair.poses
     views = [it for it in poses if it in joints]
     if not views:
         return seen
@@ -135,19 +136,39 @@ def _checked(seen: T, name: str, reported: Reported, matched: Matched, how: tupl
     return seen.with_robot(name, reported.with_zero(zero)) if taken else seen
 
 
-def _of_one_pair(seen: Observed, robot: str) -> tuple[Mount, dict[int, ViewPoses]]:
-    """The poses of the camera and the target with the most views by way of one robot alone.
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """What one camera sees of one target by way of one robot alone.
 
-    Those of different ones do not compare.
+    Attributes:
+        camera: The camera's frame.
+        target: The target's.
+        mount: Where the camera is.
+        poses: The target's pose by view.
     """
-    pairs: dict[tuple[str, int], dict[int, ViewPoses]] = {}
+
+    camera: str
+    target: str
+    mount: Mount
+    poses: Mapping[int, ViewPoses]
+
+
+_NO_PAIR = Pair("", "", "eye-in-hand", {})
+
+
+def pairs_of(seen: Observed, robot: str) -> list[Pair]:
+    """The pairs of a camera and a target by way of one robot alone, those of most views first.
+
+    Poses of different ones do not compare.
+    """
+    pairs: dict[tuple[str, str], dict[int, ViewPoses]] = {}
     for it in seen.timed.observations:
         view = it.view.number
         if view in seen.poses and is_seen(it.view) and [*it.robots, *it.lacks] == [robot]:
-            poses = seen.poses[view]
-            pairs.setdefault((it.seer, poses.board), {})[view] = poses
-    if not pairs:
-        return "eye-in-hand", {}
-    camera, board = max(sorted(pairs), key=lambda it: len(pairs[it]))
-    on_flange = seen.session.frames[camera] == frame_name("flange", robot)
-    return "eye-in-hand" if on_flange else "eye-to-hand", pairs[camera, board]
+            pairs.setdefault((it.seer, it.seen), {})[view] = seen.poses[view]
+    flange, found = frame_name("flange", robot), []
+    for camera, target in sorted(pairs, key=lambda it: (-len(pairs[it]), it)):
+        on_flange = seen.session.frames[camera] == flange
+        mount: Mount = "eye-in-hand" if on_flange else "eye-to-hand"
+        found.append(Pair(camera, target, mount, pairs[camera, target]))
+    return found
