@@ -1,6 +1,7 @@
 """Which reading of the poses is right: planted mistakes are named, sound poses are not accused."""
 
 import json
+import re
 import shlex
 import tracemalloc
 from dataclasses import replace
@@ -331,6 +332,16 @@ def test_a_refused_calibration_says_so_too():
     planted = MISTAKES["two rows exchanged"](seen_in(simulate(turning)), np.random.default_rng(0))
     with pytest.raises(DegenerateError, match=r"view 8 and view 11 exchanged.*--guess"):
         visioncal.calibrate(pairs_session(planted))
+
+
+@pytest.mark.slow
+def test_two_mistakes_at_once_are_named_together():
+    poses = MISTAKES["rows shifted by one"](cell_poses("eye-in-hand"), np.random.default_rng(0))
+    told = poses.robot.poses()
+    told[:, :3, 3] *= 1e3
+    verdict = visioncal.calibrate(pairs_session(replace(poses, robot=numbers(told)))).verdict
+    assert verdict.status == "bad"
+    assert re.search(r"positions in mm; .* one row .*--guess", verdict.reasons[0])
 
 
 def test_a_sound_calibration_is_not_troubled_by_it():

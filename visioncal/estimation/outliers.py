@@ -182,6 +182,12 @@ def _without_needless(found: Agreed) -> Agreed:
     return found if len(moves) == len(found.moves) else _agreed(problem, used, fit, moves)
 
 
+def all_as_inliers(problem: Problem, state: State) -> Agreed:
+    """Takes all observations for inliers, where it is known that they do not belong together."""
+    used = np.ones(len(problem), dtype=bool)
+    return _agreed(problem, used, fit_problem(problem, state), ())
+
+
 def settle(agreed: Agreed, movable: Sequence[str] = ()) -> Agreed:
     """Settles what agrees one by one, and what moved by less than single observations show."""
     problem, moves = agreed.problem, list(agreed.moves)

@@ -144,8 +144,11 @@ def reading_hint(seen: RunState) -> Finding | None:
         return None
     if not guess.stands_out:
         return None if guess.declared.closes else _poses_beside_joints(seen, guess.declared)
-    is_mirrored = guess.best.hypothesis.robot.signs == "mirror"
-    return read_otherwise(guess.sentence, is_mirrored=is_mirrored)
+    best, views = guess.best, seen.session.views
+    is_mirrored = best.hypothesis.robot.signs == "mirror"
+    swap = best.hypothesis.swap if len(best.differences) == 1 else ()
+    exchanged = tuple(views[row].number for row in swap)
+    return read_otherwise(guess.sentence, exchanged, is_mirrored=is_mirrored)
 
 
 def _poses_beside_joints(seen: RunState, declared: Candidate) -> Finding | None:

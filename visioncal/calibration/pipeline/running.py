@@ -165,7 +165,7 @@ def run_steps(known: RunState) -> RunState:
                     if hint is None:
                         raise
                     raise _because(error, hint) from error
-                raise _with_hint(error.with_culprits(more), seen) from error
+                raise _with_hint(error.with_culprits(more), seen, hint) from error
             # Joints that are misread explain themselves, and would mislead a guess about poses.
             if stage.name == "joints":
                 seen = known
@@ -173,7 +173,8 @@ def run_steps(known: RunState) -> RunState:
                     hint = next(readings_in_cell(known), None)
                 elif not closes_as_declared(known):
                     hint = reading_hint(known)
-                known = replace(known, is_misread=hint is not None)
+                # Of exchanged rows the others are as they should be.
+                known = replace(known, is_misread=hint is not None and not hint.views)
         return _with_other_board(_with_reading(known, seen, hint))
 
 
@@ -204,14 +205,16 @@ def _because(error: VisioncalError, cause: Finding) -> VisioncalError:
     return type(error)(message, culprits=error.culprits, next_step=str(cause.do or ""))
 
 
-def _with_hint(error: VisioncalError, seen: RunState | None) -> VisioncalError:
+def _with_hint(
+    error: VisioncalError, seen: RunState | None, hint: Finding | None
+) -> VisioncalError:
     """Adds to an error, once the target's poses are known, what leads on.
 
     That is how the robot's poses should be read, or else what proposes the views that are missing.
     """
     if seen is None:
         return error
-    hint = reading_hint(seen)
+    hint = hint or reading_hint(seen)
     if hint is not None:
         message = f"{hint.words} As declared: {error.message}"
         return type(error)(message, culprits=error.culprits, next_step=str(hint.do))

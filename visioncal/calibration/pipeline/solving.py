@@ -39,7 +39,7 @@ from visioncal.estimation.observability import (
     check_observability,
     refuse_too_few,
 )
-from visioncal.estimation.outliers import Agreed, agree, settle
+from visioncal.estimation.outliers import Agreed, agree, all_as_inliers, settle
 from visioncal.estimation.parts import Effect, Observations, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import (
@@ -178,14 +178,15 @@ def solve(
     cell, lost = _tied_part(cell)
     views = [looked.poses[it.view] for it in cell.rows]
     cell, views, problem, state, unplaced = _started(cell, views)
-    agreed = _agree(cell, problem, state)
+    agreed = all_as_inliers(problem, state) if looked.is_misread else _agree(cell, problem, state)
     late = clock_effects(cell, looked.clocks)
     agreed, seen, arms = _agreeing_looks(cell, looked, views, agreed, arms, late)
     arms = with_drifts(arms, agreed.problem.subset(agreed.used), agreed.fit, asked)
     if any(it.drift is not None for it in arms.values()):
         agreed, seen, arms = _agreeing_looks(cell, looked, views, agreed, arms, late)
     agreed = _levelled(cell, views, agreed)
-    for _ in range(_ROUNDS):
+    # Poses that are misread say nothing of the arm, nor which views are outliers.
+    for _ in range(0 if looked.is_misread else _ROUNDS):
         if asked != "hand-eye":
             arms = _levels(cell, agreed, arms, asked)
             erring = [name for name, it in arms.items() if it.frees_errors()]
@@ -198,7 +199,7 @@ def solve(
         # What agrees by now has a say in how far the arms are calibrated.
         if np.array_equal(before, agreed.used):
             break
-    if asked != "hand-eye":
+    if asked != "hand-eye" and not looked.is_misread:
         agreed, seen, arms = _with_functions(cell, agreed, seen, arms, late, asked)
     agreed = _with_repeats(agreed)
     arms = with_pose_errors(arms, agreed.problem.subset(agreed.used), agreed.fit)
@@ -286,7 +287,7 @@ def _agreeing_looks(
     for _ in range(_ROUNDS):
         agreed, seen, fitted = _with_looks(cell, looked, views, agreed, arms, late, levels)
         levels = {} if seen is None else seen.looks.levels
-        if cell.mount is None:
+        if cell.mount is None or looked.is_misread:
             break
         before, agreed = agreed.used, settle(agreed)
         if np.array_equal(before, agreed.used):

@@ -119,14 +119,17 @@ def adding(words: str, *, modelled: bool, purpose: str = "") -> Step:
     return Step(f"{words} {model}")
 
 
-def read_otherwise(sentence: str, *, is_mirrored: bool = False) -> Finding:
+def read_otherwise(
+    sentence: str, exchanged: tuple[int, ...] = (), *, is_mirrored: bool = False
+) -> Finding:
     """The finding that poses are misread.
 
     Args:
         sentence: How they are better read.
+        exchanged: The views whose poses are exchanged, where the others are as they are declared.
         is_mirrored: Whether mirrored images are as good an explanation.
     """
-    return Finding("misread_poses", sentence, MIRRORED if is_mirrored else READ_AGAIN)
+    return Finding("misread_poses", sentence, MIRRORED if is_mirrored else READ_AGAIN, exchanged)
 
 
 def wrong_poses(by_poses: str, by_joints: str) -> Finding:
