@@ -20,6 +20,9 @@ from visioncal.session.table import reported_matrices
 
 # The robot stands still while a stop's images are taken; controllers report it with some noise.
 _ONE_STOP_MM, _ONE_STOP_DEG = 1.0, 0.1
+# No arm reaches so far [m]: beside rows that are nearer, one that is a thousand times as far, to
+# within this factor, is in millimetres.
+_OUT_OF_REACH_M, _ALIKE = 20.0, 5.0
 
 
 def moved_arm(poses: FloatArray, q: FloatArray, before: Robot, after: Robot) -> FloatArray:
@@ -93,9 +96,18 @@ def reported_poses(session: Session, robot: Robot | None) -> Reported:
     rejections = []
     poses: dict[int, FloatArray] = {}
     reported = reported_matrices(session.views)
+    in_mm = _in_millimetres(reported)
     for view in session.views:
         joints = view.joints_rad
-        if view.number in reported:
+        if view.number in in_mm:
+            rejections.append(
+                Rejection(
+                    view.number,
+                    "its position looks like millimetres, and other rows are in metres: divide its "
+                    "x_m, y_m, z_m by 1000 in views.csv",
+                )
+            )
+        elif view.number in reported:
             poses[view.number] = reported[view.number]
         elif joints is None or matched is None or matched.misread:
             rejections.append(Rejection(view.number, _no_pose(joints, matched)))
@@ -106,6 +118,18 @@ def reported_poses(session: Session, robot: Robot | None) -> Reported:
         _check_stops(session, poses)
     remarks = ((), ()) if matched is None else (matched.warnings, matched.notes)
     return Reported(poses, tuple(rejections), *remarks, matched)
+
+
+def _in_millimetres(poses: Mapping[int, FloatArray]) -> set[int]:
+    """The views whose position is a thousand times as far as those of others."""
+    away_m = {view: float(np.linalg.norm(it[:3, 3])) for view, it in poses.items()}
+    near = [it for it in away_m.values() if it < _OUT_OF_REACH_M]
+    if not near:
+        return set()
+    low, high = min(near) / _ALIKE, max(near) * _ALIKE
+    return {
+        view for view, it in away_m.items() if it >= _OUT_OF_REACH_M and low <= 1e-3 * it <= high
+    }
 
 
 def _no_pose(joints: FloatArray | None, matched: Matched | None) -> str:
