@@ -72,9 +72,11 @@ def rehearse_command(
     whole = _rehearse(RehearsalOptions(robot, mount, views, seed), out, fault, view=view)
     document = whole.document()
     write_atomically(out / _SUMMARY, json.dumps(document, indent=2, allow_nan=False) + "\n")
-    whole.report(out)
     if as_json:
         typer.echo(json.dumps(document, indent=2, allow_nan=False))
+    else:
+        whole.report()
+    messages().print(escape(f"wrote {out / _SUMMARY}; look: visioncal review {out / 'result'}"))
     report_written(whole.written, quiet=True, status=0 if whole.error.passed else EXIT_WRONG)
 
 
@@ -183,7 +185,7 @@ class _Rehearsal:
             document["fault"] = {key: it for key, it in suffered.items() if it is not None}
         return document
 
-    def report(self, out: Path) -> None:
+    def report(self) -> None:
         """Says it in words."""
         say, times = answers().print, self.times_s
         print_summary(self.calibration, verbose=False)
@@ -209,7 +211,6 @@ class _Rehearsal:
             f"plan {times['plan']:.0f} s, capture {times['capture']:.0f} s, calibrate "
             f"{times['calibrate']:.0f} s; in all {times['all']:.0f} s"
         )
-        messages().print(escape(f"wrote {out / _SUMMARY}; look: visioncal review {out / 'result'}"))
 
 
 def _report_devices(bench: Bench) -> None:
