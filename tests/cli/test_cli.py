@@ -232,7 +232,7 @@ def test_demo_compares_itself_with_the_truth(tmp_path, monkeypatch):
     for _ in range(2):  # a second run replaces the first
         done = visioncal("demo", "--views", 8)
         assert done.status == 0, done.err
-    assert "against the truth" in done.err
+    assert "against the truth" in done.out
     assert (tmp_path / "demo/result/report.html").stat().st_size > 10_000
 
 

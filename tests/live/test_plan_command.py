@@ -209,6 +209,7 @@ def test_a_session_about_one_axis_is_pointed_here_and_gets_its_missing_stops(one
         ("ur5e", {"board": "4000 0 5 180 0 0"}, (), "the arm's length"),
         ("ur5e", {}, ("--box", "cage:500,0,400:900,900,700"), "Look whether the boxes are"),
         ("ur5e", {}, ("--box", "cage:500,0,400"), "NAME:X,Y,Z:SX,SY,SZ"),
+        ("ur5e", {}, ("--workspace", "1,2"), "--workspace is '1,2'; X,Y,Z:SX,SY,SZ is needed"),
         ("ur5e", {}, ("--for", "handeye"), "Did you mean hand-eye"),
         ("ur5e", {}, ("--for", "tcp"), "--for is 'tcp'; stops can be planned for hand-eye"),
         ("ur5e", {}, ("--add", "3"), "holds no recorded session"),

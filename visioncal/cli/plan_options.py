@@ -104,7 +104,6 @@ class PlanOptions:
             DataError: A number, a box or a purpose is written otherwise.
         """
         wanted = purpose_of(self.purpose, "--for")
-        named = self.workspace and f"workspace:{self.workspace}"
         form = ",".join(f"q{it + 1}" for it in range(cell.robot.joint_count))
         start = self.start_joints and numbers_in(self.start_joints, "--start-joints", form)
         unwished = self.wish_mm is None and self.wish_deg is None
@@ -114,7 +113,7 @@ class PlanOptions:
             self.criterion,
             None if unwished else Wish(self.wish_mm, self.wish_deg),
             self.candidates,
-            box_of(named, "--workspace") if named else None,
+            box_of(self.workspace, "--workspace", "workspace") if self.workspace else None,
             np.array(start) if start else None,
             self.seed,
         )
@@ -316,18 +315,26 @@ class SightOptions:
         )
 
 
-def box_of(words: str, option: str = "--box") -> Box:
+def box_of(words: str, option: str = "--box", name: str = "") -> Box:
     """Reads a box: NAME:x,y,z:sx,sy,sz, its centre in the base and its lengths [mm].
+
+    Args:
+        words: What the user wrote.
+        option: Where.
+        name: The box's; empty where the words begin with it.
 
     Raises:
         DataError: It is written otherwise.
     """
-    parts = words.split(":")
+    parts = ([name] if name else []) + words.split(":")
     if len(parts) != 3 or not parts[0].strip():
+        label = "" if name else "NAME:"
+        form = f"{label}X,Y,Z:SX,SY,SZ"
         raise DataError(
-            f"{option} is {words[:80]!r}; NAME:X,Y,Z:SX,SY,SZ is needed, with the centre in the "
-            "base and the lengths in mm.",
+            f"{option} is {words[:80]!r}; {form} is needed, with the centre in the base and the "
+            "lengths in mm.",
             culprits=[option],
+            next_step=f"Such as {option} {label.lower()}500,0,300:400,400,400",
         )
     centre = numbers_in(parts[1], option, "x,y,z")
     size = numbers_in(parts[2], option, "sx,sy,sz")
