@@ -20,7 +20,13 @@ from visioncal.cli import progress
 from visioncal.cli import simulate as simulate_module
 from visioncal.cli.app import app
 from visioncal.cli.lazy import LazyGroup
-from visioncal.core.choices import Convention, SolverName
+from visioncal.core.choices import (
+    EXPORT_NAMES,
+    FOREIGN_NAMES,
+    Convention,
+    Criterion,
+    SolverName,
+)
 from visioncal.core.conventions import POSE_FORMS, UNITS_M
 from visioncal.core.errors import DataError
 from visioncal.core.types import Mount
@@ -28,7 +34,6 @@ from visioncal.interchange.exports import EXPORT_FORMATS
 from visioncal.interchange.formats import FOREIGN_FORMATS
 from visioncal.live.capture.options import Keep
 from visioncal.live.planning.purposes import PURPOSES
-from visioncal.live.planning.selection import Criterion
 from visioncal.robot import robot_names
 from visioncal.session import Session
 from visioncal.simulation import ARMS, CellOptions, read_truth, simulate, truth_path, write_session
@@ -330,6 +335,11 @@ def test_help_lists_what_can_be_chosen(name):
     for option, choices in CHOICES[name].items():
         words = set(re.split(r"[^\w-]+", " ".join(params[option].get_help_record(context))))
         assert set(choices) <= words, option
+
+
+def test_names_that_help_lists_are_those_of_the_registries():
+    assert tuple(it.name for it in FOREIGN_FORMATS) == FOREIGN_NAMES
+    assert tuple(it.name for it in EXPORT_FORMATS) == EXPORT_NAMES
 
 
 def test_boards_and_robots_are_found_from_any_folder(tmp_path, monkeypatch):

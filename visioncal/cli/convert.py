@@ -4,32 +4,25 @@ import sys
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
-from visioncal.calibration.guess import Candidate, Guess
-from visioncal.calibration.pipeline.guess_inputs import guess_session
 from visioncal.cli.console import messages
 from visioncal.cli.numbers import size_in
 from visioncal.cli.options import Force
 from visioncal.cli.pose_options import UNITS, RobotPoseOptions, names_in, poses_option
 from visioncal.cli.progress import shown_progress
+from visioncal.core.choices import FOREIGN_NAMES, CameraMount
 from visioncal.core.errors import DataError
-from visioncal.core.types import CameraMount
-from visioncal.interchange.formats import (
-    FOREIGN_FORMATS,
-    Foreign,
-    ImportOptions,
-    InDoubt,
-    PoseImportOptions,
-    convert,
-    guess_foreign,
-)
 
-_FORMATS = ", ".join(it.name for it in FOREIGN_FORMATS)
+# Help does not wait for them.
+if TYPE_CHECKING:
+    from visioncal.calibration.guess import Candidate, Guess
+    from visioncal.interchange.formats import Foreign, ImportOptions, InDoubt
+
+_FORMATS = ", ".join(FOREIGN_NAMES)
 _other = partial(typer.Option, rich_help_panel="The recording itself")
 _camera = partial(typer.Option, rich_help_panel="Its camera")
 _doubt = partial(typer.Option, rich_help_panel="Poses that may be misread, of a session as well")
@@ -104,12 +97,14 @@ class ConvertOptions(RobotPoseOptions):
         _camera("--resolution", help="WIDTH,HEIGHT that the intrinsics hold for."),
     ] = None
 
-    def requested(self) -> ImportOptions:
+    def requested(self) -> "ImportOptions":
         """The same, as files are read.
 
         Raises:
             DataError: Names or a resolution are written otherwise.
         """
+        from visioncal.interchange.formats import PoseImportOptions
+
         columns = names_in(self.camera_columns, "--camera-columns")
         return replace(
             super().requested(),
@@ -147,6 +142,8 @@ def convert_command(
     Between our own forms nothing is lost, which digests prove. Exit status 0: it is written; 2:
     nothing was written, and the message says what is missing or wrong.
     """
+    from visioncal.interchange.formats import convert
+
     requested, form = written.requested(), written.form
     if yes and not guess:
         raise DataError("--yes takes the best guess; it needs --guess.", culprits=["--yes"])
@@ -157,8 +154,11 @@ def convert_command(
     messages().print(escape(f"wrote {dest}\nsha256 {session.digest()}"))
 
 
-def _chosen(recorded: InDoubt | Foreign, *, yes: bool) -> Candidate:
+def _chosen(recorded: "InDoubt | Foreign", *, yes: bool) -> "Candidate":
     """Tries other readings, prints them, and takes the one that is clearly right or confirmed."""
+    from visioncal.calibration.pipeline.guess_inputs import guess_session
+    from visioncal.interchange.formats import Foreign, guess_foreign
+
     with shown_progress(quiet=False) as progress:
         if isinstance(recorded, Foreign):
             guess = guess_foreign(recorded, progress=progress)
@@ -168,7 +168,7 @@ def _chosen(recorded: InDoubt | Foreign, *, yes: bool) -> Candidate:
     return _confirmed(guess, yes=yes)
 
 
-def _confirmed(guess: Guess, *, yes: bool) -> Candidate:
+def _confirmed(guess: "Guess", *, yes: bool) -> "Candidate":
     if not guess.stands_out:
         if guess.declared.closes:
             return guess.declared
@@ -197,8 +197,10 @@ def _confirmed(guess: Guess, *, yes: bool) -> Candidate:
     return guess.best
 
 
-def _print_guess(guess: Guess) -> None:
+def _print_guess(guess: "Guess") -> None:
     """Prints the readings, the best first, what was found, and what the views leave open."""
+    from rich.table import Table
+
     console = messages()
     table = Table("reading", "chain closes to", "views that agree", box=None, pad_edge=False)
     for it in guess.candidates:

@@ -1,22 +1,26 @@
 """`visioncal export`."""
 
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import TYPE_CHECKING, Annotated, get_args
 
 import typer
 from rich.markup import escape
 
 from visioncal.cli.console import messages
 from visioncal.cli.options import Force, OutFile, PartOptions
-from visioncal.core.choices import Convention
+from visioncal.core.choices import EXPORT_NAMES, Convention
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, read_text, write_atomically
-from visioncal.interchange.exports import EXPORT_FORMATS, Load, Selection, document
-from visioncal.interchange.result_files import load_exportable
+
+# Help does not wait for them.
+if TYPE_CHECKING:
+    from visioncal.interchange.exports import Load
 
 
 def _show_formats(wanted: bool) -> None:
     if wanted:
+        from visioncal.interchange.exports import EXPORT_FORMATS
+
         width = max(len(it.name) for it in EXPORT_FORMATS)
         for it in EXPORT_FORMATS:
             typer.echo(f"{it.name:<{width}}  {it.words}")
@@ -37,7 +41,7 @@ def export_command(
         typer.Option(
             "--to",
             metavar="FORMAT",
-            help=f"{', '.join(it.name for it in EXPORT_FORMATS)}; --list says what each is.",
+            help=f"{', '.join(EXPORT_NAMES)}; --list says what each is.",
         ),
     ],
     part: PartOptions,
@@ -106,6 +110,9 @@ def export_command(
     The transform a_from_b is the pose of b in a: its parent is a, its child b. Exit status 2:
     nothing was written, for the reason given.
     """
+    from visioncal.interchange.exports import Selection, document
+    from visioncal.interchange.result_files import load_exportable
+
     load = _load(mass_kg, cog_mm)
     kept = None if onto is None else read_text(onto)
     selection = Selection(
@@ -134,7 +141,9 @@ def export_command(
     messages().print(escape(f"wrote {out}"))
 
 
-def _load(mass_kg: float | None, cog_mm: tuple[float, float, float] | None) -> Load | None:
+def _load(mass_kg: float | None, cog_mm: tuple[float, float, float] | None) -> "Load | None":
+    from visioncal.interchange.exports import Load
+
     if mass_kg is None and cog_mm is None:
         return None
     if mass_kg is None or cog_mm is None:

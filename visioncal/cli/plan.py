@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
@@ -10,25 +10,19 @@ from rich.markup import escape
 from visioncal.cli.console import answers, messages, report_written
 from visioncal.cli.options import AsJson, OutFolder
 from visioncal.cli.plan_options import CellOptions, ClearanceOptions, PlanOptions, SightOptions
-from visioncal.cli.planned_cell import (
-    Kept,
-    Source,
-    begun_session,
-    cell_of,
-    chosen_part,
-    find_source,
-)
 from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
-from visioncal.core.types import Progress
 from visioncal.interchange.outputs import write_plan
-from visioncal.live.planning.cell import PlanCell
-from visioncal.live.planning.messages import accuracy_words, looks_note, summary_of
-from visioncal.live.planning.plan import Plan, make_plan
 from visioncal.live.planning.purposes import purpose_of
-from visioncal.live.planning.recorded import Begun
-from visioncal.live.planning.written import plan_document
+
+# Help does not wait for them.
+if TYPE_CHECKING:
+    from visioncal.cli.planned_cell import Kept, Source
+    from visioncal.core.types import Progress
+    from visioncal.live.planning.cell import PlanCell
+    from visioncal.live.planning.plan import Plan
+    from visioncal.live.planning.recorded import Begun
 
 _SHOWN = 12
 # The cosine of a board's z to the base's, from which on only a camera below would see it.
@@ -55,6 +49,10 @@ def plan_command(
     Writes stops.csv, plan.json, plan.rrd to look at, and plan.script for a UR. Nothing is sent to
     a robot. Exit status 2: the cell or the session allows no plan, for the reason given.
     """
+    from visioncal.cli.planned_cell import chosen_part, find_source
+    from visioncal.live.planning.plan import make_plan
+    from visioncal.live.planning.written import plan_document
+
     limits, boxes = sight.limits(kept), kept.bodies
     purpose_of(wanted.purpose, "--for")
     start, words = chosen_part(find_source(source), words)
@@ -77,9 +75,11 @@ def plan_command(
 
 
 def _begin(
-    source: Source, words: CellOptions, kept: Kept, wanted: PlanOptions, progress: Progress
-) -> tuple[PlanCell, Begun | None]:
+    source: "Source", words: CellOptions, kept: "Kept", wanted: PlanOptions, progress: "Progress"
+) -> "tuple[PlanCell, Begun | None]":
     """The cell, and what was recorded of it where stops are added to that."""
+    from visioncal.cli.planned_cell import begun_session, cell_of
+
     if wanted.add is not None and wanted.stops is not None:
         raise DataError(
             "--add and --stops exclude each other: stops are added to what was recorded, or "
@@ -93,7 +93,9 @@ def _begin(
     return begun.cell, begun if wanted.add is not None else None
 
 
-def _report(plan: Plan) -> None:
+def _report(plan: "Plan") -> None:
+    from visioncal.live.planning.messages import accuracy_words, looks_note, summary_of
+
     console = answers()
     console.print(escape(f"{plan.request.purpose.name}: {summary_of(plan)}"))
     if plan.begun is not None and plan.begun.refusal:

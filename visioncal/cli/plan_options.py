@@ -1,21 +1,21 @@
 """The options of `visioncal plan`, and what they say."""
 
+import math
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 
 from visioncal.cli.numbers import numbers_in
+from visioncal.core.choices import Criterion, Mount
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import compose
-from visioncal.core.types import Mount
-from visioncal.live.planning.accuracy import Wish
-from visioncal.live.planning.cell import Box, Limits, PlanCell
-from visioncal.live.planning.plan import Request
 from visioncal.live.planning.purposes import PURPOSES, purpose_of
-from visioncal.live.planning.selection import Criterion
+
+# Help does not wait for them.
+if TYPE_CHECKING:
+    from visioncal.live.planning.cell import Box, Limits, PlanCell
+    from visioncal.live.planning.plan import Request
 
 _what = partial(typer.Option, rich_help_panel="What is planned")
 _cell = partial(typer.Option, rich_help_panel="The cell, where the source does not say it")
@@ -97,12 +97,17 @@ class PlanOptions:
         _what("--seed", min=0, help="Other possible stops for every number."),
     ] = 0
 
-    def request(self, cell: PlanCell) -> Request:
+    def request(self, cell: "PlanCell") -> "Request":
         """The same, as the planner takes it.
 
         Raises:
             DataError: A number, a box or a purpose is written otherwise.
         """
+        import numpy as np
+
+        from visioncal.live.planning.accuracy import Wish
+        from visioncal.live.planning.plan import Request
+
         wanted = purpose_of(self.purpose, "--for")
         form = ",".join(f"q{it + 1}" for it in range(cell.robot.joint_count))
         start = self.start_joints and numbers_in(self.start_joints, "--start-joints", form)
@@ -247,7 +252,7 @@ class ClearanceOptions:
     ] = 3.0
 
     @property
-    def bodies(self) -> tuple[Box, ...]:
+    def bodies(self) -> "tuple[Box, ...]":
         """What is in the way.
 
         Raises:
@@ -302,20 +307,22 @@ class SightOptions:
         _limits("--focus-mm", metavar="NEAR,FAR", help="Depths at which images are sharp."),
     ] = None
 
-    def limits(self, kept: ClearanceOptions) -> Limits:
+    def limits(self, kept: ClearanceOptions) -> "Limits":
         """These limits and those of any motion."""
+        from visioncal.live.planning.cell import Limits
+
         return Limits(
-            float(np.deg2rad(kept.margin_deg)),
+            math.radians(kept.margin_deg),
             _span(self.distance_mm, "--distance-mm"),
             _span(self.focus_mm, "--focus-mm"),
-            float(np.deg2rad(self.tilt_deg)),
+            math.radians(self.tilt_deg),
             self.edge_px,
             1e-3 * kept.clearance_mm,
             kept.floor_m,
         )
 
 
-def box_of(words: str, option: str = "--box", name: str = "") -> Box:
+def box_of(words: str, option: str = "--box", name: str = "") -> "Box":
     """Reads a box: NAME:x,y,z:sx,sy,sz, its centre in the base and its lengths [mm].
 
     Args:
@@ -326,6 +333,11 @@ def box_of(words: str, option: str = "--box", name: str = "") -> Box:
     Raises:
         DataError: It is written otherwise.
     """
+    import numpy as np
+
+    from visioncal.core.transforms import compose
+    from visioncal.live.planning.cell import Box
+
     parts = ([name] if name else []) + words.split(":")
     if len(parts) != 3 or not parts[0].strip():
         label = "" if name else "NAME:"

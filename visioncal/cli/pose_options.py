@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from visioncal.core.conventions import POSE_FORMS, UNITS_M
+from visioncal.core.choices import POSE_FORMS, UNITS_M
 from visioncal.core.errors import DataError
 
 # Help does not wait for them.

@@ -11,6 +11,9 @@ from itertools import permutations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from visioncal.core.choices import POSE_FORMS as POSE_FORMS
+from visioncal.core.choices import UNITS_M as UNITS_M
+from visioncal.core.choices import PoseForm as PoseForm
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.transforms import compose, invert, nearest_rotation
@@ -19,8 +22,6 @@ from visioncal.core.types import FloatArray, IntArray, Mask
 # Three written digits leave a quaternion's length within 9e-4 of 1 and a matrix within 8e-4 of a
 # rotation; views.csv has the same limit. What is farther off is read in the wrong form or order.
 _NORM_TOLERANCE = 1e-3
-
-UNITS_M: Mapping[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "inch": 0.0254}
 
 
 @dataclass(frozen=True)
@@ -147,37 +148,6 @@ def _all_forms() -> tuple[RotationForm, ...]:
 
 
 ROTATION_FORMS: Mapping[str, RotationForm] = {it.name: it for it in _all_forms()}
-
-
-@dataclass(frozen=True)
-class PoseForm:
-    """How a robot's maker or a library writes a pose: a length unit [m] and a rotation."""
-
-    name: str
-    words: str
-    unit: str
-    rotation: str
-
-
-# Universal Robots, "Script manual": p[x, y, z, rx, ry, rz]. KUKA, "System variables": FRAME X, Y,
-# Z, A, B, C with A about Z, then B about Y, then C about X, moving. FANUC and Yaskawa: W, P, R
-# (Rx, Ry, Rz) about fixed X, Y, Z. ABB, "RAPID data types": pos [mm], orient q1 .. q4 = w, x, y, z.
-# Staubli VAL 3: Rx, Ry, Rz about moving axes. Doosan: A, B, C about moving Z, Y, Z. URDF
-# specification: roll, pitch, yaw about fixed x, y, z.
-POSE_FORMS: Mapping[str, PoseForm] = {
-    it.name: it
-    for it in (
-        PoseForm("ur", "Universal Robots p[...]", "m", "rotation-vector"),
-        PoseForm("kuka", "KUKA X, Y, Z, A, B, C", "mm", "euler-ZYX-deg"),
-        PoseForm("fanuc", "FANUC X, Y, Z, W, P, R", "mm", "euler-xyz-deg"),
-        PoseForm("yaskawa", "Yaskawa X, Y, Z, Rx, Ry, Rz", "mm", "euler-xyz-deg"),
-        PoseForm("abb", "ABB pos and orient", "mm", "quaternion-wxyz"),
-        PoseForm("staubli", "Staubli X, Y, Z, Rx, Ry, Rz", "mm", "euler-XYZ-deg"),
-        PoseForm("doosan", "Doosan X, Y, Z, A, B, C", "mm", "euler-ZYZ-deg"),
-        PoseForm("rpy", "URDF xyz and rpy", "m", "euler-xyz-rad"),
-        PoseForm("ros", "ROS position and orientation", "m", "quaternion-xyzw"),
-    )
-}
 
 
 @dataclass(frozen=True)

@@ -7,16 +7,16 @@ from typing import Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+# Options name them, and help does not wait for numpy.
+from visioncal.core.choices import MOUNTS as MOUNTS
+from visioncal.core.choices import CameraMount as CameraMount
+from visioncal.core.choices import Mount as Mount
+
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 IntArray: TypeAlias = npt.NDArray[np.int64]
 Mask: TypeAlias = npt.NDArray[np.bool_]
 Image: TypeAlias = npt.NDArray[np.uint8]
 
-CameraMount: TypeAlias = Literal["eye-in-hand", "eye-to-hand"]
-MOUNTS: tuple[CameraMount, ...] = ("eye-in-hand", "eye-to-hand")
-# What observes whom: a camera on the flange, one that stands still, or a measuring instrument that
-# stands still and reads a probe or points on the flange.
-Mount: TypeAlias = Literal["eye-in-hand", "eye-to-hand", "instrument"]
 CameraKind: TypeAlias = Literal["brown", "fisheye"]
 TargetKind: TypeAlias = Literal[
     "charuco", "checkerboard", "aprilgrid", "circles", "marker", "points"

@@ -5,13 +5,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from visioncal.core.choices import Criterion
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import IntArray
 from visioncal.live.planning.accuracy import Accuracy, Wish
 from visioncal.live.planning.information import World
-from visioncal.live.planning.selection import CRITERIA, Criterion, Selection, reduced
+from visioncal.live.planning.selection import CRITERIA, Selection, reduced
 
 # An exchange must gain this share; so many of them a stop are enough.
 _GAIN, _EXCHANGES = 1e-4, 1.0

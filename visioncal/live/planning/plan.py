@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from visioncal.core.choices import Criterion
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
@@ -18,7 +19,6 @@ from visioncal.live.planning.information import WORLDS, World, place_sigmas, wor
 from visioncal.live.planning.path import Route, ordered
 from visioncal.live.planning.purposes import Purpose
 from visioncal.live.planning.recorded import Begun
-from visioncal.live.planning.selection import Criterion
 
 # Stops without a safe way to them are chosen anew so often; then a plan goes without them.
 _ROUNDS = 4

@@ -16,16 +16,16 @@ A stop adds six rows, so that its effect on a covariance C is a correction of ra
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, TypeAlias, get_args
+from typing import get_args
 
 import numpy as np
 
+from visioncal.core.choices import Criterion
 from visioncal.core.types import FloatArray
 from visioncal.estimation.linalg import covariance_root, gram
 from visioncal.live.planning.accuracy import Accuracy
 from visioncal.live.planning.information import World
 
-Criterion: TypeAlias = Literal["I", "D", "A", "E", "O1"]
 CRITERIA: tuple[str, ...] = get_args(Criterion)
 
 # Directions of which all candidates together take less than this share of the variance are left
