@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from support.commands import visioncal as run
 
+from visioncal.core.errors import DataError
 from visioncal.dynamics.identified import Identified
+from visioncal.results import Calibration
 from visioncal.session import Session
 from visioncal.simulation.dynamics import real_dynamics
 from visioncal.simulation.exercise import (
@@ -166,3 +168,15 @@ def test_validation_needs_a_result(folder, tmp_path):
     done = run("dynamics", "validate", folder, "--against", tmp_path)
     assert done.status == 2
     assert "is no dynamics.json" in done.err
+
+
+def test_results_of_the_one_kind_are_no_results_of_the_other(tmp_path):
+    calibrated, identified = tmp_path / "calibrated", tmp_path / "identified"
+    for folder, name in ((calibrated, "calibration.json"), (identified, "dynamics.json")):
+        folder.mkdir()
+        (folder / name).write_text("{}", encoding="utf-8")
+    with pytest.raises(DataError, match="is a result of visioncal dynamics identify"):
+        Calibration.load(identified)
+    with pytest.raises(DataError, match=r"has no dynamics\.json") as caught:
+        Identified.load(calibrated)
+    assert "visioncal dynamics identify" in caught.value.next_step

@@ -40,7 +40,7 @@ def test_a_result_comes_out_again_of_its_recording(tmp_path):
     out = tmp_path / "out"
     assert visioncal("calibrate", session, "-o", out).status == 0
     done = visioncal("report", out, "--recompute")
-    assert (done.status, "bit for bit" in done.err) == (0, True)
+    assert (done.status, "bit for bit" in done.out) == (0, True)
     page = tmp_path / "certificate.html"
     done = visioncal("report", out, "--certificate", "--serial", "robot=7", "-o", page)
     assert done.status == 0
@@ -52,5 +52,5 @@ def test_a_result_comes_out_again_of_its_recording(tmp_path):
     assert other.status == 0
     done = visioncal("report", out, "--recompute")
     assert done.status == 3
-    assert "flange_from_cam by " in done.err
+    assert "flange_from_cam by " in done.out
     assert load_stored(out).session is not None

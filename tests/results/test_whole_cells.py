@@ -87,7 +87,7 @@ def test_the_file_has_the_sections_of_one_camera_by_name(folder):
 
 def test_a_cell_comes_out_again_of_its_recording(folder):
     done = visioncal("report", folder / "out", "--recompute")
-    assert (done.status, "bit for bit" in done.err) == (0, True), done.err
+    assert (done.status, "bit for bit" in done.out) == (0, True), done.err
 
 
 def test_the_file_says_what_each_frame_is_uncertain_by(folder, found):

@@ -539,8 +539,16 @@ def test_a_robot_whose_tip_alone_is_named_goes_by_its_poses(folder: Path) -> Non
 
 
 def test_what_is_no_session_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="is no session: a folder"):
+    with pytest.raises(DataError, match="nowhere does not exist"):
         Session.load(tmp_path / "nowhere")
+    for name in ("notes.txt", "calibration.json", "recording.rrd"):
+        (tmp_path / name).write_text("{}", encoding="utf-8")
+    with pytest.raises(DataError, match="is no session: a folder"):
+        Session.load(tmp_path / "notes.txt")
+    for path in (tmp_path, tmp_path / "calibration.json"):
+        with pytest.raises(DataError, match="but a result") as caught:
+            Session.load(path)
+        assert f"name {tmp_path / 'recording.rrd'}" in caught.value.next_step
 
 
 def test_a_byte_order_mark_and_other_line_ends_are_read(folder: Path) -> None:

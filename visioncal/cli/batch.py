@@ -20,7 +20,10 @@ _MOST_NAMED = 5
 
 def batch_command(
     out: Annotated[
-        Path, typer.Option("-o", "--out", help="Folder for the results, one in each session's.")
+        Path,
+        typer.Option(
+            "-o", "--out", file_okay=False, help="Folder for the results, one in each session's."
+        ),
     ],
     need: NeedOptions,
     sessions: Annotated[

@@ -37,7 +37,9 @@ def dynamics_identify_command(
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", help=f"A folder for {FILE}, report and recording."),
+        typer.Option(
+            "-o", "--output", file_okay=False, help=f"A folder for {FILE}, report and recording."
+        ),
     ] = None,
     friction: Annotated[
         str,

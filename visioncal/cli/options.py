@@ -15,11 +15,13 @@ SessionArgument: TypeAlias = Annotated[
     Path, typer.Argument(help="A session's folder, or its .rrd recording.")
 ]
 OutFolder: TypeAlias = Annotated[
-    Path, typer.Option("-o", "--out", help="The folder to write into.")
+    Path, typer.Option("-o", "--out", file_okay=False, help="The folder to write into.")
 ]
 OutFile: TypeAlias = Annotated[
     Path | None,
-    typer.Option("-o", "--out", help="The file to write; otherwise, or as -, stdout."),
+    typer.Option(
+        "-o", "--out", dir_okay=False, help="The file to write; otherwise, or as -, stdout."
+    ),
 ]
 AsJson: TypeAlias = Annotated[
     bool, typer.Option("--json", help="Print the result as JSON to stdout, without words.")

@@ -117,7 +117,13 @@ class DeviceOptions:
 def record_command(
     out: Annotated[
         Path,
-        typer.Option("-o", "--out", metavar="SESSION", help="The session's folder; a new one."),
+        typer.Option(
+            "-o",
+            "--out",
+            metavar="SESSION",
+            file_okay=False,
+            help="The session's folder; a new one.",
+        ),
     ],
     arm: Annotated[
         str,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import messages
+from visioncal.cli.console import answers, messages
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.refusing import refuse_given
 from visioncal.core.errors import DataError
@@ -28,7 +28,12 @@ def report_command(
     ],
     out: Annotated[
         Path | None,
-        typer.Option("-o", "--out", help="The file; report.html or certificate.html otherwise."),
+        typer.Option(
+            "-o",
+            "--out",
+            dir_okay=False,
+            help="The file; report.html or certificate.html otherwise.",
+        ),
     ] = None,
     certificate: Annotated[
         bool, typer.Option("--certificate", help="One page to print and sign, instead.")
@@ -57,7 +62,9 @@ def report_command(
 
     if not certificate:
         refuse_given(
-            {"--operator": operator or None, "--serial": serial}, "they are for --certificate"
+            {"--operator": operator or None, "--serial": serial},
+            "they are for --certificate",
+            "Give that, too, or leave it out.",
         )
     # Plots take half a second to import, which help need not wait for.
     from visioncal.present.report import write_report
@@ -106,7 +113,7 @@ def _recompute(stored: "Stored") -> None:
         )
     with shown_progress(quiet=False) as progress:
         found = recompute(stored.calibration, stored.session, progress=progress)
-    messages().print(escape(found.words))
+    answers().print(escape(found.words))
     if not found.is_same:
         raise typer.Exit(_EXIT_OTHERS)
 

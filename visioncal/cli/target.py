@@ -63,7 +63,9 @@ def make_command(
             "--kind and the options after it."
         ),
     ] = None,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the files.")] = Path(),
+    out: Annotated[
+        Path, typer.Option("-o", "--out", file_okay=False, help="Folder for the files.")
+    ] = Path(),
     page: Annotated[
         str | None,
         typer.Option(
@@ -203,7 +205,7 @@ def check_command(
         typer.Option(help="Measured side of a square; of a tag for an AprilGrid or a single one."),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Write the description here.")
+        Path | None, typer.Option("-o", "--out", dir_okay=False, help="Write the description here.")
     ] = None,
     as_json: AsJson = False,
     force: Annotated[

@@ -49,7 +49,10 @@ def verify_command(
         typer.Option(help="A table of one's own of when to calibrate again (.toml)."),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help=f"A folder for {REPORT} and {VERIFY}.")
+        Path | None,
+        typer.Option(
+            "-o", "--output", file_okay=False, help=f"A folder for {REPORT} and {VERIFY}."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

@@ -147,6 +147,13 @@ class Identified:
         from visioncal.dynamics.document import fields_from_document
 
         path = Path(path)
+        if path.is_dir() and not (path / FILE).exists():
+            raise DataError(
+                f"{path} has no {FILE}, as visioncal dynamics identify writes it.",
+                culprits=[str(path)],
+                next_step="Identify the arm first, and name its output folder: visioncal dynamics "
+                "identify --help",
+            )
         path = path / FILE if path.is_dir() else path
         try:
             return cls(**fields_from_document(parse_stored(read_bytes(path), str(path))))

@@ -46,7 +46,10 @@ class Plane:
         """
         length = float(np.linalg.norm(normal))
         if not np.isfinite(length) or length < 1e-9:
-            raise DataError(f"plane: the normal {np.asarray(normal).tolist()} has no direction.")
+            raise DataError(
+                f"plane: the normal {np.asarray(normal).tolist()} has no direction.",
+                next_step="Give one of any length but zero; 0,0,1 is upward in the base.",
+            )
         unit = np.asarray(normal, dtype=float) / length
         return cls(unit, _length(float(unit @ point)), _offset_covariance(sigma_m))
 

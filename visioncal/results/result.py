@@ -367,6 +367,13 @@ class Calibration(CalibrationSections):
             file = file / "calibration.json"
             # A cell that was aligned by an older version.
             file = before if before.is_file() and not file.exists() else file
+            if not file.exists() and (file.parent / "dynamics.json").is_file():
+                raise DataError(
+                    f"{path} is a result of visioncal dynamics identify, and has no calibration.",
+                    culprits=[str(path)],
+                    next_step="Its report is the report.html there; name an output folder of "
+                    "visioncal calibrate here.",
+                )
         return cls.from_json(read_bytes(file), str(file))
 
     @classmethod

@@ -113,18 +113,26 @@ class Session:
             from visioncal.present.recording import read_session
 
             return read_session(path)
+        if not path.exists():
+            raise DataError(
+                f"{path} does not exist; a session's folder, or an .rrd recording, is needed.",
+                culprits=[str(path)],
+                next_step="Check the path and its spelling.",
+            )
+        # What calibrate writes lies together, and is taken for its folder.
+        folder = path.parent if path.name == "calibration.json" else path
+        recording = folder / "recording.rrd"
+        if recording.is_file() and not (folder / "session.toml").exists():
+            raise DataError(
+                f"{path} is no session, but a result.",
+                culprits=[str(path)],
+                next_step=f"Its recording is the session: name {recording}.",
+            )
         if not path.is_dir():
             raise DataError(
                 f"{path} is no session: a folder with session.toml and views.csv, or an .rrd "
                 "recording, is needed.",
                 culprits=[str(path)],
-            )
-        recording = path / "recording.rrd"
-        if recording.is_file() and not (path / "session.toml").exists():
-            raise DataError(
-                f"{path} is no session, but a result.",
-                culprits=[str(path)],
-                next_step=f"Its recording is the session: name {recording}.",
             )
         document = parse_toml(
             read_text_inside(path, "session.toml", MOST_TOML_BYTES), "session.toml"
