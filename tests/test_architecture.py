@@ -116,10 +116,11 @@ def test_heavy_libraries_enter_in_one_place():
         ("visioncal.cli.calibrate", {"numpy", "rich", "visioncal.core.types"}),
         (
             "visioncal.cli.align, visioncal.cli.batch, visioncal.cli.demo, visioncal.cli.diff, "
-            "visioncal.cli.convert, visioncal.cli.doctor, visioncal.cli.export, "
-            "visioncal.cli.locate, visioncal.cli.plan, visioncal.cli.report, "
-            "visioncal.cli.review, visioncal.cli.target, visioncal.cli.touch_test, "
-            "visioncal.cli.verify",
+            "visioncal.cli.convert, visioncal.cli.correct, visioncal.cli.doctor, "
+            "visioncal.cli.export, visioncal.cli.fixture, visioncal.cli.locate, "
+            "visioncal.cli.plan, visioncal.cli.report, visioncal.cli.review, "
+            "visioncal.cli.simulate, visioncal.cli.target, visioncal.cli.tcp, "
+            "visioncal.cli.touch_test, visioncal.cli.verify",
             {"numpy", "visioncal.core.types"},
         ),
         ("visioncal", {"numpy", "typer", "visioncal.core.types"}),

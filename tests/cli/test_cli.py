@@ -17,12 +17,13 @@ import visioncal as visioncal_package
 from visioncal.calibration.pipeline import STAGES
 from visioncal.calibration.stages.kinematics import ASKED
 from visioncal.cli import progress
-from visioncal.cli import simulate as simulate_module
 from visioncal.cli.app import app
 from visioncal.cli.lazy import LazyGroup
 from visioncal.core.choices import (
     EXPORT_NAMES,
     FOREIGN_NAMES,
+    SIMULATED_ARMS,
+    SIMULATED_CELLS,
     Convention,
     Criterion,
     SolverName,
@@ -36,7 +37,14 @@ from visioncal.live.capture.options import Keep
 from visioncal.live.planning.purposes import PURPOSES
 from visioncal.robot import robot_names
 from visioncal.session import Session
-from visioncal.simulation import ARMS, CellOptions, read_truth, simulate, truth_path, write_session
+from visioncal.simulation import (
+    CellOptions,
+    cell_names,
+    read_truth,
+    simulate,
+    truth_path,
+    write_session,
+)
 from visioncal.vision.dense.library import DEVICES
 from visioncal.vision.targets import target_names
 
@@ -124,7 +132,7 @@ def test_a_result_in_the_place_of_a_session_names_its_recording(tmp_path):
 
 def test_nothing_is_rendered_for_a_folder_that_is_not_empty(tmp_path, monkeypatch):
     (tmp_path / "mine.txt").touch()
-    monkeypatch.setattr("visioncal.cli.simulate.simulate", None)
+    monkeypatch.setattr("visioncal.simulation.simulate", None)
     done = visioncal("simulate", tmp_path)
     assert done.status == 2
     assert "exists and is not empty" in done.err
@@ -287,7 +295,7 @@ def test_ctrl_c_is_status_130_and_says_what_is_left_behind(tmp_path, monkeypatch
             (folder / "views.csv").write_text("view\n")
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(simulate_module, "write_session", interrupted)
+    monkeypatch.setattr("visioncal.simulation.write_session", interrupted)
     done = visioncal("simulate", cell, "--views", 3)
     assert (done.status, done.out) == (130, "")
     left = f"written so far: {cell / 'views.csv'}" if keeps else "nothing was written"
@@ -320,7 +328,7 @@ CHOICES = {
     "align": {"level": (*(it for it in ASKED if it != "thermal"), "hand-eye")},
     "plan": {"purpose": PURPOSES, "criterion": get_args(Criterion), "mount": get_args(Mount)},
     "record": {"pose_form": ("ours", *POSE_FORMS), "keep": get_args(Keep)},
-    "simulate": {"robot": ARMS},
+    "simulate": {"robot": SIMULATED_ARMS},
     "export": {"to": [it.name for it in EXPORT_FORMATS], "convention": get_args(Convention)},
     "convert": {"form": [it.name for it in FOREIGN_FORMATS], "robot_unit": UNITS_M},
     "fixture": {"cad_unit": UNITS_M},
@@ -340,6 +348,7 @@ def test_help_lists_what_can_be_chosen(name):
 def test_names_that_help_lists_are_those_of_the_registries():
     assert tuple(it.name for it in FOREIGN_FORMATS) == FOREIGN_NAMES
     assert tuple(it.name for it in EXPORT_FORMATS) == EXPORT_NAMES
+    assert cell_names() == SIMULATED_CELLS
 
 
 def test_boards_and_robots_are_found_from_any_folder(tmp_path, monkeypatch):

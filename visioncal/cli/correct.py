@@ -1,42 +1,60 @@
 """`visioncal correct`."""
 
-import json
-from collections.abc import Iterator, Mapping, Sequence
+import math
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-import numpy as np
 import typer
-from rich.markup import escape
 
-from visioncal.cli.console import messages
-from visioncal.cli.numbers import numbers_in
 from visioncal.cli.options import AsJson, Force, OutFile, PartOptions
-from visioncal.core.errors import DataError
-from visioncal.core.files import check_free, did_you_mean, some_of, write_atomically
-from visioncal.core.number_format import figure
-from visioncal.core.transforms import invert
-from visioncal.core.types import FloatArray, IntArray
-from visioncal.interchange.result_files import load_calibration
-from visioncal.results import Calibration
-from visioncal.results.compensation.arms import CalibratedArm, predicted_sigma_mm
-from visioncal.results.compensation.correction import WIDEST_RAD, Corrected, correct
-from visioncal.results.compensation.table import (
-    Targets,
-    columns_to_send,
-    read_targets,
-    table_to_send,
-)
-from visioncal.robot import Loads
-from visioncal.session.choosing import ARM, EYE
-from visioncal.session.columns import no_celsius
+from visioncal.core.choices import WIDEST_RAD
 
-_SHOWN = 10
-_MOST_DEG = 720.0
-# Elsewhere a millimetre turns no joint by more than some tenths of a degree; beyond the second, how
-# far it is matters no more.
-_SINGULAR_DEG, _MOST_TURN_DEG = 5.0, 90.0
-_TOOLS = "flange_from_"
+
+@dataclass(frozen=True)
+class CorrectOptions:
+    """What the targets are of, and what the arm carries on its way through them."""
+
+    tool: Annotated[
+        str | None,
+        typer.Option(
+            help="What the targets are of, and the corrected ones: a tool of the calibration, or "
+            "cam; else of the flange."
+        ),
+    ] = None
+    seed_joints: Annotated[
+        str | None,
+        typer.Option(
+            metavar="Q1,Q2,...",
+            help="Joint angles near which the first target is reached, in radians; else the "
+            "middle of the joints' limits. Each further target is reached near to the one before.",
+        ),
+    ] = None
+    payload_kg: Annotated[
+        float,
+        typer.Option("--payload-kg", help="What hangs on the flange, for joints that bend (kg)."),
+    ] = 0.0
+    payload_m: Annotated[
+        str,
+        typer.Option(
+            "--payload-m", metavar="X,Y,Z", help="Where its centre is, in the flange's frame (m)."
+        ),
+    ] = "0,0,0"
+    widest_deg: Annotated[
+        float,
+        typer.Option(
+            "--widest-deg",
+            help="Warn where a joint turns farther than this from one target to the next.",
+        ),
+    ] = math.degrees(WIDEST_RAD)
+    temperatures: Annotated[
+        str | None,
+        typer.Option(
+            metavar="T1,T2,...",
+            help="Temperatures of the links behind the joints, in degrees Celsius, for an arm "
+            "whose drift was calibrated; else as warm as it was when its session began.",
+        ),
+    ] = None
 
 
 def correct_command(
@@ -58,46 +76,8 @@ def correct_command(
     ],
     part: PartOptions,
     out: OutFile = None,
-    tool: Annotated[
-        str | None,
-        typer.Option(
-            help="What the targets are of, and the corrected ones: a tool of the calibration, or "
-            "cam; else of the flange."
-        ),
-    ] = None,
-    seed_joints: Annotated[
-        str | None,
-        typer.Option(
-            metavar="Q1,Q2,...",
-            help="Joint angles near which the first target is reached, in radians; else the "
-            "middle of the joints' limits. Each further target is reached near to the one before.",
-        ),
-    ] = None,
-    payload_kg: Annotated[
-        float,
-        typer.Option("--payload-kg", help="What hangs on the flange, for joints that bend (kg)."),
-    ] = 0.0,
-    payload_m: Annotated[
-        str,
-        typer.Option(
-            "--payload-m", metavar="X,Y,Z", help="Where its centre is, in the flange's frame (m)."
-        ),
-    ] = "0,0,0",
-    widest_deg: Annotated[
-        float,
-        typer.Option(
-            "--widest-deg",
-            help="Warn where a joint turns farther than this from one target to the next.",
-        ),
-    ] = float(np.rad2deg(WIDEST_RAD)),
-    temperatures: Annotated[
-        str | None,
-        typer.Option(
-            metavar="T1,T2,...",
-            help="Temperatures of the links behind the joints, in degrees Celsius, for an arm "
-            "whose drift was calibrated; else as warm as it was when its session began.",
-        ),
-    ] = None,
+    *,
+    asked: CorrectOptions,
     skip: Annotated[
         bool,
         typer.Option("--skip-unreachable", help="Write the other targets where some are refused."),
@@ -109,236 +89,10 @@ def correct_command(
 
     Exit status 2: nothing was written, for the reason given; targets out of reach are named.
     """
-    needs = EYE if tool is not None and tool.removeprefix(_TOOLS) == "cam" else ARM
-    chosen = load_calibration(calibration, part.choice, needs)
-    known = _warm(chosen, temperatures)
-    arm = CalibratedArm.of(known)
+    # Help does not wait for it.
+    from visioncal.cli.corrected import correct_table
+
     written_to = None if out is None or out == Path("-") else out
-    if written_to is not None:
-        check_free(written_to, force=force)
-    wanted = read_targets(targets, arm.real)
-    flange_from_tool = _tool(known, tool)
-    base_from_flange = wanted.base_from_tool @ invert(flange_from_tool)
-    corrected = correct(
-        known,
-        base_from_flange,
-        _seeds(wanted.q_seed, seed_joints),
-        widest_rad=np.deg2rad(_widest(widest_deg)),
-        loads=_loads(len(base_from_flange), payload_kg, payload_m),
+    correct_table(
+        targets, calibration, part, written_to, asked, skip=skip, force=force, as_json=as_json
     )
-    lost = tuple(_unreachable(wanted, corrected))
-    rows = np.flatnonzero(corrected.reached)
-    if lost and (not skip or not len(rows)):
-        raise _refusal(lost, len(wanted))
-    sigma_mm = predicted_sigma_mm(known, base_from_flange[:, :3, 3], corrected.q)
-    base_from_tool = corrected.base_from_flange @ flange_from_tool
-    columns = columns_to_send(wanted, corrected, base_from_tool, sigma_mm)
-    warnings = [
-        *_doubts(known),
-        *_rigid(arm, payload_kg),
-        *_turns(arm, wanted, corrected, widest_deg),
-        *_singular(arm, wanted, corrected.q, rows),
-    ]
-    if written_to is not None:
-        write_atomically(written_to, table_to_send(wanted, columns, rows))
-    if as_json:
-        document = _document(wanted, columns, rows, lost) | {"warnings": warnings}
-        typer.echo(json.dumps(document, indent=2))
-        return
-    if written_to is None:
-        typer.echo(table_to_send(wanted, columns, rows), nl=False)
-    _report(columns, rows, lost, warnings)
-    if np.isnan(wanted.q_seed).all() and seed_joints is None:
-        messages().print(escape(_posture(arm, corrected.q[rows[0]])))
-    if written_to is not None:
-        messages().print(escape(f"wrote {written_to}"))
-
-
-def _warm(calibration: Calibration, words: str | None) -> Calibration:
-    """The calibration of the arm as warm as is stated."""
-    if words is None:
-        return calibration
-    count = calibration.drift.joint_count
-    form = ",".join(f"T{it}" for it in range(1, count + 1))
-    temperatures = np.array(numbers_in(words, "--temperatures", form))
-    wrong = no_celsius(temperatures)
-    if wrong:
-        raise DataError(f"--temperatures: {wrong}.", culprits=["--temperatures"])
-    return calibration.at_temperatures(temperatures)
-
-
-def _widest(degrees: float) -> float:
-    if not 0.0 < degrees <= _MOST_DEG:
-        raise DataError(
-            f"--widest-deg is {degrees:g}; degrees above 0 and up to {_MOST_DEG:g} are needed.",
-            culprits=["--widest-deg"],
-        )
-    return degrees
-
-
-def _loads(count: int, payload_kg: float, payload_m: str) -> Loads:
-    centre = numbers_in(payload_m, "--payload-m", "x,y,z")
-    return Loads.alike(count, payload_kg, centre, (0.0, 0.0, 0.0))
-
-
-def _rigid(arm: CalibratedArm, payload_kg: float) -> Iterator[str]:
-    """Says where a payload changes nothing."""
-    if payload_kg and not arm.compliance.any():
-        yield (
-            f"--payload-kg {payload_kg:g} changes nothing: the calibration has no joints that bend "
-            "(level elastic)."
-        )
-
-
-def _tool(calibration: Calibration, name: str | None) -> FloatArray:
-    """(4, 4) `flange_from_tool`; the identity where the targets are of the flange."""
-    if name is None:
-        return np.eye(4)
-    placed = calibration.placed
-    transform = name if name.startswith(_TOOLS) else f"{_TOOLS}{name}"
-    if transform not in placed:
-        known = [it.removeprefix(_TOOLS) for it in placed if it.startswith(_TOOLS)]
-        raise DataError(
-            f"--tool {name}: calibration {calibration.session_name!r} has no {transform}; on its "
-            f"flange are {', '.join(known) or 'no tools'}.",
-            culprits=["--tool"],
-            next_step=did_you_mean(name, known) or "A tool joins it by visioncal tcp.",
-        )
-    return placed[transform].matrix
-
-
-def _seeds(own: FloatArray, words: str | None) -> FloatArray:
-    """The rows' seeds (m, n), that of the option in the first where it has none."""
-    if words is None:
-        return own
-    form = ",".join(f"q{it}" for it in range(1, own.shape[1] + 1))
-    seed = np.array(numbers_in(words, "--seed-joints", form))
-    if np.isnan(own[0, 0]):
-        own = own.copy()
-        own[0] = seed
-    return own
-
-
-def _unreachable(targets: Targets, corrected: Corrected) -> Iterator[tuple[str, str]]:
-    """The rows that are not reached: where they stand, and why not."""
-    for row in np.flatnonzero(~corrected.reached):
-        off_mm, off_deg = 1e3 * corrected.off_m[row], np.rad2deg(corrected.off_rad[row])
-        near = f"the nearest posture leaves {figure(off_mm)} mm and {figure(off_deg)} deg"
-        beyond = corrected.beyond[row]
-        why = (
-            f"reached only with {some_of(beyond)} beyond its limits; within them "
-            if beyond
-            else "out of reach: "
-        )
-        yield targets.places[row], why + near
-
-
-def _refusal(lost: Sequence[tuple[str, str]], count: int) -> DataError:
-    lines = [f"{place}: {why}." for place, why in lost[:_SHOWN]]
-    if len(lost) > _SHOWN:
-        lines.append(f"And {len(lost) - _SHOWN} more of the kind.")
-    return DataError(
-        "\n".join([f"{len(lost)} of {count} targets cannot be reached.", *lines]),
-        culprits=[place for place, _ in lost],
-        next_step="Move them, or write the others with --skip-unreachable."
-        if len(lost) < count
-        else "Targets are base_from_flange in metres; of a tool, name it with --tool.",
-    )
-
-
-def _doubts(calibration: Calibration) -> Iterator[str]:
-    verdict = calibration.verdict
-    if verdict.status == "bad":
-        yield f"The calibration's verdict is bad: {' '.join(verdict.reasons[:1])}"
-
-
-def _turns(
-    arm: CalibratedArm, targets: Targets, corrected: Corrected, widest_deg: float
-) -> Iterator[str]:
-    """Says where the arm had to turn far, and may have taken another branch."""
-    turned = np.rad2deg(corrected.turned_rad)
-    wide = np.flatnonzero(corrected.reached & (turned.max(axis=1) > widest_deg))
-    for row in wide[:_SHOWN]:
-        joint = int(np.argmax(turned[row]))
-        yield (
-            f"{targets.places[row]}: {arm.real.joint_names[joint]} turns by "
-            f"{turned[row, joint]:.0f} deg from where this target was looked for; no posture "
-            "nearer was found."
-        )
-    if len(wide) > _SHOWN:
-        yield f"And {len(wide) - _SHOWN} more targets of the kind."
-
-
-def _singular(arm: CalibratedArm, targets: Targets, q: FloatArray, rows: IntArray) -> Iterator[str]:
-    """Says where a correction of a millimetre turns a joint far, and so does the way there."""
-    turns = arm.turns_deg_per_mm(q[rows])
-    near = np.flatnonzero(turns.max(axis=1) > _SINGULAR_DEG)
-    if not len(near):
-        return
-    worst = near[int(np.argmax(turns[near].max(axis=1)))]
-    joint = int(np.argmax(turns[worst]))
-    most = float(turns[worst, joint])
-    far = f"{most:.0f}" if most < _MOST_TURN_DEG else f"over {_MOST_TURN_DEG:.0f}"
-    yield (
-        f"{some_of([targets.places[rows[it]] for it in near])}: nearly singular; at "
-        f"{targets.places[rows[worst]]} a millimetre turns {arm.real.joint_names[joint]} by "
-        f"{far} deg. Move slowly there, or keep away from it."
-    )
-
-
-def _posture(arm: CalibratedArm, q: FloatArray) -> str:
-    """Says in which posture targets without a seed begin."""
-    turning = ~arm.real.chain.prismatic
-    words = [
-        f"{np.rad2deg(it):.0f}" if turns else f"{1e3 * it:.0f} mm"
-        for it, turns in zip(q, turning, strict=True)
-    ]
-    return (
-        f"the first is reached in the posture nearest to the middle of the joints' limits, "
-        f"({', '.join(words)}) deg; --seed-joints begins in another"
-    )
-
-
-def _report(
-    columns: Mapping[str, FloatArray],
-    rows: IntArray,
-    lost: Sequence[tuple[str, str]],
-    warnings: Sequence[str],
-) -> None:
-    console = messages()
-    mm, deg = columns["moved_mm"][rows], columns["moved_deg"][rows]
-    words = (
-        f"{len(rows)} of {len(rows) + len(lost)} targets corrected: moved by "
-        f"{figure(float(np.median(mm)))} mm and {figure(float(np.median(deg)))} deg (median), by "
-        f"up to {figure(float(mm.max()))} mm and {figure(float(deg.max()))} deg"
-    )
-    if "sigma_mm" in columns:
-        words += f"; predicted sigma {figure(float(np.median(columns['sigma_mm'][rows])))} mm"
-    console.print(escape(words))
-    for place, why in lost[:_SHOWN]:
-        console.print(f"[bold yellow]left out:[/] {escape(f'{place}: {why}')}")
-    if len(lost) > _SHOWN:
-        console.print(f"  and {len(lost) - _SHOWN} more")
-    for it in warnings:
-        console.print(f"[bold yellow]warning:[/] {escape(it)}")
-
-
-def _document(
-    targets: Targets,
-    columns: Mapping[str, FloatArray],
-    rows: IntArray,
-    lost: Sequence[tuple[str, str]],
-) -> dict[str, Any]:
-    kept = [it for it in targets.table.columns if it not in columns]
-    cells = [dict(zip(targets.table.columns, it, strict=True)) for it in targets.table.rows]
-    return {
-        "targets": [
-            {
-                "place": targets.places[row],
-                **{name: cells[row][name] for name in kept},
-                **{name: float(numbers[row]) for name, numbers in columns.items()},
-            }
-            for row in rows
-        ],
-        "unreachable": [{"place": place, "reason": why} for place, why in lost],
-    }

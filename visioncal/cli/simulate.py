@@ -1,56 +1,21 @@
 """`visioncal simulate`."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from visioncal.cli.console import messages
 from visioncal.cli.options import Seed
 from visioncal.cli.progress import shown_progress
-from visioncal.cli.simulated import given_for
-from visioncal.cli.simulated_cell import CENTRE_M, Along, Read, exercise_options, whole_cell
-from visioncal.core.types import CameraMount
-from visioncal.session.saving import refuse_filled
-from visioncal.simulation import (
-    ARMS,
-    CAMERAS,
-    CellOptions,
-    Payload,
-    Round,
-    Second,
-    SweepOptions,
-    WarmUpOptions,
-    aprilgrid_target,
-    arm_named,
-    cell_names,
-    charuco_target,
-    checkerboard_target,
-    circles_target,
-    simulate,
-    simulate_warm_up,
-    symmetric_circles_target,
-    tags_target,
-    touch,
-    truth_path,
-    write_session,
-    write_sweep,
-    write_touches,
-    write_warm_up,
-)
-from visioncal.simulation import sweep as swept
-from visioncal.simulation.exercise import write_exercise
-from visioncal.simulation.records import truth_of, write_truth
-from visioncal.simulation.tracked import THREE, Tracked, tracked, write_tracked
+from visioncal.cli.simulated import Read, given_for
+from visioncal.core.choices import SIMULATED_ARMS, SIMULATED_CELLS, CameraMount
 
-_BOARDS = {
-    "charuco": charuco_target,
-    "checkerboard": checkerboard_target,
-    "aprilgrid": aprilgrid_target,
-    "circles": circles_target,
-    "symmetric-circles": symmetric_circles_target,
-    "tags": tags_target,
-}
+# Help does not wait for them.
+if TYPE_CHECKING:
+    from visioncal.core.types import Target
+    from visioncal.simulation import CellOptions
+    from visioncal.simulation.tracked import Tracked
 
 
 def simulate_command(
@@ -58,7 +23,9 @@ def simulate_command(
     folder: Annotated[Path, typer.Argument(help="Where to write the session.")],
     mount: Annotated[CameraMount, typer.Option(help="Where the camera is.")] = "eye-in-hand",
     views: Annotated[int, typer.Option(min=1, help="Number of views.")] = 20,
-    robot: Annotated[str, typer.Option(metavar="|".join(ARMS), help="The arm.")] = "ur10e",
+    robot: Annotated[
+        str, typer.Option(metavar="|".join(SIMULATED_ARMS), help="The arm.")
+    ] = "ur10e",
     camera: Annotated[
         Literal["wide", "fine", "fisheye"],
         typer.Option(help="1280 x 800, 2448 x 2048, or a fisheye."),
@@ -118,7 +85,7 @@ def simulate_command(
         str | None,
         typer.Option(
             metavar="NAME|FILE.toml",
-            help=f"A whole cell: {', '.join(cell_names())}, or a file that describes one.",
+            help=f"A whole cell: {', '.join(SIMULATED_CELLS)}, or a file that describes one.",
         ),
     ] = None,
     instrument: Annotated[
@@ -170,12 +137,31 @@ def simulate_command(
     seed: Seed = 0,
 ) -> None:
     """Write a simulated session, and its truth in a file beside it."""
+    from visioncal.cli.simulated_cell import CENTRE_M, Along, exercise_options, whole_cell
+    from visioncal.session.saving import refuse_filled
+    from visioncal.simulation import (
+        CAMERAS,
+        CellOptions,
+        Payload,
+        Round,
+        Second,
+        SweepOptions,
+        WarmUpOptions,
+        simulate_warm_up,
+        truth_path,
+        write_sweep,
+        write_warm_up,
+    )
+    from visioncal.simulation import sweep as swept
+    from visioncal.simulation.exercise import write_exercise
+    from visioncal.simulation.tracked import Tracked, tracked, write_tracked
+
     given = given_for(context)
     options = CellOptions(
         robot=robot,
         mount=mount,
         views=views,
-        target=_BOARDS[board](),
+        target=_target(board),
         camera=CAMERAS[camera](),
         state_intrinsics=with_intrinsics,
         robot_sigma_m=1e-3 * robot_sigma_mm,
@@ -214,8 +200,26 @@ def simulate_command(
     messages().print(f"wrote {folder}\nwrote {truth_path(folder)}")
 
 
-def _single(options: CellOptions, folder: Path, *, images: bool, touches: bool) -> None:
+def _target(board: str) -> "Target":
+    """What is printed, by its name among the options."""
+    from visioncal import simulation
+
+    boards = {
+        "charuco": simulation.charuco_target,
+        "checkerboard": simulation.checkerboard_target,
+        "aprilgrid": simulation.aprilgrid_target,
+        "circles": simulation.circles_target,
+        "symmetric-circles": simulation.symmetric_circles_target,
+        "tags": simulation.tags_target,
+    }
+    return boards[board]()
+
+
+def _single(options: "CellOptions", folder: Path, *, images: bool, touches: bool) -> None:
     """Writes a cell of one robot, and what its tool touched."""
+    from visioncal.simulation import simulate, touch, write_session, write_touches
+    from visioncal.simulation.records import truth_of, write_truth
+
     cell = simulate(options)
     touched = touch(cell) if touches else None
     with shown_progress(quiet=False) as progress:
@@ -232,8 +236,10 @@ def _single(options: CellOptions, folder: Path, *, images: bool, touches: bool) 
         write_truth(folder, truth)
 
 
-def _read_by(instrument: Read, options: CellOptions, stops: int) -> Tracked:
+def _read_by(instrument: Read, options: "CellOptions", stops: int) -> "Tracked":
     """What an instrument reads of the arm of a cell."""
+    from visioncal.simulation.tracked import THREE, Tracked
+
     return Tracked(
         robot=options.robot,
         stops=stops,
@@ -251,6 +257,8 @@ def _read_by(instrument: Read, options: CellOptions, stops: int) -> Tracked:
 
 def _compliance(robot: str, stiffness_knm: float | None) -> tuple[float, ...]:
     """What each joint yields to a torque [rad/(N m)]; empty for a rigid arm."""
+    from visioncal.simulation import arm_named
+
     if stiffness_knm is None:
         return ()
     return (1e-3 / stiffness_knm,) * len(arm_named(robot).offset)

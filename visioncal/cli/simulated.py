@@ -1,10 +1,13 @@
 """Which options of `visioncal simulate` fit which kind of session."""
 
 from collections.abc import Mapping
+from typing import Literal, TypeAlias
 
 import typer
 
 from visioncal.core.errors import DataError
+
+Read: TypeAlias = Literal["point", "points", "probe"]
 
 # What a cell of one robot takes, whatever is recorded of it.
 _SINGLE = frozenset(

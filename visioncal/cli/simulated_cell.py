@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, TypeAlias
 
 import numpy as np
 
 from visioncal.cli.progress import shown_progress
+from visioncal.cli.simulated import Read
 from visioncal.core.errors import DataError
 from visioncal.session import frame_name
 from visioncal.simulation import (
@@ -25,8 +25,6 @@ from visioncal.simulation.dynamics import Body
 from visioncal.simulation.exercise import ExerciseOptions, Senses, exercise
 from visioncal.simulation.network_records import seed_of
 from visioncal.simulation.tracked import THREE, Tracked
-
-Read: TypeAlias = Literal["point", "points", "probe"]
 
 # Where the centre of a simulated load is, in the flange's frame [m].
 CENTRE_M = (0.0, 0.0, 0.1)

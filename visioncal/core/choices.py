@@ -1,5 +1,9 @@
-"""Names to choose among, in files and in options; help lists them without waiting for numpy."""
+"""Names to choose among and usual values, in files and in options.
 
+Help lists them without waiting for numpy.
+"""
+
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
@@ -32,6 +36,13 @@ EXPORT_NAMES = (
     *("kuka-tool", "kuka-base", "fanuc-utool", "fanuc-uframe", "robot-urdf", "robot-dh"),
     *("ur-kinematics", "robot-json", "joint-corrections"),
 )
+# Simulated arms, and the whole cells whose descriptions come with visioncal.
+SIMULATED_ARMS = ("ur3e", "ur5e", "ur10e", "generic-6r-1800")
+SIMULATED_CELLS = ("camera-and-tracker", "two-arms", "two-cameras")
+
+# Joints that turn farther than this from one target to the next have taken another branch, or the
+# targets are no path [rad].
+WIDEST_RAD = math.pi / 2
 
 # Lengths in which others write positions [m].
 UNITS_M: Mapping[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "inch": 0.0254}

@@ -4,7 +4,7 @@ Nothing here uses the application's camera, robot, targets, solvers or estimator
 projection or a wrong chain cannot hide by being wrong in both.
 """
 
-from visioncal.simulation.arms import ARMS, Arm, arm_named, forward, industrial_arm, ur_arm
+from visioncal.simulation.arms import Arm, arm_named, forward, industrial_arm, ur_arm
 from visioncal.simulation.cell import Cell, simulate
 from visioncal.simulation.described import cell_names, read_cell
 from visioncal.simulation.layout import (
@@ -62,7 +62,6 @@ from visioncal.simulation.warmup import (
 )
 
 __all__ = [
-    "ARMS",
     "CAMERAS",
     "Arm",
     "BoardAt",

@@ -143,9 +143,6 @@ def industrial_arm() -> Arm:
     )
 
 
-ARMS = ("ur3e", "ur5e", "ur10e", "generic-6r-1800")
-
-
 def arm_named(name: str) -> Arm:
     """The nominal arm of a name: Universal Robots', or `generic-6r-1800`.
 

@@ -8,11 +8,11 @@ from dataclasses import MISSING, Field, dataclass, fields
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar, get_args, get_type_hints
 
+from visioncal.core.choices import SIMULATED_ARMS
 from visioncal.core.errors import DataError
 from visioncal.core.files import Table, did_you_mean, find_described, parse_toml, read_text
 from visioncal.core.types import Camera, Target
 from visioncal.session.document import NAME
-from visioncal.simulation.arms import ARMS
 from visioncal.simulation.layout import (
     CELL,
     BoardAt,
@@ -168,7 +168,7 @@ class _Reader:
         if hint is Target:
             return TARGETS[table.choice(key, tuple(TARGETS))]()
         if key == "robot":
-            return table.choice(key, self.carriers[1:] if kind is Swept else ARMS)
+            return table.choice(key, self.carriers[1:] if kind is Swept else SIMULATED_ARMS)
         if key == "on":
             return table.choice(key, self.carriers)
         if hint is bool:

@@ -7,10 +7,11 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from visioncal.core.choices import SIMULATED_ARMS
 from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean, read_toml
 from visioncal.core.types import Progress
-from visioncal.simulation import ARMS, CAMERAS, CellOptions, simulate, write_session
+from visioncal.simulation import CAMERAS, CellOptions, simulate, write_session
 from visioncal.simulation.options import TARGETS
 
 # The field of a cell that a key varies, and its unit.
@@ -23,7 +24,7 @@ _NUMBERS: Mapping[str, tuple[str, float]] = {
 }
 # That of the names that a key takes, and what they stand for.
 _NAMES: Mapping[str, tuple[str, Mapping[str, Any]]] = {
-    "robot": ("robot", {it: partial(str, it) for it in ARMS}),
+    "robot": ("robot", {it: partial(str, it) for it in SIMULATED_ARMS}),
     "mount": ("mount", {it: partial(str, it) for it in ("eye-in-hand", "eye-to-hand")}),
     "camera": ("camera", CAMERAS),
     "board": ("target", TARGETS),

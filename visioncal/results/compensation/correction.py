@@ -7,6 +7,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from visioncal.core.choices import WIDEST_RAD as WIDEST_RAD
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import (
     LAST_ROW,
@@ -27,9 +28,6 @@ from visioncal.session.choosing import ARM, Choice
 # Transforms, or their (4, 4) or (m, 4, 4) matrices.
 Poses: TypeAlias = FloatArray | RigidTransform
 
-# Joints that turn farther than this from one target to the next have taken another branch, or the
-# targets are no path [rad].
-WIDEST_RAD = float(np.pi / 2)
 # No arm reaches this far [m], and no joint of one turns this far [rad].
 FAR_M, WIDE_RAD = 20.0, 4 * np.pi
 # No rotation is at a matrix that is off by more: it is written with fewer digits than count here.
