@@ -103,7 +103,7 @@ def test_heavy_libraries_enter_in_one_place():
     [
         (
             "visioncal.calibration.pipeline, visioncal.interchange.outputs, "
-            "visioncal.present.report, visioncal.present.recording, visioncal.cli.record",
+            "visioncal.present.report, visioncal.present.recording, visioncal.cli.recorded",
             {"depthai", "rtde_control", "rtde_receive", "torch", "kornia", "matplotlib"},
         ),
         # A report by itself waits for no library of recordings.
@@ -118,9 +118,10 @@ def test_heavy_libraries_enter_in_one_place():
             "visioncal.cli.align, visioncal.cli.batch, visioncal.cli.demo, visioncal.cli.diff, "
             "visioncal.cli.convert, visioncal.cli.correct, visioncal.cli.doctor, "
             "visioncal.cli.export, visioncal.cli.fixture, visioncal.cli.locate, "
-            "visioncal.cli.plan, visioncal.cli.report, visioncal.cli.review, "
-            "visioncal.cli.simulate, visioncal.cli.target, visioncal.cli.tcp, "
-            "visioncal.cli.touch_test, visioncal.cli.verify",
+            "visioncal.cli.plan, visioncal.cli.record, visioncal.cli.rehearse, "
+            "visioncal.cli.report, visioncal.cli.review, visioncal.cli.simulate, "
+            "visioncal.cli.target, visioncal.cli.tcp, visioncal.cli.touch_test, "
+            "visioncal.cli.verify",
             {"numpy", "visioncal.core.types"},
         ),
         ("visioncal", {"numpy", "typer", "visioncal.core.types"}),

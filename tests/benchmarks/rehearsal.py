@@ -22,6 +22,7 @@ from support.killed import kill_and_resume
 
 from visioncal.cli.recorded_cell import Scene, facts_of, scene_of
 from visioncal.cli.rehearsed import TAKING, planned, recorded
+from visioncal.core.choices import Faults
 from visioncal.core.errors import DataError, DriverError
 from visioncal.live.capture.core import Step
 from visioncal.live.capture.journal import Journal
@@ -34,7 +35,6 @@ from visioncal.live.rehearsal.bench import Bench
 from visioncal.live.rehearsal.camera import RehearsalCamera
 from visioncal.live.rehearsal.cell import RehearsalOptions, RehearsedCell, rehearsed_cell
 from visioncal.live.rehearsal.controller import spawn
-from visioncal.live.rehearsal.fault_injection import Faults
 from visioncal.live.rehearsal.options import ControllerOptions
 from visioncal.live.rehearsal.truth import TruthClient
 from visioncal.live.rehearsal.witness import Witness, pace_of

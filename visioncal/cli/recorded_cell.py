@@ -3,17 +3,14 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Annotated
 
-import typer
 from rich.markup import escape
 
 from visioncal.cli.console import messages
-from visioncal.core.conventions import POSE_FORMS
+from visioncal.cli.record_options import CellOptions
 from visioncal.core.errors import DataError, DriverError
-from visioncal.core.types import Camera, CameraMount, Mount, Target
+from visioncal.core.types import Camera, Mount, Target
 from visioncal.interchange.formats.boards import described_target
 from visioncal.live.capture.coach import Coach
 from visioncal.live.capture.core import Capture, Step, Watcher
@@ -28,38 +25,6 @@ from visioncal.live.drivers.protocols import MovingArm
 from visioncal.live.planning.read_back import PlanFile, read_plan
 from visioncal.robot import Robot, load_robot
 from visioncal.vision.targets import target_from_document
-
-_cell = partial(typer.Option, rich_help_panel="The cell, where no plan says it")
-
-
-@dataclass(frozen=True)
-class CellOptions:
-    """The cell, where no plan says it."""
-
-    target: Annotated[
-        str | None,
-        _cell(
-            "--target",
-            help="The board: a name in targets/, a .toml, or in one word as "
-            "checkerboard_9x6_23.6mm.",
-        ),
-    ] = None
-    robot: Annotated[
-        str | None,
-        _cell("--robot", help="The robot's model: a built-in name, a .urdf or .toml."),
-    ] = None
-    mount: Annotated[
-        CameraMount | None,
-        _cell("--mount", help="Where the camera is; eye-in-hand if nothing is said."),
-    ] = None
-    pose_form: Annotated[
-        str | None,
-        _cell(
-            "--pose-form",
-            metavar="|".join(("ours", *POSE_FORMS)),
-            help="With a manual arm: how poses are typed.",
-        ),
-    ] = None
 
 
 @dataclass(frozen=True, eq=False)

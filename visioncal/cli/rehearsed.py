@@ -13,8 +13,9 @@ from visioncal.calibration.pipeline import Run, run
 from visioncal.cli.console import messages, report_error, report_written
 from visioncal.cli.interrupts import ended_like_ctrl_c
 from visioncal.cli.progress import shown_progress
-from visioncal.cli.record import ViewLines, driven
+from visioncal.cli.recorded import ViewLines, driven
 from visioncal.cli.recorded_cell import Scene, facts_of, scene_of, shown_in
+from visioncal.core.choices import Faults
 from visioncal.core.errors import DataError, DriverError, VisioncalError
 from visioncal.core.types import FloatArray
 from visioncal.frames.touch_test import judged, touch_points
@@ -29,7 +30,7 @@ from visioncal.live.planning.purposes import purpose_of
 from visioncal.live.planning.written import plan_document
 from visioncal.live.rehearsal.bench import Bench
 from visioncal.live.rehearsal.cell import RehearsalOptions, RehearsedCell
-from visioncal.live.rehearsal.fault_injection import FaultInjection, Faults
+from visioncal.live.rehearsal.fault_injection import FaultInjection
 from visioncal.results import Calibration
 from visioncal.results.sections import TouchTest
 from visioncal.session import Session

@@ -40,6 +40,19 @@ EXPORT_NAMES = (
 SIMULATED_ARMS = ("ur3e", "ur5e", "ur10e", "generic-6r-1800")
 SIMULATED_CELLS = ("camera-and-tracker", "two-arms", "two-cameras")
 
+# The faults that can be rehearsed; the last two are the camera's, at a stop.
+Faults: TypeAlias = Literal[
+    "protective-stop",
+    "emergency-stop",
+    "remote-off",
+    "link-lost",
+    "silent",
+    "unplugged",
+    "covered",
+]
+# A UR's joints turn no faster while a plan is driven; slow enough to reach the stop button [rad/s
+# and rad/s^2].
+PLAN_SPEED, PLAN_ACCELERATION = 0.4, 0.6
 # Joints that turn farther than this from one target to the next have taken another branch, or the
 # targets are no path [rad].
 WIDEST_RAD = math.pi / 2

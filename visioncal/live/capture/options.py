@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+from visioncal.core.choices import PLAN_ACCELERATION, PLAN_SPEED
 from visioncal.core.errors import DataError
-from visioncal.live.planning.written import ACCELERATION, SPEED
 
 Keep = Literal["sharpest", "mean"]
 # Nobody watches an arm at a faster pace with a hand on the stop button [rad/s].
@@ -50,8 +50,8 @@ class CaptureOptions:
             person sees it and goes elsewhere.
     """
 
-    speed: float = SPEED
-    acceleration: float = ACCELERATION
+    speed: float = PLAN_SPEED
+    acceleration: float = PLAN_ACCELERATION
     frames: int = 3
     keep: Keep = "sharpest"
     still: Stillness = field(default_factory=Stillness)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from visioncal.core.choices import PLAN_ACCELERATION, PLAN_SPEED
 from visioncal.core.files import one_line, sha256
 from visioncal.core.types import FloatArray
 from visioncal.core.version import __version__
@@ -21,9 +22,6 @@ from visioncal.session.columns import POSE
 from visioncal.vision.targets import target_document
 
 SCHEMA = 1
-# A UR's joints turn no faster while a plan is driven; slow enough to reach the stop button [rad/s
-# and rad/s^2].
-SPEED, ACCELERATION = 0.4, 0.6
 # The arm has stopped to tremble before an image is taken [s].
 _SETTLING_S = 0.5
 
@@ -110,8 +108,8 @@ def program_of(plan: Plan) -> str:
     lines = [
         *(f"# {it}" for it in _heading(plan)),
         "def visioncal_plan():",
-        f"  speed = {SPEED}          # rad/s",
-        f"  acceleration = {ACCELERATION}   # rad/s^2",
+        f"  speed = {PLAN_SPEED}          # rad/s",
+        f"  acceleration = {PLAN_ACCELERATION}   # rad/s^2",
         f"  settling = {_SETTLING_S}       # s",
         *(f"  {it}" for stop in plan.stops for it in _stop_lines(stop)),
         '  popup("All stops are done.", title="visioncal", blocking=True)',

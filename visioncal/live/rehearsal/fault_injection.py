@@ -4,26 +4,16 @@ import threading
 import time
 from collections.abc import Mapping
 from contextlib import closing
-from typing import Literal, TypeAlias
 
 import numpy as np
 
+from visioncal.core.choices import Faults
 from visioncal.core.types import FloatArray
 from visioncal.live.capture.core import Step
 from visioncal.live.rehearsal.bench import Bench
 from visioncal.live.rehearsal.camera import Fault as CameraFault
 from visioncal.live.rehearsal.truth import Fault, TruthClient
 
-# What can be rehearsed; the last two are the camera's, at a stop.
-Faults: TypeAlias = Literal[
-    "protective-stop",
-    "emergency-stop",
-    "remote-off",
-    "link-lost",
-    "silent",
-    "unplugged",
-    "covered",
-]
 _AT_CONTROLLER: Mapping[str, Fault] = {
     "protective-stop": "protective-stop",
     "emergency-stop": "emergency-stop",

@@ -1,0 +1,130 @@
+"""The options of `visioncal record`, and what they say."""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from visioncal.cli.numbers import size_in
+from visioncal.core.choices import PLAN_SPEED, POSE_FORMS, CameraMount
+from visioncal.live.capture.options import CaptureOptions, Keep, Stillness
+
+# Help does not wait for it.
+if TYPE_CHECKING:
+    from visioncal.live.drivers.protocols import DeviceSetup
+
+_cell = partial(typer.Option, rich_help_panel="The cell, where no plan says it")
+_taking = partial(typer.Option, rich_help_panel="How views are taken")
+_moving = partial(typer.Option, rich_help_panel="How the arm is moved")
+_camera = partial(typer.Option, rich_help_panel="What the camera is set to")
+
+
+@dataclass(frozen=True)
+class CellOptions:
+    """The cell, where no plan says it."""
+
+    target: Annotated[
+        str | None,
+        _cell(
+            "--target",
+            help="The board: a name in targets/, a .toml, or in one word as "
+            "checkerboard_9x6_23.6mm.",
+        ),
+    ] = None
+    robot: Annotated[
+        str | None,
+        _cell("--robot", help="The robot's model: a built-in name, a .urdf or .toml."),
+    ] = None
+    mount: Annotated[
+        CameraMount | None,
+        _cell("--mount", help="Where the camera is; eye-in-hand if nothing is said."),
+    ] = None
+    pose_form: Annotated[
+        str | None,
+        _cell(
+            "--pose-form",
+            metavar="|".join(("ours", *POSE_FORMS)),
+            help="With a manual arm: how poses are typed.",
+        ),
+    ] = None
+
+
+@dataclass(frozen=True)
+class TakingOptions:
+    """How views are taken."""
+
+    frames: Annotated[
+        int,
+        _taking("--frames", min=1, max=100, help="Frames a view."),
+    ] = 3
+    keep: Annotated[
+        Keep,
+        _taking("--keep", help="The sharpest of these, or their mean."),
+    ] = "sharpest"
+    still_px: Annotated[
+        float,
+        _taking(
+            "--still-px",
+            min=0.01,
+            max=10.0,
+            help="Image motion over which nothing is taken.",
+        ),
+    ] = Stillness.image_px
+    settle_s: Annotated[
+        float,
+        _taking(
+            "--settle-s",
+            min=0.0,
+            max=30.0,
+            help="How long arm and image must have been still before.",
+        ),
+    ] = Stillness.quiet_s
+    speed: Annotated[
+        float,
+        _moving("--speed", help="Of the fastest joint, in rad/s; at most 1.5."),
+    ] = PLAN_SPEED
+
+    def options(self, *, single: bool, lost: int) -> CaptureOptions:
+        """The same, as a recording takes it.
+
+        Args:
+            single: Whether the camera gives each picture once.
+            lost: How many stops in a row may give no view.
+        """
+        return CaptureOptions(
+            speed=self.speed,
+            frames=self.frames,
+            keep=self.keep,
+            still=Stillness(image_px=self.still_px, quiet_s=self.settle_s),
+            single=single,
+            lost=lost,
+        )
+
+
+@dataclass(frozen=True)
+class DeviceOptions:
+    """What the camera is set to."""
+
+    resolution: Annotated[
+        str | None,
+        _camera("--resolution", metavar="W,H", help="Size of the images in pixels."),
+    ] = None
+    exposure_us: Annotated[
+        int | None, _camera("--exposure-us", help="Exposure time in microseconds.")
+    ] = None
+    gain: Annotated[int | None, _camera("--gain", help="ISO, or the device's own unit.")] = None
+    focus: Annotated[
+        int | None, _camera("--focus", help="Lens position, in the device's own unit.")
+    ] = None
+
+    def setup(self) -> "DeviceSetup":
+        """The same, as drivers take it.
+
+        Raises:
+            DataError: The resolution is not two numbers.
+        """
+        from visioncal.live.drivers.protocols import DeviceSetup
+
+        resolution = None if self.resolution is None else size_in(self.resolution)
+        return DeviceSetup(resolution, self.exposure_us, self.gain, self.focus)
