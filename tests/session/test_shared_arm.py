@@ -13,6 +13,7 @@ from visioncal.core.transforms import invert
 from visioncal.estimation.workspace import postures
 from visioncal.results import Calibration
 from visioncal.session import Session
+from visioncal.session.columns import MEASURED_CAM_POSE
 from visioncal.session.shared_arm import join_sessions
 from visioncal.simulation import CellOptions, simulate, write_session
 
@@ -138,6 +139,14 @@ def test_what_cannot_be_joined_is_refused_by_name(sessions, changed, words):
     )
     with pytest.raises(DataError, match=words):
         join_sessions([sessions[0], other])
+    with pytest.raises(DataError, match="is there twice"):
+        join_sessions([sessions[0], sessions[0]])
+    known = {it: at for it, at in sessions[1].document.items() if it not in ("camera", "target")}
+    columns = [*sessions[1].columns, *MEASURED_CAM_POSE]
+    rows = [[*map(it.cell, sessions[1].columns), *"0001000"] for it in sessions[1].views]
+    poses = Session.assemble(known, columns, rows, sessions[1].images)
+    with pytest.raises(DataError, match="has no board"):
+        join_sessions([sessions[0], poses])
 
 
 def test_the_command_joins_only_where_it_is_asked_to(sessions, tmp_path):

@@ -103,3 +103,8 @@ def _report(names: tuple[str, ...], found: Gains) -> None:
     if found.determined.all():
         gains = ",".join(f"{it:.5g}" for it in found.nm_per_a)
         typer.echo(f"--gains {gains}")
+    else:
+        messages().print(
+            "--gains needs all joints: move those that are not determined more, or take a body "
+            "that is heavier or whose centre is farther from their axes."
+        )

@@ -72,8 +72,14 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
     """
     if len(sessions) == 1:
         return sessions[0]
-    for session in sessions:
+    for at, session in enumerate(sessions):
         _check(session, sessions[0])
+        if any(session.digest() == it.digest() for it in sessions[:at]):
+            raise DataError(
+                f"session {session.name!r} is there twice, and would count as twice the data.",
+                culprits=[session.name],
+                next_step="Name each session once.",
+            )
     names = [f"s{at}" for at in range(1, len(sessions) + 1)]
     by_name = dict(zip(names, sessions, strict=True))
     document = {it: value for it, value in sessions[0].document.items() if it not in _NAMED}
@@ -125,7 +131,14 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
 
 def _check(session: Session, first: Session) -> None:
     label = f"session {session.name!r}"
-    if has_several(session) or session.declaration.frames or session.target is None:
+    if session.target is None and not has_several(session):
+        raise DataError(
+            f"{label} has no board: sessions are joined by their arm where a camera's images, or "
+            "corners, of a board are there; measured poses of a target are not taken.",
+            culprits=[session.name],
+            next_step="Record images, or calibrate it by itself.",
+        )
+    if has_several(session) or session.declaration.frames:
         raise DataError(
             f"{label}: only sessions of one camera and one board each are joined by their arm.",
             culprits=[session.name],

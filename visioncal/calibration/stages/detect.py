@@ -328,9 +328,9 @@ def _common_resolution(
     if len(culprits) == len(sizes) and len(set(sizes)) == 1:
         raise _other_size(session, views, sizes[0], wanted, culprits)
     if culprits:
-        source = "the camera's resolution" if stated else "most other images"
+        source = "the camera's resolution is" if stated else "most other images are"
         raise DataError(
-            f"{culprits[0]}, but {source} is {wanted[0]} x {wanted[1]} px"
+            f"{culprits[0]}, but {source} {wanted[0]} x {wanted[1]} px"
             + (f" ({len(culprits)} images in all)." if len(culprits) > 1 else "."),
             culprits=culprits,
             next_step="Correct [camera] resolution in session.toml, or take out these views.",

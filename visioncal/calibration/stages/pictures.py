@@ -236,7 +236,7 @@ def _mirrored(view: View) -> Finding:
 def _blurred(view: View, why: str, views: Sequence[View]) -> Finding:
     return Finding(
         "blurred_images",
-        f"No board can be read: in view {view.number}, {why} (limit {MAX_BLUR_PX:g} px).",
+        f"No board can be read: in view {view.number}, {why}.",
         Step("Focus the lens, expose for a shorter time with more light, and record again."),
         tuple(it.number for it in views),
     )

@@ -163,10 +163,16 @@ def why_hard_to_see(image: Image, max_blur_px: float) -> str:
     """Says what about an image hides a target: too little contrast, or blur; empty if neither."""
     low, high = np.percentile(image[::4, ::4], [2, 98])
     if high - low < _LEAST_CONTRAST:
-        return f"the image is almost uniform, with {high - low:.0f} grey levels of contrast"
+        return (
+            f"the image is almost uniform, with {high - low:.0f} grey levels of contrast "
+            f"({_LEAST_CONTRAST:.0f} are needed)"
+        )
     blur = float(_edge_sigma(image[None])[0])
     if blur > max_blur_px:
-        return f"the image is blurred, its sharpest edges are {blur:.0f} px wide"
+        return (
+            f"the image is blurred, its sharpest edges are {blur:.0f} px wide "
+            f"(limit {max_blur_px:g} px)"
+        )
     return ""
 
 
