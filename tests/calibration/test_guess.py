@@ -344,6 +344,18 @@ def test_two_mistakes_at_once_are_named_together():
     assert re.search(r"positions in mm; .* one row .*--guess", verdict.reasons[0])
 
 
+@pytest.mark.parametrize("whole", [False, True], ids=["rotations", "poses"])
+def test_rotations_that_were_never_recorded_are_named(whole):
+    poses = cell_poses("eye-in-hand")
+    told = poses.robot.poses()
+    told[:, :3, :3] = np.eye(3)
+    if whole:
+        told[:] = told[0]
+    with pytest.raises(DegenerateError, match="the camera sees the target turn by") as caught:
+        visioncal.calibrate(pairs_session(replace(poses, robot=numbers(told))))
+    assert "how the poses were recorded" in caught.value.next_step
+
+
 def test_a_sound_calibration_is_not_troubled_by_it():
     verdict = visioncal.calibrate(pairs_session(cell_poses("eye-to-hand"))).verdict
     assert not any("--guess" in it for it in verdict.reasons)

@@ -173,8 +173,15 @@ def _header_problems(columns: Sequence[str]) -> Iterator[str]:
         if 0 < len(missing) < len(group):
             yield (
                 f"the columns {', '.join(name for name in group if name in columns)} "
-                f"lack {', '.join(missing)}"
+                f"lack {', '.join(missing)}{_spelt_otherwise(columns, missing)}"
             )
+
+
+def _spelt_otherwise(columns: Sequence[str], missing: Sequence[str]) -> str:
+    """Names the columns that are missing ones in capitals or with a unit behind them."""
+    plain = {re.sub(r"[ _]*[\[(].*", "", name).lower(): name for name in columns}
+    found = [plain[it] for it in missing if it in plain]
+    return f"; {', '.join(found)} may be meant: names are plain and small" if found else ""
 
 
 def column_warnings(columns: Sequence[str], where: str) -> Iterator[str]:

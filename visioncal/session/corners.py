@@ -270,6 +270,17 @@ def _target_problems(
 ) -> Iterator[Problem]:
     """What is wrong with the rows' views and targets."""
     first = next((it for it in table.targets if it), "")
+    there = sorted(set(table.views.tolist()))
+    if len(there) == len(rows) and there != sorted(rows):
+        (by, *others) = {b - a for a, b in zip(there, sorted(rows), strict=True)}
+        if not others:
+            yield Problem(
+                f"{FILE}, column view",
+                f"it goes from {there[0]} to {there[-1]}, and that of views.csv from {min(rows)} "
+                f"to {max(rows)}: one of them is numbered otherwise",
+                step=f"Add {by} to the views of {FILE}, if both tables have the same order.",
+            )
+            return
     for view in dict.fromkeys(it for it in table.views.tolist() if it not in rows):
         mine = np.flatnonzero(table.views == view)
         more = f" and {len(mine) - 1} more" if len(mine) > 1 else ""

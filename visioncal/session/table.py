@@ -30,6 +30,7 @@ _FEWEST_ALIKE, _FAR_FROM_UNIT, _ANGLES_RAD = 3, 1.5, 7.0
 _SHOWN_PROBLEMS = 10
 # Stricter than float(), which also takes 1_000, nan, and the digits of other scripts.
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+_THOUSANDS = re.compile(r"[+-]?[0-9]{1,3}(,[0-9]{3})+\.[0-9]*")
 _INTEGER = re.compile(r"[+-]?[0-9]+")
 
 _T = TypeVar("_T")
@@ -228,6 +229,13 @@ def read_views(
     views: list[View] = []
     problems: list[Problem] = []
     first_seen: dict[int, str] = {}
+    if rows and not any(it.isdigit() for cell in rows[0].cells for it in cell):
+        raise DataError(
+            f"{rows[0].where} has no number, but {', '.join(rows[0].cells)[:80]!r}: units or names "
+            "below the header?",
+            culprits=[rows[0].where],
+            next_step=f"Delete {rows[0].where}; the header is one line.",
+        )
     for row in rows:
         reader = _RowReader(row, columns, [], with_corners)
         view = reader.view()
@@ -402,8 +410,12 @@ def read_number(cell: str) -> float:
     """
     value = float(cell) if _NUMBER.fullmatch(cell) else math.nan
     if not math.isfinite(value):
-        comma = " (the decimal sign is a point)" if "," in cell else ""
-        raise DataError(f"{cell!r} is no finite number{comma}")
+        why = " (the decimal sign is a point)" if "," in cell else ""
+        if _THOUSANDS.fullmatch(cell):
+            why = " (write it without commas between thousands)"
+        elif "\u2212" in cell:
+            why = " (its minus sign is a typographic one; write -)"
+        raise DataError(f"{cell!r} is no finite number{why}")
     return value
 
 

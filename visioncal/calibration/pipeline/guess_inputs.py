@@ -8,10 +8,16 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from visioncal.calibration.guess import Candidate, Guess, guess_reading
-from visioncal.calibration.guess.given import Recording, closes
+from visioncal.calibration.guess.given import FEWEST_ROWS, Recording, closes
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
-from visioncal.calibration.stages.cause_ranking import MIRRORED, read_otherwise, wrong_poses
+from visioncal.calibration.stages.cause_ranking import (
+    MIRRORED,
+    MIRRORED_CORNERS,
+    read_otherwise,
+    unrecorded_rotations,
+    wrong_poses,
+)
 from visioncal.calibration.stages.clocks import waits_for_clock
 from visioncal.calibration.stages.init_frames import init_frames
 from visioncal.calibration.stages.joints import match_joints
@@ -19,6 +25,7 @@ from visioncal.calibration.stages.judge import is_scattered
 from visioncal.calibration.stages.robots import Pair, pairs_of
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.errors import VisioncalError
+from visioncal.core.transforms import compose, invert, rotation_angle
 from visioncal.core.types import FloatArray, Progress
 from visioncal.core.verdict import Finding, Step
 from visioncal.estimation.chain import chain
@@ -28,6 +35,9 @@ from visioncal.session.columns import MEASURED_CAM_POSE, POSE
 
 # What the camera's poses need; the robot has no part in it, so that it can be wrong.
 _SEEING = ("detect", "intrinsics", "pnp")
+# A robot that turns by less stands, a target that turns by more does not, ambiguous poses aside
+# [deg].
+_STILL_DEG, _TURNED_DEG = 0.5, 10.0
 
 
 def guess_session(
@@ -137,6 +147,9 @@ def reading_hint(seen: RunState) -> Finding | None:
     Returns:
         It, with the command that applies it; None where no reading stands out.
     """
+    still = _unrecorded(seen)
+    if still is not None:
+        return still
     try:
         guess = guess_seen(seen)
     except VisioncalError:
@@ -148,7 +161,27 @@ def reading_hint(seen: RunState) -> Finding | None:
     is_mirrored = best.hypothesis.robot.signs == "mirror"
     swap = best.hypothesis.swap if len(best.differences) == 1 else ()
     exchanged = tuple(views[row].number for row in swap)
-    return read_otherwise(guess.sentence, exchanged, is_mirrored=is_mirrored)
+    found = read_otherwise(guess.sentence, exchanged, is_mirrored=is_mirrored)
+    if is_mirrored and not any(it.image for it in views):
+        found = replace(found, do=MIRRORED_CORNERS)
+    return found
+
+
+def _unrecorded(seen: RunState) -> Finding | None:
+    """Says that the robot's rotations were not recorded, where the camera sees others."""
+    seen = replace(seen, poses=seen.poses_of_one_board)
+    robot, camera = _at_times(seen), _camera_numbers(seen)
+    both = robot.there & camera.there
+    if both.sum() < FEWEST_ROWS:
+        return None
+    turns = (it.poses()[both, :3, :3] for it in (robot, camera))
+    by_robot, by_camera = (rotation_angle(invert(it[:1]) @ it) for it in map(_turned, turns))
+    most, half = np.rad2deg([by_robot.max(), np.median(by_camera)]).tolist()
+    return unrecorded_rotations(most, half) if most < _STILL_DEG and half > _TURNED_DEG else None
+
+
+def _turned(rotations: FloatArray) -> FloatArray:
+    return compose(rotations, np.zeros((len(rotations), 3)))
 
 
 def _poses_beside_joints(seen: RunState, declared: Candidate) -> Finding | None:
@@ -202,7 +235,7 @@ def readings_in_cell(known: RunState) -> Iterator[Finding]:
             hint = None if closes_as_declared(part) else reading_hint(part)
             if hint is None:
                 continue
-            if hint.do is not MIRRORED:
+            if hint.do not in (MIRRORED, MIRRORED_CORNERS):
                 step = (
                     f"Correct the rows of robot {robot} in views.csv (base_from_flange in metres, "
                     "quaternion x, y, z, w), and calibrate again."
@@ -211,12 +244,16 @@ def readings_in_cell(known: RunState) -> Iterator[Finding]:
                 # All cameras would say so.
                 break
             mirrored.add(pair.camera)
+            named = replace(hint, words=f"Camera {pair.camera}: {hint.words}")
+            if hint.do is MIRRORED_CORNERS:
+                yield named
+                continue
             step = (
                 f"Look at an image of {pair.camera} first: where it is mirrored (a flip in the "
                 "camera's driver, a mirror before the lens), turn its images back, and calibrate "
                 "anew."
             )
-            yield replace(hint, words=f"Camera {pair.camera}: {hint.words}", do=Step(step))
+            yield replace(named, do=Step(step))
 
 
 def _closes(known: RunState, robot: str, pair: Pair) -> bool:

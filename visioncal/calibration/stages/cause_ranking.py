@@ -46,6 +46,19 @@ MIRRORED = Step(
     GUESS_AND_CALIBRATE,
 )
 
+# Of corners without images.
+MIRRORED_CORNERS = Step(
+    "In corners.csv, u_px counts to the right and v_px down: exchange the two columns where they "
+    "are exchanged, or count from the other side where one runs backwards. Only where the robot's "
+    "frame is left-handed, write a copy of the session that is read so, and calibrate it.",
+    GUESS_AND_CALIBRATE,
+)
+_UNRECORDED = Step(
+    "Look how the poses were recorded: a logger that repeats one pose, or that writes rotations as "
+    "0, 0, 0, 1, gives no calibration. Record them again, at the same time as the images.",
+    CALIBRATE,
+)
+
 
 @dataclass(frozen=True)
 class Evidence:
@@ -130,6 +143,22 @@ def read_otherwise(
         is_mirrored: Whether mirrored images are as good an explanation.
     """
     return Finding("misread_poses", sentence, MIRRORED if is_mirrored else READ_AGAIN, exchanged)
+
+
+def unrecorded_rotations(robot_deg: float, camera_deg: float) -> Finding:
+    """The finding that the robot's poses do not turn where the camera sees that they do.
+
+    Args:
+        robot_deg: How far they turn at most [deg].
+        camera_deg: How far the target turns in half of the views or more [deg].
+    """
+    return Finding(
+        "misread_poses",
+        f"The robot's poses turn by {robot_deg:.2g} deg at most, and between the same views the "
+        f"camera sees the target turn by {camera_deg:.2g} deg: the recorded rotations are not "
+        "those of the views.",
+        _UNRECORDED,
+    )
 
 
 def wrong_poses(by_poses: str, by_joints: str) -> Finding:
