@@ -46,6 +46,8 @@ def calibrated(tmp_path_factory) -> str:
         (("elastic",), {"joints": [{"compliance_rad_per_nm": {}}]}, r"joints\[0\].compliance"),
         (("elastic",), {"weight_moments": [[1], [1, 2]]}, "an array of n x n numbers"),
         (("kinematics",), {"level": "offsets", "robot": {"joint": 1}}, "robot: name is missing"),
+        (("mount",), "eye-to-hand", r"transforms.base_from_cam is missing, and mount is 'eye-to"),
+        (("schema",), 9, r"schema is 9, this version reads 1\. A newer"),
     ],
 )
 def test_what_a_calibration_does_not_hold_is_named(calibrated, tmp_path: Path, place, value, words):

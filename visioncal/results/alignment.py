@@ -292,7 +292,7 @@ class Alignment(CellSections):
 
         Raises:
             DataError: It is another; the message names the place.
-            ValueError: It is of another schema.
+            DataError: It is of another schema.
         """
         check_schema(document)
         form = read(AlignmentForm, document, "")

@@ -121,8 +121,7 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
     """Reads the fields of a calibration from what `to_document` built.
 
     Raises:
-        ValueError: It is of another schema.
-        DataError: It is no calibration; the message names the place.
+        DataError: It is of another schema, or no calibration; the message names the place.
     """
     check_schema(document)
     form = read(CalibrationForm, document, "")

@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 from scipy.spatial.transform import RigidTransform
 
+from visioncal.core.errors import DataError
 from visioncal.core.types import Need
 from visioncal.results.arm import ArmSections
 from visioncal.results.codec import INLINE, KEPT, REST, Written
@@ -27,10 +28,16 @@ def check_schema(document: Mapping[str, Any]) -> None:
     """Checks that a result is of the schema that this version reads.
 
     Raises:
-        ValueError: It is of another.
+        DataError: It is of another.
     """
-    if document.get("schema") != SCHEMA:
-        raise ValueError(f"schema is {document.get('schema')!r}, this version reads {SCHEMA}")
+    found = document.get("schema")
+    if found != SCHEMA:
+        is_newer = isinstance(found, int) and found > SCHEMA
+        raise DataError(
+            f"schema is {found!r}, this version reads {SCHEMA}.",
+            culprits=["schema"],
+            next_step="A newer visioncal reads it." if is_newer else "Calibrate the session again.",
+        )
 
 
 @dataclass(frozen=True)

@@ -393,4 +393,13 @@ class Calibration(CalibrationSections):
                 return cls.whole(read_whole(document))
             if is_alignment(document):
                 return cls.whole(Alignment.from_document(document))
-            return cls(**fields_from_document(document))
+            fields = fields_from_document(document)
+            # Everything that looks through the camera starts from it.
+            camera = edge_names(fields["mount"])[0]
+            if camera not in fields["edges"]:
+                raise DataError(
+                    f"transforms.{camera} is missing, and mount is {fields['mount']!r}.",
+                    culprits=[f"transforms.{camera}"],
+                    next_step="Calibrate the session again.",
+                )
+            return cls(**fields)

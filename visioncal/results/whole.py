@@ -227,8 +227,7 @@ def read_whole(document: Mapping[str, Any]) -> Alignment:
     """Reads what `whole_document` built.
 
     Raises:
-        ValueError: It is of another schema.
-        DataError: It is no whole cell; the message names the place.
+        DataError: It is of another schema, or no whole cell; the message names the place.
     """
     check_schema(document)
     form = read(CellForm, document, "")
