@@ -140,7 +140,13 @@ def test_nothing_is_rendered_for_a_folder_that_is_not_empty(tmp_path, monkeypatc
 
 @pytest.mark.parametrize(
     ("option", "value"),
-    [("--need-mm", "abc"), ("--solver", "foo"), ("--threads", "0"), ("--level", "foo")],
+    [
+        ("--need-mm", "abc"),
+        ("--solver", "foo"),
+        ("--threads", "0"),
+        ("--level", "foo"),
+        ("--nosuch", "x"),
+    ],
 )
 def test_a_wrong_option_is_an_error_as_json(option, value, poor, tmp_path):
     done = visioncal("calibrate", poor, "-o", tmp_path / "out", "--json", option, value)

@@ -19,6 +19,8 @@ from visioncal.core.files import some_of
 
 # As a shell reports a program that SIGINT ended.
 _EXIT_CTRL_C = 128 + 2
+# Of what is wrong, missing or unknown among options; typer exports the first of them alone.
+_USAGE_ERROR: Any = typer.BadParameter.__mro__[1]
 
 
 class PlainCommand(TyperCommand):
@@ -29,14 +31,15 @@ class PlainCommand(TyperCommand):
     """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:  # noqa: ANN401 - typer's own
-        """Reads its options; with `--json`, a wrong value is an error as all others."""
+        """Reads its options; with `--json`, one that is wrong or unknown is an error as others."""
         wants_json = "--json" in args
         try:
             return super().parse_args(ctx, args)
-        except typer.BadParameter as error:
+        except _USAGE_ERROR as error:
             if not wants_json:
                 raise
-            named = [*error.param.opts] if error.param else []
+            param, unknown = getattr(error, "param", None), getattr(error, "option_name", "")
+            named = [*param.opts] if param else [unknown] if unknown else []
             raise DataError(
                 error.format_message(),
                 culprits=named[-1:],
