@@ -169,6 +169,9 @@ def test_sessions_of_another_camera_are_refused():
     with pytest.raises(DataError, match="no view of 0 serves") as caught:
         seen_frame(held, calibration, "fixture")
     assert "role = holdout" in caught.value.next_step
+    other = replace(session, robot_document=dict(load_robot("ur3e").document))
+    with pytest.raises(DataError, match="another robot, or another tip"):
+        seen_frame(other, calibration, "fixture")
     with pytest.raises(DataError, match="names no target"):
         seen_frame(replace(session, target=None), calibration, "fixture")
     with pytest.raises(DataError, match="millimetres"):

@@ -8,6 +8,7 @@ import numpy as np
 from visioncal.calibration.stages.detect import detect, image_of
 from visioncal.calibration.stages.observed import by_reason
 from visioncal.calibration.stages.reported_poses import Reported, reported_poses
+from visioncal.calibration.verification.prediction import check_robot
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, Progress, Rejection, Target
 from visioncal.frames.camera_chain import Eye
@@ -179,6 +180,8 @@ def nothing_fits(shown: Sighting, lost: Mapping[int, str]) -> DataError:
 
 def _checked(session: Session, calibration: Calibration) -> Target:
     check_mount(session, calibration)
+    if session.robot_document is not None and calibration.robot is not None:
+        check_robot(session, Robot.from_document(session.robot_document), calibration.robot)
     if session.target is None:
         raise DataError(
             f"session {session.name!r} names no target to look for.",

@@ -133,6 +133,9 @@ class Session:
                 f"{path} is no session: a folder with session.toml and views.csv, or an .rrd "
                 "recording, is needed.",
                 culprits=[str(path)],
+                next_step=f"Name its folder: {path.parent}."
+                if (path.parent / "session.toml").is_file()
+                else "",
             )
         document = parse_toml(
             read_text_inside(path, "session.toml", MOST_TOML_BYTES), "session.toml"

@@ -115,7 +115,7 @@ def known_before(
     session = _with_its_targets(session, prior_calibration)
     document, robot = session.robot_document, calibration.robot
     if robot is not None and document is not None:
-        _check_robot(session, Robot.from_document(document), robot)
+        check_robot(session, Robot.from_document(document), robot)
     if robot is not None:
         # As calibrated, with its base in the frame of the poses.
         session = replace(session, robot_document=robot.document)
@@ -343,8 +343,17 @@ def _check_targets(session: Session, prior_calibration: CalibrationPrior) -> Non
             )
 
 
-def _check_robot(session: Session, stated: Robot, known: Robot) -> None:
-    """Refuses another robot; the same model written otherwise passes."""
+def check_robot(session: Session, stated: Robot, known: Robot) -> None:
+    """Refuses another robot than a calibration's; the same model written otherwise passes.
+
+    Args:
+        session: The session.
+        stated: Its robot.
+        known: The calibration's.
+
+    Raises:
+        DataError: They differ.
+    """
     culprit = ["session.toml: robot.model"]
     if stated.joint_count != known.joint_count:
         raise DataError(
