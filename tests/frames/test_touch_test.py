@@ -130,7 +130,8 @@ def test_targets_are_printed_and_gaps_join_the_result(proved, monkeypatch):
     assert "nothing was kept" in ended.err
     done = visioncal("touch-test", look, "-c", out, "--tool", "gripper")
     assert done.status == 2
-    assert "The calibration has no tool" in done.err
+    assert "the calibration has no tool" in done.err
+    assert f"visioncal tcp TOUCHES -c {out} --name gripper" in done.err
 
 
 def test_what_touches_is_the_only_tool_or_the_flange(proved):

@@ -92,6 +92,13 @@ def touch_test_command(
         raise DataError("touch-test is for one camera and one robot.", culprits=["-c"])
     has_tools = any(it.startswith("flange_from_") for it in known.frames)
     is_bare = tool == "none" or (tool is None and not has_tools)
+    if not (is_bare or has_tools):
+        raise DataError(
+            f"--tool is {tool!r}, and the calibration has no tool.",
+            culprits=["--tool"],
+            next_step="Find the tip first, and let it join the calibration: "
+            f"visioncal tcp TOUCHES -c {calibration} --name gripper",
+        )
     touching = None if is_bare else Tool.among(known.frames, "The calibration", tool)
     with shown_progress(quiet=as_json):
         points = touch_points(loaded, known, touching)
