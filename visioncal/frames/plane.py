@@ -90,5 +90,9 @@ def _length(value_m: float) -> float:
 
 def _offset_covariance(sigma_m: float) -> FloatArray:
     if not np.isfinite(sigma_m) or sigma_m < 0.0:
-        raise DataError(f"plane: sigma_m is {sigma_m!r}; a standard deviation is needed.")
+        raise DataError(
+            f"plane: sigma_m is {sigma_m!r}; a standard deviation is needed.",
+            culprits=["sigma_m"],
+            next_step="Give how well its height is known, 0 or more.",
+        )
     return np.diag([0.0, 0.0, 0.0, sigma_m**2])
