@@ -25,7 +25,7 @@ from visioncal.calibration.stages.judge import is_scattered
 from visioncal.calibration.stages.robots import Pair, pairs_of
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.errors import VisioncalError
-from visioncal.core.transforms import compose, invert, rotation_angle
+from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, Progress
 from visioncal.core.verdict import Finding, Step
 from visioncal.estimation.chain import chain
@@ -174,14 +174,10 @@ def _unrecorded(seen: RunState) -> Finding | None:
     both = robot.there & camera.there
     if both.sum() < FEWEST_ROWS:
         return None
-    turns = (it.poses()[both, :3, :3] for it in (robot, camera))
-    by_robot, by_camera = (rotation_angle(invert(it[:1]) @ it) for it in map(_turned, turns))
+    common = (it.poses()[both] for it in (robot, camera))
+    by_robot, by_camera = (rotation_angle(invert(it[:1]) @ it) for it in common)
     most, half = np.rad2deg([by_robot.max(), np.median(by_camera)]).tolist()
     return unrecorded_rotations(most, half) if most < _STILL_DEG and half > _TURNED_DEG else None
-
-
-def _turned(rotations: FloatArray) -> FloatArray:
-    return compose(rotations, np.zeros((len(rotations), 3)))
 
 
 def _poses_beside_joints(seen: RunState, declared: Candidate) -> Finding | None:
