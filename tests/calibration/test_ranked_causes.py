@@ -10,9 +10,14 @@ from scipy.special import chdtrc
 from support.sound_findings import SOUND, changed, directions, left_out
 
 from visioncal.calibration.pipeline import calibrate
-from visioncal.calibration.stages.cause_ranking import NO_JOINTS, read_otherwise, with_misread
+from visioncal.calibration.stages.cause_ranking import (
+    MEASURE_BOARD,
+    NO_JOINTS,
+    read_otherwise,
+    with_misread,
+)
 from visioncal.calibration.stages.fit_messages import scale_found
-from visioncal.calibration.stages.judge import judge
+from visioncal.calibration.stages.judge import Place, judge
 from visioncal.calibration.stages.need import Picks
 from visioncal.core.transforms import exp, invert
 from visioncal.core.types import Need
@@ -136,6 +141,12 @@ def test_errors_that_are_too_large_come_from_their_sources(need) -> None:
     (arm,) = found.arms
     known = judge(replace(found, arms=(replace(arm, modelled=True),)))
     assert known.causes[1].do.command == PLAN
+    # No view tells how large a board is that limits the rest.
+    budget = {"pixels": 0.05, "board": 0.02, "held values": 0.1, "total": 0.12}
+    of_board = replace(found, places=(Place("A point", budget, 0.2),))
+    assert judge(of_board).causes[1].do is MEASURE_BOARD
+    of_lens = replace(of_board, places=(Place("A point", {**budget, "lens": 0.05}, 0.2),))
+    assert "Add views" in judge(of_lens).causes[1].do.words
     # What can be had without them is no cause of a doubt about something else.
     met = replace(found, need=None, worst=directions(1e-4), warnings=(DRIFT,))
     assert ids(judge(met)) == ["moved_slowly"]

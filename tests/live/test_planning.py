@@ -286,10 +286,8 @@ def test_before_any_stop_the_prediction_is_the_sigma_of_the_session(options):
     begun = begin(found)
     world = worlds_of([begun.cell], HAND_EYE, cell.joints[:3], recorded=begun.recorded)[0]
     solved = found.known.solved
-    # Values that are held cost by how far the data pull at them, levels of noise by how well they
-    # are known: that is told of data alone.
-    untold = sum(solved.beside.get(it, 0.0) for it in ("held_values", "noise_level"))
-    covariance = solved.covariance - untold
+    # How well levels of noise are known is told of data alone.
+    covariance = solved.covariance - solved.beside["noise_level"]
     sigmas = np.sqrt(np.diag(covariance)[:6])
     # The plan's weak prior of 0.2 m and rad is all that differs.
     assert np.sqrt(np.diag(world.covariance([]))[:6]) == pytest.approx(sigmas, rel=1e-4)
@@ -316,9 +314,8 @@ def test_errors_of_the_arm_count_in_the_prediction_as_in_the_result(case):
     assert errors.is_estimated == (case == "estimated")
     begun, q = begin(found), postures_in_view(CELL, 40)
     design = next_best(begun, HAND_EYE, q, 3).design
-    # Neither how far data pull at what is held nor how well the sizes of the arm's errors and of
-    # the noise are known can be told beforehand.
-    beside = ("held_values", "size of arm errors", "noise_level")
+    # How well the sizes of the arm's errors and of the noise are known cannot be told beforehand.
+    beside = ("size of arm errors", "noise_level")
     untold = sum((known.solved.beside.get(it, 0.0) for it in beside), 0.0)
     covariance = known.solved.covariance - untold
     obtained = 1e3 * np.sqrt(np.trace(covariance[3:6, 3:6]))

@@ -111,6 +111,12 @@ LOOK = Step(
     "Look at the worst views: does each pose belong to its image, did anything move?", REVIEW
 )
 
+# What helps where the size of a board limits a result.
+MEASURE_BOARD = Step(
+    "Measure the board with a caliper over its whole width, and state square_m, the side of one "
+    "square, and square_sigma_m, how well it is known, of the target: more views tell neither."
+)
+
 # What helps where an arm errs whose joints are not known.
 NO_JOINTS = Step(
     "Record joint angles with the poses, and name the arm as [robot] model in session.toml: "
@@ -220,7 +226,7 @@ def ranked(
     picks: Sequence[Picks],
     met: NeedMet | None,
     *,
-    modelled: bool = False,
+    more: Step | None = None,
     left_out_mm: float = 0.0,
 ) -> tuple[Finding, ...]:
     """Doubts with how likely each is the cause, and the sources of errors that are too large.
@@ -229,7 +235,7 @@ def ranked(
         doubts: All there are.
         picks: What picks err by.
         met: What is needed, and how likely it is met; None where nothing is.
-        modelled: Whether the arms' models are known, so that views can be proposed.
+        more: What makes the calibration less uncertain.
         left_out_mm: By how much left-out views disagree [mm].
     """
     found = _tested(doubts, left_out_mm)
@@ -239,7 +245,6 @@ def ranked(
         known = {it.kind for it in found if it.probability}
         # What moved is in the arm's errors by posture and time, too, which are no cause then.
         known |= {"arm_errors"} if known & {*_MOVED} else set()
-        more = None if any(it.do is NO_JOINTS for it in found) else adding(_MORE, modelled=modelled)
         found += [it for it in _sources(picks, met, more) if it.kind not in known]
     return tuple(_with_joints_at_hand(found))
 
@@ -325,7 +330,6 @@ def _odds(chance: float) -> float:
 
 # Without a source of a smaller share of the variance picks err by hardly less: by 5 %.
 _LEAST_SHARE = 0.1
-_MORE = "Add views from other poses of the robot."
 # What picks are limited by: as a kind, in words, and what helps.
 _SOURCES: Mapping[str, tuple[str, str, Step | None]] = {
     "calibration": (
@@ -356,13 +360,13 @@ _SOURCES: Mapping[str, tuple[str, str, Step | None]] = {
 }
 
 
-def _sources(picks: Sequence[Picks], met: NeedMet | None, more_views: Step | None) -> list[Finding]:
+def _sources(picks: Sequence[Picks], met: NeedMet | None, more: Step | None) -> list[Finding]:
     """What makes errors as large as they are, by the worst camera and robot.
 
     Args:
         picks: What picks err by.
         met: What is needed, and how likely it is met; None where nothing is.
-        more_views: What helps the calibration; None where more views do not.
+        more: What makes the calibration less uncertain.
     """
     if met is None:
         worst = max(picks, key=lambda it: it.good_for_mm)
@@ -384,7 +388,7 @@ def _sources(picks: Sequence[Picks], met: NeedMet | None, more_views: Step | Non
             kind,
             f"Of the {figure(total)} {unit} that picks err by (sigma), {figure(size)} {unit} come "
             f"from {words}.",
-            do or more_views,
+            do or more,
             probability=size**2 / total**2,
             without_it=f"{without}.",
             until_mm=0.0,

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from visioncal.calibration.stages.cause_ranking import NO_JOINTS, adding, ranked
+from visioncal.calibration.stages.cause_ranking import MEASURE_BOARD, NO_JOINTS, adding, ranked
 from visioncal.calibration.stages.need import Picks, need_met
 from visioncal.core.limits import CalibrationLimits, NeedLimits
 from visioncal.core.number_format import figure, percent
@@ -237,7 +237,7 @@ def judge(findings: Findings) -> Verdict:
             ordered,
             findings.picks,
             met,
-            modelled=findings.plannable,
+            more=_helping(findings),
             left_out_mm=findings.held_out.mm,
         )
     said = list(ordered)
@@ -353,14 +353,35 @@ def _scatter_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[F
 
 def _is_of_arm(findings: Findings) -> bool:
     """Whether what is uncertain is mostly what an arm does wrong whose joints are not known."""
-    if not any(it.do is NO_JOINTS for it in findings.warnings):
-        return False
-    of_arm = of_all = 0.0
+    has_no_joints = any(it.do is NO_JOINTS for it in findings.warnings)
+    return has_no_joints and _is_mostly_of(findings, "arm", "robot", "poses")
+
+
+def _is_of_board(findings: Findings) -> bool:
+    """Whether it is mostly how well boards are known, which no view tells."""
+    # A lens that is held has a part in what held values cost.
+    names = {name.partition(" of ")[0] for it in findings.places for name in it.budget_mm}
+    held = () if "lens" in names else ("held values",)
+    return _is_mostly_of(findings, "board", *held)
+
+
+def _is_mostly_of(findings: Findings, *sources: str) -> bool:
+    of_these = of_all = 0.0
     for place in findings.places:
         for name, mm in place.budget_mm.items():
-            of_arm += mm**2 * name.startswith(("arm", "robot", "poses"))
+            of_these += mm**2 * name.startswith(sources)
             of_all += mm**2 * (name == "total")
-    return of_arm > 0.5 * of_all
+    return of_these > 0.5 * of_all
+
+
+def _helping(findings: Findings) -> Step | None:
+    """What makes a result less uncertain; None where that is said of the arm already."""
+    if _is_of_board(findings):
+        return MEASURE_BOARD
+    if any(it.do is NO_JOINTS for it in findings.warnings):
+        return None
+    words = "Add views from other poses of the robot."
+    return adding(words, modelled=findings.plannable)
 
 
 def _tilted(findings: Findings) -> Step:
@@ -548,19 +569,21 @@ def _sigma_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Fin
             weak.append(f"{direction.words} ({figure(sigma)} {unit})")
             is_fatal |= bool(sigma > bad)
     if weak:
-        of_arm = _is_of_arm(findings)
+        of_arm, of_board = _is_of_arm(findings), _is_of_board(findings)
         least = f"{limits.sigma_mm[0]:g} mm and {limits.sigma_deg[0]:g} deg"
+        known = f"known to {', '.join(weak)} (sigma; doubt begins at {least}): most of that"
         words = (
-            f"As mounts, known to {', '.join(weak)} (sigma; doubt begins at {least}): most of that "
-            "is the arm's, and is the same in every recording."
+            f"As mounts, {known} is the arm's, and is the same in every recording."
             if of_arm
+            else f"Frames are {known} is the board's, as well as its size is stated."
+            if of_board
             else f"Weakly determined by the motion, with their sigmas: {', '.join(weak)}; doubt "
             f"begins at {least}."
         )
         yield Finding(
             "weak_motion",
             words,
-            NO_JOINTS if of_arm else _tilted(findings),
+            NO_JOINTS if of_arm else MEASURE_BOARD if of_board else _tilted(findings),
             is_fatal=is_fatal,
             until_mm=0.0,
         )
@@ -584,6 +607,7 @@ def _budget_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Fi
         + ", ".join(f"{figure(mm)} mm from the {name}" for name, mm in parts[:_LISTED_PARTS])
         + "."
         + (f" Over {limits.sigma_mm[0]:g} mm are also {', '.join(others)}." if others else ""),
+        MEASURE_BOARD if _is_of_board(findings) else None,
         is_fatal=budget["total"] > limits.sigma_mm[1],
         until_mm=0.0,
     )

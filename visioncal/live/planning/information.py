@@ -69,6 +69,8 @@ class Recorded:
         inflation: By how much larger their noise's variance counts than they show alone.
         beside: (12, c) by how much the edges are off beside that, for c independent errors of one:
             of an arm without joint angles, which more stops do not change.
+        held: (12, c) the same of lens and boards that are held as stated: by how far the stops
+            pull at them.
     """
 
     problem: Problem
@@ -80,6 +82,7 @@ class Recorded:
     arm: ArmErrors | None = None
     inflation: float = 1.0
     beside: FloatArray = field(default_factory=lambda: np.zeros((12, 0)))
+    held: FloatArray = field(default_factory=lambda: np.zeros((12, 0)))
 
     @property
     def shared(self) -> FloatArray:
@@ -109,8 +112,10 @@ class World:
         units: (p,) what one unit of each unknown is where different ones are compared.
         looks: How many of the unknowns are of lens and boards; they stand behind the edges.
         misfit: (k, 6, a) how residuals at each stop move, in sigmas of noise, with errors of the
-            arm that a fit takes for noise, in sigmas of theirs.
+            arm that a fit takes for noise, in sigmas of theirs, and with lens and boards that it
+            holds.
         gradient: (p, a) how the recorded stops' gradient moves with them.
+        held: How many of these are of lens and boards; they stand last.
     """
 
     factors: FloatArray
@@ -123,11 +128,13 @@ class World:
     looks: int
     misfit: FloatArray
     gradient: FloatArray
+    held: int
 
     def with_known_looks(self) -> "World":
         """Returns the world as it is where lens and board are known exactly."""
         kept = np.delete(np.arange(len(self.prior)), 12 + np.arange(self.looks))
         block = np.ix_(kept, kept)
+        of_arm = slice(self.gradient.shape[1] - self.held)
         return World(
             self.factors[:, :, kept],
             self.prior[block],
@@ -137,13 +144,15 @@ class World:
             self.turn[block],
             self.units[kept],
             0,
-            self.misfit,
-            self.gradient[kept],
+            self.misfit[:, :, of_arm],
+            self.gradient[kept, of_arm],
+            0,
         )
 
     def without_misfit(self) -> "World":
         """Returns the world as it is where a fit takes no errors of the arm for noise."""
-        return replace(self, misfit=self.misfit[:, :, :0], gradient=self.gradient[:, :0])
+        of_held = slice(self.gradient.shape[1] - self.held, None)
+        return replace(self, misfit=self.misfit[:, :, of_held], gradient=self.gradient[:, of_held])
 
     def covariance(self, rows: Sequence[int] | IntArray | Mask) -> FloatArray:
         """Covariance (p, p) of the unknowns from some candidates and what is recorded."""
@@ -297,10 +306,11 @@ def _world(
     else:
         judged = _of_workspace(cell, purpose, workspace)
     counted, place, turn = (_widened(it, looks) for it in judged)
-    misfit, gradient = factors[:, :, size:], known[:size, size:]
-    if recorded is not None and not purpose.blocks and recorded.beside.shape[1]:
-        gradient = (prior + known[:size, :size])[:, :12] @ recorded.beside
-        misfit = factors[:, :, :12] @ recorded.beside
+    misfit, gradient, held = factors[:, :, size:], known[:size, size:], 0
+    if recorded is not None and not purpose.blocks:
+        beside, held = np.hstack([recorded.beside, recorded.held]), recorded.held.shape[1]
+        gradient = np.hstack([gradient, (prior + known[:size, :size])[:, :12] @ beside])
+        misfit = np.concatenate([misfit, factors[:, :, :12] @ beside], axis=2)
     return World(
         factors[:, :, :size],
         prior,
@@ -312,6 +322,7 @@ def _world(
         looks,
         misfit,
         gradient,
+        held,
     )
 
 
