@@ -91,6 +91,14 @@ def test_figures_of_the_report_are_drawn_on_their_own(tmp_path):
     assert all(it in caught.value.next_step for it in FIGURES)
 
 
+def test_views_are_a_frame_of_pandas():
+    pytest.importorskip("pandas", reason="the extra pandas is not installed")
+    calibration = made_up().calibration
+    table = calibration.views_table()
+    assert [*table.index] == [it.view for it in calibration.views]
+    assert [*table[table.used].rms_px] == [it.rms_px for it in calibration.views if it.used]
+
+
 def test_views_are_records_where_pandas_is_not_installed(monkeypatch):
     calibration = made_up().calibration
     monkeypatch.setattr("visioncal.results.result.find_spec", lambda _: None)

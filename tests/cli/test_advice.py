@@ -89,6 +89,28 @@ def test_of_a_tool(place):
         assert list(failures(done.said)) == []
 
 
+def test_of_a_fixture(place):
+    assert visioncal("simulate", "cell", "--touches", "--no-images").status == 0
+    assert visioncal("calibrate", "cell", "-o", "out").status == 0
+    assert visioncal("tcp", "cell/touches.csv", "-c", "out", "--name", "gripper").status == 0
+    points = (place / "cell/points.csv").read_text("utf-8").splitlines()
+    view, name, x, *others = points[4].split(",")
+    points[4] = ",".join((view, name, str(float(x) + 0.004), *others))
+    (place / "missed.csv").write_text("\n".join(points), "utf-8")
+    asked = ("fixture", "cell/points.csv", "--cad", "cell/cad.csv", "-c", "out")
+    for words in (
+        ("fixture", "missed.csv", *asked[2:], "--name", "jig"),
+        (*asked, "--name", "tray", "--touch-noise-mm", "0.005"),
+        (*asked, "--name", "bin", "--touch-noise-mm=0.005"),
+    ):
+        done = visioncal(*words)
+        assert done.status == 0
+        (again,) = printed_commands(done.said)
+        # The advice's value stands in the place of what was typed.
+        assert again.count("--touch-noise-mm") == ("--touch-noise" in words[-1] + words[-2])
+        assert list(failures(done.said)) == []
+
+
 def test_of_a_whole_cell(place):
     recorded(simulate_network(OPTIONS)).save(place / "cell")
 

@@ -2,7 +2,7 @@
 
 import re
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, Self, TypeAlias
@@ -240,8 +240,25 @@ def with_paths(
     is_file = result.suffix in (".json", ".rrd")
     new = f"{result.parent if is_file else result}-new"
     paths = {"SESSION": str(session), "FIXED": fixed, "OUT": str(out) or "out", "NEW": new}
-    words = {name: shlex.quote(it) for name, it in paths.items()} | {AGAIN: shlex.join(again)}
+    typed = shlex.join([*_without(again, shlex.split(command))])
+    words = {name: shlex.quote(it) for name, it in paths.items()} | {AGAIN: typed}
     return _PATH.sub(lambda found: words[found[0]], command)
+
+
+def _without(typed: Sequence[str], added: Sequence[str]) -> Iterator[str]:
+    """A command line's words without the options, and their values, that are to be added to it."""
+    has_value = {
+        name: not value.startswith("--")
+        for name, value in zip(added, [*added, "--"][1:], strict=True)
+        if name.startswith("--")
+    }
+    words = iter(typed)
+    for word in words:
+        name, _, value = word.partition("=")
+        if name not in has_value:
+            yield word
+        elif has_value[name] and not value:
+            next(words, None)
 
 
 def _free(name: str) -> str:

@@ -26,14 +26,14 @@ class Words:
 
     Attributes:
         things: What that is.
-        again: What to do about some that contradict each other, as a sentence.
+        again: What to do about those that disagree, as a sentence.
         noisy: What makes them noisy and what to do about it, likewise.
         weak: What to do about a direction that is known badly, likewise.
         side: From which side they were measured, behind the words `the side that`.
     """
 
     things: str = "touches"
-    again: str = "Touch each once more."
+    again: str = "Touch what is named once more, and write the new poses in its rows."
     noisy: str = (
         "Touch again with a sharp tip, and check the tool; an arm that was never calibrated is "
         "off by a millimetre from posture to posture."

@@ -166,7 +166,7 @@ def _doubts(
         [_wrong(fit, touches, it) for it in rows],
         fit.agrees,
         fit.doubtful,
-        "Touch twice more.",
+        "Touch what is named once more, and write the new poses in its rows.",
     )
     yield from noisy(
         1e3 * fit.sigma_m,

@@ -48,11 +48,12 @@ def disputed(
         reasons: (n,) what is wrong with each.
         agrees: (n,) mask of those that were used.
         doubtful: (n,) mask of those of which some are wrong, unknown which.
-        again: What to do about the latter, as a sentence.
+        again: What to do about either, as a sentence.
     """
     for at in np.flatnonzero(~agrees).tolist():
         end = "" if reasons[at].endswith("?") else "."
-        yield Finding("left_out", f"{names[at]} was left out: {reasons[at]}{end}")
+        words = f"{names[at]} was left out: {reasons[at]}{end}"
+        yield Finding("left_out", words, Step(again, AGAIN))
     if doubtful.any():
         some = some_of([names[at] for at in np.flatnonzero(doubtful).tolist()])
         words = f"{some} contradict each other, and which is wrong is not known: all are used."

@@ -192,7 +192,7 @@ class Calibration(CalibrationSections):
         }
 
     def views_table(self) -> Any:  # noqa: ANN401 - a frame of pandas, or records
-        """What became of each view: a pandas.DataFrame where pandas is installed, else records.
+        """What became of each view: a pandas.DataFrame with the extra pandas, else records.
 
         Columns are the attributes of `ViewResult`; what was not computed is None (NaN in a frame).
         """
