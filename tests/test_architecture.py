@@ -117,6 +117,9 @@ def test_heavy_libraries_enter_in_one_place():
         (
             "visioncal.cli.align, visioncal.cli.batch, visioncal.cli.demo, visioncal.cli.diff, "
             "visioncal.cli.convert, visioncal.cli.correct, visioncal.cli.doctor, "
+            "visioncal.cli.dynamics_gains, visioncal.cli.dynamics_identify, "
+            "visioncal.cli.dynamics_payload, visioncal.cli.dynamics_plan, "
+            "visioncal.cli.dynamics_record, visioncal.cli.dynamics_validate, "
             "visioncal.cli.export, visioncal.cli.fixture, visioncal.cli.locate, "
             "visioncal.cli.plan, visioncal.cli.record, visioncal.cli.rehearse, "
             "visioncal.cli.report, visioncal.cli.review, visioncal.cli.simulate, "

@@ -14,7 +14,7 @@ from support.drawn import column
 from support.small_arm import small_arm, small_document
 from support.urscripts import STEP_S, driven
 
-from visioncal.cli import dynamics_plan
+from visioncal.cli import planned_motions
 from visioncal.cli.review import find_recording
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import compose
@@ -145,7 +145,7 @@ def quick(monkeypatch):
     def short(allowed, request, progress):
         return excite(allowed, replace(request, steps=4), progress)
 
-    monkeypatch.setattr(dynamics_plan, "excite", short)
+    monkeypatch.setattr(planned_motions, "excite", short)
 
 
 def plan(robot: object, out: Path, *more: object) -> Done:

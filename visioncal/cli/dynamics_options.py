@@ -2,14 +2,18 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
 
 from visioncal.cli.options import RobotName
+from visioncal.core.choices import DYNAMICS_FILE
 from visioncal.core.errors import DataError
-from visioncal.dynamics.identified import FILE, Identified
-from visioncal.dynamics.run import Request
+
+# Help does not wait for them.
+if TYPE_CHECKING:
+    from visioncal.dynamics.identified import Identified
+    from visioncal.dynamics.run import Request
 
 MotionsArgument: TypeAlias = Annotated[
     Path, typer.Argument(help="A session with streams of angles and torques: a folder or an .rrd.")
@@ -21,7 +25,7 @@ CutoffOption: TypeAlias = Annotated[
     ),
 ]
 AgainstOption: TypeAlias = Annotated[
-    Path | None, typer.Option("--against", help=f"A folder of identify, or its {FILE}.")
+    Path | None, typer.Option("--against", help=f"A folder of identify, or its {DYNAMICS_FILE}.")
 ]
 
 
@@ -44,12 +48,14 @@ class StreamOptions:
     ] = None
     robot: RobotName = None
 
-    def request(self) -> Request:
+    def request(self) -> "Request":
         """The same, as samples are read.
 
         Raises:
             DataError: The gains are no numbers.
         """
+        from visioncal.dynamics.run import Request
+
         try:
             gains = tuple(float(it) for it in self.gains.split(",")) if self.gains else ()
         except ValueError as error:
@@ -65,15 +71,17 @@ class StreamOptions:
         )
 
 
-def identified_of(against: Path | None, command: str) -> Identified:
+def identified_of(against: Path | None, command: str) -> "Identified":
     """Loads what was identified before.
 
     Raises:
         DataError: None is named, or it cannot be read.
     """
+    from visioncal.dynamics.identified import Identified
+
     if against is None:
         raise DataError(
-            f"dynamics {command}: what was identified (--against {FILE}) is needed.",
+            f"dynamics {command}: what was identified (--against {DYNAMICS_FILE}) is needed.",
             culprits=["--against"],
             next_step="Name the output folder of visioncal dynamics identify.",
         )

@@ -2,18 +2,15 @@
 
 from contextlib import closing
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.markup import escape
 
-from visioncal.cli.console import messages
-from visioncal.cli.interrupts import ended_like_ctrl_c
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free
-from visioncal.live.capture.motions import record_motion
-from visioncal.live.drivers.ur_motion import UrMotion
-from visioncal.session import STREAMS, Session, Stream, check_stream, save_stream
+
+if TYPE_CHECKING:
+    from visioncal.session import Stream
 
 
 def dynamics_record_command(
@@ -34,6 +31,15 @@ def dynamics_record_command(
     The motion is another's: start its program (such as excitation.script of `dynamics plan`) on the
     pendant once this command waits for it. Exit status 0: it is recorded; 2: it is not.
     """
+    # What help and a mistyped option need not wait for.
+    from rich.markup import escape
+
+    from visioncal.cli.console import messages
+    from visioncal.cli.interrupts import ended_like_ctrl_c
+    from visioncal.live.capture.motions import record_motion
+    from visioncal.live.drivers.ur_motion import UrMotion
+    from visioncal.session import STREAMS, check_stream
+
     kind, _, host = arm.partition(":")
     if kind != "ur" or not host:
         raise DataError(
@@ -56,8 +62,10 @@ def dynamics_record_command(
     )
 
 
-def _keep(out: Path, name: str, stream: Stream, model: str) -> None:
+def _keep(out: Path, name: str, stream: "Stream", model: str) -> None:
     """Writes a session with the stream, or adds the stream to the one that is there."""
+    from visioncal.session import Session, save_stream
+
     if (out / "session.toml").is_file():
         save_stream(out, name, stream)
         return

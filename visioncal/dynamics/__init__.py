@@ -7,7 +7,7 @@ from visioncal.dynamics.document import stribeck_rows
 from visioncal.dynamics.excitation import Excitation, ExcitationRequest, excite
 from visioncal.dynamics.friction import Friction, FrictionTerms, sign
 from visioncal.dynamics.gains import Gains, drive_gains
-from visioncal.dynamics.identified import FILE, Identified
+from visioncal.dynamics.identified import Identified
 from visioncal.dynamics.judge import judge
 from visioncal.dynamics.limits import Missing, Share, allowed_motion
 from visioncal.dynamics.model import DynamicModel
@@ -19,7 +19,6 @@ from visioncal.dynamics.sweeps import SweepRequest, Sweeps, plan_sweeps
 from visioncal.dynamics.validate import Prediction
 
 __all__ = [
-    "FILE",
     "ArmDynamics",
     "BaseModel",
     "DynamicModel",

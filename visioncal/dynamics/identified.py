@@ -9,6 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from visioncal.core.choices import DYNAMICS_FILE
 from visioncal.core.documents import parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, write_atomically
@@ -20,7 +21,6 @@ from visioncal.dynamics.motion import Motion
 from visioncal.dynamics.stribeck import Stribeck
 from visioncal.robot import Inertias, Robot
 
-FILE = "dynamics.json"
 # A parameter is determined to so many percent of itself, or worse, or not at all.
 CLASSES = ((0.02, "2 %"), (0.1, "10 %"), (1.0, "poorly"))
 UNKNOWN = "not at all"
@@ -147,19 +147,19 @@ class Identified:
         from visioncal.dynamics.document import fields_from_document
 
         path = Path(path)
-        if path.is_dir() and not (path / FILE).exists():
+        if path.is_dir() and not (path / DYNAMICS_FILE).exists():
             raise DataError(
-                f"{path} has no {FILE}, as visioncal dynamics identify writes it.",
+                f"{path} has no {DYNAMICS_FILE}, as visioncal dynamics identify writes it.",
                 culprits=[str(path)],
                 next_step="Identify the arm first, and name its output folder: visioncal dynamics "
                 "identify --help",
             )
-        path = path / FILE if path.is_dir() else path
+        path = path / DYNAMICS_FILE if path.is_dir() else path
         try:
             return cls(**fields_from_document(parse_stored(read_bytes(path), str(path))))
         except (LookupError, TypeError, ValueError, AttributeError) as error:
             raise DataError(
-                f"{path} is no {FILE} of this version: {error}.",
+                f"{path} is no {DYNAMICS_FILE} of this version: {error}.",
                 culprits=[str(path)],
                 next_step="Write one with visioncal dynamics identify.",
             ) from error

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from visioncal.core.choices import GAIN_SIGMA
 from visioncal.core.errors import DegenerateError
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray
@@ -23,10 +24,9 @@ from visioncal.robot import Inertias, body_regressor, entries
 
 # A mass that is known no better than to this share of itself is none [-].
 _WORST = 0.5
-# What a drive's gain is known to, as a share, where nobody says it, and how much of the variance
-# the drives of an arm have in common: half of what two published lists of a UR10e's gains differ by
-# has an rms of 12 %, of which a mean of 11 % is alike in all joints [-].
-GAIN_SIGMA, _ALIKE = 0.12, 0.8
+# How much of the variance of their gains the drives of an arm have in common: of the 12 % of
+# GAIN_SIGMA a mean of 11 % is alike in all joints [-].
+_ALIKE = 0.8
 _HOW = "Drive the exciting trajectory of visioncal dynamics plan with the payload on the flange."
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from visioncal.core.choices import DYNAMICS_FILE
 from visioncal.core.errors import DataError
 from visioncal.core.files import write_atomically
 from visioncal.core.output_generations import write_generation
@@ -302,9 +303,7 @@ def write_dynamics(folder: Path, run: "Run") -> Written:
 
         write_dynamics_recording(path, run, dynamics_blueprint(run))
 
-    from visioncal.dynamics import FILE
-
-    return _write(folder, {FILE: run.identified.save}, {REPORT: report, RECORDING: record})
+    return _write(folder, {DYNAMICS_FILE: run.identified.save}, {REPORT: report, RECORDING: record})
 
 
 def _write(

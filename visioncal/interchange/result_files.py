@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from visioncal.core.choices import DYNAMICS_FILE
 from visioncal.core.errors import DataError
 from visioncal.core.files import absence, read_bytes
 from visioncal.interchange.outputs import CALIBRATION, RECORDING, review_command
@@ -117,10 +118,9 @@ def load_exportable(path: Path) -> "Calibration | FrameFile | Alignment | Identi
     """
     alone = path.is_dir() and not (path / CALIBRATION).exists()
     # Half a second to import, which loading a calibration need not wait for.
-    from visioncal.dynamics import FILE as DYNAMICS
     from visioncal.dynamics import Identified
 
-    file = path / DYNAMICS if alone and (path / DYNAMICS).is_file() else path
+    file = path / DYNAMICS_FILE if alone and (path / DYNAMICS_FILE).is_file() else path
     if "base" in _content(file) and "transforms" not in _content(file):
         return Identified.load(file)
     frames = path / FRAMES if alone else path

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from visioncal.core.choices import DYNAMICS_FILE
 from visioncal.core.documents import parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, write_atomically
@@ -367,7 +368,7 @@ class Calibration(CalibrationSections):
             file = file / "calibration.json"
             # A cell that was aligned by an older version.
             file = before if before.is_file() and not file.exists() else file
-            if not file.exists() and (file.parent / "dynamics.json").is_file():
+            if not file.exists() and (file.parent / DYNAMICS_FILE).is_file():
                 raise DataError(
                     f"{path} is a result of visioncal dynamics identify, and has no calibration.",
                     culprits=[str(path)],

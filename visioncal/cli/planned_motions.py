@@ -1,0 +1,148 @@
+"""The motions of `visioncal dynamics plan`: planned, written and reported."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import typer
+from rich.markup import escape
+
+from visioncal.cli.console import answers, report_written
+from visioncal.cli.dynamics_plan import FRICTION, ArmOptions, ExcitationOptions
+from visioncal.cli.numbers import numbers_in
+from visioncal.cli.plan_options import ClearanceOptions
+from visioncal.cli.progress import shown_progress
+from visioncal.core.errors import DataError
+from visioncal.core.files import some_of
+from visioncal.core.types import FloatArray
+from visioncal.dynamics.excitation import ExcitationRequest, excite
+from visioncal.dynamics.friction import FrictionTerms
+from visioncal.dynamics.limits import Allowed, Missing, Share, allowed_motion
+from visioncal.dynamics.planned import MotionPlan
+from visioncal.dynamics.sweeps import SweepRequest, plan_sweeps
+from visioncal.dynamics.written import motion_document
+from visioncal.interchange.outputs import write_motions
+from visioncal.live.planning.cell import Box
+from visioncal.live.planning.motions import plan_warnings, plan_words
+from visioncal.robot import Robot, load_robot
+from visioncal.robot.bodies import Body, capsule
+
+
+def plan_motions(
+    robot: str,
+    motion: ExcitationOptions,
+    kept: ClearanceOptions,
+    able: ArmOptions,
+    out: Path,
+    *,
+    as_json: bool,
+) -> None:
+    """Plans an exciting motion and sweeps, writes them into a folder, and reports them.
+
+    Raises:
+        DataError: The robot cannot be read, an option is none, or the limits allow no motion.
+    """
+    share = Share(
+        float(np.deg2rad(kept.margin_deg)),
+        able.speed,
+        able.acceleration,
+        able.torque_margin,
+        1e-3 * kept.clearance_mm,
+        kept.floor_m,
+    )
+    arm = load_robot(robot)
+    missing = (able.range_deg, able.speed_deg, able.acceleration_deg)
+    allowed = allowed_motion(
+        arm,
+        share,
+        missing=Missing(*map(_radians, missing)),
+        bodies=_bodies(arm, kept.bodies, able.tool),
+        payload=None if able.payload is None else _payload(able.payload),
+    )
+    wished = ExcitationRequest(
+        motion.duration,
+        motion.harmonics,
+        _terms(motion.friction),
+        motion.starts,
+        motion.seed,
+        seconds=np.inf if motion.seconds is None else motion.seconds,
+    )
+    swept = None
+    if not motion.no_sweeps:
+        swept = SweepRequest(speeds=motion.sweep_speeds, seed=motion.seed)
+    plan = _planned(allowed, wished, swept, quiet=as_json)
+    document = motion_document(plan)
+    written = write_motions(out, plan, motion.rate_hz, document)
+    if as_json:
+        typer.echo(json.dumps(document, indent=2, allow_nan=False))
+    else:
+        _report(plan)
+    report_written(written, quiet=as_json)
+
+
+def _report(plan: MotionPlan) -> None:
+    console = answers()
+    for words in plan_words(plan):
+        console.print(escape(words))
+    for words in plan_warnings(plan):
+        console.print(f"[bold yellow]warning:[/] {escape(words)}")
+
+
+def _planned(
+    allowed: Allowed, wished: ExcitationRequest, swept: SweepRequest | None, *, quiet: bool
+) -> MotionPlan:
+    with shown_progress(quiet=quiet) as progress:
+        # The sweeps first: they are quick, and fail for the same reasons.
+        sweeps = None if swept is None else plan_sweeps(allowed, swept)
+        return MotionPlan(allowed, excite(allowed, wished, progress), sweeps)
+
+
+def _radians(degrees: float | None) -> float | None:
+    if degrees is None:
+        return None
+    if not 0.0 < degrees < np.inf:
+        raise DataError(
+            f"a limit of {degrees:g} deg is given; a number above zero is needed.",
+            culprits=["--range-deg", "--speed-deg", "--acceleration-deg"],
+        )
+    return float(np.deg2rad(degrees))
+
+
+def _terms(words: str) -> FrictionTerms:
+    wanted = [] if words.strip().lower() == "none" else [it.strip() for it in words.split(",")]
+    unknown = [it for it in wanted if it not in FRICTION]
+    if unknown:
+        raise DataError(
+            f"--friction is {words[:80]!r}; of {some_of(FRICTION)} is needed, with commas "
+            "between, or none.",
+            culprits=["--friction"],
+        )
+    return FrictionTerms(*(it in wanted for it in FRICTION))
+
+
+def _bodies(arm: Robot, boxes: Sequence[Box], tool: str | None) -> tuple[Body, ...]:
+    found = [Body(box.name, 0, "box", box.size_m, box.base_from_box) for box in boxes]
+    if tool is not None:
+        length, radius = (1e-3 * it for it in numbers_in(tool, "--tool", "length,radius"))
+        if min(length, radius) <= 0.0:
+            raise DataError(
+                f"--tool is {tool!r}; a length and a radius above zero [mm] are needed.",
+                culprits=["--tool"],
+            )
+        flange = arm.chain.placements[-1]
+        tip = flange[:3, 3] + flange[:3, 2] * max(length - radius, 0.0)
+        found.append(capsule("tool", arm.joint_count, flange[:3, 3], tip, radius))
+    return tuple(found)
+
+
+def _payload(words: str) -> FloatArray:
+    """(10,) inertial parameters of a point mass, in the flange's frame."""
+    kg, *centre_mm = numbers_in(words, "--payload", "kg,x,y,z")
+    if kg < 0.0:
+        raise DataError(
+            f"--payload is {words!r}; a mass of 0 kg or more is needed.", culprits=["--payload"]
+        )
+    x, y, z = (1e-3 * it for it in centre_mm)
+    about = [y * y + z * z, -x * y, x * x + z * z, -x * z, -y * z, x * x + y * y]
+    return kg * np.array([1.0, x, y, z, *about])

@@ -1,0 +1,175 @@
+"""What `visioncal dynamics payload` and `gains` find by a body on the flange, and its report."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import typer
+from rich.markup import escape
+
+from visioncal.cli.console import messages
+from visioncal.cli.dynamics_options import StreamOptions, identified_of
+from visioncal.cli.numbers import numbers_in
+from visioncal.core.errors import DataError
+from visioncal.core.number_format import matched, significant
+from visioncal.core.types import FloatArray
+from visioncal.dynamics import (
+    BaseModel,
+    DynamicModel,
+    FrictionTerms,
+    Gains,
+    Payload,
+    drive_gains,
+    estimate_payload,
+)
+from visioncal.dynamics.run import conditioned_streams, current_streams, of_one_arm, robot_of
+from visioncal.robot import Inertias, matrices
+from visioncal.session import Session
+
+
+def print_payload(
+    session: Path,
+    streams: StreamOptions,
+    against: Path | None,
+    *,
+    same_friction: bool,
+    gains_sigma: float,
+    as_json: bool,
+) -> None:
+    """Weighs what the flange carries.
+
+    Raises:
+        DataError: Nothing was identified before, or the streams do not determine the payload.
+    """
+    identified = identified_of(against, "payload")
+    loaded = conditioned_streams(Session.load(session), identified, streams.request())
+    found = estimate_payload(
+        identified, loaded, friction_changes=not same_friction, gain_sigma=0.01 * gains_sigma
+    )
+    if as_json:
+        typer.echo(json.dumps(found.document(), indent=2))
+        return
+    for note in (note for it in loaded for note in it.notes):
+        messages().print(escape(note))
+    typer.echo("\n".join(_lines(found)))
+
+
+def print_gains(
+    session: Path,
+    loaded: Path,
+    body: FloatArray,
+    *,
+    cutoff_hz: float | None,
+    named: str | None,
+    as_json: bool,
+) -> None:
+    """Finds the gains of an arm's drives by a body on its flange.
+
+    Args:
+        session: A session of the arm without the body.
+        loaded: One with it.
+        body: (10,) The body's inertial parameters in the flange's frame.
+        cutoff_hz: Of the low-pass, where it is given [Hz].
+        named: Which robot of a whole cell is meant.
+        as_json: Prints the document in the place of words.
+
+    Raises:
+        DataError: The sessions cannot be read, or have no currents.
+    """
+    without = of_one_arm(Session.load(session), named)
+    robot = robot_of(without)
+    empty = current_streams(without, robot, cutoff_hz)
+    full = current_streams(
+        of_one_arm(Session.load(loaded), named), robot, cutoff_hz or empty[0].cutoff_hz
+    )
+    base = BaseModel.reduce(DynamicModel(robot, FrictionTerms(motor_inertia=True)))
+    found = drive_gains(base, empty, full, body)
+    if as_json:
+        document = [_row(name, found, at) for at, name in enumerate(robot.joint_names)]
+        typer.echo(json.dumps(document, indent=2))
+        return
+    _report_gains(robot.joint_names, found)
+
+
+def _lines(found: Payload) -> list[str]:
+    mass = f"{matched(found.mass_kg, found.mass_sigma_kg)} kg"
+    centre = _listed(1e3 * found.centre_m, 1e3 * found.centre_sigma_m)
+    lines = [
+        f"mass {mass} (sigma {significant(found.mass_sigma_kg)}{_of_gains(found)})",
+        f"centre {centre} mm in the flange's frame",
+    ]
+    if found.consistent:
+        inertia = ", ".join(f"{it:.4g}" for it in found.inertia_kg_m2)
+        lines.append(f"inertia about it (xx, xy, yy, xz, yz, zz) {inertia} kg m^2")
+    else:
+        lines.append("its inertia is lost in the noise")
+    left = ", ".join(significant(it) for it in found.rms_nm.tolist())
+    lines.append(f"unexplained {left} N m, joint by joint")
+    return [*lines, f"on a UR: {_ur_words(found)}"]
+
+
+def _of_gains(found: Payload) -> str:
+    """What of the mass's sigma the drives' gains make up, where they do."""
+    if not found.gains_sigma_kg:
+        return ""
+    return f", {significant(found.gains_sigma_kg)} of it from the drives' gains"
+
+
+def _listed(values: FloatArray, sigmas: FloatArray) -> str:
+    pairs = zip(values.tolist(), sigmas.tolist(), strict=True)
+    return ", ".join(f"{matched(it, sigma)} (sigma {significant(sigma)})" for it, sigma in pairs)
+
+
+def _ur_words(found: Payload) -> str:
+    """The payload as a UR's program sets it, in kg, m and kg m^2."""
+    centre = ", ".join(f"{it:.5f}" for it in found.centre_m)
+    if not found.consistent:
+        return f"set_target_payload({found.mass_kg:.4f}, [{centre}])"
+    xx, xy, yy, xz, yz, zz = found.inertia_kg_m2.tolist()
+    inertia = ", ".join(f"{it:.6f}" for it in (xx, yy, zz, xy, xz, yz))
+    return f"set_target_payload({found.mass_kg:.4f}, [{centre}], [{inertia}])"
+
+
+def body_of(mass_kg: float, com_mm: str, inertia: str) -> FloatArray:
+    """(10,) the body's inertial parameters in the flange's frame.
+
+    Raises:
+        DataError: There is no such body.
+    """
+    centre = 1e-3 * np.array(numbers_in(com_mm, "--com-mm", "x,y,z"))
+    about = matrices(np.array(numbers_in(inertia, "--inertia", "xx,xy,yy,xz,yz,zz")))
+    body = Inertias.of_bodies(np.array([mass_kg]), centre[None], about[None])
+    if not (mass_kg > 0.0 and body.consistent):
+        raise DataError(
+            f"--mass-kg {mass_kg:g} and --inertia {inertia} are those of no body.",
+            culprits=["--mass-kg", "--inertia"],
+            next_step="A mass above 0 kg is needed, and an inertia about its centre; none stands "
+            "for a body as small as a point.",
+        )
+    return np.asarray(body.values[0])
+
+
+def _row(name: str, found: Gains, at: int) -> dict[str, str | float]:
+    """The gain of a drive; the joint alone where it is not determined."""
+    if not found.determined[at]:
+        return {"joint": name}
+    gain, sigma = float(found.nm_per_a[at]), float(found.sigma[at])
+    return {"joint": name, "nm_per_a": gain, "sigma_nm_per_a": sigma}
+
+
+def _report_gains(names: tuple[str, ...], found: Gains) -> None:
+    for name, gain, sigma, determined in zip(
+        names, found.nm_per_a.tolist(), found.sigma.tolist(), found.determined, strict=True
+    ):
+        words = "not determined: the body hardly moves it"
+        if determined:
+            words = f"{matched(gain, sigma)} N m/A (sigma {significant(sigma)})"
+        messages().print(escape(f"{name}: {words}"))
+    if found.determined.all():
+        gains = ",".join(f"{it:.5g}" for it in found.nm_per_a)
+        typer.echo(f"--gains {gains}")
+    else:
+        messages().print(
+            "--gains needs all joints: move those that are not determined more, or take a body "
+            "that is heavier or whose centre is farther from their axes."
+        )
