@@ -10,7 +10,7 @@ from support.commands import turned_poses, visioncal, write_poses
 from support.marks import slow
 from support.whole_cells import OPTIONS, recorded
 
-from visioncal.cli import dynamics_plan
+from visioncal.cli import planned_motions
 from visioncal.core.transforms import invert
 from visioncal.dynamics.excitation import ExcitationRequest
 from visioncal.session import Session
@@ -129,7 +129,7 @@ def test_of_a_whole_cell(place):
 def test_of_dynamics(place, monkeypatch):
     # The motion that is planned need not be a good one: a short search will do.
     monkeypatch.setattr(
-        dynamics_plan,
+        planned_motions,
         "ExcitationRequest",
         lambda *words, **more: replace(ExcitationRequest(*words, **more), starts=1, steps=3),
     )
