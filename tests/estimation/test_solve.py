@@ -134,6 +134,32 @@ def test_the_likelihood_jacobian_as_its_differences_say(given):
         assert at(logs).slope[level] == pytest.approx(slope, rel=1e-4, abs=1e-4)
 
 
+@pytest.mark.parametrize("kind", ["one a stop", "two a stop", "places", "combined"])
+def test_errors_of_an_arm_beside_a_likelihood_are_those_of_a_wider_problem(kind):
+    problem, fit = answered(False, views=8, seed=6)
+    seen = problem.observations
+    if kind == "two a stop":
+        problem = doubled(problem)
+    if kind == "places":  # of one point a stop, which leaves a flange's rotation open
+        seen = replace(seen, has_rotation=np.zeros(8, dtype=bool))
+        problem = replace(problem, observations=seen)
+    if kind == "combined":
+        seen = replace(seen, covariance=np.zeros_like(seen.covariance))
+        problem = replace(problem, observations=seen, is_combined=True)
+    moves = np.random.default_rng(0).standard_normal((8, 6, 3))
+    effect = Effect.free(
+        "arm", Knowledge(np.zeros((3, 3)), np.zeros(3)), flange_jacobian={ROBOT: moves}
+    )
+    wider = problem.with_effects([*problem.effects, effect])
+    there = replace(fit.state, values=np.append(fit.state.values, np.zeros(3)))
+    beside = robot_likelihood(problem, fit.state, fit.noise).beside(0, moves)
+    expected = robot_likelihood(wider, there, fit.noise)
+    np.testing.assert_allclose(beside.jacobian, expected.jacobian, rtol=1e-6, atol=1e-9)
+    # What the wider problem has left of the arm's columns beside them is rounding.
+    levels = 2.0 * fit.noise.robots
+    assert beside.value(levels) == pytest.approx(expected.value(levels), abs=1e-5)
+
+
 def test_shared_errors_of_flanges_are_eliminated_exactly():
     """Against the covariance of all observations, written out."""
     problem, fit = answered(False, views=6, seed=5)

@@ -17,12 +17,7 @@ from visioncal.estimation.budget import less_noise
 from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.parts import Effect, Noise, State
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.solve import (
-    RobotLikelihood,
-    normal_equations,
-    robot_levels,
-    robot_likelihood,
-)
+from visioncal.estimation.solve import RobotLikelihood, normal_equations
 from visioncal.estimation.variance import LEAST_SIGMA, Components, Knowledge
 from visioncal.robot import Robot
 
@@ -132,40 +127,26 @@ def pose_basis(base_from_flange: FloatArray) -> FloatArray:
 
 
 def find_arm_errors(
-    problem: Problem,
-    state: State,
-    noise: Noise,
-    robot: str,
-    basis: FloatArray,
-    *,
-    of_links: bool,
-    white: tuple[FloatArray, float] | None = None,
+    likelihood: RobotLikelihood, robot: int, basis: FloatArray, *, of_links: bool
 ) -> ArmErrors | None:
     """Estimates the size of the errors of one robot's arm, where they are significant.
 
     Args:
-        problem: The observations.
-        state: The answer under white noise.
-        noise: The levels of the sensors; those of robots are sought anew.
-        robot: The robot.
+        likelihood: That of the robots' levels without these errors, at the answer.
+        robot: The robot, by its place among them.
         basis: (s, 6, p) by stop, of `link_basis` or `pose_basis`.
         of_links: Whether it is of this arm's links.
-        white: What `robot_levels` from above gives without these errors; None to seek it.
 
     Returns:
         The errors; None where white noise explains the residuals about as well.
     """
     # An arm whose links all look like its frames, as one with parallel axes, has no columns.
-    if len(stops_of(problem, robot)) < _FEWEST_STOPS or not basis.shape[2]:
+    stops, size = likelihood.stops[(likelihood.members == robot).any(axis=1)], basis.shape[2]
+    if len(np.unique(stops)) < _FEWEST_STOPS or not size:
         return None
-    levels, unlikely = white or robot_levels(problem, state, noise, from_above=True)
-    size = basis.shape[2]
-    freely = Knowledge(np.zeros((size, size)), np.zeros(size))
-    effect = replace(ArmErrors(basis, 1.0, 0.0, of_links).effect(robot), known=freely)
-    widened = problem.with_effects([*problem.effects, effect])
-    still = State(state.edges, np.concatenate([state.values, np.zeros(size)]))
-    likelihood = robot_likelihood(widened, still, noise)
-    sigma, value = _most_likely_size(likelihood, size, levels, unlikely - 0.5 * _LIKELY)
+    levels, unlikely = likelihood.white
+    widened = likelihood.beside(robot, basis)
+    sigma, value = _most_likely_size(widened, size, levels, unlikely - 0.5 * _LIKELY)
     gain = 2.0 * (unlikely - value)
     return ArmErrors(basis, sigma, gain, of_links) if gain > _LIKELY else None
 

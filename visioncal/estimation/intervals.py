@@ -1,7 +1,6 @@
 """How well the noise's levels are known."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -11,9 +10,7 @@ from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import (
     RATIO_PRIOR,
-    robot_levels,
     robot_likelihood,
-    starting_noise,
 )
 from visioncal.estimation.variance import profile_interval
 
@@ -84,8 +81,7 @@ def noise_intervals(problem: Problem, state: State, noise: Noise) -> FloatArray:
         fifty times the level where they do not speak against that.
     """
     likelihood = robot_likelihood(problem, state, noise)
-    start = replace(noise, robots=starting_noise(problem).robots)
-    lowest = robot_levels(problem, state, start, from_above=True)[1]
+    lowest = likelihood.white[1]
     sigmas = noise.robots.ravel()
 
     def profile(level: int, logarithm: float) -> float:

@@ -10,7 +10,7 @@ restricted likelihood with log-normal priors, the length on a grid (Gilmour, Tho
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import LinAlgError, lapack
@@ -22,11 +22,10 @@ from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, HARMONICS, WEIGH
 from visioncal.estimation.linalg import gram, weighted_gram
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.solve import RATIO_PRIOR, RobotLikelihood, robot_levels, robot_likelihood
+from visioncal.estimation.solve import RATIO_PRIOR, RobotLikelihood, robot_likelihood
 from visioncal.estimation.variance import (
     LEAST_SIGMA,
     MOST_SIGMA,
-    Knowledge,
     Likely,
     most_likely,
 )
@@ -122,14 +121,14 @@ def find_joint_functions(
     Returns:
         The functions with all other errors of the arm; None where these explain about as much.
     """
-    rest = (problem, state, noise, robot)
-    plain = _Arm.of(*rest, bases, _Waves.of(harmonics), torque_nm)
+    nominal, place = robot_likelihood(problem, state, noise), problem.robots.index(robot)
+    plain = _Arm.of(nominal, place, bases, _Waves.of(harmonics), torque_nm)
     without = plain.most_likely(plain.start())
     if without is None:
         return None
     chosen, best, worse = None, without, 0
     for length in _LENGTHS_RAD:
-        arm = _Arm.of(*rest, bases, _Waves.of(harmonics, length), torque_nm)
+        arm = _Arm.of(nominal, place, bases, _Waves.of(harmonics, length), torque_nm)
         # Of what seems not to gain enough, the rest of the way does not matter.
         found = arm.most_likely(
             np.append(best.logs[: len(without.logs)], np.log(_START_RAD)),
@@ -146,13 +145,12 @@ def find_joint_functions(
     # Springs that would yield against their load are none.
     while (against := chosen.springs_of(best) < 0.0).any():
         bases = {**bases, COMPLIANCE: bases[COMPLIANCE] * ~against}
-        stiffer = _Arm.of(*rest, bases, chosen.waves, torque_nm)
+        stiffer = _Arm.of(nominal, place, bases, chosen.waves, torque_nm)
         found = stiffer.most_likely(best.logs)
         if found is None:
             break
         chosen, best = stiffer, found
-    nominal = robot_levels(problem, state, noise, from_above=True)[1]
-    return chosen.found(best, 2.0 * (nominal - best.value))
+    return chosen.found(best, 2.0 * (nominal.white[1] - best.value))
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,23 +217,15 @@ class _Arm:
     @classmethod
     def of(
         cls,
-        problem: Problem,
-        state: State,
-        noise: Noise,
-        robot: str,
+        nominal: RobotLikelihood,
+        robot: int,
         bases: Mapping[str, FloatArray],
         waves: _Waves,
         torque_nm: float,
     ) -> "_Arm":
         basis = np.concatenate([*bases.values(), waves.columns], axis=2)
-        size = basis.shape[2]
-        freely = Knowledge(np.zeros((size, size)), np.zeros(size))
-        effect = replace(ArmErrors(basis, 1.0, 0.0, True).effect(robot), known=freely)
-        widened = problem.with_effects([*problem.effects, effect])
-        still = State(state.edges, np.concatenate([problem.start_values, np.zeros(size)]))
-        likelihood = robot_likelihood(widened, still, noise)
-        moving = np.cumsum(likelihood.moving) - 1
-        random = moving[np.arange(len(likelihood.moving))[widened.effect_columns[effect.name]]]
+        size, likelihood = basis.shape[2], nominal.beside(robot, basis)
+        random = np.arange(size) + int(nominal.moving.sum())
         names = (*bases, "second", *([HARMONICS] if waves.length_rad else []))
         groups = np.repeat(np.arange(len(bases)), [it.shape[2] for it in bases.values()])
         shares = np.zeros((size, len(names)))

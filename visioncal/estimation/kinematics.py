@@ -17,7 +17,13 @@ from visioncal.estimation.arm import ArmErrors, find_arm_errors, rows_of
 from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, WEIGHT
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.solve import Solution, fit_problem, left_out_residuals, robot_levels
+from visioncal.estimation.solve import (
+    RobotLikelihood,
+    Solution,
+    fit_problem,
+    left_out_residuals,
+    robot_likelihood,
+)
 
 
 @dataclass(frozen=True)
@@ -93,7 +99,7 @@ class ArmTrials:
     bases: Mapping[str, FloatArray]
     noise: Noise | None = None
     _fits: dict[tuple[ArmErrors, ...], Solution] = field(default_factory=dict)
-    _white: dict[tuple[ArmErrors, ...], tuple[FloatArray, float]] = field(default_factory=dict)
+    _likely: dict[tuple[ArmErrors, ...], RobotLikelihood] = field(default_factory=dict)
     _found: dict[tuple[int, tuple[ArmErrors, ...]], ArmErrors | None] = field(default_factory=dict)
 
     def erring(self, errors: Mapping[str, ArmErrors]) -> Problem:
@@ -116,11 +122,11 @@ class ArmTrials:
         known = tuple(among.values())
         if (id(basis), known) not in self._found:
             fit = self.fitted(among)
-            fitted = (self.erring(among), fit.state, fit.noise)
-            if known not in self._white:
-                self._white[known] = robot_levels(*fitted, from_above=True)
+            if known not in self._likely:
+                self._likely[known] = robot_likelihood(self.erring(among), fit.state, fit.noise)
+            place = self.problem.robots.index(self.robot)
             self._found[id(basis), known] = find_arm_errors(
-                *fitted, self.robot, basis, of_links=True, white=self._white[known]
+                self._likely[known], place, basis, of_links=True
             )
         return self._found[id(basis), known]
 

@@ -25,10 +25,10 @@ from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.arm import TWIST_UNITS, ArmErrors, pose_basis, rows_of, stops_of
 from visioncal.estimation.budget import less_noise
 from visioncal.estimation.linalg import covariance_among, covariance_root
-from visioncal.estimation.parts import Effect, Noise, State
+from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import RATIO_PRIOR, normal_equations, robot_likelihood
-from visioncal.estimation.variance import LEAST_SIGMA, MOST_SIGMA, Knowledge
+from visioncal.estimation.variance import LEAST_SIGMA, MOST_SIGMA
 
 # Postures are as far apart by so much of a place as by a radian of a direction [m].
 _REACH_M = 0.5
@@ -331,11 +331,7 @@ class _Likelihood:
         place, count = problem.robots.index(robot), len(problem.poses[robot])
         moves = np.zeros((count, 6, 6))
         moves[stood] = np.eye(6)
-        nothing = Knowledge(np.zeros((6, 6)), np.zeros(6))
-        effect = Effect.free("flange", nothing, flange_jacobian={robot: moves})
-        widened = problem.with_effects([*problem.effects, effect])
-        there = State(state.edges, np.append(state.values, np.zeros(6)))
-        likelihood = robot_likelihood(widened, there, noise)
+        likelihood = robot_likelihood(problem, state, noise).beside(place, moves)
         jacobian = likelihood.reduced.jacobian[:, :, likelihood.moving]
         jacobian, by_flange = jacobian[:, :, :-6], jacobian[:, :, -6:]
         information = likelihood.known.information[:-6, :-6].copy()
@@ -345,10 +341,7 @@ class _Likelihood:
         others = problem.error_covariance(replace(noise, robots=levels))
         known = likelihood.reduced.covariance + others
         errors, parts = likelihood.reduced.errors, likelihood.components.parts
-        of, members = problem.units
-        width = errors.shape[1]
-        stops = np.zeros(len(members), dtype=np.int64)
-        stops[of[of >= 0]] = problem.observations.stops[of >= 0]
+        members, stops, width = likelihood.members, likelihood.stops, errors.shape[1]
         units = np.flatnonzero((members == place).any(axis=1))
         units = units[np.argsort(stops[units], kind="stable")]
         every = np.array_split(units, -(-len(units) * width // _MOST_ROWS))

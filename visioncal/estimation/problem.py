@@ -67,12 +67,15 @@ class Linear:
         blocks: Their Jacobian by p unknowns, one block for each pair of frames.
         by_errors: (n, 6, 6 w) that by the flanges' errors, in the places of the robots that the
             observation's unit has; see `Problem.units`.
+        by_flanges: (n, 6, 6 w) by these flanges themselves, which is the same but where the errors
+            are those of the observed frame; see `Problem.is_combined`.
         size: How many unknowns p there are.
     """
 
     residuals: FloatArray
     blocks: tuple[Block, ...]
     by_errors: FloatArray
+    by_flanges: FloatArray
     size: int
 
     @property
@@ -591,10 +594,11 @@ class Problem:
                 behind = jacobian[:, :, -by_sensor.shape[2] :]
                 behind += by_measured[block.rows] @ by_sensor
             blocks.append(replace(block, jacobian=jacobian))
-        by_errors = by_predicted @ errors
+        by_flanges = by_predicted @ errors
+        by_errors = by_flanges
         if self.is_combined:
             by_errors = np.broadcast_to(np.eye(6), errors.shape)
-        return Linear(residuals, tuple(blocks), by_errors, self.size)
+        return Linear(residuals, tuple(blocks), by_errors, by_flanges, self.size)
 
     def change_of(self, frame: str, state: State) -> FloatArray:
         """The change of a frame's edge that each observation asks for, were all else right.

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from typing import Self
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -76,6 +77,8 @@ class Reduced:
         errors: (u, 6 w) what each unit says of its flanges' errors.
         jacobian: (u, 6 w, p) how that moves with the unknowns.
         covariance: (u, 6 w, 6 w) of it, by the observations alone.
+        by_flanges: (u, 6 w, 6 w) how it moves with the flanges themselves: as much, where anything
+            was observed of them and the errors are theirs.
     """
 
     information: FloatArray
@@ -84,6 +87,7 @@ class Reduced:
     errors: FloatArray
     jacobian: FloatArray
     covariance: FloatArray
+    by_flanges: FloatArray
 
 
 def starting_noise(problem: Problem) -> Noise:
@@ -244,7 +248,7 @@ def reduce(problem: Problem, state: State, linear: Linear, covariance: FloatArra
     of, members = problem.units
     width, size = linear.by_errors.shape[2], linear.size
     total, alone = np.zeros((size + 1, size + 1)), problem.alone
-    own, inverse, blind = np.zeros((3, len(members), width, width))
+    own, inverse, blind, by_flanges = np.zeros((4, len(members), width, width))
     cross, answer = np.zeros((2, len(members), width, size + 1))
     for block in linear.blocks:
         # Residuals are the last column.
@@ -255,6 +259,7 @@ def reduce(problem: Problem, state: State, linear: Linear, covariance: FloatArra
             rows = block.rows[single]
             turned = np.linalg.inv(linear.by_errors[rows, :, :6])
             answer[np.ix_(of[rows], np.arange(6), columns)] = turned @ every[single]
+            by_flanges[of[rows], :6, :6] = turned @ linear.by_flanges[rows, :, :6]
             turned_covariance = turned @ covariance[rows] @ np.swapaxes(turned, 1, 2)
             inverse[of[rows], :6, :6] = turned_covariance
             inverse[of[rows], 6:, 6:] = ANYTHING * np.eye(width - 6)
@@ -276,6 +281,7 @@ def reduce(problem: Problem, state: State, linear: Linear, covariance: FloatArra
     joined = np.setdiff1d(np.arange(len(members)), of[alone])
     inverse[joined], blind[joined] = _pseudo_inverse(own[joined])
     answer[joined] = inverse[joined] @ cross[joined]
+    by_flanges[joined] = inverse[joined] @ own[joined]
     # A residual is what the flange's error made of it: the error itself has the other sign.
     total = total - gram(cross[joined], answer[joined])
     known = problem.knowledge(state)
@@ -286,6 +292,7 @@ def reduce(problem: Problem, state: State, linear: Linear, covariance: FloatArra
         answer[:, :, -1],
         answer[:, :, :-1],
         inverse + blind,
+        by_flanges,
     )
 
 
@@ -390,7 +397,7 @@ def estimate_noise(
             since they may be anything: a start that is too low may stay there.
     """
     of_robots = robot_likelihood(problem, state, noise)
-    noise = replace(noise, robots=of_robots.levels(noise, from_above=from_above)[0])
+    noise = replace(noise, robots=of_robots.levels(from_above=from_above)[0])
     if not len(noise.sensors):
         return noise
     # By the sensors' noise alone, which is still the same.
@@ -415,7 +422,7 @@ def robot_levels(
     Returns:
         The levels, and the negative restricted log-likelihood there.
     """
-    return robot_likelihood(problem, state, noise).levels(noise, from_above=from_above)
+    return robot_likelihood(problem, state, noise).levels(from_above=from_above)
 
 
 @dataclass(frozen=True, eq=False)
@@ -427,14 +434,23 @@ class RobotLikelihood:
         components: What makes up the covariance of that.
         known: What is known of the unknowns that move without these errors.
         moving: (p,) the unknowns that move.
-        seen: (r,) which robots have been observed.
+        members: (u, w) the robots of each unit; see `Problem.units`.
+        stops: (u,) the stop of each unit that has any.
+        before: (r, 2) the levels that the robots had before.
     """
 
     reduced: Reduced
     components: Components
     known: Knowledge
     moving: Mask
-    seen: Mask
+    members: IntArray
+    stops: IntArray
+    before: FloatArray
+
+    @cached_property
+    def seen(self) -> Mask:
+        """(r,) which robots have been observed."""
+        return np.isin(np.arange(len(self.before)), self.members)
 
     @cached_property
     def jacobian(self) -> FloatArray:
@@ -478,15 +494,51 @@ class RobotLikelihood:
         )
         return sigmas.reshape(start.shape), value
 
-    def levels(self, noise: Noise, *, from_above: bool) -> tuple[FloatArray, float]:
-        """The robots' levels (r, 2) from those of some noise on, as `robot_levels` gives them."""
-        if not len(self.components.known):
-            return noise.robots, 0.0
-        start = np.maximum(_ABOVE * noise.robots, _ABOVE_NOTHING)
+    def levels(self, *, from_above: bool) -> tuple[FloatArray, float]:
+        """The robots' levels (r, 2), as `robot_levels` gives them."""
         if from_above:
-            start = np.maximum(self.rms, _START_SIGMA) * np.ones_like(noise.robots)
-        start = np.where(self.seen[:, None], start, noise.robots)
+            return self.white
+        return self._levels(np.maximum(_ABOVE * self.before, _ABOVE_NOTHING))
+
+    @cached_property
+    def white(self) -> tuple[FloatArray, float]:
+        """The levels (r, 2) from above, and the negative logarithm of their likelihood."""
+        return self._levels(np.maximum(self.rms, _START_SIGMA) * np.ones_like(self.before))
+
+    def _levels(self, start: FloatArray) -> tuple[FloatArray, float]:
+        if not len(self.components.known):
+            return self.before, 0.0
+        start = np.where(self.seen[:, None], start, self.before)
         return self.most_likely(start, np.repeat(self.seen, 2))
+
+    def beside(self, robot: int, moves: FloatArray) -> Self:
+        """The likelihood with k more unknowns, the last ones, that move a robot's flange.
+
+        What units say of their flanges' errors is all that they say of these: nothing is left of
+        them once the errors are eliminated.
+
+        Args:
+            robot: The robot, by its place.
+            moves: (s, 6, k) by stop, how its flange moves with them.
+        """
+        reduced, size = self.reduced, moves.shape[2]
+        units, slots = np.nonzero(self.members == robot)
+        places = 6 * slots[:, None, None] + np.arange(6)
+        by_flange = np.take_along_axis(reduced.by_flanges[units], places, axis=2)
+        jacobian = np.zeros((*reduced.errors.shape, size))
+        jacobian[units] = by_flange @ moves[self.stops[units]]
+        information, gradient = self.known.information, self.known.gradient
+        return replace(
+            self,
+            reduced=replace(
+                reduced,
+                information=np.pad(reduced.information, (0, size)),
+                gradient=np.pad(reduced.gradient, (0, size)),
+                jacobian=np.concatenate([reduced.jacobian, jacobian], axis=2),
+            ),
+            known=Knowledge(np.pad(information, (0, size)), np.pad(gradient, (0, size))),
+            moving=np.pad(self.moving, (0, size), constant_values=True),
+        )
 
     def value(self, levels: FloatArray) -> float:
         """The negative logarithm of the likelihood of (r, 2) levels."""
@@ -503,7 +555,9 @@ class RobotLikelihood:
 
 def robot_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLikelihood:
     """The likelihood of the robots' levels, those of the sensors being known."""
-    _, members = problem.units
+    of, members = problem.units
+    stops = np.zeros(len(members), dtype=np.int64)
+    stops[of[of >= 0]] = problem.observations.stops[of >= 0]
     reduced = reduce(problem, state, problem.linear(state), problem.covariance(noise))
     count, width = len(problem.robots), members.shape[1]
     parts = np.zeros((2 * count, len(members), 6 * width))
@@ -521,7 +575,9 @@ def robot_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLikel
         Components(known, parts),
         Knowledge(reduced.information[np.ix_(moving, moving)], reduced.gradient[moving]),
         moving,
-        np.array([(members == it).any() for it in range(count)]),
+        members,
+        stops,
+        noise.robots,
     )
 
 

@@ -20,7 +20,7 @@ from visioncal.estimation.parts import State
 from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.residual_tests import inflation
-from visioncal.estimation.solve import Solution, covariance_of, held_shift
+from visioncal.estimation.solve import Solution, covariance_of, held_shift, robot_likelihood
 
 
 def arms_of(cell: Cell, robots: Mapping[str, Reported]) -> dict[str, RobotArm]:
@@ -160,7 +160,10 @@ def with_errors(
     arms: Mapping[str, RobotArm], problem: Problem, fit: Solution
 ) -> dict[str, RobotArm]:
     """Looks for errors of each arm that follow its posture, the others being as stated."""
-    return {name: arm.with_errors(problem, fit) for name, arm in arms.items()}
+    likelihood = robot_likelihood(problem, fit.state, fit.noise)
+    return {
+        name: arm.with_errors(likelihood, problem.robots.index(name)) for name, arm in arms.items()
+    }
 
 
 def with_pose_errors(

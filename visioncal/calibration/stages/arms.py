@@ -44,7 +44,7 @@ from visioncal.estimation.armmodel import RIGID, ArmModel, blocks_of
 from visioncal.estimation.armpair import ArmData, ArmPair
 from visioncal.estimation.parts import Effect, Noise, State
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.solve import Solution
+from visioncal.estimation.solve import RobotLikelihood, Solution
 from visioncal.results.arm import (
     ArmErrorsResult,
     ArmSections,
@@ -265,16 +265,14 @@ class RobotArm:
         found = find_drift(problem, start, stops, inputs, self.matched.arm)
         return replace(self, thermal=found)
 
-    def with_errors(self, problem: Problem, fit: Solution) -> Self:
+    def with_errors(self, likelihood: RobotLikelihood, robot: int) -> Self:
         """Looks for errors that follow its posture.
 
         Args:
-            problem: The observations, with this arm as stated.
-            fit: Their fit.
+            likelihood: That of the robots' levels with this arm as stated, at the fit.
+            robot: Its place among the robots.
         """
-        found = find_arm_errors(
-            problem, fit.state, fit.noise, self.robot, self.basis, of_links=self.is_modelled
-        )
+        found = find_arm_errors(likelihood, robot, self.basis, of_links=self.is_modelled)
         return replace(self, errors=found)
 
     def stated(self, problem: Problem) -> Problem | None:

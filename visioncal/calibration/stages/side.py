@@ -15,6 +15,7 @@ from visioncal.estimation.joint import Fitted
 from visioncal.estimation.parts import Effect, Noise
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.scene import CornerProblem, Scene, repeat_shares
+from visioncal.estimation.solve import robot_likelihood
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +80,12 @@ class FramesSide:
 
     def with_errors(self, fitted: Fitted) -> Self:
         """Looks for errors of the arms; see `joint.Side`."""
-        free = {name for name, it in self.arms.items() if it.frees_errors(freely=self.freely)}
+        problem, fit = fitted.problem, fitted.fit
+        likelihood = robot_likelihood(problem, fit.state, fit.noise)
         arms = {
-            name: it if name in free else it.with_errors(fitted.problem, fitted.fit)
+            name: it
+            if it.frees_errors(freely=self.freely)
+            else it.with_errors(likelihood, problem.robots.index(name))
             for name, it in self.arms.items()
         }
         return replace(self, arms=arms)

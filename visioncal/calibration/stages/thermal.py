@@ -18,7 +18,7 @@ from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.armpair import ArmPair
 from visioncal.estimation.parts import State
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.solve import Solution, starting_noise
+from visioncal.estimation.solve import Solution, robot_likelihood, starting_noise
 from visioncal.results.arm import (
     DriftPoint,
     DriftResidual,
@@ -149,7 +149,8 @@ def find_drift(
     basis = np.zeros((len(poses), 6, model.size_of("links")))
     basis[stops.places] = model.columns("links", stops.q)
     noise = starting_noise(problem)
-    links = find_arm_errors(problem, start, noise, robot, basis, of_links=True)
+    likelihood = robot_likelihood(problem, start, noise)
+    links = find_arm_errors(likelihood, problem.robots.index(robot), basis, of_links=True)
     if links is not None:
         problem = problem.with_effects([*problem.effects, links.effect(robot)])
         start = State(start.edges, problem.start_values)
