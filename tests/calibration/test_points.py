@@ -463,6 +463,29 @@ def test_a_deleted_row_takes_its_corners_along(cube):
         Session.load(cube)
 
 
+@pytest.mark.parametrize("count", [1, 12])
+def test_views_that_repeat_others_are_named_and_count_once(count, tmp_path):
+    folder = write_rig(tmp_path / "rig", Rig("charuco"))
+    before = calibrate(folder)
+    for name in ("views.csv", "corners.csv"):
+        header, *lines = (folder / name).read_text().splitlines()
+        rows = [it.split(",", 1) for it in lines]
+        again = [f"{int(view) + 100},{rest}" for view, rest in rows if int(view) < count]
+        (folder / name).write_text("\n".join([header, *lines, *again]) + "\n")
+    twice = calibrate(folder)
+    (found,) = (it for it in twice.verdict.findings if it.kind == "repeated_views")
+    assert found.words.startswith(
+        "View 100 repeats 0:" if count == 1 else "Views 100 to 111 repeat 0 to 11:"
+    )
+    assert twice.next_steps[0] == found.do
+    (last,) = (it for it in twice.views if it.view == 99 + count)
+    assert (last.used, last.reason) == (False, f"repeats view {count - 1}")
+    # No copy takes part, and none counts as lost.
+    assert not any(it.kind == "lost_views" for it in twice.verdict.findings)
+    for name, edge in before.edges.items():
+        assert np.array_equal(twice.edges[name].covariance, edge.covariance)
+
+
 def test_tables_that_count_from_other_numbers_are_told_apart(cube):
     lines = (cube / "views.csv").read_text().splitlines()
     numbers = [int(it.partition(",")[0]) for it in lines[1:]]

@@ -121,8 +121,10 @@ def _inverse(poses: Poses, _: np.random.Generator) -> Poses:
     return replace(poses, robot=numbers(invert(poses.true_robot)))
 
 
-def _wxyz(poses: Poses, _: np.random.Generator) -> Poses:
-    return _told(poses, "quaternion-wxyz", "m", Reading())
+def _wxyz(poses: Poses, rng: np.random.Generator) -> Poses:
+    """One order of a quaternion's numbers under the names of the other."""
+    written = ("quaternion-wxyz", "quaternion-yzwx")[rng.integers(2)]
+    return _told(poses, written, "m", Reading())
 
 
 def _order(poses: Poses, rng: np.random.Generator) -> Poses:

@@ -137,6 +137,11 @@ def _all_forms() -> tuple[RotationForm, ...]:
     return (
         _quaternions("quaternion-xyzw", "a quaternion x, y, z, w", (0, 1, 2, 3)),
         _quaternions("quaternion-wxyz", "a quaternion w, x, y, z", (3, 0, 1, 2)),
+        _quaternions(
+            "quaternion-yzwx",
+            "a quaternion y, z, w, x (x, y, z, w under the names w, x, y, z)",
+            (1, 2, 3, 0),
+        ),
         _rotation_vectors("rotation-vector", "a rotation vector in radians", 1.0),
         _rotation_vectors(
             "rotation-vector-deg", "a rotation vector in degrees", float(np.deg2rad(1.0))

@@ -25,6 +25,8 @@ MISSING = "missing_images"
 _SIZES = (NEED, GOOD_FOR, "unexplained", "optimism", "weak_motion", "place", "workspace")
 
 
+# No need is as small [mm]: what is left out of a result takes nothing from it.
+LEAST_NEED_MM = 1e-3
 _HEADLINES = {
     "good": "Good: ready to use",
     "check": "Check before use",

@@ -231,7 +231,7 @@ def first_agreement(cell: Cell, looked: Observed, mount: Mount) -> tuple[Cell, A
 def _with_poses(cell: Cell, looked: Observed) -> Cell:
     """The cell without the observations that gave no pose."""
     missing = {
-        it.view: looked.reasons.get(it.view, "nothing was found in its image")
+        it.view: cell.reasons.get(it.view, "nothing was found in its image")
         for it in cell.rows
         if it.view not in looked.poses
     }

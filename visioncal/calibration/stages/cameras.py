@@ -1,7 +1,7 @@
 """What every camera saw: its corners, its lens, and the poses that each image allows."""
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import TypeVar
@@ -12,9 +12,10 @@ from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.calibration.stages.observed import CameraLook, Observed, nothing_seen
 from visioncal.calibration.stages.pnp import Poses, estimate_poses, given_poses, measure_poses
 from visioncal.core.errors import VisioncalError
+from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
 from visioncal.core.types import Corners
-from visioncal.core.verdict import Finding, Step
+from visioncal.core.verdict import LEAST_NEED_MM, Finding, Step
 from visioncal.results import CameraResult
 from visioncal.session import Session, View, frame_name
 from visioncal.session.kinds import name_of
@@ -55,7 +56,11 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
                 looked = fit_densely(session, views, corners, seen.dense, seen.progress)
                 corners, seen = looked[0], replace(seen, dense=looked[1])
         mine = _numbered_through(session, views, corners)
-        seen = seen.with_camera(frame, CameraLook(table, mine, resolution))
+        again = _repeated(views, mine)
+        mine = {view: it for view, it in mine.items() if view not in again}
+        repeats = {view: f"repeats view {earlier}" for view, earlier in again.items()}
+        look = CameraLook(table, mine, resolution, repeats=repeats)
+        seen = seen.noting((), _said_of(again)).with_camera(frame, look)
     return seen
 
 
@@ -184,6 +189,50 @@ def _numbered_through(
     mine = [it for it in views if it.number in corners]
     first = {it.number: starts[session.board_of(it)] for it in mine}
     return {it: replace(corners[it], ids=corners[it].ids + first[it]) for it in first}
+
+
+def _repeated(views: Sequence[View], corners: Mapping[int, Corners]) -> dict[int, int]:
+    """The views that repeat an earlier one, by number: no camera gives the same corners twice.
+
+    Args:
+        views: The rows; those whose robots have numbers of their own are compared.
+        corners: What was found, by view.
+    """
+    first: dict[Hashable, int] = {}
+    again: dict[int, int] = {}
+    for view in views:
+        numbers = tuple(it for it in view.numbers.items() if it[0] != "stamp_s")
+        if numbers and view.number in corners:
+            it = corners[view.number]
+            key = (numbers, it.ids.tobytes(), it.px.tobytes())
+            earlier = first.setdefault(key, view.number)
+            if earlier != view.number:
+                again[view.number] = earlier
+    return again
+
+
+def _said_of(again: Mapping[int, int]) -> Iterator[Finding]:
+    """Says which views repeat earlier ones; they count once."""
+    if not again:
+        return
+    copies, originals = list(again), list(dict.fromkeys(again.values()))
+    rows, repeat = ("row", "repeats") if len(again) == 1 else ("rows", "repeat")
+    views = "View" if len(again) == 1 else "Views"
+    yield Finding(
+        "repeated_views",
+        f"{views} {_listed(copies)} {repeat} {_listed(originals)}: poses and corners are the same "
+        "to the last digit. They count once.",
+        Step(f"In views.csv, delete the {rows} of {views.lower()} {_listed(copies)}."),
+        tuple(copies),
+        until_mm=LEAST_NEED_MM,
+    )
+
+
+def _listed(views: Sequence[int]) -> str:
+    """Views by their numbers, those in a row by the first and the last."""
+    if len(views) > 2 and list(views) == list(range(views[0], views[-1] + 1)):
+        return f"{views[0]} to {views[-1]}"
+    return some_of([str(it) for it in views])
 
 
 @contextmanager

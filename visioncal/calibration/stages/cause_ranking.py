@@ -84,6 +84,7 @@ EVIDENCE: Mapping[str, Evidence] = {
     "holdout": Evidence(1e-3),
     "lost_views": Evidence(_REMARK),
     "shared_image": Evidence(_FACT),
+    "repeated_views": Evidence(_FACT),
     "other_board": Evidence(_FACT),
     "other_lens": Evidence(_FACT),
     "untied": Evidence(_FACT),

@@ -37,6 +37,7 @@ class CameraLook:
         resolution: Size of its images [px].
         lens: Its intrinsics; None where it has no view to measure them by.
         pixel_px: Noise of a corner's coordinate [px].
+        repeats: Why views that repeat others are not needed, by view.
     """
 
     table: CameraTable
@@ -44,6 +45,7 @@ class CameraLook:
     resolution: tuple[int, int] | None = None
     lens: CameraResult | None = None
     pixel_px: float | None = None
+    repeats: Mapping[int, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +112,10 @@ class Observed:
 
     @cached_property
     def spared(self) -> Mapping[int, str]:
-        """Why views of sweeps are not needed, by view."""
-        return {view: why for it in self.clocks.values() for view, why in it.spared.items()}
+        """Why views of sweeps, and those that repeat others, are not needed, by view."""
+        of_sweeps = (it.spared for it in self.clocks.values())
+        of_cameras = (it.repeats for it in self.cameras.values())
+        return {view: why for it in (*of_sweeps, *of_cameras) for view, why in it.items()}
 
     @property
     def lenses(self) -> Mapping[str, CameraResult]:

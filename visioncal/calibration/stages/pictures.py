@@ -10,7 +10,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.limits import MAX_BLUR_PX
 from visioncal.core.types import Image, Target
-from visioncal.core.verdict import MISSING, Finding, Step
+from visioncal.core.verdict import LEAST_NEED_MM, MISSING, Finding, Step
 from visioncal.session import Session, View
 from visioncal.session.images import FolderImages
 from visioncal.vision.finders.identify import Identity, identify
@@ -20,8 +20,6 @@ from visioncal.vision.targets import load_target, target_names
 
 # So many names are listed, and so many images are searched for whatever board they show.
 _LISTED, _LOOKED_AT = 6, 3
-# No need is as small [mm]: what is left out of a result takes nothing from it.
-_LEAST_NEED_MM = 1e-3
 _ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 # What a photograph shows of a board, beside the dictionary of its markers.
 _SEEN = ("kind", "columns", "rows", "legacy", "marker_id", "asymmetric")
@@ -109,7 +107,7 @@ def _shared(session: Session) -> Iterator[Finding]:
                 f"{words}.",
                 Step(f"In views.csv, {do}; or delete the row of view {view.number}."),
                 (before.number, view.number),
-                until_mm=_LEAST_NEED_MM,
+                until_mm=LEAST_NEED_MM,
             )
 
 
