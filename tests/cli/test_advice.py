@@ -57,6 +57,49 @@ def test_of_poor_motion_with_a_modelled_arm(place, poor):
     assert list(failures(done.said)) == []
 
 
+WRONG_PLACES = {
+    "a session's table for a result": (
+        ("export", "session/views.csv", "--to", "ros"),
+        "session/views.csv begins with 'view,",
+        "nothing need be changed",
+    ),
+    "a result for a session": (("convert", "out", "copy"), "no session, but a result", "recording"),
+    "no folder": (("calibrate", "session", "-o", ""), "-o is empty", "variable"),
+    "no folder, as one word": (("plan", "session", "--out="), "--out is empty", "variable"),
+    "touches for a drawing": (
+        ("fixture", "session/views.csv", "--cad", "session/views.csv", "--tool", "none"),
+        "views.csv has rotations",
+        "Name the touches first",
+    ),
+    "no arm": (("simulate", "x", "--robot", "foo"), "ur10e, generic-6r-1800 are", "Name one"),
+    "readings to plan for": (("plan", "tracker", "--add", "3"), "is of an instrument", "30 deg"),
+    "readings to look in": (
+        ("locate", "tracker", "-c", "tracked"),
+        "is of an instrument",
+        "visioncal verify",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG_PLACES)
+def test_of_what_is_given_in_the_wrong_place(place, name):
+    words, said, advised = WRONG_PLACES[name]
+    write_session(simulate(CellOptions(views=8, seed=4)), place / "session", images=False)
+    if "out" in words:
+        for file in ("calibration.json", "recording.rrd"):
+            (place / "out" / file).parent.mkdir(exist_ok=True)
+            (place / "out" / file).touch()
+    if "tracker" in words:
+        assert visioncal("simulate", "tracker", "--instrument", "point").status == 0
+    if "tracked" in words:
+        assert visioncal("calibrate", "tracker", "-o", "tracked").status == 0
+    done = visioncal(*words)
+    assert done.status == 2
+    assert said in done.said
+    assert advised in done.said
+    assert list(failures(done.said)) == []
+
+
 def test_of_verify(place):
     whole = Session.load(write_session(simulate(CellOptions(views=20, seed=5)), place / "all"))
     replace(whole, views=whole.views[:15]).save(place / "fit")

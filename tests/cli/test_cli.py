@@ -331,7 +331,6 @@ def test_help_has_every_word_within_the_terminal(columns):
 
 CHOICES = {
     "calibrate": {"level": (*ASKED, "hand-eye"), "solver": get_args(SolverName), "device": DEVICES},
-    "align": {"level": (*(it for it in ASKED if it != "thermal"), "hand-eye")},
     "plan": {"purpose": PURPOSES, "criterion": get_args(Criterion), "mount": get_args(Mount)},
     "record": {"pose_form": ("ours", *POSE_FORMS), "keep": get_args(Keep)},
     "simulate": {"robot": SIMULATED_ARMS},
@@ -339,6 +338,12 @@ CHOICES = {
     "convert": {"form": [it.name for it in FOREIGN_FORMATS], "robot_unit": UNITS_M},
     "fixture": {"cad_unit": UNITS_M},
 }
+
+
+def test_align_is_another_name_for_calibrate():
+    calibrate, align = (get_command(app).imported(it) for it in ("calibrate", "align"))
+    assert [it.opts for it in align.params] == [it.opts for it in calibrate.params]
+    assert align.help == calibrate.help
 
 
 @pytest.mark.parametrize("name", CHOICES)

@@ -1,16 +1,14 @@
-"""`visioncal align`, and what `calibrate` does with a whole cell."""
+"""`visioncal align`, another name for `calibrate`, and what that does with a whole cell."""
 
-import json
 from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import typer
 from rich.markup import escape
 
+from visioncal.cli.calibrate import calibrate_command
 from visioncal.cli.console import answers, messages, report_written
-from visioncal.cli.options import AsJson, NeedOptions, OutFolder, SessionArgument
 from visioncal.cli.pointing import naming
 from visioncal.cli.progress import shown_progress
 from visioncal.core.choices import Convention, ImagesKept
@@ -26,32 +24,7 @@ if TYPE_CHECKING:
 _SHOWN_LEVEL = 1.2
 
 
-def align_command(
-    session: SessionArgument,
-    need: NeedOptions,
-    out: OutFolder = Path("out"),
-    level: Annotated[
-        str,
-        typer.Option(
-            metavar="auto|hand-eye|offsets|kinematics|elastic",
-            help="The arms: hand-eye (none comes out), offsets (of their joints), kinematics, "
-            "elastic (joints that bend, too).",
-        ),
-    ] = "auto",
-    as_json: AsJson = False,
-) -> None:
-    """Put several robots, cameras and boards in one frame, adjusted together.
-
-    Writes calibration.json (every frame with its covariance, each robot's and camera's noise, what
-    moved, and every observation that disagrees), the same in the older form of alignment.json,
-    report.html and recording.rrd. calibrate does the same with a whole cell. Exit status 0:
-    there is a result, with a verdict; 2: nothing ties a robot to the rest, or the observations
-    leave a frame open.
-    """
-    loaded = need.session(session)
-    found = align_into(session, loaded, out, level=level, quiet=as_json)
-    if as_json:
-        typer.echo(json.dumps(found.document(), indent=2))
+align_command = calibrate_command
 
 
 def align_into(

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from functools import wraps
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar, get_type_hints
 
@@ -33,8 +34,9 @@ class PlainCommand(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:  # noqa: ANN401 - typer's own
         """Reads its options; with `--json`, one that is wrong or unknown is an error as others."""
         wants_json = "--json" in args
+        typed = list(args)
         try:
-            return super().parse_args(ctx, args)
+            rest = super().parse_args(ctx, args)
         except _USAGE_ERROR as error:
             if not wants_json:
                 raise
@@ -45,6 +47,25 @@ class PlainCommand(TyperCommand):
                 culprits=named[-1:],
                 next_step=f"{ctx.command_path} --help lists what it takes.",
             ) from None
+        self._refuse_empty_paths(ctx, typed)
+        return rest
+
+    def _refuse_empty_paths(self, ctx: Any, typed: list[str]) -> None:  # noqa: ANN401 - typer's own
+        """Refuses paths of no letter, as of a shell's variable that is not set: no folder is meant.
+
+        Raises:
+            DataError: There is one.
+        """
+        paths = (it for it in self.params if isinstance(ctx.params.get(it.name), Path))
+        takers = {opt for it in paths for opt in it.opts}
+        for option, value in (*pairwise(typed), *(it.split("=", 1) for it in typed if "=" in it)):
+            if option in takers and not value:
+                raise DataError(
+                    f"{option} is empty; a path is needed.",
+                    culprits=[option],
+                    next_step="Write . for the folder where you are; or look whether a variable of "
+                    "the shell is set.",
+                )
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 - typer's own types
         """Runs it; where Ctrl-C ends it, says which files it leaves behind."""

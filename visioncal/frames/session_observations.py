@@ -182,6 +182,13 @@ def _checked(session: Session, calibration: Calibration) -> Target:
     check_mount(session, calibration)
     if session.robot_document is not None and calibration.robot is not None:
         check_robot(session, Robot.from_document(session.robot_document), calibration.robot)
+    if session.mount == "instrument":
+        raise DataError(
+            f"session {session.name!r} is of an instrument; a camera sees what is located.",
+            culprits=[session.name],
+            next_step="Name a session with images of it. visioncal verify checks a calibration by "
+            "readings of the instrument.",
+        )
     if session.target is None:
         raise DataError(
             f"session {session.name!r} names no target to look for.",

@@ -9,7 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from visioncal.core.choices import SIMULATED_ARMS
 from visioncal.core.errors import DataError
+from visioncal.core.files import did_you_mean
 from visioncal.core.types import FloatArray
 
 _HALF_TURN = np.pi
@@ -111,7 +113,9 @@ def ur_arm(name: str) -> Arm:
     }
     if name not in published:
         raise DataError(
-            f"simulation: the arm {name!r} is not known, only {', '.join(sorted(published))} are."
+            f"simulation: the arm {name!r} is not known, only {', '.join(SIMULATED_ARMS)} are.",
+            culprits=["robot"],
+            next_step=did_you_mean(name, SIMULATED_ARMS) or "Name one of these.",
         )
     d1, a2, a3, d4, d5, d6 = published[name]
     quarter = 0.5 * np.pi

@@ -1,6 +1,7 @@
 """JSON that visioncal wrote, as it may come back from others: every error names its field."""
 
 import re
+from pathlib import Path
 from typing import Any
 
 from visioncal.core.documents.jsons import parse_json
@@ -17,6 +18,8 @@ _NUMBERS = re.compile(
 )
 # Tables whose fields users name.
 _NAMED = ("frames", "robots", "tree")
+# Files of other kinds, and how much of one is shown.
+_OTHER_KINDS, _SHOWN = (".csv", ".toml", ".txt", ".png", ".urdf", ".xml", ".html", ".rrd"), 40
 # Squares and products of larger numbers leave what floats hold.
 _LARGEST = 1e60
 
@@ -48,6 +51,15 @@ def parse_stored(text: bytes | str, label: str) -> StoredTable:
             it holds, as `rms_mm` does, holds something else; the message has its path.
     """
     text = decode_text(text, label) if isinstance(text, bytes) else text
+    begins = text.lstrip()[:_SHOWN].partition("\n")[0]
+    if Path(label).suffix in _OTHER_KINDS and not begins.startswith("{"):
+        raise DataError(
+            f"{label} begins with {shown(begins)}; a JSON document that visioncal wrote is needed "
+            "here.",
+            culprits=[label],
+            next_step="Name its file, as calibration.json, or its folder. This one is of another "
+            "kind; nothing need be changed in it.",
+        )
     found = _checked(parse_json(text, label), f"{label}: ", "")
     if not isinstance(found, StoredTable):
         raise DataError(f"{label} is {shown(found)}; a table is needed.", culprits=[label])

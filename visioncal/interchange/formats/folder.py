@@ -7,7 +7,9 @@ from visioncal.session import Session
 
 
 def _recognises(path: Path) -> bool:
-    return (path / "session.toml").is_file()
+    # A result is no session either, but what it is and where its session lies is told on reading.
+    is_result = path.name == "calibration.json" or (path / "recording.rrd").is_file()
+    return is_result or (path / "session.toml").is_file()
 
 
 def _write(session: Session, path: Path) -> None:

@@ -119,6 +119,13 @@ def read_nominal(path: Path, unit: str | None = None) -> NominalPoints:
         DataError: Columns are missing, a name stands there twice, or a cell is no number.
     """
     fields = read_fields(path)
+    if "qw" in fields.numbers:
+        raise DataError(
+            f"{path.name} has rotations (qx to qw), as touched poses have; a drawing has a place a "
+            "point.",
+            culprits=[str(path)],
+            next_step="Name the touches first, and the drawing's table with --cad.",
+        )
     names = _names(fields)
     twice = [it for it in dict.fromkeys(names) if names.count(it) > 1]
     if twice:

@@ -322,6 +322,14 @@ def _away(edges: FloatArray, guess: Guess | None) -> FloatArray:
 
 def _missing(known: RunState) -> DataError:
     session, missing = known.session, []
+    if session.mount == "instrument":
+        return DataError(
+            f"session {session.name!r} is of an instrument; stops are planned for cameras that see "
+            "a board.",
+            culprits=[session.name],
+            next_step="Choose stops that turn the flange by 30 degrees or more about two axes, all "
+            "over the workspace.",
+        )
     if known.robot is None:
         missing.append("a model of its robot, which says where the arm reaches")
     if not session.boards:
