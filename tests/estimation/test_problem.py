@@ -150,7 +150,9 @@ def test_equations_from_a_stop_on_are_those_of_its_observations_alone():
     cell, problem = problem_of(4, stops=6)
     fit = fit_problem(problem, true_state(cell, problem.tree))
     stops = []
-    for stop, *parts in equations_from(problem, fit, RepeatErrors.of(problem, fit)):
+    for stop, *parts in equations_from(
+        problem, fit, RepeatErrors.of(problem, fit), np.arange(problem.size)
+    ):
         later = problem.subset(problem.observations.stops >= stop)
         for part, whole in zip(parts, normal_equations(later, fit.state, fit.noise), strict=True):
             np.testing.assert_allclose(part, whole, atol=1e-9 * np.abs(parts[0]).max())
@@ -169,7 +171,9 @@ def still_cell(seed):
 def test_repeats_share_errors_that_a_step_does_not_pass_for():
     problem, fit = still_cell(5)
     errors = RepeatErrors.of(problem, fit)
-    *_, (_, information, gradient) = equations_from(problem, fit, errors)
+    *_, (_, information, gradient) = equations_from(
+        problem, fit, errors, np.arange(len(errors.covariance))
+    )
     size = problem.size
     # All stops together say what the fit does: at rest, nothing of the frames pulls.
     scale = np.sqrt(np.diag(information)[:size])

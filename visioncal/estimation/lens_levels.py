@@ -440,7 +440,9 @@ def _rows(
     linear, (of, members) = problem.linear(state), problem.units
     jacobian = linear.jacobian_of(here)
     places = problem.effect_columns[LENSES].start + np.searchsorted(seen.free, looks.places(camera))
-    known, gradient = _by_others(problem, here, state, noise)
+    others = np.ones(len(problem), dtype=bool)
+    others[here] = False
+    known, gradient = normal_equations(problem, state, noise, among=others)
     weight = floored_sigma_px(seen.sigmas_px[which]) ** -2.0
     known[np.ix_(places, places)] -= weight * seen.compressed[which].shared_information
     gradient[places] -= weight * seen.compressed[which].shared_gradient
@@ -461,20 +463,6 @@ def _rows(
         known,
         gradient,
     )
-
-
-def _by_others(
-    problem: Problem, here: IntArray, state: State, noise: Noise
-) -> tuple[FloatArray, FloatArray]:
-    """Information (p, p) and gradient (p,) of all but the rows of one camera."""
-    others = np.ones(len(problem), dtype=bool)
-    others[here] = False
-    if others.any():
-        known, gradient = normal_equations(problem.subset(others), state, noise)
-    else:
-        knowledge = problem.knowledge(state)
-        known, gradient = knowledge.information, knowledge.gradient
-    return known, gradient
 
 
 def _without(

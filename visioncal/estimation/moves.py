@@ -307,28 +307,28 @@ def slight_move(problem: Problem, fit: Solution, movable: Sequence[str]) -> Move
         fit: The unknowns and the noise.
         movable: Frames that may have moved.
     """
-    errors, seen = RepeatErrors.of(problem, fit), defaultdict[int, list[str]](list)
-    for frame in movable:
+    errors, seen = RepeatErrors.of(problem, fit), defaultdict[int, list[int]](list)
+    columns = np.array([np.r_[problem.edge_columns(it)] for it in movable]).reshape(-1, 6)
+    for place, frame in enumerate(movable):
         stops = np.unique(problem.observations.stops[problem.observations.involves(frame)])
         for stop in stops[_FEWEST : 1 - _FEWEST].tolist():
-            seen[stop].append(frame)
+            seen[stop].append(place)
     tried = int(problem.observations.stops.max()) + 1
     best, limit = None, _move_limit(problem, len(movable) * tried)
-    for stop, information, gradient in equations_from(problem, fit, errors):
+    for stop, information, gradient in equations_from(problem, fit, errors, columns.ravel()):
         if stop not in seen:
             continue
-        at = np.array([np.r_[problem.edge_columns(it)] for it in seen[stop]])
-        across = information[at]
-        alone = np.take_along_axis(across, at[:, None], axis=2)
+        across = information.reshape(*columns.shape, -1)[seen[stop]]
+        alone = np.take_along_axis(across, columns[seen[stop], None], axis=2)
         own = alone - across @ errors.covariance @ np.swapaxes(across, 1, 2)
-        values, asked = scaled_values(alone), gradient[at]
+        values, asked = scaled_values(alone), gradient.reshape(columns.shape)[seen[stop]]
         steps = -(covariance_from(own) @ asked[..., None])[..., 0]
         clear = (values[:, 0] >= _TAKEN * values[:, -1]) & (values[:, -1] > 0.0)
         clear &= scaled_values(own)[:, 0] >= _TAKEN
         squares = np.where(clear, -np.sum(steps * asked, axis=1), 0.0)
         if (most := float(squares.max())) > limit:
             place = int(squares.argmax())
-            best, limit = (seen[stop][place], stop, steps[place]), most
+            best, limit = (movable[seen[stop][place]], stop, steps[place]), most
     if best is None:
         return None
     frame, stop, step = best

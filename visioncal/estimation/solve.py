@@ -185,13 +185,20 @@ class _Whitening:
     count: int
 
     @classmethod
-    def of(cls, problem: Problem, noise: Noise, by_errors: FloatArray) -> "_Whitening":
-        """The noise of observations that move with (n, 6, 6 w) their units' errors."""
+    def of(
+        cls, problem: Problem, noise: Noise, by_errors: FloatArray, among: Mask | None = None
+    ) -> "_Whitening":
+        """The noise of observations that move with (n, 6, 6 w) their units' errors.
+
+        Of what is not `among` them nothing is known.
+        """
         (of, members), alone = problem.units, problem.alone
         own, errors = problem.covariance(noise), problem.error_covariance(noise)
-        among = by_errors[alone]
-        own[alone] += among @ errors[of[alone]] @ np.swapaxes(among, 1, 2)
+        single = by_errors[alone]
+        own[alone] += single @ errors[of[alone]] @ np.swapaxes(single, 1, 2)
         weights, units = np.asarray(np.linalg.inv(own), dtype=float), np.where(alone, -1, of)
+        if among is not None:
+            weights[~among] = 0.0
         shared, width = units >= 0, by_errors.shape[2]
         taken = np.zeros((len(weights), width, 6))
         pulled = np.swapaxes(by_errors[shared], 1, 2) @ weights[shared]
@@ -329,7 +336,12 @@ def fisher_information(problem: Problem, state: State, noise: Noise) -> FloatArr
 
 
 def normal_equations(
-    problem: Problem, state: State, noise: Noise, *, ideal: bool = False
+    problem: Problem,
+    state: State,
+    noise: Noise,
+    *,
+    ideal: bool = False,
+    among: Mask | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Information (p, p) and gradient (p,) of half the whitened squared error.
 
@@ -338,16 +350,22 @@ def normal_equations(
         state: The point of linearisation.
         noise: Its levels.
         ideal: See `Problem.linear`.
+        among: (n,) the observations that count; all where None.
     """
-    return equations_and_cost(problem, state, noise, ideal=ideal)[:2]
+    return equations_and_cost(problem, state, noise, ideal=ideal, among=among)[:2]
 
 
 def equations_and_cost(
-    problem: Problem, state: State, noise: Noise, *, ideal: bool = False
+    problem: Problem,
+    state: State,
+    noise: Noise,
+    *,
+    ideal: bool = False,
+    among: Mask | None = None,
 ) -> tuple[FloatArray, FloatArray, float]:
     """What `normal_equations` gives, and the whitened squared error."""
     linear = problem.linear(state, ideal=ideal)
-    return _Whitening.of(problem, noise, linear.by_errors).equations(problem, state, linear)
+    return _Whitening.of(problem, noise, linear.by_errors, among).equations(problem, state, linear)
 
 
 def fitted_covariance(problem: Problem, state: State, noise: Noise) -> FloatArray:
@@ -755,7 +773,7 @@ class RepeatErrors:
 
 
 def equations_from(
-    problem: Problem, solution: Solution, errors: RepeatErrors
+    problem: Problem, solution: Solution, errors: RepeatErrors, asked: IntArray
 ) -> Iterator[tuple[int, FloatArray, FloatArray]]:
     """Information and gradient of the observations from each stop on, the last first.
 
@@ -763,9 +781,10 @@ def equations_from(
         problem: The observations.
         solution: The unknowns and the noise.
         errors: What repeats share, which come last among the unknowns.
+        asked: (a,) the unknowns that are asked for.
 
     Yields:
-        Each stop with what it and all after it say, (p + q, p + q) and (p + q,): what is known
+        Each stop with what it and all after it say of these, (a, p + q) and (a,): what is known
         besides does not count.
     """
     state, noise = solution.state, solution.noise
@@ -774,7 +793,7 @@ def equations_from(
     of = np.where(errors.jacobian.any(axis=(1, 2)), -1, problem.units[0])
     residuals = linear.residuals + errors.jacobian @ errors.values
     every = np.concatenate([linear.jacobian, errors.jacobian, residuals[:, :, None]], axis=2)
-    total = np.zeros((every.shape[2], every.shape[2]))
+    total = np.zeros((len(asked), every.shape[2]))
     for stop in np.unique(stops)[::-1].tolist():
         mine = np.flatnonzero(stops == stop)
         for unit in np.unique(of[mine]).tolist():
@@ -785,8 +804,8 @@ def equations_from(
                 jacobian = linear.by_errors[rows].reshape(-1, shared.shape[1])
                 covariance += jacobian @ shared[unit] @ jacobian.T
             columns = every[rows].reshape(-1, every.shape[2])
-            total = total + columns.T @ np.linalg.solve(covariance, columns)
-        yield stop, total[:-1, :-1], total[:-1, -1]
+            total = total + np.linalg.solve(covariance, columns[:, asked]).T @ columns
+        yield stop, total[:, :-1], total[:, -1]
 
 
 def score_gain(

@@ -32,7 +32,7 @@ def left_out(solved: Solved) -> HeldOut:
 
     def again(part: Problem) -> State:
         if solved.solver == "joint" or mount is None:
-            return solve_problem(part, fit.state, fit.noise)[0]
+            return solve_problem(part, fit.state, fit.noise, is_near=True)[0]
         return closed_form_state(part, solved.solver, fit.state, mount)
 
     def pixels(rows: IntArray, state: State) -> FloatArray:

@@ -1,5 +1,6 @@
 """Predicts each observation from a fit that was made without its stop."""
 
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -112,12 +113,21 @@ def chain_rms_px(
         positions: (c, 3) all corners, each on its target [m].
     """
     rms = np.full(len(poses), np.nan)
-    for at, (pose, camera, it) in enumerate(zip(poses, cameras, seen, strict=True)):
-        if it is not None and camera is not None:
-            away = predict_corners(camera, pose, positions[it.ids]) - it.px
-            # A corner behind the camera counts as a whole image away.
-            away = np.nan_to_num(away, nan=float(max(camera.resolution)))
-            rms[at] = np.sqrt(np.mean(np.sum(away**2, axis=1)))
+    alike = defaultdict[int, list[tuple[int, Camera, Corners]]](list)
+    for at, (camera, corners) in enumerate(zip(cameras, seen, strict=True)):
+        if camera is not None and corners is not None:
+            alike[id(camera)].append((at, camera, corners))
+    for views in alike.values():
+        camera, rows = views[0][1], [at for at, _, _ in views]
+        counts = [len(it.ids) for _, _, it in views]
+        of = np.repeat(rows, counts)
+        points = positions[np.concatenate([it.ids for _, _, it in views])]
+        points = (poses[of, :3, :3] @ points[:, :, None])[:, :, 0] + poses[of, :3, 3]
+        away = project(camera, points) - np.concatenate([it.px for _, _, it in views])
+        # A corner behind the camera counts as a whole image away.
+        away = np.nan_to_num(away, nan=float(max(camera.resolution)))
+        squares = np.bincount(of, np.sum(away**2, axis=1), minlength=len(poses))
+        rms[rows] = np.sqrt(squares[rows] / counts)
     return rms
 
 
