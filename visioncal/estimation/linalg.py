@@ -58,6 +58,9 @@ def covariance_from(information: FloatArray) -> FloatArray:
     A direction without information gets a large but finite variance, never a NaN; whoever asks
     for a covariance has looked at the spectrum before.
     """
+    if information.ndim == 2:  # A large one by Cholesky, which takes a tenth of the time.
+        root = covariance_root(information)
+        return np.asarray(root @ root.T)
     values, vectors, scale = _floored(information)
     inverse = (vectors / values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
     return np.asarray(inverse * scale[..., :, None] * scale[..., None, :])

@@ -623,19 +623,22 @@ def posterior(
     residuals, gone = linear.residuals.copy(), np.zeros_like(weights)
     # The flanges' errors as their prior and their observations have them together.
     gain = errors @ np.linalg.inv(reduced.covariance + errors)
-    left, taken = errors - gain @ errors, gain @ reduced.jacobian
     flange = (gain @ reduced.errors[:, :, None])[:, :, 0]
-    # Block by block: all unknowns move the errors, and of whole cells there are many.
+    # All unknowns move the errors, and few an observation: what both make is by unit.
+    taken = gain @ reduced.jacobian
+    common = (taken.reshape(-1, taken.shape[2]) @ known).reshape(taken.shape)
+    left = errors - gain @ errors + common @ np.swapaxes(taken, 1, 2)
     for block in linear.blocks:
-        jacobian = linear.jacobian_of(block.rows)
+        jacobian, columns = block.jacobian, block.columns
+        spread = jacobian.reshape(-1, len(columns)) @ known[np.ix_(columns, columns)]
+        gone[block.rows] = spread.reshape(jacobian.shape) @ np.swapaxes(jacobian, 1, 2)
         inside = of[block.rows] >= 0
         rows = block.rows[inside]
         by_errors, units = linear.by_errors[rows], of[rows]
+        turned = np.swapaxes(by_errors, 1, 2)
         residuals[rows] -= (by_errors @ flange[units][:, :, None])[:, :, 0]
-        jacobian[inside] -= by_errors @ taken[units]
-        gone[rows] = by_errors @ left[units] @ np.swapaxes(by_errors, 1, 2)
-        spread = (jacobian.reshape(-1, jacobian.shape[2]) @ known).reshape(jacobian.shape)
-        gone[block.rows] += spread @ np.swapaxes(jacobian, 1, 2)
+        both = jacobian[inside] @ np.swapaxes(common[:, :, columns][units], 1, 2) @ turned
+        gone[rows] += by_errors @ left[units] @ turned - both - np.swapaxes(both, 1, 2)
     squares = np.einsum("ni,nij,nj->n", residuals, weights, residuals)
     directions = np.where(problem.observations.has_rotation, 6.0, 3.0)
     return squares, directions - np.einsum("nij,nji->n", weights, gone)
