@@ -45,9 +45,7 @@ _LEVELS_SETTLED = 1e-3
 RATIO_PRIOR = RatioPrior(ratio=0.6, log_sigma=1.5)
 # Robots' noise levels are started from above: at least here [rad and m].
 _START_SIGMA = 5e-4
-# Where they are sought again, it is from so much above where they were.
-_ABOVE = 1.1
-# ... and never from nothing, which no residuals would lift them from.
+# Where they are sought again, it is never from nothing, which no residuals would lift them from.
 _ABOVE_NOTHING = 2e-5
 # A sensor may be this much better or worse than is said of it, at the most.
 _SENSOR_RANGE = (1e-3, 1e4)
@@ -516,7 +514,7 @@ class RobotLikelihood:
         """The robots' levels (r, 2), as `robot_levels` gives them."""
         if from_above:
             return self.white
-        return self._levels(np.maximum(_ABOVE * self.before, _ABOVE_NOTHING))
+        return self._levels(np.maximum(self.before, _ABOVE_NOTHING))
 
     @cached_property
     def white(self) -> tuple[FloatArray, float]:

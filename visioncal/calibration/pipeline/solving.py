@@ -479,18 +479,13 @@ def _levelled(cell: Cell, views: Sequence[ViewPoses], agreed: Agreed) -> Agreed:
         sensors=np.array([places[it.seer] for it in cell.rows], dtype=np.int64),
     )
     more = np.ones(len(frames) - len(sensors))
+    least_levels = np.concatenate([np.zeros(len(sensors)), more])
+    problem = replace(problem, observations=observations, least_levels=least_levels)
     noise = agreed.fit.noise
-    return replace(
-        agreed,
-        problem=replace(
-            problem,
-            observations=observations,
-            least_levels=np.concatenate([np.zeros(len(sensors)), more]),
-        ),
-        fit=replace(
-            agreed.fit, noise=replace(noise, sensors=np.concatenate([noise.sensors, more]))
-        ),
-    )
+    noise = replace(noise, sensors=np.concatenate([noise.sensors, more]))
+    # All that is tried with the arms begins here.
+    fit = fit_problem(problem.subset(agreed.used), agreed.fit.state, noise)
+    return replace(agreed, problem=problem, fit=fit)
 
 
 def _with_effects(agreed: Agreed, effects: Sequence[Effect]) -> Agreed:
