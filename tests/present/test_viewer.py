@@ -285,6 +285,25 @@ def test_the_arm_reaches_from_the_base_to_the_flange(tmp_path):
     np.testing.assert_allclose(ends, frames[:, :3, 3], atol=1e-6)
 
 
+def test_a_view_without_joints_has_a_line_to_its_flange_in_the_place_of_the_arm(samples, tmp_path):
+    sample, file = samples["poses alone"], tmp_path / "one_without.rrd"
+    views = list(sample.session.views)
+    views[1] = without_joints(sample).session.views[1]
+    session = replace(sample.session, views=tuple(views))
+    write_recording(file, session, sample.calibration, sample.evidence, None)
+    drawn = column(file, f"{paths.ROBOT}/links", "Capsules3D:lengths")
+    balls = column(file, f"{paths.ROBOT}/joints", "Ellipsoids3D:centers")
+    lines = column(file, f"{paths.ROBOT}/reach", "LineStrips3D:strips")
+    for row in range(len(views)):
+        # What is not drawn is an empty part, which takes that of the view before off.
+        assert len(drawn[row]) == (0 if row == 1 else 7)
+        assert len(balls[row]) == (0 if row == 1 else 6)
+        assert len(lines[row]) == (1 if row == 1 else 0)
+    flange_m = session.views[1].base_from_flange().translation
+    # Single precision of lengths of about 1 m.
+    np.testing.assert_allclose(lines[1][0], [np.zeros(3), flange_m], atol=1e-6)
+
+
 def test_directions_lie_on_the_side_that_the_camera_is_on():
     # 0.5 m above the board, moved 30 degrees towards the target's x and looking back at it.
     tilt = Rotation.from_euler("y", -30, degrees=True)

@@ -91,7 +91,6 @@ def calibrate_command(
     from visioncal.cli.summary import print_summary
     from visioncal.interchange.merge_results import leftover
     from visioncal.interchange.outputs import RECORDING, write_outputs
-    from visioncal.results import to_document
     from visioncal.results.whole import whole_document
     from visioncal.session.single import is_whole_cell
 
@@ -138,7 +137,7 @@ def calibrate_command(
             left.keep()
         written = write_outputs(out, loaded, result, without=without, images=work.images)
     if as_json:
-        typer.echo(json.dumps(to_document(result.calibration), indent=2))
+        typer.echo(result.calibration.text)
     else:
         print_summary(result.calibration, verbose=verbose)
     if left is not None:

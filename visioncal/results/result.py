@@ -351,9 +351,12 @@ class Calibration(CalibrationSections):
 
     def save(self, path: Path | str) -> None:
         """Writes calibration.json, whole or not at all."""
-        write_atomically(
-            Path(path), json.dumps(to_document(self), indent=2, allow_nan=False) + "\n"
-        )
+        write_atomically(Path(path), self.text + "\n")
+
+    @cached_property
+    def text(self) -> str:
+        """The content of calibration.json, which recordings hold, too."""
+        return json.dumps(to_document(self), indent=2, allow_nan=False)
 
     @classmethod
     def load(cls, path: Path | str) -> Self:

@@ -1,10 +1,14 @@
 """The robot as it is drawn: a capsule a link and a ball a joint, from its kinematics alone."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 import rerun as rr
 
 from visioncal.core.types import FloatArray
 from visioncal.present.recording import colours, paths
+from visioncal.present.recording.recorder import send_rows
 
 # Thickness from the base to the flange, as shares of the arm's length; about that of a UR.
 _BASE_RADIUS, _FLANGE_RADIUS = 0.03, 0.02
@@ -20,27 +24,89 @@ def log_arm(stream: rr.RecordingStream, link_frames: FloatArray, entity: str = p
         link_frames: (n, 4, 4) the frames of its joints and its flange in the base [m].
         entity: Under which entity.
     """
-    origins = np.vstack([np.zeros(3), link_frames[:, :3, 3]])
-    links = np.diff(origins, axis=0)
-    lengths_m = np.linalg.norm(links, axis=1)
-    radii_m = lengths_m.sum() * np.linspace(_BASE_RADIUS, _FLANGE_RADIUS, len(links))
+    it = _Shapes.of(link_frames[None])
     capsules = rr.Capsules3D(
-        lengths=lengths_m,
-        radii=radii_m,
-        translations=origins[:-1],
-        quaternions=_from_z_to(links),
+        lengths=it.lengths_m,
+        radii=it.radii_m,
+        translations=it.begins_m,
+        quaternions=it.quaternions,
         colors=colours.LINK,
         fill_mode="solid",
     )
     stream.log(f"{entity}/links", capsules)
-    # Neither the base nor the flange is a joint.
     balls = rr.Ellipsoids3D(
-        centers=origins[1:-1],
-        radii=_JOINT_RADIUS * radii_m[:-1],
+        centers=it.joints_m,
+        half_sizes=it.half_sizes_m,
         colors=colours.JOINT,
         fill_mode="solid",
     )
     stream.log(f"{entity}/joints", balls)
+
+
+def log_arms(stream: rr.RecordingStream, views: Sequence[FloatArray | None]) -> None:
+    """Draws a session's arm in all views.
+
+    Args:
+        stream: Where to.
+        views: (n, 4, 4) of each as of `log_arm`; None where the arm is not known, which takes
+            that of the view before off the screen.
+    """
+    known = [it for it in views if it is not None]
+    link_frames, rows = np.array(known or [np.zeros((0, 4, 4))]), range(len(views))
+    drawn = [it is not None for it in views]
+    it, links, joints = _Shapes.of(link_frames), f"{paths.ROBOT}/links", f"{paths.ROBOT}/joints"
+    capsules = rr.Capsules3D.from_fields(colors=colours.LINK, fill_mode="solid")
+    stream.log(links, capsules, static=True)
+    columns = rr.Capsules3D.columns(
+        lengths=it.lengths_m,
+        radii=it.radii_m,
+        translations=it.begins_m,
+        quaternions=it.quaternions,
+    )
+    counts = link_frames.shape[1] * np.array(drawn)
+    send_rows(stream, links, rows, columns.partition(counts))
+    balls = rr.Ellipsoids3D.from_fields(colors=colours.JOINT, fill_mode="solid")
+    stream.log(joints, balls, static=True)
+    columns = rr.Ellipsoids3D.columns(centers=it.joints_m, half_sizes=it.half_sizes_m)
+    send_rows(stream, joints, rows, columns.partition(np.maximum(counts - 1, 0)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Shapes:
+    """Capsules and balls of m arms with n links each, one arm behind the other.
+
+    Attributes:
+        lengths_m: (m n,) of the capsules [m].
+        radii_m: (m n,) of the capsules [m].
+        begins_m: (m n, 3) where they begin [m].
+        quaternions: (m n, 4) x, y, z, w that turn them from the z axis.
+        joints_m: (m (n - 1), 3) centres of the balls [m]; neither base nor flange is a joint.
+        half_sizes_m: (m (n - 1), 3) of the balls [m].
+    """
+
+    lengths_m: FloatArray
+    radii_m: FloatArray
+    begins_m: FloatArray
+    quaternions: FloatArray
+    joints_m: FloatArray
+    half_sizes_m: FloatArray
+
+    @classmethod
+    def of(cls, link_frames: FloatArray) -> "_Shapes":
+        """Draws (m, n, 4, 4) frames of joints and flanges."""
+        origins = np.insert(link_frames[:, :, :3, 3], 0, 0.0, axis=1)
+        links = np.diff(origins, axis=1)
+        lengths_m = np.linalg.norm(links, axis=2)
+        shares = np.linspace(_BASE_RADIUS, _FLANGE_RADIUS, links.shape[1])
+        radii_m = lengths_m.sum(axis=1)[:, None] * shares
+        return cls(
+            lengths_m.ravel(),
+            radii_m.ravel(),
+            origins[:, :-1].reshape(-1, 3),
+            _from_z_to(links.reshape(-1, 3)),
+            origins[:, 1:-1].reshape(-1, 3),
+            np.repeat(_JOINT_RADIUS * radii_m[:, :-1].reshape(-1, 1), 3, axis=1),
+        )
 
 
 def _from_z_to(directions: FloatArray) -> FloatArray:

@@ -3,7 +3,6 @@
 Frames are rerun's named frames under our own names; what moves is placed anew with every view.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -25,7 +24,7 @@ from visioncal.present.recording.frames import Frame, scan
 from visioncal.present.recording.reader import chunks
 from visioncal.present.recording.recorder import Recorder
 from visioncal.present.recording.scene import image_plane
-from visioncal.results import Alignment, Calibration, Sight, to_document
+from visioncal.results import Alignment, Calibration, Sight
 from visioncal.robot import Robot
 from visioncal.session import Session, View, frame_name
 from visioncal.session.observations import standing
@@ -154,7 +153,7 @@ def log_cell(recorder: Recorder, session: Session, found: Alignment) -> None:
         recorder.at(row)
         _log_view(stream, scene, view, sights.get(view.number))
     recorder.keep()
-    text = json.dumps(to_document(Calibration.whole(found)), indent=2)
+    text = Calibration.whole(found).text
     components = {"seal": pa.array([sha256(text.encode())], pa.string())}
     stream.log(
         paths.ALIGNMENT,

@@ -10,6 +10,7 @@ import rerun as rr
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.present.recording import colours, coverage, paths
 from visioncal.present.recording.coverage import PointChart
+from visioncal.present.recording.recorder import send_rows
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
@@ -64,11 +65,11 @@ class JointChart:
             rr.BarChart.descriptor_color(): colour.as_arrow_array(),
             rr.BarChart.descriptor_widths(): widths_deg.as_arrow_array(),
         }
-        rr.send_columns(
+        send_rows(
+            stream,
             f"{paths.over_joint(self.joint)}/{paths.THIS_VIEW}",
-            [rr.TimeColumn(paths.TIMELINE, sequence=rows.values())],
+            rows.values(),
             [rr.ComponentColumn(it, rr.AnyBatchValue(it, found)) for it, found in columns.items()],
-            recording=stream,
         )
 
     @property
@@ -132,7 +133,18 @@ class Charts:
             joint.log(stream)
 
     def log_marks(self, stream: rr.RecordingStream, rows: Mapping[int, int]) -> None:
-        """Marks each view in the charts over the joints; see `JointChart.log_marks`."""
+        """Marks each view when that is looked at: all views of a chart as one message.
+
+        Args:
+            stream: Where to.
+            rows: The views' places in the session.
+        """
+        for chart in self.points:
+            marked = [chart.points.get(view, np.zeros((0, 2))) for view in rows]
+            points = rr.Points2D.columns(positions=np.vstack(marked))
+            entity = f"{chart.entity}/{paths.THIS_VIEW}"
+            parts = points.partition([len(it) for it in marked])
+            send_rows(stream, entity, rows.values(), parts)
         for joint in self.joints:
             joint.log_marks(stream, rows)
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -77,10 +76,13 @@ def rotation_axes_chart(evidence: Sequence[ViewEvidence]) -> PointChart | None:
 
     The middle is the flange's z axis, the rim its x, y plane; an axis and its reverse are one.
     """
-    poses = [(it.view, it.base_from_flange) for it in evidence if it.base_from_flange is not None]
+    poses = {it.view: it.base_from_flange for it in evidence if it.base_from_flange is not None}
+    if len(poses) < 2:
+        return None
+    rotations = np.array(list(poses.values()))[:, :3, :3]
+    turns = Rotation.from_matrix(rotations[:-1].transpose(0, 2, 1) @ rotations[1:]).as_rotvec()
     points: dict[int, FloatArray] = {}
-    for (_, base_from_last), (view, base_from_next) in pairwise(poses):
-        turn = Rotation.from_matrix(base_from_last[:3, :3].T @ base_from_next[:3, :3]).as_rotvec()
+    for view, turn in zip(list(poses)[1:], turns, strict=True):
         angle_rad = float(np.linalg.norm(turn))
         if angle_rad > _LEAST_TURN_RAD:
             axis = turn / (angle_rad if turn[2] > 0 else -angle_rad)

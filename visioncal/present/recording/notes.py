@@ -2,13 +2,15 @@
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import rerun as rr
 
 from visioncal.core.transforms import pose_difference
 from visioncal.core.verdict import Step, Verdict
 from visioncal.present.recording import colours, paths
+from visioncal.present.recording.recorder import send_rows
 from visioncal.present.words import SOURCES, level_reason
 from visioncal.results import Calibration, Edge, Rms, ViewResult
 from visioncal.results.arm import ArmErrorsResult
@@ -48,33 +50,44 @@ def log_static(stream: rr.RecordingStream, calibration: Calibration) -> None:
             stream.log(f"{plot}/{name}", points, static=True)
 
 
-def scales(calibration: Calibration) -> dict[str, float]:
+def _scales(views: Collection[ViewResult]) -> dict[str, float]:
     """By plot, where its scale ends: views that were not used must not flatten the others."""
     ends = {}
     for plot, attribute in _PLOTS.items():
-        known = [getattr(view, attribute) for view in calibration.views if view.used]
+        known = [getattr(view, attribute) for view in views if view.used]
         ends[plot] = _ROOM * max((it for it in known if it is not None), default=math.inf)
     return ends
 
 
-def log_view(stream: rr.RecordingStream, view: ViewResult, ends: Mapping[str, float]) -> None:
-    """Logs one view's residuals and what became of it, at the stream's current time.
+def log_views(stream: rr.RecordingStream, views: Mapping[int, ViewResult]) -> None:
+    """Logs the views' residuals and what became of them.
 
     Args:
         stream: Where to.
-        view: What became of the view.
-        ends: Where the plots' scales end, of `scales`.
+        views: What became of each view, by its place in the session.
     """
-    for plot, attribute in _PLOTS.items():
-        name, value = paths.USED if view.used else paths.REJECTED, getattr(view, attribute)
-        if value is None and not view.used:
-            # Marked on the axis: a gap would look as if there were no such view.
-            value = 0.0
-        if not view.used and value > ends[plot]:
-            name, value = paths.BEYOND, ends[plot]
-        if value is not None:
-            stream.log(f"{plot}/{name}", rr.Scalars(float(value)))
-    stream.log(paths.VIEW_NOTE, _markdown(view_markdown(view)))
+    ends, marks = _scales(views.values()), defaultdict[str, dict[int, float]](dict)
+    for row, view in views.items():
+        for plot, attribute in _PLOTS.items():
+            name, value = paths.USED if view.used else paths.REJECTED, getattr(view, attribute)
+            if value is None and not view.used:
+                # Marked on the axis: a gap would look as if there were no such view.
+                value = 0.0
+            if not view.used and value > ends[plot]:
+                name, value = paths.BEYOND, ends[plot]
+            if value is not None:
+                marks[f"{plot}/{name}"][row] = float(value)
+    for entity, values in marks.items():
+        log_scalars(stream, entity, values)
+    texts = [view_markdown(it) for it in views.values()]
+    columns = rr.TextDocument.columns(text=texts, media_type=["text/markdown"] * len(texts))
+    send_rows(stream, paths.VIEW_NOTE, views, columns)
+
+
+def log_scalars(stream: rr.RecordingStream, entity: str, values: Mapping[int, float]) -> None:
+    """Logs a number of each of some views, by their places in the session."""
+    if values:
+        send_rows(stream, entity, values, rr.Scalars.columns(scalars=list(values.values())))
 
 
 def verdict_markdown(calibration: Calibration) -> str:

@@ -1,12 +1,14 @@
 """What was detected and predicted, drawn over the images."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import rerun as rr
 
+from visioncal.core.types import FloatArray
 from visioncal.present.recording import colours, paths
+from visioncal.present.recording.recorder import send_rows
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence, magnification
 from visioncal.session import Session
@@ -52,36 +54,44 @@ class Overlay:
         active = any(it.corners is not None for it in evidence.values())
         return cls(magnification(shown, width), used, float(width), active)
 
-    def log_view(self, stream: rr.RecordingStream, seen: ViewEvidence) -> None:
-        """Logs one view's corners and residuals at the stream's current time."""
+    def log_views(self, stream: rr.RecordingStream, seen: Sequence[ViewEvidence]) -> None:
+        """Logs corners and residuals of all views, in the order of the session."""
         if not self.active:
             return
-        corners, predicted = seen.corners, seen.predicted_px
-        px = np.zeros((0, 2)) if corners is None else corners.px
-        predicted_px = np.zeros((0, 2)) if predicted is None else predicted
-        frame = rr.CoordinateFrame(paths.IMAGE_FRAME)
-        # Empty batches take back what the view before has left.
-        stream.log(
-            paths.DETECTED,
-            frame,
-            rr.Points2D(px + _CENTRE, colors=colours.DETECTED, radii=_DOT * self.width),
-        )
-        stream.log(
-            paths.PREDICTED,
-            frame,
-            rr.Points2D(
-                predicted_px + _CENTRE, colors=colours.PREDICTED, radii=0.5 * _DOT * self.width
-            ),
-        )
+        nothing = np.zeros((0, 2))
+        px = [nothing if it.corners is None else it.corners.px for it in seen]
+        predicted_px = [nothing if it.predicted_px is None else it.predicted_px for it in seen]
+        for entity, points_px, colour, size in (
+            (paths.DETECTED, px, colours.DETECTED, _DOT),
+            (paths.PREDICTED, predicted_px, colours.PREDICTED, 0.5 * _DOT),
+        ):
+            look = rr.Points2D.from_fields(colors=colour, radii=size * self.width)
+            positions = rr.Points2D.columns(positions=np.vstack(points_px) + _CENTRE)
+            self._send(stream, entity, look, positions, points_px)
         for entity, factor, wanted in (
             (paths.magnified_residuals(self.factor), self.factor, True),
             (paths.RESIDUALS_TO_SCALE, 1, False),
         ):
-            paired = len(predicted_px) == len(px) and (seen.view in self.used) is wanted
-            arrows = rr.Arrows2D(
-                vectors=factor * (predicted_px - px) if paired else np.zeros((0, 2)),
-                origins=px + _CENTRE if paired else np.zeros((0, 2)),
-                colors=colours.RESIDUAL,
-                radii=_LINE * self.width,
-            )
-            stream.log(entity, frame, arrows)
+            paired = [
+                len(ends) == len(begins) and (it.view in self.used) is wanted
+                for it, begins, ends in zip(seen, px, predicted_px, strict=True)
+            ]
+            begins_px = [it if own else nothing for it, own in zip(px, paired, strict=True)]
+            ends_px = [it if own else nothing for it, own in zip(predicted_px, paired, strict=True)]
+            origins = np.vstack(begins_px)
+            vectors = factor * (np.vstack(ends_px) - origins)
+            arrows = rr.Arrows2D.columns(vectors=vectors, origins=origins + _CENTRE)
+            style = rr.Arrows2D.from_fields(colors=colours.RESIDUAL, radii=_LINE * self.width)
+            self._send(stream, entity, style, arrows, begins_px)
+
+    def _send(
+        self,
+        stream: rr.RecordingStream,
+        entity: str,
+        look: rr.Points2D | rr.Arrows2D,
+        columns: rr.ComponentColumnList,
+        parts: Sequence[FloatArray],
+    ) -> None:
+        """Sends what is drawn in the image; empty parts take back what the view before has left."""
+        stream.log(entity, rr.CoordinateFrame(paths.IMAGE_FRAME), look, static=True)
+        send_rows(stream, entity, range(len(parts)), columns.partition([len(it) for it in parts]))

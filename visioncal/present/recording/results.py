@@ -33,7 +33,7 @@ from visioncal.present.recording.messages import recording_id
 from visioncal.present.recording.reader import chunks, read_session
 from visioncal.present.recording.recorder import Recorder
 from visioncal.present.recording.scene import Scene
-from visioncal.results import Calibration, to_document
+from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
 
@@ -163,23 +163,24 @@ def _draw(
         notes.log_static(stream, calibration)
         tools.log_static(stream, calibration)
         armtext.log_static(stream, calibration)
-    results = {} if calibration is None else {it.view: it for it in calibration.views}
-    ends = {} if calibration is None else notes.scales(calibration)
+    seen = [evidence.get(it.number, ViewEvidence(it.number)) for it in session.views]
+    scene.log_views(stream, seen)
+    overlay.log_views(stream, seen)
+    if explains:
+        for row, it in enumerate(seen):
+            recorder.at(row)
+            explained.log_view(stream, it)
+    rows = {it.view: row for row, it in enumerate(seen)}
+    if calibration is not None:
+        found = {it.view: it for it in calibration.views}
+        known = {row: found[view] for view, row in rows.items() if view in found}
+        notes.log_views(stream, known)
     warming = None if calibration is None else calibration.thermal
-    drifts = {} if warming is None else {it.view: it for it in warming.views}
-    for row, view in enumerate(session.views):
-        recorder.at(row)
-        seen = evidence.get(view.number, ViewEvidence(view.number))
-        scene.log_view(stream, view, seen)
-        overlay.log_view(stream, seen)
-        if explains:
-            explained.log_view(stream, seen)
-        if view.number in results:
-            notes.log_view(stream, results[view.number], ends)
-        if view.number in drifts:
-            stream.log(paths.DRIFT_MM, rr.Scalars(drifts[view.number].drift_mm))
-            stream.log(paths.RISE_K, rr.Scalars(drifts[view.number].rise_k))
-    scene.log_marks(stream)
+    if warming is not None:
+        drifts = {rows[it.view]: it for it in warming.views if it.view in rows}
+        for entity, attribute in ((paths.DRIFT_MM, "drift_mm"), (paths.RISE_K, "rise_k")):
+            values = {row: float(getattr(it, attribute)) for row, it in drifts.items()}
+            notes.log_scalars(stream, entity, values)
     recorder.keep()
 
 
@@ -206,7 +207,7 @@ def _log_evidence(stream: rr.RecordingStream, seen: ViewEvidence, result: str, p
 def _log_result(
     stream: rr.RecordingStream, calibration: Calibration | None, result: str, evidence_count: int
 ) -> None:
-    text = "" if calibration is None else json.dumps(to_document(calibration), indent=2)
+    text = "" if calibration is None else calibration.text
     components = {
         "result": pa.array([result], pa.string()),
         "evidence_count": pa.array([evidence_count], pa.int64()),

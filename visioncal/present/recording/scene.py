@@ -1,6 +1,6 @@
 """The cell in 3D: robot, camera and target, as the calibration puts them."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,14 +9,16 @@ import rerun as rr
 
 from visioncal.core.types import Camera, FloatArray, Target
 from visioncal.present.recording import board, colours, paths
-from visioncal.present.recording.arm import log_arm
+from visioncal.present.recording.arm import log_arms
 from visioncal.present.recording.charts import Charts
+from visioncal.present.recording.recorder import send_rows
 from visioncal.present.recording.uncertainty import Uncertainty
 from visioncal.present.recording.workspace import ArmPicture
 from visioncal.present.target_frames import target_frames
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
-from visioncal.session import Session, View
+from visioncal.session import Session
+from visioncal.session.table import reported_matrices
 from visioncal.vision.camera import matrix_3x3
 
 # Sizes of what is drawn, as shares of the cell's size: how far the flange is from the base.
@@ -55,15 +57,15 @@ class Scene:
         evidence: Mapping[int, ViewEvidence],
     ) -> "Scene":
         """Collects the poses of the flange, from the evidence or else as they were recorded."""
+        # Of several robots, each pose is in a base of its own, which nothing places.
+        reported = {} if session.is_network else reported_matrices(session.views)
         poses: dict[int, FloatArray] = {}
-        for view in session.views:
-            seen = evidence.get(view.number)
-            reported = view.base_from_flange()
+        for number in (it.number for it in session.views):
+            seen = evidence.get(number)
             if seen is not None and seen.base_from_flange is not None:
-                poses[view.number] = seen.base_from_flange
-            elif reported is not None and not session.is_network:
-                # Of several robots, each pose is in a base of its own, which nothing places.
-                poses[view.number] = reported.as_matrix()
+                poses[number] = seen.base_from_flange
+            elif number in reported:
+                poses[number] = reported[number]
         distances = [float(np.linalg.norm(pose[:3, 3])) for pose in poses.values()]
         size_m = float(np.median(distances)) if distances else 1.0
         if calibration is None:
@@ -111,23 +113,29 @@ class Scene:
         if self.arm is not None:
             self.arm.log_static(stream)
 
-    def log_view(self, stream: rr.RecordingStream, view: View, seen: ViewEvidence) -> None:
-        """Logs where everything is in one view, at the stream's current time."""
-        base_from_flange = self.base_from_flange.get(view.number)
-        log_pose(stream, paths.FLANGE, paths.FLANGE_FRAME, base_from_flange)
-        self._log_arm(stream, view)
+    def log_views(self, stream: rr.RecordingStream, seen: Sequence[ViewEvidence]) -> None:
+        """Logs where everything is in each view.
+
+        Args:
+            stream: Where to.
+            seen: What was seen in each, in the order of the session.
+        """
+        flanges = [self.base_from_flange.get(it.view) for it in seen]
+        _log_poses(stream, paths.FLANGE, paths.FLANGE_FRAME, flanges)
+        self._log_arms(stream)
         if self.calibration is None:
             return
         for end in self._ends:
-            base_from_end = self._base_from(end, base_from_flange)
-            log_pose(stream, paths.entity_of(end), end, base_from_end)
-        self._log_seen_target(stream, self._base_from("cam", base_from_flange), view, seen)
+            poses = [self._base_from(end, it) for it in flanges]
+            _log_poses(stream, paths.entity_of(end), end, poses)
+        self._log_seen_targets(stream, flanges, seen)
+        rows = {it.view: row for row, it in enumerate(seen)}
         if self.uncertainty is not None:
-            self.uncertainty.log_view(stream, view.number)
+            self.uncertainty.log_views(stream, list(rows))
         if self.charts is not None:
-            self.charts.log_view(stream, view.number)
+            self.charts.log_marks(stream, rows)
         if self.arm is not None:
-            self.arm.log_view(stream, view.number)
+            self.arm.log_views(stream, rows)
 
     @property
     def _ends(self) -> list[str]:
@@ -141,12 +149,6 @@ class Scene:
         boards = self.session.boards.items()
         frames = {f"target_{name}" if name else paths.TARGET_FRAME: it for name, it in boards}
         return {frame: it for frame, it in frames.items() if frame in self._ends}
-
-    def log_marks(self, stream: rr.RecordingStream) -> None:
-        """Logs what is known of all views at once."""
-        if self.charts is not None:
-            rows = {view.number: row for row, view in enumerate(self.session.views)}
-            self.charts.log_marks(stream, rows)
 
     @cached_property
     def _edges(self) -> Mapping[str, FloatArray]:
@@ -225,58 +227,72 @@ class Scene:
                 lines = rr.LineStrips3D(strips, colors=colour, radii=self._radius(0.3 * _LINE))
                 stream.log(f"{paths.STOPS}/{name}/carried", frame, lines, static=True)
 
-    def _carried(self, base_from_flange: FloatArray) -> list[FloatArray]:
-        """What the flange carries at one stop, as (k, 3) lines in the base: camera or boards."""
+    @cached_property
+    def _shapes(self) -> Sequence[tuple[str, FloatArray]]:
+        """What the flange carries, camera or boards, as (k, 3) lines in their frames."""
         if self.calibration is None:
             return []
         if self.calibration.mount == "eye-in-hand":
             camera = self.calibration.camera
             rim = [] if camera is None else frustum(camera.camera, SMALL_FRUSTUM * self.size_m)
-            shapes = [("cam", it) for it in rim]
-        else:
-            shapes = [(end, board.closed_outline(it)) for end, it in self._boards.items()]
+            return [("cam", it) for it in rim]
+        return [(end, board.closed_outline(it)) for end, it in self._boards.items()]
+
+    def _carried(self, base_from_flange: FloatArray) -> list[FloatArray]:
+        """The same at one stop, in the base."""
         return [
             shape @ base_from_end[:3, :3].T + base_from_end[:3, 3]
-            for end, shape in shapes
+            for end, shape in self._shapes
             if (base_from_end := self._base_from(end, base_from_flange)) is not None
         ]
 
-    def _log_arm(self, stream: rr.RecordingStream, view: View) -> None:
+    def _log_arms(self, stream: rr.RecordingStream) -> None:
         """Draws the robot, or only a line to its flange where its joints are not known."""
         robot = None if self.calibration is None else self.calibration.calibrated_robot
-        q, base_from_flange = view.joints_rad, self.base_from_flange.get(view.number)
-        if robot is not None and q is not None and len(q) == robot.joint_count:
-            log_arm(stream, robot.link_frames(q))
-            return
-        stream.log(paths.ROBOT, rr.Clear(recursive=True))
-        if base_from_flange is not None:
-            line = rr.LineStrips3D(
-                [[np.zeros(3), base_from_flange[:3, 3]]],
-                colors=colours.JOINT,
-                radii=self._radius(2 * _LINE),
-            )
-            stream.log(f"{paths.ROBOT}/reach", line)
+        arms: list[FloatArray | None] = []
+        strips: list[list[FloatArray]] = []
+        for view in self.session.views:
+            arm, line, q = None, [], view.joints_rad
+            base_from_flange = self.base_from_flange.get(view.number)
+            if robot is not None and q is not None and len(q) == robot.joint_count:
+                arm = robot.link_frames(q)
+            elif base_from_flange is not None:
+                line = [np.array([np.zeros(3), base_from_flange[:3, 3]])]
+            arms.append(arm)
+            strips.append(line)
+        log_arms(stream, arms)
+        reach = f"{paths.ROBOT}/reach"
+        style = rr.LineStrips3D.from_fields(colors=colours.JOINT, radii=self._radius(2 * _LINE))
+        stream.log(reach, style, static=True)
+        _send_strips(stream, reach, dict(enumerate(strips)))
 
-    def _log_seen_target(
+    def _log_seen_targets(
         self,
         stream: rr.RecordingStream,
-        base_from_cam: FloatArray | None,
-        view: View,
-        seen: ViewEvidence,
+        flanges: Sequence[FloatArray | None],
+        seen: Sequence[ViewEvidence],
     ) -> None:
-        """Draws the target's outline where this view alone sees it."""
-        target = self.session.boards.get(self.session.board_of(view))
-        if target is None:
+        """Draws the target's outline where each view alone sees it."""
+        # A part without strips takes those of the view before off the screen.
+        strips: dict[int, list[FloatArray]] = {}
+        for row, (view, flange, it) in enumerate(
+            zip(self.session.views, flanges, seen, strict=True)
+        ):
+            if (name := self.session.board_of(view)) not in self.session.boards:
+                continue
+            strips[row], base_from_cam = [], self._base_from("cam", flange)
+            if it.cam_from_target is not None and base_from_cam is not None:
+                base_from_target = base_from_cam @ it.cam_from_target
+                corners = self._outlines[name]
+                strips[row] = [corners @ base_from_target[:3, :3].T + base_from_target[:3, 3]]
+        if not strips:
             return
-        strips = []
-        if seen.cam_from_target is not None and base_from_cam is not None:
-            base_from_target = base_from_cam @ seen.cam_from_target
-            corners = self._outlines[self.session.board_of(view)]
-            strips.append(corners @ base_from_target[:3, :3].T + base_from_target[:3, 3])
-        # Without strips, this takes those of the view before off the screen.
-        colour = colours.REJECTED if seen.view in self._rejected else colours.DETECTED
-        line = rr.LineStrips3D(strips, colors=colour, radii=self._radius(_LINE))
-        stream.log(paths.SEEN_TARGET, rr.CoordinateFrame(paths.BASE_FRAME), line)
+        frame, width = rr.CoordinateFrame(paths.BASE_FRAME), self._radius(_LINE)
+        style = rr.LineStrips3D.from_fields(radii=width)
+        stream.log(paths.SEEN_TARGET, frame, style, static=True)
+        rejected = [seen[row].view in self._rejected for row in strips]
+        colour = [colours.REJECTED if it else colours.DETECTED for it in rejected]
+        _send_strips(stream, paths.SEEN_TARGET, strips, rr.LineStrips3D.columns(colors=colour))
 
 
 def log_image_plane(stream: rr.RecordingStream, camera: Camera, size_m: float) -> None:
@@ -330,3 +346,34 @@ def log_pose(
         child_frame=frame,
     )
     stream.log(entity, pose)
+
+
+def _log_poses(
+    stream: rr.RecordingStream, entity: str, frame: str, poses: Sequence[FloatArray | None]
+) -> None:
+    """Places a frame in each view of a session, as `log_pose` in one."""
+    known = {row: pose for row, pose in enumerate(poses) if pose is not None}
+    for row in (it for it in range(len(poses)) if it not in known):
+        stream.set_time(paths.TIMELINE, sequence=row)
+        log_pose(stream, entity, frame, None)
+    if known:
+        matrices, count = np.array(list(known.values())), len(known)
+        columns = rr.Transform3D.columns(
+            translation=matrices[:, :3, 3],
+            mat3x3=matrices[:, :3, :3],
+            parent_frame=[paths.BASE_FRAME] * count,
+            child_frame=[frame] * count,
+        )
+        send_rows(stream, entity, known, columns)
+
+
+def _send_strips(
+    stream: rr.RecordingStream,
+    entity: str,
+    strips: Mapping[int, Sequence[FloatArray]],
+    more: Iterable[rr.ComponentColumn] = (),
+) -> None:
+    """Draws lines in views, by their places; no line takes those of the view before off."""
+    lines = rr.LineStrips3D.columns(strips=[it for some in strips.values() for it in some])
+    parts = lines.partition([len(it) for it in strips.values()])
+    send_rows(stream, entity, strips, [*parts, *more])

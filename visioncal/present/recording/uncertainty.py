@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from visioncal.core.transforms import invert, mean_transform
 from visioncal.core.types import FloatArray
 from visioncal.present.recording import colours, paths
+from visioncal.present.recording.recorder import send_rows
 from visioncal.results import Calibration, Edge
 from visioncal.results.evidence import ViewEvidence
 
@@ -86,7 +87,7 @@ class Uncertainty:
         ):
             some = [view for view in self.scatter_m if (view in self.used) is wanted]
             for frame in self._frames_of(some):
-                self._log_scatter(stream, name, frame, some, colour, static=True)
+                self._log_scatter(stream, name, frame, some, colour)
         for frame in self._frames_of(self.scatter_m):
             self._log_beyond(stream, frame)
 
@@ -118,12 +119,29 @@ class Uncertainty:
         )
         stream.log(f"{entity}/label", frame, label, static=True)
 
-    def log_view(self, stream: rr.RecordingStream, view: int) -> None:
-        """Marks one view's placement of the target, at the stream's current time."""
-        some = [view] if view in self.scatter_m else []
-        # Of the other targets, this takes the mark of the view before off the screen.
+    def log_views(self, stream: rr.RecordingStream, views: Sequence[int]) -> None:
+        """Marks each view's placement of the target when it is looked at.
+
+        Args:
+            stream: Where to.
+            views: All, in the order of the session.
+        """
         for frame in self._frames_of(self.scatter_m):
-            self._log_scatter(stream, paths.THIS_VIEW, frame, some, colours.THIS_VIEW, static=False)
+            # Of the other targets, nothing takes the mark of the view before off the screen.
+            marked = [self._positions_m([it] * (it in self.scatter_m), frame) for it in views]
+            entity = f"{self._placements(frame)}/{paths.THIS_VIEW}"
+            radius = 1.5 * _POINT * self.size_m
+            style = rr.Points3D.from_fields(colors=colours.THIS_VIEW, radii=radius)
+            stream.log(entity, rr.CoordinateFrame(frame), style, static=True)
+            points = rr.Points3D.columns(positions=np.vstack(marked))
+            parts = points.partition([len(it) for it in marked])
+            send_rows(stream, entity, range(len(views)), parts)
+
+    def _positions_m(self, views: Iterable[int], frame: str) -> FloatArray:
+        """(k, 3) where the placements of a target by some views are drawn, in its frame."""
+        shown = [it for it in views if self.frames[it] == frame]
+        places_m = [self._within_reach(self.factor * self.scatter_m[it]) for it in shown]
+        return np.reshape(places_m, (-1, 3))
 
     def _log_scatter(
         self,
@@ -132,21 +150,11 @@ class Uncertainty:
         frame: str,
         views: Sequence[int],
         colour: tuple[int, int, int],
-        *,
-        static: bool,
     ) -> None:
-        positions_m = np.reshape(
-            [
-                self._within_reach(self.factor * self.scatter_m[view])
-                for view in views
-                if self.frames[view] == frame
-            ],
-            (-1, 3),
-        )
-        larger = 1.5 if name == paths.THIS_VIEW else 1.0
-        points = rr.Points3D(positions_m, colors=colour, radii=larger * _POINT * self.size_m)
+        positions_m = self._positions_m(views, frame)
+        points = rr.Points3D(positions_m, colors=colour, radii=_POINT * self.size_m)
         entity = f"{self._placements(frame)}/{name}"
-        stream.log(entity, rr.CoordinateFrame(frame), points, static=static)
+        stream.log(entity, rr.CoordinateFrame(frame), points, static=True)
 
     def _placements(self, frame: str) -> str:
         return f"{paths.entity_of(frame)}/placements_magnified_{self.factor}x"
@@ -181,27 +189,20 @@ def _scatter_m(
     calibration: Calibration, evidence: Mapping[int, ViewEvidence], used: frozenset[int]
 ) -> dict[int, FloatArray]:
     """By view, the target's place less its mean over the used views, in the target's frame."""
+    # The camera's edge, or the instrument's, is the first.
+    edge = next(iter(calibration.edges.values())).transform.as_matrix()
+    in_hand = calibration.mount == "eye-in-hand"
     placed = {
-        view: pose
+        view: np.asarray(robot @ edge @ it.cam_from_target)
         for view, it in evidence.items()
-        if (pose := _placed(calibration, it)) is not None
+        if it.base_from_flange is not None and it.cam_from_target is not None
+        for robot in [it.base_from_flange if in_hand else invert(it.base_from_flange)]
     }
     some = [placed[view] for view in used if view in placed]
     if not some:
         return {}
     mean_from_parent = invert(mean_transform(np.stack(some)))
     return {view: (mean_from_parent @ pose)[:3, 3] for view, pose in placed.items()}
-
-
-def _placed(calibration: Calibration, seen: ViewEvidence) -> FloatArray | None:
-    """(4, 4) the target as this view alone puts it, in the frame that carries it."""
-    if seen.base_from_flange is None or seen.cam_from_target is None:
-        return None
-    # The camera's edge, or the instrument's, is the first.
-    edge = next(iter(calibration.edges.values())).transform.as_matrix()
-    in_hand = calibration.mount == "eye-in-hand"
-    robot = seen.base_from_flange if in_hand else invert(seen.base_from_flange)
-    return np.asarray(robot @ edge @ seen.cam_from_target)
 
 
 def round_factor(wanted_m: float, size_m: float) -> int:

@@ -8,6 +8,8 @@ import rerun as rr
 
 from visioncal.core.types import FloatArray
 from visioncal.present.recording import colours, paths
+from visioncal.present.recording.notes import log_scalars
+from visioncal.present.recording.recorder import send_rows
 from visioncal.present.recording.uncertainty import round_factor
 from visioncal.results import Calibration
 from visioncal.results.arm import ArmResult, UnseenView
@@ -86,18 +88,24 @@ class ArmPicture:
                     )
                     stream.log(_series(plot, name, held=held), points, static=True)
 
-    def log_view(self, stream: rr.RecordingStream, view: int) -> None:
-        """Draws the arm as stated in one view, and marks what both make of it."""
-        strips = []
-        if view in self.off_m:
-            origins, off = self.off_m[view]
-            strips.append(np.vstack([np.zeros(3), origins + self.factor * off]))
-        line = rr.LineStrips3D(strips, colors=colours.STATED, radii=_LINE * self.size_m)
-        stream.log(paths.magnified_arm(self.factor), line)
-        for held, rows in ((False, self.found.left_out), (True, self.found.holdout)):
-            for it in rows:
-                if it.view == view:
-                    _log_unseen(stream, it, held=held)
+    def log_views(self, stream: rr.RecordingStream, rows: Mapping[int, int]) -> None:
+        """Draws the arm as stated in each view, and marks what both make of it.
+
+        Args:
+            stream: Where to.
+            rows: The views' places in the session.
+        """
+        drawn = [self.off_m[view] for view in rows if view in self.off_m]
+        strips = [np.vstack([np.zeros(3), at + self.factor * off]) for at, off in drawn]
+        entity = paths.magnified_arm(self.factor)
+        style = rr.LineStrips3D.from_fields(colors=colours.STATED, radii=_LINE * self.size_m)
+        stream.log(entity, style, static=True)
+        lines = rr.LineStrips3D.columns(strips=strips)
+        send_rows(
+            stream, entity, rows.values(), lines.partition([view in self.off_m for view in rows])
+        )
+        for held, views in ((False, self.found.left_out), (True, self.found.holdout)):
+            _log_unseen(stream, {rows[it.view]: it for it in views if it.view in rows}, held=held)
 
 
 def log_map(
@@ -132,14 +140,16 @@ def log_map(
     stream.log(f"{paths.WORKSPACE}/legend", frame, legend, static=True)
 
 
-def _log_unseen(stream: rr.RecordingStream, seen: UnseenView, *, held: bool) -> None:
+def _log_unseen(stream: rr.RecordingStream, seen: Mapping[int, UnseenView], *, held: bool) -> None:
     for plot, before, after in (
-        (paths.UNSEEN_MM, seen.nominal_mm, seen.mm),
-        (paths.UNSEEN_DEG, seen.nominal_deg, seen.deg),
+        (paths.UNSEEN_MM, "nominal_mm", "mm"),
+        (paths.UNSEEN_DEG, "nominal_deg", "deg"),
     ):
-        if before is not None and after is not None:
-            stream.log(_series(plot, _STATED, held=held), rr.Scalars(before))
-            stream.log(_series(plot, _CALIBRATED, held=held), rr.Scalars(after))
+        pairs = {row: (getattr(it, before), getattr(it, after)) for row, it in seen.items()}
+        known = {row: it for row, it in pairs.items() if None not in it}
+        for at, name in enumerate((_STATED, _CALIBRATED)):
+            entity = _series(plot, name, held=held)
+            log_scalars(stream, entity, {row: it[at] for row, it in known.items()})
 
 
 def _series(plot: str, name: str, *, held: bool) -> str:

@@ -12,6 +12,7 @@ from visioncal.present.recording.coverage import AXES_RINGS_DEG, DIRECTIONS_RING
 from visioncal.results import Calibration
 from visioncal.results.arm import ArmResult
 from visioncal.session import Session
+from visioncal.session.table import reported_matrices
 
 # Distance of the eye from the cell's centre, in extents of all that the cell holds.
 EYE_DISTANCE = 0.8
@@ -248,12 +249,12 @@ def _disc(name: str, entity: str, rings_deg: tuple[int, ...]) -> rrb.Spatial2DVi
 
 def _eye(session: Session, calibration: Calibration | None) -> rrb.EyeControls3D | None:
     """Looks at the cell from the side, from where all of it fills the view."""
-    poses = [pose for view in session.views if (pose := view.base_from_flange()) is not None]
+    poses = reported_matrices(session.views)
     if not poses:
         return None
     edges = {} if calibration is None else calibration.transforms
     fixed = [edge.translation for name, edge in edges.items() if name.startswith("base_from_")]
-    return eye_on(np.array([np.zeros(3), *(pose.translation for pose in poses), *fixed]))
+    return eye_on(np.array([np.zeros(3), *(it[:3, 3] for it in poses.values()), *fixed]))
 
 
 def eye_on(places: FloatArray, distance: float = EYE_DISTANCE) -> rrb.EyeControls3D:
