@@ -486,6 +486,21 @@ def test_views_that_repeat_others_are_named_and_count_once(count, tmp_path):
         assert np.array_equal(twice.edges[name].covariance, edge.covariance)
 
 
+@pytest.mark.parametrize("lens", [Rig.lens, ""])
+def test_a_rig_that_is_seen_mirrored_is_named(lens, tmp_path):
+    """Unlike a flat board, it fits no pose then."""
+    folder = write_rig(tmp_path / "rig", Rig("cube", lens=lens))
+    header, *lines = (folder / "corners.csv").read_text().splitlines()
+    cells = [dict(zip(header.split(","), it.split(","), strict=True)) for it in lines]
+    turned = [{**it, "u_px": str(1279.0 - float(it["u_px"]))} for it in cells]
+    rows = [",".join(it.values()) for it in turned]
+    (folder / "corners.csv").write_text("\n".join([header, *rows]) + "\n")
+    done = visioncal("calibrate", folder, "-o", tmp_path / "out")
+    assert done.status == 2
+    assert "seen mirrored" in done.err
+    assert "u_px counts to the right" in done.err
+
+
 def test_tables_that_count_from_other_numbers_are_told_apart(cube):
     lines = (cube / "views.csv").read_text().splitlines()
     numbers = [int(it.partition(",")[0]) for it in lines[1:]]

@@ -204,6 +204,8 @@ def test_findings_are_kept_and_name_the_session(tmp_path: Path) -> None:
     assert named.next_steps[0].command == command
     assert command in named.reasons[-1]
     folder = tmp_path / "cell"
+    # An apostrophe of a sentence is no quotation.
+    assert with_paths("Look at the camera's driver.", folder) == "Look at the camera's driver."
     assert with_paths(GUESS, folder) == f"visioncal convert {folder} {folder}-fixed --guess --yes"
     again = with_paths("visioncal calibrate SESSION -o NEW", folder, tmp_path / "out.2")
     assert again.endswith(f"-o {tmp_path}/out.2-new")

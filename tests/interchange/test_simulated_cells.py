@@ -50,16 +50,18 @@ def test_all_combinations_are_calibrated_and_compared_with_the_truth(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("view = [8]", "view is nothing that is varied.*views"),
+        ("view = [8]", "view is nothing that is varied; known are views"),
         ("views = [2]", "views has 2; 3 to"),
         ("views = [8]\nseeds = 0", "seeds is 0; 1 to"),
+        ('board = "foo"', "board has 'foo'; known are charuco"),
         ('camera = "wise"', "camera has 'wise'; known are wide, fine"),
         ('arm_sigma_mm = ["much"]', "arm_sigma_mm has 'much'; a number from 0"),
     ],
 )
 def test_what_cannot_be_varied_is_refused(tmp_path, text, words):
-    with pytest.raises(DataError, match=words):
+    with pytest.raises(DataError, match=words) as caught:
         write_cells(written(tmp_path, text), tmp_path / "cells")
+    assert caught.value.next_step or caught.value.culprits
     assert not (tmp_path / "cells").exists()
 
 

@@ -261,7 +261,7 @@ def test_a_table_is_corrected_and_keeps_its_other_columns(stored, result):
     table = write_poses(stored / "t.csv", poses, columns)
     done = run("correct", table, "--against", stored, "-o", stored / "o.csv", "--seed-joints", SEED)
     assert done.status == 0, done.err
-    assert "4 of 4 targets corrected" in done.err
+    assert "4 of 4 targets corrected" in done.out
     rows = rows_of((stored / "o.csv").read_text())
     assert [it["view"] for it in rows] == ["7", "8", "9", "10"]
     assert rows[1]["note"] == 'say "a, b"'

@@ -268,7 +268,9 @@ def test_check_prints_a_description_and_writes_it(photo, tmp_path):
     assert "square_m" not in tomllib.loads(done.stdout)
     out = tmp_path / "found.toml"
     assert isinstance(run(photo, "-o", out).exception, DataError)
-    assert run(photo, "-o", out, "--square-mm", 30).exit_code == 0
+    written = run(photo, "-o", out, "--square-mm", 30)
+    assert written.exit_code == 0
+    assert written.stdout.startswith("ChArUco board of 9 x 6 squares")
     target, _ = load_target("found.toml", tmp_path)
     assert (target.columns, target.rows, target.square_m) == (9, 6, 0.03)
     assert isinstance(run(photo, "-o", out, "--square-mm", 30).exception, DataError)

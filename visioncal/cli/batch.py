@@ -98,7 +98,11 @@ def _report(found: "Batch") -> None:
     console.print(f"{len(found.rows)} sessions: {words}")
     lines = [f"{it.name}: {it.stands_out}" for it in found.rows if it.score > 0.0][:_MOST_NAMED]
     lines += [f"{it.name}: {it.change}" for it in found.rows if it.changed][:_MOST_NAMED]
-    failed = [f"{it.name}: {it.words}" for it in found.rows if it.state == "failed"]
+    failed = [
+        f"{it.name}: {it.words} {it.next_step}".rstrip()
+        for it in found.rows
+        if it.state == "failed"
+    ]
     for line in [*lines, *failed[:_MOST_NAMED]]:
         console.print(escape(f"  {line}"))
     console.print(escape(f"written: {found.page}, {found.table}"))

@@ -9,7 +9,7 @@ import numpy as np
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import messages
+from visioncal.cli.console import answers, messages
 from visioncal.cli.correct import CorrectOptions
 from visioncal.cli.numbers import numbers_in
 from visioncal.cli.options import PartOptions
@@ -103,7 +103,7 @@ def correct_table(
         return
     if written_to is None:
         typer.echo(table_to_send(wanted, columns, rows), nl=False)
-    _report(columns, rows, lost, warnings)
+    _report(columns, rows, lost, warnings, is_answer=written_to is not None)
     if np.isnan(wanted.q_seed).all() and asked.seed_joints is None:
         messages().print(escape(_posture(arm, corrected.q[rows[0]])))
     if written_to is not None:
@@ -260,6 +260,8 @@ def _report(
     rows: IntArray,
     lost: Sequence[tuple[str, str]],
     warnings: Sequence[str],
+    *,
+    is_answer: bool,
 ) -> None:
     console = messages()
     mm, deg = columns["moved_mm"][rows], columns["moved_deg"][rows]
@@ -270,7 +272,8 @@ def _report(
     )
     if "sigma_mm" in columns:
         words += f"; predicted sigma {figure(float(np.median(columns['sigma_mm'][rows])))} mm"
-    console.print(escape(words))
+    # Where the table itself is not on stdout, this is the answer.
+    (answers() if is_answer else console).print(escape(words))
     for place, why in lost[:_SHOWN]:
         console.print(f"[bold yellow]left out:[/] {escape(f'{place}: {why}')}")
     if len(lost) > _SHOWN:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import messages
+from visioncal.cli.console import answers, messages
 from visioncal.cli.lazy import PlainCommand
 from visioncal.cli.options import AsJson
 from visioncal.core.errors import DataError
@@ -236,12 +236,13 @@ def check_command(
     description = to_toml(identity, square_m, image.name)
     if out is not None:
         write_atomically(out, description)
-    messages().print(escape(describe(identity)))
     if as_json:
         typer.echo(json.dumps(to_document(identity, square_m), indent=2))
     elif out is None:
         typer.echo(description, nl=False)
     if out is not None:
+        if not as_json:
+            answers().print(escape(describe(identity)))
         for note in identity.notes:
             messages().print(escape(note))
         messages().print(escape(f"wrote {out}"))

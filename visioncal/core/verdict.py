@@ -242,8 +242,10 @@ def with_paths(
     is_file = result.suffix in (".json", ".rrd")
     new = f"{result.parent if is_file else result}-new"
     paths = {"SESSION": str(session), "FIXED": fixed, "OUT": str(out) or "out", "NEW": new}
-    typed = shlex.join([*_without(again, shlex.split(command))])
-    words = {name: shlex.quote(it) for name, it in paths.items()} | {AGAIN: typed}
+    words = {name: shlex.quote(it) for name, it in paths.items()}
+    # Of a sentence, an apostrophe is no quotation.
+    if AGAIN in command:
+        words[AGAIN] = shlex.join([*_without(again, shlex.split(command))])
     return _PATH.sub(lambda found: words[found[0]], command)
 
 

@@ -19,6 +19,8 @@ from visioncal.vision.camera import intrinsics
 FALSE_ALARMS = 0.01
 # No cell is known better [rad and m]; exact data would otherwise measure rounding by zero.
 _LEAST_SIGMA = 1e-9
+# Focusing changes a focal length by less than this share.
+_OTHER_LENS = 0.05
 
 
 @dataclass(frozen=True)
@@ -318,13 +320,20 @@ def _findings(
             "the difference."
         )
     changed = [it.name for it in edges if it.is_change]
+    longer = 1.0 if lens is None else float(lens.b[0] / lens.a[0])
+    is_other = abs(longer - 1.0) > _OTHER_LENS
+    if is_other:
+        yield (
+            f"The focal length differs by {100.0 * abs(longer - 1.0):.0f} %: another camera, lens "
+            "or zoom. Where they are is then compared below, and nothing need have moved."
+        )
     if a.cell is not None:
         yield _whole_finding(changed)
     elif a.mount != b.mount:
         yield f"The mounts differ ({a.mount}, {b.mount}): no transform is in both."
     else:
         yield _edge_finding(a.mount, changed)
-    if lens is not None and lens.is_change:
+    if lens is not None and lens.is_change and not is_other:
         yield (
             "The intrinsics differ: another camera, focus or zoom."
             if lens.significance is not None

@@ -216,7 +216,7 @@ def _with_hint(
         return error
     hint = hint or reading_hint(seen)
     if hint is not None:
-        message = f"{hint.words} As declared: {error.message}"
+        message = hint.words
         return type(error)(message, culprits=error.culprits, next_step=str(hint.do))
     robot, next_step = seen.robot, error.next_step
     if robot is not None and not robot.can_tilt:

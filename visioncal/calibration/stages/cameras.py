@@ -6,12 +6,15 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import TypeVar
 
+import numpy as np
+
+from visioncal.calibration.stages.cause_ranking import COUNTED_BACKWARDS
 from visioncal.calibration.stages.dense import fit_densely
 from visioncal.calibration.stages.detect import DetectOptions, detect
 from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.calibration.stages.observed import CameraLook, Observed, nothing_seen
 from visioncal.calibration.stages.pnp import Poses, estimate_poses, given_poses, measure_poses
-from visioncal.core.errors import VisioncalError
+from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
 from visioncal.core.types import Corners
@@ -82,7 +85,11 @@ def estimate_lenses(seen: T) -> T:
             lens = CameraResult(stated, estimated=False)
         else:
             with _naming(session, frame):
-                found = estimate_intrinsics(fitted, targets, look.resolution, look.table.model)
+                try:
+                    found = estimate_intrinsics(fitted, targets, look.resolution, look.table.model)
+                except VisioncalError:
+                    _refuse_mirrored(seen, frame, fitted, np.inf)
+                    raise
             lens = CameraResult(found.camera, estimated=True, covariance=found.covariance)
             of = frame if len(session.cameras) > 1 else ""
             seen = seen.noting(found.rejections, (it.of(of) for it in found.warnings))
@@ -112,11 +119,13 @@ def locate_targets(seen: T) -> T:
             found = estimate_poses(
                 fitted, targets, lens.camera, 0 if lens.covariance is None else len(lens.covariance)
             )
-        if found.sigma_px > _WRONG_LENS_PX and not lens.estimated:
-            other = _other_lens(seen, frame, fitted, found.sigma_px)
+        if found.sigma_px > _WRONG_LENS_PX:
+            other = None if lens.estimated else _other_lens(seen, frame, fitted, found.sigma_px)
             if other is not None:
                 lens, found, said = other
                 seen = seen.noting((), (said,))
+            else:
+                _refuse_mirrored(seen, frame, fitted, found.sigma_px)
         rest = {view: it for view, it in corners.items() if view in seen.held_back}
         held = measure_poses(rest, targets, lens.camera, found.sigma_px)
         poses |= {it.view: it for it in (*found.views, *held)}
@@ -167,6 +176,42 @@ def _other_lens(
     result = CameraResult(lens.camera, estimated=True, covariance=lens.covariance)
     several = len(seen.session.cameras) > 1
     return result, poses, found.of(frame if several else "")
+
+
+def _refuse_mirrored(
+    seen: Observed, frame: str, corners: Mapping[int, Corners], sigma_px: float
+) -> None:
+    """Refuses corners that fit no pose as they are, and do with left and right exchanged.
+
+    Those of a flat target fit mirrored as well, by a pose behind it, which the robot's motion
+    tells.
+
+    Raises:
+        DataError: They are mirrored.
+    """
+    look, targets = seen.cameras[frame], tuple(seen.session.boards.values())
+    if look.resolution is None:
+        return
+    width = look.resolution[0]
+    turned = {
+        view: replace(it, px=np.stack([width - 1.0 - it.px[:, 0], it.px[:, 1]], axis=1))
+        for view, it in corners.items()
+    }
+    try:
+        found = estimate_intrinsics(turned, targets, look.resolution, look.table.model)
+    except VisioncalError:
+        return
+    if found.sigma_px > min(_MUCH_BETTER * sigma_px, _WRONG_LENS_PX):
+        return
+    has_images = any(it.image for it in seen.session.views if it.number in corners)
+    raise DataError(
+        "The target is seen mirrored: its corners fit no pose as they are, and to "
+        f"{figure(found.sigma_px)} px with left and right exchanged.",
+        next_step="Turn the images back (a flip in the camera's driver, or a mirror before the "
+        "lens), and calibrate anew."
+        if has_images
+        else COUNTED_BACKWARDS,
+    )
 
 
 def _images(session: Session) -> dict[str, list[View]]:

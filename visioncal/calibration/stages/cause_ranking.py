@@ -47,10 +47,13 @@ MIRRORED = Step(
 )
 
 # Of corners without images.
-MIRRORED_CORNERS = Step(
+COUNTED_BACKWARDS = (
     "In corners.csv, u_px counts to the right and v_px down: exchange the two columns where they "
-    "are exchanged, or count from the other side where one runs backwards. Only where the robot's "
-    "frame is left-handed, write a copy of the session that is read so, and calibrate it.",
+    "are exchanged, or count from the other side where one runs backwards."
+)
+MIRRORED_CORNERS = Step(
+    f"{COUNTED_BACKWARDS} Only where the robot's frame is left-handed, write a copy of the session "
+    "that is read so, and calibrate it.",
     GUESS_AND_CALIBRATE,
 )
 _UNRECORDED = Step(

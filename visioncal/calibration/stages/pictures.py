@@ -232,9 +232,10 @@ def _mirrored(view: View) -> Finding:
 
 
 def _blurred(view: View, why: str, views: Sequence[View]) -> Finding:
+    of_all = f" in {len(views)} views" if len(views) > 1 else ""
     return Finding(
         "blurred_images",
-        f"No board can be read: in view {view.number}, {why}.",
+        f"No board can be read{of_all}: in view {view.number}, {why}.",
         Step("Focus the lens, expose for a shorter time with more light, and record again."),
         tuple(it.number for it in views),
     )

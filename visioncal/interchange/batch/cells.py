@@ -50,7 +50,9 @@ def write_cells(file: Path, folder: Path, progress: Progress | None = None) -> l
     document = read_toml(file, str(file))
     seeds = document.pop("seeds", _SEEDS)
     if type(seeds) is not int or not 0 < seeds <= _MOST_SEEDS:
-        raise DataError(f"{file}: seeds is {seeds!r}; 1 to {_MOST_SEEDS} is needed.")
+        raise DataError(
+            f"{file}: seeds is {seeds!r}; 1 to {_MOST_SEEDS} is needed.", culprits=[str(file)]
+        )
     varied = {key: value if isinstance(value, list) else [value] for key, value in document.items()}
     fields = {key: [_field(file, key, it) for it in values] for key, values in varied.items()}
     wanted = []
@@ -75,23 +77,28 @@ def _field(file: Path, key: str, value: object) -> tuple[str, Any]:
     if key == "views":
         if type(value) is int and 3 <= value <= _MOST_VIEWS:
             return key, value
-        raise DataError(f"{file}: views has {value!r}; 3 to {_MOST_VIEWS} is needed.")
+        raise DataError(
+            f"{file}: views has {value!r}; 3 to {_MOST_VIEWS} is needed.", culprits=[str(file)]
+        )
     if key in _NUMBERS:
         field, unit = _NUMBERS[key]
         if isinstance(value, int | float) and 0.0 <= value <= 100.0:
             return field, unit * value
-        raise DataError(f"{file}: {key} has {value!r}; a number from 0 to 100 is needed.")
+        raise DataError(
+            f"{file}: {key} has {value!r}; a number from 0 to 100 is needed.", culprits=[str(file)]
+        )
     if key in _NAMES:
         field, known = _NAMES[key]
         if value in known:
             return field, known[str(value)]()
         raise DataError(
-            f"{file}: {key} has {value!r}; known are {', '.join(known)}."
-            f"{did_you_mean(str(value), known)}"
+            f"{file}: {key} has {value!r}; known are {', '.join(known)}.",
+            culprits=[key],
+            next_step=did_you_mean(str(value), known) or f"Write one of these in {file}, {key}.",
         )
     keys = ("views", *_NUMBERS, *_NAMES, "seeds")
     raise DataError(
-        f"{file}: {key} is nothing that is varied; known are {', '.join(keys)}."
-        f"{did_you_mean(key, keys)}",
+        f"{file}: {key} is nothing that is varied; known are {', '.join(keys)}.",
         culprits=[key],
+        next_step=did_you_mean(key, keys) or f"Write one of these in {file}.",
     )

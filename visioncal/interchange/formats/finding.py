@@ -40,10 +40,16 @@ def images_in(folder: Path) -> tuple[Path, ...]:
     """
     found = tuple(it for it in listed(folder) if is_image_name(it.name))
     if not found:
+        is_there = folder.is_dir()
         raise DataError(
-            f"{folder} has no images (png, jpg, tif).",
+            f"{folder} has no images (png, jpg, tif)."
+            if is_there
+            else f"{folder} {'is no folder' if folder.exists() else 'does not exist'}; the folder "
+            "of the images is needed.",
             culprits=[str(folder)],
-            next_step="Name the folder of the images with --images.",
+            next_step="Name the folder of the images with --images."
+            if is_there
+            else "Check the path and its spelling.",
         )
     return found
 
