@@ -100,6 +100,7 @@ def test_the_slope_of_the_likelihood_is_that_of_its_differences(monkeypatch, sti
             array[:3, :6] = 0.0
         likelihood.local[:3, :, :6] = 0.0
         likelihood.kinds[:3, :6] = -1
+        likelihood = replace(likelihood)
     logs = np.clip(logs, *likelihood.limits(())) + 0.2
     here = likelihood(logs)
     for level, step in enumerate(1e-4 * np.eye(len(logs))):

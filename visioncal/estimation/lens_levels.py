@@ -29,7 +29,7 @@ from visioncal.estimation.linalg import covariance_from, gram
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import RATIO_PRIOR, normal_equations
-from visioncal.estimation.variance import Likely, most_likely
+from visioncal.estimation.variance import HARDLY, Likely, most_likely
 
 # Lengths of the field that are tried, as shares of the image's width, from the third on; another
 # one has to gain so much.
@@ -138,6 +138,14 @@ class _Likelihood:
         every = np.concatenate([self.kinds[self.kinds >= 0], self.modes])
         return np.bincount(every, minlength=_FLANGES + 2 * self.flanges).astype(float)
 
+    @cached_property
+    def _members(self) -> tuple[FloatArray, FloatArray]:
+        """Of which level each value is: (v, l, k) of single views, (q, k) of the unknowns."""
+        levels = np.flatnonzero(self.counts)
+        modes = np.zeros((len(self.gradient), len(levels)))
+        modes[len(self.known) :] = self.modes[:, None] == levels
+        return (self.kinds[:, :, None] == levels).astype(float), modes
+
     def __call__(self, logs: FloatArray) -> Likely:
         """The negative logarithm, its slope, and its second derivative.
 
@@ -175,20 +183,14 @@ class _Likelihood:
         determinants += 2.0 * float(np.log(root[:, diagonal, diagonal]).sum() + self.counts @ logs)
         # Where a level's values are, and how well they are known: in units of the level.
         levels = np.flatnonzero(self.counts)
-        of_single = np.where(levels == self.kinds[:, :, None], single[:, :, None], 0.0)
-        of_modes = np.zeros((len(best), len(levels)))
-        of_modes[t:] = np.where(levels == self.modes[:, None], best[t:, None], 0.0)
+        singles, modes = self._members
+        of_single, of_modes = single[:, :, None] * singles, best[:, None] * modes
         sizes = np.sum(of_single**2, axis=(0, 1)) + np.sum(of_modes**2, axis=0)
-        in_common = taken @ covariance @ np.swapaxes(taken, 1, 2)
+        # One product of a tall matrix: by views it takes several times as long.
+        spread_out = (taken.reshape(-1, len(best)) @ covariance).reshape(taken.shape)
+        in_common = spread_out @ np.swapaxes(taken, 1, 2)
         own = np.diagonal(inverse + in_common, axis1=1, axis2=2)
-        masks = [self.kinds == it for it in levels.tolist()]
-        of_field = [np.flatnonzero(self.modes == it) + t for it in levels.tolist()]
-        spread = np.array(
-            [
-                own[mine].sum() + np.diag(covariance)[at].sum()
-                for mine, at in zip(masks, of_field, strict=True)
-            ]
-        )
+        spread = np.tensordot(own, singles, axes=2) + np.diag(covariance) @ modes
         sizes, spread = sizes / variances[levels], spread / variances[levels]
         slope = self.counts.copy()
         slope[levels] -= sizes + spread
@@ -253,27 +255,19 @@ class _Likelihood:
             (1 + k, 1 + k) of the corners' noise, and of the levels that anything has.
         """
         t, levels, variances = len(self.known), np.flatnonzero(self.counts), np.exp(2.0 * logs)
-        of_field = [np.flatnonzero(self.modes == it) + t for it in levels.tolist()]
-        turned = []
-        for it in levels.tolist():
-            rows = taken[self.kinds == it]
-            turned.append(covariance @ (rows.T @ rows))
-        chosen = (self.kinds[:, :, None] == levels).astype(float)
-        of_one_view = (inverse * (inverse + 2.0 * in_common)) @ chosen
-        both = np.tensordot(chosen, of_one_view, axes=([0, 1], [0, 1]))
-        for one, at in enumerate(of_field):
-            for two, there in enumerate(of_field):
-                both[one, two] += np.sum(turned[one] * turned[two].T)
-                both[one, two] += np.sum(turned[one][there] * covariance[there])
-                both[one, two] += np.sum(turned[two][at] * covariance[at])
-                both[one, two] += np.sum(covariance[np.ix_(at, there)] ** 2)
+        singles, modes = self._members
+        among_rows = [taken[self.kinds == it] for it in levels.tolist()]
+        turned = np.array([covariance @ (it.T @ it) for it in among_rows])
+        of_one_view = (inverse * (inverse + 2.0 * in_common)) @ singles
+        both = np.tensordot(singles, of_one_view, axes=([0, 1], [0, 1]))
+        both += np.tensordot(turned, turned, axes=([1, 2], [2, 1]))
+        of_rows = np.sum(turned * covariance, axis=2) @ modes
+        both += of_rows + of_rows.T + modes.T @ covariance**2 @ modes
         among = np.diag(self.counts[levels] - 2.0 * spread)
         among += both / np.outer(variances[levels], variances[levels])
         held = self.known @ covariance[:t]
-        by_held = np.array([
-            np.sum(held * it[:t]) + np.sum(held[:, at] * covariance[:t, at])
-            for it, at in zip(turned, of_field, strict=True)
-        ]) / variances[levels]  # fmt: skip
+        by_held = np.tensordot(turned[:, :t], held, axes=2)
+        by_held = (by_held + np.sum(held * covariance[:t], axis=0) @ modes) / variances[levels]
         of_noise = 2.0 * (self.counts[levels] - spread - among.sum(axis=0) - by_held)
         inner = held[:, :t]
         of_held = np.trace(inner) - np.sum(inner * inner.T) - by_held.sum()
@@ -291,7 +285,9 @@ class _Likelihood:
             enough: See `most_likely`.
         """
         low, high = self.limits(closed)
-        logs, found = most_likely(self, np.clip(logs, low, high), low, high, enough=enough)
+        hardly = HARDLY * np.maximum(self.counts, 1.0)
+        start = np.clip(logs, low, high)
+        logs, found = most_likely(self, start, low, high, enough=enough, hardly=hardly)
         # Levels that hardly count still fall, by ever smaller gains: to nothing at once.
         for level in (_FIELD, _BREATHING, _JITTER):
             if found.slope[level] <= 0.0 or logs[level] <= low[level]:

@@ -18,8 +18,9 @@ _LONGEST_STEP, SETTLED = 1.0, 1e-4
 _WORST_DAMPING = 1e6
 # A step that gains less of the log-likelihood is a thousandth of the levels' own uncertainty.
 _LITTLE = 1e-6
-# Levels that all but vanish gain less than this by falling on, and fall by longer steps.
-_HARDLY, _LONGEST_FALL = 0.1, 2.0
+# Levels that all but vanish gain less than this by falling on, for each value that they are of,
+# and curve hardly more than their variance does: they fall by longer steps.
+HARDLY, _VARIANCES, _LONGEST_FALL = 0.1, 3.0, 2.0
 # A gain is rarely so many times as large as the second order has it.
 _SURELY = 3.0
 # The root of twice the log-likelihood that a 95 % interval of one unknown gives away (chi-square),
@@ -142,6 +143,7 @@ def most_likely(
     settled: float = SETTLED,
     enough: float = np.inf,
     little: float = _LITTLE,
+    hardly: FloatArray | float = HARDLY,
 ) -> tuple[FloatArray, Found]:
     """Finds the most likely logarithms of levels, by damped steps of Newton.
 
@@ -153,6 +155,7 @@ def most_likely(
         settled: The step under which they have come to rest, too.
         enough: Where steps do not seem to lead below this value, the search ends.
         little: What a step gains of the log-likelihood once they have come to rest.
+        hardly: (k,) slopes under which levels may all but vanish; or one for all.
 
     Returns:
         The logarithms, and what is found there.
@@ -162,8 +165,8 @@ def most_likely(
         # What is at a limit and would go on is held there.
         free = np.where(now.slope > 0.0, logs > low, logs < high) & (low < high)
         curvature = now.curvature + damping * np.diag(np.maximum(np.diag(now.curvature), 1.0))
-        hardly = (now.slope > 0.0) & (now.slope < _HARDLY)
-        falling = free & hardly & (np.diag(now.curvature) < 2.5 * now.slope) & (damping < 1.0)
+        fading = (now.slope > 0.0) & (now.slope < hardly) & (damping < 1.0)
+        falling = free & fading & (np.diag(now.curvature) < _VARIANCES * now.slope)
         least = np.maximum(low - logs, np.where(falling, -_LONGEST_FALL, -_LONGEST_STEP))
         step = _bounded_step(
             now.slope, curvature, np.where(free, least, 0.0),
