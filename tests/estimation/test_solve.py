@@ -157,7 +157,27 @@ def test_errors_of_an_arm_beside_a_likelihood_are_those_of_a_wider_problem(kind)
     np.testing.assert_allclose(beside.jacobian, expected.jacobian, rtol=1e-6, atol=1e-9)
     # What the wider problem has left of the arm's columns beside them is rounding.
     levels = 2.0 * fit.noise.robots
-    assert beside.value(levels) == pytest.approx(expected.value(levels), abs=1e-5)
+    found, values = (
+        it.most_likely(levels, np.zeros(2, dtype=bool))[1] for it in (beside, expected)
+    )
+    assert found == pytest.approx(values, abs=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["one a stop", "two a stop", "combined"])
+def test_the_likelihood_of_levels_that_grow_together_is_that_of_each(kind):
+    problem, fit = answered(True, views=8, seed=6)
+    if kind == "two a stop":
+        problem = doubled(problem)
+    if kind == "combined":
+        seen = problem.observations
+        seen = replace(seen, covariance=np.zeros_like(seen.covariance))
+        problem = replace(problem, observations=seen, is_combined=True)
+    found = robot_likelihood(problem, fit.state, fit.noise)
+    scales, fixed = np.array([0.02, 0.5, 1.0, 8.0]), np.zeros(2, dtype=bool)
+    values = [found.most_likely(it * fit.noise.robots, fixed)[1] for it in scales]
+    scaled = found.scaled(0, fit.noise.robots, scales)
+    # The rounding of values of some hundreds, at a fiftieth of the noise some millions.
+    np.testing.assert_allclose(np.diff(scaled), np.diff(values), rtol=1e-7, atol=1e-7)
 
 
 def test_shared_errors_of_flanges_are_eliminated_exactly():

@@ -55,12 +55,10 @@ def expected_levels(problem: Problem, state: State, noise: Noise) -> FloatArray:
         if min(turn, shift) < _NOTHING:
             typical, width = RATIO_PRIOR.ratio, np.exp(RATIO_PRIOR.log_sigma)
             ratio = np.clip(ratio, typical / width, typical * width)
-        shifts = max(float(shift), _LEAST_MIDDLE_M) * np.exp(_SCALES)
-        values = np.empty(len(shifts))
-        for at, it in enumerate(shifts.tolist()):
-            levels = noise.robots.copy()
-            levels[robot] = it / ratio, it
-            values[at] = robots_likelihood.value(levels)
+        middle, levels = max(float(shift), _LEAST_MIDDLE_M), noise.robots.copy()
+        levels[robot] = middle / ratio, middle
+        values = robots_likelihood.scaled(robot, levels, np.exp(_SCALES))
+        shifts = middle * np.exp(_SCALES)
         weights = np.exp(values.min() - values) * np.gradient(_SCALES)
         expected = float(np.sqrt(weights @ shifts**2 / weights.sum()))
         robots[robot] = np.maximum(robots[robot], [expected / ratio, expected])

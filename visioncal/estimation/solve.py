@@ -19,9 +19,11 @@ from visioncal.estimation.levenberg_marquardt import (
 from visioncal.estimation.linalg import (
     covariance_among,
     covariance_from,
+    covariance_root,
     damped_step,
     gram,
     squared_lengths,
+    weighted_gram,
 )
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import ANYTHING, Linear, Problem
@@ -32,7 +34,6 @@ from visioncal.estimation.variance import (
     Knowledge,
     RatioPrior,
     estimate_sigmas,
-    likelihood_value,
 )
 
 _ROUNDS, _SETTLED = 20, 1e-10
@@ -556,12 +557,41 @@ class RobotLikelihood:
             moving=np.pad(self.moving, (0, size), constant_values=True),
         )
 
-    def value(self, levels: FloatArray) -> float:
-        """The negative logarithm of the likelihood of (r, 2) levels."""
-        logs = np.log(np.maximum(levels.ravel(), LEAST_SIGMA))
-        return likelihood_value(
-            self.reduced.errors, self.jacobian, self.components, self.known, logs, self._ratios
-        )
+    def scaled(self, robot: int, levels: FloatArray, scales: FloatArray) -> FloatArray:
+        """The negative logarithm of the likelihood, up to a constant, as one robot's noise grows.
+
+        In each unit the covariance at the levels and what the robot adds to it are made diagonal
+        together; only their ratio then changes with the scale.
+
+        Args:
+            robot: The robot.
+            levels: (r, 2) all robots' levels.
+            scales: (k,) by how much this one's are larger.
+
+        Returns:
+            (k,) values.
+        """
+        total = self.components.total(np.maximum(levels.ravel(), LEAST_SIGMA))
+        white = np.linalg.inv(np.linalg.cholesky(total))
+        mine = (self.members == robot).any(axis=1)
+        added = np.repeat(np.where(self.members == robot, 1.0, 0.0), 6, axis=1)
+        added *= np.tile(np.repeat(levels[robot], 3), self.members.shape[1]) ** 2
+        shares, axes = np.linalg.eigh((white * added[:, None]) @ np.swapaxes(white, 1, 2))
+        white = np.swapaxes(axes, 1, 2) @ white
+        jacobian, errors = white @ self.jacobian, (white @ self.reduced.errors[..., None])[..., 0]
+        others, left = jacobian[~mine], errors[~mine]
+        information = self.known.information + gram(others, others)
+        gradient = self.known.gradient + gram(others, left)
+        jacobian, errors, found = jacobian[mine], errors[mine], np.empty(len(scales))
+        for at, scale in enumerate(scales.tolist()):
+            grown = np.maximum(1.0 + (scale**2 - 1.0) * shares[mine], np.finfo(float).tiny)
+            weighted = errors / grown
+            root = covariance_root(information + weighted_gram(jacobian, 1.0 / grown))
+            pull = root.T @ (gradient + gram(jacobian, weighted))
+            squares = float(np.sum(errors * weighted) - pull @ pull)
+            determinants = float(np.log(grown).sum() - 2.0 * np.linalg.slogdet(root)[1])
+            found[at] = 0.5 * (squares + determinants)
+        return found
 
     @property
     def _ratios(self) -> RatioPrior:
