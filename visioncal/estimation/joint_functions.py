@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, lapack
 from scipy.special import ive
 
-from visioncal.core.types import FloatArray, IntArray
+from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, HARMONICS, WEIGHT
 from visioncal.estimation.linalg import gram, weighted_gram
@@ -26,6 +26,7 @@ from visioncal.estimation.solve import RATIO_PRIOR, RobotLikelihood, robot_likel
 from visioncal.estimation.variance import (
     LEAST_SIGMA,
     MOST_SIGMA,
+    Knowledge,
     Likely,
     most_likely,
 )
@@ -197,19 +198,25 @@ class _Arm:
     """An arm with groups of errors whose sizes are sought.
 
     Attributes:
-        likelihood: Of the residuals, all errors of the arm among the unknowns.
+        nominal: The likelihood without errors of the arm.
+        mine: (u,) the units of the robot: no other has anything of its errors.
+        own: (m, 6 w, p) how what these say moves with the unknowns, the arm's errors last.
+        others: (u - m, 6 w, p - q) the same of the others, without the arm's errors.
+        known: What is known of the unknowns besides.
         names: The groups, in the order of the sizes.
         shares: (q, g) which share of the variance of each error a group's is.
-        random: (q,) their places among the unknowns that move.
         bases: The columns of each block but the harmonics.
         waves: The harmonics.
         torque_nm: The torque that a unit of a compliance is for [N m].
     """
 
-    likelihood: RobotLikelihood
+    nominal: RobotLikelihood
+    mine: Mask
+    own: FloatArray
+    others: FloatArray
+    known: Knowledge
     names: tuple[str, ...]
     shares: FloatArray
-    random: IntArray
     bases: Mapping[str, FloatArray]
     waves: _Waves
     torque_nm: float
@@ -225,7 +232,8 @@ class _Arm:
     ) -> "_Arm":
         basis = np.concatenate([*bases.values(), waves.columns], axis=2)
         size, likelihood = basis.shape[2], nominal.beside(robot, basis)
-        random = np.arange(size) + int(nominal.moving.sum())
+        mine = (nominal.members == robot).any(axis=1)
+        own, others = likelihood.jacobian[mine], nominal.jacobian[~mine]
         names = (*bases, "second", *([HARMONICS] if waves.length_rad else []))
         groups = np.repeat(np.arange(len(bases)), [it.shape[2] for it in bases.values()])
         shares = np.zeros((size, len(names)))
@@ -236,7 +244,13 @@ class _Arm:
             shares[second, -1], shares[second.stop :, -1] = waves.series[1], 1.0
             # The process's own first harmonic is among those of eccentric gears.
             shares[:, -1] += waves.series[0] * shares[:, names.index("eccentricity")]
-        return cls(likelihood, names, shares, random, bases, waves, torque_nm)
+        known = likelihood.known
+        return cls(nominal, mine, own, others, known, names, shares, bases, waves, torque_nm)
+
+    @property
+    def random(self) -> slice:
+        """The places of the arm's errors among the unknowns."""
+        return slice(self.others.shape[2], None)
 
     def springs_of(self, step: "_Step") -> FloatArray:
         """(n,) the compliances at some step; none without any."""
@@ -249,8 +263,8 @@ class _Arm:
 
     def start(self) -> FloatArray:
         """Logarithms of the robots' levels, and of the sizes of the groups."""
-        levels = np.maximum(self.likelihood.rms, LEAST_SIGMA)
-        count = len(self.likelihood.components.parts) // 2
+        levels = np.maximum(self.nominal.rms, LEAST_SIGMA)
+        count = len(self.nominal.components.parts) // 2
         return np.concatenate([np.log(np.tile(levels, count)), self._typical])
 
     @property
@@ -273,18 +287,24 @@ class _Arm:
             return None
 
     def _likelihood(self, logs: FloatArray) -> "_Step":
-        reduced, components = self.likelihood.reduced, self.likelihood.components
-        known, levels = self.likelihood.known, len(components.parts)
-        residuals, jacobian = reduced.errors, self.likelihood.jacobian
+        components, known, mine = self.nominal.components, self.known, self.mine
+        residuals, levels, plain = self.nominal.reduced.errors, len(components.parts), self.others
+        count = plain.shape[2]
+        inner = np.s_[:count, :count]
         sigmas, squares = np.exp(logs[:levels]), np.exp(2.0 * logs[levels:])
         total, variances = components.total(sigmas), self.shares @ squares
         weights = np.linalg.inv(total)
-        weighted = weights @ jacobian
-        information = gram(jacobian, weighted) + known.information
-        information[self.random, self.random] += 1.0 / variances
+        weighted, rest = weights[mine] @ self.own, weights[~mine] @ plain
+        information = gram(self.own, weighted) + known.information
+        information[inner] += gram(plain, rest)
+        diagonal = np.arange(count, len(information))
+        information[diagonal, diagonal] += 1.0 / variances
         inverse, log_determinant = _inverted(information)
-        best = inverse @ (gram(weighted, residuals) + known.gradient)
-        left = residuals - jacobian @ best
+        pull = gram(weighted, residuals[mine]) + known.gradient
+        pull[:count] += gram(rest, residuals[~mine])
+        best, left = inverse @ pull, residuals.copy()
+        left[mine] -= self.own @ best
+        left[~mine] -= plain @ best[:count]
         pulled = (weights @ left[:, :, None])[:, :, 0]
         effects = best[self.random]
         value = 0.5 * float(
@@ -296,7 +316,11 @@ class _Arm:
             + np.sum(effects**2 / variances)
         )
         growth = 2.0 * sigmas[:, None, None] ** 2 * components.parts
-        taken = np.array([np.sum(inverse * weighted_gram(weighted, it)) for it in growth])
+        taken = np.array([
+            np.sum(inverse * weighted_gram(weighted, it[mine]))
+            + np.sum(inverse[inner] * weighted_gram(rest, it[~mine]))
+            for it in growth
+        ])  # fmt: skip
         own = np.diagonal(weights, axis1=1, axis2=2)
         by_levels = 0.5 * (np.einsum("kui,ui->k", growth, own - pulled**2) - taken)
         asked = growth * pulled
@@ -304,11 +328,12 @@ class _Arm:
         posterior = np.diag(inverse)[self.random] + effects**2
         by_sizes = (1.0 / variances - posterior / variances**2) @ owned
         # Products of the residuals' growth with each level and size, as the average information.
-        moved = np.zeros((len(best), len(squares)))
-        moved[self.random] = 2.0 * owned * (effects / variances)[:, None]
-        by_moved = (jacobian.reshape(-1, len(best)) @ moved).reshape(*residuals.shape, -1)
-        grown = np.concatenate([np.moveaxis(asked, 0, 2), by_moved], axis=2)
-        of_weights = gram(weighted, grown)
+        moved = 2.0 * owned * (effects / variances)[:, None]
+        grown = np.zeros((*residuals.shape, levels + len(squares)))
+        grown[..., :levels] = np.moveaxis(asked, 0, 2)
+        grown[mine, :, levels:] = self.own[:, :, self.random] @ moved
+        of_weights = gram(weighted, grown[mine])
+        of_weights[:count] += gram(rest, grown[~mine])
         curvature = 0.5 * (gram(grown, weights @ grown) - of_weights.T @ inverse @ of_weights)
         slope = np.concatenate([by_levels, by_sizes])
         away = (logs[levels:] - self._typical) / _SPREAD
@@ -350,9 +375,9 @@ class _Arm:
 
     def _determined(self, logs: FloatArray, sizes: FloatArray) -> FloatArray:
         """(q, r) unit vectors, in units of (q,) sizes, of harmonics that residuals determine."""
-        components = self.likelihood.components
-        weights = np.linalg.inv(components.total(np.exp(logs[: len(components.parts)])))
-        jacobian = self.likelihood.jacobian[:, :, self.random[-len(sizes) :]] * sizes
+        components = self.nominal.components
+        weights = np.linalg.inv(components.total(np.exp(logs[: len(components.parts)]))[self.mine])
+        jacobian = self.own[:, :, -len(sizes) :] * sizes
         values, vectors = np.linalg.eigh(gram(jacobian, weights @ jacobian))
         return np.asarray(vectors[:, values > _INFORMATIVE])
 
