@@ -106,8 +106,11 @@ class _Search:
         return replace(fit, noise=replace(fit.noise, robots=robots))
 
     def distances(self, used: Mask, fit: Solution) -> Distances:
-        # What is far away is wrong, however little is known of where it should be.
         found, far = distances(self.problem, used, fit), ~_near(self.problem, fit.state, used)
+        # What is far away is wrong, however little is known of where it should be; unless its own
+        # noise is as large, as of corners that deviate by pixels.
+        if far.any():
+            far &= ~explained_by_noise(self.problem, fit, len(self.problem))
         return replace(found, squares=np.where(far, np.inf, found.squares))
 
 

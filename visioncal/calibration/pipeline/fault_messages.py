@@ -288,10 +288,15 @@ def reasons(solved: Solved, faults: Sequence[PoseFault]) -> dict[int, str]:
             stops = [str(solved.cell.stops[it]) for it in fitting[at][:_NAMED]]
             one = "stop" if len(stops) == 1 else "another stop, as"
             cause = f"its image is of {one} {', '.join(stops)}; {cause}"
+        # Little may be known of where it should be: what is far away is wrong all the same.
+        beyond = (
+            f"{figure(times[at])} times the noise (limit {figure(limit[at])})"
+            if times[at] > limit[at]
+            else "many times as far as most"
+        )
         found[rows[at].view] = (
             f"disagrees with {rest}: it places {_called(solved, rows[at].seen)} {figure(mm)} mm"
-            f"{turned} away, {figure(times[at])} times the noise (limit {figure(limit[at])}); "
-            f"{cause}"
+            f"{turned} away, {beyond}; {cause}"
         )
     return found
 
