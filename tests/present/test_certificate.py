@@ -2,6 +2,9 @@
 
 from dataclasses import replace
 
+import pypdfium2
+import pytest
+from support import browser
 from support.broken_sessions import BROKEN, sound_session
 from support.commands import visioncal
 from support.pages import Page
@@ -33,6 +36,20 @@ def test_a_certificate_says_whose_it_is_and_has_room_to_sign(tmp_path):
     many = replace(sample.calibration, views=sample.calibration.views * 50)
     write_certificate(page, many, None, Signed())
     assert abs(len(Page(page.read_text("utf-8")).words) - len(words)) < 200
+
+
+@pytest.mark.skipif(browser.CHROMIUM is None, reason="Chromium is not installed here")
+def test_it_prints_on_one_page(tmp_path):
+    sample = made_up()
+    page = tmp_path / "certificate.html"
+    write_certificate(page, sample.calibration, sample.session, Signed("A. Smith", {"camera": "1"}))
+    with browser.chromium(tmp_path / "profile") as chromium:
+        chromium.visit(page.as_uri())
+        (printed,) = pypdfium2.PdfDocument(chromium.printed())
+    # A4, in points of 1/72 inch; a browser rounds to a pixel of 3/4 point.
+    assert printed.get_size() == pytest.approx((595.3, 841.9), abs=1.0)
+    words = printed.get_textpage().get_text_range()
+    assert "Checked by, date" in words
 
 
 def test_a_result_comes_out_again_of_its_recording(tmp_path):

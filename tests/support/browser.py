@@ -85,6 +85,10 @@ class Page:
         data = base64.b64decode(self.call("Page.captureScreenshot")["data"])
         return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
 
+    def printed(self) -> bytes:
+        """The PDF that printing the page gives."""
+        return base64.b64decode(self.call("Page.printToPDF", preferCSSPageSize=True)["data"])
+
     def picture_once(self, is_drawn, patience_s: float) -> np.ndarray:
         """Takes pictures until one passes; the last one where the patience ends."""
         end = time.monotonic() + patience_s

@@ -21,6 +21,7 @@ from visioncal.present.recording import board, colours, paths
 from visioncal.present.recording.arm import log_arm
 from visioncal.present.recording.celltext import sight_markdown, verdict_markdown
 from visioncal.present.recording.frames import Frame, scan
+from visioncal.present.recording.notes import log_verdict, markdown
 from visioncal.present.recording.reader import chunks
 from visioncal.present.recording.recorder import Recorder
 from visioncal.present.recording.scene import image_plane
@@ -208,7 +209,7 @@ def _log_static(stream: rr.RecordingStream, scene: CellScene) -> None:
             base = rr.CoordinateFrame(found.frames[frame])
             stream.log(f"{arm_entity(frame)}/{part}", base, static=True)
     _log_network(stream, found)
-    stream.log(paths.VERDICT, _markdown(verdict_markdown(found)), static=True)
+    log_verdict(stream, found.verdict, verdict_markdown(found))
     for seer in dict.fromkeys(it.seer for it in found.sights):
         for name, colour in ((paths.USED, colours.USED), (paths.REJECTED, colours.REJECTED)):
             points = rr.SeriesPoints(colors=colour, marker_sizes=4.0, names=f"{seer}, {name}")
@@ -325,7 +326,7 @@ def _log_view(
     size_m = 2.0 * scene.size_m
     _log_lines(stream, paths.SIGHT_LINE, paths.CELL_FRAME, strips, colour, size_m, static=False)
     note = sight_markdown(view, sight, scene.unposed(view.number))
-    stream.log(paths.VIEW_NOTE, _markdown(note))
+    stream.log(paths.VIEW_NOTE, markdown(note))
 
 
 def _middle(scene: CellScene, frame: str, cell_from_frame: FloatArray) -> FloatArray:
@@ -355,7 +356,3 @@ def _log_robot(stream: rr.RecordingStream, scene: CellScene, flange: str, view: 
         [[np.zeros(3), pose[:3, 3]]], colors=colours.JOINT, radii=2.0 * _LINE * scene.size_m
     )
     stream.log(f"{arm_entity(flange)}/reach", line)
-
-
-def _markdown(text: str) -> rr.TextDocument:
-    return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)

@@ -4,6 +4,8 @@ USED = (70, 150, 250)
 REJECTED = (230, 70, 60)
 # Stands out from the others on dark and on light ground.
 THIS_VIEW = (250, 165, 30)
+# By a verdict's status, as in the report.
+VERDICT = {"good": (26, 122, 56), "check": (226, 173, 69), "bad": (194, 43, 38)}
 
 LINK = (186, 193, 204)
 JOINT = (68, 80, 100)

@@ -38,16 +38,23 @@ _ROOM = 1.25
 
 def log_static(stream: rr.RecordingStream, calibration: Calibration) -> None:
     """Logs the verdict, the comparison of the solvers, and how the residuals' plots look."""
+    log_verdict(stream, calibration.verdict, verdict_markdown(calibration))
     for entity, text in (
-        (paths.VERDICT, verdict_markdown(calibration)),
         (paths.FIGURES, figures_markdown(calibration)),
         (paths.SOLVERS, solvers_markdown(calibration)),
     ):
-        stream.log(entity, _markdown(text), static=True)
+        stream.log(entity, markdown(text), static=True)
     for plot in _PLOTS:
         for name, label, colour, marker, size in _MARKS:
             points = rr.SeriesPoints(colors=colour, markers=marker, marker_sizes=size, names=label)
             stream.log(f"{plot}/{name}", points, static=True)
+
+
+def log_verdict(stream: rr.RecordingStream, verdict: Verdict, text: str) -> None:
+    """Logs a verdict's text, and a point in its colour: a view of nothing says that it is empty."""
+    stream.log(paths.VERDICT, markdown(text), static=True)
+    point = rr.Points2D([[0.0, 0.0]], colors=colours.VERDICT[verdict.status])
+    stream.log(paths.VERDICT_STRIP, point, static=True)
 
 
 def _scales(views: Collection[ViewResult]) -> dict[str, float]:
@@ -283,5 +290,6 @@ def plain(text: str) -> str:
     return re.sub(r"([\\`*_{}\[\]()#+\-.!|<>~&])", r"\\\1", " ".join(text.split()))
 
 
-def _markdown(text: str) -> rr.TextDocument:
+def markdown(text: str) -> rr.TextDocument:
+    """A text that viewers render as Markdown."""
     return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)

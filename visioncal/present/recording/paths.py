@@ -100,6 +100,8 @@ POSITION_MM = f"{RESIDUALS}/position_mm"
 ORIENTATION_DEG = f"{RESIDUALS}/orientation_deg"
 REPROJECTION_PX = f"{RESIDUALS}/reprojection_px"
 VERDICT = "/notes/verdict"
+# A strip in the verdict's colour: texts have none.
+VERDICT_STRIP = "/verdict_strip"
 FIGURES = "/notes/figures"
 SOLVERS = "/notes/solvers"
 TOOLS = "/notes/tools_and_fixtures"

@@ -6,7 +6,7 @@ import rerun.blueprint as rrb
 
 from visioncal.present.recording import paths
 from visioncal.present.recording.cells import residual_entity
-from visioncal.present.viewer.layout import eye_on
+from visioncal.present.viewer.layout import eye_on, verdict_views
 from visioncal.results import Alignment
 from visioncal.session import Session
 
@@ -22,13 +22,13 @@ def cell_blueprint(session: Session, found: Alignment) -> rrb.Blueprint:
         found: The result.
     """
     has_images = any(view.image for view in session.views)
-    verdict = rrb.TextDocumentView(name="Verdict", origin=paths.VERDICT)
+    verdict = verdict_views(found.verdict)
     note = rrb.TextDocumentView(name="This view", origin=paths.VIEW_NOTE)
     image = rrb.Spatial2DView(
         name="Image", origin=paths.IMAGE, contents=["$origin/**"], visual_bounds=_bounds(found)
     )
     right = (
-        rrb.Vertical(verdict, image, note, row_shares=[3.2, 4.0, 1.4])
+        rrb.Vertical(verdict, image, note, row_shares=[3.7, 3.8, 1.4])
         if has_images
         else rrb.Vertical(verdict, note, row_shares=[3, 1])
     )

@@ -7,7 +7,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from visioncal.core.types import FloatArray
-from visioncal.present.recording import paths
+from visioncal.core.verdict import Verdict
+from visioncal.present.recording import colours, paths
 from visioncal.present.recording.coverage import AXES_RINGS_DEG, DIRECTIONS_RINGS_DEG
 from visioncal.results import Calibration
 from visioncal.results.arm import ArmResult
@@ -55,10 +56,11 @@ def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.B
         not results or any(view.residual_deg is not None for view in results),
         session.mount != "instrument",
     )
+    verdict = None if calibration is None else calibration.verdict
     eye = _eye(session, calibration)
     arm = None if calibration is None else calibration.arm
     tabs = rrb.Tabs(
-        _overview(contents, eye),
+        _overview(contents, eye, verdict),
         *([] if arm is None or not arm.is_calibrated else [_arm(arm, eye)]),
         *([] if calibration is None or calibration.thermal is None else [_warming()]),
         *([_explained()] if calibration is not None and calibration.dense is not None else []),
@@ -80,7 +82,9 @@ def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.B
     )
 
 
-def _overview(contents: _Contents, eye: rrb.EyeControls3D | None) -> rrb.Container:
+def _overview(
+    contents: _Contents, eye: rrb.EyeControls3D | None, found: Verdict | None
+) -> rrb.Container:
     cell = rrb.Spatial3DView(
         name="Cell",
         origin="/",
@@ -92,7 +96,7 @@ def _overview(contents: _Contents, eye: rrb.EyeControls3D | None) -> rrb.Contain
     )
     plots = _plots(contents)
     left = rrb.Vertical(cell, rrb.Horizontal(*plots[:1], *plots[1:][-1:]), row_shares=[3, 1])
-    verdict = _verdict(contents)
+    verdict = _verdict(contents, found)
     note = rrb.TextDocumentView(name="This view", origin=paths.VIEW_NOTE)
     if not contents.images:
         right = rrb.Vertical(verdict, note, row_shares=[2, 1])
@@ -102,7 +106,7 @@ def _overview(contents: _Contents, eye: rrb.EyeControls3D | None) -> rrb.Contain
         origin=paths.IMAGE,
         contents=["$origin/**"],
     )
-    right = rrb.Vertical(verdict, image, note, row_shares=[3.2, 4.4, 1.6])
+    right = rrb.Vertical(verdict, image, note, row_shares=[3.7, 4.2, 1.5])
     return rrb.Horizontal(left, right, name="Overview", column_shares=[1.2, 1])
 
 
@@ -177,9 +181,20 @@ def _arm(found: ArmResult, eye: rrb.EyeControls3D | None) -> rrb.Container:
     return rrb.Horizontal(left, note, name="Arm", column_shares=[1.4, 1])
 
 
-def _verdict(contents: _Contents) -> rrb.Container | rrb.View:
+def verdict_views(found: Verdict | None) -> rrb.Container | rrb.View:
+    """The verdict's text, below a strip in its colour once there is one."""
+    text = rrb.TextDocumentView(name="Verdict", origin=paths.VERDICT)
+    if found is None:
+        return text
+    strip = rrb.Spatial2DView(
+        name=found.headline, origin=paths.VERDICT_STRIP, background=[*colours.VERDICT[found.status]]
+    )
+    return rrb.Vertical(strip, text, row_shares=[1, 8], name="Verdict")
+
+
+def _verdict(contents: _Contents, found: Verdict | None) -> rrb.Container | rrb.View:
     """The verdict, and what is said of tools and fixtures behind it."""
-    verdict = rrb.TextDocumentView(name="Verdict", origin=paths.VERDICT)
+    verdict = verdict_views(found)
     if not contents.frames:
         return verdict
     tools = rrb.TextDocumentView(name="Tools and fixtures", origin=paths.TOOLS)
