@@ -17,6 +17,7 @@ from visioncal.simulation import (
     CameraAt,
     checkerboard_target,
     fine_camera,
+    network_session,
     simulate_network,
 )
 from visioncal.simulation.records import POSE, pose_row
@@ -287,3 +288,12 @@ def test_a_mirrored_camera_beside_the_robots_is_named(session):
     assert found.words.startswith("Camera cam_right: With the images mirrored")
     # There are no images to look at.
     assert str(found.do).startswith("In corners.csv, u_px counts to the right")
+
+
+@pytest.mark.parametrize("seed", [6, 7])
+def test_poses_that_were_measured_worse_than_others_are_no_outliers(seed):
+    # A board that is seen squarely turns unseen: errors of its pose have no single size.
+    poses = network_session(simulate_network(replace(CELL, seed=seed)), "two arms", seen="poses")
+    found = align(poses)
+    assert found.verdict.status == "good"
+    assert all(it.used for it in found.sights)

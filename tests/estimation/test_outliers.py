@@ -108,7 +108,9 @@ def test_a_wrong_image_does_not_take_a_sound_one_of_its_stop_with_it(times, meas
     problem = looked_at_again(known.solved.problem.with_effects([]), times)
     if measured:
         unknown = np.zeros_like(problem.observations.covariance)
-        seen = replace(problem.observations, covariance=unknown)
+        seen = replace(
+            problem.observations, covariance=unknown, is_uneven=np.ones(len(unknown), dtype=bool)
+        )
         problem = replace(problem, observations=seen, is_combined=True)
     assert inliers(problem).used.all()
     wrong = problem.observations.measured.copy()

@@ -140,6 +140,7 @@ def observed(world, rng, changed=None, noise=1.0):
         np.array(rows),
         np.tile(np.diag(CAMERA_SIGMAS**2), (count, 1, 1)),
         np.ones(count, dtype=bool),
+        np.zeros(count, dtype=bool),
     )
     return Problem(world.tree(), reported, observations)
 

@@ -81,6 +81,7 @@ class ArmPair:
             np.tile(np.eye(4), (count, 1, 1)),
             np.tile(np.eye(6), (count, 1, 1)),
             np.ones(count, dtype=bool),
+            np.zeros(count, dtype=bool),
         )
         here = replace(
             self.problem,

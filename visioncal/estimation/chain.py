@@ -99,6 +99,7 @@ def chain(
             cam_from_target,
             np.zeros((count, 6, 6)) if covariance is None else covariance,
             np.ones(count, dtype=bool),
+            np.full(count, covariance is None),
         ),
         tuple(it for it in effects if len(it)),
         tuple(priors),

@@ -129,9 +129,8 @@ def distances(problem: Problem, used: Mask, fit: Solution) -> Distances:
     edges = int(problem.counted[: 6 * len(problem.unknown)].sum())
     freedom = max(0.5 * (float(problem.observations.directions[used].sum()) - edges), 6.0)
     limit = counted * f_limit(_FALSE_ALARM / len(problem), counted, freedom)
-    # Poses that were measured by others are better in some views than in others, and nobody says
-    # how much.
-    return Distances(squares, directions, _UNEVEN**2 * limit if problem.is_combined else limit)
+    uneven = np.where(problem.observations.is_uneven, _UNEVEN**2, 1.0)
+    return Distances(squares, directions, uneven * limit)
 
 
 def agree(problem: Problem, state: State | None = None, movable: Sequence[str] = ()) -> Agreed:

@@ -29,6 +29,8 @@ class Observations:
         measured: (n, 4, 4) `observer_from_observed`.
         covariance: (n, 6, 6) of its right perturbation, at a sensor's level of one.
         has_rotation: (n,) whether its rotation was measured; else its place alone.
+        is_uneven: (n,) whether its covariance is a guess: some are better than others, and nobody
+            says how much.
     """
 
     observers: tuple[str, ...]
@@ -38,6 +40,7 @@ class Observations:
     measured: FloatArray
     covariance: FloatArray
     has_rotation: Mask
+    is_uneven: Mask
 
     def __len__(self) -> int:
         return len(self.stops)
@@ -58,6 +61,7 @@ class Observations:
             self.measured[rows],
             self.covariance[rows],
             self.has_rotation[rows],
+            self.is_uneven[rows],
         )
 
     def renamed(self, frame: str, other: str, rows: Mask) -> "Observations":

@@ -590,7 +590,9 @@ def problem_of(cell: Cell, views: Sequence[ViewPoses]) -> Problem:
     }
     # What one camera measured with one robot, without a word of its noise, has that of both as one.
     is_combined = cell.mount is not None and cell.mount != "instrument" and bool(given.any())
+    is_uneven = given & [not row.seer.startswith("instrument") for row in cell.rows]
     if is_combined:
+        is_uneven |= True
         sensors, covariance = [-1] * len(views), np.zeros((len(views), 6, 6))
     return Problem(
         cell.tree,
@@ -603,6 +605,7 @@ def problem_of(cell: Cell, views: Sequence[ViewPoses]) -> Problem:
             np.array([it.cam_from_target[0] for it in views]),
             covariance,
             ~places,
+            is_uneven,
         ),
         priors=cell.priors,
         points=frozenset(it.seen for it in cell.rows) - turned,
