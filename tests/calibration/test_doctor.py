@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from support.broken_sessions import BROKEN, broken_session, sound_session
+from support.broken_sessions import BROKEN, broken_session, edit_rows, sound_session
 from support.commands import visioncal as command
 from support.typed_fixes import mended
 
@@ -66,6 +66,19 @@ def test_what_is_wrong_is_named_first(tmp_path, name):
     done = command("doctor", folder, "--json")
     assert done.status == 3
     assert json.loads(done.out) == to_document(found)
+
+
+def test_rows_in_another_unit_are_corrected_and_not_taken_again(tmp_path):
+    def in_mm(rows):
+        for row in rows[3:6]:
+            row.update({it: repr(1e3 * float(row[it])) for it in ("x_m", "y_m", "z_m")})
+        return rows
+
+    folder = sound_session(tmp_path / "session", BROKEN["an image twice"])
+    edit_rows(folder, in_mm)
+    (found,) = (it for it in visioncal.doctor(folder).findings if it.kind == "lost_views")
+    assert "divide its x_m, y_m, z_m by 1000" in found.words
+    assert found.do.words == "In views.csv, correct the rows that are named, or delete them."
 
 
 @pytest.mark.parametrize("name", REFUSED)

@@ -232,12 +232,16 @@ def _lost(known: RunState) -> Iterator[Finding]:
     reasons: Mapping[int, str] = {
         view: why for view, why in known.reasons.items() if view not in absent
     }
-    for words in by_reason(reasons):
-        yield Finding(
-            "lost_views",
-            f"{words[0].upper()}{words[1:]}.",
-            Step("Look at the image, and repeat the view or take it out of views.csv."),
-        )
+    is_read = known.mount is not None and known.robots
+    posed = known.base_from_flange.keys() if is_read else reasons.keys()
+    of_rows = {view: why for view, why in reasons.items() if view not in posed}
+    of_images = {view: why for view, why in reasons.items() if view in posed}
+    for some, do in (
+        (of_rows, "In views.csv, correct the rows that are named, or delete them."),
+        (of_images, "Look at the image, and repeat the view or take it out of views.csv."),
+    ):
+        for words in by_reason(some):
+            yield Finding("lost_views", f"{words[0].upper()}{words[1:]}.", Step(do))
 
 
 def _coverage(known: RunState) -> Iterator[Finding]:
