@@ -9,9 +9,12 @@ from support.broken_sessions import BROKEN, sound_session
 from support.commands import visioncal
 from support.pages import Page
 from support.samples import made_up
+from support.whole_cells import OPTIONS, recorded
 
+import visioncal as package
 from visioncal.interchange.result_files import load_stored
 from visioncal.present.report.certificate import Signed, write_certificate
+from visioncal.simulation import simulate_network
 
 
 def test_a_certificate_says_whose_it_is_and_has_room_to_sign(tmp_path):
@@ -36,6 +39,15 @@ def test_a_certificate_says_whose_it_is_and_has_room_to_sign(tmp_path):
     many = replace(sample.calibration, views=sample.calibration.views * 50)
     write_certificate(page, many, None, Signed())
     assert abs(len(Page(page.read_text("utf-8")).words) - len(words)) < 200
+
+
+def test_the_certificate_of_a_whole_cell_names_all_that_is_in_it(tmp_path):
+    session = recorded(simulate_network(replace(OPTIONS, stops=10)))
+    page = tmp_path / "certificate.html"
+    write_certificate(page, package.calibrate(session), session, Signed())
+    words = Page(page.read_text("utf-8")).words
+    assert "Robots a (ur5e); b (ur5e) Cameras left; hand Boards " in words
+    assert "Mount" not in words
 
 
 @pytest.mark.skipif(browser.CHROMIUM is None, reason="Chromium is not installed here")

@@ -63,17 +63,24 @@ def write_certificate(
 def _cell(
     calibration: Calibration, session: Session | None, signed: Signed
 ) -> Iterator[tuple[str, str]]:
-    yield "Mount", calibration.mount
+    if calibration.cell is None:
+        yield "Mount", calibration.mount
     if calibration.robot is not None:
         yield "Robot", calibration.robot.name
     if session is not None:
-        yield "Camera", session.camera_name
-        boards = [
+        robots = {name: it.model for name, it in session.robots.items() if name and it.model}
+        if robots:
+            yield "Robots", "; ".join(f"{name} ({model})" for name, model in robots.items())
+        cameras = [it for it in session.cameras if it] or [session.camera_name]
+        yield "Cameras" if len(cameras) > 1 else "Camera", "; ".join(cameras)
+        boards = {
             f"{it.name}, {it.columns} x {it.rows}, {1e3 * it.square_m:g} mm"
+            if it.columns
+            else it.name
             for it in session.boards.values()
-        ]
+        }
         if boards:
-            yield "Board", "; ".join(boards)
+            yield "Boards" if len(boards) > 1 else "Board", "; ".join(sorted(boards))
     yield from ((f"Serial number, {of}", number) for of, number in signed.serials.items())
     if signed.operator:
         yield "Operator", signed.operator
