@@ -25,6 +25,7 @@ from visioncal.interchange.formats import (
     PoseImportOptions,
     assemble,
     convert,
+    guess_foreign,
     read_foreign,
 )
 
@@ -83,6 +84,11 @@ def test_pairs_by_order_are_told_and_two_columns_of_images_are_one_too_many(tmp_
     requested = replace(SEEN, images=tmp_path / "images")
     foreign = read_foreign(table("x,y,z,qx,qy,qz,qw", poses), requested)
     assert any("line 2 with 000.png, log.csv, line 10 with 008.png" in it for it in foreign.notes)
+    # Why they show nothing is said before any reading is tried.
+    with pytest.raises(DataError, match=r"No board can be read in 9 views.*almost uniform"):
+        guess_foreign(foreign)
+    with pytest.raises(DataError, match="elsewhere does not exist"):
+        read_foreign(tmp_path / "log.csv", replace(SEEN, images=tmp_path / "elsewhere"))
     both = [[f"{at:03d}.png", f"{at:03d}.png", *it] for at, it in enumerate(poses)]
     with pytest.raises(DataError, match=r"left, right name images.*--image-column"):
         read_foreign(table("left,right,x,y,z,qx,qy,qz,qw", both), requested)

@@ -8,12 +8,12 @@ import numpy as np
 
 from visioncal.calibration.pipeline.guess_inputs import reading_hint, readings_in_cell
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.pipeline.running import known_at_first, unseen_cause
+from visioncal.calibration.pipeline.running import known_at_first
 from visioncal.calibration.pipeline.solving import first_agreement
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.cell import read_cell
 from visioncal.calibration.stages.observed import CameraLook, by_reason
-from visioncal.calibration.stages.pictures import unnamed_images
+from visioncal.calibration.stages.pictures import unnamed_images, unseen_cause
 from visioncal.core.errors import VisioncalError
 from visioncal.core.files import some_of
 from visioncal.core.limits import CalibrationLimits

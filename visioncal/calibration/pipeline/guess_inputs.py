@@ -22,6 +22,7 @@ from visioncal.calibration.stages.clocks import waits_for_clock
 from visioncal.calibration.stages.init_frames import init_frames
 from visioncal.calibration.stages.joints import match_joints
 from visioncal.calibration.stages.judge import is_scattered
+from visioncal.calibration.stages.pictures import because, unseen_cause
 from visioncal.calibration.stages.robots import Pair, pairs_of
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.errors import VisioncalError
@@ -306,7 +307,13 @@ def _seen(known: RunState) -> RunState:
     names = (*_SEEING, "robot", "clock") if waits_for_clock(known.session) else _SEEING
     for stage in STAGES:
         if stage.name in names:
-            known = stage.run(known)
+            try:
+                known = stage.run(known)
+            except VisioncalError as error:
+                cause = unseen_cause(known)
+                if cause is None:
+                    raise
+                raise because(error, cause) from error
     return known
 
 

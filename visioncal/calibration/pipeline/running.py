@@ -19,12 +19,12 @@ from visioncal.calibration.stages.dense import Dense
 from visioncal.calibration.stages.handeye import SOLVER_NAMES
 from visioncal.calibration.stages.kinematics import check_level
 from visioncal.calibration.stages.next_views_hint import of_arm_that_cannot_tilt, with_proposal
-from visioncal.calibration.stages.pictures import other_board, pairing
+from visioncal.calibration.stages.pictures import because, unseen_cause
 from visioncal.core.choices import CONVENTIONS, Convention, SolverName
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Progress
-from visioncal.core.verdict import MISSING, Finding
+from visioncal.core.verdict import Finding
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
@@ -159,12 +159,12 @@ def run_steps(known: RunState) -> RunState:
                 more = [it for it in known.lost_views if it not in error.culprits]
                 cause = unseen_cause(known)
                 if cause is not None:
-                    raise _because(error.with_culprits(more), cause) from error
+                    raise because(error.with_culprits(more), cause) from error
                 if known.mount is None:
                     hint = hint or next(readings_in_cell(known), None)
                     if hint is None:
                         raise
-                    raise _because(error, hint) from error
+                    raise because(error, hint) from error
                 raise _with_hint(error.with_culprits(more), seen, hint) from error
             # Joints that are misread explain themselves, and would mislead a guess about poses.
             if stage.name == "joints":
@@ -176,33 +176,6 @@ def run_steps(known: RunState) -> RunState:
                 # Of exchanged rows the others are as they should be.
                 known = replace(known, is_misread=hint is not None and not hint.views)
         return _with_other_board(_with_reading(known, seen, hint))
-
-
-def unseen_cause(known: RunState) -> Finding | None:
-    """Says why images show nothing, once they were looked at: missing files, or another board.
-
-    Args:
-        known: What is known so far.
-
-    Returns:
-        It; None where the target is in most of the images, or nothing else is seen.
-    """
-    session = known.session
-    with_image = [it for it in session.views if it.image and not it.has_corners]
-    seen = known.poses.keys() | known.corners.keys()
-    unseen = [it for it in with_image if it.number not in seen]
-    if not with_image or 3 * len(unseen) < len(with_image):
-        return None
-    missing = next((it for it in pairing(session) if it.kind == MISSING), None)
-    if missing is not None and 2 * len(missing.views) > len(unseen):
-        return missing
-    return other_board(session, unseen)
-
-
-def _because(error: VisioncalError, cause: Finding) -> VisioncalError:
-    """The same refusal with its cause first."""
-    message = f"{cause.words} {error.message}"
-    return type(error)(message, culprits=error.culprits, next_step=str(cause.do or ""))
 
 
 def _with_hint(

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from visioncal.core.errors import DataError
+from visioncal.calibration.stages.observed import Observed
+from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import some_of
 from visioncal.core.limits import MAX_BLUR_PX
 from visioncal.core.types import Image, Target
@@ -121,6 +122,33 @@ def _unnamed(session: Session) -> list[str]:
     found = (file for it in folders for file in (store.folder / it).glob("*"))
     paths = (it.relative_to(store.folder).as_posix() for it in found if it.suffix in _ENDINGS)
     return sorted(set(paths) - named)
+
+
+def unseen_cause(seen: Observed) -> Finding | None:
+    """Says why images show nothing, once they were looked at: missing files, or another board.
+
+    Args:
+        seen: What is known so far.
+
+    Returns:
+        It; None where the target is in most of the images, or nothing else is seen.
+    """
+    session = seen.session
+    with_image = [it for it in session.views if it.image and not it.has_corners]
+    there = seen.poses.keys() | seen.corners.keys()
+    unseen = [it for it in with_image if it.number not in there]
+    if not with_image or 3 * len(unseen) < len(with_image):
+        return None
+    missing = next((it for it in pairing(session) if it.kind == MISSING), None)
+    if missing is not None and 2 * len(missing.views) > len(unseen):
+        return missing
+    return other_board(session, unseen)
+
+
+def because(error: VisioncalError, cause: Finding) -> VisioncalError:
+    """The same refusal with its cause first."""
+    message = f"{cause.words} {error.message}"
+    return type(error)(message, culprits=error.culprits, next_step=str(cause.do or ""))
 
 
 def other_board(session: Session, unseen: Sequence[View]) -> Finding | None:
