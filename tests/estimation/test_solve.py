@@ -155,11 +155,11 @@ def test_errors_of_an_arm_beside_a_likelihood_are_those_of_a_wider_problem(kind)
     beside = robot_likelihood(problem, fit.state, fit.noise).beside(0, moves)
     expected = robot_likelihood(wider, there, fit.noise)
     np.testing.assert_allclose(beside.jacobian, expected.jacobian, rtol=1e-6, atol=1e-9)
+    if kind == "places":  # These leave rotations open: the rounding of none decides the likelihood.
+        return
     # What the wider problem has left of the arm's columns beside them is rounding.
-    levels = 2.0 * fit.noise.robots
-    found, values = (
-        it.most_likely(levels, np.zeros(2, dtype=bool))[1] for it in (beside, expected)
-    )
+    levels, fixed = 2.0 * fit.noise.robots, np.zeros(2, dtype=bool)
+    found, values = (it.most_likely(levels, fixed)[1] for it in (beside, expected))
     assert found == pytest.approx(values, abs=1e-5)
 
 

@@ -168,13 +168,15 @@ def most_likely(
         fading = (now.slope > 0.0) & (now.slope < hardly) & (damping < 1.0)
         falling = free & fading & (np.diag(now.curvature) < _VARIANCES * now.slope)
         least = np.maximum(low - logs, np.where(falling, -_LONGEST_FALL, -_LONGEST_STEP))
-        step = _bounded_step(
-            now.slope, curvature, np.where(free, least, 0.0),
-            np.where(free, np.minimum(high - logs, _LONGEST_STEP), 0.0), falling,
+        # A variance that falls to nothing moves all else like half a step of its logarithm.
+        fall = np.where(falling, 0.5 * np.expm1(2.0 * least), 0.0)
+        near = _bounded_step(
+            now.slope + curvature @ fall, curvature, np.where(free & ~falling, least, 0.0),
+            np.where(free & ~falling, np.minimum(high - logs, _LONGEST_STEP), 0.0),
         )  # fmt: skip
+        step = np.where(falling, least, near)
         candidate, moved = logs + step, np.abs(step).max(initial=0.0)
-        near = np.where(falling, 0.0, step)
-        gained = -float(near @ (now.slope + 0.5 * now.curvature @ near))
+        gained = -float(near @ (now.slope + now.curvature @ (fall + 0.5 * near)))
         gained += 0.5 * float(now.slope[falling].sum())
         if damping < 1.0:
             if moved < settled or gained < little:
@@ -197,10 +199,10 @@ def most_likely(
 
 
 def _bounded_step(
-    slope: FloatArray, curvature: FloatArray, least: FloatArray, most: FloatArray, falling: Mask
+    slope: FloatArray, curvature: FloatArray, least: FloatArray, most: FloatArray
 ) -> FloatArray:
     """Newton's step (k,) within bounds: where some of it would leave them, the rest follows."""
-    step, bound = np.where(falling, least, 0.0), falling | (least == most)
+    step, bound = np.zeros(len(slope)), least == most
     for _ in range(len(slope)):
         rest = ~bound
         left = -(slope + curvature @ np.where(bound, step, 0.0))[rest]
