@@ -58,8 +58,7 @@ MIRRORED_CORNERS = Step(
 )
 _UNRECORDED = Step(
     "Look how the poses were recorded: a logger that repeats one pose, or that writes rotations as "
-    "0, 0, 0, 1, gives no calibration. Record them again, at the same time as the images.",
-    CALIBRATE,
+    "0, 0, 0, 1, gives no calibration. Record them again, at the same time as the images."
 )
 
 
