@@ -4,6 +4,8 @@ import io
 import json
 import os
 import re
+import subprocess
+import sys
 import time
 from contextlib import redirect_stderr
 from pathlib import Path
@@ -366,3 +368,24 @@ def test_boards_and_robots_are_found_from_any_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = {*target_names(), *robot_names()}
     assert {"charuco_9x6_30mm", "checkerboard_9x6_25mm", "ur10e", "panda"} <= names
+
+
+def test_arrow_does_not_load_pandas_while_a_command_runs():
+    pytest.importorskip("pandas", reason="the extra pandas is not installed")
+    code = """if True:
+        import sys
+        import pyarrow
+        from visioncal.cli import app as application
+
+        def command():
+            # Of another type than arrow would find, so that it looks at what it was given.
+            assert pyarrow.array([1, 2], pyarrow.uint8()).to_pylist() == [1, 2]
+            assert "pandas" not in sys.modules
+
+        application.app = command
+        application.main()
+        import pandas
+        assert pyarrow.Table.from_pandas(pandas.DataFrame({"a": [1]})).num_rows == 1
+    """
+    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

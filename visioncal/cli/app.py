@@ -1,5 +1,6 @@
 """The application: its commands, and how their ends become exit statuses."""
 
+import atexit
 import gc
 import sys
 from errno import ENAMETOOLONG
@@ -75,7 +76,9 @@ def main() -> None:
     # A thousand modules make many objects that stay: looking for garbage among them as often as
     # Python does takes a twentieth of a small calibration's time, and finds none.
     gc.set_threshold(20_000)
-    with guarded_streams():
+    # Nor does Python find any among them as it ends, which takes as long again.
+    atexit.register(gc.freeze)
+    with guarded_streams(), _WithoutPandas():
         try:
             app()
         except VisioncalError as error:
@@ -84,6 +87,26 @@ def main() -> None:
             if error.errno != ENAMETOOLONG:
                 raise
             _refuse(DataError(f"{error.filename} is longer than the name of any file."))
+
+
+class _WithoutPandas:
+    """Hides pandas, which no command uses.
+
+    Arrow would import it, where it is installed, to see whether an array is one of pandas: half a
+    second before the first line of a recording.
+    """
+
+    def find_spec(self, fullname: str, path: object, target: object = None) -> None:
+        """Finds nothing, and no pandas."""
+        del path, target
+        if fullname == "pandas":
+            raise ModuleNotFoundError("commands do without pandas", name=fullname)
+
+    def __enter__(self) -> None:
+        sys.meta_path.insert(0, self)
+
+    def __exit__(self, *_: object) -> None:
+        sys.meta_path.remove(self)
 
 
 def _refuse(error: VisioncalError) -> None:
