@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.commands import visioncal
 from support.problems import observed, pose, world
 from support.whole_cells import FLOOR, OPTIONS, PLATE, part, recorded
 
@@ -297,3 +298,10 @@ def test_poses_that_were_measured_worse_than_others_are_no_outliers(seed):
     found = align(poses)
     assert found.verdict.status == "good"
     assert all(it.used for it in found.sights)
+
+
+def test_a_few_uneven_poses_are_no_move(tmp_path):
+    simulated = ("simulate", tmp_path / "cell", "--cell", "camera-and-tracker", "--no-images")
+    assert visioncal(*simulated, "--seed", "6").status == 0
+    found = align(Session.load(tmp_path / "cell"))
+    assert (found.verdict.status, found.moved) == ("good", ())

@@ -18,9 +18,9 @@ from visioncal.estimation.chain import chain
 from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.lens_field import LensLevels
 from visioncal.estimation.outliers import inliers
-from visioncal.estimation.parts import ROBOT
+from visioncal.estimation.parts import ROBOT, State
 from visioncal.estimation.residual_tests import drift, lens_field, neighbours
-from visioncal.estimation.solve import covariance_of
+from visioncal.estimation.solve import covariance_of, fit_problem
 from visioncal.estimation.variance import profile_interval
 from visioncal.simulation import CellOptions, fine_camera, simulate
 
@@ -77,6 +77,19 @@ def test_a_bump_is_told_from_a_creep(mount):
         assert len(words) == 1
         assert "from view 8 on" in words[0]
         assert not any("drift with time" in it.reason for it in known.warnings)
+
+
+def test_what_a_block_of_stops_alone_determines_is_not_left_out():
+    cell = simulate(replace(FINE, views=24, seed=1))
+    measured = cell.cam_from_target @ exp(1e-4 * np.random.default_rng(0).normal(size=(24, 6)))
+    # The last block's stops are the only ones that see a second target.
+    targets = ("target_a",) * 22 + ("target_b",) * 2
+    edges = inliers(chain("eye-in-hand", cell.base_from_flange, measured)).fit.state.edges
+    problem = chain("eye-in-hand", cell.base_from_flange, measured, targets=targets)
+    fit = fit_problem(problem, State(edges[[0, 1, 1]], np.zeros(0)), None)
+    found = neighbours(problem, fit.state, fit.noise, ROBOT)
+    assert not found.is_significant
+    assert 0.2 < found.factor < 3.0  # of nine blocks, 54 directions
 
 
 def test_a_bump_among_measured_poses_is_found():

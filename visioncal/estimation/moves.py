@@ -15,7 +15,7 @@ from visioncal.core.quantiles import chi2_limit, f_limit
 from visioncal.core.transforms import adjoint, exp, invert, log
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.linalg import covariance_from, scaled_values
-from visioncal.estimation.parts import State
+from visioncal.estimation.parts import UNEVEN, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import (
     RepeatErrors,
@@ -314,6 +314,7 @@ def slight_move(problem: Problem, fit: Solution, movable: Sequence[str]) -> Move
         for stop in stops[_FEWEST : 1 - _FEWEST].tolist():
             seen[stop].append(place)
     tried = int(problem.observations.stops.max()) + 1
+    spread = np.array([_spread_of_means(problem, it) for it in movable])
     best, limit = None, _move_limit(problem, len(movable) * tried)
     for stop, information, gradient in equations_from(problem, fit, errors, columns.ravel()):
         if stop not in seen:
@@ -325,7 +326,7 @@ def slight_move(problem: Problem, fit: Solution, movable: Sequence[str]) -> Move
         steps = -(covariance_from(own) @ asked[..., None])[..., 0]
         clear = (values[:, 0] >= _TAKEN * values[:, -1]) & (values[:, -1] > 0.0)
         clear &= scaled_values(own)[:, 0] >= _TAKEN
-        squares = np.where(clear, -np.sum(steps * asked, axis=1), 0.0)
+        squares = np.where(clear, -np.sum(steps * asked, axis=1), 0.0) / spread[seen[stop], stop]
         if (most := float(squares.max())) > limit:
             place = int(squares.argmax())
             best, limit = (movable[seen[stop][place]], stop, steps[place]), most
@@ -334,6 +335,20 @@ def slight_move(problem: Problem, fit: Solution, movable: Sequence[str]) -> Move
     frame, stop, step = best
     found = _move(problem, _Step(0, frame, stop, exp(step)))
     return replace(found, mahalanobis_sq=limit)
+
+
+def _spread_of_means(problem: Problem, frame: str) -> FloatArray:
+    """(s,) how much more a step of a frame before each stop may vary, if its views are uneven.
+
+    Of the n views of the shorter side one may err by `UNEVEN` times what the others do. With one
+    robot the step itself is in the noise of all, which bounds the evidence for it.
+    """
+    seen = problem.observations
+    mine = seen.involves(frame) & seen.is_uneven & (not problem.is_combined)
+    counts = np.bincount(seen.stops[mine], minlength=int(seen.stops.max()) + 1)
+    before = np.cumsum(counts) - counts
+    shorter = np.minimum(before, counts.sum() - before)
+    return np.asarray(1.0 + (UNEVEN**2 - 1.0) * (mine.any() / np.maximum(shorter, 1)))
 
 
 def _move_limit(problem: Problem, tried: int) -> float:

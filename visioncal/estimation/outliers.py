@@ -30,7 +30,7 @@ from visioncal.estimation.moves import (
     unmoved,
 )
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
-from visioncal.estimation.parts import Noise, State
+from visioncal.estimation.parts import UNEVEN, Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.robust import (
     Distances,
@@ -61,8 +61,6 @@ _NEAR_M, _FAR = 0.04, 6.0
 _GROSS = 20.0
 # Whatever robots err by more is wrong, and no noise [rad, m].
 _MOST_NOISE = np.array([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M])
-# The noise of measured poses differs by so much from view to view: with tilt and distance.
-_UNEVEN = 3.0
 # Where fewer than this share of the observations agree, which of them are right is unknown.
 _LEAST_SHARE = 0.5
 # Inliers, at the least: with fewer, outliers cannot be separated from noise.
@@ -129,7 +127,7 @@ def distances(problem: Problem, used: Mask, fit: Solution) -> Distances:
     edges = int(problem.counted[: 6 * len(problem.unknown)].sum())
     freedom = max(0.5 * (float(problem.observations.directions[used].sum()) - edges), 6.0)
     limit = counted * f_limit(_FALSE_ALARM / len(problem), counted, freedom)
-    uneven = np.where(problem.observations.is_uneven, _UNEVEN**2, 1.0)
+    uneven = np.where(problem.observations.is_uneven, UNEVEN**2, 1.0)
     return Distances(squares, directions, uneven * limit)
 
 

@@ -17,6 +17,11 @@ _OPEN = 0.05
 ROBOT = "robot"
 
 
+# Where an observation's covariance is a guess, its errors are up to so many times larger than that:
+# with tilt and distance.
+UNEVEN = 3.0
+
+
 @dataclass(frozen=True, eq=False)
 class Observations:
     """What n observations measured.

@@ -18,6 +18,8 @@ from visioncal.estimation.variance import Knowledge
 # Noise looks like a misfit in one session of ten thousand.
 _FALSE_ALARM = 1e-4
 _BLOCKS = 10
+# A block has at most this share of what is known of any direction; first order is no guess beyond.
+_MOST_LEVERAGE = 0.99
 # Cells of the image whose mean residuals are compared, an axis; corners that a cell has at least.
 _CELLS, _FEWEST_CORNERS = 6, 4
 # What a lens's own parameters and a plane's pose take out of the cells' means.
@@ -147,6 +149,9 @@ def neighbours(problem: Problem, state: State, noise: Noise, robot: str) -> Neig
         part = problem.subset(mine & np.isin(problem.observations.stops, block))
         information, gradient = normal_equations(part, state, noise)
         own = information - known.information
+        # What a block alone determines has no answer without it.
+        if np.linalg.eigvals(fitted @ own).real.max() > _MOST_LEVERAGE:
+            continue
         # Leaving the block out takes its information, too.
         without = covariance_among(whole - own, moving)
         moved = (without @ (gradient - known.gradient))[edges]
@@ -154,6 +159,8 @@ def neighbours(problem: Problem, state: State, noise: Noise, robot: str) -> Neig
         seen += float(moved @ metric @ moved)
         expected += float(np.trace(likely))
         scatter += 2.0 * float(np.trace(likely @ likely))
+    if expected == 0.0:
+        return Neighbours(1.0, is_significant=False)
     freedom = 2.0 * expected**2 / scatter
     factor = seen / expected
     return Neighbours(factor, factor > float(chi2_limit(_FALSE_ALARM, freedom)) / freedom)

@@ -40,6 +40,9 @@ _CAUSES: Mapping[Mount, str] = {
     "instrument": "an instrument or a tool that moved, readings paired with other poses, units or "
     "conventions of the poses",
 }
+# Limits of views whose poses were measured, over those of views with corners: of a board that is
+# seen squarely, sound ones are off by 8 times the median now and then.
+_UNEVEN = 1.5
 # So many views in a row are not left out by chance.
 _LEAST_RUN = 3
 # Views that disagree by less than so many times what their sensor's noise makes are explained: of a
@@ -500,7 +503,12 @@ def outlying_views(
         return ()
     away = np.array([[view.residual_mm or 0.0, view.residual_deg or 0.0] for view in used])
     ratios = (away / np.maximum(np.median(away, axis=0), _ROUNDING)).max(axis=1)
-    return tuple((view, float(it)) for view, it in zip(used, ratios, strict=True) if it > limit)
+    pairs = zip(used, ratios.tolist(), strict=True)
+    return tuple(
+        (view, it)
+        for view, it in pairs
+        if it > (limit if view.rms_px is not None else _UNEVEN * limit)
+    )
 
 
 def _residual(view: ViewResult, between: str = ", ") -> str:
