@@ -69,8 +69,8 @@ class Recorded:
         inflation: By how much larger their noise's variance counts than they show alone.
         beside: (12, c) by how much the edges are off beside that, for c independent errors of one:
             of an arm without joint angles, which more stops do not change.
-        held: (12, c) the same of lens and boards that are held as stated: by how far the stops
-            pull at them.
+        held: (k, c) gradient of what the views share and a fit holds: how the stops pull at it.
+            Further stops are expected to pull no more than by noise.
     """
 
     problem: Problem
@@ -82,7 +82,7 @@ class Recorded:
     arm: ArmErrors | None = None
     inflation: float = 1.0
     beside: FloatArray = field(default_factory=lambda: np.zeros((12, 0)))
-    held: FloatArray = field(default_factory=lambda: np.zeros((12, 0)))
+    held: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def shared(self) -> FloatArray:
@@ -308,9 +308,13 @@ def _world(
     counted, place, turn = (_widened(it, looks) for it in judged)
     misfit, gradient, held = factors[:, :, size:], known[:size, size:], 0
     if recorded is not None and not purpose.blocks:
-        beside, held = np.hstack([recorded.beside, recorded.held]), recorded.held.shape[1]
-        gradient = np.hstack([gradient, (prior + known[:size, :size])[:, :12] @ beside])
-        misfit = np.concatenate([misfit, factors[:, :, :12] @ beside], axis=2)
+        beside, held = recorded.beside, recorded.held.shape[1]
+        pull = np.zeros((size, held))
+        pull[12 : 12 + len(recorded.held)] = -recorded.held / inflation
+        further = (prior + known[:size, :size])[:, :12] @ beside
+        gradient = np.hstack([gradient, further, pull])
+        still = np.zeros((*factors.shape[:2], held))
+        misfit = np.concatenate([misfit, factors[:, :, :12] @ beside, still], axis=2)
     return World(
         factors[:, :, :size],
         prior,

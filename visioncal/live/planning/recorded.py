@@ -165,8 +165,8 @@ def begin(
         int(first_corners(targets)[begun.board]),
         arm.errors if arm.is_modelled else None,
         max((it.factor for it in alike if it is not None and it.is_significant), default=1.0),
-        np.zeros((12, 0)) if arm.is_modelled else _beside_noise(known, begun, "arm"),
-        _beside_noise(known, begun, "held_values"),
+        _beside_noise(known, begun),
+        _held_pull(known, begun.problem),
     )
     return Begun(cell, recorded, found.refusal, begun.views)
 
@@ -261,14 +261,24 @@ def _guessed(known: RunState, guess: Guess | None) -> _Start:
     )
 
 
-def _beside_noise(known: RunState, begun: "_Start", source: str) -> FloatArray:
-    """(12, c) how the edges err by what counts in the result beside noise, from one source."""
-    if known.answer is None or source not in known.answer.beside:
+def _held_pull(known: RunState, problem: Problem) -> FloatArray:
+    """(k, 1) how the stops pull at what is held of lens and boards, as their gradient, if it is."""
+    if known.answer is None:
+        return np.zeros((0, 0))
+    fitted, state, noise = known.answer.problem, known.answer.state, known.answer.noise
+    pull = normal_equations(fitted, state, noise)[1] * (fitted.counted & ~fitted.moving)
+    columns = [fitted.effect_columns[it.name] for it in problem.effects]
+    return np.concatenate([np.zeros(0), *(pull[it.start : it.stop] for it in columns)])[:, None]
+
+
+def _beside_noise(known: RunState, begun: "_Start") -> FloatArray:
+    """(12, c) how the edges err by what an arm does wrong whose joints are not known, if any."""
+    if known.answer is None or begun.arm.is_modelled or "arm" not in known.answer.beside:
         return np.zeros((12, 0))
     names = tuple(begun.problem.unknown)[:2]
     columns = [np.arange(it.start, it.stop) for it in map(known.solved.problem.edge_columns, names)]
     at = np.concatenate(columns)
-    values, vectors = np.linalg.eigh(known.answer.beside[source][np.ix_(at, at)])
+    values, vectors = np.linalg.eigh(known.answer.beside["arm"][np.ix_(at, at)])
     return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0)))[:, values > 0.0])
 
 
