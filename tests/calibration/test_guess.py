@@ -353,6 +353,7 @@ def test_rotations_that_were_never_recorded_are_named(whole):
         told[:] = told[0]
     with pytest.raises(DegenerateError, match="the camera sees the target turn by") as caught:
         visioncal.calibrate(pairs_session(replace(poses, robot=numbers(told))))
+    assert ("All rows have one pose of the robot" in caught.value.message) is whole
     assert "how the poses were recorded" in caught.value.next_step
 
 

@@ -39,6 +39,8 @@ _SEEING = ("detect", "intrinsics", "pnp")
 # A robot that turns by less stands, a target that turns by more does not, ambiguous poses aside
 # [deg].
 _STILL_DEG, _TURNED_DEG = 0.5, 10.0
+# Positions that differ by less are one [m].
+_STILL_M = 1e-3
 
 
 def guess_session(
@@ -175,10 +177,13 @@ def _unrecorded(seen: RunState) -> Finding | None:
     both = robot.there & camera.there
     if both.sum() < FEWEST_ROWS:
         return None
-    common = (it.poses()[both] for it in (robot, camera))
-    by_robot, by_camera = (rotation_angle(invert(it[:1]) @ it) for it in common)
+    moved = [invert(it[:1]) @ it for it in (way.poses()[both] for way in (robot, camera))]
+    by_robot, by_camera = map(rotation_angle, moved)
     most, half = np.rad2deg([by_robot.max(), np.median(by_camera)]).tolist()
-    return unrecorded_rotations(most, half) if most < _STILL_DEG and half > _TURNED_DEG else None
+    if most > _STILL_DEG or half < _TURNED_DEG:
+        return None
+    is_one_pose = bool(np.abs(moved[0][:, :3, 3]).max() < _STILL_M)
+    return unrecorded_rotations(most, half, is_one_pose=is_one_pose)
 
 
 def _poses_beside_joints(seen: RunState, declared: Candidate) -> Finding | None:

@@ -154,20 +154,22 @@ def read_otherwise(
     return Finding("misread_poses", sentence, MIRRORED if is_mirrored else READ_AGAIN, exchanged)
 
 
-def unrecorded_rotations(robot_deg: float, camera_deg: float) -> Finding:
+def unrecorded_rotations(robot_deg: float, camera_deg: float, *, is_one_pose: bool) -> Finding:
     """The finding that the robot's poses do not turn where the camera sees that they do.
 
     Args:
         robot_deg: How far they turn at most [deg].
         camera_deg: How far the target turns in half of the views or more [deg].
+        is_one_pose: Whether the positions are the same, too.
     """
-    return Finding(
-        "misread_poses",
-        f"The robot's poses turn by {robot_deg:.2g} deg at most, and between the same views the "
-        f"camera sees the target turn by {camera_deg:.2g} deg: the recorded rotations are not "
-        "those of the views.",
-        _UNRECORDED,
+    said, wrong = f"The robot's poses turn by {robot_deg:.2g} deg at most", "rotations"
+    if is_one_pose:
+        said, wrong = "All rows have one pose of the robot", "poses"
+    words = (
+        f"{said}, and between the same views the camera sees the target turn by "
+        f"{camera_deg:.2g} deg: the recorded {wrong} are not those of the views."
     )
+    return Finding("misread_poses", words, _UNRECORDED)
 
 
 def wrong_poses(by_poses: str, by_joints: str) -> Finding:
