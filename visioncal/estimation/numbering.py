@@ -11,6 +11,7 @@ from itertools import combinations, permutations
 from math import perm
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from visioncal.core.quantiles import f_limit
 from visioncal.core.types import FloatArray, IntArray
@@ -160,9 +161,6 @@ def _orders(measured: FloatArray, nominal: FloatArray) -> IntArray:
 
 def _nearest(measured: FloatArray, nominal: FloatArray, placed: FloatArray) -> IntArray:
     """Gives each measured point a drawn one of its own, near where the drawing is laid."""
-    # A tenth of a second to import, which points with numbers need not wait for.
-    from scipy.optimize import linear_sum_assignment
-
     for _ in range(2):
         order = linear_sum_assignment(_squares(measured, placed))[1]
         # A triangle's few points lay the drawing less well than all of them.

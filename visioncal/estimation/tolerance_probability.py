@@ -10,9 +10,9 @@ sphere. Of a covariance whose scale was estimated with n degrees of freedom, r^2
 """
 
 import numpy as np
+from scipy.optimize import brentq
 from scipy.special import fdtr, ndtri
 
-from visioncal.core.quantiles import crossing
 from visioncal.core.types import FloatArray
 
 _POINTS, _SIZE = 4096, 6
@@ -56,7 +56,7 @@ def radius_within(spreads: FloatArray, share: float, freedom: float = np.inf) ->
     def missing(logarithm: float) -> float:
         return _mean_chance(_ratio(guess * float(np.exp(logarithm)), shifted), freedom) - share
 
-    found = crossing(missing, -float(np.log(_FAR)), float(np.log(_FAR)), _TOLERANCE)
+    found = brentq(missing, -np.log(_FAR), np.log(_FAR), xtol=_TOLERANCE)
     # At the radius itself the share must be reached, so that a need of it is met.
     return guess * float(np.exp(found + 2.0 * _TOLERANCE))
 

@@ -8,7 +8,7 @@ views are draws of one inverse gamma distribution, whose two parameters all view
 import numpy as np
 from scipy.special import digamma, polygamma
 
-from visioncal.core.quantiles import chi2_limit, crossing
+from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import FloatArray
 
 # Views of one noise are taken for views of several in one session of ten thousand.
@@ -37,8 +37,11 @@ def weights_by_view(squares: FloatArray, freedom: FloatArray) -> FloatArray | No
     about = logs - np.average(logs, weights=1.0 / covariance)
     if np.sum(about**2 / covariance) < chi2_limit(_FALSE_ALARM, len(logs) - 1):
         return None
+    # Few views come here, and none that is located.
+    from scipy.optimize import brentq
+
     between = float(np.clip(np.var(logs, ddof=1) - np.mean(covariance), *_BETWEEN))
-    half = float(np.exp(crossing(lambda it: float(polygamma(1, np.exp(it))) - between, *_LOGS)))
+    half = float(np.exp(brentq(lambda it: polygamma(1, np.exp(it)) - between, *_LOGS)))
     scale = np.exp(np.mean(logs) + digamma(half))
     variances = (scale + squares / 2.0) / (half + freedom / 2.0)
     return np.asarray(np.exp(np.mean(np.log(variances)) / 2.0) / np.sqrt(variances), dtype=float)

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from visioncal.calibration.guess.fit import Fit, distances, is_about_one_axis, robust_fit
 from visioncal.calibration.guess.given import SCORE_FLOOR, STANDS_OUT
@@ -183,9 +184,6 @@ def _decided(start: FittedJoints, tried: Sequence[FittedJoints]) -> JointGuess:
 
 def _with_zeros(start: FittedJoints, q: FloatArray, poses: FloatArray) -> Iterator[FittedJoints]:
     """The best zero of each joint between the first and the last, whose zeros hide in constants."""
-    # A tenth of a second to import, which joints that fit need not wait for.
-    from scipy.optimize import minimize_scalar
-
     declared = start.reading
     turns = ~declared.robot.chain.prismatic
     farthest = 2.0 * _STEP_RAD if start.score < _CLOSES else _FARTHEST_RAD

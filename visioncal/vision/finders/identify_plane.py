@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from visioncal.core.types import FloatArray, Image, Mask
 
@@ -136,9 +137,6 @@ def bent_plane(plane: Plane, board: FloatArray, px: FloatArray) -> Plane:
 
     def misfit(bend: float) -> float:
         return float(np.sum((fitted(bend).to_px(board) - px) ** 2))
-
-    # A tenth of a second to import, which boards with a description need not wait for.
-    from scipy.optimize import minimize_scalar
 
     best = minimize_scalar(misfit, bounds=(_LEAST_BEND, _MOST_BEND), method="bounded")
     return fitted(float(best.x))
