@@ -204,7 +204,7 @@ def test_images_are_taken_in_natural_order(tmp_path):
         ({"tip": "tool0"}, "--robot-model"),
         ({"robot_model": "ur11"}, "ur10"),
         ({"intrinsics": "no such file.yaml"}, "does not exist"),
-        ({"images": Path("no such folder"), "target": "checkerboard_9x6_25mm"}, "no images"),
+        ({"images": Path("no such folder"), "target": "checkerboard_9x6_25mm"}, "does not exist"),
     ],
 )
 def test_mistakes_are_answered_with_what_there_is(tmp_path, requested, words):
