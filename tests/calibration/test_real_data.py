@@ -54,6 +54,19 @@ def test_charuco_before_a_fixed_camera(real_data):
     assert 1e3 * np.linalg.norm(away) < 4 + 3 * result.edges["base_from_cam"].sigma_mm
 
 
+@pytest.mark.parametrize("camera", [pytest.param(1, marks=pytest.mark.slow), 4])
+def test_two_exchanged_rows_among_images_of_other_rows_are_named(real_data, camera):
+    """Two fixed cameras saw one run: rows 25 and 26 of its joints are exchanged."""
+    result = visioncal.calibrate(real_data / f"sessions/ur3e_checkerboard_to_hand_cam{camera}")
+    unused = {view.view for view in result.views if not view.used}
+    assert unused >= ({25, 26} if camera == 1 else {9, 14, 15, 25, 26, 31, 33, 38})
+    assert "Views 25 and 26 are exchanged" in result.verdict.top[0]
+    assert result.verdict.status == "bad"
+    # An image that shows a tenth of its field, 1.3 m away, fixes a camera to some millimetres; its
+    # focal length is open to a few per cent, which are 40 mm.
+    assert all(1.0 < it.sigma_mm < 40.0 for it in result.placed.values())
+
+
 def test_eight_views_of_a_poor_set_are_not_called_good(real_data):
     result = visioncal.calibrate(real_data / "sessions/visp_franka_eye_in_hand")
     assert result.verdict.status != "good"

@@ -272,7 +272,7 @@ def compress_points(
         stack.weigh(breath)
         columns += [breath, now.residuals[:, :, None]]
     every = np.concatenate(columns, axis=2)
-    without = WithoutPoses.of(stack, now.by_pose, fit.information, every, shares)
+    without = WithoutPoses.of(stack, now.by_pose, every, shares)
     left, answer = without.left[:, :, :shared], without.answer[:, :, :shared]
     information = without.products[:shared, :shared]
     roots = without.roots[stack.view_of, None]
@@ -293,7 +293,7 @@ def compress_points(
             products[np.ix_(beyond, np.arange(shared))],
             products[beyond, last],
             by_field,
-            fit.information,
+            without.information,
         )
         # Coefficients follow what is shared: that then says nothing of them, nor they of it.
         information = information + products[:shared, beyond] @ found.slope
@@ -308,4 +308,4 @@ def compress_points(
         residuals, own = residuals + roots * away, own + away
         by_field = by_field @ found.open
     pulls = stack.sum_by_view(np.einsum("nij,ni->nj", left, residuals))
-    return Compressed(poses, fit.information, answer, information, pulls, own, by_field, found)
+    return Compressed(poses, without.information, answer, information, pulls, own, by_field, found)

@@ -222,7 +222,8 @@ class WithoutPoses:
     Attributes:
         stack: The corners.
         by_pose: (n, 2, 6) in units of their noise.
-        inverse: (v, 6, 6) the inverse of the information on the poses.
+        information: (v, 6, 6) information on the poses.
+        inverse: (v, 6, 6) the inverse of that.
         roots: (v,) by which share of a view each counts, as a root.
         answer: (v, 6, c) how the poses follow.
         left: (n, 2, c) what is left of the columns, by the roots.
@@ -230,6 +231,7 @@ class WithoutPoses:
 
     stack: CornerStack
     by_pose: FloatArray
+    information: FloatArray
     inverse: FloatArray
     roots: FloatArray
     answer: FloatArray
@@ -240,7 +242,6 @@ class WithoutPoses:
         cls,
         stack: CornerStack,
         by_pose: FloatArray,
-        information: FloatArray,
         columns: FloatArray,
         shares: FloatArray | None,
     ) -> "WithoutPoses":
@@ -249,11 +250,13 @@ class WithoutPoses:
         Args:
             stack: The corners of v views.
             by_pose: (n, 2, 6).
-            information: (v, 6, 6) on the poses.
             columns: What is left of them, squared, is never less than none, and as exact as the
                 square of their error. A difference of two squares would magnify it a millionfold.
             shares: (v,) as how much of a view each counts; as one where None.
         """
+        # At these very derivatives: the information of a step before would leave columns that are
+        # not at right angles to the poses, and products of `with_modes` that no columns have.
+        information = stack.products_by_view(by_pose, by_pose)
         inverse = covariance_from(information)
         roots = np.ones(len(inverse)) if shares is None else np.sqrt(shares)
         answer = -inverse @ stack.products_by_view(by_pose, columns)
@@ -261,7 +264,7 @@ class WithoutPoses:
         left += columns
         if shares is not None:
             left *= roots[stack.view_of, None, None]
-        return cls(stack, by_pose, inverse, roots, answer, left)
+        return cls(stack, by_pose, information, inverse, roots, answer, left)
 
     @cached_property
     def products(self) -> FloatArray:

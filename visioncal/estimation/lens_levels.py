@@ -64,7 +64,6 @@ class _Rows:
         camera: The lens.
         without: (n, 2, c + 2) columns by lens, board and breathing, by a change of focus, and the
             residuals, once the poses have followed.
-        information: (v, 6, 6) on the poses.
         chained: (o,) the view of each chain.
         jacobian: (o, 6, t) of the chains' residuals by the unknowns.
         by_errors: (o, 6, 6 w) by the flanges' errors.
@@ -78,7 +77,6 @@ class _Rows:
     stack: CornerStack
     camera: Camera
     without: WithoutPoses
-    information: FloatArray
     chained: IntArray
     jacobian: FloatArray
     by_errors: FloatArray
@@ -430,7 +428,6 @@ def _rows(
     columns = [now.by_intrinsics, by_board, *(
         it[:, :, None] for it in (breath, focus, now.residuals)
     )]  # fmt: skip
-    information = stack.products_by_view(now.by_pose, now.by_pose)
     every = np.concatenate(columns, axis=2)
     here = np.flatnonzero((rows >= of_camera.start) & (rows < of_camera.stop))
     linear, (of, members) = problem.linear(state), problem.units
@@ -448,8 +445,7 @@ def _rows(
     return _Rows(
         stack,
         lens,
-        WithoutPoses.of(stack, now.by_pose, information, every, mine.shares),
-        information,
+        WithoutPoses.of(stack, now.by_pose, every, mine.shares),
         rows[here] - of_camera.start,
         jacobian[:, :, kept],
         linear.by_errors[here],
@@ -498,7 +494,7 @@ def _assembled(rows: _Rows, length: float, robots: int) -> _Likelihood:
     by_flanges = np.repeat(rows.robots, 6, axis=1)
     of_flanges = np.where(by_flanges[:, None] < 0, 0.0, rows.by_errors)
     errors = np.concatenate([of_flanges, following[:, :, focus : focus + 1]], axis=2)
-    weights = rows.information[chained]
+    weights = without.information[chained]
     turned = np.swapaxes(errors, 1, 2) @ weights
     width = errors.shape[2]
     local, cross = np.zeros((views, width, width)), np.zeros((views, width, size))

@@ -21,8 +21,9 @@ _LITTLE = 1e-6
 # Levels that all but vanish gain less than this by falling on, for each value that they are of,
 # and curve hardly more than their variance does: they fall by longer steps.
 HARDLY, _VARIANCES, _LONGEST_FALL = 0.1, 3.0, 2.0
-# A gain is rarely so many times as large as the second order has it.
-_SURELY = 3.0
+# A gain is rarely so many times as large as the second order has it, for steps up to so long: a
+# level three times as large as where the search began has gained thrice that.
+_SURELY, _SHORT_STEP = 3.0, 0.5
 # The root of twice the log-likelihood that a 95 % interval of one unknown gives away (chi-square),
 # and how far and how exactly it is followed, in logarithms.
 _SURPRISE_95, _FIRST_WIDTH, _WIDEST, _EXACT = 1.96, 0.125, 4.0, 0.02
@@ -182,7 +183,8 @@ def most_likely(
             if moved < settled or gained < little:
                 logs = candidate
                 break
-            if now.value - _SURELY * gained > enough:
+            is_short = np.abs(near).max(initial=0.0) < _SHORT_STEP
+            if is_short and now.value - _SURELY * gained > enough:
                 break
         then = None
         # Of levels too far apart, one is lost in the rounding of the other.
