@@ -53,6 +53,21 @@ def test_offsets_alone_are_told_from_wrong_links():
     assert found == pytest.approx(true, abs=3e-4)
 
 
+def test_an_arm_that_is_no_longer_worth_calibrating_is_as_stated_again():
+    """Views that agree later have a say in the level: what an earlier one estimated goes."""
+    known = calibrated(simulate(replace(GOOD, offset_sigma_rad=1e-3, views=20, seed=1)))
+    agreed, arm = known.fit.agreed, known.robot_arm
+    assert arm.model is not None
+    few = np.flatnonzero(agreed.used)[:4]
+    stated = arm.without_errors(agreed.problem.subset(np.isin(np.arange(len(agreed.used)), few)))
+    start = State(agreed.fit.state.edges, stated.start_values)
+    again = arm.with_level(stated, start, "auto", few.tolist())
+    assert (again.kinematics.level, again.model) == ("nominal", None)
+    assert again.errors is None or not again.errors.is_estimated
+    np.testing.assert_array_equal(again.poses, arm.reported)
+    assert again.moved(again.put_into(stated), start) == (again, 0.0)
+
+
 @pytest.mark.slow
 def test_links_that_are_off_by_little_count_in_the_covariance():
     # Off by hardly more than the arm repeats to, in all parameters alike: offsets of the joints

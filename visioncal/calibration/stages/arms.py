@@ -44,7 +44,7 @@ from visioncal.estimation.armmodel import RIGID, ArmModel, blocks_of
 from visioncal.estimation.armpair import ArmData, ArmPair
 from visioncal.estimation.parts import Effect, Noise, State
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.solve import RobotLikelihood, Solution
+from visioncal.estimation.solve import RobotLikelihood, Solution, robot_likelihood
 from visioncal.results.arm import (
     ArmErrorsResult,
     ArmSections,
@@ -456,7 +456,14 @@ class RobotArm:
         )
         mine = np.flatnonzero(rows_of(problem, self.robot)).tolist()
         arm = replace(self, kinematics=replace(found, views=tuple(views[it] for it in mine)))
-        return arm._bending(model.erring(found.errors)) if found.errors else arm
+        if found.errors:
+            return arm._bending(model.erring(found.errors))
+        if self.model is None:
+            return arm
+        # Fewer views agree than when it was calibrated: its errors are sought as of a stated one.
+        fit = found.fits[0].fit
+        likelihood = robot_likelihood(problem, fit.state, fit.noise)
+        return replace(arm, model=None).with_errors(likelihood, problem.robots.index(self.robot))
 
     def with_functions(self, problem: Problem, start: State, asked: str, noise: Noise) -> Self:
         """Looks for functions of its joints beside all that a level of its geometry has.
