@@ -14,6 +14,7 @@ from visioncal.calibration.stages.detect import DetectOptions, detect
 from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.calibration.stages.observed import CameraLook, Observed, nothing_seen
 from visioncal.calibration.stages.pnp import Poses, estimate_poses, given_poses, measure_poses
+from visioncal.calibration.stages.rig_points import leave_out_wrong_points
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
@@ -106,6 +107,7 @@ def locate_targets(seen: T) -> T:
         DataError: No view shows a target, or a lens's distortion cannot be inverted at any view's
             corners.
     """
+    seen = leave_out_wrong_points(seen)
     session, targets = seen.session, tuple(seen.session.boards.values())
     poses = {**seen.poses, **given_poses(session)}
     for frame in seen.cameras:

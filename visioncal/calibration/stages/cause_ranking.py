@@ -88,6 +88,7 @@ EVIDENCE: Mapping[str, Evidence] = {
     "shared_image": Evidence(_FACT),
     "repeated_views": Evidence(_FACT),
     "other_board": Evidence(_FACT),
+    "rig_points": Evidence(_FACT),
     "other_lens": Evidence(_FACT),
     "untied": Evidence(_FACT),
     "too_few_stops": Evidence(_FACT),
