@@ -143,6 +143,25 @@ def test_wrong_points_of_an_exact_rig_are_named_and_left_out(tmp_path, kind, fau
     assert error @ np.linalg.solve(covariance, error) < 40.0
 
 
+@pytest.mark.parametrize("mount", [IN_HAND, TO_HAND])
+def test_a_rig_that_is_larger_than_its_table_is_named_with_its_size(tmp_path, mount):
+    """Views alone do not tell: a larger rig farther away looks the same."""
+    folder = write_rig(tmp_path / "cell", Rig("cube", mount))
+    table = folder / "target.csv"
+    head, *rows = (line.split(",") for line in table.read_text().splitlines())
+    small = [[number, *(repr(float(it) / 1.01) for it in place)] for number, *place in rows]
+    table.write_text("\n".join(",".join(it) for it in (head, *small)) + "\n")
+    result = calibrate(folder)
+    (found,) = (it for it in result.verdict.causes if it.kind == "board_size")
+    (advised,) = re.findall(r"multiply the table's x_m, y_m and z_m by ([0-9.]+)", found.do.words)
+    # The sentence has a sigma of 0.1 %, by residuals that are the size's own doing.
+    assert float(advised) == pytest.approx(1.01, abs=3e-3)
+    by = float(advised)
+    sized = [[number, *(repr(float(it) * by) for it in place)] for number, *place in small]
+    table.write_text("\n".join(",".join(it) for it in (head, *sized)) + "\n")
+    assert not any(it.kind == "board_size" for it in calibrate(folder).verdict.findings)
+
+
 def test_sigmas_weigh_the_corners(tmp_path):
     rig = Rig("charuco", uneven=5.0)
     plain, weighed = (

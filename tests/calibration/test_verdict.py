@@ -15,6 +15,13 @@ from visioncal.results import Rms
 LOST = [Rejection(at, "blurred: very") for at in range(30, 40)]
 
 
+def test_noise_that_chance_makes_of_a_good_arms_is_no_doubt():
+    """Coarse poses leave it open: doubt is about what it is at the least."""
+    loud = {"away_mm": 0.1, "away_deg": 0.025}
+    assert judge(changed(SOUND, **loud, surely=(0.05, 0.012))).status == "good"
+    assert judge(changed(SOUND, **loud, surely=(0.05, 0.021))).status == "check"
+
+
 def test_sound_findings_are_good_and_say_how_good():
     verdict = judge(SOUND)
     assert verdict.status == "good"

@@ -18,7 +18,7 @@ from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
 from visioncal.estimation.linalg import covariance_among
-from visioncal.estimation.parts import Noise, State
+from visioncal.estimation.parts import Effect, Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.scene import lens_prior
 from visioncal.estimation.solve import (
@@ -28,6 +28,7 @@ from visioncal.estimation.solve import (
     normal_equations,
     score_gain,
 )
+from visioncal.estimation.variance import Knowledge
 
 # Freeing unknowns must gain more than noise does in one session of ten thousand.
 _FALSE_ALARM = 1e-4
@@ -252,6 +253,31 @@ def measured_scale(side: Side, fitted: Fitted, board: int = 0) -> MeasuredScale:
         (_UNEVEN if side.has_links else 1.0) * measured**-0.5,
         stated,
     )
+
+
+def measured_rig(side: Side, fitted: Fitted, frame: str, rig: int) -> MeasuredScale:
+    """Measures the size of a rig of points by the robots' motion; its table is taken for exact.
+
+    A larger rig farther away looks the same: its views alone say nothing of that.
+
+    Args:
+        side: The frames' side of the fit.
+        fitted: The fit.
+        frame: The rig's.
+        rig: Which target it is.
+    """
+    problem, state = fitted.problem, fitted.fit.state
+    seen = np.array([it == frame for it in problem.observations.observed])
+    poses = problem.observations.measured[seen]
+    by_size = np.zeros((len(seen), 6, 1))
+    by_size[seen, 3:] = np.swapaxes(poses[:, :3, :3], 1, 2) @ poses[:, :3, 3:]
+    size = Effect.free("size of a rig", Knowledge(np.zeros((1, 1)), np.zeros(1)), by_size)
+    problem = problem.with_effects([*problem.effects, size])
+    there = State(state.edges, np.append(state.values, 0.0))
+    information, gradient = normal_equations(problem, there, fitted.fit.noise)
+    covariance = covariance_among(information, problem.moving)
+    sigma = (_UNEVEN if side.has_links else 1.0) * float(covariance[-1, -1] ** 0.5)
+    return MeasuredScale(rig, -float(covariance[-1] @ gradient), sigma, 0.0)
 
 
 def moved_mahalanobis_sq(fitted: Fitted, places: IntArray) -> float:

@@ -222,14 +222,16 @@ def _arms(answer: Answer) -> list[Arm]:
     problem, solved = answer.problem, answer.solved
     modelled = {name or "robot" for name in solved.cell.session.robot_documents}
     found = []
-    for robot in problem.robots:
+    for robot, intervals in zip(problem.robots, answer.intervals, strict=True):
         noise, numbers = answer.sigmas[robot], answer.arms[robot].numbers
         known = not problem.is_combined
+        surely = (1e3 * float(intervals[1, 0]), float(np.rad2deg(intervals[0, 0])))
         found.append(
             Arm(
                 len(stops_of(problem, robot)),
                 noise["translation_mm"] if known else None,
                 noise["rotation_deg"] if known else None,
+                surely if known else None,
                 errs=_errs(solved.arms[robot]),
                 workspace_mm=None if numbers is None else 1e3 * float(np.median(numbers.sigmas_m)),
                 modelled=robot in modelled,

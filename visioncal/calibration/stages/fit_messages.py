@@ -17,14 +17,18 @@ from visioncal.estimation.joint import (
     Side,
     chance_limit,
     contradicted_lens,
+    measured_rig,
     measured_scale,
     moved_mahalanobis_sq,
 )
 from visioncal.estimation.scene import ONLY_CAMERA, Scene
 from visioncal.estimation.solve import covariance_of, held_shift
+from visioncal.session.frames import frame_name
 
 # A rig that is as stated seems not to be in one session of ten thousand.
 _FALSE_ALARM = 1e-4
+# Rigs are measured and made to so much, as a share.
+_SAME_SIZE = 5e-4
 # Intrinsics that would move by less move no corner visibly [px].
 _LEAST_MOVE_PX = 0.05
 _NEW_LENS = Step(
@@ -53,6 +57,8 @@ def found_of_looks(side: Side, fitted: Fitted, covariance: FloatArray) -> Iterat
     for board, target in enumerate(scene.targets):
         if board not in looks.printed:
             yield from points_found(target, looks.moved_points(board))
+            frame = frame_name("target", scene.names[board])
+            yield from rig_size_found(target, measured_rig(side, fitted, frame, board))
             continue
         called = f"board {scene.names[board]}".strip()
         if _moves(fitted, looks.scale_of(board)):
@@ -167,6 +173,31 @@ def points_found(target: Target, moved_m: FloatArray) -> Iterator[Finding]:
             f"to {figure(1e3 * float(sigmas[worst]))} mm (sigma_m). The result goes by both.",
             Step("Measure the point again."),
         )
+
+
+def rig_size_found(target: Target, measured: MeasuredScale) -> Iterator[Finding]:
+    """Whether a rig is larger or smaller than its table, by the robot's motion.
+
+    Args:
+        target: The rig.
+        measured: Its size by that.
+    """
+    if not measured.is_another or abs(measured.scale) < _SAME_SIZE:
+        return
+    word = "larger" if measured.scale > 0 else "smaller"
+    yield Finding(
+        "board_size",
+        f"By the robot's motion target {target.name} is {figure(100 * abs(measured.scale))} % "
+        f"{word} than the table of its points has it (sigma {figure(100 * measured.sigma)} %). The "
+        "result goes by the table.",
+        Step(
+            "Measure the distance of two points that are far apart. Where they are as the robot "
+            f"says, multiply the table's x_m, y_m and z_m by {1 + measured.scale:.5g}; otherwise "
+            "see to the arm.",
+            CALIBRATE,
+        ),
+        mahalanobis_sq=(measured.scale / measured.sigma) ** 2,
+    )
 
 
 def _lens_found(fitted: Fitted, camera: str) -> Iterator[Finding]:

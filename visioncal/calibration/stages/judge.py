@@ -102,6 +102,7 @@ class Arm:
         stops: At how many stops it has a part in the fit.
         away_mm: Noise of its flange; None where that cannot be separated from the cameras' [mm].
         away_deg: The same in rotation [deg].
+        surely: Ends of their 95 % intervals below [mm, deg]; as found where None.
         errs: Whether its errors follow its posture, which is said elsewhere.
         workspace_mm: Predicted sigma of a tool's place all over a calibrated arm's workspace, in
             the median; None for a nominal arm [mm].
@@ -113,6 +114,7 @@ class Arm:
     stops: int
     away_mm: float | None = None
     away_deg: float | None = None
+    surely: tuple[float, float] | None = None
     errs: bool = False
     workspace_mm: float | None = None
     modelled: bool = False
@@ -687,13 +689,14 @@ def _robot(arm: Arm) -> str:
 def _robot_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
     """An arm is a good instrument: what looks like its error is often something else's.
 
-    A task that needs ten times as much has an arm that is as good as it has to be.
+    What chance makes of a good arm's noise, where poses are coarse, is no error. A task that needs ten times as much has an arm that is as good as it has to be.
     """
     for it in findings.arms:
         if it.away_mm is None or it.away_deg is None or it.errs:
             continue
+        found_mm, found_deg = it.surely or (it.away_mm, it.away_deg)
         beyond = max(it.away_mm / limits.robot_mm, it.away_deg / limits.robot_deg)
-        if beyond > 1.0:
+        if max(found_mm / limits.robot_mm, found_deg / limits.robot_deg) > 1.0:
             cause, step = (
                 (
                     "the instrument reads worse than is stated of it, was moved, or the arm's "

@@ -1,0 +1,75 @@
+"""Real recordings: verdict, sigma, and how far left-out views are off, beside Park's answer.
+
+    PYTHONPATH=tests python tests/benchmarks/real_sets.py [NAME ...]
+
+Nobody knows the truth of these; what was wrong with each is in the folder's own description.
+"""
+
+import textwrap
+from multiprocessing import Pool
+from pathlib import Path
+
+from results import QUICK, WORDS, write_section
+
+import visioncal
+from visioncal.core.errors import VisioncalError
+
+SESSIONS = Path(__file__).parents[3] / "shared" / "data" / "sessions"
+WORKERS = 2
+HEAD = (
+    "session", "verdict", "left out", "sigma mm, deg", "left-out views", "all, Park's", "first"
+)  # fmt: skip
+
+
+def first_words(text: str) -> str:
+    """What a table has room for of a sentence."""
+    return textwrap.shorten(text.split(". ")[0], 140, placeholder=" ...")
+
+
+def row_of(session: Path) -> tuple[str, ...]:
+    """Calibrates one session: the cells of its row."""
+    try:
+        result = visioncal.calibrate(session)
+    except VisioncalError as refused:
+        return session.name, "refused", *[""] * 4, first_words(str(refused))
+    unused = [it.view for it in result.views if not it.used]
+    words = " ".join(map(str, unused)) if len(unused) < 15 else f"{len(unused)} views"
+    sigmas = [f"{it.sigma_mm:.2g}, {it.sigma_deg:.2g}" for it in result.placed.values()]
+    held_out, park = result.validation.held_out, result.solvers.get("park")
+    return (
+        session.name,
+        result.verdict.status,
+        words or "none",
+        "; ".join(sigmas),
+        f"{held_out.mm:.2g} mm, {held_out.deg:.2g} deg",
+        "" if park is None else f"{park.rms_mm:.2g} mm, {park.rms_deg:.2g} deg",
+        first_words(result.verdict.top[0]),
+    )
+
+
+def main() -> None:
+    """Prints the table and keeps it."""
+    sessions = [it for it in sorted(SESSIONS.iterdir()) if (it / "session.toml").is_file()]
+    wished = [it for it in sessions if it.name in WORDS] if WORDS else sessions
+    with Pool(WORKERS) as pool:
+        rows = pool.map(row_of, wished[-1:] if QUICK else wished, chunksize=1)
+    lines = [HEAD, ["---"] * len(HEAD), *rows]
+    table = "\n".join("| " + " | ".join(it) + " |" for it in lines)
+    print(table)
+    if not WORDS:
+        text = f"""Sigmas are those of the camera and of the board or, by an instrument, of its
+base and probe. Views are left out one by one, the rest of the answer being fitted anew; Park's
+solution (of the same views, their poses by the fitted lens and board) is beside it by the residuals
+of the views that it was fitted to. No truth is known.
+
+{table}
+"""
+        command = "PYTHONPATH=tests python tests/benchmarks/real_sets.py"
+        write_section("Real recordings", command, text)
+
+
+if __name__ == "__main__":
+    if SESSIONS.is_dir():
+        main()
+    else:
+        print(f"left out: {SESSIONS} is absent")
