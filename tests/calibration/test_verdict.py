@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from support.sound_findings import PAIR, SOUND, changed, directions, left_out, views
 
-from visioncal.calibration.stages.judge import judge
+from visioncal.calibration.stages.judge import Sensor, judge
+from visioncal.calibration.stages.need import Picks
 from visioncal.core.number_format import figure
 from visioncal.core.types import Rejection
 from visioncal.core.verdict import remarks
+from visioncal.estimation.observability import Direction
 from visioncal.results import Rms
 
 LOST = [Rejection(at, "blurred: very") for at in range(30, 40)]
@@ -184,3 +186,16 @@ def test_what_settles_it_comes_first():
     verdict = judge(changed(SOUND, pixel_px=4.0, warnings=remarks(("Something.",)), stops=8))
     assert verdict.reasons[0].startswith("Corners deviate")
     assert len(verdict.reasons) == 3
+
+
+def test_views_of_a_cell_are_planned_for_the_camera_that_is_known_least():
+    sensors = [Sensor(9, name=f"cam_{it}") for it in ("hand", "left", "top", "fixed")]
+    # No robot looks with the fixed one: of it no stop can be planned.
+    picks = [Picks(it.name, "b", {}, 9.0, 1.0) for it in sensors[:3]]
+    worst = [
+        Direction(f"{name}'s offset along the cell's x", sigma, 1e-3, is_rotation=False)
+        for name, sigma in (("cam_left", 1e-3), ("cam_top", 3e-3), ("cam_fixed", 5e-3))
+    ]
+    cell = replace(SOUND, sensors=sensors, picks=picks, worst=worst)
+    assert cell.of_camera == " --camera top"
+    assert SOUND.of_camera == ""

@@ -3,6 +3,7 @@
 import json
 import shlex
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -86,6 +87,15 @@ def test_the_tip_and_its_rotation(tmp_path):
         "pivot of 10 touches of one point; rotation from 3 along z and 3 in the xz plane"
     )
     assert {it["kind"] for it in tool["observations"]} == {"point", "z", "xz"}
+
+
+def test_poses_of_a_tool_that_was_active_are_doubted(tmp_path):
+    made = touched(Job(), 1)
+    of_tip = made.touches.base_from_flange.copy()
+    of_tip[:, :3, 3] += of_tip[:, :3, :3] @ TIP
+    tool = found(tcp(tmp_path, replace(made.touches, base_from_flange=of_tip), "--json"))
+    assert tool["verdict"]["status"] == "check"
+    assert "active in the controller" in tool["verdict"]["reasons"][0]
 
 
 def test_several_points_need_fewer_touches_of_each(tmp_path):

@@ -31,6 +31,8 @@ TOUCH_KINDS = ("point", "z", "xz")
 # Another reading closes twenty times better by chance less than once in a thousand times: so
 # likely it is meant (Sellke, Bayarri and Berger 2001, as of sessions' readings).
 _MISREAD = 0.98
+# No tool is as short: poses whose own origin is so near to the tip are a tool's already.
+_NO_TOOL_M = 2e-3
 
 
 def touched_tool(
@@ -181,6 +183,15 @@ def _doubts(
             "The tip would be farther from the flange than the point from the base: poses read the "
             "other way round look like this.",
             Step("If the columns hold flange_from_base, say so.", f"{AGAIN} --robot-inverse"),
+        )
+    tip_m = float(np.linalg.norm(fit.flange_from_tool[:3, 3]))
+    if tip_m < _NO_TOOL_M:
+        yield Finding(
+            "active_tool",
+            f"The tip is {figure(1e3 * tip_m)} mm from the origin of the "
+            "poses' own frame: they look like those of a tool that was active in the controller, "
+            "and of that tool's tip.",
+            Step("Set the controller's tool to zero, and write the poses of the flange."),
         )
     yield from weak_directions(
         fit.worst,

@@ -305,7 +305,7 @@ def _described(matched: Matched, found: _Constants) -> Matched:
     if offset_mm > 1e3 * _AGREE_M + shift * 1e3 or turn_deg > np.rad2deg(_AGREE_RAD + angle):
         words = (
             f"The reported poses are of a tool frame, {offset_mm:.1f} mm and {turn_deg:.1f} deg "
-            f"from the flange of {robot.name}: the camera's transform is to that frame."
+            f"from the flange of {robot.name}: what the flange carries is placed in that frame."
         )
         step = Step(
             "If the flange itself is meant, set the controller's tool to zero and record again, or "

@@ -26,6 +26,7 @@ from visioncal.core.verdict import (
 )
 from visioncal.estimation.observability import Direction
 from visioncal.results import NeedMet, Rms, ViewResult
+from visioncal.session.frames import thing_name
 
 # Scatters under a nanometre and a micro-degree are rounding, and their ratios say nothing.
 _ROUNDING = 1e-6
@@ -172,6 +173,18 @@ class Findings:
         return has_images and all(it.modelled for it in self.arms)
 
     @property
+    def of_camera(self) -> str:
+        """The option that names, of several cameras that a robot looks with, the least known."""
+        cameras = dict.fromkeys(it.camera for it in self.picks)
+        if len({it.name for it in self.sensors}) < 2 or not cameras:
+            return ""
+        weak_m = {
+            camera: max((it.sigma for it in self.worst if _is_offset_of(it, camera)), default=0.0)
+            for camera in cameras
+        }
+        return f" --camera {thing_name(max(cameras, key=weak_m.__getitem__), 'camera')}"
+
+    @property
     def rms(self) -> Rms:
         """Residuals of all used views."""
         return self._pooled(lambda it: it.rms)
@@ -197,6 +210,10 @@ class Findings:
 
         each = [of(it) for it in self.pairs]
         return Rms(pooled([it.mm for it in each]) or 0.0, pooled([it.deg for it in each]))
+
+
+def _is_offset_of(direction: Direction, frame: str) -> bool:
+    return not direction.is_rotation and direction.words.startswith(f"{frame}'s ")
 
 
 def judge(findings: Findings) -> Verdict:
@@ -386,12 +403,12 @@ def _helping(findings: Findings) -> Step | None:
     if any(it.do is NO_JOINTS for it in findings.warnings):
         return None
     words = "Add views from other poses of the robot."
-    return adding(words, modelled=findings.plannable)
+    return adding(words, modelled=findings.plannable, purpose=findings.of_camera)
 
 
 def _tilted(findings: Findings) -> Step:
     words = "Add 5 views or more, tilted by 20 to 40 degrees about different axes."
-    return adding(words, modelled=findings.plannable)
+    return adding(words, modelled=findings.plannable, purpose=findings.of_camera)
 
 
 def _pair_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
@@ -559,7 +576,7 @@ def _accuracy_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[
             step = adding(
                 "Add views with other postures of the arm, all over the workspace.",
                 modelled=findings.plannable,
-                purpose=" --for kinematics",
+                purpose=f" --for kinematics{findings.of_camera}",
             )
             is_fatal = it.workspace_mm > limits.sigma_mm[1]
             found = Finding("workspace", words, step, is_fatal=is_fatal, until_mm=0.0)
@@ -689,7 +706,8 @@ def _robot(arm: Arm) -> str:
 def _robot_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
     """An arm is a good instrument: what looks like its error is often something else's.
 
-    What chance makes of a good arm's noise, where poses are coarse, is no error. A task that needs ten times as much has an arm that is as good as it has to be.
+    What chance makes of a good arm's noise, where poses are coarse, is no error. A task that needs
+    ten times as much has an arm that is as good as it has to be.
     """
     for it in findings.arms:
         if it.away_mm is None or it.away_deg is None or it.errs:
