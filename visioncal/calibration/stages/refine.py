@@ -138,7 +138,11 @@ def _equally_weighed(
     if all(it.is_estimated for it in erring.errors):
         return answer, estimating
     fitted = settle(answer.looks, estimating, answer.moving, answer.frames)
-    return fitted, estimating.with_errors(fitted)
+    found = estimating.with_errors(fitted)
+    # Errors that were less than significant under the stated lenses may be it under these.
+    if [it.is_estimated for it in found.errors] != [it.is_estimated for it in estimating.errors]:
+        fitted = settle(fitted.looks, found, fitted.moving, fitted.frames)
+    return fitted, found
 
 
 def _sized(side: Side, fitted: Fitted) -> Fitted:
