@@ -273,6 +273,23 @@ def test_what_cannot_be_calibrated_is_refused_by_name():
             known_of(session)
 
 
+@pytest.mark.parametrize("options", [PROBE, POINTS], ids=["probe", "three"])
+def test_misread_joints_are_named(options):
+    sound = session_of(tracked(options))
+    wrong_sign = edited(sound, "q5_rad", lambda _, cell: repr(-float(cell)))
+    in_degrees = sound
+    for joint in range(1, 7):
+        in_degrees = edited(
+            in_degrees, f"q{joint}_rad", lambda _, cell: repr(float(np.rad2deg(float(cell))))
+        )
+    for session, words in (
+        (wrong_sign, "With q5_rad of the opposite sign, they fit what the instrument reads"),
+        (in_degrees, "With the angles in degrees, they fit what the instrument reads"),
+    ):
+        with pytest.raises(DataError, match=words):
+            known_of(session)
+
+
 def test_a_misspelt_point_is_named():
     named = edited(session_of(tracked(POINTS)), "point", lambda _, cell: f"nest_{cell}")
     wrong = edited(named, "point", lambda at, cell: "nset_a" if at == 6 else cell)

@@ -21,10 +21,11 @@ from visioncal.calibration.stages.observed import all_held_back
 from visioncal.calibration.stages.pictures import pairing
 from visioncal.calibration.stages.readings import (
     exchanged_points,
+    probe_poses,
     read_instrument,
     read_instruments,
 )
-from visioncal.calibration.stages.robots import check_joints, read_robots
+from visioncal.calibration.stages.robots import check_joints, check_read_joints, read_robots
 from visioncal.core.errors import DataError
 from visioncal.core.types import Rejection
 from visioncal.core.verdict import Finding, Step
@@ -96,6 +97,7 @@ def _readings(known: RunState) -> RunState:
     if known.mount == "instrument":
         readings = read_instrument(known.session)
         known = replace(known, readings=readings).noting(readings.rejections)
+        check_read_joints(known, probe_poses(known.session, readings))
         if not readings.are_poses:
             if known.solver != "joint":
                 raise DataError(

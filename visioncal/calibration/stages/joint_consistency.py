@@ -78,9 +78,11 @@ def _as_flange(cam_from_target: FloatArray, mount: Mount) -> FloatArray:
     return invert(cam_from_target) if mount == "eye-in-hand" else cam_from_target
 
 
-def misread_joints(guess: JointGuess, robot: Robot, *, has_poses: bool) -> DataError:
-    """The error of a session whose angles fit the camera in another reading only."""
-    sentence = guess.sentence("what the camera sees")
+def misread_joints(
+    guess: JointGuess, robot: Robot, *, has_poses: bool, seen: str = "what the camera sees"
+) -> DataError:
+    """The error of a session whose angles fit what was observed in another reading only."""
+    sentence = guess.sentence(seen)
     also = " The reported poses are those of the same angles, and as wrong." if has_poses else ""
     columns = guess.best.reading.columns or range(robot.joint_count)
     return DataError(

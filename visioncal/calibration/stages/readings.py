@@ -1,7 +1,7 @@
 """Readings of a measuring instrument: places of points on the flange, or poses of a probe."""
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -20,6 +20,7 @@ from visioncal.estimation.positions import (
     find_mounting,
     residuals,
 )
+from visioncal.estimation.procrustes import align
 from visioncal.session import Session, View
 from visioncal.session.instruments import Instrument, instrument_names, stated_instrument
 from visioncal.session.kinds import is_read, is_seen, name_of
@@ -31,6 +32,8 @@ _FARTHEST_M = 160.0
 _OFF, _USUAL = 5.0, 2.0
 # Readings agree to no better than this [m]: exact ones would otherwise be judged by rounding.
 _LEAST_M = 1e-7
+# Points whose width is under this share of their length are as good as on a line.
+_LINE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +105,30 @@ def read_instrument(session: Session) -> Readings:
         {view.number: _probe(view) for view in kept} if are_poses else None,
         (*missing, *rejections),
     )
+
+
+def probe_poses(session: Session, readings: Readings) -> dict[int, FloatArray]:
+    """Poses (4, 4) of what the flange carries, in the instrument's frame, by one view of each stop.
+
+    They are those of the probe, or of all points together as the first such stop has them; there
+    are none of fewer than three points, or of points on a line.
+    """
+    if readings.probes is not None:
+        return dict(readings.probes)
+    station = {it.view.number: it.station for it in session.observations}
+    stops: dict[Hashable, dict[int, int]] = defaultdict(dict)
+    for view, point in readings.points.items():
+        stops[station[view]][point] = view
+    numbers = range(len(readings.names))
+    views = [[it[at] for at in numbers] for it in stops.values() if len(it) == len(numbers)]
+    places = np.array([[readings.read_m[view] for view in it] for it in views])
+    if len(numbers) < 3 or not views:
+        return {}
+    away = places[0] - places[0].mean(axis=0)
+    sizes = np.linalg.svd(away, compute_uv=False)
+    if sizes[1] < _LINE * sizes[0]:
+        return {}
+    return {it[0]: align(at, places[0]) for it, at in zip(views, places, strict=True)}
 
 
 def read_instruments(session: Session) -> dict[int, ViewPoses]:

@@ -17,7 +17,7 @@ from visioncal.calibration.stages.motion import is_open
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.reported_poses import Reported, reported_poses
-from visioncal.core.types import Mount, Rejection
+from visioncal.core.types import FloatArray, Mount, Rejection
 from visioncal.core.verdict import remarks
 from visioncal.robot import Robot
 from visioncal.session import Observation, Session, frame_name
@@ -134,6 +134,33 @@ def _checked(seen: T, name: str, reported: Reported, matched: Matched, how: tupl
     taken = takes and matched.zero is None
     seen = seen.noting((), (lost_zero(guess, zero, taken=taken).of(_called(session, name)),))
     return seen.with_robot(name, reported.with_zero(zero)) if taken else seen
+
+
+def check_read_joints(seen: Observed, probes: Mapping[int, FloatArray]) -> None:
+    """Refuses joints that only fit what an instrument reads where they are read otherwise.
+
+    A lost zero is none of these: it is found with the arm.
+
+    Args:
+        seen: What is known.
+        probes: (4, 4) `instrument_from_probe` by view; empty where points do not give them.
+
+    Raises:
+        DataError: They do.
+    """
+    for reported in seen.robots.values():
+        matched, joints = reported.matched, reported.joints_rad or {}
+        views = [it for it in probes if it in joints and it not in seen.held_back]
+        if matched is None or not views:
+            continue
+        q, looks = (np.array([by_view[it] for it in views]) for by_view in (joints, probes))
+        # The instrument stands still beside the robot, as a camera does.
+        guess = guess_seen_joints(matched.arm, q, looks, "eye-to-hand")
+        if guess is not None and guess.stands_out and guess.zero is None:
+            mine = (it for it in seen.session.views if it.number in joints)
+            has_poses = any(it.base_from_flange() is not None for it in mine)
+            by = "what the instrument reads"
+            raise misread_joints(guess, matched.robot, has_poses=has_poses, seen=by)
 
 
 @dataclass(frozen=True, eq=False)
