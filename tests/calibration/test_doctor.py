@@ -2,10 +2,12 @@
 
 import json
 import re
+from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
-from support.broken_sessions import BROKEN, broken_session, edit_rows, sound_session
+from support.broken_sessions import BROKEN, broken_session, edit, edit_rows, sound_session
 from support.commands import visioncal as command
 from support.typed_fixes import mended
 
@@ -54,6 +56,23 @@ def test_nothing_is_wrong_with_a_sound_session(sound):
     done = command("doctor", sound)
     assert (done.status, done.err) == (0, "")
     assert f"visioncal calibrate {sound} -o out" in done.out
+
+
+def test_markers_too_small_to_read_are_no_mirror_and_no_other_board(tmp_path):
+    """Its squares are seen, and look alike in a mirror."""
+    plain = BROKEN["semicolons"].options
+    small = replace(plain.target, marker_m=0.4 * plain.target.square_m)
+    options = replace(plain, target=small, views=8)
+    folder = sound_session(tmp_path / "far", replace(BROKEN["semicolons"], options=options))
+    for file in (folder / "images").iterdir():
+        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        cv2.imwrite(str(file), cv2.resize(image, (480, 300), interpolation=cv2.INTER_AREA))
+    edit(folder, lambda text: re.sub(r"resolution = \[[^]]*\]", "resolution = [480, 300]", text))
+    edit(folder, lambda text: re.sub(r"(matrix|distortion) = \[[^]]*\]", "", text))
+    first, *rest = visioncal.doctor(folder).findings
+    assert first.kind == "unread_markers"
+    assert re.search(r"markers cannot be read: they are \d+ px wide", first.words)
+    assert not {it.kind for it in rest} & {"mirrored_images", "other_board"}
 
 
 @pytest.mark.parametrize("name", NAMED)

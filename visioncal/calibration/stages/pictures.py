@@ -14,9 +14,11 @@ from visioncal.core.types import Image, Target
 from visioncal.core.verdict import LEAST_NEED_MM, MISSING, Finding, Step
 from visioncal.session import Session, View
 from visioncal.session.images import FolderImages
-from visioncal.vision.finders.identify import Identity, identify
+from visioncal.vision.finders.board import find_board
+from visioncal.vision.finders.identify import MAYBE_CHARUCO, Identity, identify
 from visioncal.vision.finders.identify_text import describe
 from visioncal.vision.finders.imaging import decode_image, why_hard_to_see
+from visioncal.vision.finders.result import DetectedCorners
 from visioncal.vision.targets import load_target, target_names
 
 # So many names are listed, and so many images are searched for whatever board they show.
@@ -26,6 +28,7 @@ _ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 _SEEN = ("kind", "columns", "rows", "legacy", "marker_id", "asymmetric")
 # A board is named by an image that shows so much of it.
 _CLEARLY = 0.2
+_UNREAD, _MIRRORED = "unread_markers", "mirrored_images"
 # Sizes of squares that are the same but for rounding.
 _SAME_SIZE = 0.01
 
@@ -175,28 +178,51 @@ def other_board(session: Session, unseen: Sequence[View]) -> Finding | None:
         if why:
             hard = hard or _blurred(view, why, there)
             continue
-        found = _identified(image)
-        if found is None and _identified(np.ascontiguousarray(image[:, ::-1])) is not None:
-            return _mirrored(view)
+        found = _identified(image, declared)
+        cause = _unread(view, image, found, declared)
+        if cause is not None and (found is not None or cause.kind == _MIRRORED):
+            return cause
+        hard = hard or cause
         if found is not None and (shown is None or _is_better(found, shown[1])):
             shown = view, found
-    if shown is None:
+    if shown is None or (hard and hard.kind == _UNREAD and _has_its_squares(shown[1], declared)):
         return hard
     view, found = shown
     # Of a grid or a rig of tags, one alone names no board: the finder says what it lacks.
-    is_its_tag = found.kind == "marker" and declared.kind in ("aprilgrid", "points")
-    if is_its_tag and declared.dictionary in (found.dictionary, *found.larger):
+    if declared.kind in ("aprilgrid", "points") and _is_its_tag(found, declared):
         return None
     return None if _is(found, declared) else _another(view, found, declared)
 
 
-def _identified(image: Image) -> Identity | None:
-    """The board of an image; None where few of its corners are seen, as where it is blurred."""
+def _identified(image: Image, declared: Target) -> Identity | None:
+    """The board of an image; None where few of its corners are seen, as where it is blurred.
+
+    A single marker of a declared ChArUco board is none.
+    """
     try:
         found = identify(image)
     except DataError:
         return None
+    if declared.kind == "charuco" and _is_its_tag(found, declared):
+        return None
     return found if found.corners_seen >= _CLEARLY * found.corners else None
+
+
+def _is_its_tag(found: Identity, declared: Target) -> bool:
+    """Whether a single marker is of the dictionary that a board is declared to have."""
+    return found.kind == "marker" and declared.dictionary in (found.dictionary, *found.larger)
+
+
+def _has_its_squares(found: Identity, declared: Target) -> bool:
+    """Whether a checkerboard is as large as the one that a declared ChArUco board is made from."""
+    inner = {declared.columns - 1, declared.rows - 1}
+    is_pair = declared.kind == "charuco" and found.kind == "checkerboard"
+    return is_pair and {found.columns, found.rows} == inner
+
+
+def _lacks_markers(found: Identity, declared: Target) -> bool:
+    """Whether the squares of a declared ChArUco board are seen, but its markers cannot be read."""
+    return _has_its_squares(found, declared) and MAYBE_CHARUCO in found.notes
 
 
 def _is_better(found: Identity, before: Identity) -> bool:
@@ -219,14 +245,55 @@ def _another(view: View, found: Identity, declared: Target) -> Finding:
         step = Step(
             'In session.toml, write target = "seen.toml", which this command makes; give it the '
             "measured side of a square.",
-            f"visioncal target check SESSION/{shlex.quote(view.image)} "
-            f"--square-mm {1e3 * declared.square_m:g} -o SESSION/seen.toml",
+            _made_from(view, declared),
         )
     words = (
         f"The images show another board than declared: a {describe(found)} (view {view.number}), "
         f"and {declared.name} is a {_declared(declared)}."
     )
     return Finding("other_board", words, step, (view.number,))
+
+
+def _unread(view: View, image: Image, found: Identity | None, declared: Target) -> Finding | None:
+    """What an image shows in which nothing of a board is read, or its squares alone."""
+    if found is not None and not _lacks_markers(found, declared):
+        return None
+    mirrored = _identified(np.ascontiguousarray(image[:, ::-1]), declared)
+    # Squares look alike in a mirror: only what is read in it says that there is one.
+    of_it = ("charuco",) if declared.kind == "charuco" else ("charuco", "aprilgrid", "marker")
+    if mirrored is not None and mirrored.kind in of_it:
+        return _mirrored(view)
+    squares = found or mirrored
+    if squares is None or not _lacks_markers(squares, declared):
+        return None
+    seen = find_board(image, squares.target(declared.name, declared.square_m))
+    wide = ""
+    if isinstance(seen, DetectedCorners) and len(seen.ids) == squares.columns * squares.rows:
+        grid = seen.px.reshape(squares.rows, squares.columns, 2)
+        square_px = float(np.median(np.linalg.norm(np.diff(grid, axis=1), axis=2)))
+        wide = f": they are {square_px * declared.marker_m / declared.square_m:.0f} px wide"
+    step = Step("Bring the board nearer, focus, or use a board of fewer and larger squares.")
+    if found is not None:  # Where a few markers are read after all, it is no checkerboard.
+        step = Step(
+            f"{step.words} Where all of it is in the images, it serves as a checkerboard: write "
+            'target = "seen.toml" in session.toml, which this command makes.',
+            _made_from(view, declared),
+        )
+    return Finding(
+        _UNREAD,
+        f"The images show the squares of {declared.name}, but its markers cannot be read{wide} "
+        f"(view {view.number}).",
+        step,
+        (view.number,),
+    )
+
+
+def _made_from(view: View, declared: Target) -> str:
+    """The command that describes the board of a view's image."""
+    return (
+        f"visioncal target check SESSION/{shlex.quote(view.image)} "
+        f"--square-mm {1e3 * declared.square_m:g} -o SESSION/seen.toml"
+    )
 
 
 def _as_large(one: Target, other: Target) -> bool:
@@ -247,7 +314,7 @@ def _declared(target: Target) -> str:
 
 def _mirrored(view: View) -> Finding:
     return Finding(
-        "mirrored_images",
+        _MIRRORED,
         f"The images are mirrored: the board is seen in view {view.number} only where left and "
         "right are exchanged.",
         Step(
