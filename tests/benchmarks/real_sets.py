@@ -17,13 +17,18 @@ from visioncal.core.errors import VisioncalError
 SESSIONS = Path(__file__).parents[3] / "shared" / "data" / "sessions"
 WORKERS = 2
 HEAD = (
-    "session", "verdict", "left out", "sigma mm, deg", "left-out views", "all, Park's", "first"
+    "session", "verdict", "left out", "sigmas", "left-out views", "all, Park's", "first"
 )  # fmt: skip
 
 
 def first_words(text: str) -> str:
     """What a table has room for of a sentence."""
     return textwrap.shorten(text.split(". ")[0], 140, placeholder=" ...")
+
+
+def both(mm: float, deg: float | None) -> str:
+    """A length and, where it is known, an angle."""
+    return f"{mm:.2g} mm" + ("" if deg is None else f", {deg:.2g} deg")
 
 
 def row_of(session: Path) -> tuple[str, ...]:
@@ -34,15 +39,15 @@ def row_of(session: Path) -> tuple[str, ...]:
         return session.name, "refused", *[""] * 4, first_words(str(refused))
     unused = [it.view for it in result.views if not it.used]
     words = " ".join(map(str, unused)) if len(unused) < 15 else f"{len(unused)} views"
-    sigmas = [f"{it.sigma_mm:.2g}, {it.sigma_deg:.2g}" for it in result.placed.values()]
+    sigmas = [both(it.sigma_mm, it.sigma_deg) for it in result.placed.values()]
     held_out, park = result.validation.held_out, result.solvers.get("park")
     return (
         session.name,
         result.verdict.status,
         words or "none",
         "; ".join(sigmas),
-        f"{held_out.mm:.2g} mm, {held_out.deg:.2g} deg",
-        "" if park is None else f"{park.rms_mm:.2g} mm, {park.rms_deg:.2g} deg",
+        both(held_out.mm, held_out.deg),
+        "" if park is None else both(park.rms_mm, park.rms_deg),
         first_words(result.verdict.top[0]),
     )
 
