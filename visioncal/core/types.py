@@ -1,7 +1,7 @@
 """Plain frozen data that travels between the layers; it carries no behaviour of its own."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -134,6 +134,11 @@ class Corners:
     blur_px: float
     weights: FloatArray | None = None
     stated_px: float | None = None
+
+    def take(self, rows: IntArray | Mask) -> "Corners":
+        """Returns those of (m,) rows or of an (n,) mask."""
+        weights = None if self.weights is None else self.weights[rows]
+        return replace(self, ids=self.ids[rows], px=self.px[rows], weights=weights)
 
 
 @dataclass(frozen=True)

@@ -267,10 +267,11 @@ def measured_rig(side: Side, fitted: Fitted, frame: str, rig: int) -> MeasuredSc
         rig: Which target it is.
     """
     problem, state = fitted.problem, fitted.fit.state
-    seen = np.array([it == frame for it in problem.observations.observed])
-    poses = problem.observations.measured[seen]
-    by_size = np.zeros((len(seen), 6, 1))
-    by_size[seen, 3:] = np.swapaxes(poses[:, :3, :3], 1, 2) @ poses[:, :3, 3:]
+    # A rig that was moved has a frame for each place where it was.
+    mine = np.array([it.partition("@")[0] == frame for it in problem.observations.observed])
+    poses = problem.observations.measured[mine]
+    by_size = np.zeros((len(mine), 6, 1))
+    by_size[mine, 3:] = np.swapaxes(poses[:, :3, :3], 1, 2) @ poses[:, :3, 3:]
     size = Effect.free("size of a rig", Knowledge(np.zeros((1, 1)), np.zeros(1)), by_size)
     problem = problem.with_effects([*problem.effects, size])
     there = State(state.edges, np.append(state.values, 0.0))

@@ -37,7 +37,7 @@ def weights_by_view(squares: FloatArray, freedom: FloatArray) -> FloatArray | No
     about = logs - np.average(logs, weights=1.0 / covariance)
     if np.sum(about**2 / covariance) < chi2_limit(_FALSE_ALARM, len(logs) - 1):
         return None
-    # Few views come here, and none that is located.
+    # Few sessions have such views, and `locate` need not wait a tenth of a second for this import.
     from scipy.optimize import brentq
 
     between = float(np.clip(np.var(logs, ddof=1) - np.mean(covariance), *_BETWEEN))

@@ -10,7 +10,7 @@ from visioncal.core.limits import MAX_BLUR_PX
 from visioncal.core.number_format import figure
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.types import Camera, Corners, FloatArray, Image, IntArray, Target
+from visioncal.core.types import Camera, Corners, FloatArray, Image, Target
 from visioncal.estimation.appearance import (
     SCALE,
     Appearance,
@@ -176,7 +176,7 @@ def _fitted(
         if passed.is_open:
             break
         kept = passed.mask
-        corners = _chosen(corners, corners.ids[kept], np.flatnonzero(kept))
+        corners = corners.take(kept)
     return poses, corners, float(np.sum(residuals[passed.mask] ** 2))
 
 
@@ -204,8 +204,7 @@ def _jacobian(
     """
     # Turned, corner i lies where corner p[i] was: what was seen as that one is i.
     ids = np.argsort(rotations(target)[poses.turns[at]])[corners.ids]
-    order = np.argsort(ids)
-    turned = _chosen(corners, ids[order], order)
+    turned = replace(corners, ids=ids).take(np.argsort(ids))
     stack = _stack(eye, turned, corner_positions(target), noise_px)
     found = _compressed(eye.camera, stack, target, poses.cam_from_target[at : at + 1])
     by_pose = reproject(stack, eye.camera, found.cam_from_target, lens=False).by_pose
@@ -213,12 +212,6 @@ def _jacobian(
     stack.weigh(beyond)
     moved = stack.products_by_view(by_pose, beyond)
     return found, -(covariance_from(found.information) @ moved)[0]
-
-
-def _chosen(corners: Corners, ids: IntArray, rows: IntArray) -> Corners:
-    """Some of the corners, in another order and by other numbers."""
-    weights = None if corners.weights is None else corners.weights[rows]
-    return replace(corners, ids=ids, px=corners.px[rows], weights=weights)
 
 
 def _compressed(

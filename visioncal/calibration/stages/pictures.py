@@ -15,7 +15,7 @@ from visioncal.core.verdict import LEAST_NEED_MM, MISSING, Finding, Step
 from visioncal.session import Session, View
 from visioncal.session.images import FolderImages
 from visioncal.vision.finders.board import find_board
-from visioncal.vision.finders.identify import MAYBE_CHARUCO, Identity, identify
+from visioncal.vision.finders.identify import Identity, identify
 from visioncal.vision.finders.identify_text import describe
 from visioncal.vision.finders.imaging import decode_image, why_hard_to_see
 from visioncal.vision.finders.result import DetectedCorners
@@ -222,7 +222,7 @@ def _has_its_squares(found: Identity, declared: Target) -> bool:
 
 def _lacks_markers(found: Identity, declared: Target) -> bool:
     """Whether the squares of a declared ChArUco board are seen, but its markers cannot be read."""
-    return _has_its_squares(found, declared) and MAYBE_CHARUCO in found.notes
+    return _has_its_squares(found, declared) and found.is_filled
 
 
 def _is_better(found: Identity, before: Identity) -> bool:

@@ -72,10 +72,7 @@ def chosen(view: ViewPoses, pick: int, target: Target | None) -> ViewPoses:
     if corners is not None and target is not None and turn:
         # Turned, corner i lies where corner rotations[i] was: what was seen as that one is i.
         renumbered = np.argsort(rotations(target)[turn])[corners.ids - view.first] + view.first
-        order = np.argsort(renumbered)
-        weights = None if corners.weights is None else corners.weights[order]
-        px = corners.px[order]
-        corners = replace(corners, ids=renumbered[order], px=px, weights=weights)
+        corners = replace(corners, ids=renumbered).take(np.argsort(renumbered))
     return replace(
         view,
         corners=corners,

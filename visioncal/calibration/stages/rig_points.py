@@ -15,7 +15,7 @@ import numpy as np
 from visioncal.calibration.stages.observed import Observed
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import skew
-from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Mask, Target
+from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Target
 from visioncal.core.verdict import CALIBRATE, Finding, Step
 from visioncal.estimation.numbering import find_numbering
 from visioncal.estimation.planar import determines_pose
@@ -71,15 +71,9 @@ def leave_out_wrong_points(seen: T) -> T:
         seen = seen.noting((), (_said(target, places, called),))
         gone = np.array([first + it for it in places])
         for frame, look in seen.cameras.items():
-            kept = {view: _without(it, gone) for view, it in look.corners.items()}
+            kept = {view: it.take(~np.isin(it.ids, gone)) for view, it in look.corners.items()}
             seen = seen.with_camera(frame, replace(look, corners=kept))
     return seen
-
-
-def _without(corners: Corners, ids: IntArray) -> Corners:
-    keep = ~np.isin(corners.ids, ids)
-    weights = None if corners.weights is None else corners.weights[keep]
-    return replace(corners, ids=corners.ids[keep], px=corners.px[keep], weights=weights)
 
 
 def _places_elsewhere(seen: Observed, target: Target, first: int) -> dict[int, FloatArray]:

@@ -25,7 +25,7 @@ _LISTED = 12
 _USUAL_PIXELS, _MUCH_LARGER = 2e6, 0.5
 # So many markers on one lattice are a board, even where its corners are not found.
 _SURE_MARKERS = 8
-MAYBE_CHARUCO = (
+_MAYBE_CHARUCO = (
     "The light squares are not plain: rather a ChArUco board whose markers are too blurred to "
     "read. Take a sharper picture."
 )
@@ -75,6 +75,11 @@ class Identity:
     asymmetric: bool = False
     diameter_share: float = 0.0
     notes: tuple[str, ...] = ()
+
+    @property
+    def is_filled(self) -> bool:
+        """Whether the light squares of a checkerboard hold what may be markers."""
+        return _MAYBE_CHARUCO in self.notes
 
     def target(self, name: str, square_m: float) -> Target:
         """Builds the target.
@@ -160,8 +165,8 @@ def _notes_beside(others: Iterable[Identity]) -> Iterator[str]:
     for it in others:
         if it.kind == "marker":
             yield f"Beside it, marker {it.marker_ids[0]} of {it.dictionary} is seen."
-        elif MAYBE_CHARUCO in it.notes:
-            yield f"Squares are seen around it. {MAYBE_CHARUCO}"
+        elif it.is_filled:
+            yield f"Squares are seen around it. {_MAYBE_CHARUCO}"
 
 
 def _charucos(image: Image, markers: tuple[Marker, ...]) -> dict[str, Identity]:
@@ -241,7 +246,7 @@ def _checkerboards(image: Image) -> list[Identity]:
     count = squares.columns * squares.rows
     notes = []
     if squares.filled:
-        notes.append(MAYBE_CHARUCO)
+        notes.append(_MAYBE_CHARUCO)
     if squares.cut:
         notes.append("The board may go on outside the image.")
     if not squares.found:
