@@ -11,6 +11,7 @@ from support.problems import observed, world
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.stages import refine
 from visioncal.calibration.stages.diagnose import misfits
+from visioncal.calibration.stages.turned_images import turned_how
 from visioncal.core.transforms import exp
 from visioncal.estimation.arm import ArmErrors, covariance_of_size
 from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance, radius95
@@ -334,6 +335,52 @@ def test_a_focus_that_follows_the_distance_is_counted_and_named(mount):
     # 12 components: 2.8 is one in a thousand. Left out of the model, it is above 100.
     assert np.mean(squared) / 3 < 2.8
     assert named == 4
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_one_image_that_was_turned_is_named_and_no_lens_that_refocuses(mount):
+    camera = fine_camera()
+    # A principal point off the middle: turned, the image is of another lens than the others.
+    camera = replace(camera, matrix=camera.matrix + np.array([0.0, 0.0, 25.0, -8.0]))
+    cell = simulate(replace(FINE, mount=mount, camera=camera, pixel_sigma_px=0.01))
+    last = np.array(camera.resolution) - 1.0
+    corners = list(cell.corners)
+    corners[5] = replace(corners[5], px=last - corners[5].px)
+    known = calibrated(replace(cell, corners=tuple(corners)), joints=False)
+    assert [it.kind for it in known.findings.warnings] == ["turned_images"]
+    (found,) = known.findings.warnings
+    assert (found.views, "turned by 180 deg" in found.words) == ((5,), True)
+    assert "mogrify -rotate 180 SESSION/5.png" in found.do.command
+    assert "its image is turned by 180 deg" in known.solved.sights[5].reason
+    # 3 components: 5.4 is one in a thousand.
+    assert mahalanobis_sq_of_place(cell, known) / 3 < 5.4
+
+
+# What was done to an image (rows, columns), and what undoes it by the words of the finding.
+CHANGES = {
+    "turned by 180 deg": lambda it: np.rot90(it, 2),
+    "turned by 90 deg counterclockwise": np.rot90,
+    "turned by 90 deg clockwise": lambda it: np.rot90(it, -1),
+    "mirrored left to right": np.fliplr,
+    "mirrored upside down": np.flipud,
+}
+
+
+@pytest.mark.parametrize("words", CHANGES)
+def test_how_an_image_was_turned_is_by_its_corners(words):
+    image, rng = np.zeros((400, 400), dtype=np.int64), np.random.default_rng(0)
+    rows, columns = np.mgrid[60:240:30, 100:340:30].reshape(2, -1)
+    rows = rows + (columns // 30) * 3  # On no lattice that a turn carries into itself.
+    image[rows, columns] = np.arange(1, len(rows) + 1)
+    places = np.stack([columns, rows], axis=1).astype(float)
+    seen = np.argwhere(CHANGES[words](image))[:, ::-1] + rng.normal(0.0, 0.1, places.shape)
+    assert turned_how(seen, places, (400, 400), 0.1).words == words
+    # Quarters change the size of other images; where corners agree, or nowhere, nothing is said.
+    is_quarter = "90" in words
+    found = turned_how(seen, places, (400, 399), 0.1)
+    assert found is None or not is_quarter
+    assert turned_how(places, places, (400, 400), 0.1) is None
+    assert turned_how(seen + 7.0, places, (400, 400), 0.1) is None
 
 
 def mahalanobis_sq_of_place(cell, known):

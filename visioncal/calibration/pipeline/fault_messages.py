@@ -1,5 +1,6 @@
 """What is wrong with observations that disagree, and what moved, for people."""
 
+import shlex
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,6 +9,7 @@ import numpy as np
 
 from visioncal.calibration.pipeline.solving import Solved
 from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
+from visioncal.calibration.stages.turned_images import Turned
 from visioncal.calibration.stages.validate import apart
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
@@ -136,17 +138,44 @@ def moved_found(moved: Moved) -> Finding:
 
 
 def pose_faults(solved: Solved) -> tuple[PoseFault, ...]:
-    """Robots that were pushed, and poses of theirs that are exchanged or wrong."""
+    """Images that were turned, robots that were pushed, poses that are exchanged or wrong."""
     out = np.flatnonzero(~solved.agreed.used)
     if not len(out):
         return ()
+    turned = _turned_images(solved)
+    explained = {row for it in turned for row in it.rows}
     mutual = exchanged(solved.agreed.problem, _fitting(solved, out))
     if solved.cell.mount is not None:
-        return tuple(_exchanged_views(solved, mutual))
+        return (*turned, *_exchanged_views(solved, mutual))
     found = _pushed_bases(solved)
     found += _exchanged(solved, mutual)
-    explained = {row for it in found for row in it.rows}
-    return (*found, *_wrong_poses(solved, explained))
+    explained |= {row for it in found for row in it.rows}
+    return (*turned, *found, *_wrong_poses(solved, explained))
+
+
+def _turned_images(solved: Solved) -> list[PoseFault]:
+    """Images that agree with the others once they are turned back, by how they were turned."""
+    rows, found = solved.cell.rows, []
+    alike: dict[Turned, list[int]] = defaultdict(list)
+    for at, row in enumerate(rows):
+        if row.view in solved.turned and not solved.agreed.used[at]:
+            alike[solved.turned[row.view]].append(at)
+    images = {it.number: it.image for it in solved.cell.session.views}
+    for how, mine in alike.items():
+        views = _numbers(solved, mine)
+        named = some_of([*map(str, views)], _LISTED)
+        subject = f"The image of view {named} is" if len(views) == 1 else f"Images {named} are"
+        them = "it agrees" if len(views) == 1 else "they agree"
+        left_out = "It was" if len(views) == 1 else "They were"
+        words = f"{subject} {how.words}: turned back, {them} with the others. {left_out} left out."
+        step = Step("Turn these corners back in corners.csv, and calibrate again.", CALIBRATE)
+        if all(images[it] for it in views):
+            files = " ".join(f"SESSION/{shlex.quote(images[it])}" for it in views)
+            turn = f"mogrify {how.option} {files}"
+            step = Step("Turn the file back, and calibrate again.", f"{turn} && {CALIBRATE}")
+        fault = Finding("turned_images", words, step, views)
+        found.append(PoseFault(fault, tuple(mine), f"its image is {how.words}"))
+    return found
 
 
 def _exchanged_views(solved: Solved, mutual: Mapping[int, int]) -> Iterator[PoseFault]:

@@ -1,7 +1,7 @@
 """From what was seen to the fit of the whole cell: start, agreement, lenses and boards."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -24,7 +24,8 @@ from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.priors import loosened, without_most_contradicted
 from visioncal.calibration.stages.refine import lens_levels, refined
 from visioncal.calibration.stages.side import FramesSide
-from visioncal.calibration.stages.validate import chain_rms_px
+from visioncal.calibration.stages.turned_images import Turned, turned_how
+from visioncal.calibration.stages.validate import chain_rms_px, predict_corners
 from visioncal.core.choices import SolverName
 from visioncal.core.errors import DegenerateError
 from visioncal.core.types import FloatArray, IntArray, Mask, Mount, Target
@@ -71,6 +72,7 @@ class Solved:
         arms: The robots' arms, as far as they were calibrated.
         asked: How far that was to be.
         late: The errors of clocks, as effects.
+        turned: How images of views that disagree were turned or mirrored, by view.
         solver: By which solver the edges are.
     """
 
@@ -82,6 +84,7 @@ class Solved:
     arms: Mapping[str, RobotArm]
     asked: str
     late: tuple[Effect, ...]
+    turned: Mapping[int, Turned] = field(default_factory=dict)
     solver: str = "joint"
 
     @property
@@ -180,7 +183,12 @@ def solve(
     cell, views, problem, state, unplaced = _started(cell, views)
     agreed = all_as_inliers(problem, state) if looked.is_misread else _agree(cell, problem, state)
     late = clock_effects(cell, looked.clocks)
-    agreed, seen, arms = _agreeing_looks(cell, looked, views, agreed, arms, late)
+    fitted = _agreeing_looks(cell, looked, views, agreed, arms, late)
+    if turned := {} if looked.is_misread else _turned_images(cell, views, fitted[0], fitted[1]):
+        # Their corners would pass for a lens that changes from view to view.
+        looked = replace(looked, turned=turned)
+        fitted = _agreeing_looks(cell, looked, views, agreed, arms, late)
+    agreed, seen, arms = fitted
     arms = with_drifts(arms, agreed.problem.subset(agreed.used), agreed.fit, asked)
     if any(it.drift is not None for it in arms.values()):
         agreed, seen, arms = _agreeing_looks(cell, looked, views, agreed, arms, late)
@@ -203,7 +211,8 @@ def solve(
         agreed, seen, arms = _with_functions(cell, agreed, seen, arms, late, asked)
     agreed = _with_repeats(agreed)
     arms = with_pose_errors(arms, agreed.problem.subset(agreed.used), agreed.fit)
-    found = Solved(cell, agreed, seen, tuple(views), (*lost, *unplaced), arms, asked, late)
+    untied = (*lost, *unplaced)
+    found = Solved(cell, agreed, seen, tuple(views), untied, arms, asked, late, looked.turned)
     return found if solver == "joint" else _by_closed_form(found, solver)
 
 
@@ -293,6 +302,28 @@ def _agreeing_looks(
         if np.array_equal(before, agreed.used):
             break
     return agreed, seen, fitted
+
+
+def _turned_images(
+    cell: Cell, views: Sequence[ViewPoses], agreed: Agreed, seen: LinearisedCorners | None
+) -> dict[int, Turned]:
+    """How images of views that disagree were turned or mirrored, by view."""
+    fit = Solved(cell, agreed, seen, tuple(views), (), {}, "", ())
+    looks, state, problem = fit.looks, agreed.fit.state, agreed.problem
+    if looks is None or agreed.used.all():
+        return {}
+    typical_px = float(np.nanmedian(fit.chain_px(np.flatnonzero(agreed.used), state)))
+    predicted, found = problem.predicted(state), {}
+    for at in np.flatnonzero(~agreed.used).tolist():
+        seer, view = cell.rows[at].seer, views[at]
+        if view.corners is None or seer not in looks.problems:
+            continue
+        camera = looks.camera(seer)
+        places = predict_corners(camera, predicted[at], looks.corners[view.board])
+        how = turned_how(view.corners.px, places, camera.resolution, typical_px)
+        if how is not None:
+            found[view.view] = how
+    return found
 
 
 def _with_looks(
@@ -407,7 +438,7 @@ def _views_by_camera(looked: Observed, views: Sequence[ViewPoses]) -> dict[str, 
     """The views of each camera's images that some fit may use, each with its one pose."""
     known = {**looked.poses, **{it.view: it for it in views}}
     # Frames of a sweep that are not needed were taken on the move: rows of theirs are not at rest.
-    out = looked.held_back | looked.spared.keys()
+    out = looked.held_back | looked.spared.keys() | looked.turned.keys()
     return {
         frame: [known[it] for it in look.corners if it in known and it not in out]
         for frame, look in looked.cameras.items()

@@ -79,6 +79,7 @@ class Evidence:
 _CHAIN = "chain"
 EVIDENCE: Mapping[str, Evidence] = {
     "exchanged_views": Evidence(1e-6),
+    "turned_images": Evidence(1e-6),
     "wrong_pose": Evidence(1e-3),
     "wrong_views": Evidence(1e-3),
     "something_moved": Evidence(1e-3),

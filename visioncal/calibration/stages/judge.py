@@ -46,6 +46,8 @@ _CAUSES: Mapping[Mount, str] = {
 _UNEVEN = 1.5
 # So many views in a row are not left out by chance.
 _LEAST_RUN = 3
+# Kinds of findings about views that are left out.
+_LEFT_OUT = ("exchanged_views", "turned_images", "wrong_pose", "something_moved")
 # Views that disagree by less than so many times what their sensor's noise makes are explained: of a
 # small board far away, nothing better is to be had.
 _OF_NOISE = 1.5
@@ -277,7 +279,7 @@ def judge(findings: Findings) -> Verdict:
 
 def _warned(found: Finding, findings: Findings) -> Finding:
     """A stage's warning, with what the result is without the views that it has left out."""
-    left_out = found.kind in ("exchanged_views", "wrong_pose", "something_moved")
+    left_out = found.kind in _LEFT_OUT
     return replace(found, without_it=_without_them(findings.held_out)) if left_out else found
 
 

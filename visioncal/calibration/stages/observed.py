@@ -11,6 +11,7 @@ from visioncal.calibration.stages.clock import Clocked, Pair
 from visioncal.calibration.stages.dense import Dense
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.reported_poses import Reported
+from visioncal.calibration.stages.turned_images import Turned
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.types import Corners, FloatArray, Progress, Rejection
@@ -67,6 +68,7 @@ class Observed:
         dense: How corners are fitted by all pixels around them; None for the template's.
         is_misread: Whether robots' poses are clearly misread, so that they determine nothing of
             lenses and boards.
+        turned: How images were turned or mirrored that say nothing of their camera's lens, by view.
     """
 
     session: Session
@@ -82,6 +84,7 @@ class Observed:
     notes: tuple[str, ...] = ()
     dense: Dense | None = None
     is_misread: bool = False
+    turned: Mapping[int, Turned] = field(default_factory=dict)
 
     def noting(self, rejections: Iterable[Rejection], warnings: Iterable[Finding] = ()) -> Self:
         """Adds rejected views, of which the first reason counts, and warnings."""
