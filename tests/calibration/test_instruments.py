@@ -1,6 +1,7 @@
 """Calibration by a measuring instrument: recovery, sigmas, rank, wrong rows and refusals."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -346,3 +347,29 @@ def test_a_mounting_is_found_from_a_rough_start():
     )
     found = fit_mounting(places, off, 2)
     assert found.on_flange == pytest.approx(mounting.on_flange, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("options", "joint", "slip_deg"),
+    [(POINT, 3, 0.15), (POINT, 5, 0.05), (PROBE, 1, -0.1), slow(POINTS, 2, 0.3)],
+)
+def test_a_joint_that_slips_between_readings_is_named(options, joint, slip_deg):
+    """Functions of the joints would explain much of it, and leave the result good."""
+    shop = tracked(replace(options, **WRONG, stops=40))
+    slipped = shop.joints.copy()
+    slipped[20:, joint - 1] += np.deg2rad(slip_deg)
+    known = known_of(session_of(replace(shop, joints=slipped)))
+    assert known.verdict.status != "good"
+    (found,) = (it for it in known.verdict.findings if it.kind == "joint_slipped")
+    assert found == known.verdict.causes[0]
+    assert f"joint {joint} (" in found.words
+    assert "from stop 20 on" in found.words
+    ((slip, sigma_deg),) = _steps_deg(found.words)
+    # Known to its sigma; the noise beside an unmodelled step is that of a fit without it.
+    assert slip == pytest.approx(slip_deg, abs=4.0 * sigma_deg)
+    assert sigma_deg < 0.03
+
+
+def _steps_deg(words):
+    found = re.findall(r"it reads ([+-][0-9.]+) deg \(sigma ([0-9.]+)\)", words)
+    return [tuple(map(float, it)) for it in found]

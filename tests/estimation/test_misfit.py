@@ -8,11 +8,12 @@ from support.cells import calibrated, error_of
 from support.marks import slow
 from support.problems import observed, world
 
+from visioncal.calibration.pipeline import calibrate
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.stages import refine
 from visioncal.calibration.stages.diagnose import misfits
 from visioncal.calibration.stages.turned_images import turned_how
-from visioncal.core.transforms import exp
+from visioncal.core.transforms import exp, invert, log
 from visioncal.estimation.arm import ArmErrors, covariance_of_size
 from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance, radius95
 from visioncal.estimation.chain import chain
@@ -24,6 +25,7 @@ from visioncal.estimation.residual_tests import drift, lens_field, neighbours
 from visioncal.estimation.solve import covariance_of, fit_problem
 from visioncal.estimation.variance import profile_interval
 from visioncal.simulation import CellOptions, fine_camera, simulate
+from visioncal.simulation.records import POSE, pairs_session
 
 FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
 MOUNTS = ("eye-in-hand", "eye-to-hand")
@@ -103,6 +105,46 @@ def test_a_bump_among_measured_poses_is_found():
     found = misfits(problem, inliers(problem).fit, {})[ROBOT]
     assert found.moved is None
     assert found.step.stop == 12
+
+
+@pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
+def test_a_bump_is_in_the_covariance(mount):
+    """The answer is between both places, and as far from each as it says."""
+    squares = []
+    for seed in range(4):
+        cell = simulate(replace(FINE, mount=mount, seed=seed))
+        on_flange = next(it for name, it in cell.transforms.items() if name.startswith("flange"))
+        later = on_flange @ exp(np.array([0.001, 0, 0, 0, 1.6e-3, 1.2e-3]))
+        flange = cell.base_from_flange.copy()
+        flange[10:] = flange[10:] @ on_flange @ invert(later)
+        result, known = answered(replace(cell, base_from_flange=flange))
+        assert [it.kind for it in known.verdict.causes][:1] == ["moved_at_once"]
+        assert not {"weak_motion", "place", "calibration"} & {
+            it.kind for it in known.verdict.findings
+        }
+        edge = result.edges["cam" if mount == "eye-in-hand" else "target"]
+        for true in (on_flange, later):
+            away = log(invert(true) @ edge.matrix)
+            squares.append(away @ np.linalg.solve(edge.covariance, away) / 6.0)
+    # Without the bump in it, the covariance is a tenth of what it has to be.
+    assert np.mean(squares) < 1.5
+
+
+@pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
+def test_a_joint_that_slips_between_images_is_named(mount, tmp_path):
+    cell = simulate(CellOptions(mount=mount, views=24, seed=3))
+    session = pairs_session(cell, "slipped")
+    views = []
+    for at, view in enumerate(session.views):
+        numbers = {name: it for name, it in view.numbers.items() if name not in POSE}
+        numbers["q3_rad"] += np.deg2rad(0.15 * (at >= 12))
+        views.append(replace(view, numbers=numbers))
+    columns = tuple(it for it in session.columns if it not in POSE)
+    replace(session, columns=columns, views=tuple(views)).save(tmp_path / "slipped")
+    verdict = calibrate(tmp_path / "slipped").verdict
+    cause = verdict.causes[0]
+    assert (verdict.status, cause.kind) == ("check", "joint_slipped")
+    assert "joint 3 (elbow_joint) steps: from view 12 on, it reads +0.1" in cause.words
 
 
 @pytest.mark.parametrize("mount", MOUNTS)

@@ -6,16 +6,18 @@ in the noise of each, by Rao's score test of a step at every stop (as Page 1955 
 """
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
 from visioncal.core.quantiles import chi2_limit, f_limit
 from visioncal.core.transforms import adjoint, exp, invert, log
 from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.estimation.arm import rows_of
 from visioncal.estimation.linalg import covariance_from, scaled_values
-from visioncal.estimation.parts import UNEVEN, State
+from visioncal.estimation.parts import UNEVEN, Effect, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import (
     RepeatErrors,
@@ -24,6 +26,7 @@ from visioncal.estimation.solve import (
     equations_from,
     fitted_covariance,
 )
+from visioncal.estimation.variance import Knowledge
 
 # A move must explain so many observations, of so many stops, more than they are explained now.
 _FEWEST = 3
@@ -41,6 +44,8 @@ _RIVAL_SHARE = 0.9
 _RIVAL_GAIN, _MOST_TRIED, _STEPS_EACH = 0.6, 6, 2
 # A step that the other unknowns take up to this share of its information is no step of its own.
 _TAKEN = 1e-6
+# Noise is left, however much a step explains.
+_MOST_EXPLAINED = 0.99
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +67,27 @@ class Move:
     change: FloatArray
     rivals: tuple[str, ...] = ()
     mahalanobis_sq: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Slip:
+    """A joint whose offset is another one from some stop on.
+
+    Attributes:
+        robot: Its robot, as the problem has it.
+        joint: The joint, numbered from 0.
+        stop: The first stop with the other offset.
+        step_rad: By how much farther it stands from then on than it reads [rad].
+        sigma_rad: How well that is known [rad].
+        mahalanobis_sq: The evidence for it.
+    """
+
+    robot: str
+    joint: int
+    stop: int
+    step_rad: float
+    sigma_rad: float
+    mahalanobis_sq: float
 
 
 def moved(problem: Problem, fit: Solution, move: Move) -> tuple[Problem, Solution]:
@@ -307,34 +333,181 @@ def slight_move(problem: Problem, fit: Solution, movable: Sequence[str]) -> Move
         fit: The unknowns and the noise.
         movable: Frames that may have moved.
     """
-    errors, seen = RepeatErrors.of(problem, fit), defaultdict[int, list[int]](list)
     columns = np.array([np.r_[problem.edge_columns(it)] for it in movable]).reshape(-1, 6)
-    for place, frame in enumerate(movable):
-        stops = np.unique(problem.observations.stops[problem.observations.involves(frame)])
-        for stop in stops[_FEWEST : 1 - _FEWEST].tolist():
-            seen[stop].append(place)
     tried = int(problem.observations.stops.max()) + 1
     spread = np.array([_spread_of_means(problem, it) for it in movable])
+    between = [_between(problem, problem.observations.involves(it)) for it in movable]
     best, limit = None, _move_limit(problem, len(movable) * tried)
-    for stop, information, gradient in equations_from(problem, fit, errors, columns.ravel()):
-        if stop not in seen:
-            continue
-        across = information.reshape(*columns.shape, -1)[seen[stop]]
-        alone = np.take_along_axis(across, columns[seen[stop], None], axis=2)
-        own = alone - across @ errors.covariance @ np.swapaxes(across, 1, 2)
-        values, asked = scaled_values(alone), gradient.reshape(columns.shape)[seen[stop]]
-        steps = -(covariance_from(own) @ asked[..., None])[..., 0]
+    for it in _scored(problem, fit, columns, between):
+        values = scaled_values(it.alone)
         clear = (values[:, 0] >= _TAKEN * values[:, -1]) & (values[:, -1] > 0.0)
-        clear &= scaled_values(own)[:, 0] >= _TAKEN
-        squares = np.where(clear, -np.sum(steps * asked, axis=1), 0.0) / spread[seen[stop], stop]
+        clear &= scaled_values(it.own)[:, 0] >= _TAKEN
+        squares = np.where(clear, it.squares, 0.0) / spread[it.seen, it.stop]
         if (most := float(squares.max())) > limit:
             place = int(squares.argmax())
-            best, limit = (movable[seen[stop][place]], stop, steps[place]), most
+            best, limit = (movable[it.seen[place]], it.stop, it.steps[place]), most
     if best is None:
         return None
     frame, stop, step = best
     found = _move(problem, _Step(0, frame, stop, exp(step)))
     return replace(found, mahalanobis_sq=limit)
+
+
+def slipped_joint(
+    problem: Problem, fit: Solution, offsets: Mapping[str, FloatArray]
+) -> Slip | None:
+    """The most significant step of a joint's offset at any stop; None where noise explains all.
+
+    Args:
+        problem: The observations that agree.
+        fit: The unknowns and the noise.
+        offsets: (s, 6, n) by robot, how its flange moves at each stop with the offset of each of
+            its n joints.
+    """
+    joints = [(robot, at) for robot, it in offsets.items() for at in range(it.shape[2])]
+    if not joints:
+        return None
+    columns = problem.size + np.arange(len(joints))[:, None]
+    between = [_between(problem, rows_of(problem, robot)) for robot, _ in joints]
+    tried = len(joints) * (int(problem.observations.stops.max()) + 1)
+    best, limit = None, float(f_limit(_FALSE_MOVE / tried, 1, _residual_freedom(problem, fit)))
+    for it in _scored(problem, fit, columns, between, offsets):
+        alone, own = it.alone[:, 0, 0], it.own[:, 0, 0]
+        squares = np.where(own > _TAKEN * alone, it.squares, 0.0)
+        if (most := float(squares.max())) > limit:
+            place, limit = int(squares.argmax()), most
+            robot, joint = joints[it.seen[place]]
+            sigma_rad = float(own[place] ** -0.5)
+            best = Slip(robot, joint, it.stop, float(it.steps[place, 0]), sigma_rad, most)
+    return best
+
+
+def log_gain(problem: Problem, fit: Solution, step: Move | Slip) -> float:
+    """Twice what a step gains of the log-likelihood, the noise being that beside it.
+
+    Args:
+        problem: The observations that agree.
+        fit: The unknowns and the noise, without the step.
+        step: What moved at once, by its score.
+    """
+    freedom = _residual_freedom(problem, fit)
+    share = min(step.mahalanobis_sq / freedom, _MOST_EXPLAINED)
+    return -freedom * float(np.log1p(-share))
+
+
+def step_covariance(
+    problem: Problem, fit: Solution, step: Move | Slip, offsets: Mapping[str, FloatArray]
+) -> FloatArray:
+    """What a step that a fit does not have adds to its covariance (p, p).
+
+    The answer is between what holds before the step and what holds from then on: the squares of its
+    distances from both count.
+
+    Args:
+        problem: The observations that agree.
+        fit: The unknowns and the noise, without the step.
+        step: What moved at once.
+        offsets: As of `slipped_joint`.
+    """
+    after, places = np.zeros(problem.size), np.array([step.stop])
+    if isinstance(step, Move):
+        columns = np.r_[problem.edge_columns(step.frame)]
+        change = after[columns] = log(step.change)
+        offsets = {}
+    else:
+        offsets = {step.robot: offsets[step.robot]}
+        columns, change = np.array([problem.size + step.joint]), np.array([step.step_rad])
+    (found,) = _scored(problem, fit, columns[None], [places], offsets)
+    before = found.following[0] @ change
+    return np.outer(before, before) + np.outer(before + after, before + after)
+
+
+@dataclass(frozen=True, eq=False)
+class _Scored:
+    """Steps of k unknowns, c numbers each, at one stop, by Rao's score test.
+
+    Attributes:
+        stop: The stop.
+        seen: (k,) which of the unknowns that are asked for.
+        alone: (k, c, c) information on each, were all else known.
+        own: (k, c, c) that beside all else.
+        following: (k, p, c) how the unknowns of the fit would move with each.
+        steps: (k, c) the likeliest ones.
+        squares: (k,) the evidence for them.
+    """
+
+    stop: int
+    seen: IntArray
+    alone: FloatArray
+    own: FloatArray
+    following: FloatArray
+    steps: FloatArray
+    squares: FloatArray
+
+
+def _scored(
+    problem: Problem,
+    fit: Solution,
+    columns: IntArray,
+    between: Sequence[IntArray],
+    offsets: Mapping[str, FloatArray] = MappingProxyType({}),
+) -> Iterator[_Scored]:
+    """The steps of some unknowns at the stops at which they may be, the last first.
+
+    Args:
+        problem: The observations.
+        fit: The unknowns and the noise.
+        columns: (u, c) the columns of each; those of joints' offsets are behind the problem's.
+        between: The stops at which each may step.
+        offsets: As of `slipped_joint`.
+    """
+    errors, size = RepeatErrors.of(problem, fit), problem.size
+    free = [
+        Effect.free(
+            f"offsets of {robot}",
+            Knowledge(np.zeros((it.shape[2],) * 2), np.zeros(it.shape[2])),
+            flange_jacobian={robot: it},
+        )
+        for robot, it in offsets.items()
+    ]
+    wider = problem.with_effects([*problem.effects, *free])
+    values = np.append(fit.state.values, np.zeros(wider.size - size))
+    there = replace(fit, state=State(fit.state.edges, values))
+    seen: dict[int, list[int]] = defaultdict(list)
+    for place, stops in enumerate(between):
+        for stop in stops.tolist():
+            seen[stop].append(place)
+    for stop, information, gradient in equations_from(wider, there, errors, columns.ravel()):
+        if stop not in seen:
+            continue
+        mine = np.array(seen[stop])
+        every = information.reshape(*columns.shape, -1)[mine]
+        alone = np.take_along_axis(every, columns[mine, None], axis=2)
+        across = np.delete(every, np.s_[size : wider.size], axis=2)
+        following = -errors.covariance @ np.swapaxes(across, 1, 2)
+        own = alone + across @ following
+        asked = gradient.reshape(columns.shape)[mine]
+        steps = -(covariance_from(own) @ asked[..., None])[..., 0]
+        squares = -np.sum(steps * asked, axis=1)
+        yield _Scored(stop, mine, alone, own, following[:, :size], steps, squares)
+
+
+def _residual_freedom(problem: Problem, fit: Solution) -> float:
+    """Degrees of freedom of the residuals: what is known besides of unknowns leaves some to them.
+
+    Args:
+        problem: The observations.
+        fit: The unknowns and the noise.
+    """
+    known = problem.knowledge(fit.state).information
+    share = float(np.sum(fitted_covariance(problem, fit.state, fit.noise) * known))
+    taken = float(np.sum(problem.moving)) - share
+    return max(float(problem.observations.directions.sum()) - taken, 6.0)
+
+
+def _between(problem: Problem, rows: Mask) -> IntArray:
+    """The stops with enough others, of (n,) some observations, before them and from them on."""
+    return np.asarray(np.unique(problem.observations.stops[rows])[_FEWEST : 1 - _FEWEST])
 
 
 def _spread_of_means(problem: Problem, frame: str) -> FloatArray:

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from visioncal.calibration.pipeline.arm_results import covariance_beside_noise
+from visioncal.calibration.pipeline.arm_results import covariance_beside_noise, joint_offsets
 from visioncal.calibration.pipeline.budget import budget_mm, left_out, middles_of
 from visioncal.calibration.pipeline.fault_messages import (
     PoseFault,
@@ -163,8 +163,10 @@ def answer_of(
     # A closed form is not at rest, and that would pass for a misfit.
     at_rest = fit if solved.solver == "joint" else fit_problem(part, fit.state)
     arms = {name: it.errors for name, it in solved.arms.items() if not it.is_modelled and it.errors}
-    found = misfits(part, at_rest, arms)
-    beside = covariance_beside_noise(part, fit, solved.arms, found, is_fit=solved.solver == "joint")
+    offsets = joint_offsets(solved.arms)
+    found = misfits(part, at_rest, arms, offsets)
+    is_fit = solved.solver == "joint"
+    beside = covariance_beside_noise(part, fit, solved.arms, found, offsets, is_fit=is_fit)
     covariance = sum(beside.values(), covariance_of(part, fit))
     faults, held_out = pose_faults(solved), left_out(solved)
     return Answer(

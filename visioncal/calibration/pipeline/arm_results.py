@@ -16,11 +16,16 @@ from visioncal.core.types import FloatArray
 from visioncal.core.verdict import NOTE, Finding, remarks
 from visioncal.estimation.arm import covariance_of_size, misfit_covariance
 from visioncal.estimation.intervals import expected_levels
+from visioncal.estimation.moves import Slip, step_covariance
+from visioncal.estimation.null_space import joint_words
 from visioncal.estimation.parts import State
 from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.residual_tests import inflation
 from visioncal.estimation.solve import Solution, covariance_of, held_shift, robot_likelihood
+
+# What moved at once, as a source of uncertainty.
+STEP = "what moved at once"
 
 
 def arms_of(cell: Cell, robots: Mapping[str, Reported]) -> dict[str, RobotArm]:
@@ -36,11 +41,18 @@ def arms_of(cell: Cell, robots: Mapping[str, Reported]) -> dict[str, RobotArm]:
     return found
 
 
+def joint_offsets(arms: Mapping[str, RobotArm]) -> dict[str, FloatArray]:
+    """(s, 6, n) how flanges move with the offsets of their joints, of arms that are modelled."""
+    found = {name: it.joint_offsets for name, it in arms.items()}
+    return {name: it for name, it in found.items() if it is not None}
+
+
 def covariance_beside_noise(
     problem: Problem,
     fit: Solution,
     arms: Mapping[str, RobotArm],
     found: Mapping[str, ResidualTest],
+    offsets: Mapping[str, FloatArray],
     *,
     is_fit: bool = True,
 ) -> dict[str, FloatArray]:
@@ -51,6 +63,7 @@ def covariance_beside_noise(
         fit: Their fit.
         arms: The arms; errors that are no unknowns count, and how well the size of others is known.
         found: What their residuals show.
+        offsets: How flanges move with the offsets of their joints; see `joint_offsets`.
         is_fit: Whether it is at rest: a closed form is pulled by more than what is held.
     """
     parts: dict[str, FloatArray] = {}
@@ -76,10 +89,24 @@ def covariance_beside_noise(
             parts[f"size of arm errors{_of(arms, robot)}"] = covariance_of_size(
                 problem, covariance, robot, arm.errors
             )
+    return parts | _beyond_noise(problem, fit, arms, found, offsets)
+
+
+def _beyond_noise(
+    problem: Problem,
+    fit: Solution,
+    arms: Mapping[str, RobotArm],
+    found: Mapping[str, ResidualTest],
+    offsets: Mapping[str, FloatArray],
+) -> dict[str, FloatArray]:
+    """Covariances (p, p) by what residuals show: stops that err alike, and what moved at once."""
+    parts: dict[str, FloatArray] = {}
     for robot, it in found.items():
         if it.alike is not None and it.alike.is_significant:
             more = inflation(problem, fit.state, fit.noise, robot, it.alike.factor)
             parts[f"misfit{_of(arms, robot)}"] = more
+        if it.step is not None:
+            parts[STEP] = step_covariance(problem, fit, it.step, offsets)
     return parts
 
 
@@ -96,9 +123,20 @@ def doubts_of_arms(
     from_when: Callable[[int], str],
 ) -> Iterator[Finding]:
     """Finds what speaks against the robots; `from_when` words a stop in the session's numbers."""
+
+    def joint(slip: Slip) -> str:
+        matched = arms[slip.robot].matched
+        words = (
+            f"joint {slip.joint + 1}" if matched is None else joint_words(slip.joint, matched.robot)
+        )
+        return words if len(arms) == 1 else f"{words} of robot {slip.robot}"
+
     for robot, arm in arms.items():
-        for it in (*_doubts(arm, found.get(robot), asked, from_when), *results[robot].doubts()):
-            yield it if it.kind == "moved_at_once" else it.of(_called(arms, robot))
+        mine = _doubts(arm, found.get(robot), asked, from_when, joint)
+        for it in (*mine, *results[robot].doubts()):
+            yield (
+                it if it.kind in ("moved_at_once", "joint_slipped") else it.of(_called(arms, robot))
+            )
 
 
 def notes_on_arms(arms: Mapping[str, RobotArm], results: Mapping[str, ArmFound]) -> Iterator[str]:
@@ -111,7 +149,11 @@ def notes_on_arms(arms: Mapping[str, RobotArm], results: Mapping[str, ArmFound])
 
 
 def _doubts(
-    arm: RobotArm, found: ResidualTest | None, asked: str, from_when: Callable[[int], str]
+    arm: RobotArm,
+    found: ResidualTest | None,
+    asked: str,
+    from_when: Callable[[int], str],
+    joint: Callable[[Slip], str],
 ) -> Iterator[Finding]:
     if arm.joints_rad is None and asked not in ("auto", "hand-eye"):
         yield Finding(
@@ -125,7 +167,7 @@ def _doubts(
         yield from doubts(arm.kinematics)
     if found is not None:
         calibrated = arm.model is not None
-        yield from diagnose.doubts(found, arm.errors, from_when, calibrated=calibrated)
+        yield from diagnose.doubts(found, arm.errors, from_when, joint, calibrated=calibrated)
 
 
 def _called(arms: Mapping[str, RobotArm], robot: str) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 
 from visioncal.calibration.pipeline.arm_results import (
     arms_of,
+    joint_offsets,
     with_drifts,
     with_errors,
     with_pose_errors,
@@ -35,6 +36,7 @@ from visioncal.estimation.effects.lenses import LENSES, CameraParameters, Linear
 from visioncal.estimation.joint import Fitted
 from visioncal.estimation.joint import settle as settle_looks
 from visioncal.estimation.lens_field import LensLevels
+from visioncal.estimation.moves import log_gain, slipped_joint
 from visioncal.estimation.observability import (
     FEWEST_VIEWS,
     check_observability,
@@ -378,14 +380,21 @@ def _with_functions(
 ) -> tuple[Agreed, LinearisedCorners | None, Mapping[str, RobotArm]]:
     """Fits with functions of the joints of each arm that has any, beside the errors of the others.
 
-    What agrees is known by then: their many values would make each look for outliers slow.
+    What agrees is known by then: their many values would make each look for outliers slow. They
+    explain much of what a joint does that slipped: where that alone explains more, there are none.
     """
-    problem, found = agreed.problem.subset(agreed.used), dict(arms)
+    part, found = agreed.problem.subset(agreed.used), dict(arms)
+    problem = part
     for name, arm in arms.items():
         stated = arm.without_errors(problem)
         start = State(agreed.fit.state.edges, stated.start_values)
-        found[name] = arm.with_functions(stated, start, asked, agreed.fit.noise)
-        problem = found[name].put_into(problem)
+        wider = arm.with_functions(stated, start, asked, agreed.fit.noise)
+        if wider.gain_of_functions:
+            slip = slipped_joint(part, agreed.fit, joint_offsets({name: arm}))
+            if slip and log_gain(part, agreed.fit, slip) > wider.gain_of_functions:
+                continue
+        found[name] = wider
+        problem = wider.put_into(problem)
     if all(found[name] is arm for name, arm in arms.items()):
         return agreed, seen, arms
     return _at_rest(cell, agreed, seen, found, late)

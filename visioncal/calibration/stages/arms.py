@@ -175,6 +175,14 @@ class RobotArm:
         """Whether functions of its joints were found."""
         return self.kinematics is not None and self.kinematics.functions is not None
 
+    @property
+    def gain_of_functions(self) -> float:
+        """Twice what functions of its joints gain of the log-likelihood; zero without any."""
+        if self.kinematics is None or self.kinematics.functions is None:
+            return 0.0
+        level, ratios = self.kinematics, [it.likelihood_ratio for it in self.kinematics.levels]
+        return level.chosen.likelihood_ratio - max(ratios[:-1])
+
     def at(self, stops: IntArray) -> Self:
         """The arm at (k,) of its stops."""
         stood = self.stood[stops]
@@ -423,6 +431,14 @@ class RobotArm:
         if self.model is None:
             return self._by_stop(link_basis(self.matched.arm, self.joints_rad))
         return self._by_stop(self.model.basis(self.joints_rad, self.loads))
+
+    @property
+    def joint_offsets(self) -> FloatArray | None:
+        """(s, 6, n) how its flange moves with the offsets of its joints; None without a model."""
+        if self.matched is None or self.joints_rad is None:
+            return None
+        stated = ArmModel.of(self.matched.arm, self.joints_rad, self.reported[self.stood])
+        return self._columns(self.model or stated, "offsets")
 
     def with_level(
         self,

@@ -101,6 +101,7 @@ EVIDENCE: Mapping[str, Evidence] = {
     "corner_noise": Evidence(1e-4, "corners"),
     "moved_slowly": Evidence(1e-4, _CHAIN),
     "moved_at_once": Evidence(1e-4, _CHAIN),
+    "joint_slipped": Evidence(1e-4, _CHAIN),
     "correlated_errors": Evidence(1e-4, _CHAIN),
     "arm_errors": Evidence(1e-4, _CHAIN),
     "weak_lens": Evidence(_REMARK, "lens"),
@@ -108,7 +109,8 @@ EVIDENCE: Mapping[str, Evidence] = {
     "misread_joints": Evidence(1e-3),
     "unexplained": Evidence(_REMARK, _CHAIN),
 }
-_MOVED = ("moved_slowly", "moved_at_once")
+MOVED_AT_ONCE = ("moved_at_once", "joint_slipped")
+_MOVED = ("moved_slowly", *MOVED_AT_ONCE)
 _UNUSED_JOINTS = ("misread_joints", "other_arm")
 # What is measured by way of the robot says nothing where its poses are misread.
 _BY_THE_CHAIN = ("board_size", "board_shape", "lens", "lens_field", "corner_noise", "arm_errors")
@@ -252,6 +254,8 @@ def ranked(
         known = {it.kind for it in found if it.probability}
         # What moved is in the arm's errors by posture and time, too, which are no cause then.
         known |= {"arm_errors"} if known & {*_MOVED} else set()
+        # ... and in the calibration's uncertainty.
+        known |= {"calibration"} if known & {*MOVED_AT_ONCE} else set()
         found += [it for it in _sources(picks, met, more) if it.kind not in known]
     return tuple(_with_joints_at_hand(found))
 

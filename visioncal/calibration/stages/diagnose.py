@@ -2,24 +2,26 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
 from visioncal.calibration.stages.cause_ranking import NO_JOINTS
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import pose_difference
+from visioncal.core.types import FloatArray
 from visioncal.core.verdict import PLAN, Finding, Step
 from visioncal.estimation.arm import LEVER_M, SIGNIFICANT, ArmErrors, stops_of
-from visioncal.estimation.moves import Move, slight_move
+from visioncal.estimation.moves import Move, Slip, log_gain, slight_move, slipped_joint
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.residual_tests import Drift, Neighbours, drift, neighbours
 from visioncal.estimation.solve import Solution
 
-_THINGS = {"cam": "The camera", "target": "The target"}
+_THINGS = {"cam": "The camera", "target": "The target", "instrument": "The instrument"}
 # Fewer stops than this leave no residuals to be tested.
 _FEWEST_STOPS = 6
-# Noise is left, however much a step explains.
-_MOST_EXPLAINED = 0.99
+# Of two steps, one is clearly the likelier where it is so by odds of a hundred to one.
+_CLEARLY = 2.0 * float(np.log(100.0))
 
 
 @dataclass(frozen=True)
@@ -31,15 +33,20 @@ class ResidualTest:
             whose covariance has that.
         moved: How its base or what it looks at crept; None where noise explains it.
         step: What moved at once, and where that explains more than a creep does.
+        rival: What explains about as much as that; None where nothing does.
     """
 
     alike: Neighbours | None
     moved: Drift | None
-    step: Move | None = None
+    step: Move | Slip | None = None
+    rival: Move | Slip | None = None
 
 
 def misfits(
-    problem: Problem, fit: Solution, errors: Mapping[str, ArmErrors]
+    problem: Problem,
+    fit: Solution,
+    errors: Mapping[str, ArmErrors],
+    offsets: Mapping[str, FloatArray] = MappingProxyType({}),
 ) -> dict[str, ResidualTest]:
     """Tests the residuals of each robot's stops for what is no noise; of few stops, none.
 
@@ -47,48 +54,66 @@ def misfits(
         problem: The observations, their stops in the order of the session.
         fit: Their fit, at rest.
         errors: Those of arms whose joints are not known, by the robot.
+        offsets: (s, 6, n) of the others, how their flanges move with the offsets of their joints.
     """
     robots = [it for it in problem.robots if len(stops_of(problem, it)) >= _FEWEST_STOPS]
     # Frames are those of all robots: what moved is sought once, and said once.
     slight = slight_move(problem, fit, tuple(problem.unknown)) if robots else None
+    slipped = slipped_joint(problem, fit, {it: offsets[it] for it in robots if it in offsets})
     found: dict[str, ResidualTest] = {}
     for robot in robots:
         fitted = (problem, fit.state, fit.noise, robot)
         crept, arm = drift(*fitted), errors.get(robot)
         alike = None if arm else neighbours(*fitted)
-        step = _step(problem, slight, crept)
+        steps = _steps(problem, fit, (slight, slipped), crept)
         # What a process over postures or time explains as well is no motion.
-        if arm and step and step.mahalanobis_sq < arm.gain:
-            step = None
+        if arm:
+            steps = [it for it in steps if it.mahalanobis_sq >= arm.gain]
         if arm and crept and crept.mahalanobis_sq < arm.gain:
             crept = None
-        if step:
+        if steps:
             # Before and after it, neighbours err alike because of it.
             known = any(it.step for it in found.values())
-            found[robot] = ResidualTest(None, None, None if known else step)
+            first, second = (*steps, None)[:2]
+            found[robot] = ResidualTest(None, None, *(() if known else (first, second)))
         else:
             found[robot] = ResidualTest(alike, crept)
     return found
 
 
-def _step(problem: Problem, found: Move | None, crept: Drift | None) -> Move | None:
+def _steps(
+    problem: Problem,
+    fit: Solution,
+    found: tuple[Move | None, Slip | None],
+    crept: Drift | None,
+) -> list[Move | Slip]:
     """What moved at once, where that explains the residuals better than a creep from end to end.
 
-    A step may be at any stop and of any frame: it must gain by twice the logarithm of these.
+    A step may be at any stop and of any frame or joint: it must gain by twice the logarithm of
+    these. A joint's has one number where a frame's has six, of which each must gain by as much as
+    the Bayesian information criterion asks for (Schwarz 1978).
+
+    Returns:
+        The likelier one, and the other where it is hardly less likely.
     """
     price = 2.0 * np.log(len(problem.unknown) * (1 + int(problem.observations.stops.max())))
-    if found is None or (crept and found.mahalanobis_sq < crept.mahalanobis_sq + price):
-        return None
-    # The noise is that of a fit without the step: with it, twice the logarithm gains more.
-    freedom = max(6 * len(problem) - problem.size, 7)
-    share = min(found.mahalanobis_sq / freedom, _MOST_EXPLAINED)
-    return replace(found, mahalanobis_sq=-freedom * float(np.log1p(-share)) - price)
+    each = float(np.log(problem.observations.directions.sum()))
+    likely: list[tuple[float, Move | Slip]] = []
+    for it in found:
+        if it is None or (crept and it.mahalanobis_sq < crept.mahalanobis_sq + price):
+            continue
+        gain = log_gain(problem, fit, it) - price
+        numbers = 6 if isinstance(it, Move) else 1
+        likely.append((gain - numbers * each, replace(it, mahalanobis_sq=gain)))
+    likely.sort(key=lambda it: -it[0])
+    return [it for gain, it in likely if gain > likely[0][0] - _CLEARLY]
 
 
 def doubts(
     found: ResidualTest,
     arm: ArmErrors | None,
     from_when: Callable[[int], str],
+    joint: Callable[[Slip], str],
     *,
     calibrated: bool,
 ) -> Iterator[Finding]:
@@ -98,6 +123,7 @@ def doubts(
         found: What the residuals show.
         arm: The errors of an arm whose joints are not known.
         from_when: Words a stop of the fit in the session's own numbers.
+        joint: Words a joint of a robot.
         calibrated: Whether the arm was.
     """
     alike, moved = found.alike, found.moved
@@ -121,16 +147,7 @@ def doubts(
     if arm is not None and arm.is_significant and arm.look is not None:
         yield _of_looks(arm, *(np.sqrt(3.0) * arm.look).tolist())
     if found.step is not None:
-        shift_mm, turn_deg = pose_difference(np.eye(4), found.step.change)
-        frame, stop = found.step.frame, found.step.stop
-        yield Finding(
-            "moved_at_once",
-            f"{_THINGS.get(frame, frame)} moved at once: {from_when(stop)}, it is "
-            f"{figure(shift_mm)} mm and {figure(turn_deg)} deg from where it was; the result is "
-            "between both places.",
-            Step("Fasten it, and record again; or keep only the views before or after."),
-            mahalanobis_sq=found.step.mahalanobis_sq,
-        )
+        yield _at_once(found.step, found.rival, from_when, joint)
     if moved is not None:
         yield Finding(
             "moved_slowly",
@@ -146,6 +163,48 @@ def doubts(
             "robot's share of the sigmas was multiplied by as much.",
             Step("Record again, with the stops in an order of chance."),
         )
+
+
+def _at_once(
+    step: Move | Slip,
+    rival: Move | Slip | None,
+    from_when: Callable[[int], str],
+    joint: Callable[[Slip], str],
+) -> Finding:
+    """Says what moved at once, and what may have in its place."""
+    is_joint = isinstance(step, Slip)
+    instead = (
+        f" Or else, as these views leave it open: {_step_words(rival, from_when, joint)}."
+        if rival
+        else ""
+    )
+    do = "Look whether the joint keeps its zero" if is_joint else "Fasten it"
+    return Finding(
+        "joint_slipped" if is_joint else "moved_at_once",
+        f"{_step_words(step, from_when, joint)}; the result is between "
+        f"{'before and after' if is_joint else 'both places'}.{instead}",
+        Step(f"{do}, and record again; or keep only the views before or after."),
+        mahalanobis_sq=step.mahalanobis_sq,
+    )
+
+
+def _step_words(
+    step: Move | Slip, from_when: Callable[[int], str], joint: Callable[[Slip], str]
+) -> str:
+    if isinstance(step, Slip):
+        # What is to be added to a reading so that it is the joint's angle, the other way round.
+        reads_deg, sigma_deg = (float(np.rad2deg(it)) for it in (-step.step_rad, step.sigma_rad))
+        sign = "+" if reads_deg > 0.0 else "-"
+        return (
+            f"The offset of {joint(step)} steps: {from_when(step.stop)}, it reads "
+            f"{sign}{figure(abs(reads_deg))} deg (sigma {figure(sigma_deg)}) from what it read "
+            "before, as where an encoder slipped or a zero was lost"
+        )
+    shift_mm, turn_deg = pose_difference(np.eye(4), step.change)
+    return (
+        f"{_THINGS.get(step.frame, step.frame)} moved at once: {from_when(step.stop)}, it is "
+        f"{figure(shift_mm)} mm and {figure(turn_deg)} deg from where it was"
+    )
 
 
 def _size(shift_m: float, turn_rad: float) -> str:

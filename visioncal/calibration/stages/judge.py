@@ -5,7 +5,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from visioncal.calibration.stages.cause_ranking import MEASURE_BOARD, NO_JOINTS, adding, ranked
+from visioncal.calibration.stages.cause_ranking import (
+    MEASURE_BOARD,
+    MOVED_AT_ONCE,
+    NO_JOINTS,
+    adding,
+    ranked,
+)
 from visioncal.calibration.stages.need import Picks, need_met
 from visioncal.core.limits import CalibrationLimits, NeedLimits
 from visioncal.core.number_format import figure, percent
@@ -560,6 +566,9 @@ def _accuracy_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[
     Edges are known in the arm's own frames. Those of a calibrated arm are as open as the errors of
     the first and the last link, which its poses make up for.
     """
+    # What moved at once is in all that is known, and more views do not help.
+    if any(it.kind in MOVED_AT_ONCE for it in findings.warnings):
+        return
     if any(it.workspace_mm is None for it in findings.arms):
         yield from _sigma_doubts(findings, limits)
         yield from _budget_doubts(findings, limits)
