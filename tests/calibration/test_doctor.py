@@ -17,7 +17,9 @@ from visioncal.calibration.stages.image_size import scaled_matrix, turned_lens
 from visioncal.core.errors import DataError
 from visioncal.core.types import Camera
 from visioncal.interchange.formats import load_in_doubt
+from visioncal.simulation import checkerboard_target
 from visioncal.vision.camera import project
+from visioncal.vision.finders.board import FINDERS
 
 # Of each kind of finding one: what its first sentence is about, and the kind.
 NAMED = {
@@ -114,6 +116,28 @@ def test_a_board_that_is_not_declared_is_named_by_calibrate(tmp_path):
     with pytest.raises(DataError, match="ChArUco board of 9 x 6 squares") as caught:
         visioncal.calibrate(folder)
     assert 'target = "charuco_9x6_30mm"' in caught.value.next_step
+
+
+@pytest.mark.parametrize(("more", "words"), [(1, "squares were counted"), (-1, "taken off twice")])
+def test_squares_in_the_place_of_inner_corners_are_named_at_once(
+    tmp_path, monkeypatch, more, words
+):
+    plain = BROKEN["semicolons"]
+    options = replace(plain.options, target=checkerboard_target(), views=5)
+    folder = sound_session(tmp_path / "squares", replace(plain, options=options))
+    described = (
+        f'kind = "checkerboard"\ncolumns = {9 + more}\nrows = {6 + more}\nsquare_m = 0.025\n'
+    )
+    (folder / "board.toml").write_text(described)
+    edit(folder, lambda text: text.replace("checkerboard_9x6_25mm", "board.toml"))
+    # A thorough search for what is not there takes seconds an image.
+    monkeypatch.setitem(FINDERS, "checkerboard", None)
+    (found,) = visioncal.doctor(folder).findings
+    assert found.kind == "other_board"
+    assert words in found.words
+    with pytest.raises(DataError, match=words) as caught:
+        visioncal.calibrate(folder)
+    assert 'target = "checkerboard_9x6_25mm"' in caught.value.next_step
 
 
 def test_rotations_of_another_form_are_loaded_in_doubt(tmp_path):

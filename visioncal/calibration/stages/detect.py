@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Condition
 
 import cv2
@@ -23,10 +23,11 @@ from visioncal.core.types import Corners, Image, IntArray, Progress, Rejection, 
 from visioncal.estimation.planar import determines_pose
 from visioncal.session import Session, View
 from visioncal.session.kinds import name_of
-from visioncal.vision.finders import NotFound, find_target, fitting_layouts
+from visioncal.vision.finders import DetectedCorners, NotFound, find_target, fitting_layouts
 from visioncal.vision.finders.aprilgrid import LACKS_SQUARES, free_tags_step
 from visioncal.vision.finders.checkerboard import MOST_PIXELS as MOST_CHECKERBOARD_PIXELS
 from visioncal.vision.finders.headers import MOST_PIXELS, claimed_size
+from visioncal.vision.finders.identify_checkerboard import find_squares
 from visioncal.vision.finders.imaging import blur_at_corners, decode_image, why_hard_to_see
 from visioncal.vision.targets import corner_positions, point_numbers
 
@@ -48,12 +49,14 @@ class DetectOptions:
             corners to 0.1 px; motion of this size is a pose that changed during the exposure.
         threads: How many images are worked on at a time; 0 for one a core.
         keeps: Whether what is found is kept beside the session, for the next search.
+        quick: Whether nothing more is searched where a first, quick search fails.
     """
 
     min_corners: int = 6
     max_blur_px: float = MAX_BLUR_PX
     threads: int = 0
     keeps: bool = False
+    quick: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,13 +130,20 @@ def detect(
     views = [view for view in among if view.image and not view.has_corners]
     stated = _stated_resolution(session, among)
     looks: list[_Look] = []
+    others = {it for it in session.boards if _shows_another(session, it, views)}
+    quick = replace(options, quick=True, keeps=False)
     room = _Room()
     kept = KeptCorners.beside(session, options.min_corners, options.max_blur_px)
     with (
         _ONE_OPENCV_THREAD.held(),
         ThreadPoolExecutor(options.threads or os.cpu_count() or 1) as pool,
     ):
-        for look in pool.map(lambda view: _look(session, view, stated, options, room, kept), views):
+
+        def look_at(view: View) -> _Look:
+            mine = quick if session.board_of(view) in others else options
+            return _look(session, view, stated, mine, room, kept)
+
+        for look in pool.map(look_at, views):
             looks.append(look)
             if progress is not None:
                 progress("detect", len(looks), len(views))
@@ -157,6 +167,31 @@ def detect(
         tuple(it for it in found if isinstance(it, Rejection)),
         resolution,
     )
+
+
+def _shows_another(session: Session, name: str, views: Sequence[View]) -> bool:
+    """Whether images clearly show a checkerboard of another size than the declared one.
+
+    A thorough search for what is not there takes seconds an image, and is spared where all of a
+    few images show another board.
+    """
+    target = session.boards[name]
+    if target.kind != "checkerboard":
+        return False
+    mine = [it for it in views if session.board_of(it) == name]
+    sample = mine[:: max(len(mine) // _LAYOUT_SAMPLE, 1)][:_LAYOUT_SAMPLE]
+    for view in sample:
+        image = image_of(session, view)
+        if isinstance(image, Rejection):
+            return False
+        if isinstance(find_target(image, target, quick=True), DetectedCorners):
+            return False
+        seen = find_squares(image)
+        if seen is None or not seen.found or seen.cut:
+            return False
+        if {seen.columns, seen.rows} == {target.columns, target.rows}:
+            return False
+    return bool(sample)
 
 
 @contextmanager
@@ -243,7 +278,7 @@ def look_for(
         otherwise than on this target.
     """
     options = options or DetectOptions()
-    seen = find_target(image, target)
+    seen = find_target(image, target, quick=options.quick)
     if isinstance(seen, NotFound):
         cause = why_hard_to_see(image, options.max_blur_px)
         reason = f"{seen.reason}; {cause}" if cause else seen.reason

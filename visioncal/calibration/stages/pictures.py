@@ -185,6 +185,8 @@ def other_board(session: Session, unseen: Sequence[View]) -> Finding | None:
         hard = hard or cause
         if found is not None and (shown is None or _is_better(found, shown[1])):
             shown = view, found
+            if found.whole and found.corners_seen == found.corners:
+                break
     if shown is None or (hard and hard.kind == _UNREAD and _has_its_squares(shown[1], declared)):
         return hard
     view, found = shown
@@ -249,9 +251,22 @@ def _another(view: View, found: Identity, declared: Target) -> Finding:
         )
     words = (
         f"The images show another board than declared: a {describe(found)} (view {view.number}), "
-        f"and {declared.name} is a {_declared(declared)}."
+        f"and {declared.name} is a {_declared(declared)}.{_miscounted(found, declared)}"
     )
     return Finding("other_board", words, step, (view.number,))
+
+
+def _miscounted(found: Identity, declared: Target) -> str:
+    """What was counted in the place of inner corners, in words; empty where that is not it."""
+    if found.kind != "checkerboard" or declared.kind != "checkerboard":
+        return ""
+    one, other = (sorted((it.columns, it.rows)) for it in (declared, found))
+    more = {a - b for a, b in zip(one, other, strict=True)}
+    if more == {1}:
+        return " The squares were counted: columns and rows are of inner corners, one less each."
+    if more == {-1}:
+        return " One was taken off twice: columns and rows are of inner corners themselves."
+    return ""
 
 
 def _unread(view: View, image: Image, found: Identity | None, declared: Target) -> Finding | None:

@@ -14,19 +14,20 @@ from visioncal.vision.finders.template import refine
 __all__ = ["DetectedCorners", "NotFound", "blur_of", "find_target", "fitting_layouts"]
 
 
-def find_target(image: Image, target: Target) -> DetectedCorners | NotFound:
+def find_target(image: Image, target: Target, *, quick: bool = False) -> DetectedCorners | NotFound:
     """Finds a target's corners to sub-pixel accuracy.
 
     Args:
         image: (h, w) grey image.
         target: What to look for.
+        quick: Whether nothing more is searched where a first, quick search for a board fails.
 
     Returns:
         The corners, or why there are none.
     """
     match target.kind:
         case "charuco" | "checkerboard" | "aprilgrid" | "circles":
-            return find_board(image, target)
+            return find_board(image, target, quick=quick)
         case "marker":
             return find_marker(image, target)
         case "points" if target.point_tags:

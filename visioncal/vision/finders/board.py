@@ -45,7 +45,7 @@ QUICK: dict[TargetKind, _Finder] = {
 }
 
 
-def find_board(image: Image, target: Target) -> DetectedCorners | NotFound:
+def find_board(image: Image, target: Target, *, quick: bool = False) -> DetectedCorners | NotFound:
     """Finds the corners of a board whose corners the template fits.
 
     OpenCV finds them, by a quick search or in a small copy where that sees the whole board; the
@@ -54,6 +54,7 @@ def find_board(image: Image, target: Target) -> DetectedCorners | NotFound:
     Args:
         image: (h, w) grey image.
         target: A target of one of the kinds of `FINDERS`.
+        quick: Whether nothing more is searched where the first of these finds nothing.
 
     Returns:
         The corners, or why there are none.
@@ -67,6 +68,8 @@ def find_board(image: Image, target: Target) -> DetectedCorners | NotFound:
             refined = _refined(image, target, DetectedCorners(seen.ids, px))
             if refined.weights is None:
                 return refined
+        if quick and isinstance(seen, NotFound):
+            return seen
     seen = FINDERS[target.kind](image, target)
     return seen if isinstance(seen, NotFound) else _refined(image, target, seen)
 
