@@ -125,6 +125,10 @@ def stretched(x: float, y: float):
     return lambda corners, _: corners * np.array([x, y, 1.0])
 
 
+def sheared(by_rad: float):
+    return lambda corners, _: corners + by_rad / 2 * corners[:, [1, 0, 2]] * [1.0, 1.0, 0.0]
+
+
 def breathing(share: float):
     """The focal length follows the distance, over the mean one."""
     return lambda far, _: 1 + share * (far - 1)
@@ -269,6 +273,7 @@ WORLDS = {
     "board bent 0.5 mm": World(board=bent(5e-4)),
     "board 0.2 % too large": World(board=stretched(1.002, 1.002)),
     "board 0.1 % longer one way": World(board=stretched(1.0005, 0.9995)),
+    "board sheared by 1.5 mrad": World(board=sheared(1.5e-3)),
     "drift 0.5 mm": World(robot=lifted(lambda share: 5e-4 * share)),
     "given lens off by 0.5 px": World(off_px=0.5),
     "given lens off by 2 px": World(off_px=2.0),

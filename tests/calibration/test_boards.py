@@ -1,5 +1,6 @@
 """Several boards in one chain: where they are, what they tell together, and what is wrong."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -15,9 +16,11 @@ from visioncal.calibration.stages.detect import detect
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import exp, invert, log
+from visioncal.estimation.appearance import BOARD_NAMES
 from visioncal.estimation.workspace import postures
 from visioncal.frames.session_observations import session_looks
 from visioncal.interchange.outputs import write_outputs
+from visioncal.results import Calibration, to_document
 from visioncal.session import Session
 from visioncal.simulation import (
     CellOptions,
@@ -162,6 +165,20 @@ def test_a_board_of_another_size_is_named():
     # The robot measures a size to some hundredths of a percent.
     assert shapes["second"].shape["scale"] == pytest.approx(0.01, abs=1e-3)
     assert shapes["first"].shape["scale"] == 0.0
+
+
+def test_files_from_before_boards_were_sheared_mean_the_same_values():
+    result = result_of(calibrated(simulate(replace(TWO, second=Second(scale=1.01), seed=5))))
+    document = to_document(result)
+    first, second = document["joint_fit"]["looks"]
+    assert second == first + len(BOARD_NAMES)
+    document["joint_fit"]["looks"] = [first, second - 1]
+    for board in document["boards"].values():
+        del board["shape"]["shear"]
+    before = CalibrationPrior.of(Calibration.from_json(json.dumps(document), "before"))
+    now = CalibrationPrior.of(result)
+    np.testing.assert_array_equal(before.free.columns, now.free.columns)
+    np.testing.assert_array_equal(before.free.appearance.board, now.free.appearance.board)
 
 
 def test_one_view_places_a_board():

@@ -14,7 +14,7 @@ from visioncal.estimation.appearance import BOARD_NAMES, SCALE, Appearance, boar
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.poses import reproject
 from visioncal.simulation import CellOptions, fine_camera, simulate
-from visioncal.vision.camera import intrinsics
+from visioncal.vision.camera import intrinsics, project
 from visioncal.vision.targets import corner_positions
 
 FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
@@ -37,7 +37,7 @@ def test_poses_and_cost_follow_lens_and_board_as_their_derivatives_say():
     middle = compressed(cell)
     size = len(intrinsics(cell.options.camera)) + len(BOARD_NAMES)
     # Steps that move corners by about a tenth of a pixel.
-    steps = np.concatenate([np.full(4, 0.1), np.full(5, 1e-3), np.full(2, 1e-5), np.full(7, 1e-5)])
+    steps = np.concatenate([np.full(4, 0.1), np.full(5, 1e-3), np.full(10, 1e-5)])
     for at in range(size):
         shift = np.zeros(size)
         shift[at] = steps[at]
@@ -89,7 +89,7 @@ def test_the_poses_take_their_share_of_the_information_and_no_more():
 
 def test_the_corners_alone_do_not_tell_the_size():
     middle = compressed(simulate(replace(FINE, views=6, seed=1)))
-    grown = compressed(simulate(replace(FINE, views=6, seed=1)), np.eye(18)[9 + SCALE] * 0.01)
+    grown = compressed(simulate(replace(FINE, views=6, seed=1)), np.eye(19)[9 + SCALE] * 0.01)
     assert np.all(middle.shared_information[9 + SCALE] == 0.0)
     # Fits to the same pixels settle to 1e-8 m, which is a millionth of a pixel.
     np.testing.assert_allclose(grown.residuals, middle.residuals, atol=1e-4)
@@ -136,6 +136,38 @@ def mahalanobis_sq(cell, known, size=12) -> float:
 
 # A true covariance exceeds it in one run of a thousand.
 UNLIKELY = chi2.ppf(0.999, 12)
+
+
+def printed_anew(cell, change):
+    """The cell's corners, on a board whose flat corners are where a (3, 3) matrix has them."""
+    flat, camera = corner_positions(cell.options.target), cell.options.camera
+
+    def seen(it, pose, places):
+        return project(camera, places[it.ids] @ pose[:3, :3].T + pose[:3, 3])
+
+    corners = tuple(
+        replace(it, px=it.px + seen(it, pose, flat @ change.T) - seen(it, pose, flat))
+        for it, pose in zip(cell.corners, cell.cam_from_target, strict=True)
+    )
+    return replace(cell, corners=corners)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (np.diag([-5e-4, 5e-4, 0.0]), "longer along its y than along its x, by 0.1 %"),
+        ([[0, 7.5e-4, 0], [7.5e-4, 0, 0], [0, 0, 0]], "rows and columns meet at 89.91"),
+    ],
+    ids=["stretched", "sheared"],
+)
+def test_a_board_that_is_printed_askew_is_named_and_costs_nothing(mount, change, words):
+    cell = printed_anew(simulate(replace(FINE, mount=mount, seed=4)), np.eye(3) + change)
+    known = calibrated(cell)
+    (finding,) = [it for it in known.warnings if it.kind == "board_shape"]
+    assert words in finding.reason
+    assert "not flat" not in finding.reason
+    assert mahalanobis_sq(cell, known) < UNLIKELY
 
 
 @pytest.mark.parametrize("mount", MOUNTS)

@@ -1,9 +1,10 @@
 """What all views share besides the edges: the lens, and the board as it really is.
 
-A printed board is stretched, longer one way than the other, and bent. In the target's frame, a
-corner p lies at `(1 + scale) p + aspect (-x, y, 0) / 2 + z(x, y)`, z being a polynomial of second
-and third order. What of it is an offset or a tilt belongs to the board's pose and is taken out, so
-that the target's frame is that of the plane which fits the corners best.
+A printed board is stretched, longer one way than the other, sheared, and bent. In the target's
+frame, a corner p lies at `(1 + scale) p + aspect (-x, y, 0) / 2 + shear (y, x, 0) / 2 + z(x, y)`, z
+being a polynomial of second and third order. What of it is an offset or a tilt belongs to the
+board's pose and is taken out, so that the target's frame is that of the plane which fits the
+corners best.
 
 The points of a rig are where its table has them, or near there, each by what it is known to.
 """
@@ -32,18 +33,21 @@ from visioncal.vision.targets import corner_positions
 
 # The effect's name in a problem.
 LENS_AND_BOARD = "lens and board"
-SCALE, ASPECT = 0, 1
+SCALE, ASPECT, SHEAR = 0, 1, 9
+_BENDS = slice(2, 9)
+# The places are those of files, too; shear came last.
 BOARD_NAMES = (
     "scale",
     "aspect",
     *(f"bow_{it}" for it in (["xx", "xy", "yy", "xxx", "xxy", "xyy", "yyy"])),
+    "shear",
 )
 # Exponents of the polynomial's terms.
 _POWERS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 
-# What is known of any printed board: its sides differ by 0.1 % or so, and it is bent by a hundredth
-# of its size at the most.
-_ASPECT_SIGMA, _BOW_SIGMA_SHARE = 1e-3, 1e-2
+# What is known of any printed board: its sides differ by 0.1 % or so, its rows and columns meet at
+# a right angle to 1 mrad or so, and it is bent by a hundredth of its size at the most.
+_ASPECT_SIGMA, _SHEAR_SIGMA, _BOW_SIGMA_SHARE = 1e-3, 1e-3, 1e-2
 # A rig of more points is taken for exact: each adds three unknowns that all views share.
 MOST_LOOSE = 100
 
@@ -55,7 +59,7 @@ def board_basis(positions: FloatArray) -> FloatArray:
         positions: (c, 3) corners of the flat board, in the target's frame [m].
 
     Returns:
-        (c, 3, 9) in the order of `BOARD_NAMES`; bows are in metres at the board's edge.
+        (c, 3, 10) in the order of `BOARD_NAMES`; bows are in metres at the board's edge.
     """
     middle = (positions.min(axis=0) + positions.max(axis=0)) / 2
     half = float(np.ptp(positions, axis=0).max()) / 2
@@ -63,9 +67,10 @@ def board_basis(positions: FloatArray) -> FloatArray:
     basis = np.zeros((len(positions), 3, len(BOARD_NAMES)))
     basis[:, :, SCALE] = positions
     basis[:, 0, ASPECT], basis[:, 1, ASPECT] = -positions[:, 0] / 2, positions[:, 1] / 2
+    basis[:, :2, SHEAR] = positions[:, 1::-1] / 2
     bows = np.stack([u**a * v**b for a, b in _POWERS], axis=1)
     plane = np.stack([np.ones_like(u), u, v], axis=1)
-    basis[:, 2, 2:] = bows - plane @ np.linalg.lstsq(plane, bows, rcond=None)[0]
+    basis[:, 2, _BENDS] = bows - plane @ np.linalg.lstsq(plane, bows, rcond=None)[0]
     return basis
 
 
@@ -103,7 +108,7 @@ def board_prior(target: Target) -> FloatArray:
     positions = corner_positions(target)
     half = float(np.ptp(positions, axis=0).max()) / 2
     bows = np.full(len(_POWERS), _BOW_SIGMA_SHARE * half)
-    return np.array([target.square_sigma_m / target.square_m, _ASPECT_SIGMA, *bows])
+    return np.array([target.square_sigma_m / target.square_m, _ASPECT_SIGMA, *bows, _SHEAR_SIGMA])
 
 
 @dataclass(frozen=True, eq=False)

@@ -142,7 +142,7 @@ class CornerProblem:
 
     @property
     def shape(self) -> IntArray:
-        """Places of the printed boards' aspects and bends."""
+        """Places of the printed boards' aspects, shears and bends."""
         return self._joined(self.shape_of(board) for board in self.printed)
 
     @property
@@ -156,7 +156,7 @@ class CornerProblem:
         return self.points_of(board)[:1]
 
     def shape_of(self, board: int) -> IntArray:
-        """Places (8,) of one printed board's aspect and bend."""
+        """Places (9,) of one printed board's aspect, shear and bend."""
         return self.points_of(board)[1:]
 
     def points_of(self, target: int) -> IntArray:

@@ -15,6 +15,8 @@ from visioncal.results.edge import Covariance
 from visioncal.vision.targets import corner_positions
 
 _BEND = "bow_"
+# Files of earlier versions are without it.
+_LATER = "shear"
 # Names of levels with their 95 % intervals.
 Intervals = Mapping[str, tuple[float, float]]
 
@@ -79,7 +81,8 @@ class BoardResult(Section):
 
     Attributes:
         shape: Its departure from the stated one, by the names of `estimation.BOARD_NAMES`: `scale`
-            and `aspect` are relative, bows are of the board's edge [m].
+            and `aspect` are relative, `shear` is by how much its rows and columns meet at less than
+            a right angle [rad], bows are of the board's edge [m].
         sigma: Standard deviations of those that were free.
         estimated: Those that the fit moved.
         bend_mm: The depth within which its corners lie [mm].
@@ -97,13 +100,13 @@ class BoardResult(Section):
             ValueError: It is not.
         """
         for name in BOARD_NAMES:
-            if name not in self.shape:
+            if name not in self.shape and name != _LATER:
                 raise ValueError(f"shape.{name} is missing")
 
     @property
     def values(self) -> FloatArray:
-        """(9,) the shape in the order of `BOARD_NAMES`."""
-        return np.array([self.shape[it] for it in BOARD_NAMES])
+        """(10,) the shape in the order of `BOARD_NAMES`."""
+        return np.array([self.shape.get(it, 0.0) for it in BOARD_NAMES])
 
     @property
     def is_bent(self) -> bool:

@@ -70,7 +70,7 @@ def found_of_looks(side: Side, fitted: Fitted, covariance: FloatArray) -> Iterat
             )
             yield scale_found(called, target.square_m, measured, written)
         if _moved(fitted, looks.shape_of(board)):
-            yield bend_found(called, 1e3 * float(np.ptp(looks.corners[board][:, 2])))
+            yield shape_found(fitted, board, called)
 
 
 def noise_found(stack: CornerStack, residuals: FloatArray, unknowns: int) -> Iterator[Finding]:
@@ -136,13 +136,41 @@ def scale_found(
     )
 
 
-def bend_found(board: str, bend_mm: float) -> Finding:
-    """Words a board that is not flat; `bend_mm` is the depth of its corners [mm]."""
+def shape_found(fitted: Fitted, board: int, called: str) -> Finding:
+    """Words a board that is bent, longer one way than the other, or sheared.
+
+    Of these, what is more than chance is worded; all of them together are.
+
+    Args:
+        fitted: The fit, with the board's shape free.
+        board: Its place among the targets.
+        called: What it is called.
+    """
+    looks = fitted.looks
+    places = looks.shape_of(board)
+    aspect, *bends, shear = places
+    parts, steps = [], []
+    for place, words in (
+        (aspect, "longer along its {} than along its {}, by {} %"),
+        (shear, "sheared: its rows and columns meet at {} deg"),
+    ):
+        if not _moved(fitted, np.array([place])):
+            continue
+        value = float(looks.values[place])
+        if place == aspect:
+            far, near = ("y", "x") if value > 0 else ("x", "y")
+            parts.append(words.format(far, near, figure(100 * abs(value))))
+        else:
+            parts.append(words.format(f"{90 - np.rad2deg(value):.3f}"))
+        steps = ["Print it anew on another printer."]
+    if _moved(fitted, np.array(bends)) or not parts:
+        depth = figure(1e3 * float(np.ptp(looks.corners[board][:, 2])))
+        parts.insert(0, f"not flat: its corners lie within {depth} mm of depth")
+        steps.insert(0, "Put the board on a stiff, flat plate, and record again.")
     return Finding(
         "board_shape",
-        f"The {board} is not flat: its corners lie within {figure(bend_mm)} mm of "
-        "depth. Its shape was estimated with the rest.",
-        Step("Put the board on a stiff, flat plate, and record again."),
+        f"The {called} is {', and '.join(parts)}. Its shape was estimated with the rest.",
+        Step(" ".join(steps)),
     )
 
 

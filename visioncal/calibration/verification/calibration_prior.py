@@ -21,6 +21,7 @@ from visioncal.estimation.parts import Noise, State
 from visioncal.results import Calibration
 from visioncal.results.sections import BoardResult, FittedArm, JointFit, RigResult
 from visioncal.robot import Robot, WeightFunctions
+from visioncal.vision.camera import intrinsics
 from visioncal.vision.targets import numbered_positions, target_from_document
 
 # A scale that is known by more degrees of freedom is as good as known.
@@ -164,11 +165,32 @@ def _read(calibration: Calibration, fit: JointFit) -> CalibrationPrior:
             np.concatenate([np.zeros(len(fit.looks)), values]),
         ),
         jacobian @ fit.covariance @ jacobian.T,
-        fit.looks,
+        _looks(calibration, fit, targets),
         "none" if fit.arm is None else fit.arm.of,
         len(values),
         _model(calibration.calibrated_robot, fit.arm),
     )
+
+
+def _looks(
+    calibration: Calibration, fit: JointFit, targets: Mapping[str, Target]
+) -> tuple[int, ...]:
+    """Places of the fit's free values among the lens's and then the targets'.
+
+    Files of earlier versions know nothing of a board's shear, the last of its values: what follows
+    them lies one place farther for each board.
+    """
+    only, camera = calibration.board, calibration.camera
+    boards = [*calibration.boards.values(), *([] if only is None else [only])]
+    if camera is None or all("shear" in it.shape for it in boards):
+        return fit.looks
+    sizes = [len(intrinsics(camera.camera)), *(len(board_prior(it)) for it in targets.values())]
+    is_new = [
+        at == size - 1 and kind != "points"
+        for size, kind in zip(sizes, ("points", *(it.kind for it in targets.values())), strict=True)
+        for at in range(size)
+    ]
+    return tuple(np.flatnonzero(~np.array(is_new))[list(fit.looks)].tolist())
 
 
 def _jacobian(placed: FloatArray, looks: int, arm: int) -> FloatArray:

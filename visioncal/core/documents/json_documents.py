@@ -14,7 +14,7 @@ _UNITS = r"mm|m|deg|rad|mrad|px|s|c|nm|kg|a|n|k|m_s2|rad_s2|kg_m2|sigma"
 _NUMBERS = re.compile(
     rf".+_({_UNITS})|.+_per_.+|mm|deg|px|sigma|matrix|quaternion_xyzw|covariance|edge_covariance"
     "|view|corners|resolution|distortion|spectrum|inflation|likelihood_ratio|condition|unknowns"
-    "|median|most|p95|value|nominal|change|misfit|correlation|placement|o[1-5]|bow_[xy]+|aspect"
+    "|median|most|p95|value|nominal|change|misfit|correlation|placement|o[1-5]|bow_[xy]+|aspect|shear"
 )
 # Tables whose fields users name.
 _NAMED = ("frames", "robots", "tree")

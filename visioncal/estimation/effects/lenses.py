@@ -81,7 +81,7 @@ class CameraParameters:
         return self._here(self._one.scale_of(board))
 
     def shape_of(self, board: int) -> IntArray:
-        """Places (8,) of one printed board's aspect and bend."""
+        """Places (9,) of one printed board's aspect, shear and bend."""
         return self._here(self._one.shape_of(board))
 
     def moved_points(self, rig: int) -> FloatArray:
@@ -131,7 +131,7 @@ class CameraParameters:
 
     @property
     def shape(self) -> IntArray:
-        """Places of the printed boards' aspects and bends."""
+        """Places of the printed boards' aspects, shears and bends."""
         return self._here(self._one.shape)
 
     def stated_scale_sigma(self, board: int) -> float:

@@ -1,5 +1,7 @@
 """Where the uncertainty comes from, in words: sources, noise, board and arm."""
 
+import numpy as np
+
 from visioncal.core.number_format import decimals_for, matched, significant
 from visioncal.core.types import Target
 from visioncal.present.report.content import PLUS_MINUS, Fact, answering_solver, frame_words
@@ -81,6 +83,11 @@ def board_facts(
         facts.append(Fact("bend", f"{significant(board.bend_mm)} mm", "of depth over its corners"))
     else:
         facts.append(Fact("bend", "none", "flat within what is seen"))
+    if "shear" in board.estimated:
+        angle, sigma = np.rad2deg([board.shape["shear"], board.sigma["shear"]])
+        known = f"{PLUS_MINUS} {significant(sigma)}"
+        angle_deg = f"{90 - angle:.{decimals_for(sigma)}f} deg"
+        facts.append(Fact("angle of rows and columns", angle_deg, known))
     return tuple(facts)
 
 
