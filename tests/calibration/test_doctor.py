@@ -13,7 +13,7 @@ from support.typed_fixes import mended
 
 import visioncal
 from visioncal.calibration.pipeline.checkup import to_document
-from visioncal.calibration.stages.image_size import scaled_matrix, turned_lens
+from visioncal.calibration.stages.image_size import resized_lens, scaled_matrix, turned_lens
 from visioncal.core.errors import DataError
 from visioncal.core.types import Camera
 from visioncal.interchange.formats import load_in_doubt
@@ -116,6 +116,21 @@ def test_a_board_that_is_not_declared_is_named_by_calibrate(tmp_path):
     with pytest.raises(DataError, match="ChArUco board of 9 x 6 squares") as caught:
         visioncal.calibrate(folder)
     assert 'target = "charuco_9x6_30mm"' in caught.value.next_step
+
+
+def test_a_matrix_of_larger_images_is_named_by_the_ratio(tmp_path):
+    folder = broken_session(tmp_path / "session", BROKEN["the lens of larger images"])
+    first, *_ = visioncal.doctor(folder).findings
+    cause = visioncal.calibrate(folder).verdict.causes[0]
+    for found in (first, cause):
+        assert found.kind == "lens"
+        assert "is for images of 1280 x 800 px, and these are 960 x 600 px" in found.words
+        # Three quarters of 914.2, 913.6; of 645.3 + 0.5 and 396.8 + 0.5, less 0.5.
+        assert "matrix = [685.65, 685.20, 483.85, 297.48]" in found.do.words
+    stated = Camera("brown", (640, 400), np.array([900.0, 900.0, 640.0, 400.0]), np.zeros(5))
+    # Another camera, whose centre is in the middle of its own images, and one that is well known.
+    assert resized_lens(stated, np.array([700.0, 700.0, 320.0, 200.0])) == ("", "")
+    assert resized_lens(stated, np.array([905.0, 905.0, 644.0, 402.0])) == ("", "")
 
 
 @pytest.mark.parametrize(("more", "words"), [(1, "squares were counted"), (-1, "taken off twice")])

@@ -315,6 +315,30 @@ def test_wrong_rows_are_named(line, said, cube):
     assert said in error.value.message
 
 
+@pytest.mark.parametrize(("kind", "first"), [("checkerboard", 1), ("cube", 0)])
+def test_points_that_count_from_another_number_are_named_at_once(tmp_path, kind, first):
+    """Of a board, whose corners count from 0, and of a rig whose table counts from 1."""
+    folder = write_rig(tmp_path / kind, Rig(kind))
+
+    def renumber(name: str, column: int, start: int) -> None:
+        header, *rows = ((folder / name).read_text()).splitlines()
+        cells = [it.split(",") for it in rows]
+        numbers = sorted({int(it[column]) for it in cells})
+        for it in cells:
+            it[column] = str(numbers.index(int(it[column])) + start)
+        (folder / name).write_text("\n".join([header, *map(",".join, cells)]) + "\n")
+
+    renumber("corners.csv", 1, first)
+    if kind == "cube":
+        renumber("target.csv", 0, 1)
+    with pytest.raises(DataError, match=f"counts the points of target .* from {first}: ") as error:
+        Session.load(folder)
+    sign = "-" if first else "+"
+    assert f"write point {sign} 1 in the place of point" in error.value.next_step
+    # One sentence, and not a line for each of hundreds of corners.
+    assert "\n" not in error.value.message
+
+
 @pytest.mark.parametrize(
     ("header", "cells", "said"),
     [

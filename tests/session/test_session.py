@@ -434,6 +434,29 @@ def test_a_wrong_session_toml_is_refused_by_field(
     assert "write mount" not in error.next_step
 
 
+@pytest.mark.parametrize(
+    "written",
+    [
+        "800, 0, 640, 0, 801.5, 400, 0, 0, 1",
+        "[800, 0, 640], [0, 801.5, 400], [0, 0, 1]",
+        "[800, 0, 0], [0, 801.5, 0], [640, 400, 1]",
+        "[800, 801.5, 640, 400]",
+    ],
+)
+def test_a_matrix_of_other_brackets_is_written_anew(folder: Path, written: str) -> None:
+    text = (folder / "session.toml").read_text()
+    text = re.sub(r"(?m)^matrix = .*$", f"matrix = [{written}]", text)
+    (folder / "session.toml").write_text(text)
+    error = refusal(folder)
+    assert error.culprits == ("session.toml: camera.matrix",)
+    assert "[800, 801.5, 640, 400]" in error.message
+
+
+def test_a_misspelt_matrix_is_named_where_it_is_missing(folder: Path) -> None:
+    edit(folder, "session.toml", "matrix =", "matrx =")
+    assert "Did you mean matrix" in refusal(folder).next_step
+
+
 def test_all_wrong_fields_are_named_at_once(folder: Path) -> None:
     edit(folder, "session.toml", '"bench"', "7")
     edit(folder, "session.toml", "1280, 800", "1280")

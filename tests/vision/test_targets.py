@@ -94,6 +94,39 @@ def test_a_wrong_field_is_named_with_what_it_must_be(change: dict[str, Any], wor
         target_from_document(CHARUCO | change, "mine")
 
 
+@pytest.mark.parametrize(
+    ("change", "unit", "right"),
+    [
+        ({"square_m": 30.0}, "square_m in mm", "square_m = 0.03"),
+        ({"square_m": 1.1811}, "square_m in inches", "square_m = 0.0299999"),
+        ({"square_m": 3}, "square_m in cm", "square_m = 0.03"),
+        # No square is too large here, and 19 mm of marker are too small for 750 mm.
+        ({"square_m": 0.75, "marker_m": 0.014}, "square_m in inches", "square_m = 0.01905"),
+        ({"marker_m": 22}, "marker_m in mm", "marker_m = 0.022"),
+        ({"marker_m": 0.866}, "marker_m in inches", "marker_m = 0.0219964"),
+    ],
+)
+def test_a_side_in_another_unit_is_named_by_the_ratio(
+    change: dict[str, Any], unit: str, right: str
+) -> None:
+    with pytest.raises(DataError, match=unit) as caught:
+        target_from_document(CHARUCO | change, "mine")
+    assert caught.value.next_step.endswith(f"write {right}.")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "meant"),
+    [("square_m", "square", "square_m"), ("columns", "colums", "columns")],
+)
+def test_a_key_that_is_missing_and_misspelt_is_named(old: str, new: str, meant: str) -> None:
+    document = {new if key == old else key: value for key, value in CHARUCO.items()}
+    with pytest.raises(DataError, match=f"{old} is missing") as caught:
+        target_from_document(document, "mine")
+    assert (
+        f"{new} is no known name and was not read. Did you mean {meant}" in caught.value.next_step
+    )
+
+
 def test_a_marker_needs_an_id_of_its_dictionary() -> None:
     assert target_from_document(MARKER, "tag").marker_id == 7
     with pytest.raises(DataError, match="id is 587; a whole number from 0 to 586"):

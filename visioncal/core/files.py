@@ -383,11 +383,12 @@ class Table:
             )
         return value
 
-    def refuse(self, key: str, value: object, needed: str) -> DataError:
+    def refuse(self, key: str, value: object, needed: str, next_step: str = "") -> DataError:
         """Builds the error for a field whose value does not serve."""
         return DataError(
             f"{self.label}: {key} is {value!r}; {needed} is needed.",
             culprits=[f"{self.label}: {key}"],
+            next_step=next_step,
         )
 
     def number(self, key: str, default: float | None = None, *, positive: bool = False) -> float:
@@ -435,5 +436,5 @@ class Table:
         needed = " or ".join(f'"{choice}"' for choice in choices)
         value = self._value(key, default, needed)
         if value not in choices:
-            raise self.refuse(key, value, needed)
+            raise self.refuse(key, value, needed, did_you_mean(str(value), choices))
         return str(value)

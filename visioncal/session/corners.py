@@ -1,6 +1,6 @@
 """corners.csv: where images show known points of the targets, as another detector found them."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -318,6 +318,9 @@ def check_points(table: CornerTable, boards: Sequence[Target]) -> None:
         DataError: They are not; it names them.
     """
     numbers = {it: frozenset(point_numbers(it)) for it in dict.fromkeys(boards)}
+    for target, known in numbers.items():
+        mine = {it for it, of in zip(table.points.tolist(), boards, strict=True) if of is target}
+        _check_first_number(mine, known, target, FILE if table.is_file else "corners")
     problems: list[Problem] = []
     seen: dict[tuple[int, int], int] = {}
     for at, key in enumerate(zip(table.views.tolist(), table.points.tolist(), strict=True)):
@@ -332,6 +335,25 @@ def check_points(table: CornerTable, boards: Sequence[Target]) -> None:
             problems.append(Problem(place, words))
     if problems:
         raise problems_error(problems)
+
+
+def _check_first_number(seen: Set[int], known: Set[int], target: Target, file: str) -> None:
+    """Refuses corners that all count from one number higher or lower than the target's points.
+
+    Raises:
+        DataError: They do.
+    """
+    for more, sign in ((-1, "-"), (1, "+")):
+        if not seen <= known and {it + more for it in seen} <= known:
+            first = min(known) - more
+            rig = f", or in the table of {target.name} count its points from {first}"
+            raise DataError(
+                f"{file} counts the points of target {target.name} from {first}: it has "
+                f"{min(seen)} to {max(seen)}, and {_range(target)}.",
+                culprits=[f"{file}: point"],
+                next_step=f"In {file}, write point {sign} 1 in the place of point"
+                f"{rig * (target.kind == 'points')}.",
+            )
 
 
 def _range(target: Target) -> str:

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from functools import reduce
 from typing import Annotated, Any, Literal, TypeAlias, cast, get_args
 
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError
@@ -24,6 +25,8 @@ Kind: TypeAlias = Literal["camera", "robot", "target", "instrument"]
 KINDS: tuple[Kind, ...] = ("camera", "robot", "target", "instrument")
 
 _COEFFICIENTS: Mapping[str, tuple[int, ...]] = {"brown": (5, 8), "fisheye": (4,)}
+# Of a matrix of 3 x 3, and their places where it is written column by column.
+_ENTRIES, _TRANSPOSED = 9, (0, 3, 6, 1, 4, 7, 2, 5, 8)
 # Names become parts of the names of frames: base_from_target_NAME.
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
 # No arm carries a camera or a board farther out, and no cell is larger [m]; offsets written in
@@ -116,17 +119,19 @@ def read_declaration(
             culprits=[f"{label}: schema"],
             next_step="A newer visioncal may read it." if is_newer else "Write schema = 1.",
         )
+    hints: list[str] = []
     try:
         declaration = Declaration.model_validate(dict(document))
     except ValidationError as error:
-        problems = [(_dotted(entry["loc"]), _in_words(entry)) for entry in error.errors()]
+        problems = list(_misfits(error.errors(), document))
     else:
         problems = list(_contradictions(declaration, observed))
+        hints = [it for it in _unknown_keys(declaration, "", label) if "Did you mean" in it]
     if problems:
         raise DataError(
             f"{label}: {'; '.join(f'{field} {words}' for field, words in problems)}.",
             culprits=[f"{label}: {field}" for field, _ in problems],
-            next_step=_nearest_mount(document, label),
+            next_step=_nearest_mount(document, label) or " ".join(hints),
         )
     return declaration
 
@@ -137,6 +142,37 @@ def _nearest_mount(document: Mapping[str, Any], label: str) -> str:
     spelt = given.lower().replace("_", "-").replace(" ", "-")
     is_meant = spelt in get_args(CameraMount) and spelt != given
     return f'In {label}, write mount = "{spelt}".' if is_meant else ""
+
+
+def _misfits(
+    errors: Sequence[Mapping[str, Any]], document: Mapping[str, Any]
+) -> Iterator[tuple[str, str]]:
+    """Words pydantic's errors, by dotted paths; a list that is nested wrong once."""
+    lists: dict[str, str] = {}
+    for entry in errors:
+        place = tuple(entry["loc"])
+        at = next((at for at, it in enumerate(place) if it in ("matrix", "distortion")), None)
+        field = () if at is None else place[: at + 1]
+        value = reduce(lambda table, key: table[key], field, document) if field else None
+        words = _of_list(str(field[-1]), value) if isinstance(value, list) else ""
+        if not words:
+            yield _dotted(place), _in_words(entry)
+        elif lists.setdefault(_dotted(field), words) is words:
+            yield _dotted(field), words
+
+
+def _of_list(name: str, value: list[Any]) -> str:
+    """What is wrong with a lens's matrix of 3 x 3, or a list in a list; empty for neither."""
+    flat = [it for part in value for it in (part if isinstance(part, list) else [part])]
+    if not all(type(it) in (int, float) for it in flat):
+        return ""
+    if name == "matrix" and len(flat) == _ENTRIES:
+        for fx, skew, cx, low, fy, cy, *last in (flat, [flat[it] for it in _TRANSPOSED]):
+            if [skew, low, *last] == [0, 0, 0, 0, 1]:
+                return f"is the 3 x 3 {value!r}, but must be fx, fy, cx, cy: {[fx, fy, cx, cy]}"
+        return f"is {value!r}, but must be fx, fy, cx, cy"
+    is_nested = any(isinstance(it, list) for it in value)
+    return f"is {value!r}, but must be one list: {flat}" if is_nested else ""
 
 
 def _dotted(location: Sequence[int | str]) -> str:

@@ -27,8 +27,14 @@ DEFAULT_RELATIVE_SIGMA = 1e-3
 # No square is known better, not even one etched in glass.
 LEAST_SIGMA_M = 1e-8
 
-# No printed square is larger; a larger number is in millimetres.
-LARGEST_M = 1.0
+# No printed square is larger; a larger number is in millimetres, one up to this in centimetres or
+# inches: no square of so few millimetres is printed.
+LARGEST_M, _LARGEST_IN_CM = 1.0, 4.0
+
+# Sides of markers by those of squares, and a share at which none can be read; units that are
+# written in the place of metres [m].
+_MARKERS, _UNREADABLE = (0.4, 0.95), 0.1
+_UNITS = {"mm": 1e-3, "inches": 0.0254, "cm": 1e-2}
 
 # What descriptions of targets say, of one kind or another.
 _SIZES = {"square_m", "square_sigma_m", "marker_m", "size_m", "diameter_m", "spacing", "border"}
@@ -160,7 +166,14 @@ def target_from_document(document: Mapping[str, Any], name: str) -> Target:
     Raises:
         DataError: A field is missing, of another type, or out of range.
     """
-    table = Table(document, f"target {name}")
+    try:
+        return _described(Table(document, f"target {name}"), name)
+    except DataError as error:
+        hint = error.next_step or " ".join(misspelt_keys(document))
+        raise type(error)(error.message, culprits=error.culprits, next_step=hint) from error
+
+
+def _described(table: Table, name: str) -> Target:
     kind = table.choice("kind", get_args(TargetKind))
     if kind == "marker":
         return _marker(table, name)
@@ -172,6 +185,8 @@ def target_from_document(document: Mapping[str, Any], name: str) -> Target:
         return _circles(table, name)
     columns = table.integer("columns", _MIN_SQUARES, _MAX_SQUARES)
     rows = table.integer("rows", _MIN_SQUARES, _MAX_SQUARES)
+    if kind == "charuco":
+        _check_one_unit(table)
     square_m = _size(table, "square_m")
     sigma_m = _sigma(table, square_m)
     if kind == "checkerboard":
@@ -194,9 +209,38 @@ def target_from_document(document: Mapping[str, Any], name: str) -> Target:
 
 def _size(table: Table, key: str) -> float:
     size_m = table.number(key, positive=True)
-    if size_m > LARGEST_M:
+    if size_m > _LARGEST_IN_CM:
         raise table.refuse(key, size_m, f"metres, such as {1e-3 * size_m:g} for {size_m:g} mm")
+    if size_m > LARGEST_M:
+        cm, inches = f"{1e-2 * size_m:g} for {size_m:g} cm", f"{0.0254 * size_m:g} for inches"
+        raise table.refuse(key, size_m, f"metres: {cm}, {inches}")
     return size_m
+
+
+def _check_one_unit(table: Table) -> None:
+    """Refuses sides of squares and markers of which one is in another unit, as their ratio says.
+
+    Raises:
+        DataError: In metres they are of no board, and in another unit one of them is.
+    """
+    square, marker = (table.number(it, positive=True) for it in ("square_m", "marker_m"))
+    if _UNREADABLE * square < marker < square:
+        return
+    low, high = _MARKERS
+    for unit, size_m in _UNITS.items():
+        for key, inside, outside in (
+            ("square_m", marker, square * size_m),
+            ("marker_m", marker * size_m, square),
+        ):
+            if low * outside < inside < high * outside:
+                right = outside if key == "square_m" else inside
+                raise DataError(
+                    f"{table.label}: square_m is {square:g} and marker_m is {marker:g}; one is in "
+                    f"another unit: with {key} in {unit}, and not in metres, a marker is "
+                    f"{inside / outside:.2f} of a square, as usual.",
+                    culprits=[f"{table.label}: {key}"],
+                    next_step=f"In the target's .toml, write {key} = {right:.6g}.",
+                )
 
 
 def _sigma(table: Table, size_m: float) -> float:

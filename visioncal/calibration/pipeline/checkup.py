@@ -12,6 +12,8 @@ from visioncal.calibration.pipeline.running import known_at_first
 from visioncal.calibration.pipeline.solving import first_agreement
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.cell import read_cell
+from visioncal.calibration.stages.image_size import resized_lens
+from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.calibration.stages.observed import CameraLook, by_reason
 from visioncal.calibration.stages.pictures import unnamed_images, unseen_cause
 from visioncal.core.errors import VisioncalError
@@ -20,7 +22,7 @@ from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure
 from visioncal.core.shown import html_card
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.types import Mount, Progress
+from visioncal.core.types import Camera, Mount, Progress
 from visioncal.core.verdict import CALIBRATE, MISSING, Finding, Step, with_paths
 from visioncal.session import Session
 
@@ -133,10 +135,10 @@ def _findings(known: RunState, error: VisioncalError | None) -> Iterator[Finding
         yield _refused("refused", error)
     said = () if cause is None else (cause.kind,)
     warned = [it for it in known.warnings if it.kind not in (*_NO_FAULT, *said)]
-    yield from sorted(warned, key=lambda it: it.do is None)
+    is_said = "other_lens" in {it.kind for it in warned}
+    lens = [] if error is not None or is_said else list(_lenses(known))
+    yield from sorted([*lens, *warned], key=lambda it: it.do is None)
     if error is None:
-        lens = list(_lenses(known))
-        yield from lens
         if hint is None and known.mount is not None and not lens:
             yield from _motion(known, known.mount)
         yield from _lost(known)
@@ -158,13 +160,14 @@ def _lenses(known: RunState) -> Iterator[Finding]:
             continue
         middle = (np.array(stated.resolution) - 1.0) / 2.0
         shares = stated.matrix[2:] / middle
-        words = ""
+        words, mend = "", step
         if np.all(np.abs(shares - 1.0) > _OFF_CENTRE) and abs(shares[0] / shares[1] - 1.0) < 0.1:
             x, y = stated.matrix[2:]
             words = (
                 f"The stated matrix is of images of another size: its centre is at ({x:.0f}, "
                 f"{y:.0f}) px, and the middle of these is at ({middle[0]:.0f}, {middle[1]:.0f}) px."
             )
+            words, mend = _resized(known, look, stated) or (words, mend)
         elif (noise_px := _measured_px(look)) > _MOST_PX:
             words = (
                 f"Corners deviate by {figure(noise_px)} px from any pose of a flat board "
@@ -172,7 +175,18 @@ def _lenses(known: RunState) -> Iterator[Finding]:
                 "board is not flat."
             )
         if words:
-            yield Finding("lens", words, step).of(frame if len(known.cameras) > 1 else "")
+            yield Finding("lens", words, mend).of(frame if len(known.cameras) > 1 else "")
+
+
+def _resized(known: RunState, look: CameraLook, stated: Camera) -> tuple[str, Step] | None:
+    """How much larger the images of a stated matrix are, by a lens of these images."""
+    targets, model = tuple(known.session.boards.values()), look.table.model
+    try:
+        found = estimate_intrinsics(look.corners, targets, stated.resolution, model)
+    except VisioncalError:
+        return None
+    words, do = resized_lens(stated, found.camera.matrix)
+    return (words, Step(do)) if words else None
 
 
 def _measured_px(look: CameraLook) -> float:

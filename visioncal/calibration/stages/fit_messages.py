@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from visioncal.calibration.stages.image_size import resized_lens
 from visioncal.core.number_format import figure
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import FloatArray, IntArray, Target
@@ -240,7 +241,11 @@ def _lens_found(fitted: Fitted, camera: str) -> Iterator[Finding]:
     if not problem.scene.estimated and _moved(fitted, lens):
         is_exact = problem.scene.matrix_sigma_px is None
         steps = (looks.values - looks.stated)[lens[:4]]
-        yield lens_found(steps, is_doubtful=is_exact or contradicted_lens(fitted, camera))
+        words, do = resized_lens(problem.scene.camera, looks.values[lens[:4]])
+        if words:
+            yield Finding("lens", f"{words} It was refined.", Step(do, CALIBRATE))
+        else:
+            yield lens_found(steps, is_doubtful=is_exact or contradicted_lens(fitted, camera))
     if problem.contested:
         at = np.arange(fitted.problem.size)[fitted.columns]
         at = at[np.searchsorted(fitted.seen.free, lens[:4])]

@@ -1,6 +1,7 @@
 """Images of another size than the camera's: resized, cut or turned, and the lens that they have."""
 
 from collections.abc import Iterator, Mapping
+from fractions import Fraction
 
 import numpy as np
 
@@ -10,6 +11,9 @@ from visioncal.core.types import Camera, Corners, FloatArray, Target
 
 # Sides whose shares differ by less are of images that were resized, and not cut.
 _SAME_SHAPE = 0.02
+# Images are resized by more, and mostly by a ratio of small numbers: focal lengths by images are
+# right to a share of this.
+_LEAST_SCALE, _LARGEST_PART, _SAME_SCALE = 1.1, 8, 0.02
 
 
 def other_size_step(
@@ -52,6 +56,35 @@ def _written(key: str, values: FloatArray, form: str) -> str:
 def scaled_matrix(matrix: FloatArray, scale: float) -> FloatArray:
     """fx, fy, cx, cy of images that were resized; pixel centres are at whole numbers."""
     return np.array([*(scale * matrix[:2]), *(scale * (matrix[2:] + 0.5) - 0.5)])
+
+
+def resized_lens(stated: Camera, matrix: FloatArray) -> tuple[str, str]:
+    """Says that a stated matrix is for images of another size, by the one that the images have.
+
+    Args:
+        stated: The lens as it is stated, with the size of the images.
+        matrix: (4,) fx, fy, cx, cy by the images [px].
+
+    Returns:
+        What is wrong, and what to write; both empty where no one ratio explains the difference.
+    """
+    scale = float(np.sqrt(np.prod(matrix[:2] / stated.matrix[:2])))
+    if max(scale, 1.0 / scale) < _LEAST_SCALE:
+        return "", ""
+    near = float(Fraction(scale).limit_denominator(_LARGEST_PART))
+    if abs(near / scale - 1.0) < _SAME_SCALE:
+        scale = near
+    away = np.abs(scaled_matrix(stated.matrix, scale) - matrix)
+    limits = [_SAME_SCALE * scale * stated.matrix[0]] * 2 + [_SAME_SHAPE * stated.resolution[0]] * 2
+    if np.any(away > limits):
+        return "", ""
+    width, height = stated.resolution
+    return (
+        f"The stated matrix is for images of {width / scale:.0f} x {height / scale:.0f} px, and "
+        f"these are {width} x {height} px: fx is {stated.matrix[0]:.1f} px there, and "
+        f"{matrix[0]:.1f} px by these images ({scale:.3g} times as large).",
+        f"In session.toml, write {_written('matrix', scaled_matrix(stated.matrix, scale), '.2f')}.",
+    )
 
 
 def turned_lens(camera: Camera, *, clockwise: bool) -> Camera:
