@@ -179,6 +179,12 @@ def test_a_measurement_that_good_data_contradict_is_told_and_left_out():
     assert "is contradicted by the views" in told
     assert f"{1e3 * true + 5.0:g} mm" in told
     assert told.endswith("it is not used.")
+    assert [it.kind for it in wrong.verdict.causes] == ["prior"]
+    # It is said before that the views are few.
+    few = simulate(CellOptions(robot="ur5e", views=6, seed=5))
+    z_m = float(few.transforms["flange_from_cam"][2, 3]) + 0.02
+    ranked = run(few, {"flange_from_cam": {"z_m": z_m, "sigma_m": 1e-3}}).verdict.ranked
+    assert [it.kind for it in ranked[:2]] == ["prior", "few_stops"]
     # The same views once more, from where they were with it.
     sigmas = np.sqrt(np.diag(free.solved.covariance))
     off = log(invert(free.solved.state.edges) @ wrong.solved.state.edges).ravel()

@@ -91,6 +91,7 @@ EVIDENCE: Mapping[str, Evidence] = {
     "other_board": Evidence(_FACT),
     "rig_points": Evidence(_FACT),
     "other_lens": Evidence(_FACT),
+    "prior": Evidence(2.7e-3),
     "untied": Evidence(_FACT),
     "too_few_stops": Evidence(_FACT),
     "board_size": Evidence(2.7e-3, _CHAIN),
@@ -113,7 +114,15 @@ MOVED_AT_ONCE = ("moved_at_once", "joint_slipped")
 _MOVED = ("moved_slowly", *MOVED_AT_ONCE)
 _UNUSED_JOINTS = ("misread_joints", "other_arm")
 # What is measured by way of the robot says nothing where its poses are misread.
-_BY_THE_CHAIN = ("board_size", "board_shape", "lens", "lens_field", "corner_noise", "arm_errors")
+_BY_THE_CHAIN = (
+    "board_size",
+    "board_shape",
+    "lens",
+    "lens_field",
+    "corner_noise",
+    "arm_errors",
+    "prior",
+)
 LOOK = Step(
     "Look at the worst views: does each pose belong to its image, did anything move?", REVIEW
 )

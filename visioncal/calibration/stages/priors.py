@@ -101,4 +101,4 @@ def prior_words(
             yield from remarks([it.remark], NOTE)
         else:
             step = Step("Measure it again, or delete it from session.toml.", CALIBRATE)
-            yield Finding("prior", it.doubt, step)
+            yield Finding("prior", it.doubt, step, mahalanobis_sq=it.contradiction**2)
