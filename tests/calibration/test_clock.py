@@ -61,6 +61,46 @@ def session(moved) -> Session:
     return sweep_session(moved, "swept")
 
 
+def restamped(session: Session, stamp) -> Session:
+    """The session with the views' times as `stamp` makes them of (n,) times [s]."""
+    before_s = np.array([it.stamp_s for it in session.views])
+    pairs = zip(session.views, stamp(before_s).tolist(), strict=True)
+    views = tuple(replace(it, numbers={**it.numbers, "stamp_s": s}) for it, s in pairs)
+    return replace(session, views=views)
+
+
+@pytest.mark.parametrize(
+    ("stamp", "words"),
+    [
+        (lambda s: s + 0.02 * (s >= s[300]), "from view 300 on it is +20"),
+        (lambda s: s - 0.02 * (s >= s[200]), "from view 200 on it is -"),
+        (lambda s: s + 1e-3 * (s - s[0]), "drifts against the robot's, by +"),
+    ],
+    ids=["jump", "back", "drift"],
+)
+def test_a_clock_that_changes_is_named_and_taken_out(stamp, words):
+    moved = swept(how=SweepOptions())
+    session = sweep_session(moved, "swept")
+    known = calibrate(restamped(session, stamp))
+    cause = known.verdict.causes[0]
+    assert cause.kind == "clock_changed"
+    assert words in cause.words
+    sound = calibrate(session)
+    assert sound.verdict.status == "good"
+    (x, again) = (it.transforms["flange_from_cam"].as_matrix() for it in (sound, known))
+    # Some frames about the jump are stamped in a mixed order; the rest is as without it.
+    assert np.linalg.norm(x[:3, 3] - again[:3, 3]) < 3e-4
+
+
+@pytest.mark.parametrize(
+    "mount", ["eye-in-hand", pytest.param("eye-to-hand", marks=pytest.mark.slow)]
+)
+def test_a_clock_that_runs_evenly_is_not_doubted_for_an_arm_that_errs(mount):
+    for seed in range(3):
+        moved = swept(seed, mount, SweepOptions(), dh_sigma_m=5e-4, dh_sigma_rad=5e-4)
+        assert not clocked_of(sweep_session(moved, "swept")).warnings
+
+
 def stating(session: Session, ahead_s: float) -> Session:
     document = {**session.document, "clock": {"camera_minus_robot_s": ahead_s}}
     return replace(session, document=document)

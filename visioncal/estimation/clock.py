@@ -36,6 +36,9 @@ _ROUNDS, _SETTLED_S = 12, 1e-7
 _OUTLYING = 4.0
 # Errors of frames within this time of each other may be alike [s]; so many stretches suffice.
 _STRETCH_S, _FEWEST_STRETCHES = 1.0, 6
+# So many frames are asked for their own offset, so far from the common one at most, in such steps
+# [s].
+_MOST_ASKED, _FARTHEST_S, _ASKED_STEP_S = 600, 0.5, 0.02
 # Fits that leave so many times the least, of rotations times positions, are no worse.
 _ALIKE = 1.2
 
@@ -80,6 +83,30 @@ class DelayedFit:
         """(k,) which of the times are beyond chance."""
         limit = f_limit(_FALSE_ALARM, 1, self.freedom)
         return np.asarray((self.times_s / self.sigmas_s) ** 2 > limit)
+
+
+@dataclass(frozen=True)
+class ClockChange:
+    """How an offset changes over the frames.
+
+    Attributes:
+        from_s: From which of the camera's times on it is another [s]; of a drift, from which on it
+            grows.
+        step_s: By how much it is larger then [s]; of a drift, in a second.
+        sigma_s: The standard deviation of that.
+        is_drift: Whether it grows steadily.
+    """
+
+    from_s: float
+    step_s: float
+    sigma_s: float
+    is_drift: bool
+
+    def corrected(self, stamps_s: FloatArray) -> FloatArray:
+        """(m,) times as a clock would have them that did not change [s]."""
+        later_s = stamps_s - self.from_s
+        change = later_s if self.is_drift else (later_s >= 0.0).astype(float)
+        return np.asarray(stamps_s - self.step_s * change)
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +175,7 @@ def fit_offset(robot: Trajectory, frames: Frames, starts: Sequence[float]) -> tu
     # Few frames agree with anything.
     most = max((it.frames for it in fits), default=0)
     whole = (it for it in fits if 2 * it.frames > most)
-    return tuple(sorted(whole, key=_left))
+    return tuple(sorted(whole, key=left_by))
 
 
 def fit_delays(
@@ -174,6 +201,112 @@ def fit_delays(
         return _fitted(robot, some, start.offset_s, start.fit.state, late)
 
 
+def clock_change(robot: Trajectory, frames: Frames, fit: ClockFit) -> ClockChange | None:
+    """Looks for a step of the offset at any frame, and for a steady drift.
+
+    Each frame is asked for the offset at which it is where the fit has it. Means of these over
+    stretches of time are independent, as far as errors that last are: what they leave is the noise
+    of the test (of a change point; Page 1955).
+
+    Args:
+        robot: `base_from_flange` over the robot's time.
+        frames: What the camera saw.
+        fit: The fit with one offset.
+
+    Returns:
+        The change; None where noise explains it, or there are too few stretches.
+    """
+    some = frames.only(_evenly(len(frames), _MOST_ASKED))
+    some = some.only(robot.covers(some.stamps_s - fit.offset_s, _FARTHEST_S))
+    asked_s, weights = _asked_offsets(robot, some, fit)
+    times_s, of = some.stamps_s, np.zeros(len(some), dtype=np.int64)
+    if len(some):
+        of = np.unique((times_s - times_s[0]) // _STRETCH_S, return_inverse=True)[1]
+    sums = np.bincount(of, weights).astype(float)
+    kept = sums > 0.0
+    if np.sum(kept) < _FEWEST_STRETCHES:
+        return None
+    means = (np.bincount(of, weights * asked_s)[kept]) / sums[kept]
+    middles = (np.bincount(of, weights * times_s)[kept]) / sums[kept]
+    columns = [(middles >= it).astype(float) for it in middles[2:-1]]
+    tried = [_slope(it, means, sums[kept]) for it in (middles - middles[0], *columns)]
+    freedom = len(means) - 2
+    best = int(np.argmax([it[2] for it in tried]))
+    step_s, sigma_s, square = tried[best]
+    if square < f_limit(_FALSE_ALARM / len(tried), 1, freedom):
+        return None
+    if best == 0:
+        return ClockChange(float(times_s[0]), step_s, sigma_s, is_drift=True)
+    # Within the stretches about it, the frame that parts best.
+    near = np.flatnonzero((times_s >= middles[best]) & (times_s <= middles[best + 2]))
+    parts = [_slope((times_s >= times_s[it]).astype(float), asked_s, weights)[2] for it in near]
+    from_s = float(times_s[near[int(np.argmax(parts))]])
+    return ClockChange(from_s, step_s, sigma_s, is_drift=False)
+
+
+def refined_change(
+    robot: Trajectory, frames: Frames, fit: ClockFit, stamped: Frames, change: ClockChange
+) -> ClockChange:
+    """The change with what frames ask for that are corrected by it.
+
+    Args:
+        robot: `base_from_flange` over the robot's time.
+        frames: What the camera saw, at corrected times.
+        fit: The fit of these.
+        stamped: The same at the times that were stamped.
+        change: The change by which they are corrected.
+    """
+    some = _evenly(len(frames), _MOST_ASKED)
+    inside = robot.covers(frames.stamps_s[some] - fit.offset_s, _FARTHEST_S)
+    some = some[inside]
+    asked_s, weights = _asked_offsets(robot, frames.only(some), fit)
+    later_s = stamped.stamps_s[some] - change.from_s
+    column = later_s if change.is_drift else (later_s >= 0.0).astype(float)
+    more_s, sigma_s, _ = _slope(column, asked_s, weights)
+    return replace(change, step_s=change.step_s + more_s, sigma_s=sigma_s)
+
+
+def _asked_offsets(
+    robot: Trajectory, frames: Frames, fit: ClockFit
+) -> tuple[FloatArray, FloatArray]:
+    """(m,) by how much the offset is to change for each frame [s], and the information on it.
+
+    What no offset explains has none.
+    """
+    best = np.full(len(frames), np.inf)
+    asked_s, weights = np.zeros(len(frames)), np.zeros(len(frames))
+    for change_s in np.arange(-_FARTHEST_S, _FARTHEST_S + 0.5 * _ASKED_STEP_S, _ASKED_STEP_S):
+        problem = clock_problem(robot, frames, fit.offset_s + change_s)
+        linear = problem.linear(State(fit.fit.state.edges, problem.start_values))
+        late = linear.jacobian[:, :, -1:]
+        both = np.concatenate([late, linear.residuals[:, :, None]], axis=2)
+        blocks = problem.total_covariance(linear, fit.fit.noise)
+        products = np.swapaxes(both, 1, 2) @ np.linalg.solve(blocks, both)
+        own, pull = np.maximum(products[:, 0, 0], 1e-12), products[:, 0, 1]
+        step_s = -pull / own
+        left = products[:, 1, 1] - pull**2 / own
+        better = (left < best) & (np.abs(step_s) <= _ASKED_STEP_S)
+        best = np.where(better, left, best)
+        asked_s = np.where(better, change_s + step_s, asked_s)
+        weights = np.where(better, own, weights)
+    sound = best <= _OUTLYING**2 * float(np.median(best))
+    return asked_s, np.where(sound, weights, 0.0)
+
+
+def _slope(column: FloatArray, values: FloatArray, weights: FloatArray) -> tuple[float, ...]:
+    """A slope beside a constant by weighted least squares, its sigma, and F for it."""
+    count, total = len(values), weights.sum()
+    centred = column - weights @ column / total
+    about = values - weights @ values / total
+    square = float(weights @ centred**2)
+    if square <= 0.0:
+        return 0.0, np.inf, 0.0
+    slope = float(weights @ (centred * about)) / square
+    left = float(weights @ (about - slope * centred) ** 2) / (count - 2)
+    sigma = float(np.sqrt(left / square))
+    return slope, sigma, (slope / sigma) ** 2 if sigma > 0.0 else 0.0
+
+
 def clear_fit(fits: Sequence[ClockFit], stated_s: float | None) -> ClockFit | None:
     """The fit that stands out: motion that repeats itself has several that leave as little.
 
@@ -181,14 +314,14 @@ def clear_fit(fits: Sequence[ClockFit], stated_s: float | None) -> ClockFit | No
     """
     if not fits:
         return None
-    alike = [it for it in fits if _left(it) <= _ALIKE * _left(fits[0])]
+    alike = [it for it in fits if left_by(it) <= _ALIKE * left_by(fits[0])]
     if all(abs(it.offset_s - fits[0].offset_s) <= NEAR_S for it in alike):
         return fits[0]
     near = [it for it in alike if stated_s is not None and abs(it.offset_s - stated_s) <= NEAR_S]
     return near[0] if near else None
 
 
-def _left(fit: ClockFit) -> float:
+def left_by(fit: ClockFit) -> float:
     """What a fit leaves of rotations and positions, as its likelihood has it."""
     return float(fit.fit.noise.robots.prod())
 

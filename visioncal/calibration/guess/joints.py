@@ -59,7 +59,7 @@ def joint_readings(robot: Robot) -> Iterator[JointReading]:
     """All other readings that are tried, but for lost zeros: one mistake, then two."""
     declared = declared_reading(robot)
     columns = [*_exchanges(declared), *_signs(declared)]
-    units = list(_units(declared))
+    units = list(unit_readings(declared))
     yield from units
     yield from columns
     yield from _couplings(declared)
@@ -87,21 +87,22 @@ def with_zero(declared: JointReading, joint: int, zero_rad: float) -> JointReadi
     )
 
 
-def _units(declared: JointReading) -> Iterator[JointReading]:
+def unit_readings(declared: JointReading) -> Iterator[JointReading]:
+    """The readings in which angles are in degrees, or were taken for degrees."""
     turns = ~declared.robot.chain.prismatic
     many = f"q1_rad to q{len(turns)}_rad"
     yield replace(
         declared,
         mixing=np.diag(np.where(turns, np.pi / 180.0, 1.0)),
         words="the angles in degrees",
-        fix=f"In views.csv, multiply {many} by pi / 180.",
+        fix=f"Where the angles are recorded, multiply {many} by pi / 180.",
         cost=1,
     )
     yield replace(
         declared,
         mixing=np.diag(np.where(turns, 180.0 / np.pi, 1.0)),
         words="the angles in radians that were taken for degrees",
-        fix=f"In views.csv, multiply {many} by 180 / pi.",
+        fix=f"Where the angles are recorded, multiply {many} by 180 / pi.",
         cost=1,
     )
 

@@ -103,6 +103,7 @@ EVIDENCE: Mapping[str, Evidence] = {
     "moved_slowly": Evidence(1e-4, _CHAIN),
     "moved_at_once": Evidence(1e-4, _CHAIN),
     "joint_slipped": Evidence(1e-4, _CHAIN),
+    "clock_changed": Evidence(1e-4, _CHAIN),
     "correlated_errors": Evidence(1e-4, _CHAIN),
     "arm_errors": Evidence(1e-4, _CHAIN),
     "weak_lens": Evidence(_REMARK, "lens"),
@@ -313,13 +314,16 @@ def _feigned(first: Mapping[str, Finding]) -> set[str]:
     a focus that changes does not go by the time, and is found moving in one session of ten
     thousand. Before and after a step, errors by posture and time are alike because of it. What a
     held lens that the corners contradict does to views passes for a board of another size or
-    shape; the corners alone do not show the size, and the lens is tested beside both.
+    shape; the corners alone do not show the size, and the lens is tested beside both. What is left
+    of a clock's jump passes for motion.
     """
     feigned: set[str] = set()
     if moved := [first[it].mahalanobis_sq for it in _MOVED if it in first]:
         feigned.add("focus")
         if "arm_errors" in first and max(moved) > first["arm_errors"].mahalanobis_sq:
             feigned.add("arm_errors")
+    if "clock_changed" in first:
+        feigned |= {*_MOVED, "arm_errors", "correlated_errors"}
     if "lens" in first and first["lens"].mahalanobis_sq:
         feigned |= {"board_size", "board_shape"}
     return feigned

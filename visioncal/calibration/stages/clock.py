@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from visioncal.calibration.guess.joints import JointReading, declared_reading, unit_readings
 from visioncal.calibration.stages.image_delays import find_delays, straighten
 from visioncal.calibration.stages.motion import Motion, at_rest, is_open, slow_and_new
 from visioncal.calibration.stages.offset import (
@@ -16,6 +17,7 @@ from visioncal.calibration.stages.offset import (
     LARGEST_SIGMA_S,
     LEAST_CORRELATION,
     Clock,
+    change_doubt,
     clock_words,
     no_offset,
     speed_words,
@@ -24,12 +26,24 @@ from visioncal.calibration.stages.offset import (
     why_undetermined,
 )
 from visioncal.calibration.stages.pnp import ViewPoses
+from visioncal.core.errors import DataError
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Mount, Rejection
 from visioncal.core.verdict import Finding
-from visioncal.estimation.clock import ClockFit, DelayedFit, clear_fit, fit_offset
+from visioncal.estimation.clock import (
+    ClockChange,
+    ClockFit,
+    DelayedFit,
+    clear_fit,
+    clock_change,
+    fit_offset,
+    left_by,
+    refined_change,
+)
 from visioncal.estimation.clock_correlation import Frames, Match, turning_matches
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.effects.delays import Delay
+from visioncal.estimation.trajectory import Trajectory
+from visioncal.robot import Robot
 from visioncal.session import View
 
 # A stated offset is taken to be known so well [s].
@@ -41,6 +55,11 @@ _IN_A_GAP = "no pose of the robot: samples of its stream are missing around that
 _IN_MOTION = "no pose of the robot: taken in motion, and how far the clocks differ is not known"
 # So many views are all used; of more, slow ones.
 _MANY_VIEWS = 60
+# A change of the offset must leave so much less of rotations times positions; it is refined in so
+# many rounds at most, or until it moves by less than this share of its sigma.
+_CLEARLY_LESS, _ROUNDS, _AT_REST = 0.9, 6, 0.3
+# What turns together goes along by so much.
+_SURELY_ALIKE = 0.9
 
 
 @dataclass(frozen=True)
@@ -135,24 +154,89 @@ def set_clock(sweep: Sweep, poses: Mapping[int, ViewPoses]) -> Clocked:
         DegenerateError: The motion does not determine the offset, it is not stated, and too few
             views were taken at rest.
     """
-    motion = sweep.motion
+    found = _match(sweep, poses)
+    change = None if found.fit is None else _change(sweep, found.frames, found.fit)
+    if change is None:
+        return _placed_by(sweep, found, poses)
+    doubt = change_doubt(change, found.views)
+    sweep = replace(sweep, views=tuple(_corrected(it, change) for it in sweep.views))
+    placed = _placed_by(sweep, _match(sweep, poses), poses)
+    return replace(placed, warnings=(*placed.warnings, doubt))
+
+
+@dataclass(frozen=True, eq=False)
+class _Matched:
+    """What the motion says of the clocks.
+
+    Attributes:
+        views: The views that wait for a pose, by their times.
+        frames: What those in the fit saw.
+        matches: The offsets at which camera and robot turn alike.
+        sound: Those that are no chance.
+        fits: The fits from them.
+        fit: The one that stands out; None where none does.
+    """
+
+    views: Sequence[View]
+    frames: Frames
+    matches: Sequence[Match]
+    sound: Sequence[Match]
+    fits: Sequence[ClockFit]
+    fit: ClockFit | None
+
+
+def _match(sweep: Sweep, poses: Mapping[int, ViewPoses]) -> _Matched:
+    flange, stated_s = sweep.motion.flange, sweep.stated_s
     views = [view for view in sweep.views if is_open(view) and view.number in poses]
     views.sort(key=lambda view: view.stamp_s or 0.0)
-    fitted = [view for view in views if not view.holdout]
-    stated_s = sweep.stated_s
-    frames = _frames(sweep, fitted, poses)
-    matches = turning_matches(motion.flange, frames, stated_s or 0.0)
+    frames = _frames(sweep, [view for view in views if not view.holdout], poses)
+    matches = turning_matches(flange, frames, stated_s or 0.0)
     sound = [it for it in matches if it.correlation >= LEAST_CORRELATION and not it.at_end]
     starts = [it.offset_s for it in sound] + [it for it in (stated_s,) if it is not None]
-    fits = fit_offset(motion.flange, frames, starts) if sound else ()
-    fit = clear_fit(fits, stated_s)
+    fits = fit_offset(flange, frames, starts) if sound else ()
+    return _Matched(views, frames, matches, sound, fits, clear_fit(fits, stated_s))
+
+
+def _placed_by(sweep: Sweep, found: _Matched, poses: Mapping[int, ViewPoses]) -> Clocked:
+    """Gives views their poses by the best that the motion says."""
+    fit, sound = found.fit, found.sound
     if fit is not None and fit.sigma_s <= LARGEST_SIGMA_S:
         nearest_s = fit.offset_s
         match = min(sound, key=lambda it: abs(it.offset_s - nearest_s))
-        return _by_motion(sweep, views, (fit, match), frames, poses)
-    if len(sound) == 1 and frames.are_dense and sound[0].sigma_s <= LARGEST_SIGMA_S:
-        return _by_turning(sweep, views, sound[0])
-    return _undetermined(sweep, views, (fits, matches))
+        return _by_motion(sweep, found.views, (fit, match), found.frames, poses)
+    if len(sound) == 1 and found.frames.are_dense and sound[0].sigma_s <= LARGEST_SIGMA_S:
+        return _by_turning(sweep, found.views, sound[0])
+    return _undetermined(sweep, found.views, (found.fits, found.matches))
+
+
+def _change(sweep: Sweep, frames: Frames, fit: ClockFit) -> ClockChange | None:
+    """How the offset changes over the frames; None where it does not, or that explains little.
+
+    A fit to both sides of a jump misleads about its size, which is found in a few rounds.
+    """
+    flange, change = sweep.motion.flange, clock_change(sweep.motion.flange, frames, fit)
+    for _ in range(_ROUNDS if change else 0):
+        if change is None:
+            return None
+        there = replace(frames, stamps_s=change.corrected(frames.stamps_s))
+        fits = fit_offset(flange, there, [fit.offset_s])
+        if not fits or left_by(fits[0]) > _CLEARLY_LESS * left_by(fit):
+            return None
+        if frames.stack is not None:
+            # What a rolling shutter does goes with the motion, and would be taken for the clock's.
+            break
+        before_s, change = change.step_s, refined_change(flange, there, fits[0], frames, change)
+        if abs(change.step_s - before_s) < _AT_REST * change.sigma_s:
+            break
+    return change
+
+
+def _corrected(view: View, change: ClockChange) -> View:
+    """A view with the time that a clock without the change would have given it."""
+    if view.stamp_s is None:
+        return view
+    (stamp_s,) = change.corrected(np.array([view.stamp_s])).tolist()
+    return replace(view, numbers={**view.numbers, "stamp_s": stamp_s})
 
 
 def _frames(sweep: Sweep, views: Sequence[View], poses: Mapping[int, ViewPoses]) -> Frames:
@@ -163,6 +247,41 @@ def _frames(sweep: Sweep, views: Sequence[View], poses: Mapping[int, ViewPoses])
     seen = [it for it in seen if it[1].board == most]
     clear = [it for it in seen if len(it[1].cam_from_target) == 1]
     return sweep.frames(clear if 2 * len(clear) > len(seen) else seen)
+
+
+def misread_joints(sweep: Sweep, poses: Mapping[int, ViewPoses], robot: Robot) -> DataError | None:
+    """The error of a stream of joint angles alone that turn as the camera sees in another unit.
+
+    Args:
+        sweep: What a camera saw while a robot moved, which its stream does not explain.
+        poses: What the camera saw, by view.
+        robot: The model by which the stream's poses are.
+
+    Returns:
+        The error; None where no other unit explains it.
+    """
+    if sweep.motion.reported or sweep.motion.joints is None:
+        return None
+    samples, q = sweep.motion.joints
+    frames = _match(sweep, poses).frames
+
+    def alike(reading: JointReading) -> float:
+        flange = Trajectory(samples.stamps_s, reading.poses(q))
+        matches = turning_matches(flange, frames, sweep.stated_s or 0.0)
+        return max((it.correlation for it in matches), default=0.0)
+
+    declared, file = declared_reading(robot), f"streams/{sweep.motion.name}.csv"
+    recorded = alike(declared)
+    for reading in unit_readings(declared):
+        read = alike(reading)
+        if recorded < LEAST_CORRELATION and read > _SURELY_ALIKE:
+            return DataError(
+                f"{file}: the joint angles are misread. With {reading.words}, robot and camera "
+                f"turn alike with a correlation of {read:.2f}; as recorded, of {recorded:.2f}.",
+                culprits=[f"{file}: q{at + 1}_rad" for at in range(robot.joint_count)],
+                next_step=reading.fix,
+            )
+    return None
 
 
 def _by_motion(

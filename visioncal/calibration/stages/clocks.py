@@ -11,11 +11,12 @@ from typing import TypeVar
 import numpy as np
 
 from visioncal.calibration.stages.cell import Cell, robot_key
-from visioncal.calibration.stages.clock import Clocked, Pair, Sweep, set_clock
+from visioncal.calibration.stages.clock import Clocked, Pair, Sweep, misread_joints, set_clock
 from visioncal.calibration.stages.motion import is_open, motion_of, stream_of
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.offset import Clock
-from visioncal.core.errors import VisioncalError
+from visioncal.calibration.stages.pnp import ViewPoses
+from visioncal.core.errors import DegenerateError, VisioncalError
 from visioncal.core.types import Rejection
 from visioncal.core.verdict import Finding, Step
 from visioncal.estimation.effects.clock import clock_effect
@@ -66,12 +67,9 @@ def _with_pair(seen: T, pair: Pair, rows: list[View]) -> T:
     is_only = max(len(session.cameras), len(session.robots)) < 2
     of = "" if is_only else pair.words
     on_flange = session.frames[pair.camera] == frame_name("flange", pair.robot)
+    model = None if document is None else Robot.from_document(document)
     try:
-        motion = motion_of(
-            session,
-            None if document is None else Robot.from_document(document),
-            stream_of(session, pair.robot),
-        )
+        motion = motion_of(session, model, stream_of(session, pair.robot))
         sweep = Sweep(
             motion,
             "eye-in-hand" if on_flange else "eye-to-hand",
@@ -80,7 +78,7 @@ def _with_pair(seen: T, pair: Pair, rows: list[View]) -> T:
             None if lens is None else lens.camera,
             numbered_positions(tuple(session.boards.values())),
         )
-        clocked = set_clock(sweep, seen.poses)
+        clocked = _set(sweep, seen.poses, model)
     except VisioncalError as error:
         if is_only:
             raise
@@ -96,6 +94,16 @@ def _with_pair(seen: T, pair: Pair, rows: list[View]) -> T:
         notes=(*seen.notes, *(f"{of}: {it}" if of else it for it in clocked.notes)),
     )
     return seen.noting(clocked.rejections, (it.of(of) for it in clocked.warnings))
+
+
+def _set(sweep: Sweep, poses: Mapping[int, ViewPoses], model: Robot | None) -> Clocked:
+    try:
+        return set_clock(sweep, poses)
+    except DegenerateError as error:
+        misread = None if model is None else misread_joints(sweep, poses, model)
+        if misread is None:
+            raise
+        raise misread from error
 
 
 def _stated_s(session: Session, camera: str) -> float | None:

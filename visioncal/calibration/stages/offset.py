@@ -12,7 +12,7 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import GUESS, Finding, Step
-from visioncal.estimation.clock import ClockFit
+from visioncal.estimation.clock import ClockChange, ClockFit
 from visioncal.estimation.clock_correlation import Match
 from visioncal.results.sections import ClockResult
 from visioncal.session import View
@@ -99,6 +99,36 @@ def turning_doubt(match: Match) -> Finding:
         f"{match.correlation:.2f}). It is known no better, because the chain of frames does not "
         "close over the motion.",
         Step("Try other conventions of the poses.", GUESS),
+    )
+
+
+def change_doubt(change: ClockChange, views: Sequence[View]) -> Finding:
+    """Says how the offset between the clocks changed.
+
+    Args:
+        change: How.
+        views: The views, as they were stamped.
+    """
+    if change.is_drift:
+        how = (
+            f"drifts against the robot's, by {1e6 * change.step_s:+.0f} ppm (sigma "
+            f"{figure(1e6 * change.sigma_s)})"
+        )
+    else:
+        later = [it.number for it in views if (it.stamp_s or 0.0) >= change.from_s]
+        how = (
+            f"jumps against the robot's: from view {(*later, 0)[0]} on it is "
+            f"{1e3 * change.step_s:+.1f} ms (sigma {figure(1e3 * change.sigma_s)} ms) farther "
+            "ahead than before"
+        )
+    return Finding(
+        "clock_changed",
+        f"The camera's clock {how}. The times were taken as they would be without that.",
+        Step(
+            "Stamp images and robot by one clock, which no time server sets while it records; then "
+            "record again."
+        ),
+        mahalanobis_sq=(change.step_s / change.sigma_s) ** 2,
     )
 
 
