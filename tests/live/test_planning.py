@@ -17,6 +17,7 @@ from visioncal.live.planning.accuracy import Wish
 from visioncal.live.planning.cell import Box
 from visioncal.live.planning.design import chosen, shortfall
 from visioncal.live.planning.information import stop_factors, worlds_of
+from visioncal.live.planning.plan import Request, make_plan
 from visioncal.live.planning.purposes import PURPOSES, purpose_of
 from visioncal.live.planning.recorded import Guess, begin
 from visioncal.live.planning.selection import CRITERIA
@@ -269,6 +270,20 @@ def test_a_session_that_is_good_already_needs_no_stop():
     assert easy.design.met
     assert len(easy.design.rows) == 0
     assert easy.helps == ()
+
+
+def test_the_few_stops_that_a_recorded_cell_allows_are_added():
+    """As before a fixed camera: of a guessed cell so few say that it is guessed wrong."""
+    begun = begin(so_far_of(simulate(CellOptions(mount="eye-to-hand", seed=4))))
+    cell = replace(begun.cell, limits=replace(begun.cell.limits, edge_px=330.0))
+    request = Request(HAND_EYE, count=5)
+    plan = make_plan(cell, request, begun=replace(begun, cell=cell))
+    assert len(plan.stops) == 5
+    # A tenth of the wish is what a guessed cell has to have.
+    assert 5 < plan.found < 0.1 * request.candidates
+    assert plan.design.predicted.mm < plan.design.before.mm
+    with pytest.raises(DataError, match=f"{plan.found} of {request.candidates} possible stops"):
+        make_plan(cell, request)
 
 
 @pytest.mark.parametrize(

@@ -73,7 +73,12 @@ class Candidates:
 
 
 def candidates(
-    cell: PlanCell, count: int, seed: int = 0, progress: Progress | None = None
+    cell: PlanCell,
+    count: int,
+    seed: int = 0,
+    progress: Progress | None = None,
+    *,
+    least: int | None = None,
 ) -> Candidates:
     """Finds stops all over what the robot can reach and the camera can see.
 
@@ -86,6 +91,8 @@ def candidates(
         count: How many are wished.
         seed: Of everything random; the same seed gives the same stops.
         progress: Called as stops are found.
+        least: With fewer than these there is no plan; None for a tenth of the wish, without which
+            a guessed cell is rather guessed wrong.
 
     Returns:
         The stops, in random order; fewer than wished where the cell gives no more.
@@ -95,7 +102,7 @@ def candidates(
     """
     search = _Search(cell, count, seed)
     search.run(progress)
-    if len(search.kept) < max(_LEAST_SHARE * count, min(_LEAST, count)):
+    if len(search.kept) < (least or max(_LEAST_SHARE * count, min(_LEAST, count))):
         search.ask_again()
         raise search.losses.error(len(search.kept), count)
     q = _unwound(cell, search.collisions, np.array([it for it, _ in search.kept]))

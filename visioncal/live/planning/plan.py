@@ -140,7 +140,9 @@ def make_plan(
         DataError: The cell allows too few stops, or none has a safe way to another.
     """
     progress = progress or _silent
-    found = candidates(cell, request.candidates, request.seed, progress)
+    # Where a recorded cell allows few stops, as before a fixed camera, these are the ones to add.
+    least = None if begun is None else min(request.count, request.candidates)
+    found = candidates(cell, request.candidates, request.seed, progress, least=least)
     progress("information", 0, 1)
     worlds = worlds_of(
         (cell, *cell.guesses(WORLDS - 1, request.seed)),
