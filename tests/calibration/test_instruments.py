@@ -18,10 +18,12 @@ from support.tracked import (
 )
 
 import visioncal
+from visioncal.calibration.pipeline import calibrate
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import exp, invert
 from visioncal.estimation.positions import Mounting, Places, fit_mounting
 from visioncal.estimation.workspace import postures
+from visioncal.robot import Robot
 from visioncal.session import MemoryImages, Session
 from visioncal.session.instruments import instrument_names, known_instrument, stated_instrument
 from visioncal.simulation.arms import forward
@@ -373,3 +375,33 @@ def test_a_joint_that_slips_between_readings_is_named(options, joint, slip_deg):
 def _steps_deg(words):
     found = re.findall(r"it reads ([+-][0-9.]+) deg \(sigma ([0-9.]+)\)", words)
     return [tuple(map(float, it)) for it in found]
+
+
+def test_an_arm_that_cannot_tilt_is_asked_for_a_measured_height():
+    joint = {"a_m": 0.4, "d_m": 0.1, "alpha_rad": 0.0}
+    model = {"schema": 1, "name": "scara", "convention": "standard", "joint": [joint] * 3}
+    rng, place = np.random.default_rng(1), np.array([0.06, 0.02, 0.05, 1.0])
+    q = rng.uniform(-1.5, 1.5, (20, 3))
+    instrument_from_base = invert(exp(np.array([0.1, -0.2, 2.5, 2.5, -1.0, 0.4])))
+    read = instrument_from_base @ Robot.from_document(model).base_from_flange(q) @ place
+    read[:, :3] += 2e-5 * rng.normal(size=(20, 3))
+    columns = ["view", "q1_rad", "q2_rad", "q3_rad", "meas_x_m", "meas_y_m", "meas_z_m"]
+    rows = [
+        [str(at), *map(repr, (*angles.tolist(), *xyz[:3].tolist()))]
+        for at, (angles, xyz) in enumerate(zip(q, read, strict=True))
+    ]
+    document = {"schema": 1, "name": "scara", "robot": {"model": "arm.toml"}}
+    document["instrument"] = {"sigma_m": 2e-5}
+    images = MemoryImages({})
+    with pytest.raises(DegenerateError) as refused:
+        calibrate(Session.assemble(document, columns, rows, images, robot_document=model))
+    assert refused.value.next_step == (
+        "This arm cannot tilt: measure that offset for [prior.flange_from_probe], as z_m and "
+        "sigma_m in session.toml."
+    )
+    document["prior"] = {"flange_from_probe": {"z_m": 0.05, "sigma_m": 5e-4}}
+    found = calibrate(Session.assemble(document, columns, rows, images, robot_document=model))
+    assert not [it for it in found.verdict.findings if it.do and "tilt" in it.do.words]
+    height = found.edges["flange_from_probe"].matrix[2, 3]
+    # Readings alone leave it open: it is where it was measured.
+    assert height == pytest.approx(0.05, abs=1e-5)

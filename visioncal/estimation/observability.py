@@ -449,9 +449,11 @@ def motion_words(robot: FloatArray, flange: FloatArray, stops: str, frame: str) 
 
 def _or_measured(mount: Mount, culprit: str) -> str:
     """A further advice for an arm that cannot tilt, as with four axes, and an open offset."""
-    if mount == "instrument" or "offset along" not in culprit:
+    if "offset along" not in culprit:
         return ""
-    return f"Where the arm cannot tilt, measure that offset for [prior.{edge_names(mount)[0]}]. "
+    # A caliper reaches what is on the flange, and no instrument's origin.
+    name = edge_names(mount)[mount == "instrument"]
+    return f"Where the arm cannot tilt, measure that offset for [prior.{name}]. "
 
 
 def _advice(mount: Mount) -> str:

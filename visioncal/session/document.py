@@ -32,7 +32,10 @@ NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
 # No arm carries a camera or a board farther out, and no cell is larger [m]; offsets written in
 # millimetres are beyond, from 4 mm on a flange and 101 mm in a cell.
 _MOST_ON_FLANGE_M, _MOST_M = 3.0, 100.0
-_EDGES = ("flange_from_cam", "base_from_target", "base_from_cam", "flange_from_target")
+_EDGES = (
+    *("flange_from_cam", "base_from_target", "base_from_cam", "flange_from_target"),
+    *("base_from_instrument", "flange_from_probe"),
+)
 
 
 def _short(field: str) -> BeforeValidator:

@@ -236,6 +236,7 @@ def _arms(answer: Answer) -> list[Arm]:
                 workspace_mm=None if numbers is None else 1e3 * float(np.median(numbers.sigmas_m)),
                 modelled=robot in modelled,
                 by_functions=solved.arms[robot].has_functions,
+                can_tilt=solved.arms[robot].can_tilt,
                 name=robot if len(problem.robots) > 1 else "",
             )
         )

@@ -171,6 +171,11 @@ class RobotArm:
         return self.matched is not None and self.joints_rad is not None
 
     @property
+    def can_tilt(self) -> bool:
+        """Whether its flange turns about more than one direction, as far as is known."""
+        return self.matched is None or self.matched.robot.can_tilt
+
+    @property
     def has_functions(self) -> bool:
         """Whether functions of its joints were found."""
         return self.kinematics is not None and self.kinematics.functions is not None

@@ -159,7 +159,12 @@ def _tables_of_priors(session: Session, tree: Tree) -> dict[str, PriorTable]:
     """
     tables = session.declaration.prior
     if not session.declaration.has_names:
-        return {name: it for name, it in tables.items() if name in pair_edges(session)}
+        kept = {name: it for name, it in tables.items() if name in pair_edges(session)}
+        of_probe = edge_names("instrument")[1]
+        probe = next((it for it in tree.branches if it.startswith("point")), "")
+        if probe and of_probe in kept:
+            kept[f"flange_from_{probe}"] = kept.pop(of_probe)
+        return kept
 
     def full(frame: str) -> str:
         alike = [it for it in tree.branches if it.startswith(f"{frame}_")]

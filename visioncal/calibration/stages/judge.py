@@ -117,6 +117,7 @@ class Arm:
             the median; None for a nominal arm [mm].
         modelled: Whether its model is known.
         by_functions: Whether functions of its joints follow the very stops of the fit.
+        can_tilt: Whether its flange turns about more than one direction.
         name: Its name; empty where there is no other.
     """
 
@@ -128,6 +129,7 @@ class Arm:
     workspace_mm: float | None = None
     modelled: bool = False
     by_functions: bool = False
+    can_tilt: bool = True
     name: str = ""
 
 
@@ -416,6 +418,8 @@ def _helping(findings: Findings) -> Step | None:
 
 def _tilted(findings: Findings) -> Step:
     words = "Add 5 views or more, tilted by 20 to 40 degrees about different axes."
+    if not all(it.can_tilt for it in findings.arms):
+        words = "Add 5 views or more, all over the workspace and turned as far as the arm turns."
     return adding(words, modelled=findings.plannable, purpose=findings.of_camera)
 
 
