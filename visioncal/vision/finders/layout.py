@@ -18,6 +18,9 @@ def layout_misfit(on_board: FloatArray, in_image: FloatArray) -> float:
     A wide lens bends a board of many squares by more than a side, but nowhere a few neighbours:
     where the whole board does not fit a plane, each marker is judged together with those around it.
 
+    Beyond `LAYOUT_MISFIT`, which no layout that fits reaches, it is a lower bound: whoever tries
+    many layouts need not know how wrong each is.
+
     Args:
         on_board: (m, 4, 2) the markers' corners on the board, in any unit.
         in_image: (m, 4, 2) where they are seen [px].
@@ -28,8 +31,12 @@ def layout_misfit(on_board: FloatArray, in_image: FloatArray) -> float:
     centres = in_image.mean(axis=1)
     distances = np.linalg.norm(centres[:, None] - centres, axis=2)
     near = np.argsort(distances, axis=1)[:, :_NEIGHBOURS]
-    parts = [_off_plane(on_board[it], in_image[it]) for it in near]
-    return float(np.sqrt(np.mean(np.square(parts))))
+    squares, most = 0.0, len(near) * LAYOUT_MISFIT**2
+    for it in near:
+        squares += _off_plane(on_board[it], in_image[it]) ** 2
+        if squares > most:
+            break
+    return float(np.sqrt(squares / len(near)))
 
 
 def _off_plane(on_board: FloatArray, in_image: FloatArray) -> float:
