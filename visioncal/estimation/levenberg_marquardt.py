@@ -11,6 +11,9 @@ ITERATIONS = 400
 START_DAMPING, _LEAST_DAMPING, _WORST_DAMPING = 1e-4, 1e-12, 1e9
 # Damping falls after a step that lowered the cost by more than this share of what it promised.
 _KEPT = 0.25
+# A step that promised less than this, and went up, is the last: in units of the noise that is a
+# hundredth of a sigma.
+_LITTLE = 1e-4
 # Near the answer, where directions that are hardly determined would need many damped steps.
 NEAR_DAMPING = 1e-9
 
@@ -67,8 +70,10 @@ def levenberg_marquardt(
             if rested:
                 return now.state, True
         else:
+            # Curvature that Gauss and Newton leave out is all that is left to follow, or rounding.
+            if now.fall is not None and now.fall(damping) <= _LITTLE:
+                return now.state, True
             damping *= 10
-            # No step, however small, goes down any more: rounding is all that is left.
             if damping > _WORST_DAMPING:
                 return now.state, True
     return now.state, False
