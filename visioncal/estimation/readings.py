@@ -35,16 +35,17 @@ def readings_that_close(touches: Touches) -> tuple[Reading, ...]:
     """Finds other ways to read the poses by which the touches close, where as read they do not.
 
     Touches of one point close in both directions alike, with the tip and the point exchanged; of
-    several, in one only.
+    several, in one only. Those along the tool's axes, all of one point, do in one only, too.
 
     Args:
-        touches: As they were read; those of kind `point` count.
+        touches: As they were read; those of kind `point` count, and others where they are of one.
 
     Returns:
         The readings under which they close to within 2 mm and twenty times better, best first.
     """
     there = touches.subset(touches.are("point"))
     poses = there.base_from_flange
+    inverse = "the other way round, as flange_from_base"
     as_read = _linear_rms(there)
     first = "with quaternions as w, x, y, z"
     others = {
@@ -53,7 +54,6 @@ def readings_that_close(touches: Touches) -> tuple[Reading, ...]:
     }
     options = {first: "--robot-columns x_m,y_m,z_m,qy,qz,qw,qx"}
     if len(np.unique(there.points)) > 1:
-        inverse = "the other way round, as flange_from_base"
         others |= {f"{words} and {inverse}": invert(it) for words, it in others.items()}
         others[inverse] = invert(poses)
         options |= {inverse: "--robot-inverse"}
@@ -67,7 +67,11 @@ def readings_that_close(touches: Touches) -> tuple[Reading, ...]:
         )
         for words, other in others.items()
     ]
-    closing = [it for it in found if it.rms_m < min(as_read / _MUCH_BETTER, _CLOSED_M)]
+    if len(np.unique(touches.points)) == 1:
+        back = replace(touches, base_from_flange=invert(touches.base_from_flange))
+        sizes = (_axes_rms(back), _axes_rms(touches))
+        found.append(Reading(inverse, *sizes, "--robot-inverse"))
+    closing = [it for it in found if it.rms_m < min(it.as_read_m / _MUCH_BETTER, _CLOSED_M)]
     return tuple(sorted(closing, key=lambda it: it.rms_m))
 
 
@@ -85,3 +89,26 @@ def _linear_rms(touches: Touches) -> float:
         for it in np.unique(touches.points)
     ]
     return float(np.sqrt(np.sum(np.concatenate(away) ** 2) / len(touches)))
+
+
+def _axes_rms(touches: Touches) -> float:
+    """How far touches of one point are off: of its place, and of the tool's z axis and xz plane.
+
+    Zero without touches along z.
+    """
+    there = touches.subset(touches.are("point"))
+    poses = there.base_from_flange
+    tip = linear_tip(poses, there.points)
+    point = (poses[:, :3, :3] @ tip + poses[:, :3, 3]).mean(axis=0)
+    back = invert(touches.base_from_flange)
+    seen = back[:, :3, :3] @ point + back[:, :3, 3] - tip
+    along, beside = seen[touches.are("z")], seen[touches.are("xz")]
+    if not len(along):
+        return 0.0
+    z = np.linalg.svd(along)[2][0]
+    away, beside = [along - np.outer(along @ z, z)], beside - np.outer(beside @ z, z)
+    if len(beside):
+        x = np.linalg.svd(beside)[2][0]
+        away.append(beside - np.outer(beside @ x, x))
+    squares = np.sum(np.concatenate(away) ** 2, axis=1)
+    return float(np.hypot(np.sqrt(squares.mean()), _linear_rms(there)))

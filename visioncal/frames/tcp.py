@@ -106,7 +106,11 @@ def _with_reading(error: VisioncalError, touches: Touches) -> VisioncalError:
 
 def _reading_hint(touches: Touches) -> str:
     found = readings_that_close(touches)
-    return f"{_closing_words(found[0])}: are the columns in that order?" if found else ""
+    if not found:
+        return ""
+    if found[0].options == "--robot-inverse":
+        return f"{_closing_words(found[0])}: do the columns hold it? Then add {found[0].options}."
+    return f"{_closing_words(found[0])}: are the columns in that order?"
 
 
 def _closing_words(best: Reading) -> str:
