@@ -19,7 +19,7 @@ from visioncal.calibration.stages.cause_ranking import (
 from visioncal.calibration.stages.fit_messages import scale_found
 from visioncal.calibration.stages.judge import Place, judge
 from visioncal.calibration.stages.need import Picks
-from visioncal.core.transforms import exp, invert
+from visioncal.core.transforms import exp, invert, pose_difference
 from visioncal.core.types import Need
 from visioncal.core.verdict import CALIBRATE, GUESS, PLAN, Finding, Step, Verdict, with_paths
 from visioncal.estimation.joint import MeasuredScale
@@ -267,6 +267,29 @@ def test_what_was_bumped_on_the_flange_is_named_whatever_the_need(mount, bumped)
         assert "from view 9 on" in found.words
         # Processes over posture and time explain the same, and are not the cause.
         assert calibrate(session).verdict.causes[0].kind == "moved_at_once"
+
+
+@pytest.mark.parametrize("since", [12, 6])
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_a_tool_that_is_switched_on_midway_is_named(mount, since):
+    cell = simulate(CellOptions(mount=mount, views=18, seed=3))
+    tool, flange = exp(np.array([0.0, 0.5, 0.7, 0.02, -0.01, 0.18])), cell.base_from_flange.copy()
+    flange[since:] = flange[since:] @ tool
+    session = Session.from_corners(
+        [(it.ids, it.px) for it in cell.corners],
+        flange,
+        cell.options.target,
+        cell.stated_camera.resolution,
+        mount=mount,
+        camera=cell.stated_camera,
+    )
+    cause = calibrate(session).verdict.causes[0]
+    assert cause.kind == "something_moved"
+    # Of the two parts the larger one is kept.
+    when, change = ("from view 12 on", tool) if since == 12 else ("before view 6", invert(tool))
+    shift_mm, turn_deg = pose_difference(np.eye(4), change)
+    assert when in cause.words
+    assert f"another tool frame, {shift_mm:.0f} mm and {turn_deg:.0f} deg from" in cause.words
 
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])

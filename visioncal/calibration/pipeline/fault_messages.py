@@ -21,6 +21,8 @@ from visioncal.results import Moved
 
 # A robot is pushed where it is seen elsewhere at so many stops, which agree to such a share.
 _FEWEST_STOPS, _ALIKE = 3, 0.5
+# Views that one step explains agree on it to within this share of it.
+_SURELY_ALIKE = 0.05
 # A robot's pose is wrong where so many observations of its stop say so.
 _FEWEST = 2
 
@@ -146,7 +148,8 @@ def pose_faults(solved: Solved) -> tuple[PoseFault, ...]:
     explained = {row for it in turned for row in it.rows}
     mutual = exchanged(solved.agreed.problem, _fitting(solved, out))
     if solved.cell.mount is not None:
-        return (*turned, *_exchanged_views(solved, mutual))
+        swapped = tuple(_exchanged_views(solved, mutual))
+        return (*turned, *swapped, *(() if turned or swapped else _moved_runs(solved)))
     found = _pushed_bases(solved)
     found += _exchanged(solved, mutual)
     explained |= {row for it in found for row in it.rows}
@@ -176,6 +179,55 @@ def _turned_images(solved: Solved) -> list[PoseFault]:
         fault = Finding("turned_images", words, step, views)
         found.append(PoseFault(fault, tuple(mine), f"its image is {how.words}"))
     return found
+
+
+def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
+    """Views from some view on, or before one, that one step of a frame explains.
+
+    A tool that is switched on in the controller moves what is on the flange, as it is reported.
+    """
+    agreed, rows = solved.agreed, solved.cell.rows
+    problem, out = agreed.problem, np.flatnonzero(~agreed.used)
+    order = np.argsort(problem.observations.stops, kind="stable")
+    used = agreed.used[order]
+    is_run = len(out) >= _FEWEST_STOPS and np.sum(used[1:] != used[:-1]) == 1
+    if not is_run or not problem.observations.has_rotation[out].all():
+        return
+    asked = {it: problem.change_of(it, agreed.fit.state)[out] for it in problem.unknown}
+    asked = {it: change for it, change in asked.items() if np.isfinite(change).all()}
+    scatter_m = {
+        it: float(np.median(distances(change, mean_transform(change))[0]))
+        for it, change in asked.items()
+    }
+    if not scatter_m:
+        return
+    frame = min(scatter_m, key=scatter_m.__getitem__)
+    change, edge = mean_transform(asked[frame]), agreed.fit.state.edges[problem.unknown[frame]]
+    shift_mm, turn_deg = pose_difference(np.eye(4), change)
+    if 1e3 * scatter_m[frame] > _SURELY_ALIKE * shift_mm:
+        return
+    ordered = [rows[it].view for it in order.tolist()]
+    first = int(np.argmax(used[1:] != used[:-1])) + 1
+    when = f"from view {ordered[first]} on" if used[0] else f"before view {ordered[first]}"
+    views = _numbers(solved, out.tolist())
+    thing = frame.partition("_")[0].replace("cam", "camera")
+    moved = f"the {thing} stood {figure(shift_mm)} mm and {figure(turn_deg)} deg elsewhere"
+    step = Step("Fasten what moved, and calibrate the views before and after it apart.")
+    parent = problem.tree.branches.get(problem.tree.branches[frame].parent)
+    if parent is not None and parent.robot:
+        tool = edge @ invert(change) @ invert(edge)
+        tool_mm, tool_deg = pose_difference(np.eye(4), tool)
+        moved += (
+            f", or the controller reported another tool frame, {figure(tool_mm)} mm and "
+            f"{figure(tool_deg)} deg from that of the other views"
+        )
+        step = Step(
+            "Look which tool was active in the controller, and set the same one for all views; or "
+            "calibrate the views before and after it apart."
+        )
+    words = f"{_views(solved, out.tolist())} were left out: {when}, as they agree, {moved}."
+    found = Finding("something_moved", f"V{words[1:]}", step, views)
+    yield PoseFault(found, tuple(out.tolist()), f"{when}, something had moved")
 
 
 def _exchanged_views(solved: Solved, mutual: Mapping[int, int]) -> Iterator[PoseFault]:
