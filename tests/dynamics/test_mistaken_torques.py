@@ -1,5 +1,7 @@
 """Torques and angles of the wrong joint, the wrong sign or other units are named."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.moved_arms import changed, robot_with_bodies
@@ -18,8 +20,9 @@ TORQUE, ANGLE, SPEED = "tau{}_nm", "q{}_rad", "dq{}_rad_s"
 ALL = range(1, 7)
 
 
-def check(stream, name="ur5e"):
+def check(stream, name="ur5e", *, with_inertias=True):
     robot = robot_with_bodies(nominal_dynamics(name))
+    robot = robot if with_inertias else replace(robot, inertias=None)
     base = BaseModel.reduce(DynamicModel(robot, FrictionTerms()))
     check_mistakes(base, [condition(read_recorded(stream, "streams/robot.csv", 6))])
 
@@ -75,3 +78,29 @@ def test_mistakes_are_named(stream, change, words):
 def test_right_recordings_pass(seed, name, motion):
     rng = np.random.default_rng(10 + seed)
     check(record(real_dynamics(name, rng, stribeck=True), motion(6, rng), rng), name)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (swapped(1, 2, TORQUE), "the torques of joints 1 and 2 are swapped"),
+        (swapped(5, 6, TORQUE), "the torques of joints 5 and 6 are swapped"),
+        (swapped(3, 4, ANGLE, SPEED), "the angles of joints 3 and 4 are swapped"),
+        (swapped(2, 3, TORQUE, ANGLE, SPEED), "joints 2 and 3 are swapped, with angles"),
+        (scaled(-1.0, [2], TORQUE), "the torque of joint 2 has the other sign"),
+        (scaled(57.2958, ALL, ANGLE, SPEED), "angles are in degrees"),
+    ],
+)
+def test_mistakes_are_named_without_inertias(stream, change, words):
+    """No inertias at all explain them: only a scale of all torques is open."""
+    with pytest.raises(DataError, match=words):
+        check(changed(stream, change), with_inertias=False)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("motion", [multi_sine, slow_sweep])
+def test_right_recordings_pass_without_inertias(seed, motion):
+    name = "ur10e" if seed % 2 else "ur5e"
+    rng = np.random.default_rng(30 + seed)
+    stream = record(real_dynamics(name, rng, stribeck=True), motion(6, rng), rng)
+    check(stream, name, with_inertias=False)

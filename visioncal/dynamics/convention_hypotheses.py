@@ -29,6 +29,9 @@ _BETTER, _LEFT = 10.0, 0.5
 # joints together, and leaves no more than this share: right recordings of exciting motions get
 # worse by any swap, and those of slow sweeps, where friction is all there is, hardly change.
 _FITS_BETTER, _FIT_LEFT = 10.0, 0.01
+# Without inertias a mistake is named where undoing it divides what a fit leaves by this much, and
+# leaves no more than this share; of right recordings it is divided by 1.2 at most.
+_SURELY_BETTER, _EXPLAINED = 100.0, 0.1
 # Of the power of a joint's torques so much is always left: noise, and inertias that are off.
 _FLOOR = 0.01
 # Inertias are off by less than these factors, and a torque on the motor's side, or in thousandths,
@@ -56,8 +59,11 @@ class _Guess:
 def check_mistakes(base: BaseModel, streams: Sequence[Conditioned]) -> None:
     """Refuses recordings that are plainly mistaken.
 
+    Without inertias a fit has to explain the torques: units and the sign of all of them are open
+    then, as a heavier arm needs more.
+
     Args:
-        base: The model of an arm with inertias.
+        base: The model of an arm.
         streams: The recordings.
 
     Raises:
@@ -69,14 +75,18 @@ def check_mistakes(base: BaseModel, streams: Sequence[Conditioned]) -> None:
         if len(measured) < _LEAST:
             continue
         as_it_is = _as_it_is(robot, measured)
-        found = _predicted_better(robot, as_it_is) or _fitted_better(base, as_it_is)
+        if robot.inertias is None:
+            found = _explained_better(base, as_it_is)
+        else:
+            found = _predicted_better(robot, as_it_is) or _fitted_better(base, as_it_is)
         if found is not None:
             raise DataError(
                 f"{stream.label}: {found[0].words}: {found[1]}.",
                 culprits=[f"joint {it + 1}" for it in found[0].joints],
                 next_step="Mend the columns of the stream, or name the robot that was recorded.",
             )
-        _check_units(stream.label, robot, as_it_is)
+        if robot.inertias is not None:
+            _check_units(stream.label, robot, as_it_is)
 
 
 def _some(stream: Conditioned) -> Measured:
@@ -124,6 +134,26 @@ def _fitted_better(base: BaseModel, as_it_is: _Guess) -> tuple[_Guess, str] | No
         return None
     times = float(np.exp(gain / len(as_it_is.joints)))
     return best, f"so taken, the best fit leaves {times:.2g} times less of the torques' power"
+
+
+def _explained_better(base: BaseModel, as_it_is: _Guess) -> tuple[_Guess, str] | None:
+    """The mistake without which a fit of any inertias leaves by far less, if there is one, and why.
+
+    Slow sweeps tell the torques of two joints hardly from their angles: both are named.
+    """
+    before = _unfitted(base, as_it_is.measured)
+    tried = []
+    for guess in _guesses(base.model.robot, as_it_is):
+        after = _unfitted(base, guess.measured)
+        if after.max() < _EXPLAINED:
+            tried.append((float(np.sum(np.log(before / after))), guess))
+    gain, best = max(tried, key=lambda it: it[0], default=(0.0, as_it_is))
+    if gain < np.log(_SURELY_BETTER):
+        return None
+    alike = [it.words for more, it in tried if more > gain - np.log(_FITS_BETTER)]
+    times = float(np.exp(gain / len(as_it_is.joints)))
+    why = f"so taken, the best fit leaves {times:.2g} times less of the torques' power a joint"
+    return replace(best, words=", or ".join(alike)), why
 
 
 def _unfitted(base: BaseModel, measured: Measured) -> FloatArray:

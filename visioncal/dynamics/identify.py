@@ -61,7 +61,7 @@ def identify(
 
     Args:
         robot: The arm; where it has inertias, torques are checked against these, and standard
-            parameters are sought near them.
+            parameters are sought near them. Without, units of all torques cannot be told.
         streams: Motions with their torques.
         options: What is estimated.
 
@@ -72,7 +72,7 @@ def identify(
     options = Options() if options is None else options
     base = BaseModel.reduce(DynamicModel(robot, options.terms))
     check_turning(base, streams)
-    if options.checked and robot.inertias is not None:
+    if options.checked:
         check_mistakes(base, streams)
     blocks = [block_of(base, it) for it in streams]
     check_identifiable(base, blocks)
