@@ -294,9 +294,11 @@ def test_missing_cut_and_empty_images_are_named_and_left_out(session_copy, resul
     images[1].unlink()
     images[4].write_bytes(images[4].read_bytes()[:4000])
     images[7].write_bytes(b"")
+    cv2.imwrite(str(images[9]), cv2.resize(cv2.imread(str(images[9])), None, fx=0.5, fy=0.5))
     calibration = visioncal.calibrate(session_copy)
     unused = {view.view: view.reason for view in calibration.views if not view.used}
-    assert set(unused) == {1, 4, 7}
+    assert set(unused) == {1, 4, 7, 9}
+    assert "640 x 400 px, and the camera's images are 1280 x 800" in unused[9]
     assert "missing" in unused[1]
     assert "cut short" in unused[4]
     assert "empty" in unused[7]

@@ -14,7 +14,7 @@ from visioncal.calibration.stages.need import Picks, need_met
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import exp
 from visioncal.core.types import Need
-from visioncal.core.verdict import remarks
+from visioncal.core.verdict import EMPTY_IMAGE, Finding, remarks
 from visioncal.estimation.tolerance_probability import chance_within, radius_within
 from visioncal.results import Calibration, NeedMet, Picker, Rms, to_document
 from visioncal.results.codec import read, write
@@ -141,6 +141,16 @@ def test_limits_give_way_to_the_need_and_what_is_unexplained_does_not(changes, g
     assert f"good for tasks of {good_from_mm:g}" in plain.reasons[-1] or not good_from_mm
     assert judge(replace(found, need=Need(plain.good_for_mm))).status == "good"
     assert judge(replace(found, need=Need(0.9 * plain.good_for_mm))).status == "check"
+
+
+def test_a_part_of_the_image_without_corners_is_a_hint_where_a_need_is_met() -> None:
+    empty = Finding(EMPTY_IMAGE, "No corner was ever seen in the upper left.", until_mm=0.0)
+    found = replace(SOUND, warnings=(empty,), picks=(of_size(0.1),))
+    assert judge(found).status == "check"
+    assert judge(found).good_for_mm == pytest.approx(0.28, rel=0.01)
+    met = judge(replace(found, need=NEED))
+    assert met.status == "good"
+    assert met.reasons[-1] == empty.words
 
 
 def test_the_worst_pair_counts_and_is_named() -> None:

@@ -365,6 +365,7 @@ def test_real_sessions_round_trip(name: str, tmp_path: Path) -> None:
 
 TOML_REFUSALS = [
     ("schema = 1", "schema = 2", "schema is 2; this version reads schema 1"),
+    ("schema = 1", "schema = true", "schema is True; this version reads schema 1"),
     ("schema = 1\n", "", r"schema is missing \(schema = 1\)"),
     ('name = "bench"\n', "", "name is missing"),
     ('"bench"', "7", 'name is 7, but must be a "text"'),

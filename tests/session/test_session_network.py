@@ -72,6 +72,18 @@ def folder(tmp_path: Path) -> Path:
     return session
 
 
+def test_rows_without_a_robot_are_named_before_frames_that_hang_on_nothing(tmp_path):
+    (tmp_path / "session.toml").write_text(
+        'schema = 1\nname = "s"\nmount = "eye-in-hand"\ntarget = "charuco_9x6_30mm"\n'
+        "[camera]\nresolution = [1280, 800]\n"
+    )
+    (tmp_path / "views.csv").write_text("view\n0\n1\n")
+    (tmp_path / "corners.csv").write_text("view,point,u_px,v_px\n0,0,10,10\n1,0,20,20\n")
+    with pytest.raises(DataError, match="no row says where the robot is") as caught:
+        _ = Session.load(tmp_path).frames
+    assert "x_m, y_m, z_m, qx, qy, qz, qw" in caught.value.next_step
+
+
 def test_every_frame_hangs_on_another(folder):
     session = Session.load(folder)
     assert session.frames == {

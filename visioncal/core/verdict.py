@@ -21,6 +21,8 @@ _SHOWN, _LEAST_LIKELY, _LIKELY = 3, 0.05, 0.2
 AGREEMENT, NEED, GOOD_FOR, NOTE = "agreement", "need", "good_for", "note"
 # Files that a session names and does not have: no doubt about the rest, and said first.
 MISSING = "missing_images"
+# A part of the image in which no corner was seen: a hint where the task says what it needs.
+EMPTY_IMAGE = "empty_image"
 # What says how large errors are, the most important first.
 _SIZES = (NEED, GOOD_FOR, "unexplained", "optimism", "weak_motion", "place", "workspace")
 

@@ -115,7 +115,7 @@ def read_declaration(
     """
     # Before the fields: those of another schema would be reported one by one, and wrongly.
     schema = document.get("schema")
-    if schema is not None and schema != 1:
+    if schema is not None and (schema != 1 or isinstance(schema, bool)):
         is_newer = isinstance(schema, int) and schema > 1
         raise DataError(
             f"{label}: schema is {schema!r}; this version reads schema 1.",

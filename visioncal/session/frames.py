@@ -250,6 +250,14 @@ class _Tree:
         return {other for pair in pairs if frame in pair for other in pair if other != frame}
 
     def _unclear(self, missing: Sequence[str]) -> DataError:
+        mount = self.declaration.mount
+        if mount is not None and not self.robots:
+            return DataError(
+                f'views.csv: no row says where the robot is, which mount = "{mount}" needs.',
+                culprits=["views.csv: x_m", "views.csv: q1_rad"],
+                next_step="Give each row the flange's pose, as x_m, y_m, z_m, qx, qy, qz, qw, or "
+                "the joints' angles, as q1_rad, q2_rad and so on with [robot] in session.toml.",
+            )
         places = [*(frame_name("flange", it) for it in self.robots), CELL]
         example = "\n".join(f'{it} = "{places[0]}"' for it in missing)
         among = ", ".join(f'"{it}"' for it in places)

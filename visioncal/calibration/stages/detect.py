@@ -119,9 +119,9 @@ def detect(
         The corners and the rejected views.
 
     Raises:
-        DataError: No view shows the target, an image has another size than the camera, the size
-            of the images is not known, or the board that was printed has another layout than the
-            one declared.
+        DataError: No view shows the target, half of the images or more have another size than the
+            camera, the size of the images is not known, or the board that was printed has another
+            layout than the one declared.
     """
     options = options or DetectOptions()
     if not session.boards:
@@ -151,6 +151,7 @@ def detect(
         kept.save()
     given = [view for view in among if view.has_corners]
     resolution = _common_resolution(session, views, looks, given, stated)
+    looks = [_of_size(it, view, resolution) for it, view in zip(looks, views, strict=True)]
     for name in session.boards:
         _check_layout(session, name, views, looks)
     own = {view.number: look.found for view, look in zip(views, looks, strict=True)}
@@ -333,7 +334,7 @@ def _common_resolution(
     given: Sequence[View],
     stated: tuple[int, int] | None,
 ) -> tuple[int, int]:
-    """Checks that all images have the camera's size, or at least one size between them."""
+    """The camera's size, or that of most images; checks that more than half of them have it."""
     sizes = [look.resolution for look in looks if look.resolution is not None]
     if not sizes and given:
         if stated is None:
@@ -362,7 +363,7 @@ def _common_resolution(
     ]
     if len(culprits) == len(sizes) and len(set(sizes)) == 1:
         raise _other_size(session, views, sizes[0], wanted, culprits)
-    if culprits:
+    if 2 * len(culprits) >= len(sizes):
         source = "the camera's resolution is" if stated else "most other images are"
         raise DataError(
             f"{culprits[0]}, but {source} {wanted[0]} x {wanted[1]} px"
@@ -371,6 +372,15 @@ def _common_resolution(
             next_step="Correct [camera] resolution in session.toml, or take out these views.",
         )
     return wanted
+
+
+def _of_size(look: _Look, view: View, resolution: tuple[int, int]) -> _Look:
+    """The look at an image; a rejection where it has another size than the camera's."""
+    if look.resolution in (None, resolution):
+        return look
+    (width, height), (wide, high) = look.resolution, resolution
+    words = f"{view.image} is {width} x {height} px, and the camera's images are {wide} x {high}"
+    return _Look(Rejection(view.number, words), None)
 
 
 def _other_size(

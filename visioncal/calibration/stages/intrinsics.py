@@ -10,7 +10,7 @@ import numpy as np
 from visioncal.core.errors import ConvergenceError, DataError, DegenerateError
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, CameraKind, Corners, FloatArray, Rejection, Target
-from visioncal.core.verdict import Finding, Step
+from visioncal.core.verdict import EMPTY_IMAGE, Finding, Step
 from visioncal.estimation.bundle import BundleFit, fit_bundle
 from visioncal.estimation.corners import CornerStack, mean_square_by_view
 from visioncal.estimation.gating import gate
@@ -229,10 +229,12 @@ def _warnings(stack: CornerStack, fit: BundleFit) -> Iterator[Finding]:
     empty = _unvisited(stack, fit.camera.resolution)
     if empty:
         yield Finding(
-            "empty_image",
+            EMPTY_IMAGE,
             f"No corner was ever seen in the {' and '.join(empty)} of the image, so the lens is "
             "extrapolated there.",
             Step("Move the target there in some views."),
+            # What is needed is needed where the views looked, or at a declared place.
+            until_mm=0.0,
         )
 
 

@@ -18,6 +18,7 @@ from visioncal.core.number_format import figure, percent
 from visioncal.core.types import Mount, Need, Rejection
 from visioncal.core.verdict import (
     AGREEMENT,
+    EMPTY_IMAGE,
     GOOD_FOR,
     MISSING,
     NEED,
@@ -256,10 +257,14 @@ def judge(findings: Findings) -> Verdict:
     good_for_mm = _good_for_mm(findings.picks, doubts)
     met = need_met(findings.need, findings.picks)
     status: VerdictStatus = "good" if not doubts else "check"
+    hints: list[Finding] = []
     if met is None:
         status = "bad" if any(doubt.is_fatal for doubt in doubts) else status
     elif met.probability >= NeedLimits.probability[0]:
-        doubts = [it for it in doubts if it.until_mm > (met.need.mm or 0.0)]
+        enough = met.need.mm or 0.0
+        # Where nothing was seen, later picks may be all the same.
+        hints = [replace(it, kind=NOTE) for it in doubts if it.kind == EMPTY_IMAGE]
+        doubts = [it for it in doubts if it.until_mm > enough]
         status = "check" if doubts else "good"
     else:
         status = "check" if met.probability >= NeedLimits.probability[1] else "bad"
@@ -281,7 +286,7 @@ def judge(findings: Findings) -> Verdict:
             Finding(NEED, met_words(findings, met)),
         )
     said += [] if doubts else [_praise(findings, is_enough=status == "good")]
-    said += [it for it in findings.warnings if it.kind == MISSING]
+    said += [*hints, *(it for it in findings.warnings if it.kind == MISSING)]
     return Verdict(status, (*said, *remarks(findings.notes, NOTE)), good_for_mm)
 
 
