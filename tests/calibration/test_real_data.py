@@ -47,7 +47,9 @@ def test_charuco_before_a_fixed_camera(real_data):
     # What is wrong with the cell: a board that is bent and half a per cent larger than stated.
     assert result.verdict.status == "check"
     assert any("The board is not flat" in it for it in result.verdict.reasons)
-    assert any("0.47 % larger than stated" in it for it in result.verdict.reasons)
+    assert any("larger than stated" in it for it in result.verdict.reasons)
+    # A tenth of its sigma: one more unknown of the board's shape moves it by less.
+    assert result.board.shape["scale"] == pytest.approx(0.0047, abs=1e-4)
     # Park's camera, within what 15 views leave open; he takes the board as stated, and half a per
     # cent of the 0.9 m to it is 4 mm.
     away = result.transforms["base_from_cam"].translation - [-0.0184, 1.2637, 0.2900]
@@ -61,7 +63,7 @@ def test_two_exchanged_rows_among_images_of_other_rows_are_named(real_data, came
     unused = {view.view for view in result.views if not view.used}
     assert unused >= ({25, 26} if camera == 1 else {9, 14, 15, 25, 26, 31, 33, 38})
     assert "Views 25 and 26 are exchanged" in result.verdict.top[0]
-    assert result.verdict.status == "bad"
+    assert result.verdict.status == ("check" if camera == 1 else "bad")
     # An image that shows a tenth of its field, 1.3 m away, fixes a camera to some millimetres; its
     # focal length is open to a few per cent, which are 40 mm.
     assert all(1.0 < it.sigma_mm < 40.0 for it in result.placed.values())
@@ -74,7 +76,8 @@ def test_eight_views_of_a_poor_set_are_not_called_good(real_data):
     assert any("disagree with the others by" in it for it in result.verdict.reasons)
     # The stated side of 23.6 mm does not fit the robot's motion, by 14.5 %.
     (size,) = [it for it in result.verdict.reasons if "By the robot's motion" in it]
-    assert "squares of 27.0" in size
+    assert "larger than stated" in size
+    assert abs(result.board.shape["scale"] - 0.145) < 2 * result.board.sigma["scale"]
     assert result.camera.estimated
     assert any("The given intrinsics do not fit" in it for it in result.verdict.reasons)
     away = result.transforms["flange_from_cam"].translation - [0.0582, -0.0342, -0.0426]

@@ -23,6 +23,7 @@ AGREEMENT, NEED, GOOD_FOR, NOTE = "agreement", "need", "good_for", "note"
 MISSING = "missing_images"
 # A part of the image in which no corner was seen: a hint where the task says what it needs.
 EMPTY_IMAGE = "empty_image"
+EXCHANGED, _SURE = "exchanged_views", 0.99
 # What says how large errors are, the most important first.
 _SIZES = (NEED, GOOD_FOR, "unexplained", "optimism", "weak_motion", "place", "workspace")
 
@@ -177,7 +178,12 @@ class Verdict:
     def causes(self) -> tuple[Finding, ...]:
         """What may be why it is not good, likeliest first."""
         found = (it for it in self.findings if it.probability)
-        return tuple(sorted(found, key=lambda it: -it.probability))
+
+        def order(it: Finding) -> tuple[float, bool, float]:
+            # Among what is as good as certain, rows that are exchanged mislead all the rest.
+            return -min(it.probability, _SURE), it.kind != EXCHANGED, -it.probability
+
+        return tuple(sorted(found, key=order))
 
     @property
     def ranked(self) -> tuple[Finding, ...]:
