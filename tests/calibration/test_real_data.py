@@ -48,8 +48,8 @@ def test_charuco_before_a_fixed_camera(real_data):
     assert result.verdict.status == "check"
     assert any("The board is not flat" in it for it in result.verdict.reasons)
     assert any("larger than stated" in it for it in result.verdict.reasons)
-    # A tenth of its sigma: one more unknown of the board's shape moves it by less.
-    assert result.board.shape["scale"] == pytest.approx(0.0047, abs=1e-4)
+    # A fifth of its sigma: one more unknown of the board's shape moves it by less.
+    assert result.board.shape["scale"] == pytest.approx(0.0047, abs=2e-4)
     # Park's camera, within what 15 views leave open; he takes the board as stated, and half a per
     # cent of the 0.9 m to it is 4 mm.
     away = result.transforms["base_from_cam"].translation - [-0.0184, 1.2637, 0.2900]

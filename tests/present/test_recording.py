@@ -1,7 +1,10 @@
 """Recordings: the session in them is the session that was written, to the last bit."""
 
 import datetime
+import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -180,6 +183,37 @@ def test_full_disk_is_an_error(
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=3_000_000))
     with pytest.raises(DataError, match="cannot be written: 3 MB are free"):
         write_session(tmp_path / "recording.rrd", sample.session)
+    assert list(tmp_path.iterdir()) == []
+
+
+_LIMITED = """
+import resource, sys
+from pathlib import Path
+from support.samples import made_up
+from visioncal.core.errors import DataError
+from visioncal.present.recording import recorder, write_recording
+
+recorder._WRITTEN_S = 2.0
+resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))
+try:
+    write_recording(Path(sys.argv[1]), made_up().session, None, (), None)
+except DataError as error:
+    print(error.message)
+"""
+
+
+def test_a_writer_that_has_ended_is_not_waited_for_without_end(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", _LIMITED, str(tmp_path / "recording.rrd")]
+    # A hundred times what it takes: without a limit it would not end at all.
+    done = subprocess.run(
+        command,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    assert "recording.rrd cannot be written" in done.stdout
     assert list(tmp_path.iterdir()) == []
 
 

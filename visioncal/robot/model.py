@@ -224,8 +224,8 @@ class Robot:
     def can_tilt(self) -> bool:
         """Whether the flange turns about more than one direction: arms of four axes do not."""
         axes = self.joint_jacobian(np.zeros((1, self.joint_count)))[0, :3]
-        largest, second, _ = np.linalg.svd(axes, compute_uv=False)
-        return bool(second > _PARALLEL * largest)
+        sizes = np.linalg.svd(axes, compute_uv=False)
+        return int(np.sum(sizes > _PARALLEL * sizes[0])) > 1
 
     def function_jacobian(self, q: FloatArray) -> FloatArray:
         """How the flange moves when the joints' functions change.

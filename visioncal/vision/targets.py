@@ -31,9 +31,9 @@ LEAST_SIGMA_M = 1e-8
 # inches: no square of so few millimetres is printed.
 LARGEST_M, _LARGEST_IN_CM = 1.0, 4.0
 
-# Sides of markers by those of squares, and a share at which none can be read; units that are
-# written in the place of metres [m].
-_MARKERS, _UNREADABLE = (0.4, 0.95), 0.1
+# Sides of markers by those of squares, and a share at which none can be read; the least squares
+# that such markers are on [m]; units that are written in the place of metres [m].
+_MARKERS, _UNREADABLE, _SMALLEST_SQUARE_M = (0.4, 0.95), 0.1, 5e-3
 _UNITS = {"mm": 1e-3, "inches": 0.0254, "cm": 1e-2}
 
 # What descriptions of targets say, of one kind or another.
@@ -232,8 +232,8 @@ def _check_one_unit(table: Table) -> None:
             ("square_m", marker, square * size_m),
             ("marker_m", marker * size_m, square),
         ):
-            if low * outside < inside < high * outside:
-                right = outside if key == "square_m" else inside
+            right = outside if key == "square_m" else inside
+            if low * outside < inside < high * outside and outside > _SMALLEST_SQUARE_M:
                 raise DataError(
                     f"{table.label}: square_m is {square:g} and marker_m is {marker:g}; one is in "
                     f"another unit: with {key} in {unit}, and not in metres, a marker is "

@@ -4,6 +4,7 @@ import os
 import shutil
 from collections.abc import Iterable
 from pathlib import Path
+from threading import Thread
 from types import TracebackType
 from typing import Self
 
@@ -15,6 +16,9 @@ from visioncal.present.recording.frames import scan
 
 # Room for one more view, however large its image, and for the end of the file.
 _ROOM_BYTES = 100_000_000
+# So long rerun may take to write what was logged last [s]. Where its writer has ended, as on a full
+# disk, it would be waited for without end.
+_WRITTEN_S = 30.0
 
 
 class Recorder:
@@ -34,7 +38,7 @@ class Recorder:
         Raises:
             OSError: The file cannot be created.
         """
-        self._path = path
+        self._path, self._is_lost = path, False
         self.stream = rr.RecordingStream(
             paths.APPLICATION, recording_id=recording_id, send_properties=recording_id is None
         )
@@ -66,8 +70,16 @@ class Recorder:
         self.stream.set_time(paths.TIMELINE, sequence=row)
 
     def keep(self) -> None:
-        """Hands what was logged to the operating system: it survives the death of the process."""
-        self.stream.flush()
+        """Hands what was logged to the operating system: it survives the death of the process.
+
+        Raises:
+            OSError: It could not be written.
+        """
+        try:
+            self.stream.flush(timeout_sec=_WRITTEN_S)
+        except (RuntimeError, ValueError) as error:
+            self._is_lost = True
+            raise OSError(f"the disk may be full, or files may not be so large: {error}") from error
 
     def __enter__(self) -> Self:
         return self
@@ -83,7 +95,12 @@ class Recorder:
         Raises:
             OSError: The file could not be written.
         """
-        self.stream.disconnect()
+        ending = Thread(target=self.stream.disconnect, daemon=True)
+        ending.start()
+        ending.join(0.0 if self._is_lost else _WRITTEN_S)
+        if ending.is_alive():
+            # It would be waited for when Python ends, too.
+            rr.unregister_shutdown()
         if kind is not None:
             return
         # Rerun only prints that it could not write.
