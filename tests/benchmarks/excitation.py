@@ -9,8 +9,7 @@ from multiprocessing import Pool
 import numpy as np
 from results import few, first, wished, write_section
 
-from visioncal.dynamics.base import BaseModel
-from visioncal.dynamics.condition import condition_of
+from visioncal.dynamics.base import BaseModel, condition_of
 from visioncal.dynamics.excitation import Excitation, ExcitationRequest, excite
 from visioncal.dynamics.friction import FrictionTerms
 from visioncal.dynamics.limits import Allowed, Share, allowed_motion

@@ -28,8 +28,7 @@ from visioncal.calibration.verification.messages import _signed_axis
 from visioncal.calibration.verification.prediction import known_before, predict_stops, seen_by
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert, log
-from visioncal.present.report.check import render_check
-from visioncal.present.report.check_page import page_of
+from visioncal.present.report.check import page_of, render_check
 from visioncal.results import Calibration
 from visioncal.robot import load_robot
 from visioncal.session import Session

@@ -13,8 +13,7 @@ from support.small_arm import small_arm
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import compose
 from visioncal.dynamics import excitation
-from visioncal.dynamics.base import BaseModel
-from visioncal.dynamics.condition import smooth_condition
+from visioncal.dynamics.base import BaseModel, smooth_condition
 from visioncal.dynamics.excitation import ExcitationRequest, excite
 from visioncal.dynamics.fourier import Harmonics, Series
 from visioncal.dynamics.friction import FrictionTerms

@@ -21,8 +21,8 @@ from visioncal.core.transforms import compose
 from visioncal.dynamics.excitation import excite
 from visioncal.dynamics.fourier import Harmonics, Series
 from visioncal.dynamics.limits import Share, allowed_motion
-from visioncal.dynamics.programs import excitation_program, sweeps_program
 from visioncal.dynamics.sweeps import Stroke, SweepRequest, Sweeps, plan_sweeps
+from visioncal.dynamics.written import excitation_program, sweeps_program
 from visioncal.present.recording import paths
 from visioncal.robot import load_robot
 from visioncal.robot.bodies import Body

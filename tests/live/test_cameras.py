@@ -13,13 +13,12 @@ import pytest
 
 from visioncal.core.errors import DataError, DriverError
 from visioncal.live.drivers import extras
-from visioncal.live.drivers.grabbed import GrabbedPictures
 from visioncal.live.drivers.images import FolderCamera
 from visioncal.live.drivers.newest import Arrival
 from visioncal.live.drivers.oak import OakCamera
 from visioncal.live.drivers.oak_hosted import HostedOak
 from visioncal.live.drivers.protocols import CameraDevice, DeviceSetup
-from visioncal.live.drivers.uvc import UvcCamera
+from visioncal.live.drivers.uvc import GrabbedPictures, UvcCamera
 
 RNG = np.random.default_rng(7)
 
@@ -161,7 +160,7 @@ def arrivals_of(monkeypatch, *pictures, **words):
     """What becomes of pictures that come, and are stamped, at given times."""
     capture = Queued(*pictures)
     clock = SimpleNamespace(monotonic=lambda: capture.now_s)
-    monkeypatch.setattr("visioncal.live.drivers.grabbed.time", clock)
+    monkeypatch.setattr("visioncal.live.drivers.uvc.time", clock)
     source = GrabbedPictures(capture, "camera", **words)
     return [source.grab() for _ in pictures], source
 

@@ -11,13 +11,12 @@ from support.recorded import QUICK, REPEATABILITY_M, errors_m, recorded
 from visioncal.calibration.pipeline import run
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.transforms import compose
-from visioncal.live.capture.approach import Ways
 from visioncal.live.capture.core import missed
 from visioncal.live.capture.drive import travel_s
 from visioncal.live.capture.joint_pose_check import JointPoseCheck
 from visioncal.live.capture.live import LiveCell
 from visioncal.live.capture.options import CaptureOptions, Stillness
-from visioncal.live.capture.record import departure
+from visioncal.live.capture.record import Ways, departure
 from visioncal.live.capture.still import image_motion_px
 from visioncal.live.planning.cell import Box
 from visioncal.live.planning.read_back import PlanFile

@@ -15,10 +15,10 @@ from visioncal.core.errors import DataError, DriverError
 from visioncal.core.types import Camera
 from visioncal.interchange.exports import Selection, document
 from visioncal.live.drivers import oak
+from visioncal.live.drivers.extras import depthai
 from visioncal.live.drivers.oak import OakCamera
 from visioncal.live.drivers.oak_calibration import calibration_json, factory_intrinsics
 from visioncal.live.drivers.oak_hosted import HostedOak
-from visioncal.live.drivers.oak_library import depthai
 from visioncal.live.drivers.protocols import CameraDevice, DeviceSetup, Frame
 from visioncal.live.rehearsal.camera import RehearsalCamera
 from visioncal.results import CameraResult

@@ -23,7 +23,7 @@ from support.recorded import REPEATABILITY_M
 from visioncal.cli import recorded
 from visioncal.core.errors import DataError, DriverError
 from visioncal.live.capture import devices
-from visioncal.live.capture.clock import HostClock
+from visioncal.live.capture.live import HostClock
 from visioncal.live.planning.plan import Request, make_plan
 from visioncal.live.planning.purposes import purpose_of
 from visioncal.live.planning.read_back import PlanFile, read_plan

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from visioncal.core.types import Camera
-from visioncal.live.planning.window import Window
+from visioncal.live.planning.visibility import Window
 from visioncal.vision.camera import project
 
 SIZE = (1280, 800)

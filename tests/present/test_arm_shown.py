@@ -13,7 +13,7 @@ from support.pages import Page, section
 from support.samples import Sample, made_up
 
 from visioncal.core.errors import DataError
-from visioncal.present.recording import armtext, notes, paths, read_calibration, write_recording
+from visioncal.present.recording import markdown, notes, paths, read_calibration, write_recording
 from visioncal.present.recording.workspace import ArmPicture
 from visioncal.present.report.arm import arm_card
 from visioncal.present.report.page import render
@@ -228,7 +228,7 @@ def test_the_arm_is_drawn_as_calibrated_and_the_stated_one_off_it(sample, tmp_pa
 
 def test_the_note_names_what_is_sure_and_what_is_not_told(sample):
     found = with_arm(sample, calibrated()).arm
-    text = armtext.markdown(found)
+    text = markdown.markdown(found)
     assert "| **geometry of the links** | 36 | 0.073 |" in text
     assert "| shoulder pan joint | a | 0 | 1.20 | **+1.20** |" in text
     assert "| elbow joint | d |" in text

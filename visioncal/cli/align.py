@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 from rich.markup import escape
 
 from visioncal.cli.calibrate import calibrate_command
-from visioncal.cli.console import answers, messages, report_written
-from visioncal.cli.pointing import naming
+from visioncal.cli.console import answers, messages, naming, report_written
 from visioncal.cli.progress import shown_progress
 from visioncal.core.choices import Convention, ImagesKept
 from visioncal.core.number_format import figure

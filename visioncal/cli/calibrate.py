@@ -85,8 +85,7 @@ def calibrate_command(
     from visioncal.calibration.pipeline.run_state import RunState
     from visioncal.calibration.pipeline.running import check_dense, check_solver
     from visioncal.cli.align import align_into
-    from visioncal.cli.console import messages, report_written
-    from visioncal.cli.pointing import naming
+    from visioncal.cli.console import messages, naming, report_written
     from visioncal.cli.progress import shown_progress
     from visioncal.cli.summary import print_summary
     from visioncal.interchange.merge_results import leftover

@@ -1,7 +1,10 @@
-"""What the commands share: messages to stderr, results to stdout."""
+"""What the commands share: messages to stderr, results to stdout, advice with the paths typed."""
 
 import json
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
@@ -102,3 +105,19 @@ def report_written(written: "Written", *, quiet: bool = False, status: int = 0) 
         )
     if status or written.undrawn:
         raise typer.Exit(status or _EXIT_BUG)
+
+
+@contextmanager
+def naming(session: Path, out: Path | str = "") -> Iterator[None]:
+    """Puts a run's paths into the commands that errors of the block point to."""
+    try:
+        yield
+    except VisioncalError as error:
+        # Help need not wait for it.
+        from visioncal.core.verdict import with_paths
+
+        raise type(error)(
+            error.message,
+            culprits=error.culprits,
+            next_step=with_paths(error.next_step, session, out),
+        ) from error

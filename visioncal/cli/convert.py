@@ -10,8 +10,8 @@ import typer
 from rich.markup import escape
 
 from visioncal.cli.console import messages
-from visioncal.cli.numbers import size_in
 from visioncal.cli.options import Force
+from visioncal.cli.parsing import size_in
 from visioncal.cli.pose_options import UNITS, RobotPoseOptions, names_in, poses_option
 from visioncal.cli.progress import shown_progress
 from visioncal.core.choices import FOREIGN_NAMES, CameraMount

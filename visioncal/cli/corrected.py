@@ -11,8 +11,8 @@ from rich.markup import escape
 
 from visioncal.cli.console import answers, messages
 from visioncal.cli.correct import CorrectOptions
-from visioncal.cli.numbers import numbers_in
 from visioncal.cli.options import PartOptions
+from visioncal.cli.parsing import numbers_in
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, did_you_mean, some_of, write_atomically
 from visioncal.core.number_format import figure

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import answers
+from visioncal.cli.console import answers, naming
 from visioncal.cli.options import AsJson, SessionArgument
-from visioncal.cli.pointing import naming
 from visioncal.cli.progress import shown_progress
 
 # Help does not wait for them.

@@ -10,11 +10,9 @@ import typer
 from rich.markup import escape
 
 from visioncal.cli.console import messages
-from visioncal.cli.numbers import numbers_in
 from visioncal.cli.options import AsJson, CameraName, RobotName
-from visioncal.cli.planes import FORMS, plane_of
+from visioncal.cli.parsing import FORMS, numbers_in, plane_of, refuse_given
 from visioncal.cli.progress import shown_progress
-from visioncal.cli.refusing import refuse_given
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
@@ -213,7 +211,7 @@ def _flange_of(
 ) -> "FloatArray | None":
     """Where the flange was at the one view that is meant; a camera that stands still needs none."""
     from visioncal.frames.session_observations import pose_of
-    from visioncal.results.session_match import check_mount
+    from visioncal.results.picking import check_mount
 
     check_mount(session, calibration)
     if calibration.mount == "eye-to-hand":

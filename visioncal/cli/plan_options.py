@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from visioncal.cli.numbers import numbers_in
+from visioncal.cli.parsing import numbers_in
 from visioncal.core.choices import Criterion, Mount
 from visioncal.core.errors import DataError
 from visioncal.live.planning.purposes import PURPOSES, purpose_of

@@ -8,9 +8,8 @@ from typing import TypeAlias
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.cli.numbers import numbers_in, size_in
+from visioncal.cli.parsing import numbers_in, refuse_given, size_in
 from visioncal.cli.plan_options import CellOptions
-from visioncal.cli.refusing import refuse_given
 from visioncal.core.errors import DataError
 from visioncal.core.files import absence, read_bytes, some_of
 from visioncal.core.transforms import compose

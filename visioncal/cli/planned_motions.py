@@ -10,7 +10,7 @@ from rich.markup import escape
 
 from visioncal.cli.console import answers, report_written
 from visioncal.cli.dynamics_plan import FRICTION, ArmOptions, ExcitationOptions
-from visioncal.cli.numbers import numbers_in
+from visioncal.cli.parsing import numbers_in
 from visioncal.cli.plan_options import ClearanceOptions
 from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
@@ -24,7 +24,7 @@ from visioncal.dynamics.sweeps import SweepRequest, plan_sweeps
 from visioncal.dynamics.written import motion_document
 from visioncal.interchange.outputs import write_motions
 from visioncal.live.planning.cell import Box
-from visioncal.live.planning.motions import plan_warnings, plan_words
+from visioncal.live.planning.messages import plan_warnings, plan_words
 from visioncal.robot import Robot, load_robot
 from visioncal.robot.bodies import Body, capsule
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from visioncal.cli.numbers import size_in
+from visioncal.cli.parsing import size_in
 from visioncal.core.choices import PLAN_SPEED, POSE_FORMS, CameraMount
 from visioncal.live.capture.options import CaptureOptions, Keep, Stillness
 

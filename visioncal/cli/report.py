@@ -7,8 +7,8 @@ import typer
 from rich.markup import escape
 
 from visioncal.cli.console import answers, messages
+from visioncal.cli.parsing import refuse_given
 from visioncal.cli.progress import shown_progress
-from visioncal.cli.refusing import refuse_given
 from visioncal.core.errors import DataError
 
 # Help does not wait for them.

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 import typer
 
 from visioncal.cli.framing import Place
-from visioncal.cli.numbers import numbers_in
+from visioncal.cli.parsing import numbers_in, refuse_given
 from visioncal.cli.progress import shown_progress
-from visioncal.cli.refusing import refuse_given
 from visioncal.core.errors import DataError
 from visioncal.frames.naming import FrameKind
 

@@ -8,7 +8,7 @@ import typer
 
 from visioncal.cli.framing import FrameOptions, Place, TouchOptions, keep_and_report
 from visioncal.cli.options import AsJson, PartOptions
-from visioncal.cli.refusing import refuse_given
+from visioncal.cli.parsing import refuse_given
 from visioncal.cli.target_in_images import PointOption, frame_by_images, image_session
 
 

@@ -13,8 +13,8 @@ from rich.console import Console
 from rich.markup import escape
 
 from visioncal.cli.console import answers, asked, messages, report_error, report_written
-from visioncal.cli.numbers import numbers_in
 from visioncal.cli.options import AsJson, SessionArgument
+from visioncal.cli.parsing import numbers_in
 from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.number_format import figure

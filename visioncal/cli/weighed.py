@@ -9,7 +9,7 @@ from rich.markup import escape
 
 from visioncal.cli.console import messages
 from visioncal.cli.dynamics_options import StreamOptions, identified_of
-from visioncal.cli.numbers import numbers_in
+from visioncal.cli.parsing import numbers_in
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import matched, significant
 from visioncal.core.types import FloatArray

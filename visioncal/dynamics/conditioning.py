@@ -11,10 +11,9 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.types import FloatArray, Mask
 from visioncal.dynamics.clock import Clock, clock_notes, even_parts, without_frozen
-from visioncal.dynamics.lowpass import LowPass
+from visioncal.dynamics.lowpass import WIDER, LowPass, band_of, smoothed_motion, window_of
 from visioncal.dynamics.motion import Measured, Motion
 from visioncal.dynamics.reading import Recorded
-from visioncal.dynamics.smoothing import WIDER, band_of, smoothed_motion, window_of
 
 # Torques of a rigid arm have all but their friction's corners within so many times the band of its
 # motion; below so many a second there is little to estimate noise from, and beyond the other gears

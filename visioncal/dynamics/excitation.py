@@ -19,8 +19,7 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.files import some_of
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, Progress
-from visioncal.dynamics.base import BaseModel
-from visioncal.dynamics.condition import Condition, condition_of
+from visioncal.dynamics.base import BaseModel, Condition, condition_of
 from visioncal.dynamics.fourier import Harmonics, Series
 from visioncal.dynamics.friction import FrictionTerms
 from visioncal.dynamics.limit_check import CHECK_HZ, Kept, kept_limits

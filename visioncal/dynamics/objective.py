@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.core.types import FloatArray
-from visioncal.dynamics.base import BaseModel
-from visioncal.dynamics.condition import smooth_condition
+from visioncal.dynamics.base import BaseModel, smooth_condition
 from visioncal.dynamics.fourier import Harmonics, Series
 from visioncal.dynamics.limits import Allowed
 from visioncal.dynamics.model import DynamicModel

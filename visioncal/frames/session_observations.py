@@ -14,7 +14,7 @@ from visioncal.core.types import FloatArray, Progress, Rejection, Target
 from visioncal.frames.camera_chain import Eye
 from visioncal.frames.single_view import Parent, Sight, needs_robot
 from visioncal.results import HELD_BACK, Calibration
-from visioncal.results.session_match import check_mount, check_resolution
+from visioncal.results.picking import check_mount, check_resolution
 from visioncal.robot import Robot
 from visioncal.session import Session, View
 from visioncal.session.loads import loads_of

@@ -142,8 +142,8 @@ def write_check(
     """
 
     def page(path: Path) -> None:
+        from visioncal.present.report.check import page_of
         from visioncal.present.report.check import write_check as write_page
-        from visioncal.present.report.check_page import page_of
 
         write_page(path, page_of(check, triggers, verdict))
 
@@ -264,9 +264,9 @@ def write_motions(
     """
 
     def draw(path: Path) -> None:
-        from visioncal.live.planning.motion_preview import motion_preview
+        from visioncal.live.planning.preview import motion_preview
         from visioncal.present.recording.motions import write_motion_preview
-        from visioncal.present.viewer.motions import motion_blueprint
+        from visioncal.present.viewer.planned import motion_blueprint
 
         preview = motion_preview(plan)
         write_motion_preview(path, preview, motion_blueprint(preview))

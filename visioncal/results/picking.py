@@ -1,12 +1,13 @@
-"""A calibration and a session of whole cells, cut down to one camera, robot and target alike."""
+"""A calibration and a session that go together: of one camera, and cut down to one pair alike."""
 
 from collections.abc import Collection
 
+from visioncal.core.errors import DataError
 from visioncal.results.result import Calibration
 from visioncal.session import Session
 from visioncal.session.choosing import PARTS, Choice, Part
 from visioncal.session.selecting import has_several, select
-from visioncal.session.single import is_to_be_parted
+from visioncal.session.single import check_one_of_each, is_to_be_parted
 
 
 def picked(
@@ -37,3 +38,39 @@ def picked(
         return session, calibration if several else calibration.chosen(choice)
     named = {part: choice.of(part) for part in needs}
     return session, calibration.chosen(Choice(**named), needs)
+
+
+def check_mount(session: Session, calibration: Calibration) -> None:
+    """Refuses the session of a camera that is mounted elsewhere than the calibrated one.
+
+    Raises:
+        DataError: So it is.
+    """
+    check_one_of_each(session)
+    if session.mount != calibration.mount:
+        raise DataError(
+            f"session {session.name!r} has its camera {session.mount}, and the calibration "
+            f"{calibration.session_name!r} is of one {calibration.mount}.",
+            culprits=["session.toml: mount"],
+            next_step="Correct mount in session.toml, or name the calibration of this camera.",
+        )
+
+
+def check_resolution(
+    session: Session, calibration: Calibration, resolution: tuple[int, int]
+) -> None:
+    """Refuses images of another size than those of the calibrated camera.
+
+    Raises:
+        DataError: So they are.
+    """
+    camera = calibration.camera
+    if camera is None or resolution == camera.camera.resolution:
+        return
+    shown, needed = (f"{it[0]} x {it[1]}" for it in (resolution, camera.camera.resolution))
+    raise DataError(
+        f"session {session.name!r}: its images have {shown} pixels, and the calibrated camera has "
+        f"{needed}.",
+        culprits=["session.toml: camera.resolution"],
+        next_step="Take the images with the same camera, binning and region as calibrated.",
+    )

@@ -16,7 +16,6 @@ from visioncal.core.files import MOST_TOML_BYTES, parse_toml, read_text_inside
 from visioncal.core.shown import html_card, text_card
 from visioncal.core.types import Camera, Corners, FloatArray, Image, Mount, Need, Target
 from visioncal.session import columns as known
-from visioncal.session.arms import read_robots
 from visioncal.session.arrays import Cell, of_corners, of_images
 from visioncal.session.boards import COLUMN, read_targets, target_warnings
 from visioncal.session.checks import check_images_can_be_used, check_times, view_warnings
@@ -34,7 +33,7 @@ from visioncal.session.digest import digest_facts
 from visioncal.session.document import Declaration, declaration_warnings, read_declaration
 from visioncal.session.frames import check_frames, frame_name, resolve_frames, robots_of
 from visioncal.session.images import FolderImages, ImageStore, MemoryImages
-from visioncal.session.kinds import check_kinds_named, is_seen, kind_warnings
+from visioncal.session.kinds import check_kinds_named, is_seen, kind_warnings, read_robots
 from visioncal.session.observations import Observation, observations_of, stop_warnings
 from visioncal.session.outside import outside_warnings
 from visioncal.session.saving import placed_files, write_folder

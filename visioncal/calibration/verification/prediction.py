@@ -23,7 +23,7 @@ from visioncal.estimation.lens_field import depths_m
 from visioncal.estimation.parts import ROBOT, State
 from visioncal.estimation.problem import Problem
 from visioncal.results import CameraResult
-from visioncal.results.session_match import check_mount, check_resolution
+from visioncal.results.picking import check_mount, check_resolution
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.boards import COLUMN

@@ -4,9 +4,8 @@ from collections.abc import Sequence
 
 from visioncal.core.conventions import POSE_FORMS, write_pose
 from visioncal.interchange.exports.content import Content
-from visioncal.interchange.exports.format import ExportFormat
-from visioncal.interchange.exports.frames import ROS_FRAMES, ros_notes
-from visioncal.interchange.exports.writing import comments, numbers
+from visioncal.interchange.exports.format import ExportFormat, comments, numbers
+from visioncal.interchange.exports.ros import ROS_FRAMES, ros_notes
 
 _NUMBERS = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
 

@@ -1,17 +1,45 @@
-"""The lens alone: ROS's camera_info and Kalibr's camera chain."""
+"""The lens alone: ROS's camera_info, Kalibr's camera chain, the calibration of a Luxonis OAK."""
 
 import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import Camera, FloatArray
 from visioncal.interchange.exports.content import Content
-from visioncal.interchange.exports.format import ExportFormat
-from visioncal.interchange.exports.writing import comments, numbers, yaml_text
+from visioncal.interchange.exports.format import ExportFormat, comments, numbers, yaml_text
+from visioncal.live.drivers.oak_calibration import calibration_json
 from visioncal.vision.camera import matrix_3x3
 
 _CAMERA = {"cam": "camera"}
 # By the number of coefficients: OpenCV's five, eight, and the fisheye's four.
 _ROS_MODELS = {5: "plumb_bob", 8: "rational_polynomial", 4: "equidistant"}
+
+
+def _write(content: Content) -> str:
+    """Writes the JSON of depthai's CalibrationHandler; the child's name is the camera's socket."""
+    return calibration_json(camera_of(content), content.child, content.onto)
+
+
+def _warn(content: Content) -> str:
+    said = warn_of_field(content)
+    if content.onto is not None:
+        return said
+    board = (
+        "this calibration holds one camera and nothing of its board. Before a device is given it, "
+        "write it onto the device's own: --onto FILE, as CalibrationHandler.eepromToJsonFile saves "
+        "it."
+    )
+    return f"{said} {board}".strip()
+
+
+OAK = ExportFormat(
+    "oak",
+    "the lens as the calibration JSON of an OAK [px]; --child names the socket",
+    _write,
+    "lens",
+    {"cam": "CAM_A"},
+    frozenset({"onto"}),
+    warn=_warn,
+)
 
 
 def camera_of(content: Content) -> Camera:

@@ -13,9 +13,8 @@ from visioncal.interchange.exports.controllers import CONTROLLERS
 from visioncal.interchange.exports.dynamics import write_dynamics
 from visioncal.interchange.exports.format import ExportFormat
 from visioncal.interchange.exports.launch import MOVEIT, ROS_LAUNCH
-from visioncal.interchange.exports.lens import CAMERA_INFO, KALIBR
+from visioncal.interchange.exports.lens import CAMERA_INFO, KALIBR, OAK
 from visioncal.interchange.exports.matrices import OPENCV, TEXT, ZIVID
-from visioncal.interchange.exports.oak import OAK
 from visioncal.interchange.exports.programs import PROGRAMS
 from visioncal.interchange.exports.robots import ROBOTS
 from visioncal.interchange.exports.ros import EASY_HANDEYE, EASY_HANDEYE2, ROS

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from visioncal.core.conventions import POSE_FORMS, write_pose
 from visioncal.core.files import one_line
 from visioncal.interchange.exports.content import Content
-from visioncal.interchange.exports.format import ExportFormat
-from visioncal.interchange.exports.frames import ROS_FRAMES, ros_notes
-from visioncal.interchange.exports.writing import numbers
+from visioncal.interchange.exports.format import ExportFormat, numbers
+from visioncal.interchange.exports.ros import ROS_FRAMES, ros_notes
 
 
 def _write(content: Content) -> str:

@@ -1,4 +1,4 @@
-"""Tables, JSON and .npz with named columns or keys, a row a view."""
+"""Tables, JSON and .npz with named columns or keys, a row a view; and lines of a pendant."""
 
 import re
 from collections import defaultdict
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from visioncal.core.conventions import PoseNumbers
+from visioncal.core.conventions import PoseNumbers, write_pose
 from visioncal.core.documents import (
     read_json,
     read_npy,
@@ -16,6 +16,8 @@ from visioncal.core.documents import (
     read_table,
     read_yaml,
 )
+from visioncal.core.documents.bounds import read_plain_text
+from visioncal.core.documents.pendants import PendantPose, is_marked_pose, read_pose
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.interchange.formats.fields import (
@@ -32,7 +34,6 @@ from visioncal.interchange.formats.foreign import Foreign
 from visioncal.interchange.formats.format import ForeignFormat
 from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.pairing import with_camera_file
-from visioncal.interchange.formats.pendants import pendant_fields
 from visioncal.interchange.formats.poses import (
     CAMERA_KEYS,
     JOINT_KEYS,
@@ -48,6 +49,10 @@ from visioncal.session.columns import joint_columns
 DOCUMENTS = (".json", ".yaml", ".yml", ".xml")
 ENDINGS = (".csv", ".tsv", ".txt", ".npz", ".npy", *DOCUMENTS)
 _IMAGE_NAMES = ("image", "img", "filename", "file", "image_file", "image_path")
+# Names under which poses are looked for, by how many numbers they have.
+_NAMES = {6: ("x", "y", "z", "rx", "ry", "rz"), 7: ("x", "y", "z", "q1", "q2", "q3", "q4")}
+_IMAGE = re.compile(r"[^\s,;\"']+\.(?:png|jpe?g|tiff?|bmp)(?![\w.])", re.IGNORECASE)
+_COMMENTS = ("#", "%", "//", "!")
 
 
 def read_fields(path: Path) -> Fields:
@@ -266,3 +271,46 @@ TABLE = ForeignFormat(
     lambda path: _pose_file(path) is not None,
     _read_file,
 )
+
+
+def pendant_fields(path: Path) -> Fields | None:
+    """Takes the lines of a text file that hold poses, each with its image where it names one.
+
+    Returns:
+        The rows; None where the file's first lines hold no pose with a maker's marks.
+
+    Raises:
+        DataError: A line has no pose, or another maker's than the first.
+    """
+    lines = [
+        (at, line)
+        for at, line in enumerate(read_plain_text(path).splitlines(), start=1)
+        if line.strip() and not line.strip().startswith(_COMMENTS)
+    ]
+    # A header may stand first.
+    first = next((at for at, (_, line) in enumerate(lines[:2]) if is_marked_pose(line)), None)
+    if first is None:
+        return None
+    places = tuple(f"{path.name}, line {at}" for at, _ in lines[first:])
+    texts = [line for _, line in lines[first:]]
+    images = tuple(found[0] if (found := _IMAGE.search(it)) else "" for it in texts)
+    poses = [
+        read_pose(_IMAGE.sub(" ", text), place) for text, place in zip(texts, places, strict=True)
+    ]
+    form = poses[0].form
+    _check_one_form(poses, places)
+    numbers = np.array([write_pose(it.pose, form) for it in poses])
+    columns = dict(zip(_NAMES[numbers.shape[1]], numbers.T, strict=True))
+    named = {"image": images} if any(images) else {}
+    return Fields(path.stem, path.parent, places, columns, named, form=form.name)
+
+
+def _check_one_form(poses: list[PendantPose], places: tuple[str, ...]) -> None:
+    form = poses[0].form
+    others = [place for place, it in zip(places, poses, strict=True) if it.form != form]
+    if others:
+        raise DataError(
+            f"{some_of(others)}: another maker's form than {form.words}, as {places[0]} has.",
+            culprits=others,
+            next_step="Put the poses of one robot into a file of their own.",
+        )

@@ -8,9 +8,8 @@ import numpy as np
 from visioncal.core.errors import DriverError
 from visioncal.core.transforms import pose_difference
 from visioncal.core.types import FloatArray
-from visioncal.live.capture.clock import Clock
 from visioncal.live.capture.core import Capture, Step
-from visioncal.live.capture.live import LiveCell
+from visioncal.live.capture.live import Clock, LiveCell
 from visioncal.live.capture.options import Stillness
 from visioncal.live.capture.record import closed_cleanly
 from visioncal.live.capture.still import why_arm_moves

@@ -1,11 +1,12 @@
-"""The devices of a live cell, and what holds of every moment of it."""
+"""The devices of a live cell and its clock, and what holds of every moment of it."""
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Protocol
 
 from visioncal.core.errors import DriverError
-from visioncal.live.capture.clock import Clock, HostClock
 from visioncal.live.drivers.protocols import Arm, ArmState, CameraDevice, MovingArm
 
 # A state older than this is no news [s].
@@ -17,6 +18,35 @@ _STOPPED = {
     "the pendant,",
     "fault": "Read the fault on the pendant, restart the robot there,",
 }
+
+
+class Clock(Protocol):
+    """A clock that never goes back, and a way to wait by it."""
+
+    def now(self) -> float:
+        """The time, on the clock by which arm and camera stamp [s]."""
+
+    def sleep(self, seconds: float) -> None:
+        """Waits."""
+
+    def unix_offset_s(self) -> float:
+        """What makes a time of this clock a UNIX time [s]."""
+
+
+class HostClock:
+    """The host's monotonic clock."""
+
+    def now(self) -> float:
+        """The time [s]."""
+        return time.monotonic()
+
+    def sleep(self, seconds: float) -> None:
+        """Waits."""
+        time.sleep(seconds)
+
+    def unix_offset_s(self) -> float:
+        """What makes a time of this clock a UNIX time [s]."""
+        return time.time() - time.monotonic()
 
 
 @dataclass(frozen=True, eq=False)

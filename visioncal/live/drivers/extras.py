@@ -1,14 +1,21 @@
-"""Client libraries that only some users need, and the command that installs a missing one."""
+"""Client libraries that only some users need, and the command that installs a missing one.
 
+DepthAI, the library of Luxonis' OAK cameras, is imported here alone, with its telemetry off.
+"""
+
+import os
 from collections.abc import Mapping
 from importlib import import_module
 from importlib.util import find_spec
 from types import ModuleType
+from typing import Any, TypeAlias
 
 from visioncal.core.errors import DriverError
 
 # What the extras of this package install, by their names in pyproject.toml.
 _PACKAGES = {"ur": "ur-rtde>=1.6.5,<2", "oak": "depthai>=3.12,<4"}
+# A pipeline, a node, an output, a message: their classes are there only where the library is.
+Handle: TypeAlias = Any
 
 
 def refuse_without(needed: str, extras: Mapping[str, str]) -> None:
@@ -50,3 +57,19 @@ def client_library(module: str, extra: str) -> ModuleType:
             culprits=[module],
             next_step=f"Install it: pip install '{_PACKAGES[extra]}'",
         ) from error
+
+
+def depthai() -> ModuleType:
+    """Imports depthai.
+
+    It reads its environment once, when it is imported; by default it reports to its maker.
+
+    Raises:
+        DriverError: It is not installed, with the command that installs it.
+    """
+    os.environ["DEPTHAI_TELEMETRY"] = "0"
+    # Its warnings about USB in containers are no news to a user of a recording or a rehearsal.
+    os.environ.setdefault("DEPTHAI_LEVEL", "error")
+    # It looks for a device for 10 s; one that is there is found within one.
+    os.environ.setdefault("DEPTHAI_SEARCH_TIMEOUT", "3000")
+    return client_library("depthai", "oak")

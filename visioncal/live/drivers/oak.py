@@ -11,9 +11,9 @@ from types import MappingProxyType, ModuleType
 from visioncal.core.errors import DriverError
 from visioncal.core.files import did_you_mean
 from visioncal.core.types import Camera
+from visioncal.live.drivers.extras import Handle, depthai
 from visioncal.live.drivers.oak_calibration import SOCKETS, factory_intrinsics
 from visioncal.live.drivers.oak_frames import FrameEnd, began_after, worded
-from visioncal.live.drivers.oak_library import Handle, depthai
 from visioncal.live.drivers.protocols import DeviceSetup, Frame
 from visioncal.live.drivers.stopwatch import Stopwatch
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.types import Camera, FloatArray
-from visioncal.live.drivers.oak_library import Handle, depthai
+from visioncal.live.drivers.extras import Handle, depthai
 from visioncal.vision.camera import matrix_3x3
 
 SOCKETS = tuple(f"CAM_{letter}" for letter in "ABCDEFGHIJ")

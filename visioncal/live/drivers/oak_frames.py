@@ -13,7 +13,7 @@ import numpy as np
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.files import check_free
 from visioncal.core.types import Image
-from visioncal.live.drivers.oak_library import Handle
+from visioncal.live.drivers.extras import Handle
 from visioncal.live.drivers.protocols import Frame
 
 # What depthai's recorder keeps without loss; into others it encodes.

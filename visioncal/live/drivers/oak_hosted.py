@@ -9,8 +9,8 @@ from types import MappingProxyType, ModuleType
 
 from visioncal.core.errors import DriverError
 from visioncal.core.types import Camera
+from visioncal.live.drivers.extras import Handle, depthai
 from visioncal.live.drivers.oak_frames import FrameEnd, began_after
-from visioncal.live.drivers.oak_library import Handle, depthai
 from visioncal.live.drivers.protocols import Frame
 from visioncal.live.drivers.stopwatch import Stopwatch
 

@@ -9,8 +9,8 @@ import numpy as np
 from visioncal.core.errors import DriverError
 from visioncal.core.types import FloatArray
 from visioncal.live.capture.live import LiveCell
+from visioncal.live.drivers.extras import depthai
 from visioncal.live.drivers.oak_hosted import HostedOak
-from visioncal.live.drivers.oak_library import depthai
 from visioncal.live.drivers.protocols import CameraDevice
 from visioncal.live.drivers.ur import UrArm
 from visioncal.live.rehearsal.camera import Pace, RehearsalCamera

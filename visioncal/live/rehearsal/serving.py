@@ -1,22 +1,99 @@
-"""The ports of a simulated controller, served by one loop."""
+"""The ports of a simulated controller, served by one loop.
+
+Sources: Universal Robots, "Dashboard Server e-Series", and "Remote Control Via TCP/IP": a robot
+state message of the primary interface is its size (int32), 16, and packages of size, type and
+content; numbers are big-endian.
+"""
 
 import asyncio
 import re
+import struct
 import time
 from collections.abc import Awaitable, Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from visioncal.live.rehearsal.dashboard import BANNER, DASHBOARD_PORT, answer
+from visioncal.live.rehearsal.kinematics import tool_pose
 from visioncal.live.rehearsal.machine import Machine
 from visioncal.live.rehearsal.options import ControllerOptions
-from visioncal.live.rehearsal.primary import PRIMARY_PORTS, state_message
 from visioncal.live.rehearsal.rtde_port import RtdePort
 from visioncal.live.rehearsal.rtde_wire import RTDE_PORT
 from visioncal.live.rehearsal.script import ControlScript
 from visioncal.live.rehearsal.truth import TRUTH_PORT, TruthChannel
 from visioncal.live.rehearsal.variables import Moment
+
+PRIMARY_PORTS = (30001, 30002, 30011, 30012)
+_ROBOT_STATE, _CARTESIAN, _KINEMATICS = 16, 4, 5
+_LINEARISED = 1
+DASHBOARD_PORT = 29999
+BANNER = "Connected: Universal Robots Dashboard Server"
+_SAFETY = {
+    "normal": "NORMAL",
+    "protective-stop": "PROTECTIVE_STOP",
+    "emergency-stop": "ROBOT_EMERGENCY_STOP",
+}
+
+
+def answer(machine: Machine, line: str, now_s: float) -> str:
+    """Answers one line of a client, and does what it orders."""
+    asked = line.strip().lower()
+    state = _state(machine, asked)
+    if state is not None:
+        return state
+    if asked == "stop":
+        machine.stop_program(now_s)
+        return "Stopped"
+    if asked == "unlock protective stop":
+        machine.release()
+        return "Protective stop releasing"
+    if asked == "power off":
+        machine.stop_program(now_s)
+        machine.mode = "POWER_OFF"
+        return "Powering off"
+    if asked in ("power on", "brake release"):
+        machine.mode = "RUNNING"
+        return "Powering on" if asked == "power on" else "Brake releasing"
+    if asked.startswith(("popup", "close popup", "close safety popup", "addtolog")):
+        return "ok"
+    return f"could not understand: '{line.strip()}'"
+
+
+def _state(machine: Machine, asked: str) -> str | None:
+    """Answers a question; None where it is none."""
+    playing = machine.program == "playing"
+    answers = {
+        "polyscopeversion": machine.polyscope,
+        "get serial number": "20235500001",
+        # The model's name without its series, as the real one.
+        "get robot model": machine.believed.name.removesuffix("e").upper(),
+        "is in remote control": str(machine.remote).lower(),
+        "robotmode": f"Robotmode: {machine.mode}",
+        "safetymode": f"Safetymode: {_SAFETY[machine.safety]}",
+        "safetystatus": f"Safetystatus: {_SAFETY[machine.safety]}",
+        "running": f"Program running: {str(playing).lower()}",
+        "programstate": f"{machine.program.upper()} rtde_control",
+        "quit": "Disconnected",
+    }
+    return answers.get(asked)
+
+
+def state_message(machine: Machine, now_s: float) -> bytes:
+    """A robot state message with the tool's pose and offset, and with the arm's table of joints."""
+    q, _ = machine.joints(now_s)
+    pose = tool_pose(machine, q).tolist()
+    cartesian = struct.pack(">12d", *pose, *machine.tcp.tolist())
+    arm = machine.believed
+    columns = (arm.offset, arm.a, arm.d, arm.alpha)
+    numbers = [float(it) for column in columns for it in column]
+    kinematics = struct.pack(f">6I{len(numbers)}dI", *range(1, 7), *numbers, _LINEARISED)
+    body = _package(_CARTESIAN, cartesian) + _package(_KINEMATICS, kinematics)
+    return _package(_ROBOT_STATE, body)
+
+
+def _package(kind: int, content: bytes) -> bytes:
+    return struct.pack(">IB", 5 + len(content), kind) + content
+
 
 SCRIPT_PORT = 30003
 PORTS = (RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, TRUTH_PORT, *PRIMARY_PORTS)
@@ -25,7 +102,6 @@ _PRIMARY_EVERY_S = 0.1
 _FROZEN_S = 0.02
 # The last line of the client's program.
 _END = re.compile(rb"^end\s*$", re.MULTILINE)
-
 _Handler: TypeAlias = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 
 

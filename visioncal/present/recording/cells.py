@@ -19,8 +19,8 @@ from visioncal.core.types import FloatArray, Target
 from visioncal.present.cellmap import pairs, places, spans
 from visioncal.present.recording import board, colours, paths
 from visioncal.present.recording.arm import log_arm
-from visioncal.present.recording.celltext import sight_markdown, verdict_markdown
 from visioncal.present.recording.frames import Frame, scan
+from visioncal.present.recording.markdown import sight_markdown, verdict_markdown
 from visioncal.present.recording.notes import log_verdict, markdown
 from visioncal.present.recording.reader import chunks
 from visioncal.present.recording.recorder import Recorder

@@ -5,7 +5,7 @@ counts.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,8 +21,7 @@ from visioncal.core.files import named_errors, sha256
 from visioncal.core.temporary_files import aside_file
 from visioncal.core.types import Corners, FloatArray
 from visioncal.present.recording import (
-    armtext,
-    explained,
+    markdown,
     notes,
     overlays,
     paths,
@@ -157,19 +156,19 @@ def _draw(
     stream = recorder.stream
     scene = Scene.of(session, calibration, evidence)
     overlay = overlays.Overlay.of(session, calibration, evidence)
-    explains = explained.is_drawn(evidence.values())
+    explains = _any_is_explained(evidence.values())
     scene.log_static(stream)
     if calibration is not None:
         notes.log_static(stream, calibration)
         tools.log_static(stream, calibration)
-        armtext.log_static(stream, calibration)
+        markdown.log_static(stream, calibration)
     seen = [evidence.get(it.number, ViewEvidence(it.number)) for it in session.views]
     scene.log_views(stream, seen)
     overlay.log_views(stream, seen)
     if explains:
         for row, it in enumerate(seen):
             recorder.at(row)
-            explained.log_view(stream, it)
+            _log_explained(stream, it)
     rows = {it.view: row for row, it in enumerate(seen)}
     if calibration is not None:
         found = {it.view: it for it in calibration.views}
@@ -302,3 +301,23 @@ def _damaged(path: Path) -> DataError:
         culprits=[str(path)],
         next_step="Calibrate the session in it again.",
     )
+
+
+def _any_is_explained(evidence: Iterable[ViewEvidence]) -> bool:
+    """Whether any image was explained."""
+    return any(it.explained is not None for it in evidence)
+
+
+def _log_explained(stream: rr.RecordingStream, seen: ViewEvidence) -> None:
+    """Logs one view's images at the stream's current time, or takes back the view before."""
+    found = seen.explained
+    for entity, image in (
+        (paths.DRAWN, None if found is None else found.drawn),
+        (paths.REST, None if found is None else found.rest),
+    ):
+        if image is None:
+            stream.log(entity, rr.Clear(recursive=False))
+        else:
+            stream.log(entity, rr.EncodedImage(contents=image, media_type="image/jpeg"))
+    words = "This image was not looked at." if found is None else found.words
+    stream.log(paths.BLUR_NOTE, rr.TextDocument(words, media_type="text/markdown"))

@@ -20,7 +20,6 @@ from visioncal.present.report import (
     plots,
     sources,
     springs,
-    thermal,
     tools,
     uncertainty,
 )
@@ -170,7 +169,7 @@ def _drift(calibration: Calibration) -> dict[str, object]:
     found = calibration.thermal
     if found is None:
         return {"drift_card": None, "drift_plot": ""}
-    return {"drift_card": thermal.drift_card(found), "drift_plot": thermal.course(found)}
+    return {"drift_card": arm.drift_card(found), "drift_plot": arm.course(found)}
 
 
 def _plots(

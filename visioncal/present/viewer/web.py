@@ -4,28 +4,28 @@ Rerun's own server listens to the whole network and its page asks servers outsid
 news. This one answers for a handful of names with a page that may load nothing from elsewhere.
 """
 
+import re
 import shutil
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from http import HTTPStatus
+from http.client import HTTPConnection, HTTPException
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from visioncal.core.errors import DataError
+from visioncal.core.errors import DataError, DriverError
 from visioncal.core.files import read_bytes
 from visioncal.present.recording import paths
-from visioncal.present.viewer.assets import MODULE, SCRIPT, viewer_assets
-from visioncal.present.viewer.process import until_interrupted
+from visioncal.present.viewer.process import until_interrupted, viewer_process
 
 _HOST = "127.0.0.1"
 _PAGE, _STYLE, _STARTER, _RECORDING = "review.html", "review.css", "review.js", "recording.rrd"
 _REPORT = "report.html"
 _HTML, _JAVASCRIPT = "text/html; charset=utf-8", "text/javascript; charset=utf-8"
-
 _HEADERS = {
     "Content-Security-Policy": "; ".join(
         (
@@ -48,6 +48,11 @@ _HEADERS = {
     # Another recording may be shown at the same address later.
     "Cache-Control": "no-store",
 }
+SCRIPT, MODULE = "re_viewer.js", "re_viewer_bg.wasm"
+_PATIENCE_S = 30.0
+_SERVING = re.compile(r"Hosting a web-viewer at http://127\.0\.0\.1:(\d+)")
+# A recording by its URL makes rerun serve the files alone; nobody ever asks for it.
+_NO_RECORDING = "http://127.0.0.1/none.rrd"
 
 
 @dataclass(frozen=True)
@@ -184,3 +189,44 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *arguments: object) -> None:  # noqa: A002
         """Keeps the terminal quiet."""
+
+
+def viewer_assets() -> Mapping[str, bytes]:
+    """Fetches the script and the module of the web viewer, by name.
+
+    Rerun's command is let serve them on this machine for the quarter of a second that it takes.
+
+    Raises:
+        DriverError: Rerun's command does not start, or does not have them.
+    """
+    arguments = ("--serve-web", "--bind", "127.0.0.1", "--web-viewer-port", "0", _NO_RECORDING)
+    with viewer_process(*arguments) as process:
+        said: list[str] = []
+        for line in process.stdout or ():
+            said.append(line.strip())
+            if serving := _SERVING.search(line):
+                return {name: _fetch(int(serving[1]), name) for name in (SCRIPT, MODULE)}
+    raise _unserved(" ".join(said[-1:]) or "it said nothing")
+
+
+def _fetch(port: int, name: str) -> bytes:
+    # Not urllib, which would ask a proxy of the environment for it.
+    connection = HTTPConnection("127.0.0.1", port, timeout=_PATIENCE_S)
+    try:
+        connection.request("GET", f"/{name}")
+        response = connection.getresponse()
+        content = response.read()
+    except (OSError, HTTPException) as error:
+        raise _unserved(f"{name}: {error}") from error
+    finally:
+        connection.close()
+    if response.status != 200:
+        raise _unserved(f"{name}: HTTP status {response.status}")
+    return content
+
+
+def _unserved(reason: str) -> DriverError:
+    return DriverError(
+        f"rerun's command does not hand out its web viewer: {reason}.",
+        next_step="Install rerun-sdk again, or leave out --web for the native viewer.",
+    )

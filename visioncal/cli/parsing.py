@@ -1,9 +1,9 @@
-"""The plane that features lie in, as an option says it."""
+"""Options as they are written: numbers with commas between, a plane, what others leave no use."""
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from visioncal.cli.numbers import numbers_in
 from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean, some_of
 
@@ -12,12 +12,72 @@ if TYPE_CHECKING:
     from visioncal.frames.plane import Plane
     from visioncal.results import Calibration, Edge
 
+# Digits of the width or height of an image, and more than any has.
+_MOST_DIGITS = 6
 FORMS = (
     "z=20 (of the base, in mm), base_from_fixture or base_from_fixture:z=-5 (of a frame, whose z "
     "may point down: a board's points into it), or nx,ny,nz,d (a normal, and its product with any "
     "of the plane's points in mm)"
 )
 _LEAD = "base_from_"
+
+
+def numbers_in(words: str, option: str, form: str) -> tuple[float, ...]:
+    """Reads an option of numbers.
+
+    Args:
+        words: What the user wrote: `12.5,-3,0`.
+        option: The option's name, for messages.
+        form: What is needed, as names with commas between: `x,y,z`.
+
+    Raises:
+        DataError: It is not as many finite numbers.
+    """
+    try:
+        values = tuple(float(it) for it in words.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != len(form.split(",")) or not all(map(math.isfinite, values)):
+        raise DataError(
+            f"{option} is {words[:80]!r}; {form} is needed, numbers with commas between.",
+            culprits=[option],
+        )
+    return values
+
+
+def size_in(words: str) -> tuple[int, int]:
+    """Reads the width and height of images [px], written as 1280,800 or 1280x800.
+
+    Raises:
+        DataError: It is not two whole numbers above 0.
+    """
+    sides = words.replace("x", ",").split(",")
+    numbers = [
+        int(it) for it in sides if it.strip().isdecimal() and len(it.strip()) <= _MOST_DIGITS
+    ]
+    if len(sides) != 2 or len(numbers) != 2 or min(numbers) < 1:
+        raise DataError(
+            f"--resolution is {words[:40]!r}; width and height of the images are needed [px], two "
+            "whole numbers above 0, as 1280,800.",
+            culprits=["--resolution"],
+        )
+    return numbers[0], numbers[1]
+
+
+def refuse_given(options: Mapping[str, object], why: str, next_step: str = "Leave it out.") -> None:
+    """Refuses options that have no use here.
+
+    Args:
+        options: By their names; None for those that were not given.
+        why: They have none, in words.
+        next_step: What to do instead.
+
+    Raises:
+        DataError: One is given.
+    """
+    given = [name for name, value in options.items() if value is not None]
+    if given:
+        raise DataError(f"{some_of(given)}: {why}.", culprits=given, next_step=next_step)
 
 
 def plane_of(
