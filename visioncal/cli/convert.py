@@ -33,16 +33,15 @@ class ConvertOptions(RobotPoseOptions):
     """How somebody else wrote a recording."""
 
     form: Annotated[str | None, _other("--from", help=f"Its format, by name: {_FORMATS}.")] = None
-    mount: Annotated[CameraMount | None, _other("--mount", help="Where the camera is.")] = None
+    mount: Annotated[CameraMount | None, _other(help="Where the camera is.")] = None
     target: Annotated[
         str | None,
         _other(
-            "--target",
             help="A name in targets/, a .toml, or in one word as checkerboard_9x6_23.6mm, "
-            "charuco_5x7_36.2mm_18.3mm_DICT_6X6_250, marker_DICT_4X4_50_10_48mm.",
+            "charuco_5x7_36.2mm_18.3mm_DICT_6X6_250, marker_DICT_4X4_50_10_48mm."
         ),
     ] = None
-    tip: Annotated[str | None, _other("--tip", help="The frame that the poses are of.")] = None
+    tip: Annotated[str | None, _other(help="The frame that the poses are of.")] = None
     camera_columns: Annotated[
         str | None,
         poses_option(
@@ -51,12 +50,10 @@ class ConvertOptions(RobotPoseOptions):
             help="Columns or keys of measured poses of the target: rvec,tvec.",
         ),
     ] = None
-    camera_form: Annotated[str | None, poses_option("--camera-form", help="As --robot-form.")] = (
+    camera_form: Annotated[str | None, poses_option(help="As --robot-form.")] = None
+    camera_unit: Annotated[str | None, poses_option(metavar=UNITS, help="Of their positions.")] = (
         None
     )
-    camera_unit: Annotated[
-        str | None, poses_option("--camera-unit", metavar=UNITS, help="Of their positions.")
-    ] = None
     camera_inverse: Annotated[
         bool | None,
         poses_option("--camera-inverse/--camera-as-is", help="They give the camera in the target."),
@@ -64,17 +61,13 @@ class ConvertOptions(RobotPoseOptions):
     camera_file: Annotated[
         Path | None,
         poses_option(
-            "--camera-file",
             help="A second file with the camera's poses; with times in both, the clocks' offset is "
-            "found.",
+            "found."
         ),
     ] = None
     images: Annotated[
         Path | None,
-        _camera(
-            "--images",
-            help="The folder of the images; matched by name, by number, or in order.",
-        ),
+        _camera(help="The folder of the images; matched by name, by number, or in order."),
     ] = None
     image_column: Annotated[
         str | None,
@@ -87,14 +80,12 @@ class ConvertOptions(RobotPoseOptions):
     intrinsics: Annotated[
         str | None,
         _camera(
-            "--intrinsics",
             help="A file (ROS, OpenCV, Kalibr, ViSP, .npz, .json), or `estimate` to ignore those "
-            "of the source.",
+            "of the source."
         ),
     ] = None
     resolution: Annotated[
-        str | None,
-        _camera("--resolution", help="WIDTH,HEIGHT that the intrinsics hold for."),
+        str | None, _camera(help="WIDTH,HEIGHT that the intrinsics hold for.")
     ] = None
 
     def requested(self) -> "ImportOptions":

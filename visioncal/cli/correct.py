@@ -31,20 +31,15 @@ class CorrectOptions:
         ),
     ] = None
     payload_kg: Annotated[
-        float,
-        typer.Option("--payload-kg", help="What hangs on the flange, for joints that bend (kg)."),
+        float, typer.Option(help="What hangs on the flange, for joints that bend (kg).")
     ] = 0.0
     payload_m: Annotated[
-        str,
-        typer.Option(
-            "--payload-m", metavar="X,Y,Z", help="Where its centre is, in the flange's frame (m)."
-        ),
+        str, typer.Option(metavar="X,Y,Z", help="Where its centre is, in the flange's frame (m).")
     ] = "0,0,0"
     widest_deg: Annotated[
         float,
         typer.Option(
-            "--widest-deg",
-            help="Warn where a joint turns farther than this from one target to the next.",
+            help="Warn where a joint turns farther than this from one target to the next."
         ),
     ] = math.degrees(WIDEST_RAD)
     temperatures: Annotated[

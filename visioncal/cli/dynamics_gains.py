@@ -11,23 +11,14 @@ from visioncal.cli.options import AsJson, RobotName
 
 def dynamics_gains_command(
     session: MotionsArgument,
-    loaded: Annotated[
-        Path, typer.Option("--loaded", help="A session of the same arm with the body on it.")
-    ],
-    mass_kg: Annotated[float, typer.Option("--mass-kg", help="Of the body (kg).")],
+    loaded: Annotated[Path, typer.Option(help="A session of the same arm with the body on it.")],
+    mass_kg: Annotated[float, typer.Option(help="Of the body (kg).")],
     com_mm: Annotated[
-        str,
-        typer.Option(
-            "--com-mm", metavar="X,Y,Z", help="Its centre of mass in the flange's frame (mm)."
-        ),
+        str, typer.Option(metavar="X,Y,Z", help="Its centre of mass in the flange's frame (mm).")
     ],
     inertia: Annotated[
         str,
-        typer.Option(
-            "--inertia",
-            metavar="XX,XY,YY,XZ,YZ,ZZ",
-            help="Its inertia about that centre (kg m^2).",
-        ),
+        typer.Option(metavar="XX,XY,YY,XZ,YZ,ZZ", help="Its inertia about that centre (kg m^2)."),
     ] = "0,0,0,0,0,0",
     cutoff_hz: CutoffOption = None,
     named: RobotName = None,

@@ -34,14 +34,12 @@ class StreamOptions:
     """Which samples are taken, and how they become torques."""
 
     stream: Annotated[
-        list[str] | None,
-        typer.Option("--stream", help="A stream with torques; may be repeated. Default: all."),
+        list[str] | None, typer.Option(help="A stream with torques; may be repeated. Default: all.")
     ] = None
     cutoff_hz: CutoffOption = None
     gains: Annotated[
         str | None,
         typer.Option(
-            "--gains",
             metavar="K1,K2,...",
             help="Torque for a current, by joint [N m/A], where currents were recorded.",
         ),

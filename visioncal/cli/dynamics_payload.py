@@ -20,12 +20,7 @@ def dynamics_payload_command(
         ),
     ] = False,
     gains_sigma: Annotated[
-        float,
-        typer.Option(
-            "--gains-sigma",
-            min=0.0,
-            help="What each of the --gains is known to, in percent.",
-        ),
+        float, typer.Option(min=0.0, help="What each of the --gains is known to, in percent.")
     ] = 100.0 * GAIN_SIGMA,
     as_json: AsJson = False,
 ) -> None:

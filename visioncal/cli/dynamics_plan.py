@@ -20,90 +20,58 @@ _missing = partial(typer.Option, rich_help_panel="What its description lacks")
 class ExcitationOptions:
     """The motion."""
 
-    duration: Annotated[
-        float,
-        _motion("--duration", help="How long the exciting motion lasts, in s."),
-    ] = 20.0
-    harmonics: Annotated[int, _motion("--harmonics", help="Harmonics of that period.")] = 5
+    duration: Annotated[float, _motion(help="How long the exciting motion lasts, in s.")] = 20.0
+    harmonics: Annotated[int, _motion(help="Harmonics of that period.")] = 5
     friction: Annotated[
         str,
-        _motion(
-            "--friction",
-            help=f"What is to be identified besides inertias: {', '.join(FRICTION)}; or none.",
-        ),
+        _motion(help=f"What is to be identified besides inertias: {', '.join(FRICTION)}; or none."),
     ] = "coulomb,viscous,offset"
-    sweep_speeds: Annotated[
-        int,
-        _motion("--sweep-speeds", help="Speeds at which each joint sweeps."),
-    ] = 6
+    sweep_speeds: Annotated[int, _motion(help="Speeds at which each joint sweeps.")] = 6
     no_sweeps: Annotated[bool, _motion("--no-sweeps", help="The exciting motion alone.")] = False
     rate_hz: Annotated[
         float,
         _motion("--rate", min=1.0, max=4000.0, help="Rows a second of the tables."),
     ] = 500.0
     starts: Annotated[
-        int,
-        _motion(
-            "--starts",
-            help="Random motions to search from; more take longer and find better ones.",
-        ),
+        int, _motion(help="Random motions to search from; more take longer and find better ones.")
     ] = 4
     seconds: Annotated[
         float | None,
         _motion(
-            "--seconds",
             help="End the search after so many s of one core, once a motion is found; what is "
-            "found then depends on the computer.",
+            "found then depends on the computer."
         ),
     ] = None
-    seed: Annotated[
-        int,
-        _motion("--seed", min=0, help="Other random starts for every number."),
-    ] = 0
+    seed: Annotated[int, _motion(min=0, help="Other random starts for every number.")] = 0
 
 
 @dataclass(frozen=True)
 class ArmOptions:
     """What the arm may do, carries and lacks."""
 
-    speed: Annotated[float, _limits("--speed", help="Share of the greatest speeds.")] = 0.9
-    acceleration: Annotated[
-        float,
-        _limits("--acceleration", help="Share of the greatest accelerations."),
-    ] = 0.9
+    speed: Annotated[float, _limits(help="Share of the greatest speeds.")] = 0.9
+    acceleration: Annotated[float, _limits(help="Share of the greatest accelerations.")] = 0.9
     torque_margin: Annotated[
         float,
-        _limits(
-            "--torque-margin",
-            help="Torques may be so many times larger than the nominal inertias have them.",
-        ),
+        _limits(help="Torques may be so many times larger than the nominal inertias have them."),
     ] = 1.2
     tool: Annotated[
         str | None,
-        _limits(
-            "--tool",
-            metavar="LENGTH,RADIUS",
-            help="What sticks out of the flange, along its z, in mm.",
-        ),
+        _limits(metavar="LENGTH,RADIUS", help="What sticks out of the flange, along its z, in mm."),
     ] = None
     payload: Annotated[
         str | None,
         _limits(
-            "--payload",
             metavar="KG,X,Y,Z",
             help="What the flange carries: its mass, and its centre in the flange's frame in mm.",
         ),
     ] = None
     range_deg: Annotated[
-        float | None,
-        _missing("--range-deg", help="Range to either side of joints without limits."),
+        float | None, _missing(help="Range to either side of joints without limits.")
     ] = None
-    speed_deg: Annotated[
-        float | None, _missing("--speed-deg", help="Greatest speed, in deg/s.")
-    ] = None
+    speed_deg: Annotated[float | None, _missing(help="Greatest speed, in deg/s.")] = None
     acceleration_deg: Annotated[
-        float | None,
-        _missing("--acceleration-deg", help="Greatest acceleration, in deg/s^2."),
+        float | None, _missing(help="Greatest acceleration, in deg/s^2.")
     ] = None
 
 

@@ -39,9 +39,7 @@ def export_command(
     to: Annotated[
         str,
         typer.Option(
-            "--to",
-            metavar="FORMAT",
-            help=f"{', '.join(EXPORT_NAMES)}; --list says what each is.",
+            metavar="FORMAT", help=f"{', '.join(EXPORT_NAMES)}; --list says what each is."
         ),
     ],
     part: PartOptions,
@@ -49,34 +47,30 @@ def export_command(
     edge: Annotated[
         str | None,
         typer.Option(
-            "--edge",
             help="The transform; where none is named the camera's, the only tool or the only "
-            "fixture, as the format has it. Of an aligned cell any frame from any other, or all.",
+            "fixture, as the format has it. Of an aligned cell any frame from any other, or all."
         ),
     ] = None,
     inverse: Annotated[bool, typer.Option("--inverse", help="Write the inverse of it.")] = False,
     parent: Annotated[
-        str | None,
-        typer.Option("--parent", help="What to call the frame in which the pose is given."),
+        str | None, typer.Option(help="What to call the frame in which the pose is given.")
     ] = None,
     child: Annotated[
-        str | None, typer.Option("--child", help="What to call the frame whose pose it is.")
+        str | None, typer.Option(help="What to call the frame whose pose it is.")
     ] = None,
     number: Annotated[
-        int | None,
-        typer.Option("--number", help="Which of the controller's tools or bases it becomes."),
+        int | None, typer.Option(help="Which of the controller's tools or bases it becomes.")
     ] = None,
     mass_kg: Annotated[
-        float | None, typer.Option("--mass-kg", help="The tool's mass, for ABB's tooldata (kg).")
+        float | None, typer.Option(help="The tool's mass, for ABB's tooldata (kg).")
     ] = None,
     cog_mm: Annotated[
         tuple[float, float, float] | None,
-        typer.Option("--cog-mm", help="Its centre of mass in the flange's frame: X Y Z (mm)."),
+        typer.Option(help="Its centre of mass in the flange's frame: X Y Z (mm)."),
     ] = None,
     convention: Annotated[
         str | None,
         typer.Option(
-            "--convention",
             metavar="|".join(get_args(Convention)),
             help="robot-dh: of its joint table; modified is Craig's.",
         ),
@@ -87,9 +81,7 @@ def export_command(
     ] = None,
     onto: Annotated[
         Path | None,
-        typer.Option(
-            "--onto", help="oak: the device's own calibration JSON, of which all else is kept."
-        ),
+        typer.Option(help="oak: the device's own calibration JSON, of which all else is kept."),
     ] = None,
     with_corrections: Annotated[
         bool,

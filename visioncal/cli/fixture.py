@@ -33,19 +33,17 @@ def fixture_command(
     cad: Annotated[
         Path | None,
         typer.Option(
-            "--cad", help="A table of the drawing: point, x_mm, y_mm, z_mm (or x_m ...), sigma_mm."
+            help="A table of the drawing: point, x_mm, y_mm, z_mm (or x_m ...), sigma_mm."
         ),
     ] = None,
     cad_unit: Annotated[
-        str | None,
-        typer.Option("--cad-unit", metavar="|".join(UNITS_M), help="What x, y, z in it are in."),
+        str | None, typer.Option(metavar="|".join(UNITS_M), help="What x, y, z in it are in.")
     ] = None,
     tool: Annotated[
         str | None,
         typer.Option(
-            "--tool",
             help="What touched: a tool of the calibration, a file of frames (frames.json, or "
-            "frames.json:gripper), or none, where the poses are of the tip itself.",
+            "frames.json:gripper), or none, where the poses are of the tip itself."
         ),
     ] = None,
     point: PointOption = None,

@@ -45,9 +45,7 @@ class FrameOptions:
             help="A file of frames (.json) to put it into instead; made where missing.",
         ),
     ] = None
-    name: Annotated[str | None, typer.Option("--name", help="What to call it: gripper, jig_2.")] = (
-        None
-    )
+    name: Annotated[str | None, typer.Option(help="What to call it: gripper, jig_2.")] = None
     force: Force = False
 
 

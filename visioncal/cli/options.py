@@ -49,9 +49,9 @@ class PartOptions:
 
     camera: CameraName = None
     robot: RobotName = None
-    target: Annotated[
-        str | None, typer.Option("--target", help="Of a whole cell: which target, as floor.")
-    ] = None
+    target: Annotated[str | None, typer.Option(help="Of a whole cell: which target, as floor.")] = (
+        None
+    )
 
     @property
     def choice(self) -> "Choice":
@@ -68,14 +68,11 @@ class NeedOptions:
     need_mm: Annotated[
         float | None,
         typer.Option(
-            "--need-mm",
             help="How near picks have to come, in mm: the verdict is about it. In the place of "
-            "the need in session.toml.",
+            "the need in session.toml."
         ),
     ] = None
-    need_deg: Annotated[
-        float | None, typer.Option("--need-deg", help="The same in rotation, in degrees.")
-    ] = None
+    need_deg: Annotated[float | None, typer.Option(help="The same in rotation, in degrees.")] = None
 
     def session(self, path: Path) -> "Session":
         """Loads a session with that need.

@@ -30,45 +30,29 @@ class PlanOptions:
 
     add: Annotated[
         int | None,
-        _what(
-            "--add",
-            min=1,
-            max=500,
-            help="How many stops to add to a recorded session, which counts.",
-        ),
+        _what(min=1, max=500, help="How many stops to add to a recorded session, which counts."),
     ] = None
     purpose: Annotated[
         str,
         _what("--for", metavar="|".join(PURPOSES), help="What they are for."),
     ] = "hand-eye"
-    stops: Annotated[
-        int | None,
-        _what(
-            "--stops",
-            min=1,
-            max=500,
-            help=f"How many stops: {_USUAL_STOPS}.",
-        ),
-    ] = None
+    stops: Annotated[int | None, _what(min=1, max=500, help=f"How many stops: {_USUAL_STOPS}.")] = (
+        None
+    )
     criterion: Annotated[
         Criterion,
         _what(
-            "--criterion",
             help="I: mean variance of the places that count; D, A, E: of the unknowns; O1: of the "
-            "Jacobian.",
+            "Jacobian."
         ),
     ] = "I"
     wish_mm: Annotated[
-        float | None,
-        _what("--wish-mm", help="Fewer stops where they predict this sigma, in mm."),
+        float | None, _what(help="Fewer stops where they predict this sigma, in mm.")
     ] = None
-    wish_deg: Annotated[
-        float | None, _what("--wish-deg", help="The same of the rotation, in degrees.")
-    ] = None
+    wish_deg: Annotated[float | None, _what(help="The same of the rotation, in degrees.")] = None
     workspace: Annotated[
         str | None,
         _what(
-            "--workspace",
             metavar="X,Y,Z:SX,SY,SZ",
             help="Where the arm's place counts: a box by its centre in the base and its lengths, "
             "in mm; else all of its reach.",
@@ -77,25 +61,15 @@ class PlanOptions:
     start_joints: Annotated[
         str | None,
         _what(
-            "--start-joints",
             metavar="Q1,Q2,...",
             help="Where the arm stands now, in radians; else the way to the first stop is not "
             "looked at.",
         ),
     ] = None
     candidates: Annotated[
-        int,
-        _what(
-            "--candidates",
-            min=12,
-            max=20000,
-            help="From how many possible stops they are chosen.",
-        ),
+        int, _what(min=12, max=20000, help="From how many possible stops they are chosen.")
     ] = 1500
-    seed: Annotated[
-        int,
-        _what("--seed", min=0, help="Other possible stops for every number."),
-    ] = 0
+    seed: Annotated[int, _what(min=0, help="Other possible stops for every number.")] = 0
 
     def request(self, cell: "PlanCell") -> "Request":
         """The same, as the planner takes it.
@@ -128,36 +102,29 @@ class PlanOptions:
 class CellOptions:
     """What the user says of the cell; None for what is not said."""
 
-    robot: Annotated[
-        str | None,
-        _cell("--robot", help="The robot, where a session names none."),
-    ] = None
+    robot: Annotated[str | None, _cell(help="The robot, where a session names none.")] = None
     target: Annotated[
         str | None,
         _cell(
-            "--target",
             help="The board: a name in targets/, a .toml, or in one word as "
-            "checkerboard_9x6_23.6mm.",
+            "checkerboard_9x6_23.6mm."
         ),
     ] = None
     camera: Annotated[
         str | None,
         _cell(
-            "--camera",
             metavar="FX,FY,CX,CY | FILE",
             help="The lens: four numbers in pixels, a file of intrinsics, or an earlier "
             "calibration.",
         ),
     ] = None
     resolution: Annotated[
-        str | None,
-        _cell("--resolution", metavar="W,H", help="Size of the images in pixels."),
+        str | None, _cell(metavar="W,H", help="Size of the images in pixels.")
     ] = None
-    mount: Annotated[Mount | None, _cell("--mount", help="Where the camera is.")] = None
+    mount: Annotated[Mount | None, _cell(help="Where the camera is.")] = None
     cam: Annotated[
         str | None,
         _cell(
-            "--cam",
             metavar="'X Y Z RX RY RZ'",
             help="Rough place of the camera on the flange (or in the base), in mm and degrees: "
             "turned about the fixed axes x, then y, then z. It looks along its z.",
@@ -166,44 +133,25 @@ class CellOptions:
     board: Annotated[
         str | None,
         _cell(
-            "--board",
             metavar="'X Y Z RX RY RZ'",
             help="Rough place of the board in the base (or on the flange), in the same form. Its z "
             "points into the paper: face up is '... 180 0 0'.",
         ),
     ] = None
     guess_mm: Annotated[
-        float,
-        _doubt(
-            "--guess-mm",
-            min=0.1,
-            max=500.0,
-            help="How well both places are known, per axis.",
-        ),
+        float, _doubt(min=0.1, max=500.0, help="How well both places are known, per axis.")
     ] = 20.0
-    guess_deg: Annotated[
-        float,
-        _doubt(
-            "--guess-deg",
-            min=0.01,
-            max=45.0,
-            help="The same of their rotations.",
-        ),
-    ] = 5.0
+    guess_deg: Annotated[float, _doubt(min=0.01, max=45.0, help="The same of their rotations.")] = (
+        5.0
+    )
     noise_px: Annotated[
-        float | None,
-        _doubt("--noise-px", help="Of a corner in the image; else 0.1, or as recorded."),
+        float | None, _doubt(help="Of a corner in the image; else 0.1, or as recorded.")
     ] = None
     noise_mm: Annotated[
-        float | None,
-        _doubt(
-            "--noise-mm",
-            help="Of the robot at a stop, per axis; else 0.03, or as recorded.",
-        ),
+        float | None, _doubt(help="Of the robot at a stop, per axis; else 0.03, or as recorded.")
     ] = None
     noise_deg: Annotated[
-        float | None,
-        _doubt("--noise-deg", help="The same of its rotation; else 0.003, or as recorded."),
+        float | None, _doubt(help="The same of its rotation; else 0.003, or as recorded.")
     ] = None
 
     def options(self, *names: str) -> dict[str, object]:
@@ -225,30 +173,13 @@ class ClearanceOptions:
         ),
     ] = None
     floor: Annotated[
-        str,
-        _limits(
-            "--floor",
-            metavar="Z|none",
-            help="Height of the floor or table in the base, in mm.",
-        ),
+        str, _limits(metavar="Z|none", help="Height of the floor or table in the base, in mm.")
     ] = "0"
     clearance_mm: Annotated[
-        float,
-        _limits(
-            "--clearance-mm",
-            min=0.0,
-            max=1000.0,
-            help="Of the arm from floor, board, boxes and itself.",
-        ),
+        float, _limits(min=0.0, max=1000.0, help="Of the arm from floor, board, boxes and itself.")
     ] = 30.0
     margin_deg: Annotated[
-        float,
-        _limits(
-            "--margin-deg",
-            min=0.0,
-            max=90.0,
-            help="Of the joints from their limits.",
-        ),
+        float, _limits(min=0.0, max=90.0, help="Of the joints from their limits.")
     ] = 3.0
 
     @property
@@ -278,33 +209,20 @@ class SightOptions:
 
     tilt_deg: Annotated[
         float,
-        _limits(
-            "--tilt-deg",
-            min=5.0,
-            max=80.0,
-            help="Most between the line of sight and the board's normal.",
-        ),
+        _limits(min=5.0, max=80.0, help="Most between the line of sight and the board's normal."),
     ] = 50.0
     edge_px: Annotated[
-        float,
-        _limits(
-            "--edge-px",
-            min=0.0,
-            max=10000.0,
-            help="Of the board from the image's edge.",
-        ),
+        float, _limits(min=0.0, max=10000.0, help="Of the board from the image's edge.")
     ] = 20.0
     distance_mm: Annotated[
         str | None,
         _limits(
-            "--distance-mm",
             metavar="NEAR,FAR",
             help="Of the camera from the board; else as the board fills the image.",
         ),
     ] = None
     focus_mm: Annotated[
-        str | None,
-        _limits("--focus-mm", metavar="NEAR,FAR", help="Depths at which images are sharp."),
+        str | None, _limits(metavar="NEAR,FAR", help="Depths at which images are sharp.")
     ] = None
 
     def limits(self, kept: ClearanceOptions) -> "Limits":

@@ -27,7 +27,6 @@ def record_command(
     arm: Annotated[
         str,
         typer.Option(
-            "--arm",
             metavar="ur:HOST|manual",
             help="The arm: a UR by its address, or poses that you type from the pendant.",
         ),
@@ -35,7 +34,6 @@ def record_command(
     camera: Annotated[
         str,
         typer.Option(
-            "--camera",
             metavar="oak|uvc:N|uvc:URL|folder:PATH",
             help="The camera: an OAK (oak:SERIAL for one of several), a webcam, a network "
             "camera's stream, or pictures that were taken already.",
@@ -45,8 +43,7 @@ def record_command(
     takes: TakingOptions,
     device: DeviceOptions,
     plan: Annotated[
-        Path | None,
-        typer.Option("--plan", help="What visioncal plan wrote: a folder, or its plan.json."),
+        Path | None, typer.Option(help="What visioncal plan wrote: a folder, or its plan.json.")
     ] = None,
     follow: Annotated[
         bool,
@@ -55,12 +52,7 @@ def record_command(
         ),
     ] = False,
     views: Annotated[
-        int,
-        typer.Option(
-            "--views",
-            min=0,
-            help="With --follow or a manual arm: end after so many.",
-        ),
+        int, typer.Option(min=0, help="With --follow or a manual arm: end after so many.")
     ] = 0,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with a recording that was ended or cut off.")

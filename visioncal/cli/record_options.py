@@ -27,25 +27,20 @@ class CellOptions:
     target: Annotated[
         str | None,
         _cell(
-            "--target",
             help="The board: a name in targets/, a .toml, or in one word as "
-            "checkerboard_9x6_23.6mm.",
+            "checkerboard_9x6_23.6mm."
         ),
     ] = None
     robot: Annotated[
-        str | None,
-        _cell("--robot", help="The robot's model: a built-in name, a .urdf or .toml."),
+        str | None, _cell(help="The robot's model: a built-in name, a .urdf or .toml.")
     ] = None
     mount: Annotated[
-        CameraMount | None,
-        _cell("--mount", help="Where the camera is; eye-in-hand if nothing is said."),
+        CameraMount | None, _cell(help="Where the camera is; eye-in-hand if nothing is said.")
     ] = None
     pose_form: Annotated[
         str | None,
         _cell(
-            "--pose-form",
-            metavar="|".join(("ours", *POSE_FORMS)),
-            help="With a manual arm: how poses are typed.",
+            metavar="|".join(("ours", *POSE_FORMS)), help="With a manual arm: how poses are typed."
         ),
     ] = None
 
@@ -54,36 +49,18 @@ class CellOptions:
 class TakingOptions:
     """How views are taken."""
 
-    frames: Annotated[
-        int,
-        _taking("--frames", min=1, max=100, help="Frames a view."),
-    ] = 3
-    keep: Annotated[
-        Keep,
-        _taking("--keep", help="The sharpest of these, or their mean."),
-    ] = "sharpest"
+    frames: Annotated[int, _taking(min=1, max=100, help="Frames a view.")] = 3
+    keep: Annotated[Keep, _taking(help="The sharpest of these, or their mean.")] = "sharpest"
     still_px: Annotated[
-        float,
-        _taking(
-            "--still-px",
-            min=0.01,
-            max=10.0,
-            help="Image motion over which nothing is taken.",
-        ),
+        float, _taking(min=0.01, max=10.0, help="Image motion over which nothing is taken.")
     ] = Stillness.image_px
     settle_s: Annotated[
         float,
-        _taking(
-            "--settle-s",
-            min=0.0,
-            max=30.0,
-            help="How long arm and image must have been still before.",
-        ),
+        _taking(min=0.0, max=30.0, help="How long arm and image must have been still before."),
     ] = Stillness.quiet_s
-    speed: Annotated[
-        float,
-        _moving("--speed", help="Of the fastest joint, in rad/s; at most 1.5."),
-    ] = PLAN_SPEED
+    speed: Annotated[float, _moving(help="Of the fastest joint, in rad/s; at most 1.5.")] = (
+        PLAN_SPEED
+    )
 
     def options(self, *, single: bool, lost: int) -> CaptureOptions:
         """The same, as a recording takes it.
@@ -107,16 +84,11 @@ class DeviceOptions:
     """What the camera is set to."""
 
     resolution: Annotated[
-        str | None,
-        _camera("--resolution", metavar="W,H", help="Size of the images in pixels."),
+        str | None, _camera(metavar="W,H", help="Size of the images in pixels.")
     ] = None
-    exposure_us: Annotated[
-        int | None, _camera("--exposure-us", help="Exposure time in microseconds.")
-    ] = None
-    gain: Annotated[int | None, _camera("--gain", help="ISO, or the device's own unit.")] = None
-    focus: Annotated[
-        int | None, _camera("--focus", help="Lens position, in the device's own unit.")
-    ] = None
+    exposure_us: Annotated[int | None, _camera(help="Exposure time in microseconds.")] = None
+    gain: Annotated[int | None, _camera(help="ISO, or the device's own unit.")] = None
+    focus: Annotated[int | None, _camera(help="Lens position, in the device's own unit.")] = None
 
     def setup(self) -> "DeviceSetup":
         """The same, as drivers take it.

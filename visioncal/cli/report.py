@@ -38,12 +38,10 @@ def report_command(
     certificate: Annotated[
         bool, typer.Option("--certificate", help="One page to print and sign, instead.")
     ] = False,
-    operator: Annotated[
-        str, typer.Option("--operator", help="With --certificate: who calibrated.")
-    ] = "",
+    operator: Annotated[str, typer.Option(help="With --certificate: who calibrated.")] = "",
     serial: Annotated[
         list[str] | None,
-        typer.Option("--serial", metavar="WHAT=NUMBER", help="With --certificate, as camera=1234."),
+        typer.Option(metavar="WHAT=NUMBER", help="With --certificate, as camera=1234."),
     ] = None,
     recompute: Annotated[
         bool,

@@ -32,8 +32,7 @@ def review_command(
         bool, typer.Option("--no-open", help="With --web: print the URL and open no browser.")
     ] = False,
     view: Annotated[
-        int | None,
-        typer.Option("--view", help="The number of the view to open it at. Default: the worst."),
+        int | None, typer.Option(help="The number of the view to open it at. Default: the worst.")
     ] = None,
 ) -> None:
     """Open a recording in the rerun viewer, on this machine alone.

@@ -39,24 +39,20 @@ def touch_test_command(
     tool: Annotated[
         str | None,
         typer.Option(
-            "--tool",
             help="Which tool of the calibration has the tip, see tcp; none: the flange itself. "
-            "Without this its only tool, or the flange where it has none.",
+            "Without this its only tool, or the flange where it has none."
         ),
     ] = None,
     height_mm: Annotated[
-        float, typer.Option("--height-mm", min=1.0, max=1000.0, help="To hover at, first.")
+        float, typer.Option(min=1.0, max=1000.0, help="To hover at, first.")
     ] = 50.0,
     gaps_mm: Annotated[
         str | None,
-        typer.Option(
-            "--gaps-mm", metavar="A,B,C,D,E", help="Tip to point, as measured, in their order."
-        ),
+        typer.Option(metavar="A,B,C,D,E", help="Tip to point, as measured, in their order."),
     ] = None,
     drive: Annotated[
         str | None,
         typer.Option(
-            "--drive",
             metavar="ur:HOST",
             help="Bring the tip above each point by this arm, slowly; the rest is by hand.",
         ),

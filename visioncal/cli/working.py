@@ -16,9 +16,7 @@ class WorkOptions:
     threads: Annotated[
         int | None,
         typer.Option(
-            "--threads",
-            min=1,
-            help="Images searched at a time; one a core where left out. No result changes.",
+            min=1, help="Images searched at a time; one a core where left out. No result changes."
         ),
     ] = None
     keep_corners: Annotated[
@@ -38,9 +36,8 @@ class WorkOptions:
     images: Annotated[
         ImagesKept,
         typer.Option(
-            "--images",
             help=f"What {RECORDING} keeps of them: full, so that it is the whole session; faint "
-            "copies to look at; or none. Their digests are kept in any case.",
+            "copies to look at; or none. Their digests are kept in any case."
         ),
     ] = "full"
 
