@@ -17,7 +17,7 @@ from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Verdict
 from visioncal.core.version import __version__
 from visioncal.estimation.tree import Branch, Step, Tree
-from visioncal.results.codec import KEPT, read, reading, write
+from visioncal.results.codec import KEPT, names_but, read, reading, write
 from visioncal.results.edge import Edge, JointCovariance, StoredEdge
 from visioncal.results.frame import Frame
 from visioncal.results.lens import CameraResult, StoredCamera
@@ -331,19 +331,8 @@ class AlignmentForm:
 
 
 # Fields that an alignment has under the same names.
-_SAME = (
-    "created",
-    "reference",
-    "frames",
-    "robots",
-    "cameras",
-    "noise",
-    "moved",
-    "untied",
-    "weakest",
-    "verdict",
-    "need",
-    "details",
+_SAME = names_but(
+    AlignmentForm, "schema visioncal session transforms joint_covariance observations"
 )
 
 

@@ -140,6 +140,11 @@ def entries(cls: type) -> tuple[Entry, ...]:
     return tuple(sorted(found, key=lambda it: REST not in it.marks))
 
 
+def names_but(cls: type, others: str) -> tuple[str, ...]:
+    """The names of a dataclass' fields, but for some, with blanks between."""
+    return tuple(it.name for it in fields(cls) if it.name not in others.split())
+
+
 def write(cls: type, value: object) -> dict[str, Any]:
     """Writes the fields that a dataclass has.
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from visioncal.core.types import Mount
 from visioncal.core.version import __version__
 from visioncal.results.arm import StoredRobot
-from visioncal.results.codec import read, read_fields, write
+from visioncal.results.codec import names_but, read, read_fields, write
 from visioncal.results.edge import JointCovariance, StoredEdge
 from visioncal.results.frame import Frame
 from visioncal.results.lens import StoredCamera
@@ -85,20 +85,7 @@ class CalibrationForm:
 
 
 # Fields that a calibration has under the same names.
-_SAME = (
-    "created",
-    "mount",
-    "solvers",
-    "camera",
-    "robot",
-    "noise",
-    "views",
-    "rms",
-    "validation",
-    "verdict",
-    "need",
-    "frames",
-)
+_SAME = names_but(CalibrationForm, "schema visioncal session transforms joint_covariance ray_frame")
 
 
 def to_document(calibration: "Calibration") -> dict[str, Any]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from visioncal.core.version import __version__
 from visioncal.results.alignment import Alignment, Moved, Sight, Untied
-from visioncal.results.codec import INLINE, KEPT, read, read_fields, write
+from visioncal.results.codec import INLINE, KEPT, names_but, read, read_fields, write
 from visioncal.results.edge import JointCovariance, StoredEdge
 from visioncal.results.frame import Frame
 from visioncal.results.lens import StoredCamera
@@ -185,17 +185,10 @@ class CellForm:
 
 
 # Fields that a cell has under the same names.
-_SAME = (
-    "created",
-    "reference",
-    "targets",
-    "noise",
-    "moved",
-    "untied",
-    "weakest",
-    "verdict",
-    "need",
-    "details",
+_SAME = names_but(
+    CellForm,
+    "schema visioncal session tree transforms joint_covariance cameras robots views rms "
+    "validation frames",
 )
 
 

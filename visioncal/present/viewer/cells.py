@@ -1,12 +1,18 @@
 """The layout in which the rerun viewer opens the recording of an aligned cell."""
 
 import numpy as np
-import rerun as rr
 import rerun.blueprint as rrb
 
 from visioncal.present.recording import paths
 from visioncal.present.recording.cells import residual_entity
-from visioncal.present.viewer.layout import eye_on, verdict_views
+from visioncal.present.viewer.layout import (
+    eye_on,
+    image_view,
+    series,
+    space_view,
+    verdict_views,
+    with_panels,
+)
 from visioncal.results import Alignment
 from visioncal.session import Session
 
@@ -24,9 +30,7 @@ def cell_blueprint(session: Session, found: Alignment) -> rrb.Blueprint:
     has_images = any(view.image for view in session.views)
     verdict = verdict_views(found.verdict)
     note = rrb.TextDocumentView(name="This view", origin=paths.VIEW_NOTE)
-    image = rrb.Spatial2DView(
-        name="Image", origin=paths.IMAGE, contents=["$origin/**"], visual_bounds=_bounds(found)
-    )
+    image = image_view("Image", paths.IMAGE, _bounds(found))
     right = (
         rrb.Vertical(verdict, image, note, row_shares=[3.7, 3.8, 1.4])
         if has_images
@@ -37,22 +41,12 @@ def cell_blueprint(session: Session, found: Alignment) -> rrb.Blueprint:
     seers = list(dict.fromkeys(it.seer for it in found.sights))
     residuals = rrb.Vertical(
         *(
-            rrb.TimeSeriesView(
-                name=f"{seer}: residual [mm]; red: not used",
-                origin=residual_entity(seer, "").rstrip("/"),
-                contents=["$origin/**"],
-                plot_legend=rrb.PlotLegend(visible=False),
-            )
-            for seer in seers
+            series(f"{it}: residual [mm]; red: not used", residual_entity(it, "").rstrip("/"))
+            for it in seers
         ),
         name="Residuals",
     )
-    return rrb.Blueprint(
-        rrb.Tabs(overview, network, residuals, active_tab=0),
-        rrb.TimePanel(state=rrb.PanelState.Collapsed, timeline=paths.TIMELINE, play_state="paused"),
-        rrb.SelectionPanel(state=rrb.PanelState.Collapsed),
-        rrb.BlueprintPanel(state=rrb.PanelState.Collapsed),
-    )
+    return with_panels(rrb.Tabs(overview, network, residuals, active_tab=0))
 
 
 def _bounds(found: Alignment) -> rrb.VisualBounds2D | None:
@@ -69,12 +63,6 @@ def _cell(found: Alignment) -> rrb.Spatial3DView:
         found.edge_of(it).matrix[:3, 3] for it, on in found.frames.items() if on == paths.CELL_FRAME
     ]
     entities = (paths.CELL, paths.ROBOTS, paths.SIGHT_LINE)
-    return rrb.Spatial3DView(
-        name="Cell",
-        origin="/",
-        contents=[*(f"+ {it}/**" for it in entities), f"+ {paths.IMAGE}"],
-        eye_controls=eye_on(np.array([np.zeros(3), *places]), _DISTANCE),
-        spatial_information=rrb.SpatialInformation(
-            paths.CELL_FRAME, axes=rr.ViewCoordinates.RIGHT_HAND_Z_UP
-        ),
-    )
+    contents = [*(f"+ {it}/**" for it in entities), f"+ {paths.IMAGE}"]
+    eye = eye_on(np.array([np.zeros(3), *places]), _DISTANCE)
+    return space_view("Cell", contents, eye, paths.CELL_FRAME)

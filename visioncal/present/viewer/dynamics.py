@@ -1,12 +1,11 @@
 """The layout in which the rerun viewer opens the recording of a dynamic identification."""
 
 import numpy as np
-import rerun as rr
 import rerun.blueprint as rrb
 
 from visioncal.dynamics import Run
 from visioncal.present.recording import paths
-from visioncal.present.viewer.layout import eye_on
+from visioncal.present.viewer.layout import eye_on, series, space_view, with_panels
 
 
 def dynamics_blueprint(run: Run) -> rrb.Blueprint:
@@ -19,35 +18,21 @@ def dynamics_blueprint(run: Run) -> rrb.Blueprint:
         The layout, to be written into the recording.
     """
     tabs = rrb.Tabs(_overview(run), _figures(), active_tab=0)
-    return rrb.Blueprint(
-        tabs,
-        rrb.TimePanel(
-            state=rrb.PanelState.Collapsed, timeline=paths.MOTION_TIMELINE, play_state="paused"
-        ),
-        rrb.SelectionPanel(state=rrb.PanelState.Collapsed),
-        rrb.BlueprintPanel(state=rrb.PanelState.Collapsed),
-    )
+    return with_panels(tabs, paths.MOTION_TIMELINE)
 
 
 def _overview(run: Run) -> rrb.Container:
     robot = run.identified.robot
     joints, names = range(robot.joint_count), robot.joint_names
-    torques = [_series(f"{names[it]} [N m]", paths.of_joint(paths.TORQUES, it)) for it in joints]
+    torques = [series(f"{names[it]} [N m]", paths.of_joint(paths.TORQUES, it)) for it in joints]
     q = np.concatenate([it.q for it in run.predictions])
     flange = robot.base_from_flange(q)[:, :3, 3]
-    arm = rrb.Spatial3DView(
-        name="The arm as it moved",
-        origin="/",
-        contents=[f"+ {paths.BASE}/**", f"+ {paths.ROBOT}/**"],
-        eye_controls=eye_on(np.array([np.zeros(3), *flange])),
-        spatial_information=rrb.SpatialInformation(
-            paths.BASE_FRAME, axes=rr.ViewCoordinates.RIGHT_HAND_Z_UP
-        ),
-    )
+    contents = [f"+ {paths.BASE}/**", f"+ {paths.ROBOT}/**"]
+    arm = space_view("The arm as it moved", contents, eye_on(np.array([np.zeros(3), *flange])))
     left = rrb.Vertical(
         arm,
-        _series("Error of all joints [N m]", paths.TORQUE_ERRORS),
-        _series("Speeds [rad/s]", paths.SPEEDS),
+        series("Error of all joints [N m]", paths.TORQUE_ERRORS),
+        series("Speeds [rad/s]", paths.SPEEDS),
         row_shares=[2, 1, 1],
     )
     return rrb.Horizontal(
@@ -63,13 +48,4 @@ def _figures() -> rrb.Container:
         rrb.TextDocumentView(name="How well torques are predicted", origin=paths.DYNAMICS_NOTE),
         rrb.TextDocumentView(name="Base parameters", origin=paths.PARAMETERS_NOTE),
         name="Figures",
-    )
-
-
-def _series(name: str, entity: str) -> rrb.TimeSeriesView:
-    return rrb.TimeSeriesView(
-        name=name,
-        origin=entity,
-        contents=["$origin/**"],
-        plot_legend=rrb.PlotLegend(visible=False),
     )

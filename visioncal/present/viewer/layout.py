@@ -1,5 +1,6 @@
 """The layout in which the rerun viewer opens a recording."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,26 +75,59 @@ def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.B
         ),
         active_tab=0,
     )
+    return with_panels(tabs)
+
+
+def with_panels(content: rrb.Container, timeline: str = paths.TIMELINE) -> rrb.Blueprint:
+    """A layout whose panels are folded, paused at the start of a timeline."""
+    folded = rrb.PanelState.Collapsed
     return rrb.Blueprint(
-        tabs,
-        rrb.TimePanel(state=rrb.PanelState.Collapsed, timeline=paths.TIMELINE, play_state="paused"),
-        rrb.SelectionPanel(state=rrb.PanelState.Collapsed),
-        rrb.BlueprintPanel(state=rrb.PanelState.Collapsed),
+        content,
+        rrb.TimePanel(state=folded, timeline=timeline, play_state="paused"),
+        rrb.SelectionPanel(state=folded),
+        rrb.BlueprintPanel(state=folded),
+    )
+
+
+def space_view(
+    name: str,
+    contents: Sequence[str],
+    eye: rrb.EyeControls3D | None = None,
+    frame: str = paths.BASE_FRAME,
+) -> rrb.Spatial3DView:
+    """Entities in space, with z upwards."""
+    return rrb.Spatial3DView(
+        name=name,
+        origin="/",
+        contents=contents,
+        eye_controls=eye,
+        spatial_information=rrb.SpatialInformation(frame, axes=rr.ViewCoordinates.RIGHT_HAND_Z_UP),
+    )
+
+
+def image_view(
+    name: str, entity: str, bounds: rrb.VisualBounds2D | None = None
+) -> rrb.Spatial2DView:
+    """An entity in a plane, with all that is drawn over it."""
+    return rrb.Spatial2DView(
+        name=name, origin=entity, contents=["$origin/**"], visual_bounds=bounds
+    )
+
+
+def series(name: str, entity: str) -> rrb.TimeSeriesView:
+    """The curves of an entity, without a legend, which would hide some of them."""
+    return rrb.TimeSeriesView(
+        name=name,
+        origin=entity,
+        contents=["$origin/**"],
+        plot_legend=rrb.PlotLegend(visible=False),
     )
 
 
 def _overview(
     contents: _Contents, eye: rrb.EyeControls3D | None, found: Verdict | None
 ) -> rrb.Container:
-    cell = rrb.Spatial3DView(
-        name="Cell",
-        origin="/",
-        contents=_cell_contents(contents),
-        eye_controls=eye,
-        spatial_information=rrb.SpatialInformation(
-            paths.BASE_FRAME, axes=rr.ViewCoordinates.RIGHT_HAND_Z_UP
-        ),
-    )
+    cell = space_view("Cell", _cell_contents(contents), eye)
     plots = _plots(contents)
     left = rrb.Vertical(cell, rrb.Horizontal(*plots[:1], *plots[1:][-1:]), row_shares=[3, 1])
     verdict = _verdict(contents, found)
@@ -101,11 +135,7 @@ def _overview(
     if not contents.images:
         right = rrb.Vertical(verdict, note, row_shares=[2, 1])
         return rrb.Horizontal(left, right, name="Overview", column_shares=[1.3, 1])
-    image = rrb.Spatial2DView(
-        name="Image: green detected, blue predicted, red residual",
-        origin=paths.IMAGE,
-        contents=["$origin/**"],
-    )
+    image = image_view("Image: green detected, blue predicted, red residual", paths.IMAGE)
     right = rrb.Vertical(verdict, image, note, row_shares=[3.7, 4.2, 1.5])
     return rrb.Horizontal(left, right, name="Overview", column_shares=[1.2, 1])
 
@@ -139,45 +169,18 @@ def _arm(found: ArmResult, eye: rrb.EyeControls3D | None) -> rrb.Container:
     """The accuracy of the calibrated arm, how views left out speak for it, and its parameters."""
     # The places are all around the base, farther out than the views.
     wider = eye_on(found.map_places_m, MAP_DISTANCE) if found.workspace_map else eye
-    cell = rrb.Spatial3DView(
-        name="Sigma of a tool's place over the workspace",
-        origin="/",
-        contents=[
-            f"+ {paths.BASE}/**",
-            f"+ {paths.ROBOT}/**",
-            f"+ {paths.STOPS}/{paths.USED}",
-            f"+ {paths.WORKSPACE}/**",
-            f"+ {paths.NOMINAL_ARM}/**",
-        ],
-        eye_controls=wider,
-        spatial_information=rrb.SpatialInformation(
-            paths.BASE_FRAME, axes=rr.ViewCoordinates.RIGHT_HAND_Z_UP
-        ),
-    )
+    places = (paths.BASE, paths.ROBOT, paths.WORKSPACE, paths.NOMINAL_ARM)
+    contents = [*(f"+ {it}/**" for it in places), f"+ {paths.STOPS}/{paths.USED}"]
+    cell = space_view("Sigma of a tool's place over the workspace", contents, wider)
     note = rrb.TextDocumentView(name="The arm", origin=paths.ARM_NOTE)
     if not found.left_out:
         return rrb.Horizontal(cell, note, name="Arm", column_shares=[1.4, 1])
     # What else there is to say stands in the note; a title has little room.
     words = "orange: as stated, blue: calibrated"
-    unseen = rrb.Horizontal(
-        *(
-            rrb.TimeSeriesView(
-                name=name,
-                origin=entity,
-                contents=["$origin/**"],
-                plot_legend=rrb.PlotLegend(visible=False),
-            )
-            for name, entity in (
-                (f"Left out [mm], {words}", paths.UNSEEN_MM),
-                *(
-                    [(f"Left out [deg], {words}", paths.UNSEEN_DEG)]
-                    if found.nominal.held_out_deg is not None
-                    else []
-                ),
-            )
-        )
-    )
-    left = rrb.Vertical(cell, unseen, row_shares=[2.4, 1])
+    unseen = [series(f"Left out [mm], {words}", paths.UNSEEN_MM)]
+    if found.nominal.held_out_deg is not None:
+        unseen.append(series(f"Left out [deg], {words}", paths.UNSEEN_DEG))
+    left = rrb.Vertical(cell, rrb.Horizontal(*unseen), row_shares=[2.4, 1])
     return rrb.Horizontal(left, note, name="Arm", column_shares=[1.4, 1])
 
 
@@ -225,11 +228,7 @@ def _coverage(contents: _Contents) -> rrb.Container:
         return rrb.Horizontal(axes, name="Coverage")
     if not contents.images:
         return rrb.Horizontal(directions, axes, name="Coverage")
-    image = rrb.Spatial2DView(
-        name="Corners of all views in the image",
-        origin=paths.IMAGE_COVERAGE,
-        contents=["$origin/**"],
-    )
+    image = image_view("Corners of all views in the image", paths.IMAGE_COVERAGE)
     return rrb.Horizontal(
         image, rrb.Vertical(directions, axes), name="Coverage", column_shares=[1.6, 1]
     )
@@ -254,12 +253,7 @@ def _disc(name: str, entity: str, rings_deg: tuple[int, ...]) -> rrb.Spatial2DVi
     """A chart of directions, with room for the words around its rim."""
     reach_deg = 1.2 * rings_deg[-1]
     bounds = rrb.VisualBounds2D(x_range=(-reach_deg, reach_deg), y_range=(-reach_deg, reach_deg))
-    return rrb.Spatial2DView(
-        name=f"{name} (rings: {rings_deg[0]}\N{DEGREE SIGN})",
-        origin=entity,
-        contents=["$origin/**"],
-        visual_bounds=bounds,
-    )
+    return image_view(f"{name} (rings: {rings_deg[0]}\N{DEGREE SIGN})", entity, bounds)
 
 
 def _eye(session: Session, calibration: Calibration | None) -> rrb.EyeControls3D | None:
@@ -308,12 +302,4 @@ def _plots(contents: _Contents) -> list[rrb.TimeSeriesView]:
         wanted.append(("Reprojection error [px]", paths.REPROJECTION_PX))
     # A legend would hide the marks at the top and at the bottom, of just these views.
     legend = "; red: not used, \N{BLACK UP-POINTING TRIANGLE} off scale" if contents.unused else ""
-    return [
-        rrb.TimeSeriesView(
-            name=f"{name}{legend}",
-            origin=entity,
-            contents=["$origin/**"],
-            plot_legend=rrb.PlotLegend(visible=False),
-        )
-        for name, entity in wanted
-    ]
+    return [series(f"{name}{legend}", entity) for name, entity in wanted]

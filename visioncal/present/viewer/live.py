@@ -10,7 +10,8 @@ import rerun.blueprint as rrb
 
 from visioncal.core.errors import DriverError
 from visioncal.present.recording import paths
-from visioncal.present.viewer.process import viewer_process
+from visioncal.present.viewer.layout import image_view, space_view
+from visioncal.present.viewer.process import free_port, viewer_process
 
 _HOST = "127.0.0.1"
 # A viewer that does not listen by then is not coming [s].
@@ -32,9 +33,7 @@ def live_viewer(name: str) -> Iterator[rr.RecordingStream]:
     Raises:
         DriverError: It cannot be shown here.
     """
-    with socket.socket() as free:
-        free.bind((_HOST, 0))
-        port = free.getsockname()[1]
+    port = free_port()
     with viewer_process("--bind", _HOST, "--port", str(port)) as process:
         until = time.monotonic() + _PATIENCE_S
         while process.poll() is None and time.monotonic() < until and not _listens(port):
@@ -60,31 +59,11 @@ def live_viewer(name: str) -> Iterator[rr.RecordingStream]:
 
 def live_blueprint() -> rrb.Blueprint:
     """The layout of a recording at work: image and cell, coverage and predicted sigma."""
-    image = rrb.Spatial2DView(name="This view", origin=paths.IMAGE, contents=["$origin/**"])
-    cell = rrb.Spatial3DView(
-        name="Cell: views so far in blue",
-        origin="/",
-        contents=[
-            *(
-                f"+ {it}/**"
-                for it in (
-                    paths.BASE,
-                    paths.ROBOT,
-                    paths.FLANGE,
-                    paths.CAMERA,
-                    paths.TARGET,
-                    paths.STOPS,
-                )
-            ),
-            f"- {paths.DETECTED}/**",
-        ],
-        spatial_information=rrb.SpatialInformation(
-            paths.BASE_FRAME, axes=rr.ViewCoordinates.RIGHT_HAND_Z_UP
-        ),
-    )
-    covered = rrb.Spatial2DView(
-        name="What corners have reached", origin=paths.IMAGE_COVERAGE, contents=["$origin/**"]
-    )
+    entities = (paths.BASE, paths.ROBOT, paths.FLANGE, paths.CAMERA, paths.TARGET, paths.STOPS)
+    shown = [*(f"+ {it}/**" for it in entities), f"- {paths.DETECTED}/**"]
+    cell = space_view("Cell: views so far in blue", shown)
+    image = image_view("This view", paths.IMAGE)
+    covered = image_view("What corners have reached", paths.IMAGE_COVERAGE)
     sigma = rrb.TimeSeriesView(name="Predicted sigma [mm]", origin=paths.LIVE_SIGMA)
     note = rrb.TextDocumentView(name="This view", origin=paths.LIVE_NOTE)
     return rrb.Blueprint(

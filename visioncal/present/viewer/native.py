@@ -1,6 +1,5 @@
 """A recording in rerun's native viewer."""
 
-import socket
 import time
 from pathlib import Path
 from subprocess import Popen
@@ -10,7 +9,7 @@ from rerun.experimental import ViewerClient
 
 from visioncal.core.errors import DriverError
 from visioncal.present.recording import paths
-from visioncal.present.viewer.process import until_interrupted, viewer_process
+from visioncal.present.viewer.process import free_port, until_interrupted, viewer_process
 
 # How long a recording is waited for, and how often it is asked for.
 _PATIENCE_S, _AGAIN_S = 60.0, 0.2
@@ -27,7 +26,7 @@ def review_native(recording: Path, row: int | None = None) -> None:
         DriverError: The viewer cannot be shown here.
     """
     # The viewer listens to other programs, on this machine only.
-    port = _free_port()
+    port = free_port()
     arguments = ("--bind", "127.0.0.1", "--port", str(port), str(recording.absolute()))
     with until_interrupted(), viewer_process(*arguments) as process:
         if row is not None:
@@ -39,12 +38,6 @@ def review_native(recording: Path, row: int | None = None) -> None:
                 f"rerun's viewer ended with status {process.returncode}: {last[0]}.",
                 next_step="Without a display, show the recording in a browser: --web.",
             )
-
-
-def _free_port() -> int:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
 
 
 def _seek(process: Popen[str], port: int, row: int) -> None:

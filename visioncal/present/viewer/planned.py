@@ -1,14 +1,21 @@
 """The layouts in which the rerun viewer opens the preview of a plan, of stops or of motions."""
 
 import numpy as np
-import rerun as rr
 import rerun.blueprint as rrb
 
 from visioncal.core.types import FloatArray
 from visioncal.present.recording import paths
 from visioncal.present.recording.motions import MotionPreview
 from visioncal.present.recording.preview import Preview
-from visioncal.present.viewer.layout import EYE_DISTANCE, MAP_DISTANCE, disc_views, eye_on
+from visioncal.present.viewer.layout import (
+    EYE_DISTANCE,
+    MAP_DISTANCE,
+    disc_views,
+    eye_on,
+    image_view,
+    space_view,
+    with_panels,
+)
 
 _TITLES = {
     "position_deg": "Joint angles [deg]",
@@ -33,12 +40,7 @@ def plan_blueprint(preview: Preview) -> rrb.Blueprint:
     tabs = [_overview(places), _coverage()]
     if len(preview.places_m):
         tabs.insert(1, _workspace(preview))
-    return rrb.Blueprint(
-        rrb.Tabs(*tabs, active_tab=0),
-        rrb.TimePanel(state=rrb.PanelState.Collapsed, timeline=paths.TIMELINE, play_state="paused"),
-        rrb.SelectionPanel(state=rrb.PanelState.Collapsed),
-        rrb.BlueprintPanel(state=rrb.PanelState.Collapsed),
-    )
+    return with_panels(rrb.Tabs(*tabs, active_tab=0))
 
 
 def _cell(
@@ -53,28 +55,15 @@ def _cell(
         paths.OBSTACLES,
         *more,
     )
-    return rrb.Spatial3DView(
-        name=name,
-        origin="/",
-        # The predicted corners would float as a crowd of points in the frustum.
-        contents=[
-            *(f"+ {it}/**" for it in entities),
-            f"- {paths.IMAGE}/**",
-            f"+ {paths.IMAGE}",
-        ],
-        eye_controls=eye_on(places, distance),
-        spatial_information=rrb.SpatialInformation(
-            paths.BASE_FRAME, axes=rr.ViewCoordinates.RIGHT_HAND_Z_UP
-        ),
-    )
+    # The predicted corners would float as a crowd of points in the frustum.
+    contents = [*(f"+ {it}/**" for it in entities), f"- {paths.IMAGE}/**", f"+ {paths.IMAGE}"]
+    return space_view(name, contents, eye_on(places, distance))
 
 
 def _overview(places: FloatArray) -> rrb.Container:
     note = rrb.TextDocumentView(name="The plan", origin=paths.PLAN_NOTE)
     stop = rrb.TextDocumentView(name="This stop", origin=paths.STOP_NOTE)
-    image = rrb.Spatial2DView(
-        name="The board in the image, as predicted", origin=paths.IMAGE, contents=["$origin/**"]
-    )
+    image = image_view("The board in the image, as predicted", paths.IMAGE)
     cell = _cell("Cell: stops in blue, way in orange", places, paths.STOPS, paths.WAY)
     right = rrb.Vertical(note, image, stop, row_shares=[3.4, 3.6, 1.6])
     return rrb.Horizontal(cell, right, name="Plan", column_shares=[1.5, 1])
@@ -91,11 +80,7 @@ def _workspace(preview: Preview) -> rrb.Container:
 
 
 def _coverage() -> rrb.Container:
-    image = rrb.Spatial2DView(
-        name="Corners of all stops in the image",
-        origin=paths.IMAGE_COVERAGE,
-        contents=["$origin/**"],
-    )
+    image = image_view("Corners of all stops in the image", paths.IMAGE_COVERAGE)
     sigma = rrb.BarChartView(
         name="Predicted sigma [mm] after so many stops, the most informative first",
         origin=paths.PREDICTED_SIGMA,
@@ -119,14 +104,10 @@ def motion_blueprint(preview: MotionPreview) -> rrb.Blueprint:
         The layout, to be written into the recording.
     """
     entities = (paths.BASE, paths.ROBOT, paths.FLANGE, paths.OBSTACLES, paths.WAY)
-    cell = rrb.Spatial3DView(
-        name="The flange's way: exciting motion in orange, sweeps in blue",
-        origin="/",
-        contents=[f"+ {it}/**" for it in entities],
-        eye_controls=eye_on(preview.places_m),
-        spatial_information=rrb.SpatialInformation(
-            paths.BASE_FRAME, axes=rr.ViewCoordinates.RIGHT_HAND_Z_UP
-        ),
+    cell = space_view(
+        "The flange's way: exciting motion in orange, sweeps in blue",
+        [f"+ {it}/**" for it in entities],
+        eye_on(preview.places_m),
     )
     note = rrb.TextDocumentView(name="The plan", origin=paths.PLAN_NOTE)
     kinds: tuple[str, ...] = paths.MOTION_KINDS
@@ -141,15 +122,9 @@ def motion_blueprint(preview: MotionPreview) -> rrb.Blueprint:
         )
         for it in kinds
     ]
-    return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Vertical(cell, note, row_shares=[2, 1]),
-            rrb.Vertical(*curves, row_shares=[2, *(1 for _ in curves[1:])]),
-            column_shares=[1, 1],
-        ),
-        rrb.TimePanel(
-            state=rrb.PanelState.Collapsed, timeline=paths.MOTION_TIMELINE, play_state="paused"
-        ),
-        rrb.SelectionPanel(state=rrb.PanelState.Collapsed),
-        rrb.BlueprintPanel(state=rrb.PanelState.Collapsed),
+    both = rrb.Horizontal(
+        rrb.Vertical(cell, note, row_shares=[2, 1]),
+        rrb.Vertical(*curves, row_shares=[2, *(1 for _ in curves[1:])]),
+        column_shares=[1, 1],
     )
+    return with_panels(both, paths.MOTION_TIMELINE)
