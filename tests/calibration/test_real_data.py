@@ -56,7 +56,8 @@ def test_charuco_before_a_fixed_camera(real_data):
     assert 1e3 * np.linalg.norm(away) < 4 + 3 * result.edges["base_from_cam"].sigma_mm
 
 
-@pytest.mark.parametrize("camera", [pytest.param(1, marks=pytest.mark.slow), 4])
+@pytest.mark.slow
+@pytest.mark.parametrize("camera", [1, 4])
 def test_two_exchanged_rows_among_images_of_other_rows_are_named(real_data, camera):
     """Two fixed cameras saw one run: rows 25 and 26 of its joints are exchanged."""
     result = visioncal.calibrate(real_data / f"sessions/ur3e_checkerboard_to_hand_cam{camera}")
