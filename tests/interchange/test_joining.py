@@ -12,8 +12,7 @@ from support.samples import Sample, made_up, tool_frame, with_frames
 import visioncal.present.recording
 from visioncal.calibration.pipeline import Run, run
 from visioncal.cli.calibrate import calibrate_command
-from visioncal.cli.options import NeedOptions
-from visioncal.cli.working import WorkOptions
+from visioncal.cli.options import NeedOptions, WorkOptions
 from visioncal.core.errors import DataError
 from visioncal.frames.frame_from_images import SEEN_BY
 from visioncal.interchange.merge_results import leftover, rewrite

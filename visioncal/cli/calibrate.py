@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from visioncal.cli.options import AsJson, NeedOptions, OutFolder
-from visioncal.cli.working import WorkOptions
+from visioncal.cli.options import AsJson, NeedOptions, OutFolder, WorkOptions
 from visioncal.core.choices import Convention, SolverName
 
 if TYPE_CHECKING:

@@ -28,8 +28,7 @@ def demo_command(
     The camera's intrinsics are not given: they too are estimated from the images.
     """
     from visioncal.calibration.pipeline import run
-    from visioncal.cli.against_truth import truth_table
-    from visioncal.cli.summary import print_summary
+    from visioncal.cli.summary import print_summary, truth_table
     from visioncal.session import Session
     from visioncal.simulation import CellOptions, read_truth, truth_path
 

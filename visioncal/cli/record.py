@@ -6,8 +6,7 @@ from typing import Annotated
 
 import typer
 
-from visioncal.cli.console import asked, messages
-from visioncal.cli.interrupts import ended_like_ctrl_c
+from visioncal.cli.console import asked, ended_like_ctrl_c, messages
 from visioncal.cli.options import AsJson, View
 from visioncal.cli.record_options import CellOptions, DeviceOptions, TakingOptions
 from visioncal.live.capture.options import CaptureOptions

@@ -14,11 +14,10 @@ from visioncal.cli.console import messages
 from visioncal.cli.recorded_cell import Scene
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.number_format import figure
-from visioncal.live.capture.core import Step, Watcher, missed
+from visioncal.live.capture.core import Step, Watcher, line_of, missed
 from visioncal.live.capture.devices import ArmWish, open_arm, open_camera
 from visioncal.live.capture.journal import Journal
 from visioncal.live.capture.live import HostClock, LiveCell
-from visioncal.live.capture.messages import line_of
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.record import Departure, departure, record
 from visioncal.live.drivers.protocols import DeviceSetup, MovingArm

@@ -10,10 +10,9 @@ from typing import Any
 
 from rich.markup import escape
 
-from visioncal.cli.against_truth import truth_table
 from visioncal.cli.console import answers, messages
 from visioncal.cli.rehearsed import TAKING, Recorded, calibrated, planned, recorded, touched
-from visioncal.cli.summary import print_summary
+from visioncal.cli.summary import print_summary, truth_table
 from visioncal.core.choices import Faults
 from visioncal.core.version import __version__
 from visioncal.frames.touch_test import finding_of

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from visioncal.calibration.pipeline import Run, run
-from visioncal.cli.console import messages, report_error, report_written
-from visioncal.cli.interrupts import ended_like_ctrl_c
+from visioncal.cli.console import ended_like_ctrl_c, messages, report_error, report_written
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.recorded import ViewLines, driven
 from visioncal.cli.recorded_cell import Scene, facts_of, scene_of, shown_in

@@ -1,8 +1,9 @@
-"""Results as they are summed up for people."""
+"""Results as they are summed up for people, and beside the truth of a simulated cell."""
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
+import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
@@ -10,6 +11,8 @@ from visioncal.cli.console import answers
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import pose_difference
+from visioncal.core.types import Camera, FloatArray
+from visioncal.live.rehearsal.compared import edge_errors
 from visioncal.results import Calibration, Sight, Step, Verdict, ViewResult
 
 _COLOURS = {"good": "bold green", "check": "bold yellow", "bad": "bold red"}
@@ -95,4 +98,28 @@ def _solver_table(calibration: Calibration) -> Table:
         cells = [f"{mm:.3f} mm, {deg:.4f} deg" for mm, deg in away]
         deg = "" if result.rms_deg is None else f"{result.rms_deg:.4f}"
         table.add_row(name, f"{result.rms_mm:.3f}", deg, *cells)
+    return table
+
+
+def truth_table(
+    calibration: Calibration, transforms: Mapping[str, FloatArray], camera: Camera
+) -> Table:
+    """Errors against the truth, in millimetres and degrees and in units of the sigma.
+
+    Args:
+        calibration: The result.
+        transforms: (4, 4) the true edges by name.
+        camera: The true lens.
+    """
+    table = Table("against the truth", "error", "sigma", "error / sigma", box=None)
+    for name, it in edge_errors(calibration, transforms).items():
+        for error, sigma, unit in ((it.mm, it.sigma_mm, "mm"), (it.deg, it.sigma_deg, "deg")):
+            table.add_row(
+                name, f"{error:.3f} {unit}", f"{sigma:.3f} {unit}", f"{error / sigma:.2f}"
+            )
+    if calibration.camera is not None and calibration.camera.covariance is not None:
+        sigmas = np.sqrt(np.diag(calibration.camera.covariance))[:4]
+        errors = calibration.camera.camera.matrix - camera.matrix
+        for name, error, sigma in zip(("fx", "fy", "cx", "cy"), errors, sigmas, strict=True):
+            table.add_row(name, f"{error:+.2f} px", f"{sigma:.2f} px", f"{abs(error) / sigma:.2f}")
     return table

@@ -2,7 +2,6 @@
 
 from visioncal.dynamics.arm import ArmDynamics
 from visioncal.dynamics.base import BaseModel
-from visioncal.dynamics.curves import friction_at, left_for_friction
 from visioncal.dynamics.document import stribeck_rows
 from visioncal.dynamics.excitation import Excitation, ExcitationRequest, excite
 from visioncal.dynamics.friction import Friction, FrictionTerms, sign
@@ -16,7 +15,7 @@ from visioncal.dynamics.observer import MomentumObserver, external_torques
 from visioncal.dynamics.payload import Payload, estimate_payload
 from visioncal.dynamics.run import Run
 from visioncal.dynamics.sweeps import SweepRequest, Sweeps, plan_sweeps
-from visioncal.dynamics.validate import Prediction
+from visioncal.dynamics.validate import Prediction, friction_at, left_for_friction
 
 __all__ = [
     "ArmDynamics",

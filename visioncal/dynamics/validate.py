@@ -1,4 +1,4 @@
-"""How well torques are predicted that no parameter was fitted to."""
+"""How well torques are predicted that no parameter was fitted to, and friction over speed."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -129,3 +129,20 @@ def _link_torques(model: DynamicModel, motion: Motion) -> FloatArray:
 def _known_torques(identified: Identified, friction: FloatArray, motion: Motion) -> FloatArray:
     model = identified.base.model
     return np.asarray(_link_torques(model, motion) + model.terms.columns(motion) @ friction)
+
+
+def friction_at(identified: Identified, dq: FloatArray) -> FloatArray:
+    """The friction of all joints at (m, n) speeds, without what rotors take: (m, n) [N m]."""
+    model = identified.base.model
+    values = np.zeros(len(model.names))
+    values[identified.base.independent] = identified.values
+    still = np.zeros_like(dq)
+    motion = Motion(np.zeros(len(dq)), still, dq, still)
+    own = model.terms.columns(motion) @ values[10 * model.robot.joint_count :]
+    return np.asarray(own + identified.stribeck.torques(motion))
+
+
+def left_for_friction(identified: Identified, prediction: Prediction) -> FloatArray:
+    """What measured torques leave for friction: (k, n) its curve plus the errors [N m]."""
+    off = prediction.measured_nm - prediction.predicted_nm
+    return np.asarray(friction_at(identified, prediction.dq) + off)

@@ -14,7 +14,6 @@ from visioncal.interchange.formats.foreign import Foreign
 from visioncal.interchange.formats.import_options import ImportOptions, PoseImportOptions
 from visioncal.interchange.formats.registry import (
     FOREIGN_FORMATS,
-    OWN_FORMATS,
     convert,
     read_foreign,
     write_session,
@@ -29,7 +28,6 @@ from visioncal.interchange.formats.rereading import (
 
 __all__ = [
     "FOREIGN_FORMATS",
-    "OWN_FORMATS",
     "Foreign",
     "ImportOptions",
     "InDoubt",

@@ -10,13 +10,11 @@ from visioncal.core.files import check_free, did_you_mean
 from visioncal.interchange.formats.assemble import assemble, wished
 from visioncal.interchange.formats.columns import TABLE
 from visioncal.interchange.formats.finding import listed
-from visioncal.interchange.formats.folder import FOLDER
 from visioncal.interchange.formats.foreign import Foreign
-from visioncal.interchange.formats.format import ForeignFormat, OwnFormat
+from visioncal.interchange.formats.format import ForeignFormat
 from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.industrial import HAND_EYE, KINEMATICS
 from visioncal.interchange.formats.poses import check_radians
-from visioncal.interchange.formats.recording import RECORDING
 from visioncal.interchange.formats.rereading import InDoubt, load_in_doubt, reread, reread_session
 from visioncal.interchange.formats.ros import EASY_HANDEYE, MOVEIT
 from visioncal.interchange.formats.views import VIEWS
@@ -24,8 +22,6 @@ from visioncal.interchange.formats.visp import VISP
 from visioncal.interchange.formats.zivid import ZIVID
 from visioncal.session import Session
 from visioncal.session.single import check_one_of_each
-
-OWN_FORMATS: tuple[OwnFormat, ...] = (FOLDER, RECORDING)
 
 # The first that recognises a path reads it: those that look for less come last.
 FOREIGN_FORMATS: tuple[ForeignFormat, ...] = (
@@ -59,7 +55,7 @@ def convert(
     A session goes from one form of ours to another without loss.
 
     Args:
-        source: The session, in any of `OWN_FORMATS`, or a recording in any of `FOREIGN_FORMATS`.
+        source: The session, as a folder or an .rrd, or a recording in any of `FOREIGN_FORMATS`.
         dest: Where to; its suffix says in which form, and none of theirs means a folder.
         requested: What is to be known of somebody else's recording beyond what it says.
         form: The name of its format, where it is not to be recognised.
@@ -75,8 +71,7 @@ def convert(
             written or, read again, is another session.
     """
     _check_dest(source, dest, force=force)
-    own = next((it for it in OWN_FORMATS if form is None and it.recognises(source)), None)
-    if own is None:
+    if form is not None or not _is_session(source):
         foreign = read_foreign(source, requested, form)
         if choose is None:
             check_radians(foreign.robot, requested.robot, "robot")
@@ -91,7 +86,7 @@ def convert(
             next_step="Edit its session.toml, or convert its views.csv.",
         )
     elif choose is None:
-        session = own.read(source)
+        session = Session.load(source)
     else:
         doubtful = load_in_doubt(source)
         check_one_of_each(doubtful.session)
@@ -128,14 +123,32 @@ def write_session(session: Session, dest: Path) -> None:
             culprits=[session.name],
             next_step="Nothing was written; record it again.",
         )
-    form = _format_for(dest)
-    form.write(session, dest)
-    if form.read(dest).digest() != session.digest():
+    if _is_recording(dest):
+        # The codec takes half a second to import, which help need not wait for.
+        from visioncal.present.recording import write_recording
+        from visioncal.present.viewer import blueprint
+
+        write_recording(dest, session, None, (), blueprint(session))
+    else:
+        session.save(dest)
+    if Session.load(dest).digest() != session.digest():
         raise DataError(
             f"{dest} does not hold the session {session.name}: their digests differ.",
             culprits=[str(dest)],
             next_step="Remove it, and report this with the session.",
         )
+
+
+def _is_recording(path: Path) -> bool:
+    return path.suffix.lower() == ".rrd"
+
+
+def _is_session(path: Path) -> bool:
+    """Whether a path is one of ours."""
+    # A result is no session either, but what it is and where its session lies is told on reading.
+    is_result = path.name == "calibration.json" or (path / "recording.rrd").is_file()
+    is_folder = is_result or (path / "session.toml").is_file()
+    return is_folder or (path.is_file() and _is_recording(path))
 
 
 def _check_source(source: Path) -> None:
@@ -154,7 +167,7 @@ def _check_source(source: Path) -> None:
 
 
 def _check_dest(source: Path, dest: Path, *, force: bool) -> None:
-    is_folder = not _format_for(dest).suffix
+    is_folder = not _is_recording(dest)
     # An empty folder is free for a session's folder, which looks for itself.
     if not (is_folder and dest.is_dir()):
         same = source.exists() and dest.exists() and dest.samefile(source)
@@ -173,7 +186,8 @@ def _foreign_format(source: Path, form: str | None) -> ForeignFormat:
     for known in FOREIGN_FORMATS:
         if known.name == form or (form is None and known.recognises(source)):
             return known
-    words = "; ".join([it.words for it in OWN_FORMATS] + [it.words for it in FOREIGN_FORMATS])
+    own = ("a session's folder", "an .rrd recording")
+    words = "; ".join([*own, *(it.words for it in FOREIGN_FORMATS)])
     inside = ", ".join(it.name for it in listed(source)[:8]) if source.is_dir() else ""
     raise DataError(
         f"{source} is no session and in no format that is known: {words}."
@@ -181,8 +195,3 @@ def _foreign_format(source: Path, form: str | None) -> ForeignFormat:
         culprits=[str(source)],
         next_step="Write the poses into a CSV with a header, a row a view.",
     )
-
-
-def _format_for(dest: Path) -> OwnFormat:
-    by_suffix = {it.suffix: it for it in OWN_FORMATS}
-    return by_suffix.get(dest.suffix.lower(), FOLDER)

@@ -1,4 +1,4 @@
-"""One view after the other: settled, taken, checked, put on the disk, and reported."""
+"""One view after the other: settled, taken, checked, put on the disk, and reported in words."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -17,6 +17,7 @@ from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.predict import Prediction
 from visioncal.live.capture.take import Missed, Taken, settle, take
 from visioncal.live.planning.accuracy import Accuracy
+from visioncal.live.planning.messages import accuracy_words
 from visioncal.vision.finders.imaging import decode_image
 
 
@@ -188,3 +189,30 @@ def missed(steps: Sequence[Step]) -> Iterator[tuple[int, str]]:
     for step in steps:
         if isinstance(step.found, Missed):
             yield step.view, step.found.reason
+
+
+def line_of(step: Step) -> str:
+    """Says what became of a view: `[3/30] view 2: 54 corners, ...; coverage 45 % -> next: ...`."""
+    found, place = step.found, f"[{step.place}{f'/{step.count}' if step.count else ''}]"
+    onward = f" -> next: {step.advice}" if step.advice else ""
+    if isinstance(found, Missed):
+        return f"{place} view {step.view}: not taken: {found.reason}{onward}"
+    return (
+        f"{place} view {step.view}: {len(found.corners.ids)} corners, edges "
+        f"{found.corners.blur_px:.1f} px, {found.motion_px:.2f} px still; {step.covered}"
+        f"{_accuracy(step.accuracy)}{onward}"
+    )
+
+
+def note_of(step: Step) -> str:
+    """The same in Markdown, for the viewer."""
+    sigma = "" if step.accuracy is None else f"\n\nPredicted sigma: {accuracy_words(step.accuracy)}"
+    return f"**View {step.view}**\n\n{step.covered}{sigma}\n\nNext: {step.advice or 'anything new'}"
+
+
+def _accuracy(found: Accuracy | None) -> str:
+    if found is None:
+        return ""
+    if found.is_open:
+        return "; predicted sigma: not determined yet"
+    return f"; predicted sigma {figure(found.mm)} mm"

@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from visioncal.live.capture.core import Step
-from visioncal.live.capture.messages import note_of
+from visioncal.live.capture.core import Step, note_of
 from visioncal.live.capture.take import Missed
 
 if TYPE_CHECKING:

@@ -8,7 +8,6 @@ import queue
 import socket
 import struct
 import threading
-from types import TracebackType
 from typing import BinaryIO, Self
 
 from visioncal.core.errors import DriverError
@@ -124,12 +123,7 @@ class Dashboard:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _check_banner(self, banner: str) -> None:

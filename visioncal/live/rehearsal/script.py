@@ -45,20 +45,22 @@ class ControlScript:
         self._operation, self._writes = 0, 0
         self._least_hz, self._heard_s, self._ticked_s = 0.0, 0.0, 0.0
         self._commands: Mapping[int, Callable[[float], None]] = {
-            1: self._move_joints,
+            1: lambda now_s: self._turn_to(self._goal(), now_s),
             2: self._move_joints_to_pose,
-            3: self._move_straight,
-            4: self._move_straight_to_joints,
+            3: lambda now_s: self._go_to(self._goal(), now_s),
+            4: lambda now_s: self._go_to(tool_pose(machine, self._goal()), now_s),
             17: self._set_payload,
             29: self._set_tcp,
             30: self._inverse,
-            31: self._protective_stop,
+            31: lambda now_s: machine.trip("protective-stop", now_s),
             33: self._halt,
             34: self._halt,
             35: self._set_watchdog,
-            40: self._send_tcp,
-            43: self._forward,
-            44: self._forward_of,
+            40: lambda _: self._send(machine.tcp),
+            43: lambda now_s: self._send(tool_pose(machine, machine.joints(now_s)[0])),
+            44: lambda _: self._send(
+                flange_pose(machine, self._goal(), self.registers.double_in[6:12])
+            ),
             46: self._inverse,
             47: self._steady,
         }
@@ -114,9 +116,6 @@ class ControlScript:
     def _goal(self) -> FloatArray:
         return np.array(self.registers.double_in[:6])
 
-    def _move_joints(self, now_s: float) -> None:
-        self._turn_to(self._goal(), now_s)
-
     def _move_joints_to_pose(self, now_s: float) -> None:
         q, _ = self._machine.joints(now_s)
         goal = posture(self._machine, self._goal(), q)
@@ -130,12 +129,6 @@ class ControlScript:
         q, _ = self._machine.joints(now_s)
         self._machine.start(joint_way(q, goal, speed=speed, acceleration=acceleration), now_s)
         self._moved(now_s)
-
-    def _move_straight_to_joints(self, now_s: float) -> None:
-        self._go_to(tool_pose(self._machine, self._goal()), now_s)
-
-    def _move_straight(self, now_s: float) -> None:
-        self._go_to(self._goal(), now_s)
 
     def _go_to(self, goal: FloatArray, now_s: float) -> None:
         q, _ = self._machine.joints(now_s)
@@ -186,22 +179,10 @@ class ControlScript:
     def _set_watchdog(self, now_s: float) -> None:
         self._least_hz, self._heard_s = self.registers.double_in[0], now_s
 
-    def _protective_stop(self, now_s: float) -> None:
-        self._machine.trip("protective-stop", now_s)
-
     # What is asked.
 
     def _send(self, numbers: FloatArray) -> None:
         self.registers.double_out[: numbers.size] = numbers.tolist()
-
-    def _send_tcp(self, now_s: float) -> None:  # noqa: ARG002
-        self._send(self._machine.tcp)
-
-    def _forward(self, now_s: float) -> None:
-        self._send(tool_pose(self._machine, self._machine.joints(now_s)[0]))
-
-    def _forward_of(self, now_s: float) -> None:  # noqa: ARG002
-        self._send(flange_pose(self._machine, self._goal(), self.registers.double_in[6:12]))
 
     def _inverse(self, now_s: float) -> None:
         goal = posture(self._machine, self._goal(), self._machine.joints(now_s)[0])

@@ -1,6 +1,7 @@
 """What a simulated controller reports of itself, by RTDE's names."""
 
 import math
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -88,40 +89,15 @@ class Moment:
         return power | program | _POWER_BUTTON
 
 
-_NOTHING = (0.0,) * 6
 _Reader = Callable[[Moment], Value]
-
-
-def _zeros(_: Moment) -> Value:
-    return _NOTHING
-
-
-def _zero(_: Moment) -> Value:
-    return 0.0
-
-
-def _one(_: Moment) -> Value:
-    return 1.0
-
-
-def _angles(moment: Moment) -> Value:
-    return tuple(moment.joints[0].tolist())
-
-
-def _speeds(moment: Moment) -> Value:
-    return tuple(moment.joints[1].tolist())
 
 
 def _constant(value: Value) -> _Reader:
     return lambda _: value
 
 
-def _int_register(place: int) -> _Reader:
-    return lambda moment: moment.registers.int_out[place]
-
-
-def _double_register(place: int) -> _Reader:
-    return lambda moment: moment.registers.double_out[place]
+def _register(kind: str, place: int) -> _Reader:
+    return lambda moment: getattr(moment.registers, f"{kind}_out")[place]
 
 
 def _table() -> dict[str, tuple[str, _Reader]]:
@@ -129,14 +105,6 @@ def _table() -> dict[str, tuple[str, _Reader]]:
     six, three = "VECTOR6D", "VECTOR3D"
     table: dict[str, tuple[str, _Reader]] = {
         "timestamp": ("DOUBLE", lambda it: it.up_s),
-        "actual_q": (six, _angles),
-        "target_q": (six, _angles),
-        "actual_qd": (six, _speeds),
-        "target_qd": (six, _speeds),
-        "actual_current": (six, lambda it: it.currents),
-        "target_current": (six, lambda it: it.currents),
-        "actual_TCP_pose": (six, lambda it: it.tcp_pose),
-        "target_TCP_pose": (six, lambda it: it.tcp_pose),
         "joint_temperatures": (six, lambda it: it.temperatures),
         "joint_mode": ("VECTOR6INT32", _constant((253,) * 6)),
         "robot_mode": ("INT32", lambda it: _MODES.get(it.machine.mode, -1)),
@@ -150,19 +118,25 @@ def _table() -> dict[str, tuple[str, _Reader]]:
         "actual_main_voltage": ("DOUBLE", _constant(48.0)),
         "actual_robot_voltage": ("DOUBLE", _constant(48.0)),
         "actual_joint_voltage": (six, _constant((48.0,) * 6)),
-        "actual_digital_input_bits": ("UINT64", _zero),
-        "actual_digital_output_bits": ("UINT64", _zero),
+        "actual_digital_input_bits": ("UINT64", _constant(0.0)),
+        "actual_digital_output_bits": ("UINT64", _constant(0.0)),
     }
-    table |= dict.fromkeys(("speed_scaling", "target_speed_fraction"), ("DOUBLE", _one))
+    # What is aimed at is reached at once.
+    for kind in ("actual", "target"):
+        table[f"{kind}_q"] = (six, lambda it: tuple(it.joints[0].tolist()))
+        table[f"{kind}_qd"] = (six, lambda it: tuple(it.joints[1].tolist()))
+        table[f"{kind}_current"] = (six, lambda it: it.currents)
+        table[f"{kind}_TCP_pose"] = (six, lambda it: it.tcp_pose)
+    table |= dict.fromkeys(("speed_scaling", "target_speed_fraction"), ("DOUBLE", _constant(1.0)))
     numbers = ("actual_execution_time", "actual_momentum", "actual_robot_current")
     analog = [f"standard_analog_{way}{place}" for way in ("input", "output") for place in (0, 1)]
-    table |= dict.fromkeys((*numbers, *analog), ("DOUBLE", _zero))
+    table |= dict.fromkeys((*numbers, *analog), ("DOUBLE", _constant(0.0)))
     vectors = ("target_qdd", "target_moment", "joint_control_output", "actual_TCP_speed")
     more = ("actual_TCP_force", "target_TCP_speed", "ft_raw_wrench", "payload_inertia")
-    table |= dict.fromkeys((*vectors, *more), (six, _zeros))
+    table |= dict.fromkeys((*vectors, *more), (six, _constant((0.0,) * 6)))
     for place in range(48):
-        table[f"output_int_register_{place}"] = ("INT32", _int_register(place))
-        table[f"output_double_register_{place}"] = ("DOUBLE", _double_register(place))
+        table[f"output_int_register_{place}"] = ("INT32", _register("int", place))
+        table[f"output_double_register_{place}"] = ("DOUBLE", _register("double", place))
     return table
 
 
@@ -175,19 +149,11 @@ def input_type(name: str) -> str:
         return "INT32"
     if name.startswith("input_double_register_"):
         return "DOUBLE"
-    others = {
-        "external_force_torque": "VECTOR6D",
-        "speed_slider_mask": "UINT32",
-        "speed_slider_fraction": "DOUBLE",
-        "standard_digital_output_mask": "UINT8",
-        "standard_digital_output": "UINT8",
-        "configurable_digital_output_mask": "UINT8",
-        "configurable_digital_output": "UINT8",
-        "tool_digital_output_mask": "UINT8",
-        "tool_digital_output": "UINT8",
-        "standard_analog_output_mask": "UINT8",
-        "standard_analog_output_type": "UINT8",
-        "standard_analog_output_0": "DOUBLE",
-        "standard_analog_output_1": "DOUBLE",
-    }
+    if re.fullmatch("(standard|configurable|tool)_digital_output(_mask)?", name):
+        return "UINT8"
+    if re.fullmatch("standard_analog_output_(mask|type)", name):
+        return "UINT8"
+    if re.fullmatch("standard_analog_output_[01]|speed_slider_fraction", name):
+        return "DOUBLE"
+    others = {"external_force_torque": "VECTOR6D", "speed_slider_mask": "UINT32"}
     return others.get(name, "")

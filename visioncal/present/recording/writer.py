@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from rerun.blueprint import BlueprintLike
@@ -192,12 +191,7 @@ class RecordingWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Closes the recording, with a mark that all views are there unless an error left it.
 
         Raises:
@@ -206,7 +200,7 @@ class RecordingWriter:
         with named_errors(self._label):
             if kind is None:
                 codec.log_end(self._recorder.stream, len(self._numbers))
-            self._recorder.__exit__(kind, error, trace)
+            self._recorder.__exit__(kind)
 
 
 def write_recording(

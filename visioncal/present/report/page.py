@@ -19,7 +19,6 @@ from visioncal.present.report import (
     content,
     plots,
     sources,
-    springs,
     tools,
     uncertainty,
 )
@@ -159,9 +158,9 @@ def _springs(calibration: Calibration) -> dict[str, object]:
     if found is None:
         return {"springs": (), "spring_facts": (), "spring_plot": ""}
     return {
-        "springs": springs.spring_rows(found),
-        "spring_facts": springs.spring_facts(found),
-        "spring_plot": springs.deflection_against_load(found),
+        "springs": arm.spring_rows(found),
+        "spring_facts": tuple(arm.spring_facts(found)),
+        "spring_plot": arm.deflection_against_load(found),
     }
 
 
