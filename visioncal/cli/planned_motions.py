@@ -18,7 +18,7 @@ from visioncal.core.files import some_of
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.excitation import ExcitationRequest, excite
 from visioncal.dynamics.friction import FrictionTerms
-from visioncal.dynamics.limits import Allowed, Missing, Share, allowed_motion
+from visioncal.dynamics.limits import Missing, Share, allowed_motion
 from visioncal.dynamics.planned import MotionPlan
 from visioncal.dynamics.sweeps import SweepRequest, plan_sweeps
 from visioncal.dynamics.written import motion_document
@@ -71,7 +71,10 @@ def plan_motions(
     swept = None
     if not motion.no_sweeps:
         swept = SweepRequest(speeds=motion.sweep_speeds, seed=motion.seed)
-    plan = _planned(allowed, wished, swept, quiet=as_json)
+    with shown_progress(quiet=as_json) as progress:
+        # The sweeps first: they are quick, and fail for the same reasons.
+        sweeps = None if swept is None else plan_sweeps(allowed, swept)
+        plan = MotionPlan(allowed, excite(allowed, wished, progress), sweeps)
     document = motion_document(plan)
     written = write_motions(out, plan, motion.rate_hz, document)
     if as_json:
@@ -87,15 +90,6 @@ def _report(plan: MotionPlan) -> None:
         console.print(escape(words))
     for words in plan_warnings(plan):
         console.print(f"[bold yellow]warning:[/] {escape(words)}")
-
-
-def _planned(
-    allowed: Allowed, wished: ExcitationRequest, swept: SweepRequest | None, *, quiet: bool
-) -> MotionPlan:
-    with shown_progress(quiet=quiet) as progress:
-        # The sweeps first: they are quick, and fail for the same reasons.
-        sweeps = None if swept is None else plan_sweeps(allowed, swept)
-        return MotionPlan(allowed, excite(allowed, wished, progress), sweeps)
 
 
 def _radians(degrees: float | None) -> float | None:

@@ -70,7 +70,8 @@ def report_departure(leaving: Departure, cell: LiveCell, taking: CaptureOptions)
     if not count:
         say("All stops of the plan have their view; nothing is left to drive.")
         return
-    first = leaving.stops[0]
+    first, seconds = leaving.stops[0], leaving.duration_s
+    long = f"{seconds / 60:.0f} min" if seconds > 90 else f"{seconds:.0f} s"
     postures = len(leaving.first)
     via = (
         f" by {postures - 1} posture{'s' if postures > 2 else ''} in between"
@@ -80,7 +81,7 @@ def report_departure(leaving: Departure, cell: LiveCell, taking: CaptureOptions)
     say(
         escape(
             f"{cell.arm.name}, {cell.camera.name}: {count} stop{'s' if count > 1 else ''} to drive "
-            f"at {taking.speed:g} rad/s, about {_minutes(leaving.duration_s)}"
+            f"at {taking.speed:g} rad/s, about {long}"
         )
     )
     say(
@@ -165,7 +166,3 @@ def check_not_begun(journal: Journal, camera: str) -> None:
             culprits=["--resume"],
             next_step="Record all of it into a new folder.",
         )
-
-
-def _minutes(seconds: float) -> str:
-    return f"{seconds / 60:.0f} min" if seconds > 90 else f"{seconds:.0f} s"

@@ -74,7 +74,8 @@ def check_mistakes(base: BaseModel, streams: Sequence[Conditioned]) -> None:
         measured = _some(stream)
         if len(measured) < _LEAST:
             continue
-        as_it_is = _as_it_is(robot, measured)
+        joints = tuple(range(measured.torques_nm.shape[1]))
+        as_it_is = _Guess("", joints, measured, _predicted(robot, measured.motion))
         if robot.inertias is None:
             found = _explained_better(base, as_it_is)
         else:
@@ -166,11 +167,6 @@ def _unfitted(base: BaseModel, measured: Measured) -> FloatArray:
     values = np.linalg.lstsq(rows, y.ravel(), rcond=1e-9)[0]
     left = np.mean((y - (rows @ values).reshape(y.shape)) ** 2, axis=0)
     return np.asarray(np.maximum(left, 1e-12))
-
-
-def _as_it_is(robot: Robot, measured: Measured) -> _Guess:
-    joints = tuple(range(measured.torques_nm.shape[1]))
-    return _Guess("", joints, measured, _predicted(robot, measured.motion))
 
 
 def _guesses(robot: Robot, as_it_is: _Guess) -> Iterator[_Guess]:

@@ -7,7 +7,7 @@ import numpy as np
 from visioncal.core.files import some_of
 from visioncal.core.limits import DynamicsLimits
 from visioncal.core.number_format import figure
-from visioncal.core.types import FloatArray, Mask
+from visioncal.core.types import Mask
 from visioncal.core.verdict import NOTE, Finding, Step, Verdict, VerdictStatus
 from visioncal.dynamics.base import random_motion
 from visioncal.dynamics.identified import UNKNOWN, Identified, Validation
@@ -69,6 +69,7 @@ def _of_prediction(identified: Identified) -> Iterator[tuple[VerdictStatus, Find
         return
     shares = validation.shares
     worst = int(np.argmax(shares))
+    percents = ", ".join(figure(100.0 * float(it)) for it in shares)
     status: VerdictStatus = "good"
     if shares[worst] > _LIMITS.range_share[0]:
         status = "bad" if shares.min() > _LIMITS.range_share[1] else "check"
@@ -76,7 +77,7 @@ def _of_prediction(identified: Identified) -> Iterator[tuple[VerdictStatus, Find
         status,
         Finding(
             "prediction",
-            f"The torques of {validation.label} are predicted to {_percents(shares)} of their "
+            f"The torques of {validation.label} are predicted to {percents} % of their "
             f"range (joints 1 to {len(shares)}).",
         ),
     )
@@ -186,10 +187,6 @@ def _of_parameters(identified: Identified) -> Iterator[tuple[VerdictStatus, Find
                 _plan(identified, _MOTION),
             ),
         )
-
-
-def _percents(shares: FloatArray) -> str:
-    return ", ".join(figure(100.0 * float(it)) for it in shares) + " %"
 
 
 def _joints(which: Mask) -> str:

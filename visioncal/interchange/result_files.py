@@ -74,7 +74,11 @@ def load_result(path: Path) -> Calibration:
             return Calibration.load(path)
         except DataError as error:
             if _holds_frames(path):
-                raise _frames_alone(path) from error
+                raise DataError(
+                    f"{path} holds frames of tools and fixtures, and no calibration.",
+                    culprits=[str(path)],
+                    next_step="Name the calibration's folder or its calibration.json.",
+                ) from error
             raise
     # The codec takes half a second to import, which a calibration.json need not wait for.
     from visioncal.present.recording import read_alignment, read_calibration
@@ -145,14 +149,6 @@ def _content(path: Path) -> dict[str, object]:
     except (ValueError, RecursionError):
         return {}
     return document if isinstance(document, dict) else {}
-
-
-def _frames_alone(path: Path) -> DataError:
-    return DataError(
-        f"{path} holds frames of tools and fixtures, and no calibration.",
-        culprits=[str(path)],
-        next_step="Name the calibration's folder or its calibration.json.",
-    )
 
 
 def _refuse_session(path: Path) -> None:

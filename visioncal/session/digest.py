@@ -35,7 +35,11 @@ def digest_facts(
         "target": target_document,
         "robot": None if robot_document is None else _robots(document, robot_document),
         "columns": columns,
-        "rows": [[_fact(view, column) for column in columns] for view in views],
+        # A cell's value is free of its spelling.
+        "rows": [
+            [view.numbers[it] if it in view.numbers else view.cell(it) for it in columns]
+            for view in views
+        ],
         "images": {path: it for path, it in digests.items() if it},
     }
     if streams:
@@ -101,11 +105,6 @@ def _pathless(entry: object, field: str) -> object:
     if isinstance(table, Mapping) and is_file(table.get(field)):
         return {key: value for key, value in table.items() if key != field}
     return table
-
-
-def _fact(view: View, column: str) -> float | str:
-    """A cell's value, free of its spelling."""
-    return view.numbers[column] if column in view.numbers else view.cell(column)
 
 
 def _canonical(value: object) -> object:

@@ -224,7 +224,8 @@ class Ways:
         """
         if _there(here, stop.q):
             return (stop.q,)
-        planned = self._planned_from(stop)
+        at = self.plan.stops.index(stop)
+        planned = self.plan.stops[at - 1].q if at else self.plan.start_q
         if planned is not None and _there(here, planned):
             return (*stop.via, stop.q)
         self._check_limits(here)
@@ -239,11 +240,6 @@ class Ways:
                 "--start-joints as it stands.",
             )
         return (*route.segments[0], stop.q)
-
-    def _planned_from(self, stop: Stop) -> FloatArray | None:
-        """Where the plan has the arm come from; None where it does not say."""
-        at = self.plan.stops.index(stop)
-        return self.plan.stops[at - 1].q if at else self.plan.start_q
 
     def _check_limits(self, here: FloatArray) -> None:
         robot = self.plan.cell.robot

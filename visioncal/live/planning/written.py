@@ -15,7 +15,7 @@ from visioncal.core.files import one_line, sha256
 from visioncal.core.types import FloatArray
 from visioncal.core.version import __version__
 from visioncal.live.planning.accuracy import Accuracy
-from visioncal.live.planning.cell import Box, Limits, PlanCell
+from visioncal.live.planning.cell import Box, PlanCell
 from visioncal.live.planning.plan import Plan, PlannedStop, Request
 from visioncal.robot import has_ur_axes
 from visioncal.session.columns import POSE
@@ -203,20 +203,16 @@ def _cell_document(cell: PlanCell) -> dict[str, Any]:
             "robot_translation_m": float(cell.noise.robots[0, 1]),
             "robot_rotation_rad": float(cell.noise.robots[0, 0]),
         },
-        "limits": _limits_document(cell.limits),
+        "limits": {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in vars(cell.limits).items()
+            if value is not None
+        },
         "boxes": [_box_document(it) for it in cell.boxes],
     }
     if cell.covariance is not None:
         document["guesses"]["covariance"] = cell.covariance.tolist()
     return document
-
-
-def _limits_document(limits: Limits) -> dict[str, Any]:
-    return {
-        name: list(value) if isinstance(value, tuple) else value
-        for name, value in vars(limits).items()
-        if value is not None
-    }
 
 
 def _box_document(box: Box) -> dict[str, Any]:

@@ -43,6 +43,27 @@ def log_arm(stream: rr.RecordingStream, link_frames: FloatArray, entity: str = p
     stream.log(f"{entity}/joints", balls)
 
 
+def log_frames(
+    stream: rr.RecordingStream, axis_m: float, more: Sequence[tuple[str, str, float]] = ()
+) -> None:
+    """Draws the axes of base and flange, and puts the arm into the base.
+
+    Args:
+        stream: Where to.
+        axis_m: Length of the flange's axes [m]; the base's are twice as long.
+        more: Other entities with axes, their frames, and lengths as shares of the flange's.
+    """
+    base = rr.Transform3D(parent_frame="cell", child_frame=paths.BASE_FRAME)
+    stream.log(paths.BASE, base, static=True)
+    own = ((paths.BASE, paths.BASE_FRAME, 2.0), (paths.FLANGE, paths.FLANGE_FRAME, 1.0))
+    for entity, frame, times in (*own, *more):
+        axes = rr.TransformAxes3D(times * axis_m, show_frame=True)
+        stream.log(entity, rr.CoordinateFrame(frame), axes, static=True)
+    for part in ("links", "joints"):
+        frame_of_arm = rr.CoordinateFrame(paths.BASE_FRAME)
+        stream.log(f"{paths.ROBOT}/{part}", frame_of_arm, static=True)
+
+
 def log_arms(stream: rr.RecordingStream, views: Sequence[FloatArray | None]) -> None:
     """Draws a session's arm in all views.
 

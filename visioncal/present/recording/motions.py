@@ -13,7 +13,7 @@ from visioncal.core.files import written_beside
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.motion import Motion
 from visioncal.present.recording import colours, paths
-from visioncal.present.recording.arm import log_arm
+from visioncal.present.recording.arm import log_arm, log_frames
 from visioncal.present.recording.obstacles import Obstacle, log_obstacles
 from visioncal.present.recording.recorder import Recorder
 from visioncal.present.recording.scene import log_pose
@@ -93,17 +93,8 @@ def write_motion_preview(
 def _log_static(stream: rr.RecordingStream, preview: MotionPreview) -> None:
     places = preview.places_m
     size_m = float(np.median(np.linalg.norm(places[1:], axis=1)))
-    base = rr.Transform3D(parent_frame="cell", child_frame=paths.BASE_FRAME)
-    stream.log(paths.BASE, base, static=True)
-    for entity, frame, times in (
-        (paths.BASE, paths.BASE_FRAME, 2.0),
-        (paths.FLANGE, paths.FLANGE_FRAME, 1.0),
-    ):
-        axes = rr.TransformAxes3D(times * _AXIS * size_m, show_frame=True)
-        stream.log(entity, rr.CoordinateFrame(frame), axes, static=True)
+    log_frames(stream, _AXIS * size_m)
     in_base = rr.CoordinateFrame(paths.BASE_FRAME)
-    for entity in ("links", "joints"):
-        stream.log(f"{paths.ROBOT}/{entity}", in_base, static=True)
     log_obstacles(stream, preview.obstacles, preview.floor_m, size_m)
     rest = 1
     for at, part in enumerate(preview.parts):

@@ -257,16 +257,12 @@ def solvers_markdown(calibration: Calibration) -> str:
             if name in result.transforms:
                 ours, theirs = calibration.transforms[name], result.transforms[name]
                 differences = pose_difference(ours.as_matrix(), theirs.as_matrix())
-                cells += [_difference(value) for value in differences]
+                # Rounding errors of the result's own row are no difference.
+                cells += [f"{it:.2g}" if it > 1e-9 else "0" for it in differences]
             else:
                 cells += ["", ""]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
-
-
-def _difference(value: float) -> str:
-    """A difference from the result; rounding errors of the result's own row are none."""
-    return f"{value:.2g}" if value > 1e-9 else "0"
 
 
 def view_markdown(view: ViewResult) -> str:

@@ -13,7 +13,7 @@ from visioncal.core.files import written_beside
 from visioncal.core.transforms import invert
 from visioncal.core.types import Camera, FloatArray, Mount, Target
 from visioncal.present.recording import board, colours, paths
-from visioncal.present.recording.arm import log_arm
+from visioncal.present.recording.arm import log_arm, log_frames
 from visioncal.present.recording.charts import Charts
 from visioncal.present.recording.coverage import (
     corners_chart,
@@ -146,19 +146,8 @@ def _corners_px(preview: Preview, cam_from_target: FloatArray) -> FloatArray:
 
 def _log_static(stream: rr.RecordingStream, preview: Preview, charts: Charts) -> None:
     size_m = preview.size_m
-    base = rr.Transform3D(parent_frame="cell", child_frame=paths.BASE_FRAME)
-    stream.log(paths.BASE, base, static=True)
-    for entity, frame, times in (
-        (paths.BASE, paths.BASE_FRAME, 2.0),
-        (paths.FLANGE, paths.FLANGE_FRAME, 1.0),
-        (paths.CAMERA, paths.CAM_FRAME, 0.7),
-        (paths.TARGET, paths.TARGET_FRAME, 0.7),
-    ):
-        axes = rr.TransformAxes3D(times * _AXIS * size_m, show_frame=True)
-        stream.log(entity, rr.CoordinateFrame(frame), axes, static=True)
-    in_base = rr.CoordinateFrame(paths.BASE_FRAME)
-    for entity in ("links", "joints"):
-        stream.log(f"{paths.ROBOT}/{entity}", in_base, static=True)
+    carried = ((paths.CAMERA, paths.CAM_FRAME, 0.7), (paths.TARGET, paths.TARGET_FRAME, 0.7))
+    log_frames(stream, _AXIS * size_m, carried)
     log_image_plane(stream, preview.camera, size_m)
     width, height = preview.camera.resolution
     border = rr.Boxes2D(mins=[[0.0, 0.0]], sizes=[[width, height]], colors=colours.GRID)

@@ -5,7 +5,7 @@ counts.
 """
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -156,7 +156,6 @@ def _draw(
     stream = recorder.stream
     scene = Scene.of(session, calibration, evidence)
     overlay = overlays.Overlay.of(session, calibration, evidence)
-    explains = _any_is_explained(evidence.values())
     scene.log_static(stream)
     if calibration is not None:
         notes.log_static(stream, calibration)
@@ -165,7 +164,7 @@ def _draw(
     seen = [evidence.get(it.number, ViewEvidence(it.number)) for it in session.views]
     scene.log_views(stream, seen)
     overlay.log_views(stream, seen)
-    if explains:
+    if any(it.explained is not None for it in seen):
         for row, it in enumerate(seen):
             recorder.at(row)
             _log_explained(stream, it)
@@ -301,11 +300,6 @@ def _damaged(path: Path) -> DataError:
         culprits=[str(path)],
         next_step="Calibrate the session in it again.",
     )
-
-
-def _any_is_explained(evidence: Iterable[ViewEvidence]) -> bool:
-    """Whether any image was explained."""
-    return any(it.explained is not None for it in evidence)
 
 
 def _log_explained(stream: rr.RecordingStream, seen: ViewEvidence) -> None:

@@ -87,7 +87,10 @@ class Uncertainty:
         ):
             some = [view for view in self.scatter_m if (view in self.used) is wanted]
             for frame in self._frames_of(some):
-                self._log_scatter(stream, name, frame, some, colour)
+                positions_m = self._positions_m(some, frame)
+                points = rr.Points3D(positions_m, colors=colour, radii=_POINT * self.size_m)
+                entity = f"{self._placements(frame)}/{name}"
+                stream.log(entity, rr.CoordinateFrame(frame), points, static=True)
         for frame in self._frames_of(self.scatter_m):
             self._log_beyond(stream, frame)
 
@@ -142,19 +145,6 @@ class Uncertainty:
         shown = [it for it in views if self.frames[it] == frame]
         places_m = [self._within_reach(self.factor * self.scatter_m[it]) for it in shown]
         return np.reshape(places_m, (-1, 3))
-
-    def _log_scatter(
-        self,
-        stream: rr.RecordingStream,
-        name: str,
-        frame: str,
-        views: Sequence[int],
-        colour: tuple[int, int, int],
-    ) -> None:
-        positions_m = self._positions_m(views, frame)
-        points = rr.Points3D(positions_m, colors=colour, radii=_POINT * self.size_m)
-        entity = f"{self._placements(frame)}/{name}"
-        stream.log(entity, rr.CoordinateFrame(frame), points, static=True)
 
     def _placements(self, frame: str) -> str:
         return f"{paths.entity_of(frame)}/placements_magnified_{self.factor}x"
