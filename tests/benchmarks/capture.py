@@ -31,7 +31,7 @@ from visioncal.live.planning.purposes import purpose_of
 from visioncal.live.planning.read_back import PlanFile, Stop
 from visioncal.live.rehearsal.camera import RehearsalCamera
 from visioncal.live.rehearsal.controller import spawn
-from visioncal.live.rehearsal.options import ControllerOptions
+from visioncal.live.rehearsal.machine import ControllerOptions
 from visioncal.live.rehearsal.truth import TruthClient
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate

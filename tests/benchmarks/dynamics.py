@@ -22,10 +22,9 @@ from visioncal.core.types import FloatArray
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.conditioning import Conditioned, condition
 from visioncal.dynamics.excitation import ExcitationRequest, excite
-from visioncal.dynamics.friction import FrictionTerms
 from visioncal.dynamics.identify import SLOW_RAD_S, Identification, Options, identify
 from visioncal.dynamics.limits import Share, allowed_motion
-from visioncal.dynamics.model import DynamicModel
+from visioncal.dynamics.model import DynamicModel, FrictionTerms
 from visioncal.dynamics.motion import Measured, Motion
 from visioncal.dynamics.reading import Recorded
 from visioncal.dynamics.validate import friction_of_known, predict, validate

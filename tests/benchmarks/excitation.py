@@ -11,9 +11,8 @@ from results import few, first, wished, write_section
 
 from visioncal.dynamics.base import BaseModel, condition_of
 from visioncal.dynamics.excitation import Excitation, ExcitationRequest, excite
-from visioncal.dynamics.friction import FrictionTerms
 from visioncal.dynamics.limits import Allowed, Share, allowed_motion
-from visioncal.dynamics.model import DynamicModel
+from visioncal.dynamics.model import DynamicModel, FrictionTerms
 from visioncal.robot import load_robot
 
 SEEDS = 10

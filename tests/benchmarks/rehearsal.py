@@ -35,7 +35,7 @@ from visioncal.live.rehearsal.bench import Bench
 from visioncal.live.rehearsal.camera import RehearsalCamera
 from visioncal.live.rehearsal.cell import RehearsalOptions, RehearsedCell, rehearsed_cell
 from visioncal.live.rehearsal.controller import spawn
-from visioncal.live.rehearsal.options import ControllerOptions
+from visioncal.live.rehearsal.machine import ControllerOptions
 from visioncal.live.rehearsal.truth import TruthClient
 from visioncal.live.rehearsal.witness import Witness, pace_of
 from visioncal.session import Session

@@ -9,15 +9,13 @@ import pytest
 from support.moved_arms import changed, recorded, robot_with_bodies, true_base
 
 from visioncal.core.errors import DegenerateError
-from visioncal.dynamics.base import BaseModel
+from visioncal.dynamics.base import BaseModel, null_space
 from visioncal.dynamics.conditioning import condition
-from visioncal.dynamics.friction import FrictionTerms
 from visioncal.dynamics.identified import Identified, Validation
 from visioncal.dynamics.identify import SLOW_RAD_S, Options, block_of, identify
 from visioncal.dynamics.judge import judge
 from visioncal.dynamics.limits import Share, allowed_motion
-from visioncal.dynamics.model import DynamicModel
-from visioncal.dynamics.null_space import null_space
+from visioncal.dynamics.model import DynamicModel, FrictionTerms
 from visioncal.dynamics.reading import Recorded, read_recorded
 from visioncal.dynamics.sweeps import SweepRequest, plan_sweeps
 from visioncal.dynamics.validate import friction_of_known, predict, validate

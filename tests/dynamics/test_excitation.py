@@ -16,10 +16,8 @@ from visioncal.dynamics import excitation
 from visioncal.dynamics.base import BaseModel, smooth_condition
 from visioncal.dynamics.excitation import ExcitationRequest, excite
 from visioncal.dynamics.fourier import Harmonics, Series
-from visioncal.dynamics.friction import FrictionTerms
-from visioncal.dynamics.limit_check import kept_limits
-from visioncal.dynamics.limits import Missing, Share, allowed_motion
-from visioncal.dynamics.model import DynamicModel
+from visioncal.dynamics.limits import Missing, Share, allowed_motion, kept_limits
+from visioncal.dynamics.model import DynamicModel, FrictionTerms
 from visioncal.dynamics.motion import Motion
 from visioncal.dynamics.objective import Objective
 from visioncal.robot import Robot, joint_torques, load_robot

@@ -10,8 +10,7 @@ from visioncal.core.errors import DataError
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.conditioning import condition
 from visioncal.dynamics.convention_hypotheses import check_mistakes
-from visioncal.dynamics.friction import FrictionTerms
-from visioncal.dynamics.model import DynamicModel
+from visioncal.dynamics.model import DynamicModel, FrictionTerms
 from visioncal.dynamics.reading import read_recorded
 from visioncal.simulation.dynamics import nominal_dynamics, real_dynamics
 from visioncal.simulation.exercise import multi_sine, record, slow_sweep

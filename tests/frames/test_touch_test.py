@@ -18,7 +18,7 @@ from visioncal.interchange.merge_results import rewrite
 from visioncal.live.capture.hover import Hovering
 from visioncal.live.drivers.ur import UrArm
 from visioncal.live.rehearsal.controller import spawn
-from visioncal.live.rehearsal.options import ControllerOptions
+from visioncal.live.rehearsal.machine import ControllerOptions
 from visioncal.results import Calibration, Edge
 from visioncal.results.frame import Frame
 from visioncal.session import Session

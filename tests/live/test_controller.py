@@ -9,10 +9,15 @@ import pytest
 
 from visioncal.core.errors import DriverError
 from visioncal.live.rehearsal.controller import main, spawn
-from visioncal.live.rehearsal.kinematics import matrix_of, pose_of, tool_pose
-from visioncal.live.rehearsal.machine import Machine
+from visioncal.live.rehearsal.machine import (
+    ControllerOptions,
+    Machine,
+    believed_arm,
+    matrix_of,
+    pose_of,
+    tool_pose,
+)
 from visioncal.live.rehearsal.motion import Brake, Profile, joint_way
-from visioncal.live.rehearsal.options import ControllerOptions, believed_arm
 from visioncal.live.rehearsal.rtde_wire import HEADER_BYTES, Kind, Recipe, read_header
 from visioncal.live.rehearsal.script import DONE, READY, ControlScript
 from visioncal.live.rehearsal.truth import TruthClient

@@ -11,7 +11,7 @@ from visioncal.live.capture import motions
 from visioncal.live.capture.motions import record_motion
 from visioncal.live.drivers.protocols import JointSample
 from visioncal.live.rehearsal.controller import spawn
-from visioncal.live.rehearsal.options import ControllerOptions
+from visioncal.live.rehearsal.machine import ControllerOptions
 from visioncal.session import Session
 
 RATE_HZ = 100.0

@@ -19,8 +19,7 @@ from visioncal.live.capture.take import Missed
 from visioncal.live.planning.purposes import purpose_of
 from visioncal.live.planning.read_back import PlanFile, Stop
 from visioncal.live.rehearsal.cell import GUESS_M, GUESS_RAD, RehearsalOptions, rehearsed_cell
-from visioncal.live.rehearsal.compared import edge_errors, explained
-from visioncal.live.rehearsal.witness import pace_of
+from visioncal.live.rehearsal.witness import edge_errors, explained, pace_of
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate
 

@@ -16,7 +16,7 @@ from visioncal.core.errors import DriverError
 from visioncal.live.drivers.protocols import MovingArm
 from visioncal.live.drivers.ur import UrArm
 from visioncal.live.rehearsal.controller import spawn
-from visioncal.live.rehearsal.options import ControllerOptions, believed_arm
+from visioncal.live.rehearsal.machine import ControllerOptions, believed_arm
 from visioncal.simulation.arms import forward
 
 pytest.importorskip("rtde_control", reason="ur-rtde is not installed (the extra `ur`)")

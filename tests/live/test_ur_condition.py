@@ -9,11 +9,10 @@ import pytest
 
 from visioncal.core.errors import DriverError
 from visioncal.live.drivers.ur import UrArm
-from visioncal.live.drivers.ur_net import check_states_come, connect, resolve
-from visioncal.live.drivers.ur_primary import read_tool_offset
+from visioncal.live.drivers.ur_net import check_states_come, connect, read_tool_offset, resolve
 from visioncal.live.drivers.ur_status import read_condition
 from visioncal.live.rehearsal.controller import free_host, spawn
-from visioncal.live.rehearsal.options import ControllerOptions
+from visioncal.live.rehearsal.machine import ControllerOptions
 
 OPTIONS = ControllerOptions(seed=3, tcp=(0.01, -0.02, 0.15, 0.1, 0.2, -0.3))
 

@@ -1,10 +1,33 @@
-"""`visioncal dynamics`: its commands."""
+"""What the commands of `visioncal dynamics` share: which samples, and what was identified."""
 
-from typing import ClassVar
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, ClassVar, TypeAlias
 
 import typer
 
 from visioncal.cli.lazy import LazyGroup
+from visioncal.cli.options import RobotName
+from visioncal.core.choices import DYNAMICS_FILE
+from visioncal.core.errors import DataError
+
+# Help does not wait for them.
+if TYPE_CHECKING:
+    from visioncal.dynamics.identified import Identified
+    from visioncal.dynamics.run import Request
+
+MotionsArgument: TypeAlias = Annotated[
+    Path, typer.Argument(help="A session with streams of angles and torques: a folder or an .rrd.")
+]
+CutoffOption: TypeAlias = Annotated[
+    float | None,
+    typer.Option(
+        "--cutoff-hz", min=0.1, help="Of the low-pass. Default: ten times the motion's band."
+    ),
+]
+AgainstOption: TypeAlias = Annotated[
+    Path | None, typer.Option("--against", help=f"A folder of identify, or its {DYNAMICS_FILE}.")
+]
 
 
 class _Commands(LazyGroup):
@@ -27,3 +50,60 @@ dynamics_app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
 )
+
+
+@dataclass(frozen=True)
+class StreamOptions:
+    """Which samples are taken, and how they become torques."""
+
+    stream: Annotated[
+        list[str] | None, typer.Option(help="A stream with torques; may be repeated. Default: all.")
+    ] = None
+    cutoff_hz: CutoffOption = None
+    gains: Annotated[
+        str | None,
+        typer.Option(
+            metavar="K1,K2,...",
+            help="Torque for a current, by joint [N m/A], where currents were recorded.",
+        ),
+    ] = None
+    robot: RobotName = None
+
+    def request(self) -> "Request":
+        """The same, as samples are read.
+
+        Raises:
+            DataError: The gains are no numbers.
+        """
+        from visioncal.dynamics.run import Request
+
+        try:
+            gains = tuple(float(it) for it in self.gains.split(",")) if self.gains else ()
+        except ValueError as error:
+            raise DataError(
+                f"--gains is {self.gains!r}; numbers with commas between are needed.",
+                culprits=["--gains"],
+            ) from error
+        return Request(
+            tuple(self.stream or ()),
+            cutoff_hz=self.cutoff_hz,
+            gains_nm_a=gains,
+            robot=self.robot,
+        )
+
+
+def identified_of(against: Path | None, command: str) -> "Identified":
+    """Loads what was identified before.
+
+    Raises:
+        DataError: None is named, or it cannot be read.
+    """
+    from visioncal.dynamics.identified import Identified
+
+    if against is None:
+        raise DataError(
+            f"dynamics {command}: what was identified (--against {DYNAMICS_FILE}) is needed.",
+            culprits=["--against"],
+            next_step="Name the output folder of visioncal dynamics identify.",
+        )
+    return Identified.load(against)

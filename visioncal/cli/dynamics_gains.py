@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from visioncal.cli.dynamics_options import CutoffOption, MotionsArgument
+from visioncal.cli.dynamics import CutoffOption, MotionsArgument
 from visioncal.cli.options import AsJson, RobotName
 
 

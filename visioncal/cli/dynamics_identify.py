@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from visioncal.cli.dynamics_options import MotionsArgument, StreamOptions
+from visioncal.cli.dynamics import MotionsArgument, StreamOptions
 from visioncal.cli.options import AsJson
 from visioncal.core.choices import DYNAMICS_FILE
 

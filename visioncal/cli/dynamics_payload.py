@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from visioncal.cli.dynamics_options import AgainstOption, MotionsArgument, StreamOptions
+from visioncal.cli.dynamics import AgainstOption, MotionsArgument, StreamOptions
 from visioncal.cli.options import AsJson
 from visioncal.core.choices import GAIN_SIGMA
 

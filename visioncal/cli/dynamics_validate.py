@@ -1,6 +1,6 @@
 """`visioncal dynamics validate`."""
 
-from visioncal.cli.dynamics_options import AgainstOption, MotionsArgument, StreamOptions
+from visioncal.cli.dynamics import AgainstOption, MotionsArgument, StreamOptions
 from visioncal.cli.options import AsJson
 
 

@@ -9,16 +9,16 @@ from rich.markup import escape
 from rich.table import Table
 
 from visioncal.cli.console import answers, messages, report_written
+from visioncal.cli.dynamics import StreamOptions, identified_of
 from visioncal.cli.dynamics_identify import FRICTION
-from visioncal.cli.dynamics_options import StreamOptions, identified_of
 from visioncal.cli.summary import print_verdict
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.dynamics.document import stribeck_rows, to_document
-from visioncal.dynamics.friction import FrictionTerms
 from visioncal.dynamics.identified import CLASSES, UNKNOWN, Identified
 from visioncal.dynamics.identify import SLOW_RAD_S, Options
 from visioncal.dynamics.judge import judge
+from visioncal.dynamics.model import FrictionTerms
 from visioncal.dynamics.run import Request, identify_session, validate_session
 from visioncal.dynamics.validate import Prediction, validate
 from visioncal.interchange.outputs import write_dynamics

@@ -19,9 +19,15 @@ from visioncal.interchange.formats.boards import described_target
 from visioncal.interchange.formats.intrinsics import read_intrinsics
 from visioncal.interchange.outputs import CALIBRATION
 from visioncal.interchange.result_files import load_calibration, load_stored
-from visioncal.live.planning.cell import Box, Limits, PlanCell
+from visioncal.live.planning.cell import (
+    TYPICAL_NOISE,
+    TYPICAL_PX,
+    Box,
+    Limits,
+    PlanCell,
+    cell_of_calibration,
+)
 from visioncal.live.planning.recorded import Begun, Guess, begin, so_far
-from visioncal.live.planning.sources import TYPICAL_NOISE, TYPICAL_PX, cell_of_calibration
 from visioncal.results import Calibration
 from visioncal.robot import Robot, load_robot
 from visioncal.session import Session

@@ -17,11 +17,10 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.excitation import ExcitationRequest, excite
-from visioncal.dynamics.friction import FrictionTerms
 from visioncal.dynamics.limits import Missing, Share, allowed_motion
-from visioncal.dynamics.planned import MotionPlan
+from visioncal.dynamics.model import FrictionTerms
 from visioncal.dynamics.sweeps import SweepRequest, plan_sweeps
-from visioncal.dynamics.written import motion_document
+from visioncal.dynamics.written import MotionPlan, motion_document
 from visioncal.interchange.outputs import write_motions
 from visioncal.live.planning.cell import Box
 from visioncal.live.planning.messages import plan_warnings, plan_words

@@ -19,8 +19,14 @@ from visioncal.frames.touch_test import finding_of
 from visioncal.interchange.outputs import Written
 from visioncal.live.rehearsal.bench import Bench
 from visioncal.live.rehearsal.cell import RehearsalOptions, RehearsedCell, rehearsed_cell
-from visioncal.live.rehearsal.compared import Explained, edge_errors, explained
-from visioncal.live.rehearsal.witness import Pace, Witness, pace_of
+from visioncal.live.rehearsal.witness import (
+    Explained,
+    Pace,
+    Witness,
+    edge_errors,
+    explained,
+    pace_of,
+)
 from visioncal.results import Calibration
 from visioncal.results.arm import NOMINAL
 from visioncal.results.sections import TouchTest

@@ -12,7 +12,7 @@ from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import pose_difference
 from visioncal.core.types import Camera, FloatArray
-from visioncal.live.rehearsal.compared import edge_errors
+from visioncal.live.rehearsal.witness import edge_errors
 from visioncal.results import Calibration, Sight, Step, Verdict, ViewResult
 
 _COLOURS = {"good": "bold green", "check": "bold yellow", "bad": "bold red"}

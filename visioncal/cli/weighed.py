@@ -8,7 +8,7 @@ import typer
 from rich.markup import escape
 
 from visioncal.cli.console import messages
-from visioncal.cli.dynamics_options import StreamOptions, identified_of
+from visioncal.cli.dynamics import StreamOptions, identified_of
 from visioncal.cli.parsing import numbers_in
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import matched, significant

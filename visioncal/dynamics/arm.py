@@ -7,8 +7,8 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
-from visioncal.dynamics.friction import Friction
 from visioncal.dynamics.identified import Identified
+from visioncal.dynamics.model import Friction
 from visioncal.robot import Inertias, Robot, joint_torques, momenta, moving, with_inertias
 
 

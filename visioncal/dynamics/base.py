@@ -1,11 +1,14 @@
 """Base parameters, all that a motion can identify: independent combinations of a model's.
 
+What a motion does not determine of them is named, with its cause.
+
 Many of a model's parameters move the torques alike, or not at all. A rank-revealing decomposition
 of its regressor in many random states finds a set of columns that are independent, and how the
 others follow from these (Gautier 1991, Numerical calculation of the base inertial parameters of
 robots); Businger and Golub's pivots (1965) and columns of equal length make the choice sound.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -13,10 +16,13 @@ import numpy as np
 from scipy.linalg import qr, solve_triangular
 from scipy.special import logsumexp, softmax
 
-from visioncal.core.errors import DataError
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.files import some_of
 from visioncal.core.types import FloatArray, IntArray
+from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.model import DynamicModel
 from visioncal.dynamics.motion import Motion
+from visioncal.dynamics.regression import Block
 
 # States that stand for all, and their greatest speeds [rad/s] and accelerations [rad/s^2]; at these
 # gravity, speed and acceleration have like shares in the torques.
@@ -31,6 +37,17 @@ _TIE = 1e-4
 _ROUNDING = 1e-9
 # A motion without effect on a parameter must not divide by zero.
 _TINY = 1e-12
+# A joint that never gets faster than this stands still, and its speed is noise [rad/s].
+_STILL_RAD_S = 0.01
+# Not determined are directions with less than this share of a full motion's information.
+# Fast multi-sines get 1e-4 of it along the worst direction, motion about one axis 1e-16.
+_UNDETERMINED = 1e-9
+# Parameters with this share of an undetermined direction are named with it.
+_SHARE = 0.3
+_NEXT = (
+    "Let all joints move at once, to and fro, fast and over a wide range: visioncal dynamics plan "
+    "writes such a motion."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,3 +217,73 @@ def smooth_condition(rows: FloatArray, sharpness: float) -> tuple[float, FloatAr
     by_unit = 2.0 * unit @ ((vectors * by_values) @ vectors.T)
     by_rows = (by_unit - unit * np.sum(by_unit * unit, axis=0)) / lengths
     return float(value), np.asarray(by_rows)
+
+
+def check_turning(base: BaseModel, streams: Sequence[Conditioned]) -> None:
+    """Refuses motions in which a joint stands still.
+
+    Raises:
+        DegenerateError: One does.
+    """
+    fastest = np.max(
+        [np.abs(it.measured.motion.dq).max(axis=0) for of in streams for it in of.pieces], axis=0
+    )
+    still = np.flatnonzero(fastest < _STILL_RAD_S)
+    if not len(still):
+        return
+    names = base.model.robot.joint_names
+    stopped = [f"joint {it + 1} ({names[it]})" for it in still]
+    kept = zip(base.names, base.independent, strict=True)
+    lost = [name for name, at in kept if _joint_of(base.model.names[at]) in still + 1]
+    raise DegenerateError(
+        f"dynamics: {some_of(stopped)} {'stands' if len(stopped) == 1 else 'stand'} still in "
+        f"{some_of([it.label for it in streams])} (at most {fastest[still].max():.2g} rad/s): "
+        f"{len(lost)} of {base.rank} base parameters, {some_of(lost, 5)}, are not determined.",
+        culprits=stopped,
+        next_step=_NEXT,
+    )
+
+
+def _joint_of(name: str) -> int:
+    """The joint, from 1, of a parameter as `m4*cx4` or `Fc4`."""
+    return int(name[len(name.rstrip("0123456789")) :])
+
+
+def check_identifiable(base: BaseModel, blocks: Sequence[Block]) -> None:
+    """Refuses motions that leave a combination of base parameters open.
+
+    Raises:
+        DegenerateError: There is one; its main parameters are named.
+    """
+    lost = null_space(base, blocks)
+    if lost:
+        names = base.names
+        raise DegenerateError(
+            f"dynamics: the motion does not determine {len(lost)} of {base.rank} base parameters: "
+            f"{some_of([names[it] for it in lost], 5)}.",
+            culprits=[names[it] for it in lost],
+            next_step=_NEXT,
+        )
+
+
+def null_space(base: BaseModel, blocks: Sequence[Block]) -> list[int]:
+    """The base parameters in directions about which a motion says nothing."""
+    information = np.zeros((base.rank, base.rank))
+    rows = 0
+    for block in blocks:
+        for joint in range(block.y.shape[1]):
+            x = block.x[:, joint]
+            information += x.T @ x
+            rows += len(x)
+    sizes = _usual(base)
+    relative = information / np.outer(sizes, sizes) / max(rows, 1)
+    values, vectors = np.linalg.eigh(relative)
+    null = np.flatnonzero(values < _UNDETERMINED)
+    shares = np.sqrt(np.sum(vectors[:, null] ** 2, axis=1))
+    return [int(it) for it in np.flatnonzero(shares > _SHARE)]
+
+
+def _usual(base: BaseModel) -> FloatArray:
+    """(b,) root mean square of each column in a motion all around."""
+    rows = base.regressor(random_motion(base.model, np.random.default_rng(1)))
+    return np.asarray(np.sqrt(np.mean(rows.reshape(-1, base.rank) ** 2, axis=0)))

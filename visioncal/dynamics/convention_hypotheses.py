@@ -16,7 +16,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.conditioning import Conditioned
-from visioncal.dynamics.friction import sign
+from visioncal.dynamics.model import sign
 from visioncal.dynamics.motion import Measured, Motion
 from visioncal.robot import Inertias, Robot, joint_torques
 

@@ -9,10 +9,9 @@ from visioncal.core.types import FloatArray
 from visioncal.core.version import __version__
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.consistent import Consistent
-from visioncal.dynamics.friction import FrictionTerms
 from visioncal.dynamics.identified import Identified, Lag, StreamFacts, Validation
 from visioncal.dynamics.judge import judge
-from visioncal.dynamics.model import DynamicModel
+from visioncal.dynamics.model import DynamicModel, FrictionTerms
 from visioncal.dynamics.stribeck import Stribeck
 from visioncal.robot import Robot
 

@@ -21,10 +21,8 @@ from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, Progress
 from visioncal.dynamics.base import BaseModel, Condition, condition_of
 from visioncal.dynamics.fourier import Harmonics, Series
-from visioncal.dynamics.friction import FrictionTerms
-from visioncal.dynamics.limit_check import CHECK_HZ, Kept, kept_limits
-from visioncal.dynamics.limits import Allowed
-from visioncal.dynamics.model import DynamicModel
+from visioncal.dynamics.limits import CHECK_HZ, Allowed, Kept, kept_limits
+from visioncal.dynamics.model import DynamicModel, FrictionTerms
 from visioncal.dynamics.objective import Objective
 
 # How long a motion may be [s], and of how many harmonics: fewer cannot determine the parameters of

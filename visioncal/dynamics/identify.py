@@ -6,14 +6,12 @@ from functools import partial
 
 import numpy as np
 
-from visioncal.dynamics.base import BaseModel
+from visioncal.dynamics.base import BaseModel, check_identifiable, check_turning
 from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.consistent import fit_consistent
 from visioncal.dynamics.convention_hypotheses import check_mistakes
-from visioncal.dynamics.friction import FrictionTerms
 from visioncal.dynamics.identified import Identified, StreamFacts
-from visioncal.dynamics.model import DynamicModel
-from visioncal.dynamics.null_space import check_identifiable, check_turning
+from visioncal.dynamics.model import DynamicModel, FrictionTerms
 from visioncal.dynamics.regression import Block, Regression, regress, rms_of, spread_of
 from visioncal.dynamics.stribeck import Stribeck, fit_stribeck
 from visioncal.robot import Robot

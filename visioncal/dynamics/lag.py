@@ -12,13 +12,11 @@ import numpy as np
 
 from visioncal.core.limits import DynamicsLimits
 from visioncal.core.types import FloatArray, Mask
-from visioncal.dynamics.base import BaseModel
+from visioncal.dynamics.base import BaseModel, null_space
 from visioncal.dynamics.conditioning import Conditioned
-from visioncal.dynamics.friction import FrictionTerms
 from visioncal.dynamics.identified import Lag
 from visioncal.dynamics.identify import block_of
-from visioncal.dynamics.model import DynamicModel
-from visioncal.dynamics.null_space import null_space
+from visioncal.dynamics.model import DynamicModel, FrictionTerms
 from visioncal.dynamics.regression import Block, Regression, regress, rms_of, spread_of
 from visioncal.robot import Robot
 

@@ -16,8 +16,8 @@ from visioncal.core.errors import DegenerateError
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.conditioning import Conditioned
-from visioncal.dynamics.friction import FrictionTerms
 from visioncal.dynamics.identified import Identified
+from visioncal.dynamics.model import FrictionTerms
 from visioncal.dynamics.motion import Motion
 from visioncal.dynamics.regression import Block, Regression, regress
 from visioncal.robot import Inertias, body_regressor, entries

@@ -14,7 +14,7 @@ import numpy as np
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.dynamics.conditioning import Conditioned
-from visioncal.dynamics.friction import sign
+from visioncal.dynamics.model import sign
 from visioncal.dynamics.motion import Motion
 from visioncal.dynamics.regression import Block, Regression, regress
 from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt

@@ -13,8 +13,7 @@ import numpy as np
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.fourier import even_times
-from visioncal.dynamics.limit_check import Kept, kept_limits
-from visioncal.dynamics.limits import Allowed
+from visioncal.dynamics.limits import Allowed, Kept, kept_limits
 from visioncal.dynamics.motion import Motion
 
 # Ramps last at least, and constant speed is held at least [s].

@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
@@ -13,10 +14,8 @@ from visioncal.core.version import __version__
 from visioncal.dynamics.base import Condition
 from visioncal.dynamics.excitation import Excitation
 from visioncal.dynamics.fourier import Series
-from visioncal.dynamics.limit_check import CHECK_HZ, Kept
-from visioncal.dynamics.limits import Allowed
+from visioncal.dynamics.limits import CHECK_HZ, Allowed, Kept
 from visioncal.dynamics.motion import Motion
-from visioncal.dynamics.planned import MotionPlan
 from visioncal.dynamics.sweeps import REST_S, Stroke, Sweeps
 from visioncal.robot import Robot, has_ur_axes
 
@@ -26,6 +25,21 @@ MOTION_FILES = ("sweeps.script", "sweeps.csv", "excitation.script", "excitation.
 _SPEED, _ACCELERATION, _SETTLING_S = 0.4, 0.6, 1.0
 # Of servoj: it looks ahead so far [s], and follows as stiffly as the controller allows by default.
 _LOOKAHEAD_S, _GAIN = 0.1, 300
+
+
+@dataclass(frozen=True, eq=False)
+class MotionPlan:
+    """What is to be driven.
+
+    Attributes:
+        allowed: What all of it keeps.
+        excitation: The exciting motion.
+        sweeps: Those for friction; None where they were not wished.
+    """
+
+    allowed: Allowed
+    excitation: Excitation
+    sweeps: Sweeps | None
 
 
 def motion_files(plan: MotionPlan, rate_hz: float) -> dict[str, str]:

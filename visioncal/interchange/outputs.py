@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from visioncal.core.choices import ImagesKept
     from visioncal.core.verdict import Verdict
     from visioncal.dynamics import Run
-    from visioncal.dynamics.planned import MotionPlan
+    from visioncal.dynamics.written import MotionPlan
     from visioncal.live.planning.plan import Plan
     from visioncal.results import Alignment
     from visioncal.session import Session

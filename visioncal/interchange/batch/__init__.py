@@ -1,7 +1,7 @@
 """Calibrating many sessions at once, on this machine or on a cluster."""
 
-from visioncal.interchange.batch.jobs import Job, Options, jobs_of
 from visioncal.interchange.batch.run import Batch, batch
+from visioncal.interchange.batch.work import Job, Options, jobs_of
 from visioncal.results.fleet import FleetRow
 
 __all__ = ["Batch", "FleetRow", "Job", "Options", "batch", "jobs_of"]

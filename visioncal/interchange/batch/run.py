@@ -19,7 +19,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean, read_toml, write_atomically
 from visioncal.core.transforms import pose_difference
 from visioncal.core.types import Progress
-from visioncal.interchange.batch.jobs import Options, jobs_of
+from visioncal.interchange.batch.work import Options, jobs_of
 from visioncal.interchange.batch.workers import rows_of
 from visioncal.interchange.outputs import CALIBRATION
 from visioncal.results import Calibration

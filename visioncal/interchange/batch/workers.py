@@ -11,8 +11,7 @@ from queue import Empty, SimpleQueue
 from threading import Event, Thread
 
 from visioncal.core.errors import DataError
-from visioncal.interchange.batch.jobs import Job
-from visioncal.interchange.batch.work import died, work
+from visioncal.interchange.batch.work import Job, died, work
 from visioncal.results.fleet import FleetRow
 
 # A session that so many workers have died of is not tried again.

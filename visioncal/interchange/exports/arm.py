@@ -11,8 +11,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray
 from visioncal.estimation.workspace import postures
-from visioncal.interchange.exports.content import Selection
-from visioncal.interchange.exports.format import Takes
+from visioncal.interchange.exports.content import Selection, Takes
 from visioncal.interchange.exports.sources import Source
 from visioncal.results import Calibration, Verdict
 from visioncal.results.arm import JointFunctions, JointRange, WorkspaceSigma

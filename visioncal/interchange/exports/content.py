@@ -1,14 +1,24 @@
-"""What is asked for of a result, and what a format then writes."""
+"""What is asked for of a result, what a format is, and what it then writes."""
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any, Literal, TypeAlias
 
+import yaml
+
+from visioncal.core.files import one_line
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray, Mount
 from visioncal.results import CameraResult, Edge, Verdict
 from visioncal.results.refitted_lens import RefittedLens, refitted
 
 _OF_LENS = "it goes with the lens of that calibration: with other intrinsics, use its ray_frame"
+# Any transform; the camera's alone, in its own direction; the lens alone; where something sits on
+# the flange; or where something stands in the base.
+Holds: TypeAlias = Literal["any edge", "hand-eye", "lens", "tool", "fixture"]
+# What of a selection a format has a use for, beside the transform and its frames' names.
+Takes: TypeAlias = Literal["number", "load", "convention", "hash", "onto"]
 
 
 @dataclass(frozen=True)
@@ -135,3 +145,64 @@ class Content:
         """Lines for a comment: where it comes from, its quality, and what it does."""
         is_of_lens = self.lens is not None and any(it.startswith("cam") for it in self.frames)
         return [self.origin, self.quality, self.direction, *([_OF_LENS] if is_of_lens else [])]
+
+
+def _nothing_amiss(_: Content) -> str:
+    return ""
+
+
+@dataclass(frozen=True)
+class ExportFormat:
+    """A form in which others read a result.
+
+    Attributes:
+        name: As the command line has it.
+        words: What it is and who reads it, with its units, in one line.
+        write: Builds the document.
+        holds: What of a result it can hold.
+        frames: What its readers call our frames; ours keep their names where it says nothing.
+        takes: Its further options.
+        counterpart: The maker's format of fixtures, for one of tools; and the other way round.
+        write_all: Builds the document of all transforms of a cell; None where it holds one.
+        warn: Words what the user must still do before the document serves; empty for nothing.
+    """
+
+    name: str
+    words: str
+    write: Callable[[Content], str]
+    holds: Holds = "any edge"
+    frames: Mapping[str, str] = field(default_factory=dict)
+    takes: frozenset[Takes] = frozenset()
+    counterpart: str = ""
+    write_all: Callable[[Sequence[Content]], str] | None = None
+    warn: Callable[[Content], str] = _nothing_amiss
+
+
+def numbers(values: FloatArray) -> list[float]:
+    """Turns an array into plain floats, whose text reads back as the same doubles."""
+    # A negative zero would only raise questions.
+    return [float(it) + 0.0 for it in values.ravel()]
+
+
+def rows(matrix: FloatArray) -> list[list[float]]:
+    """Turns (n, m) numbers into n lists of plain floats."""
+    return [numbers(row) for row in matrix]
+
+
+def fixed(value: float, decimals: int) -> str:
+    """Writes a number without an exponent, which not every robot's language reads."""
+    text = f"{value:.{decimals}f}"
+    return text[1:] if text.startswith("-") and not text.strip("-0.") else text
+
+
+def comments(mark: str, lines: Iterable[str]) -> str:
+    """Writes lines as comments, each behind `mark`; no text can end its comment early."""
+    return "".join(f"{mark} {one_line(it)}\n" for it in lines)
+
+
+def yaml_text(document: dict[str, Any], *, short_lists: bool = False) -> str:
+    """Writes YAML in the order given; `short_lists` puts lists of numbers on one line."""
+    style = None if short_lists else False
+    return yaml.safe_dump(
+        document, sort_keys=False, default_flow_style=style, width=float("inf"), allow_unicode=True
+    )

@@ -4,8 +4,13 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import Camera, FloatArray
-from visioncal.interchange.exports.content import Content
-from visioncal.interchange.exports.format import ExportFormat, comments, numbers, yaml_text
+from visioncal.interchange.exports.content import (
+    Content,
+    ExportFormat,
+    comments,
+    numbers,
+    yaml_text,
+)
 from visioncal.live.drivers.oak_calibration import calibration_json
 from visioncal.vision.camera import matrix_3x3
 

@@ -6,8 +6,7 @@ import cv2
 
 from visioncal.core.files import one_line
 from visioncal.core.types import FloatArray
-from visioncal.interchange.exports.content import Content
-from visioncal.interchange.exports.format import ExportFormat, comments, rows, yaml_text
+from visioncal.interchange.exports.content import Content, ExportFormat, comments, rows, yaml_text
 from visioncal.interchange.exports.lens import warn_of_field
 from visioncal.vision.camera import matrix_3x3
 

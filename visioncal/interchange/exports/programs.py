@@ -11,8 +11,7 @@ from typing import Literal
 
 from visioncal.core.conventions import POSE_FORMS, write_pose
 from visioncal.core.errors import DataError
-from visioncal.interchange.exports.content import Content
-from visioncal.interchange.exports.format import ExportFormat, fixed
+from visioncal.interchange.exports.content import Content, ExportFormat, fixed
 
 # The last position register of a controller as it is delivered.
 REGISTER = 100

@@ -11,10 +11,9 @@ from visioncal.core.transforms import adjoint, invert
 from visioncal.dynamics import Identified
 from visioncal.interchange.exports.arm import ArmFormat, select_arm
 from visioncal.interchange.exports.armfiles import ARMS
-from visioncal.interchange.exports.content import Content, Selection
+from visioncal.interchange.exports.content import Content, ExportFormat, Selection
 from visioncal.interchange.exports.controllers import CONTROLLERS
 from visioncal.interchange.exports.dynamics import write_dynamics
-from visioncal.interchange.exports.format import ExportFormat
 from visioncal.interchange.exports.lens import CAMERA_INFO, KALIBR, OAK
 from visioncal.interchange.exports.matrices import OPENCV, TEXT, ZIVID
 from visioncal.interchange.exports.programs import PROGRAMS

@@ -8,8 +8,7 @@ from functools import partial
 
 from visioncal.core.conventions import POSE_FORMS, PoseForm, write_pose
 from visioncal.core.types import FloatArray
-from visioncal.interchange.exports.content import Content
-from visioncal.interchange.exports.format import ExportFormat, comments, fixed
+from visioncal.interchange.exports.content import Content, ExportFormat, comments, fixed
 
 # A nanometre and 2e-10 rad, which is a nanometre at five metres.
 _DECIMALS = {"m": 9, "mm": 6}

@@ -10,8 +10,13 @@ REP 103 calls an optical frame.
 from collections.abc import Mapping, Sequence
 
 from visioncal.core.conventions import POSE_FORMS, write_pose
-from visioncal.interchange.exports.content import Content
-from visioncal.interchange.exports.format import ExportFormat, comments, numbers, yaml_text
+from visioncal.interchange.exports.content import (
+    Content,
+    ExportFormat,
+    comments,
+    numbers,
+    yaml_text,
+)
 
 ROS_FRAMES: Mapping[str, str] = {
     "base": "base",

@@ -5,8 +5,7 @@ from collections.abc import Sequence
 
 from visioncal.core.conventions import POSE_FORMS, write_pose
 from visioncal.core.files import one_line
-from visioncal.interchange.exports.content import Content
-from visioncal.interchange.exports.format import ExportFormat, numbers
+from visioncal.interchange.exports.content import Content, ExportFormat, numbers
 from visioncal.interchange.exports.ros import ROS_FRAMES, ros_notes
 
 

@@ -30,8 +30,7 @@ from visioncal.interchange.formats.fields import (
     unnamed_columns,
 )
 from visioncal.interchange.formats.finding import images_beside, images_named, is_image_name, listed
-from visioncal.interchange.formats.foreign import Foreign
-from visioncal.interchange.formats.format import ForeignFormat
+from visioncal.interchange.formats.foreign import Foreign, ForeignFormat
 from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.pairing import with_camera_file
 from visioncal.interchange.formats.poses import (

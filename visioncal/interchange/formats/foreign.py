@@ -1,12 +1,13 @@
-"""What someone else recorded, before anything is believed of it."""
+"""What someone else recorded, before anything is believed of it; and what a format of it is."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from visioncal.core.conventions import PoseNumbers
 from visioncal.core.types import FloatArray, IntArray, Mount
+from visioncal.interchange.formats.import_options import ImportOptions
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,3 +79,21 @@ def rows_of(foreign: Foreign, rows: IntArray) -> Foreign:
         views=tuple((foreign.views or tuple(range(count)))[it] for it in rows),
         columns={name: tuple(cells[it] for it in rows) for name, cells in foreign.columns.items()},
     )
+
+
+@dataclass(frozen=True)
+class ForeignFormat:
+    """A form in which others store what they recorded; it is read and never written.
+
+    Attributes:
+        name: As the command line has it.
+        words: What it is, for messages.
+        recognises: Whether a path that exists looks like it; it never raises DataError.
+        read: Reads the recording at a path; how its poses are written is already taken as the
+            user says, so that whoever gets them need not ask.
+    """
+
+    name: str
+    words: str
+    recognises: Callable[[Path], bool]
+    read: Callable[[Path, ImportOptions], Foreign]

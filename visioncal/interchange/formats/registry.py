@@ -10,8 +10,7 @@ from visioncal.core.files import check_free, did_you_mean
 from visioncal.interchange.formats.assemble import assemble, wished
 from visioncal.interchange.formats.columns import TABLE
 from visioncal.interchange.formats.finding import listed
-from visioncal.interchange.formats.foreign import Foreign
-from visioncal.interchange.formats.format import ForeignFormat
+from visioncal.interchange.formats.foreign import Foreign, ForeignFormat
 from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.industrial import HAND_EYE, KINEMATICS
 from visioncal.interchange.formats.poses import check_radians

@@ -8,8 +8,7 @@ from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.documents import mapping, number, read_json, read_yaml
 from visioncal.core.errors import DataError
 from visioncal.interchange.formats.finding import head
-from visioncal.interchange.formats.foreign import Foreign
-from visioncal.interchange.formats.format import ForeignFormat
+from visioncal.interchange.formats.foreign import Foreign, ForeignFormat
 from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.poses import as_matrix, matrix_numbers
 

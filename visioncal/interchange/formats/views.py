@@ -11,8 +11,7 @@ from visioncal.core.files import is_inside
 from visioncal.interchange.formats.columns import DOCUMENTS, ENDINGS, foreign_from, read_document
 from visioncal.interchange.formats.fields import fields_of_records, flattened
 from visioncal.interchange.formats.finding import listed, number_in
-from visioncal.interchange.formats.foreign import Foreign
-from visioncal.interchange.formats.format import ForeignFormat
+from visioncal.interchange.formats.foreign import Foreign, ForeignFormat
 from visioncal.interchange.formats.import_options import ImportOptions
 
 

@@ -12,8 +12,7 @@ from visioncal.core.documents.bounds import read_plain_text
 from visioncal.core.errors import DataError
 from visioncal.core.types import MOUNTS, Mount
 from visioncal.interchange.formats.finding import images_beside, listed, number_in
-from visioncal.interchange.formats.foreign import Foreign
-from visioncal.interchange.formats.format import ForeignFormat
+from visioncal.interchange.formats.foreign import Foreign, ForeignFormat
 from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.intrinsics import read_intrinsics
 

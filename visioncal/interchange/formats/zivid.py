@@ -9,8 +9,7 @@ from visioncal.core.documents import mapping, read_yaml
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.finding import head, images_beside, listed, number_in
-from visioncal.interchange.formats.foreign import Foreign
-from visioncal.interchange.formats.format import ForeignFormat
+from visioncal.interchange.formats.foreign import Foreign, ForeignFormat
 from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.poses import as_matrix, matrix_numbers
 

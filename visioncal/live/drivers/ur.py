@@ -21,9 +21,9 @@ from visioncal.live.drivers.ur_net import (
     Dashboard,
     check_states_come,
     connect,
+    read_tool_offset,
     resolve,
 )
-from visioncal.live.drivers.ur_primary import read_tool_offset
 from visioncal.live.drivers.ur_status import Condition, read_condition
 from visioncal.live.drivers.ur_watch import StateStream
 

@@ -10,8 +10,7 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.types import FloatArray, IntArray, Mask, Progress
-from visioncal.live.planning.cell import PlanCell
-from visioncal.live.planning.obstacles import collisions_of
+from visioncal.live.planning.cell import PlanCell, collisions_of
 from visioncal.live.planning.shade import Shade
 from visioncal.live.planning.visibility import sight_of
 from visioncal.robot import Robot

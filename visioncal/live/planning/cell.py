@@ -1,20 +1,36 @@
-"""What is known of a cell before it is calibrated, and what its robot must not do."""
+"""What is known of a cell before it is calibrated, and what its robot must keep away from."""
 
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import exp, invert
+from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import Camera, FloatArray, Mount, Target
 from visioncal.estimation.parts import Noise
+from visioncal.frames.touches import robot_noise
+from visioncal.results import Calibration
 from visioncal.robot import Robot
-from visioncal.vision.targets import corner_positions
+from visioncal.robot.bodies import Body, arm_bodies, capsule
+from visioncal.robot.collision import Collisions
+from visioncal.vision.targets import corner_positions, extent_m
 
 # Beyond this angle a printed board is seen from its edge [rad].
 _STEEPEST_RAD = 1.4
 # A matrix that was typed with three digits is this far from a rotation.
 _ROTATION_TOLERANCE = 1e-3
+# What well-kept arms and cameras repeat to, where nothing is known of it [rad, m and px].
+TYPICAL_NOISE, TYPICAL_PX = Noise.of_robot(5e-5, 3e-5), 0.1
+# A calibrated cell may have been touched since, by about this [rad and m].
+_TOUCHED_RAD, _TOUCHED_M = 5e-3, 2e-3
+# A camera with its lens and plug, as a box about its housing [m].
+_CAMERA_M, _CAMERA_BEHIND_M = np.array([0.1, 0.1, 0.1]), 0.03
+# The plate under a board, and how far it reaches beyond the print [m].
+_PLATE_M, _RIM_M = 0.01, 0.02
+# What holds the camera or the board on the flange [m].
+_HOLDER_RADIUS_M = 0.02
+# Things stand where they are guessed to within so many standard deviations.
+_SURELY = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,3 +210,118 @@ def _check_pose(what: str, pose: FloatArray) -> None:
             f"{what}: a 4 x 4 matrix of a rotation and a translation [m] is needed.",
             culprits=[what],
         )
+
+
+def cell_of_calibration(
+    calibration: Calibration,
+    target: Target,
+    limits: Limits,
+    boxes: tuple[Box, ...] = (),
+    *,
+    robot: Robot | None = None,
+) -> PlanCell:
+    """Takes a calibrated cell as the guess for another calibration of it.
+
+    Both edges are trusted as far as they are known, but not beyond a millimetre or two: the reason
+    for another calibration may be that somebody touched the camera or the board.
+
+    Args:
+        calibration: The result; its arm is taken as far as it is calibrated.
+        target: The board, which a calibration does not keep.
+        limits: What the stops must keep.
+        boxes: What else stands in the cell.
+        robot: The arm, where the calibration has none.
+
+    Raises:
+        DataError: The calibration has no robot or no camera.
+    """
+    arm = calibration.calibrated_robot or robot
+    if arm is None:
+        raise DataError(
+            f"calibration {calibration.session_name!r} names no robot, and its stops cannot be "
+            "planned without one.",
+            culprits=["robot"],
+            next_step="Name it with --robot.",
+        )
+    if calibration.camera is None:
+        raise DataError(
+            f"calibration {calibration.session_name!r} was made from measured poses and knows no "
+            "camera.",
+            culprits=["camera"],
+            next_step="Plan from a robot, with --camera, --cam and --board.",
+        )
+    x, z = calibration.edges.values()
+    sigma_m = max(1e-3 * x.sigma_mm, 1e-3 * z.sigma_mm) / np.sqrt(3.0)
+    sigma_rad = np.deg2rad(max(x.sigma_deg, z.sigma_deg)) / np.sqrt(3.0)
+    noise, pixel_px = _noise(calibration)
+    return PlanCell(
+        calibration.mount,
+        arm,
+        calibration.camera.camera,
+        target,
+        x.matrix,
+        z.matrix,
+        max(float(sigma_rad), _TOUCHED_RAD),
+        max(float(sigma_m), _TOUCHED_M),
+        noise,
+        pixel_px,
+        limits,
+        boxes,
+    )
+
+
+def _noise(calibration: Calibration) -> tuple[Noise, float]:
+    found = calibration.noise
+    noise = robot_noise(calibration)
+    # A few stops may show less than there is by chance.
+    at_least = np.maximum(noise.robots, 0.5 * TYPICAL_NOISE.robots)
+    return replace(noise, robots=at_least), found.get("pixel_px", TYPICAL_PX)
+
+
+def collisions_of(cell: PlanCell) -> Collisions:
+    """Prepares the distances of a cell.
+
+    What is only guessed, the camera and the board, is kept away from by what the guess may be off,
+    besides the clearance.
+
+    Args:
+        cell: The cell.
+
+    Returns:
+        The distances between the arm, what it carries, and what stands around it.
+    """
+    hand = cell.robot.joint_count
+    in_hand = cell.mount == "eye-in-hand"
+    flange = cell.robot.chain.placements[-1]
+    held, stands = (cell.x, cell.z) if in_hand else (cell.z, cell.x)
+    unsure_m = _SURELY * (cell.sigma_m + cell.sigma_rad * 0.5 * board_size_m(cell.target))
+    held_body, standing_body = (_camera, _board) if in_hand else (_board, _camera)
+    carried = held_body(cell.target, hand, flange @ held, unsure_m)
+    middle = carried.link_from_body[:3, 3]
+    bodies = [
+        *arm_bodies(cell.robot),
+        capsule("holder", hand, flange[:3, 3], middle, _HOLDER_RADIUS_M, unsure_m=unsure_m),
+        carried,
+        standing_body(cell.target, 0, stands, unsure_m),
+        *(Body(box.name, 0, "box", box.size_m, box.base_from_box) for box in cell.boxes),
+    ]
+    return Collisions(cell.robot, bodies, cell.limits.clearance_m, cell.limits.floor_m)
+
+
+def board_size_m(target: Target) -> float:
+    """The diagonal of the print [m]."""
+    low, high = extent_m(target)
+    return float(np.linalg.norm(high - low))
+
+
+def _camera(_: Target, link: int, link_from_cam: FloatArray, unsure_m: float) -> Body:
+    behind = compose(np.eye(3), np.array([0.0, 0.0, -_CAMERA_BEHIND_M]))
+    return Body("camera", link, "box", _CAMERA_M, link_from_cam @ behind, unsure_m=unsure_m)
+
+
+def _board(target: Target, link: int, link_from_target: FloatArray, unsure_m: float) -> Body:
+    """The plate, whose face is the print."""
+    low, high = extent_m(target)
+    centre = compose(np.eye(3), np.append(0.5 * (low + high), 0.5 * _PLATE_M))
+    size = np.append(high - low + 2.0 * _RIM_M, _PLATE_M)
+    return Body("board", link, "box", size, link_from_target @ centre, unsure_m=unsure_m)

@@ -2,9 +2,9 @@
 
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
-from visioncal.dynamics.limit_check import Kept
-from visioncal.dynamics.planned import MotionPlan
+from visioncal.dynamics.limits import Kept
 from visioncal.dynamics.sweeps import Sweeps
+from visioncal.dynamics.written import MotionPlan
 from visioncal.live.planning.accuracy import Accuracy
 from visioncal.live.planning.plan import Plan
 

@@ -7,8 +7,7 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
-from visioncal.live.planning.cell import PlanCell
-from visioncal.live.planning.obstacles import collisions_of
+from visioncal.live.planning.cell import PlanCell, collisions_of
 from visioncal.robot.collision import Collisions
 
 # Exchanges gain at least this [rad]; a tour is improved over and over at most so many times.

@@ -3,7 +3,7 @@
 import numpy as np
 
 from visioncal.dynamics.motion import Motion
-from visioncal.dynamics.planned import MotionPlan
+from visioncal.dynamics.written import MotionPlan
 from visioncal.live.planning.messages import accuracy_words, looks_note, plan_words, summary_of
 from visioncal.live.planning.plan import Plan, PlannedStop
 from visioncal.present.recording.motions import MotionPart, MotionPreview

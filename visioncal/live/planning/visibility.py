@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, invert
 from visioncal.core.types import Camera, FloatArray, Mask, Target
-from visioncal.live.planning.cell import PlanCell
-from visioncal.live.planning.obstacles import board_size_m
+from visioncal.live.planning.cell import PlanCell, board_size_m
 from visioncal.vision.camera import normalise, project_with_jacobian
 from visioncal.vision.targets import extent_m
 

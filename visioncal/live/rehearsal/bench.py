@@ -16,7 +16,7 @@ from visioncal.live.drivers.ur import UrArm
 from visioncal.live.rehearsal.camera import Pace, RehearsalCamera
 from visioncal.live.rehearsal.cell import RehearsedCell
 from visioncal.live.rehearsal.controller import SimulatedController, spawn
-from visioncal.live.rehearsal.options import ControllerOptions
+from visioncal.live.rehearsal.machine import ControllerOptions
 from visioncal.live.rehearsal.truth import TruthClient
 
 # An OAK's rate and an exposure under bright light.

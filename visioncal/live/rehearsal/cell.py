@@ -6,9 +6,8 @@ import numpy as np
 
 from visioncal.core.transforms import exp
 from visioncal.core.types import CameraMount
-from visioncal.live.planning.cell import Limits, PlanCell
-from visioncal.live.planning.sources import TYPICAL_NOISE, TYPICAL_PX
-from visioncal.live.rehearsal.options import ControllerOptions, true_arm
+from visioncal.live.planning.cell import TYPICAL_NOISE, TYPICAL_PX, Limits, PlanCell
+from visioncal.live.rehearsal.machine import ControllerOptions, true_arm
 from visioncal.robot import load_robot
 from visioncal.simulation import Cell, CellOptions, simulate
 from visioncal.simulation.arms import ArmErrors

@@ -20,7 +20,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Self
 
 from visioncal.core.errors import DataError, DriverError
-from visioncal.live.rehearsal.options import ControllerOptions
+from visioncal.live.rehearsal.machine import ControllerOptions
 from visioncal.live.rehearsal.serving import PORTS, ControllerServer
 from visioncal.live.rehearsal.truth import TruthClient
 from visioncal.simulation.arms import ArmErrors

@@ -1,22 +1,76 @@
-"""The simulated arm and what its controller knows of it: motion, safety, tool and load."""
+"""The simulated arm and what its controller knows of it: motion, safety, tool and load.
+
+The controller reckons with poses as x, y, z [m] and a rotation vector [rad], by the simulation's
+arm that it believes in.
+"""
 
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation, Slerp
 
 from visioncal.core.types import FloatArray
 from visioncal.live.rehearsal.motion import Brake, Motion, Rest
-from visioncal.live.rehearsal.options import ControllerOptions, believed_arm, true_arm
-from visioncal.simulation.arms import forward
+from visioncal.simulation.arms import Arm, ArmErrors, disturb, forward, inverse, ur_arm
 
 # How long the arm's past is kept [s]: a picture is asked for within this time.
 _MEMORY_S = 60.0
 # How hard a stop of the safety system brakes [rad/s^2].
 _HARD = 20.0
-
 Program: TypeAlias = Literal["stopped", "playing", "paused"]
+# Postures under a straight line of the tool.
+_KNOTS = 64
+# Elbow up, the tool looking down: clear of every singularity.
+_HOME = (0.0, -1.45, 1.75, -1.9, -1.5708, 0.0)
+
+
+@dataclass(frozen=True)
+class ControllerOptions:
+    """A simulated controller and its arm.
+
+    Attributes:
+        robot: `ur3e`, `ur5e` or `ur10e`.
+        seed: Of everything random.
+        errors: How the real arm departs from what its controller believes.
+        q: Joint angles at the start [rad].
+        tcp: The tool offset that is set: x, y, z [m] and a rotation vector [rad].
+        payload_kg: The load that is set [kg].
+        payload_m: Its centre in the flange frame [m].
+        repeatability_rad: How far a joint stands beside what its encoder says, drawn anew at each
+            arrival [rad].
+        polyscope: What the dashboard answers when asked for its version.
+        remote: Whether remote control is on.
+        safety: `normal`, `protective-stop` or `emergency-stop`, at the start.
+        mode: The robot's mode at the start, in the dashboard's words: `RUNNING`, `POWER_OFF`.
+        rate_hz: States a second.
+    """
+
+    robot: str = "ur10e"
+    seed: int = 0
+    errors: ArmErrors = field(default_factory=lambda: ArmErrors(3e-4, 3e-4, 5e-4))
+    q: tuple[float, ...] = _HOME
+    tcp: tuple[float, ...] = (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)
+    payload_kg: float = 0.6
+    payload_m: tuple[float, ...] = (0.0, 0.0, 0.04)
+    repeatability_rad: float = 1e-5
+    polyscope: str = "URSoftware 5.11.6.1010000 (Aug 01 2024)"
+    remote: bool = True
+    safety: str = "normal"
+    mode: str = "RUNNING"
+    rate_hz: float = 125.0
+
+
+def believed_arm(options: ControllerOptions) -> Arm:
+    """The arm by which the controller reckons: its data sheet."""
+    return ur_arm(options.robot)
+
+
+def true_arm(options: ControllerOptions) -> Arm:
+    """The arm that really stands there."""
+    return disturb(believed_arm(options), options.errors, np.random.default_rng([options.seed, 2]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,3 +194,63 @@ class Machine:
 
     def _draw_slack(self) -> FloatArray:
         return self._repeatability_rad * self._rng.standard_normal(self.believed.a.size)
+
+
+def matrix_of(pose: FloatArray | Sequence[float]) -> FloatArray:
+    """(4, 4) of six numbers."""
+    numbers = np.asarray(pose, dtype=float)
+    turn = Rotation.from_rotvec(numbers[3:])
+    return np.asarray(RigidTransform.from_components(numbers[:3], turn).as_matrix())
+
+
+def pose_of(matrix: FloatArray) -> FloatArray:
+    """(6,) of a matrix."""
+    turn = Rotation.from_matrix(matrix[:3, :3]).as_rotvec()
+    return np.concatenate([matrix[:3, 3], turn])
+
+
+def tool_pose(machine: Machine, q: FloatArray) -> FloatArray:
+    """(6,) the tool's pose in a posture [rad], with the offset that is set."""
+    return flange_pose(machine, q, machine.tcp)
+
+
+def flange_pose(machine: Machine, q: FloatArray, tcp: FloatArray | Sequence[float]) -> FloatArray:
+    """(6,) the pose of a tool that sits on the flange at `tcp`."""
+    return pose_of(forward(machine.believed, q[None])[0] @ matrix_of(tcp))
+
+
+def posture(machine: Machine, pose: FloatArray, near: FloatArray) -> FloatArray | None:
+    """(n,) joint angles for a pose of the tool, near others [rad]; None out of reach."""
+    base_from_flange = matrix_of(pose) @ np.linalg.inv(matrix_of(machine.tcp))
+    reach = inverse(machine.believed, base_from_flange[None], near[None])
+    return reach.joints[0] if reach.solved[0] else None
+
+
+def postures_to(
+    machine: Machine, pose: FloatArray, start: FloatArray
+) -> tuple[list[FloatArray], float]:
+    """The postures under a straight line of the tool, and its length.
+
+    Args:
+        machine: The arm.
+        pose: (6,) the line's end.
+        start: (n,) the posture at its start [rad].
+
+    Returns:
+        The postures, none where the line leaves the reach, and the length [m]; of a turn on the
+        spot, its angle [rad].
+    """
+    begin = tool_pose(machine, start)
+    turns = Rotation.from_rotvec([begin[3:], pose[3:]])
+    distance = float(np.linalg.norm(pose[:3] - begin[:3])) or float(
+        (turns[0].inv() * turns[1]).magnitude()
+    )
+    knots = [start]
+    between = Slerp([0.0, 1.0], turns)
+    for share in np.linspace(0.0, 1.0, _KNOTS)[1:]:
+        place = begin[:3] + share * (pose[:3] - begin[:3])
+        next_knot = posture(machine, np.concatenate([place, between(share).as_rotvec()]), knots[-1])
+        if next_knot is None:
+            return [], distance
+        knots.append(next_knot)
+    return knots, distance

@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from visioncal.core.types import FloatArray
-from visioncal.live.rehearsal.kinematics import flange_pose, posture, postures_to, tool_pose
-from visioncal.live.rehearsal.machine import Machine
+from visioncal.live.rehearsal.machine import Machine, flange_pose, posture, postures_to, tool_pose
 from visioncal.live.rehearsal.motion import joint_way, sampled_way
 
 READY, DONE = 1, 2

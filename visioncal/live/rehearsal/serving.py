@@ -14,9 +14,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from visioncal.live.rehearsal.kinematics import tool_pose
-from visioncal.live.rehearsal.machine import Machine
-from visioncal.live.rehearsal.options import ControllerOptions
+from visioncal.live.rehearsal.machine import ControllerOptions, Machine, tool_pose
 from visioncal.live.rehearsal.rtde_port import RtdePort
 from visioncal.live.rehearsal.rtde_wire import RTDE_PORT
 from visioncal.live.rehearsal.script import ControlScript

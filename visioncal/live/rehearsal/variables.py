@@ -9,8 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from visioncal.core.types import FloatArray
-from visioncal.live.rehearsal.kinematics import tool_pose
-from visioncal.live.rehearsal.machine import Machine
+from visioncal.live.rehearsal.machine import Machine, tool_pose
 from visioncal.live.rehearsal.rtde_wire import Value
 from visioncal.live.rehearsal.script import Registers
 from visioncal.simulation.arms import link_frames
