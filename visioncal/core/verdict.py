@@ -23,6 +23,7 @@ AGREEMENT, NEED, GOOD_FOR, NOTE = "agreement", "need", "good_for", "note"
 MISSING = "missing_images"
 # A part of the image in which no corner was seen: a hint where the task says what it needs.
 EMPTY_IMAGE = "empty_image"
+# Rows of poses that are exchanged come first among causes that are as good as certain.
 EXCHANGED, _SURE = "exchanged_views", 0.99
 # What says how large errors are, the most important first.
 _SIZES = (NEED, GOOD_FOR, "unexplained", "optimism", "weak_motion", "place", "workspace")

@@ -337,20 +337,23 @@ def slight_move(problem: Problem, fit: Solution, movable: Sequence[str]) -> Move
     tried = int(problem.observations.stops.max()) + 1
     spread = np.array([_spread_of_means(problem, it) for it in movable])
     between = [_between(problem, problem.observations.involves(it)) for it in movable]
+    freedom = _residual_freedom(problem, fit)
     best, limit = None, _move_limit(problem, len(movable) * tried)
     for it in _scored(problem, fit, columns, between):
         values = scaled_values(it.alone)
         clear = (values[:, 0] >= _TAKEN * values[:, -1]) & (values[:, -1] > 0.0)
         clear &= scaled_values(it.own)[:, 0] >= _TAKEN
         squares = np.where(clear, it.squares, 0.0) / spread[it.seen, it.stop]
-        if (most := float(squares.max())) > limit:
-            place = int(squares.argmax())
-            best, limit = (movable[it.seen[place]], it.stop, it.steps[place]), most
+        tested = _beside_itself(squares, freedom, 6)
+        place = int(tested.argmax())
+        if tested[place] > limit:
+            best = movable[it.seen[place]], it.stop, it.steps[place], float(squares[place])
+            limit = tested[place]
     if best is None:
         return None
-    frame, stop, step = best
+    frame, stop, step, square = best
     found = _move(problem, _Step(0, frame, stop, exp(step)))
-    return replace(found, mahalanobis_sq=limit)
+    return replace(found, mahalanobis_sq=square)
 
 
 def slipped_joint(
@@ -370,28 +373,39 @@ def slipped_joint(
     columns = problem.size + np.arange(len(joints))[:, None]
     between = [_between(problem, rows_of(problem, robot)) for robot, _ in joints]
     tried = len(joints) * (int(problem.observations.stops.max()) + 1)
-    best, limit = None, float(f_limit(_FALSE_MOVE / tried, 1, _residual_freedom(problem, fit)))
+    freedom = _residual_freedom(problem, fit)
+    best, limit = None, float(f_limit(_FALSE_MOVE / tried, 1, freedom))
     for it in _scored(problem, fit, columns, between, offsets):
         alone, own = it.alone[:, 0, 0], it.own[:, 0, 0]
         squares = np.where(own > _TAKEN * alone, it.squares, 0.0)
-        if (most := float(squares.max())) > limit:
-            place, limit = int(squares.argmax()), most
-            robot, joint = joints[it.seen[place]]
-            sigma_rad = float(own[place] ** -0.5)
-            best = Slip(robot, joint, it.stop, float(it.steps[place, 0]), sigma_rad, most)
+        tested = _beside_itself(squares, freedom, 1)
+        place = int(tested.argmax())
+        if tested[place] > limit:
+            limit, (robot, joint) = tested[place], joints[it.seen[place]]
+            step_rad, sigma_rad = float(it.steps[place, 0]), float(own[place] ** -0.5)
+            best = Slip(robot, joint, it.stop, step_rad, sigma_rad, float(squares[place]))
     return best
 
 
-def log_gain(problem: Problem, fit: Solution, step: Move | Slip) -> float:
-    """Twice what a step gains of the log-likelihood, the noise being that beside it.
+def _beside_itself(squares: FloatArray, freedom: float, numbers: int) -> FloatArray:
+    """A score test's squares, of so many numbers, as F tests have them: by the noise beside them.
+
+    What is tested is in the noise that the score is measured by, which bounds the score.
+    """
+    left = np.maximum(freedom - squares, (1.0 - _MOST_EXPLAINED) * freedom)
+    return squares * max(freedom - numbers, 1.0) / left
+
+
+def log_gain(problem: Problem, fit: Solution, mahalanobis_sq: float) -> float:
+    """Twice what an effect gains of the log-likelihood, the noise being that beside it.
 
     Args:
-        problem: The observations that agree.
-        fit: The unknowns and the noise, without the step.
-        step: What moved at once, by its score.
+        problem: The observations.
+        fit: The unknowns and the noise, without the effect.
+        mahalanobis_sq: Its evidence by Rao's score test.
     """
     freedom = _residual_freedom(problem, fit)
-    share = min(step.mahalanobis_sq / freedom, _MOST_EXPLAINED)
+    share = min(mahalanobis_sq / freedom, _MOST_EXPLAINED)
     return -freedom * float(np.log1p(-share))
 
 
@@ -400,8 +414,8 @@ def step_covariance(
 ) -> FloatArray:
     """What a step that a fit does not have adds to its covariance (p, p).
 
-    The answer is between what holds before the step and what holds from then on: the squares of its
-    distances from both count.
+    The answer is between what holds before the step and what holds from then on, of which each is
+    as likely to be asked for: the mean of its squared distances.
 
     Args:
         problem: The observations that agree.
@@ -419,7 +433,7 @@ def step_covariance(
         columns, change = np.array([problem.size + step.joint]), np.array([step.step_rad])
     (found,) = _scored(problem, fit, columns[None], [places], offsets)
     before = found.following[0] @ change
-    return np.outer(before, before) + np.outer(before + after, before + after)
+    return (np.outer(before, before) + np.outer(before + after, before + after)) / 2.0
 
 
 @dataclass(frozen=True, eq=False)

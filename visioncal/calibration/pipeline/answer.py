@@ -6,7 +6,11 @@ from functools import cached_property
 
 import numpy as np
 
-from visioncal.calibration.pipeline.arm_results import covariance_beside_noise, joint_offsets
+from visioncal.calibration.pipeline.arm_results import (
+    beside_steps,
+    covariance_beside_noise,
+    joint_offsets,
+)
 from visioncal.calibration.pipeline.budget import budget_mm, left_out, middles_of
 from visioncal.calibration.pipeline.fault_messages import (
     PoseFault,
@@ -166,6 +170,7 @@ def answer_of(
     offsets = joint_offsets(solved.arms)
     found = misfits(part, at_rest, arms, offsets)
     is_fit = solved.solver == "joint"
+    solved = replace(solved, arms=beside_steps(solved.arms, part, fit, found))
     beside = covariance_beside_noise(part, fit, solved.arms, found, offsets, is_fit=is_fit)
     covariance = sum(beside.values(), covariance_of(part, fit))
     faults, held_out = pose_faults(solved), left_out(solved)

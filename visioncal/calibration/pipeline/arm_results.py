@@ -7,6 +7,7 @@ import numpy as np
 
 from visioncal.calibration.stages import diagnose, thermal
 from visioncal.calibration.stages.arms import ArmFound, RobotArm
+from visioncal.calibration.stages.cause_ranking import MOVED_AT_ONCE
 from visioncal.calibration.stages.cell import Cell, robot_key
 from visioncal.calibration.stages.diagnose import ResidualTest
 from visioncal.calibration.stages.kinematics import doubts, findings
@@ -16,13 +17,19 @@ from visioncal.core.types import FloatArray
 from visioncal.core.verdict import NOTE, Finding, remarks
 from visioncal.estimation.arm import covariance_of_size, misfit_covariance
 from visioncal.estimation.intervals import expected_levels
-from visioncal.estimation.moves import Slip, step_covariance
+from visioncal.estimation.moves import Move, Slip, moved, step_covariance
 from visioncal.estimation.null_space import joint_words
 from visioncal.estimation.parts import State
 from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.residual_tests import inflation
-from visioncal.estimation.solve import Solution, covariance_of, held_shift, robot_likelihood
+from visioncal.estimation.solve import (
+    Solution,
+    covariance_of,
+    fit_problem,
+    held_shift,
+    robot_likelihood,
+)
 
 # What moved at once, as a source of uncertainty.
 STEP = "what moved at once"
@@ -134,9 +141,7 @@ def doubts_of_arms(
     for robot, arm in arms.items():
         mine = _doubts(arm, found.get(robot), asked, from_when, joint)
         for it in (*mine, *results[robot].doubts()):
-            yield (
-                it if it.kind in ("moved_at_once", "joint_slipped") else it.of(_called(arms, robot))
-            )
+            yield (it if it.kind in MOVED_AT_ONCE else it.of(_called(arms, robot)))
 
 
 def notes_on_arms(arms: Mapping[str, RobotArm], results: Mapping[str, ArmFound]) -> Iterator[str]:
@@ -218,3 +223,20 @@ def with_pose_errors(
         else replace(it, errors=find_pose_errors(problem, fit.state, fit.noise, name))
         for name, it in arms.items()
     }
+
+
+def beside_steps(
+    arms: Mapping[str, RobotArm],
+    problem: Problem,
+    fit: Solution,
+    found: Mapping[str, ResidualTest],
+) -> Mapping[str, RobotArm]:
+    """Weighs these errors beside a frame that moved at once, which counts by itself.
+
+    Processes over time and postures would explain a step, too.
+    """
+    step = next((it.step for it in found.values() if it.step), None)
+    if not isinstance(step, Move) or all(it.is_modelled for it in arms.values()):
+        return arms
+    apart, start = moved(problem, fit, step)
+    return with_pose_errors(arms, apart, fit_problem(apart, start.state, start.noise))

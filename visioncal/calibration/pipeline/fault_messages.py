@@ -15,7 +15,7 @@ from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import distances, invert, mean_transform, pose_difference
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.core.verdict import CALIBRATE, Finding, Step, look_at
+from visioncal.core.verdict import CALIBRATE, EXCHANGED, Finding, Step, look_at
 from visioncal.estimation.problem import Problem
 from visioncal.results import Moved
 
@@ -240,7 +240,7 @@ def _exchanged_views(solved: Solved, mutual: Mapping[int, int]) -> Iterator[Pose
                 "each fits the pose in the other's row. They were left out."
             )
             views = (rows[first].view, rows[second].view)
-            found = Finding("exchanged_views", words, _EXCHANGE, views)
+            found = Finding(EXCHANGED, words, _EXCHANGE, views)
             yield PoseFault(found, (first, second))
 
 
@@ -446,6 +446,6 @@ def _exchanged(solved: Solved, mutual: Mapping[int, int]) -> list[PoseFault]:
                     "pose is right at the other's stop."
                 )
                 both_views = _numbers(solved, at_both)
-                swapped = Finding("exchanged_views", words, _EXCHANGE, both_views)
+                swapped = Finding(EXCHANGED, words, _EXCHANGE, both_views)
                 found.append(PoseFault(swapped, tuple(at_both), short))
     return found

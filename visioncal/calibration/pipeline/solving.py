@@ -391,7 +391,7 @@ def _with_functions(
         wider = arm.with_functions(stated, start, asked, agreed.fit.noise)
         if wider.gain_of_functions:
             slip = slipped_joint(part, agreed.fit, joint_offsets({name: arm}))
-            if slip and log_gain(part, agreed.fit, slip) > wider.gain_of_functions:
+            if slip and log_gain(part, agreed.fit, slip.mahalanobis_sq) > wider.gain_of_functions:
                 continue
         found[name] = wider
         problem = wider.put_into(problem)

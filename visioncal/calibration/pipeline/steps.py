@@ -137,7 +137,8 @@ def _examine(known: RunState) -> RunState:
     check_answer(known)
     answer = answer_of(known.cell, known, known.fitted, known.convention)
     out = (it for it in answer.sights if not it.used and it.view not in known.held_back)
-    return replace(known, answer=answer).noting(Rejection(it.view, it.reason) for it in out)
+    known = replace(known, fit=answer.solved, answer=answer)
+    return known.noting(Rejection(it.view, it.reason) for it in out)
 
 
 def _judge(known: RunState) -> RunState:

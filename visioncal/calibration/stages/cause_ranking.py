@@ -24,6 +24,7 @@ from visioncal.core.limits import CalibrationLimits, NeedLimits
 from visioncal.core.number_format import figure, percent
 from visioncal.core.verdict import (
     CALIBRATE,
+    EXCHANGED,
     GOOD_FOR,
     GUESS_AND_CALIBRATE,
     PLAN,
@@ -78,7 +79,7 @@ class Evidence:
 # The misfit that errors of the chain as a whole explain: views disagree, the flange errs.
 _CHAIN = "chain"
 EVIDENCE: Mapping[str, Evidence] = {
-    "exchanged_views": Evidence(1e-6),
+    EXCHANGED: Evidence(1e-6),
     "turned_images": Evidence(1e-6),
     "wrong_pose": Evidence(1e-3),
     "wrong_views": Evidence(1e-3),
@@ -212,7 +213,7 @@ def with_misread(verdict: Verdict, found: Finding) -> Verdict:
         verdict: On the poses as they are declared.
         found: That they are misread.
     """
-    if verdict.causes and verdict.causes[0].kind == "exchanged_views":
+    if verdict.causes and verdict.causes[0].kind == EXCHANGED:
         # The same, found by the views themselves; the command exchanges the rows.
         words = "Write a copy of the session with these rows exchanged, and calibrate it."
         step = found.do and replace(found.do, words=words)

@@ -99,10 +99,11 @@ def _steps(
     price = 2.0 * np.log(len(problem.unknown) * (1 + int(problem.observations.stops.max())))
     each = float(np.log(problem.observations.directions.sum()))
     likely: list[tuple[float, Move | Slip]] = []
+    least = log_gain(problem, fit, crept.mahalanobis_sq) if crept else 0.0
     for it in found:
-        if it is None or (crept and it.mahalanobis_sq < crept.mahalanobis_sq + price):
+        gain = log_gain(problem, fit, it.mahalanobis_sq) - price if it else -np.inf
+        if it is None or gain < least:
             continue
-        gain = log_gain(problem, fit, it) - price
         numbers = 6 if isinstance(it, Move) else 1
         likely.append((gain - numbers * each, replace(it, mahalanobis_sq=gain)))
     likely.sort(key=lambda it: -it[0])

@@ -148,22 +148,19 @@ def shape_found(fitted: Fitted, board: int, called: str) -> Finding:
         called: What it is called.
     """
     looks = fitted.looks
-    places = looks.shape_of(board)
-    aspect, *bends, shear = places
+    aspect, *bends, shear = looks.shape_of(board)
     parts, steps = [], []
-    for place, words in (
-        (aspect, "longer along its {} than along its {}, by {} %"),
-        (shear, "sheared: its rows and columns meet at {} deg"),
-    ):
-        if not _moved(fitted, np.array([place])):
-            continue
-        value = float(looks.values[place])
-        if place == aspect:
-            far, near = ("y", "x") if value > 0 else ("x", "y")
-            parts.append(words.format(far, near, figure(100 * abs(value))))
-        else:
-            parts.append(words.format(f"{90 - np.rad2deg(value):.3f}"))
-        steps = ["Print it anew on another printer."]
+    if _moved(fitted, np.array([aspect])):
+        longer = float(looks.values[aspect])
+        far, near = ("y", "x") if longer > 0 else ("x", "y")
+        parts.append(
+            f"longer along its {far} than along its {near}, by {figure(100 * abs(longer))} %"
+        )
+    if _moved(fitted, np.array([shear])):
+        corner_deg = 90.0 - np.rad2deg(float(looks.values[shear]))
+        parts.append(f"sheared: its rows and columns meet at {corner_deg:.3f} deg")
+    if parts:
+        steps.append("Print it anew on another printer.")
     if _moved(fitted, np.array(bends)) or not parts:
         depth = figure(1e3 * float(np.ptp(looks.corners[board][:, 2])))
         parts.insert(0, f"not flat: its corners lie within {depth} mm of depth")

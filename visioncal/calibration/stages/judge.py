@@ -19,6 +19,7 @@ from visioncal.core.types import Mount, Need, Rejection
 from visioncal.core.verdict import (
     AGREEMENT,
     EMPTY_IMAGE,
+    EXCHANGED,
     GOOD_FOR,
     MISSING,
     NEED,
@@ -54,7 +55,7 @@ _UNEVEN = 1.5
 # So many views in a row are not left out by chance.
 _LEAST_RUN = 3
 # Kinds of findings about views that are left out.
-_LEFT_OUT = ("exchanged_views", "turned_images", "wrong_pose", "something_moved")
+_LEFT_OUT = (EXCHANGED, "turned_images", "wrong_pose", "something_moved")
 # Views that disagree by less than so many times what their sensor's noise makes are explained: of a
 # small board far away, nothing better is to be had.
 _OF_NOISE = 1.5

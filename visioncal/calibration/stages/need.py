@@ -98,7 +98,8 @@ class Picks:
     def _budget(self, of: slice) -> dict[str, float]:
         every = {**self.parts, "total": self.spreads}
         squares = {name: np.trace(it[:, of, of], axis1=1, axis2=2) for name, it in every.items()}
-        return {name: float(np.sqrt(it.mean())) for name, it in squares.items()}
+        # Of two sources that make up for each other, one may be under zero.
+        return {name: float(max(it.mean(), 0.0) ** 0.5) for name, it in squares.items()}
 
     def stays_within(self, need: Need | None) -> str:
         """Within what 95 % of picks land, in the units of a need."""
