@@ -146,9 +146,10 @@ def photograph(target: Target, shot: Shot, seed: int = 0) -> tuple[np.ndarray, n
     board = np.concatenate([places, np.ones_like(places[..., :1])], axis=-1) @ np.linalg.inv(flat).T
     board = board[..., :2] / board[..., 2:]
     ink = shot.ink_px / shot.square_px
-    picture = _covered(board[..., 0], board[..., 1], lines, light, ink)
     if target.kind == "circles":
         picture = _discs(board, target, ink)
+    else:
+        picture = _covered(board[..., 0], board[..., 1], lines, light, ink)
     picture = _through(picture, shot, rng.uniform(0, np.pi))
     picture = picture.reshape(height, SAMPLES, width, SAMPLES).mean(axis=(1, 3))
     return _read_out(picture, shot, rng), truth
@@ -174,15 +175,22 @@ def _covered(x, y, lines, light, ink):
     """Share of each sub-pixel that is light."""
     near = [_nearest(it, line) for it, line in zip((x, y), lines, strict=True)]
     (at_x, off_x), (at_y, off_y) = near
+    (wide_x, reach_x), (wide_y, reach_y) = _extent(x), _extent(y)
+    picture = light[at_y + (off_y > 0), at_x + (off_x > 0)]
+    # Elsewhere, no edge comes into the sub-pixel.
+    cut = (np.abs(off_x) < reach_x + abs(ink)) | (np.abs(off_y) < reach_y + abs(ink))
+    at_x, off_x, at_y, off_y = (it[cut] for it in (at_x, off_x, at_y, off_y))
+    wide_x, wide_y = wide_x[:, cut], wide_y[:, cut]
     cells = [[light[at_y + j, at_x + i] for i in (0, 1)] for j in (0, 1)]
     # Dark grows by the ink: an edge from dark to light moves towards the light side.
-    share_x = [_beyond(x, off_x - ink * (row[1] - row[0])) for row in cells]
+    share_x = [_beyond(wide_x, off_x - ink * (row[1] - row[0])) for row in cells]
     own = np.where(off_x > 0, cells[1][1] - cells[0][1], cells[1][0] - cells[0][0])
-    share_y = _beyond(y, off_y - ink * own)
+    share_y = _beyond(wide_y, off_y - ink * own)
     upper, lower = (
         row[0] + (row[1] - row[0]) * share for row, share in zip(cells, share_x, strict=True)
     )
-    return upper + (lower - upper) * share_y
+    picture[cut] = upper + (lower - upper) * share_y
+    return picture
 
 
 def _discs(board, target, ink):
@@ -190,7 +198,10 @@ def _discs(board, target, ink):
     places = corner_positions(target)[:, :2] / target.square_m
     radius = target.diameter_m / target.square_m / 2 + ink
     away = KDTree(places).query(board.reshape(-1, 2))[0].reshape(board.shape[:2])
-    return _beyond(away, away - radius)
+    wide, reach = _extent(away)
+    share, cut = (away > radius).astype(float), np.abs(away - radius) < reach
+    share[cut] = _beyond(wide[:, cut], away[cut] - radius)
+    return share
 
 
 def _nearest(places, lines):
@@ -200,11 +211,17 @@ def _nearest(places, lines):
     return at, places - lines[at]
 
 
-def _beyond(field, off):
-    """Share of a sub-pixel beyond a straight line: its places are the sum of two even spreads."""
+def _extent(field):
+    """Both even spreads (2, h, w) of a sub-pixel's places, the larger first, and half their sum."""
     down, right = (np.maximum(np.abs(it), 1e-9) for it in np.gradient(field))
     large, small = np.maximum(down, right), np.minimum(down, right)
     small = np.maximum(small, 1e-3 * large)
+    return np.stack([large, small]), (large + small) / 2
+
+
+def _beyond(wide, off):
+    """Share of a sub-pixel beyond a straight line: its places are the sum of two even spreads."""
+    large, small = wide
     outer, inner = (large + small) / 2, (large - small) / 2
     parts = ((off + outer, 1), (off + inner, -1), (off - inner, -1), (off - outer, 1))
     share = sum(sign * np.maximum(it, 0.0) ** 2 for it, sign in parts) / (2 * large * small)
