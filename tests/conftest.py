@@ -2,8 +2,9 @@
 
 import os
 
-# A test a core: threads of theirs would only wait for one another. Read as numpy is loaded.
+# A test a core: threads of theirs would only wait for one another. Read as libraries are loaded.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from dataclasses import replace
 from pathlib import Path
