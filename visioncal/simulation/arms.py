@@ -252,10 +252,10 @@ def inverse(arm: Arm, base_from_flange: FloatArray, seeds: FloatArray) -> Reach:
 
 def _link(arm: Arm, i: int, angle: FloatArray) -> FloatArray:
     """(m, 4, 4) `link_from_next` of joint i."""
-    phases = np.array(
-        [np.sin(angle), np.cos(angle), np.sin(_TEETH * angle), np.cos(_TEETH * angle)]
-    )
-    turned = angle + arm.offset[i] + arm.waves[:, i] @ phases
+    turned = angle + arm.offset[i]
+    if arm.waves[:, i].any():
+        phases = [np.sin(angle), np.cos(angle), np.sin(_TEETH * angle), np.cos(_TEETH * angle)]
+        turned = turned + arm.waves[:, i] @ np.array(phases)
     if arm.beyond is not None:
         nodes = np.linspace(0.0, 2.0 * np.pi, len(arm.beyond), endpoint=False)
         turned = turned + np.interp(angle, nodes, arm.beyond[:, i], period=2.0 * np.pi)

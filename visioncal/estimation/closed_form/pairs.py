@@ -61,15 +61,13 @@ def pair_up(robot: FloatArray, camera: FloatArray) -> Pairs:
 
 def pair_products(left: FloatArray, right: FloatArray) -> FloatArray:
     """Products `left[j] * right[i]` of (m, 4) quaternions for all pairs of views, as (4, n)."""
-    groups = _groups(len(left))
-    if len(groups) == 1:
+    if len(left) <= _GROUP:
         return quaternions.all_products(left, right)
-    return np.concatenate([quaternions.all_products(left[it], right[it]) for it in groups], axis=1)
+    parts = [quaternions.all_products(left[it], right[it]) for it in _groups(len(left))]
+    return np.concatenate(parts, axis=1)
 
 
 def _groups(views: int) -> list[IntArray]:
-    """Which views are paired with each other."""
-    order = np.arange(views)
-    if views > _GROUP:
-        order = np.random.default_rng(0).permutation(views)
+    """Which of many views are paired with each other."""
+    order = np.random.default_rng(0).permutation(views)
     return np.array_split(order, -(-views // _GROUP))
