@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support.cells import calibrated_sweep
+from support.marks import slow
 
 from visioncal.calibration.pipeline import STAGES, calibrate
 from visioncal.calibration.pipeline.result import result_of
@@ -84,7 +85,7 @@ def restamped(session: Session, stamp) -> Session:
 @pytest.mark.parametrize(
     ("stamp", "words"),
     [
-        (lambda s: s + 0.02 * (s >= s[300]), "from view 300 on it is +20"),
+        slow(lambda s: s + 0.02 * (s >= s[300]), "from view 300 on it is +20"),
         (lambda s: s - 0.02 * (s >= s[200]), "from view 200 on it is -"),
         (lambda s: s + 1e-3 * (s - s[0]), "drifts against the robot's, by +"),
     ],

@@ -49,7 +49,7 @@ def test_of_broken_sessions(place, name):
     assert list(failures("".join(it.said for it in said))) == []
 
 
-@pytest.mark.parametrize("poor", [{"tilt_rad": (0.0, 0.1), "views": 8}, {"views": 5}])
+@pytest.mark.parametrize("poor", [{"tilt_rad": (0.0, 0.1), "views": 8}, slow({"views": 5})])
 def test_of_poor_motion_with_a_modelled_arm(place, poor):
     write_session(simulate(CellOptions(seed=4, **poor)), place / "session")
     done = visioncal("calibrate", "session", "-o", "out", "--need-mm", "0.02")
