@@ -343,6 +343,33 @@ def test_views_in_milliseconds_are_named(session):
     assert "Divide the column stamp_s" in caught.value.next_step
 
 
+def test_times_that_images_share_are_named(session):
+    for stamp in (lambda s: np.full_like(s, 3.0), np.floor):
+        with pytest.raises(DataError, match=r"views have the same stamp_s as others .*: it is"):
+            clocked_of(restamped(session, stamp))
+    # Whatever is stated, one time is no time of all of them.
+    with pytest.raises(DataError, match=f"{len(session.views)} of {len(session.views)} views have"):
+        clocked_of(stating(restamped(session, np.zeros_like), AHEAD_S))
+
+
+def test_at_rest_images_may_share_a_time():
+    resting = dwelling(0.0)
+    again = [replace(it, number=it.number + 100) for it in resting.views]
+    assert clocked_of(replace(resting, views=(*resting.views, *again))).clock.method == "rest"
+
+
+def test_times_out_of_order_are_named_where_the_motion_contradicts_them(session):
+    shuffled = np.random.default_rng(3).permutation
+    with pytest.raises(DataError, match=r"^The column stamp_s .* does not ascend") as caught:
+        clocked_of(restamped(session, shuffled))
+    assert caught.value.culprits == ("views.csv: stamp_s",)
+    # Rows in any order are as good, where each has the time of its own image.
+    numbers = shuffled(len(session.views)).tolist()
+    views = [replace(it, number=at) for it, at in zip(session.views, numbers, strict=True)]
+    clock = clocked_of(replace(session, views=tuple(views))).clock
+    assert abs(clock.camera_minus_robot_s - AHEAD_S) < 1e-4
+
+
 def test_a_stream_of_another_time_is_named(session):
     late = session.streams["robot"].values + 1e6 * np.eye(14)[0]
     late = replace(session.streams["robot"], values=late)

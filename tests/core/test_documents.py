@@ -252,7 +252,7 @@ def test_files_that_are_none_of_text_or_too_large(file, tmp_path):
         read_json(file("a.json", b"[\n\0]"))
     with pytest.raises(DataError, match="not UTF-8"):
         read_table(file("a.csv", "größe\n1\n".encode("latin-1")))
-    with pytest.raises(DataError, match="is no regular file"):
+    with pytest.raises(DataError, match="is a folder, and no file"):
         read_yaml(tmp_path)
     with pytest.raises(DataError, match="does not exist"):
         read_yaml(tmp_path / "absent.yaml")

@@ -46,7 +46,7 @@ def test_failed_write_leaves_the_old_content_and_nothing_else(
 def test_missing_file_and_folder_are_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"nowhere\.txt does not exist"):
         read_bytes(tmp_path / "nowhere.txt")
-    with pytest.raises(DataError, match="is no regular file"):
+    with pytest.raises(DataError, match="is a folder, and no file"):
         read_bytes(tmp_path)
     with pytest.raises(DataError, match="cannot be written"):
         write_atomically(tmp_path / "missing" / "a.txt", "")

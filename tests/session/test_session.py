@@ -415,6 +415,7 @@ TOML_REFUSALS = [
     ("[robot]", '[need]\nat = "views"\n[robot]', "need says neither mm nor deg: give how near"),
     ("[robot]", '[need]\nmm = 1\nat = "table"\n[robot]', "need.at is 'table', but must be \"v"),
     ("[robot]", "[need]\nmm = 1\nat = [1, 2]\n[robot]", r"need.at is \[1, 2\], but must be"),
+    ("[robot]", "[need]\nmm = 1\nat = [nan, 0, 0]\n[robot]", "nan, 0, 0], but must be finite num"),
     ("[robot]", "[need]\nmm = 1\nat = [500, 0, 0]\n[robot]", "farther than any arm reaches: .* me"),
 ]
 
@@ -539,6 +540,12 @@ def test_a_missing_or_empty_file_is_named(folder: Path, name: str) -> None:
     assert name in refusal(folder).message
     (folder / name).unlink()
     assert f"{name} does not exist" in refusal(folder).message
+
+
+def test_a_folder_in_the_place_of_a_file_is_named(folder: Path) -> None:
+    (folder / "board.toml").unlink()
+    (folder / "board.toml").mkdir()
+    assert "board.toml is a folder, and no file" in refusal(folder).message
 
 
 def test_a_header_without_rows_is_named(folder: Path) -> None:

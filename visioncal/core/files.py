@@ -167,6 +167,8 @@ def absence(path: Path) -> str:
     try:
         if path.is_file():
             return ""
+        if path.is_dir():
+            return "is a folder, and no file"
         return "is no regular file" if path.exists() else "does not exist"
     except (OSError, ValueError) as error:
         words = error.strerror if isinstance(error, OSError) and error.strerror else error
@@ -342,7 +344,7 @@ def find_described(
         if path.is_file():
             return path
         raise DataError(
-            f"The {what} file {path} does not exist.",
+            f"The {what} file {path} {absence(path)}.",
             culprits=[str(path)],
             next_step="Check the path and its spelling."
             if folder is None

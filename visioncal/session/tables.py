@@ -106,6 +106,8 @@ class NeedTable(TableModel):
         numbers = self.at if isinstance(self.at, list) else []
         if len(numbers) != 3 or not all(type(it) in (int, float) for it in numbers):
             return f'is {self.at!r}, but must be "{VIEWS}" or [x, y, z] in the base [m]'
+        if not all(abs(it) < np.inf for it in numbers):
+            return f"is {self.at!r}, but must be finite numbers: [x, y, z] in the base [m]"
         if not all(abs(it) <= _FAR_M for it in numbers):
             return (
                 f"is {self.at!r}, farther than any arm reaches: it is in the base, in metres "

@@ -20,6 +20,8 @@ from visioncal.calibration.stages.offset import (
     change_doubt,
     clock_words,
     no_offset,
+    not_ascending,
+    shared_times,
     speed_words,
     stated_doubts,
     turning_doubt,
@@ -150,7 +152,7 @@ def set_clock(sweep: Sweep, poses: Mapping[int, ViewPoses]) -> Clocked:
         poses: What the camera saw, by view.
 
     Raises:
-        DataError: No view lies within the stream.
+        DataError: No view lies within the stream, or the views' times are wrong.
         DegenerateError: The motion does not determine the offset, it is not stated, and too few
             views were taken at rest.
     """
@@ -206,6 +208,9 @@ def _placed_by(sweep: Sweep, found: _Matched, poses: Mapping[int, ViewPoses]) ->
         return _by_motion(sweep, found.views, (fit, match), found.frames, poses)
     if len(sound) == 1 and found.frames.are_dense and sound[0].sigma_s <= LARGEST_SIGMA_S:
         return _by_turning(sweep, found.views, sound[0])
+    wrong = shared_times(found.views, poses)
+    if wrong is not None:
+        raise wrong
     return _undetermined(sweep, found.views, (found.fits, found.matches))
 
 
@@ -359,6 +364,7 @@ def _undetermined(
 ) -> Clocked:
     """Does without an estimate: by what is stated, or with views at rest."""
     why, stated_s = why_undetermined(*tried), sweep.stated_s
+    likeliest = not_ascending(views) or why
     offset_s = stated_s or 0.0
     correlation = max((it.correlation for it in tried[1]), default=None)
     stamps_s = np.array([view.stamp_s for view in views], dtype=float)
@@ -375,7 +381,7 @@ def _undetermined(
         warning = Finding(
             "clock",
             f"[clock] camera_minus_robot_s is taken as stated, {1e3 * stated_s:+.4g} ms, to "
-            f"{1e3 * _STATED_SIGMA_S:g} ms, although views were taken in motion: {why}.",
+            f"{1e3 * _STATED_SIGMA_S:g} ms, although views were taken in motion: {likeliest}.",
         )
         clock = replace(clock, method="stated", sigma_s=_STATED_SIGMA_S)
         return _placed(sweep, views, clock, [warning], [])
@@ -384,7 +390,7 @@ def _undetermined(
     warning = Finding(
         "clock",
         f"{int((~resting).sum())} views that were taken in motion are left out, as the offset "
-        f"between the clocks is not known: {why}.",
+        f"between the clocks is not known: {likeliest}.",
     )
     kept = [view for view, it in zip(views, resting, strict=True) if it]
     placed = _placed(sweep, kept, clock, [warning], [])

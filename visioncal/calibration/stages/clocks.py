@@ -16,7 +16,7 @@ from visioncal.calibration.stages.motion import is_open, motion_of, stream_of
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.offset import Clock
 from visioncal.calibration.stages.pnp import ViewPoses
-from visioncal.core.errors import DegenerateError, VisioncalError
+from visioncal.core.errors import DataError, DegenerateError, VisioncalError
 from visioncal.core.types import Rejection
 from visioncal.core.verdict import Finding, Step
 from visioncal.estimation.effects.clock import clock_effect
@@ -99,7 +99,7 @@ def _with_pair(seen: T, pair: Pair, rows: list[View]) -> T:
 def _set(sweep: Sweep, poses: Mapping[int, ViewPoses], model: Robot | None) -> Clocked:
     try:
         return set_clock(sweep, poses)
-    except DegenerateError as error:
+    except (DataError, DegenerateError) as error:
         misread = None if model is None else misread_joints(sweep, poses, model)
         if misread is None:
             raise

@@ -8,7 +8,9 @@ import numpy as np
 
 from visioncal.calibration.stages.image_delays import FoundDelay
 from visioncal.calibration.stages.motion import Motion
+from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import GUESS, Finding, Step
@@ -23,6 +25,11 @@ LEAST_CORRELATION, LARGEST_SIGMA_S, _ANY_SIGMA_S = 0.5, 0.01, 1.0
 FEWEST_VIEWS = 3
 # A stated offset that is off by so many sigmas, and by this share of a frame, is reported.
 _STATED_SIGMAS, _STATED_SHARE = 3.0, 0.1
+# Images of one time whose targets are farther apart, as a share of their distance, are of several.
+_ELSEWHERE = 0.05
+# Rows by the names of their images ("10" before "2") fall in a tenth of the steps, shuffled ones in
+# half.
+_SHUFFLED = 0.25
 
 ClockMethod: TypeAlias = Literal["motion", "turning", "stated", "rest"]
 
@@ -175,6 +182,57 @@ def why_undetermined(fits: Sequence[ClockFit], matches: Sequence[Match]) -> str:
     return f"the motion repeats itself: offsets of {several} ms explain it alike"
 
 
+def shared_times(views: Sequence[View], poses: Mapping[int, ViewPoses]) -> DataError | None:
+    """The error of views of one time that show the same target in several places.
+
+    Args:
+        views: The views of one camera that wait for a pose of the robot.
+        poses: What it saw, by view.
+
+    Returns:
+        The error; None where these are no more than half of the views.
+    """
+    same: dict[tuple[float | None, int], list[View]] = {}
+    for view in views:
+        same.setdefault((view.stamp_s, poses[view.number].board), []).append(view)
+    shared = [it for it in same.values() if _elsewhere(it, poses)]
+    if 2 * sum(map(len, shared)) <= len(views):
+        return None
+    largest = max(shared, key=len)
+    return DataError(
+        f"{sum(map(len, shared))} of {len(views)} views have the same stamp_s as others that show "
+        f"the target elsewhere: it is {largest[0].stamp_s:.6f} s in views "
+        f"{some_of([str(it.number) for it in largest])}.",
+        culprits=["views.csv: stamp_s"],
+        next_step="Write the time at which each image was taken into stamp_s, in seconds with all "
+        "the digits that the camera gives.",
+    )
+
+
+def _elsewhere(views: Sequence[View], poses: Mapping[int, ViewPoses]) -> bool:
+    """Whether views show the target in several places."""
+    first_m, *others = (poses[it.number].cam_from_target[:, :3, 3] for it in views)
+    at_m = first_m[0]
+    # A board that looks the same upside down may be taken for either.
+    away_m = [np.linalg.norm(it - at_m, axis=1).min() for it in others]
+    return max(away_m, default=0.0) > _ELSEWHERE * float(np.linalg.norm(at_m))
+
+
+def not_ascending(views: Sequence[View]) -> str:
+    """Says so where the times do not go along with the views' numbers; empty where they do."""
+    ordered = sorted(views, key=lambda it: it.number)
+    stamps_s = np.array([it.stamp_s for it in ordered], dtype=float)
+    falls = np.flatnonzero(np.diff(stamps_s) < 0.0)
+    if len(falls) <= _SHUFFLED * max(len(ordered) - 1, 0):
+        return ""
+    before, after = ordered[falls[0]], ordered[falls[0] + 1]
+    return (
+        f"the column stamp_s of views.csv does not ascend with the views: it falls {len(falls)} "
+        f"times in {len(ordered)} rows, first from {before.stamp_s:.6f} s (view {before.number}) "
+        f"to {after.stamp_s:.6f} s (view {after.number})"
+    )
+
+
 def no_offset(
     motion: Motion, views: Sequence[View], resting: Mask, why: str
 ) -> DegenerateError | DataError:
@@ -203,12 +261,24 @@ def no_offset(
             next_step="Stamp both with clocks that differ by seconds at most, or state about what "
             "they differ by: [clock] camera_minus_robot_s.",
         )
+    more = (
+        "Sweep the robot to and fro, about different axes, with the target in view; or take "
+        f"{FEWEST_VIEWS} views or more at rest; or state [clock] camera_minus_robot_s."
+    )
+    disorder = not_ascending(views)
+    if disorder:
+        return DataError(
+            f"{disorder[0].upper()}{disorder[1:]}; and the motion does not tell the offset between "
+            f"the clocks of camera and robot: {why}.",
+            culprits=["views.csv: stamp_s"],
+            next_step="Write into each row's stamp_s the time at which its own image was taken. "
+            f"Where the rows are in another order on purpose: {more[0].lower()}{more[1:]}",
+        )
     return DegenerateError(
         f"clock: the offset between the clocks of camera and robot is left open by {len(views)} "
         f"views, of which {int(resting.sum())} were taken at rest: {why}.",
         culprits=[f"streams/{motion.name}.csv", "views.csv: stamp_s"],
-        next_step="Sweep the robot to and fro, about different axes, with the target in view; or "
-        f"take {FEWEST_VIEWS} views or more at rest; or state [clock] camera_minus_robot_s.",
+        next_step=more,
     )
 
 
