@@ -7,7 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.advice import failures, printed_commands
+from support.commands import visioncal as typed
 from support.foreign_samples import easy_handeye_file
+from support.whole_cells import misfit
 from typer.testing import CliRunner
 
 import visioncal
@@ -64,8 +67,9 @@ def in_millimetres(rows):
         row.update({name: repr(1e3 * float(row[name])) for name in POSE[:3]})
 
 
-def guessed(source, dest, *more):
-    return CliRunner().invoke(app, ["convert", str(source), str(dest), "--guess", *more])
+def guessed(source, dest, *more, strict=False):
+    words = ["convert", str(source), str(dest), "--guess", *more]
+    return CliRunner().invoke(app, words, catch_exceptions=not strict)
 
 
 def by_view(session, names):
@@ -125,6 +129,56 @@ def test_a_board_in_millimetres_is_read_so_and_said(cell):
     assert any(
         "board.toml cannot be in metres: 30 is read as 30 mm" in it for it in session.warnings
     )
+
+
+def mirrored_cell(folder, *, corners=True):
+    """Writes a cell whose corners.csv is mirrored, or else whose robot's frame is left-handed."""
+    cell = simulate(CellOptions(views=18, seed=3))
+    flange, width = cell.base_from_flange, cell.stated_camera.resolution[0]
+    mirror = np.eye(4) if corners else np.diag([1.0, -1.0, 1.0, 1.0])
+    seen = [it.px * [-1, 1] + [width - 1, 0] if corners else it.px for it in cell.corners]
+    Session.from_corners(
+        [(it.ids, px) for it, px in zip(cell.corners, seen, strict=True)],
+        mirror @ flange @ mirror,
+        replace(cell.options.target, square_sigma_m=1e-7),
+        cell.stated_camera.resolution,
+        mount="eye-in-hand",
+    ).save(folder)
+    return cell
+
+
+def test_mirrored_corners_are_turned_back_by_what_is_typed(tmp_path):
+    cell = mirrored_cell(tmp_path / "cell")
+    done = typed("calibrate", tmp_path / "cell", "-o", tmp_path / "out")
+    (line,) = (it for it in printed_commands(done.said) if "--guess" in it)
+    assert list(failures(line)) == []
+    found = visioncal.Calibration.load(tmp_path / "out")
+    assert found.verdict.status == "good"
+    for name, truth in cell.transforms.items():
+        edge = found.edges[name]
+        # Chi-square of six: a sound edge is beyond in one of ten thousand.
+        assert misfit(edge.matrix, edge.covariance, truth) < 28.0
+    changed = "corners.csv is mirrored back: each u_px is 1279 less what it was"
+    (said,) = Session.load(tmp_path / "cell-fixed").declaration.corrected
+    assert said.startswith(changed)
+    assert any(changed in it.words for it in found.verdict.findings)
+    assert by_view(Session.load(tmp_path / "cell-fixed"), POSE) == by_view(
+        Session.load(tmp_path / "cell"), POSE
+    )
+
+
+def test_poses_are_mirrored_only_when_that_is_asked_for(tmp_path):
+    mirrored_cell(tmp_path / "cell", corners=False)
+    done = typed("calibrate", tmp_path / "cell", "-o", tmp_path / "out")
+    assert "--mirror-poses" in done.said
+    assert not any("--guess" in it for it in printed_commands(done.said))
+    with pytest.raises(DataError, match="mirrored images are the usual cause"):
+        guessed(tmp_path / "cell", tmp_path / "fixed", "--yes", strict=True)
+    assert not (tmp_path / "fixed").exists()
+    assert guessed(tmp_path / "cell", tmp_path / "fixed", "--yes", "--mirror-poses").exit_code == 0
+    fixed = Session.load(tmp_path / "fixed")
+    assert "left-handed frame" in fixed.declaration.corrected[0]
+    assert visioncal.calibrate(fixed).verdict.status == "good"
 
 
 # A cell: what the camera is from the flange, and the target from the base; or the other way round.

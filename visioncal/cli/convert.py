@@ -127,6 +127,10 @@ def convert_command(
     yes: Annotated[
         bool, _doubt("--yes", help="Take the best one where it stands out clearly.")
     ] = False,
+    mirror_poses: Annotated[
+        bool,
+        _doubt("--mirror-poses", help="Mirror the robot's poses where its frame is left-handed."),
+    ] = False,
 ) -> None:
     """Write a session as a folder or a recording, or make one of another program's.
 
@@ -138,8 +142,19 @@ def convert_command(
     requested, form = written.requested(), written.form
     if yes and not guess:
         raise DataError("--yes takes the best guess; it needs --guess.", culprits=["--yes"])
+    if mirror_poses and not guess:
+        words = "--mirror-poses is for what a guess finds; it needs --guess."
+        raise DataError(words, culprits=["--mirror-poses"])
     choose = partial(_chosen, yes=yes) if guess else None
-    session = convert(source, dest, requested=requested, form=form, force=force, choose=choose)
+    session = convert(
+        source,
+        dest,
+        requested=requested,
+        form=form,
+        force=force,
+        choose=choose,
+        mirrors_poses=mirror_poses,
+    )
     for warning in session.warnings:
         messages().print(escape(f"note: {warning}"))
     messages().print(escape(f"wrote {dest}\nsha256 {session.digest()}"))

@@ -48,6 +48,7 @@ class Declaration(TableModel):
 
     Of each kind there is one, in the table of the singular, or there are several by name, in those
     of the plural. frames: what each frame hangs on, as far as that is said; see `frames`.
+    corrected: what `convert --guess` changed of what was recorded, in sentences.
     """
 
     schema_version: Literal[1] = Field(alias="schema")
@@ -66,6 +67,7 @@ class Declaration(TableModel):
     clocks: dict[str, ClockTable] = Field(default_factory=dict)
     prior: dict[str, PriorTable] = Field(default_factory=dict)
     need: NeedTable | None = None
+    corrected: list[str] = Field(default_factory=list)
 
     def named(self, kind: Kind) -> dict[str, TableModel]:
         """The tables of a kind by the names that rows give them; that of a singular is empty."""

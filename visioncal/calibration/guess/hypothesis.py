@@ -12,6 +12,9 @@ from visioncal.core.types import FloatArray, IntArray, Mask, Mount
 
 # `mirror`: the whole frame is left-handed. A letter: that coordinate alone has the wrong sign.
 Signs: TypeAlias = Literal["", "mirror", "x", "y", "z"]
+MIRROR_WORDS = (
+    "the images mirrored, or the robot's poses in a left-handed frame (one axis mirrored)"
+)
 SIGNS: tuple[Signs, ...] = ("", "mirror", "x", "y", "z")
 
 # Mirroring any one axis is the same up to half turns of both frames; y is taken.
@@ -219,7 +222,7 @@ def _of_side(whose: str, tried: Taken, declared: Taken) -> Iterator[str]:
     if tried.transposed != declared.transposed:
         yield f"{whose} rotations transposed"
     if tried.signs == "mirror":
-        yield f"the images mirrored, or {whose} poses in a left-handed frame (one axis mirrored)"
+        yield MIRROR_WORDS
     elif tried.signs:
         yield f"{whose} positions with {tried.signs} negated"
     if tried.half_turned:

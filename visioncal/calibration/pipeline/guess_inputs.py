@@ -12,6 +12,7 @@ from visioncal.calibration.guess.given import FEWEST_ROWS, Recording, closes
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.cause_ranking import (
+    COUNTED_BACKWARDS,
     MIRRORED,
     MIRRORED_CORNERS,
     read_otherwise,
@@ -165,9 +166,39 @@ def reading_hint(seen: RunState) -> Finding | None:
     swap = best.hypothesis.swap if len(best.differences) == 1 else ()
     exchanged = tuple(views[row].number for row in swap)
     found = read_otherwise(guess.sentence, exchanged, is_mirrored=is_mirrored)
-    if is_mirrored and not any(it.image for it in views):
+    if is_mirrored and corners_are_mirrored(seen):
         found = replace(found, do=MIRRORED_CORNERS)
     return found
+
+
+def corners_are_mirrored(seen: RunState) -> bool:
+    """Whether corners.csv shows boards from behind, as a camera cannot see a print.
+
+    A left-handed frame of the robot does not do that, nor do images that were mirrored before
+    another program numbered their corners.
+
+    Args:
+        seen: What is known once the camera's poses are.
+    """
+    session = seen.session
+    if any(it.image for it in session.views) or not session.corners:
+        return False
+    if any(it.kind == "points" for it in session.boards.values()):
+        # Its z may point either way.
+        return False
+    poses = _camera_numbers(replace(seen, poses=seen.poses_of_one_board)).poses()
+    # A board's z points into it.
+    into = np.sum(poses[:, :3, 2] * poses[:, :3, 3], axis=1)
+    return bool(np.nanmedian(into) < 0.0)
+
+
+def session_is_mirrored(session: Session) -> bool:
+    """Does what `corners_are_mirrored` does with a session of which nothing is known yet.
+
+    Raises:
+        VisioncalError: The camera's poses cannot be found.
+    """
+    return corners_are_mirrored(_seen(RunState(session)))
 
 
 def _unrecorded(seen: RunState) -> Finding | None:
@@ -248,7 +279,8 @@ def readings_in_cell(known: RunState) -> Iterator[Finding]:
             mirrored.add(pair.camera)
             named = replace(hint, words=f"Camera {pair.camera}: {hint.words}")
             if hint.do is MIRRORED_CORNERS:
-                yield named
+                # A copy is written of one camera and one robot alone.
+                yield replace(named, do=Step(COUNTED_BACKWARDS))
                 continue
             step = (
                 f"Look at an image of {pair.camera} first: where it is mirrored (a flip in the "

@@ -56,6 +56,7 @@ def _read_robot(known: RunState) -> RunState:
         )
     said = map(_suspicious, session.warnings)
     known = known.noting((), (*pairing(session), *said, *not_used(known)))
+    known = replace(known, notes=(*known.notes, *session.declaration.corrected))
     if len(known.held_back) == len(session.views):
         raise all_held_back(known)
     # Views that have a time alone get their poses once the camera's are known.

@@ -40,11 +40,12 @@ from visioncal.results import NeedMet
 # The limits of tests that are passed by chance: none is behind the first, the last is a fact.
 _REMARK, _FACT = float(np.exp(-1.0)), 1e-12
 
+# No copy mirrors sound poses unasked: another sign of y would look as good.
+_LEFT_HANDED = "Only where the robot's frame is left-handed, convert with --guess --mirror-poses."
 MIRRORED = Step(
     "Look at an image first: where it is mirrored (a flip in the camera's driver, a mirror before "
-    "the lens), turn the images back, and calibrate anew. Only where the robot's frame is "
-    "left-handed, write a copy of the session that is read so, and calibrate it.",
-    GUESS_AND_CALIBRATE,
+    "the lens), turn the images back (and find the corners anew), and calibrate anew. "
+    f"{_LEFT_HANDED}"
 )
 
 # Of corners without images.
@@ -53,8 +54,8 @@ COUNTED_BACKWARDS = (
     "are exchanged, or count from the other side where one runs backwards."
 )
 MIRRORED_CORNERS = Step(
-    f"{COUNTED_BACKWARDS} Only where the robot's frame is left-handed, write a copy of the session "
-    "that is read so, and calibrate it.",
+    f"{COUNTED_BACKWARDS} As they are, the board would be seen from behind. Write a copy of the "
+    "session whose u_px are mirrored back, and calibrate it.",
     GUESS_AND_CALIBRATE,
 )
 _UNRECORDED = Step(

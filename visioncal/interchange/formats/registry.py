@@ -48,6 +48,7 @@ def convert(
     form: str | None = None,
     force: bool = False,
     choose: Choose | None = None,
+    mirrors_poses: bool = False,
 ) -> Session:
     """Writes a session, or somebody else's recording, as a session's folder or as a recording.
 
@@ -61,6 +62,7 @@ def convert(
         force: Whether a file that is there may be replaced; a folder never is.
         choose: Called, where it is in doubt how the poses are meant, with what was read; what it
             answers is what is written.
+        mirrors_poses: Whether that may mirror the robot's poses.
 
     Returns:
         The session.
@@ -76,7 +78,9 @@ def convert(
             check_radians(foreign.robot, requested.robot, "robot")
             if foreign.camera is not None:
                 check_radians(foreign.camera, requested.camera, "camera")
-        session = assemble(foreign if choose is None else reread(foreign, choose(foreign)))
+        if choose is not None:
+            foreign = reread(foreign, choose(foreign), mirrors_poses=mirrors_poses)
+        session = assemble(foreign)
     elif requested != _DEFAULTS:
         raise DataError(
             f"{source} is a session already; what describes poses and cameras is for somebody "
@@ -89,7 +93,9 @@ def convert(
     else:
         doubtful = load_in_doubt(source)
         check_one_of_each(doubtful.session)
-        session = reread_session(doubtful.session, choose(doubtful), doubtful.robot)
+        session = reread_session(
+            doubtful.session, choose(doubtful), doubtful.robot, mirrors_poses=mirrors_poses
+        )
     write_session(session, dest)
     return session
 

@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 
 from visioncal.calibration.guess import Candidate, Guess, guess_reading
-from visioncal.calibration.guess.hypothesis import Hypothesis
+from visioncal.calibration.guess.hypothesis import MIRROR_WORDS, Hypothesis
 from visioncal.calibration.pipeline.guess_inputs import (
     chain_poses,
     guess_session,
     numbers_in,
     reported_or_chained,
     seen_poses,
+    session_is_mirrored,
 )
 from visioncal.core.conventions import UNITS_M, PoseNumbers, Reading
 from visioncal.core.documents.tables import is_number
@@ -33,6 +34,7 @@ from visioncal.session.columns import (
     joint_columns,
     position_columns,
 )
+from visioncal.session.corners import CornerTable
 from visioncal.session.table import Row, parse_csv
 from visioncal.vision.targets import LARGEST_M
 
@@ -72,12 +74,20 @@ def guess_foreign(foreign: Foreign, *, progress: Progress | None = None) -> Gues
     )
 
 
-def reread(foreign: Foreign, candidate: Candidate) -> Foreign:
+def reread(foreign: Foreign, candidate: Candidate, *, mirrors_poses: bool = False) -> Foreign:
     """Reads a recording as a candidate has it: poses, pairing, mount and the size of the board.
 
+    Args:
+        foreign: The recording.
+        candidate: How its poses are meant.
+        mirrors_poses: Whether the robot's poses may be mirrored.
+
     Raises:
-        DataError: It reads the robot's poses otherwise, and there are joint angles in their place.
+        DataError: It reads the robot's poses otherwise, and there are joint angles in their place;
+            or it mirrors them, unasked.
     """
+    if _mirrors(candidate) and not mirrors_poses:
+        raise _not_mirrored(candidate)
     foreign, notes, taken = spoken(foreign), _note(candidate), candidate.hypothesis
     if foreign.mount is None:
         notes = (*notes, f"The mount is taken for {taken.mount}.")
@@ -211,18 +221,32 @@ def _number(cell: str) -> float:
 
 
 def reread_session(
-    session: Session, candidate: Candidate, robot: PoseNumbers | None = None
+    session: Session,
+    candidate: Candidate,
+    robot: PoseNumbers | None = None,
+    *,
+    mirrors_poses: bool = False,
 ) -> Session:
     """Reads a session's poses as a candidate has it; everything else stays as it is.
+
+    Of a mirror, corners.csv is turned back where it shows the board from behind. The session says
+    what was changed.
 
     Args:
         session: The session.
         candidate: How its poses are meant.
         robot: The numbers of its robot's poses as they are written; left out, those that it has.
+        mirrors_poses: Whether the robot's poses may be mirrored.
 
     Raises:
         DataError: The session that comes out is wrong; or as `reread`.
     """
+    corners = session.corner_table
+    changed: tuple[str, ...] = ()
+    if _mirrors(candidate) and not mirrors_poses:
+        if corners is None or session.resolution is None or not session_is_mirrored(session):
+            raise _not_mirrored(candidate)
+        corners, changed, candidate = _turned_back(corners, session.resolution[0], candidate)
     cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
     camera = numbers_in(session, MEASURED_CAM_POSE)
     robot = numbers_in(session, POSE) if robot is None else robot
@@ -235,7 +259,10 @@ def reread_session(
     if camera.there.any():
         corrected = pose_cells(taken.camera_numbers(camera), MEASURED_CAM_POSE)
         _replace(cells, corrected, MEASURED_CAM_POSE)
+    changed = (*changed, *_note(candidate))
     document = {**session.document, "mount": taken.mount}
+    if changed:
+        document["corrected"] = [*session.declaration.corrected, *changed]
     target = session.target_document
     if target is not None and candidate.board_scale != 1.0 and not session.targets:
         target = _scaled(target, candidate.board_scale)
@@ -247,9 +274,9 @@ def reread_session(
         session.images,
         target_document=target,
         robot_document=session.robot_document,
-        corners=session.corner_table,
+        corners=corners,
     ).with_streams({name: _reread_stream(it, taken) for name, it in session.streams.items()})
-    said = dict.fromkeys((*_note(candidate), *session.warnings, *reread.warnings))
+    said = dict.fromkeys((*changed, *session.warnings, *reread.warnings))
     return replace(reread, warnings=tuple(said))
 
 
@@ -266,6 +293,42 @@ def _reread_stream(stream: Stream, taken: Hypothesis) -> Stream:
     values[:, columns] = [[float(row.get(name, "nan")) for name in POSE] for row in rows]
     values.setflags(write=False)
     return replace(stream, values=values)
+
+
+def _mirrors(candidate: Candidate) -> bool:
+    return candidate.hypothesis.robot.signs == "mirror"
+
+
+def _not_mirrored(candidate: Candidate) -> DataError:
+    """Says that poses are not mirrored unasked: those of mirrored images are right."""
+    return DataError(
+        "Nothing was written: mirrored images are the usual cause, and then the robot's poses are "
+        "right.",
+        culprits=[candidate.words],
+        next_step="Turn the images back, and find their corners anew; only where the robot's "
+        "frame is left-handed, mirror its poses with --mirror-poses.",
+    )
+
+
+def _turned_back(
+    corners: CornerTable, width: int, candidate: Candidate
+) -> tuple[CornerTable, tuple[str, ...], Candidate]:
+    """Mirrors corners back, with the words for it and a candidate that leaves the poses alone."""
+    px = corners.px.copy()
+    px[:, 0] = width - 1 - px[:, 0]
+    words = (
+        f"corners.csv is mirrored back: each u_px is {width - 1} less what it was, and the robot's "
+        "poses are not mirrored. Where it was v_px that counted from the wrong side, mirror v_px "
+        "instead: the camera's frame is turned by 180 deg about its z else."
+    )
+    tried = candidate.hypothesis
+    tried = replace(tried, robot=replace(tried.robot, signs=""))
+    others = tuple(it for it in candidate.differences if it != MIRROR_WORDS)
+    return (
+        replace(corners, px=px),
+        (words,),
+        replace(candidate, hypothesis=tried, differences=others),
+    )
 
 
 def _note(candidate: Candidate) -> tuple[str, ...]:
