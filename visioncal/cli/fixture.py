@@ -97,9 +97,6 @@ def _tool(said: str | None, calibration: "Calibration | None", robot: str | None
 
     Returns:
         The tool; None where the poses are of the tip itself.
-
-    Raises:
-        DataError: There is no such tool, or none that could be meant.
     """
     from visioncal.frames.measured import NO_TOOL, Tool
     from visioncal.interchange.result_files import load_placed

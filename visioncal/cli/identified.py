@@ -72,11 +72,7 @@ def print_predictions(
 
 
 def _terms(words: str) -> FrictionTerms:
-    """The terms of friction that the user names.
-
-    Raises:
-        DataError: There is no such term.
-    """
+    """The terms of friction that the user names."""
     names = [] if words == "none" else [it.strip() for it in words.split(",")]
     wrong = [it for it in names if it not in FRICTION]
     if wrong:

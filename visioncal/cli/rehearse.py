@@ -64,11 +64,7 @@ def rehearse_command(
 
 
 def _make_place(out: Path) -> None:
-    """Makes room in the place of an earlier rehearsal; nothing else is ever removed.
-
-    Raises:
-        DataError: There is a session that is not a rehearsal's.
-    """
+    """Makes room in the place of an earlier rehearsal; nothing else is ever removed."""
     mark, session = out / _SUMMARY, out / "session"
     if session.exists():
         if not mark.is_file():

@@ -201,11 +201,7 @@ class _Kept:
 
 
 def _check_all_seen(steps: Sequence[Step]) -> None:
-    """Raises what a recording ends with where stops gave no view.
-
-    Raises:
-        DataError: Some gave none.
-    """
+    """Raises what a recording ends with where stops gave no view."""
     without = list(missed(steps))
     if without:
         view, reason = without[0]

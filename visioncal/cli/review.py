@@ -61,11 +61,7 @@ def review_command(
 
 
 def _row(file: Path, view: int | None) -> int | None:
-    """The place among its views at which a recording is opened; None for the first.
-
-    Raises:
-        DataError: The session in it has no such view.
-    """
+    """The place among its views at which a recording is opened; None for the first."""
     from visioncal.interchange.result_files import load_result
     from visioncal.present.recording import read_session
     from visioncal.results.parts import worst_view

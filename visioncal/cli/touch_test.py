@@ -193,12 +193,7 @@ def _driven(
     *,
     asks: bool,
 ) -> list[float]:
-    """Brings the tip above each point, and asks for its gap.
-
-    Raises:
-        DataError: The arm's model is not known, nobody can be asked, or no way leads there.
-        DriverError: The arm cannot be driven.
-    """
+    """Brings the tip above each point, and asks for its gap."""
     from visioncal.core.transforms import invert
     from visioncal.live.capture.devices import ArmWish, open_arm
     from visioncal.live.capture.hover import Hovering
@@ -262,11 +257,7 @@ def _gap() -> float:
 
 
 def _line(question: str) -> str:
-    """Asks, and gives the line that was typed.
-
-    Raises:
-        DataError: Nothing more is typed.
-    """
+    """Asks, and gives the line that was typed."""
     try:
         return asked(question)
     except EOFError:

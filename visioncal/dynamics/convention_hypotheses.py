@@ -269,11 +269,7 @@ def _named(joints: tuple[int, ...]) -> str:
 
 
 def _check_units(label: str, robot: Robot, guess: _Guess) -> None:
-    """Refuses torques that are multiples of what they should be.
-
-    Raises:
-        DataError: They are.
-    """
+    """Refuses torques that are multiples of what they should be."""
     scales = np.full(len(guess.joints), np.nan)
     for joint in guess.joints:
         found, left = _fitted(guess, joint)

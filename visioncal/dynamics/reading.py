@@ -113,11 +113,7 @@ def read_recorded(
 
 
 def _check_stamps(label: str, times_s: FloatArray) -> None:
-    """Refuses stamps by which nothing could be told of a motion.
-
-    Raises:
-        DataError: They are farther apart.
-    """
+    """Refuses stamps by which nothing could be told of a motion."""
     usual_s = float(np.median(np.diff(times_s)))
     if usual_s <= _SLOWEST_S:
         return

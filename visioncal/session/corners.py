@@ -338,11 +338,7 @@ def check_points(table: CornerTable, boards: Sequence[Target]) -> None:
 
 
 def _check_first_number(seen: Set[int], known: Set[int], target: Target, file: str) -> None:
-    """Refuses corners that all count from one number higher or lower than the target's points.
-
-    Raises:
-        DataError: They do.
-    """
+    """Refuses corners that all count from one number higher or lower than the target's points."""
     for more, sign in ((-1, "-"), (1, "+")):
         if not seen <= known and {it + more for it in seen} <= known:
             first = min(known) - more

@@ -41,11 +41,7 @@ _ATTRIBUTES = (
 
 
 def _write(what: Literal["UTOOL", "UFRAME"], content: Content) -> str:
-    """Writes the program; what it sets and what it overwrites stand in its remarks.
-
-    Raises:
-        DataError: It is not said which tool or frame it sets.
-    """
+    """Writes the program; what it sets and what it overwrites stand in its remarks."""
     if content.number is None:
         raise DataError(
             f"fanuc-{what.lower()} sets {what}[n] of the controller, and n is not said.",

@@ -239,11 +239,7 @@ def _images(
 
 
 def _image_name(fields: Fields, folder: Path | None, taken: Collection[str]) -> str:
-    """Finds the field that names images, by its name or its cells; empty where none does.
-
-    Raises:
-        DataError: Several do, and none has a usual name.
-    """
+    """Finds the field that names images, by its name or its cells; empty where none does."""
     free = {name: cells for name, cells in fields.texts.items() if name not in taken}
     usual = (it for it in _IMAGE_NAMES if any(map(is_image_name, free.get(it, ()))))
     if name := next(usual, ""):

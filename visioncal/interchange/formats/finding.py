@@ -140,9 +140,6 @@ def _images_of(
 
     Returns:
         (n,) paths, None in a row whose number no image has; and a note where order decides.
-
-    Raises:
-        DataError: Their numbers differ, with what is over.
     """
     there = images_in(folder)
     by_number = _unique_numbers(there)

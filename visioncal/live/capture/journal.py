@@ -188,11 +188,7 @@ def _columns(view: View) -> tuple[str, ...]:
 
 
 def _check_same(before: dict[str, Any], facts: Facts, folder: Path) -> None:
-    """Refuses to go on with the recording of something else.
-
-    Raises:
-        DataError: Naming what differs.
-    """
+    """Refuses to go on with the recording of something else."""
     now = facts.provenance()
     differ = [name for name, value in now.items() if before.get(name) != value]
     if not differ:

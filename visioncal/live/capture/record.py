@@ -178,11 +178,7 @@ def kept_words(journal: Journal) -> str:
 
 
 def _check_model(cell: LiveCell, plan: PlanFile, here: FloatArray) -> None:
-    """Checks that the arm is the plan's: its ways were looked at with that arm in that base.
-
-    Raises:
-        DataError: It is another one.
-    """
+    """Checks that the arm is the plan's: its ways were looked at with that arm in that base."""
     robot = plan.cell.robot
     if len(here) != robot.joint_count:
         raise DataError(

@@ -175,11 +175,7 @@ def _target(content: Mapping[str, Any]) -> Target:
 
 
 def _array(values: object, shape: tuple[int, ...]) -> FloatArray:
-    """An array of finite numbers in a shape.
-
-    Raises:
-        ValueError: It is another.
-    """
+    """An array of finite numbers in a shape."""
     array = np.array(values, dtype=float)
     if not np.isfinite(array).all():
         raise ValueError("a number that is not finite")

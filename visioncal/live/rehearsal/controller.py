@@ -149,11 +149,7 @@ def _text(options: ControllerOptions) -> str:
 
 
 def _read(text: str, **more: str | int | None) -> ControllerOptions:
-    """Reads what `_text` wrote, with more options where they are not None.
-
-    Raises:
-        DataError: It is something else.
-    """
+    """Reads what `_text` wrote, with more options where they are not None."""
     try:
         table: dict[str, Any] = json.loads(text)
         table |= {key: value for key, value in more.items() if value is not None}

@@ -51,11 +51,7 @@ def recording_id(payload: bytes) -> str:
 
 
 def _fields(message: bytes) -> tuple[dict[int, int], dict[int, bytes]]:
-    """Splits a message of Protocol Buffers into its integers and its other fields, by number.
-
-    Raises:
-        ValueError: It ends within a field, or has a field of an unknown type.
-    """
+    """Splits a message of Protocol Buffers into its integers and its other fields, by number."""
     numbers: dict[int, int] = {}
     fields: dict[int, bytes] = {}
     at = 0

@@ -253,11 +253,7 @@ def _no_header(scanned: Scan, damaged: Sequence[Frame]) -> DataError:
 
 
 def _whole_streams(path: Path, records: _Records) -> dict[str, Stream]:
-    """The streams that were written, in the order of the header.
-
-    Raises:
-        DataError: Streams were damaged; it names them.
-    """
+    """The streams that were written, in the order of the header."""
     found, seals = records.streams, records.header.stream_seals
     damaged = [
         name
@@ -277,11 +273,7 @@ def _whole_streams(path: Path, records: _Records) -> dict[str, Stream]:
 def _corners_of(
     path: Path, records: _Records, cells: Sequence[Sequence[str]]
 ) -> CornerTable | None:
-    """The corners of the views that are complete; None where the session has none.
-
-    Raises:
-        DataError: They were damaged.
-    """
+    """The corners of the views that are complete; None where the session has none."""
     seal, found = records.header.corners, records.corners
     if not seal:
         return None
@@ -301,9 +293,6 @@ def _complete_rows(path: Path, records: _Records) -> list[int]:
 
     Views are written one after the other, so what is missing before the last trace of a view, or
     from a recording that was closed, was damaged rather than cut off.
-
-    Raises:
-        DataError: Rows or images were damaged; it names them.
     """
     rows, images, closed = records.rows, records.images, records.closed
     # The last view of a recording that was cut off may lack its row or its image.
