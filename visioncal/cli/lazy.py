@@ -51,7 +51,7 @@ class PlainCommand(TyperCommand):
         return rest
 
     def _refuse_empty_paths(self, ctx: Any, typed: list[str]) -> None:  # noqa: ANN401 - typer's own
-        """Refuses paths of no letter, as of a variable of the shell that is not set: none is meant."""
+        """Refuses paths of no letter, as of a shell's variable that is not set: none is meant."""
         paths = (it for it in self.params if isinstance(ctx.params.get(it.name), Path))
         takers = {opt for it in paths for opt in it.opts}
         for option, value in (*pairwise(typed), *(it.split("=", 1) for it in typed if "=" in it)):

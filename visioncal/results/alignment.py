@@ -20,7 +20,7 @@ from visioncal.estimation.tree import Branch, Step, Tree
 from visioncal.results.codec import KEPT, names_but, read, reading, write
 from visioncal.results.edge import Edge, JointCovariance, StoredEdge
 from visioncal.results.frame import Frame
-from visioncal.results.lens import CameraResult, StoredCamera
+from visioncal.results.lens import CameraResult
 from visioncal.results.parts import SCHEMA, NeedMet, RobotResult, SessionForm, check_schema
 from visioncal.results.sections import CellDetails, CellSections
 from visioncal.results.verdicts import StoredVerdict
@@ -319,7 +319,7 @@ class AlignmentForm:
     robots: Mapping[str, str]
     transforms: Mapping[str, StoredEdge]
     joint_covariance: JointCovariance
-    cameras: Mapping[str, StoredCamera]
+    cameras: Mapping[str, CameraResult]
     noise: Mapping[str, Mapping[str, float]]
     observations: tuple[Sight, ...]
     moved: tuple[Moved, ...]

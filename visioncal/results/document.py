@@ -10,7 +10,7 @@ from visioncal.results.arm import StoredRobot
 from visioncal.results.codec import names_but, read, read_fields, write
 from visioncal.results.edge import JointCovariance, StoredEdge
 from visioncal.results.frame import Frame
-from visioncal.results.lens import StoredCamera
+from visioncal.results.lens import CameraResult
 from visioncal.results.parts import (
     SCHEMA,
     NeedMet,
@@ -63,7 +63,7 @@ class CalibrationForm:
     transforms: Mapping[str, StoredEdge]
     joint_covariance: JointCovariance
     solvers: Mapping[str, SolverResult]
-    camera: StoredCamera | None = None
+    camera: CameraResult | None = None
     ray_frame: RayFrame | None = None
     robot: StoredRobot | None = None
     noise: Mapping[str, float]

@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.core.types import Camera, CameraKind, FloatArray
 from visioncal.estimation.lens_field import LensLevels, displacements
-from visioncal.results.codec import Array, Matrix, Section, Vector, Written
+from visioncal.results.codec import INLINE, Array, Matrix, Section, Vector, Written
 from visioncal.results.edge import Covariance
 from visioncal.vision.camera import project_with_jacobian
 
@@ -56,6 +56,34 @@ class LensField(Section):
 
 
 @dataclass(frozen=True, eq=False)
+class CameraForm:
+    """The intrinsics of a camera.
+
+    Attributes:
+        model: `brown` or `fisheye`.
+        resolution: Width and height [px].
+        matrix: fx, fy, cx, cy [px].
+        distortion: The coefficients in OpenCV's order.
+    """
+
+    model: CameraKind
+    resolution: tuple[int, int]
+    matrix: Annotated[FloatArray, Array((4,))]
+    distortion: Vector
+
+
+_StoredCamera = Annotated[
+    Camera,
+    INLINE,
+    Written(
+        lambda it: it,
+        lambda it, _: Camera(it.model, it.resolution, it.matrix, it.distortion),
+        CameraForm,
+    ),
+]
+
+
+@dataclass(frozen=True, eq=False)
 class CameraResult:
     """The camera that the result was obtained with.
 
@@ -68,11 +96,28 @@ class CameraResult:
         field: What the lens does beyond its model; None where nothing shows that.
     """
 
-    camera: Camera
+    camera: _StoredCamera
     estimated: bool
-    covariance: FloatArray | None = None
-    edge_covariance: FloatArray | None = None
+    covariance: Covariance | None = None
+    edge_covariance: Matrix | None = None
     field: LensField | None = None
+
+    def __post_init__(self) -> None:
+        """Checks that the covariances are of its intrinsics, and of its field.
+
+        Raises:
+            ValueError: They are not.
+        """
+        size = 4 + len(self.camera.distortion)
+        for it in (self.covariance, self.edge_covariance):
+            if it is not None and len(it) != size:
+                raise ValueError(f"a covariance has {len(it)} rows; {size} are needed")
+        if self.field is not None:
+            count = self.displacements(np.zeros((1, 2))).shape[2]
+            for name in ("coefficients", "root", "intrinsics_covariance", "edge_covariance"):
+                rows = len(getattr(self.field, name))
+                if rows != count:
+                    raise ValueError(f"field.{name} has {rows} rows; {count} are needed")
 
     def covariance_with(self, edge: FloatArray) -> FloatArray:
         """The (6 + k + m,) squared covariance of the camera's edge, its lens, and its field.
@@ -145,68 +190,3 @@ class CameraResult:
             field = replace(field, edge_covariance=beside @ jacobian.T)
         edges = None if edges is None else edges @ jacobian.T
         return replace(self, edge_covariance=edges, field=field)
-
-
-@dataclass(frozen=True, eq=False)
-class CameraForm:
-    """A camera.
-
-    Attributes:
-        model: `brown` or `fisheye`.
-        resolution: Width and height [px].
-        matrix: fx, fy, cx, cy [px].
-        distortion: The coefficients in OpenCV's order.
-        estimated: Whether it was estimated from this session's images.
-        covariance: (k, k) of matrix and distortion, where estimated.
-        edge_covariance: (k, 6 e) of these with the transforms, in the order of `joint_covariance`.
-        field: What the lens does beyond its model.
-    """
-
-    model: CameraKind
-    resolution: tuple[int, int]
-    matrix: Annotated[FloatArray, Array((4,))]
-    distortion: Vector
-    estimated: bool
-    covariance: Covariance | None = None
-    edge_covariance: Matrix | None = None
-    field: LensField | None = None
-
-    @classmethod
-    def of(cls, result: CameraResult) -> "CameraForm":
-        """Writes a camera."""
-        camera = result.camera
-        return cls(
-            camera.model,
-            camera.resolution,
-            camera.matrix,
-            camera.distortion,
-            result.estimated,
-            result.covariance,
-            result.edge_covariance,
-            result.field,
-        )
-
-    def result(self, _: str) -> CameraResult:
-        """Reads it.
-
-        Raises:
-            ValueError: The covariances are not of its intrinsics, or of its field.
-        """
-        size = len(self.matrix) + len(self.distortion)
-        for it in (self.covariance, self.edge_covariance):
-            if it is not None and len(it) != size:
-                raise ValueError(f"a covariance has {len(it)} rows; {size} are needed")
-        camera = Camera(self.model, self.resolution, self.matrix, self.distortion)
-        found = CameraResult(
-            camera, self.estimated, self.covariance, self.edge_covariance, self.field
-        )
-        if self.field is not None:
-            count = found.displacements(np.zeros((1, 2))).shape[2]
-            for name in ("coefficients", "root", "intrinsics_covariance", "edge_covariance"):
-                rows = len(getattr(self.field, name))
-                if rows != count:
-                    raise ValueError(f"field.{name} has {rows} rows; {count} are needed")
-        return found
-
-
-StoredCamera = Annotated[CameraResult, Written(CameraForm.of, CameraForm.result, CameraForm)]

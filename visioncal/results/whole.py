@@ -15,7 +15,7 @@ from visioncal.results.alignment import Alignment, Moved, Sight, Untied
 from visioncal.results.codec import INLINE, KEPT, names_but, read, read_fields, write
 from visioncal.results.edge import JointCovariance, StoredEdge
 from visioncal.results.frame import Frame
-from visioncal.results.lens import StoredCamera
+from visioncal.results.lens import CameraResult
 from visioncal.results.parts import (
     HELD_BACK,
     SCHEMA,
@@ -168,7 +168,7 @@ class CellForm:
     tree: Mapping[str, str]
     transforms: Mapping[str, StoredEdge]
     joint_covariance: JointCovariance
-    cameras: Mapping[str, StoredCamera]
+    cameras: Mapping[str, CameraResult]
     robots: Mapping[str, RobotResult]
     targets: Mapping[str, Mapping[str, Any]]
     noise: Mapping[str, Mapping[str, float]]
