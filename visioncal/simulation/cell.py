@@ -24,7 +24,7 @@ from visioncal.simulation.boards import Sheet, centre_m, corners_m
 from visioncal.simulation.optics import mistaken, project, sees
 from visioncal.simulation.options import CellOptions
 from visioncal.simulation.poses import draw_views, mean_view
-from visioncal.simulation.sag import Payload, giving_of, sagging
+from visioncal.simulation.sag import Payload, giving_of, loads_in_turn, sagging
 from visioncal.simulation.second import Shown, chains, sheets_of, shown_at, with_second
 
 # Postures with a smaller dexterity are so near a singularity that no operator would choose them.
@@ -150,7 +150,7 @@ def simulate(options: CellOptions, postures: FloatArray | None = None) -> Cell:
     transforms = _bumped(options, transforms)
     sigma = np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3)
     jitter = stream(options, Stream.ROBOT).standard_normal((options.views, 6)) * sigma
-    payloads = _payloads(options)
+    payloads = loads_in_turn(options.payloads, options.views)
     approach = _approach(options)
     true_base_from_flange = _stands(options, true_arm, moved, payloads, approach) @ exp(jitter)
     joints, wrong_stops = _misreport(options, arm, moved)
@@ -191,12 +191,6 @@ def _stands(
     """Where the flange of an arm that gives way stands, (m, 4, 4), at (m, n) joint angles [rad]."""
     giving = giving_of(arm, options.compliance_rad_per_nm, options.mass_share, options.backlash_rad)
     return forward(arm, sagging(arm, giving, q, payloads, approach))
-
-
-def _payloads(options: CellOptions) -> list[Payload]:
-    """What the arm carries stop by stop; empty for nothing."""
-    carried = options.payloads
-    return [carried[at % len(carried)] for at in range(options.views)] if carried else []
 
 
 def _approach(options: CellOptions) -> FloatArray:

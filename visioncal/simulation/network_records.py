@@ -13,7 +13,6 @@ from visioncal.session import MemoryImages, Session, View, frame_name
 from visioncal.simulation.boards import corners_m
 from visioncal.simulation.cell import Cell
 from visioncal.simulation.exercise import Exercised
-from visioncal.simulation.layout import CameraAt
 from visioncal.simulation.network import first_pushed
 from visioncal.simulation.observed_points import (
     Network,
@@ -24,7 +23,7 @@ from visioncal.simulation.observed_points import (
 )
 from visioncal.simulation.options import CellOptions
 from visioncal.simulation.records import (
-    POSE,
+    camera_table,
     noisy_pose,
     pose_row,
     target_document,
@@ -34,6 +33,7 @@ from visioncal.simulation.records import (
 from visioncal.simulation.render import Scene, encode, prepare_scene, render
 from visioncal.simulation.second import Shown
 from visioncal.simulation.standing import Stream, stream
+from visioncal.simulation.sweep import POSE
 from visioncal.simulation.touching import Touching, write_touches
 
 # What rows have of what was seen: rendered images, the names of images that are not there, or the
@@ -138,7 +138,10 @@ def _document(cell: Network, name: str) -> dict[str, Any]:
         "schema": 1,
         "name": name,
         "robots": {it.name: {"model": it.robot, "tip": "flange"} for it in options.robots},
-        "cameras": {it.name: _camera_table(it) for it in options.cameras},
+        "cameras": {
+            it.name: camera_table(it.camera, with_intrinsics=it.state_intrinsics)
+            for it in options.cameras
+        },
         "targets": {
             it.name: {"target": target_place(it.target, f"target_{it.name}.toml")}
             for it in options.boards
@@ -151,14 +154,6 @@ def _document(cell: Network, name: str) -> dict[str, Any]:
             for it in options.instruments
         }
     return document
-
-
-def _camera_table(camera: CameraAt) -> dict[str, Any]:
-    optics = camera.camera
-    table: dict[str, Any] = {"resolution": list(optics.resolution), "model": optics.model}
-    if camera.state_intrinsics:
-        table |= {"matrix": optics.matrix.tolist(), "distortion": optics.distortion.tolist()}
-    return table
 
 
 def _row(cell: Network, sight: Sight, seen: Seen) -> View:

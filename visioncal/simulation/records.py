@@ -22,9 +22,8 @@ from visioncal.simulation.options import charuco_target, checkerboard_target
 from visioncal.simulation.render import encode, prepare_scene, render
 from visioncal.simulation.sag import Payload
 from visioncal.simulation.second import BOARDS
-from visioncal.simulation.sweep import Sweep
+from visioncal.simulation.sweep import POSE, Sweep
 
-POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 # An operator's pace: a stop every so many seconds [s].
 _PACE_S = 4.0
 
@@ -327,15 +326,15 @@ def _document(cell: Cell, name: str) -> dict[str, Any]:
 
 
 def _camera_table(cell: Cell) -> dict[str, Any]:
-    camera = cell.stated_camera
-    table: dict[str, Any] = {
-        "name": "simulated",
-        "resolution": list(camera.resolution),
-        "model": camera.model,
-    }
-    if cell.options.state_intrinsics:
-        table["matrix"] = camera.matrix.tolist()
-        table["distortion"] = camera.distortion.tolist()
+    stated = camera_table(cell.stated_camera, with_intrinsics=cell.options.state_intrinsics)
+    return {"name": "simulated", **stated}
+
+
+def camera_table(camera: Camera, *, with_intrinsics: bool) -> dict[str, Any]:
+    """What session.toml says of a camera."""
+    table: dict[str, Any] = {"resolution": list(camera.resolution), "model": camera.model}
+    if with_intrinsics:
+        table |= {"matrix": camera.matrix.tolist(), "distortion": camera.distortion.tolist()}
     return table
 
 

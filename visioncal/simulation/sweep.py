@@ -31,7 +31,7 @@ from visioncal.simulation.optics import project, sees
 from visioncal.simulation.options import CellOptions
 from visioncal.simulation.second import Shown, chains
 
-POSE_COLUMNS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 # A frame that shows less of the board gives no pose.
 _FEWEST_CORNERS = 8
 # In which row a corner is depends on when it is taken: by a few thousandths of itself each time.
@@ -179,4 +179,4 @@ def recorded(stamps_s: FloatArray, joints: FloatArray, poses: FloatArray) -> Rec
     quaternions[1:] *= np.where(np.cumsum(turned) % 2, -1.0, 1.0)[:, None]
     names = [f"q{at + 1}_rad" for at in range(joints.shape[1])]
     values = np.hstack([stamps_s[:, None], poses[:, :3, 3], quaternions, joints])
-    return Recorded(("stamp_s", *POSE_COLUMNS, *names), values)
+    return Recorded(("stamp_s", *POSE, *names), values)

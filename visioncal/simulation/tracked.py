@@ -9,8 +9,9 @@ from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import FloatArray
 from visioncal.session import MemoryImages, Session
 from visioncal.simulation.arms import Arm, ArmErrors, arm_named, disturb, forward
-from visioncal.simulation.records import POSE, load_row, pose_row, write_truth
-from visioncal.simulation.sag import Payload, giving_of, sagging
+from visioncal.simulation.records import load_row, pose_row, write_truth
+from visioncal.simulation.sag import Payload, giving_of, loads_in_turn, sagging
+from visioncal.simulation.sweep import POSE
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,7 @@ def tracked(options: Tracked, joints: FloatArray | None = None) -> Shop:
         joints = above(arm, options.stops, rng)
     sigmas = np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3)
     giving = giving_of(true_arm, options.compliance, 1.0, ())
-    standing = sagging(true_arm, giving, joints, payloads_of(options, len(joints)))
+    standing = sagging(true_arm, giving, joints, loads_in_turn(options.payloads, len(joints)))
     flange = forward(true_arm, standing) @ exp(rng.normal(size=(len(joints), 6)) * sigmas)
     rows = []
     for stop, pose in enumerate(flange):
@@ -108,12 +109,6 @@ def tracked(options: Tracked, joints: FloatArray | None = None) -> Shop:
             place_read = true[:3, 3] + options.sigma_m * rng.normal(size=3)
             rows.append((stop, point, compose(true[:3, :3] @ turned, place_read)))
     return Shop(options, arm, true_arm, x, z, joints, tuple(rows))
-
-
-def payloads_of(options: Tracked, stops: int) -> list[Payload]:
-    """What hung on the flange at each stop; empty for nothing."""
-    hung = options.payloads
-    return [hung[at % len(hung)] for at in range(stops)] if hung else []
 
 
 def above(arm: Arm, stops: int, rng: np.random.Generator) -> FloatArray:
@@ -139,7 +134,7 @@ def session_of(
     """
     options = shop.options
     nominal = forward(shop.arm, shop.joints)
-    payloads = payloads_of(options, len(shop.joints))
+    payloads = loads_in_turn(options.payloads, len(shop.joints))
     rows = []
     for view, (stop, point, read) in enumerate(shop.rows):
         keys = POSE if options.poses else POSE[:3]
