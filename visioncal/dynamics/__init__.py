@@ -4,14 +4,13 @@ from visioncal.dynamics.arm import ArmDynamics
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.document import stribeck_rows
 from visioncal.dynamics.excitation import Excitation, ExcitationRequest, excite
-from visioncal.dynamics.gains import Gains, drive_gains
 from visioncal.dynamics.identified import Identified
 from visioncal.dynamics.judge import judge
 from visioncal.dynamics.limits import Missing, Share, allowed_motion
 from visioncal.dynamics.model import DynamicModel, Friction, FrictionTerms, sign
 from visioncal.dynamics.motion import Measured, Motion
 from visioncal.dynamics.observer import MomentumObserver, external_torques
-from visioncal.dynamics.payload import Payload, estimate_payload
+from visioncal.dynamics.payload import Gains, Payload, drive_gains, estimate_payload
 from visioncal.dynamics.run import Run
 from visioncal.dynamics.sweeps import SweepRequest, Sweeps, plan_sweeps
 from visioncal.dynamics.validate import Prediction, friction_at, left_for_friction

@@ -1,12 +1,18 @@
-"""A calibrated arm as a file: URDF, joint table, UR's kinematics, a chain, joints' corrections."""
+"""A calibrated arm as a file: URDF, joint table, UR's kinematics, a chain, joints' corrections.
+
+An arm whose dynamics were identified is a URDF, or a chain for a session.
+"""
 
 import json
 
 import numpy as np
 
+from visioncal.core.errors import DataError
 from visioncal.core.transforms import log
 from visioncal.core.types import IntArray
-from visioncal.interchange.exports.arm import ArmContent, ArmFormat, omission_mm
+from visioncal.dynamics import ArmDynamics, Identified
+from visioncal.interchange.exports.arm import ArmContent, ArmFormat, check_said, omission_mm
+from visioncal.interchange.exports.content import Selection
 from visioncal.robot import (
     DHTable,
     Robot,
@@ -16,6 +22,8 @@ from visioncal.robot import (
     table_toml,
     ur_flange,
     ur_kinematics_yaml,
+    weighed_urdf,
+    with_inertias,
     without_functions,
 )
 
@@ -193,3 +201,45 @@ JOINT_CORRECTIONS = ArmFormat(
 )
 
 ARMS = (ROBOT_URDF, ROBOT_DH, UR_KINEMATICS, ROBOT_JSON, JOINT_CORRECTIONS)
+
+
+def write_dynamics(identified: Identified, to: str, selection: Selection) -> str:
+    """Writes an arm with the inertias of its links that were identified, as bodies.
+
+    Args:
+        identified: The result.
+        to: `robot-urdf`: the URDF that it was described by, or a small one; `robot-json`: a chain,
+            which a session may name as its robot.
+        selection: What is asked for beside; there is nothing to choose.
+
+    Returns:
+        The text.
+
+    Raises:
+        DataError: The format holds no inertias, something was said for which it has no use, or no
+            inertias were identified.
+    """
+    form = _of_inertias(to)
+    check_said(selection, form)
+    arm = ArmDynamics.of(identified)
+    session = identified.facts["session"]["name"]
+    notes = [f"dynamics identified by visioncal from {session!r}, {identified.facts['created']}"]
+    if form is ROBOT_JSON:
+        document = with_inertias(arm.robot.corrected(), arm.inertias).document
+        text = json.dumps({**document, "source": notes[0]}, indent=2, allow_nan=False)
+        return f"{text}\n"
+    if "urdf" in arm.robot.document:
+        return weighed_urdf(arm.robot, arm.inertias, notes)
+    return small_urdf(arm.weighed(), notes)
+
+
+def _of_inertias(name: str) -> ArmFormat:
+    known = {it.name: it for it in (ROBOT_URDF, ROBOT_JSON)}
+    if name in known:
+        return known[name]
+    raise DataError(
+        f"Identified dynamics are inertias of an arm's links, which {name} does not hold; "
+        f"{' and '.join(known)} do.",
+        culprits=[name],
+        next_step=f"visioncal export DYNAMICS --to {ROBOT_URDF.name}",
+    )

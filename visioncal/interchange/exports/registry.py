@@ -10,15 +10,21 @@ from visioncal.core.files import did_you_mean
 from visioncal.core.transforms import adjoint, invert
 from visioncal.dynamics import Identified
 from visioncal.interchange.exports.arm import ArmFormat, select_arm
-from visioncal.interchange.exports.armfiles import ARMS
+from visioncal.interchange.exports.armfiles import ARMS, write_dynamics
 from visioncal.interchange.exports.content import Content, ExportFormat, Selection
 from visioncal.interchange.exports.controllers import CONTROLLERS
-from visioncal.interchange.exports.dynamics import write_dynamics
 from visioncal.interchange.exports.lens import CAMERA_INFO, KALIBR, OAK
 from visioncal.interchange.exports.matrices import OPENCV, TEXT, ZIVID
 from visioncal.interchange.exports.programs import PROGRAMS
 from visioncal.interchange.exports.robots import ROBOTS
-from visioncal.interchange.exports.ros import EASY_HANDEYE, EASY_HANDEYE2, MOVEIT, ROS, ROS_LAUNCH
+from visioncal.interchange.exports.ros import (
+    EASY_HANDEYE,
+    EASY_HANDEYE2,
+    MOVEIT,
+    ROS,
+    ROS_LAUNCH,
+    URDF,
+)
 from visioncal.interchange.exports.sources import (
     HAND_EYE,
     Kind,
@@ -28,7 +34,6 @@ from visioncal.interchange.exports.sources import (
     is_kind,
     placements,
 )
-from visioncal.interchange.exports.urdf import URDF
 from visioncal.results import Alignment, Calibration, Edge, Verdict
 from visioncal.session.choosing import ARM, EYE, PARTS, Choice
 

@@ -1,4 +1,4 @@
-"""A transform for ROS: the fields of a message, a calibration of easy_handeye, a launch file.
+"""A transform for ROS: the fields of a message, easy_handeye, a launch file, a URDF's joint.
 
 A robot's ROS description calls the controller's own base frame `base`, and the frame of the poses
 that the controller reports without a tool `tool0` (ROS-Industrial, draft REP 199; Universal Robots,
@@ -7,9 +7,11 @@ ur_description, doc/robot_frames.rst). Its `base_link` and `flange` may be turne
 REP 103 calls an optical frame.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 
 from visioncal.core.conventions import POSE_FORMS, write_pose
+from visioncal.core.files import one_line
 from visioncal.interchange.exports.content import (
     Content,
     ExportFormat,
@@ -34,6 +36,50 @@ _MEANINGS: Mapping[str, str] = {
     "fixture": "the fixture's own frame",
 }
 _NUMBERS = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
+
+
+def _write_urdf(content: Content) -> str:
+    return _write_urdf_all([content])
+
+
+def _write_urdf_all(contents: Sequence[Content]) -> str:
+    """Writes a document that `xacro:include` takes in, with the children's links and the joints.
+
+    `rpy` turns about the parent's fixed axes, x first, then y, then z: the rotation is Rz(yaw)
+    Ry(pitch) Rx(roll) (ROS wiki, urdf/XML/joint; urdfdom, Rotation::setFromRPY).
+    """
+    # A cell's root is a parent alone, and no robot's description has a link for it.
+    roots = {it.parent for it in contents if it.frames[0] == "cell"}
+    links = "".join(f'  <link name="{it}"/>\n' for it in sorted(roots))
+    joints = "".join(map(_urdf_joint, contents))
+    return f'<?xml version="1.0"?>\n<robot name="visioncal">\n{links}{joints}</robot>\n'
+
+
+def _urdf_joint(content: Content) -> str:
+    # XML ends a comment at two hyphens.
+    notes = "".join(
+        f"  <!-- {re.sub('-(?=-)', '- ', one_line(it))} -->\n" for it in ros_notes(content)
+    )
+    pose = [repr(it) for it in numbers(write_pose(content.matrix, POSE_FORMS["rpy"]))]
+    joint = f"{content.parent}-{content.child}".replace("/", "_")
+    return (
+        f"{notes}"
+        f'  <link name="{content.child}"/>\n'
+        f'  <joint name="{joint}" type="fixed">\n'
+        f'    <parent link="{content.parent}"/>\n'
+        f'    <child link="{content.child}"/>\n'
+        f'    <origin xyz="{" ".join(pose[:3])}" rpy="{" ".join(pose[3:])}"/>\n'
+        "  </joint>\n"
+    )
+
+
+URDF = ExportFormat(
+    "urdf",
+    "a link and a fixed joint for a URDF or xacro [m, rad about fixed x, y, z]",
+    _write_urdf,
+    frames=ROS_FRAMES,
+    write_all=_write_urdf_all,
+)
 
 
 def _program(contents: Sequence[Content]) -> str:

@@ -17,8 +17,7 @@ from visioncal.interchange.formats.poses import check_radians
 from visioncal.interchange.formats.rereading import InDoubt, load_in_doubt, reread, reread_session
 from visioncal.interchange.formats.ros import EASY_HANDEYE, MOVEIT
 from visioncal.interchange.formats.views import VIEWS
-from visioncal.interchange.formats.visp import VISP
-from visioncal.interchange.formats.zivid import ZIVID
+from visioncal.interchange.formats.yaml_folders import VISP, ZIVID
 from visioncal.session import Session
 from visioncal.session.single import check_one_of_each
 

@@ -20,9 +20,8 @@ from visioncal.present.cellmap import Pair, pairs, places, spans, weakest_frame
 from visioncal.present.report import bars, content, svg, tools
 from visioncal.present.report.axes import Box, Margins, Panel, Scale, boxes
 from visioncal.present.report.bars import Bar
-from visioncal.present.report.content import Fact
+from visioncal.present.report.content import Fact, template
 from visioncal.present.report.svg import Figure
-from visioncal.present.report.templating import template
 from visioncal.results import HELD_BACK, Alignment, Calibration, CameraResult, Sight
 
 _DEG = "\N{DEGREE SIGN}"

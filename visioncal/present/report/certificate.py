@@ -8,8 +8,7 @@ from visioncal.core.files import write_atomically
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure
 from visioncal.core.version import __version__
-from visioncal.present.report.content import need_facts, readable_time
-from visioncal.present.report.templating import template
+from visioncal.present.report.content import need_facts, readable_time, template
 from visioncal.results import Calibration
 from visioncal.session import Session
 

@@ -18,8 +18,8 @@ from visioncal.core.verdict import Verdict
 from visioncal.core.version import __version__
 from visioncal.present.report import svg
 from visioncal.present.report.axes import Margins, Panel, Scale, boxes
+from visioncal.present.report.content import template
 from visioncal.present.report.svg import Figure
-from visioncal.present.report.templating import template
 
 _WIDE_IN, _HIGH_IN = 9.2, 3.6
 # Bars of a stop, side by side, and how many labels have room below them.

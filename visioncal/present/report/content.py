@@ -1,11 +1,13 @@
-"""What the report says: rows of ready text, made from a calibration."""
+"""What the report says: rows of ready text, made from a calibration, for the templates."""
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from functools import cache
 from importlib import metadata
 
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from visioncal.core.number_format import decimals_for, fixed, matched, percent, significant
 from visioncal.core.transforms import pose_difference
@@ -26,9 +28,7 @@ from visioncal.vision.camera import intrinsics
 
 PLUS_MINUS = "\N{PLUS-MINUS SIGN}"
 _DEPENDENCIES = ("numpy", "scipy", "opencv-contrib-python-headless", "pin", "rerun-sdk")
-
 _VIEW_COLUMNS = 3
-
 _MOUNTS = {
     "eye-in-hand": "the camera rides on the robot",
     "eye-to-hand": "the camera stands still and the robot carries the target",
@@ -381,3 +381,20 @@ def _mark(view: ViewResult, outlying: Collection[int]) -> str:
 def dependency_versions() -> tuple[Fact, ...]:
     """Versions of the libraries that compute the result, as installed here."""
     return tuple(Fact(name, metadata.version(name)) for name in _DEPENDENCIES)
+
+
+def template(name: str) -> Template:
+    """A template by its name, in which what is not given is an error."""
+    return _environment().get_template(name)
+
+
+@cache
+def _environment() -> Environment:
+    # It keeps the templates, which take longer to be compiled than a page to be made.
+    return Environment(
+        loader=PackageLoader("visioncal", "present/report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )

@@ -23,9 +23,8 @@ from visioncal.dynamics import (
 )
 from visioncal.present.report import content, svg
 from visioncal.present.report.axes import Box, Margins, Panel, Scale, boxes, spanning
-from visioncal.present.report.content import Fact
+from visioncal.present.report.content import Fact, template
 from visioncal.present.report.svg import Figure
-from visioncal.present.report.templating import template
 
 _UNITS = {
     "m": "kg",

@@ -7,7 +7,7 @@ from itertools import groupby
 
 from visioncal.core.number_format import significant
 from visioncal.core.version import __version__
-from visioncal.present.report.templating import template
+from visioncal.present.report.content import template
 from visioncal.results.fleet import CellFigures, FleetRow
 
 _ICONS = {"good": "good", "check": "check"}

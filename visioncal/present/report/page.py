@@ -22,7 +22,7 @@ from visioncal.present.report import (
     tools,
     uncertainty,
 )
-from visioncal.present.report.templating import template
+from visioncal.present.report.content import template
 from visioncal.present.report.thumbnails import Thumbnail, drawn, thumbnail
 from visioncal.present.report.trends import residuals_over_joints
 from visioncal.results import Calibration, ViewResult
