@@ -11,6 +11,7 @@ from visioncal.core.documents.jsons import parse_json
 from visioncal.core.errors import DataError
 from visioncal.core.files import Table, read_text
 from visioncal.core.types import MOUNTS, Camera, CameraKind, FloatArray, Mount, Target
+from visioncal.estimation.chain import edge_names
 from visioncal.estimation.parts import Noise
 from visioncal.live.planning.cell import Box, Limits, PlanCell
 from visioncal.live.planning.purposes import Purpose, purpose_of
@@ -119,7 +120,7 @@ def _cell(content: Mapping[str, Any]) -> PlanCell:
     if mount not in MOUNTS:
         raise ValueError(f"mount {mount!r}")
     guesses, noise, lens = content["guesses"], content["noise"], content["camera"]
-    x, z = _EDGES[mount]
+    x, z = edge_names(mount)
     limits: dict[str, Any] = {
         name: tuple(value) if isinstance(value, list) else value
         for name, value in content["limits"].items()
@@ -145,12 +146,6 @@ def _cell(content: Mapping[str, Any]) -> PlanCell:
         ),
         None if covariance is None else _array(covariance, (12, 12)),
     )
-
-
-_EDGES: Mapping[str, tuple[str, str]] = {
-    "eye-in-hand": ("flange_from_cam", "base_from_target"),
-    "eye-to-hand": ("base_from_cam", "flange_from_target"),
-}
 
 
 def _camera(lens: Mapping[str, Any]) -> Camera:

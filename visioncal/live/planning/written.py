@@ -14,6 +14,7 @@ from visioncal.core.choices import PLAN_ACCELERATION, PLAN_SPEED
 from visioncal.core.files import one_line, sha256
 from visioncal.core.types import FloatArray
 from visioncal.core.version import __version__
+from visioncal.estimation.chain import edge_names
 from visioncal.live.planning.accuracy import Accuracy
 from visioncal.live.planning.cell import Box, PlanCell
 from visioncal.live.planning.plan import Plan, PlannedStop, Request
@@ -176,11 +177,7 @@ def _stop_document(stop: PlannedStop) -> dict[str, Any]:
 
 
 def _cell_document(cell: PlanCell) -> dict[str, Any]:
-    x, z = (
-        ("flange_from_cam", "base_from_target")
-        if cell.mount == "eye-in-hand"
-        else ("base_from_cam", "flange_from_target")
-    )
+    x, z = edge_names(cell.mount)
     camera = cell.camera
     document: dict[str, Any] = {
         "mount": cell.mount,
