@@ -4,7 +4,7 @@ Torques come from the simulated arm's own frames, by moments about its axes, and
 the application's.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,50 +18,38 @@ _GRAVITY = np.array([0.0, 0.0, -9.80665])
 _ROUNDS = 8
 # Masses [kg] and their centres [m] in the frames of the links, after Universal Robots, "DH
 # parameters for calculations of kinematics and dynamics"; round numbers for the other arm.
-_BODIES = {
+_BODIES: Mapping[str, Sequence[tuple[float, Sequence[float]]]] = {
     "ur3e": (
-        (1.98, 3.4445, 1.437, 0.871, 0.805, 0.261),
-        (
-            (0.0, -0.02, 0.0),
-            (0.13, 0.0, 0.1157),
-            (0.05, 0.0, 0.0238),
-            (0.0, 0.0, 0.01),
-            (0.0, 0.0, 0.01),
-            (0.0, 0.0, -0.02),
-        ),
+        (1.98, (0.0, -0.02, 0.0)),
+        (3.4445, (0.13, 0.0, 0.1157)),
+        (1.437, (0.05, 0.0, 0.0238)),
+        (0.871, (0.0, 0.0, 0.01)),
+        (0.805, (0.0, 0.0, 0.01)),
+        (0.261, (0.0, 0.0, -0.02)),
     ),
     "ur5e": (
-        (3.761, 8.058, 2.846, 1.37, 1.3, 0.365),
-        (
-            (0.0, -0.02561, 0.00193),
-            (0.2125, 0.0, 0.11336),
-            (0.15, 0.0, 0.0265),
-            (0.0, -0.0018, 0.01634),
-            (0.0, 0.0018, 0.01634),
-            (0.0, 0.0, -0.001159),
-        ),
+        (3.761, (0.0, -0.02561, 0.00193)),
+        (8.058, (0.2125, 0.0, 0.11336)),
+        (2.846, (0.15, 0.0, 0.0265)),
+        (1.37, (0.0, -0.0018, 0.01634)),
+        (1.3, (0.0, 0.0018, 0.01634)),
+        (0.365, (0.0, 0.0, -0.001159)),
     ),
     "ur10e": (
-        (7.369, 13.051, 3.989, 2.1, 1.98, 0.615),
-        (
-            (0.021, 0.0, 0.027),
-            (0.38, 0.0, 0.158),
-            (0.24, 0.0, 0.068),
-            (0.0, 0.007, 0.018),
-            (0.0, 0.007, 0.018),
-            (0.0, 0.0, -0.026),
-        ),
+        (7.369, (0.021, 0.0, 0.027)),
+        (13.051, (0.38, 0.0, 0.158)),
+        (3.989, (0.24, 0.0, 0.068)),
+        (2.1, (0.0, 0.007, 0.018)),
+        (1.98, (0.0, 0.007, 0.018)),
+        (0.615, (0.0, 0.0, -0.026)),
     ),
     "generic-6r-1800": (
-        (120.0, 75.0, 60.0, 25.0, 10.0, 5.0),
-        (
-            (-0.1, 0.1, 0.0),
-            (-0.45, 0.0, 0.1),
-            (-0.05, 0.0, 0.15),
-            (0.0, -0.3, 0.0),
-            (0.0, 0.0, 0.03),
-            (0.0, 0.0, -0.04),
-        ),
+        (120.0, (-0.1, 0.1, 0.0)),
+        (75.0, (-0.45, 0.0, 0.1)),
+        (60.0, (-0.05, 0.0, 0.15)),
+        (25.0, (0.0, -0.3, 0.0)),
+        (10.0, (0.0, 0.0, 0.03)),
+        (5.0, (0.0, 0.0, -0.04)),
     ),
 }
 
@@ -155,7 +143,7 @@ def load_torques(
 ) -> FloatArray:
     """(m, n) by which weight and force turn the joints [N m]: their moments about the axes."""
     frames = link_frames(arm, joints)
-    kg, centres = (np.array(it) for it in _BODIES[arm.name])
+    kg, centres = (np.array(it) for it in zip(*_BODIES[arm.name], strict=True))
     weights = giving.mass_share * kg[:, None] * _GRAVITY
     at = frames[:, 1:, :3, :3] @ centres[:, :, None]
     places = at[..., 0] + frames[:, 1:, :3, 3]
