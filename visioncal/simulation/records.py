@@ -26,6 +26,9 @@ from visioncal.simulation.sweep import POSE, Sweep
 
 # An operator's pace: a stop every so many seconds [s].
 _PACE_S = 4.0
+# A step of a pose for differences, and it ahead and behind along each axis: (2, 6, 4, 4).
+_STEP = 1e-6
+_STEPS = exp(_STEP * np.stack([np.eye(6), -np.eye(6)]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,15 +229,10 @@ def noisy_pose(
 
 def _pose_jacobian(camera: Camera, cam_from_target: FloatArray, points: FloatArray) -> FloatArray:
     """(2n, 6) derivative of the pixels by the pose's right perturbation, by differences."""
-    step = 1e-6
-    columns = []
-    for twist in step * np.eye(6):
-        ahead, behind = cam_from_target @ exp(twist), cam_from_target @ exp(-twist)
-        pixels = [
-            project(camera, points @ pose[:3, :3].T + pose[:3, 3]) for pose in (ahead, behind)
-        ]
-        columns.append((pixels[0] - pixels[1]).ravel() / (2.0 * step))
-    return np.stack(columns, axis=1)
+    poses = cam_from_target @ _STEPS
+    turns, places = np.swapaxes(poses[..., :3, :3], -1, -2), poses[..., None, :3, 3]
+    ahead, behind = project(camera, points @ turns + places).reshape(2, 6, -1)
+    return np.asarray((ahead - behind).T / (2.0 * _STEP))
 
 
 def _image_session(cell: Cell, name: str, progress: Callable[[float], None] | None) -> Session:
