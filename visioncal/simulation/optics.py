@@ -139,10 +139,13 @@ def sees(camera: Camera, points_cam: FloatArray, margin_px: float) -> npt.NDArra
     px = project(camera, points_cam)
     width, height = camera.resolution
     inside = (px >= margin_px - 0.5) & (px <= np.array([width, height]) - 0.5 - margin_px)
-    # Far outside the image a polynomial can fold a point back into it; its ray then disagrees.
-    unit = points_cam / np.linalg.norm(points_cam, axis=-1, keepdims=True)
-    agrees = np.einsum("...i,...i->...", rays(camera, px), unit) > 1.0 - 1e-9
-    return np.asarray(inside.all(axis=-1) & agrees & (points_cam[..., 2] > 0.0))
+    seen = np.asarray(inside.all(axis=-1) & (points_cam[..., 2] > 0.0))
+    if seen.any():
+        # From far outside the image a polynomial can fold a point back into it; its ray disagrees.
+        points = points_cam[seen]
+        unit = points / np.linalg.norm(points, axis=-1, keepdims=True)
+        seen[seen] = np.einsum("ni,ni->n", rays(camera, px[seen]), unit) > 1.0 - 1e-9
+    return seen
 
 
 def _to_pixels(camera: Camera, x: FloatArray, y: FloatArray) -> FloatArray:
