@@ -12,6 +12,7 @@ import numpy.typing as npt
 from visioncal.core.choices import SIMULATED_ARMS
 from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean
+from visioncal.core.transforms import cross
 from visioncal.core.types import FloatArray
 
 _HALF_TURN = np.pi
@@ -283,11 +284,12 @@ def _linearise(
     frames = link_frames(arm, joints)
     axes, origins = frames[:, :-1, :3, 2], frames[:, :-1, :3, 3]
     tip = frames[:, -1]
-    levers = np.cross(axes, tip[:, None, :3, 3] - origins)
+    levers = cross(axes, tip[:, None, :3, 3] - origins)
     jacobian = np.swapaxes(np.concatenate([axes, levers], axis=2), 1, 2)
     # Half the sum of the cross products of the axes: zero only where the rotations agree, or
     # where they differ by half a turn, which the caller's check of the error does not see.
-    turn = 0.5 * np.cross(tip[:, :3, :3], goal[:, :3, :3], axis=1).sum(axis=2)
+    here, there = (np.swapaxes(it[:, :3, :3], 1, 2) for it in (tip, goal))
+    turn = 0.5 * cross(here, there).sum(axis=1)
     opposed = np.einsum("mij,mij->m", tip[:, :3, :3], goal[:, :3, :3]) < 0.0
     turn[opposed] *= 2.0 / np.maximum(np.linalg.norm(turn[opposed], axis=1), 1e-3)[:, None]
     shift = goal[:, :3, 3] - tip[:, :3, 3]
