@@ -9,7 +9,7 @@ from support.commands import visioncal
 from support.problems import observed, pose, world
 from support.whole_cells import FLOOR, OPTIONS, PLATE, part, recorded
 
-from visioncal.calibration.pipeline import align
+from visioncal.calibration.pipeline import align, guess_inputs, running
 from visioncal.calibration.pipeline.checkup import doctor
 from visioncal.core.errors import DegenerateError
 from visioncal.session import MemoryImages, Session
@@ -289,6 +289,38 @@ def test_a_mirrored_camera_beside_the_robots_is_named(session):
     assert found.words.startswith("Camera cam_right: With the images mirrored")
     # There are no images to look at.
     assert str(found.do).startswith("In corners.csv, u_px counts to the right")
+
+
+@pytest.mark.parametrize(
+    ("kind", "names", "words"),
+    [
+        ("camera", ("left", "hand"), "The views of cameras left and hand are exchanged"),
+        ("robot", ("a", "b"), "The poses of robots a and b are exchanged"),
+    ],
+)
+def test_exchanged_names_are_the_cause_that_is_said_first(session, kind, names, words):
+    other = dict(zip(names, names[::-1], strict=True))
+
+    def exchanged(_, row):
+        row[kind] = other.get(row[kind], row[kind])
+
+    wrong = rewritten(part(session, 0, 10), exchanged)
+    with pytest.raises(DegenerateError) as caught:
+        align(wrong)
+    assert caught.value.message.startswith(words)
+    assert f"In the column {kind} of views.csv, write {names[1]} for {names[0]}" in (
+        caught.value.next_step
+    )
+    (found,) = [it for it in doctor(wrong).findings if it.kind == "exchanged_names"]
+    assert found.words.startswith(words)
+
+
+def test_exchanges_are_tried_only_where_views_disagree(session, monkeypatch):
+    # A cell that is sound has no pair that does not close.
+    monkeypatch.setattr(guess_inputs, "exchanged_names", None)
+    monkeypatch.setattr(running, "exchanged_names", None)
+    assert align(session).verdict.status == "good"
+    assert not [it for it in doctor(session).findings if it.kind == "exchanged_names"]
 
 
 @pytest.mark.parametrize("seed", [6, 7])

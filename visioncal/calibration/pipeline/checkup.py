@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from visioncal.calibration.pipeline.exchanged_names import exchanged_names
 from visioncal.calibration.pipeline.guess_inputs import reading_hint, readings_in_cell
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.running import known_at_first
@@ -129,8 +130,10 @@ def _findings(known: RunState, error: VisioncalError | None) -> Iterator[Finding
     hint = reading_hint(known) if error is None and known.mount is not None else None
     if hint is not None:
         yield hint
-    if error is None and known.mount is None:
-        yield from readings_in_cell(known)
+    if known.mount is None:
+        readings = [*readings_in_cell(known)] if error is None else []
+        names = None if readings else exchanged_names(known)
+        yield from readings if names is None else [names]
     if error is not None and cause is None:
         yield _refused("refused", error)
     said = () if cause is None else (cause.kind,)

@@ -9,6 +9,7 @@ from scipy.spatial.transform import RigidTransform
 
 from visioncal.calibration.guess import Candidate, Guess, guess_reading
 from visioncal.calibration.guess.given import FEWEST_ROWS, Recording, closes
+from visioncal.calibration.pipeline.exchanged_names import exchanged_names
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.cause_ranking import (
@@ -242,7 +243,7 @@ def _poses_beside_joints(seen: RunState, declared: Candidate) -> Finding | None:
 
 
 def readings_in_cell(known: RunState) -> Iterator[Finding]:
-    """Says which robots and cameras of a whole cell only another reading of the poses explains.
+    """Says which robots and cameras of a whole cell only another reading of the rows explains.
 
     Each camera is looked at with one target and by way of one robot alone, those of most views
     first. Where no reading explains the chain, what is wrong is no reading.
@@ -252,11 +253,18 @@ def readings_in_cell(known: RunState) -> Iterator[Finding]:
     """
     session = known.session
     mirrored: set[str] = set()
+    is_first = True
     for robot in session.robots:
         looked = set(mirrored)
         for pair in pairs_of(known, robot):
             if pair.camera in looked or _closes(known, robot, pair):
                 continue
+            # Sooner tried than readings, and nothing else looks like it.
+            exchanged = exchanged_names(known) if is_first else None
+            if exchanged is not None:
+                yield exchanged
+                return
+            is_first = False
             looked.add(pair.camera)
             try:
                 part = RunState(session.of(pair.camera, robot, pair.target), None, known.threads)

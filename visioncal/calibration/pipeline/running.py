@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from visioncal.calibration.pipeline.exchanged_names import exchanged_names
 from visioncal.calibration.pipeline.guess_inputs import (
     closes_as_declared,
     is_suspect,
@@ -161,7 +162,7 @@ def run_steps(known: RunState) -> RunState:
                 if cause is not None:
                     raise because(error.with_culprits(more), cause) from error
                 if known.mount is None:
-                    hint = hint or next(readings_in_cell(known), None)
+                    hint = hint or exchanged_names(known) or next(readings_in_cell(known), None)
                     if hint is None:
                         raise
                     raise because(error, hint) from error

@@ -21,6 +21,7 @@ from visioncal.calibration.stages.handeye import closed_form_state
 from visioncal.calibration.stages.init_frames import init_frames
 from visioncal.calibration.stages.kinematics import check_asked
 from visioncal.calibration.stages.observed import Observed, nothing_seen
+from visioncal.calibration.stages.pairwise import AGREE_M
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.priors import loosened, without_most_contradicted
 from visioncal.calibration.stages.refine import lens_levels, refined
@@ -29,9 +30,10 @@ from visioncal.calibration.stages.turned_images import Turned, turned_how
 from visioncal.calibration.stages.validate import chain_rms_px, predict_corners
 from visioncal.core.choices import SolverName
 from visioncal.core.errors import DegenerateError
+from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask, Mount, Target
 from visioncal.core.verdict import Finding
-from visioncal.estimation.arm import rows_of
+from visioncal.estimation.arm import LEVER_M, rows_of
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
 from visioncal.estimation.joint import Fitted
 from visioncal.estimation.joint import settle as settle_looks
@@ -237,6 +239,26 @@ def first_agreement(cell: Cell, looked: Observed, mount: Mount) -> tuple[Cell, A
     cell, _, problem, state, _ = _started(cell, views)
     check_observability(problem, state, starting_noise(problem), mount)
     return cell, _agree(cell, problem, state)
+
+
+def agreeing_views(cell: Cell, looked: Observed) -> frozenset[int]:
+    """The views that the first consensus of a cell's frames predicts; nothing is fitted.
+
+    Args:
+        cell: A cell.
+        looked: What was observed in it.
+
+    Raises:
+        DataError: Nothing was seen.
+        DegenerateError: A robot is tied to nothing, or a frame may be in two places.
+    """
+    cell, _ = _tied_part(_with_poses(cell, looked))
+    views = [looked.poses[it.view] for it in cell.rows]
+    cell, _, problem, state, _ = _started(cell, views)
+    between = invert(problem.predicted(state)) @ problem.observations.measured
+    away = np.linalg.norm(between[:, :3, 3], axis=1) + LEVER_M * rotation_angle(between)
+    near = (away < AGREE_M).tolist()
+    return frozenset(row.view for row, is_near in zip(cell.rows, near, strict=True) if is_near)
 
 
 def _with_poses(cell: Cell, looked: Observed) -> Cell:

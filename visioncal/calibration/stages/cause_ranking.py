@@ -81,6 +81,7 @@ class Evidence:
 _CHAIN = "chain"
 EVIDENCE: Mapping[str, Evidence] = {
     EXCHANGED: Evidence(1e-6),
+    "exchanged_names": Evidence(1e-6),
     "turned_images": Evidence(1e-6),
     "wrong_pose": Evidence(1e-3),
     "wrong_views": Evidence(1e-3),

@@ -25,7 +25,7 @@ FEWEST = 3
 # than this [m, with rotations on a lever] is no start.
 _NULL_RATIO, _WORST_M = 1e-8, 0.1
 # Views that agree do so to this, on average, rotations on a lever [m].
-_AGREE_M = 0.02
+AGREE_M = 0.02
 # Noise by which pairs are weighed against each other [rad, m].
 _USUAL = Noise(np.full((1, 2), 5e-4), np.zeros(0))
 # ... and so little is the camera's beside it [rad and m].
@@ -164,7 +164,7 @@ def hand_eye(
     """
     half, found = trimmed(robot, candidates)
     typical = float(found.away.min(axis=1)[half].mean())
-    if typical > _AGREE_M:
+    if typical > AGREE_M:
         return None
     picked = candidates.poses[half, found.picks[half]]
     exact = np.tile(_EXACT**2 * np.eye(6), (len(picked), 1, 1))
