@@ -7,8 +7,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from support.boards import charuco, checkerboard, circles
 from support.broken_sessions import BROKEN, broken_session, edit, edit_rows, sound_session
 from support.commands import visioncal as command
+from support.rendered import Shot, photograph
 from support.typed_fixes import mended
 
 import visioncal
@@ -18,6 +20,7 @@ from visioncal.calibration.stages.image_size import resized_lens, scaled_matrix,
 from visioncal.core.errors import DataError
 from visioncal.core.types import Camera
 from visioncal.interchange.formats import load_in_doubt
+from visioncal.session import Session
 from visioncal.simulation import checkerboard_target
 from visioncal.vision.camera import project
 from visioncal.vision.finders.board import FINDERS
@@ -76,6 +79,56 @@ def test_markers_too_small_to_read_are_no_mirror_and_no_other_board(tmp_path):
     assert first.kind == "unread_markers"
     assert re.search(r"markers cannot be read: they are \d+ px wide", first.words)
     assert not {it.kind for it in rest} & {"mirrored_images", "other_board"}
+
+
+def first_of_blurred(shown, sigma_px):
+    """What is said of a declared ChArUco board of 9 x 6 where images show another or are blurred.
+
+    A module of its markers is 2.9 px wide.
+    """
+    image, _ = photograph(shown, Shot(square_px=28))
+    image = np.pad(image, 20, mode="edge")
+    image = cv2.GaussianBlur(image, (0, 0), sigma_px) if sigma_px else image
+    session = Session.from_arrays([image] * 3, np.tile(np.eye(4), (3, 1, 1)), charuco(9, 6))
+    return visioncal.doctor(session).findings[0]
+
+
+# Dark squares pass for circles at the first, for squares at the second.
+@pytest.mark.parametrize(("columns", "sigma_px"), [(9, 2.9), (9, 2.0), (9, 5.0), (12, 2.9)])
+def test_a_board_too_blurred_for_its_markers_is_no_other_board(columns, sigma_px):
+    found = first_of_blurred(charuco(columns, 6), sigma_px)
+    assert re.match("The images are too blurred|No board can .* image is blurred", found.words)
+    assert "Focus the lens" in found.do.words
+    assert "target check" not in str(found.do)
+
+
+def test_how_blurred_and_how_small_markers_are_is_said():
+    said = first_of_blurred(charuco(9, 6), 2.9).words
+    blur_px, module_px, read_px = map(float, re.findall(r"([0-9.]+) px", said))
+    # With what every picture here has of its own; the sharpest edges are looked for, to a tenth.
+    assert blur_px == pytest.approx(3.0, rel=0.1)
+    # Tilted by 25 deg, its squares are up to a tenth narrower than 28 px.
+    assert module_px == pytest.approx(28 * 0.022 / 0.03 / 7, rel=0.1)
+    assert read_px == pytest.approx(0.4 * module_px, abs=0.06)
+
+
+@pytest.mark.parametrize(
+    ("shown", "sigma_px", "words"),
+    [
+        (circles(5, 9, asymmetric=True), 0.0, "an asymmetric grid of 5 x 9 circles"),
+        (
+            circles(4, 7, asymmetric=True, diameter_m=0.014),
+            2.9,
+            "an asymmetric grid of 4 x 7 circles",
+        ),
+        (checkerboard(7, 4), 0.0, "a checkerboard of 7 x 4 inner corners"),
+        (checkerboard(7, 4), 2.0, "a checkerboard of 7 x 4 inner corners"),
+    ],
+)
+def test_another_board_is_named_though_blurred(shown, sigma_px, words):
+    found = first_of_blurred(shown, sigma_px)
+    assert found.kind == "other_board"
+    assert f"than declared: {words}" in found.words
 
 
 @pytest.mark.parametrize("name", NAMED)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from support.boards import charuco, checkerboard, printed
 from support.marks import slow
+from support.rendered import Shot, photograph
 from typer.testing import CliRunner
 
 from visioncal.cli.target import target_app
@@ -22,6 +23,7 @@ from visioncal.simulation import (
     render_view,
     simulate,
 )
+from visioncal.vision.finders.circles import seen_grids
 from visioncal.vision.finders.identify import identify
 from visioncal.vision.finders.identify_text import to_toml
 from visioncal.vision.finders.imaging import decode_image
@@ -162,6 +164,15 @@ def test_a_blurred_charuco_board_is_doubted_to_be_a_checkerboard(sigma_px):
     identity = identify(cv2.GaussianBlur(page, (0, 0), sigma_px))
     assert identity.kind != "charuco"
     assert any("rather a ChArUco board" in note for note in identity.notes)
+
+
+def test_dark_squares_of_a_blurred_board_are_no_circles():
+    image, _ = photograph(charuco(9, 6), Shot(square_px=28))
+    image = cv2.GaussianBlur(np.pad(image, 20, mode="edge"), (0, 0), 2.9)
+    assert seen_grids(image)
+    identity = identify(image)
+    assert (identity.kind, identity.columns, identity.rows) == ("checkerboard", 8, 5)
+    assert identity.is_filled
 
 
 @pytest.mark.parametrize("sigma_px", [4.0, 8.0, 16.0])

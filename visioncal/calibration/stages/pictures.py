@@ -14,12 +14,10 @@ from visioncal.core.types import Image, Target
 from visioncal.core.verdict import LEAST_NEED_MM, MISSING, Finding, Step
 from visioncal.session import Session, View
 from visioncal.session.images import FolderImages
-from visioncal.vision.finders.board import find_board
 from visioncal.vision.finders.identify import Identity, identify
 from visioncal.vision.finders.identify_text import describe
-from visioncal.vision.finders.imaging import decode_image, why_hard_to_see
-from visioncal.vision.finders.result import DetectedCorners
-from visioncal.vision.targets import load_target, target_names
+from visioncal.vision.finders.imaging import blur_of_edges, decode_image, why_hard_to_see
+from visioncal.vision.targets import load_target, marker_cells, target_names
 
 # So many names are listed, and so many images are searched for whatever board they show.
 _LISTED, _LOOKED_AT = 6, 3
@@ -29,6 +27,11 @@ _SEEN = ("kind", "columns", "rows", "legacy", "marker_id", "asymmetric")
 # A board is named by an image that shows so much of it.
 _CLEARLY = 0.2
 _UNREAD, _MIRRORED = "unread_markers", "mirrored_images"
+# Markers are read up to a blur (sigma) of 0.4 of their modules, and from 1.2 on leave light squares
+# plain. From 0.9 on, dark squares pass for circles as wide as their rows are apart.
+_READ, _PLAIN, _ROUND, _WIDE = 0.4, 1.2, 0.9, 0.9
+# No lens in focus is worse [px].
+_SHARP_PX = 1.2
 # Sizes of squares that are the same but for rounding.
 _SAME_SIZE = 0.01
 
@@ -207,7 +210,12 @@ def _identified(image: Image, declared: Target) -> Identity | None:
         return None
     if declared.kind == "charuco" and _is_its_tag(found, declared):
         return None
-    return found if found.corners_seen >= _CLEARLY * found.corners else None
+    if found.corners_seen >= _CLEARLY * found.corners:
+        return found
+    # Of a blurred board, squares may be counted where its corners are not found one by one.
+    many = 2 * found.corners > (declared.columns - 1) * (declared.rows - 1)
+    blurred = found.is_filled and many and _lacks_markers(image, found, declared)
+    return found if blurred else None
 
 
 def _is_its_tag(found: Identity, declared: Target) -> bool:
@@ -222,9 +230,28 @@ def _has_its_squares(found: Identity, declared: Target) -> bool:
     return is_pair and {found.columns, found.rows} == inner
 
 
-def _lacks_markers(found: Identity, declared: Target) -> bool:
-    """Whether the squares of a declared ChArUco board are seen, but its markers cannot be read."""
-    return _has_its_squares(found, declared) and found.is_filled
+def _module_px(found: Identity, declared: Target) -> float:
+    """How wide the modules of a declared ChArUco board's markers are, by its squares [px]."""
+    modules = len(marker_cells(declared.dictionary, 0))
+    return found.square_px * declared.marker_m / declared.square_m / modules
+
+
+def _lacks_markers(image: Image, found: Identity, declared: Target) -> bool:
+    """Whether squares are seen that a declared ChArUco board has, but no markers in them."""
+    if declared.kind != "charuco" or found.kind not in ("checkerboard", "circles"):
+        return False
+    blur = blur_of_edges(image) / _module_px(found, declared)
+    if found.is_filled:
+        return blur > _READ or _has_its_squares(found, declared)
+    if found.kind == "circles":
+        return found.asymmetric and found.diameter_share > _WIDE and blur > _ROUND
+    return blur > _PLAIN and not _is_larger(found, declared)
+
+
+def _is_larger(found: Identity, declared: Target) -> bool:
+    """Whether a checkerboard has more squares along a side than a ChArUco board."""
+    seen, inner = (sorted((it.columns, it.rows)) for it in (found, declared))
+    return any(one > other - 1 for one, other in zip(seen, inner, strict=True))
 
 
 def _is_better(found: Identity, before: Identity) -> bool:
@@ -250,10 +277,15 @@ def _another(view: View, found: Identity, declared: Target) -> Finding:
             _made_from(view, declared),
         )
     words = (
-        f"The images show another board than declared: a {describe(found)} (view {view.number}), "
+        "The images show another board than declared: "
+        f"{_article(describe(found))} (view {view.number}), "
         f"and {declared.name} is a {_declared(declared)}.{_miscounted(found, declared)}"
     )
     return Finding("other_board", words, step, (view.number,))
+
+
+def _article(words: str) -> str:
+    return f"{'an' if words[0] in 'aA' else 'a'} {words}"
 
 
 def _miscounted(found: Identity, declared: Target) -> str:
@@ -271,7 +303,7 @@ def _miscounted(found: Identity, declared: Target) -> str:
 
 def _unread(view: View, image: Image, found: Identity | None, declared: Target) -> Finding | None:
     """What an image shows in which nothing of a board is read, or its squares alone."""
-    if found is not None and not _lacks_markers(found, declared):
+    if found is not None and not _lacks_markers(image, found, declared):
         return None
     mirrored = _identified(np.ascontiguousarray(image[:, ::-1]), declared)
     # Squares look alike in a mirror: only what is read in it says that there is one.
@@ -279,14 +311,22 @@ def _unread(view: View, image: Image, found: Identity | None, declared: Target) 
     if mirrored is not None and mirrored.kind in of_it:
         return _mirrored(view)
     squares = found or mirrored
-    if squares is None or not _lacks_markers(squares, declared):
+    if squares is None or not _lacks_markers(image, squares, declared):
         return None
-    seen = find_board(image, squares.target(declared.name, declared.square_m))
-    wide = ""
-    if isinstance(seen, DetectedCorners) and len(seen.ids) == squares.columns * squares.rows:
-        grid = seen.px.reshape(squares.rows, squares.columns, 2)
-        square_px = float(np.median(np.linalg.norm(np.diff(grid, axis=1), axis=2)))
-        wide = f": they are {square_px * declared.marker_m / declared.square_m:.0f} px wide"
+    blur_px, module_px = blur_of_edges(image), _module_px(squares, declared)
+    if blur_px > max(_READ * module_px, _SHARP_PX):
+        return Finding(
+            _UNREAD,
+            f"The images are too blurred for the markers of {declared.name}: their edges have a "
+            f"blur (sigma) of {blur_px:.1f} px, and a marker's modules are {module_px:.1f} px wide "
+            f"(view {view.number}); up to {_READ * module_px:.1f} px are read.",
+            Step(
+                "Focus the lens, expose for a shorter time with more light, or bring the board "
+                "nearer; then record again."
+            ),
+            (view.number,),
+        )
+    marker_px = squares.square_px * declared.marker_m / declared.square_m
     step = Step("Bring the board nearer, focus, or use a board of fewer and larger squares.")
     if found is not None:  # Where a few markers are read after all, it is no checkerboard.
         step = Step(
@@ -296,8 +336,8 @@ def _unread(view: View, image: Image, found: Identity | None, declared: Target) 
         )
     return Finding(
         _UNREAD,
-        f"The images show the squares of {declared.name}, but its markers cannot be read{wide} "
-        f"(view {view.number}).",
+        f"The images show the squares of {declared.name}, but its markers cannot be read: they are "
+        f"{marker_px:.0f} px wide, {module_px:.1f} px a module (view {view.number}).",
         step,
         (view.number,),
     )

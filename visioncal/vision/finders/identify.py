@@ -52,6 +52,7 @@ class Identity:
         border: Dark modules around their bits.
         asymmetric: Whether every second row of circles is shifted.
         diameter_share: Their diameter over the distance of rows; 0 without circles.
+        square_px: Side of a checkerboard's squares, or distance of rows of circles, about [px].
         corners_seen: Corners that the finder of that kind finds.
         corners: Corners that the target has.
         notes: What else there is to know, in sentences.
@@ -74,6 +75,7 @@ class Identity:
     border: int = 1
     asymmetric: bool = False
     diameter_share: float = 0.0
+    square_px: float = 0.0
     notes: tuple[str, ...] = ()
 
     @property
@@ -128,7 +130,8 @@ def identify(image: Image) -> Identity:
         identity = _identity(np.asarray(small, np.uint8))
         if identity is not None:
             note = f"It is found only in the picture reduced to {small.shape[1]} pixels in width."
-            return replace(identity, notes=(note, *identity.notes))
+            square_px = identity.square_px / scale
+            return replace(identity, square_px=square_px, notes=(note, *identity.notes))
     why = why_hard_to_see(image, _MAX_BLUR_PX)
     height, width = image.shape
     raise DataError(
@@ -150,8 +153,13 @@ def _identity(image: Image) -> Identity | None:
     boards = _charucos(image, markers)
     singles = _singles(tuple(it for it in genuine(markers) if it.family not in boards))
     grids = _aprilgrids(image)
-    # Circles in staggered rows pass for a checkerboard.
-    found = [*boards.values(), *grids] or _circles(image) or [*_checkerboards(image), *singles]
+    found = [*boards.values(), *grids]
+    if not found:
+        squares = _checkerboards(image)
+        # Circles in staggered rows pass for a checkerboard, and the dark squares of a blurred board
+        # for circles; what lies in the light squares tells that there are squares.
+        circles = [] if any(it.is_filled for it in squares) else _circles(image)
+        found = circles or [*squares, *singles]
     if not found:
         return None
     best = max(found, key=lambda it: it.corners_seen)
@@ -259,7 +267,14 @@ def _checkerboards(image: Image) -> list[Identity]:
     whole = not squares.cut and squares.found
     return [
         Identity(
-            "checkerboard", squares.columns, squares.rows, whole, seen, count, notes=tuple(notes)
+            "checkerboard",
+            squares.columns,
+            squares.rows,
+            whole,
+            seen,
+            count,
+            square_px=squares.square_px,
+            notes=tuple(notes),
         )
     ]
 
@@ -315,6 +330,7 @@ def _circles(image: Image) -> list[Identity]:
             corners=len(grid.px),
             asymmetric=grid.asymmetric,
             diameter_share=grid.share,
+            square_px=grid.diameter_px / grid.share,
             notes=tuple(notes),
         )
     ]

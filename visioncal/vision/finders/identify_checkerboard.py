@@ -45,6 +45,7 @@ class Squares:
         cut: Whether it may go on outside the image.
         found: Whether the corner finder finds a board of just this size.
         filled: Whether the light squares are not plain, as where markers are too blurred to read.
+        square_px: About their side [px].
     """
 
     columns: int
@@ -52,6 +53,7 @@ class Squares:
     cut: bool
     found: bool
     filled: bool
+    square_px: float
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,7 @@ def find_squares(image: Image) -> Squares | None:
         if not found:
             continue
         grid = np.asarray(px, dtype=float).reshape(*np.asarray(meta).shape[:2], 2)
-        here = _counted(small, grid)
+        here = _counted(small, grid, scale)
         if here is not None and (best is None or _rank(here) > _rank(best)):
             best = here
         if best is not None and best.found:
@@ -114,7 +116,7 @@ def _rank(squares: Squares) -> tuple[bool, int]:
     return squares.found, squares.columns * squares.rows
 
 
-def _counted(image: Image, grid: FloatArray) -> Squares | None:
+def _counted(image: Image, grid: FloatArray, scale: float) -> Squares | None:
     """Counts a board's corners, starting from the (rows, columns, 2) ones that were found."""
     rows, columns = grid.shape[:2]
     extent = _Extent(0, 0, columns - 1, rows - 1)
@@ -133,7 +135,8 @@ def _counted(image: Image, grid: FloatArray) -> Squares | None:
     if rows < _SEED[1]:
         return None
     found = _is_there(image, (columns, rows))
-    return Squares(columns, rows, cut, found, _filled(image, plane, shrunk, typical))
+    filled = _filled(image, plane, shrunk, typical)
+    return Squares(columns, rows, cut, found, filled, _side_px(plane, grown) / scale)
 
 
 def _plane(image: Image, corners: FloatArray, px: FloatArray) -> Plane | None:
@@ -145,6 +148,13 @@ def _plane(image: Image, corners: FloatArray, px: FloatArray) -> Plane | None:
         return None
     plane, right = max(found, key=lambda it: int(it[1].sum()))
     return bent_plane(plane, corners[right], px[right])
+
+
+def _side_px(plane: Plane, extent: _Extent) -> float:
+    """The median side of a board's squares [px]."""
+    px = plane.to_px(extent.corners()).reshape(*extent.size[::-1], 2)
+    sides = [np.linalg.norm(np.diff(px, axis=it), axis=2).ravel() for it in (0, 1)]
+    return float(np.median(np.concatenate(sides)))
 
 
 def _outermost(extent: _Extent, side: str) -> _Extent:
