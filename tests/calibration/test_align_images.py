@@ -1,11 +1,13 @@
 """A whole cell from its pictures: `visioncal align` on a folder, and on its recording."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from support.broken_sessions import edit_rows
 from support.commands import visioncal
 
 from visioncal.core.transforms import log
@@ -69,6 +71,17 @@ def test_pictures_of_several_cameras_are_one_cell(out):
         assert "disagrees" in left_out[view]
     assert found.cameras["cam_right"].estimated
     assert not found.cameras["cam_left"].estimated
+
+
+def test_cameras_exchanged_in_all_rows_are_told_by_the_size_of_their_images(folder, tmp_path):
+    wrong = tmp_path / "wrong"
+    shutil.copytree(folder, wrong)
+    other = {"left": "right", "right": "left"}
+    edit_rows(wrong, lambda rows: [it | {"camera": other[it["camera"]]} for it in rows])
+    done = visioncal("align", wrong, "-o", tmp_path / "out")
+    assert done.status == 2
+    assert "that is the size of camera right's" in done.err
+    assert "Where left and right are exchanged in the column camera of views.csv" in done.err
 
 
 @pytest.mark.slow

@@ -391,9 +391,18 @@ def _other_size(
     culprits: Sequence[str],
 ) -> DataError:
     """What to raise where all images are of one other size than the camera's."""
-    camera = session.cameras[name_of(session.declaration, "camera", views[0])]
+    mine = name_of(session.declaration, "camera", views[0])
+    camera = session.cameras[mine]
     words, step = "", f"In session.toml, write resolution = [{size[0]}, {size[1]}]"
-    if camera.stated is not None:
+    other = next((it for it, at in session.cameras.items() if at.size == size), None)
+    if other is not None:
+        words = f"that is the size of camera {other}'s"
+        step = (
+            f"Where {mine} and {other} are exchanged in the column camera of views.csv, exchange "
+            f"them there; where they are not, write resolution = [{size[0]}, {size[1]}] of {mine} "
+            "in session.toml"
+        )
+    elif camera.stated is not None:
         name = session.board_of(views[0])
         seen = _sample(session, views, name) if size == stated[::-1] else {}
         words, step = other_size_step(camera.stated, size, seen, session.boards[name])
