@@ -19,6 +19,7 @@ from visioncal.calibration.stages.cause_ranking import (
 from visioncal.calibration.stages.fit_messages import scale_found
 from visioncal.calibration.stages.judge import Place, judge
 from visioncal.calibration.stages.need import Picks
+from visioncal.core.errors import DegenerateError
 from visioncal.core.transforms import exp, invert, pose_difference
 from visioncal.core.types import Need
 from visioncal.core.verdict import CALIBRATE, GUESS, PLAN, Finding, Step, Verdict, with_paths
@@ -27,7 +28,7 @@ from visioncal.results import Rms
 from visioncal.results.codec import read, write
 from visioncal.results.verdicts import VerdictForm
 from visioncal.session import Session
-from visioncal.simulation import CellOptions, simulate
+from visioncal.simulation import Cell, CellOptions, simulate
 
 EXCHANGED = Finding(
     "exchanged_views",
@@ -239,6 +240,33 @@ def test_scatter_without_any_finding_is_unexplained() -> None:
     assert ids(_scattered()) == ["unexplained"]
 
 
+def session_of(cell: Cell, base_from_flange: np.ndarray) -> Session:
+    """A cell's corners with other reported poses."""
+    return Session.from_corners(
+        [(it.ids, it.px) for it in cell.corners],
+        base_from_flange,
+        cell.options.target,
+        cell.stated_camera.resolution,
+        mount=cell.options.mount,
+        camera=cell.stated_camera,
+    )
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize(("shuffled", "named"), [(18, True), (9, False)])
+def test_rows_that_were_shuffled_are_named(mount, shuffled, named):
+    """Of all of them: where the other half is as it should be, that is not said."""
+    cell = simulate(CellOptions(mount=mount, views=18, seed=4))
+    order = np.arange(18)
+    order[:shuffled] = np.random.default_rng(1).permutation(shuffled)
+    session = session_of(cell, cell.base_from_flange[order])
+    try:
+        first = calibrate(session).verdict.top[0]
+    except DegenerateError as error:
+        first = str(error)
+    assert ("poses are not those of the images" in first) == named
+
+
 @pytest.mark.parametrize("bumped", [False, True])
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 def test_what_was_bumped_on_the_flange_is_named_whatever_the_need(mount, bumped):
@@ -249,14 +277,7 @@ def test_what_was_bumped_on_the_flange_is_named_whatever_the_need(mount, bumped)
         on_flange = next(it for name, it in cell.transforms.items() if name.startswith("flange"))
         knock = on_flange @ exp(np.array([0.006, -0.003, 0.0, 0.0, 0.003, 0.001]))
         flange[9:] = flange[9:] @ on_flange @ invert(knock)
-    session = Session.from_corners(
-        [(it.ids, it.px) for it in cell.corners],
-        flange,
-        cell.options.target,
-        cell.stated_camera.resolution,
-        mount=mount,
-        camera=cell.stated_camera,
-    )
+    session = session_of(cell, flange)
     verdict = calibrate(session, need_mm=20.0).verdict
     causes = [it.kind for it in verdict.findings if it.probability > 0.5]
     assert ("moved_at_once" in causes) == bumped
@@ -275,14 +296,7 @@ def test_a_tool_that_is_switched_on_midway_is_named(mount, since):
     cell = simulate(CellOptions(mount=mount, views=18, seed=3))
     tool, flange = exp(np.array([0.0, 0.5, 0.7, 0.02, -0.01, 0.18])), cell.base_from_flange.copy()
     flange[since:] = flange[since:] @ tool
-    session = Session.from_corners(
-        [(it.ids, it.px) for it in cell.corners],
-        flange,
-        cell.options.target,
-        cell.stated_camera.resolution,
-        mount=mount,
-        camera=cell.stated_camera,
-    )
+    session = session_of(cell, flange)
     cause = calibrate(session).verdict.causes[0]
     assert cause.kind == "something_moved"
     # Of the two parts the larger one is kept.

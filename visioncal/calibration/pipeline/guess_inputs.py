@@ -17,6 +17,7 @@ from visioncal.calibration.stages.cause_ranking import (
     MIRRORED,
     MIRRORED_CORNERS,
     read_otherwise,
+    unpaired_rows,
     unrecorded_rotations,
     wrong_poses,
 )
@@ -29,9 +30,9 @@ from visioncal.calibration.stages.robots import Pair, pairs_of
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.errors import VisioncalError
 from visioncal.core.transforms import invert, rotation_angle
-from visioncal.core.types import FloatArray, Progress
+from visioncal.core.types import FloatArray, IntArray, Progress
 from visioncal.core.verdict import Finding, Step
-from visioncal.estimation.chain import chain
+from visioncal.estimation.chain import chain, robot_part
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.columns import MEASURED_CAM_POSE, POSE
@@ -43,6 +44,11 @@ _SEEING = ("detect", "intrinsics", "pnp")
 _STILL_DEG, _TURNED_DEG = 0.5, 10.0
 # Positions that differ by less are one [m].
 _STILL_M = 1e-3
+# Robot and camera turn alike between two views where they differ by less [deg].
+_ALIKE_DEG = 3.0
+# Rows are as good as shuffled where so many shuffles are as good in such a share; not of fewer
+# rows, or of turns so small that chance makes more of the pairs alike.
+_SHUFFLES, _CHANCE, _FEWEST_SHUFFLED, _MOST_BY_CHANCE = 200, 0.05, 8, 0.3
 
 
 def guess_session(
@@ -161,7 +167,9 @@ def reading_hint(seen: RunState) -> Finding | None:
         # Too little to guess from: what failed has been said already.
         return None
     if not guess.stands_out:
-        return None if guess.declared.closes else _poses_beside_joints(seen, guess.declared)
+        if guess.declared.closes:
+            return None
+        return _poses_beside_joints(seen, guess.declared) or _unpaired(seen)
     best, views = guess.best, seen.session.views
     is_mirrored = best.hypothesis.robot.signs == "mirror"
     swap = best.hypothesis.swap if len(best.differences) == 1 else ()
@@ -216,6 +224,37 @@ def _unrecorded(seen: RunState) -> Finding | None:
         return None
     is_one_pose = bool(np.abs(moved[0][:, :3, 3]).max() < _STILL_M)
     return unrecorded_rotations(most, half, is_one_pose=is_one_pose)
+
+
+def _unpaired(seen: RunState) -> Finding | None:
+    """Says that rows and images have nothing in common, where shuffled rows fit as well.
+
+    A permutation test (Pitman 1937) of how much robot and camera turn between two views, which is
+    the same whatever the frames between them are.
+    """
+    seen = replace(seen, poses=seen.poses_of_one_board)
+    robot, camera = _at_times(seen), _camera_numbers(seen)
+    both = robot.there & camera.there
+    if both.sum() < _FEWEST_SHUFFLED:
+        return None
+    by_robot = _turns(robot_part(robot.poses()[both], seen.session.mount))
+    by_camera = _turns(invert(camera.poses()[both]))
+    first, second = np.triu_indices(len(by_robot), 1)
+
+    def alike(order: IntArray) -> float:
+        apart = by_robot[order[first], order[second]] - by_camera[first, second]
+        return float(np.mean(np.abs(apart) < np.deg2rad(_ALIKE_DEG)))
+
+    rng, share = np.random.default_rng(0), alike(np.arange(len(by_robot)))
+    shuffled = [alike(rng.permutation(len(by_robot))) for _ in range(_SHUFFLES)]
+    if share > np.quantile(shuffled, 1.0 - _CHANCE) or np.mean(shuffled) > _MOST_BY_CHANCE:
+        return None
+    return unpaired_rows(share, float(np.mean(shuffled)))
+
+
+def _turns(poses: FloatArray) -> FloatArray:
+    """(n, n) by how much each of (n, 4, 4) poses is turned from each other [rad]."""
+    return rotation_angle(invert(poses)[:, None] @ poses)
 
 
 def _poses_beside_joints(seen: RunState, declared: Candidate) -> Finding | None:

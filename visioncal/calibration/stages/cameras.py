@@ -30,8 +30,8 @@ from visioncal.vision.targets import first_corners
 T = TypeVar("T", bound=Observed)
 
 # Corners are found to a few tenths of a pixel, and a lens that once was this camera's still fits to
-# a few pixels: beyond these, where another fits this much better, it never was.
-_WRONG_LENS_PX, _MUCH_BETTER = 5.0, 0.1
+# a pixel or two: beyond these, where another fits this much better, it never was.
+_WRONG_LENS_PX, _MUCH_BETTER = 2.0, 0.1
 
 
 def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:

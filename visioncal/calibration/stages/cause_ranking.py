@@ -62,6 +62,10 @@ _UNRECORDED = Step(
     "Look how the poses were recorded: a logger that repeats one pose, or that writes rotations as "
     "0, 0, 0, 1, gives no calibration. Record them again, at the same time as the images."
 )
+_UNPAIRED = Step(
+    "Look how rows and images were paired: files sorted by name (10 before 2), rows sorted anew, "
+    "views.csv of another run. Write into column image which file belongs to each row."
+)
 
 
 @dataclass(frozen=True)
@@ -187,6 +191,20 @@ def unrecorded_rotations(robot_deg: float, camera_deg: float, *, is_one_pose: bo
         f"{camera_deg:.2g} deg: the recorded {wrong} are not those of the views."
     )
     return Finding("misread_poses", words, _UNRECORDED)
+
+
+def unpaired_rows(share: float, chance: float) -> Finding:
+    """The finding that rows and images have nothing in common.
+
+    Args:
+        share: Of the pairs of views, those between which robot and camera turn alike.
+        chance: The same where rows are shuffled.
+    """
+    words = (
+        "The robot's poses are not those of the images: of all pairs of views, robot and camera "
+        f"turn alike in {percent(share)}, and in {percent(chance)} if rows are shuffled."
+    )
+    return Finding("misread_poses", words, _UNPAIRED)
 
 
 def wrong_poses(by_poses: str, by_joints: str) -> Finding:
