@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from dataclasses import replace
 
 import cv2
@@ -62,6 +63,23 @@ def test_nothing_is_wrong_with_a_sound_session(sound):
     done = command("doctor", sound)
     assert (done.status, done.err) == (0, "")
     assert f"visioncal calibrate {sound} -o out" in done.out
+
+
+def test_rows_that_no_image_shows_are_counted(sound, tmp_path):
+    folder = tmp_path / "rows"
+    shutil.copytree(sound, folder)
+    described = (
+        'kind = "charuco"\ncolumns = 9\nrows = 7\nsquare_m = 0.03\nmarker_m = 0.022\n'
+        'dictionary = "DICT_5X5_100"\n'
+    )
+    (folder / "board.toml").write_text(described)
+    edit(folder, lambda text: text.replace("charuco_9x6_30mm", "board.toml"))
+    found = visioncal.doctor(folder)
+    # Another row is no mistake of what is there.
+    assert found.is_sound
+    (said,) = (it for it in found.seen if "rows of squares" in it)
+    assert re.match(r"6 rows of squares, where 7 are declared and \d+ images have room", said)
+    assert "rows of squares" not in str(visioncal.doctor(sound))
 
 
 def test_markers_too_small_to_read_are_no_mirror_and_no_other_board(tmp_path):

@@ -26,11 +26,14 @@ from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, Mount, Progress
 from visioncal.core.verdict import CALIBRATE, MISSING, Finding, Step, with_paths
 from visioncal.session import Session
+from visioncal.vision.finders.board import hidden_corners
 
 # What is looked at; what comes after is the fit.
 _LAST = "joints"
 # A lens is estimated by corners all over the image: so many of these parts of it need some.
 _PARTS, _LEAST_PARTS = 4, 7
+# So many images that show where a row should be, without it, are no chance.
+_LEAST_WITHOUT = 3
 # A lens's centre is nearer to the middle of its images than this share of it.
 _OFF_CENTRE = 0.15
 # Noise of corners beyond which a lens is in doubt [px], and of the flange [mm].
@@ -291,10 +294,32 @@ def _seen(known: RunState) -> Iterator[str]:
         size = "" if look.resolution is None else " of {} x {} px".format(*look.resolution)
         edges = f", edges {np.median(blur):.1f} px wide" if blur else ""
         yield f"the board in {len(look.corners)} {'images' if images else 'views'}{size}{edges}"
+        yield from _unseen_rows(session, look)
     if known.base_from_flange:
         yield f"{len(known.base_from_flange)} poses of the robot"
     if session.streams:
         yield f"streams {some_of(list(session.streams))}"
+
+
+def _unseen_rows(session: Session, look: CameraLook) -> Iterator[str]:
+    """Says which last rows of a ChArUco board are in no image, though there is room for them.
+
+    With fewer rows its markers are numbered alike: nothing else shows that too many are declared.
+    """
+    target = session.target
+    if target is None or session.targets or target.kind != "charuco" or look.resolution is None:
+        return
+    across, rows = target.columns - 1, target.rows - 1
+    seen = max((int(it.ids.max()) // across + 1 for it in look.corners.values()), default=rows)
+    last, shape = np.arange(seen * across, rows * across), look.resolution[::-1]
+    # The board's place is known well by most of the corners that there may be.
+    clear = [it for it in look.corners.values() if 2 * len(it.ids) > seen * across]
+    without = [it for it in clear if np.isin(last, hidden_corners(it, shape, target)).all()]
+    if len(last) and len(without) >= _LEAST_WITHOUT:
+        yield (
+            f"{seen + 1} rows of squares, where {target.rows} are declared and {len(without)} "
+            "images have room for all: count them, unless something covers the rest"
+        )
 
 
 def next_command(checkup: Checkup, session: Path | str) -> str:

@@ -8,7 +8,7 @@ from typing import TypeAlias
 import cv2
 import numpy as np
 
-from visioncal.core.types import FloatArray, Image, Target, TargetKind
+from visioncal.core.types import Corners, FloatArray, Image, IntArray, Target, TargetKind
 from visioncal.vision.finders.aprilgrid import find_aprilgrid
 from visioncal.vision.finders.charuco import find_charuco
 from visioncal.vision.finders.checkerboard import find_checkerboard
@@ -62,7 +62,7 @@ def find_board(image: Image, target: Target, *, quick: bool = False) -> Detected
     for find, by in _quick_searches(image, target.kind):
         small = image if by == 1 else _shrunk(image, by)
         seen = find(small, target)
-        if isinstance(seen, DetectedCorners) and _is_whole(seen, small, target):
+        if isinstance(seen, DetectedCorners) and not len(hidden_corners(seen, small.shape, target)):
             # Where a pixel of the small image has its centre in the large one.
             px = by * seen.px + (by - 1) / 2
             refined = _refined(image, target, DetectedCorners(seen.ids, px))
@@ -101,18 +101,29 @@ def _shrunk(image: Image, by: int) -> Image:
     return np.asarray(small, np.uint8)
 
 
-def _is_whole(seen: DetectedCorners, image: Image, target: Target) -> bool:
-    """Whether no corner that the image should show is missing."""
+def hidden_corners(
+    seen: DetectedCorners | Corners, shape: tuple[int, ...], target: Target
+) -> IntArray:
+    """Finds the corners that an image should show with the squares around them, and does not.
+
+    Args:
+        seen: Those that are found; where too few to say where the board lies, all others are taken.
+        shape: Height and width of the image [px].
+        target: A board of squares.
+
+    Returns:
+        (n,) their numbers, ascending.
+    """
     places: FloatArray = corner_positions(target)[:, :2] / target.square_m
     missing = np.setdiff1d(np.arange(len(places)), seen.ids)
     if not len(missing):
-        return True
+        return missing
     homography = cv2.findHomography(places[seen.ids], seen.px)[0] if len(seen.ids) > 3 else None
     if homography is None:
-        return False
+        return missing
     # A corner takes both markers beside it.
     around = places[missing, None] + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     ahead = around @ homography[2, :2] + homography[2, 2]
     px = (around @ homography[:2, :2].T + homography[:2, 2]) / ahead[..., None]
-    inside = (ahead > 0) & ((px > 0) & (px < np.array(image.shape[::-1]) - 1)).all(axis=-1)
-    return not inside.all(axis=1).any()
+    inside = (ahead > 0) & ((px > 0) & (px < np.array(shape[::-1]) - 1)).all(axis=-1)
+    return np.asarray(missing[inside.all(axis=1)])
