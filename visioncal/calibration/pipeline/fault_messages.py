@@ -184,7 +184,8 @@ def _turned_images(solved: Solved) -> list[PoseFault]:
 def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
     """Views from some view on, or before one, that one step of a frame explains.
 
-    A tool that is switched on in the controller moves what is on the flange, as it is reported.
+    A tool frame that is switched on in the controller moves what is on the flange, as it is
+    reported, and another base frame what stands.
     """
     agreed, rows = solved.agreed, solved.cell.rows
     problem, out = agreed.problem, np.flatnonzero(~agreed.used)
@@ -214,16 +215,17 @@ def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
     moved = f"the {thing} stood {figure(shift_mm)} mm and {figure(turn_deg)} deg elsewhere"
     step = Step("Fasten what moved, and calibrate the views before and after it apart.")
     parent = problem.tree.branches.get(problem.tree.branches[frame].parent)
-    if parent is not None and parent.robot:
-        tool = edge @ invert(change) @ invert(edge)
-        tool_mm, tool_deg = pose_difference(np.eye(4), tool)
+    on_flange = parent is not None and bool(parent.robot)
+    if on_flange or len(problem.robots) == 1:
+        which = "tool" if on_flange else "base"
+        other_mm, other_deg = pose_difference(np.eye(4), edge @ change @ invert(edge))
         moved += (
-            f", or the controller reported another tool frame, {figure(tool_mm)} mm and "
-            f"{figure(tool_deg)} deg from that of the other views"
+            f", or the controller reported another {which} frame, {figure(other_mm)} mm and "
+            f"{figure(other_deg)} deg from that of the other views"
         )
         step = Step(
-            "Look which tool was active in the controller, and set the same one for all views; or "
-            "calibrate the views before and after it apart."
+            f"Look which {which} frame was active in the controller, and set the same one for all "
+            "views; or fasten what moved, and calibrate the views before and after it apart."
         )
     words = f"{_views(solved, out.tolist())} were left out: {when}, as they agree, {moved}."
     found = Finding("something_moved", f"V{words[1:]}", step, views)

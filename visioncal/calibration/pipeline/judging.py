@@ -244,7 +244,7 @@ def _arms(answer: Answer) -> list[Arm]:
 
 
 def _errs(arm: RobotArm) -> bool:
-    return arm.errors is not None and arm.errors.is_likely
+    return arm.errors is not None and arm.errors.is_significant
 
 
 def check_answer(known: RunState) -> None:

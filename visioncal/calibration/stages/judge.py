@@ -745,9 +745,12 @@ def _robot_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Fin
                 if findings.mount == "instrument"
                 else (
                     "the board is of another size than stated, or warped, the intrinsics are not "
-                    "this camera's, or the arm's model is off by as much.",
+                    "this camera's, the arm's model is off by as much, or poses were read before "
+                    "the arm stood still.",
                     Step(
-                        "Measure the board over many squares; check the lens and the arm's model."
+                        "Stand still before each image, and read one pose twice to see how well it "
+                        "repeats; measure the board over many squares; check the lens and the "
+                        "arm's model."
                     ),
                 )
             )
