@@ -17,7 +17,7 @@ from support.typed_fixes import mended
 import visioncal
 from visioncal.calibration.pipeline import checkup
 from visioncal.calibration.pipeline.checkup import to_document
-from visioncal.calibration.stages.image_size import resized_lens, scaled_matrix, turned_lens
+from visioncal.calibration.stages.image_size import other_images, scaled_matrix, turned_lens
 from visioncal.core.errors import DataError
 from visioncal.core.types import Camera
 from visioncal.interchange.formats import load_in_doubt
@@ -204,8 +204,21 @@ def test_a_matrix_of_larger_images_is_named_by_the_ratio(tmp_path):
         assert "matrix = [685.65, 685.20, 483.85, 297.48]" in found.do.words
     stated = Camera("brown", (640, 400), np.array([900.0, 900.0, 640.0, 400.0]), np.zeros(5))
     # Another camera, whose centre is in the middle of its own images, and one that is well known.
-    assert resized_lens(stated, np.array([700.0, 700.0, 320.0, 200.0])) == ("", "")
-    assert resized_lens(stated, np.array([905.0, 905.0, 644.0, 402.0])) == ("", "")
+    assert other_images(stated, np.array([700.0, 700.0, 320.0, 200.0])) == ("", "")
+    assert other_images(stated, np.array([905.0, 905.0, 644.0, 402.0])) == ("", "")
+
+
+def test_a_lens_of_images_before_they_were_turned_round_is_named():
+    matrix, distortion = np.array([900.0, 901.0, 323.0, 195.0]), np.array([-0.1, 0.0, 1e-3, -2e-3])
+    stated = Camera("brown", (640, 400), matrix, np.append(distortion, 0.0))
+    words, do = other_images(stated, np.array([900.4, 901.1, 316.2, 203.7]))
+    assert words.startswith("The images were turned by 180 degrees")
+    # 639 and 399 less what is stated.
+    assert "matrix = [900.00, 901.00, 316.00, 204.00]" in do
+    assert "distortion = [-0.1, 0, -0.001, 0.002, 0]" in do
+    # Another camera, and one that is as it is stated.
+    assert other_images(stated, np.array([920.0, 921.0, 316.2, 203.7])) == ("", "")
+    assert other_images(stated, np.array([900.4, 901.1, 322.2, 195.7])) == ("", "")
 
 
 @pytest.mark.parametrize(("more", "words"), [(1, "squares were counted"), (-1, "taken off twice")])

@@ -6,9 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
+from visioncal.calibration.pipeline import calibrate
 from visioncal.calibration.stages.intrinsics import IntrinsicsOptions, estimate_intrinsics
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.types import Camera
+from visioncal.session import Session
 from visioncal.simulation import CellOptions, fisheye_camera, simulate, wide_camera
 from visioncal.vision.camera import intrinsics
 from visioncal.vision.targets import corner_positions
@@ -111,6 +113,22 @@ def test_frontal_views_are_warned_of_or_refused():
     flat = {"tilt_rad": (0.0, 0.002), "distance_m": (0.5, 0.505), "roll_rad": 0.0}
     with pytest.raises(DegenerateError, match="focal length open to"):
         estimate(cell_with(wide_camera(), 4, **flat))
+
+
+def test_a_robot_that_never_moved_is_named_before_the_lens_that_this_leaves_open():
+    cell = cell_with(wide_camera(), 4)
+    seen, rng = cell.corners[0], np.random.default_rng(0)
+    corners = [(seen.ids, seen.px + NOISE_PX * rng.normal(size=seen.px.shape)) for _ in range(12)]
+    session = Session.from_corners(
+        corners,
+        np.tile(cell.base_from_flange[0], (12, 1, 1)),
+        cell.options.target,
+        wide_camera().resolution,
+        mount="eye-in-hand",
+    )
+    with pytest.raises(DegenerateError, match="are all from one pose of the robot") as refused:
+        calibrate(session)
+    assert "flange is tilted by 20 to 40 degrees" in str(refused.value.next_step)
 
 
 def test_parts_of_the_image_that_were_never_visited_are_named():

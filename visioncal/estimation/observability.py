@@ -27,6 +27,8 @@ TYPICAL_NOISE, TYPICAL_PX = Noise.of_robot(float(np.deg2rad(0.05)), 1e-4), 0.2
 # A direction this close to an axis is called by the axis.
 _NEARLY_AXIS = 0.95
 FEWEST_VIEWS = 3
+# A robot that turns by less between all of its stops does not turn.
+_STILL_RAD = float(np.deg2rad(0.5))
 _PAIRED = 300
 # What is wrong where unknowns that all views share are not determined, and what to do.
 _UNDETERMINED = {
@@ -428,11 +430,12 @@ def motion_words(robot: FloatArray, flange: FloatArray, stops: str, frame: str) 
         frame: In which frame the robot's part turns, in words.
     """
     turns = _turns(robot)
-    largest = np.rad2deg(np.linalg.norm(turns, axis=1).max())
+    largest_rad = np.linalg.norm(turns, axis=1).max()
+    largest, is_still = np.rad2deg(largest_rad), largest_rad < _STILL_RAD
     spread_mm = 1e3 * np.linalg.norm(np.ptp(flange[:, :3, 3], axis=0))
-    if largest < 0.5 and spread_mm < 1.0:
+    if is_still and spread_mm < 1.0:
         return f"the {stops} are all from one pose of the robot"
-    if largest < 0.5:
+    if is_still:
         return (
             f"the {stops} differ in position only (largest rotation between two of "
             f"them: {figure(largest)} deg)"
@@ -445,6 +448,22 @@ def motion_words(robot: FloatArray, flange: FloatArray, stops: str, frame: str) 
         )
     about_second = f"by {figure(aside)} deg about a second axis"
     return f"the {stops} turn by at most {figure(largest)} deg, and {about_second}"
+
+
+def poor_motion(base_from_flange: FloatArray, mount: Mount) -> tuple[str, str]:
+    """What leaves a calibration open whatever else is known, and what to do; empty where nothing.
+
+    Args:
+        base_from_flange: (m, 4, 4) where the flange stood, two times or more.
+        mount: Where the camera is.
+    """
+    robot = robot_part(base_from_flange, mount)
+    turns = _turns(robot)
+    if np.linalg.norm(turns, axis=1).max() >= _STILL_RAD and not _lone_axis(turns)[2]:
+        return "", ""
+    views = f"{len(robot)} views with poses"
+    words = motion_words(robot, base_from_flange, views, f"the {_frame(mount)}")
+    return f"{title(mount)}: {words}.", _advice(mount)
 
 
 def _or_measured(mount: Mount, culprit: str) -> str:

@@ -13,7 +13,7 @@ from visioncal.calibration.pipeline.running import known_at_first
 from visioncal.calibration.pipeline.solving import first_agreement
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.cell import read_cell
-from visioncal.calibration.stages.image_size import resized_lens
+from visioncal.calibration.stages.image_size import other_images
 from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.calibration.stages.observed import CameraLook, by_reason
 from visioncal.calibration.stages.pictures import unnamed_images, unseen_cause
@@ -191,7 +191,7 @@ def _resized(known: RunState, look: CameraLook, stated: Camera) -> tuple[str, St
         found = estimate_intrinsics(look.corners, targets, stated.resolution, model)
     except VisioncalError:
         return None
-    words, do = resized_lens(stated, found.camera.matrix)
+    words, do = other_images(stated, found.camera.matrix)
     return (words, Step(do)) if words else None
 
 

@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+
 from visioncal.calibration.pipeline.exchanged_names import exchanged_names
 from visioncal.calibration.pipeline.guess_inputs import (
     closes_as_declared,
@@ -25,7 +27,8 @@ from visioncal.core.choices import CONVENTIONS, Convention, SolverName
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Progress
-from visioncal.core.verdict import Finding
+from visioncal.core.verdict import Finding, Step
+from visioncal.estimation.observability import poor_motion
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
@@ -158,7 +161,9 @@ def run_steps(known: RunState) -> RunState:
             except VisioncalError as error:
                 # Views that are out of the game are often why the rest does not suffice.
                 more = [it for it in known.lost_views if it not in error.culprits]
-                cause = unseen_cause(known)
+                cause = unseen_cause(known) or (
+                    _poor_motion(known) if stage.name == "intrinsics" else None
+                )
                 if cause is not None:
                     raise because(error.with_culprits(more), cause) from error
                 if known.mount is None:
@@ -177,6 +182,15 @@ def run_steps(known: RunState) -> RunState:
                 # Of exchanged rows the others are as they should be.
                 known = replace(known, is_misread=hint is not None and not hint.views)
         return _with_other_board(_with_reading(known, seen, hint))
+
+
+def _poor_motion(known: RunState) -> Finding | None:
+    """Says that a robot hardly moved, which leaves the lens open, too."""
+    poses = np.array([*known.base_from_flange.values()]) if known.mount else np.zeros(0)
+    if known.mount is None or len(poses) < 2:
+        return None
+    words, advice = poor_motion(poses, known.mount)
+    return Finding("weak_motion", words, Step(advice)) if words else None
 
 
 def _with_hint(

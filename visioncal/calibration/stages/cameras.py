@@ -11,7 +11,7 @@ import numpy as np
 from visioncal.calibration.stages.cause_ranking import COUNTED_BACKWARDS
 from visioncal.calibration.stages.dense import fit_densely
 from visioncal.calibration.stages.detect import DetectOptions, detect
-from visioncal.calibration.stages.image_size import resized_lens
+from visioncal.calibration.stages.image_size import other_images
 from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.calibration.stages.observed import CameraLook, Observed, nothing_seen
 from visioncal.calibration.stages.pnp import Poses, estimate_poses, given_poses, measure_poses
@@ -175,7 +175,7 @@ def _other_lens(
         "In session.toml, delete matrix and distortion, or give those of this camera: matrix is "
         "fx, fy, cx, cy in pixels."
     )
-    resized, do = resized_lens(seen.lenses[frame].camera, lens.camera.matrix)
+    resized, do = other_images(seen.lenses[frame].camera, lens.camera.matrix)
     if resized:
         words, step = f"{resized} The lens was estimated of these images.", Step(do)
     found = Finding("other_lens", words, step)

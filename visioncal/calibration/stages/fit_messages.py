@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.calibration.stages.image_size import resized_lens
+from visioncal.calibration.stages.image_size import other_images
 from visioncal.core.number_format import figure
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import FloatArray, IntArray, Target
@@ -238,7 +238,7 @@ def _lens_found(fitted: Fitted, camera: str) -> Iterator[Finding]:
     if not problem.scene.estimated and _moved(fitted, lens):
         is_exact = problem.scene.matrix_sigma_px is None
         steps = (looks.values - looks.stated)[lens[:4]]
-        words, do = resized_lens(problem.scene.camera, looks.values[lens[:4]])
+        words, do = other_images(problem.scene.camera, looks.values[lens[:4]])
         if words:
             yield Finding("lens", f"{words} It was refined.", Step(do, CALIBRATE))
         else:

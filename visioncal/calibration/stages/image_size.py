@@ -14,6 +14,9 @@ _SAME_SHAPE = 0.02
 # Images are resized by more, and mostly by a ratio of small numbers: focal lengths by images are
 # right to a share of this.
 _LEAST_SCALE, _LARGEST_PART, _SAME_SCALE = 1.1, 8, 0.02
+# A half turn of images moves the principal point by more, and both of its numbers to within such a
+# share of that; a focal length stays.
+_LEAST_TURN_PX, _SAME_TURN, _SAME_FOCUS = 3.0, 0.15, 0.005
 
 
 def other_size_step(
@@ -58,16 +61,31 @@ def scaled_matrix(matrix: FloatArray, scale: float) -> FloatArray:
     return np.array([*(scale * matrix[:2]), *(scale * (matrix[2:] + 0.5) - 0.5)])
 
 
-def resized_lens(stated: Camera, matrix: FloatArray) -> tuple[str, str]:
-    """Says that a stated matrix is for images of another size, by the one that the images have.
+def other_images(stated: Camera, matrix: FloatArray) -> tuple[str, str]:
+    """Says that a stated matrix is for other images, by the one that these have.
+
+    They are of another size, or turned by 180 degrees.
 
     Args:
         stated: The lens as it is stated, with the size of the images.
         matrix: (4,) fx, fy, cx, cy by the images [px].
 
     Returns:
-        What is wrong, and what to write; both empty where no one ratio explains the difference.
+        What is wrong, and what to write; both empty where neither explains the difference.
     """
+    half_turned = turned_lens(turned_lens(stated, clockwise=True), clockwise=True)
+    shift_px = np.linalg.norm(half_turned.matrix[2:] - stated.matrix[2:])
+    away_px = np.linalg.norm(half_turned.matrix[2:] - matrix[2:])
+    same_focus = np.abs(matrix[:2] / stated.matrix[:2] - 1.0).max() < _SAME_FOCUS
+    if same_focus and shift_px > _LEAST_TURN_PX and away_px < _SAME_TURN * shift_px:
+        said = _written("matrix", half_turned.matrix, ".2f")
+        if np.any(stated.distortion != half_turned.distortion):
+            said += f" and {_written('distortion', half_turned.distortion, '.6g')}"
+        return (
+            "The images were turned by 180 degrees after the matrix was made: cx and cy are "
+            f"{matrix[2]:.1f} and {matrix[3]:.1f} px by these images.",
+            f"In session.toml, write {said}; the camera's frame turns with the images.",
+        )
     scale = float(np.sqrt(np.prod(matrix[:2] / stated.matrix[:2])))
     if max(scale, 1.0 / scale) < _LEAST_SCALE:
         return "", ""
