@@ -8,6 +8,7 @@ import pytest
 from support.cells import calibrated
 from support.sound_findings import SOUND, changed, directions
 
+from visioncal.calibration.pipeline.judging import findings_of
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.stages.judge import judge
 from visioncal.calibration.stages.need import Picks, need_met
@@ -87,6 +88,24 @@ def test_picks_err_as_the_chain_does(mount: str) -> None:
     assert total == pytest.approx(1e3 * np.sqrt(np.mean(np.sum(away**2, axis=1))), rel=0.05)
     looks = {"look"} if mount == "eye-in-hand" else set()
     assert set(parts) == {"calibration", "pick", "total"} | looks
+
+
+@pytest.mark.parametrize(("views", "is_found"), [(slice(1), False), (slice(1, None), True)])
+def test_only_views_that_are_known_well_show_what_is_not_predicted(views: slice, is_found: bool):
+    """A view of a small board from the front: off by 2 deg, which is 2.5 times its sigma."""
+    known = calibrated(simulate(CellOptions(views=12)), joints=False)
+    answer = known.solved
+    seen = answer.problem.observations
+    among = seen.covariance.copy()
+    among[0, :3, :3] = np.deg2rad(0.8) ** 2 / 3.0 * np.eye(3)
+    away_rad = answer.held_out.away_rad.copy()
+    away_rad[views] = np.deg2rad(2.0)
+    blurred = replace(answer.problem, observations=replace(seen, covariance=among))
+    held = replace(answer.held_out, away_rad=away_rad)
+    findings = findings_of(replace(known, answer=replace(answer, problem=blurred, held_out=held)))
+    (picks,) = findings.picks
+    kinds = [it.kind for it in judge(findings).findings]
+    assert (("left out" in picks.parts), ("unexplained" in kinds)) == (is_found, is_found)
 
 
 def of_size(sigma_mm: float, camera: str = "cam", robot: str = "robot") -> Picks:

@@ -18,8 +18,9 @@ from visioncal.calibration.stages.judge import Arm, Findings, Pair, Place, Senso
 from visioncal.calibration.stages.need import Fitted, picks_of
 from visioncal.calibration.stages.priors import prior_words
 from visioncal.core.files import some_of
+from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure
-from visioncal.core.types import Mask, Mount, Rejection
+from visioncal.core.types import FloatArray, Mask, Mount, Rejection
 from visioncal.core.verdict import NOTE, Finding, Step
 from visioncal.estimation.arm import stops_of
 from visioncal.estimation.budget import radius95
@@ -32,7 +33,6 @@ from visioncal.estimation.observability import (
     directions,
     edge_directions,
 )
-from visioncal.estimation.parts import Observations
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.tree import Tree
 from visioncal.results import HELD_BACK, Edge, Rms, Sight
@@ -51,7 +51,7 @@ def findings_of(known: RunState) -> Findings:
         *solved.found_of_looks(answer.covariance),
     ]
     return Findings(
-        _pairs(tied, explained, answer.problem.observations, alone=known.mount is not None),
+        _pairs(tied, explained, answer, alone=known.mount is not None),
         _sensors(tied, answer.sigmas, solved.shown_px, known.spared.keys() | known.held_back),
         _arms(answer),
         worst,
@@ -151,7 +151,7 @@ def _clock_words(known: RunState) -> Iterator[str]:
 
 
 def _pairs(
-    sights: Sequence[Sight], explained: Collection[int], used: Observations, *, alone: bool
+    sights: Sequence[Sight], explained: Collection[int], answer: Answer, *, alone: bool
 ) -> list[Pair]:
     """What each camera saw of each target; of one camera and one robot, all that there is."""
     rows: dict[tuple[str, str], list[Sight]] = {}
@@ -163,27 +163,47 @@ def _pairs(
             rms_of(mine),
             left_out_rms(mine),
             holdout_rms(mine),
-            disagreeing=[
+            [
                 Rejection(it.view, it.reason)
                 for it in mine
                 if _disagrees(it) and it.view not in explained
             ],
-            name=f"{seer} of {seen}" if len(rows) > 1 else "",
-            noise=_noise_of(used, mine),
+            f"{seer} of {seen}" if len(rows) > 1 else "",
+            *_weighed(answer, mine),
         )
         for (seer, seen), mine in rows.items()
     ]
 
 
-def _noise_of(used: Observations, sights: Sequence[Sight]) -> Rms:
-    """What the noise of a sensor makes of what it saw in these sights, by their covariance."""
+def _weighed(answer: Answer, sights: Sequence[Sight]) -> tuple[Rms, Rms]:
+    """What a sensor's noise makes of some sights, and by how much they are away when left out.
+
+    A square varies as its mean does, so that views weigh by the inverse square of what is expected
+    of each where doubt begins: one whose own pose is known badly says nothing of the others.
+    """
+    used, held, limits = answer.problem.observations, answer.held_out, CalibrationLimits()
     seen = {(it.seer, it.seen) for it in sights}
-    mine = [it in seen for it in zip(used.observers, used.observed, strict=True)]
-    if not any(mine):
-        return Rms(0.0, 0.0)
-    squares = np.diagonal(used.covariance[mine], axis1=1, axis2=2).reshape(-1, 2, 3).sum(axis=2)
-    turned, shifted = np.median(squares, axis=0)
-    return Rms(1e3 * float(np.sqrt(shifted)), float(np.rad2deg(np.sqrt(turned))))
+    mine = np.array([it in seen for it in zip(used.observers, used.observed, strict=True)])
+
+    def rms(block: slice, away: FloatArray, doubt: float) -> FloatArray | None:
+        known = mine & np.isfinite(away)
+        if not known.any():
+            return None
+        noise = np.trace(used.covariance[known, block, block], axis1=1, axis2=2)
+        weights = (noise + doubt**2) ** -2.0
+        squares = np.stack([noise, away[known] ** 2], axis=1)
+        return np.sqrt(np.average(squares, axis=0, weights=weights))
+
+    turned = rms(slice(3), held.away_rad, float(np.deg2rad(limits.scatter_deg[0])))
+    shifted = rms(slice(3, 6), held.away_m, 1e-3 * limits.scatter_mm[0])
+    noise, away = (
+        Rms(
+            0.0 if shifted is None else 1e3 * float(shifted[at]),
+            None if turned is None else float(np.rad2deg(turned[at])),
+        )
+        for at in (0, 1)
+    )
+    return noise, away
 
 
 def _disagrees(sight: Sight) -> bool:

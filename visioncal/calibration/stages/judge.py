@@ -73,6 +73,7 @@ class Pair:
         disagreeing: Those whose robot pose and image do not belong together.
         name: Both, by name; empty where there are no others.
         noise: What the sensor's own noise makes of its views.
+        away: `held_out` with the same weights as `noise`; None where all views weigh alike.
     """
 
     views: Sequence[ViewResult]
@@ -82,6 +83,7 @@ class Pair:
     disagreeing: Sequence[Rejection] = ()
     name: str = ""
     noise: Rms = field(default_factory=lambda: Rms(0.0, 0.0))
+    away: Rms | None = None
 
 
 @dataclass(frozen=True)
@@ -432,7 +434,7 @@ def _tilted(findings: Findings) -> Step:
 def _pair_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
     words, views, is_fatal = [], list[ViewResult](), False
     for pair in findings.pairs:
-        held = pair.held_out
+        held = pair.away or pair.held_out
         beyond = [
             (f"{figure(value)} {unit} (doubt begins at {check:g})", value > bad)
             for value, unit, (check, bad), noise in zip(

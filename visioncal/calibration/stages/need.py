@@ -348,9 +348,11 @@ def _unpredicted(fitted: Fitted) -> FloatArray:
             continue
         among = expected[known][:, axes, axes]
         variance = np.trace(among, axis1=1, axis2=2)
-        mean, shown = float(variance.mean()), float(np.mean(away[known] ** 2))
-        # A mean of sums of squares is about chi-square, with so many degrees (Satterthwaite 1946).
-        count = float(variance.sum()) ** 2 / float(np.sum(among**2))
+        # By how much a sum of squares varies: a view whose own pose is known badly shows little.
+        weights = 1.0 / np.sum(among**2, axis=(1, 2))
+        mean, shown = np.average([variance, away[known] ** 2], axis=1, weights=weights)
+        # About chi-square, with so many degrees (Satterthwaite 1946).
+        count = mean**2 * float(weights.sum())
         if shown > mean * chi2_limit(NeedLimits.chance, count) / count:
             found[axes, axes] = (shown - mean) / 3.0 * np.eye(3)
     return found
