@@ -49,7 +49,7 @@ def html_card(
         else ""
     )
     rows = "".join(
-        f'<tr><td style="text-align:left;color:#888">{escape(name)}</td>'
+        f'<tr><td style="text-align:left;color:#767676;padding-right:1.5em">{escape(name)}</td>'
         f'<td style="text-align:left">{escape(value)}</td></tr>'
         for name, value in facts.items()
     )

@@ -141,7 +141,7 @@ def step_lines(steps: Sequence[Step]) -> Iterator[str]:
     if steps:
         yield from ("", "## What to do next", "")
     for at, it in enumerate(steps, 1):
-        yield f"{at}. {plain(it.words)}" + (f" `{it.command}`" if it.command else "")
+        yield f"{at}. {plain(it.words)}" + (f"  \n   `{it.command}`" if it.command else "")
 
 
 def further_lines(verdict: Verdict) -> Iterator[str]:

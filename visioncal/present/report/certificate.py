@@ -94,7 +94,7 @@ def _result(calibration: Calibration) -> Iterator[tuple[str, str]]:
         sigma = f"sigma {figure(edge.sigma_mm)} mm"
         if edge.oriented:
             sigma += f" and {figure(edge.sigma_deg)} deg"
-        yield name, f"({x:.3f}, {y:.3f}, {z:.3f}) mm; ({turn}) deg; {sigma}"
+        yield name, f"({x:.3f}, {y:.3f}, {z:.3f}) mm; rotation vector ({turn}) deg; {sigma}"
     if (test := calibration.touch_test) is not None:
         largest = max(it.gap_mm for it in test.points)
         words = "passed" if test.passed else "not passed"

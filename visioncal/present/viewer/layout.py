@@ -300,6 +300,7 @@ def _plots(contents: _Contents) -> list[rrb.TimeSeriesView]:
     ]
     if contents.images:
         wanted.append(("Reprojection error [px]", paths.REPROJECTION_PX))
-    # A legend would hide the marks at the top and at the bottom, of just these views.
-    legend = "; red: not used, \N{BLACK UP-POINTING TRIANGLE} off scale" if contents.unused else ""
+    # A legend would hide the marks at the top and at the bottom, of just these views; a longer
+    # title would be cut beside a plot's buttons.
+    legend = "; red: not used" if contents.unused else ""
     return [series(f"{name}{legend}", entity) for name, entity in wanted]
