@@ -62,7 +62,7 @@ def test_exchanged_rows_come_first_with_what_is_left_without_them() -> None:
     first = verdict.causes[0]
     assert first.probability > 0.9999
     assert first.without_it == (
-        "Without them, views that are left out in turn agree to 0.11 mm and 0.011 deg."
+        "Without these views, the others predict each other to 0.11 mm and 0.011 deg."
     )
     assert first.do == EXCHANGED.do
     assert verdict.causes == tuple(sorted(verdict.causes, key=lambda it: -it.probability))
@@ -91,7 +91,7 @@ def test_explanations_of_one_misfit_share_it(warnings, chances) -> None:
 
 def test_a_size_is_said_as_the_result_has_it() -> None:
     assert "0.4 % larger than stated (sigma 0.09 %): squares of 30.12 mm" in SIZE.words
-    assert "square_m = 0.03012;" in SIZE.do.words
+    assert "square_m = 0.03012 in" in SIZE.do.words
 
 
 def test_what_moves_picks_little_is_no_cause_of_a_large_misfit() -> None:
@@ -134,7 +134,7 @@ def test_errors_that_are_too_large_come_from_their_sources(need) -> None:
     verdict = judge(found)
     assert ids(verdict) == ["robot_noise", "calibration"]
     assert [it.probability for it in verdict.causes] == pytest.approx([0.64, 0.36])
-    without = f"Without it 95 % of picks land within {0.3 * np.sqrt(7.815):.2f} mm"
+    without = f"Without this part 95 % of picks land within {0.3 * np.sqrt(7.815):.2f} mm"
     assert verdict.causes[0].without_it.startswith(without)
     assert ("within what is needed" in verdict.causes[0].without_it) == (need is not None)
     # No command proposes views of an arm whose model nobody knows.

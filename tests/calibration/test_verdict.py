@@ -70,7 +70,7 @@ def test_sound_findings_are_good_and_say_how_good():
             "check",
             "the direction 2 (2 mm)",
         ),
-        ({"away_mm": 1.0}, "check", "have to be off by 1 mm and 0.0057 deg"),
+        ({"away_mm": 1.0}, "check", "take a flange that is off by 1 mm and 0.0057 deg"),
         ({"away_deg": 0.029}, "check", "0.029 deg from stop to stop"),
         ({"stops": 8}, "check", "Only 8 stops are used"),
         ({"stops": 4, "views": views(4)}, "bad", "Only 4 views are used"),

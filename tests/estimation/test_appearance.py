@@ -176,7 +176,7 @@ def test_a_board_within_what_is_stated_is_measured_and_not_accused(mount):
     known = calibrated(cell)
     (sentence,) = [it for it in known.verdict.reasons if "robot's motion" in it]
     assert "% larger than stated" in sentence
-    assert "which what is stated allows (to within 0.1 %)" in sentence
+    assert "The stated size allows this (to within 0.1 %)" in sentence
     assert known.verdict.status == "good"
     assert mahalanobis_sq(cell, known) < UNLIKELY
 
@@ -188,7 +188,7 @@ def test_a_size_that_is_contradicted_is_dropped_and_no_arm_is_blamed(mount, scal
     """As after printing with `fit to page`: the robot's measure is all that is left."""
     cell = simulate(replace(FINE, mount=mount, seed=3, board_scale=scale))
     known = calibrated(cell, joints=joints)
-    assert any("which is not what is stated" in it for it in known.verdict.reasons)
+    assert any("The result takes the robot's scale" in it for it in known.verdict.reasons)
     assert known.verdict.status == "check"
     assert known.robot_arm.errors is None or not known.robot_arm.errors.is_significant
     assert mahalanobis_sq(cell, known) < UNLIKELY

@@ -67,10 +67,19 @@ def print_summary(calibration: Calibration, *, verbose: bool) -> None:
         + ("" if held.deg is None else f", {figure(held.deg)} deg")
         + (f", {figure(held.px)} px" if held.px and held.px < _MOST_PX else "")
     )
-    for words in unused_words(calibration.views):
+    for words in unused_words(_unsaid(calibration)):
         console.print(f"  {escape(words)}")
     if verbose:
         console.print(_solver_table(calibration))
+
+
+def _unsaid(calibration: Calibration) -> Iterator[ViewResult]:
+    """The views about which the verdict does not say already why they were left out."""
+    left_out = [it for it in calibration.verdict.findings if it.without_it]
+    for view in calibration.views:
+        about = [it for it in left_out if view.view in it.views]
+        if not any(it.kind != "wrong_views" or view.reason in it.words for it in about):
+            yield view
 
 
 def unused_words(views: Iterable[ViewResult | Sight]) -> Iterator[str]:

@@ -204,8 +204,8 @@ def _with_hint(
         return error
     hint = hint or reading_hint(seen)
     if hint is not None:
-        message = hint.words
-        return type(error)(message, culprits=error.culprits, next_step=str(hint.do))
+        # The directions that the poses, misread, leave open mean nothing.
+        return type(error)(hint.words, next_step=str(hint.do))
     robot, next_step = seen.robot, error.next_step
     if robot is not None and not robot.can_tilt:
         next_step = of_arm_that_cannot_tilt(next_step)

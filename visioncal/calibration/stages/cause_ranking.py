@@ -399,7 +399,7 @@ _SOURCES: Mapping[str, tuple[str, str, Step | None]] = {
     ),
     "left out": (
         "unexplained",
-        "what left-out views err by beyond what is predicted",
+        "errors of left-out views that the prediction does not explain",
         LOOK,
     ),
 }
@@ -426,13 +426,13 @@ def _sources(picks: Sequence[Picks], met: NeedMet | None, more: Step | None) -> 
             continue
         kind, words, do = _SOURCES[name]
         rest = worst.without(name)
-        without = f"Without it 95 % of picks land within {rest.stays_within(need)}"
+        without = f"Without this part 95 % of picks land within {rest.stays_within(need)}"
         if met is not None:
             without += f", and {percent(rest.probability(met.need))} within what is needed"
         found = Finding(
             kind,
-            f"Of the {figure(total)} {unit} that picks err by (sigma), {figure(size)} {unit} come "
-            f"from {words}.",
+            f"Picks err by {figure(total)} {unit} (sigma); {figure(size)} {unit} of this come from "
+            f"{words}.",
             do or more,
             probability=size**2 / total**2,
             without_it=f"{without}.",

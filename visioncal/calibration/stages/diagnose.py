@@ -179,7 +179,11 @@ def _at_once(
         if rival
         else ""
     )
-    do = "Look whether the joint keeps its zero" if is_joint else "Fasten it"
+    if isinstance(step, Slip):
+        do = "Look whether the joint keeps its zero"
+    else:
+        thing = _THINGS.get(step.frame, step.frame)
+        do = f"Fasten {thing[0].lower()}{thing[1:]}"
     return Finding(
         "joint_slipped" if is_joint else "moved_at_once",
         f"{_step_words(step, from_when, joint)}; the result is between "

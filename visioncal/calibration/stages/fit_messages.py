@@ -122,15 +122,15 @@ def scale_found(
         f"not of {side:.4g} mm"
     )
     if not measured.contradicts:
-        allowed = f"{sized}, which what is stated allows (to within {share})."
+        allowed = f"{sized}. The stated size allows this (to within {share})."
         return Finding(NOTE, f"{allowed} The result goes by both.")
     return Finding(
         "board_size",
-        f"{sized}, which is not what is stated (to within {share}). The result goes by the robot; "
-        "if the board is right, the arm's model is off by as much.",
+        f"{sized} (stated to within {share}). The result takes the robot's scale; if the board is "
+        "right, the arm's model is off by as much.",
         Step(
-            "Measure the board over many squares. Where it is as the robot says, in its .toml, "
-            f"write square_m = {1e-3 * side * (1 + written.scale):.4g}; otherwise see to the arm.",
+            "Measure the board over many squares. If the robot is right, write square_m = "
+            f"{1e-3 * side * (1 + written.scale):.4g} in the board's .toml; else check the arm.",
             CALIBRATE,
         ),
         mahalanobis_sq=measured.scale**2 / (measured.sigma**2 + measured.stated_sigma**2),

@@ -296,11 +296,13 @@ def judge(findings: Findings) -> Verdict:
 def _warned(found: Finding, findings: Findings) -> Finding:
     """A stage's warning, with what the result is without the views that it has left out."""
     left_out = found.kind in _LEFT_OUT
-    return replace(found, without_it=_without_them(findings.held_out)) if left_out else found
+    without_it = _without(found.views, findings.held_out)
+    return replace(found, without_it=without_it) if left_out else found
 
 
-def _without_them(held_out: Rms) -> str:
-    return f"Without them, views that are left out in turn agree to {_both(held_out)}."
+def _without(views: Sequence[int], held_out: Rms) -> str:
+    left_out = f"view {views[0]}" if len(views) == 1 else "these views"
+    return f"Without {left_out}, the others predict each other to {_both(held_out)}."
 
 
 def _good_for_mm(picks: Sequence[Picks], doubts: Sequence[Finding]) -> float | None:
@@ -481,20 +483,21 @@ def _disagreement_doubts(pair: Pair) -> Iterator[Finding]:
         return
     views, run = tuple(it.view for it in out), _run(pair)
     if len(out) == 1:
-        words = f"View {views[0]} was left out: it {out[0].reason}."
+        named, them, rows = f"view {views[0]}", "it", "its row"
+        words = f"View {views[0]} was left out. It {out[0].reason}."
     else:
-        named = ", ".join(map(str, views))
-        words = f"Views {named} were left out; view {views[0]} {out[0].reason}.{run}"
+        named, them, rows = f"views {', '.join(map(str, views))}", "them", "their rows"
+        words = f"V{named[1:]} were left out. View {views[0]} {out[0].reason}.{run}"
     step = (
         Step("Fasten what moved, and calibrate the views before and after it apart.")
         if run
         else Step(
-            "Look at the images and poses of these views: repeat them, or in views.csv, delete "
-            f"the row{'s' if len(views) > 1 else ''} of view {', '.join(map(str, views))}.",
+            f"Compare image and pose of {named}: record {them} again, or in views.csv, delete "
+            f"{rows}.",
             look_at(views[0]),
         )
     )
-    kind, without_it = "something_moved" if run else "wrong_views", _without_them(pair.held_out)
+    kind, without_it = "something_moved" if run else "wrong_views", _without(views, pair.held_out)
     yield Finding(kind, words, step, views, without_it=without_it).of(pair.name)
 
 
@@ -669,10 +672,7 @@ def _stop_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Find
     for it in findings.arms:
         if it.stops < check:
             counted = f"{used} views" if it.stops == used else f"{it.stops} stops"
-            words = (
-                f"Only {counted} are used; {check} or more give the result something to be checked "
-                "with."
-            )
+            words = f"Only {counted} are used; {check} or more are needed to check the result."
             step, is_fatal = _tilted(findings), it.stops < bad
             kind = "too_few_stops" if is_fatal else "few_stops"
             found = Finding(kind, words, step, is_fatal=is_fatal, until_mm=0.0)
@@ -757,9 +757,9 @@ def _robot_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Fin
                 )
             )
             words = (
-                f"To explain what is seen, the flange would have to be off by {figure(it.away_mm)} "
-                f"mm and {figure(it.away_deg)} deg from stop to stop; arms repeat to 0.1 mm. More "
-                f"likely {cause}"
+                f"The residuals would take a flange that is off by {figure(it.away_mm)} mm and "
+                f"{figure(it.away_deg)} deg from stop to stop; arms repeat to 0.1 mm. More likely "
+                f"{cause}"
             )
             until_mm = 10.0 * beyond * limits.robot_mm
             yield Finding("unexplained", words, step, until_mm=until_mm).of(_robot(it))

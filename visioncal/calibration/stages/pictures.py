@@ -71,7 +71,7 @@ def _missing(session: Session) -> Iterator[Finding]:
         words = f"{words}."
         rows = ", ".join(str(it.number) for it in missing)
         step = Step(
-            f"Copy {'it' if len(names) == 1 else 'them'} there; or in views.csv, delete the "
+            f"Copy the image{'s' if len(names) > 1 else ''} there; or in views.csv, delete the "
             f"row{'s' if len(names) > 1 else ''} of view {rows}."
         )
     views = tuple(it.number for it in missing)
@@ -373,8 +373,8 @@ def _mirrored(view: View) -> Finding:
         f"The images are mirrored: the board is seen in view {view.number} only where left and "
         "right are exchanged.",
         Step(
-            "Switch off mirroring (flip) in the camera's driver and record again; images that are "
-            "there can be turned back:",
+            "Switch off mirroring (flip) in the camera's driver, and record again; or turn the "
+            "images back.",
             f"mogrify -flop SESSION/{Path(view.image).parent.as_posix()}/*",
         ),
         (view.number,),

@@ -349,8 +349,9 @@ def _agreement(check: Check) -> str:
     off_deg, off_mm = figure(float(np.rad2deg(turn))), figure(1e3 * float(shift))
     return (
         f"{_stops(check)} {verb} with the calibration: off by {off_mm} mm "
-        f"and {off_deg} deg (rms); chance makes it more in {chance} "
-        f"of checks. A camera that had moved by {figure(1e3 * float(sure[3:].max()))} mm or "
+        f"and {off_deg} deg (rms); by chance alone it is more in "
+        f"{chance} of checks. "
+        f"A camera that had moved by {figure(1e3 * float(sure[3:].max()))} mm or "
         f"{figure(float(np.rad2deg(sure[:3].max())))} deg would have shown."
     )
 
