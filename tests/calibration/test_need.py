@@ -10,12 +10,14 @@ from support.sound_findings import SOUND, changed, directions
 
 from visioncal.calibration.pipeline.judging import findings_of
 from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.judge import judge
 from visioncal.calibration.stages.need import Picks, need_met
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import exp
 from visioncal.core.types import Need
 from visioncal.core.verdict import EMPTY_IMAGE, Finding, remarks
+from visioncal.estimation.arm import ArmErrors, misfit_jacobian, pose_basis
 from visioncal.estimation.tolerance_probability import chance_within, radius_within
 from visioncal.results import Calibration, NeedMet, Picker, Rms, to_document
 from visioncal.results.codec import read, write
@@ -60,8 +62,8 @@ def test_round_errors_have_the_closed_form() -> None:
 def test_picks_err_as_the_chain_does(mount: str) -> None:
     """Against errors that are drawn and put through the chain, by no slope of ours."""
     cell = simulate(CellOptions(mount=mount, views=12))
-    known = calibrated(cell, joints=False)
-    (picks,) = known.findings.picks
+    known = without_arm_errors(calibrated(cell, joints=False))
+    (picks,) = findings_of(known).picks
     rng, count = np.random.default_rng(0), 20_000
     result = known.solved
     covariance = np.linalg.cholesky(result.covariance[:6, :6])
@@ -88,6 +90,35 @@ def test_picks_err_as_the_chain_does(mount: str) -> None:
     assert total == pytest.approx(1e3 * np.sqrt(np.mean(np.sum(away**2, axis=1))), rel=0.05)
     looks = {"look"} if mount == "eye-in-hand" else set()
     assert set(parts) == {"calibration", "pick", "total"} | looks
+
+
+def without_arm_errors(known: RunState) -> RunState:
+    """The same with an arm of which nothing but noise is known."""
+    answer, solved = known.solved, known.fitted
+    arms = {name: replace(it, errors=None) for name, it in solved.arms.items()}
+    covariance = answer.covariance - answer.beside["arm"]
+    changed = replace(answer, covariance=covariance)
+    return replace(known, answer=changed, fit=replace(solved, arms=arms))
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_what_an_arm_does_again_moves_no_pick(mount: str) -> None:
+    """Its base and its flange are off by 2 mm and 4 mrad: the frames have taken it up."""
+    known = without_arm_errors(calibrated(simulate(CellOptions(mount=mount)), joints=False))
+    answer, solved = known.solved, known.fitted
+    ((robot, arm),) = solved.arms.items()
+    poses = answer.problem.poses[robot]
+    fixed = pose_basis(poses)[:, :, :12]
+    errors = ArmErrors(fixed, 4e-3, gain=0.0, of_links=False)
+    off = errors.sigma * misfit_jacobian(answer.problem, answer.state, answer.noise, robot, errors)
+    erring = replace(
+        known,
+        answer=replace(answer, covariance=answer.covariance + off @ off.T),
+        fit=replace(solved, arms={robot: replace(arm, errors=errors)}),
+    )
+    (before,), (after,) = (findings_of(it).picks for it in (known, erring))
+    # Both are the same to rounding, of spreads that would be a hundred times as large.
+    np.testing.assert_allclose(after.spreads, before.spreads, atol=1e-3 * before.spreads.max())
 
 
 @pytest.mark.parametrize(("views", "is_found"), [(slice(1), False), (slice(1, None), True)])

@@ -15,7 +15,8 @@ Where the robot arrives differs from the thing by
 No camera finds a thing without noise; that is the task's own, and not among them. Where the arm
 errs with its posture, calibrated or not, the place is compared with where the chain as a whole puts
 it: what its first and last link do looks the same in all views, the frames of camera and target
-have taken it up, and an arm that picks does it again.
+have taken it up, and an arm that picks does it again. Of errors that are not beyond chance, they
+alone are taken so.
 """
 
 from collections.abc import Mapping, Sequence
@@ -197,12 +198,8 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
     carries = np.array([_is_between(problem, it, base, robot) for it in seen.observers])
     calibrated = arm is not None and arm.model is not None
     errors = None if arm is None or calibrated else arm.errors
-    # Errors of postures that are not beyond chance are in the noise of a look.
-    unfitted = errors
-    if errors is None or errors.is_estimated or not (errors.of_links or errors.is_significant):
-        unfitted = None
-    level = np.diag(np.repeat(noise.robots[problem.robots.index(robot)], 3) ** 2)
-    whole = calibrated or unfitted is not None
+    unfitted = None if errors is None or errors.is_estimated else errors
+    whole = calibrated or (unfitted is not None and (unfitted.of_links or unfitted.is_significant))
     if whole:
         # The whole chain, in the targets' frames: the noise of its flanges is in it.
         looking, at_m = problem, middles
@@ -211,29 +208,33 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
         if need is not None and need.at != "views":
             at_m = np.where(carries[:, None], at_m, np.array(need.at))
     linear, covariance, parts = looking.linear(state, ideal=True), fitted.covariance, {}
+    turned, at = adjoint(in_base), problem.robots.index(robot)
+    level = white = noise.robots[at]
     if unfitted is not None:
         off = unfitted.sigma * misfit_jacobian(fitted.whole, state, noise, robot, unfitted)
         # Errors that follow the posture are why neighbours err alike.
         covariance = covariance - fitted.inflation * off @ off.T
-        parts["arm"] = _left_by_arm(fitted, robot, unfitted, off)
+        left = _left_by_arm(fitted, robot, unfitted, off)
+        parts["arm"] = left if whole else turned @ left @ np.swapaxes(turned, 1, 2)
         if unfitted.white is not None:
-            levels = noise.robots.copy()
-            levels[problem.robots.index(robot)] = unfitted.white
+            white, levels = unfitted.white, noise.robots.copy()
+            levels[at] = white
             noise = replace(noise, robots=levels)
-    elif errors is not None and errors.of_links:
+    elif errors is not None:
         parts["arm"] = _of_arm(problem, robot, errors)
     parts["calibration"] = linear.covariance(covariance)
     if problem.is_combined:
         # Noise of both as one counts as the robot's, where it carries the camera.
-        turned = adjoint(in_base)
-        look = carries[:, None, None] * (turned @ level @ np.swapaxes(turned, 1, 2))
+        alone = turned @ _axes(white) @ np.swapaxes(turned, 1, 2)
+        look = carries[:, None, None] * alone
     else:
         look = looking.total_covariance(linear, noise) - looking.covariance(noise)
     parts["look"] = look
     placed = {name: _at_points(it, at_m) for name, it in parts.items()}
-    # Of a whole chain before a camera that stands still, it is among the chain's already.
-    goes = carries | (not whole)
-    placed["pick"] = np.where(goes[:, None, None], _of_flange(problem, robot, in_base, level), 0.0)
+    # A camera that is carried looks from another posture than the robot then has; before one that
+    # stands still it is the same, and of a whole chain its noise is among the chain's already.
+    going = np.where(carries[:, None, None], _axes(level), 0.0 if whole else _axes(white))
+    placed["pick"] = _of_flange(problem, robot, in_base, going)
     placed["left out"] = np.broadcast_to(_unpredicted(fitted), parts["look"].shape)
     return Picks(
         camera,
@@ -244,18 +245,23 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
     )
 
 
-def _of_flange(problem: Problem, robot: str, in_base: FloatArray, level: FloatArray) -> FloatArray:
-    """(n, 6, 6) the noise of a flange at its own origin.
+def _axes(level: FloatArray) -> FloatArray:
+    """(6, 6) the covariance of a flange's noise of a level (2,), of rotation and place."""
+    return np.diag(np.repeat(level, 3) ** 2)
+
+
+def _of_flange(problem: Problem, robot: str, in_base: FloatArray, noise: FloatArray) -> FloatArray:
+    """(n, 6, 6) the noise of a flange at its own origin, of (n, 6, 6) by its level.
 
     Where the noise of robot and camera is one, it is that of targets: what the flange's rotation
     does to them by their distance is in that of their place.
     """
-    found = np.broadcast_to(level, (len(problem), 6, 6)).copy()
+    found = noise.copy()
     if problem.is_combined:
         flange_m = problem.poses[robot][problem.observations.stops, :3, 3]
         lever_m2 = np.sum((in_base[:, :3, 3] - flange_m) ** 2, axis=1)
         # About three axes alike, a rotation moves a point by two of its components.
-        own = np.maximum(level[3, 3] - level[0, 0] * lever_m2 * 2.0 / 3.0, 0.0)
+        own = np.maximum(noise[:, 3, 3] - noise[:, 0, 0] * lever_m2 * 2.0 / 3.0, 0.0)
         found[:, 3:, 3:] = own[:, None, None] * np.eye(3)
     return found
 
