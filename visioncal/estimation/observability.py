@@ -450,7 +450,7 @@ def motion_words(robot: FloatArray, flange: FloatArray, stops: str, frame: str) 
     return f"the {stops} turn by at most {figure(largest)} deg, and {about_second}"
 
 
-def poor_motion(base_from_flange: FloatArray, mount: Mount) -> tuple[str, str]:
+def too_little_motion(base_from_flange: FloatArray, mount: Mount) -> tuple[str, str]:
     """What leaves a calibration open whatever else is known, and what to do; empty where nothing.
 
     Args:

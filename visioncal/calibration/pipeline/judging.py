@@ -32,6 +32,7 @@ from visioncal.estimation.observability import (
     check_observability,
     directions,
     edge_directions,
+    too_little_motion,
 )
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.tree import Tree
@@ -267,6 +268,17 @@ def _errs(arm: RobotArm) -> bool:
     return arm.errors is not None and arm.errors.is_significant
 
 
+def poor_motion(known: RunState) -> tuple[str, str]:
+    """What leaves one camera and one robot open by the robot's poses alone, and what to do.
+
+    Empty where nothing does, and of whole cells.
+    """
+    poses = np.array([*known.base_from_flange.values()]) if known.mount else np.zeros(0)
+    if known.mount is None or len(poses) < 2:
+        return "", ""
+    return too_little_motion(poses, known.mount)
+
+
 def check_answer(known: RunState) -> None:
     """Refuses motion that does not determine a frame well enough for anybody.
 
@@ -274,6 +286,9 @@ def check_answer(known: RunState) -> None:
         DegenerateError: A direction of a frame is not determined at all, or its predicted sigma is
             over the limit.
     """
+    if known.is_misread and not poor_motion(known)[0]:
+        # Where poses are read wrongly, what is predicted at their fit says nothing of the motion.
+        return
     agreed, cell = known.fitted.agreed, known.fitted.cell
     part, fit = known.fitted.part, agreed.fit
     seen = known.fitted.seen

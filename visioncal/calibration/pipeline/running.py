@@ -4,8 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
-
 from visioncal.calibration.pipeline.exchanged_names import exchanged_names
 from visioncal.calibration.pipeline.guess_inputs import (
     closes_as_declared,
@@ -13,6 +11,7 @@ from visioncal.calibration.pipeline.guess_inputs import (
     reading_hint,
     readings_in_cell,
 )
+from visioncal.calibration.pipeline.judging import poor_motion
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
@@ -28,7 +27,6 @@ from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Progress
 from visioncal.core.verdict import Finding, Step
-from visioncal.estimation.observability import poor_motion
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
@@ -186,10 +184,7 @@ def run_steps(known: RunState) -> RunState:
 
 def _poor_motion(known: RunState) -> Finding | None:
     """Says that a robot hardly moved, which leaves the lens open, too."""
-    poses = np.array([*known.base_from_flange.values()]) if known.mount else np.zeros(0)
-    if known.mount is None or len(poses) < 2:
-        return None
-    words, advice = poor_motion(poses, known.mount)
+    words, advice = poor_motion(known)
     return Finding("weak_motion", words, Step(advice)) if words else None
 
 

@@ -130,6 +130,7 @@ _BY_THE_CHAIN = (
     "corner_noise",
     "arm_errors",
     "prior",
+    *MOVED_AT_ONCE,
 )
 LOOK = Step(
     "Look at the worst views: does each pose belong to its image, did anything move?", REVIEW
