@@ -405,7 +405,7 @@ def test_few_stops_are_said_to_be_few():
     cell = simulate_network(NetworkOptions(stops=6))
     found = aligned(cell)
     assert found.verdict.status == "check"
-    assert "Robot a: only 6 stops are used; 10 or more give" in found.verdict.reasons[0]
+    assert "Robot a: only 6 stops are used; 10 or more are needed" in found.verdict.reasons[0]
     with pytest.raises(DegenerateError, match=r"too few, .* all 2 stops of robot b"):
         aligned(simulate_network(NetworkOptions(stops=2)))
 
