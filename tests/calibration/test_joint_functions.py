@@ -156,7 +156,7 @@ def test_the_words_name_where_it_is_no_better():
         better_share=0.7,
         regions=tuple(regions),
     ).words
-    assert "errs by 0.15 mm (as stated 0.98); elsewhere 0.5 of 1.1 mm" in words
+    assert "errs by 0.15 mm (the stated arm by 0.98 mm). Elsewhere 0.5 mm are" in words
     assert "70 % of the workspace; behind the base it is no better than as stated." in words
 
 

@@ -24,8 +24,8 @@ _EXIT_FAILED = 3
 # What comes of the triggers of the policy.
 _TRIGGERED = {
     "fired": "[bold yellow]calibrate again[/] because of",
-    "quiet": "not because of",
-    "unknown": "not known",
+    "quiet": "no reason to calibrate again",
+    "unknown": "could not be checked",
 }
 
 

@@ -137,7 +137,7 @@ def finding_of(test: TouchTest) -> Finding:
         f"{figure(max(gaps))} mm; 95 % were predicted within {figure(radius)} mm."
     )
     if test.passed:
-        return Finding("touch_test", words)
+        return Finding("touch_test", f"{words} The gaps are as predicted.")
     step = Step("Measure the tool's tip anew, then look whether the camera or the robot was moved.")
     return Finding("touch_test", f"{words} That is more than predicted.", step, is_fatal=True)
 

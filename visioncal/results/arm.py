@@ -200,11 +200,11 @@ class CarriesOver:
         worse = [_WHERE[it.region] for it in self.regions if not it.better]
         where = f"; {listed(worse)} it is no better than as stated" if worse else ""
         return (
-            f"Where it was measured the calibrated arm errs by {figure(self.measured_mm)} mm (as "
-            f"stated {figure(self.measured_nominal_mm)}); elsewhere {figure(self.sigma_mm)} of "
-            f"{figure(self.nominal_mm)} mm are predicted, {figure(self.session_mm)} mm for another "
-            f"session among it. It is clearly better in {percent(self.better_share)} of the "
-            f"workspace{where}."
+            f"Where it was measured, the calibrated arm errs by {figure(self.measured_mm)} mm (the "
+            f"stated arm by {figure(self.measured_nominal_mm)} mm). Elsewhere "
+            f"{figure(self.sigma_mm)} mm are predicted (the stated arm: {figure(self.nominal_mm)} "
+            f"mm), {figure(self.session_mm)} mm of this for another session. The calibrated arm is "
+            f"clearly better in {percent(self.better_share)} of the workspace{where}."
         )
 
 
