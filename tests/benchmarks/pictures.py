@@ -55,7 +55,9 @@ def main() -> None:
                 _sized(page, width, height, is_phone=width < 500)
                 page.visit(Path(file).absolute().as_uri())
                 _keep(name, page.picture())
-            for name, folder, row in () if QUICK else (("viewer", "doubted", 6),):
+            for name, folder, row in (
+                () if QUICK else (("demo", "out", 5), ("viewer", "doubted", 6))
+            ):
                 _sized(page, 1400, 880, is_phone=False)
                 with _served(Path(folder, "recording.rrd")) as url:
                     page.visit(f"{url}#when=view@{row}")

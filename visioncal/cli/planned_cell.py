@@ -151,7 +151,7 @@ def cell_of(source: Source, words: CellOptions, kept: Kept) -> PlanCell:
             f"{source.words}: {some_of(missing)} {'is' if len(missing) == 1 else 'are'} needed to "
             "know the cell.",
             culprits=missing,
-            next_step="Give them, or plan from a session or a calibration of the cell, which have them.",
+            next_step="Give them, or plan from a session or a calibration of the cell.",
         )
     refuse_given(words.options("robot"), f"{source.words} is named already")
     camera = _camera(str(words.camera), words.resolution)
