@@ -66,7 +66,7 @@ def align_into(
 
 
 def _report(result: "Alignment") -> None:
-    from visioncal.cli.summary import print_verdict, unused_words
+    from visioncal.cli.summary import print_verdict, unsaid, unused_words
 
     console = answers()
     print_verdict(result.verdict, result.session_name)
@@ -87,6 +87,6 @@ def _report(result: "Alignment") -> None:
         if level > _SHOWN_LEVEL or not words:
             words.append(f"{figure(level)} times what is said of it")
         console.print(f"noise of {name}: {', '.join(words)}")
-    for unused in unused_words(result.sights):
+    for unused in unused_words(unsaid(result.verdict, result.sights)):
         console.print(escape(f"  {unused}"))
     console.print(escape(result.weakest))

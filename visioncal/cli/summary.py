@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import TypeVar
 
 import numpy as np
 from rich.markup import escape
@@ -18,6 +19,7 @@ from visioncal.results import Calibration, Sight, Step, Verdict, ViewResult
 _COLOURS = {"good": "bold green", "check": "bold yellow", "bad": "bold red"}
 # Beyond any image, what is predicted is nowhere [px].
 _MOST_PX = 1e4
+_Seen = TypeVar("_Seen", ViewResult, Sight)
 _SAME_REASON = 20  # more views of one reason share a line
 
 
@@ -67,16 +69,16 @@ def print_summary(calibration: Calibration, *, verbose: bool) -> None:
         + ("" if held.deg is None else f", {figure(held.deg)} deg")
         + (f", {figure(held.px)} px" if held.px and held.px < _MOST_PX else "")
     )
-    for words in unused_words(_unsaid(calibration)):
+    for words in unused_words(unsaid(calibration.verdict, calibration.views)):
         console.print(f"  {escape(words)}")
     if verbose:
         console.print(_solver_table(calibration))
 
 
-def _unsaid(calibration: Calibration) -> Iterator[ViewResult]:
+def unsaid(verdict: Verdict, views: Iterable[_Seen]) -> Iterator[_Seen]:
     """The views about which the verdict does not say already why they were left out."""
-    left_out = [it for it in calibration.verdict.findings if it.without_it]
-    for view in calibration.views:
+    left_out = [it for it in verdict.findings if it.without_it]
+    for view in views:
         about = [it for it in left_out if view.view in it.views]
         if not any(it.kind != "wrong_views" or view.reason in it.words for it in about):
             yield view

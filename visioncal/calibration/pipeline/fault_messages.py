@@ -133,8 +133,8 @@ def moved_found(moved: Moved) -> Finding:
     return Finding(
         "moved_frame",
         f"{moved.frame} {what} between stops {moved.last_stop} and {moved.first_stop}, by "
-        f"{figure(moved.shift_mm)} mm and {figure(moved.turn_deg)} deg{rivals}; the result has it "
-        f"where it stood last, and as {moved.before} where it stood before.",
+        f"{figure(moved.shift_mm)} mm and {figure(moved.turn_deg)} deg{rivals}. The result has "
+        f"{moved.frame} where it stood last, and as {moved.before} where it stood before.",
         Step(f"Fasten {moved.frame}, and record again."),
     )
 

@@ -232,7 +232,7 @@ def _warnings(stack: CornerStack, fit: BundleFit) -> Iterator[Finding]:
             EMPTY_IMAGE,
             f"No corner was ever seen in the {' and '.join(empty)} of the image, so the lens is "
             "extrapolated there.",
-            Step("Move the target there in some views."),
+            Step("In some views, move the target into that part of the image."),
             # What is needed is needed where the views looked, or at a declared place.
             until_mm=0.0,
         )
