@@ -22,6 +22,7 @@ from visioncal.present.report.axes import Box, Margins, Panel, Scale, boxes
 from visioncal.present.report.bars import Bar
 from visioncal.present.report.content import Fact, template
 from visioncal.present.report.svg import Figure
+from visioncal.present.words import SOURCES
 from visioncal.results import HELD_BACK, Alignment, Calibration, CameraResult, Sight
 
 _DEG = "\N{DEGREE SIGN}"
@@ -198,7 +199,7 @@ def source_table(found: Alignment) -> PairTable | None:
         PairRow(edge, tuple(significant(it.get(name)) for name in shown))
         for edge, it in budgets.items()
     )
-    return PairTable("", tuple(shown), rows)
+    return PairTable("", tuple(SOURCES.get(it, it) for it in shown), rows)
 
 
 def _noise_facts(found: Alignment) -> list[Fact]:
