@@ -275,7 +275,9 @@ def _seen(
         return ()
     rows, slots = pair.rows[first[among]], slots[first[among]]
     errors = linear.by_errors[rows].reshape(len(rows), 6, -1, 6)[np.arange(len(rows)), :, slots]
-    left = -np.linalg.solve(errors, linear.residuals[rows, :, None])[:, 3:, 0]
+    # A point alone does not part a flange's rotation from its place: all counts as place.
+    turns = problem.observations.has_rotation[rows, None] | (np.arange(6) >= 3)
+    left = -(np.linalg.pinv(errors * turns[:, None]) @ linear.residuals[rows, :, None])[:, 3:, 0]
     moved = fit.motion(stops)[chosen, :3, 3]
     # Where it has hardly moved it has no direction: that of the farthest stop serves them all.
     lengths = np.linalg.norm(moved, axis=1)
