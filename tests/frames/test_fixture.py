@@ -512,6 +512,8 @@ def test_units_of_the_drawing(tmp_path, tool_file):
 
     assert run(("X", "Y", "Z"), "--cad-unit", "mm").status == 0
     assert run(("X_mm", "Y_mm", "Z_mm")).status == 0
+    # Who says a unit has seen that the names are wrong.
+    assert run(("x_m", "y_m", "z_m"), "--cad-unit", "mm").status == 0
     for done, words in (
         (run(("x_m", "y_m", "z_m")), "the drawn ones are in mm and were read as m"),
         (run(("x", "y", "z")), "x, y, z are in no unit that is named"),

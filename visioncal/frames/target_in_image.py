@@ -120,7 +120,9 @@ def check_size(eye: Eye, image: Image, label: str) -> None:
             f"{label}: it has {shown} pixels, and the calibrated camera has {width} x {height}, "
             "grey.",
             culprits=[label],
-            next_step="Take the image with the same camera, binning and region as calibrated.",
+            next_step="Give its grey levels: cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)."
+            if image.shape[:2] == (height, width)
+            else "Take the image with the same camera, binning and region as calibrated.",
         )
 
 

@@ -178,7 +178,7 @@ def _axes(
 
     Args:
         fields: The rows.
-        unit: What they are in, where their names do not say.
+        unit: What they are in; left out, their names say it.
         option: By which the user says that.
         named: The columns, where the user names them.
     """
@@ -191,7 +191,8 @@ def _axes(
     for name, length in UNITS_M.items():
         wanted = named or [f"{axis}_{name}" for axis in "xyz"]
         if all(it.lower() in known and it.endswith(f"_{name}") for it in wanted):
-            return tuple(known[it.lower()] for it in wanted), length
+            # Who names a unit has seen that the columns' names are wrong.
+            return tuple(known[it.lower()] for it in wanted), UNITS_M[unit] if unit else length
     plain = tuple(named) or tuple(known.get(axis, "") for axis in "xyz")
     if not all(plain):
         raise DataError(
