@@ -39,7 +39,12 @@ from visioncal.present.report import write_report
 from visioncal.results import Calibration, to_document
 from visioncal.session import Session, corners
 from visioncal.simulation import CellOptions, simulate
-from visioncal.vision.targets import load_target, target_document, target_from_document
+from visioncal.vision.targets import (
+    corner_positions,
+    load_target,
+    target_document,
+    target_from_document,
+)
 
 IN_HAND, TO_HAND = "eye-in-hand", "eye-to-hand"
 REFINED, AUTO = f'{LENS}intrinsics = "refine"\n', LENS
@@ -675,3 +680,33 @@ def test_a_misspelt_key_of_a_board_is_named(drawn):
     (drawn / "b.toml").write_text("".join(lines))
     words = "b.toml: legacyy is no known name and was not read. Did you mean legacy?"
     assert words in Session.load(drawn).warnings
+
+
+@pytest.mark.parametrize(("size", "dh_sigma"), [(1.004, 0.0), (1.0, 3e-4)])
+@pytest.mark.parametrize("mount", [IN_HAND, TO_HAND])
+def test_a_rigs_size_is_parted_from_errors_of_the_links(tmp_path, mount, size, dh_sigma):
+    """Longer links explain a larger rig, and one size is simpler: of an arm that errs it is not."""
+    options = CellOptions(mount=mount, views=20, seed=2, dh_sigma_m=dh_sigma, dh_sigma_rad=dh_sigma)
+    cell = simulate(options)
+    rows = enumerate((size * corner_positions(options.target)).tolist())
+    lines = [",".join(map(repr, (number, *place))) for number, place in rows]
+    (tmp_path / "rig.csv").write_text("\n".join(("point,x_m,y_m,z_m", *lines)) + "\n")
+    (tmp_path / "rig.toml").write_text('kind = "points"\npoints = "rig.csv"\n')
+    session = Session.from_corners(
+        [(it.ids, it.px) for it in cell.corners],
+        cell.base_from_flange,
+        load_target("rig.toml", tmp_path)[0],
+        cell.stated_camera.resolution,
+        mount=mount,
+        camera=cell.stated_camera,
+        robot=options.robot,
+        q=cell.joints,
+    )
+    result = calibrate(session)
+    found = [it.words for it in result.verdict.causes if it.kind == "board_size"]
+    assert bool(found) == (size != 1.0)
+    for it in found:
+        said = re.search(r"is ([0-9.]+) % smaller than the table .* \(sigma ([0-9.]+) %\)", it)
+        percent, sigma = map(float, said.groups())
+        assert abs(percent - 0.4) < 4.0 * sigma < 0.1
+    assert (result.verdict.status == "good") == (size == 1.0)

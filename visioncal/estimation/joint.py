@@ -23,9 +23,11 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.scene import lens_prior
 from visioncal.estimation.solve import (
     Solution,
+    covariance_of,
     fit_problem,
     fitted_covariance,
     normal_equations,
+    robot_likelihood,
     score_gain,
 )
 from visioncal.estimation.variance import Knowledge
@@ -267,18 +269,50 @@ def measured_rig(side: Side, fitted: Fitted, frame: str, rig: int) -> MeasuredSc
         rig: Which target it is.
     """
     problem, state = fitted.problem, fitted.fit.state
-    # A rig that was moved has a frame for each place where it was.
-    mine = np.array([it.partition("@")[0] == frame for it in problem.observations.observed])
-    poses = problem.observations.measured[mine]
-    by_size = np.zeros((len(mine), 6, 1))
-    by_size[mine, 3:] = np.swapaxes(poses[:, :3, :3], 1, 2) @ poses[:, :3, 3:]
-    size = Effect.free("size of a rig", Knowledge(np.zeros((1, 1)), np.zeros(1)), by_size)
-    problem = problem.with_effects([*problem.effects, size])
+    problem = problem.with_effects([*problem.effects, _rig_size(problem, frame)])
     there = State(state.edges, np.append(state.values, 0.0))
     information, gradient = normal_equations(problem, there, fitted.fit.noise)
     covariance = covariance_among(information, problem.moving)
     sigma = (_UNEVEN if side.has_links else 1.0) * float(covariance[-1, -1] ** 0.5)
     return MeasuredScale(rig, -float(covariance[-1] @ gradient), sigma, 0.0)
+
+
+def rig_by_stated_arms(
+    fitted: Fitted, stated: Problem, frame: str, rig: int
+) -> MeasuredScale | None:
+    """Measures the size of a rig by arms as they are stated; see `measured_rig`.
+
+    Longer links explain a larger rig as well: one size is simpler than many links.
+
+    Args:
+        fitted: The fit, with arms that were calibrated.
+        stated: The same observations, with arms as stated.
+        frame: The rig's.
+        rig: Which target it is.
+
+    Returns:
+        Its size; None where arms that err are likelier.
+    """
+    sized = stated.with_effects([*stated.effects, _rig_size(stated, frame)])
+    fit = fit_problem(sized, State(fitted.fit.state.edges, sized.start_values))
+
+    def unlikely(problem: Problem, at: Solution) -> float:
+        return robot_likelihood(problem, at.state, at.noise).white[1]
+
+    if unlikely(sized, fit) > unlikely(fitted.problem, fitted.fit):
+        return None
+    sigma = float(covariance_of(sized, fit)[-1, -1] ** 0.5)
+    return MeasuredScale(rig, float(fit.state.values[-1]), sigma, 0.0)
+
+
+def _rig_size(problem: Problem, frame: str) -> Effect:
+    """The size of a rig as an unknown, which moves all that is seen of it towards the camera."""
+    # A rig that was moved has a frame for each place where it was.
+    mine = np.array([it.partition("@")[0] == frame for it in problem.observations.observed])
+    poses = problem.observations.measured[mine]
+    by_size = np.zeros((len(mine), 6, 1))
+    by_size[mine, 3:] = np.swapaxes(poses[:, :3, :3], 1, 2) @ poses[:, :3, 3:]
+    return Effect.free("size of a rig", Knowledge(np.zeros((1, 1)), np.zeros(1)), by_size)
 
 
 def moved_mahalanobis_sq(fitted: Fitted, places: IntArray) -> float:

@@ -102,7 +102,11 @@ class Solved:
             part = self.agreed.problem.subset(self.agreed.used)
             side = _side(self.cell, self.agreed, self.arms, self.late)
             fitted = Fitted(self.seen, part, self.agreed.fit)
-            yield from found_of_looks(side, fitted, covariance)
+            stated = part
+            for arm in self.arms.values():
+                stated = arm.without_errors(stated)
+            is_calibrated = any(it.model is not None for it in self.arms.values())
+            yield from found_of_looks(side, fitted, covariance, stated if is_calibrated else None)
 
     @property
     def shown_px(self) -> dict[str, float]:

@@ -21,7 +21,9 @@ from visioncal.estimation.joint import (
     measured_rig,
     measured_scale,
     moved_mahalanobis_sq,
+    rig_by_stated_arms,
 )
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.scene import ONLY_CAMERA, Scene
 from visioncal.estimation.solve import covariance_of, held_shift
 from visioncal.session.frames import frame_name
@@ -39,13 +41,16 @@ _NEW_LENS = Step(
 )
 
 
-def found_of_looks(side: Side, fitted: Fitted, covariance: FloatArray) -> Iterator[Finding]:
+def found_of_looks(
+    side: Side, fitted: Fitted, covariance: FloatArray, stated: Problem | None
+) -> Iterator[Finding]:
     """Says what a joint fit found of lenses and boards; what is no reason for doubt is a note.
 
     Args:
         side: The frames' side of the fit.
         fitted: The answer.
         covariance: (p, p) of its unknowns, with all that counts beside the noise.
+        stated: The same observations with arms as stated; None where none was calibrated.
     """
     looks = fitted.looks
     cameras = zip(looks.problems.items(), fitted.seen.compressed, strict=True)
@@ -59,7 +64,10 @@ def found_of_looks(side: Side, fitted: Fitted, covariance: FloatArray) -> Iterat
         if board not in looks.printed:
             yield from points_found(target, looks.moved_points(board))
             frame = frame_name("target", scene.names[board])
-            yield from rig_size_found(target, measured_rig(side, fitted, frame, board))
+            measured = measured_rig(side, fitted, frame, board)
+            if stated is not None:
+                measured = rig_by_stated_arms(fitted, stated, frame, board) or measured
+            yield from rig_size_found(target, measured)
             continue
         called = f"board {scene.names[board]}".strip()
         if _moves(fitted, looks.scale_of(board)):
