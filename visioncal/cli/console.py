@@ -1,12 +1,10 @@
 """What the commands share: messages to stderr, results to stdout, advice, and signals as Ctrl-C."""
 
 import json
-import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING
 
 import typer
@@ -123,24 +121,3 @@ def naming(session: Path, out: Path | str = "") -> Iterator[None]:
             culprits=error.culprits,
             next_step=with_paths(error.next_step, session, out),
         ) from error
-
-
-@contextmanager
-def ended_like_ctrl_c() -> Iterator[None]:
-    """Runs a block that SIGTERM, and a terminal that is closed, end as Ctrl-C does.
-
-    Raises:
-        KeyboardInterrupt: When one of them comes.
-    """
-    names = [it for it in ("SIGTERM", "SIGHUP") if hasattr(signal, it)]
-    numbers = [getattr(signal, it) for it in names]
-    previous = {number: signal.signal(number, _interrupt) for number in numbers}
-    try:
-        yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 - signal's interface
-    raise KeyboardInterrupt

@@ -34,7 +34,8 @@ def dynamics_record_command(
     # What help and a mistyped option need not wait for.
     from rich.markup import escape
 
-    from visioncal.cli.console import ended_like_ctrl_c, messages
+    from visioncal.cli.console import messages
+    from visioncal.core.interrupts import ended_like_ctrl_c
     from visioncal.live.capture.motions import record_motion
     from visioncal.live.drivers.ur_motion import UrMotion
     from visioncal.session import STREAMS, check_stream

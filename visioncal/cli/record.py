@@ -6,9 +6,10 @@ from typing import Annotated
 
 import typer
 
-from visioncal.cli.console import asked, ended_like_ctrl_c, messages
+from visioncal.cli.console import asked, messages
 from visioncal.cli.options import AsJson, View
 from visioncal.cli.record_options import CellOptions, DeviceOptions, TakingOptions
+from visioncal.core.interrupts import ended_like_ctrl_c
 from visioncal.live.capture.options import CaptureOptions
 
 

@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from visioncal.calibration.pipeline import Run, run
-from visioncal.cli.console import ended_like_ctrl_c, messages, report_error, report_written
+from visioncal.cli.console import messages, report_error, report_written
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.recorded import ViewLines, driven
 from visioncal.cli.recorded_cell import Scene, facts_of, scene_of, shown_in
 from visioncal.core.choices import Faults
 from visioncal.core.errors import DataError, DriverError, VisioncalError
+from visioncal.core.interrupts import ended_like_ctrl_c
 from visioncal.core.types import FloatArray
 from visioncal.frames.touch_test import judged, touch_points
 from visioncal.interchange.outputs import Written, write_outputs, write_plan

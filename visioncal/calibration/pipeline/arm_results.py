@@ -141,7 +141,7 @@ def doubts_of_arms(
     for robot, arm in arms.items():
         mine = _doubts(arm, found.get(robot), asked, from_when, joint)
         for it in (*mine, *results[robot].doubts()):
-            yield (it if it.kind in MOVED_AT_ONCE else it.of(_called(arms, robot)))
+            yield it if it.kind in MOVED_AT_ONCE else it.of(_called(arms, robot))
 
 
 def notes_on_arms(arms: Mapping[str, RobotArm], results: Mapping[str, ArmFound]) -> Iterator[str]:

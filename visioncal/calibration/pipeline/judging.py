@@ -268,15 +268,13 @@ def _errs(arm: RobotArm) -> bool:
     return arm.errors is not None and arm.errors.is_significant
 
 
-def poor_motion(known: RunState) -> tuple[str, str]:
-    """What leaves one camera and one robot open by the robot's poses alone, and what to do.
-
-    Empty where nothing does, and of whole cells.
-    """
-    poses = np.array([*known.base_from_flange.values()]) if known.mount else np.zeros(0)
-    if known.mount is None or len(poses) < 2:
-        return "", ""
-    return too_little_motion(poses, known.mount)
+def poor_motion(known: RunState) -> Finding | None:
+    """Says that a robot's poses alone leave one camera and it open; None of whole cells."""
+    if known.mount is None or len(known.base_from_flange) < 2:
+        return None
+    poses = np.array([*known.base_from_flange.values()])
+    words, advice = too_little_motion(poses, known.mount)
+    return Finding("weak_motion", words, Step(advice)) if words else None
 
 
 def check_answer(known: RunState) -> None:
@@ -286,7 +284,7 @@ def check_answer(known: RunState) -> None:
         DegenerateError: A direction of a frame is not determined at all, or its predicted sigma is
             over the limit.
     """
-    if known.is_misread and not poor_motion(known)[0]:
+    if known.is_misread and poor_motion(known) is None:
         # Where poses are read wrongly, what is predicted at their fit says nothing of the motion.
         return
     agreed, cell = known.fitted.agreed, known.fitted.cell

@@ -26,7 +26,7 @@ from visioncal.core.choices import CONVENTIONS, Convention, SolverName
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Progress
-from visioncal.core.verdict import Finding, Step
+from visioncal.core.verdict import Finding
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
@@ -160,7 +160,7 @@ def run_steps(known: RunState) -> RunState:
                 # Views that are out of the game are often why the rest does not suffice.
                 more = [it for it in known.lost_views if it not in error.culprits]
                 cause = unseen_cause(known) or (
-                    _poor_motion(known) if stage.name == "intrinsics" else None
+                    poor_motion(known) if stage.name == "intrinsics" else None
                 )
                 if cause is not None:
                     raise because(error.with_culprits(more), cause) from error
@@ -180,12 +180,6 @@ def run_steps(known: RunState) -> RunState:
                 # Of exchanged rows the others are as they should be.
                 known = replace(known, is_misread=hint is not None and not hint.views)
         return _with_other_board(_with_reading(known, seen, hint))
-
-
-def _poor_motion(known: RunState) -> Finding | None:
-    """Says that a robot hardly moved, which leaves the lens open, too."""
-    words, advice = poor_motion(known)
-    return Finding("weak_motion", words, Step(advice)) if words else None
 
 
 def _with_hint(

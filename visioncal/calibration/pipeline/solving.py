@@ -102,11 +102,12 @@ class Solved:
             part = self.agreed.problem.subset(self.agreed.used)
             side = _side(self.cell, self.agreed, self.arms, self.late)
             fitted = Fitted(self.seen, part, self.agreed.fit)
-            stated = part
-            for arm in self.arms.values():
-                stated = arm.without_errors(stated)
-            is_calibrated = any(it.model is not None for it in self.arms.values())
-            yield from found_of_looks(side, fitted, covariance, stated if is_calibrated else None)
+            arms, stated = self.arms.values(), None
+            if any(it.model is not None for it in arms):
+                stated = part
+                for arm in arms:
+                    stated = arm.without_errors(stated)
+            yield from found_of_looks(side, fitted, covariance, stated)
 
     @property
     def shown_px(self) -> dict[str, float]:

@@ -7,7 +7,8 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from types import FrameType
+
+from visioncal.core.interrupts import ended_like_ctrl_c
 
 _PATIENCE_S = 5.0
 # Nothing listens at the port of the discard service, so what goes there ends there.
@@ -51,19 +52,8 @@ def free_port() -> int:
 @contextmanager
 def until_interrupted() -> Iterator[None]:
     """Runs a block that Ctrl-C or SIGTERM ends as its ordinary end, not as an error."""
-    previous = {
-        number: signal.signal(number, _interrupt) for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    try:
-        with suppress(KeyboardInterrupt):
-            yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 - signal's interface
-    raise KeyboardInterrupt
+    with suppress(KeyboardInterrupt), ended_like_ctrl_c("SIGINT", "SIGTERM"):
+        yield
 
 
 def _quiet(environment: Mapping[str, str]) -> dict[str, str]:
