@@ -41,7 +41,6 @@ class FrameOptions:
         typer.Option(
             "-o",
             "--out",
-            dir_okay=False,
             help="A file of frames (.json) to put it into instead; made where missing.",
         ),
     ] = None

@@ -22,9 +22,7 @@ OutFolder: TypeAlias = Annotated[
 ]
 OutFile: TypeAlias = Annotated[
     Path | None,
-    typer.Option(
-        "-o", "--out", dir_okay=False, help="The file to write; otherwise, or as -, stdout."
-    ),
+    typer.Option("-o", "--out", help="The file to write; otherwise, or as -, stdout."),
 ]
 AsJson: TypeAlias = Annotated[
     bool, typer.Option("--json", help="Print the result as JSON to stdout, without words.")

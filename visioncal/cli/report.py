@@ -31,7 +31,6 @@ def report_command(
         typer.Option(
             "-o",
             "--out",
-            dir_okay=False,
             help="The file; report.html or certificate.html otherwise.",
         ),
     ] = None,

@@ -205,7 +205,7 @@ def check_command(
         typer.Option(help="Measured side of a square; of a tag for an AprilGrid or a single one."),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", dir_okay=False, help="Write the description here.")
+        Path | None, typer.Option("-o", "--out", help="Write the description here.")
     ] = None,
     as_json: AsJson = False,
     force: Annotated[

@@ -5,7 +5,7 @@ the chains of frames are closed over all stops with what is left open of these. 
 the answer, until it stays, is Gauss-Newton's method on the whole problem.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, Self
 
@@ -269,7 +269,7 @@ def measured_rig(side: Side, fitted: Fitted, frame: str, rig: int) -> MeasuredSc
         rig: Which target it is.
     """
     problem, state = fitted.problem, fitted.fit.state
-    problem = problem.with_effects([*problem.effects, _rig_size(problem, frame)])
+    problem = problem.with_effects([*problem.effects, target_sizes(problem, [frame])])
     there = State(state.edges, np.append(state.values, 0.0))
     information, gradient = normal_equations(problem, there, fitted.fit.noise)
     covariance = covariance_among(information, problem.moving)
@@ -293,7 +293,7 @@ def rig_by_stated_arms(
     Returns:
         Its size; None where arms that err are likelier.
     """
-    sized = stated.with_effects([*stated.effects, _rig_size(stated, frame)])
+    sized = stated.with_effects([*stated.effects, target_sizes(stated, [frame])])
     fit = fit_problem(sized, State(fitted.fit.state.edges, sized.start_values))
 
     def unlikely(problem: Problem, at: Solution) -> float:
@@ -305,14 +305,22 @@ def rig_by_stated_arms(
     return MeasuredScale(rig, float(fit.state.values[-1]), sigma, 0.0)
 
 
-def _rig_size(problem: Problem, frame: str) -> Effect:
-    """The size of a rig as an unknown, which moves all that is seen of it towards the camera."""
-    # A rig that was moved has a frame for each place where it was.
-    mine = np.array([it.partition("@")[0] == frame for it in problem.observations.observed])
-    poses = problem.observations.measured[mine]
-    by_size = np.zeros((len(mine), 6, 1))
-    by_size[mine, 3:] = np.swapaxes(poses[:, :3, :3], 1, 2) @ poses[:, :3, 3:]
-    return Effect.free("size of a rig", Knowledge(np.zeros((1, 1)), np.zeros(1)), by_size)
+def target_sizes(problem: Problem, frames: Sequence[str], sigma: float = np.inf) -> Effect:
+    """The sizes of targets as unknowns, which move all that is seen of each towards the camera.
+
+    Args:
+        problem: The observations.
+        frames: The targets' k frames.
+        sigma: What each size is known to, as a share of itself.
+    """
+    # A target that was moved has a frame for each place where it was.
+    observed = np.array([it.partition("@")[0] for it in problem.observations.observed])
+    poses = problem.observations.measured
+    by_size = np.zeros((len(observed), 6, len(frames)))
+    by_size[:, 3:] = np.swapaxes(poses[:, :3, :3], 1, 2) @ poses[:, :3, 3:]
+    by_size *= (observed[:, None] == np.array(frames))[:, None]
+    known = Knowledge(sigma**-2.0 * np.eye(len(frames)), np.zeros(len(frames)))
+    return Effect.free("sizes of targets", known, by_size)
 
 
 def moved_mahalanobis_sq(fitted: Fitted, places: IntArray) -> float:

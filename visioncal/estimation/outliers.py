@@ -99,9 +99,13 @@ class _Search:
         return self.fit_from(used, start.state, start.noise)
 
     def fit_from(self, used: Mask, state: State, noise: Noise | None = None) -> Solution:
-        fit = fit_problem(self.problem.subset(used), state, noise)
-        robots = np.minimum(fit.noise.robots, _MOST_NOISE)
-        return replace(fit, noise=replace(fit.noise, robots=robots))
+        part = self.problem.subset(used)
+        fit = fit_problem(part, state, noise)
+        if np.all(fit.noise.robots <= _MOST_NOISE):
+            return fit
+        # Frames that are fitted beside more noise than robots have may be anywhere.
+        most = replace(fit.noise, robots=np.minimum(fit.noise.robots, _MOST_NOISE))
+        return Solution(solve_problem(part, state, most)[0], most)
 
     def distances(self, used: Mask, fit: Solution) -> Distances:
         found, far = distances(self.problem, used, fit), ~_near(self.problem, fit.state, used)

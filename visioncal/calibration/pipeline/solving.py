@@ -29,13 +29,13 @@ from visioncal.calibration.stages.side import FramesSide
 from visioncal.calibration.stages.turned_images import Turned, turned_how
 from visioncal.calibration.stages.validate import chain_rms_px, predict_corners
 from visioncal.core.choices import SolverName
-from visioncal.core.errors import DegenerateError
+from visioncal.core.errors import ConvergenceError, DegenerateError
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask, Mount, Target
 from visioncal.core.verdict import Finding
 from visioncal.estimation.arm import LEVER_M, rows_of
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
-from visioncal.estimation.joint import Fitted
+from visioncal.estimation.joint import Fitted, target_sizes
 from visioncal.estimation.joint import settle as settle_looks
 from visioncal.estimation.lens_field import LensLevels
 from visioncal.estimation.moves import log_gain, slipped_joint
@@ -55,10 +55,16 @@ from visioncal.estimation.solve import (
     solve_problem,
     starting_noise,
 )
+from visioncal.session.frames import frame_name
 
 # Arms are linearised anew so often, or until their errors move by less, which is far below any
 # arm's repeatability.
 _ROUNDS, _AT_REST_RAD = 4, 1e-7
+# What targets' sizes are known to while it is sought what agrees, as a share: prints are scaled to
+# fit a page.
+_SIZE_SIGMA = 0.03
+# Where all goes astray, boards that are off by more begin as they were found.
+_FAR_SIZE = 5e-3
 # Covariance of a pose that was given without one, but for its level [rad^2, m^2].
 _NOMINAL = np.diag(np.repeat([1e-3, 5e-4], 3) ** 2)
 
@@ -190,17 +196,21 @@ def solve(
     cell, lost = _tied_part(cell)
     views = [looked.poses[it.view] for it in cell.rows]
     cell, views, problem, state, unplaced = _started(cell, views)
-    agreed = all_as_inliers(problem, state) if looked.is_misread else _agree(cell, problem, state)
+    sizes: Mapping[str, float] = {}
+    if looked.is_misread:
+        agreed = all_as_inliers(problem, state)
+    else:
+        agreed, sizes = _agree(cell, problem, state)
     late = clock_effects(cell, looked.clocks)
-    fitted = _agreeing_looks(cell, looked, views, agreed, arms, late)
+    fitted = _agreeing_looks(cell, looked, views, agreed, arms, late, sizes)
     if turned := {} if looked.is_misread else _turned_images(cell, views, fitted[0], fitted[1]):
         # Their corners would pass for a lens that changes from view to view.
         looked = replace(looked, turned=turned)
-        fitted = _agreeing_looks(cell, looked, views, agreed, arms, late)
+        fitted = _agreeing_looks(cell, looked, views, agreed, arms, late, sizes)
     agreed, seen, arms = fitted
     arms = with_drifts(arms, agreed.problem.subset(agreed.used), agreed.fit, asked)
     if any(it.drift is not None for it in arms.values()):
-        agreed, seen, arms = _agreeing_looks(cell, looked, views, agreed, arms, late)
+        agreed, seen, arms = _agreeing_looks(cell, looked, views, agreed, arms, late, sizes)
     agreed = _levelled(cell, views, agreed)
     # Poses that are misread say nothing of the arm, nor which views are outliers.
     for _ in range(0 if looked.is_misread else _ROUNDS):
@@ -243,7 +253,7 @@ def first_agreement(cell: Cell, looked: Observed, mount: Mount) -> tuple[Cell, A
     views = [looked.poses[it.view] for it in cell.rows]
     cell, _, problem, state, _ = _started(cell, views)
     check_observability(problem, state, starting_noise(problem), mount)
-    return cell, _agree(cell, problem, state)
+    return cell, _agree(cell, problem, state)[0]
 
 
 def agreeing_views(cell: Cell, looked: Observed) -> frozenset[int]:
@@ -315,6 +325,7 @@ def _agreeing_looks(
     agreed: Agreed,
     arms: Mapping[str, RobotArm],
     late: Sequence[Effect],
+    sizes: Mapping[str, float],
 ) -> tuple[Agreed, LinearisedCorners | None, Mapping[str, RobotArm]]:
     """Fits lenses, boards and frames, until the same observations agree under them.
 
@@ -323,7 +334,7 @@ def _agreeing_looks(
     """
     levels: Mapping[str, LensLevels] = {}
     for _ in range(_ROUNDS):
-        agreed, seen, fitted = _with_looks(cell, looked, views, agreed, arms, late, levels)
+        agreed, seen, fitted = _with_looks(cell, looked, views, agreed, arms, late, levels, sizes)
         levels = {} if seen is None else seen.looks.levels
         if cell.mount is None or looked.is_misread:
             break
@@ -363,6 +374,7 @@ def _with_looks(
     arms: Mapping[str, RobotArm],
     late: Sequence[Effect],
     levels: Mapping[str, LensLevels],
+    sizes: Mapping[str, float],
 ) -> tuple[Agreed, LinearisedCorners | None, Mapping[str, RobotArm]]:
     """Fits lenses, boards and frames, with errors of the arms sought anew beside their drift."""
     arms = {name: it.erring(None) for name, it in arms.items()}
@@ -374,7 +386,16 @@ def _with_looks(
         if looked.is_misread:
             fitted = settle_looks(looks, side, looks.first, _frames(agreed))
             return _settled(agreed, side, fitted), fitted.seen, side.arms
-        fitted, side = refined(side, looks, _frames(agreed))
+        try:
+            fitted, side = refined(side, looks, _frames(agreed))
+        except ConvergenceError:
+            names = next(iter(looked.scenes.values())).names
+            frames = [frame_name("target", it) for it in names]
+            found = {it: sizes.get(frames[it], 0.0) for it in looks.printed}
+            far = {board: size for board, size in found.items() if abs(size) > _FAR_SIZE}
+            if not far:
+                raise
+            fitted, side = refined(side, looks.with_sizes(far), _frames(agreed))
         return _settled(agreed, side, fitted), fitted.seen, side.arms
     drifts = tuple(effects_of(arms))
     agreed = _with_effects(agreed, drifts) if drifts else agreed
@@ -491,15 +512,34 @@ def _with_repeats(agreed: Agreed) -> Agreed:
     return replace(agreed, problem=problem, fit=fit)
 
 
-def _agree(cell: Cell, problem: Problem, state: State) -> Agreed:
-    """Finds what belongs together, and what of the priors the observations do not contradict."""
-    movable = _movable(cell, problem)
+def _agree(cell: Cell, problem: Problem, state: State) -> tuple[Agreed, Mapping[str, float]]:
+    """Finds what belongs together, and what of the priors the observations do not contradict.
+
+    Also gives by which share each printed target of a whole cell is larger than stated, roughly.
+    """
+    movable, seen = _movable(cell, problem), problem.observations
+    if printed := _printed(seen) if movable else []:
+        # All that is seen of a board of another size disagrees with the rest, and would be out.
+        problem = problem.with_effects([target_sizes(problem, printed, _SIZE_SIGMA)])
+        state = State(state.edges, problem.start_values)
     if not cell.priors:
-        return agree(problem, state, movable)
-    loose = replace(problem, priors=loosened(cell.priors))
-    agreed = _with_priors(cell, agree(loose, state, movable))
-    fit = fit_problem(agreed.problem.subset(agreed.used), agreed.fit.state, agreed.fit.noise)
-    return replace(agreed, fit=fit)
+        agreed = agree(problem, state, movable)
+    else:
+        loose = replace(problem, priors=loosened(cell.priors))
+        agreed = _with_priors(cell, agree(loose, state, movable))
+        fit = fit_problem(agreed.problem.subset(agreed.used), agreed.fit.state, agreed.fit.noise)
+        agreed = replace(agreed, fit=fit)
+    # What corners say of sizes is found with the lenses.
+    edges, sizes = agreed.fit.state.edges, agreed.fit.state.values.tolist()
+    fit = replace(agreed.fit, state=State(edges, np.zeros(0)))
+    agreed = replace(agreed, problem=agreed.problem.with_effects(()), fit=fit)
+    return agreed, dict(zip(printed, sizes, strict=True))
+
+
+def _printed(seen: Observations) -> list[str]:
+    """The targets of which corners were seen: the covariances of others' poses are not known."""
+    pairs = zip(seen.observed, seen.sensors.tolist(), strict=True)
+    return list(dict.fromkeys(target for target, sensor in pairs if sensor < 0))
 
 
 def _settle(cell: Cell, agreed: Agreed) -> Agreed:

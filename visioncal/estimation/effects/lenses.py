@@ -33,11 +33,13 @@ class CameraParameters:
         problems: Each camera's corners, by the camera.
         values: (k,) all lenses' intrinsics, camera by camera, and then all boards' shapes.
         poses: (v, 4, 4) of the views, camera by camera.
+        resized: Printed boards whose scales are free from the start.
     """
 
     problems: Mapping[str, CornerProblem]
     values: FloatArray
     poses: FloatArray
+    resized: tuple[int, ...] = ()
 
     @classmethod
     def of(
@@ -120,8 +122,8 @@ class CameraParameters:
     @property
     def first(self) -> IntArray:
         """What is free from the start."""
-        found = (self.places(name)[it.first] for name, it in self.problems.items())
-        return np.unique(np.concatenate([*found]))
+        found = [self.places(name)[it.first] for name, it in self.problems.items()]
+        return np.unique(np.concatenate([*found, *map(self.scale_of, self.resized)]))
 
     @property
     def counted(self) -> IntArray:
@@ -156,6 +158,12 @@ class CameraParameters:
             for name, it in self.problems.items()
         }
         return replace(self, problems=problems)
+
+    def with_sizes(self, scales: Mapping[int, float]) -> "CameraParameters":
+        """The same, printed boards being larger than stated by some shares, free from the start."""
+        places = [int(self.scale_of(it)[0]) for it in scales]
+        unstated = replace(self.without_prior(places), resized=tuple(scales))
+        return unstated.with_values(np.array(places), np.array([*scales.values()]))
 
     def contesting(self, names: Collection[str]) -> "CameraParameters":
         """The same, the intrinsics of some cameras being held although corners contradict them."""
