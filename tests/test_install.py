@@ -20,7 +20,7 @@ def test_a_wheel_carries_its_data_and_finds_it(tmp_path):
     assert not [name for name in names if name.endswith(".md")]
     code = (
         "import visioncal.vision.targets as t, visioncal.robot as r, visioncal.present.report;"
-        "target, _ = t.load_target('charuco_9x6_30mm', None);"
+        "target = t.load_target('charuco_9x6_30mm');"
         "print(t.__file__, target.square_m, r.load_robot('ur10e').joint_count)"
     )
     done = subprocess.run(

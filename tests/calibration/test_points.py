@@ -42,6 +42,7 @@ from visioncal.simulation import CellOptions, simulate
 from visioncal.vision.targets import (
     corner_positions,
     load_target,
+    read_target,
     target_document,
     target_from_document,
 )
@@ -395,7 +396,7 @@ def test_wrong_rigs_are_refused(table, said, tmp_path):
 
 
 def test_a_rig_is_described_by_its_document(tmp_path):
-    target, document = load_target(write_target(tmp_path, "cube", "rig", 1e-4), tmp_path)
+    target, document = read_target(write_target(tmp_path, "cube", "rig", 1e-4), tmp_path)
     assert target_document(target) == document
     assert target_from_document(document, "rig") == target
     assert target.point_numbers == tuple(numbers_of("cube"))
@@ -695,7 +696,7 @@ def test_a_rigs_size_is_parted_from_errors_of_the_links(tmp_path, mount, size, d
     session = Session.from_corners(
         [(it.ids, it.px) for it in cell.corners],
         cell.base_from_flange,
-        load_target("rig.toml", tmp_path)[0],
+        load_target("rig.toml", tmp_path),
         cell.stated_camera.resolution,
         mount=mount,
         camera=cell.stated_camera,

@@ -48,7 +48,7 @@ def test_a_table_is_read_with_its_tags(tmp_path):
         *(f"{10 + it},{it % 2},{it // 2},0,7,{it}" for it in range(4)),
     ]
     (tmp_path / "rig.csv").write_text("\n".join(rows))
-    target, _ = load_target("rig.toml", tmp_path)
+    target = load_target("rig.toml", tmp_path)
     assert target.point_tags == ((7, 0), (7, 1), (7, 2), (7, 3))
     assert target.dictionary == "DICT_APRILTAG_36h11"
     assert target_from_document(target_document(target), "rig") == target

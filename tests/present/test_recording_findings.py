@@ -79,7 +79,7 @@ def test_findings_that_cannot_be_read_are_named(
 
 
 def test_the_board_is_as_large_and_as_deep_as_its_corners(sample: Sample) -> None:
-    target, _ = load_target(TARGET, None)
+    target = load_target(TARGET)
     board = with_findings(sample, sick()).board
     flat, bent = corner_positions(target), board.corners(target)
     stretched = np.ptp(bent, axis=0)[:2] / np.ptp(flat, axis=0)[:2]

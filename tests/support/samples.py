@@ -66,7 +66,7 @@ def made_up(views: int = 9, name: str = "bench <1> & 2", *, images: bool = True)
     """Builds a sample; without images its target poses are in the table, as cft_*."""
     rng = np.random.default_rng(7)
     robot = load_robot("ur10e")
-    target, _ = load_target(TARGET, None)
+    target = load_target(TARGET)
     q = HOME_RAD + rng.uniform(-0.22, 0.22, (views, 6)) * [0.4, 0.4, 0.6, 1, 1, 1.6]
     base_from_flange = robot.base_from_flange(q)
     base_from_target = (

@@ -29,7 +29,7 @@ from visioncal.vision.finders.identify_text import to_toml
 from visioncal.vision.finders.imaging import decode_image
 from visioncal.vision.targets import load_target, target_from_document, target_names
 
-SHIPPED = {name: load_target(name, None)[0] for name in target_names()}
+SHIPPED = {name: load_target(name) for name in target_names()}
 ODD = {
     "legacy": charuco(9, 6, legacy=True),
     "legacy, tags": charuco(8, 6, "DICT_APRILTAG_36h11", legacy=True),
@@ -282,7 +282,7 @@ def test_check_prints_a_description_and_writes_it(photo, tmp_path):
     written = run(photo, "-o", out, "--square-mm", 30)
     assert written.exit_code == 0
     assert written.stdout.startswith("ChArUco board of 9 x 6 squares")
-    target, _ = load_target("found.toml", tmp_path)
+    target = load_target("found.toml", tmp_path)
     assert (target.columns, target.rows, target.square_m) == (9, 6, 0.03)
     assert isinstance(run(photo, "-o", out, "--square-mm", 30).exception, DataError)
 

@@ -35,7 +35,7 @@ ODD = {
     "portrait": checkerboard(6, 9),
     "marker": Target("tag", "marker", 1, 1, 0.048, 1e-5, dictionary="DICT_7X7_50", marker_id=5),
 }
-BOARDS = {name: load_target(name, None)[0] for name in target_names()} | ODD
+BOARDS = {name: load_target(name) for name in target_names()} | ODD
 
 
 def scales(image, target, size_mm) -> tuple[int, np.ndarray]:
@@ -204,7 +204,7 @@ def test_make_writes_four_files_and_replaces_none(tmp_path):
     assert done.exit_code == 0, done.exception
     files = {path.name for path in (tmp_path / "new").iterdir()}
     assert files == {f"charuco_5x4_30mm.{it}" for it in ("pdf", "svg", "png", "toml")}
-    target, _ = load_target("charuco_5x4_30mm.toml", tmp_path / "new")
+    target = load_target("charuco_5x4_30mm.toml", tmp_path / "new")
     assert (target.columns, target.rows, target.square_m) == (5, 4, 0.03)
     again = run("make", *options, "-o", tmp_path / "new")
     assert isinstance(again.exception, DataError)

@@ -14,6 +14,7 @@ from visioncal.vision.targets import (
     charuco_board,
     corner_positions,
     load_target,
+    read_target,
     rotation_transforms,
     rotations,
     target_document,
@@ -44,7 +45,7 @@ def checkerboard(columns: int, rows: int) -> Target:
 
 @pytest.mark.parametrize("name", target_names())
 def test_shipped_targets_load_and_round_trip(name: str, tmp_path: Path) -> None:
-    target, document = load_target(name, tmp_path)
+    target, document = read_target(name, tmp_path)
     assert target.name == name
     assert target_from_document(target_document(target), name) == target
     assert target_from_document(document, name) == target
@@ -60,7 +61,7 @@ def test_a_path_is_relative_to_the_folder_that_names_it(tmp_path: Path) -> None:
     (tmp_path / "boards" / "my board.toml").write_text(
         '\ufeffkind = "checkerboard"\ncolumns = 4\nrows = 3\nsquare_m = 0.05\n', encoding="utf-8"
     )
-    target, _ = load_target("boards\\my board.toml", tmp_path)
+    target = load_target("boards\\my board.toml", tmp_path)
     assert (target.name, target.columns) == ("my board", 4)
     assert target.square_sigma_m == DEFAULT_RELATIVE_SIGMA * 0.05
 

@@ -164,7 +164,7 @@ def make_command(
         )
     sized = request is None or request.square_mm is not None
     pages = _pages(page, landscape, larger=sized)
-    chosen = requested_target(request, pages) if request else load_target(str(target), None)[0]
+    chosen = requested_target(request, pages) if request else load_target(str(target))
     sheet = arrange(chosen, pages)
     files = write_board(out, sheet, dpi=dpi, force=force)
     for file in files:

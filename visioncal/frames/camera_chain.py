@@ -134,7 +134,8 @@ class Eye:
                 "taken: on the command line with --pose, or by a session and its --view.",
             )
         if isinstance(base_from_flange, RigidTransform):
-            base_from_flange = np.asarray(base_from_flange.as_matrix())
+            base_from_flange = base_from_flange.as_matrix()
+        base_from_flange = np.asarray(base_from_flange, dtype=float)
         checked_pose(base_from_flange, "base_from_flange")
         return Stop(
             base_from_flange @ self.edge,

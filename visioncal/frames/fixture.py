@@ -1,5 +1,6 @@
 """A fixture from touches: where the tip was, the fit, and what it rests on."""
 
+from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.limits import FixtureLimits
@@ -15,6 +16,7 @@ from visioncal.results import Calibration, Frame
 from visioncal.robot import Robot
 
 
+@typed
 def touched_fixture(
     rows: TouchRows,
     tool: Tool | None,

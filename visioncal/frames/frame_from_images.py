@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from visioncal.calibration.stages.observed import by_reason
+from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.limits import ImageFrameLimits
 from visioncal.core.number_format import figure
@@ -70,6 +71,7 @@ class _Placed:
     lost: Mapping[int, str]
 
 
+@typed
 def seen_frame(
     session: Session,
     calibration: Calibration,

@@ -1,9 +1,11 @@
 """The pick: where a feature that an image shows lies in the base, and how well that is known."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
+from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.core.types import Corners, FloatArray, Image, Target
@@ -15,11 +17,13 @@ from visioncal.frames.target_in_image import SeenTarget, see
 from visioncal.results import Calibration
 from visioncal.session.choosing import EYE, Choice
 from visioncal.vision.camera import normalise
+from visioncal.vision.targets import load_target
 
 # A ray within this angle of a plane [rad] meets it at no place of use.
 _PARALLEL = 1e-6
 
 
+@typed
 def locate(
     calibration: Calibration,
     px: FloatArray,
@@ -200,10 +204,11 @@ _SOURCES = {
 }
 
 
+@typed
 def locate_target(
     calibration: Calibration,
     seen: Corners | Image,
-    target: Target,
+    target: Target | Path | str,
     base_from_flange: Pose | None = None,
     point_target_m: FloatArray | Sequence[float] = (0.0, 0.0, 0.0),
     *,
@@ -220,7 +225,7 @@ def locate_target(
     Args:
         calibration: The camera's.
         seen: The target's corners, or the (h, w) grey image to find them in.
-        target: What is seen.
+        target: What is seen, or its name or file as `load_target` takes it.
         base_from_flange: Where the robot stood at the image, as it reported it; only for a camera
             on the flange.
         point_target_m: (3,) the point in the target's frame [m].
@@ -235,7 +240,8 @@ def locate_target(
     """
     eye = Eye.of(calibration.chosen(Choice(camera, robot), EYE))
     stop = eye.at(base_from_flange)
-    view = see(eye, seen, target, label, sigma_px)
+    board = target if isinstance(target, Target) else load_target(target)
+    view = see(eye, seen, board, label, sigma_px)
     point = checked_point(point_target_m, "point_target_m")
     places = view.cam_from_target[:, :3, :3] @ point + view.cam_from_target[:, :3, 3]
     pose, point_cam = view.cam_from_target[0], places[0]

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, Progress
 from visioncal.frames.locate import locate_target
@@ -30,6 +31,7 @@ class Picks:
     warnings: tuple[str, ...] = ()
 
 
+@typed
 def locate_views(
     session: Session,
     calibration: Calibration,

@@ -5,6 +5,7 @@ from typing import Self
 
 import numpy as np
 
+from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray
@@ -27,11 +28,13 @@ class Plane:
     covariance: FloatArray
 
     @classmethod
+    @typed
     def horizontal(cls, z_m: float, sigma_m: float = 0.0) -> Self:
         """The plane `z = z_m` of the base, of a height known to `sigma_m` [m]."""
         return cls.through(np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, z_m]), sigma_m)
 
     @classmethod
+    @typed
     def through(cls, normal: FloatArray, point: FloatArray, sigma_m: float = 0.0) -> Self:
         """A plane by its normal and a point in it.
 
@@ -44,6 +47,9 @@ class Plane:
             DataError: The normal has no direction, or a number is not finite or no length in
                 metres.
         """
+        for name, it in (("normal", normal), ("point", point)):
+            if np.shape(it) != (3,):
+                raise DataError(f"plane: the {name} is {it!r}; three numbers are needed.")
         length = float(np.linalg.norm(normal))
         if not np.isfinite(length) or length < 1e-9:
             raise DataError(
@@ -54,6 +60,7 @@ class Plane:
         return cls(unit, _length(float(unit @ point)), _offset_covariance(sigma_m))
 
     @classmethod
+    @typed
     def of_frame(cls, edge: Edge, z_m: float = 0.0, sigma_m: float = 0.0) -> Self:
         """The plane `z = z_m` of a frame in the base, such as a fixture.
 

@@ -16,6 +16,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from scipy.linalg import block_diag
 
+from visioncal.core.arguments import check_fields
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import Corners, FloatArray, Image
@@ -42,6 +43,9 @@ class Sight:
     seen: Corners | Image
     base_from_flange: FloatArray | None = None
     stop: int | None = None
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     @property
     def stop_key(self) -> object:

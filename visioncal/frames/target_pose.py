@@ -2,10 +2,12 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Self
 
 import numpy as np
 
+from visioncal.core.arguments import typed
 from visioncal.core.number_format import figure
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import adjoint, compose, invert, pose_difference
@@ -22,6 +24,7 @@ from visioncal.frames.single_view import (
 )
 from visioncal.frames.target_in_image import SeenTarget, see
 from visioncal.results import Calibration, Edge
+from visioncal.vision.targets import load_target
 
 # Images scatter more than this by chance in one set of ten thousand.
 _FALSE_ALARM = 1e-4
@@ -92,10 +95,11 @@ class TargetPose:
         return float(np.sqrt(np.mean(self.away_deg[self.agrees] ** 2)))
 
 
+@typed
 def place_seen(
     calibration: Calibration,
     sights: Sequence[Sight],
-    target: Target,
+    target: Target | Path | str,
     parent: Parent,
     *,
     sigma_px: float | None = None,
@@ -108,7 +112,7 @@ def place_seen(
     Args:
         calibration: The camera's.
         sights: The images; one is enough, and then nothing checks it.
-        target: What they show.
+        target: What they show, or its name or file as `load_target` takes it.
         parent: `base` for a fixture, `flange` for a tool.
         sigma_px: Noise of a corner's coordinate [px]; the calibration's where None.
 
@@ -118,7 +122,8 @@ def place_seen(
     """
     check_labels(sights)
     eye = Eye.of(calibration)
-    looks = [see(eye, it.seen, target, it.label, sigma_px) for it in sights]
+    board = target if isinstance(target, Target) else load_target(target)
+    looks = [see(eye, it.seen, board, it.label, sigma_px) for it in sights]
     return place_looks(eye, sights, looks, parent)
 
 

@@ -6,6 +6,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError, DegenerateError, VisioncalError
 from visioncal.core.limits import ToolLimits
 from visioncal.core.number_format import figure
@@ -35,6 +36,7 @@ _MISREAD = 0.98
 _NO_TOOL_M = 2e-3
 
 
+@typed
 def touched_tool(
     rows: TouchRows,
     calibration: Calibration | None = None,

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from visioncal.core.arguments import typed
 from visioncal.core.documents import parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean, read_bytes, write_atomically
@@ -150,12 +151,14 @@ class Alignment(CellSections):
         """The estimated transforms by name."""
         return {name: edge.transform for name, edge in self.edges.items()}
 
+    @typed
     def edge_of(self, frame: str) -> Edge:
         """How a frame hangs on its parent; the reference, exactly in the cell's place."""
         if frame == self.reference:
             return Edge(np.eye(4), np.zeros((6, 6)))
         return self.edges[f"{self.frames[frame]}_from_{frame}"]
 
+    @typed
     def between(
         self, first: str, second: str, poses: Mapping[str, FloatArray] | None = None
     ) -> Edge:
@@ -256,12 +259,14 @@ class Alignment(CellSections):
         )
         return write(AlignmentForm, form)
 
+    @typed
     def save(self, path: Path | str) -> None:
         """Writes alignment.json, whole or not at all."""
         text = json.dumps(self.document(), indent=2, allow_nan=False) + "\n"
         write_atomically(Path(path), text)
 
     @classmethod
+    @typed
     def load(cls, path: Path | str) -> Self:
         """Reads an alignment.json, or the one in a folder.
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtrc, fdtrc
 
+from visioncal.core.arguments import typed
 from visioncal.core.files import some_of
 from visioncal.core.transforms import inverse_right_jacobian, invert, log, pose_difference
 from visioncal.core.types import Camera, FloatArray, Mount
@@ -151,6 +152,7 @@ class Comparison:
         )
 
 
+@typed
 def compare(
     a: Calibration,
     b: Calibration,

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from visioncal.core.arguments import typed
 from visioncal.core.choices import DYNAMICS_FILE
 from visioncal.core.documents import parse_stored
 from visioncal.core.errors import DataError
@@ -117,6 +118,7 @@ class Calibration(CalibrationSections):
         """The calibration that stands for a whole cell."""
         return cls(**whole_fields(cell))
 
+    @typed
     def of(
         self, camera: str | None = None, robot: str | None = None, target: str | None = None
     ) -> Self:
@@ -202,6 +204,7 @@ class Calibration(CalibrationSections):
             return records
         return import_module("pandas").DataFrame.from_records(records, index="view")
 
+    @typed
     def plot(self, what: str = "residuals") -> "Drawing":
         """Draws a figure of the report, which a notebook shows and `save` writes as .svg.
 
@@ -223,6 +226,7 @@ class Calibration(CalibrationSections):
         intervals = {} if self.uncertainty is None else self.uncertainty.noise_95
         return freedom_of(intervals.values()) if intervals else np.inf
 
+    @typed
     def covariance(self, name: str) -> FloatArray:
         """Covariance of one transform.
 
@@ -237,6 +241,7 @@ class Calibration(CalibrationSections):
         """
         return self.placed[name].covariance
 
+    @typed
     def base_from_flange(
         self,
         q: FloatArray,
@@ -320,6 +325,7 @@ class Calibration(CalibrationSections):
             )
         return self.thermal.model(arm)
 
+    @typed
     def at_temperatures(self, temperatures_c: FloatArray) -> Self:
         """Returns the calibration of the arm as it is with its links at (n,) temperatures [deg C].
 
@@ -349,6 +355,7 @@ class Calibration(CalibrationSections):
         """
         return None if self.elastic is None else self.elastic.weight_moments
 
+    @typed
     def save(self, path: Path | str) -> None:
         """Writes calibration.json, whole or not at all."""
         write_atomically(Path(path), self.text + "\n")
@@ -359,6 +366,7 @@ class Calibration(CalibrationSections):
         return json.dumps(to_document(self), indent=2, allow_nan=False)
 
     @classmethod
+    @typed
     def load(cls, path: Path | str) -> Self:
         """Reads a calibration.json or an alignment.json, or the one in a folder.
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.files import Table
 from visioncal.core.types import FloatArray, IntArray, Mask
@@ -67,6 +68,7 @@ class Loads:
         return cls.alike(count, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
     @classmethod
+    @typed
     def alike(
         cls,
         count: int,

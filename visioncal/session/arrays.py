@@ -17,7 +17,7 @@ from visioncal.session.images import MemoryImages
 from visioncal.vision.finders.imaging import encode_png
 from visioncal.vision.targets import target_document
 
-Poses: TypeAlias = RigidTransform | FloatArray
+Poses: TypeAlias = RigidTransform | FloatArray | Sequence[RigidTransform]
 # Entries of a rotation that were written with three decimals are off by half of that.
 _ROUGH = 5e-3
 _KEPT_PLACE = (
@@ -30,14 +30,14 @@ class Cell(TypedDict, total=False):
 
     Attributes:
         mount: Where the camera is; eye-in-hand where left out.
-        camera: Its intrinsics; left out, they are estimated.
+        camera: Its intrinsics, as a table of session.toml has them; left out, they are estimated.
         robot: The robot's model, by a built-in name.
         q: (n, j) joint angles [rad].
         name: The session's name.
     """
 
     mount: Mount
-    camera: Camera
+    camera: Camera | Mapping[str, Any]
     robot: str
     q: npt.ArrayLike
     name: str
@@ -208,9 +208,13 @@ def _facts(
     }
 
 
-def _camera(camera: Camera | None, resolution: tuple[int, int] | None) -> dict[str, Any]:
+def _camera(
+    camera: Camera | Mapping[str, Any] | None, resolution: tuple[int, int] | None
+) -> dict[str, Any]:
     if camera is None:
         return {} if resolution is None else {"resolution": list(resolution)}
+    if isinstance(camera, Mapping):
+        return {k: np.asarray(it).tolist() for k, it in camera.items()}
     return {
         "resolution": list(camera.resolution),
         "model": camera.model,

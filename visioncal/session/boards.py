@@ -9,7 +9,7 @@ from visioncal.core.types import Target
 from visioncal.core.verdict import READ_AGAIN
 from visioncal.session.document import Declaration
 from visioncal.session.outside import without_content
-from visioncal.vision.targets import load_target, misspelt_keys, target_from_document
+from visioncal.vision.targets import misspelt_keys, read_target, target_from_document
 
 # The column of views.csv that names the target of a row.
 COLUMN = "target"
@@ -61,7 +61,7 @@ def read_targets(
 def _load(place: str, folder: Path | None) -> tuple[Target, dict[str, Any]]:
     with without_content(place, "target", folder):
         try:
-            return load_target(place, folder)
+            return read_target(place, folder)
         except DataError as error:
             if "metres, such as" not in error.message:
                 raise

@@ -9,14 +9,14 @@ from typing import Any, Unpack
 import numpy as np
 import numpy.typing as npt
 import tomli_w
-from scipy.spatial.transform import RigidTransform
 
+from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_TOML_BYTES, parse_toml, read_text_inside
 from visioncal.core.shown import html_card, text_card
-from visioncal.core.types import Camera, Corners, FloatArray, Image, Mount, Need, Target
+from visioncal.core.types import Camera, Corners, Image, Mount, Need, Target
 from visioncal.session import columns as known
-from visioncal.session.arrays import Cell, of_corners, of_images
+from visioncal.session.arrays import Cell, Poses, of_corners, of_images
 from visioncal.session.boards import COLUMN, read_targets, target_warnings
 from visioncal.session.checks import check_images_can_be_used, check_times, view_warnings
 from visioncal.session.choosing import Choice
@@ -86,6 +86,7 @@ class Session:
     corner_table: CornerTable | None = None
 
     @classmethod
+    @typed
     def load(
         cls,
         path: Path | str,
@@ -207,10 +208,11 @@ class Session:
         )
 
     @classmethod
+    @typed
     def from_arrays(
         cls,
         images: Sequence[Image | bytes],
-        base_from_flange: RigidTransform | FloatArray,
+        base_from_flange: Poses,
         board: Target | str,
         **cell: Unpack[Cell],
     ) -> "Session":
@@ -229,10 +231,11 @@ class Session:
         return cls.assemble(**of_images(images, base_from_flange, board, **cell))
 
     @classmethod
+    @typed
     def from_corners(
         cls,
         corners: Sequence[tuple[npt.ArrayLike, npt.ArrayLike]],
-        base_from_flange: RigidTransform | FloatArray,
+        base_from_flange: Poses,
         board: Target | str,
         resolution: tuple[int, int],
         **cell: Unpack[Cell],
@@ -269,6 +272,7 @@ class Session:
             **({"streams": ", ".join(self.streams)} if self.streams else {}),
         }
 
+    @typed
     def of(
         self, camera: str | None = None, robot: str | None = None, target: str | None = None
     ) -> "Session":
@@ -297,6 +301,7 @@ class Session:
         ordered = dict(sorted(streams.items()))
         return replace(self, streams=ordered, warnings=(*self.warnings, *gap_warnings(ordered)))
 
+    @typed
     def needing(self, mm: float | None = None, deg: float | None = None) -> "Session":
         """Returns the session of a task that needs something else; what is None stays as declared.
 
@@ -327,6 +332,7 @@ class Session:
         table = self.declaration.need
         return None if table is None else table.need
 
+    @typed
     def save(self, folder: Path | str) -> None:
         """Writes the session as a folder that needs no other file; whole or not at all.
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.session.boards import COLUMN as TARGET
@@ -56,6 +57,7 @@ class JoinedImages:
         return self.stores[first], rest
 
 
+@typed
 def join_sessions(sessions: Sequence[Session]) -> Session:
     """Joins sessions of one arm.
 

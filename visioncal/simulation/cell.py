@@ -7,6 +7,7 @@ from enum import IntEnum
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import Camera, Corners, FloatArray
@@ -111,6 +112,7 @@ class Cell:
         return _stands(self.options, self.true_arm, q, payloads)
 
 
+@typed
 def simulate(options: CellOptions, postures: FloatArray | None = None) -> Cell:
     """Builds a cell, moves its robot and looks at the board.
 

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
+from visioncal.core.arguments import check_fields
 from visioncal.core.errors import DataError
 from visioncal.core.types import Camera, Mount, Target
 from visioncal.simulation.optics import wide_camera
@@ -233,6 +234,7 @@ class CellOptions:
     camera_moved_m: float = 0.0
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if self.views < 1:
             raise DataError(f"simulation: views is {self.views}, at least 1 is needed.")
         if not 0 <= self.wrong_views <= self.views:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.files import decode_text, read_bytes, write_atomically
 from visioncal.core.transforms import exp
@@ -55,6 +56,7 @@ class Truth:
     options: Mapping[str, Any]
 
 
+@typed
 def write_session(
     cell: Cell,
     folder: Path | str,

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from visioncal.core import transforms
+from visioncal.core.arguments import typed
 from visioncal.core.documents.tables import TextTable, read_table
 from visioncal.core.errors import DataError
 from visioncal.core.files import Table, did_you_mean, find_described, is_inside, read_toml
@@ -76,12 +77,22 @@ def target_names() -> tuple[str, ...]:
     return tuple(sorted(_shipped()))
 
 
-def load_target(name_or_path: str, folder: Path | None) -> tuple[Target, dict[str, Any]]:
-    """Loads a target's description.
+@typed
+def load_target(name_or_path: str | Path, folder: str | Path | None = None) -> Target:
+    """Loads a target.
 
     Args:
         name_or_path: A name among `target_names()`, or the path of a `.toml`.
         folder: Relative paths start here; the working directory where None.
+
+    Raises:
+        DataError: There is no such target, or its description is wrong.
+    """
+    return read_target(str(name_or_path), None if folder is None else Path(folder))[0]
+
+
+def read_target(name_or_path: str, folder: Path | None) -> tuple[Target, dict[str, Any]]:
+    """Loads a target as `load_target` does.
 
     Returns:
         The target, and the content of its file as it was read.

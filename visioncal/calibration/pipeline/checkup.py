@@ -17,6 +17,7 @@ from visioncal.calibration.stages.image_size import other_images
 from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.calibration.stages.observed import CameraLook, by_reason
 from visioncal.calibration.stages.pictures import unnamed_images, unseen_cause
+from visioncal.core.arguments import typed
 from visioncal.core.errors import VisioncalError
 from visioncal.core.files import some_of
 from visioncal.core.limits import CalibrationLimits
@@ -72,6 +73,7 @@ class Checkup:
         return "\n".join(lines)
 
 
+@typed
 def doctor(session: Session | Path | str, *, progress: Progress | None = None) -> Checkup:
     """Looks for what is wrong with a session, in seconds: nothing is fitted to the chain.
 

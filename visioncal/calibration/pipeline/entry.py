@@ -8,12 +8,14 @@ from visioncal.calibration.pipeline.dense_corners import run_dense
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.running import check_dense, known_at_first, run_steps
 from visioncal.calibration.pipeline.whole import alignment_of
+from visioncal.core.arguments import typed
 from visioncal.core.choices import Convention, SolverName
 from visioncal.core.types import Corners, Progress
 from visioncal.results import Alignment, Calibration
 from visioncal.session import Session
 
 
+@typed
 def calibrate(
     session: Session | Path | str,
     *,
@@ -88,6 +90,7 @@ def calibrate(
     return result_of(run_steps(needing))
 
 
+@typed
 def align(
     session: Session | Path | str,
     *,

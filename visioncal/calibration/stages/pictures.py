@@ -266,7 +266,7 @@ def _is(found: Identity, target: Target) -> bool:
 
 
 def _another(view: View, found: Identity, declared: Target) -> Finding:
-    shipped = (load_target(name, None)[0] for name in target_names())
+    shipped = (load_target(name) for name in target_names())
     mine = [it.name for it in shipped if _is(found, it) and _as_large(it, declared)]
     if mine:
         step = Step(f'In session.toml, write target = "{mine[0]}".')

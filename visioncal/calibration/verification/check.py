@@ -21,6 +21,7 @@ from visioncal.calibration.verification.prediction import (
     asked_of_boards,
     predict_stops,
 )
+from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.limits import CheckLimits
 from visioncal.core.quantiles import f_limit
@@ -105,6 +106,7 @@ class Check:
         return bool(self.log_evidence < np.log(_LIMITS.likelihood_ratio))
 
 
+@typed
 def verify(
     session: Session | Path | str,
     calibration: Calibration | Path | str,

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from visioncal.core.arguments import typed
 from visioncal.core.choices import SIMULATED_ARMS
 from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean, read_toml, write_atomically
@@ -76,6 +77,7 @@ class Batch:
         return found
 
 
+@typed
 def batch(
     sessions: Iterable[Path | str] | Path | str = (),
     out: Path | str = "out",

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean
 from visioncal.core.transforms import adjoint, invert
@@ -76,6 +77,7 @@ class Document:
     warnings: tuple[str, ...]
 
 
+@typed
 def export(source: Source | Identified, to: str, selection: Selection = _EVERYTHING) -> str:
     """Writes a result in somebody else's format.
 

@@ -8,7 +8,7 @@ from typing import Any
 from visioncal.core.documents.yamls import read_yaml
 from visioncal.core.errors import DataError
 from visioncal.core.files import Table
-from visioncal.vision.targets import load_target, metres, target_from_document, target_names
+from visioncal.vision.targets import metres, read_target, target_from_document, target_names
 
 _MM = r"([0-9]{1,5}(?:\.[0-9]{1,9})?)mm"
 _CHARUCO = re.compile(rf"charuco_([0-9]{{1,3}})x([0-9]{{1,3}})_{_MM}_{_MM}_(DICT_\w+?)(_legacy)?")
@@ -46,7 +46,7 @@ def described_target(words: str) -> Mapping[str, Any]:
                 f"description: {FORMS}.",
                 culprits=[words[:80]],
             )
-        return load_target(words, None)[1]
+        return read_target(words, None)[1]
     target_from_document(document, words)
     return document
 
@@ -110,5 +110,5 @@ def _in_one_word(words: str) -> dict[str, Any] | None:
 
 def target_name(document: Mapping[str, Any]) -> str | None:
     """Finds the shipped target with this content; None where there is none."""
-    shipped = ((it, load_target(it, None)[1]) for it in target_names())
+    shipped = ((it, read_target(it, None)[1]) for it in target_names())
     return next((name for name, content in shipped if content == document), None)

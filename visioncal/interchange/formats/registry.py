@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from visioncal.calibration.guess import Candidate
+from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, did_you_mean
 from visioncal.interchange.formats.assemble import assemble, wished
@@ -39,6 +40,7 @@ _DEFAULTS = ImportOptions()
 Choose: TypeAlias = Callable[[InDoubt | Foreign], Candidate]
 
 
+@typed
 def convert(
     source: Path,
     dest: Path,

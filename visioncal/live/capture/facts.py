@@ -145,7 +145,7 @@ def _pose(pose: FloatArray) -> dict[str, float]:
 
 def _shipped_target(target: Target) -> str:
     """The name of a board that comes with visioncal; empty for another."""
-    if target.name in target_names() and load_target(target.name, None)[0] == target:
+    if target.name in target_names() and load_target(target.name) == target:
         return target.name
     return ""
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from visioncal.core.arguments import typed
 from visioncal.core.choices import Criterion
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
@@ -121,6 +122,7 @@ class Plan:
         return np.array([it.q for it in self.stops])
 
 
+@typed
 def make_plan(
     cell: PlanCell,
     request: Request,

@@ -163,7 +163,7 @@ def _target(content: Mapping[str, Any]) -> Target:
     """The board, under the name that it has where it comes with visioncal."""
     named = target_from_document(content, "board")
     for name in target_names():
-        shipped = load_target(name, None)[0]
+        shipped = load_target(name)
         if target_document(shipped) == target_document(named):
             return shipped
     return named

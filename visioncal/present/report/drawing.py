@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.files import write_atomically
 from visioncal.present.report import plots, sources
@@ -35,6 +36,7 @@ class Drawing:
     def _repr_html_(self) -> str:
         return f'<div style="{_COLOURS};max-width:52em">{self.markup}</div>'
 
+    @typed
     def save(self, path: Path | str) -> None:
         """Writes it as an .svg, whole or not at all."""
         begin = self.markup.index("<svg")

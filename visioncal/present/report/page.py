@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.files import write_atomically
 from visioncal.core.types import Target
@@ -34,6 +35,7 @@ _MAX_REJECTED_PICTURES = 4
 _PAPER = 235
 
 
+@typed
 def write_report(
     path: Path,
     calibration: Calibration,

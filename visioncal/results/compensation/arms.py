@@ -6,6 +6,7 @@ from typing import Self
 
 import numpy as np
 
+from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.results import Calibration
@@ -44,6 +45,7 @@ class CalibratedArm:
     weight_moments: FloatArray | None
 
     @classmethod
+    @typed
     def of(cls, calibration: Calibration) -> Self:
         """Takes both models out of a calibration.
 
@@ -61,6 +63,7 @@ class CalibratedArm:
             )
         return cls(nominal, real, Inverse(real), calibration.compliance, calibration.weight_moments)
 
+    @typed
     def unbent(self, q: FloatArray, loads: Loads | None = None) -> FloatArray:
         """Where to send the joints so that under their loads they stand elsewhere.
 

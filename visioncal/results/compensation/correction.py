@@ -7,6 +7,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from visioncal.core.arguments import typed
 from visioncal.core.choices import WIDEST_RAD as WIDEST_RAD
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import (
@@ -76,6 +77,7 @@ class Corrected:
         return rotation_angle(invert(self.wanted) @ self.base_from_flange)
 
 
+@typed
 def correct(
     calibration: Calibration | CalibratedArm,
     base_from_flange: Poses,

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.types import Image, Target, TargetKind
 from visioncal.vision.finders.charuco import find_charuco
@@ -108,6 +109,7 @@ class Identity:
         )
 
 
+@typed
 def identify(image: Image) -> Identity:
     """Names the target in an image: ChArUco board, AprilGrid, checkerboard, circles or marker.
 

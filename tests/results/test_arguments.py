@@ -1,0 +1,169 @@
+"""Public functions given what they do not take: refused by name, never from inside."""
+
+import inspect
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.picks import calibration_of
+
+import visioncal
+from visioncal.core.errors import DataError, VisioncalError
+from visioncal.simulation import CellOptions, simulate, write_session
+from visioncal.vision.finders.imaging import decode_image
+
+BOARD = "charuco_9x6_30mm"
+METHODS = {
+    "Session": ("load", "from_arrays", "from_corners"),
+    "Calibration": ("load",),
+    "Alignment": ("load",),
+    "CalibratedArm": ("of",),
+    "Plane": ("horizontal", "of_frame", "through"),
+    "Loads": ("alike",),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """A cell, and what functions take of it."""
+
+    session: visioncal.Session
+    calibration: visioncal.Calibration
+    image: np.ndarray
+    pose: np.ndarray
+    folder: Path
+
+    @property
+    def foreign(self) -> list[Any]:
+        """What people hand over by mistake."""
+        files = [None, BOARD, self.folder / "views.csv", {"a": 1}, 3.5, [1], object()]
+        return [*files, self.session, self.calibration, self.image.astype(float)]
+
+    @property
+    def sound(self) -> dict[str, Any]:
+        """Arguments by name; what is not here is given as the wrong one is."""
+        return {
+            "session": self.session,
+            "calibration": self.calibration,
+            "a": self.calibration,
+            "b": self.calibration,
+            "px": [[640.0, 400.0]],
+            "plane": visioncal.Plane.horizontal(0.0),
+            "base_from_flange": self.pose,
+            "seen": self.image,
+            "target": BOARD,
+            "sights": [visioncal.Sight("1", self.image, self.pose)],
+            "parent": "base",
+            "kind": "fixture",
+        }
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory) -> Bench:
+    folder = tmp_path_factory.mktemp("bench") / "session"
+    cell = simulate(CellOptions(views=4, seed=2))
+    write_session(cell, folder)
+    session = visioncal.Session.load(folder)
+    image = decode_image(session.images.read(session.views[0].image))
+    pose = session.views[0].base_from_flange().as_matrix()
+    return Bench(session, calibration_of(cell), image, pose, folder)
+
+
+def public_functions() -> Iterator[Callable[..., Any]]:
+    for name in visioncal.__all__:
+        thing = getattr(visioncal, name)
+        if callable(thing) and not inspect.isclass(thing):
+            yield thing
+        for method in METHODS.get(name, ()):
+            yield getattr(thing, method)
+
+
+def is_refused(function: Callable[..., Any], given: dict[str, Any]) -> bool:
+    try:
+        function(**given)
+    except VisioncalError:
+        return True
+    return False
+
+
+def test_nothing_public_fails_from_inside(bench, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    refused = 0
+    for function in public_functions():
+        parameters = inspect.signature(function).parameters
+        needed = [it for it, of in parameters.items() if of.default is of.empty and of.kind != 4]
+        for wrong in parameters:
+            for value in bench.foreign:
+                given = {it: bench.sound.get(it, value) for it in needed} | {wrong: value}
+                refused += is_refused(function, given)
+    # Most of what is tried is wrong; without a check it would not get here.
+    assert refused > 500
+
+
+def test_what_was_given_and_what_is_needed_is_said(bench):
+    words = {
+        "correct: calibration is None; a Calibration or a CalibratedArm is needed.": (
+            lambda: visioncal.correct(None, bench.pose)
+        ),
+        "locate: calibration is text ('out'); a Calibration is needed. "
+        "Load it first: visioncal.Calibration.load('out').": (
+            lambda: visioncal.locate("out", [[1.0, 2.0]], visioncal.Plane.horizontal(0.0))
+        ),
+        "CellOptions: target is text ('charuco_9x6_30mm'); a Target is needed. "
+        "Load it first: visioncal.load_target('charuco_9x6_30mm').": (
+            lambda: CellOptions(target=BOARD)
+        ),
+        "Sight: seen is an array of float64, of the shape (2, 3); a Corners or an image of uint8 "
+        "is needed.": lambda: visioncal.Sight("1", np.zeros((2, 3))),
+        "Session.from_arrays: mount is text ('eye-on-hand'); 'eye-in-hand' or 'eye-to-hand' or "
+        "'instrument' is needed. Did you mean eye-to-hand or eye-in-hand?": (
+            lambda: visioncal.Session.from_arrays(
+                [bench.image], bench.pose[None], BOARD, mount="eye-on-hand"
+            )
+        ),
+    }
+    for expected, call in words.items():
+        with pytest.raises(DataError) as refused:
+            call()
+        assert str(refused.value) == expected
+
+
+def test_a_board_is_taken_by_its_name_and_from_its_file(bench, tmp_path):
+    target = visioncal.load_target(BOARD)
+    file = tmp_path / "board.toml"
+    file.write_text(
+        'kind = "charuco"\ncolumns = 9\nrows = 6\nsquare_m = 0.03\nmarker_m = 0.022\n'
+        'dictionary = "DICT_5X5_100"\nsquare_sigma_m = 3e-5\n'
+    )
+    seen = [
+        visioncal.locate_target(bench.calibration, bench.image, it, bench.pose.tolist()).p_base
+        for it in (target, BOARD, file, str(file))
+    ]
+    sights = [visioncal.Sight("1", bench.image, bench.pose)]
+    placed = [
+        visioncal.place_seen(bench.calibration, sights, it, "base").matrix[:3, 3]
+        for it in (target, BOARD, file)
+    ]
+    assert all(np.array_equal(it, seen[0]) for it in seen)
+    assert all(np.array_equal(it, placed[0]) for it in placed)
+
+
+def test_a_camera_is_taken_as_a_table_and_poses_as_a_list(bench):
+    camera = bench.session.camera
+    table = {
+        "resolution": camera.resolution,
+        "model": camera.model,
+        "matrix": camera.matrix,
+        "distortion": camera.distortion,
+    }
+    poses = [it.base_from_flange() for it in bench.session.views[:1]]
+    one, other = (
+        visioncal.Session.from_arrays([bench.image], poses, BOARD, camera=it)
+        for it in (camera, table)
+    )
+    assert one.digest() == other.digest()
+    with pytest.raises(DataError, match="matrix"):
+        visioncal.Session.from_arrays([bench.image], poses, BOARD, camera={"matrix": [1, 2]})

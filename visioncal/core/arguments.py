@@ -1,0 +1,185 @@
+"""Arguments of public functions: what is of another type is refused by its name."""
+
+import inspect
+import types
+import typing
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from functools import cache, wraps
+from numbers import Integral, Real
+from pathlib import Path
+from typing import Any, Literal, ParamSpec, TypeVar, Union
+
+import numpy as np
+import numpy.typing as npt
+
+from visioncal.core.errors import DataError
+from visioncal.core.files import did_you_mean
+from visioncal.core.types import Image, Target
+
+Given = ParamSpec("Given")
+Answer = TypeVar("Answer")
+
+_NUMBERS: dict[Any, Any] = {float: Real, int: Integral, bool: bool | np.bool_}
+_WORDS = {
+    Path: "a path",
+    str: "text",
+    float: "a number",
+    int: "a whole number",
+    bool: "True or False",
+    bytes: "bytes",
+    types.NoneType: "None",
+}
+
+
+def typed(function: Callable[Given, Answer]) -> Callable[Given, Answer]:
+    """Has a function refuse arguments of other types than it declares.
+
+    Literals, shapes and values are left to the function, and so is what no type can tell.
+    """
+
+    @wraps(function)
+    def checked(*args: Given.args, **kwargs: Given.kwargs) -> Answer:
+        signature, hints = _declared(function)
+        try:
+            given = signature.bind(*args, **kwargs).arguments
+        except TypeError:
+            # Python's own words name the function.
+            return function(*args, **kwargs)
+        for name, value in given.items():
+            kind = signature.parameters[name].kind
+            values = {name: value}
+            if kind is inspect.Parameter.VAR_KEYWORD:
+                values, hint = value, typing.get_args(hints.get(name))
+                fields = typing.get_type_hints(hint[0]) if hint else {}
+            else:
+                fields = hints
+            for key, it in values.items():
+                _check(function.__qualname__, key, it, fields.get(key, Any))
+        return function(*args, **kwargs)
+
+    return checked
+
+
+def check_fields(instance: Any) -> None:  # noqa: ANN401 - any dataclass
+    """Refuses a dataclass whose fields are of other types than it declares.
+
+    Raises:
+        DataError: One of them is.
+    """
+    kind = type(instance)
+    for name, hint in _hints(typing.cast(Hashable, kind)).items():
+        _check(kind.__name__, name, getattr(instance, name), hint)
+
+
+@cache
+def _declared(function: Callable[..., Any]) -> tuple[inspect.Signature, dict[str, Any]]:
+    return inspect.signature(function), _hints(function)
+
+
+@cache
+def _hints(owner: Any) -> dict[str, Any]:  # noqa: ANN401 - a function or a class
+    return typing.get_type_hints(owner)
+
+
+def _check(owner: str, name: str, value: object, hint: object) -> None:
+    if _fits(value, hint):
+        return
+    options = list(_options(hint))
+    needed = " or ".join(
+        dict.fromkeys(_words(it) for it in options if it is not str or Path not in options)
+    )
+    step = ""
+    if isinstance(value, str | Path):
+        loaders = [f"{it.__name__}.load" for it in options if hasattr(it, "load")]
+        loaders += ["load_target"] * (Target in options)
+        step = f"Load it first: visioncal.{loaders[0]}({str(value)!r})." if loaders else ""
+        step = step or did_you_mean(str(value), _names(options))
+    raise DataError(
+        f"{owner}: {name} is {_seen(value)}; {needed} is needed.", culprits=[name], next_step=step
+    )
+
+
+def _seen(value: object) -> str:
+    if value is None:
+        return "None"
+    if isinstance(value, str | Path):
+        return f"{_WORDS[str] if isinstance(value, str) else _WORDS[Path]} ({str(value)!r})"
+    if isinstance(value, np.ndarray):
+        return f"an array of {value.dtype}, of the shape {value.shape}"
+    return f"of the type {type(value).__name__}"
+
+
+def _options(hint: Any) -> Iterator[Any]:  # noqa: ANN401
+    """The types of which a value may be one."""
+    if typing.get_origin(hint) in (Union, types.UnionType):
+        for it in typing.get_args(hint):
+            yield from _options(it)
+    else:
+        yield hint
+
+
+def _names(options: Sequence[Any]) -> list[str]:
+    literals = [typing.get_args(it) for it in options if typing.get_origin(it) is Literal]
+    return [it for names in literals for it in names if isinstance(it, str)]
+
+
+def _words(hint: Any) -> str:  # noqa: ANN401
+    origin = typing.get_origin(hint)
+    if hint in _WORDS:
+        return _WORDS[hint]
+    if origin is np.ndarray:
+        return "an image of uint8" if hint == Image else "an array"
+    if origin is Literal:
+        return " or ".join(map(repr, typing.get_args(hint)))
+    if origin is Callable:
+        return "a function"
+    if origin is not None and issubclass(origin, Mapping):
+        return "a dict"
+    if origin is not None:
+        return "a list"
+    name = getattr(hint, "__name__", str(hint))
+    return f"a{'n' if name[0] in 'AEIOU' else ''} {name}"
+
+
+def _fits(value: object, hint: Any) -> bool:  # noqa: ANN401 - a type, or a form of one
+    """Whether a value is of a type, as far as that can be seen at once."""
+    options = list(_options(hint))
+    if len(options) > 1:
+        return hint is npt.ArrayLike or any(_fits(value, it) for it in options)
+    origin, inner = typing.get_origin(hint), typing.get_args(hint)
+    if origin is None:
+        is_open = hint is Any or not isinstance(hint, type)
+        return is_open or isinstance(value, _NUMBERS.get(hint, hint))
+    if origin in _FORMS:
+        return _FORMS[origin](value, inner)
+    return not isinstance(origin, type) or _is_collection(value, origin, inner)
+
+
+def _is_array(value: object, inner: tuple[Any, ...]) -> bool:
+    if inner == typing.get_args(Image):
+        return isinstance(value, np.ndarray) and value.dtype == np.uint8 and value.ndim > 1
+    try:
+        return np.asarray(value).dtype.kind in "biuf"
+    except ValueError:
+        # Rows of several lengths; the function says which.
+        return not isinstance(value, str)
+
+
+def _is_collection(value: object, origin: type, inner: tuple[Any, ...]) -> bool:
+    if isinstance(value, np.ndarray):
+        if value.ndim == 0 or not issubclass(Sequence, origin):
+            return False
+        elements: Sequence[Any] = list(value[:1])
+    elif isinstance(value, str | bytes) or not isinstance(value, origin):
+        return False
+    else:
+        elements = value if isinstance(value, list | tuple) else ()
+    return len(inner) != 1 or all(_fits(it, inner[0]) for it in elements)
+
+
+_FORMS: dict[Any, Callable[[object, tuple[Any, ...]], bool]] = {
+    np.ndarray: _is_array,
+    Literal: lambda value, inner: any(isinstance(value, type(it)) and value == it for it in inner),
+    Callable: lambda value, _: callable(value),
+    tuple: lambda value, _: _is_collection(value, Sequence, (Any,)),
+}
