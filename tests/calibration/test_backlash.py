@@ -41,8 +41,11 @@ def test_play_is_in_the_result(worn):
     assert rows[1].deadband_rad == pytest.approx(PLAY[1], rel=0.2)
 
 
-def test_an_arm_that_is_right_but_for_its_play():
-    known = calibrated(simulate(replace(GOOD, views=40, backlash_rad=PLAY, seed=3)))
+@pytest.mark.parametrize("way", [1.0, -1.0], ids=["from", "to"])
+def test_an_arm_that_is_right_but_for_its_play(way):
+    cell = simulate(replace(GOOD, views=40, backlash_rad=PLAY, seed=3))
+    # Some write the side that the joints moved to; a dead-band is a width all the same.
+    known = calibrated(replace(cell, approach=way * cell.approach))
     assert known.robot_arm.kinematics.level == "backlash"
     told = [it.deadband_rad for it in known.arm_found.plays]
     assert told == pytest.approx(PLAY, abs=1.5e-4)

@@ -93,8 +93,9 @@ def test_a_simulated_cell_sags_and_has_play():
     assert -0.1 < away[:, 2, 3].mean() < -2e-3
     assert np.array_equal(soft.base_from_flange, rigid.base_from_flange)
     worn = simulate(CellOptions(views=6, backlash_rad=(0.0, 2e-4, 0.0, 0.0, 0.0, 0.0)))
-    assert worn.approach.tolist() == [1, -1, 1, -1, 1, -1]
-    up = rigid.joints + np.outer(-worn.approach, [0, 1e-4, 0, 0, 0, 0])
+    assert worn.approach.tolist() == [-1, 1, -1, 1, -1, 1]
+    # A joint that came from above stays above its encoder.
+    up = rigid.joints + np.outer(worn.approach, [0, 1e-4, 0, 0, 0, 0])
     exact = forward(rigid.true_arm, up) @ (
         np.linalg.inv(forward(rigid.true_arm, rigid.joints)) @ rigid.true_base_from_flange
     )

@@ -187,7 +187,7 @@ class ArmModel:
                 it, in the middle of its play, where None.
         """
         if loads is not None and self.backlash.any():
-            q = q - 0.5 * loads.side[:, None] * self.backlash
+            q = q + 0.5 * loads.side[:, None] * self.backlash
         return bent_joints(self.robot, q, self.compliance, loads, self.moments)
 
     def base_from_flange(self, q: FloatArray, loads: Loads | None = None) -> FloatArray:
@@ -222,7 +222,7 @@ class ArmModel:
         bent = self.bent(q, loads)
         if name == BACKLASH:
             sides = np.zeros(len(q)) if loads is None else loads.side
-            return np.asarray(-0.5 * sides[:, None, None] * self.robot.axis_jacobian(bent))
+            return np.asarray(0.5 * sides[:, None, None] * self.robot.axis_jacobian(bent))
         if name == WEIGHT and self.functions is not None:
             shares = self.functions.bends(self.robot, bent)
             return np.asarray(self.robot.axis_jacobian(bent) @ shares)

@@ -56,7 +56,7 @@ class JointBacklash:
     Attributes:
         joint: Its name.
         deadband_rad: How far apart the joint stands when it is approached from its two sides at the
-            same reading of its encoder [rad]. Negative where it overshoots.
+            same reading of its encoder [rad]. Negative where it alone overshoots.
         sigma_rad: Its standard deviation [rad].
     """
 

@@ -197,7 +197,7 @@ def _stands(
 
 def _approach(options: CellOptions) -> FloatArray:
     """(m,) the sides from which stops are approached: from either in turn where there is play."""
-    sides = np.where(np.arange(options.views) % 2, -1.0, 1.0)
+    sides = np.where(np.arange(options.views) % 2, 1.0, -1.0)
     return sides if options.backlash_rad else np.zeros(options.views)
 
 

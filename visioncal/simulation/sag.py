@@ -103,15 +103,15 @@ def sagging(
         giving: How it gives way.
         joints: (m, n) joint angles as the encoders have them [rad].
         payloads: m loads, one a stop; none where empty.
-        approach: (m,) the side from which all joints came to each stop, +1 or -1; zero for the
-            middle of their play.
+        approach: (m,) the side from which all joints came to each stop, +1 from above or -1; zero
+            for the middle of their play.
 
     Returns:
         (m, n) angles at which a rigid arm without play stands likewise [rad].
     """
     side = np.zeros(len(joints)) if approach is None else approach
-    # A joint that came up from below stops short of where its encoder has it.
-    at_rest = joints - 0.5 * side[:, None] * giving.backlash
+    # A joint that came down from above stops short of where its encoder has it.
+    at_rest = joints + 0.5 * side[:, None] * giving.backlash
     sagged = at_rest
     if giving.compliance.any():
         for _ in range(_ROUNDS):

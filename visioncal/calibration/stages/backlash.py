@@ -13,6 +13,8 @@ from visioncal.results.arm import JointBacklash
 def plays_of(model: ArmModel, covariance: FloatArray) -> tuple[JointBacklash, ...]:
     """Tells the play of each joint; nothing where stops did not come from both sides.
 
+    Joints lag. Where they lead as a whole, the column approach says which way they moved.
+
     Args:
         model: The arm.
         covariance: (p, p) covariance of its errors.
@@ -22,7 +24,8 @@ def plays_of(model: ArmModel, covariance: FloatArray) -> tuple[JointBacklash, ..
     place = model.place_of(BACKLASH)
     sigmas = model.weights[BACKLASH] * np.sqrt(np.diag(covariance)[place])
     names = model.nominal.joint_names
-    columns = zip(names, model.backlash.tolist(), sigmas.tolist(), strict=True)
+    sign = np.copysign(1.0, np.sum(model.backlash / sigmas**2))
+    columns = zip(names, (sign * model.backlash).tolist(), sigmas.tolist(), strict=True)
     return tuple(JointBacklash(name, band, sigma) for name, band, sigma in columns)
 
 

@@ -320,9 +320,10 @@ def _good_for(
         return ()
     verb = "would be" if status == "bad" else "is"
     worst = max(findings.picks, key=lambda it: it.good_for_mm)
+    sensor = "instrument" if worst.camera.startswith("instrument") else "camera"
     words = (
         f"It {verb} good for tasks of {figure(good_for_mm)} mm and more at "
-        f"{figure(worst.distance_m)} m from the camera."
+        f"{figure(worst.distance_m)} m from the {sensor}."
     )
     return (Finding(GOOD_FOR, words),)
 
