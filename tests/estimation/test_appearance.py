@@ -254,6 +254,17 @@ def test_intrinsics_within_their_stated_sigma_are_refined_without_a_doubt():
     assert mahalanobis_sq(cell, known) < UNLIKELY
 
 
+@pytest.mark.parametrize(("off_px", "status"), [(0.02, "good"), (0.5, "check")])
+def test_intrinsics_that_are_off_by_less_than_images_show_are_no_doubt(off_px, status):
+    # Corners as exact as centres of circles: both moves are beyond chance.
+    cell = simulate(replace(FINE, seed=2, pixel_sigma_px=0.002))
+    known = with_lens(cell, off_px * np.array([1.0, -1.0, 1.0, 0.5]))
+    assert known.verdict.status == status
+    words = "by less than images show" if status == "good" else "do not fit these images"
+    assert any(words in it for it in known.verdict.reasons)
+    assert mahalanobis_sq(cell, known) < UNLIKELY
+
+
 def test_given_intrinsics_that_do_not_fit_are_refined_or_held_as_asked():
     cell = simulate(replace(FINE, seed=5, views=15))
     off = np.array([6.0, 6.0, -8.0, 5.0])

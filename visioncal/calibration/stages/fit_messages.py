@@ -8,7 +8,7 @@ import numpy as np
 from visioncal.calibration.stages.image_size import other_images
 from visioncal.core.number_format import figure
 from visioncal.core.quantiles import chi2_limit
-from visioncal.core.types import FloatArray, IntArray, Target
+from visioncal.core.types import Camera, FloatArray, IntArray, Target
 from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Step
 from visioncal.estimation.appearance import MOST_LOOSE
 from visioncal.estimation.corners import CornerStack
@@ -24,16 +24,19 @@ from visioncal.estimation.joint import (
     rig_by_stated_arms,
 )
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.scene import ONLY_CAMERA, Scene
+from visioncal.estimation.scene import ONLY_CAMERA, CornerProblem, Scene
 from visioncal.estimation.solve import covariance_of, held_shift
 from visioncal.session.frames import frame_name
+from visioncal.vision.camera import normalise, project
 
 # A rig that is as stated seems not to be in one session of ten thousand.
 _FALSE_ALARM = 1e-4
 # Rigs are measured and made to so much, as a share.
 _SAME_SIZE = 5e-4
-# Intrinsics that would move by less move no corner visibly [px].
-_LEAST_MOVE_PX = 0.05
+# Intrinsics that move by less, or corners by less, show in no image [px].
+_LEAST_MOVE_PX = 0.1
+# No printed board is as it was drawn to less [m].
+_LEAST_BEND_M = 1e-5
 _NEW_LENS = Step(
     "In session.toml, delete matrix and distortion, so that they are estimated, or calibrate "
     "the camera anew.",
@@ -146,7 +149,7 @@ def scale_found(
 
 
 def shape_found(fitted: Fitted, board: int, called: str) -> Finding:
-    """Words a board that is bent, longer one way than the other, or sheared.
+    """Words a board that is bent, longer one way than the other, or sheared; a note of the least.
 
     Of these, what is more than chance is worded; all of them together are.
 
@@ -156,7 +159,14 @@ def shape_found(fitted: Fitted, board: int, called: str) -> Finding:
         called: What it is called.
     """
     looks = fitted.looks
-    aspect, *bends, shear = looks.shape_of(board)
+    shape = looks.shape_of(board)
+    aspect, *bends, shear = shape
+    drawn = looks.with_values(shape, np.zeros(len(shape))).corners[board]
+    away = float(np.linalg.norm(looks.corners[board] - drawn, axis=1).max())
+    if away < _LEAST_BEND_M:
+        return Finding(
+            NOTE, f"The {called} is within {figure(1e3 * away)} mm of its drawing, size aside."
+        )
     parts, steps = [], []
     if _moved(fitted, np.array([aspect])):
         longer = float(looks.values[aspect])
@@ -250,7 +260,9 @@ def _lens_found(fitted: Fitted, camera: str) -> Iterator[Finding]:
         if words:
             yield Finding("lens", f"{words} It was refined.", Step(do, CALIBRATE))
         else:
-            yield lens_found(steps, is_doubtful=is_exact or contradicted_lens(fitted, camera))
+            is_wrong = is_exact or contradicted_lens(fitted, camera)
+            moved_px = _corners_moved_px(problem, looks.camera(camera))
+            yield lens_found(steps, is_doubtful=is_wrong and moved_px > _LEAST_MOVE_PX)
     if problem.contested:
         at = np.arange(fitted.problem.size)[fitted.columns]
         at = at[np.searchsorted(fitted.seen.free, lens[:4])]
@@ -261,12 +273,22 @@ def _lens_found(fitted: Fitted, camera: str) -> Iterator[Finding]:
             yield replace(contest_found(problem.scene, moves), mahalanobis_sq=squared)
 
 
+def _corners_moved_px(problem: CornerProblem, refined: Camera) -> float:
+    """By how much a refined lens moves any corner that was seen, its ray being what it was [px]."""
+    stated = problem.scene.camera
+    plane = normalise(stated, problem.stack.px)
+    rays = np.column_stack([plane, np.ones(len(plane))])
+    moved = np.linalg.norm(project(refined, rays) - project(stated, rays), axis=1)
+    return float(np.nanmax(moved, initial=0.0))
+
+
 def lens_found(steps_px: FloatArray, *, is_doubtful: bool) -> Finding:
     """Words given intrinsics that were refined; a note where they are no reason for doubt.
 
     Args:
         steps_px: (4,) by how much fx, fy, cx, cy moved [px].
-        is_doubtful: Whether they were taken for exact, or for better than they are.
+        is_doubtful: Whether they were taken for exact, or for better than they are, and corners
+            show it.
     """
     if is_doubtful:
         return Finding(
@@ -277,8 +299,8 @@ def lens_found(steps_px: FloatArray, *, is_doubtful: bool) -> Finding:
         )
     return Finding(
         NOTE,
-        "The given intrinsics were refined within what is stated: fx, fy, cx, cy moved by "
-        f"{_px(steps_px)} px.",
+        "The given intrinsics were refined within what is stated, or by less than images show: "
+        f"fx, fy, cx, cy moved by {_px(steps_px)} px.",
     )
 
 
