@@ -118,8 +118,8 @@ def test_what_was_given_and_what_is_needed_is_said(bench):
         ),
         "Sight: seen is an array of float64, of the shape (2, 3); a Corners or an image of uint8 "
         "is needed.": lambda: visioncal.Sight("1", np.zeros((2, 3))),
-        "Session.from_arrays: mount is text ('eye-on-hand'); 'eye-in-hand' or 'eye-to-hand' or "
-        "'instrument' is needed. Did you mean eye-to-hand or eye-in-hand?": (
+        "Session.from_arrays: mount 'eye-on-hand' is not one of eye-in-hand, eye-to-hand, "
+        "instrument. Did you mean eye-to-hand or eye-in-hand?": (
             lambda: visioncal.Session.from_arrays(
                 [bench.image], bench.pose[None], BOARD, mount="eye-on-hand"
             )

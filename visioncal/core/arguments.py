@@ -85,6 +85,12 @@ def _check(owner: str, name: str, value: object, hint: object) -> None:
     if _fits(value, hint):
         return
     options = list(_options(hint))
+    if isinstance(value, str) and (names := _names(options)):
+        raise DataError(
+            f"{owner}: {name} {value!r} is not one of {', '.join(names)}.",
+            culprits=[name],
+            next_step=did_you_mean(value, names),
+        )
     needed = " or ".join(
         dict.fromkeys(_words(it) for it in options if it is not str or Path not in options)
     )
@@ -93,7 +99,6 @@ def _check(owner: str, name: str, value: object, hint: object) -> None:
         loaders = [f"{it.__name__}.load" for it in options if hasattr(it, "load")]
         loaders += ["load_target"] * (Target in options)
         step = f"Load it first: visioncal.{loaders[0]}({str(value)!r})." if loaders else ""
-        step = step or did_you_mean(str(value), _names(options))
     raise DataError(
         f"{owner}: {name} is {_seen(value)}; {needed} is needed.", culprits=[name], next_step=step
     )
