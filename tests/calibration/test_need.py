@@ -121,6 +121,22 @@ def test_what_an_arm_does_again_moves_no_pick(mount: str) -> None:
     np.testing.assert_allclose(after.spreads, before.spreads, atol=1e-3 * before.spreads.max())
 
 
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_a_board_of_another_size_misplaces_things_for_a_calibrated_arm(mount: str) -> None:
+    """Its size is known to 0.1 %, and is off by 1.5 times that: the arm becomes as large."""
+    size = 1.0015
+    cell = simulate(CellOptions(mount=mount, dh_sigma_m=3e-4, dh_sigma_rad=3e-4, board_scale=size))
+    known = calibrated(cell)
+    assert all(it.is_modelled for it in known.fitted.arms.values())
+    (picks,) = known.findings.picks
+    middle, scaled = np.array([0.135, 0.09, 0.0, 1.0]), np.diag([size, size, size, 1.0])
+    went = known.solved.problem.predicted(known.solved.state) @ middle
+    seen = cell.cam_from_target[np.array(known.used)] @ scaled @ middle
+    away_mm = 1e3 * np.sqrt(np.mean(np.sum((went - seen)[:, :3] ** 2, axis=1)))
+    # 1.5 sigma of that size make nearly all of it, and what is held counts by its pull as well.
+    assert 0.7 < away_mm / picks.budget_mm["total"] < 2.0
+
+
 @pytest.mark.parametrize(("views", "is_found"), [(slice(1), False), (slice(1, None), True)])
 def test_only_views_that_are_known_well_show_what_is_not_predicted(views: slice, is_found: bool):
     """A view of a small board from the front: off by 2 deg, which is 2.5 times its sigma."""

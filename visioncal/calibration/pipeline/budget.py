@@ -10,7 +10,7 @@ from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.handeye import closed_form_state
 from visioncal.calibration.stages.validate import HeldOut, validate
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.estimation.appearance import shape_slices
+from visioncal.estimation.appearance import shape_basis, shape_slices
 from visioncal.estimation.budget import (
     Sources,
     covariance_by_source,
@@ -167,6 +167,23 @@ def columns_of_boards(solved: Solved) -> IntArray:
     """The problem's columns of boards' shapes, as far as they are free."""
     found = (it for name, it in _looks(solved).items() if name.startswith("board"))
     return np.concatenate([np.zeros(0, dtype=np.int64), *found])
+
+
+def middles_moved(solved: Solved) -> dict[str, FloatArray]:
+    """(3, b) how the middle of each target moves with `columns_of_boards`, by its frame [m]."""
+    seen, looks = solved.seen, solved.looks
+    if seen is None or looks is None:
+        return {}
+    plates, at = solved.cell.session.plates, looks.boards
+    free = seen.free[(seen.free >= at.start) & (seen.free < at.stop)]
+    found = {}
+    for (name, target), mine in zip(
+        plates.items(), shape_slices(tuple(plates.values()), at.start), strict=True
+    ):
+        by_shape = np.zeros((3, at.stop))
+        by_shape[:, mine] = shape_basis(target).mean(axis=0)
+        found[frame_name("target", name)] = by_shape[:, free]
+    return found
 
 
 def _looks(solved: Solved) -> dict[str, IntArray]:

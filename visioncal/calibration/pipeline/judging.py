@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.calibration.pipeline.answer import Answer
 from visioncal.calibration.pipeline.arm_results import doubts_of_arms, notes_on_arms
-from visioncal.calibration.pipeline.budget import columns_of_boards, middles_of
+from visioncal.calibration.pipeline.budget import columns_of_boards, middles_moved, middles_of
 from visioncal.calibration.pipeline.fault_messages import by_way_of, moved_found
 from visioncal.calibration.pipeline.lens_fields import errors_found
 from visioncal.calibration.pipeline.network_ties import robot_motion, untied_words
@@ -94,6 +94,7 @@ def _pickable(known: RunState) -> Fitted:
         dict(zip(answer.problem.robots, freedom, strict=True)),
         solved.arms,
         columns_of_boards(solved),
+        middles_moved(solved),
         answer.problem,
     )
 

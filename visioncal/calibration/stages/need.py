@@ -140,6 +140,7 @@ class Fitted:
         freedom: Degrees of freedom of each robot's noise.
         arms: The robots' arms, at the problem's stops.
         of_boards: The problem's columns of boards' shapes.
+        moved: (3, b) how the middle of each target moves with these, by its frame [m].
         whole: The observations of all pairs, merged or not, that the fit was made from.
         inflation: By how much the covariance was multiplied because neighbouring stops err alike.
     """
@@ -153,6 +154,7 @@ class Fitted:
     freedom: Mapping[str, float]
     arms: Mapping[str, RobotArm]
     of_boards: IntArray
+    moved: Mapping[str, FloatArray]
     whole: Problem
     inflation: float = 1.0
 
@@ -202,7 +204,7 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
     whole = calibrated or (unfitted is not None and (unfitted.of_links or unfitted.is_significant))
     if whole:
         # The whole chain, in the targets' frames: the noise of its flanges is in it.
-        looking, at_m = problem, middles
+        looking, at_m = _of_things(fitted), middles
     else:
         looking, at_m = _to_base(fitted, base, in_base), _carried(in_base, middles)
         if need is not None and need.at != "views":
@@ -303,6 +305,25 @@ def _to_base(fitted: Fitted, base: str, in_base: FloatArray) -> Problem:
         points=frozenset(),
         with_repeats=False,
     )
+
+
+def _of_things(fitted: Fitted) -> Problem:
+    """The observations as if they were of things that stand where the boards' middles are.
+
+    A board of another size was measured at another distance, and a thing is not: all that a board's
+    shape then moves is its middle.
+    """
+    problem, effects = fitted.problem, []
+    still, frames = np.zeros((3, len(fitted.of_boards))), problem.observations.observed
+    moved = np.array([fitted.moved.get(it.partition("@")[0], still) for it in frames])
+    for it in problem.effects:
+        at, seen = problem.effect_columns[it.name], it.by_sensor
+        of_boards = np.isin(np.arange(at.start, at.stop), fitted.of_boards)
+        if seen is not None and of_boards.any():
+            seen = seen.copy()
+            seen[:, :3, of_boards], seen[:, 3:, of_boards] = 0.0, -moved
+        effects.append(replace(it, by_sensor=seen))
+    return replace(problem, effects=tuple(effects))
 
 
 def _carried(poses: FloatArray, points: FloatArray) -> FloatArray:
