@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.special import chdtrc
+from support.cells import calibrated
 from support.sound_findings import SOUND, changed, directions, left_out
 
 from visioncal.calibration.pipeline import calibrate
@@ -339,3 +340,21 @@ def test_a_held_lens_that_is_wrong_is_no_board_of_another_size(mount):
         corners=session.corner_table,
     )
     assert calibrate(held).verdict.causes[0].kind == "lens"
+
+
+@pytest.mark.parametrize("states_lens", [True, False])
+def test_weak_motion_comes_first_and_its_advice_once(states_lens: bool) -> None:
+    # Tilted by 3 degrees, a robot's rotation error of 0.02 deg moves the camera's offset by 2 mm.
+    options = CellOptions(
+        tilt_rad=(0.0, 0.06),
+        distance_m=(0.25, 0.9),
+        robot_sigma_m=1e-4,
+        robot_sigma_rad=3e-4,
+        state_intrinsics=states_lens,
+    )
+    verdict = calibrated(simulate(options)).verdict
+    assert verdict.status == "check"
+    assert verdict.ranked[0].kind == "weak_motion"
+    assert ("weak_lens" in {it.kind for it in verdict.findings}) != states_lens
+    (step,) = verdict.next_steps
+    assert step.words.startswith("Add 5 views or more, tilted by 20 to 40 degrees")

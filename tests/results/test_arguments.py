@@ -167,3 +167,12 @@ def test_a_camera_is_taken_as_a_table_and_poses_as_a_list(bench):
     assert one.digest() == other.digest()
     with pytest.raises(DataError, match="matrix"):
         visioncal.Session.from_arrays([bench.image], poses, BOARD, camera={"matrix": [1, 2]})
+
+
+def test_pictures_of_16_bits_are_taken_where_they_are_stored(bench):
+    deep = 257 * bench.image.astype(np.uint16)
+    taken = visioncal.Session.from_arrays([deep], bench.pose[None], BOARD)
+    shallow = visioncal.Session.from_arrays([bench.image], bench.pose[None], BOARD)
+    assert taken.views[0].image == shallow.views[0].image
+    with pytest.raises(DataError, match="seen is an array of uint16"):
+        visioncal.locate_target(bench.calibration, deep, BOARD, bench.pose)

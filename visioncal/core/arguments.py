@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean
-from visioncal.core.types import Image, Target
+from visioncal.core.types import Target
 
 Given = ParamSpec("Given")
 Answer = TypeVar("Answer")
@@ -73,7 +73,11 @@ def check_fields(instance: Any) -> None:  # noqa: ANN401 - any dataclass
 
 @cache
 def _declared(function: Callable[..., Any]) -> tuple[inspect.Signature, dict[str, Any]]:
-    return inspect.signature(function), _hints(function)
+    taken = {name: it for name, it in function.__annotations__.items() if name != "return"}
+    # What a function gives back may be known to type checkers alone.
+    alone = types.SimpleNamespace(__annotations__=taken)
+    hints = typing.get_type_hints(alone, getattr(function, "__globals__", None))
+    return inspect.signature(function), hints
 
 
 @cache
@@ -85,6 +89,10 @@ def _check(owner: str, name: str, value: object, hint: object) -> None:
     if _fits(value, hint):
         return
     options = list(_options(hint))
+    for option in options:
+        if isinstance(value, list | tuple) and _is_list(option):
+            for at, it in enumerate(value):
+                _check(owner, f"{name}[{at}]", it, typing.get_args(option)[0])
     if isinstance(value, str) and (names := _names(options)):
         raise DataError(
             f"{owner}: {name} {value!r} is not one of {', '.join(names)}.",
@@ -128,12 +136,18 @@ def _names(options: Sequence[Any]) -> list[str]:
     return [it for names in literals for it in names if isinstance(it, str)]
 
 
+def _is_list(hint: Any) -> bool:  # noqa: ANN401
+    origin, inner = typing.get_origin(hint), typing.get_args(hint)
+    return isinstance(origin, type) and issubclass(list, origin) and len(inner) == 1
+
+
 def _words(hint: Any) -> str:  # noqa: ANN401
     origin = typing.get_origin(hint)
     if hint in _WORDS:
         return _WORDS[hint]
     if origin is np.ndarray:
-        return "an image of uint8" if hint == Image else "an array"
+        pixels = _pixels(typing.get_args(hint))
+        return "an array" if pixels is None else f"an image of {pixels.__name__}"
     if origin is Literal:
         return " or ".join(map(repr, typing.get_args(hint)))
     if origin is Callable:
@@ -160,9 +174,16 @@ def _fits(value: object, hint: Any) -> bool:  # noqa: ANN401 - a type, or a form
     return not isinstance(origin, type) or _is_collection(value, origin, inner)
 
 
+def _pixels(inner: tuple[Any, ...]) -> type | None:
+    """The type of an image's pixels; None of an array of numbers."""
+    (kind,) = typing.get_args(inner[1])
+    return kind if isinstance(kind, type) and issubclass(kind, np.unsignedinteger) else None
+
+
 def _is_array(value: object, inner: tuple[Any, ...]) -> bool:
-    if inner == typing.get_args(Image):
-        return isinstance(value, np.ndarray) and value.dtype == np.uint8 and value.ndim > 1
+    pixels = _pixels(inner)
+    if pixels is not None:
+        return isinstance(value, np.ndarray) and value.dtype == pixels and value.ndim > 1
     try:
         return np.asarray(value).dtype.kind in "biuf"
     except ValueError:

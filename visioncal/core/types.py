@@ -16,6 +16,7 @@ FloatArray: TypeAlias = npt.NDArray[np.float64]
 IntArray: TypeAlias = npt.NDArray[np.int64]
 Mask: TypeAlias = npt.NDArray[np.bool_]
 Image: TypeAlias = npt.NDArray[np.uint8]
+Image16: TypeAlias = npt.NDArray[np.uint16]
 
 CameraKind: TypeAlias = Literal["brown", "fisheye"]
 TargetKind: TypeAlias = Literal[

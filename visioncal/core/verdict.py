@@ -19,8 +19,10 @@ VerdictStatus: TypeAlias = Literal["good", "check", "bad"]
 _SHOWN, _LEAST_LIKELY, _LIKELY = 3, 0.05, 0.2
 # Kinds of findings that are no doubts.
 AGREEMENT, NEED, GOOD_FOR, NOTE = "agreement", "need", "good_for", "note"
-# Files that a session names and does not have: no doubt about the rest, and said first.
-MISSING = "missing_images"
+# Images that are not there, or of another size than the camera's: no doubt about the rest, and said
+# first.
+MISSING, OTHER_SIZE = "missing_images", "image_size"
+NOT_USABLE = (MISSING, OTHER_SIZE)
 # A part of the image in which no corner was seen: a hint where the task says what it needs.
 EMPTY_IMAGE = "empty_image"
 # Rows of poses that are exchanged come first among causes that are as good as certain.
@@ -191,7 +193,7 @@ class Verdict:
         """All findings as people read them: the likeliest cause, what it costs, then the rest."""
         causes = [it for it in self.causes if it.probability >= _LEAST_LIKELY]
         costs = [it for kind in _SIZES for it in self.findings if it.kind == kind]
-        missing = [it for it in self.findings if it.kind == MISSING]
+        missing = [it for it in self.findings if it.kind in NOT_USABLE]
         ordered = [*missing, *causes[:1], *costs[:1], *causes[1:], *self.findings]
         return tuple({id(it): it for it in ordered}.values())
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform
 from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean
 from visioncal.core.transforms import LAST_ROW, rigid_fault
-from visioncal.core.types import Camera, FloatArray, Image, IntArray, Mount, Target
+from visioncal.core.types import Camera, FloatArray, Image, Image16, IntArray, Mount, Target
 from visioncal.session.columns import POSE
 from visioncal.session.corners import CornerTable
 from visioncal.session.images import MemoryImages
@@ -55,7 +55,10 @@ class Facts(TypedDict):
 
 
 def of_images(
-    images: Sequence[Image | bytes], poses: Poses, board: Target | str, **cell: Unpack[Cell]
+    images: Sequence[Image | Image16 | bytes],
+    poses: Poses,
+    board: Target | str,
+    **cell: Unpack[Cell],
 ) -> Facts:
     """The facts of a session of images; see `Session.from_arrays`."""
     matrices = _matrices(poses, "images", len(images))

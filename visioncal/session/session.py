@@ -14,7 +14,7 @@ from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_TOML_BYTES, parse_toml, read_text_inside
 from visioncal.core.shown import html_card, text_card
-from visioncal.core.types import Camera, Corners, Image, Mount, Need, Target
+from visioncal.core.types import Camera, Corners, Image, Image16, Mount, Need, Target
 from visioncal.session import columns as known
 from visioncal.session.arrays import Cell, Poses, of_corners, of_images
 from visioncal.session.boards import COLUMN, read_targets, target_warnings
@@ -211,7 +211,7 @@ class Session:
     @typed
     def from_arrays(
         cls,
-        images: Sequence[Image | bytes],
+        images: Sequence[Image | Image16 | bytes],
         base_from_flange: Poses,
         board: Target | str,
         **cell: Unpack[Cell],

@@ -10,7 +10,7 @@ import numpy as np
 
 from visioncal.calibration.stages.cause_ranking import COUNTED_BACKWARDS
 from visioncal.calibration.stages.dense import fit_densely
-from visioncal.calibration.stages.detect import DetectOptions, detect
+from visioncal.calibration.stages.detect import Detections, DetectOptions, detect
 from visioncal.calibration.stages.image_size import other_images
 from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.calibration.stages.observed import CameraLook, Observed, nothing_seen
@@ -20,7 +20,7 @@ from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
 from visioncal.core.types import Corners
-from visioncal.core.verdict import LEAST_NEED_MM, Finding, Step
+from visioncal.core.verdict import LEAST_NEED_MM, OTHER_SIZE, Finding, Step
 from visioncal.results import CameraResult
 from visioncal.session import Session, View, frame_name
 from visioncal.session.kinds import name_of
@@ -56,7 +56,7 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
                 options = DetectOptions(threads=seen.threads, keeps=seen.keeps_corners)
                 found = detect(session, options, seen.progress, among=views)
             corners, resolution = found.corners, found.resolution
-            seen = seen.noting(found.rejections)
+            seen = seen.noting(found.rejections, _of_other_size(session, found))
             if seen.dense is not None:
                 looked = fit_densely(session, views, corners, seen.dense, seen.progress)
                 corners, seen = looked[0], replace(seen, dense=looked[1])
@@ -260,6 +260,27 @@ def _repeated(views: Sequence[View], corners: Mapping[int, Corners]) -> dict[int
             if earlier != view.number:
                 again[view.number] = earlier
     return again
+
+
+def _of_other_size(session: Session, found: Detections) -> Iterator[Finding]:
+    """Says which images are not of the camera's size."""
+    if not found.other_sizes:
+        return
+    views, (wide, high) = tuple(found.other_sizes), found.resolution
+    names = {it.number: it.image for it in session.views}
+    shown = [f"{names[at]} ({w} x {h} px)" for at, (w, h) in found.other_sizes.items()]
+    one = len(views) == 1
+    is_turned = {*found.other_sizes.values()} == {(high, wide)}
+    words = (
+        f"{len(views)} image{' is' if one else 's are'} "
+        f"{'turned by 90 degrees' if is_turned else 'of another size'}, and not used: "
+        f"{some_of(shown)}; the camera's are {wide} x {high} px."
+    )
+    rows = f"the row{'' if one else 's'} of view{'' if one else 's'} {_listed(views)}"
+    these = names[views[0]] if one else "these images"
+    mend = f"Turn {these} back" if is_turned else f"Take {these} again at the camera's full size"
+    step = Step(f"{mend}; or in views.csv, delete {rows}.")
+    yield Finding(OTHER_SIZE, words, step, views, until_mm=0.0)
 
 
 def _said_of(again: Mapping[int, int]) -> Iterator[Finding]:

@@ -137,6 +137,7 @@ LOOK = Step(
 )
 
 # What helps where the size of a board limits a result.
+TILTED = Step("Add views tilted by 30 to 45 degrees.")
 MEASURE_BOARD = Step(
     "Measure the board with a caliper over its whole width, and state square_m, the side of one "
     "square, and square_sigma_m, how well it is known, of the target: more views tell neither."
@@ -289,7 +290,18 @@ def ranked(
         # ... and in the calibration's uncertainty.
         known |= {"calibration"} if known & {*MOVED_AT_ONCE} else set()
         found += [it for it in _sources(picks, met, more) if it.kind not in known]
-    return tuple(_with_joints_at_hand(found))
+    return tuple(_with_weak_motion(_with_joints_at_hand(found), more))
+
+
+def _with_weak_motion(found: Sequence[Finding], more: Step | None) -> Sequence[Finding]:
+    """The same where the motion is why the calibration is uncertain: one cause, and one advice."""
+    weak = next((it for it in found if it.kind == "weak_motion"), None)
+    source = next((it for it in found if it.kind == "calibration"), None)
+    if weak is None or source is None or source.probability < 0.5 or more in (None, MEASURE_BOARD):
+        return found
+    first = replace(weak, probability=source.probability)
+    rest = (it for it in found if it is not weak)
+    return [first, *(replace(it, do=weak.do) if it.do in (more, TILTED) else it for it in rest)]
 
 
 def _with_joints_at_hand(found: Sequence[Finding]) -> Sequence[Finding]:

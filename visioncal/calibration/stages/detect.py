@@ -61,11 +61,19 @@ class DetectOptions:
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """The corners by view, in the session's order, and the views without."""
+    """The corners by view, in the session's order, and the views without.
+
+    Attributes:
+        corners: The corners.
+        rejections: Why views have none.
+        resolution: The camera's (width, height) [px].
+        other_sizes: The (width, height) of images that have another one, by view [px].
+    """
 
     corners: Mapping[int, Corners]
     rejections: tuple[Rejection, ...]
     resolution: tuple[int, int]
+    other_sizes: Mapping[int, tuple[int, int]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,6 +159,7 @@ def detect(
         kept.save()
     given = [view for view in among if view.has_corners]
     resolution = _common_resolution(session, views, looks, given, stated)
+    sizes = {view.number: it.resolution for view, it in zip(views, looks, strict=True)}
     looks = [_of_size(it, view, resolution) for it, view in zip(looks, views, strict=True)]
     for name in session.boards:
         _check_layout(session, name, views, looks)
@@ -167,6 +176,7 @@ def detect(
         {it.view: it for it in found if isinstance(it, Corners)},
         tuple(it for it in found if isinstance(it, Rejection)),
         resolution,
+        {view: it for view, it in sizes.items() if it not in (None, resolution)},
     )
 
 

@@ -7,6 +7,7 @@ from typing import Literal, TypeAlias
 import cv2
 import numpy as np
 
+from visioncal.calibration.stages.cause_ranking import TILTED
 from visioncal.core.errors import ConvergenceError, DataError, DegenerateError
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, CameraKind, Corners, FloatArray, Rejection, Target
@@ -246,7 +247,7 @@ def _causes(fit: BundleFit) -> Iterator[Finding]:
         yield Finding(
             "weak_lens",
             f"All views are frontal (tilted by at most {tilt.max():.0f} degrees).",
-            Step("Add views tilted by 30 to 45 degrees."),
+            TILTED,
             until_mm=0.0,
         )
     distance = np.linalg.norm(poses[:, :3, 3], axis=1)

@@ -21,8 +21,8 @@ from visioncal.core.verdict import (
     EMPTY_IMAGE,
     EXCHANGED,
     GOOD_FOR,
-    MISSING,
     NEED,
+    NOT_USABLE,
     NOTE,
     REVIEW,
     Finding,
@@ -255,7 +255,7 @@ def judge(findings: Findings) -> Verdict:
         *(doubt for it in sensors for doubt in _lost_doubts(it, limits)),
         *(doubt for it in sensors for doubt in _noise_doubts(it, limits)),
         *([] if scatter else _robot_doubts(findings, limits)),
-        *(_warned(it, findings) for it in findings.warnings if it.kind != MISSING),
+        *(_warned(it, findings) for it in findings.warnings if it.kind not in NOT_USABLE),
     ]
     good_for_mm = _good_for_mm(findings.picks, doubts)
     met = need_met(findings.need, findings.picks)
@@ -289,7 +289,7 @@ def judge(findings: Findings) -> Verdict:
             Finding(NEED, met_words(findings, met)),
         )
     said += [] if doubts else [_praise(findings, is_enough=status == "good")]
-    said += [*hints, *(it for it in findings.warnings if it.kind == MISSING)]
+    said += [*hints, *(it for it in findings.warnings if it.kind in NOT_USABLE)]
     return Verdict(status, (*said, *remarks(findings.notes, NOTE)), good_for_mm)
 
 

@@ -11,7 +11,7 @@ from scipy.special import ndtri
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_IMAGE_BYTES, read_bytes
-from visioncal.core.types import FloatArray, Image
+from visioncal.core.types import FloatArray, Image, Image16
 from visioncal.vision.finders.headers import MOST_PIXELS, SIGNATURES, claimed_size, start_of_scan
 
 # Half-widths of the window around a corner in which its edges' width is measured [px].
@@ -66,13 +66,13 @@ def decode_image(data: bytes, *, colour: bool = False) -> Image | str:
     return np.asarray(image, dtype=np.uint8) if image.dtype == np.uint8 else _to_eight_bits(image)
 
 
-def encode_png(image: Image) -> bytes:
+def encode_png(image: Image | Image16) -> bytes:
     """Writes a (h, w) or (h, w, 3) image of 8 or 16 bits as png, without loss.
 
     Raises:
         DataError: It is no such image.
     """
-    pixels = np.asarray(image)
+    pixels: npt.NDArray[np.integer[Any]] = np.asarray(image)
     if pixels.dtype not in (np.uint8, np.uint16) or pixels.ndim not in (2, 3) or not pixels.size:
         raise DataError(
             f"an image has the shape {pixels.shape} and the type {pixels.dtype}; (h, w) or "
