@@ -11,7 +11,8 @@ from support.whole_cells import FLOOR, OPTIONS, PLATE, part, recorded
 
 from visioncal.calibration.pipeline import align, guess_inputs, running
 from visioncal.calibration.pipeline.checkup import doctor
-from visioncal.core.errors import DegenerateError
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.interchange.formats.exchanging import exchange_views
 from visioncal.session import MemoryImages, Session
 from visioncal.simulation import (
     BoardAt,
@@ -146,6 +147,25 @@ def test_poses_of_a_robot_that_are_exchanged_are_named(session):
     assert any(it.startswith(words) for it in found.verdict.reasons)
     out = [it.view for it in found.sights if not it.used]
     assert out == [*of_plate(session, "plate_b", first), *of_plate(session, "plate_b", second)]
+
+
+def test_two_images_that_are_exchanged_have_a_command_that_mends_them(session):
+    # The images of one camera at two stops.
+    views = [it for it in session.views if it.text["target"] == "plate_b"]
+    of_one = [it.number for it in views if it.text["camera"] == views[0].text["camera"]]
+    first, second = of_one[1], of_one[3]
+    swapped = exchange_views(session, first, second)
+    found = align(swapped)
+    (wrong,) = (it for it in found.verdict.findings if it.kind == "exchanged_views")
+    assert set(wrong.views) == {first, second}
+    assert f"--exchange {first},{second}" in wrong.do.command
+    mended = exchange_views(swapped, first, second)
+    assert len(mended.declaration.corrected) == 2
+    again = align(mended)
+    assert all(it.used for it in again.sights if it.view in (first, second))
+    other = next(it.number for it in session.views if it.text["target"] != "plate_b")
+    with pytest.raises(DataError, match=r"of another .*target"):
+        exchange_views(session, first, other)
 
 
 def test_a_camera_whose_corners_are_bad_is_named(session):

@@ -160,6 +160,9 @@ def test_a_lost_encoder_is_found_and_not_thrown_away(with_poses):
     nominal, *others = known.robot_arm.kinematics.levels
     assert nominal.left_out.mm > 10.0
     assert others[-1].left_out.mm < 0.5
+    (lost,) = (it for it in known.verdict.findings if it.kind == "misread_joints")
+    assert lost.do.words.startswith("Home elbow_joint anew")
+    assert "visioncal export OUT --to robot-urdf" in lost.do.command
     theta = {it.joint: it for it in parameters(known) if it.name == "theta_rad"}
     # Errors of the arm's other parameters are up to a few milliradians.
     assert theta["elbow_joint"].nominal == pytest.approx(0.0, abs=1e-9)
@@ -180,6 +183,8 @@ def test_zeros_that_differ_between_poses_and_joints_are_named():
     assert matched.zero.zeros == pytest.approx(off, abs=1e-4)  # the search stops at 1e-6 rad
     assert matched.arm.base_from_flange(told.joints - off) == pytest.approx(told.poses, abs=1e-4)
     assert "moved by 10.00 deg" in matched.warnings[0].reason
+    assert "Home elbow_joint anew, or add 10.00 deg to q3_rad" in matched.warnings[0].reason
+    assert "visioncal export OUT --to robot-urdf" in matched.warnings[0].do.command
 
 
 def test_one_row_of_wrong_joints_costs_its_view_alone():

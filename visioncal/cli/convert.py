@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from visioncal.cli.console import messages
 from visioncal.cli.options import Force
-from visioncal.cli.parsing import size_in
+from visioncal.cli.parsing import pair_in, size_in
 from visioncal.cli.pose_options import UNITS, RobotPoseOptions, names_in, poses_option
 from visioncal.cli.progress import shown_progress
 from visioncal.core.choices import FOREIGN_NAMES, CameraMount
@@ -131,6 +131,10 @@ def convert_command(
         bool,
         _doubt("--mirror-poses", help="Mirror the robot's poses where its frame is left-handed."),
     ] = False,
+    exchange: Annotated[
+        str | None,
+        _doubt("--exchange", help="Two views whose images are exchanged, by number: 8,17."),
+    ] = None,
 ) -> None:
     """Write a session as a folder or a recording, or make one of another program's.
 
@@ -154,6 +158,7 @@ def convert_command(
         force=force,
         choose=choose,
         mirrors_poses=mirror_poses,
+        exchange=None if exchange is None else pair_in(exchange, "--exchange"),
     )
     for warning in session.warnings:
         messages().print(escape(f"note: {warning}"))

@@ -45,6 +45,21 @@ def numbers_in(words: str, option: str, form: str) -> tuple[float, ...]:
     return values
 
 
+def pair_in(words: str, option: str) -> tuple[int, int]:
+    """Reads the numbers of two views, written as 8,17.
+
+    Raises:
+        DataError: It is not two whole numbers.
+    """
+    numbers = [int(it) for it in words.split(",") if it.strip().isdecimal()]
+    if len(numbers) != 2 or words.count(",") != 1:
+        raise DataError(
+            f"{option} is {words[:40]!r}; the numbers of two views are needed, as 8,17.",
+            culprits=[option],
+        )
+    return numbers[0], numbers[1]
+
+
 def size_in(words: str) -> tuple[int, int]:
     """Reads the width and height of images [px], written as 1280,800 or 1280x800.
 

@@ -75,6 +75,12 @@ def look_at(view: int) -> str:
     return f"{REVIEW} --view {view}"
 
 
+def exchanging(first: int, second: int) -> str:
+    """The command that calibrates with the images of two views exchanged."""
+    fixed = CALIBRATE.replace("SESSION", "FIXED")
+    return f"visioncal convert SESSION FIXED --exchange {first},{second} && {fixed}"
+
+
 READ_AGAIN = Step(
     "Write a copy of the session that is read so, and calibrate it.", GUESS_AND_CALIBRATE
 )

@@ -15,7 +15,7 @@ from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import distances, invert, mean_transform, pose_difference
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.core.verdict import CALIBRATE, EXCHANGED, Finding, Step, look_at
+from visioncal.core.verdict import CALIBRATE, EXCHANGED, Finding, Step, exchanging, look_at
 from visioncal.estimation.problem import Problem
 from visioncal.results import Moved
 
@@ -153,6 +153,10 @@ def pose_faults(solved: Solved) -> tuple[PoseFault, ...]:
     found = _pushed_bases(solved)
     found += _exchanged(solved, mutual)
     explained |= {row for it in found for row in it.rows}
+    found += _exchanged_views(
+        solved, {it: by for it, by in mutual.items() if not {it, by} & explained}
+    )
+    explained |= {row for it in found for row in it.rows}
     return (*turned, *found, *_wrong_poses(solved, explained))
 
 
@@ -242,7 +246,12 @@ def _exchanged_views(solved: Solved, mutual: Mapping[int, int]) -> Iterator[Pose
                 "each fits the pose in the other's row. They were left out."
             )
             views = (rows[first].view, rows[second].view)
-            found = Finding(EXCHANGED, words, _EXCHANGE, views)
+            step = Step(
+                "Write a copy of the session in which their images are exchanged, and calibrate "
+                "it.",
+                exchanging(*views),
+            )
+            found = Finding(EXCHANGED, words, step, views)
             yield PoseFault(found, (first, second))
 
 

@@ -12,7 +12,7 @@ from visioncal.calibration.guess.misread import (
     JointGuess,
     guess_joints,
 )
-from visioncal.calibration.stages.joints import Matched, zero_taken
+from visioncal.calibration.stages.joints import ARM_AS_FOUND, Matched, zero_taken
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Mount, Rejection
@@ -100,5 +100,7 @@ def lost_zero(guess: JointGuess, zero: JointReading, *, taken: bool) -> Finding:
         f"{guess.sentence('what the camera sees')}"
     )
     if taken:
-        return Finding("misread_joints", f"{words} {zero_taken(zero)}")
+        return Finding(
+            "misread_joints", f"{words} {zero_taken(zero)}", Step(zero.fix, ARM_AS_FOUND)
+        )
     return Finding("misread_joints", words, Step(zero.fix))

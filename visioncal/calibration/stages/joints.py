@@ -37,6 +37,8 @@ _MOST = 8
 # Where at least this share of the rows disagrees, it is not the rows that are wrong.
 _HALF = 0.5
 _LISTED_COLUMNS = 7
+# The arm as it was calibrated, for other programs.
+ARM_AS_FOUND = "visioncal export OUT --to robot-urdf -o robot.urdf"
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +163,7 @@ def _compared(matched: Matched, views: Sequence[int], q: FloatArray, poses: Floa
             "The joint angles do not belong to the reported poses as they are declared. "
             f"{guess.sentence('the reported poses')} {zero_taken(zero)}"
         )
-        lost = Finding("misread_joints", words, Step(zero.fix))
+        lost = Finding("misread_joints", words, Step(zero.fix, ARM_AS_FOUND))
         matched = replace(matched, zero=zero, warnings=(lost,))
     model = matched.arm.base_from_flange(q)
     found = _constants(model, poses, guess)

@@ -10,6 +10,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, did_you_mean
 from visioncal.interchange.formats.assemble import assemble, wished
 from visioncal.interchange.formats.columns import TABLE
+from visioncal.interchange.formats.exchanging import exchange_views
 from visioncal.interchange.formats.finding import listed
 from visioncal.interchange.formats.foreign import Foreign, ForeignFormat
 from visioncal.interchange.formats.import_options import ImportOptions
@@ -50,6 +51,7 @@ def convert(
     force: bool = False,
     choose: Choose | None = None,
     mirrors_poses: bool = False,
+    exchange: tuple[int, int] | None = None,
 ) -> Session:
     """Writes a session, or somebody else's recording, as a session's folder or as a recording.
 
@@ -64,6 +66,7 @@ def convert(
         choose: Called, where it is in doubt how the poses are meant, with what was read; what it
             answers is what is written.
         mirrors_poses: Whether that may mirror the robot's poses.
+        exchange: Two views whose images, corners and readings are to be exchanged.
 
     Returns:
         The session.
@@ -97,6 +100,8 @@ def convert(
         session = reread_session(
             doubtful.session, choose(doubtful), doubtful.robot, mirrors_poses=mirrors_poses
         )
+    if exchange is not None:
+        session = exchange_views(session, *exchange)
     write_session(session, dest)
     return session
 
