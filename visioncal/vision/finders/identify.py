@@ -26,6 +26,9 @@ _LISTED = 12
 _USUAL_PIXELS, _MUCH_LARGER = 2e6, 0.5
 # So many markers on one lattice are a board, even where its corners are not found.
 _SURE_MARKERS = 8
+# Dark squares pass for circles in staggered rows, as wide as the rows are apart; blur widens
+# printed ones from 0.7 to 0.9.
+_WIDE = 0.95
 _MAYBE_CHARUCO = (
     "The light squares are not plain: rather a ChArUco board whose markers are too blurred to "
     "read. Take a sharper picture."
@@ -161,6 +164,8 @@ def _identity(image: Image) -> Identity | None:
         # Circles in staggered rows pass for a checkerboard, and the dark squares of a blurred board
         # for circles; what lies in the light squares tells that there are squares.
         circles = [] if any(it.is_filled for it in squares) else _circles(image)
+        if squares and any(it.asymmetric and it.diameter_share > _WIDE for it in circles):
+            circles = []
         found = circles or [*squares, *singles]
     if not found:
         return None
