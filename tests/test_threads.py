@@ -10,12 +10,13 @@ import cv2
 import pytest
 from support.kept import assert_same_evidence
 from support.marks import slow
-from threadpoolctl import threadpool_info
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from visioncal.calibration.pipeline import calibrate, run
 from visioncal.calibration.stages import detect
 from visioncal.core.errors import DataError
 from visioncal.core.threads import SharedSetting
+from visioncal.dynamics import run as dynamics
 from visioncal.interchange.outputs import write_outputs
 from visioncal.present.recording import read_evidence
 from visioncal.results import to_document
@@ -99,3 +100,21 @@ def test_a_shared_setting_is_made_by_the_first_and_undone_by_the_last():
     assert log == ["made", "undone"]
     with shared.held():
         assert log == ["made", "undone", "made"]
+
+
+def test_dynamics_are_identified_on_one_thread(monkeypatch):
+    # On a busy machine two of them took a hundred seconds for what one does in four.
+    within = []
+
+    def look(*_):
+        within.extend(settings()[1])
+        raise DataError("Enough is seen.")
+
+    monkeypatch.setattr(dynamics, "of_one_arm", look)
+    with threadpool_limits(2, user_api="blas"):
+        before = settings()
+        with pytest.raises(DataError, match="Enough"):
+            dynamics.identify_session(None)
+        assert settings() == before
+    assert within
+    assert {count for _, count in within} == {1}

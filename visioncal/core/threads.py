@@ -6,10 +6,14 @@ for itself would restore what another one had set.
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from functools import cache
+from functools import cache, wraps
 from threading import Lock, RLock
+from typing import ParamSpec, TypeVar
 
 from threadpoolctl import ThreadpoolController
+
+Given = ParamSpec("Given")
+Answer = TypeVar("Answer")
 
 # Matplotlib's settings are the process's, too, but differ: figures are drawn one at a time.
 DRAWING = RLock()
@@ -48,6 +52,17 @@ class SharedSetting:
 def one_blas_thread() -> AbstractContextManager[None]:
     """Keeps small dense solves on one thread: on a busy machine threads make them far slower."""
     return _ONE_BLAS_THREAD.held()
+
+
+def on_one_blas_thread(function: Callable[Given, Answer]) -> Callable[Given, Answer]:
+    """Has a function run within `one_blas_thread`."""
+
+    @wraps(function)
+    def alone(*args: Given.args, **kwargs: Given.kwargs) -> Answer:
+        with one_blas_thread():
+            return function(*args, **kwargs)
+
+    return alone
 
 
 @cache

@@ -15,6 +15,7 @@ from scipy.linalg import qr
 from visioncal.core.choices import GAIN_SIGMA
 from visioncal.core.errors import DegenerateError
 from visioncal.core.number_format import figure
+from visioncal.core.threads import on_one_blas_thread
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.conditioning import Conditioned
@@ -114,6 +115,7 @@ class Payload:
         return document
 
 
+@on_one_blas_thread
 def estimate_payload(
     identified: Identified,
     loaded: Sequence[Conditioned],
@@ -229,6 +231,7 @@ class Gains:
         return np.asarray(self.sigma < _WORST_GAIN * np.abs(self.nm_per_a))
 
 
+@on_one_blas_thread
 def drive_gains(
     base: BaseModel,
     empty: Sequence[Conditioned],

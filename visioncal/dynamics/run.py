@@ -8,6 +8,7 @@ import numpy as np
 
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.files import did_you_mean
+from visioncal.core.threads import on_one_blas_thread
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.conditioning import Conditioned, condition
 from visioncal.dynamics.identified import Identified, Lag
@@ -85,6 +86,7 @@ class Run:
         return self.fitted if self.predicted is None else (*self.fitted, self.predicted)
 
 
+@on_one_blas_thread
 def identify_session(session: Session, request: Request | None = None) -> Run:
     """Identifies the dynamics of a session's arm.
 
@@ -145,6 +147,7 @@ def validate_session(
     return [predict(identified, it) for it in conditioned_streams(session, identified, request)]
 
 
+@on_one_blas_thread
 def conditioned_streams(
     session: Session, identified: Identified, request: Request
 ) -> list[Conditioned]:
@@ -165,6 +168,7 @@ def conditioned_streams(
     return [replace(it, notes=(*it.notes, f"{it.label}: {lag.words}")) for it in streams]
 
 
+@on_one_blas_thread
 def current_streams(
     session: Session, robot: Robot, cutoff_hz: float | None = None
 ) -> list[Conditioned]:
