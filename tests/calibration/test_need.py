@@ -89,7 +89,7 @@ def test_picks_err_as_the_chain_does(mount: str) -> None:
     # Of the lens, which is given and refined within what it is stated to, little is left.
     assert total == pytest.approx(1e3 * np.sqrt(np.mean(np.sum(away**2, axis=1))), rel=0.05)
     looks = {"look"} if mount == "eye-in-hand" else set()
-    assert set(parts) == {"calibration", "pick", "total"} | looks
+    assert set(parts) == {"board", "calibration", "pick", "total"} | looks
 
 
 def without_arm_errors(known: RunState) -> RunState:
@@ -135,6 +135,10 @@ def test_a_board_of_another_size_misplaces_things_for_a_calibrated_arm(mount: st
     away_mm = 1e3 * np.sqrt(np.mean(np.sum((went - seen)[:, :3] ** 2, axis=1)))
     # 1.5 sigma of that size make nearly all of it, and what is held counts by its pull as well.
     assert 0.7 < away_mm / picks.budget_mm["total"] < 2.0
+    # More views would not help, and are not the advice.
+    cause = judge(replace(known.findings, need=Need(0.3))).causes[0]
+    assert cause.kind == "unmeasured_board"
+    assert "square_sigma_m" in cause.do.words
 
 
 @pytest.mark.parametrize(("views", "is_found"), [(slice(1), False), (slice(1, None), True)])

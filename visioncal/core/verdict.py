@@ -39,7 +39,7 @@ _HEADLINES = {
     "bad": "Bad: do not use",
 }
 # Kinds of findings about the sources of errors: how likely they are is their share, in their words.
-SOURCES = ("calibration", "robot_noise", "robot_noise_of_pick")
+SOURCES = ("calibration", "unmeasured_board", "robot_noise", "robot_noise_of_pick")
 # Commands of steps.
 CALIBRATE, PLAN = "visioncal calibrate SESSION -o OUT", "visioncal plan SESSION --add 5"
 GUESS = "visioncal convert SESSION FIXED --guess --yes"

@@ -395,6 +395,11 @@ _SOURCES: Mapping[str, tuple[str, str, Step | None]] = {
         "the calibration itself",
         None,
     ),
+    "board": (
+        "unmeasured_board",
+        "the board, whose size is not known better",
+        Step("Measure it over many squares, and state square_m and square_sigma_m in its .toml."),
+    ),
     "look": (
         "robot_noise",
         "the robot's own noise where it looks, which more views do not change",

@@ -4,8 +4,8 @@ A pick: the camera sees a thing as the views saw their target, and the robot goe
 Where the robot arrives differs from the thing by
 
     calibration   the chain from the robot's base to the camera and the lens: the errors of all
-                  unknowns together, through the same slopes that the fit has. The uncertainty of
-                  the board counts by what it did to these; the thing is another
+                  unknowns together, through the same slopes that the fit has
+    board         by what the uncertainty of its size and shape did to these; the thing is another
     look          the robot's noise at the look, where it carries the camera
     arm           errors that follow the arm's posture and were not calibrated
     pick          the noise of the flange when it goes there; a tool's length adds to it
@@ -224,7 +224,9 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
             noise = replace(noise, robots=levels)
     elif errors is not None:
         parts["arm"] = _of_arm(problem, robot, errors)
-    parts["calibration"] = linear.covariance(covariance)
+    of_boards = _by_boards(covariance, fitted.of_boards)
+    parts["calibration"] = linear.covariance(covariance - of_boards)
+    parts["board"] = linear.covariance(of_boards)
     if problem.is_combined:
         # Noise of both as one counts as the robot's, where it carries the camera.
         alone = turned @ _axes(white) @ np.swapaxes(turned, 1, 2)
@@ -324,6 +326,12 @@ def _of_things(fitted: Fitted) -> Problem:
             seen[:, :3, of_boards], seen[:, 3:, of_boards] = 0.0, -moved
         effects.append(replace(it, by_sensor=seen))
     return replace(problem, effects=tuple(effects))
+
+
+def _by_boards(covariance: FloatArray, columns: IntArray) -> FloatArray:
+    """(p, p) what would not be of a covariance, were the boards' shapes known."""
+    among = covariance[:, columns]
+    return np.asarray(among @ np.linalg.pinv(among[columns], hermitian=True) @ among.T)
 
 
 def _carried(poses: FloatArray, points: FloatArray) -> FloatArray:
