@@ -208,6 +208,18 @@ def test_a_lens_that_is_not_as_stated_is_named(session):
     assert sum("given intrinsics" in it for it in verdict.reasons) == 1
 
 
+@pytest.mark.slow
+def test_a_lens_of_half_the_resolution_is_named_where_corners_hardly_deviate_by_it(session):
+    """Small boards before a long lens look nearly as well by another: the rest would not agree."""
+    document = deepcopy(dict(session.document))
+    matrix = document["cameras"]["right"]["matrix"]
+    document["cameras"]["right"]["matrix"] = [0.5 * it for it in matrix]
+    found = align(rewritten(session, lambda *_: None, document))
+    assert found.verdict.causes[0].kind == "other_lens"
+    assert found.verdict.causes[0].words.startswith("cam_right: the stated matrix is for images")
+    assert all(it.used for it in found.sights)
+
+
 def test_few_stops_are_told_by_robot(session):
     verdict = align(part(session, 0, 8)).verdict
     assert verdict.status == "check"

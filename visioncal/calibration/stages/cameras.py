@@ -12,14 +12,14 @@ from visioncal.calibration.stages.cause_ranking import COUNTED_BACKWARDS
 from visioncal.calibration.stages.dense import fit_densely
 from visioncal.calibration.stages.detect import Detections, DetectOptions, detect
 from visioncal.calibration.stages.image_size import other_images
-from visioncal.calibration.stages.intrinsics import estimate_intrinsics
+from visioncal.calibration.stages.intrinsics import Intrinsics, estimate_intrinsics
 from visioncal.calibration.stages.observed import CameraLook, Observed, nothing_seen
 from visioncal.calibration.stages.pnp import Poses, estimate_poses, given_poses, measure_poses
 from visioncal.calibration.stages.rig_points import leave_out_wrong_points
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
-from visioncal.core.types import Corners
+from visioncal.core.types import Camera, Corners
 from visioncal.core.verdict import LEAST_NEED_MM, OTHER_SIZE, Finding, Step
 from visioncal.results import CameraResult
 from visioncal.session import Session, View, frame_name
@@ -32,6 +32,11 @@ T = TypeVar("T", bound=Observed)
 # Corners are found to a few tenths of a pixel, and a lens that once was this camera's still fits to
 # a pixel or two: beyond these, where another fits this much better, it never was.
 _WRONG_LENS_PX, _MUCH_BETTER = 2.0, 0.1
+# Small boards before a long lens look nearly as well by another: from so many pixels on, one is
+# looked for whose focal lengths are off by more than any focusing [share], by more sigmas than a
+# bent board makes, and that leaves the corners much less.
+_DOUBTFUL_PX, _CLEARLY_BETTER = 0.5, 0.5
+_OTHER_FOCAL, _OTHER_SIGMAS = 0.1, 20.0
 
 
 def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
@@ -122,12 +127,12 @@ def locate_targets(seen: T) -> T:
             found = estimate_poses(
                 fitted, targets, lens.camera, 0 if lens.covariance is None else len(lens.covariance)
             )
-        if found.sigma_px > _WRONG_LENS_PX:
+        if found.sigma_px > _DOUBTFUL_PX:
             other = None if lens.estimated else _other_lens(seen, frame, fitted, found.sigma_px)
             if other is not None:
                 lens, found, said = other
                 seen = seen.noting((), (said,))
-            else:
+            elif found.sigma_px > _WRONG_LENS_PX:
                 _refuse_mirrored(seen, frame, fitted, found.sigma_px)
         rest = {view: it for view, it in corners.items() if view in seen.held_back}
         held = measure_poses(rest, targets, lens.camera, found.sigma_px)
@@ -162,7 +167,8 @@ def _other_lens(
     except VisioncalError:
         # The images do not determine one, or the board is not the stated one.
         return None
-    if lens.sigma_px > _MUCH_BETTER * stated_px:
+    stated = seen.lenses[frame].camera
+    if not _is_another(lens, stated, stated_px):
         return None
     poses = estimate_poses(corners, targets, lens.camera, len(lens.covariance))
     words = (
@@ -175,13 +181,23 @@ def _other_lens(
         "In session.toml, delete matrix and distortion, or give those of this camera: matrix is "
         "fx, fy, cx, cy in pixels."
     )
-    resized, do = other_images(seen.lenses[frame].camera, lens.camera.matrix)
+    resized, do = other_images(stated, lens.camera.matrix)
     if resized:
         words, step = f"{resized} The lens was estimated of these images.", Step(do)
     found = Finding("other_lens", words, step)
     result = CameraResult(lens.camera, estimated=True, covariance=lens.covariance)
     several = len(seen.session.cameras) > 1
     return result, poses, found.of(frame if several else "")
+
+
+def _is_another(lens: Intrinsics, stated: Camera, stated_px: float) -> bool:
+    """Whether the lens that the images determine is none that the stated one may have become."""
+    if stated_px > _WRONG_LENS_PX and lens.sigma_px <= _MUCH_BETTER * stated_px:
+        return True
+    off = np.abs(lens.camera.matrix[:2] - stated.matrix[:2])
+    sigma = np.sqrt(np.diag(lens.covariance)[:2])
+    is_far = np.all((off > _OTHER_FOCAL * stated.matrix[:2]) & (off > _OTHER_SIGMAS * sigma))
+    return bool(is_far) and lens.sigma_px <= _CLEARLY_BETTER * stated_px
 
 
 def _refuse_mirrored(

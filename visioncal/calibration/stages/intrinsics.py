@@ -1,7 +1,7 @@
 """The camera's intrinsics, where the session gives none."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import cv2
@@ -104,15 +104,15 @@ def estimate_intrinsics(
         if model == "brown" and options.coefficients == 8:
             # From the polynomial: from nowhere, a pole and a zero may cancel inside the image.
             fit = _fit(stack, _padded(fit.camera), fit.cam_from_target)
-        reasons: dict[int, str] = {}
-        for _ in range(_ROUNDS):
-            passed = gate(stack, fit.residuals)
-            if passed.is_open:
-                break
-            reasons |= passed.reasons
-            kept = stack.keep(passed.mask)
-            poses = fit.cam_from_target[np.isin(stack.views, kept.views)]
-            stack, fit = kept, _fit(kept, fit.camera, poses)
+        every = stack
+        stack, fit, reasons = _gated(every, fit)
+        if reasons:
+            # A pose that began under a wrong focal length may tilt the other way, and stays there:
+            # the views that are tilted most, and say most of the lens, pass for outliers.
+            plain = replace(fit.camera, distortion=np.zeros_like(fit.camera.distortion))
+            again = _gated(every, _fit(every, plain, planar_poses(every, plain).first))
+            if len(again[2]) < len(reasons):
+                stack, fit, reasons = again
         if model == "brown" and options.coefficients == "auto":
             fit = _with_rational_terms(stack, fit)
     _check(fit)
@@ -123,6 +123,20 @@ def estimate_intrinsics(
         tuple(Rejection(*item) for item in reasons.items()),
         tuple(_warnings(stack, fit)),
     )
+
+
+def _gated(stack: CornerStack, fit: BundleFit) -> tuple[CornerStack, BundleFit, dict[int, str]]:
+    """Fits without corners and views whose residuals are no noise; reasons by view."""
+    reasons: dict[int, str] = {}
+    for _ in range(_ROUNDS):
+        passed = gate(stack, fit.residuals)
+        if passed.is_open:
+            break
+        reasons |= passed.reasons
+        kept = stack.keep(passed.mask)
+        poses = fit.cam_from_target[np.isin(stack.views, kept.views)]
+        stack, fit = kept, _fit(kept, fit.camera, poses)
+    return stack, fit, reasons
 
 
 def _fit(stack: CornerStack, camera: Camera, poses: FloatArray) -> BundleFit:
