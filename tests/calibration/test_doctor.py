@@ -37,7 +37,7 @@ NAMED = {
     "another dictionary": "other_board",
     "mirrored images": "mirrored_images",
     "blurred images": "blurred_images",
-    "the lens of larger images": "lens",
+    "the lens of larger images": "other_lens",
     "no turns": "motion",
 }
 # Files that cannot be read as they stand are refused, with what to type.
@@ -198,7 +198,7 @@ def test_a_matrix_of_larger_images_is_named_by_the_ratio(tmp_path):
     first, *_ = visioncal.doctor(folder).findings
     cause = visioncal.calibrate(folder).verdict.causes[0]
     for found in (first, cause):
-        assert found.kind == "lens"
+        assert found.kind == "other_lens"
         assert "is for images of 1280 x 800 px, and these are 960 x 600 px" in found.words
         # Three quarters of 914.2, 913.6; of 645.3 + 0.5 and 396.8 + 0.5, less 0.5.
         assert "matrix = [685.65, 685.20, 483.85, 297.48]" in found.do.words
