@@ -260,6 +260,24 @@ def test_a_board_that_slips_and_a_camera_that_is_bumped_are_two_frames_each():
     assert np.linalg.norm(was[:3, 3]) < 4e-4
 
 
+@pytest.mark.parametrize("twist", [(0.005, 0, 0, 0.002, 0.002, 0), (0, 0, 0, 0.003, 0, 0)])
+def test_a_robot_that_is_pushed_is_no_board_and_no_camera_of_it_that_slipped(twist):
+    """Where it turns little, what it carries asks for much the same: for less of the views."""
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        cell = world(rng, 20, 0.9)
+        parents = {**cell.parents, "cam_right": "flange_b"}
+        truth = {**cell.truth, "cam_right": pose((178, 3, 0), (0.05, 0.0, 0.1))}
+        pairs = [it for it in cell.pairs if it[:2] != ("cam_right", "target_b")]
+        carrying = replace(cell, parents=parents, truth=truth, pairs=pairs)
+        for one, carried in ((cell, {"target_b"}), (carrying, {"target_b", "cam_right"})):
+            problem = observed(one, rng, pushed(one, "base_b", 10, twist))
+            found = settle(agree(problem, started(problem), MOVABLE), MOVABLE)
+            assert not found.moves
+            out = [bool(carried & {*it[:2]}) and it[2] >= 10 for it in one.pairs]
+            assert (~found.used).tolist() == out
+
+
 def test_a_slip_that_hides_in_the_noise_of_single_views_is_found():
     rng = np.random.default_rng(10)
     cell = world(rng, 40, 1.0)

@@ -207,7 +207,8 @@ def gross_move(
     """The move that explains most of what is not explained yet; None where none explains enough.
 
     Two things that moved at once look like one from where both are seen: of moves that explain
-    about as much, the one counts that leaves most to the next.
+    about as much, the one counts that leaves most to the next. A robot that was pushed is none:
+    what looks like it stays unexplained.
 
     Args:
         problem: All n observations.
@@ -216,7 +217,7 @@ def gross_move(
         movable: Frames that may have moved.
     """
     steps = _steps(problem, fit, agrees, movable)
-    if not steps:
+    if not steps or _pushed_gain(problem, fit, agrees) > steps[0].gain:
         return None
     rivals = [it for it in steps if it.gain >= _RIVAL_GAIN * steps[0].gain][:_MOST_TRIED]
     moves = [_move(problem, it) for it in rivals]
@@ -253,6 +254,18 @@ def _steps(problem: Problem, fit: Solution, agrees: Mask, movable: Sequence[str]
         if np.sum(~agrees[rows]) >= _FEWEST:
             found += _best_steps(problem, fit, agrees, frame, rows)
     return sorted(found, key=lambda it: -it.gain)
+
+
+def _pushed_gain(problem: Problem, fit: Solution, agrees: Mask) -> int:
+    """How many more observations the step of a robot's base explains that explains most."""
+    gains = [0]
+    for base in {branch.parent for branch in problem.tree.branches.values() if branch.robot}:
+        if base not in problem.unknown:
+            continue
+        rows = np.flatnonzero(np.isfinite(problem.change_of(base, fit.state)[:, 0, 0]))
+        if np.sum(~agrees[rows]) >= _FEWEST:
+            gains += [it.gain for it in _best_steps(problem, fit, agrees, base, rows)]
+    return max(gains)
 
 
 def _followed(
