@@ -208,6 +208,23 @@ def test_a_lens_that_is_not_as_stated_is_named(session):
     assert sum("given intrinsics" in it for it in verdict.reasons) == 1
 
 
+def test_two_targets_that_are_exchanged_are_named_by_their_points(session):
+    """A checkerboard of 54 points under the name of a ChArUco board of 40, and the reverse."""
+    targets = dict(session.target_document)
+    targets["floor"], targets["plate_b"] = targets["plate_b"], targets["floor"]
+    with pytest.raises(DataError, match="Targets floor and plate_b are exchanged") as refused:
+        Session.assemble(
+            session.document,
+            session.columns,
+            [[view.cell(it) for it in session.columns] for view in session.views],
+            session.images,
+            target_document=targets,
+            corners=session.corner_table,
+        )
+    assert "points 0 to 53 of plate_b, which has 0 to 39; floor has" in str(refused.value)
+    assert "in column target of views.csv" in refused.value.next_step
+
+
 @pytest.mark.slow
 def test_a_lens_of_half_the_resolution_is_named_where_corners_hardly_deviate_by_it(session):
     """Small boards before a long lens look nearly as well by another: the rest would not agree."""

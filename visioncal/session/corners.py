@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -307,20 +308,30 @@ def _target_problems(
             yield Problem(f"{place}, column {COLUMN}", words)
 
 
-def check_points(table: CornerTable, boards: Sequence[Target]) -> None:
+# A number that is mistyped is one, and those of another target are many.
+_FEWEST_EXCHANGED = 4
+
+
+def check_points(table: CornerTable, names: Sequence[str], targets: Mapping[str, Target]) -> None:
     """Checks that the points are the targets', and each there once a view.
 
     Args:
         table: The corners.
-        boards: (n,) the target that each is of.
+        names: (n,) the target that each is of, by the session's name.
+        targets: The session's targets by name.
 
     Raises:
         DataError: They are not; it names them.
     """
+    boards, file = [targets[it] for it in names], FILE if table.is_file else "corners"
     numbers = {it: frozenset(point_numbers(it)) for it in dict.fromkeys(boards)}
     for target, known in numbers.items():
         mine = {it for it, of in zip(table.points.tolist(), boards, strict=True) if of is target}
-        _check_first_number(mine, known, target, FILE if table.is_file else "corners")
+        _check_first_number(mine, known, target, file)
+    by_name: dict[str, set[int]] = {}
+    for name, point in zip(names, table.points.tolist(), strict=True):
+        by_name.setdefault(name, set()).add(point)
+    _check_exchanged(by_name, {it: numbers[targets[it]] for it in by_name}, file)
     problems: list[Problem] = []
     seen: dict[tuple[int, int], int] = {}
     for at, key in enumerate(zip(table.views.tolist(), table.points.tolist(), strict=True)):
@@ -350,6 +361,26 @@ def _check_first_number(seen: Set[int], known: Set[int], target: Target, file: s
                 next_step=f"In {file}, write point {sign} 1 in the place of point"
                 f"{rig * (target.kind == 'points')}.",
             )
+
+
+def _check_exchanged(
+    seen: Mapping[str, Set[int]], known: Mapping[str, Set[int]], file: str
+) -> None:
+    """Refuses two targets of which each has the points that the corners of the other have."""
+    for one, other in combinations(seen, 2):
+        wrong, right = (other, one) if seen[one] <= known[one] else (one, other)
+        if len(seen[wrong] - known[wrong]) < _FEWEST_EXCHANGED:
+            continue
+        if not (seen[one] <= known[other] and seen[other] <= known[one]):
+            continue
+        raise DataError(
+            f"Targets {one} and {other} are exchanged: {file} has points {min(seen[wrong])} to "
+            f"{max(seen[wrong])} of {wrong}, which has {min(known[wrong])} to "
+            f"{max(known[wrong])}; {right} has them all.",
+            culprits=[f"target {one}", f"target {other}"],
+            next_step=f"Exchange {one} and {other}: in [targets] of session.toml what each is, or "
+            "in column target of views.csv which one each row shows.",
+        )
 
 
 def _range(target: Target) -> str:

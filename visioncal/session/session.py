@@ -561,6 +561,6 @@ def _build(
     )
     if corners is not None:
         seen = (view for view in views if view.has_corners)
-        shown = {view.number: session.boards[session.board_of(view)] for view in seen}
-        check_points(corners, [shown[it] for it in corners.views.tolist()])
+        shown = {view.number: session.board_of(view) for view in seen}
+        check_points(corners, [shown[it] for it in corners.views.tolist()], session.boards)
     return session
