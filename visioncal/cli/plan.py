@@ -94,7 +94,12 @@ def _begin(
 
 
 def _report(plan: "Plan") -> None:
-    from visioncal.live.planning.messages import accuracy_words, looks_note, summary_of
+    from visioncal.live.planning.messages import (
+        accuracy_words,
+        looks_note,
+        need_words,
+        summary_of,
+    )
 
     console = answers()
     console.print(escape(f"{plan.request.purpose.name}: {summary_of(plan)}"))
@@ -115,6 +120,8 @@ def _report(plan: "Plan") -> None:
     if plan.design.met:
         after = accuracy_words(plan.design.predicted)
         console.print(escape(f"that meets the wish, with {len(plan.stops)} stops: {after}"))
+    if plan.need is not None and plan.need.met:
+        console.print(f"that meets the need, with {len(plan.stops)} stops: {need_words(plan.need)}")
     if plan.request.start_q is None:
         console.print(
             "the way from where the arm stands to the first stop was not looked at; --start-joints "

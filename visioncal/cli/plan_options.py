@@ -21,6 +21,8 @@ _what = partial(typer.Option, rich_help_panel="What is planned")
 _cell = partial(typer.Option, rich_help_panel="The cell, where the source does not say it")
 _limits = partial(typer.Option, rich_help_panel="What the arm must keep")
 _doubt = partial(typer.Option, rich_help_panel="How well it is known")
+# Of a plan until a need is met.
+_MOST_FOR_NEED = 40
 _USUAL_STOPS = ", ".join(f"{it.stops} for {it.name}" for it in PURPOSES.values())
 
 
@@ -50,6 +52,14 @@ class PlanOptions:
         float | None, _what(help="Fewer stops where they predict this sigma, in mm.")
     ] = None
     wish_deg: Annotated[float | None, _what(help="The same of the rotation, in degrees.")] = None
+    need_mm: Annotated[
+        float | None,
+        _what(
+            help="Fewer stops where they predict that 95 % of picks land within so many mm; up to "
+            f"{_MOST_FOR_NEED} stops where no number is given."
+        ),
+    ] = None
+    need_deg: Annotated[float | None, _what(help="The same of the rotation, in degrees.")] = None
     workspace: Annotated[
         str | None,
         _what(
@@ -79,6 +89,7 @@ class PlanOptions:
         """
         import numpy as np
 
+        from visioncal.core.types import Need
         from visioncal.live.planning.accuracy import Wish
         from visioncal.live.planning.plan import Request
 
@@ -86,15 +97,17 @@ class PlanOptions:
         form = ",".join(f"q{it + 1}" for it in range(cell.robot.joint_count))
         start = self.start_joints and numbers_in(self.start_joints, "--start-joints", form)
         unwished = self.wish_mm is None and self.wish_deg is None
+        needless = self.need_mm is None and self.need_deg is None
         return Request(
             wanted,
-            self.add or self.stops or wanted.stops,
+            self.add or self.stops or (wanted.stops if needless else _MOST_FOR_NEED),
             self.criterion,
             None if unwished else Wish(self.wish_mm, self.wish_deg),
             self.candidates,
             box_of(self.workspace, "--workspace", "workspace") if self.workspace else None,
             np.array(start) if start else None,
             self.seed,
+            None if needless else Need(self.need_mm, self.need_deg),
         )
 
 

@@ -9,14 +9,22 @@ from visioncal.core.arguments import typed
 from visioncal.core.choices import Criterion
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
-from visioncal.core.number_format import figure
-from visioncal.core.types import FloatArray, IntArray, Progress
+from visioncal.core.limits import CalibrationLimits
+from visioncal.core.number_format import figure, percent
+from visioncal.core.types import FloatArray, IntArray, Need, Progress
 from visioncal.live.planning.accuracy import Accuracy, Wish
 from visioncal.live.planning.candidates import Candidates, candidates
 from visioncal.live.planning.cell import Box, PlanCell
 from visioncal.live.planning.design import Design, chosen, shortfall
 from visioncal.live.planning.improving import helps
 from visioncal.live.planning.information import WORLDS, World, place_sigmas, worlds_of
+from visioncal.live.planning.needed import (
+    NeedPlanned,
+    Picking,
+    check_need,
+    need_planned,
+    words_of,
+)
 from visioncal.live.planning.path import Route, ordered
 from visioncal.live.planning.purposes import Purpose
 from visioncal.live.planning.recorded import Begun
@@ -34,6 +42,7 @@ class Request:
         count: The most stops.
         criterion: What makes stops good.
         wish: The accuracy at which fewer are enough; None for none.
+        need: How near picks have to come, at which fewer are enough; None for none.
         candidates: From how many possible stops they are chosen.
         workspace: Where the arm's place counts; None for all of its reach.
         start_q: (n,) joint angles where the arm stands now [rad]; None where that is not known, and
@@ -49,6 +58,7 @@ class Request:
     workspace: Box | None = None
     start_q: FloatArray | None = None
     seed: int = 0
+    need: Need | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +106,9 @@ class Plan:
         lost: What kept how many tries from being possible.
         in_the_way: What kept stops from being driven to, one for each that was exchanged for
             another.
-        shortfall: Why the wished accuracy is not met, in words; empty where it is or none was
-            wished.
+        shortfall: Why the wished accuracy, or the need, is not met, in words; empty where it is or
+            none was wished.
+        need: What is predicted of picks; None where nothing is needed.
         map_m: (w, 3) places all over the workspace, in the base [m]; empty where the purpose does
             not judge it.
         map_sigma_m: (w,) predicted standard deviations there [m].
@@ -115,6 +126,7 @@ class Plan:
     shortfall: str
     map_m: FloatArray
     map_sigma_m: FloatArray
+    need: NeedPlanned | None = None
 
     @property
     def q(self) -> FloatArray:
@@ -142,19 +154,22 @@ def make_plan(
         DataError: The cell allows too few stops, or none has a safe way to another.
     """
     progress = progress or _silent
+    if request.need is not None:
+        check_need(request.need, request.purpose.judged)
     # Where a recorded cell allows few stops, as before a fixed camera, these are the ones to add.
     least = None if begun is None else min(request.count, request.candidates)
     found = candidates(cell, request.candidates, request.seed, progress, least=least)
     progress("information", 0, 1)
+    cells = (cell, *cell.guesses(WORLDS - 1, request.seed))
     worlds = worlds_of(
-        (cell, *cell.guesses(WORLDS - 1, request.seed)),
+        cells,
         request.purpose,
         found.q,
         recorded=None if begun is None else begun.recorded,
         workspace=request.workspace,
     )
     progress("choice", 0, 1)
-    chosen_stops = _with_a_way(cell, request, found.q, worlds, progress)
+    chosen_stops = _with_a_way(cells, request, found.q, worlds, begun, progress)
     world, route = worlds[0], chosen_stops.route
     design = chosen_stops.design
     first = 1 if begun is None else 1 + max(begun.views)
@@ -165,7 +180,12 @@ def make_plan(
     if request.purpose.judged == "workspace" and not design.predicted.is_open:
         covariance = world.covariance(design.rows)
         map_m, map_sigma_m = place_sigmas(cell, request.purpose, covariance, request.workspace)
-    wish = request.wish
+    wish, needed = request.wish, None
+    if request.need is not None:
+        picking = Picking(cells, worlds, found.q, request.need)
+        needed = need_planned(picking, design.rows, request.count)
+    missing = [] if wish is None else [shortfall(design, wish, request.count)]
+    missing += [] if needed is None else [needed.limits]
     return Plan(
         cell,
         request,
@@ -176,9 +196,10 @@ def make_plan(
         len(found),
         found.lost,
         chosen_stops.in_the_way,
-        "" if wish is None else shortfall(design, wish, request.count),
+        " ".join(it for it in missing if it),
         map_m,
         map_sigma_m,
+        needed,
     )
 
 
@@ -192,23 +213,22 @@ class _Chosen:
 
 
 def _with_a_way(
-    cell: PlanCell,
+    cells: tuple[PlanCell, ...],
     request: Request,
     q: FloatArray,
     worlds: tuple[World, ...],
+    begun: Begun | None,
     progress: Progress,
 ) -> _Chosen:
     """Chooses stops that can be driven to one after the other."""
     left = np.arange(len(q))
     given_up: list[str] = []
     for turn in range(_ROUNDS):
-        few = tuple(replace(it, factors=it.factors[left]) for it in worlds)
-        design = chosen(few, request.count, criterion=request.criterion, wish=request.wish)
-        if not len(design.rows):
-            raise _needless(design)
+        few = tuple(replace(it, factors=it.factors[left], misfit=it.misfit[left]) for it in worlds)
+        design = _enough(cells, request, q[left], few, begun)
         design = replace(design, rows=left[design.rows])
         progress("path", turn, _ROUNDS)
-        route = ordered(cell, request.start_q, q[design.rows], request.seed)
+        route = ordered(cells[0], request.start_q, q[design.rows], request.seed)
         if not route.unreachable:
             return _Chosen(design, route, tuple(given_up))
         given_up += route.unreachable.values()
@@ -219,6 +239,43 @@ def _with_a_way(
         culprits=tuple(dict.fromkeys(given_up)),
         next_step="Make room around the arm, lower the clearance, or ask for fewer stops.",
     )
+
+
+def _enough(
+    cells: tuple[PlanCell, ...],
+    request: Request,
+    q: FloatArray,
+    worlds: tuple[World, ...],
+    begun: Begun | None,
+) -> Design:
+    """Chooses the fewest stops that meet what is wished and needed, or as many as are allowed."""
+
+    def of(count: int) -> Design:
+        return chosen(worlds, count, criterion=request.criterion, wish=request.wish)
+
+    design = of(request.count)
+    if not len(design.rows):
+        raise _needless(design)
+    if request.need is None:
+        return design
+    picking = Picking(cells, worlds, q, request.need)
+    fewest, share = picking.fewest(design.rows), picking.share_of(design.rows)
+    recorded = 0 if begun is None else len(begun.views)
+    if fewest == 0 and recorded >= CalibrationLimits.stops[0]:
+        before = percent(picking.chance(design.rows[:0]))
+        raise DataError(
+            f"plan: by what was recorded, {before} of picks land within {words_of(request.need)}; "
+            "no stop needs to be added.",
+            next_step="Need less than that, or leave the need out to see what stops would give.",
+        )
+    # Few stops tell what they determine, and not whether one of them is wrong.
+    fewest = max(fewest, CalibrationLimits.stops[0] - recorded)
+    # The first of many stops are not the best of few, which may be enough where one less is not.
+    for count in range(max(fewest - 1, 1), len(design.rows)):
+        smaller = of(count)
+        if count >= CalibrationLimits.stops[0] - recorded and picking.chance(smaller.rows) >= share:
+            return smaller
+    return design
 
 
 def _needless(design: Design) -> DataError:

@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.core.choices import PLAN_ACCELERATION, PLAN_SPEED
 from visioncal.core.files import one_line, sha256
-from visioncal.core.types import FloatArray
+from visioncal.core.types import FloatArray, Need
 from visioncal.core.version import __version__
 from visioncal.estimation.chain import edge_names
-from visioncal.live.planning.accuracy import Accuracy
+from visioncal.live.planning.accuracy import Accuracy, Wish
 from visioncal.live.planning.cell import Box, PlanCell
 from visioncal.live.planning.plan import Plan, PlannedStop, Request
 from visioncal.robot import has_ur_axes
@@ -83,6 +83,13 @@ def plan_document(plan: Plan, source: Mapping[str, str]) -> dict[str, Any]:
         document["refusal_before"] = plan.begun.refusal
     if design.met is not None:
         document["wish_met"] = design.met
+    if plan.need is not None:
+        document["need"] = {
+            **_given(plan.need.need),
+            "probability": plan.need.probability,
+            **({} if plan.begun is None else {"probability_before": plan.need.before}),
+            "probability_of_all_candidates": plan.need.best,
+        }
     if plan.shortfall:
         document["shortfall"] = plan.shortfall
     document |= {
@@ -220,6 +227,10 @@ def _box_document(box: Box) -> dict[str, Any]:
     }
 
 
+def _given(asked: Wish | Need) -> dict[str, float]:
+    return {it: getattr(asked, it) for it in ("mm", "deg") if getattr(asked, it) is not None}
+
+
 def _request_document(request: Request) -> dict[str, Any]:
     wish = request.wish
     document: dict[str, Any] = {
@@ -230,7 +241,9 @@ def _request_document(request: Request) -> dict[str, Any]:
         "seed": request.seed,
     }
     if wish is not None:
-        document["wish"] = {it: value for it, value in vars(wish).items() if value is not None}
+        document["wish"] = _given(wish)
+    if request.need is not None:
+        document["need"] = _given(request.need)
     if request.workspace is not None:
         document["workspace"] = _box_document(request.workspace)
     if request.start_q is not None:
