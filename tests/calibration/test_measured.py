@@ -20,6 +20,7 @@ from visioncal.results import Calibration
 from visioncal.robot import Robot
 from visioncal.session import MemoryImages, Session
 from visioncal.simulation import Cell, CellOptions, Second, simulate
+from visioncal.simulation.records import pairs_session
 
 SIGMA_M = 5e-4
 X = exp(np.array([0.02, -0.03, 0.4, 0.06, -0.02, 0.081]))
@@ -264,3 +265,27 @@ def test_a_plan_counts_what_was_measured():
     covariance = world.covariance(np.arange(0))
     # Without a further stop: the three lengths are known to what they were measured to, or better.
     assert np.sqrt(np.diag(covariance)[3:6]).max() < 1.05 * SIGMA_M
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize("scale", [1.0, 1.01, 0.995])
+def test_measured_distances_of_another_scale_are_named(mount, scale):
+    cell = simulate(CellOptions(mount=mount, views=16, board_scale=scale, seed=2))
+    verdict = calibrate(pairs_session(cell, "measured")).verdict
+    named = [it for it in verdict.findings if it.kind == "board_size"]
+    if scale == 1.0:
+        assert verdict.status == "good"
+        assert not named
+        return
+    assert verdict.status != "good"
+    assert verdict.ranked[0] is named[0]
+    # A scale's sigma is a hundredth of a percent there; the factor has five digits.
+    factor = float(named[0].do.words.split()[-1].rstrip("."))
+    assert factor == pytest.approx(scale, abs=4e-4)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_an_arm_that_is_off_is_no_board_of_another_size(seed):
+    arm = CellOptions(views=10, dh_sigma_m=2e-3, seed=seed)
+    verdict = calibrate(pairs_session(simulate(arm), "measured")).verdict
+    assert "board_size" not in {it.kind for it in verdict.findings}

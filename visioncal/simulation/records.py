@@ -189,6 +189,8 @@ def read_truth(path: Path | str) -> Truth:
 def measured_poses(cell: Cell) -> FloatArray:
     """(m, 4, 4) `cam_from_target` as a PnP on the noisy corners of each view would give it.
 
+    It knows the board by its stated size: one that is larger is seen so much nearer.
+
     The error is drawn from the covariance of a least-squares fit of the pose to the corners that
     are seen, `pixel_sigma_px` squared times the inverse of their Gram matrix.
 
@@ -199,12 +201,14 @@ def measured_poses(cell: Cell) -> FloatArray:
     draws = rng.standard_normal((len(cell.corners), 6))
     measured = cell.cam_from_target.copy()
     for view, pose in enumerate(cell.cam_from_target):
-        points = corners_m(cell.sheets[cell.shown.boards[view]])
+        sheet = cell.sheets[cell.shown.boards[view]]
+        points = corners_m(sheet)
         ids = cell.exact_corners[view].ids
         if ids.size < 4:
             raise DataError(f"simulation: view {view} shows {ids.size} corners, a pose needs 4.")
         camera, sigma_px = cell.options.camera, cell.options.pixel_sigma_px
         measured[view] = noisy_pose(camera, pose, points[ids], sigma_px, draws[view])
+        measured[view, :3, 3] /= sheet.scale
     return measured
 
 

@@ -14,12 +14,14 @@ from visioncal.calibration.pipeline.network_ties import robot_motion, untied_wor
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cell import Cell
+from visioncal.calibration.stages.distance_scale import distance_scale
 from visioncal.calibration.stages.judge import Arm, Findings, Pair, Place, Sensor
 from visioncal.calibration.stages.need import Fitted, picks_of
 from visioncal.calibration.stages.priors import prior_words
 from visioncal.core.files import some_of
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure
+from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Mask, Mount, Rejection
 from visioncal.core.verdict import NOTE, Finding, Step
 from visioncal.estimation.arm import stops_of
@@ -118,7 +120,22 @@ def _of_pair(known: RunState) -> _Parts:
     budget = {name.replace("_", " "): mm for name, mm in work.budget_mm.items()}
     place = Place("Where the views look, a point", budget, work.radius95_mm)
     mount = known.session.mount
-    return directions(answer.problem, answer.state, answer.covariance, mount), [place], ()
+    found = _scale_of_measured(known)
+    return directions(answer.problem, answer.state, answer.covariance, mount), [place], found
+
+
+def _scale_of_measured(known: RunState) -> tuple[Finding, ...]:
+    """Whether poses that another program measured have the robot's scale."""
+    views = [it for it in known.base_from_flange if it in known.poses and it not in known.reasons]
+    if known.cameras or known.mount == "instrument" or not views:
+        return ()
+    poses = np.array([known.base_from_flange[it] for it in views])
+    seen = np.array([known.poses[it].cam_from_target[0] for it in views])
+    is_carried = known.mount == "eye-in-hand"
+    # The one camera may have a name.
+    (edge,) = (it for name, it in known.solved.last_edges.items() if name.startswith("cam"))
+    found = distance_scale(poses if is_carried else invert(poses), seen, edge.matrix)
+    return () if found is None else (found,)
 
 
 def _of_cell(known: RunState) -> _Parts:

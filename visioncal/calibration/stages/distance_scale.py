@@ -1,0 +1,57 @@
+"""Whether poses that another program measured have distances of another scale than the robot's."""
+
+import numpy as np
+
+from visioncal.core.number_format import figure
+from visioncal.core.types import FloatArray
+from visioncal.core.verdict import Finding, Step
+
+# Errors of an arm's lengths are smaller, or leave as much unexplained.
+_LEAST, _SURE, _EXPLAINED = 2e-3, 5.0, 0.1
+
+
+def distance_scale(
+    parent_from_flange: FloatArray, cam_from_target: FloatArray, flange_from_seer: FloatArray
+) -> Finding | None:
+    """Says by how much measured distances are too long or too short, where that is clear.
+
+    parent_from_flange * flange_from_seer * cam_from_target is the same for all views; its position
+    is linear in the scale of the measured distances, and in both unknown positions.
+
+    Args:
+        parent_from_flange: (m, 4, 4) the robot's poses; their inverses for a camera that stands
+            still.
+        cam_from_target: (m, 4, 4) as measured.
+        flange_from_seer: (4, 4) the camera's transform, of which the rotation is taken.
+
+    Returns:
+        What to say; None where the scale is one, or leaves more than a tenth of the scatter.
+    """
+    count = len(cam_from_target)
+    if 3 * count < 14:
+        return None
+    turned = parent_from_flange[:, :3, :3]
+    seen = (turned @ flange_from_seer[:3, :3] @ cam_from_target[:, :3, 3:])[..., 0]
+    same = np.broadcast_to(-np.eye(3), (count, 3, 3))
+    a = np.concatenate([turned, same, seen[..., None]], axis=2).reshape(3 * count, 7)
+    b = -parent_from_flange[:, :3, 3].reshape(-1)
+    found, *_ = np.linalg.lstsq(a, b)
+    left = float(np.sum((b - a @ found) ** 2))
+    stated, *_ = np.linalg.lstsq(a[:, :6], b - a[:, 6])
+    left_stated = float(np.sum((b - a[:, 6] - a[:, :6] @ stated) ** 2))
+    share = float(found[6]) - 1.0
+    variance = left / (3 * count - 7) * np.linalg.pinv(a.T @ a)[6, 6]
+    if abs(share) < max(_LEAST, _SURE * variance**0.5) or left > _EXPLAINED * left_stated:
+        return None
+    short, size = ("short", "larger") if share > 0.0 else ("long", "smaller")
+    percent = f"{figure(100 * abs(share))} % (sigma {figure(100 * variance**0.5)} %)"
+    return Finding(
+        "board_size",
+        f"By the robot's motion the distances in the measured poses (cft_) are too {short} by "
+        f"{percent}: the board is {size} by that than the program was told that measured them.",
+        Step(
+            "Measure the board with a caliper, and measure the poses again with its true size; or "
+            f"multiply cft_x_m, cft_y_m and cft_z_m by {1.0 + share:.5g}."
+        ),
+        mahalanobis_sq=share**2 / variance if variance > 0.0 else np.inf,
+    )
