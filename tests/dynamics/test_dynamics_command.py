@@ -47,6 +47,18 @@ def test_a_session_of_streams_alone_survives_the_disk(folder):
     assert again.digest() == session.digest()
 
 
+def test_the_end_of_a_motion_is_judged_by_the_torques_of_all_of_it(tmp_path, monkeypatch):
+    # As the page types it, but for --validate-on: in the last 30 % joint 5 bears the same torque
+    # all the time, and its error is 6 % of that.
+    monkeypatch.chdir(tmp_path)
+    assert run("simulate", "session", "--torques").status == 0
+    done = run("dynamics", "identify", "session", "-o", "out")
+    assert done.out.startswith("good  dynamics of ur10e"), done.out
+    found = Identified.load(tmp_path / "out")
+    assert found.validation.label == "the last 30 % of streams/fresh.csv"
+    assert (found.validation.shares < 0.02).all()
+
+
 def test_identify_and_validate(folder, tmp_path):
     asked = ("--stream", "excite", "--stream", "sweeps")
     done = run("dynamics", "identify", folder, *asked, "-o", tmp_path / "out")

@@ -56,10 +56,11 @@ class Request:
 
 @dataclass(frozen=True, eq=False)
 class _Split:
-    """Streams without the end of the fastest motion, and that."""
+    """Streams without the end of the fastest motion, that, and whose it is."""
 
     rest: tuple[Conditioned, ...]
     unseen: Conditioned
+    fastest: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,16 +116,20 @@ def identify_session(session: Session, request: Request | None = None) -> Run:
     split = _split(robot, recorded, streams, request)
     options = _with_rotors(robot, split, request)
     whole = identify(robot, streams, options)
-    proof = None
+    proof, validation = None, None
     if request.validate_on:
         other = _read(session, robot, request.validate_on, request)
         proof = _predicted(whole, _conditioned(robot, other, request))
+        validation = validate(whole.identified, proof)
     elif split is not None:
         of_rest = identify(robot, split.rest, replace(options, checked=False))
         proof = _predicted(of_rest, split.unseen, "the last 30 % of ")
+        # In a part of a motion a joint may bear the same torque all the time.
+        ranges_nm = whole.identified.streams[split.fastest].torque_nm
+        validation = replace(validate(whole.identified, proof), torque_nm=ranges_nm)
     identified = replace(
         whole.identified,
-        validation=None if proof is None else validate(whole.identified, proof),
+        validation=validation,
         lag=lag,
         facts={
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -288,7 +293,7 @@ def _split(
     rest = list(streams)
     try:
         rest[fastest] = _conditioned(robot, begin, filtered)
-        split = _Split(tuple(rest), _conditioned(robot, end, filtered))
+        split = _Split(tuple(rest), _conditioned(robot, end, filtered), fastest)
         identify(robot, split.rest, _quick(request.options, request.rotors is not False))
     except (DataError, DegenerateError):
         return None
