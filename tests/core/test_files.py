@@ -46,8 +46,13 @@ def test_failed_write_leaves_the_old_content_and_nothing_else(
 def test_missing_file_and_folder_are_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"nowhere\.txt does not exist"):
         read_bytes(tmp_path / "nowhere.txt")
-    with pytest.raises(DataError, match="is a folder, and no file"):
-        read_bytes(tmp_path)
+    (tmp_path / "images" / "view10").mkdir(parents=True)
+    with pytest.raises(DataError, match=r"is a folder, and no file. Check the path"):
+        read_bytes(tmp_path / "images")
+    for name in ("view10.png", "view2.png"):
+        (tmp_path / "images" / name).touch()
+    with pytest.raises(DataError, match=r"Name a file in it, such as .*view2\.png\.$"):
+        read_bytes(tmp_path / "images")
     with pytest.raises(DataError, match="cannot be written"):
         write_atomically(tmp_path / "missing" / "a.txt", "")
 

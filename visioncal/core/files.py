@@ -136,13 +136,12 @@ def read_bytes(path: Path | str, most: int = MOST_BYTES) -> bytes:
     path = Path(path)
     why_not = absence(path)
     if why_not:
-        raise DataError(
-            f"{path} {why_not}.",
-            culprits=[str(path)],
-            next_step="Save what it gives as a file first."
-            if "regular" in why_not
-            else "Check the path and its spelling.",
-        )
+        step = "Check the path and its spelling."
+        if "regular" in why_not:
+            step = "Save what it gives as a file first."
+        elif "folder" in why_not and (inside := [it for it in path.glob("*") if it.is_file()]):
+            step = f"Name a file in it, such as {min(inside, key=natural)}."
+        raise DataError(f"{path} {why_not}.", culprits=[str(path)], next_step=step)
     try:
         with path.open("rb") as file:
             data = file.read(most + 1)
