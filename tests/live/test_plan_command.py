@@ -285,9 +285,12 @@ def test_what_keeps_picks_from_a_need_is_named(tmp_path):
 def test_what_was_recorded_meets_a_need_as_its_calibration_says(mount, tmp_path):
     options = CellOptions(robot="ur5e", views=10, mount=mount, seed=3)
     session = write_session(simulate(options), tmp_path / "s")
-    calibrated = visioncal("calibrate", session, "--need-mm", 0.15, "--json")
+    calibrated = visioncal(
+        "calibrate", session, "-o", tmp_path / "out", "--need-mm", 0.15, "--json"
+    )
     said = json.loads(calibrated.out)["need"]["probability"]
-    done = visioncal("plan", session, "--add", 2, "--need-mm", 0.15, "--candidates", 60, "--json")
+    more = ("--add", 2, "--need-mm", 0.15, "--candidates", 60)
+    done = visioncal("plan", session, *more, "-o", tmp_path / "plan", "--json")
     if done.status == 0:
         before = json.loads(done.out)["need"]["probability_before"]
     else:
