@@ -28,7 +28,7 @@ from visioncal.calibration.verification.messages import _signed_axis
 from visioncal.calibration.verification.prediction import known_before, predict_stops, seen_by
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert, log
-from visioncal.present.report.check import page_of, render_check
+from visioncal.present.report.check import render_check
 from visioncal.results import Calibration
 from visioncal.robot import load_robot
 from visioncal.session import Session
@@ -200,16 +200,16 @@ def test_the_page_shows_what_is_left_with_the_change_undone(place):
         load_policy(),
         facts_of(found.seen.known.session, place.calibration, failed=True, collision=True),
     )
-    page = Page(render_check(page_of(found, policy, verdict_of(found))))
+    page = Page(render_check(found, policy, verdict_of(found)))
     assert "does not hold any more" in page.words
     assert "with the likeliest change undone: the camera moved by" in page.words
     assert [f"{1e3 * it:.3f}" in page.words for it in (*before, *after)] == [True] * 10
     assert "now a collision" in page.words
     passed = checked(place, np.random.default_rng(0))
     assert (passed.left == passed.away).all()
-    assert "undone" not in Page(render_check(page_of(passed, (), verdict_of(passed)))).words
+    assert "undone" not in Page(render_check(passed, (), verdict_of(passed))).words
     more = checked(place, np.random.default_rng(6), Change(noise_factor=8.0))
-    assert "undone" not in Page(render_check(page_of(more, (), verdict_of(more)))).words
+    assert "undone" not in Page(render_check(more, (), verdict_of(more))).words
 
 
 def test_two_slips_are_more_than_one_change_explains():

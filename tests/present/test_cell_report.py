@@ -49,10 +49,10 @@ def test_observations_are_counted_by_who_saw_whom():
 
 def test_the_table_has_any_frame_in_any_other():
     table = pair_table(CELL, "cell")
-    assert [it.name for it in table.rows] == ["base_a", "base_b", "cam_top"]
+    assert list(table.rows) == ["base_a", "base_b", "cam_top"]
     edge = CELL.between("cam_top", "base_b")
-    assert table.rows[2].cells[1].startswith(f"{significant(edge.sigma_mm)} mm")
-    assert table.rows[2].cells[2] == ""
+    assert table.rows["cam_top"][1].startswith(f"{significant(edge.sigma_mm)} mm")
+    assert table.rows["cam_top"][2] == ""
 
 
 def test_errors_of_robots_are_told_where_they_were_estimated():

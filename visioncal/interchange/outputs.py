@@ -142,10 +142,9 @@ def write_check(
     """
 
     def page(path: Path) -> None:
-        from visioncal.present.report.check import page_of
-        from visioncal.present.report.check import write_check as write_page
+        from visioncal.present.report.check import render_check
 
-        write_page(path, page_of(check, triggers, verdict))
+        write_atomically(path, render_check(check, triggers, verdict))
 
     return _write(folder, {VERIFY: _text(document)}, {REPORT: page})
 

@@ -45,17 +45,14 @@ def pairs(found: Alignment) -> tuple[Pair, ...]:
     listed = []
     for (seer, seen), mine in rows.items():
         used = [found.sights[at] for at in mine if found.sights[at].used]
-        rms = (
-            _rms([it.residual_mm for it in used]),
-            _rms([it.residual_deg for it in used]),
-            _rms([it.left_out_mm for it in used]),
-            _rms([it.left_out_deg for it in used]),
-        )
-        listed.append(Pair(seer, seen, len(used), len(mine) - len(used), *rms))
+        names = ("residual_mm", "residual_deg", "left_out_mm", "left_out_deg")
+        away = (rms([getattr(it, name) for it in used]) for name in names)
+        listed.append(Pair(seer, seen, len(used), len(mine) - len(used), *away))
     return tuple(listed)
 
 
-def _rms(values: Sequence[float | None]) -> float | None:
+def rms(values: Sequence[float | None]) -> float | None:
+    """Root mean square of those that are known; None of none."""
     known = [it for it in values if it is not None]
     return float(sum(it * it for it in known) / len(known)) ** 0.5 if known else None
 

@@ -144,9 +144,7 @@ def verdict_markdown(found: Alignment) -> str:
     lines += [f"- {plain(it.frame)} is not tied. {plain(it.remedy)}" for it in found.untied]
     lines += [f"The frame of the cell is that of {plain(found.reference)}.", ""]
     lines += ["| transform | x, y, z [mm] | rotation vector [deg] | sigma |", "|---|---|---|---|"]
-    lines += [
-        f"| {plain(name)} {edge_line(it, oriented=it.oriented)}" for name, it in found.edges.items()
-    ]
+    lines += [f"| {plain(name)} {edge_line(it)}" for name, it in found.edges.items()]
     left_out = [it for it in found.sights if not it.used]
     used = len(found.sights) - len(left_out)
     lines += ["", f"{used} of {len(found.sights)} observations used."]

@@ -112,14 +112,7 @@ def verdict_markdown(calibration: Calibration) -> str:
         "| transform | x, y, z [mm] | rotation vector [deg] | sigma |",
         "|---|---|---|---|",
     ]
-    lines += [
-        f"| {plain(name)} {edge_line(it, oriented=it.oriented)}"
-        for name, it in calibration.edges.items()
-    ]
-    lines += [
-        f"| {plain(name)} {edge_line(it.edge, oriented=it.oriented)}"
-        for name, it in calibration.frames.items()
-    ]
+    lines += [f"| {plain(name)} {edge_line(it)}" for name, it in calibration.placed.items()]
     known = calibration.budget
     if known is not None:
         lines += ["", _work_line(known)]
@@ -151,15 +144,10 @@ def further_lines(verdict: Verdict) -> Iterator[str]:
     yield from (f"- {plain(it)}" for it in verdict.rest)
 
 
-def edge_line(edge: Edge, *, oriented: bool = True) -> str:
-    """A row of a table: position, rotation and sigma of a transform.
-
-    Args:
-        edge: The transform.
-        oriented: Whether its rotation was measured.
-    """
+def edge_line(edge: Edge) -> str:
+    """A row of a table: position, rotation and sigma of a transform."""
     position = ", ".join(f"{value:.2f}" for value in 1e3 * edge.transform.translation)
-    if not oriented:
+    if not edge.oriented:
         return f"| {position} | not measured | {edge.sigma_mm:.2g} mm |"
     turn = ", ".join(f"{value:.3f}" for value in edge.transform.rotation.as_rotvec(degrees=True))
     return f"| {position} | {turn} | {edge.sigma_mm:.2g} mm, {edge.sigma_deg:.2g} deg |"

@@ -27,7 +27,7 @@ def _frame(name: str, frame: Frame) -> Iterator[str]:
     for reason in frame.verdict.reasons:
         yield f"- {plain(reason)}"
     yield from ("", "| x, y, z [mm] | rotation vector [deg] | sigma |", "|---|---|---|")
-    yield edge_line(frame.edge, oriented=frame.oriented)
+    yield edge_line(frame.edge)
     used = sum(it.used for it in frame.observations)
     yield ""
     yield (

@@ -4,7 +4,7 @@ The network of frames is drawn as a graph: what hangs on what, who saw whom, how
 """
 
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -46,26 +46,18 @@ _SMALL, _HEAD_PT = 7.0, 6.0
 
 
 @dataclass(frozen=True)
-class PairRow:
-    """One row of the table of how well frames are known in each other: a name, and its cells."""
-
-    name: str
-    cells: tuple[str, ...]
-
-
-@dataclass(frozen=True)
 class PairTable:
     """How well the frames of one body are known in each other, as text.
 
     Attributes:
         title: What carries them.
         columns: The frames.
-        rows: One for each frame in which the others are given.
+        rows: The cells of each frame in which the others are given, by its name.
     """
 
     title: str
     columns: tuple[str, ...]
-    rows: tuple[PairRow, ...]
+    rows: Mapping[str, tuple[str, ...]]
 
 
 def write_cell_report(path: Path, found: Alignment) -> None:
@@ -83,18 +75,15 @@ def write_cell_report(path: Path, found: Alignment) -> None:
 
 def render_cell(found: Alignment) -> str:
     """Renders the report as HTML text; see `write_cell_report`."""
-    cards = [
-        content.edge_card(name, edge, oriented=edge.oriented) for name, edge in found.edges.items()
-    ]
     return template("cell.html.j2").render(
         found=found,
         created=content.readable_time(found.created),
         kinds=_kinds(found),
         key_figures=_key_figures(found),
         graph=graph(found),
-        links=[_link_row(it) for it in cellmap.pairs(found)],
+        links=cellmap.pairs(found),
         tables=[it for body in ("cell", *found.robots) if (it := pair_table(found, body))],
-        edges=cards,
+        edges=[content.edge_card(*it) for it in found.edges.items()],
         frames=tools.frame_cards(Calibration.whole(found)),
         sources=source_table(found),
         noise=_noise_facts(found),
@@ -136,19 +125,6 @@ def _key_figures(found: Alignment) -> list[Fact]:
     return facts
 
 
-def _link_row(pair: cellmap.Pair) -> dict[str, str | int]:
-    return {
-        "seer": pair.seer,
-        "seen": pair.seen,
-        "used": pair.used,
-        "left_out": pair.left_out,
-        "mm": significant(pair.rms_mm),
-        "deg": significant(pair.rms_deg),
-        "unseen_mm": significant(pair.unseen_mm),
-        "unseen_deg": significant(pair.unseen_deg),
-    }
-
-
 def pair_table(found: Alignment, body: str) -> PairTable | None:
     """How well frames of one body are known in each other [mm, deg]; None of fewer than two.
 
@@ -164,7 +140,7 @@ def pair_table(found: Alignment, body: str) -> PairTable | None:
         return None
     # In the frame of a point alone nothing has a place: its axes are chosen.
     turned = [it for it in frames if _is_turned(found, it)]
-    rows = tuple(PairRow(a, tuple(_between(found, a, b) for b in frames)) for a in turned)
+    rows = {a: tuple(_between(found, a, b) for b in frames) for a in turned}
     return PairTable("the cell" if body == "cell" else body, tuple(frames), rows)
 
 
@@ -195,10 +171,9 @@ def source_table(found: Alignment) -> PairTable | None:
         for name in names
         if any(it.get(name, 0.0) > _LEAST_SHARE * it["total"] for it in budgets.values())
     ]
-    rows = tuple(
-        PairRow(edge, tuple(significant(it.get(name)) for name in shown))
-        for edge, it in budgets.items()
-    )
+    rows = {
+        edge: tuple(significant(it.get(name)) for name in shown) for edge, it in budgets.items()
+    }
     return PairTable("", tuple(SOURCES.get(it, it) for it in shown), rows)
 
 
@@ -253,7 +228,8 @@ def residuals(found: Alignment) -> Markup:
     grid = boxes(figure, len(shown), 1, Margins(0.75, 0.75, top=0.25), (0.0, 0.45))
     for (box,), (seer, rows) in zip(grid, shown.items(), strict=True):
         title = "view" if box is grid[-1][0] else ""
-        bars.draw(figure, box, [_bar(it) for it in rows], _rms(rows), titles=(title, "mm"))
+        rms_mm = cellmap.rms([it.residual_mm for it in rows if it.used])
+        bars.draw(figure, box, [_bar(it) for it in rows], rms_mm, titles=(title, "mm"))
         figure.text(box.left, box.top - 5.0, seer)
     return figure.inline("Bars: residuals of each observation")
 
@@ -262,11 +238,6 @@ def _bar(sight: Sight) -> Bar:
     far = sight.residual_mm is not None and sight.reason != HELD_BACK
     colour = svg.ACCENT if sight.used else svg.BAD if far else svg.MUTED
     return Bar(str(sight.view), sight.residual_mm, sight.used, colour)
-
-
-def _rms(rows: Sequence[Sight]) -> float | None:
-    used = [it.residual_mm**2 for it in rows if it.used and it.residual_mm is not None]
-    return float(sum(used) / len(used)) ** 0.5 if used else None
 
 
 def graph(found: Alignment) -> Markup:

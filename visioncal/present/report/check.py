@@ -1,8 +1,6 @@
 """The page of a check: one HTML file that says whether a calibration still holds."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from markupsafe import Markup
@@ -12,7 +10,6 @@ from visioncal.calibration.verification.check import Check, Suspect
 from visioncal.calibration.verification.document import listed_suspects
 from visioncal.calibration.verification.messages import thing
 from visioncal.calibration.verification.policy import Outcome
-from visioncal.core.files import write_atomically
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Verdict
 from visioncal.core.version import __version__
@@ -26,134 +23,58 @@ _WIDE_IN, _HIGH_IN = 9.2, 3.6
 _BAR, _MOST_LABELS = 0.38, 20
 
 
-@dataclass(frozen=True)
-class ChangeRow:
-    """A change that was compared, as text; `named` are those that the check takes for true."""
-
-    words: str
-    share: str
-    named: bool
-
-
-@dataclass(frozen=True)
-class TriggerRow:
-    """A reason to calibrate again, as text, and whether it is `fired`, `quiet` or `unknown`."""
-
-    state: str
-    words: str
-
-
-@dataclass(frozen=True, eq=False)
-class CheckPage:
-    """What the page of a check says.
-
-    Attributes:
-        session: Name of the check's session.
-        against: Name and time of the calibration.
-        passed: Whether it still holds.
-        verdict: What was found and what to do, the most important first.
-        changes: What may have changed, the likeliest first.
-        undone: What the likeliest change is, where one was found; else empty.
-        stops: Names of the m stops, by their views.
-        before: (m, 2) how far each places the target from where the calibration has it
-            [mm, deg].
-        after: (m, 2) the same with that change undone.
-        triggers: Reasons to calibrate again.
-        warnings: What is odd, in sentences.
-        not_used: Views that were not used, and why.
-    """
-
-    session: str
-    against: str
-    passed: bool
-    verdict: Verdict
-    changes: Sequence[ChangeRow]
-    undone: str
-    stops: Sequence[str]
-    before: FloatArray
-    after: FloatArray
-    triggers: Sequence[TriggerRow]
-    warnings: Sequence[str]
-    not_used: Sequence[tuple[int, str]]
-
-
-def write_check(path: Path, page: CheckPage) -> None:
-    """Writes the page as one HTML file that needs no network and no script.
-
-    Raises:
-        DataError: The file cannot be written.
-    """
-    write_atomically(path, render_check(page))
-
-
-def render_check(page: CheckPage) -> str:
-    """Renders the page as HTML text."""
-    return template("check.html.j2").render(
-        page=page,
-        version=__version__,
-        rows=[
-            (name, *(f"{it:.3f}" for it in (before[0], after[0], before[1], after[1])))
-            for name, before, after in zip(page.stops, page.before, page.after, strict=True)
-        ],
-        rms=[
-            f"{it:.3f}"
-            for it in np.sqrt(np.mean(np.square([page.before, page.after]), axis=1)).T.ravel()
-        ],
-        plot=_residuals(page),
-    )
-
-
-def _residuals(page: CheckPage) -> Markup:
-    """Residuals stop by stop: as the calibration has the cell, and with the change undone."""
-    count, sides = len(page.stops), [("as calibrated", svg.ACCENT, page.before)]
-    if page.undone:
-        sides = [("as calibrated", svg.BAD, page.before),
-                 ("with the change undone", svg.ACCENT, page.after)]  # fmt: skip
-    step = -(-count // _MOST_LABELS)
-    ticks = [(float(it), page.stops[it]) for it in range(0, count, step)]
-    figure = Figure(_WIDE_IN, _HIGH_IN)
-    rows = boxes(figure, 2, 1, Margins(0.75, top=0.3), (0.0, 0.2))
-    for column, label in enumerate(("position [mm]", "rotation [deg]")):
-        ((box,), last) = (rows[column], column == 1)
-        top = 1.05 * max(float(values[:, column].max()) for *_, values in sides) or 1.0
-        panel = Panel(figure, box, Scale(-0.7, count - 0.3), Scale(0.0, top))
-        panel.x_axis("stop, by its views" if last else "", ticks, grid=False, words=last)
-        panel.y_axis(label)
-        for side, (_, colour, values) in enumerate(sides):
-            # Side by side where there are two.
-            shift = (side - 0.5) * _BAR if page.undone else 0.0
-            width = _BAR if page.undone else 1.5 * _BAR
-            panel.bars([it + shift for it in range(count)], values[:, column], width, colour)
-    if page.undone:
-        entries = [("\N{BLACK SQUARE}", colour, words) for words, colour, _ in sides]
-        figure.legend(rows[0][0].right, 12.0, entries)
-    return figure.inline("Residuals of each stop, before and after the change")
-
-
-def page_of(check: Check, triggers: Sequence[Outcome], verdict: Verdict) -> CheckPage:
-    """Puts together what the page of a check says.
+def render_check(check: Check, triggers: Sequence[Outcome], verdict: Verdict) -> str:
+    """Renders the page of a check as HTML text.
 
     Args:
         check: The check.
         triggers: What became of the policy's triggers.
         verdict: What it found.
     """
-    known, calibration = check.seen.known, check.calibration
-    order = {"fired": 0, "unknown": 1, "quiet": 2}
-    return CheckPage(
-        known.session.name,
-        f"{calibration.session_name}, {calibration.created}",
-        check.passed,
-        verdict,
-        [] if check.passed else [_change(check, it) for it in listed_suspects(check)],
-        _undone(check),
-        [", ".join(map(str, views)) for views in check.seen.views],
-        _lengths(check.away),
-        _lengths(check.left),
-        [TriggerRow(it.state, it.words) for it in sorted(triggers, key=lambda it: order[it.state])],
-        check.seen.warnings,
-        sorted(known.reasons.items()),
+    undone, order = _undone(check), ("fired", "unknown", "quiet")
+    stops = [", ".join(map(str, views)) for views in check.seen.views]
+    before, after = _lengths(check.away), _lengths(check.left)
+    return template("check.html.j2").render(
+        check=check,
+        verdict=verdict,
+        version=__version__,
+        undone=undone,
+        changes=[] if check.passed else [_change(check, it) for it in listed_suspects(check)],
+        triggers=sorted(triggers, key=lambda it: order.index(it.state)),
+        not_used=sorted(check.seen.known.reasons.items()),
+        rows=[
+            (name, *(f"{it:.3f}" for it in (was[0], left[0], was[1], left[1])))
+            for name, was, left in zip(stops, before, after, strict=True)
+        ],
+        rms=[f"{it:.3f}" for it in np.sqrt(np.mean(np.square([before, after]), axis=1)).T.ravel()],
+        plot=_residuals(stops, before, after if undone else None),
     )
+
+
+def _residuals(stops: Sequence[str], before: FloatArray, after: FloatArray | None) -> Markup:
+    """Residuals stop by stop: as the calibration has the cell, and with the change undone."""
+    count, sides = len(stops), [("as calibrated", svg.ACCENT, before)]
+    if after is not None:
+        sides = [("as calibrated", svg.BAD, before),
+                 ("with the change undone", svg.ACCENT, after)]  # fmt: skip
+    step = -(-count // _MOST_LABELS)
+    ticks = [(float(it), stops[it]) for it in range(0, count, step)]
+    figure = Figure(_WIDE_IN, _HIGH_IN)
+    rows = boxes(figure, 2, 1, Margins(0.75, top=0.3), (0.0, 0.2))
+    # Side by side where there are two.
+    width, shifts = (1.5 * _BAR, (0.0,)) if after is None else (_BAR, (-0.5 * _BAR, 0.5 * _BAR))
+    for column, label in enumerate(("position [mm]", "rotation [deg]")):
+        ((box,), last) = (rows[column], column == 1)
+        top = 1.05 * max(float(values[:, column].max()) for *_, values in sides) or 1.0
+        panel = Panel(figure, box, Scale(-0.7, count - 0.3), Scale(0.0, top))
+        panel.x_axis("stop, by its views" if last else "", ticks, grid=False, words=last)
+        panel.y_axis(label)
+        for shift, (_, colour, values) in zip(shifts, sides, strict=True):
+            panel.bars([it + shift for it in range(count)], values[:, column], width, colour)
+    if after is not None:
+        entries = [("\N{BLACK SQUARE}", colour, words) for words, colour, _ in sides]
+        figure.legend(rows[0][0].right, 12.0, entries)
+    return figure.inline("Residuals of each stop, before and after the change")
 
 
 def _undone(check: Check) -> str:
@@ -162,10 +83,11 @@ def _undone(check: Check) -> str:
     return "" if found is None or found.name == NOISE else thing(check, found)
 
 
-def _change(check: Check, suspect: Suspect) -> ChangeRow:
+def _change(check: Check, suspect: Suspect) -> tuple[str, str, bool]:
+    """A change that was compared: in words, its share, and whether the check takes it for true."""
     share = 100.0 * suspect.probability
     words = f"{share:.0f} %" if share >= 1.0 else f"{share:.1g} %"
-    return ChangeRow(thing(check, suspect), words, suspect in check.named)
+    return thing(check, suspect), words, suspect in check.named
 
 
 def _lengths(twists: FloatArray) -> FloatArray:

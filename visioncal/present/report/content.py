@@ -1,6 +1,6 @@
 """What the report says: rows of ready text, made from a calibration, for the templates."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cache
@@ -12,7 +12,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from visioncal.core.number_format import decimals_for, fixed, matched, percent, significant
 from visioncal.core.transforms import pose_difference
 from visioncal.core.types import FloatArray
-from visioncal.present.report.advice import Suspects, contradicts, outlying_views
+from visioncal.present.report.advice import contradicts
+from visioncal.present.words import joint_words, level_words, parameter_row, spring_words
 from visioncal.results import (
     Calibration,
     Edge,
@@ -28,7 +29,6 @@ from visioncal.vision.camera import intrinsics
 
 PLUS_MINUS = "\N{PLUS-MINUS SIGN}"
 _DEPENDENCIES = ("numpy", "scipy", "opencv-contrib-python-headless", "pin", "rerun-sdk")
-_VIEW_COLUMNS = 3
 _MOUNTS = {
     "eye-in-hand": "the camera rides on the robot",
     "eye-to-hand": "the camera stands still and the robot carries the target",
@@ -66,45 +66,6 @@ class EdgeCard:
     matrix: str
 
 
-@dataclass(frozen=True)
-class SolverRow:
-    """One solver: its residuals, and how far each of its edges is from the result's.
-
-    The solver that gave the result has no differences.
-    """
-
-    name: str
-    rms_mm: str
-    rms_deg: str
-    differences: tuple[tuple[str, str], ...]
-
-
-@dataclass(frozen=True)
-class ViewRow:
-    """One view, as text.
-
-    `mark` is `used`, `look` (used, but outlying), `left-out` (it contradicts the others) or
-    `rejected`.
-    """
-
-    number: int
-    mark: str
-    corners: str
-    px: str
-    mm: str
-    deg: str
-
-
-@dataclass(frozen=True)
-class ResidualRow:
-    """Root mean square residuals of one set of views, as text."""
-
-    label: str
-    mm: str
-    deg: str
-    px: str
-
-
 def readable_time(created: str) -> str:
     """When something was computed, for people; it stands in ISO 8601."""
     try:
@@ -114,21 +75,8 @@ def readable_time(created: str) -> str:
     return f"{time:%Y-%m-%d %H:%M %Z}".strip()
 
 
-def edge_cards(calibration: Calibration) -> tuple[EdgeCard, ...]:
-    """The estimated transforms, the wanted one first."""
-    return tuple(
-        edge_card(name, edge, oriented=edge.oriented) for name, edge in calibration.edges.items()
-    )
-
-
-def edge_card(name: str, edge: Edge, *, oriented: bool = True) -> EdgeCard:
-    """Writes a transform as text.
-
-    Args:
-        name: Its name, such as `flange_from_cam`.
-        edge: The transform.
-        oriented: Whether its rotation was measured; else it is the parent's own.
-    """
+def edge_card(name: str, edge: Edge) -> EdgeCard:
+    """Writes a transform of some name, such as `flange_from_cam`, as text."""
     parent, _, child = name.partition("_from_")
     rotation = edge.matrix[:3, :3]
     # The perturbation is in the child's frame; the components are along the parent's axes.
@@ -139,7 +87,7 @@ def edge_card(name: str, edge: Edge, *, oriented: bool = True) -> EdgeCard:
         Fact(axis, matched(value, sigma), f"{PLUS_MINUS} {_rounded(sigma)} mm")
         for axis, value, sigma in zip("xyz", translation_mm, sigmas_mm, strict=True)
     ]
-    if oriented:
+    if edge.oriented:
         rows += _rotation_facts(edge)
     else:
         rows.append(Fact("rotation", "not measured", f"taken as that of {frame_words(parent)}"))
@@ -147,7 +95,7 @@ def edge_card(name: str, edge: Edge, *, oriented: bool = True) -> EdgeCard:
         name,
         f"The pose of {frame_words(child)} in the frame of {frame_words(parent)}.",
         _rounded(edge.sigma_mm),
-        _rounded(edge.sigma_deg) if oriented else "",
+        _rounded(edge.sigma_deg) if edge.oriented else "",
         tuple(rows),
         _matrix_text(edge.matrix),
     )
@@ -192,44 +140,36 @@ def answering_solver(calibration: Calibration) -> str | None:
     return None
 
 
-def solver_rows(calibration: Calibration) -> tuple[SolverRow, ...]:
-    """The solvers, each with its distance from the result in position [mm] and angle [deg]."""
+def solver_rows(
+    calibration: Calibration,
+) -> Iterator[tuple[str, SolverResult, list[tuple[float | None, float | None]]]]:
+    """The solvers by label, each with its distances from the result's edges [mm], [deg]."""
     answer = answering_solver(calibration)
-    return tuple(
-        _solver_row(calibration, name, it, is_answer=name == answer)
-        for name, it in calibration.solvers.items()
-    )
-
-
-def _solver_row(
-    calibration: Calibration, name: str, result: SolverResult, *, is_answer: bool
-) -> SolverRow:
-    differences = []
-    for edge_name, edge in calibration.edges.items():
-        if is_answer or edge_name not in result.matrices:
-            differences.append((significant(None), significant(None)))
+    for name, result in calibration.solvers.items():
+        if name == answer:
+            yield f"{name} (result)", result, [(None, None)] * len(calibration.edges)
             continue
-        mm, deg = pose_difference(edge.matrix, result.matrices[edge_name])
-        differences.append((significant(mm), significant(deg)))
-    label = f"{name} (result)" if is_answer else name
-    return SolverRow(
-        label, significant(result.rms_mm), significant(result.rms_deg), tuple(differences)
-    )
+        yield (
+            name,
+            result,
+            [
+                pose_difference(edge.matrix, result.matrices[it])
+                if it in result.matrices
+                else (None, None)
+                for it, edge in calibration.edges.items()
+            ],
+        )
 
 
-def residual_rows(calibration: Calibration) -> tuple[ResidualRow, ...]:
+def residual_rows(calibration: Calibration) -> list[tuple[str, Rms]]:
     """Residuals of the fit, of views left out in turn, and of the declared hold-out set."""
     validation = calibration.validation
-    sets: list[tuple[str, Rms | None]] = [
+    sets = [
         ("used views, as fitted", calibration.rms),
         (f"left out in turn ({validation.method})", validation.held_out),
         ("declared hold-out views", validation.holdout),
     ]
-    return tuple(
-        ResidualRow(label, significant(rms.mm), significant(rms.deg), significant(rms.px))
-        for label, rms in sets
-        if rms is not None
-    )
+    return [(label, rms) for label, rms in sets if rms is not None]
 
 
 def key_figures(calibration: Calibration) -> tuple[Fact, ...]:
@@ -345,34 +285,8 @@ def lens_facts(calibration: Calibration) -> tuple[Fact, ...]:
     )
 
 
-def lens_origin(calibration: Calibration) -> str:
-    """Where the intrinsics are from, in words."""
-    estimated = calibration.camera is not None and calibration.camera.estimated
-    return "estimated from this session" if estimated else "as given by the session"
-
-
-def view_columns(
-    views: Sequence[ViewResult], found: Sequence[Suspects]
-) -> tuple[tuple[ViewRow, ...], ...]:
-    """The views of the session in its order, split into columns that stand side by side."""
-    outlying = outlying_views(found)
-    rows = [_view_row(view, outlying) for view in views]
-    height = max(-(-len(rows) // _VIEW_COLUMNS), 1)
-    return tuple(tuple(rows[start : start + height]) for start in range(0, len(rows), height))
-
-
-def _view_row(view: ViewResult, outlying: Collection[int]) -> ViewRow:
-    return ViewRow(
-        view.view,
-        _mark(view, outlying),
-        significant(None) if view.corners is None else str(view.corners),
-        significant(view.rms_px),
-        significant(view.residual_mm),
-        significant(view.residual_deg),
-    )
-
-
-def _mark(view: ViewResult, outlying: Collection[int]) -> str:
+def view_mark(view: ViewResult, outlying: Collection[int]) -> str:
+    """What became of a view: `used`, `look` (at it), `left-out` or `rejected`."""
     if view.used:
         return "look" if view.view in outlying else "used"
     return "left-out" if contradicts(view) else "rejected"
@@ -391,10 +305,13 @@ def template(name: str) -> Template:
 @cache
 def _environment() -> Environment:
     # It keeps the templates, which take longer to be compiled than a page to be made.
-    return Environment(
+    found = Environment(
         loader=PackageLoader("visioncal", "present/report"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    forms = (significant, joint_words, level_words, parameter_row, spring_words)
+    found.filters |= {it.__name__: it for it in forms}
+    return found

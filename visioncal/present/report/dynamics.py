@@ -2,7 +2,6 @@
 
 import platform
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -45,42 +44,6 @@ _COLUMNS = 3
 _CURVE_POINTS, _TICKS = 401, 5
 # Between columns and between rows.
 _FRICTION_GAPS_IN = (0.55, 0.5)
-
-
-@dataclass(frozen=True)
-class TorqueRow:
-    """How well the torques of a joint are predicted, as text."""
-
-    joint: str
-    torque: str
-    noise: str
-    fitted: str
-    unseen: str
-    share: str
-    consistent: str
-    known: str
-
-
-@dataclass(frozen=True)
-class ParameterRow:
-    """A base parameter, as text; `mark` is `sure`, `used` or `rejected`."""
-
-    name: str
-    value: str
-    sigma: str
-    unit: str
-    share: str
-    mark: str
-
-
-@dataclass(frozen=True)
-class LinkRow:
-    """A link as a body, as text: mass and centre, and the mass that was known before."""
-
-    joint: str
-    kg: str
-    known_kg: str
-    centre_mm: str
 
 
 def write_dynamics_report(path: Path, run: Run) -> None:
@@ -144,52 +107,38 @@ def _key_figures(identified: Identified) -> Iterator[Fact]:
     yield Fact("samples", str(samples), f"{identified.robot.joint_count} torques each")
 
 
-def _torque_rows(identified: Identified) -> Iterator[TorqueRow]:
+def _torque_rows(identified: Identified) -> Iterator[tuple[str, list[str]]]:
+    """Each joint, with its torques as they were fitted and as they were predicted."""
     (first, *_), found = identified.streams, identified.validation
-    nothing = "\N{EN DASH}"
+    figures: list[FloatArray | None] = [first.torque_nm, first.noise_nm, first.rms_nm]
+    if found is None:
+        figures += [None] * 4
+    else:
+        figures += [found.rms_nm, 100.0 * found.shares]
+        figures += [found.consistent_rms_nm, found.known_rms_nm]
     for at, joint in enumerate(identified.robot.joint_names):
-        seen = (
-            (nothing, nothing, nothing, nothing)
-            if found is None
-            else (
-                significant(float(found.rms_nm[at])),
-                significant(100.0 * float(found.shares[at])),
-                _at(found.consistent_rms_nm, at),
-                _at(found.known_rms_nm, at),
-            )
-        )
-        yield TorqueRow(
-            joint,
-            significant(float(first.torque_nm[at])),
-            significant(float(first.noise_nm[at])),
-            significant(float(first.rms_nm[at])),
-            *seen,
-        )
+        yield joint, [_at(it, at) for it in figures]
 
 
 def _at(values: FloatArray | None, place: int) -> str:
     return significant(None if values is None else float(values[place]))
 
 
-def _parameter_rows(identified: Identified) -> Iterator[ParameterRow]:
+def _parameter_rows(identified: Identified) -> Iterator[tuple[str, list[str]]]:
+    """What is known of each base parameter, as a mark and cells."""
     marks = {"2 %": "sure", "10 %": "used"}
     base = identified.base
     for name, own, value, sigma, share in zip(
         base.names,
         base.independent,
-        identified.values,
-        identified.sigmas,
+        identified.values.tolist(),
+        identified.sigmas.tolist(),
         identified.determined,
         strict=True,
     ):
-        yield ParameterRow(
-            name,
-            matched(float(value), float(sigma)),
-            significant(float(sigma)),
-            unit_of(base.model.names[own]),
-            share,
-            marks.get(share, "rejected"),
-        )
+        unit = unit_of(base.model.names[own])
+        cells = [name, matched(value, sigma), significant(sigma), unit, share]
+        yield marks.get(share, "rejected"), cells
 
 
 def unit_of(name: str) -> str:
@@ -205,14 +154,15 @@ def _counts(identified: Identified) -> str:
     return "; ".join(f"{it}: {shares.count(it)}" for it in kinds)
 
 
-def _link_rows(identified: Identified) -> Iterator[LinkRow]:
+def _link_rows(identified: Identified) -> Iterator[tuple[str, ...]]:
+    """Each link as a body: its joint, mass, the mass that was known before, and its centre."""
     if identified.inertias is None:
         return
     found, known = identified.inertias.masses, identified.robot.masses
     for at, joint in enumerate(identified.robot.joint_names):
         centre = ", ".join(f"{it:.1f}" for it in 1e3 * found.centres_m[at])
         before = significant(None if known is None else float(known.kg[at]), 3)
-        yield LinkRow(joint, significant(float(found.kg[at]), 3), before, centre)
+        yield joint, significant(float(found.kg[at]), 3), before, centre
 
 
 def _hump_facts(identified: Identified) -> Iterator[Fact]:

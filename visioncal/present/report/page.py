@@ -86,6 +86,7 @@ def render(
 
 def _words(calibration: Calibration) -> dict[str, object]:
     found, touched = advice.suspects(calibration), calibration.touch_test
+    outlying = advice.outlying_views(found)
     return {
         "created": content.readable_time(calibration.created),
         "touched_at": content.readable_time(touched.created) if touched else "",
@@ -93,16 +94,15 @@ def _words(calibration: Calibration) -> dict[str, object]:
         "has_outliers": any(it.used for it in found),
         "has_contradicting": any(it.contradict for it in found),
         "key_figures": content.key_figures(calibration),
-        "edges": content.edge_cards(calibration),
+        "edges": [content.edge_card(*it) for it in calibration.edges.items()],
         "frames": tools.frame_cards(calibration),
         "method": content.method_facts(calibration),
         "lens": content.lens_facts(calibration),
-        "lens_origin": content.lens_origin(calibration),
         "residuals": content.residual_rows(calibration),
-        "solvers": content.solver_rows(calibration),
+        "solvers": list(content.solver_rows(calibration)),
         "has_pixels": calibration.rms.px is not None,
         "observed": "probe" if calibration.mount == "instrument" else "target",
-        "view_columns": content.view_columns(calibration.views, found),
+        "marks": {it.view: content.view_mark(it, outlying) for it in calibration.views},
     }
 
 
@@ -145,7 +145,8 @@ def _arm(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> dict[str
     stops_m = np.reshape([it[:3, 3] for it in poses if it is not None], (-1, 3))
     return {
         "arm_is_calibrated": found is not None and found.is_calibrated,
-        "arm_card": None if found is None else arm.arm_card(found),
+        "arm_result": found,
+        **({} if found is None else arm.arm_words(found)),
         "unseen_plot": "" if found is None else armplots.before_and_after(found),
         "side_plot": armplots.side_map(found, stops_m) if found and mapped else "",
         "top_plot": armplots.top_map(found, stops_m) if found and mapped else "",
@@ -160,7 +161,7 @@ def _springs(calibration: Calibration) -> dict[str, object]:
     if found is None:
         return {"springs": (), "spring_facts": (), "spring_plot": ""}
     return {
-        "springs": arm.spring_rows(found),
+        "springs": found.joints,
         "spring_facts": tuple(arm.spring_facts(found)),
         "spring_plot": arm.deflection_against_load(found),
     }
@@ -169,8 +170,8 @@ def _springs(calibration: Calibration) -> dict[str, object]:
 def _drift(calibration: Calibration) -> dict[str, object]:
     found = calibration.thermal
     if found is None:
-        return {"drift_card": None, "drift_plot": ""}
-    return {"drift_card": arm.drift_card(found), "drift_plot": arm.course(found)}
+        return {}
+    return {"drift_sentence": arm.drift_sentence(found), "drift_plot": arm.course(found)}
 
 
 def _plots(

@@ -14,7 +14,6 @@ from visioncal.present.report.svg import Figure
 from visioncal.results import Calibration, Frame, Observation
 
 _WIDTH_IN, _HEIGHT_IN = 5.0, 1.7
-_COLUMNS = 3
 # More characters than this below the bars run into each other, so their labels stand upright.
 _MOST_CHARACTERS, _LONGEST = 36, 12
 _MOST_LABELS = 24
@@ -23,72 +22,27 @@ _LETTER_IN = 0.068
 
 
 @dataclass(frozen=True)
-class ObservationRow:
-    """One touch, point or view, as text; `mark` is `used`, `look` or `left-out`."""
-
-    name: str
-    kind: str
-    mm: str
-    mark: str
-    reason: str
-
-
-@dataclass(frozen=True)
 class FrameCard:
     """A tool or a fixture.
 
     Attributes:
-        pose: Its transform.
-        status: Of its verdict.
-        headline: The verdict in a few words.
-        reasons: Of the verdict.
-        facts: How it was obtained.
-        plot: What its observations are off; empty where that is not known.
-        suspects: The observations that something is wrong with.
-        columns: All observations, split into columns that stand side by side.
-        has_kinds: Whether the observations have kinds.
+        pose: Where it is.
+        frame: How it was found.
+        facts: The figures of that.
+        plot: How far each observation is off; empty where that is not known of any.
     """
 
     pose: EdgeCard
-    status: str
-    headline: str
-    reasons: tuple[str, ...]
+    frame: Frame
     facts: tuple[Fact, ...]
     plot: Markup
-    suspects: tuple[ObservationRow, ...]
-    columns: tuple[tuple[ObservationRow, ...], ...]
-    has_kinds: bool
 
 
 def frame_cards(calibration: Calibration) -> tuple[FrameCard, ...]:
     """The tools and fixtures of a calibration, in its order."""
-    return tuple(_card(name, frame) for name, frame in calibration.frames.items())
-
-
-def _card(name: str, frame: Frame) -> FrameCard:
-    rows = tuple(_row(it) for it in frame.observations)
-    height = max(-(-len(rows) // _COLUMNS), 1)
-    return FrameCard(
-        edge_card(name, frame.edge, oriented=frame.oriented),
-        frame.verdict.status,
-        frame.verdict.headline,
-        frame.verdict.reasons,
-        _facts(frame),
-        _plot(name, frame),
-        tuple(it for it in rows if it.mark != "used"),
-        tuple(rows[start : start + height] for start in range(0, len(rows), height)),
-        any(it.kind for it in rows),
-    )
-
-
-def _row(observation: Observation) -> ObservationRow:
-    doubtful = "look" if observation.reason else "used"
-    return ObservationRow(
-        observation.name,
-        observation.kind,
-        significant(observation.residual_mm),
-        doubtful if observation.used else "left-out",
-        observation.reason,
+    return tuple(
+        FrameCard(edge_card(name, it.edge), it, _facts(it), _plot(name, it))
+        for name, it in calibration.frames.items()
     )
 
 
