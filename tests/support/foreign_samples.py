@@ -210,6 +210,92 @@ def plain_table(folder: Path) -> Recording:
     return Recording(folder / "poses.txt", ImportOptions(mount="eye-in-hand"))
 
 
+def rows_by_turns(folder: Path) -> Recording:
+    """The robot's pose in a row and the camera's in the next, each with its name."""
+    pairs = zip(quaternions(BASE_FROM_FLANGE), quaternions(CAM_FROM_TARGET), strict=True)
+    both = [row for pair in pairs for row in zip(("hand", "eye"), pair, strict=True)]
+    text = "".join(f"{name}, {', '.join(map(repr, it.tolist()))}\n" for name, it in both)
+    return Recording(_write(folder / "log.csv", text), ImportOptions(mount="eye-in-hand"))
+
+
+def _matrices_in_files(folder: Path, join: Callable[[np.ndarray], np.ndarray]) -> Recording:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, poses in (("robot", BASE_FROM_FLANGE), ("camera", CAM_FROM_TARGET)):
+        np.savetxt(folder / f"{name}.csv", join(poses), "%.17g", delimiter=",")
+    requested = ImportOptions(mount="eye-in-hand", camera_file=folder / "camera.csv")
+    return Recording(folder / "robot.csv", requested)
+
+
+def matrices_beside(folder: Path) -> Recording:
+    return _matrices_in_files(folder, np.hstack)
+
+
+def matrices_below(folder: Path) -> Recording:
+    return _matrices_in_files(folder, np.vstack)
+
+
+def printed_lists(folder: Path) -> Recording:
+    """Rows as a program prints them, under a remark in another encoding."""
+    rows = np.hstack([quaternions(BASE_FROM_FLANGE), quaternions(CAM_FROM_TARGET)])
+    recording = Recording(folder / "log.txt", ImportOptions(mount="eye-in-hand"))
+    text = "".join(f"pose {at}: {row}\n" for at, row in enumerate(rows.tolist()))
+    _write(recording.source, text)
+    recording.source.write_bytes("# größer\n".encode("latin-1") + text.encode())
+    return recording
+
+
+def headed_units(folder: Path) -> Recording:
+    """A header in a comment, with the units of its columns."""
+    angles = Rotation.from_matrix(BASE_FROM_FLANGE[:, :3, :3]).as_euler("xyz", degrees=True)
+    rows = np.hstack([1e3 * BASE_FROM_FLANGE[:, :3, 3], angles])
+    names = "file, X(mm), Y(mm), Z(mm), roll [deg], pitch [deg], yaw [deg]"
+    text = f"# columns: {names.replace(' [', '[')}\n"
+    for at, row in enumerate(rows.tolist()):
+        text += f"shot{at}.png, {', '.join(map(repr, row))}\n"
+        picture(folder / f"shot{at}.png")
+    requested = ImportOptions(mount="eye-in-hand", target=CHARUCO)
+    return Recording(_write(folder / "robot.txt", text), requested)
+
+
+def ros_poses(folder: Path) -> Recording:
+    """Two lists of messages."""
+    lists = {
+        name: [
+            {
+                first: dict(zip("xyz", it[:3], strict=True)),
+                second: dict(zip("xyzw", it[3:], strict=True)),
+            }
+            for it in quaternions(poses).tolist()
+        ]
+        for name, poses, first, second in (
+            ("robot_poses", BASE_FROM_FLANGE, "position", "orientation"),
+            ("marker_transforms", CAM_FROM_TARGET, "translation", "rotation"),
+        )
+    }
+    return Recording(
+        _write(folder / "log.json", json.dumps({"count": COUNT, **lists})),
+        ImportOptions(mount="eye-in-hand"),
+    )
+
+
+def numbers_first(folder: Path) -> Recording:
+    """Matrices and images of which the number stands first."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for at, pose in enumerate(BASE_FROM_FLANGE):
+        np.savetxt(folder / f"{at:03d}_pose.csv", pose, "%.17g")
+        picture(folder / f"{at:03d}_image.png")
+    return Recording(folder, ImportOptions(mount="eye-in-hand", target=CHARUCO))
+
+
+def visp_seen(folder: Path) -> Recording:
+    """ViSP's poses of the object in the camera, without images."""
+    for name, poses in (("fPe", BASE_FROM_FLANGE), ("cPo", CAM_FROM_TARGET)):
+        for at, row in enumerate(vectors(poses), start=1):
+            data = "".join(f"  - [{value!r}]\n" for value in row.tolist())
+            _write(folder / f"pose_{name}_{at}.yaml", f"rows: 6\ncols: 1\ndata:\n{data}")
+    return Recording(folder, ImportOptions(mount="eye-in-hand"))
+
+
 def stacked_npz(folder: Path) -> Recording:
     folder.mkdir(parents=True, exist_ok=True)
     camera = vectors(CAM_FROM_TARGET)
@@ -302,6 +388,14 @@ RECORDINGS: Mapping[str, Callable[[Path], Recording]] = {
         stacked_npz,
         keyed_json,
         images_and_table,
+        rows_by_turns,
+        matrices_beside,
+        matrices_below,
+        printed_lists,
+        headed_units,
+        ros_poses,
+        numbers_first,
+        visp_seen,
     )
 }
 

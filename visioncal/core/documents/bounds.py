@@ -1,5 +1,6 @@
 """How much of a file is read, and how deep it may go."""
 
+import re
 from pathlib import Path
 
 from visioncal.core.errors import DataError
@@ -10,9 +11,13 @@ MAX_VALUES = 1_000_000
 # Matrices in lists in tables need six.
 MAX_DEPTH = 40
 
+_COMMENT_LINE = re.compile(rb"^[ \t]*(?:#|%|//).*$", re.MULTILINE)
+
 
 def read_plain_text(path: Path) -> str:
     """Reads a bounded UTF-8 text file, with or without a byte-order mark.
+
+    Lines that begin as comments may be in any encoding that leaves ASCII as it is.
 
     Raises:
         DataError: As `read_bytes`, or the bytes are not UTF-8 or hold NUL, as binary files do.
@@ -25,7 +30,8 @@ def read_plain_text(path: Path) -> str:
             culprits=[str(path)],
             next_step=save_as_utf8("UTF-16"),
         )
-    return decode_text(data, str(path))
+    readable = _COMMENT_LINE.sub(lambda it: it[0].decode("utf-8", "replace").encode(), data)
+    return decode_text(readable, str(path))
 
 
 def too_many(where: str) -> DataError:

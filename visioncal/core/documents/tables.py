@@ -18,6 +18,11 @@ _LINE_END = re.compile(r"\r\n|\r|\n")
 # Excel writes the separator itself into the first line, for itself.
 _SEPARATOR = re.compile(r"sep=([;\t,])", re.I)
 _COMMENTS = ("#", "%", "//")
+# A row as programs print a list, with its name before it: `pose: [1.0, 2.0]`, `array([1, 2]),`.
+_LISTED = re.compile(
+    r"(?:[^\W\d][\w .-]*+[:=]\s*+)?(?:[^\W\d][\w.]*+\s*+)?"
+    r"(?:\[([^][(){}]*+)\]|\(([^][(){}]*+)\)|\(\[([^][(){}]*+)\]\)|\{([^][(){}]*+)\})\s*+[,;]?"
+)
 
 
 @dataclass(frozen=True)
@@ -52,8 +57,9 @@ def read_table(path: Path) -> TextTable:
     """Reads a table; the separator is a semicolon, a tab, a comma or blanks, in this order.
 
     A comment that has as many words as the table has columns, right before the first row, is the
-    header where there is no other; a first line such as `sep=;` names the separator. Between
-    semicolons or tabs a decimal comma is read as a point.
+    header where there is no other, whatever stands before a colon in it; a first line such as
+    `sep=;` names the separator. Between semicolons or tabs a decimal comma is read as a point. Rows
+    may be lists in brackets, with a name before them.
 
     Raises:
         DataError: It is missing, no text, too large, empty, its rows differ in length, or two
@@ -66,11 +72,13 @@ def read_table(path: Path) -> TextTable:
     said = _SEPARATOR.fullmatch(every[0])
     if said:
         every[0] = ""
-    lines = [
-        (at, line)
-        for at, line in enumerate(every, start=1)
-        if line.strip() and not line.strip().startswith(_COMMENTS)
-    ]
+    lines = _without_brackets(
+        [
+            (at, line)
+            for at, line in enumerate(every, start=1)
+            if line.strip() and not line.strip().startswith(_COMMENTS)
+        ]
+    )
     if not lines:
         raise DataError(f"{where} has no rows.", culprits=[where])
     separator = said[1] if said else next((it for it in ";\t," if it in lines[0][1]), " ")
@@ -95,6 +103,13 @@ def read_table(path: Path) -> TextTable:
             )
     named = tuple(columns or (str(at) for at in range(1, width + 1)))
     return TextTable(path, _unique(named, where), columns is not None, tuple(rows), tuple(numbers))
+
+
+def _without_brackets(lines: list[tuple[int, str]]) -> list[tuple[int, str]]:
+    """Takes what stands in the brackets of lines that are all lists of one kind."""
+    listed = [_LISTED.fullmatch(line.strip()) for _, line in lines]
+    inside = [next(filter(None, it.groups()), "") for it in listed if it]
+    return list(zip((at for at, _ in lines), inside, strict=True)) if all(listed) else lines
 
 
 def _cells(line: str, separator: str, where: str) -> tuple[str, ...]:
@@ -127,7 +142,8 @@ def _header_in_comments(
     comment = next((it.strip() for it in reversed(before) if it.strip()), "")
     if not comment.startswith(_COMMENTS):
         return None
-    words = comment.lstrip("#%/ ").replace(separator, " ").replace(",", " ").split()
+    said = comment.lstrip("#%/ ").rpartition(":")[2]
+    words = said.replace(separator, " ").replace(",", " ").split()
     fits = len(words) == width and not any(is_number(it) for it in words)
     return tuple(words) if fits else None
 

@@ -34,9 +34,7 @@ from visioncal.interchange.formats.foreign import Foreign, ForeignFormat
 from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.pairing import with_camera_file
 from visioncal.interchange.formats.poses import (
-    CAMERA_KEYS,
     JOINT_KEYS,
-    ROBOT_KEYS,
     joints_from,
     known_names,
     pose_names,
@@ -92,7 +90,7 @@ def read_document(path: Path) -> object:
 
 
 def _fields_of_document(document: object, path: Path) -> Fields:
-    """Takes a list of records, the longest such list inside a mapping, or a mapping of lists.
+    """Takes a list of records, the longest such lists inside a mapping, or a mapping of lists.
 
     In a mapping, names with numbers (`robot_0`, `board_0`, `robot_1`, ...) are rows as well.
     """
@@ -104,14 +102,13 @@ def _fields_of_document(document: object, path: Path) -> Fields:
             return fields_of_records(rows, places, path.stem, path.parent, tuple(numbered))
         lists = [it for it in document.values() if isinstance(it, list) and it]
         tables = [it for it in lists if isinstance(it[0], Mapping)]
-        if tables:
-            document = max(tables, key=len)
-        elif document and all(isinstance(it, Mapping) for it in document.values()):
+        if not tables and document and all(isinstance(it, Mapping) for it in document.values()):
             document = list(document.values())
         elif lists:
-            count = max(len(it) for it in lists)
+            count = max(len(it) for it in tables or lists)
             columns = {k: v for k, v in document.items() if isinstance(v, list) and len(v) == count}
-            document = [{k: v[at] for k, v in columns.items()} for at in range(count)]
+            rows = [{k: v[at] for k, v in columns.items()} for at in range(count)]
+            document = next(iter(columns.values())) if tables and len(columns) == 1 else rows
     if not isinstance(document, list) or not document:
         raise DataError(
             f"{path} holds no rows; a list with one entry a pose is needed.", culprits=[str(path)]
@@ -171,9 +168,9 @@ def foreign_from(
     unnamed = unnamed_columns(fields)
     given = (*requested.robot.names, *requested.camera.names, *requested.joints)
     used = {fields.find(it) for it in given}
-    robot_names = pose_names(fields, requested.robot.names, unnamed["robot"], ROBOT_KEYS, used)
+    robot_names = pose_names(fields, requested.robot.names, unnamed["robot"], "robot", used)
     used.update(robot_names)
-    camera_names = pose_names(fields, requested.camera.names, unnamed["camera"], CAMERA_KEYS, used)
+    camera_names = pose_names(fields, requested.camera.names, unnamed["camera"], "camera", used)
     used.update(camera_names)
     joint_names = requested.joints or _joint_names(fields, used)
     used.update(joint_names)
@@ -191,6 +188,8 @@ def foreign_from(
     if camera_names:
         camera, more = poses_from(fields, camera_names, requested.camera, "camera")
         notes = (*notes, *more)
+    # The coordinates of a field that is taken.
+    used |= {it for it in fields.texts if it.rpartition(".")[0] in used}
     stamps = stamp_name(fields, used)
     if stamps and stamps in unnamed["time"]:
         notes = (*notes, f"Column {stamps} is taken for times, as the source does not say.")

@@ -20,6 +20,14 @@ _TIME_NAMES = ("stamp_s", "t", "time", "timestamp", "stamp", "time_s", "#timesta
 _UNNAMED = {6: (0, 6, 0), 7: (0, 7, 0), 8: (1, 7, 0), 14: (0, 7, 7), 16: (0, 16, 0)}
 _UNNAMED |= {15: (1, 7, 7), 17: (1, 16, 0), 32: (0, 16, 16), 33: (1, 16, 16)}
 _LISTED = 40
+_NO_QUATERNION = 0.01
+# Counts of rows are whole and small; seconds of an epoch are not.
+_LARGEST_COUNT = 1e6
+# What stands before the poses of each where they are in rows by turns.
+_LABELS = {
+    "robot_pose": ("robot", "hand", "gripper", "flange", "tcp", "tool", "ee", "arm", "base"),
+    "camera_pose": ("camera", "cam", "eye", "target", "board", "marker", "tag", "object"),
+}
 # A pose and its covariance have fewer numbers; lists of corners and images have more.
 _MOST_NUMBERS = 200
 
@@ -119,7 +127,13 @@ class Fields:
 
 
 def fields_of_table(table: TextTable) -> Fields:
-    """Takes the columns of a table; those in which every filled cell is a number become numbers."""
+    """Takes the columns of a table; those in which every filled cell is a number become numbers.
+
+    Matrices below or beside each other are a row each; so are two rows, of the robot and of the
+    camera, that come by turns.
+    """
+    if it := _stacked_matrices(table) or _rows_by_turns(table):
+        return it
     columns = list(zip(*table.rows, strict=True))
     texts = dict(zip(table.columns, columns, strict=True))
     numbers = {
@@ -129,6 +143,44 @@ def fields_of_table(table: TextTable) -> Fields:
     }
     places = tuple(table.place(it) for it in range(len(table.rows)))
     return Fields(table.path.stem, table.path.parent, places, numbers, texts)
+
+
+def _stacked_matrices(table: TextTable) -> Fields | None:
+    """Takes 4 x 4 matrices that stand below each other, or beside each other in four rows."""
+    height, width = len(table.rows), len(table.columns)
+    count = height * width // 16
+    if table.has_header or count < 2 or 4 not in (height, width) or (height + width) % 4:
+        return None
+    if not all(is_number(it) for row in table.rows for it in row):
+        return None
+    numbers = np.array(table.rows, dtype=float)
+    matrices = (
+        numbers.reshape(4, count, 4).swapaxes(0, 1) if height == 4 else numbers.reshape(-1, 4, 4)
+    )
+    if not (matrices[:, 3] == [0, 0, 0, 1]).all():
+        return None
+    places = tuple(f"{table.path.name}, matrix {at}" for at in range(1, count + 1))
+    rows = {"matrix": matrices.reshape(count, 16)}
+    return Fields(table.path.stem, table.path.parent, places, rows)
+
+
+def _rows_by_turns(table: TextTable) -> Fields | None:
+    """Takes rows that say in their first cell, by turns, which of two poses they hold."""
+    labels = [row[0] for row in table.rows]
+    numbers = [row[1:] for row in table.rows]
+    both = labels[:2]
+    if len(set(both)) < 2 or len(labels) < 4 or labels != both * (len(labels) // 2):
+        return None
+    if is_number(both[0]) or not all(is_number(it) for row in numbers for it in row):
+        return None
+    arrays = np.array(numbers, dtype=float)
+    found = {
+        next((name for name, known in _LABELS.items() if label.lower() in known), label): at
+        for at, label in enumerate(both)
+    }
+    named = {name: arrays[at::2] for name, at in found.items()}
+    places = tuple(table.place(at) for at in range(0, len(labels), 2))
+    return Fields(table.path.stem, table.path.parent, places, named)
 
 
 def fields_of_records(
@@ -175,12 +227,16 @@ def fields_of_records(
 def flattened(record: object, prefix: str = "") -> dict[str, object]:
     """Joins the names of nested mappings by points; parsing has bounded their depth.
 
+    Numbers called x, y, z, or x, y, z, w, are an array besides.
+
     Returns:
         Texts, arrays of few numbers, and lists that are no arrays; what is larger or null is left
         out.
     """
     if isinstance(record, Mapping):
         flat: dict[str, object] = {}
+        if prefix and [*record] in (["x", "y", "z"], ["x", "y", "z", "w"], ["w", "x", "y", "z"]):
+            flat |= flattened([record[it] for it in "xyzw"[: len(record)]], prefix)
         for name, value in record.items():
             flat |= flattened(value, f"{prefix}{name}.")
         return flat
@@ -241,6 +297,11 @@ def unnamed_columns(fields: Fields) -> Mapping[str, tuple[str, ...]]:
     if not names or list(fields.texts) != names:
         return {"time": (), "robot": (), "camera": ()}
     time, robot, camera = _UNNAMED.get(len(names), (0, 0, 0))
+    if len(names) == 7 and set(names) == set(fields.numbers):
+        last = np.stack([fields.numbers[it] for it in names[3:]])
+        if (np.abs(np.linalg.norm(last, axis=0) - 1.0) > _NO_QUATERNION).all():
+            # A number or a time, and a position with three angles.
+            time, robot = 1, 6
     return {
         "time": tuple(names[:time]),
         "robot": tuple(names[time : time + robot]),
@@ -263,7 +324,9 @@ def _unnamed_times(fields: Fields, taken: Collection[str]) -> tuple[str, ...]:
     unnamed = unnamed_columns(fields)
     if not set(unnamed["robot"]) <= set(taken):
         return ()
-    # Numbers of rows are no times.
-    return tuple(
-        it for it in unnamed["time"] if (np.diff(np.sort(fields.column(it)[:, 0])) != 1).any()
-    )
+    return tuple(it for it in unnamed["time"] if not _are_counts(fields.column(it)[:, 0]))
+
+
+def _are_counts(numbers: FloatArray) -> bool:
+    """Whether numbers are those of rows, of which some may be left out, and no times."""
+    return bool((numbers % 1 == 0).all() and numbers.max(initial=0.0) < _LARGEST_COUNT)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import is_inside, natural
+from visioncal.core.files import is_inside, natural, some_of
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 # Enough to recognise a text file.
@@ -17,6 +17,11 @@ def number_in(name: str) -> int | None:
     """Takes the last number in a name without its ending; None where there is none."""
     digits = re.findall(r"[0-9]+", Path(name).stem)
     return int(digits[-1]) if digits and len(digits[-1]) < 19 else None
+
+
+def kind_of(path: Path) -> str:
+    """A file's name without the last number in it: what files of one kind have in common."""
+    return re.sub(r"[0-9]+([^0-9]*)$", r"\1", path.stem).strip("_-. ") + path.suffix.lower()
 
 
 def listed(folder: Path) -> tuple[Path, ...]:
@@ -140,9 +145,24 @@ def _images_of(
 
     Returns:
         (n,) paths, None in a row whose number no image has; and a note where order decides.
+
+    Raises:
+        DataError: There are no images, several a pose, or not as many as rows.
     """
     there = images_in(folder)
     by_number = _unique_numbers(there)
+    kinds = Counter(kind_of(it) for it in there if number_in(it.name) in set(views))
+    if numbered and kinds and len(by_number) < len(there):
+        usual = [it for it, count in kinds.items() if count == max(kinds.values())]
+        if len(usual) > 1:
+            raise DataError(
+                f"{folder} has several images a pose ({some_of(usual)}, with numbers); one is "
+                "needed.",
+                culprits=usual,
+                next_step="Put those of one kind into a folder, and name it with --images.",
+            )
+        there = tuple(it for it in there if kind_of(it) in usual)
+        by_number = _unique_numbers(there)
     if numbered and len(by_number) == len(there) and by_number.keys() & set(views):
         return tuple(by_number.get(it) for it in views), ()
     if len(there) != len(views):

@@ -1,7 +1,5 @@
 """Poses of the robot in one file and of the camera in another: paired by time, or row by row."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from visioncal.core.conventions import PoseNumbers
@@ -10,7 +8,7 @@ from visioncal.core.types import FloatArray, IntArray
 from visioncal.interchange.formats.fields import Fields, stamp_name, unnamed_columns
 from visioncal.interchange.formats.foreign import Foreign, Sweep
 from visioncal.interchange.formats.import_options import ImportOptions, PoseImportOptions
-from visioncal.interchange.formats.poses import CAMERA_KEYS, ROBOT_KEYS, pose_names, poses_from
+from visioncal.interchange.formats.poses import pose_names, poses_from
 from visioncal.interchange.formats.streams import pair_streams, seconds
 
 
@@ -24,10 +22,8 @@ def with_camera_file(
     Raises:
         DataError: Either holds no poses, they are not as many, or their motions do not agree.
     """
-    robot, robot_names, first = _poses(robot_fields, requested.robot, "robot", ROBOT_KEYS)
-    # A file of the camera's poses alone calls them what a robot's file calls its own.
-    keys = (*CAMERA_KEYS, *ROBOT_KEYS)
-    camera, camera_names, second = _poses(camera_fields, requested.camera, "camera", keys)
+    robot, robot_names, first = _poses(robot_fields, requested.robot, "robot")
+    camera, camera_names, second = _poses(camera_fields, requested.camera, "camera")
     notes = (*first, *second)
     robot_stamp = stamp_name(robot_fields, robot_names)
     camera_stamp = stamp_name(camera_fields, camera_names)
@@ -41,10 +37,13 @@ def with_camera_file(
 
 
 def _poses(
-    fields: Fields, requested: PoseImportOptions, whose: str, keys: Sequence[tuple[str, ...]]
+    fields: Fields, requested: PoseImportOptions, whose: str
 ) -> tuple[PoseNumbers, tuple[str, ...], tuple[str, ...]]:
     """Takes the poses of one file: (poses, the fields that hold them, what was assumed)."""
-    names = pose_names(fields, requested.names, unnamed_columns(fields)["robot"], keys, ())
+    unnamed = unnamed_columns(fields)["robot"]
+    # A file of the camera's poses alone calls them what a robot's file calls its own.
+    ways = (pose_names(fields, requested.names, unnamed, it, ()) for it in (whose, "robot"))
+    names = next(filter(None, ways), ())
     if not names:
         raise DataError(
             f"{fields.name}: which of its fields are the {whose}'s poses is not known; it has "

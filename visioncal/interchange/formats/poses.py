@@ -13,6 +13,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.fields import Fields
 from visioncal.interchange.formats.import_options import PoseImportOptions
+from visioncal.interchange.formats.worded import ANGLE_UNITS, without_unit, worded_poses
 from visioncal.session.columns import SELECTORS
 
 # Names under which pose pairs are commonly stored, the most specific first.
@@ -31,12 +32,14 @@ ROBOT_KEYS: tuple[tuple[str, ...], ...] = (
     ("x", "y", "z", "qx", "qy", "qz", "qw"),
     ("tx", "ty", "tz", "qx", "qy", "qz", "qw"),
     ("x", "y", "z", "rx", "ry", "rz"),
+    ("x", "y", "z", "roll", "pitch", "yaw"),
     ("x", "y", "z", "a", "b", "c"),
     ("x", "y", "z", "w", "p", "r"),
     ("x", "y", "z", "q1", "q2", "q3", "q4"),
     ("pose",),
     ("robot",),
     ("robot.rvec", "robot.tvec"),
+    ("matrix",),
 )
 CAMERA_KEYS: tuple[tuple[str, ...], ...] = (
     ("cft_x_m", "cft_y_m", "cft_z_m", "cft_qx", "cft_qy", "cft_qz", "cft_qw"),
@@ -68,6 +71,8 @@ def known_names(
 ) -> tuple[str, ...]:
     """Finds the first of several sets of names that are all there and free, in any case of letters.
 
+    Units behind names do not count.
+
     What holds no numbers counts where its name is clear, so that it is refused by its place.
 
     Returns:
@@ -90,8 +95,11 @@ def _sets_of_names(
     endings = Counter(it.rsplit(".", 1)[-1] for it in free)
     full = {end: it for it in free if endings[end := it.rsplit(".", 1)[-1]] == 1}
     full |= {it: it for it in free}
-    # A name in the very letters of a candidate goes before one in other letters.
-    full = {it.lower(): name for it, name in full.items()} | full
+    # A name in the very letters of a candidate goes before one in other letters or with a unit.
+    plain = {it: without_unit(it)[0].lower() for it in full}
+    counts = Counter(plain.values())
+    bare = {plain[it]: name for it, name in full.items() if counts[plain[it]] == 1}
+    full = bare | {it.lower(): name for it, name in full.items()} | full
     for them in candidates:
         found = tuple(full.get(it, full.get(it.lower(), "")) for it in them)
         if all(found):
@@ -102,7 +110,7 @@ def pose_names(
     fields: Fields,
     given: Sequence[str],
     unnamed: tuple[str, ...],
-    keys: Sequence[tuple[str, ...]],
+    whose: str,
     taken: Collection[str],
 ) -> tuple[str, ...]:
     """Finds the fields that hold poses.
@@ -111,7 +119,7 @@ def pose_names(
         fields: The fields.
         given: What the user names.
         unnamed: What they are in a table without a header.
-        keys: What they are usually called.
+        whose: `robot` or `camera`.
         taken: Full names of those that hold something else.
 
     Returns:
@@ -122,7 +130,10 @@ def pose_names(
     """
     if given:
         return tuple(fields.find(it) for it in given)
-    return () if set(unnamed) & set(taken) else unnamed or known_names(fields, keys, taken)
+    if unnamed:
+        return () if set(unnamed) & set(taken) else unnamed
+    keys = ROBOT_KEYS if whose == "robot" else CAMERA_KEYS
+    return known_names(fields, keys, taken) or worded_poses(fields, whose, taken)
 
 
 def poses_from(
@@ -162,10 +173,14 @@ def poses_from(
             culprits=list(names),
             next_step=f"Name the fields of the {whose}'s poses with --{whose}-columns.",
         )
-    rotation, notes = _likely_rotation(rotations.shape[1], turned, requested, whose)
+    units = {without_unit(it)[1] for it in names}
+    rotation, notes = _likely_rotation(
+        rotations.shape[1], turned, requested, whose, degrees="deg" in units
+    )
     numbers = PoseNumbers(positions, rotations, Reading(rotation), places)
-    if names[0].endswith("_m"):
-        requested = replace(requested, unit=requested.unit or "m")
+    lengths = units - {"", *ANGLE_UNITS}
+    if len(lengths) == 1:
+        requested = replace(requested, unit=requested.unit or lengths.pop())
     return _checked(requested.applied_to(numbers), requested, whose, notes)
 
 
@@ -220,14 +235,16 @@ def check_radians(
     """
     there, rotation = poses.there, poses.reading.rotation
     radians = rotation == "rotation-vector" or rotation.endswith("-rad")
-    if not radians or not there.any():
+    open_degrees = rotation == "rotation-vector-deg" and requested.form is None
+    if not (radians or open_degrees) or not there.any():
         return
     largest = np.abs(np.where(there[:, None], poses.rotations, 0.0)).max(axis=1)
     row = int(largest.argmax())
-    if largest[row] > _MOST_RAD:
+    if open_degrees or largest[row] > _MOST_RAD:
+        found = "angles in degrees" if open_degrees else f"an angle of {largest[row]:.4g}"
         raise DataError(
-            f"{poses.places[row]}: the {whose}'s rotation has an angle of {largest[row]:.4g}, "
-            "too large for radians"
+            f"{poses.places[row]}: the {whose}'s rotation has {found}"
+            + ("" if open_degrees else ", too large for radians")
             + ("." if requested.form else ", and the source does not say what it is."),
             culprits=[poses.places[row]],
             next_step=f"Say --{whose}-form: kuka, or doosan, where the angles are A, B, C; fanuc "
@@ -293,11 +310,11 @@ def _split(
             return second, first, (names[0],)
         return first, second, (names[1],)
     flat = np.hstack(blocks)
-    return flat[:, :3], flat[:, 3:], tuple(names[3:])
+    return flat[:, :3], flat[:, 3:], tuple(names[3:] or names)
 
 
 def _likely_rotation(
-    size: int, names: Sequence[str], requested: PoseImportOptions, whose: str
+    size: int, names: Sequence[str], requested: PoseImportOptions, whose: str, *, degrees: bool
 ) -> tuple[str, tuple[str, ...]]:
     if size == 9:
         return "matrix", ()
@@ -314,7 +331,10 @@ def _likely_rotation(
         )
     joined = " ".join(names).lower()
     if _ANGLES_NAME.search(joined):
-        return "euler-xyz-rad", ()
+        return f"euler-xyz-{'deg' if degrees else 'rad'}", ()
+    if degrees:
+        # What they are besides is asked for, unless the user says it.
+        return "rotation-vector-deg", ()
     if requested.form is None and "rvec" not in joined:
         return "rotation-vector", (
             f"The {whose}'s rotations ({', '.join(names)}) are taken for rotation vectors in "

@@ -14,7 +14,7 @@ from visioncal.frames.touches import TouchRows, touches_of
 from visioncal.interchange.formats.columns import foreign_from, read_fields, view_numbers
 from visioncal.interchange.formats.fields import Fields, unnamed_columns
 from visioncal.interchange.formats.import_options import ImportOptions, PoseImportOptions
-from visioncal.interchange.formats.poses import ROBOT_KEYS, check_radians, pose_names
+from visioncal.interchange.formats.poses import check_radians, pose_names
 from visioncal.session import Session
 from visioncal.session.columns import joint_columns
 
@@ -41,7 +41,7 @@ def read_touches(
         return touches_of(Session.load(path), robot)
     fields = _of_robot(read_fields(path), robot)
     unnamed = unnamed_columns(fields)["robot"]
-    named = pose_names(fields, requested.robot.names, unnamed, ROBOT_KEYS, ())
+    named = pose_names(fields, requested.robot.names, unnamed, "robot", ())
     if positions and (not named or (requested.robot.names and len(named) == 3)):
         return _rows_of(fields, path, _positions_alone(fields, requested.robot), None)
     joints = requested.joints or joint_columns(tuple(fields.numbers))

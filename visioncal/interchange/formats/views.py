@@ -10,7 +10,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import is_inside
 from visioncal.interchange.formats.columns import DOCUMENTS, ENDINGS, foreign_from, read_document
 from visioncal.interchange.formats.fields import fields_of_records, flattened
-from visioncal.interchange.formats.finding import listed, number_in
+from visioncal.interchange.formats.finding import is_image_name, kind_of, listed, number_in
 from visioncal.interchange.formats.foreign import Foreign, ForeignFormat
 from visioncal.interchange.formats.import_options import ImportOptions
 
@@ -29,8 +29,7 @@ def _families(folder: Path) -> tuple[_Family, ...]:
     for file in listed(folder):
         number = number_in(file.name)
         if file.suffix.lower() in ENDINGS and number is not None:
-            digits = file.stem.rstrip("0123456789")
-            groups[f"{digits.rstrip('_-. ')}{file.suffix.lower()}"].setdefault(number, file)
+            groups[kind_of(file)].setdefault(number, file)
     families = [_Family(name.rsplit(".", 1)[0], files) for name, files in groups.items()]
     return tuple(
         sorted((it for it in families if len(it.files) > 1), key=lambda it: -len(it.files))
@@ -66,7 +65,9 @@ def _read_views(path: Path, requested: ImportOptions) -> Foreign:
     ]
     name = (path if folder == path else folder.parent).resolve().name
     fields = fields_of_records(records, places, name, folder, tuple(views))
-    return foreign_from(fields, requested)
+    around = (it for it in (folder, path, path / "images") if is_inside(it, path))
+    images = next((it for it in around if any(is_image_name(at.name) for at in listed(it))), None)
+    return foreign_from(fields, requested, images=images)
 
 
 def _record(path: Path) -> dict[str, object]:

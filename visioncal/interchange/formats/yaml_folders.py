@@ -1,6 +1,7 @@
 """Folders with a YAML a pose: ViSP's, with a camera XML, and Zivid's, a 4 x 4 matrix in mm each."""
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,10 @@ from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.intrinsics import read_intrinsics
 from visioncal.interchange.formats.poses import as_matrix, matrix_numbers
 
-# `franka_pose_rPe_3.yaml`: the end effector in the robot's reference frame.
+# `franka_pose_rPe_3.yaml`: the end effector in the robot's reference frame; `pose_cPo_3.yaml`: the
+# object in the camera.
 _POSE_NAME = re.compile(r".*pose_[a-z]Pe_[0-9]+\.ya?ml", re.IGNORECASE)
+_SEEN_NAME = re.compile(r".*pose_cPo_[0-9]+\.ya?ml", re.IGNORECASE)
 _ZIVID_NAME = re.compile(r"(pos|pose|robot_pose)_?[0-9]+\.ya?ml", re.IGNORECASE)
 
 
@@ -64,27 +67,30 @@ ZIVID = ForeignFormat(
 )
 
 
-def _pose_files(path: Path) -> tuple[Path, ...]:
+def _pose_files(path: Path, name: re.Pattern[str] = _POSE_NAME) -> tuple[Path, ...]:
     if not path.is_dir():
         return ()
-    return tuple(it for it in listed(path) if _POSE_NAME.fullmatch(it.name))
+    return tuple(it for it in listed(path) if name.fullmatch(it.name))
 
 
 def _read(path: Path, requested: ImportOptions) -> Foreign:
-    """Reads the folder; a pose is tx, ty, tz [m] and theta-u [rad] (ViSP, vpPoseVector)."""
+    """Reads the folder; a pose is tx, ty, tz [m] and theta-u [rad] (ViSP, vpPoseVector).
+
+    Poses of the object in the camera are taken where there are no images.
+    """
     files = _pose_files(path)
     if not files:
         raise DataError(f"{path} has no files like franka_pose_rPe_1.yaml.", culprits=[str(path)])
-    rows = [_pose(it) for it in files]
-    numbers = np.array(rows)
     views = tuple(number_in(it.name) or 0 for it in files)
     places = tuple(it.name for it in files)
     notes: list[str] = []
     images, paired = images_beside(path, requested.images, views, places, numbered=True)
-    robot = PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading("rotation-vector"), places)
+    seen = {} if any(images) else {number_in(it.name): it for it in _pose_files(path, _SEEN_NAME)}
+    camera = requested.camera.applied_to(_poses([seen.get(it) for it in views], places))
     return Foreign(
         name=path.resolve().name,
-        robot=requested.robot.applied_to(robot),
+        robot=requested.robot.applied_to(_poses(files, places)),
+        camera=camera if seen else None,
         images=images,
         mount=_mount(path, notes),
         target=None if requested.target else _target(path, notes),
@@ -92,6 +98,11 @@ def _read(path: Path, requested: ImportOptions) -> Foreign:
         views=views,
         notes=(*notes, *paired),
     )
+
+
+def _poses(files: Sequence[Path | None], places: tuple[str, ...]) -> PoseNumbers:
+    numbers = np.array([[np.nan] * 6 if it is None else _pose(it) for it in files])
+    return PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading("rotation-vector"), places)
 
 
 def _pose(path: Path) -> list[float]:
@@ -148,7 +159,7 @@ def _target(path: Path, notes: list[str]) -> dict[str, Any] | None:
 
 VISP = ForeignFormat(
     "visp",
-    "ViSP's poses (*_pose_rPe_1.yaml) with images and a camera XML",
+    "ViSP's poses (*_pose_rPe_1.yaml) with images and a camera XML, or with pose_cPo_1.yaml",
     lambda path: bool(_pose_files(path)),
     _read,
 )
