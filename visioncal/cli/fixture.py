@@ -88,16 +88,7 @@ def fixture_command(
 
 
 def _tool(said: str | None, calibration: "Calibration | None", robot: str | None) -> "Tool | None":
-    """Finds the tool that the points were touched with.
-
-    Args:
-        said: A name, a file, both with a colon between, or `none`; None for the only one.
-        calibration: What is known of the cell.
-        robot: Which robot of a whole cell is meant.
-
-    Returns:
-        The tool; None where the poses are of the tip itself.
-    """
+    """Finds the tool that the points were touched with."""
     from visioncal.frames.measured import NO_TOOL, Tool
     from visioncal.interchange.result_files import load_placed
 

@@ -170,11 +170,7 @@ def _report_point(point: "TouchPoint", target: dict[str, Any], console: Console)
 
 
 def _asked(points: "Sequence[TouchPoint]", targets: Sequence[dict[str, Any]]) -> list[float]:
-    """Asks for the gaps, one point after the other.
-
-    Raises:
-        DataError: Nothing more is typed.
-    """
+    """Asks for the gaps, one point after the other."""
     console = messages()
     console.print(_FORM)
     gaps = []

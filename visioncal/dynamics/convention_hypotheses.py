@@ -250,11 +250,7 @@ def _left(guess: _Guess) -> FloatArray:
 
 
 def _fitted(guess: _Guess, joint: int) -> tuple[FloatArray, float]:
-    """A joint's torques by multiples of what is predicted and of friction, none below zero.
-
-    Returns:
-        The multiples of prediction, dry and viscous friction; and the share that is left.
-    """
+    """A joint's torques by multiples of what is predicted and of friction, none below zero."""
     dq, torques = guess.measured.motion.dq[:, joint], guess.measured.torques_nm[:, joint]
     columns = np.column_stack([guess.predicted[:, joint], sign(dq), dq])
     columns, about = columns - columns.mean(axis=0), torques - torques.mean()

@@ -158,9 +158,6 @@ def _most_likely_size(
 
     They are observed to be zero, in units of their own, as one more component of the variance.
     Where that does not seem to be likely enough, the search ends before.
-
-    Returns:
-        The size, and the negative logarithm of its restricted likelihood.
     """
     reduced, components = likelihood.reduced, likelihood.components
     width, columns = reduced.errors.shape[1], reduced.jacobian.shape[2]

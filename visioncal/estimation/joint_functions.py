@@ -274,12 +274,7 @@ class _Arm:
         return np.log([_TYPICAL[it] * factor.get(it, 1.0) for it in self.names])
 
     def most_likely(self, start: FloatArray, enough: float = np.inf) -> "_Step | None":
-        """Finds the most likely levels and sizes; None where there are none to start from.
-
-        Args:
-            start: Their logarithms to start from.
-            enough: See `variance.most_likely`.
-        """
+        """Finds the most likely levels and sizes; None where there are none to start from."""
         low, high = (np.full(len(start), np.log(it)) for it in (LEAST_SIGMA, MOST_SIGMA))
         try:
             return most_likely(self._likelihood, start, low, high, 0.0, enough, little=_LITTLE)[1]

@@ -275,13 +275,7 @@ class _Likelihood:
     def minimised(
         self, logs: FloatArray, closed: tuple[int, ...], enough: float = np.inf
     ) -> tuple[float, FloatArray]:
-        """The most likely logarithms, some of them closed to what is least; the value first.
-
-        Args:
-            logs: Where to start.
-            closed: The levels that are none.
-            enough: See `most_likely`.
-        """
+        """The most likely logarithms, some of them closed to what is least; the value first."""
         low, high = self.limits(closed)
         hardly = HARDLY * np.maximum(self.counts, 1.0)
         start = np.clip(logs, low, high)
@@ -384,11 +378,7 @@ def estimate_levels(
 
 
 def _factor(scaled: FloatArray) -> tuple[FloatArray, bool]:
-    """Cholesky's factor of a matrix of unit diagonal; what rounding made negative is raised.
-
-    Raises:
-        ConvergenceError: It is far from positive: the fit behind it has run away.
-    """
+    """Cholesky's factor of a matrix of unit diagonal; what rounding made negative is raised."""
     ridge = _RIDGE
     while True:
         raised = scaled + ridge * np.eye(len(scaled))

@@ -107,9 +107,6 @@ def _eigen(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
 
     The usual way, divide and conquer, gives up on some good matrices with many eigenvalues that are
     all but equal, as held unknowns make them; the other way is slower and does not.
-
-    Raises:
-        LinAlgError: A matrix has entries that are no finite numbers.
     """
     try:
         return np.linalg.eigh(matrices)

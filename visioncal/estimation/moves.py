@@ -520,12 +520,7 @@ def _scored(
 
 
 def _residual_freedom(problem: Problem, fit: Solution) -> float:
-    """Degrees of freedom of the residuals: what is known besides of unknowns leaves some to them.
-
-    Args:
-        problem: The observations.
-        fit: The unknowns and the noise.
-    """
+    """Degrees of freedom of residuals: what is known besides of unknowns leaves some to them."""
     known = problem.knowledge(fit.state).information
     share = float(np.sum(fitted_covariance(problem, fit.state, fit.noise) * known))
     taken = float(np.sum(problem.moving)) - share

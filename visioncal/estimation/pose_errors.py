@@ -205,12 +205,7 @@ def posture_clusters(poses: FloatArray) -> IntArray:
 
 
 def _models(poses: FloatArray, white: FloatArray) -> Iterator[_Model]:
-    """All models but white noise alone, and both kinds of processes at once.
-
-    Args:
-        poses: (s, 4, 4) of the flange.
-        white: (2,) the noise where nothing else is; errors of the flange have its shape.
-    """
+    """All models but white noise alone, and both kinds of processes at once."""
     flange = np.broadcast_to(np.diag(np.repeat(white, 3)), (len(poses), 6, 6))
     level = float(np.sqrt(np.mean(np.square(white / TWIST_UNITS[[0, 3]]))))
     base = level * adjoint(invert(poses)) * TWIST_UNITS

@@ -116,11 +116,7 @@ def _id(name: str, drawing: NominalPoints) -> int:
 
 
 def _seen(shown: Sighting, ids: Sequence[int]) -> tuple[int, ...]:
-    """The drawn markers that an image shows.
-
-    Raises:
-        DataError: They are too few.
-    """
+    """The drawn markers that an image shows."""
     pictures = [it.seen for it in shown.sights if not isinstance(it.seen, Corners)]
     there = {it for image in pictures for it in marker_ids(image, shown.target.dictionary)}
     seen = tuple(it for it in ids if it in there)

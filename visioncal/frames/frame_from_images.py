@@ -141,11 +141,7 @@ def seen_frame(
 
 
 def _looks(eye: Eye, shown: Sighting) -> tuple[tuple[View, ...], list[SeenTarget], dict[int, str]]:
-    """What was seen in each image, and why some show nothing that fits.
-
-    Raises:
-        DataError: None does.
-    """
+    """What was seen in each image, and why some show nothing that fits."""
     views, looks, lost = [], [], dict(shown.lost)
     for sight, view in zip(shown.sights, shown.views, strict=True):
         try:
@@ -161,11 +157,7 @@ def _looks(eye: Eye, shown: Sighting) -> tuple[tuple[View, ...], list[SeenTarget
 def _check_still(
     eye: Eye, placed: _Placed, sights: Sequence[Sight], looks: Sequence[SeenTarget]
 ) -> None:
-    """Refuses a target that moves where it should stand still, and stands still elsewhere.
-
-    Raises:
-        DataError: So it is.
-    """
+    """Refuses a target that moves where it should stand still, and stands still elsewhere."""
     other: FrameKind = "fixture" if placed.kind == "tool" else "tool"
     parent, seen = PARENTS[other], placed.seen
     has_poses = all(it.base_from_flange is not None for it in sights)

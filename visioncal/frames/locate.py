@@ -89,11 +89,7 @@ def _rays(eye: Eye, px: FloatArray) -> FloatArray:
 
 
 def _depth(stop: Stop, plane: Plane, ray: FloatArray, label: str) -> float:
-    """How far along a ray of unit depth it meets the plane.
-
-    Raises:
-        DataError: It does not, in front of the camera.
-    """
+    """How far along a ray of unit depth it meets the plane."""
     along = stop.base_from_cam[:3, :3] @ ray
     rise = float(plane.normal @ along)
     gap = plane.offset_m - float(plane.normal @ stop.base_from_cam[:3, 3])

@@ -241,11 +241,7 @@ def _robot(session: Session, calibration: Calibration) -> Robot | None:
 def _usable(
     session: Session, asked: Sequence[View], target: Target, lost: Mapping[int, str]
 ) -> tuple[View, ...]:
-    """The views that nothing speaks against so far.
-
-    Raises:
-        DataError: There are none.
-    """
+    """The views that nothing speaks against so far."""
     views = tuple(it for it in asked if it.number not in lost)
     if views:
         return views

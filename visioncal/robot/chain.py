@@ -192,11 +192,7 @@ def chain_from_document(table: Table) -> Chain:
 
 
 def _harmonics(rows: Sequence[Table]) -> FloatArray | None:
-    """(n, k, 2) harmonics of the joints; None where no row has any.
-
-    Raises:
-        DataError: They are no pairs of numbers, or not as many of each joint.
-    """
+    """(n, k, 2) harmonics of the joints; None where no row has any."""
     given = [row.content.get("harmonics", []) for row in rows]
     if not any(given):
         return None

@@ -133,14 +133,7 @@ class _Reader:
     carriers: tuple[str, ...]
 
     def read(self, kind: type[_T], row: object, path: str, **given: object) -> _T:
-        """One table as an object of a dataclass.
-
-        Args:
-            kind: The dataclass.
-            row: The table.
-            path: Where it stands in the file; empty for the file itself.
-            given: Fields that are no keys of the table.
-        """
+        """One table as an object of a dataclass."""
         label = f"{self.file}, {path}" if path else self.file
         if not isinstance(row, dict):
             raise Table({path: row}, self.file).refuse(path, row, "a table")

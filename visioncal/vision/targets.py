@@ -231,11 +231,7 @@ def _size(table: Table, key: str) -> float:
 
 
 def _check_one_unit(table: Table) -> None:
-    """Refuses sides of squares and markers of which one is in another unit, as their ratio says.
-
-    Raises:
-        DataError: In metres they are of no board, and in another unit one of them is.
-    """
+    """Refuses sides of squares and markers of which one is in another unit, as their ratio says."""
     square, marker = (table.number(it, positive=True) for it in ("square_m", "marker_m"))
     if _UNREADABLE * square < marker < square:
         return

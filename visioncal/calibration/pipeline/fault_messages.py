@@ -302,14 +302,7 @@ def _pushed_bases(solved: Solved) -> list[PoseFault]:
 
 
 def _moved_by(solved: Solved, base: str, rows: IntArray, of: FloatArray | None = None) -> str:
-    """By how much observations ask for a base elsewhere, in words; empty where they disagree.
-
-    Args:
-        solved: The fit.
-        base: The frame of the base.
-        rows: (m,) the observations.
-        of: (4, 4) what of the base is meant, in its frame; its own origin where None.
-    """
+    """By how much observations ask for a base elsewhere, in words; empty where they disagree."""
     asked = solved.agreed.problem.change_of(base, solved.agreed.fit.state)[rows]
     if of is not None:
         asked = invert(of) @ asked @ of

@@ -147,18 +147,7 @@ def locate_targets(seen: T) -> T:
 def _other_lens(
     seen: Observed, frame: str, corners: Mapping[int, Corners], stated_px: float
 ) -> tuple[CameraResult, Poses, Finding] | None:
-    """The lens by the images, where the stated one cannot be this camera's.
-
-    Args:
-        seen: What is known.
-        frame: The camera.
-        corners: Its corners by view.
-        stated_px: What corners deviate by from any pose by the stated lens [px].
-
-    Returns:
-        It, the poses by it, and what is said; None where no lens explains the corners so much
-        better.
-    """
+    """The lens by the images, where the stated one cannot be this camera's."""
     look, targets = seen.cameras[frame], tuple(seen.session.boards.values())
     if look.resolution is None:
         return None
@@ -207,9 +196,6 @@ def _refuse_mirrored(
 
     Those of a flat target fit mirrored as well, by a pose behind it, which the robot's motion
     tells.
-
-    Raises:
-        DataError: They are mirrored.
     """
     look, targets = seen.cameras[frame], tuple(seen.session.boards.values())
     if look.resolution is None:
@@ -259,12 +245,7 @@ def _numbered_through(
 
 
 def _repeated(views: Sequence[View], corners: Mapping[int, Corners]) -> dict[int, int]:
-    """The views that repeat an earlier one, by number: no camera gives the same corners twice.
-
-    Args:
-        views: The rows; those whose robots have numbers of their own are compared.
-        corners: What was found, by view.
-    """
+    """The views that repeat an earlier one, by number: no camera gives the same corners twice."""
     first: dict[Hashable, int] = {}
     again: dict[int, int] = {}
     for view in views:

@@ -424,13 +424,7 @@ _SOURCES: Mapping[str, tuple[str, str, Step | None]] = {
 
 
 def _sources(picks: Sequence[Picks], met: NeedMet | None, more: Step | None) -> list[Finding]:
-    """What makes errors as large as they are, by the worst camera and robot.
-
-    Args:
-        picks: What picks err by.
-        met: What is needed, and how likely it is met; None where nothing is.
-        more: What makes the calibration less uncertain.
-    """
+    """What makes errors as large as they are, by the worst camera and robot."""
     if met is None:
         worst = max(picks, key=lambda it: it.good_for_mm)
     else:

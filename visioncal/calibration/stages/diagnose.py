@@ -92,9 +92,6 @@ def _steps(
     A step may be at any stop and of any frame or joint: it must gain by twice the logarithm of
     these. A joint's has one number where a frame's has six, of which each must gain by as much as
     the Bayesian information criterion asks for (Schwarz 1978).
-
-    Returns:
-        The likelier one, and the other where it is hardly less likely.
     """
     price = 2.0 * np.log(len(problem.unknown) * (1 + int(problem.observations.stops.max())))
     each = float(np.log(problem.observations.directions.sum()))

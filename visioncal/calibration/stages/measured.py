@@ -119,13 +119,7 @@ def _components(
 
 
 def _without_prior(off_m: float, sigma_m: float, prior_m: float) -> tuple[float, float]:
-    """How far the views alone are from a measured component, and to what they know it [m].
-
-    Args:
-        off_m: How far the answer is from it [m].
-        sigma_m: What the answer is known to [m].
-        prior_m: What the component is known to [m].
-    """
+    """How far the views alone are from a measured component, and to what they know it [m]."""
     own = max(sigma_m**-2.0 - prior_m**-2.0, 0.0)
     alone = np.inf if own == 0.0 else 1.0 / np.sqrt(own)
     # Both together are their mean, each weighted with its information.

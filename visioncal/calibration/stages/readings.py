@@ -248,11 +248,7 @@ def _are_poses(rows: Sequence[View]) -> bool:
 
 
 def _names(rows: Sequence[View], *, are_poses: bool) -> tuple[tuple[str, ...], list[Rejection]]:
-    """The points' names, and rows whose point determines nothing.
-
-    Raises:
-        DataError: A name is missing or misspelt, or several probes were read.
-    """
+    """The points' names, and rows whose point determines nothing."""
     by_name = defaultdict(list)
     for view in rows:
         by_name[_name(view)].append(view.number)

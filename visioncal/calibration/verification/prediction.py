@@ -177,13 +177,7 @@ def _breathed(
 def _straightened(
     corners: Mapping[int, Corners], lens: CameraResult, depths: Mapping[int, float]
 ) -> dict[int, Corners]:
-    """Corners by view where the lens would show them, were it what its model says.
-
-    Args:
-        corners: As they were detected.
-        lens: With its field.
-        depths: How far along the camera's axis they are, where that is known [m].
-    """
+    """Corners by view where the lens would show them, were it what its model says."""
     return {
         view: replace(it, px=lens.in_model(it.px, depths.get(view))) for view, it in corners.items()
     }
@@ -274,9 +268,6 @@ def _with_its_targets(session: Session, prior_calibration: CalibrationPrior) -> 
 
     The only one of a session has no name: where several were calibrated with, it is the one among
     them that is printed alike.
-
-    Raises:
-        DataError: They are others than were calibrated with, or it is not known which of them.
     """
     known, shown = prior_calibration.targets, session.boards
     if len(known) < 2 and len(shown) < 2:

@@ -174,14 +174,7 @@ def _sigmas(fields: Fields, length_m: float) -> FloatArray:
 def _axes(
     fields: Fields, unit: str | None, option: str, named: Sequence[str] = ()
 ) -> tuple[tuple[str, ...], float]:
-    """Finds the columns of x, y, z, and the length of their unit [m].
-
-    Args:
-        fields: The rows.
-        unit: What they are in; left out, their names say it.
-        option: By which the user says that.
-        named: The columns, where the user names them.
-    """
+    """Finds the columns of x, y, z, and the length of their unit [m]."""
     if unit is not None and unit not in UNITS_M:
         raise DataError(
             f"There is no unit of length named {unit!r}; the names are {some_of(list(UNITS_M))}.",
