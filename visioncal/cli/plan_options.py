@@ -104,7 +104,7 @@ class PlanOptions:
             self.criterion,
             None if unwished else Wish(self.wish_mm, self.wish_deg),
             self.candidates,
-            box_of(self.workspace, "--workspace", "workspace") if self.workspace else None,
+            _box_of(self.workspace, "--workspace", "workspace") if self.workspace else None,
             np.array(start) if start else None,
             self.seed,
             None if needless else Need(self.need_mm, self.need_deg),
@@ -202,7 +202,7 @@ class ClearanceOptions:
         Raises:
             DataError: A box is written otherwise.
         """
-        return tuple(box_of(it) for it in self.boxes or ())
+        return tuple(_box_of(it) for it in self.boxes or ())
 
     @property
     def floor_m(self) -> float | None:
@@ -253,17 +253,8 @@ class SightOptions:
         )
 
 
-def box_of(words: str, option: str = "--box", name: str = "") -> "Box":
-    """Reads a box: NAME:x,y,z:sx,sy,sz, its centre in the base and its lengths [mm].
-
-    Args:
-        words: What the user wrote.
-        option: Where.
-        name: The box's; empty where the words begin with it.
-
-    Raises:
-        DataError: It is written otherwise.
-    """
+def _box_of(words: str, option: str = "--box", name: str = "") -> "Box":
+    """Reads a box: NAME:x,y,z:sx,sy,sz, its centre in the base and its lengths [mm]."""
     import numpy as np
 
     from visioncal.core.transforms import compose

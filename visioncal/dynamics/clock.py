@@ -87,7 +87,7 @@ def even_parts(recorded: Recorded, bad: Mask, clock: Clock, widest_s: float) -> 
         clock: Of their stamps.
         widest_s: Angles are interpolated where samples are missing for no longer [s].
     """
-    bounds = [0, *(gaps_of(clock, widest_s) + 1), len(recorded)]
+    bounds = [0, *(_gaps_of(clock, widest_s) + 1), len(recorded)]
     return [
         _even(recorded, bad, clock, slice(begin, end))
         for begin, end in pairwise(bounds)
@@ -95,7 +95,7 @@ def even_parts(recorded: Recorded, bad: Mask, clock: Clock, widest_s: float) -> 
     ]
 
 
-def gaps_of(clock: Clock, widest_s: float) -> IntArray:
+def _gaps_of(clock: Clock, widest_s: float) -> IntArray:
     """The samples behind which others are missing for longer than that [s]."""
     return np.flatnonzero((clock.counts > 1) & ((clock.counts - 1) * clock.usual_s > widest_s))
 
@@ -103,7 +103,7 @@ def gaps_of(clock: Clock, widest_s: float) -> IntArray:
 def clock_notes(recorded: Recorded, clock: Clock, widest_s: float) -> list[str]:
     """What is wrong with a stream's clock, and what was done about it, in words."""
     steps, notes = np.diff(recorded.times_s), []
-    gaps = gaps_of(clock, widest_s)
+    gaps = _gaps_of(clock, widest_s)
     if len(gaps):
         places = [f"{recorded.times_s[it] - recorded.times_s[0]:.2f} s" for it in gaps]
         notes.append(

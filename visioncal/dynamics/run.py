@@ -102,7 +102,7 @@ def identify_session(session: Session, request: Request | None = None) -> Run:
     request = Request() if request is None else request
     session = of_one_arm(session, request.robot)
     robot = robot_of(session)
-    names = [it for it in torque_streams(session, request.streams) if it != request.validate_on]
+    names = [it for it in _torque_streams(session, request.streams) if it != request.validate_on]
     if not names:
         raise DataError(
             f"session {session.name!r}: {request.validate_on} is its only stream of torques, and "
@@ -162,7 +162,7 @@ def conditioned_streams(
         DataError: The robot is another one, there is no such stream, or a stream is wrong.
     """
     robot, session = identified.robot, of_one_arm(session, request.robot)
-    names = torque_streams(session, request.streams)
+    names = _torque_streams(session, request.streams)
     recorded = [_read(session, robot, it, request) for it in names]
     cutoff_hz = request.cutoff_hz or identified.streams[0].cutoff_hz
     filtered = replace(request, cutoff_hz=cutoff_hz)
@@ -191,7 +191,7 @@ def current_streams(
         DataError: There is no stream of currents, or one is wrong.
     """
     request = Request(cutoff_hz=cutoff_hz, gains_nm_a=(1.0,) * robot.joint_count)
-    recorded = [_read(session, robot, it, request) for it in torque_streams(session)]
+    recorded = [_read(session, robot, it, request) for it in _torque_streams(session)]
     recorded = [it for it in recorded if it.of_currents]
     if not recorded:
         raise DataError(
@@ -229,12 +229,8 @@ def robot_of(session: Session) -> Robot:
     return Robot.from_document(session.robot_document)
 
 
-def torque_streams(session: Session, wanted: Sequence[str] = ()) -> list[str]:
-    """Names of the streams that have torques or currents, or of those that are wanted.
-
-    Raises:
-        DataError: There is none.
-    """
+def _torque_streams(session: Session, wanted: Sequence[str] = ()) -> list[str]:
+    """Names of the streams that have torques or currents, or of those that are wanted."""
     for name in wanted:
         if name not in session.streams:
             raise DataError(
@@ -259,7 +255,7 @@ def torque_streams(session: Session, wanted: Sequence[str] = ()) -> list[str]:
 
 
 def _read(session: Session, robot: Robot, name: str, request: Request) -> Recorded:
-    (name,) = torque_streams(session, [name])
+    (name,) = _torque_streams(session, [name])
     label = f"{STREAMS}/{name}.csv"
     return read_recorded(session.streams[name], label, robot.joint_count, request.gains_nm_a)
 

@@ -47,17 +47,17 @@ def motion_files(plan: MotionPlan, rate_hz: float) -> dict[str, str]:
     robot, found = plan.allowed.robot, {}
     programmed = has_ur_axes(robot)
     if plan.sweeps is not None:
-        found["sweeps.csv"] = motion_table(plan.sweeps.sampled(rate_hz))
+        found["sweeps.csv"] = _motion_table(plan.sweeps.sampled(rate_hz))
         if programmed:
             found["sweeps.script"] = sweeps_program(robot, plan.sweeps)
     series = plan.excitation.series
-    found["excitation.csv"] = motion_table(series.sampled(rate_hz))
+    found["excitation.csv"] = _motion_table(series.sampled(rate_hz))
     if programmed:
         found["excitation.script"] = excitation_program(robot, series)
     return found
 
 
-def motion_table(motion: Motion) -> str:
+def _motion_table(motion: Motion) -> str:
     """Writes a motion as a table with the columns of a session's stream."""
     joints = range(1, motion.q.shape[1] + 1)
     columns = [

@@ -55,7 +55,7 @@ def covariance_by_source(
     """
     fitted = covariance_among(fisher_information(problem, state, noise), problem.counted)
     linear, own = problem.linear(state, ideal=True), problem.covariance(noise)
-    gain = weighted_jacobian(problem, linear, own, noise) @ fitted[:, : 6 * len(problem.unknown)]
+    gain = _weighted_jacobian(problem, linear, own, noise) @ fitted[:, : 6 * len(problem.unknown)]
     found: dict[str, FloatArray] = defaultdict(lambda: np.zeros((gain.shape[2],) * 2))
     for frame in dict.fromkeys(problem.observations.observers):
         mine = np.array([it == frame for it in problem.observations.observers])
@@ -96,26 +96,16 @@ def less_noise(
     """
     fitted = covariance_among(fisher_information(problem, state, noise), problem.counted)
     linear, place = problem.linear(state, ideal=True), problem.robots.index(robot)
-    gain = weighted_jacobian(problem, linear, problem.covariance(noise), noise) @ fitted
+    gain = _weighted_jacobian(problem, linear, problem.covariance(noise), noise) @ fitted
     mine = _of_flange(problem, linear, gain, place)
     change = np.repeat(white**2 - noise.robots[place] ** 2, 3)
     return gram(mine, change[:, None] * mine)
 
 
-def weighted_jacobian(
+def _weighted_jacobian(
     problem: Problem, linear: Linear, own: FloatArray, noise: Noise
 ) -> FloatArray:
-    """The inverse covariance of all residuals times their Jacobian.
-
-    Args:
-        problem: The observations.
-        linear: Their residuals and Jacobian.
-        own: (n, 6, 6) covariances of the observations' own noise.
-        noise: The levels.
-
-    Returns:
-        (n, 6, p).
-    """
+    """(n, 6, p) the inverse covariance of all residuals times their Jacobian."""
     found, alone, (of, _) = linear.jacobian, problem.alone, problem.units
     total = problem.total_covariance(linear, noise)
     found[alone] = np.linalg.solve(total[alone], found[alone])

@@ -129,11 +129,11 @@ class FeatureProblem:
         """Gives the frame from the means of each kind, then from one touch of each."""
         points = self.touches.points
         kinds = [self.touches.rows(kind) for kind in FEATURE_KINDS]
-        yield frame_from(*(points[rows].mean(axis=0) for rows in kinds))
+        yield _frame_from(*(points[rows].mean(axis=0) for rows in kinds))
         sets = np.array(list(product(*kinds)))
         if len(sets) > _SETS:
             sets = np.random.default_rng(0).choice(sets, _SETS, replace=False)
-        frames = (frame_from(*points[rows]) for rows in sets)
+        frames = (_frame_from(*points[rows]) for rows in sets)
         # Three touches on one line make no frame, and nothing would contradict what is none.
         yield from (it for it in frames if np.linalg.det(it[:3, :3]) > _IS_FRAME)
 
@@ -158,7 +158,7 @@ class FeatureProblem:
         return state @ exp(step)
 
 
-def frame_from(origin: FloatArray, on_x: FloatArray, in_xy: FloatArray) -> FloatArray:
+def _frame_from(origin: FloatArray, on_x: FloatArray, in_xy: FloatArray) -> FloatArray:
     """Builds the (4, 4) frame of three points: on the origin, the x axis and the xy plane.
 
     Of points on a line axes are zero, and the determinant is.

@@ -192,7 +192,7 @@ def unmoved(
     return joined, replace(fit, state=state), rest
 
 
-def twin_name(problem: Problem, frame: str) -> str:
+def _twin_name(problem: Problem, frame: str) -> str:
     """A name for a frame from when on it moved."""
     first, _, number = frame.partition("@")
     count = int(number or 1) + 1
@@ -280,7 +280,7 @@ def _followed(
 
 
 def _move(problem: Problem, step: _Step) -> Move:
-    return Move(step.frame, twin_name(problem, step.frame), step.stop, step.change)
+    return Move(step.frame, _twin_name(problem, step.frame), step.stop, step.change)
 
 
 def _best_steps(

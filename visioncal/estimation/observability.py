@@ -198,7 +198,7 @@ def _refuse_vague(problem: Problem, state: State, noise: Noise, scene: Scene) ->
     beyond = [
         (frame, it)
         for frame in problem.unknown
-        for it in frame_directions(problem, state, covariance, frame, scene.names[frame])
+        for it in _frame_directions(problem, state, covariance, frame, scene.names[frame])
         if it.sigma > it.limit
     ]
     if beyond:
@@ -212,18 +212,10 @@ def _refuse_vague(problem: Problem, state: State, noise: Noise, scene: Scene) ->
         )
 
 
-def frame_directions(
+def _frame_directions(
     problem: Problem, state: State, covariance: FloatArray, frame: str, names: tuple[str, str]
 ) -> tuple[Direction, ...]:
-    """The worst directions of a frame: of its offset and, where it has one, of its rotation.
-
-    Args:
-        problem: The observations.
-        state: The answer.
-        covariance: (p, p) covariance of the unknowns.
-        frame: The frame.
-        names: What it is called, and the frame that it hangs on.
-    """
+    """The worst directions of a frame: of its offset and, where it has one, of its rotation."""
     columns = problem.edge_columns(frame)
     edge = state.edges[problem.unknown[frame]]
     found = edge_directions(edge, covariance[columns, columns], *names)
@@ -264,7 +256,7 @@ def directions(
     return tuple(
         it
         for frame, names in _names(problem, mount).items()
-        for it in frame_directions(problem, state, covariance, frame, names)
+        for it in _frame_directions(problem, state, covariance, frame, names)
     )
 
 

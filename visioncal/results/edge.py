@@ -51,7 +51,7 @@ class Edge:
         return float(np.rad2deg(np.sqrt(np.trace(self.covariance[:3, :3]))))
 
 
-def covariance_fault(matrix: FloatArray) -> str:
+def _covariance_fault(matrix: FloatArray) -> str:
     """Says where a matrix is no covariance; empty for one."""
     variance = np.diagonal(matrix)
     scale = np.sqrt(np.where(variance > 0.0, variance, 1.0))
@@ -68,7 +68,7 @@ def covariance_fault(matrix: FloatArray) -> str:
     return ""
 
 
-Covariance = Annotated[FloatArray, Array((-1, -1), covariance_fault)]
+Covariance = Annotated[FloatArray, Array((-1, -1), _covariance_fault)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +131,7 @@ class EdgeForm(PoseForm):
         sigma_deg: Root of the trace of the rotation's covariance [deg].
     """
 
-    covariance: Annotated[FloatArray, Array((6, 6), covariance_fault)]
+    covariance: Annotated[FloatArray, Array((6, 6), _covariance_fault)]
     sigma_mm: float
     sigma_deg: float
 

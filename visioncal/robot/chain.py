@@ -278,16 +278,12 @@ def _placement(row: Table) -> FloatArray:
     matrix = np.array(
         [number_list(Table({"placement": it}, row.label), "placement", 4) for it in rows]
     )
-    check_rigid(matrix, row.label)
+    _check_rigid(matrix, row.label)
     return matrix
 
 
-def check_rigid(matrix: FloatArray, label: str) -> None:
-    """Checks that (4, 4) numbers are a rigid transform.
-
-    Raises:
-        DataError: They are not.
-    """
+def _check_rigid(matrix: FloatArray, label: str) -> None:
+    """Checks that (4, 4) numbers are a rigid transform."""
     rotation = matrix[:3, :3]
     if (
         # Squares of the largest numbers overflow.

@@ -33,7 +33,7 @@ def read_targets(
     Raises:
         DataError: There is no such target, or its description is wrong.
     """
-    places = declared_targets(declaration)
+    places = _declared_targets(declaration)
     if not places:
         return {}, document
     if len(places) == 1:
@@ -78,14 +78,14 @@ def target_warnings(declaration: Declaration, document: Mapping[str, Any] | None
         declaration: What the session declares.
         document: The descriptions, in the form of `read_targets`.
     """
-    places = declared_targets(declaration)
+    places = _declared_targets(declaration)
     for name, place in places.items():
         described = document if len(places) == 1 else (document or {}).get(name)
         for words in misspelt_keys(described or {}):
             yield f"{place}: {words}"
 
 
-def declared_targets(declaration: Declaration) -> dict[str, str]:
+def _declared_targets(declaration: Declaration) -> dict[str, str]:
     """The targets' built-in names or paths, by the names that rows give them."""
     if declaration.target is not None:
         return {"": declaration.target}

@@ -47,7 +47,7 @@ def robots_of(
     return {name: it for name, it in found.items() if isinstance(it, RobotTable)}
 
 
-def point_name(view: View) -> str:
+def _point_name(view: View) -> str:
     """The point that an instrument's reading is of; empty where it has no name."""
     return view.text.get("point", "").strip()
 
@@ -123,7 +123,7 @@ class _Tree:
         listed = [("base", it) for it in self.robots] + [("flange", it) for it in self.robots]
         for kind in ("camera", "target", "instrument"):
             listed += [(kind, name) for name in self._names(kind)]
-        points = dict.fromkeys(point_name(it) for it in self.views if is_read(it))
+        points = dict.fromkeys(_point_name(it) for it in self.views if is_read(it))
         listed += [("point", name) for name in points]
         return {frame_name(kind, name): (kind, name) for kind, name in listed}
 
@@ -223,7 +223,7 @@ class _Tree:
     def _of_point(self, frame: str) -> str | None:
         """A point moves with the robot that its rows name; where they have no pose, it is fixed."""
         _, name = self.frames[frame]
-        rows = [it for it in self.views if is_read(it) and point_name(it) == name]
+        rows = [it for it in self.views if is_read(it) and _point_name(it) == name]
         moved = [it for it in rows if has_robot_state(it)]
         if not moved and len(self.robots) < 2:
             return CELL if self.declaration.is_network else self._flange_of(frame)
@@ -278,7 +278,7 @@ def observed(declaration: Declaration, view: View) -> tuple[str, str]:
         )
     if is_read(view):
         instrument = name_of(declaration, "instrument", view)
-        return frame_name("instrument", instrument), frame_name("point", point_name(view))
+        return frame_name("instrument", instrument), frame_name("point", _point_name(view))
     return "", ""
 
 

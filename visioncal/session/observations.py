@@ -100,12 +100,8 @@ def standing(declaration: Declaration, views: Sequence[View]) -> dict[int, Mappi
     return found
 
 
-def still_since(views: Iterable[View]) -> dict[int, int]:
-    """Of each row of one robot, by its view: the row since which the robot has not moved.
-
-    Args:
-        views: Rows that have its pose and name no stop, in their order.
-    """
+def _still_since(views: Iterable[View]) -> dict[int, int]:
+    """Of each row of one robot, by its view: the row since which the robot has not moved."""
     found: dict[int, int] = {}
     first = last = None
     for view in views:
@@ -159,7 +155,7 @@ def _stops(declaration: Declaration, views: Sequence[View]) -> list[_Stop]:
     for view in views:
         if view.stop is None and not view.is_of_lens and has_robot_state(view):
             rows_of.setdefault(name_of(declaration, "robot", view), []).append(view)
-    since = {row: first for mine in rows_of.values() for row, first in still_since(mine).items()}
+    since = {row: first for mine in rows_of.values() for row, first in _still_since(mine).items()}
     for view in views:
         alone = view.stop is None or view.is_of_lens
         key = (1, since.get(view.number, view.number)) if alone else (0, view.stop or 0)

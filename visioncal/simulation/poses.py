@@ -22,7 +22,7 @@ _MARGIN_PX = 12.0
 _LEAST_SHARE = 0.6
 
 
-def working_distance_m(options: CellOptions) -> tuple[float, float]:
+def _working_distance_m(options: CellOptions) -> tuple[float, float]:
     """Least and greatest distance between camera and board [m]."""
     if options.distance_m is not None:
         return options.distance_m
@@ -37,7 +37,7 @@ def working_distance_m(options: CellOptions) -> tuple[float, float]:
 
 def mean_view(options: CellOptions, sheet: Sheet) -> FloatArray:
     """The view that the others are spread around: straight, at the mean distance, (4, 4)."""
-    middle = 0.5 * sum(working_distance_m(options))
+    middle = 0.5 * sum(_working_distance_m(options))
     return compose(np.eye(3), np.array([0.0, 0.0, middle]) - centre_m(sheet))
 
 
@@ -56,7 +56,7 @@ def draw_views(
         (k, 4, 4) `cam_from_target`, k <= count.
     """
     rotation = _rotations(options, count, rng)
-    distance = rng.uniform(*working_distance_m(options), size=count)
+    distance = rng.uniform(*_working_distance_m(options), size=count)
     # At most this share of the views may be cut.
     may_be_cut = rng.random(count) < (options.cut_views if found_in_part(options.target) else 0)
     reach = np.where(may_be_cut, 0.4, 0.3)[:, None]

@@ -219,7 +219,7 @@ def _behind(
         np.uint8,
     )
     if not scene.backdrop.moves:
-        draw_arm(behind, camera, cell.arm, joints, invert(cell.transforms["base_from_cam"]))
+        _draw_arm(behind, camera, cell.arm, joints, invert(cell.transforms["base_from_cam"]))
     offset = (places - scene.backdrop.lamp_m * np.array([-0.3, -0.2])) / scene.backdrop.lamp_m
     distance2 = (offset**2).sum(axis=-1)
     light = behind.astype(np.float32)
@@ -344,18 +344,10 @@ class _Tube:
     grey: float
 
 
-def draw_arm(
+def _draw_arm(
     image: Image, camera: Camera, arm: Arm, joints: FloatArray, cam_from_base: FloatArray
 ) -> None:
-    """Draws an arm into an image, its far parts first.
-
-    Args:
-        image: (height, width) image, changed in place.
-        camera: The camera.
-        arm: The arm.
-        joints: (n,) its joint angles [rad].
-        cam_from_base: (4, 4) where it stands before the camera.
-    """
+    """Draws an arm into an image, its far parts first."""
     tubes = _tubes(arm, link_frames(arm, joints[None])[0])
     seen = []
     for tube in tubes:

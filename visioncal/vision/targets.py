@@ -474,7 +474,7 @@ def corner_positions(target: Target) -> FloatArray:
     if target.kind == "marker":
         return np.asarray(side * (_CLOCKWISE - np.array([0.5, 0.5, 0.0])))
     if target.kind == "aprilgrid":
-        places = np.pad((1.0 + target.spacing) * tag_places(target), ((0, 0), (0, 1)))
+        places = np.pad((1.0 + target.spacing) * _tag_places(target), ((0, 0), (0, 1)))
         return np.asarray(side * (places[:, None] + _CLOCKWISE).reshape(-1, 3))
     if target.kind == "circles":
         places = circle_places(target.columns, target.rows, asymmetric=target.asymmetric)
@@ -485,7 +485,7 @@ def corner_positions(target: Target) -> FloatArray:
     return np.asarray(side * flat, dtype=float)
 
 
-def tag_places(target: Target) -> IntArray:
+def _tag_places(target: Target) -> IntArray:
     """The (t, 2) columns and rows of an AprilGrid's tags, in the order of their ids.
 
     As on Kalibr's pages the first tag is at the lower left, and ids run along the rows.

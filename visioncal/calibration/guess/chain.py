@@ -23,17 +23,8 @@ _FEWEST_ROWS = 4
 _AGREES = 0.02
 
 
-def chain_fit(hypothesis: Hypothesis, robot: PoseNumbers, chain: FloatArray) -> Fit | None:
-    """Compares the poses of a reading with those of the joints.
-
-    Args:
-        hypothesis: The reading.
-        robot: The robot's numbers.
-        chain: (n, 4, 4) `base_from_flange` through the model; NaN where there are no joints.
-
-    Returns:
-        The fit, whose x is `base_from_model`; None where too few rows have both.
-    """
+def _chain_fit(hypothesis: Hypothesis, robot: PoseNumbers, chain: FloatArray) -> Fit | None:
+    """Compares the poses of a reading with those of the joints."""
     poses = hypothesis.robot.poses(robot)
     there = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(chain).all(axis=(1, 2))
     if there.sum() < _FEWEST_ROWS:
@@ -48,7 +39,7 @@ def by_chain(
     scored = [
         (fit.score, at)
         for at, label in enumerate(labels)
-        if (fit := chain_fit(label, robot, chain)) is not None
+        if (fit := _chain_fit(label, robot, chain)) is not None
     ]
     scored.sort()
     if len(scored) < 2 or scored[1][0] < _CLEARLY * scored[0][0]:
@@ -61,7 +52,7 @@ def is_half_turned(hypothesis: Hypothesis, robot: PoseNumbers, chain: FloatArray
 
     Universal Robots' controllers call the one base, ROS the other base_link (REP 199).
     """
-    fit = chain_fit(hypothesis, robot, chain)
+    fit = _chain_fit(hypothesis, robot, chain)
     if fit is None or fit.score > _AGREES:
         return False
     away_mm, away_deg = pose_difference(HALF_TURN, fit.x)

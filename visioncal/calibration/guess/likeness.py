@@ -13,7 +13,7 @@ from visioncal.calibration.guess.given import Recording, Scored
 _CLEARLY = 1.5
 
 
-def is_before(recording: Recording, scored: Scored) -> bool:
+def _is_before(recording: Recording, scored: Scored) -> bool:
     """Whether the target is before the camera."""
     camera = scored.hypothesis.camera.poses(recording.camera)
     return bool(np.median(camera[scored.rows, 2, 3]) > 0.0)
@@ -29,12 +29,12 @@ def flange_and_cell_m(scored: Scored) -> tuple[float, float]:
 def likeness(recording: Recording, scored: Scored) -> tuple[bool, bool]:
     """A key by which likely cells come last."""
     on_flange_m, at_base_m = flange_and_cell_m(scored)
-    return is_before(recording, scored), on_flange_m < at_base_m
+    return _is_before(recording, scored), on_flange_m < at_base_m
 
 
 def is_far_likelier(recording: Recording, scored: Scored, other: Scored) -> bool:
     """Whether a reading is that of a cell and another, with its edges exchanged, is not."""
-    before, other_before = is_before(recording, scored), is_before(recording, other)
+    before, other_before = _is_before(recording, scored), _is_before(recording, other)
     if before != other_before:
         return before
     on_flange_m, at_base_m = flange_and_cell_m(scored)

@@ -42,13 +42,10 @@ def left_out(solved: Solved) -> HeldOut:
     return validate(solved.part, again, pixels, of)
 
 
-def covariances_of_edges(solved: Solved, beside: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-    """Covariances (6 e, 6 e) of the unknown frames, by source and as a `total`.
-
-    Args:
-        solved: The fit.
-        beside: (p, p) what counts beside its noise, by source.
-    """
+def _covariances_of_edges(
+    solved: Solved, beside: Mapping[str, FloatArray]
+) -> dict[str, FloatArray]:
+    """Covariances (6 e, 6 e) of the unknown frames, by source and as a `total`."""
     fit, part = solved.agreed.fit, solved.part
     parts = covariance_by_source(part, fit.state, fit.noise, _sources(solved))
     size = 6 * len(part.unknown)
@@ -59,16 +56,16 @@ def covariances_of_edges(solved: Solved, beside: Mapping[str, FloatArray]) -> di
 
 def budget_mm(solved: Solved, beside: Mapping[str, FloatArray]) -> dict[str, dict[str, float]]:
     """Sigmas of each unknown frame's place in its parent, by source and as a `total` [mm]."""
-    parts, part = covariances_of_edges(solved, beside), solved.part
+    parts, part = _covariances_of_edges(solved, beside), solved.part
     found: dict[str, dict[str, float]] = {}
     for key in part.unknown:
         at = part.edge_columns(key).start
         place = slice(at + 3, at + 6)
-        found[key] = {name: 1e3 * root_trace(it[place, place]) for name, it in parts.items()}
+        found[key] = {name: 1e3 * _root_trace(it[place, place]) for name, it in parts.items()}
     return found
 
 
-def root_trace(covariance: FloatArray) -> float:
+def _root_trace(covariance: FloatArray) -> float:
     """Root of the trace: of two sources that make up for each other, one may be under zero."""
     return float(max(np.trace(covariance), 0.0) ** 0.5)
 
@@ -107,13 +104,13 @@ def work_of(solved: Solved, beside: Mapping[str, FloatArray], covariance: FloatA
     point = seen.mean(axis=0)
     at_work = {
         name: point_covariance(state.edges[0], it[:6, :6], point)
-        for name, it in covariances_of_edges(solved, beside).items()
+        for name, it in _covariances_of_edges(solved, beside).items()
     }
     limit = np.tile(np.repeat([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M], 3), 2)
     values = np.linalg.eigvalsh(covariance[:12, :12] / np.outer(limit, limit))
     return Work(
         point,
-        {name: 1e3 * root_trace(it) for name, it in at_work.items()},
+        {name: 1e3 * _root_trace(it) for name, it in at_work.items()},
         1e3 * radius95(at_work["total"]),
         np.sqrt(np.maximum(values, 0.0)),
     )

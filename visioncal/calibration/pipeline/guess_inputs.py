@@ -175,19 +175,16 @@ def reading_hint(seen: RunState) -> Finding | None:
     swap = best.hypothesis.swap if len(best.differences) == 1 else ()
     exchanged = tuple(views[row].number for row in swap)
     found = read_otherwise(guess.sentence, exchanged, is_mirrored=is_mirrored)
-    if is_mirrored and corners_are_mirrored(seen):
+    if is_mirrored and _corners_are_mirrored(seen):
         found = replace(found, do=MIRRORED_CORNERS)
     return found
 
 
-def corners_are_mirrored(seen: RunState) -> bool:
+def _corners_are_mirrored(seen: RunState) -> bool:
     """Whether corners.csv shows boards from behind, as a camera cannot see a print.
 
     A left-handed frame of the robot does not do that, nor do images that were mirrored before
     another program numbered their corners.
-
-    Args:
-        seen: What is known once the camera's poses are.
     """
     session = seen.session
     if any(it.image for it in session.views) or not session.corners:
@@ -202,12 +199,12 @@ def corners_are_mirrored(seen: RunState) -> bool:
 
 
 def session_is_mirrored(session: Session) -> bool:
-    """Does what `corners_are_mirrored` does with a session of which nothing is known yet.
+    """Does what `_corners_are_mirrored` does with a session of which nothing is known yet.
 
     Raises:
         VisioncalError: The camera's poses cannot be found.
     """
-    return corners_are_mirrored(_seen(RunState(session)))
+    return _corners_are_mirrored(_seen(RunState(session)))
 
 
 def _unrecorded(seen: RunState) -> Finding | None:

@@ -357,7 +357,7 @@ def _motion(cell: Cell, part: Problem, frame: str) -> str:
     return "; ".join(words) or f"{int(rows.sum())} observations are too few or too poor"
 
 
-def worst_direction(cell: Cell, frame: str, edge: Edge) -> Direction:
+def _worst_direction(cell: Cell, frame: str, edge: Edge) -> Direction:
     """The direction of a frame that is known worst, in the axes of the frame that it hangs on."""
     found = _directions(cell, frame, edge)
     return max(found, key=lambda it: it.sigma / it.limit)
@@ -397,7 +397,7 @@ def weakest_link(cell: Cell, edges: Mapping[str, Edge]) -> str:
     if not edges:
         return ""
     name, edge = max(edges.items(), key=lambda it: it[1].sigma_mm)
-    worst = worst_direction(cell, name, edge)
+    worst = _worst_direction(cell, name, edge)
     return (
         f"The weakest link is {name}: sigma {figure(edge.sigma_mm)} mm and "
         f"{figure(edge.sigma_deg)} deg, most of it in {worst.words}. {_resting(cell, name)}"

@@ -684,7 +684,7 @@ def problem_of(cell: Cell, views: Sequence[ViewPoses]) -> Problem:
     given = np.array([not it.covariance.any() for it in views])
     levels = {it: at for at, it in enumerate(sensors_of(cell, views))}
     sensors = [
-        levels.get(row.seer, -1) if is_sensed(row.seer, view) else -1
+        levels.get(row.seer, -1) if _is_sensed(row.seer, view) else -1
         for row, view in zip(cell.rows, views, strict=True)
     ]
     covariance = np.array([it.covariance[0] for it in views])
@@ -720,7 +720,7 @@ def problem_of(cell: Cell, views: Sequence[ViewPoses]) -> Problem:
     )
 
 
-def is_sensed(seer: str, view: ViewPoses) -> bool:
+def _is_sensed(seer: str, view: ViewPoses) -> bool:
     """Whether an observation's noise is known up to a level: those of corners is known."""
     return seer.startswith("instrument") or not view.covariance.any()
 
@@ -733,4 +733,4 @@ def sensors_of(cell: Cell, views: Sequence[ViewPoses]) -> tuple[str, ...]:
     if cell.mount is not None:
         return ()
     pairs = zip(cell.rows, views, strict=True)
-    return tuple(dict.fromkeys(row.seer for row, view in pairs if is_sensed(row.seer, view)))
+    return tuple(dict.fromkeys(row.seer for row, view in pairs if _is_sensed(row.seer, view)))

@@ -59,18 +59,18 @@ def found_of_looks(
     cameras = zip(looks.problems.items(), fitted.seen.compressed, strict=True)
     for (camera, problem), it in cameras:
         moving = np.flatnonzero(np.isin(looks.places(camera), fitted.moving))
-        scattered = noise_found(problem.stack, it.residuals, problem.unknowns(it, moving))
+        scattered = _noise_found(problem.stack, it.residuals, problem.unknowns(it, moving))
         of = "" if camera == ONLY_CAMERA else camera
         yield from (it.of(of) for it in (*scattered, *_lens_found(fitted, camera)))
     scene = next(iter(looks.problems.values())).scene
     for board, target in enumerate(scene.targets):
         if board not in looks.printed:
-            yield from points_found(target, looks.moved_points(board))
+            yield from _points_found(target, looks.moved_points(board))
             frame = frame_name("target", scene.names[board])
             measured = measured_rig(side, fitted, frame, board)
             if stated is not None:
                 measured = rig_by_stated_arms(fitted, stated, frame, board) or measured
-            yield from rig_size_found(target, measured)
+            yield from _rig_size_found(target, measured)
             continue
         called = f"board {scene.names[board]}".strip()
         if _moves(fitted, looks.scale_of(board)):
@@ -82,17 +82,11 @@ def found_of_looks(
             )
             yield scale_found(called, target.square_m, measured, written)
         if _moved(fitted, looks.shape_of(board)):
-            yield shape_found(fitted, board, called)
+            yield _shape_found(fitted, board, called)
 
 
-def noise_found(stack: CornerStack, residuals: FloatArray, unknowns: int) -> Iterator[Finding]:
-    """Finds whether corners scatter otherwise than corners.csv states; less is no doubt.
-
-    Args:
-        stack: The corners.
-        residuals: (n, 2) by their weights [px].
-        unknowns: How many were fitted to them.
-    """
+def _noise_found(stack: CornerStack, residuals: FloatArray, unknowns: int) -> Iterator[Finding]:
+    """Finds whether corners scatter otherwise than corners.csv states; less is no doubt."""
     stated, shown = stack.stated_px, stack.shown_px(residuals, unknowns)
     if stated is None or not stack.contradicts(residuals, unknowns):
         return
@@ -148,15 +142,10 @@ def scale_found(
     )
 
 
-def shape_found(fitted: Fitted, board: int, called: str) -> Finding:
+def _shape_found(fitted: Fitted, board: int, called: str) -> Finding:
     """Words a board that is bent, longer one way than the other, or sheared; a note of the least.
 
     Of these, what is more than chance is worded; all of them together are.
-
-    Args:
-        fitted: The fit, with the board's shape free.
-        board: Its place among the targets.
-        called: What it is called.
     """
     looks = fitted.looks
     shape = looks.shape_of(board)
@@ -190,13 +179,8 @@ def shape_found(fitted: Fitted, board: int, called: str) -> Finding:
     )
 
 
-def points_found(target: Target, moved_m: FloatArray) -> Iterator[Finding]:
-    """Whether a rig's points lie farther from where its table has them than it says.
-
-    Args:
-        target: The rig.
-        moved_m: (3 n,) how far its points were moved [m]; empty where they were not.
-    """
+def _points_found(target: Target, moved_m: FloatArray) -> Iterator[Finding]:
+    """Whether a rig's points lie farther from where its table has them than it says."""
     if not target.point_sigmas_m:
         return
     if not len(moved_m):
@@ -219,13 +203,8 @@ def points_found(target: Target, moved_m: FloatArray) -> Iterator[Finding]:
         )
 
 
-def rig_size_found(target: Target, measured: MeasuredScale) -> Iterator[Finding]:
-    """Whether a rig is larger or smaller than its table, by the robot's motion.
-
-    Args:
-        target: The rig.
-        measured: Its size by that.
-    """
+def _rig_size_found(target: Target, measured: MeasuredScale) -> Iterator[Finding]:
+    """Whether a rig is larger or smaller than its table, by the robot's motion."""
     if not measured.is_another or abs(measured.scale) < _SAME_SIZE:
         return
     word = "larger" if measured.scale > 0 else "smaller"
@@ -270,7 +249,7 @@ def _lens_found(fitted: Fitted, camera: str) -> Iterator[Finding]:
         if np.abs(moves).max() > _LEAST_MOVE_PX:
             known = covariance_of(fitted.problem, fitted.fit)[np.ix_(at, at)]
             squared = float(moves @ np.linalg.solve(known, moves))
-            yield replace(contest_found(problem.scene, moves), mahalanobis_sq=squared)
+            yield replace(_contest_found(problem.scene, moves), mahalanobis_sq=squared)
 
 
 def _corners_moved_px(problem: CornerProblem, refined: Camera) -> float:
@@ -304,13 +283,8 @@ def lens_found(steps_px: FloatArray, *, is_doubtful: bool) -> Finding:
     )
 
 
-def contest_found(scene: Scene, moves_px: FloatArray) -> Finding:
-    """Words intrinsics that stay although the corners speak against them.
-
-    Args:
-        scene: What the camera looks at.
-        moves_px: (4,) how far fx, fy, cx, cy would move [px].
-    """
+def _contest_found(scene: Scene, moves_px: FloatArray) -> Finding:
+    """Words intrinsics that stay although the corners speak against them."""
     why = (
         'intrinsics = "hold" keeps them'
         if scene.mode == "hold"

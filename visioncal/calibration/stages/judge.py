@@ -286,7 +286,7 @@ def judge(findings: Findings) -> Verdict:
     else:
         said.insert(
             len(said) * (met.probability >= NeedLimits.probability[0]),
-            Finding(NEED, met_words(findings, met)),
+            Finding(NEED, _met_words(findings, met)),
         )
     said += [] if doubts else [_praise(findings, is_enough=status == "good")]
     said += [*hints, *(it for it in findings.warnings if it.kind in NOT_USABLE)]
@@ -328,7 +328,7 @@ def _good_for(
     return (Finding(GOOD_FOR, words),)
 
 
-def met_words(findings: Findings, met: NeedMet) -> str:
+def _met_words(findings: Findings, met: NeedMet) -> str:
     """How likely picks land within what is needed."""
     need, worst = met.need, min(findings.picks, key=lambda it: it.probability(met.need))
     within = [f"{value:g} {unit}" for value, unit in ((need.mm, "mm"), (need.deg, "deg")) if value]

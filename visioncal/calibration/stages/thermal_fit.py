@@ -94,7 +94,7 @@ class ThermalFit:
     @property
     def not_determined(self) -> tuple[str, ...]:
         """The parameters that stay at what was known before, by joint."""
-        names = parameter_names(self.model)
+        names = _parameter_names(self.model)
         return tuple(it for it, share in zip(names, self.shares, strict=True) if share > _LITTLE)
 
     def links_c(self, stops: Stops) -> FloatArray:
@@ -116,7 +116,7 @@ class ThermalFit:
         return replace(free, values=nothing, held=nothing == 0.0)
 
 
-def parameter_names(model: ThermalModel) -> tuple[str, ...]:
+def _parameter_names(model: ThermalModel) -> tuple[str, ...]:
     """The parameters' names, in the order of their covariance."""
     kinds = ["growth", "drift", "tau"] + ["gain"] * (model.heating.kind == "currents")
     return tuple(f"{kind} of {joint}" for kind in kinds for joint in model.robot.joint_names)

@@ -46,7 +46,7 @@ def rows_of(
         )
     if has_dask and (scheduler is not None or os.name == "posix"):
         return _by_dask(jobs, count, scheduler)
-    return by_processes(jobs, count)
+    return _by_processes(jobs, count)
 
 
 def _by_dask(jobs: Sequence[Job], count: int, scheduler: str | None) -> Iterator[FleetRow]:
@@ -87,7 +87,7 @@ def _by_dask(jobs: Sequence[Job], count: int, scheduler: str | None) -> Iterator
                 cluster.close()
 
 
-def by_processes(jobs: Sequence[Job], count: int) -> Iterator[FleetRow]:
+def _by_processes(jobs: Sequence[Job], count: int) -> Iterator[FleetRow]:
     """The rows of all jobs, by processes of this machine; one that dies is replaced."""
     waiting: SimpleQueue[Job] = SimpleQueue()
     rows: SimpleQueue[FleetRow | BaseException] = SimpleQueue()

@@ -69,12 +69,8 @@ URSCRIPT = Language(
 )
 
 
-def check_identifier(name: str, language: Language) -> str:
-    """Gives back a name that the language takes for a variable's.
-
-    Raises:
-        DataError: It does not.
-    """
+def _check_identifier(name: str, language: Language) -> str:
+    """Gives back a name that the language takes for a variable's."""
     compared = name if language.cased else name.lower()
     if not language.shape.fullmatch(name):
         wrong = f"{language.needed}, are needed"
@@ -104,7 +100,7 @@ def _write_ur_feature(content: Content) -> str:
     PolyScope's features are entered by hand; its programs move in a variable of type pose as in a
     feature (script manual, "Numbers, Variables, and Types" and "Scoping rules").
     """
-    name = check_identifier(content.child, URSCRIPT)
+    name = _check_identifier(content.child, URSCRIPT)
     pose = ur_pose(pose_texts(content.matrix, POSE_FORMS["ur"]))
     return comments("#", content.notes) + f"global {name} = {pose}\n"
 
@@ -115,7 +111,7 @@ def _write_abb_tool(content: Content) -> str:
     `loaddata`'s centre of mass is in the flange's frame [mm]; axes and moments of inertia are
     left at those of a point.
     """
-    name = check_identifier(content.child, RAPID)
+    name = _check_identifier(content.child, RAPID)
     pose = abb_pose(pose_texts(content.matrix, POSE_FORMS["abb"]))
     load = _NO_LOAD
     if content.load is not None:
@@ -141,7 +137,7 @@ def _write_abb_wobj(content: Content) -> str:
     robhold, ufprog, ufmec, uframe, oframe (RAPID reference, data types, `wobjdata`): a fixed frame,
     and the object's own at its origin.
     """
-    name = check_identifier(content.child, RAPID)
+    name = _check_identifier(content.child, RAPID)
     pose = abb_pose(pose_texts(content.matrix, POSE_FORMS["abb"]))
     notes = comments("!", content.notes)
     return f'{notes}PERS wobjdata {name}:=[FALSE,TRUE,"",{pose},{_NO_POSE}];\n'

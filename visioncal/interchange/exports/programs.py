@@ -55,7 +55,7 @@ def _write(what: Literal["UTOOL", "UFRAME"], content: Content) -> str:
         f"{what}[{content.number}]=PR[{REGISTER}]",
     ]
     lines = [
-        f"/PROG  {program_name(what, content.number)}",
+        f"/PROG  {_program_name(what, content.number)}",
         "/ATTR",
         *(it.format(count=len(instructions)) for it in _ATTRIBUTES),
         "/MN",
@@ -67,7 +67,7 @@ def _write(what: Literal["UTOOL", "UFRAME"], content: Content) -> str:
     return _NEWLINE.join(lines) + _NEWLINE
 
 
-def program_name(what: Literal["UTOOL", "UFRAME"], number: int) -> str:
+def _program_name(what: Literal["UTOOL", "UFRAME"], number: int) -> str:
     """Names the program, which is its file's name, too: 8 characters are safe everywhere."""
     return f"SET_{what[:2]}{number}"
 

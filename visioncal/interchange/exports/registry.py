@@ -112,7 +112,7 @@ def document(source: Source | Identified, to: str, selection: Selection = _EVERY
         omitted = tuple(f"{it}." for it in arm.omitted)
         return Document(form.write(arm), (*_of_verdict(arm.verdict), *form.warn(arm), *omitted))
     if selection.edge == _ALL:
-        contents = select_all(source, selection, form)
+        contents = _select_all(source, selection, form)
         written = "" if form.write_all is None else form.write_all(contents)
         return Document(written, _of_verdict(contents[0].verdict))
     content = select(source, selection, form)
@@ -181,13 +181,8 @@ def select(source: Source, selection: Selection, form: ExportFormat) -> Content:
     return _content(form, selection, there, _named(form, selection, there))
 
 
-def select_all(source: Source, selection: Selection, form: ExportFormat) -> tuple[Content, ...]:
-    """Picks all transforms of an aligned cell, each frame's in that on which it hangs.
-
-    Raises:
-        DataError: It is no such cell, the format holds one transform, or what is asked for is of
-            one.
-    """
+def _select_all(source: Source, selection: Selection, form: ExportFormat) -> tuple[Content, ...]:
+    """Picks all transforms of an aligned cell, each frame's in that on which it hangs."""
     there = placements(source, selection.camera)
     _check_takes(form, selection)
     why = ""

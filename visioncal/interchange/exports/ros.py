@@ -58,7 +58,7 @@ def _write_urdf_all(contents: Sequence[Content]) -> str:
 def _urdf_joint(content: Content) -> str:
     # XML ends a comment at two hyphens.
     notes = "".join(
-        f"  <!-- {re.sub('-(?=-)', '- ', one_line(it))} -->\n" for it in ros_notes(content)
+        f"  <!-- {re.sub('-(?=-)', '- ', one_line(it))} -->\n" for it in _ros_notes(content)
     )
     pose = [repr(it) for it in numbers(write_pose(content.matrix, POSE_FORMS["rpy"]))]
     joint = f"{content.parent}-{content.child}".replace("/", "_")
@@ -117,7 +117,7 @@ def _node(content: Content) -> str:
 
 def _write_launch(content: Content) -> str:
     first = f'"""Publishes where {content.child} is in {content.parent}."""\n\n'
-    return first + comments("#", ros_notes(content)) + _program([content])
+    return first + comments("#", _ros_notes(content)) + _program([content])
 
 
 def _write_launches(contents: Sequence[Content]) -> str:
@@ -135,7 +135,7 @@ def _write_moveit(content: Content) -> str:
     """
     mount = "" if content.mount is None else f"{content.mount.upper()}: "
     first = f'""" {mount}{content.parent} -> {content.child} """\n'
-    return first + comments("#", ros_notes(content)) + _program([content])
+    return first + comments("#", _ros_notes(content)) + _program([content])
 
 
 ROS_LAUNCH = ExportFormat(
@@ -169,7 +169,7 @@ def _write_transform(content: Content) -> str:
         "child_frame_id": content.child,
         "transform": _message(content),
     }
-    return comments("#", ros_notes(content)) + yaml_text(document)
+    return comments("#", _ros_notes(content)) + yaml_text(document)
 
 
 def _write_easy_handeye(content: Content) -> str:
@@ -192,7 +192,7 @@ def _write_easy_handeye(content: Content) -> str:
         "transformation": {"x": x, "y": y, "z": z, "qx": qx, "qy": qy, "qz": qz, "qw": qw},
     }
     use = "its publisher finds it as ~/.ros/easy_handeye/visioncal.yaml"
-    return comments("#", [*ros_notes(content), use]) + yaml_text(document)
+    return comments("#", [*_ros_notes(content), use]) + yaml_text(document)
 
 
 def _calibrated_frames(content: Content) -> dict[str, str]:
@@ -225,7 +225,7 @@ def _write_easy_handeye2(content: Content) -> str:
         "transform": _message(content),
     }
     use = "its publisher finds it as ~/.ros2/easy_handeye2/calibrations/visioncal.calib"
-    return comments("#", [*ros_notes(content), use]) + yaml_text(document)
+    return comments("#", [*_ros_notes(content), use]) + yaml_text(document)
 
 
 def _write_transforms(contents: Sequence[Content]) -> str:
@@ -256,7 +256,7 @@ EASY_HANDEYE2 = ExportFormat(
 )
 
 
-def ros_notes(content: Content) -> list[str]:
+def _ros_notes(content: Content) -> list[str]:
     """Says in lines for a comment what the transform is, its quality, and what its frames are."""
     names = zip((content.parent, content.child), content.frames, strict=True)
     meanings = [f"{name}: {_MEANINGS[own]}" for name, own in names if own in _MEANINGS]

@@ -65,7 +65,7 @@ def read_fields(path: Path) -> Fields:
         return fields_of_arrays({"value": read_npy(path)}, path)
     if suffix in DOCUMENTS:
         return _fields_of_document(read_document(path), path)
-    lines = pendant_fields(path)
+    lines = _pendant_fields(path)
     if lines is not None:
         return lines
     table = read_table(path)
@@ -267,15 +267,8 @@ TABLE = ForeignFormat(
 )
 
 
-def pendant_fields(path: Path) -> Fields | None:
-    """Takes the lines of a text file that hold poses, each with its image where it names one.
-
-    Returns:
-        The rows; None where the file's first lines hold no pose with a maker's marks.
-
-    Raises:
-        DataError: A line has no pose, or another maker's than the first.
-    """
+def _pendant_fields(path: Path) -> Fields | None:
+    """Takes the lines of a text file that hold poses, each with its image where it names one."""
     lines = [
         (at, line)
         for at, line in enumerate(read_plain_text(path).splitlines(), start=1)

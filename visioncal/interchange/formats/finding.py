@@ -37,12 +37,8 @@ def listed(folder: Path) -> tuple[Path, ...]:
     return tuple(sorted(own, key=natural))
 
 
-def images_in(folder: Path) -> tuple[Path, ...]:
-    """Lists the images of a folder in natural order.
-
-    Raises:
-        DataError: There are none.
-    """
+def _images_in(folder: Path) -> tuple[Path, ...]:
+    """Lists the images of a folder in natural order."""
     found = tuple(it for it in listed(folder) if is_image_name(it.name))
     if not found:
         is_there = folder.is_dir()
@@ -100,7 +96,7 @@ def images_named(
 
 
 def _found(names: Sequence[str | None], folder: Path) -> list[Path | None]:
-    there = images_in(folder)
+    there = _images_in(folder)
     by_name = {it.stem: it for it in there} | {it.name: it for it in there}
     by_number = _unique_numbers(there)
     wanted = [number_in(it) for it in names if it]
@@ -149,7 +145,7 @@ def _images_of(
     Raises:
         DataError: There are no images, several a pose, or not as many as rows.
     """
-    there = images_in(folder)
+    there = _images_in(folder)
     by_number = _unique_numbers(there)
     kinds = Counter(kind_of(it) for it in there if number_in(it.name) in set(views))
     if numbered and kinds and len(by_number) < len(there):

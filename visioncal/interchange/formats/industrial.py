@@ -54,7 +54,7 @@ def _read_hand_eye(path: Path, requested: ImportOptions) -> Foreign:
         if not isinstance(name, str):
             raise DataError(f"{file}: data, row {at} names no pose.", culprits=[str(file)])
         stored = below(file.parent, name)
-        poses.append(pose_numbers_of(read_yaml(stored), str(stored)))
+        poses.append(_pose_numbers_of(read_yaml(stored), str(stored)))
         places.append(name)
         names.append(str(entry["image"]) if entry.get("image") else None)
     numbers = np.array(poses)
@@ -83,7 +83,7 @@ def _read_hand_eye(path: Path, requested: ImportOptions) -> Foreign:
     )
 
 
-def pose_numbers_of(value: object, where: str) -> list[float]:
+def _pose_numbers_of(value: object, where: str) -> list[float]:
     """Reads x, y, z, qx, qy, qz, qw [m]."""
     content = mapping(value, where)
     return [number(content.get(it), f"{where}: {it}") for it in _POSE]
@@ -146,7 +146,7 @@ def _read_kinematics(path: Path, requested: ImportOptions) -> Foreign:
     joints: dict[str, list[FloatArray]] = {"camera_joints": [], "target_joints": []}
     for name, row in document.items():
         entry = mapping(row, f"{file}: {name}")
-        poses.append(pose_numbers_of(entry.get("pose"), f"{file}: {name}: pose"))
+        poses.append(_pose_numbers_of(entry.get("pose"), f"{file}: {name}: pose"))
         for chain, values in joints.items():
             values.append(as_numbers(entry.get(chain, []), f"{file}: {name}: {chain}").reshape(-1))
     moving = [it for it, values in joints.items() if any(len(row) for row in values)]

@@ -157,19 +157,19 @@ def closed_cleanly(cell: LiveCell, journal: Journal) -> Iterator[None]:
             yield
     except KeyboardInterrupt:
         raise DriverError(
-            f"stopped by Ctrl-C or a signal; the arm was halted. {kept_words(journal)}",
+            f"stopped by Ctrl-C or a signal; the arm was halted. {_kept_words(journal)}",
             culprits=["Ctrl-C"],
             next_step="Go on with --resume.",
         ) from None
     except VisioncalError as error:
-        message = f"{error.message} {kept_words(journal)}"
+        message = f"{error.message} {_kept_words(journal)}"
         step = error.next_step
         if "--resume" not in step:
             step = f"{step} Go on with --resume.".strip()
         raise type(error)(message, culprits=error.culprits, next_step=step) from error
 
 
-def kept_words(journal: Journal) -> str:
+def _kept_words(journal: Journal) -> str:
     """Says what is on the disk."""
     count = len(journal.views)
     if not count:

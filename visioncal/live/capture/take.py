@@ -52,12 +52,8 @@ class Settled:
     last: Look
 
 
-def take_look(cell: LiveCell) -> Look:
-    """Takes a frame, with the states of the arm around its exposure.
-
-    Raises:
-        DriverError: A device fails, or the frame is older than the request.
-    """
+def _take_look(cell: LiveCell) -> Look:
+    """Takes a frame, with the states of the arm around its exposure."""
     asked = cell.clock.now()
     before = cell.state()
     frame = cell.camera.frame()
@@ -80,12 +76,12 @@ def settle(cell: LiveCell, options: CaptureOptions) -> Settled | Missed:
     """
     still = options.still
     begun = cell.clock.now()
-    first = take_look(cell)
+    first = _take_look(cell)
     if options.single:
         return Settled(first, first)
     while True:
-        then = take_look(cell)
-        why = why_moving(first, then, options)[0]
+        then = _take_look(cell)
+        why = _why_moving(first, then, options)[0]
         if why:
             first = then
         elif then.after.stamp_s - first.before.stamp_s >= still.quiet_s:
@@ -94,7 +90,7 @@ def settle(cell: LiveCell, options: CaptureOptions) -> Settled | Missed:
             return Missed(f"nothing came to rest in {still.patience_s:g} s: {why or 'too slow'}")
 
 
-def why_moving(first: Look, then: Look, options: CaptureOptions) -> tuple[str, float]:
+def _why_moving(first: Look, then: Look, options: CaptureOptions) -> tuple[str, float]:
     """Says what moved from one look to another, or nothing; and the image's motion [px]."""
     why = why_arm_moves(first.before, then.before, options.still)
     why = why or why_arm_moves(first.before, then.after, options.still)
@@ -139,8 +135,8 @@ def _frames(
     """Frames of one rest, the reason why they are none, and how far the image moved [px]."""
     looks, moved = [settled.last], 0.0
     while len(looks) < (1 if options.single else options.frames):
-        then = take_look(cell)
-        why, moved = why_moving(settled.first, then, options)
+        then = _take_look(cell)
+        why, moved = _why_moving(settled.first, then, options)
         if why:
             return [], why, moved
         looks.append(then)

@@ -85,7 +85,7 @@ class FrameEnd:
         self._stop()
 
 
-def times_beside(raw: Path) -> Path:
+def _times_beside(raw: Path) -> Path:
     """Where the times of raw frames are: a file beside theirs."""
     return raw.with_suffix(".mcap")
 
@@ -124,11 +124,11 @@ def _recorder(dai: ModuleType, pipeline: Handle, output: Handle, raw: Path) -> H
             f"{' or '.join(_RAW_ENDINGS)} is needed.",
             culprits=[str(raw)],
         )
-    for path in (raw, times_beside(raw)):
+    for path in (raw, _times_beside(raw)):
         check_free(path, force=False)
     recorder = pipeline.create(dai.node.RecordVideo)
     recorder.setRecordVideoFile(raw)
-    recorder.setRecordMetadataFile(times_beside(raw))
+    recorder.setRecordMetadataFile(_times_beside(raw))
     # Where none is said it is reckoned from the first frames, and fails on ones sent at once.
     recorder.setFps(_NOMINAL_HZ)
     output.link(recorder.input)

@@ -48,10 +48,10 @@ class Window:
             edge_px: How far points stay from the image's edge [px].
         """
         self._camera, self._edge_px = camera, edge_px
-        whole = border_tangents(camera, 0.0, _RAYS)
+        whole = _border_tangents(camera, 0.0, _RAYS)
         # Tangents of rays are shorter; beyond, a lens model may fold back into the image.
         self._rays_within = float(np.nanmax(np.linalg.norm(whole, axis=-1))) * (1.0 + 1e-6)
-        self._inner, self._outer = _planes(border_tangents(camera, edge_px, _RAYS))
+        self._inner, self._outer = _planes(_border_tangents(camera, edge_px, _RAYS))
 
     def holds(self, points_cam: FloatArray) -> Mask:
         """Whether all of (..., p, 3) points in the camera's frame are in the image (...)."""
@@ -71,7 +71,7 @@ class Window:
         return np.asarray(good.reshape(points_cam.shape[:-1]).all(axis=-1))
 
 
-def border_tangents(camera: Camera, edge_px: float, rays: int) -> FloatArray:
+def _border_tangents(camera: Camera, edge_px: float, rays: int) -> FloatArray:
     """(4, rays, 2) x / z and y / z of rays along the image's sides, `edge_px` inside.
 
     The sides are the upper, lower, left and right one; NaN where the lens has no ray.
@@ -245,7 +245,7 @@ def sight_of(cell: PlanCell, seed: int) -> Sight:
     Raises:
         DataError: The lens sees nothing, or as good as nothing.
     """
-    border = border_tangents(cell.camera, cell.limits.edge_px, _BORDER_RAYS)
+    border = _border_tangents(cell.camera, cell.limits.edge_px, _BORDER_RAYS)
     seen = np.abs(border[np.isfinite(border).all(axis=-1)]).max(axis=-1, initial=0.0)
     if not len(seen) or seen.min() < _NARROWEST:
         raise DataError(
@@ -274,7 +274,7 @@ def _distance_m(cell: PlanCell) -> tuple[float, float]:
     At a distance d the board is off by the errors of both places, by d times the error of the
     camera's direction, and by half its own size times the error of its own.
     """
-    border = border_tangents(cell.camera, cell.limits.edge_px, _BORDER_RAYS)
+    border = _border_tangents(cell.camera, cell.limits.edge_px, _BORDER_RAYS)
     half = float(np.nanmin(np.abs(border).max(axis=-1)))
     radius = 0.5 * board_size_m(cell.target)
     full = radius / half

@@ -76,7 +76,7 @@ def _state(machine: Machine, asked: str) -> str | None:
     return answers.get(asked)
 
 
-def state_message(machine: Machine, now_s: float) -> bytes:
+def _state_message(machine: Machine, now_s: float) -> bytes:
     """A robot state message with the tool's pose and offset, and with the arm's table of joints."""
     q, _ = machine.joints(now_s)
     pose = tool_pose(machine, q).tolist()
@@ -193,7 +193,7 @@ class ControllerServer:
     ) -> None:
         while not writer.is_closing():
             await self._silence.over()
-            writer.write(state_message(machine, time.monotonic()))
+            writer.write(_state_message(machine, time.monotonic()))
             await writer.drain()
             await asyncio.sleep(_PRIMARY_EVERY_S)
 

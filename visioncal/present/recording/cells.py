@@ -202,12 +202,12 @@ def _log_static(stream: rr.RecordingStream, scene: CellScene) -> None:
         if frame not in found.robots and frame not in former:
             _log_frame(stream, scene, frame, on)
     for frame in found.robots:
-        entity = frame_entity(frame)
+        entity = _frame_entity(frame)
         shown = rr.TransformAxes3D(_AXIS * scene.size_m, show_frame=True)
         stream.log(entity, rr.CoordinateFrame(frame), shown, static=True)
         for part in ("links", "joints", "reach"):
             base = rr.CoordinateFrame(found.frames[frame])
-            stream.log(f"{arm_entity(frame)}/{part}", base, static=True)
+            stream.log(f"{_arm_entity(frame)}/{part}", base, static=True)
     _log_network(stream, found)
     log_verdict(stream, found.verdict, verdict_markdown(found))
     for seer in dict.fromkeys(it.seer for it in found.sights):
@@ -216,12 +216,12 @@ def _log_static(stream: rr.RecordingStream, scene: CellScene) -> None:
             stream.log(residual_entity(seer, name), points, static=True)
 
 
-def frame_entity(frame: str) -> str:
+def _frame_entity(frame: str) -> str:
     """The entity of a frame of the cell."""
     return f"{paths.CELL}/{rr.escape_entity_path_part(frame)}"
 
 
-def arm_entity(flange: str) -> str:
+def _arm_entity(flange: str) -> str:
     """The entity of the arm that moves a flange."""
     return f"{paths.ROBOTS}/{flange}"
 
@@ -233,7 +233,7 @@ def residual_entity(seer: str, name: str) -> str:
 
 def _log_frame(stream: rr.RecordingStream, scene: CellScene, frame: str, on: str) -> None:
     """Places a frame on what it hangs on, and draws what it is."""
-    entity, matrix = frame_entity(frame), scene.found.edge_of(frame).matrix
+    entity, matrix = _frame_entity(frame), scene.found.edge_of(frame).matrix
     stream.log(
         entity,
         rr.Transform3D(
@@ -341,18 +341,18 @@ def _log_robot(stream: rr.RecordingStream, scene: CellScene, flange: str, view: 
     by = scene.shown[view.number].get(flange, view.number)
     pose, base = scene.flange(flange, by), scene.found.frames[flange]
     if pose is None:
-        stream.log(frame_entity(flange), rr.Clear(recursive=False))
-        stream.log(arm_entity(flange), rr.Clear(recursive=True))
+        stream.log(_frame_entity(flange), rr.Clear(recursive=False))
+        stream.log(_arm_entity(flange), rr.Clear(recursive=True))
         return
     placed = rr.Transform3D(
         translation=pose[:3, 3], mat3x3=pose[:3, :3], parent_frame=base, child_frame=flange
     )
-    stream.log(frame_entity(flange), placed)
+    stream.log(_frame_entity(flange), placed)
     robot, q = scene.robots.get(flange), scene.robot_rows[by][flange].joints_rad
     if robot is not None and q is not None and len(q) == robot.joint_count:
-        log_arm(stream, robot.link_frames(q), arm_entity(flange))
+        log_arm(stream, robot.link_frames(q), _arm_entity(flange))
         return
     line = rr.LineStrips3D(
         [[np.zeros(3), pose[:3, 3]]], colors=colours.JOINT, radii=2.0 * _LINE * scene.size_m
     )
-    stream.log(f"{arm_entity(flange)}/reach", line)
+    stream.log(f"{_arm_entity(flange)}/reach", line)

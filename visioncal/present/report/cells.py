@@ -85,7 +85,7 @@ def render_cell(found: Alignment) -> str:
         tables=[it for body in ("cell", *found.robots) if (it := pair_table(found, body))],
         edges=[content.edge_card(*it) for it in found.edges.items()],
         frames=tools.frame_cards(Calibration.whole(found)),
-        sources=source_table(found),
+        sources=_source_table(found),
         noise=_noise_facts(found),
         arms=_arm_facts(found),
         lenses=[(name, _lens_facts(it)) for name, it in found.cameras.items()],
@@ -157,7 +157,7 @@ def _is_turned(found: Alignment, frame: str) -> bool:
     return frame in (*found.robots, found.reference) or found.edge_of(frame).oriented
 
 
-def source_table(found: Alignment) -> PairTable | None:
+def _source_table(found: Alignment) -> PairTable | None:
     """What each frame's place is uncertain by, source by source [mm]; None where that is unknown.
 
     A source that counts for less than a hundredth of every frame's variance is left out.

@@ -56,10 +56,10 @@ def write_dynamics_report(path: Path, run: Run) -> None:
     Raises:
         DataError: The file cannot be written.
     """
-    write_atomically(path, render_dynamics(run))
+    write_atomically(path, _render_dynamics(run))
 
 
-def render_dynamics(run: Run) -> str:
+def _render_dynamics(run: Run) -> str:
     """Renders the report as HTML text; see `write_dynamics_report`."""
     identified = run.identified
     source = identified.facts.get("session", {})
@@ -136,12 +136,12 @@ def _parameter_rows(identified: Identified) -> Iterator[tuple[str, list[str]]]:
         identified.determined,
         strict=True,
     ):
-        unit = unit_of(base.model.names[own])
+        unit = _unit_of(base.model.names[own])
         cells = [name, matched(value, sigma), significant(sigma), unit, share]
         yield marks.get(share, "rejected"), cells
 
 
-def unit_of(name: str) -> str:
+def _unit_of(name: str) -> str:
     """The unit of a standard parameter."""
     if "*" in name:
         return _FIRST_MOMENT

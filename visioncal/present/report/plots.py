@@ -75,7 +75,7 @@ def image_coverage(calibration: Calibration, evidence: Sequence[ViewEvidence]) -
     if not seen or calibration.camera is None:
         return Markup("")
     px = np.concatenate([it.corners.px for it in seen if it.corners is not None])
-    errors = np.concatenate([corner_errors(it) for it in seen])
+    errors = np.concatenate([_corner_errors(it) for it in seen])
     known = np.isfinite(errors)
     width, height = calibration.camera.camera.resolution
     errors_known = bool(known.any())
@@ -119,7 +119,7 @@ def _draw_bitmap(panel: Panel, px: FloatArray, steps: IntArray, colours: Sequenc
     panel.figure.image(box.left, box.top, box.right - box.left, box.bottom - box.top, uri)
 
 
-def corner_errors(evidence: ViewEvidence) -> FloatArray:
+def _corner_errors(evidence: ViewEvidence) -> FloatArray:
     """Distances [px] of a view's corners from their predictions; NaN where there is none."""
     if evidence.corners is None:
         return np.zeros(0)

@@ -99,7 +99,7 @@ def review_web(
 def _routes(recording: Path) -> dict[str, _Route]:
     """All that can be asked for; no path is ever made of a request."""
     own = {name: read_bytes(Path(__file__).with_name(name)) for name in (_PAGE, _STYLE, _STARTER)}
-    assets = viewer_assets()
+    assets = _viewer_assets()
     report = recording.with_name(_REPORT)
     # What the notes of the views lead to.
     beside = {f"/{_REPORT}": _Route(_HTML, report)} if report.is_file() else {}
@@ -191,13 +191,10 @@ class _Handler(BaseHTTPRequestHandler):
         """Keeps the terminal quiet."""
 
 
-def viewer_assets() -> Mapping[str, bytes]:
+def _viewer_assets() -> Mapping[str, bytes]:
     """Fetches the script and the module of the web viewer, by name.
 
     Rerun's command is let serve them on this machine for the quarter of a second that it takes.
-
-    Raises:
-        DriverError: Rerun's command does not start, or does not have them.
     """
     arguments = ("--serve-web", "--bind", "127.0.0.1", "--web-viewer-port", "0", _NO_RECORDING)
     with viewer_process(*arguments) as process:
