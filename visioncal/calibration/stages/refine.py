@@ -161,6 +161,11 @@ def lens_levels(side: Side, fitted: Fitted) -> dict[str, LensLevels]:
 
     Lenses and boards are free for that, so that what they have wrong is not taken for it.
     """
+    levels = fitted.looks.levels
+    if any(it.breathing for it in levels.values()):
+        # Linearised far from where there is none, that would be underrated.
+        still = {name: replace(it, breathing=0.0) for name, it in levels.items()}
+        fitted = again(fitted, side, fitted.moving, fitted.looks.with_levels(still))
     looks = fitted.seen.looks
     # A size of the board is left to the motion: a wrong one would pass for breathing.
     sizes = [looks.scale_of(it) for it in looks.printed]
