@@ -92,6 +92,40 @@ def test_a_mount_that_nothing_tells_is_asked_for():
     assert guess.best.hypothesis.mount == "eye-in-hand"
 
 
+@pytest.mark.parametrize("is_measured", [True, False])
+@pytest.mark.parametrize("size", [0.3, 0.55, 3.0])
+def test_a_target_of_another_size_is_named_by_its_size(size, is_measured):
+    # Not by units that would almost do: inches for centimetres are 2.54.
+    poses = cell_poses("eye-to-hand")
+    stated = replace(poses.camera, positions=poses.camera.positions / size)
+    guess = guess_reading(poses.robot, stated, "eye-to-hand", is_measured=is_measured)
+    (word,) = guess.best.differences
+    assert word.startswith("the target ")
+    # A tenth of what the least of these sizes is off by; the noise is a thousandth.
+    assert guess.best.hypothesis.camera.scale == pytest.approx(size, rel=0.02)
+    found = guess.best.hypothesis.camera_numbers(stated).poses()
+    np.testing.assert_allclose(found, poses.camera.poses(), atol=0.02)
+
+
+def test_a_wrong_mount_and_a_wrong_size_are_both_named():
+    poses = cell_poses("eye-to-hand")
+    stated = replace(poses.camera, positions=3.0 * poses.camera.positions)
+    guess = guess_reading(poses.robot, stated, "eye-in-hand")
+    assert any(it.startswith("the target 0.33 times") for it in guess.best.differences)
+    assert "mounted eye-to-hand" in guess.sentence
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_a_wrong_mount_is_named_though_poses_are_poor(mount):
+    # As of a hobby arm: 5 degrees and 10 mm.
+    poses, rng = cell_poses(mount), np.random.default_rng(2)
+    noise = exp(rng.normal(0.0, [0.05] * 3 + [6e-3] * 3, (len(poses.robot), 6)))
+    poor = numbers(poses.camera.poses() @ noise)
+    guess = guess_reading(poses.robot, poor, OTHER[mount], is_measured=True)
+    assert guess.best.words == f"the camera mounted {mount}", guess.sentence
+    assert guess_reading(poses.robot, poor, mount, is_measured=True).stands_out is False
+
+
 @pytest.mark.parametrize(("written", "read"), [("ZYX", "xyz"), ("xyz", "ZYX")])
 def test_readings_with_the_same_poses_leave_nothing_open(written, read):
     # Angles of a KUKA read as those of a FANUC: several orders of turns undo that.

@@ -289,3 +289,13 @@ def test_an_arm_that_is_off_is_no_board_of_another_size(seed):
     arm = CellOptions(views=10, dh_sigma_m=2e-3, seed=seed)
     verdict = calibrate(pairs_session(simulate(arm), "measured")).verdict
     assert "board_size" not in {it.kind for it in verdict.findings}
+
+
+def test_a_size_that_no_arm_explains_is_named_among_poor_poses():
+    # As of a single marker: what the size leaves is more than a tenth of what it explains.
+    noise = {"robot_sigma_m": 2e-3, "robot_sigma_rad": 0.01}
+    cell = simulate(CellOptions(views=20, board_scale=0.96, seed=1, **noise))
+    verdict = calibrate(pairs_session(cell, "measured")).verdict
+    (named,) = (it for it in verdict.findings if it.kind == "board_size")
+    # Four of its sigmas.
+    assert float(named.do.words.split()[-1].rstrip(".")) == pytest.approx(0.96, abs=0.02)

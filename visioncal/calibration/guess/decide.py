@@ -34,6 +34,9 @@ _RIVALS = 1.5
 # Views beyond this many typical distances do not agree with the others.
 _AGREES = 5.0
 _LISTED = 12
+# Of the few readings that only exchange frames one may be right though the poses are poor: with
+# turns of 5 degrees of noise, say. Fewer views would close so far by chance.
+_ROUGHLY, _FEWEST_ROUGH = 2.0 * CLOSING_SCORE, 8
 # Poses of two readings that differ by less than this share of what is left are the same.
 _SAME = 0.3
 
@@ -189,7 +192,7 @@ def _decided(recording: Recording, scored: Sequence[Scored]) -> Scored:
     alike = [it for it in others if it.score <= _ALIKE * least]
     alike.sort(key=lambda it: (it.cost, it.score))
     best, rivals = alike[0], alike[1:]
-    if best.score > CLOSING_SCORE:
+    if best.score > (_ROUGHLY if _is_turned_about(recording, best) else CLOSING_SCORE):
         return declared
     # Declared in units in which no camera could see the target, the chain may close as well.
     is_likely = is_likely_unit(recording, declared.hypothesis.camera.unit)
@@ -202,6 +205,15 @@ def _decided(recording: Recording, scored: Sequence[Scored]) -> Scored:
         for it in rivals
     )
     return declared if is_open or _is_poor(recording, best) else best
+
+
+def _is_turned_about(recording: Recording, scored: Scored) -> bool:
+    """Whether a reading of many views is but an inverse or another mount."""
+    tried, declared = scored.hypothesis, recording.declared
+    robot = replace(tried.robot, inverse=declared.robot.inverse)
+    camera = replace(tried.camera, inverse=declared.camera.inverse)
+    is_same = replace(tried, robot=robot, camera=camera, mount=declared.mount) == declared
+    return is_same and scored.cost <= 1 and len(scored.rows) >= _FEWEST_ROUGH
 
 
 def _are_same(recording: Recording, one: Scored, other: Scored) -> bool:
@@ -253,6 +265,7 @@ def _candidate(recording: Recording, scored: Scored) -> Candidate:
         agreeing=int((fit.away <= _AGREES * max(fit.score, SCORE_FLOOR)).sum()),
         rows=len(fit.away),
         is_board=recording.is_measured,
+        other_mount=() if scored.other_mount is None else recording.changes(scored.other_mount),
     )
 
 

@@ -81,6 +81,8 @@ class Scored:
         labels: Readings that close the chain in the same way: all that are as simple; of the
             declared reading those under which the cell is likelier.
         cost: How unlikely the reading is beside the declared one.
+        other_mount: Of the labels, one with the other mount that is as likely; None where there is
+            none.
     """
 
     hypothesis: Hypothesis
@@ -88,6 +90,7 @@ class Scored:
     rows: IntArray
     labels: tuple[Hypothesis, ...] = ()
     cost: float = 0.0
+    other_mount: Hypothesis | None = None
 
     @property
     def score(self) -> float:

@@ -7,6 +7,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, UNITS_M, PoseNumbers, Reading
+from visioncal.core.number_format import figure
 from visioncal.core.transforms import compose, invert
 from visioncal.core.types import FloatArray, IntArray, Mask, Mount
 
@@ -67,6 +68,8 @@ class Taken:
         transposed: Whether rotations are transposed while positions are not those of an inverse.
         signs: Whether an axis has the wrong sign.
         half_turned: Whether the base is to be turned by half a turn about its z.
+        scale: What distances are to be multiplied with besides: those to a target of another size
+            than was stated.
     """
 
     turns: Turns
@@ -75,6 +78,7 @@ class Taken:
     transposed: bool = False
     signs: Signs = ""
     half_turned: bool = False
+    scale: float = 1.0
 
     @classmethod
     def as_declared(cls, reading: Reading) -> "Taken":
@@ -89,14 +93,14 @@ class Taken:
             form = "matrix" if form == "matrix-transposed" else "matrix-transposed"
         elif self.transposed:
             return None
-        if self.turns.written or self.signs or self.half_turned:
+        if self.turns.written or self.signs or self.half_turned or self.scale != 1.0:
             return None
         return Reading(form, self.unit, self.inverse)
 
     def poses(self, numbers: PoseNumbers) -> FloatArray:
         """(n, 4, 4) transforms [m]; NaN in a row without one."""
         rotations = self.turns.rotations(numbers)
-        positions = UNITS_M[self.unit] * numbers.positions
+        positions = UNITS_M[self.unit] * self.scale * numbers.positions
         if self.signs == "mirror":
             rotations = rotations * np.outer(_MIRROR, _MIRROR)
             positions = positions * _MIRROR
@@ -196,6 +200,8 @@ def _differences(
         yield f"the board's size in {tried.camera.unit}"
     elif not is_board:
         yield from _of_side("the camera's", tried.camera, declared.camera)
+    if tried.camera.scale != declared.camera.scale:
+        yield f"the target {figure(tried.camera.scale)} times as large as stated"
     if tried.mount != declared.mount:
         yield f"the camera mounted {tried.mount}"
     if tried.shift:

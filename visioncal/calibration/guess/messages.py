@@ -58,7 +58,13 @@ def _found(declared: Candidate, best: Candidate) -> str:
         )
     if best.hypothesis.swap and best.changes == 1:
         return f"{closes}; as declared, {declared.agreeing} of {declared.rows} views agree."
-    return f"{closes} instead of {_figures(declared)}."
+    return f"{closes} instead of {_figures(declared)}{_other_mount(best)}."
+
+
+def _other_mount(best: Candidate) -> str:
+    other = "; ".join(it for it in best.other_mount if it not in best.differences)
+    own = "; ".join(it for it in best.differences if it not in best.other_mount)
+    return f"; {other} in place of {own} fits as well" if other else ""
 
 
 def _figures(it: Candidate) -> str:

@@ -5,7 +5,7 @@ to take the numbers are solved for at once: they share the left side of the equa
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -19,8 +19,14 @@ from visioncal.core.transforms import compose, nearest_rotation, rotation_angle
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.closed_form import SOLVERS
 
-# Poses are written in these; micrometres are for instruments.
-UNITS = ("m", "mm", "cm", "inch")
+# Poses are written in these; micrometres are for instruments. Nobody has a robot in inches and a
+# camera in centimetres, but a target of another size than stated looks like it.
+_UNITS = ("m", "mm", "cm", "inch")
+UNIT_PAIRS = tuple(it for it in product(_UNITS, _UNITS) if {*it} != {"cm", "inch"})
+
+# Sizes of targets that are looked for, as logarithms of their share of the stated size: a half more
+# or less is fitted elsewhere. Fewer views could be of any.
+_SMALLEST, _LARGEST, _FEWEST_SIZED = np.log(1.5), np.log(20.0), 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +58,7 @@ class Variant:
         carried: Whether they are those of the inverse pose: by the rotations, negated.
         signs: As in `Taken`.
         ratio: Their unit over the unit of the camera's.
+        scale: What the camera's are to be multiplied with besides.
         changes: In how many of these the variant departs from what was declared.
     """
 
@@ -59,6 +66,7 @@ class Variant:
     signs: Signs
     ratio: float
     changes: int
+    scale: float = 1.0
 
 
 def solve_turn(
@@ -100,10 +108,36 @@ def score_variants(recording: Recording, turned: Turned) -> Iterator[tuple[float
     nearest = np.partition(away, len(kept) - 1, axis=0)[: len(kept)]
     scores = np.hypot(np.sqrt(np.mean(nearest**2, axis=0)), turned.score)
     yield from zip(scores, variants, strict=True)
+    yield from _of_another_size(recording, turned, variants, matrix)
+
+
+def _of_another_size(
+    recording: Recording, turned: Turned, variants: Sequence[Variant], matrix: FloatArray
+) -> Iterator[tuple[float, Variant]]:
+    """Scores the positions as they are, or of the inverse, with the size of the target unknown.
+
+    `R_i t_X + r p_i - t_Z = -R_i R_X c_i`, whose r is the ratio over the scale. Sizes near the
+    stated one are found by whoever fits them; here, units would be taken for them.
+    """
+    declared = _ratio(recording.declared.robot.unit, recording.declared.camera.unit)
+    kept = turned.kept
+    for it in (it for it in variants if it.ratio == declared and not it.signs):
+        steps, lever = _steps(recording, turned, (it, replace(it, ratio=0.0)))
+        steps = (steps - steps[kept].mean(axis=0)) / lever
+        # Without the robot's positions the camera's are left.
+        towards = steps[..., 1]
+        left = np.concatenate([matrix, steps[..., :1] - steps[..., 1:]], axis=2)
+        found = -np.linalg.pinv(left[kept].reshape(-1, 4), rcond=1e-3) @ towards[kept].reshape(-1)
+        scale = 1.0 / found[3] if found[3] > 0.0 else np.inf
+        if len(kept) < _FEWEST_SIZED or not _SMALLEST < abs(np.log(scale)) < _LARGEST:
+            continue
+        away = np.sort(np.linalg.norm(towards + left @ found, axis=1))[: len(kept)]
+        score = float(np.hypot(np.sqrt(np.mean(away**2)), turned.score))
+        yield score, replace(it, changes=it.changes + 1, scale=float(scale))
 
 
 def _variants(recording: Recording) -> Iterator[Variant]:
-    ratios = sorted({_ratio(a, b) for a, b in product(UNITS, UNITS)})
+    ratios = sorted({_ratio(*it) for it in UNIT_PAIRS})
     declared = recording.declared
     inverse = declared.robot.inverse != (recording.mount == "eye-to-hand")
     given = (inverse != declared.camera.inverse, _ratio(declared.robot.unit, declared.camera.unit))

@@ -26,6 +26,8 @@ class Candidate:
         agreeing: How many views agree with each other.
         rows: How many views were looked at.
         is_board: Whether the camera's poses were measured from images.
+        other_mount: Words for what is different in a reading with the other mount that is as good
+            and as likely; none where there is none.
     """
 
     hypothesis: Hypothesis
@@ -37,6 +39,7 @@ class Candidate:
     agreeing: int
     rows: int
     is_board: bool = False
+    other_mount: tuple[str, ...] = ()
 
     @property
     def words(self) -> str:
@@ -72,7 +75,8 @@ class Candidate:
         """What the sizes of the board are to be multiplied with, where images were measured."""
         if not self.is_board:
             return 1.0
-        return UNITS_M[self.hypothesis.camera.unit] / UNITS_M[self.declared.camera.unit]
+        camera = self.hypothesis.camera
+        return camera.scale * UNITS_M[camera.unit] / UNITS_M[self.declared.camera.unit]
 
 
 def _short(value: float) -> str:

@@ -22,7 +22,13 @@ from visioncal.calibration.guess.forms import (
 from visioncal.calibration.guess.given import SCORE_FLOOR, Recording, Scored, fitted, is_likely_unit
 from visioncal.calibration.guess.hypothesis import Hypothesis, Taken, strangeness
 from visioncal.calibration.guess.likeness import is_far_likelier, likeness
-from visioncal.calibration.guess.positions import UNITS, Turned, Variant, score_variants, solve_turn
+from visioncal.calibration.guess.positions import (
+    UNIT_PAIRS,
+    Turned,
+    Variant,
+    score_variants,
+    solve_turn,
+)
 from visioncal.core.conventions import UNITS_M
 from visioncal.core.types import MOUNTS, IntArray
 
@@ -128,9 +134,11 @@ def _labels(
     transposed = turned.transposed[0] != variant.carried, turned.transposed[1]
     pairs = [
         (a, b)
-        for a, b in product(UNITS, UNITS)
+        for a, b in UNIT_PAIRS
         if np.isclose(UNITS_M[a] / UNITS_M[b], variant.ratio, rtol=1e-6)
     ]
+    if variant.scale != 1.0:
+        pairs = [(recording.declared.robot.unit, recording.declared.camera.unit)]
     likely = [it for it in pairs if is_likely_unit(recording, it[1])]
     inverses = (False,) if recording.is_measured else (False, True)
     for mount, inverse, (unit, camera_unit) in product(MOUNTS, inverses, likely or pairs):
@@ -142,7 +150,13 @@ def _labels(
                 transposed[0],
                 variant.signs,
             ),
-            Taken(camera.turns[pairing.camera], camera_unit, inverse, transposed[1]),
+            Taken(
+                camera.turns[pairing.camera],
+                camera_unit,
+                inverse,
+                transposed[1],
+                scale=variant.scale,
+            ),
             mount,
             pairing.shift,
         )
@@ -158,8 +172,14 @@ def _best_label(recording: Recording, labels: Sequence[Hypothesis], rows: IntArr
         scored,
         key=lambda it: (likeness(recording, it), it.hypothesis.mount == recording.mount),
     )
+    as_likely = (
+        it.hypothesis
+        for it in scored
+        if it.hypothesis.mount != chosen.hypothesis.mount
+        and likeness(recording, it) == likeness(recording, chosen)
+    )
     cost = recording.cost(chosen.hypothesis)
-    return replace(chosen, labels=tuple(labels), cost=cost)
+    return replace(chosen, labels=tuple(labels), cost=cost, other_mount=next(as_likely, None))
 
 
 def _with_likelier(

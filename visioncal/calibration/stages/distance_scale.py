@@ -6,8 +6,9 @@ from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Finding, Step
 
-# Errors of an arm's lengths are smaller, or leave as much unexplained.
-_LEAST, _SURE, _EXPLAINED = 2e-3, 5.0, 0.1
+# Errors of an arm's lengths are smaller, or leave as much unexplained; none are as large as the
+# last share.
+_LEAST, _SURE, _EXPLAINED, _NO_ARM = 2e-3, 5.0, 0.1, 0.02
 
 
 def distance_scale(
@@ -25,7 +26,8 @@ def distance_scale(
         flange_from_seer: (4, 4) the camera's transform, of which the rotation is taken.
 
     Returns:
-        What to say; None where the scale is one, or leaves more than a tenth of the scatter.
+        What to say; None where the scale is one, or a small departure from it leaves more than a
+        tenth of the scatter.
     """
     count = len(cam_from_target)
     if 3 * count < 14:
@@ -41,7 +43,9 @@ def distance_scale(
     left_stated = float(np.sum((b - a[:, 6] - a[:, :6] @ stated) ** 2))
     share = float(found[6]) - 1.0
     variance = left / (3 * count - 7) * np.linalg.pinv(a.T @ a)[6, 6]
-    if abs(share) < max(_LEAST, _SURE * variance**0.5) or left > _EXPLAINED * left_stated:
+    if abs(share) < max(_LEAST, _SURE * variance**0.5):
+        return None
+    if abs(share) < _NO_ARM and left > _EXPLAINED * left_stated:
         return None
     short, size = ("short", "larger") if share > 0.0 else ("long", "smaller")
     percent = f"{figure(100 * abs(share))} % (sigma {figure(100 * variance**0.5)} %)"

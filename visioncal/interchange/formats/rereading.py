@@ -110,8 +110,16 @@ def reread(foreign: Foreign, candidate: Candidate, *, mirrors_poses: bool = Fals
         joints_rad=joints,
         mount=taken.mount,
         target=None if target is None else _scaled(target, candidate.board_scale),
-        notes=(*foreign.notes, *notes),
+        notes=(*(it for it in foreign.notes if not _is_overruled(it, candidate)), *notes),
     )
+
+
+def _is_overruled(note: str, candidate: Candidate) -> bool:
+    """Whether a note says what was assumed of something that is now read otherwise."""
+    if " taken for " not in note:
+        return False
+    start = note.replace("quaternions", "rotations").lower()
+    return any(start.startswith(" ".join(it.split()[:3])) for it in candidate.differences)
 
 
 @dataclass(frozen=True, eq=False)
