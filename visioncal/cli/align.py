@@ -1,6 +1,5 @@
 """`visioncal align`, another name for `calibrate`, and what that does with a whole cell."""
 
-from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,13 +8,14 @@ from rich.markup import escape
 
 from visioncal.cli.calibrate import calibrate_command
 from visioncal.cli.console import answers, messages, naming, report_written
+from visioncal.cli.options import WorkOptions
 from visioncal.cli.progress import shown_progress
-from visioncal.core.choices import Convention, ImagesKept
 from visioncal.core.number_format import figure
 from visioncal.interchange.outputs import write_alignment
 
 # Help does not wait for them.
 if TYPE_CHECKING:
+    from visioncal.calibration.pipeline.running import Asked
     from visioncal.results import Alignment
     from visioncal.session import Session
 
@@ -27,36 +27,21 @@ align_command = calibrate_command
 
 
 def align_into(
-    path: Path,
-    session: "Session",
-    out: Path,
-    *,
-    level: str,
-    quiet: bool,
-    convention: Convention | None = None,
-    without: Collection[str] = (),
-    images: ImagesKept = "full",
-    threads: int | None = None,
-    keep_corners: bool = False,
+    path: Path, session: "Session", out: Path, asked: "Asked", work: WorkOptions, *, quiet: bool
 ) -> "Alignment":
     """Aligns the cell of a session from some path, writes the result and reports it."""
-    from visioncal.calibration.pipeline import align
+    from visioncal.calibration.pipeline.running import known_at_first, run_steps
+    from visioncal.calibration.pipeline.whole import alignment_of
     from visioncal.interchange.merge_results import leftover
 
     left = leftover(out)
     with naming(path, out), shown_progress(quiet=quiet) as progress:
-        result = align(
-            session,
-            level=level,
-            convention=convention,
-            progress=progress,
-            threads=threads,
-            keep_corners=keep_corners,
-        )
+        known = known_at_first(session, **(asked | {"progress": progress}))
+        result = alignment_of(run_steps(known))
     result = replace(result, verdict=result.verdict.with_paths(path, out))
     if left is not None:
         left.keep()
-    written = write_alignment(out, session, result, without=without, images=images)
+    written = write_alignment(out, session, result, without=work.left_out, images=work.images)
     if not quiet:
         _report(result)
     if left is not None:

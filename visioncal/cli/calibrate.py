@@ -81,8 +81,7 @@ def calibrate_command(
     from rich.markup import escape
 
     from visioncal.calibration.pipeline import run, run_dense
-    from visioncal.calibration.pipeline.run_state import RunState
-    from visioncal.calibration.pipeline.running import check_dense, check_solver
+    from visioncal.calibration.pipeline.running import Asked, check_dense, known_at_first
     from visioncal.cli.align import align_into
     from visioncal.cli.console import messages, naming, report_written
     from visioncal.cli.progress import shown_progress
@@ -92,27 +91,22 @@ def calibrate_command(
     from visioncal.results.whole import whole_document
     from visioncal.session.single import is_whole_cell
 
-    without = work.left_out
     # Of several sessions, the recording is the session of them all.
     session = sessions[0] if len(sessions) == 1 else out / RECORDING
     with naming(session, out):
         loaded = _joined([need.session(it) for it in sessions], shared=robot_shared)
+    asked = Asked(
+        solver=solver,
+        level=level,
+        convention=convention,
+        threads=work.threads,
+        keep_corners=work.keep_corners,
+    )
     if is_whole_cell(loaded):
-        check_solver(RunState(loaded, solver=solver))
+        known = known_at_first(loaded, **asked)
         if dense:
-            check_dense(RunState(loaded))
-        found = align_into(
-            session,
-            loaded,
-            out,
-            level=level,
-            convention=convention,
-            quiet=as_json,
-            without=without,
-            images=work.images,
-            threads=work.threads,
-            keep_corners=work.keep_corners,
-        )
+            check_dense(known)
+        found = align_into(session, loaded, out, asked, work, quiet=as_json)
         document = whole_document(found)
         if as_json:
             typer.echo(json.dumps(document, indent=2))
@@ -120,20 +114,12 @@ def calibrate_command(
     left = leftover(out)
     with naming(session, out), shown_progress(quiet=as_json) as progress:
         calibrated = partial(run_dense, device=device) if dense else run
-        result = calibrated(
-            loaded,
-            solver=solver,
-            level=level,
-            convention=convention,
-            progress=progress,
-            threads=work.threads,
-            keep_corners=work.keep_corners,
-        )
+        result = calibrated(loaded, **(asked | {"progress": progress}))
         progress("write", 0, 1)
         result = result.with_paths(session, out)
         if left is not None:
             left.keep()
-        written = write_outputs(out, loaded, result, without=without, images=work.images)
+        written = write_outputs(out, loaded, result, without=work.left_out, images=work.images)
     if as_json:
         typer.echo(result.calibration.text)
     else:

@@ -88,7 +88,7 @@ def doctor(session: Session | Path | str, *, progress: Progress | None = None) -
     Raises:
         DataError: It cannot be read.
     """
-    known = known_at_first(session, progress, level="auto", convention=None)
+    known = known_at_first(session, progress=progress)
     with one_blas_thread():
         known, error = _looked(known)
         found = [*_findings(known, error)]

@@ -2,15 +2,14 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Unpack
 
 import numpy as np
 
-from visioncal.calibration.pipeline.running import Run, run
+from visioncal.calibration.pipeline.running import Asked, Run, run
 from visioncal.calibration.stages.dense import Dense, explained
-from visioncal.core.choices import Convention, SolverName
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.number_format import figure
-from visioncal.core.types import Progress
 from visioncal.results import Calibration, Rms
 from visioncal.results.sections import CornerResiduals, DenseResult, ImageBlur
 from visioncal.session import Session
@@ -49,28 +48,13 @@ def _figures(rms: Rms) -> str:
     return f"{px}{figure(rms.mm)} mm"
 
 
-def run_dense(
-    session: Session,
-    *,
-    device: str = "auto",
-    solver: SolverName = "joint",
-    level: str = "auto",
-    convention: Convention | None = None,
-    progress: Progress | None = None,
-    threads: int | None = None,
-    keep_corners: bool = False,
-) -> Run:
+def run_dense(session: Session, *, device: str = "auto", **asked: Unpack[Asked]) -> Run:
     """Calibrates a session by the template's corners and by dense ones; see `calibrate`.
 
     Args:
         session: The session.
         device: What torch works on: `auto` for a GPU where there is one, `cpu` or `cuda`.
-        solver: See `calibrate`.
-        level: Likewise.
-        convention: Likewise.
-        progress: Likewise.
-        threads: Likewise.
-        keep_corners: Likewise.
+        asked: See `calibrate`.
 
     Returns:
         The one with dense corners, unless it predicts views that were left out worse than the
@@ -87,21 +71,9 @@ def run_dense(
             next_step="Leave it out.",
         )
 
-    def calibrated(dense: Dense | None) -> Run:
-        return run(
-            session,
-            solver=solver,
-            level=level,
-            convention=convention,
-            progress=progress,
-            dense=dense,
-            threads=threads,
-            keep_corners=keep_corners,
-        )
-
-    plain = calibrated(None)
+    plain = run(session, **asked)
     try:
-        found = calibrated(Dense(on, threads=threads or 0))
+        found = run(session, dense=Dense(on, threads=asked.get("threads") or 0), **asked)
     except VisioncalError as error:
         return _noting(plain, None, [f"Dense corners are not kept: {error.message}"])
     if found.dense is None or not found.dense.fits:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from visioncal.calibration.pipeline.dense_corners import run_dense
 from visioncal.calibration.pipeline.result import result_of
-from visioncal.calibration.pipeline.running import check_dense, known_at_first, run_steps
+from visioncal.calibration.pipeline.running import Asked, check_dense, known_at_first, run_steps
 from visioncal.calibration.pipeline.whole import alignment_of
 from visioncal.core.arguments import typed
 from visioncal.core.choices import Convention, SolverName
@@ -65,29 +65,20 @@ def calibrate(
         DegenerateError: The motion leaves a direction of the answer open.
         ConvergenceError: The intrinsics do not come to rest.
     """
-    known = known_at_first(
-        session,
-        progress,
+    asked = Asked(
         solver=solver,
         level=level,
         convention=convention,
+        progress=progress,
         threads=threads,
         keep_corners=keep_corners,
     )
-    needing = replace(known, session=known.session.needing(need_mm, need_deg))
+    known = known_at_first(session, **asked)
+    known = replace(known, session=known.session.needing(need_mm, need_deg))
     if dense:
-        check_dense(needing)
-        return run_dense(
-            needing.session,
-            device=device,
-            solver=solver,
-            level=level,
-            convention=convention,
-            progress=progress,
-            threads=threads,
-            keep_corners=keep_corners,
-        ).calibration
-    return result_of(run_steps(needing))
+        check_dense(known)
+        return run_dense(known.session, device=device, **asked).calibration
+    return result_of(run_steps(known))
 
 
 @typed
@@ -125,9 +116,9 @@ def align(
     """
     known = known_at_first(
         session,
-        progress,
         level=level,
         convention=convention,
+        progress=progress,
         threads=threads,
         keep_corners=keep_corners,
     )

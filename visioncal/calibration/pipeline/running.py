@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TypedDict, Unpack
 
 from visioncal.calibration.pipeline.exchanged_names import exchanged_names
 from visioncal.calibration.pipeline.guess_inputs import (
@@ -54,45 +55,32 @@ class Run:
         return replace(self, calibration=replace(self.calibration, verdict=verdict))
 
 
+class Asked(TypedDict, total=False):
+    """How a session is calibrated, as `calibrate` says: each by its name, or as it is there."""
+
+    solver: SolverName
+    level: str
+    convention: Convention | None
+    progress: Progress | None
+    threads: int | None
+    keep_corners: bool
+
+
 def run(
-    session: Session | Path | str,
-    *,
-    solver: SolverName = "joint",
-    level: str = "auto",
-    convention: Convention | None = None,
-    progress: Progress | None = None,
-    dense: Dense | None = None,
-    threads: int | None = None,
-    keep_corners: bool = False,
+    session: Session | Path | str, *, dense: Dense | None = None, **asked: Unpack[Asked]
 ) -> Run:
     """Calibrates a session and keeps the evidence; see `calibrate`."""
-    first = known_at_first(
-        session,
-        progress,
-        solver=solver,
-        level=level,
-        convention=convention,
-        threads=threads,
-        keep_corners=keep_corners,
-    )
-    known = run_steps(replace(first, dense=dense))
+    known = run_steps(replace(known_at_first(session, **asked), dense=dense))
     held = known.solved.held_out
     pairs = zip(held.away_m.tolist(), held.rms_px.tolist(), strict=True)
     left_out = dict(zip(known.used, pairs, strict=True))
     return Run(result_of(known), view_evidence(known), known.dense, left_out)
 
 
-def known_at_first(
-    session: Session | Path | str,
-    progress: Progress | None,
-    *,
-    solver: SolverName = "joint",
-    level: str,
-    convention: Convention | None,
-    threads: int | None = None,
-    keep_corners: bool = False,
-) -> RunState:
+def known_at_first(session: Session | Path | str, **asked: Unpack[Asked]) -> RunState:
     """What is known at the start, checked."""
+    threads, solver = asked.get("threads"), asked.get("solver", "joint")
+    level, convention = asked.get("level", "auto"), asked.get("convention")
     if threads is not None and threads < 1:
         raise DataError(f"threads is {threads}; at least 1 is needed.", culprits=["--threads"])
     if solver not in SOLVER_NAMES:
@@ -106,29 +94,20 @@ def known_at_first(
     loaded = session if isinstance(session, Session) else Session.load(session)
     known = RunState(
         loaded,
-        progress,
+        asked.get("progress"),
         threads or 0,
-        keep_corners,
+        asked.get("keep_corners", False),
         solver=solver,
         level=level,
         convention=convention,
     )
-    check_solver(known)
-    return known
-
-
-def check_solver(known: RunState) -> None:
-    """Refuses a closed form for a whole cell.
-
-    Raises:
-        DataError: It is asked for.
-    """
-    if known.mount is None and known.solver != "joint":
+    if known.mount is None and solver != "joint":
         raise DataError(
-            f"solver {known.solver} cannot be asked of a whole cell: it has the joint solver.",
+            f"solver {solver} cannot be asked of a whole cell: it has the joint solver.",
             culprits=["--solver"],
             next_step="Leave it out, or calibrate one camera and robot of it (Session.of).",
         )
+    return known
 
 
 def check_dense(known: RunState) -> None:
