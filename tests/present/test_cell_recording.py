@@ -4,16 +4,17 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
+from visioncal.calibration.pipeline import Run
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, pose_difference
 from visioncal.interchange.exports import Selection, export
-from visioncal.interchange.outputs import write_alignment
+from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import load_exportable
 from visioncal.present.recording import paths, read_alignment, read_session
 from visioncal.present.recording.cells import CellScene
 from visioncal.present.recording.frames import scan
 from visioncal.present.recording.reader import chunks
-from visioncal.results import Alignment, Edge, Sight, Verdict
+from visioncal.results import Alignment, Calibration, Edge, Sight, Verdict
 from visioncal.session import MemoryImages, Session
 from visioncal.simulation import (
     BoardAt,
@@ -85,7 +86,7 @@ def test_frames_are_drawn_where_they_were(cell, session):
 
 def test_session_and_result_come_back_from_the_recording(cell, session, tmp_path):
     found = true_alignment(cell, session)
-    files = write_alignment(tmp_path / "out", session, found).files
+    files = write_outputs(tmp_path / "out", session, Run(Calibration.whole(found), ())).files
     assert [it.name for it in files] == [
         "calibration.json",
         "alignment.json",
@@ -106,7 +107,7 @@ def test_session_and_result_come_back_from_the_recording(cell, session, tmp_path
 
 
 def test_a_changed_result_is_noticed(cell, session, tmp_path):
-    write_alignment(tmp_path, session, true_alignment(cell, session))
+    write_outputs(tmp_path, session, Run(Calibration.whole(true_alignment(cell, session)), ()))
     recording = tmp_path / "recording.rrd"
     ((frame, _, _),) = chunks(scan(recording), (paths.ALIGNMENT,), [])
     data = bytearray(recording.read_bytes())
@@ -120,5 +121,5 @@ def test_a_changed_result_is_noticed(cell, session, tmp_path):
 def test_images_that_are_missing_leave_the_rest(cell, tmp_path):
     session = network_session(cell, "cell", seen="names")
     assert isinstance(session.images, MemoryImages)
-    write_alignment(tmp_path, session, true_alignment(cell, session))
+    write_outputs(tmp_path, session, Run(Calibration.whole(true_alignment(cell, session)), ()))
     assert read_session(tmp_path / "recording.rrd").digest() == session.digest()

@@ -8,8 +8,9 @@ from support.aligned_cells import made_up_cell
 
 from visioncal.core.number_format import significant
 from visioncal.present.cellmap import pairs, weakest_frame
-from visioncal.present.report.cells import pair_table, render_cell, write_cell_report
-from visioncal.results import Moved, RobotResult, Sight, Untied
+from visioncal.present.report import write_report
+from visioncal.present.report.cells import pair_table, render_cell
+from visioncal.results import Calibration, Moved, RobotResult, Sight, Untied
 from visioncal.results.arm import ArmLevel, ArmResult
 
 CELL = made_up_cell(5)
@@ -77,7 +78,7 @@ def test_what_moved_and_what_is_untied_is_told(tmp_path):
         moved=(Moved("cam_top", "cam_top_until_stop_4", 4, 5, 0.58, 0.03, ("target_plate",)),),
         untied=(Untied("cam_<far>", "Let it see target_plate."),),
     )
-    write_cell_report(tmp_path / "report.html", found)
+    write_report(tmp_path / "report.html", Calibration.whole(found), None, ())
     html = (tmp_path / "report.html").read_text(encoding="utf-8")
     words = text_of(html)
     assert "Between stops 4 and 5. cam_top is where it stood last" in words

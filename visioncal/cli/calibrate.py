@@ -1,6 +1,5 @@
 """`visioncal calibrate`."""
 
-import json
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -81,15 +80,12 @@ def calibrate_command(
     from rich.markup import escape
 
     from visioncal.calibration.pipeline import run, run_dense
-    from visioncal.calibration.pipeline.running import Asked, check_dense, known_at_first
-    from visioncal.cli.align import align_into
+    from visioncal.calibration.pipeline.running import Asked
     from visioncal.cli.console import messages, naming, report_written
     from visioncal.cli.progress import shown_progress
     from visioncal.cli.summary import print_summary
     from visioncal.interchange.merge_results import leftover
     from visioncal.interchange.outputs import RECORDING, write_outputs
-    from visioncal.results.whole import whole_document
-    from visioncal.session.single import is_whole_cell
 
     # Of several sessions, the recording is the session of them all.
     session = sessions[0] if len(sessions) == 1 else out / RECORDING
@@ -102,15 +98,6 @@ def calibrate_command(
         threads=work.threads,
         keep_corners=work.keep_corners,
     )
-    if is_whole_cell(loaded):
-        known = known_at_first(loaded, **asked)
-        if dense:
-            check_dense(known)
-        found = align_into(session, loaded, out, asked, work, quiet=as_json)
-        document = whole_document(found)
-        if as_json:
-            typer.echo(json.dumps(document, indent=2))
-        return
     left = leftover(out)
     with naming(session, out), shown_progress(quiet=as_json) as progress:
         calibrated = partial(run_dense, device=device) if dense else run

@@ -79,12 +79,6 @@ def report_command(
         messages().print(f"wrote {escape(str(page))}")
         return
     out = out or Path("report.html")
-    if stored.calibration.cell is not None:
-        from visioncal.present.report.cells import write_cell_report
-
-        write_cell_report(out, stored.calibration.cell)
-        messages().print(f"wrote {escape(str(out))}")
-        return
     write_report(
         out,
         stored.calibration,
@@ -93,7 +87,8 @@ def report_command(
         stored.note,
         stored.review,
     )
-    if stored.note:
+    # The page of a whole cell shows nothing of what a recording has.
+    if stored.note and stored.calibration.cell is None:
         messages().print(escape(stored.note))
     messages().print(f"wrote {escape(str(out))}")
 

@@ -14,11 +14,13 @@ from visioncal.core.number_format import figure
 from visioncal.core.transforms import pose_difference
 from visioncal.core.types import Camera, FloatArray
 from visioncal.live.rehearsal.witness import edge_errors
-from visioncal.results import Calibration, Sight, Step, Verdict, ViewResult
+from visioncal.results import Alignment, Calibration, Sight, Step, Verdict, ViewResult
 
 _COLOURS = {"good": "bold green", "check": "bold yellow", "bad": "bold red"}
 # Beyond any image, what is predicted is nowhere [px].
 _MOST_PX = 1e4
+# Levels of noise that are nearer to what is said are not mentioned.
+_SHOWN_LEVEL = 1.2
 _Seen = TypeVar("_Seen", ViewResult, Sight)
 _SAME_REASON = 20  # more views of one reason share a line
 
@@ -49,8 +51,10 @@ def print_steps(steps: Sequence[Step]) -> None:
 
 def print_summary(calibration: Calibration, *, verbose: bool) -> None:
     """Prints a result for people: the verdict first, then the figures it rests on."""
-    console = answers()
+    console, cell = answers(), calibration.cell
     print_verdict(calibration.verdict, calibration.session_name)
+    if cell is not None:
+        console.print(f"the cell's frame is that of {cell.reference}")
     for name, edge in calibration.edges.items():
         x, y, z = 1e3 * edge.transform.translation
         console.print(
@@ -61,6 +65,9 @@ def print_summary(calibration: Calibration, *, verbose: bool) -> None:
                 else ", its rotation not measured"
             )
         )
+    if cell is not None:
+        _print_cell(cell)
+        return
     used = sum(view.used for view in calibration.views)
     held = calibration.validation.held_out
     console.print(
@@ -73,6 +80,24 @@ def print_summary(calibration: Calibration, *, verbose: bool) -> None:
         console.print(f"  {escape(words)}")
     if verbose:
         console.print(_solver_table(calibration))
+
+
+def _print_cell(cell: Alignment) -> None:
+    """Prints the noise of a whole cell, what was left out, and what is known worst."""
+    console = answers()
+    for name, levels in cell.noise.items():
+        words = [
+            f"{figure(value)} {key.rpartition('_')[2]}"
+            for key, value in levels.items()
+            if key != "level"
+        ]
+        level = levels.get("level", 1.0)
+        if level > _SHOWN_LEVEL or not words:
+            words.append(f"{figure(level)} times what is said of it")
+        console.print(f"noise of {name}: {', '.join(words)}")
+    for unused in unused_words(unsaid(cell.verdict, cell.sights)):
+        console.print(escape(f"  {unused}"))
+    console.print(escape(cell.weakest))
 
 
 def unsaid(verdict: Verdict, views: Iterable[_Seen]) -> Iterator[_Seen]:

@@ -1,13 +1,13 @@
 """What has joined the result of an earlier calibration: written with it anew, or kept beside."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from visioncal.calibration.pipeline import Run
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, some_of
-from visioncal.interchange.outputs import CALIBRATION, Written, write_alignment, write_outputs
+from visioncal.interchange.outputs import CALIBRATION, Written, write_outputs
 from visioncal.interchange.result_files import FRAMES, load_stored
 from visioncal.results import Calibration, Frame, FrameFile
 
@@ -38,9 +38,6 @@ def rewrite(folder: Path, calibration: Calibration) -> Written:
             culprits=[str(folder)],
             next_step="Name the output folder that the result was loaded from.",
         )
-    if calibration.cell is not None:
-        cell = replace(calibration.cell, placed=calibration.frames)
-        return write_alignment(folder, stored.session, cell)
     run = Run(calibration, stored.evidence)
     return write_outputs(folder, stored.session, run, stored.note)
 

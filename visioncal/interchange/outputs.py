@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from visioncal.dynamics import Run
     from visioncal.dynamics.written import MotionPlan
     from visioncal.live.planning.plan import Plan
-    from visioncal.results import Alignment
     from visioncal.session import Session
 
 CALIBRATION, REPORT, RECORDING = "calibration.json", "report.html", "recording.rrd"
@@ -74,7 +73,7 @@ def write_outputs(
     without: Collection[str] = (),
     images: "ImagesKept" = "full",
 ) -> Written:
-    """Writes the three files into a folder, all at once whenever it is killed.
+    """Writes the files of a result into a folder, all at once whenever it is killed.
 
     Several threads may do so at once; their figures are drawn one at a time.
 
@@ -114,8 +113,10 @@ def write_outputs(
             write_recording(path, session, run.calibration, run.evidence, layout, images)
 
         drawings[RECORDING] = record
-    result = {CALIBRATION: run.calibration.save}
-    return _write(folder, result, drawings, (ALIGNMENT,), without)
+    results = {CALIBRATION: run.calibration.save}
+    if (cell := run.calibration.whole_cell) is not None:
+        results[ALIGNMENT] = cell.save
+    return _write(folder, results, drawings, (ALIGNMENT,), without)
 
 
 def write_check(
@@ -161,51 +162,6 @@ def refuse_calibration(folder: Path) -> None:
             culprits=[str(folder)],
             next_step="Name another folder with -o.",
         )
-
-
-def write_alignment(
-    folder: Path,
-    session: "Session | None",
-    found: "Alignment",
-    *,
-    without: Collection[str] = (),
-    images: "ImagesKept" = "full",
-) -> Written:
-    """Writes the alignment of a cell, its report and its recording into a folder, all at once.
-
-    Args:
-        folder: Where to; it is made where there is none.
-        session: What was aligned; None where it was not kept, which leaves the recording out.
-        found: The result.
-        without: As in `write_outputs`.
-        images: Likewise.
-
-    Returns:
-        The files that were written: the result even where drawing the others failed.
-
-    Raises:
-        DataError: The folder cannot be written; the files in it stay as they were.
-    """
-
-    def report(path: Path) -> None:
-        from visioncal.present.report.cells import write_cell_report
-
-        write_cell_report(path, found)
-
-    drawings: dict[str, _Writer] = {REPORT: report}
-    if session is not None:
-
-        def record(path: Path) -> None:
-            from visioncal.present.recording import write_cell_recording
-            from visioncal.present.viewer.cells import cell_blueprint
-
-            write_cell_recording(path, session, found, cell_blueprint(session, found), images)
-
-        drawings[RECORDING] = record
-    from visioncal.results import Calibration
-
-    results = {CALIBRATION: Calibration.whole(found).save, ALIGNMENT: found.save}
-    return _write(folder, results, drawings, without=without)
 
 
 def write_plan(folder: Path, plan: "Plan", document: Mapping[str, Any]) -> Written:
@@ -292,9 +248,9 @@ def write_dynamics(folder: Path, run: "Run") -> Written:
     """
 
     def report(path: Path) -> None:
-        from visioncal.present.report.dynamics import write_dynamics_report
+        from visioncal.present.report.dynamics import render_dynamics
 
-        write_dynamics_report(path, run)
+        write_atomically(path, render_dynamics(run))
 
     def record(path: Path) -> None:
         from visioncal.present.recording.dynamics import write_dynamics_recording

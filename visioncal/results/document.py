@@ -1,7 +1,7 @@
 """calibration.json of one camera and one robot."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Literal
 
 from visioncal.core.types import Mount
@@ -90,8 +90,9 @@ _SAME = names_but(CalibrationForm, "schema visioncal session transforms joint_co
 
 def to_document(calibration: "Calibration") -> dict[str, Any]:
     """Builds the content of calibration.json; what was not computed is absent."""
-    if calibration.cell is not None:
-        return whole_document(replace(calibration.cell, placed=calibration.frames))
+    cell = calibration.whole_cell
+    if cell is not None:
+        return whole_document(cell)
     form = CalibrationForm(
         schema=SCHEMA,
         session=SessionForm(calibration.session_name, calibration.session_sha256),

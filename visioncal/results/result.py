@@ -107,6 +107,13 @@ class Calibration(CalibrationSections):
         return ray_frame(edge, self.edges[edge], self.camera)
 
     @property
+    def whole_cell(self) -> Alignment | None:
+        """The whole cell, with what has joined it and the verdict as they are here."""
+        if self.cell is None:
+            return None
+        return replace(self.cell, placed=self.frames, verdict=self.verdict)
+
+    @property
     def next_steps(self) -> tuple[Step, ...]:
         """What to do about what was found, of tools and fixtures, too; the most pressing first."""
         doubtful = (name for name, it in self.frames.items() if it.verdict.status != "good")

@@ -13,6 +13,7 @@ from visioncal.core.number_format import figure
 from visioncal.results import Calibration, Rms
 from visioncal.results.sections import CornerResiduals, DenseResult, ImageBlur
 from visioncal.session import Session
+from visioncal.session.single import is_whole_cell
 from visioncal.vision.dense.library import chosen_device
 
 # What is worse by less standard errors is chance.
@@ -63,6 +64,12 @@ def run_dense(session: Session, *, device: str = "auto", **asked: Unpack[Asked])
     Raises:
         DataError: torch or kornia is missing, there are no images of boards, or as `calibrate`.
     """
+    if is_whole_cell(session):
+        raise DataError(
+            "dense corners cannot be asked of a whole cell.",
+            culprits=["--dense"],
+            next_step="Leave it out, or calibrate one camera and robot of it (Session.of).",
+        )
     on = chosen_device(device)
     if not any(it.kind in ("charuco", "checkerboard") for it in session.boards.values()):
         raise DataError(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from visioncal.calibration.pipeline.dense_corners import run_dense
 from visioncal.calibration.pipeline.result import result_of
-from visioncal.calibration.pipeline.running import Asked, check_dense, known_at_first, run_steps
+from visioncal.calibration.pipeline.running import Asked, known_at_first, run_steps
 from visioncal.calibration.pipeline.whole import alignment_of
 from visioncal.core.arguments import typed
 from visioncal.core.choices import Convention, SolverName
@@ -76,7 +76,6 @@ def calibrate(
     known = known_at_first(session, **asked)
     known = replace(known, session=known.session.needing(need_mm, need_deg))
     if dense:
-        check_dense(known)
         return run_dense(known.session, device=device, **asked).calibration
     return result_of(run_steps(known))
 

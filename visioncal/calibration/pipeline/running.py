@@ -74,7 +74,9 @@ def run(
     held = known.solved.held_out
     pairs = zip(held.away_m.tolist(), held.rms_px.tolist(), strict=True)
     left_out = dict(zip(known.used, pairs, strict=True))
-    return Run(result_of(known), view_evidence(known), known.dense, left_out)
+    # A whole cell is drawn by its result alone.
+    evidence = () if known.mount is None else view_evidence(known)
+    return Run(result_of(known), evidence, known.dense, left_out)
 
 
 def known_at_first(session: Session | Path | str, **asked: Unpack[Asked]) -> RunState:
@@ -108,20 +110,6 @@ def known_at_first(session: Session | Path | str, **asked: Unpack[Asked]) -> Run
             next_step="Leave it out, or calibrate one camera and robot of it (Session.of).",
         )
     return known
-
-
-def check_dense(known: RunState) -> None:
-    """Refuses dense corners for a whole cell.
-
-    Raises:
-        DataError: It is one.
-    """
-    if known.mount is None:
-        raise DataError(
-            "dense corners cannot be asked of a whole cell.",
-            culprits=["--dense"],
-            next_step="Leave it out, or calibrate one camera and robot of it (Session.of).",
-        )
 
 
 def run_steps(known: RunState) -> RunState:

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
-from visioncal.calibration.pipeline import align, run
+from visioncal.calibration.pipeline import run
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import natural, read_text, write_atomically
 from visioncal.core.version import __version__
@@ -16,13 +16,11 @@ from visioncal.interchange.outputs import (
     CALIBRATION,
     REPORT,
     Written,
-    write_alignment,
     write_outputs,
 )
 from visioncal.results import Calibration
 from visioncal.results.fleet import FleetRow, row_of
 from visioncal.session import Session
-from visioncal.session.single import is_whole_cell
 
 ROW, PICTURE = "row.json", "picture.jpg"
 _SESSION = "session.toml"
@@ -194,14 +192,9 @@ def _kept(job: Job, made_by: Mapping[str, object]) -> FleetRow | None:
 
 def _calibrated(job: Job, session: Session) -> tuple[Calibration, Written]:
     """Calibrates on one thread, as `visioncal calibrate` does, and writes what it writes."""
-    options = job.options
-    if is_whole_cell(session):
-        cell = align(session, level=options.level, threads=1)
-        cell = replace(cell, verdict=cell.verdict.with_paths(job.session, job.folder))
-        written = write_alignment(job.folder, session, cell, without=options.without)
-        return Calibration.whole(cell), written
-    done = run(session, level=options.level, threads=1).with_paths(job.session, job.folder)
-    return done.calibration, write_outputs(job.folder, session, done, without=options.without)
+    done = run(session, level=job.options.level, threads=1).with_paths(job.session, job.folder)
+    written = write_outputs(job.folder, session, done, without=job.options.without)
+    return done.calibration, written
 
 
 def _draw(folder: Path, session: Session, found: Calibration) -> bool:

@@ -7,11 +7,7 @@ changed or cut off after it was written is noticed; see `frames`.
 from visioncal.present.recording.cells import read_alignment
 from visioncal.present.recording.reader import read_session
 from visioncal.present.recording.results import append_results, read_calibration, read_evidence
-from visioncal.present.recording.writer import (
-    RecordingWriter,
-    write_cell_recording,
-    write_recording,
-)
+from visioncal.present.recording.writer import RecordingWriter, write_recording
 
 __all__ = [
     "RecordingWriter",
@@ -20,6 +16,5 @@ __all__ = [
     "read_calibration",
     "read_evidence",
     "read_session",
-    "write_cell_recording",
     "write_recording",
 ]

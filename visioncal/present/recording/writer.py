@@ -1,7 +1,6 @@
 """Writes a session to a recording: view by view as it is captured, or as a whole."""
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Self
 
@@ -15,7 +14,7 @@ from visioncal.present.recording.cells import log_cell
 from visioncal.present.recording.elsewhere import ImagesElsewhere, faint_picture
 from visioncal.present.recording.recorder import Recorder
 from visioncal.present.recording.results import log_results
-from visioncal.results import Alignment, Calibration
+from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
 from visioncal.session.checks import check_images_can_be_used
@@ -121,20 +120,11 @@ class RecordingWriter:
             DataError: The file cannot be written.
         """
         with named_errors(self._label):
-            log_results(self._recorder, session, calibration, evidence)
-
-    def add_alignment(self, session: Session, found: Alignment) -> None:
-        """Adds the result of aligning the cell, drawn and exact.
-
-        Args:
-            session: The session with all of its views.
-            found: Its result.
-
-        Raises:
-            DataError: The file cannot be written.
-        """
-        with named_errors(self._label):
-            log_cell(self._recorder, session, found)
+            cell = None if calibration is None else calibration.whole_cell
+            if cell is not None:
+                log_cell(self._recorder, session, cell)
+            else:
+                log_results(self._recorder, session, calibration, evidence)
 
     def add_session(self, session: Session) -> None:
         """Adds all views of a session.
@@ -225,38 +215,6 @@ def write_recording(
     Raises:
         DataError: The file cannot be written, or an image of the session cannot be read.
     """
-    with _whole(path, session, blueprint, images) as writer:
-        writer.add_results(session, calibration, evidence)
-
-
-def write_cell_recording(
-    path: Path,
-    session: Session,
-    found: Alignment,
-    blueprint: BlueprintLike | None,
-    images: ImagesKept = "full",
-) -> None:
-    """Writes a session and the alignment of its cell as one recording.
-
-    Args:
-        path: The `.rrd` to write; it appears whole or not at all.
-        session: What was recorded; `read_session` gives it back.
-        found: Its result.
-        blueprint: The layout to open it in.
-        images: As in `write_recording`.
-
-    Raises:
-        DataError: The file cannot be written, or an image of the session cannot be read.
-    """
-    with _whole(path, session, blueprint, images) as writer:
-        writer.add_alignment(session, found)
-
-
-@contextmanager
-def _whole(
-    path: Path, session: Session, blueprint: BlueprintLike | None, images: ImagesKept
-) -> Iterator[RecordingWriter]:
-    """A writer that has a session's views; the file appears once nothing went wrong."""
     with (
         written_beside(path) as aside,
         RecordingWriter(
@@ -269,4 +227,4 @@ def _whole(
         ) as writer,
     ):
         writer.add_session(session)
-        yield writer
+        writer.add_results(session, calibration, evidence)

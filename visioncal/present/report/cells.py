@@ -6,12 +6,10 @@ The network of frames is drawn as a graph: what hangs on what, who saw whom, how
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from markupsafe import Markup
 
-from visioncal.core.files import write_atomically
 from visioncal.core.number_format import significant
 from visioncal.core.types import FloatArray
 from visioncal.core.version import __version__
@@ -60,21 +58,8 @@ class PairTable:
     rows: Mapping[str, tuple[str, ...]]
 
 
-def write_cell_report(path: Path, found: Alignment) -> None:
-    """Writes the report as one HTML file that needs no network and no script.
-
-    Args:
-        path: The file to write; it appears whole or not at all.
-        found: What to report.
-
-    Raises:
-        DataError: The file cannot be written.
-    """
-    write_atomically(path, render_cell(found))
-
-
 def render_cell(found: Alignment) -> str:
-    """Renders the report as HTML text; see `write_cell_report`."""
+    """Renders the report of a whole cell as HTML text."""
     return template("cell.html.j2").render(
         found=found,
         created=content.readable_time(found.created),

@@ -2,12 +2,10 @@
 
 import platform
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 import numpy as np
 from markupsafe import Markup
 
-from visioncal.core.files import write_atomically
 from visioncal.core.number_format import matched, significant
 from visioncal.core.types import FloatArray
 from visioncal.core.version import __version__
@@ -46,21 +44,8 @@ _CURVE_POINTS, _TICKS = 401, 5
 _FRICTION_GAPS_IN = (0.55, 0.5)
 
 
-def write_dynamics_report(path: Path, run: Run) -> None:
-    """Writes the report as one HTML file that needs no network and no script.
-
-    Args:
-        path: The file to write; it appears whole or not at all.
-        run: What to report.
-
-    Raises:
-        DataError: The file cannot be written.
-    """
-    write_atomically(path, _render_dynamics(run))
-
-
-def _render_dynamics(run: Run) -> str:
-    """Renders the report as HTML text; see `write_dynamics_report`."""
+def render_dynamics(run: Run) -> str:
+    """Renders the report as HTML text."""
     identified = run.identified
     source = identified.facts.get("session", {})
     shown = [] if run.predicted is None else [(run.predicted, "not fitted")]

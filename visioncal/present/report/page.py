@@ -23,6 +23,7 @@ from visioncal.present.report import (
     tools,
     uncertainty,
 )
+from visioncal.present.report.cells import render_cell
 from visioncal.present.report.content import template
 from visioncal.present.report.thumbnails import Thumbnail, drawn, thumbnail
 from visioncal.present.report.trends import residuals_over_joints
@@ -69,6 +70,9 @@ def render(
     review: str = "",
 ) -> str:
     """Renders the report as HTML text; see `write_report`."""
+    cell = calibration.whole_cell
+    if cell is not None:
+        return render_cell(cell)
     return template("report.html.j2").render(
         calibration=calibration,
         note=note,

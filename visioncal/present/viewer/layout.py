@@ -47,6 +47,11 @@ def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.B
     Returns:
         The layout, to be written into the recording.
     """
+    if calibration is not None and calibration.cell is not None:
+        # It is made of what is here.
+        from visioncal.present.viewer.cells import cell_blueprint
+
+        return cell_blueprint(session, calibration.cell)
     joints = [len(view.joints_rad) for view in session.views if view.joints_rad is not None]
     results = () if calibration is None else calibration.views
     contents = _Contents(
