@@ -39,6 +39,9 @@ LINES = {
     "{E6POS: X 400.0,Y -100,Z 300.0,A 10,B -20,C 170,S 6,T 50,E1 0.0,E2 0.0}": Rotation.from_euler(
         "ZYX", [10, -20, 170], degrees=True
     ),
+    '<Position X="400.0" Y="-100.0" Z="300" A="10.0" B="-20" C="170.0"></Position>': (
+        Rotation.from_euler("ZYX", [10, -20, 170], degrees=True)
+    ),
     "X = 400.000 mm, Y = -100 mm, Z = 300 mm,  W = 10 deg, P = -20 deg, R = 170 deg": (
         Rotation.from_euler("xyz", [10, -20, 170], degrees=True)
     ),

@@ -234,6 +234,16 @@ def matrices_below(folder: Path) -> Recording:
     return _matrices_in_files(folder, np.vstack)
 
 
+def printed_matrices(folder: Path) -> Recording:
+    """A log of a program, with matrices under what they are."""
+    text = "server 1.17.3 listens\n"
+    for at, poses in enumerate(zip(BASE_FROM_FLANGE, CAM_FROM_TARGET, strict=True)):
+        for name, pose in zip(("Flange in base", "Board in camera"), poses, strict=True):
+            text += f">>> {name}, pose {at}:\n{str(pose.tolist()).replace('], ', '],' + chr(10))}\n"
+        text += "4 frames were dropped\n"
+    return Recording(_write(folder / "server.log", text), ImportOptions(mount="eye-in-hand"))
+
+
 def printed_lists(folder: Path) -> Recording:
     """Rows as a program prints them, under a remark in another encoding."""
     rows = np.hstack([quaternions(BASE_FROM_FLANGE), quaternions(CAM_FROM_TARGET)])
@@ -392,6 +402,7 @@ RECORDINGS: Mapping[str, Callable[[Path], Recording]] = {
         matrices_beside,
         matrices_below,
         printed_lists,
+        printed_matrices,
         headed_units,
         ros_poses,
         numbers_first,

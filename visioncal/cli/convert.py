@@ -187,7 +187,8 @@ def _confirmed(guess: "Guess", *, yes: bool) -> "Candidate":
             "Nothing was written: the chain does not close as declared, and no other reading "
             "stands out.",
             next_step="Check that the poses and what the camera saw are of the same views and the "
-            "same robot; without --guess it is written as declared.",
+            "same robot, and that positions stand before rotations (where not, name the columns in "
+            "that order: --robot-columns 4,5,6,1,2,3). Without --guess it is written as declared.",
         )
     if yes:
         return guess.best

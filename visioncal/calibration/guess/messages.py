@@ -84,7 +84,11 @@ def notes(
         is_declared: Whether it is the declared one.
         is_poor: Whether the views turn about one axis at most.
     """
-    others = [it for it in best.labels if it != best.hypothesis]
+    # Other units for both make the cell as much larger.
+    own = best.hypothesis.robot.unit, best.hypothesis.camera.unit
+    others = [
+        it for it in best.labels if it != best.hypothesis and (it.robot.unit, it.camera.unit) == own
+    ]
     also = " or with ".join("; ".join(recording.changes(it)) for it in others)
     if also and not is_declared:
         yield (

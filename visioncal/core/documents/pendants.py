@@ -18,7 +18,7 @@ from visioncal.core.types import FloatArray
 _NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 _UNIT = r"(?:mm|m|deg|rad)"
 _NAMED = re.compile(
-    rf"(?<![\w.])([Qq][1-4]|[A-Za-z]+)(?:_m)?\s*[:=]?\s*({_NUMBER})\s*({_UNIT})?(?![\w.])"
+    rf"(?<![\w.])([Qq][1-4]|[A-Za-z]+)(?:_m)?\s*[:=]?\s*\"?({_NUMBER})\s*({_UNIT})?(?![\w.])"
 )
 _BETWEEN = re.compile(r"[\s\[\]{}(),;]+")
 # What stands around the numbers of a pose, and in which form it is then.

@@ -40,16 +40,19 @@ from visioncal.interchange.formats.poses import (
     pose_names,
     poses_from,
 )
+from visioncal.interchange.formats.printed import printed_fields
 from visioncal.interchange.formats.streams import in_seconds
 from visioncal.session.columns import joint_columns
 
 DOCUMENTS = (".json", ".yaml", ".yml", ".xml")
-ENDINGS = (".csv", ".tsv", ".txt", ".npz", ".npy", *DOCUMENTS)
+ENDINGS = (".csv", ".tsv", ".txt", ".log", ".npz", ".npy", *DOCUMENTS)
 _IMAGE_NAMES = ("image", "img", "filename", "file", "image_file", "image_path")
 # Names under which poses are looked for, by how many numbers they have.
 _NAMES = {6: ("x", "y", "z", "rx", "ry", "rz"), 7: ("x", "y", "z", "q1", "q2", "q3", "q4")}
 _IMAGE = re.compile(r"[^\s,;\"']+\.(?:png|jpe?g|tiff?|bmp)(?![\w.])", re.IGNORECASE)
 _COMMENTS = ("#", "%", "//", "!")
+# How many numbers poses have in one field.
+_WHOLE_POSES = (6, 7, 12, 16)
 
 
 def read_fields(path: Path) -> Fields:
@@ -65,7 +68,7 @@ def read_fields(path: Path) -> Fields:
         return fields_of_arrays({"value": read_npy(path)}, path)
     if suffix in DOCUMENTS:
         return _fields_of_document(read_document(path), path)
-    lines = _pendant_fields(path)
+    lines = _pendant_fields(path) or printed_fields(path)
     if lines is not None:
         return lines
     table = read_table(path)
@@ -195,6 +198,8 @@ def foreign_from(
         notes = (*notes, f"Column {stamps} is taken for times, as the source does not say.")
     used |= {stamps, "view"} if view_numbers(fields) else {stamps}
     paths, image_name, more = _images(fields, requested, images, used)
+    if camera is None and not paths:
+        _check_no_more_poses(fields, used)
     return Foreign(
         name=fields.name,
         robot=robot,
@@ -208,6 +213,23 @@ def foreign_from(
         columns={it: cells for it, cells in fields.texts.items() if it not in used | {image_name}},
         notes=(*notes, *more),
     )
+
+
+def _check_no_more_poses(fields: Fields, used: Collection[str]) -> None:
+    """Raises DataError where fields may be poses of the target, of which nobody says so."""
+    rest = [
+        name
+        for name, it in fields.numbers.items()
+        if it.ndim > 1 and it[0].size in _WHOLE_POSES and name not in used
+    ]
+    if rest:
+        raise DataError(
+            f"{fields.name}: which of its fields are the target's poses is not known; "
+            f"{some_of(rest)} may be.",
+            culprits=rest,
+            next_step="Name them with --camera-columns; where they are of the camera in the "
+            "target, with --camera-inverse.",
+        )
 
 
 def view_numbers(fields: Fields) -> tuple[int, ...]:

@@ -53,7 +53,10 @@ def worded_poses(fields: Fields, whose: str, taken: Collection[str]) -> tuple[st
 def _whole(sizes: dict[str, int], whose: str) -> Iterator[tuple[str, ...]]:
     for name, size in sizes.items():
         words = _words(name)
-        if size in (6, 7, 12, 16) and (_WHOLE | _PLACED_FIRST) & {*words} and _is_of(words, whose):
+        is_whole = size == 16 or (size in (6, 7, 12) and (_WHOLE | _PLACED_FIRST) & {*words})
+        # A matrix that is alone and of nobody is the robot's.
+        is_plain = [*sizes.values()] == [16] and whose == "robot" and not _sides(words)
+        if is_whole and (is_plain or _is_of(words, whose)):
             yield (name,)
 
 
@@ -81,10 +84,14 @@ def _words(name: str) -> list[str]:
 def _is_of(words: Sequence[str], whose: str) -> bool:
     """Whether words name frames of one side alone, in the order of the pose that is wanted."""
     stays, placed = _FRAMES[whose]
-    others = {"robot": "camera", "camera": "robot"}[whose]
-    if {*words} & (_FRAMES[others][0] | _FRAMES[others][1] | _MEANT[others]):
+    if _sides(words) != [whose]:
         return False
     frames = [it for it in words if it in stays | placed]
     if {*frames} & stays and {*frames} & placed:
         return (frames[0] in placed) == bool({*words} & _PLACED_FIRST)
-    return bool(frames or {*words} & _MEANT[whose])
+    return True
+
+
+def _sides(words: Sequence[str]) -> list[str]:
+    """Whose frames words name."""
+    return [it for it in _FRAMES if {*words} & (_FRAMES[it][0] | _FRAMES[it][1] | _MEANT[it])]
