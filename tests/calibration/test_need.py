@@ -13,6 +13,7 @@ from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.judge import judge
 from visioncal.calibration.stages.need import Picks, need_met
+from visioncal.core.codec import read, write
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import exp
 from visioncal.core.types import Need
@@ -20,7 +21,6 @@ from visioncal.core.verdict import EMPTY_IMAGE, Finding, remarks
 from visioncal.estimation.arm import ArmErrors, misfit_jacobian, pose_basis
 from visioncal.estimation.tolerance_probability import chance_within, radius_within
 from visioncal.results import Calibration, NeedMet, Picker, Rms, to_document
-from visioncal.results.codec import read, write
 from visioncal.simulation import CellOptions, simulate
 
 

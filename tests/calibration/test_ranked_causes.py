@@ -21,12 +21,12 @@ from visioncal.calibration.stages.cause_ranking import (
 from visioncal.calibration.stages.fit_messages import scale_found
 from visioncal.calibration.stages.judge import Place, judge
 from visioncal.calibration.stages.need import Picks
+from visioncal.core.codec import read, write
 from visioncal.core.transforms import exp, invert, pose_difference
 from visioncal.core.types import Need
 from visioncal.core.verdict import CALIBRATE, GUESS, PLAN, Finding, Step, Verdict, with_paths
 from visioncal.estimation.joint import MeasuredScale
 from visioncal.results import Rms
-from visioncal.results.codec import read, write
 from visioncal.results.verdicts import VerdictForm
 from visioncal.session import Session
 from visioncal.simulation import Cell, CellOptions, simulate

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from visioncal.core.codec import read
 from visioncal.core.types import FloatArray
 from visioncal.results.arm import ArmResult
-from visioncal.results.codec import read
 from visioncal.robot import Robot, load_robot
 
 # What the parameters' changes are, with their sigmas: one sure, one chance, one held.

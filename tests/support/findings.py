@@ -5,9 +5,9 @@ from typing import Any
 
 from support.samples import Sample
 
+from visioncal.core.codec import read_fields
 from visioncal.estimation.appearance import BOARD_NAMES
 from visioncal.results import Calibration
-from visioncal.results.codec import read_fields
 from visioncal.results.sections import CalibrationSections
 
 # So begins the reason of a view that contradicts the others; test_report checks it on a real one.

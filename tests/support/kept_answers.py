@@ -16,9 +16,9 @@ from support.cells import calibrated
 
 from visioncal.calibration.pipeline import align, calibrate
 from visioncal.calibration.pipeline.result import result_of
+from visioncal.core.codec import write
 from visioncal.core.errors import VisioncalError
 from visioncal.core.transforms import invert, log
-from visioncal.results.codec import write
 from visioncal.results.sections import CalibrationSections
 from visioncal.session import Session
 from visioncal.simulation import (

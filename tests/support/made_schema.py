@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import numpy as np
 
-from visioncal.results.codec import INLINE, REST, Array, Written, entries
+from visioncal.core.codec import INLINE, REST, Array, Written, entries
 from visioncal.results.document import CalibrationForm
 from visioncal.results.sections import CalibrationSections, CellSections
 from visioncal.results.whole import CellForm

@@ -5,10 +5,11 @@ import shlex
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, Self, TypeAlias
+from typing import Annotated, Literal, Self, TypeAlias
 
 import numpy as np
 
+from visioncal.core.codec import DROPPED, UNWRITTEN
 from visioncal.core.number_format import percent
 from visioncal.core.shown import html_card
 
@@ -63,7 +64,7 @@ class Step:
     """
 
     words: str
-    command: str = ""
+    command: Annotated[str, DROPPED] = ""
 
     def __str__(self) -> str:
         is_shown = self.command and AGAIN not in self.command
@@ -110,12 +111,12 @@ class Finding:
     words: str
     do: Step | None = None
     views: tuple[int, ...] = ()
-    probability: float = 0.0
-    without_it: str = ""
-    is_fatal: bool = field(default=False, compare=False)
-    until_mm: float = field(default=np.inf, compare=False)
-    mahalanobis_sq: float = field(default=0.0, compare=False)
-    up_to_mm: float = field(default=np.inf, compare=False)
+    probability: Annotated[float, DROPPED] = 0.0
+    without_it: Annotated[str, DROPPED] = ""
+    is_fatal: Annotated[bool, UNWRITTEN] = field(default=False, compare=False)
+    until_mm: Annotated[float, UNWRITTEN] = field(default=np.inf, compare=False)
+    mahalanobis_sq: Annotated[float, UNWRITTEN] = field(default=0.0, compare=False)
+    up_to_mm: Annotated[float, UNWRITTEN] = field(default=np.inf, compare=False)
 
     def of(self, name: str) -> Self:
         """The same finding with whom it is of, where there are several; empty names nobody."""

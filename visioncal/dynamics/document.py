@@ -1,10 +1,12 @@
 """dynamics.json."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from visioncal.core.codec import read, write
 from visioncal.core.types import FloatArray
 from visioncal.core.version import __version__
 from visioncal.dynamics.base import BaseModel
@@ -16,9 +18,6 @@ from visioncal.dynamics.stribeck import Stribeck
 from visioncal.robot import Robot
 
 SCHEMA = 1
-# What a validation has of each joint, always and where it is known.
-_ALWAYS = ("rms_nm", "torque_nm", "noise_nm")
-_MAYBE = ("consistent_rms_nm", "known_rms_nm")
 
 
 def to_document(identified: Identified) -> dict[str, Any]:
@@ -40,14 +39,15 @@ def to_document(identified: Identified) -> dict[str, Any]:
         ],
         "covariance": identified.covariance.tolist(),
         "stribeck": stribeck_rows(identified),
-        "streams": [_stream_document(it) for it in identified.streams],
+        "streams": [write(StreamFacts, it) for it in identified.streams],
     }
     if identified.consistent is not None:
         document["standard"] = _standard_document(identified, identified.consistent)
     if identified.lag is not None:
-        document["lag"] = vars(identified.lag)
+        document["lag"] = write(Lag, identified.lag)
     if identified.validation is not None:
-        document["validation"] = _validation_document(identified.validation)
+        shares = {"share": identified.validation.shares.tolist()}
+        document["validation"] = write(Validation, identified.validation) | shares
     verdict = judge(identified)
     return document | {"verdict": {"status": verdict.status, "reasons": list(verdict.reasons)}}
 
@@ -81,21 +81,6 @@ def stribeck_rows(identified: Identified) -> list[dict[str, Any]]:
     return rows
 
 
-def _stream_document(facts: StreamFacts) -> dict[str, Any]:
-    return {
-        "stream": facts.label,
-        "samples": facts.samples,
-        "left_out": facts.left_out,
-        "band_hz": facts.band_hz,
-        "cutoff_hz": facts.cutoff_hz,
-        "rate_hz": facts.rate_hz,
-        "noise_nm": facts.noise_nm.tolist(),
-        "rms_nm": facts.rms_nm.tolist(),
-        "torque_nm": facts.torque_nm.tolist(),
-        "notes": list(facts.notes),
-    }
-
-
 def _standard_document(identified: Identified, consistent: Consistent) -> dict[str, Any]:
     return {
         "parameters": [
@@ -110,12 +95,6 @@ def _standard_document(identified: Identified, consistent: Consistent) -> dict[s
         "covariance": consistent.covariance.tolist(),
         "misfit": consistent.misfit,
     }
-
-
-def _validation_document(validation: Validation) -> dict[str, Any]:
-    arrays = {name: getattr(validation, name) for name in (*_ALWAYS, *_MAYBE)}
-    present = {name: it.tolist() for name, it in arrays.items() if it is not None}
-    return {"samples": validation.label, **present, "share": validation.shares.tolist()}
 
 
 _OWN_KEYS = frozenset(
@@ -137,7 +116,6 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
     base = _base(DynamicModel(robot, terms), [str(row["name"]) for row in document["base"]])
     size = base.rank + 2 * len(document["stribeck"])
     standard = document.get("standard")
-    validation, lag = document.get("validation"), document.get("lag")
     return {
         "robot": robot,
         "base": base,
@@ -145,11 +123,27 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
         "covariance": _array(document["covariance"], (size, size)),
         "stribeck": _stribeck(document["stribeck"], terms),
         "consistent": None if standard is None else _consistent(standard, len(base.model.names)),
-        "streams": tuple(_stream_facts(it, robot.joint_count) for it in document["streams"]),
-        "validation": None if validation is None else _validation(validation, robot.joint_count),
-        "lag": None if lag is None else Lag(**{name: float(it) for name, it in lag.items()}),
+        **_of_joints(read(_Figures, document, ""), robot.joint_count),
         "facts": {name: value for name, value in document.items() if name not in _OWN_KEYS},
     }
+
+
+@dataclass(frozen=True)
+class _Figures:
+    """What is read as it was written."""
+
+    streams: tuple[StreamFacts, ...]
+    validation: Validation | None = None
+    lag: Lag | None = None
+
+
+def _of_joints(found: _Figures, joints: int) -> dict[str, Any]:
+    """The same by name, if all of it is of so many joints."""
+    for it in (*found.streams, found.validation):
+        for name, value in vars(it).items() if it else ():
+            if isinstance(value, np.ndarray) and len(value) != joints:
+                raise ValueError(f"{name} has {len(value)} numbers for {joints} joints")
+    return vars(found)
 
 
 def _base(model: DynamicModel, names: Sequence[str]) -> BaseModel:
@@ -175,30 +169,6 @@ def _consistent(document: Mapping[str, Any], count: int) -> Consistent:
     if values.shape != (count,):
         raise ValueError(f"it has {len(values)} standard parameters instead of {count}")
     return Consistent(values, _array(document["covariance"], (count, count)), document["misfit"])
-
-
-def _stream_facts(document: Mapping[str, Any], joints: int) -> StreamFacts:
-    def of_joints(name: str) -> FloatArray:
-        return _array(document[name], (joints,))
-
-    return StreamFacts(
-        label=document["stream"],
-        samples=int(document["samples"]),
-        left_out=int(document["left_out"]),
-        band_hz=float(document["band_hz"]),
-        cutoff_hz=float(document["cutoff_hz"]),
-        rate_hz=float(document["rate_hz"]),
-        noise_nm=of_joints("noise_nm"),
-        rms_nm=of_joints("rms_nm"),
-        torque_nm=of_joints("torque_nm"),
-        notes=tuple(document["notes"]),
-    )
-
-
-def _validation(document: Mapping[str, Any], joints: int) -> Validation:
-    arrays = {name: _array(document[name], (joints,)) for name in _ALWAYS}
-    more = {name: _array(document[name], (joints,)) for name in _MAYBE if name in document}
-    return Validation(document["samples"], **arrays, **more)
 
 
 def _column(rows: Sequence[Mapping[str, Any]], name: str) -> FloatArray:

@@ -5,11 +5,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 
 from visioncal.core.choices import DYNAMICS_FILE
+from visioncal.core.codec import KEPT, Key, Vector
 from visioncal.core.documents import parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, write_atomically
@@ -43,16 +44,16 @@ class StreamFacts:
         notes: What was found in its samples, in words.
     """
 
-    label: str
+    label: Annotated[str, Key("stream")]
     samples: int
     left_out: int
     band_hz: float
     cutoff_hz: float
     rate_hz: float
-    noise_nm: FloatArray
-    rms_nm: FloatArray
-    torque_nm: FloatArray
-    notes: tuple[str, ...] = ()
+    noise_nm: Vector
+    rms_nm: Vector
+    torque_nm: Vector
+    notes: Annotated[tuple[str, ...], KEPT] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,12 +70,12 @@ class Validation:
             them; None where it has none.
     """
 
-    label: str
-    rms_nm: FloatArray
-    torque_nm: FloatArray
-    noise_nm: FloatArray
-    consistent_rms_nm: FloatArray | None = None
-    known_rms_nm: FloatArray | None = None
+    label: Annotated[str, Key("samples")]
+    rms_nm: Vector
+    torque_nm: Vector
+    noise_nm: Vector
+    consistent_rms_nm: Vector | None = None
+    known_rms_nm: Vector | None = None
 
     @property
     def shares(self) -> FloatArray:
@@ -157,6 +158,8 @@ class Identified:
         path = path / DYNAMICS_FILE if path.is_dir() else path
         try:
             return cls(**fields_from_document(parse_stored(read_bytes(path), str(path))))
+        except DataError as error:
+            raise error.within(str(path)) from error
         except (LookupError, TypeError, ValueError, AttributeError) as error:
             raise DataError(
                 f"{path} is no {DYNAMICS_FILE} of this version: {error}.",

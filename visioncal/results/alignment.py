@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from visioncal.core.arguments import typed
+from visioncal.core.codec import KEPT, names_but, read, reading, write
 from visioncal.core.documents import parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean, read_bytes, write_atomically
@@ -18,7 +19,6 @@ from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Verdict
 from visioncal.core.version import __version__
 from visioncal.estimation.tree import Branch, Step, Tree
-from visioncal.results.codec import KEPT, names_but, read, reading, write
 from visioncal.results.edge import Edge, JointCovariance, StoredEdge
 from visioncal.results.frame import Frame
 from visioncal.results.lens import CameraResult

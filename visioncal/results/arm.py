@@ -8,11 +8,11 @@ from typing import Annotated, Literal
 import numpy as np
 
 from visioncal.core.choices import Convention
+from visioncal.core.codec import Array, Key, Matrix, Section, Written
 from visioncal.core.number_format import figure, percent
 from visioncal.core.types import FloatArray
 from visioncal.estimation.bending import Factor
 from visioncal.estimation.null_space import listed
-from visioncal.results.codec import Array, Key, Matrix, Section, Written
 from visioncal.results.edge import Covariance
 from visioncal.robot import Robot
 from visioncal.robot.thermal import Heating, Kind, ThermalModel

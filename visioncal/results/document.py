@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Literal
 
+from visioncal.core.codec import names_but, read, read_fields, write
 from visioncal.core.types import Mount
 from visioncal.core.version import __version__
 from visioncal.results.arm import StoredRobot
-from visioncal.results.codec import names_but, read, read_fields, write
 from visioncal.results.edge import JointCovariance, StoredEdge
 from visioncal.results.frame import Frame
 from visioncal.results.lens import CameraResult

@@ -7,9 +7,9 @@ from typing import Annotated
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from visioncal.core.codec import Array, Written
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
-from visioncal.results.codec import Array, Written
 
 # Forms of one pose that were rounded to six places agree to this [m, rad]; no cell is known better.
 _SAME = 5e-6

@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Self
 
+from visioncal.core.codec import INLINE, KEPT, read, write
 from visioncal.core.documents import parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, write_atomically
 from visioncal.core.version import __version__
-from visioncal.results.codec import INLINE, KEPT, read, write
 from visioncal.results.edge import StoredEdge
 from visioncal.results.verdicts import StoredVerdict
 

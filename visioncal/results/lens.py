@@ -5,9 +5,9 @@ from typing import Annotated
 
 import numpy as np
 
+from visioncal.core.codec import INLINE, Array, Matrix, Section, Vector, Written
 from visioncal.core.types import Camera, CameraKind, FloatArray
 from visioncal.estimation.lens_field import LensLevels, displacements
-from visioncal.results.codec import INLINE, Array, Matrix, Section, Vector, Written
 from visioncal.results.edge import Covariance
 from visioncal.vision.camera import project_with_jacobian
 

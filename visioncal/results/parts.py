@@ -6,10 +6,10 @@ from typing import Annotated, Any, Literal
 
 from scipy.spatial.transform import RigidTransform
 
+from visioncal.core.codec import INLINE, KEPT, REST, Written
 from visioncal.core.errors import DataError
 from visioncal.core.types import Need
 from visioncal.results.arm import ArmSections
-from visioncal.results.codec import INLINE, KEPT, REST, Written
 from visioncal.results.edge import StoredPose
 from visioncal.robot import Robot
 

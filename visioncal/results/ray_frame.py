@@ -11,9 +11,9 @@ from typing import Annotated
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from visioncal.core.codec import Array, Section
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray
-from visioncal.results.codec import Array, Section
 from visioncal.results.edge import Edge, StoredEdge, StoredPose
 from visioncal.results.lens import CameraResult
 from visioncal.vision.camera import normalise

@@ -14,6 +14,7 @@ from scipy.spatial.transform import RigidTransform
 
 from visioncal.core.arguments import typed
 from visioncal.core.choices import DYNAMICS_FILE
+from visioncal.core.codec import reading
 from visioncal.core.documents import parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, write_atomically
@@ -26,7 +27,6 @@ from visioncal.estimation.intervals import freedom_of
 from visioncal.results.alignment import FILE as ALIGNMENT
 from visioncal.results.alignment import Alignment, is_alignment
 from visioncal.results.arm import NOMINAL, ArmResult
-from visioncal.results.codec import reading
 from visioncal.results.document import fields_from_document, to_document
 from visioncal.results.edge import Edge
 from visioncal.results.frame import Frame

@@ -6,11 +6,11 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from visioncal.core.codec import REST, Array, Matrix, Section, Vector
 from visioncal.core.types import FloatArray, Mask, Target
 from visioncal.estimation.appearance import BOARD_NAMES, board_basis
 from visioncal.estimation.effects.rolling_shutter import Shutter
 from visioncal.results.arm import ArmSections
-from visioncal.results.codec import REST, Array, Matrix, Section, Vector
 from visioncal.results.edge import Covariance
 from visioncal.vision.targets import corner_positions
 

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 
+from visioncal.core.codec import entries
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Finding, Verdict
 from visioncal.results.alignment import Alignment, Sight
 from visioncal.results.arm import ArmSections
-from visioncal.results.codec import entries
 from visioncal.results.edge import Edge
 from visioncal.results.frame import Frame
 from visioncal.results.parts import Rms, RobotResult, Validation

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated
 
+from visioncal.core.codec import DROPPED, Written
 from visioncal.core.verdict import Finding, Step, Verdict, VerdictStatus
-from visioncal.results.codec import DROPPED, Written
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,53 +46,6 @@ class CauseForm:
 
 
 @dataclass(frozen=True, kw_only=True)
-class StepForm:
-    """What to do about a finding: a sentence, and a command line that does it or leads on."""
-
-    words: str
-    command: Annotated[str, DROPPED] = ""
-
-
-@dataclass(frozen=True, kw_only=True)
-class FindingForm:
-    """One thing that was found; see `core.verdict.Finding`.
-
-    Attributes:
-        kind: What it is, as a short name that stays.
-        words: The same in sentences, with its figures.
-        do: What to do about it.
-        views: The views that it is about.
-        probability: How likely it is the cause of what is wrong; absent for what is no cause.
-        without_it: What the result would be without it, in a sentence.
-    """
-
-    kind: str
-    words: str
-    do: StepForm | None = None
-    views: tuple[int, ...] = ()
-    probability: Annotated[float, DROPPED] = 0.0
-    without_it: Annotated[str, DROPPED] = ""
-
-    @classmethod
-    def of(cls, found: Finding) -> "FindingForm":
-        """Writes a finding."""
-        step = found.do
-        return cls(
-            kind=found.kind,
-            words=found.words,
-            do=None if step is None else StepForm(words=step.words, command=step.command),
-            views=found.views,
-            probability=found.probability,
-            without_it=found.without_it,
-        )
-
-    def finding(self) -> Finding:
-        """Reads it."""
-        step = None if self.do is None else Step(self.do.words, self.do.command)
-        return Finding(self.kind, self.words, step, self.views, self.probability, self.without_it)
-
-
-@dataclass(frozen=True, kw_only=True)
 class VerdictForm:
     """Whether a result can be trusted.
 
@@ -109,7 +62,7 @@ class VerdictForm:
     reasons: tuple[str, ...]
     good_for_mm: float | None = None
     causes: tuple[CauseForm, ...] = ()
-    findings: tuple[FindingForm, ...] | None = None
+    findings: tuple[Finding, ...] | None = None
 
     @classmethod
     def of(cls, verdict: Verdict) -> "VerdictForm":
@@ -119,13 +72,13 @@ class VerdictForm:
             reasons=verdict.reasons,
             good_for_mm=verdict.good_for_mm,
             causes=tuple(map(CauseForm.of, verdict.causes)),
-            findings=tuple(map(FindingForm.of, verdict.findings)),
+            findings=verdict.findings,
         )
 
     def verdict(self, _: str) -> Verdict:
         """Reads it."""
-        found = self._earlier() if self.findings is None else (it.finding() for it in self.findings)
-        return Verdict(self.status, tuple(found), self.good_for_mm)
+        found = tuple(self._earlier()) if self.findings is None else self.findings
+        return Verdict(self.status, found, self.good_for_mm)
 
     def _earlier(self) -> Iterator[Finding]:
         """Findings of reasons and causes, of which a reason may begin with a cause's sentence."""

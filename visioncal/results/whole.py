@@ -10,9 +10,9 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from visioncal.core.codec import INLINE, KEPT, names_but, read, read_fields, write
 from visioncal.core.version import __version__
 from visioncal.results.alignment import Alignment, Moved, Sight, Untied
-from visioncal.results.codec import INLINE, KEPT, names_but, read, read_fields, write
 from visioncal.results.edge import JointCovariance, StoredEdge
 from visioncal.results.frame import Frame
 from visioncal.results.lens import CameraResult

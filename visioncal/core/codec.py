@@ -82,8 +82,8 @@ class Written:
 
 # Fields whose keys stand beside those of their owner, and one that has all keys of no other.
 INLINE, REST = object(), object()
-# A field that is on disk though it is empty, and a text that is not.
-KEPT, DROPPED = object(), object()
+# A field that is on disk though it is empty, a text that is not, and one that is never.
+KEPT, DROPPED, UNWRITTEN = object(), object(), object()
 Vector = Annotated[FloatArray, Array((-1,))]
 Matrix = Annotated[FloatArray, Array((-1, -1))]
 
@@ -133,6 +133,8 @@ def entries(cls: type) -> tuple[Entry, ...]:
     for it in fields(cls):
         kind = hints[it.name]
         marks = get_args(kind)[1:] if get_origin(kind) is Annotated else ()
+        if UNWRITTEN in marks:
+            continue
         keys = [mark.name for mark in marks if isinstance(mark, Key)]
         required = it.default is MISSING and it.default_factory is MISSING
         found.append(Entry(it.name, keys[0] if keys else it.name, kind, required, marks))
