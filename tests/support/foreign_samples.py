@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from visioncal.core.conventions import POSE_FORMS, write_pose
 from visioncal.core.transforms import exp, invert
 from visioncal.interchange.formats import ImportOptions, PoseImportOptions
 
@@ -234,6 +235,19 @@ def matrices_below(folder: Path) -> Recording:
     return _matrices_in_files(folder, np.vstack)
 
 
+def fanuc_program(folder: Path) -> Recording:
+    """A listing of taught positions, each in several lines, beside the images of the stops."""
+    text = '/PROG  LOOK\n/ATTR\nCOMMENT = "";\n/MN\n   1:J P[1] 100% FINE ;\n/POS\n'
+    for at, pose in enumerate(BASE_FROM_FLANGE, start=1):
+        x, y, z, w, p, r = write_pose(pose, POSE_FORMS["fanuc"]).tolist()
+        text += f"P[{at}]{{\n   GP1:\n\tUF : 0, UT : 1,\tCONFIG : 'N U T, 0, 0, 0',\n"
+        text += f"\tX = {x!r}  mm,\tY = {y!r}  mm,\tZ = {z!r}  mm,\n"
+        text += f"\tW = {w!r} deg,\tP = {p!r} deg,\tR = {r!r} deg\n}};\n"
+        picture(folder / f"{at}.png")
+    requested = ImportOptions(mount="eye-in-hand", target=CHARUCO)
+    return Recording(_write(folder / "look.ls", text + "/END\n").parent, requested)
+
+
 def printed_matrices(folder: Path) -> Recording:
     """A log of a program, with matrices under what they are."""
     text = "server 1.17.3 listens\n"
@@ -403,6 +417,7 @@ RECORDINGS: Mapping[str, Callable[[Path], Recording]] = {
         matrices_below,
         printed_lists,
         printed_matrices,
+        fanuc_program,
         headed_units,
         ros_poses,
         numbers_first,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from visioncal.core.conventions import PoseNumbers, write_pose
+from visioncal.core.conventions import PoseNumbers
 from visioncal.core.documents import (
     read_json,
     read_npy,
@@ -16,8 +16,6 @@ from visioncal.core.documents import (
     read_table,
     read_yaml,
 )
-from visioncal.core.documents.bounds import read_plain_text
-from visioncal.core.documents.pendants import PendantPose, is_marked_pose, read_pose
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.interchange.formats.fields import (
@@ -33,6 +31,7 @@ from visioncal.interchange.formats.finding import images_beside, images_named, i
 from visioncal.interchange.formats.foreign import Foreign, ForeignFormat
 from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.pairing import with_camera_file
+from visioncal.interchange.formats.pendants import PROGRAMS, pendant_fields, program_fields
 from visioncal.interchange.formats.poses import (
     JOINT_KEYS,
     joints_from,
@@ -45,12 +44,8 @@ from visioncal.interchange.formats.streams import in_seconds
 from visioncal.session.columns import joint_columns
 
 DOCUMENTS = (".json", ".yaml", ".yml", ".xml")
-ENDINGS = (".csv", ".tsv", ".txt", ".log", ".npz", ".npy", *DOCUMENTS)
+ENDINGS = (".csv", ".tsv", ".txt", ".log", ".npz", ".npy", *DOCUMENTS, *PROGRAMS)
 _IMAGE_NAMES = ("image", "img", "filename", "file", "image_file", "image_path")
-# Names under which poses are looked for, by how many numbers they have.
-_NAMES = {6: ("x", "y", "z", "rx", "ry", "rz"), 7: ("x", "y", "z", "q1", "q2", "q3", "q4")}
-_IMAGE = re.compile(r"[^\s,;\"']+\.(?:png|jpe?g|tiff?|bmp)(?![\w.])", re.IGNORECASE)
-_COMMENTS = ("#", "%", "//", "!")
 # How many numbers poses have in one field.
 _WHOLE_POSES = (6, 7, 12, 16)
 
@@ -68,7 +63,9 @@ def read_fields(path: Path) -> Fields:
         return fields_of_arrays({"value": read_npy(path)}, path)
     if suffix in DOCUMENTS:
         return _fields_of_document(read_document(path), path)
-    lines = _pendant_fields(path) or printed_fields(path)
+    if suffix in PROGRAMS:
+        return program_fields(path)
+    lines = pendant_fields(path) or printed_fields(path)
     if lines is not None:
         return lines
     table = read_table(path)
@@ -287,39 +284,3 @@ TABLE = ForeignFormat(
     lambda path: _pose_file(path) is not None,
     _read_file,
 )
-
-
-def _pendant_fields(path: Path) -> Fields | None:
-    """Takes the lines of a text file that hold poses, each with its image where it names one."""
-    lines = [
-        (at, line)
-        for at, line in enumerate(read_plain_text(path).splitlines(), start=1)
-        if line.strip() and not line.strip().startswith(_COMMENTS)
-    ]
-    # A header may stand first.
-    first = next((at for at, (_, line) in enumerate(lines[:2]) if is_marked_pose(line)), None)
-    if first is None:
-        return None
-    places = tuple(f"{path.name}, line {at}" for at, _ in lines[first:])
-    texts = [line for _, line in lines[first:]]
-    images = tuple(found[0] if (found := _IMAGE.search(it)) else "" for it in texts)
-    poses = [
-        read_pose(_IMAGE.sub(" ", text), place) for text, place in zip(texts, places, strict=True)
-    ]
-    form = poses[0].form
-    _check_one_form(poses, places)
-    numbers = np.array([write_pose(it.pose, form) for it in poses])
-    columns = dict(zip(_NAMES[numbers.shape[1]], numbers.T, strict=True))
-    named = {"image": images} if any(images) else {}
-    return Fields(path.stem, path.parent, places, columns, named, form=form.name)
-
-
-def _check_one_form(poses: list[PendantPose], places: tuple[str, ...]) -> None:
-    form = poses[0].form
-    others = [place for place, it in zip(places, poses, strict=True) if it.form != form]
-    if others:
-        raise DataError(
-            f"{some_of(others)}: another maker's form than {form.words}, as {places[0]} has.",
-            culprits=others,
-            next_step="Put the poses of one robot into a file of their own.",
-        )
