@@ -86,6 +86,14 @@ def test_near_views_of_a_large_board_have_one_pose():
     assert all(len(view.cam_from_target) == 1 for view in poses_of(cell).views)
 
 
+def test_a_pose_that_both_starts_run_into_has_no_rival():
+    # Corners so exact that a pose costs more where the one fit left it than where the other did.
+    cell = simulate(CellOptions(seed=9, pixel_sigma_px=0.01, tilt_rad=(0.1, 0.3)))
+    for view in poses_of(cell).views:
+        first, *others = view.cam_from_target
+        assert all(np.linalg.norm(log(invert(first) @ it)[:3]) > 1e-3 for it in others)
+
+
 def test_wrong_corners_are_left_out_and_wrong_views_named():
     cell = simulate(CellOptions(seed=4, pixel_sigma_px=0.1))
     corners = corners_of(cell)

@@ -30,6 +30,8 @@ _RIVAL_CHI2 = 36.0
 # The closed form's guess is refined while its rms [px] is under this many times the better
 # pose's, or about a pixel: the fit brings it down by two at most.
 _PROMISING_RATIO = 5.0
+# Rotations [rad] no further apart are one pose that was reached from both starts.
+_SAME_RAD = 1e-5
 _ROUNDS = 3
 
 
@@ -163,10 +165,13 @@ def _with_rivals(
     spreads = [
         floored_sigma_px(sigma_px) ** 2 * covariance_from(it.information) for it in (best, other)
     ]
+    turned_by = np.abs(best.cam_from_target - other.cam_from_target)[:, :3, :3].max(axis=(1, 2))
     views = []
     for at, (view, board) in enumerate(zip(stack.views, boards.tolist(), strict=True)):
         turns, turned = turns_of[board], turned_of[board]
-        rival = _is_rival(mean_squares[0][at], mean_squares[1][at], stack.counts[at], sigma_px)
+        rival = turned_by[at] > _SAME_RAD and _is_rival(
+            mean_squares[0][at], mean_squares[1][at], stack.counts[at], sigma_px
+        )
         fits = (best, other) if rival else (best,)
         covariance = [turned @ it[at] @ np.swapaxes(turned, 1, 2) for it in spreads[: len(fits)]]
         views.append(
@@ -246,8 +251,6 @@ def _sorted(stack: CornerStack, first: PoseFit, second: PoseFit) -> tuple[PoseFi
 
 def _is_rival(best: float, other: float, corners: int, sigma_px: float) -> bool:
     """Whether the mirrored pose explains a view's corners about as well as the better one."""
-    if abs(best - other) <= 1e-6 * other:
-        return False  # both starts ran into the same pose
     mahalanobis_sq = corners * (other - best) / floored_sigma_px(sigma_px) ** 2
     return bool(other < _RIVAL_RATIO**2 * best or mahalanobis_sq < _RIVAL_CHI2)
 
