@@ -12,6 +12,7 @@ from visioncal.interchange.formats.columns import DOCUMENTS, ENDINGS, foreign_fr
 from visioncal.interchange.formats.fields import fields_of_records, flattened
 from visioncal.interchange.formats.finding import is_image_name, kind_of, listed, number_in
 from visioncal.interchange.formats.foreign import Foreign, ForeignFormat
+from visioncal.interchange.formats.halcon import halcon_pose
 from visioncal.interchange.formats.import_options import ImportOptions
 
 
@@ -81,7 +82,8 @@ def _record(path: Path) -> dict[str, object]:
     elif suffix in DOCUMENTS:
         document = read_document(path)
     else:
-        document = _table_record(path)
+        pose = halcon_pose(path) if suffix == ".dat" else None
+        document = _table_record(path) if pose is None else pose
     return flattened(document if isinstance(document, Mapping) else {"matrix": document})
 
 
