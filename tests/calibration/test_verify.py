@@ -40,10 +40,10 @@ from visioncal.vision.targets import numbered_positions
 MOUNTS = ("eye-in-hand", "eye-to-hand")
 
 
-def checked(place, rng, change=None, **options):
+def checked(place, rng, change=None, stops=5, **options):
     prior_calibration = CalibrationPrior.of(place.calibration)
     return check(
-        seen_by(known_again(place.cell, rng, change), prior_calibration),
+        seen_by(known_again(place.cell, rng, change, stops), prior_calibration),
         prior_calibration,
         **options,
     )
@@ -136,6 +136,14 @@ def test_what_no_stops_can_tell_apart_is_named_together(place):
     assert set(names(first)) == {"joint 1", stands}
     assert "No stops separate that from" in verdict_of(first).reasons[1]
     assert set(names(checked(place, rng, slip(6, 0.05)))) == {"joint 6", carried}
+
+
+def test_one_stop_is_no_robot_that_scatters(place):
+    rng = np.random.default_rng(1)
+    found = checked(place, rng, Change(board=knock(rng, 2.0, 0.0)), stops=1)
+    assert not found.passed
+    assert {"camera", "board"} <= set(names(found))
+    assert "This stop does not separate that from" in verdict_of(found).reasons[1]
 
 
 def test_a_board_that_was_turned_by_much_is_told(place):

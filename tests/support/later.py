@@ -103,9 +103,11 @@ def _detected(
     return Corners(view, ids, px[ids] + noise, cell.options.blur_px)
 
 
-def known_again(cell: Cell, rng: np.random.Generator, change: Change | None = None) -> RunState:
+def known_again(
+    cell: Cell, rng: np.random.Generator, change: Change | None = None, stops: int = 5
+) -> RunState:
     """What is known of such stops after detection."""
-    return known_of(again(cell, rng, change))
+    return known_of(again(cell, rng, change, stops))
 
 
 def knock(rng: np.random.Generator, mm: float, deg: float) -> FloatArray:

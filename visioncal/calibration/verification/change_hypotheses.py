@@ -55,7 +55,7 @@ def causes_of(
         ),
         *(_jointly(BOTH, camera, it) for it in boards if _both_possible(seen, prior_calibration)),
         *_joints(seen, prior_calibration),
-        _noise(seen),
+        *_noise(seen),
         *_views(seen, prior_calibration),
     )
 
@@ -146,8 +146,10 @@ def _stretch(robot: Robot, q: FloatArray) -> FloatArray:
     return np.asarray(robot.placement_jacobian(q) @ twists.reshape(-1))
 
 
-def _noise(seen: PredictedStops) -> Cause:
-    return replace(_cause(NOISE, seen, np.zeros(0)), noise_factors=_FACTORS)
+def _noise(seen: PredictedStops) -> Iterator[Cause]:
+    """The robot's: one stop alone scatters from no other."""
+    if seen.stops > 1:
+        yield replace(_cause(NOISE, seen, np.zeros(0)), noise_factors=_FACTORS)
 
 
 def _views(seen: PredictedStops, prior_calibration: CalibrationPrior) -> Iterator[Cause]:

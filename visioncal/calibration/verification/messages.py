@@ -158,7 +158,8 @@ def _rivals(check: Check, best: Suspect, others: Sequence[Suspect]) -> Finding:
     if robot is not None and best.name in (f"{JOINT} 1", f"{JOINT} {robot.joint_count}"):
         # A base that turns about the first axis, or a tool about the last, looks the same anywhere.
         return Finding("rivals", f"No stops separate that from {named}.", Step("Look at both."))
-    words = f"These {_stops(check)} do not separate that from {named}."
+    these = "This stop does" if check.seen.stops == 1 else f"These {check.seen.stops} stops do"
+    words = f"{these} not separate that from {named}."
     step = _runnable(check, Step("Verify with stops all over the workspace.", PLAN))
     return Finding("rivals", words, step)
 
