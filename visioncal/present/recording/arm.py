@@ -43,6 +43,13 @@ def log_arm(stream: rr.RecordingStream, link_frames: FloatArray, entity: str = p
     stream.log(f"{entity}/joints", balls)
 
 
+def placed(pose: FloatArray, parent: str, child: str) -> rr.Transform3D:
+    """Hangs a frame on another by a pose (4, 4) `parent_from_child`."""
+    return rr.Transform3D(
+        translation=pose[:3, 3], mat3x3=pose[:3, :3], parent_frame=parent, child_frame=child
+    )
+
+
 def log_frames(
     stream: rr.RecordingStream, axis_m: float, more: Sequence[tuple[str, str, float]] = ()
 ) -> None:

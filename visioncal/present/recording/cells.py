@@ -18,7 +18,7 @@ from visioncal.core.number_format import significant
 from visioncal.core.types import FloatArray, Target
 from visioncal.present.cellmap import pairs, places, spans
 from visioncal.present.recording import board, colours, paths
-from visioncal.present.recording.arm import log_arm
+from visioncal.present.recording.arm import log_arm, placed
 from visioncal.present.recording.frames import Frame, scan
 from visioncal.present.recording.markdown import sight_markdown, verdict_markdown
 from visioncal.present.recording.notes import log_verdict, markdown
@@ -236,9 +236,7 @@ def _log_frame(stream: rr.RecordingStream, scene: CellScene, frame: str, on: str
     entity, matrix = _frame_entity(frame), scene.found.edge_of(frame).matrix
     stream.log(
         entity,
-        rr.Transform3D(
-            translation=matrix[:3, 3], mat3x3=matrix[:3, :3], parent_frame=on, child_frame=frame
-        ),
+        placed(matrix, on, frame),
         rr.CoordinateFrame(frame),
         rr.TransformAxes3D(_AXIS * scene.size_m, show_frame=True),
         static=True,
@@ -344,10 +342,7 @@ def _log_robot(stream: rr.RecordingStream, scene: CellScene, flange: str, view: 
         stream.log(_frame_entity(flange), rr.Clear(recursive=False))
         stream.log(_arm_entity(flange), rr.Clear(recursive=True))
         return
-    placed = rr.Transform3D(
-        translation=pose[:3, 3], mat3x3=pose[:3, :3], parent_frame=base, child_frame=flange
-    )
-    stream.log(_frame_entity(flange), placed)
+    stream.log(_frame_entity(flange), placed(pose, base, flange))
     robot, q = scene.robots.get(flange), scene.robot_rows[by][flange].joints_rad
     if robot is not None and q is not None and len(q) == robot.joint_count:
         log_arm(stream, robot.link_frames(q), _arm_entity(flange))

@@ -8,9 +8,10 @@ import rerun as rr
 
 from visioncal.core.types import Camera, FloatArray, Image, Mount, Target
 from visioncal.present.recording import board, colours, paths
-from visioncal.present.recording.arm import log_arm
+from visioncal.present.recording.arm import log_arm, log_frames
 from visioncal.present.recording.charts import Charts
 from visioncal.present.recording.coverage import corners_chart
+from visioncal.present.recording.notes import markdown
 from visioncal.present.recording.scene import SMALL_FRUSTUM, frustum, log_image_plane, log_pose
 from visioncal.robot import Robot
 
@@ -79,19 +80,12 @@ class LiveDrawing:
     def begin(self) -> None:
         """Draws what stands still."""
         stream, cell = self.stream, self.cell
-        base = rr.Transform3D(parent_frame="cell", child_frame=paths.BASE_FRAME)
-        stream.log(paths.BASE, base, static=True)
-        frames = [(paths.BASE, paths.BASE_FRAME), (paths.FLANGE, paths.FLANGE_FRAME)]
+        more: list[tuple[str, str, float]] = []
         if cell.x is not None:
-            frames += [(paths.CAMERA, paths.CAM_FRAME), (paths.TARGET, paths.TARGET_FRAME)]
+            more = [(paths.CAMERA, paths.CAM_FRAME, 1.0), (paths.TARGET, paths.TARGET_FRAME, 1.0)]
             on_target = rr.CoordinateFrame(paths.TARGET_FRAME)
             stream.log(f"{paths.TARGET}/sheet", on_target, board.sheet(cell.target), static=True)
-        for entity, frame in frames:
-            axes = rr.TransformAxes3D(_AXIS_M, show_frame=True)
-            stream.log(entity, rr.CoordinateFrame(frame), axes, static=True)
-        in_base = rr.CoordinateFrame(paths.BASE_FRAME)
-        for entity in ("links", "joints"):
-            stream.log(f"{paths.ROBOT}/{entity}", in_base, static=True)
+        log_frames(stream, _AXIS_M, more)
         if cell.camera is not None:
             log_image_plane(stream, cell.camera, 1.0)
 
@@ -108,8 +102,7 @@ class LiveDrawing:
         charts.log_view(stream, view.view)
         if view.sigma_mm is not None:
             stream.log(paths.LIVE_SIGMA, rr.Scalars(view.sigma_mm))
-        note = rr.TextDocument(view.note, media_type="text/markdown")
-        stream.log(paths.LIVE_NOTE, note)
+        stream.log(paths.LIVE_NOTE, markdown(view.note))
 
     def _draw_image(self, view: LiveView) -> None:
         in_image = rr.CoordinateFrame(paths.IMAGE_FRAME)

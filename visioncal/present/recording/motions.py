@@ -14,6 +14,7 @@ from visioncal.core.types import FloatArray
 from visioncal.dynamics.motion import Motion
 from visioncal.present.recording import colours, paths
 from visioncal.present.recording.arm import log_arm, log_frames
+from visioncal.present.recording.notes import markdown
 from visioncal.present.recording.obstacles import Obstacle, log_obstacles
 from visioncal.present.recording.recorder import Recorder
 from visioncal.present.recording.scene import log_pose
@@ -109,8 +110,7 @@ def _log_static(stream: rr.RecordingStream, preview: MotionPreview) -> None:
     for kind in paths.MOTION_KINDS:
         lines = rr.SeriesLines(names=names, colors=tints)
         stream.log(f"{paths.MOTION}/{kind}", lines, static=True)
-    note = rr.TextDocument(preview.note, media_type="text/markdown")
-    stream.log(paths.PLAN_NOTE, note, static=True)
+    stream.log(paths.PLAN_NOTE, markdown(preview.note), static=True)
 
 
 def _log_curves(stream: rr.RecordingStream, part: MotionPart, begin_s: float) -> None:

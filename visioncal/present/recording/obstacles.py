@@ -8,6 +8,7 @@ import rerun as rr
 
 from visioncal.core.types import FloatArray
 from visioncal.present.recording import colours, paths
+from visioncal.present.recording.arm import placed
 
 # A piece of floor is drawn, so many times as wide as the cell.
 _FLOOR = 1.3
@@ -53,11 +54,6 @@ def log_obstacles(
             fill_mode="solid",
         )
         name = f"box_{at + 1}"
-        pose = rr.Transform3D(
-            translation=box.base_from_box[:3, 3],
-            mat3x3=box.base_from_box[:3, :3],
-            parent_frame=paths.BASE_FRAME,
-            child_frame=name,
-        )
+        pose = placed(box.base_from_box, paths.BASE_FRAME, name)
         entity = f"{paths.OBSTACLES}/{name}"
         stream.log(entity, pose, rr.CoordinateFrame(name), drawn, static=True)

@@ -20,6 +20,7 @@ from visioncal.present.recording.coverage import (
     directions_chart,
     rotation_axes_chart,
 )
+from visioncal.present.recording.notes import markdown
 from visioncal.present.recording.obstacles import Obstacle, log_obstacles
 from visioncal.present.recording.recorder import Recorder
 from visioncal.present.recording.scene import SMALL_FRUSTUM, frustum, log_image_plane, log_pose
@@ -161,7 +162,7 @@ def _log_static(stream: rr.RecordingStream, preview: Preview, charts: Charts) ->
     if len(preview.places_m):
         log_map(stream, preview.places_m, preview.places_sigma_mm, size_m)
     charts.log_static(stream)
-    note = rr.TextDocument(preview.note, media_type="text/markdown")
+    note = markdown(preview.note)
     stream.log(paths.PLAN_NOTE, note, static=True)
     known = np.isfinite(preview.sigmas_mm)
     if known.any():
@@ -232,8 +233,7 @@ def _log_stops(recorder: Recorder, preview: Preview, charts: Charts) -> None:
         cam_from_target = _log_cell(stream, preview, stop.q)
         charts.log_view(stream, stop.view)
         _log_image(stream, preview, cam_from_target)
-        text = rr.TextDocument(stop.note, media_type="text/markdown")
-        stream.log(paths.STOP_NOTE, text)
+        stream.log(paths.STOP_NOTE, markdown(stop.note))
     recorder.keep()
 
 

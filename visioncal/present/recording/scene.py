@@ -9,7 +9,7 @@ import rerun as rr
 
 from visioncal.core.types import Camera, FloatArray, Target
 from visioncal.present.recording import board, colours, paths
-from visioncal.present.recording.arm import log_arms
+from visioncal.present.recording.arm import log_arms, log_frames, placed
 from visioncal.present.recording.charts import Charts
 from visioncal.present.recording.recorder import send_rows
 from visioncal.present.recording.uncertainty import Uncertainty
@@ -83,16 +83,9 @@ class Scene:
     def log_static(self, stream: rr.RecordingStream) -> None:
         """Logs what does not change from view to view."""
         # The edge to the cell keeps the base known in views that know no other frame.
-        stream.log(
-            paths.BASE,
-            rr.Transform3D(parent_frame="cell", child_frame=paths.BASE_FRAME),
-            static=True,
-        )
-        for entity in ("links", "joints", "reach"):
-            frame = rr.CoordinateFrame(paths.BASE_FRAME)
-            stream.log(f"{paths.ROBOT}/{entity}", frame, static=True)
-        self._log_axes(stream, paths.BASE, paths.BASE_FRAME, 2.0)
-        self._log_axes(stream, paths.FLANGE, paths.FLANGE_FRAME, 1.0)
+        log_frames(stream, _AXIS * self.size_m)
+        in_base = rr.CoordinateFrame(paths.BASE_FRAME)
+        stream.log(f"{paths.ROBOT}/reach", in_base, static=True)
         if self.calibration is None:
             self._log_stops(stream)
             return
@@ -186,12 +179,7 @@ class Scene:
         """Draws tools, which the flange takes along, and fixtures, which stand in the base."""
         for name, frame in calibration.frames.items():
             parent, _, child = name.partition("_from_")
-            pose = rr.Transform3D(
-                translation=frame.edge.matrix[:3, 3],
-                mat3x3=frame.edge.matrix[:3, :3],
-                parent_frame=parent,
-                child_frame=child,
-            )
+            pose = placed(frame.edge.matrix, parent, child)
             stream.log(paths.entity_of(child), pose, static=True)
             self._log_axes(stream, paths.entity_of(child), child, 0.5)
 
@@ -339,13 +327,7 @@ def log_pose(
     if base_from_frame is None:
         stream.log(entity, rr.Clear(recursive=False))
         return
-    pose = rr.Transform3D(
-        translation=base_from_frame[:3, 3],
-        mat3x3=base_from_frame[:3, :3],
-        parent_frame=paths.BASE_FRAME,
-        child_frame=frame,
-    )
-    stream.log(entity, pose)
+    stream.log(entity, placed(base_from_frame, paths.BASE_FRAME, frame))
 
 
 def _log_poses(
