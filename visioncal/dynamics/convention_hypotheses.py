@@ -117,11 +117,9 @@ def _predicted_better(robot: Robot, as_it_is: _Guess) -> tuple[_Guess, str] | No
 
 
 def _fitted_better(base: BaseModel, as_it_is: _Guess) -> tuple[_Guess, str] | None:
-    """Two exchanged joints, if a fit finds such a pair, and why.
-
-    Where friction is most of their torques, predictions hardly show it; but no inertias at all
-    can explain the others' torques.
-    """
+    """Two exchanged joints, if a fit finds such a pair, and why."""
+    # Where friction is most of their torques, predictions hardly show it; but no inertias at all
+    # can explain the others' torques.
     before, predicted = _unfitted(base, as_it_is.measured), _left(as_it_is)
     best, gain = None, np.log(_FITS_BETTER)
     for guess in _swapped_joints(base.model.robot, as_it_is):

@@ -147,10 +147,8 @@ def _of_joints(found: _Figures, joints: int) -> dict[str, Any]:
 
 
 def _base(model: DynamicModel, names: Sequence[str]) -> BaseModel:
-    """The base parameters that begin as those that were written.
-
-    Which ones are kept may hang on rounding, and so on the machine.
-    """
+    """The base parameters that begin as those that were written."""
+    # Which ones are kept may hang on rounding, and so on the machine.
     kept = [model.names.index(it.split()[0]) for it in names]
     return BaseModel.keeping(model, np.array(kept, dtype=np.int64))
 

@@ -97,10 +97,8 @@ class Objective:
         return value, np.split(by_states, len(states), axis=1)
 
     def _regressors(self, states: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
-        """Rows (m, n, b), and their derivatives (3 n, m, n, b) by the numbers of the states.
-
-        Forward differences; the rows are linear in the accelerations and quadratic in the speeds.
-        """
+        """Rows (m, n, b), and their derivatives (3 n, m, n, b) by the numbers of the states."""
+        # Forward differences; the rows are linear in the accelerations and quadratic in the speeds.
         count, joints = states[0].shape
         stepped = [np.repeat(it[None], 3 * joints + 1, axis=0) for it in states]
         for kind, values in enumerate(stepped):

@@ -177,10 +177,8 @@ def _block(identified: Identified, terms: FrictionTerms, stream: Conditioned) ->
 
 
 def _of_arm(identified: Identified, loaded: Sequence[Conditioned], fit: Regression) -> FloatArray:
-    """What the arm's own covariance adds to that of the payload.
-
-    The fit takes torques that the arm's parameters explain wrongly for the payload's.
-    """
+    """What the arm's own covariance adds to that of the payload."""
+    # The fit takes torques that the arm's parameters explain wrongly for the payload's.
     base = identified.base
     information = np.zeros((len(fit.values), len(fit.values)))
     cross = np.zeros((len(fit.values), base.rank))
@@ -196,11 +194,9 @@ def _of_arm(identified: Identified, loaded: Sequence[Conditioned], fit: Regressi
 
 
 def _of_gains(loaded: Sequence[Conditioned], fit: Regression, sigma: float) -> FloatArray:
-    """What errors of the drives' gains add to the covariance.
-
-    A joint's torques with and without the payload are currents times one gain: what they say of the
-    payload is as wrong, in share, as the gain.
-    """
+    """What errors of the drives' gains add to the covariance."""
+    # A joint's torques with and without the payload are currents times one gain: what they say of
+    # the payload is as wrong, in share, as the gain.
     count = len(fit.values)
     information, parts = np.zeros((count, count)), np.zeros((count, fit.blocks[0].y.shape[1]))
     for stream, block, noise in zip(loaded, fit.blocks, fit.sigmas, strict=True):

@@ -144,10 +144,8 @@ def spread_of(values: FloatArray, used: Mask) -> FloatArray:
 def _weighted(
     blocks: Sequence[Block],
 ) -> tuple[FloatArray, tuple[FloatArray, ...], FloatArray]:
-    """Parameters, noise of the joints by block, and a root (p, p) of the white covariance.
-
-    Each joint's rows are decomposed once; changing weights costs triangles alone.
-    """
+    """Parameters, noise of the joints by block, and a root (p, p) of the white covariance."""
+    # Each joint's rows are decomposed once; changing weights costs triangles alone.
     joints = [_decomposed(block) for block in blocks]
     size = blocks[0].x.shape[2]
     sigmas = [np.ones(len(it)) for it in joints]
@@ -213,12 +211,10 @@ def _sigma(joint: _Joint, values: FloatArray, root: FloatArray, before: float) -
 
 
 def _covariance(fit: Regression) -> FloatArray:
-    """The estimate's covariance under correlated noise.
-
-    That of least squares under another noise than it was weighted for (White 1980; Newey and West
-    1987), with the correlations that the filter leaves of white noise, and those of the residuals
-    where they are plainly larger.
-    """
+    """The estimate's covariance under correlated noise."""
+    # That of least squares under another noise than it was weighted for (White 1980; Newey and West
+    # 1987), with the correlations that the filter leaves of white noise, and those of the residuals
+    # where they are plainly larger.
     white = fit.covariance
     scores = np.zeros_like(white)
     for block, residuals, sigma in zip(fit.blocks, fit.residuals, fit.sigmas, strict=True):
@@ -236,10 +232,8 @@ def _covariance(fit: Regression) -> FloatArray:
 
 
 def _scores(rows: FloatArray, shares: FloatArray) -> FloatArray:
-    """`rows^T T rows`, where T has ones on its diagonal and `shares` beside it.
-
-    By the noise's spectrum, which cannot be negative, whatever cut-off correlations say.
-    """
+    """`rows^T T rows`, where T has ones on its diagonal and `shares` beside it."""
+    # By the noise's spectrum, which cannot be negative, whatever cut-off correlations say.
     if not len(shares):
         return np.asarray(rows.T @ rows)
     size = next_fast_len(len(rows) + len(shares), real=True)

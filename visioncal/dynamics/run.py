@@ -278,10 +278,8 @@ def _lagging(
 def _split(
     robot: Robot, recorded: Sequence[Recorded], streams: Sequence[Conditioned], request: Request
 ) -> _Split | None:
-    """Leaves the end of the fastest motion out; None where the rest determines too little.
-
-    Sweeps move one joint after the other: no part of them stands for the others.
-    """
+    """Leaves the end of the fastest motion out; None where the rest determines too little."""
+    # Sweeps move one joint after the other: no part of them stands for the others.
     fastest = int(np.argmax([_speed(it) for it in streams]))
     filtered = replace(request, cutoff_hz=streams[fastest].cutoff_hz)
     begin = recorded[fastest].part(0.0, 1.0 - HELD_OUT)

@@ -115,10 +115,8 @@ def _polished(
 
 
 def _shown(found: Stribeck, fit: Regression, coulomb_nm: FloatArray) -> FloatArray:
-    """(a,) whether a hump is above chance and within the range of speeds.
-
-    Friction that would drive a joint at low speeds (Fs below 0) is none: something else is.
-    """
+    """(a,) whether a hump is above chance and within the range of speeds."""
+    # Friction that would drive a joint at low speeds (Fs below 0) is none: something else is.
     count = len(found.joints)
     sigma = np.sqrt(np.diag(fit.covariance)[-2 * count : -count])
     limit = float(np.sqrt(chi2_limit(_CHANCE, 2.0)))

@@ -154,11 +154,9 @@ def find_arm_errors(
 def _most_likely_size(
     likelihood: RobotLikelihood, size: int, levels: FloatArray, enough: float
 ) -> tuple[float, float]:
-    """The most likely size of the last unknowns as random effects, beside the robots' levels.
-
-    They are observed to be zero, in units of their own, as one more component of the variance.
-    Where that does not seem to be likely enough, the search ends before.
-    """
+    """The most likely size of the last unknowns as random effects, beside the robots' levels."""
+    # They are observed to be zero, in units of their own, as one more component of the variance.
+    # Where that does not seem to be likely enough, the search ends before.
     reduced, components = likelihood.reduced, likelihood.components
     width, columns = reduced.errors.shape[1], reduced.jacobian.shape[2]
     units, places = np.divmod(np.arange(size), width)

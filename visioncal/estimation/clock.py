@@ -120,10 +120,9 @@ class _Late:
     def problem(
         self, robot: Trajectory, frames: Frames, offset_s: float, state: State
     ) -> tuple[Problem, FloatArray]:
-        """The problem of some frames, with changes of the offset and of the times [s].
-
-        With it, (m, k) half the gradient of each frame's corners by the times, its pose being free.
-        """
+        """The problem of some frames, with changes of the offset and of the times [s]."""
+        # With it, (m, k) half the gradient of each frame's corners by the times, its pose being
+        # free.
         stack = frames.stack
         if self.camera is None or stack is None:
             return clock_problem(robot, frames, offset_s), np.zeros((len(frames), 0))
@@ -269,10 +268,8 @@ def refined_change(
 def _asked_offsets(
     robot: Trajectory, frames: Frames, fit: ClockFit
 ) -> tuple[FloatArray, FloatArray]:
-    """(m,) by how much the offset is to change for each frame [s], and the information on it.
-
-    What no offset explains has none.
-    """
+    """(m,) by how much the offset is to change for each frame [s], and the information on it."""
+    # What no offset explains has none.
     best = np.full(len(frames), np.inf)
     asked_s, weights = np.zeros(len(frames)), np.zeros(len(frames))
     for change_s in np.arange(-_FARTHEST_S, _FARTHEST_S + 0.5 * _ASKED_STEP_S, _ASKED_STEP_S):
@@ -400,12 +397,10 @@ def _sound(problem: Problem, fit: Solution) -> Mask:
 def _sigmas_s(
     problem: Problem, fit: Solution, stamps_s: FloatArray, pulls: FloatArray
 ) -> tuple[FloatArray, float]:
-    """Standard deviations of the offset and of times, the larger of two each, and their freedom.
-
-    One takes the errors of all frames for independent. The other takes those of a stretch of time
-    together, as they are: where a lens or an arm errs the same for a while, it is the honest one
-    (the jackknife over clusters; Bell and McCaffrey 2002).
-    """
+    """Standard deviations of the offset and of times, the larger of two each, and their freedom."""
+    # One takes the errors of all frames for independent. The other takes those of a stretch of time
+    # together, as they are: where a lens or an arm errs the same for a while, it is the honest one
+    # (the jackknife over clusters; Bell and McCaffrey 2002).
     # A direction without information has a very large variance here.
     covariance = covariance_from(fisher_information(problem, fit.state, fit.noise))
     independent = np.diag(covariance)[12:]

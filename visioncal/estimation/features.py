@@ -159,10 +159,8 @@ class FeatureProblem:
 
 
 def _frame_from(origin: FloatArray, on_x: FloatArray, in_xy: FloatArray) -> FloatArray:
-    """Builds the (4, 4) frame of three points: on the origin, the x axis and the xy plane.
-
-    Of points on a line axes are zero, and the determinant is.
-    """
+    """Builds the (4, 4) frame of three points: on the origin, the x axis and the xy plane."""
+    # Of points on a line axes are zero, and the determinant is.
     x = on_x - origin
     x = x / max(float(np.linalg.norm(x)), np.finfo(float).tiny)
     z = np.cross(x, in_xy - origin)

@@ -138,12 +138,10 @@ def _core(problem: GroupProblem[State], count: int) -> GroupFit[State]:
 
 
 def _doubtful(fit: GroupFit[State]) -> Mask:
-    """Groups that disagree, of which the wrong ones are unknown.
-
-    Each excluded group is set against each that stays: under the mean-shift model, with a level of
-    noise that is unknown, the odds of the one being wrong rather than the other are those of what
-    is left of the squared residuals without it (Cook and Weisberg 1982, section 2.2.2).
-    """
+    """Groups that disagree, of which the wrong ones are unknown."""
+    # Each excluded group is set against each that stays: under the mean-shift model, with a level
+    # of noise that is unknown, the odds of the one being wrong rather than the other are those of
+    # what is left of the squared residuals without it (Cook and Weisberg 1982, section 2.2.2).
     doubtful = np.zeros(len(fit.used), dtype=bool)
     for one in np.flatnonzero(~fit.used):
         both = fit.used.copy()

@@ -182,11 +182,9 @@ def _settled(side: Side, fitted: Fitted) -> Fitted:
 
 
 def _stepped(fitted: Fitted) -> LinearisedCorners:
-    """Linearises where the fit came to rest, or on the way there as far as the corners follow.
-
-    Far from the answer, as where a lens was stated for images of another size, the whole step
-    leads to lenses that see nothing.
-    """
+    """Linearises where the fit came to rest, or on the way there as far as the corners follow."""
+    # Far from the answer, as where a lens was stated for images of another size, the whole step
+    # leads to lenses that see nothing.
     limits = [_FOLLOWS * floored_sigma_px(it) for it in fitted.seen.sigmas_px]
     looks, free, change = fitted.seen.looks, fitted.seen.free, fitted.change
     for _ in range(_HALVINGS):

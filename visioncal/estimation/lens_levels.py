@@ -145,11 +145,9 @@ class _Likelihood:
         return (self.kinds[:, :, None] == levels).astype(float), modes
 
     def __call__(self, logs: FloatArray) -> Likely:
-        """The negative logarithm, its slope, and its second derivative.
-
-        Where that is not positive, the average information takes its place (Gilmour, Thompson and
-        Cullis 1995): it never is negative.
-        """
+        """The negative logarithm, its slope, and its second derivative."""
+        # Where that is not positive, the average information takes its place (Gilmour, Thompson and
+        # Cullis 1995): it never is negative.
         t, variances, is_random = len(self.known), np.exp(2.0 * logs), self.kinds >= 0
         weight, behind = 1.0 / variances[_NOISE], np.arange(t, len(self.gradient))
         precision = np.where(is_random, 1.0 / variances[self.kinds], 1.0)

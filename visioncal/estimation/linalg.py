@@ -103,11 +103,9 @@ def covariance_among(information: FloatArray, among: Mask) -> FloatArray:
 
 
 def _eigen(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Eigenvalues (..., n), ascending, and eigenvectors (..., n, n) of symmetric matrices.
-
-    The usual way, divide and conquer, gives up on some good matrices with many eigenvalues that are
-    all but equal, as held unknowns make them; the other way is slower and does not.
-    """
+    """Eigenvalues (..., n), ascending, and eigenvectors (..., n, n) of symmetric matrices."""
+    # The usual way, divide and conquer, gives up on some good matrices with many eigenvalues that
+    # are all but equal, as held unknowns make them; the other way is slower and does not.
     try:
         return np.linalg.eigh(matrices)
     except np.linalg.LinAlgError:

@@ -533,11 +533,9 @@ def _between(problem: Problem, rows: Mask) -> IntArray:
 
 
 def _spread_of_means(problem: Problem, frame: str) -> FloatArray:
-    """(s,) how much more a step of a frame before each stop may vary, if its views are uneven.
-
-    Of the n views of the shorter side one may err by `UNEVEN` times what the others do. With one
-    robot the step itself is in the noise of all, which bounds the evidence for it.
-    """
+    """(s,) how much more a step of a frame before each stop may vary, if its views are uneven."""
+    # Of the n views of the shorter side one may err by `UNEVEN` times what the others do. With one
+    # robot the step itself is in the noise of all, which bounds the evidence for it.
     seen = problem.observations
     mine = seen.involves(frame) & seen.is_uneven & (not problem.is_combined)
     counts = np.bincount(seen.stops[mine], minlength=int(seen.stops.max()) + 1)

@@ -281,11 +281,9 @@ def _core(problem: Problem, state: State | None, among: Mask) -> tuple[Mask, Sol
 
 
 def _of_pairs(problem: Problem, mask: Mask, state: State) -> Mask:
-    """The observations of a mask, and of each pair of frames the nearest half, as far as near.
-
-    The nearest half of all may be of few pairs, such as the still boards of still cameras: frames
-    that only others see would be free.
-    """
+    """The observations of a mask, and of each pair of frames the nearest half, as far as near."""
+    # The nearest half of all may be of few pairs, such as the still boards of still cameras: frames
+    # that only others see would be free.
     away, found = _away(problem, state), mask.copy()
     for group in problem.groups if len(problem.groups) > 1 else ():
         found[group.rows[np.argsort(away[group.rows])][: (len(group.rows) + 1) // 2]] = True

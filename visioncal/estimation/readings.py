@@ -92,10 +92,8 @@ def _linear_rms(touches: Touches) -> float:
 
 
 def _axes_rms(touches: Touches) -> float:
-    """How far touches of one point are off: of its place, and of the tool's z axis and xz plane.
-
-    Zero without touches along z.
-    """
+    """How far touches of one point are off: of its place, and of the tool's z axis and xz plane."""
+    # Zero without touches along z.
     there = touches.subset(touches.are("point"))
     poses = there.base_from_flange
     tip = linear_tip(poses, there.points)

@@ -187,10 +187,8 @@ class _Whitening:
     def of(
         cls, problem: Problem, noise: Noise, by_errors: FloatArray, among: Mask | None = None
     ) -> "_Whitening":
-        """The noise of observations that move with (n, 6, 6 w) their units' errors.
-
-        Of what is not `among` them nothing is known.
-        """
+        """The noise of observations that move with (n, 6, 6 w) their units' errors."""
+        # Of what is not `among` them nothing is known.
         (of, members), alone = problem.units, problem.alone
         own, errors = problem.covariance(noise), problem.error_covariance(noise)
         single = by_errors[alone]

@@ -217,10 +217,8 @@ def compare(
 
 
 def _comparable(a: Calibration, b: Calibration, name: str) -> tuple[Edge, Edge]:
-    """A transform of both; a camera's in the frame of its centre ray, where both have that.
-
-    Where an optical axis points is a convention that lenses take up: a ray is where it is.
-    """
+    """A transform of both; a camera's in the frame of its centre ray, where both have that."""
+    # Where an optical axis points is a convention that lenses take up: a ray is where it is.
     first, second = a.ray_frame, b.ray_frame
     if name != edge_names(a.mount)[0] or first is None or second is None:
         return a.edges[name], b.edges[name]

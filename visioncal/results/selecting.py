@@ -148,11 +148,9 @@ def _chain(cell: Alignment, chosen: Chosen) -> dict[str, tuple[FloatArray, Float
 
 
 def _noise(cell: Alignment, chosen: Chosen, rms: Rms) -> dict[str, float]:
-    """The noise of corners and of the robot.
-
-    Of poses that were measured without corners, that of camera and robot together is as this pair
-    scatters: the camera's own level is a mean over all that it sees, near and far.
-    """
+    """The noise of corners and of the robot."""
+    # Of poses that were measured without corners, that of camera and robot together is as this pair
+    # scatters: the camera's own level is a mean over all that it sees, near and far.
     robot, camera = (cell.noise.get(it, {}) for it in (chosen.robot or "robot", chosen.camera))
     found = {"pixel_px": camera["pixel_px"]} if "pixel_px" in camera else {}
     names = ("translation_mm", "rotation_deg")

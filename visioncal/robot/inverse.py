@@ -78,10 +78,8 @@ class _Bounds:
     turning: Mask
 
     def nearest(self, positions: FloatArray, wanted: FloatArray) -> FloatArray:
-        """Turns joints by whole turns, within the limits, as near to `wanted` as can be.
-
-        Positions within the limits stay so.
-        """
+        """Turns joints by whole turns, within the limits, as near to `wanted` as can be."""
+        # Positions within the limits stay so.
         turns = np.round((wanted - positions) / _TURN)
         if not turns.any():
             return positions
@@ -91,10 +89,8 @@ class _Bounds:
         return np.asarray(positions + _TURN * turns)
 
     def apart(self, turned: FloatArray) -> float:
-        """How far postures are apart that differ by (n,) positions; whole turns do not count.
-
-        A posture that is a whole turn away is the same branch of the arm; any other is not.
-        """
+        """How far postures are apart that differ by (n,) positions; whole turns do not count."""
+        # A posture that is a whole turn away is the same branch of the arm; any other is not.
         turns = np.where(self.turning, np.round(turned / _TURN), 0.0)
         return float(np.linalg.norm(turned - _TURN * turns))
 
@@ -262,10 +258,8 @@ class Inverse:
     def _left(
         self, goal: "pin.SE3", positions: FloatArray, light: float
     ) -> tuple[FloatArray, FloatArray]:
-        """What is left to the goal, seen from it: (6,) and the rotation itself (3, 3).
-
-        In Pinocchio's order, translations [m] first; rotations [rad] count by `light`.
-        """
+        """What is left to the goal, seen from it: (6,) and the rotation itself (3, 3)."""
+        # In Pinocchio's order, translations [m] first; rotations [rad] count by `light`.
         import pinocchio as pin
 
         pin.computeJointJacobians(self._model, self._data, positions)
@@ -309,10 +303,8 @@ def _moved(
 
 
 def _step(jacobian: FloatArray, error: FloatArray, damping: float) -> FloatArray:
-    """The damped step; of the two equal forms the one with the smaller system.
-
-    LAPACK itself: numpy's way to it takes as long as the rest of a step.
-    """
+    """The damped step; of the two equal forms the one with the smaller system."""
+    # LAPACK itself: numpy's way to it takes as long as the rest of a step.
     rows, columns = jacobian.shape
     long = columns > rows
     gram = jacobian @ jacobian.T if long else jacobian.T @ jacobian

@@ -130,10 +130,8 @@ def _row_jacobian(table: DHTable, row: int) -> FloatArray:
 
 
 def _columns(table: DHTable, row: int) -> list[int]:
-    """Which numbers of a row move; the others stay by the convention or are not identifiable.
-
-    Between exactly parallel axes d stays, and theta too where the axes are one.
-    """
+    """Which numbers of a row move; the others stay by the convention or are not identifiable."""
+    # Between exactly parallel axes d stays, and theta too where the axes are one.
     has_beta = bool(table.parallel[row + 1])
     alpha, beta = table.alpha_rad[row + 1], table.beta_rad[row + 1]
     next_axis = about_x(np.zeros(()), alpha, beta)[:3, 2]

@@ -253,11 +253,9 @@ def _showing(view: View, board: str) -> View:
 
 
 def _of_rows(table: CornerTable, rows: Mapping[int, View]) -> CornerTable:
-    """The corners without those of views whose rows were deleted; as they are where some lack.
-
-    Where a row has neither corners nor an image, views are numbered otherwise, not deleted; and a
-    number with fewer corners than show a pose is a mistyped one.
-    """
+    """The corners without those of views whose rows were deleted; as they are where some lack."""
+    # Where a row has neither corners nor an image, views are numbered otherwise, not deleted; and a
+    # number with fewer corners than show a pose is a mistyped one.
     there, counts = np.unique(table.views, return_counts=True)
     others = {it for it in there.tolist() if it not in rows}
     few = {*there[counts < _FEWEST].tolist()}

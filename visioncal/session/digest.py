@@ -55,10 +55,8 @@ def is_file(name: object) -> bool:
 
 
 def _without_paths(document: Mapping[str, object]) -> dict[str, object]:
-    """Leaves out where the target's and the robot's files lie; what they hold counts instead.
-
-    So it does with the need, which is of the task.
-    """
+    """Leaves out where the target's and the robot's files lie; what they hold counts instead."""
+    # So it does with the need, which is of the task.
     kept = {name: it for name, it in document.items() if name != "need"}
     if is_file(kept.get("target")):
         del kept["target"]

@@ -99,11 +99,9 @@ class LiveView:
     def _shifted(
         self, light: Float32Array, now_from_middle: FloatArray, middle: FloatArray
     ) -> Float32Array:
-        """Moves a picture as if all that it shows were as far away as the board.
-
-        A smear is as long as it should be at the board's middle, and symmetric to the true place
-        of every corner everywhere.
-        """
+        """Moves a picture as if all that it shows were as far away as the board."""
+        # A smear is as long as it should be at the board's middle, and symmetric to the true place
+        # of every corner everywhere.
         camera = self._cell.options.camera
         raster = trace(camera, Patch(0, 0, *camera.resolution), 1)
         depth = float((middle[:3, :3] @ centre_m(self._cell.sheet) + middle[:3, 3])[2])

@@ -486,10 +486,8 @@ def corner_positions(target: Target) -> FloatArray:
 
 
 def _tag_places(target: Target) -> IntArray:
-    """The (t, 2) columns and rows of an AprilGrid's tags, in the order of their ids.
-
-    As on Kalibr's pages the first tag is at the lower left, and ids run along the rows.
-    """
+    """The (t, 2) columns and rows of an AprilGrid's tags, in the order of their ids."""
+    # As on Kalibr's pages the first tag is at the lower left, and ids run along the rows.
     rows, columns = np.divmod(np.arange(target.columns * target.rows), target.columns)
     return np.stack([columns, target.rows - 1 - rows], axis=1)
 

@@ -108,11 +108,9 @@ def _found(recording: Recording, chain: FloatArray | None) -> _Found:
 
 
 def _of_likelier_mount(first: _Found, second: _Found, chain: FloatArray | None) -> _Found:
-    """Chooses the mount: by residuals, by the joints, by what cells look like, by the changes.
-
-    An inverse of the poses closes the chain under the wrong mount as poses as they are do under
-    the right one, so that the number of changes alone says nothing.
-    """
+    """Chooses the mount: by residuals, by the joints, by what cells look like, by the changes."""
+    # An inverse of the poses closes the chain under the wrong mount as poses as they are do under
+    # the right one, so that the number of changes alone says nothing.
     better, worse = sorted((first, second), key=lambda it: it.best.score)
     if better.best.score > CLOSING_SCORE or worse.best.score > STANDS_OUT * better.best.score:
         return better

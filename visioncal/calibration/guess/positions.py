@@ -114,11 +114,9 @@ def score_variants(recording: Recording, turned: Turned) -> Iterator[tuple[float
 def _of_another_size(
     recording: Recording, turned: Turned, variants: Sequence[Variant], matrix: FloatArray
 ) -> Iterator[tuple[float, Variant]]:
-    """Scores the positions as they are, or of the inverse, with the size of the target unknown.
-
-    `R_i t_X + r p_i - t_Z = -R_i R_X c_i`, whose r is the ratio over the scale. Sizes near the
-    stated one are found by whoever fits them; here, units would be taken for them.
-    """
+    """Scores the positions as they are, or of the inverse, with the size of the target unknown."""
+    # `R_i t_X + r p_i - t_Z = -R_i R_X c_i`, whose r is the ratio over the scale. Sizes near the
+    # stated one are found by whoever fits them; here, units would be taken for them.
     declared = _ratio(recording.declared.robot.unit, recording.declared.camera.unit)
     kept = turned.kept
     for it in (it for it in variants if it.ratio == declared and not it.signs):

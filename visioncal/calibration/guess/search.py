@@ -125,11 +125,9 @@ def _pairing_cost(robot: Forms, camera: Forms, it: Pairing) -> float:
 def _labels(
     recording: Recording, robot: Forms, camera: Forms, turned: Turned, variant: Variant
 ) -> Iterator[Hypothesis]:
-    """All readings that give the same chain.
-
-    An inverse of the robot's poses, one of the camera's and another mount are the same change;
-    units go in pairs.
-    """
+    """All readings that give the same chain."""
+    # An inverse of the robot's poses, one of the camera's and another mount are the same change;
+    # units go in pairs.
     pairing = turned.pairing
     transposed = turned.transposed[0] != variant.carried, turned.transposed[1]
     pairs = [
@@ -163,10 +161,8 @@ def _labels(
 
 
 def _best_label(recording: Recording, labels: Sequence[Hypothesis], rows: IntArray) -> Scored:
-    """Chooses among readings of one class by what cells look like.
-
-    The target is before the camera, and what sits on the flange is near it.
-    """
+    """Chooses among readings of one class by what cells look like."""
+    # The target is before the camera, and what sits on the flange is near it.
     scored = [fitted(recording, it, rows, _STARTS) for it in labels]
     chosen = max(
         scored,

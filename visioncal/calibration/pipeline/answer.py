@@ -267,11 +267,9 @@ def _known(figures: FloatArray) -> list[float | None]:
 
 
 def _away(solved: Solved) -> FloatArray:
-    """(n, 2) residuals of the observations [mm], [deg].
-
-    Of one camera and one robot it is how far each places its target from where those that are used
-    do on average; of a whole cell, how far it is from what the rest predicts.
-    """
+    """(n, 2) residuals of the observations [mm], [deg]."""
+    # Of one camera and one robot it is how far each places its target from where those that are
+    # used do on average; of a whole cell, how far it is from what the rest predicts.
     if solved.cell.mount is None:
         return residuals(solved)
     problem = solved.agreed.problem

@@ -304,10 +304,8 @@ def _seen(known: RunState) -> Iterator[str]:
 
 
 def _unseen_rows(session: Session, look: CameraLook) -> Iterator[str]:
-    """Says which last rows of a ChArUco board are in no image, though there is room for them.
-
-    With fewer rows its markers are numbered alike: nothing else shows that too many are declared.
-    """
+    """Says which last rows of a ChArUco board are in no image, though there is room for them."""
+    # With fewer rows its markers are numbered alike: nothing else shows that too many are declared.
     target = session.target
     if target is None or session.targets or target.kind != "charuco" or look.resolution is None:
         return

@@ -21,10 +21,8 @@ _CHANCE = 2.0
 
 
 def _is_worse(before: Run, after: Run) -> bool:
-    """Whether views that were left out are predicted worse, in pixels or in millimetres.
-
-    That is so where their squared errors grow in the mean, by more than chance explains.
-    """
+    """Whether views that were left out are predicted worse, in pixels or in millimetres."""
+    # That is so where their squared errors grow in the mean, by more than chance explains.
     views = sorted(before.left_out.keys() & after.left_out.keys())
     growth = np.array(
         [np.square(after.left_out[it]) - np.square(before.left_out[it]) for it in views]

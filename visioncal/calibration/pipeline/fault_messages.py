@@ -186,11 +186,9 @@ def _turned_images(solved: Solved) -> list[PoseFault]:
 
 
 def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
-    """Views from some view on, or before one, that one step of a frame explains.
-
-    A tool frame that is switched on in the controller moves what is on the flange, as it is
-    reported, and another base frame what stands.
-    """
+    """Views from some view on, or before one, that one step of a frame explains."""
+    # A tool frame that is switched on in the controller moves what is on the flange, as it is
+    # reported, and another base frame what stands.
     agreed, rows = solved.agreed, solved.cell.rows
     problem, out = agreed.problem, np.flatnonzero(~agreed.used)
     order = np.argsort(problem.observations.stops, kind="stable")
@@ -272,11 +270,9 @@ def _views(solved: Solved, rows: Sequence[int]) -> str:
 
 
 def _pushed_bases(solved: Solved) -> list[PoseFault]:
-    """Robots whose observations all disagree from some stop on, as one other place explains.
-
-    Such observations are left out, and the base is where it stood before: a base is no frame that
-    may be two, because all that its robot carries hangs on it.
-    """
+    """Robots whose observations all disagree from some stop on, as one other place explains."""
+    # Such observations are left out, and the base is where it stood before: a base is no frame that
+    # may be two, because all that its robot carries hangs on it.
     problem, used = solved.agreed.problem, solved.agreed.used
     stops, found = problem.observations.stops, []
     for flange, branch in problem.tree.branches.items():

@@ -93,10 +93,8 @@ def _covariance(known: RunState) -> FloatArray:
 
 
 def _written(known: RunState) -> FloatArray:
-    """(w, p) how what is written moves with the fit's unknowns.
-
-    Further boards are written relative to the first; clocks and drift are left out.
-    """
+    """(w, p) how what is written moves with the fit's unknowns."""
+    # Further boards are written relative to the first; clocks and drift are left out.
     problem, rows = known.solved.problem, np.eye(known.solved.problem.size)
     placed = known.solved.state.edges[1:]
     # z_k exp(d_k) = z exp(d) exp(-d_u) target_1_from_target_k

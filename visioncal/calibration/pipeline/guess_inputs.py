@@ -181,11 +181,9 @@ def reading_hint(seen: RunState) -> Finding | None:
 
 
 def _corners_are_mirrored(seen: RunState) -> bool:
-    """Whether corners.csv shows boards from behind, as a camera cannot see a print.
-
-    A left-handed frame of the robot does not do that, nor do images that were mirrored before
-    another program numbered their corners.
-    """
+    """Whether corners.csv shows boards from behind, as a camera cannot see a print."""
+    # A left-handed frame of the robot does not do that, nor do images that were mirrored before
+    # another program numbered their corners.
     session = seen.session
     if any(it.image for it in session.views) or not session.corners:
         return False
@@ -224,11 +222,9 @@ def _unrecorded(seen: RunState) -> Finding | None:
 
 
 def _unpaired(seen: RunState) -> Finding | None:
-    """Says that rows and images have nothing in common, where shuffled rows fit as well.
-
-    A permutation test (Pitman 1937) of how much robot and camera turn between two views, which is
-    the same whatever the frames between them are.
-    """
+    """Says that rows and images have nothing in common, where shuffled rows fit as well."""
+    # A permutation test (Pitman 1937) of how much robot and camera turn between two views, which is
+    # the same whatever the frames between them are.
     seen = replace(seen, poses=seen.poses_of_one_board)
     robot, camera = _at_times(seen), _camera_numbers(seen)
     both = robot.there & camera.there
@@ -399,10 +395,8 @@ def _seen(known: RunState) -> RunState:
 
 
 def _seen_ways(seen: RunState, robot: PoseNumbers) -> Iterator[PoseNumbers]:
-    """The camera's poses as the declared robot would have them, and then by the images alone.
-
-    They differ where an image allows several poses: the wrong robot would choose wrong ones.
-    """
+    """The camera's poses as the declared robot would have them, and then by the images alone."""
+    # They differ where an image allows several poses: the wrong robot would choose wrong ones.
     if any(len(it.cam_from_target) > 1 for it in seen.poses.values()):
         # Where the declared robot cannot choose, the images alone are left.
         with suppress(VisioncalError):

@@ -195,11 +195,10 @@ def _pairs(
 
 
 def _weighed(answer: Answer, sights: Sequence[Sight]) -> tuple[Rms, Rms]:
-    """What a sensor's noise makes of some sights, and by how much they are away when left out.
-
-    A square varies as its mean does, so that views weigh by the inverse square of what is expected
-    of each where doubt begins: one whose own pose is known badly says nothing of the others.
-    """
+    """What a sensor's noise makes of some sights, and by how much they are away when left out."""
+    # A square varies as its mean does, so that views weigh by the inverse square of what is
+    # expected of each where doubt begins: one whose own pose is known badly says nothing of the
+    # others.
     used, held, limits = answer.problem.observations, answer.held_out, CalibrationLimits()
     seen = {(it.seer, it.seen) for it in sights}
     mine = np.array([it in seen for it in zip(used.observers, used.observed, strict=True)])

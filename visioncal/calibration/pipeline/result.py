@@ -70,10 +70,8 @@ def result_of(known: RunState) -> Calibration:
 
 
 def _edge_names(known: RunState) -> dict[str, str]:
-    """The names of the edges by the frames that they place, the camera's first.
-
-    Of points that an instrument read, the first is the probe.
-    """
+    """The names of the edges by the frames that they place, the camera's first."""
+    # Of points that an instrument read, the first is the probe.
     frames, first = known.solved.problem.unknown, edge_names(known.session.mount)
     parents = [it.partition("_from_")[0] for it in first]
     names = {it: f"{parents[min(at, 1)]}_from_{it}" for at, it in enumerate(frames)}

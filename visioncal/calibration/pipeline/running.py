@@ -152,10 +152,9 @@ def run_steps(known: RunState) -> RunState:
 def _with_hint(
     error: VisioncalError, seen: RunState | None, hint: Finding | None
 ) -> VisioncalError:
-    """Adds to an error, once the target's poses are known, what leads on.
-
-    That is how the robot's poses should be read, or else what proposes the views that are missing.
-    """
+    """Adds to an error, once the target's poses are known, what leads on."""
+    # That is how the robot's poses should be read, or else what proposes the views that are
+    # missing.
     if seen is None:
         return error
     hint = hint or reading_hint(seen)

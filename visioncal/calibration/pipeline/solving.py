@@ -290,10 +290,8 @@ def _with_poses(cell: Cell, looked: Observed) -> Cell:
 
 
 def _without_misreported(agreed: Agreed, arms: Mapping[str, RobotArm], before: Mask) -> Agreed:
-    """Leaves out what agrees with an arm's joints alone, where its reported pose is another.
-
-    A wrong report says nothing against joints and cameras, but would mislead the next fit.
-    """
+    """Leaves out what agrees with an arm's joints alone, where its reported pose is another."""
+    # A wrong report says nothing against joints and cameras, but would mislead the next fit.
     problem, used = agreed.problem, agreed.used.copy()
     stops = problem.observations.stops
     for robot, arm in arms.items():
@@ -327,11 +325,9 @@ def _agreeing_looks(
     late: Sequence[Effect],
     sizes: Mapping[str, float],
 ) -> tuple[Agreed, LinearisedCorners | None, Mapping[str, RobotArm]]:
-    """Fits lenses, boards and frames, until the same observations agree under them.
-
-    In a whole cell, what moved must not be taken for a wrong view: there it is left to the end,
-    when the arms are calibrated.
-    """
+    """Fits lenses, boards and frames, until the same observations agree under them."""
+    # In a whole cell, what moved must not be taken for a wrong view: there it is left to the end,
+    # when the arms are calibrated.
     levels: Mapping[str, LensLevels] = {}
     for _ in range(_ROUNDS):
         agreed, seen, fitted = _with_looks(cell, looked, views, agreed, arms, late, levels, sizes)
@@ -503,20 +499,16 @@ def _views_by_camera(looked: Observed, views: Sequence[ViewPoses]) -> dict[str, 
 
 
 def _with_repeats(agreed: Agreed) -> Agreed:
-    """Fits once more, repeated views of still boards by still cameras sharing an error.
-
-    What moved was looked for without it: their differences do not share it.
-    """
+    """Fits once more, repeated views of still boards by still cameras sharing an error."""
+    # What moved was looked for without it: their differences do not share it.
     problem = replace(agreed.problem, with_repeats=True)
     fit = fit_problem(problem.subset(agreed.used), agreed.fit.state, agreed.fit.noise)
     return replace(agreed, problem=problem, fit=fit)
 
 
 def _agree(cell: Cell, problem: Problem, state: State) -> tuple[Agreed, Mapping[str, float]]:
-    """Finds what belongs together, and what of the priors the observations do not contradict.
-
-    Also gives by which share each printed target of a whole cell is larger than stated, roughly.
-    """
+    """Finds what belongs together, and what of the priors the observations do not contradict."""
+    # Also gives by which share each printed target of a whole cell is larger than stated, roughly.
     movable, seen = _movable(cell, problem), problem.observations
     if printed := _printed(seen) if movable else []:
         # All that is seen of a board of another size disagrees with the rest, and would be out.
@@ -552,11 +544,9 @@ def _settle(cell: Cell, agreed: Agreed) -> Agreed:
 
 
 def _with_priors(cell: Cell, agreed: Agreed) -> Agreed:
-    """Puts in the components of priors that the observations do not contradict.
-
-    The worst is left out first: it misleads about the rest. The noise is that of a fit with loose
-    priors: estimated beside a wrong one, it would grow until it explains it.
-    """
+    """Puts in the components of priors that the observations do not contradict."""
+    # The worst is left out first: it misleads about the rest. The noise is that of a fit with loose
+    # priors: estimated beside a wrong one, it would grow until it explains it.
     problem, noise = replace(agreed.problem, priors=cell.priors), agreed.fit.noise
     while True:
         part = problem.subset(agreed.used)
@@ -568,12 +558,10 @@ def _with_priors(cell: Cell, agreed: Agreed) -> Agreed:
 
 
 def _levelled(cell: Cell, views: Sequence[ViewPoses], agreed: Agreed) -> Agreed:
-    """Asks for the noise level of cameras, too, now that what is wrong is out.
-
-    Corners of one image may err alike, as those of small squares do: poses then scatter by more
-    than corners do about them, but never by less. Where one camera sees one robot once a stop, the
-    robot's noise has taken that up.
-    """
+    """Asks for the noise level of cameras, too, now that what is wrong is out."""
+    # Corners of one image may err alike, as those of small squares do: poses then scatter by more
+    # than corners do about them, but never by less. Where one camera sees one robot once a stop,
+    # the robot's noise has taken that up.
     is_alone = cell.mount is not None and not agreed.problem.shared_units
     if is_alone or agreed.problem.is_combined:
         return agreed
@@ -603,10 +591,8 @@ def _with_effects(agreed: Agreed, effects: Sequence[Effect]) -> Agreed:
 
 
 def _movable(cell: Cell, problem: Problem) -> tuple[str, ...]:
-    """What may be bumped or slip: all that is unknown but bases.
-
-    One camera that sees one robot move cannot distinguish what slipped from a wrong pose.
-    """
+    """What may be bumped or slip: all that is unknown but bases."""
+    # One camera that sees one robot move cannot distinguish what slipped from a wrong pose.
     if cell.mount is not None:
         return ()
     bases = {branch.parent for branch in problem.tree.branches.values() if branch.robot}

@@ -192,11 +192,9 @@ def _is_another(lens: Intrinsics, stated: Camera, stated_px: float) -> bool:
 def _refuse_mirrored(
     seen: Observed, frame: str, corners: Mapping[int, Corners], sigma_px: float
 ) -> None:
-    """Refuses corners that fit no pose as they are, and do with left and right exchanged.
-
-    Those of a flat target fit mirrored as well, by a pose behind it, which the robot's motion
-    tells.
-    """
+    """Refuses corners that fit no pose as they are, and do with left and right exchanged."""
+    # Those of a flat target fit mirrored as well, by a pose behind it, which the robot's motion
+    # tells.
     look, targets = seen.cameras[frame], tuple(seen.session.boards.values())
     if look.resolution is None:
         return

@@ -342,15 +342,13 @@ def _tested(doubts: Sequence[Finding], left_out_mm: float) -> list[Finding]:
 
 
 def _feigned(first: Mapping[str, Finding]) -> set[str]:
-    """Kinds of findings that another one of these passes for.
-
-    What moves along a camera's axis passes for changes of its focus, which are random in the fit;
-    a focus that changes does not go by the time, and is found moving in one session of ten
-    thousand. Before and after a step, errors by posture and time are alike because of it. What a
-    held lens that the corners contradict does to views passes for a board of another size or
-    shape; the corners alone do not show the size, and the lens is tested beside both. What is left
-    of a clock's jump passes for motion.
-    """
+    """Kinds of findings that another one of these passes for."""
+    # What moves along a camera's axis passes for changes of its focus, which are random in the fit;
+    # a focus that changes does not go by the time, and is found moving in one session of ten
+    # thousand. Before and after a step, errors by posture and time are alike because of it. What a
+    # held lens that the corners contradict does to views passes for a board of another size or
+    # shape; the corners alone do not show the size, and the lens is tested beside both. What is
+    # left of a clock's jump passes for motion.
     feigned: set[str] = set()
     if moved := [first[it].mahalanobis_sq for it in _MOVED if it in first]:
         feigned.add("focus")

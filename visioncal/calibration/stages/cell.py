@@ -152,11 +152,9 @@ def read_cell(seen: Observed) -> Cell:
 
 
 def _tables_of_priors(session: Session, tree: Tree) -> dict[str, PriorTable]:
-    """What is stated beforehand, by the full names of its frames.
-
-    Of one camera and one robot that have no names, it is of an unknown edge, or not used. Where
-    they have names, flange and cam mean the only ones.
-    """
+    """What is stated beforehand, by the full names of its frames."""
+    # Of one camera and one robot that have no names, it is of an unknown edge, or not used. Where
+    # they have names, flange and cam mean the only ones.
     tables = session.declaration.prior
     if not session.declaration.has_names:
         kept = {name: it for name, it in tables.items() if name in pair_edges(session)}

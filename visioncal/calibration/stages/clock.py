@@ -215,10 +215,8 @@ def _placed_by(sweep: Sweep, found: _Matched, poses: Mapping[int, ViewPoses]) ->
 
 
 def _change(sweep: Sweep, frames: Frames, fit: ClockFit) -> ClockChange | None:
-    """How the offset changes over the frames; None where it does not, or that explains little.
-
-    A fit to both sides of a jump misleads about its size, which is found in a few rounds.
-    """
+    """How the offset changes over the frames; None where it does not, or that explains little."""
+    # A fit to both sides of a jump misleads about its size, which is found in a few rounds.
     flange, change = sweep.motion.flange, clock_change(sweep.motion.flange, frames, fit)
     for _ in range(_ROUNDS if change else 0):
         if change is None:

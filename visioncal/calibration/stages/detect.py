@@ -181,11 +181,9 @@ def detect(
 
 
 def _shows_another(session: Session, name: str, views: Sequence[View]) -> bool:
-    """Whether images clearly show a checkerboard of another size than the declared one.
-
-    A thorough search for what is not there takes seconds an image, and is spared where all of a
-    few images show another board.
-    """
+    """Whether images clearly show a checkerboard of another size than the declared one."""
+    # A thorough search for what is not there takes seconds an image, and is spared where all of a
+    # few images show another board.
     target = session.boards[name]
     if target.kind != "checkerboard":
         return False

@@ -87,12 +87,10 @@ def _steps(
     found: tuple[Move | None, Slip | None],
     crept: Drift | None,
 ) -> list[Move | Slip]:
-    """What moved at once, where that explains the residuals better than a creep from end to end.
-
-    A step may be at any stop and of any frame or joint: it must gain by twice the logarithm of
-    these. A joint's has one number where a frame's has six, of which each must gain by as much as
-    the Bayesian information criterion asks for (Schwarz 1978).
-    """
+    """What moved at once, where that explains the residuals better than a creep from end to end."""
+    # A step may be at any stop and of any frame or joint: it must gain by twice the logarithm of
+    # these. A joint's has one number where a frame's has six, of which each must gain by as much as
+    # the Bayesian information criterion asks for (Schwarz 1978).
     price = 2.0 * np.log(len(problem.unknown) * (1 + int(problem.observations.stops.max())))
     each = float(np.log(problem.observations.directions.sum()))
     likely: list[tuple[float, Move | Slip]] = []

@@ -52,11 +52,9 @@ def other_stops(
 def _squares_by_stop(
     problem: Problem, fit: Solution, at: int, moves: Sequence[Move], starts: Mapping[str, int]
 ) -> FloatArray:
-    """Squared distances (s,) of an observation from what is predicted at every stop.
-
-    Infinite where a robot's pose is not known, or where no robot has a part in it. What moved is at
-    its other place from the stops in `starts` on.
-    """
+    """Squared distances (s,) of an observation from what is predicted at every stop."""
+    # Infinite where a robot's pose is not known, or where no robot has a part in it. What moved is
+    # at its other place from the stops in `starts` on.
     seen = problem.observations
     stops = np.arange(max(map(len, problem.poses.values()), default=0))
     repeated = np.full(len(stops), at)

@@ -87,10 +87,8 @@ def init_frames(
 
 
 def _distances(problem: Problem, candidates: Candidates, tied: Tied) -> FloatArray:
-    """(n, k) how far the views' candidates are from what the start predicts [m].
-
-    Of views of frames that are not tied, they say nothing.
-    """
+    """(n, k) how far the views' candidates are from what the start predicts [m]."""
+    # Of views of frames that are not tied, they say nothing.
     frames = {it: tied.edges.get(it, np.eye(4)) for it in problem.unknown}
     away = candidates.distances(problem.predicted(problem.start(frames)))
     for group in problem.groups:
@@ -124,10 +122,8 @@ def _unclear(problem: Problem, candidates: Candidates, tied: Tied, away: FloatAr
 def _numbered_as_first(
     problem: Problem, tied: Tied, picks: IntArray, turned: Mapping[str, FloatArray]
 ) -> tuple[Tied, IntArray]:
-    """Turns boards that look the same turned so that their first views keep their numbering.
-
-    Those stay that were measured to be somewhere.
-    """
+    """Turns boards that look the same turned so that their first views keep their numbering."""
+    # Those stay that were measured to be somewhere.
     edges, picks = dict(tied.edges), picks.copy()
     for frame in edges.keys() & turned.keys() - _measured(problem):
         rows, turns = problem.observations.involves(frame), turned[frame]

@@ -127,11 +127,9 @@ def _implied(
 def _parted(
     growth: Growth, placed: Mapping[str, FloatArray]
 ) -> Iterator[tuple[str, FloatArray, float]]:
-    """Frames that are one of two that robots part, of all that some views have to do with.
-
-    Views say `before * u * between * v * after = seen`, u and v being unknown: a hand-eye
-    calibration with `between^-1` for its robot. Where three are unknown, two arms part them.
-    """
+    """Frames that are one of two that robots part, of all that some views have to do with."""
+    # Views say `before * u * between * v * after = seen`, u and v being unknown: a hand-eye
+    # calibration with `between^-1` for its robot. Where three are unknown, two arms part them.
     for pair in growth.oriented:
         rows = growth.sighted.early(pair.rows)
         factors = factors_of(growth, pair, rows)

@@ -70,11 +70,9 @@ def contradicted_joints(
 
 
 def _as_flange(cam_from_target: FloatArray, mount: Mount) -> FloatArray:
-    """`base_from_flange` up to the two unknown edges.
-
-    It is `cam_from_target` of a camera that does not move, and its inverse where the target does
-    not.
-    """
+    """`base_from_flange` up to the two unknown edges."""
+    # It is `cam_from_target` of a camera that does not move, and its inverse where the target does
+    # not.
     return invert(cam_from_target) if mount == "eye-in-hand" else cam_from_target
 
 

@@ -517,10 +517,9 @@ def _run(pair: Pair) -> str:
 
 
 def _outlier_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
-    """Names single views whose residual stands out from the others'.
-
-    Where the corners show how well each view sees the board, the consensus has judged them better.
-    """
+    """Names single views whose residual stands out from the others'."""
+    # Where the corners show how well each view sees the board, the consensus has judged them
+    # better.
     if any(it.away_mm is not None for it in findings.arms):
         return
     for pair in findings.pairs:
@@ -577,11 +576,9 @@ def _holdout_doubts(pair: Pair, mount: Mount, limits: CalibrationLimits) -> Iter
 
 
 def _accuracy_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
-    """Judges the answer where it counts.
-
-    Edges are known in the arm's own frames. Those of a calibrated arm are as open as the errors of
-    the first and the last link, which its poses make up for.
-    """
+    """Judges the answer where it counts."""
+    # Edges are known in the arm's own frames. Those of a calibrated arm are as open as the errors
+    # of the first and the last link, which its poses make up for.
     # What moved at once is in all that is known, and more views do not help.
     if any(it.kind in MOVED_AT_ONCE for it in findings.warnings):
         return
@@ -728,11 +725,9 @@ def _robot(arm: Arm) -> str:
 
 
 def _robot_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
-    """An arm is a good instrument: what looks like its error is often something else's.
-
-    What chance makes of a good arm's noise, where poses are coarse, is no error. A task that needs
-    ten times as much has an arm that is as good as it has to be.
-    """
+    """An arm is a good instrument: what looks like its error is often something else's."""
+    # What chance makes of a good arm's noise, where poses are coarse, is no error. A task that
+    # needs ten times as much has an arm that is as good as it has to be.
     for it in findings.arms:
         if it.away_mm is None or it.away_deg is None or it.errs:
             continue

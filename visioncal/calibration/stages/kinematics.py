@@ -265,12 +265,10 @@ def _unlikeliness(problem: Problem, fit: LevelFit) -> float:
 
 
 def _best(levels: Sequence[Level]) -> Level:
-    """The likeliest level that predicts better than the first one, by more than chance each.
-
-    The price of all its columns is in a level's likelihood, but for that of their size. Of two
-    levels with as many sizes, such as offsets or links, neither is the simpler one: to prefer
-    offsets would leave links that are off by as little out of the covariance.
-    """
+    """The likeliest level that predicts better than the first one, by more than chance each."""
+    # The price of all its columns is in a level's likelihood, but for that of their size. Of two
+    # levels with as many sizes, such as offsets or links, neither is the simpler one: to prefer
+    # offsets would leave links that are off by as little out of the covariance.
     best = levels[0]
     for level in levels[1:]:
         better = level.left_out.mm < levels[0].left_out.mm

@@ -255,11 +255,9 @@ def _axes(level: FloatArray) -> FloatArray:
 
 
 def _of_flange(problem: Problem, robot: str, in_base: FloatArray, noise: FloatArray) -> FloatArray:
-    """(n, 6, 6) the noise of a flange at its own origin, of (n, 6, 6) by its level.
-
-    Where the noise of robot and camera is one, it is that of targets: what the flange's rotation
-    does to them by their distance is in that of their place.
-    """
+    """(n, 6, 6) the noise of a flange at its own origin, of (n, 6, 6) by its level."""
+    # Where the noise of robot and camera is one, it is that of targets: what the flange's rotation
+    # does to them by their distance is in that of their place.
     found = noise.copy()
     if problem.is_combined:
         flange_m = problem.poses[robot][problem.observations.stops, :3, 3]
@@ -284,10 +282,8 @@ def _in_base(problem: Problem, state: State, base: str) -> FloatArray:
 
 
 def _to_base(fitted: Fitted, base: str, in_base: FloatArray) -> Problem:
-    """The observations as if they were of the base itself, by way of what they saw.
-
-    What a lens does to the measured poses of targets then moves the base instead.
-    """
+    """The observations as if they were of the base itself, by way of what they saw."""
+    # What a lens does to the measured poses of targets then moves the base instead.
     problem = fitted.problem
     carry, effects = adjoint(in_base), []
     for it in problem.effects:
@@ -310,11 +306,9 @@ def _to_base(fitted: Fitted, base: str, in_base: FloatArray) -> Problem:
 
 
 def _of_things(fitted: Fitted) -> Problem:
-    """The observations as if they were of things that stand where the boards' middles are.
-
-    A board of another size was measured at another distance, and a thing is not: all that a board's
-    shape then moves is its middle.
-    """
+    """The observations as if they were of things that stand where the boards' middles are."""
+    # A board of another size was measured at another distance, and a thing is not: all that a
+    # board's shape then moves is its middle.
     problem, effects = fitted.problem, []
     still, frames = np.zeros((3, len(fitted.of_boards))), problem.observations.observed
     moved = np.array([fitted.moved.get(it.partition("@")[0], still) for it in frames])

@@ -200,10 +200,8 @@ def other_board(session: Session, unseen: Sequence[View]) -> Finding | None:
 
 
 def _identified(image: Image, declared: Target) -> Identity | None:
-    """The board of an image; None where few of its corners are seen, as where it is blurred.
-
-    A single marker of a declared ChArUco board is none.
-    """
+    """The board of an image; None where few of its corners are seen, as where it is blurred."""
+    # A single marker of a declared ChArUco board is none.
     try:
         found = identify(image)
     except DataError:

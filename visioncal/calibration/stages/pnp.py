@@ -209,11 +209,9 @@ def given_poses(session: Session) -> dict[int, ViewPoses]:
 
 
 def _mirrored(stack: CornerStack, camera: Camera, fit: PoseFit, starts: FloatArray) -> PoseFit:
-    """Refines the other planar solution in the views where it may be a rival.
-
-    Elsewhere it has no minimum of its own, and a fit from there would wander to the first one:
-    that one stands in for it.
-    """
+    """Refines the other planar solution in the views where it may be a rival."""
+    # Elsewhere it has no minimum of its own, and a fit from there would wander to the first one:
+    # that one stands in for it.
     raw = mean_square_by_view(stack, reproject(stack, camera, starts).residuals)
     promising = raw < _PROMISING_RATIO**2 * mean_square_by_view(stack, fit.residuals) + 1.0
     of_corner = promising[stack.view_of]

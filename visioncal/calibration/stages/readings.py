@@ -309,11 +309,9 @@ def _check_stops(readings: Readings, stops: IntArray) -> None:
 def _exchanged(
     readings: Readings, views: Sequence[int], places: Places, mounting: Mounting
 ) -> Iterator[Rejection]:
-    """Finds stops at which the names of two points are exchanged.
-
-    Where the arm puts the flange wrongly, all points of a stop are off alike: what counts is how
-    they lie to each other.
-    """
+    """Finds stops at which the names of two points are exchanged."""
+    # Where the arm puts the flange wrongly, all points of a stop are off alike: what counts is how
+    # they lie to each other.
     off = residuals(places, mounting)
     stops = [np.flatnonzero(places.stops == stop) for stop in range(places.stops.max() + 1)]
     rows_of = [rows for rows in stops if len(rows) > 1]

@@ -116,13 +116,11 @@ def _refined(
 def _equally_weighed(
     side: FramesSide, looks: CameraParameters, frames: Mapping[str, FloatArray]
 ) -> tuple[Fitted, FramesSide]:
-    """Fits all with the weights that the corners have.
-
-    Errors of an arm are sought once lenses and boards are as the corners ask for. They may have
-    passed for another lens or board: all is then chosen once more with them free. Errors of any
-    arm's shape decide which values are free, but are not estimated. Their size is that under the
-    stated lenses and boards: a board that changes its size with the arm hides a part of it.
-    """
+    """Fits all with the weights that the corners have."""
+    # Errors of an arm are sought once lenses and boards are as the corners ask for. They may have
+    # passed for another lens or board: all is then chosen once more with them free. Errors of any
+    # arm's shape decide which values are free, but are not estimated. Their size is that under the
+    # stated lenses and boards: a board that changes its size with the arm hides a part of it.
     stated = settle(looks, side, looks.first, frames)
     if not looks.levels:
         levels = lens_levels(side, _sized(side, stated))
@@ -183,11 +181,9 @@ def lens_levels(side: Side, fitted: Fitted) -> dict[str, LensLevels]:
 
 
 def _still_asked_for(erring: Side, stated: Fitted, answer: Fitted) -> Fitted:
-    """The fit with errors of arms free, and of what was set free before what is still asked for.
-
-    Before, noise was as large as these errors: what they had passed for is as stated again, and
-    what really is another is clear now.
-    """
+    """The fit with errors of arms free, and of what was set free before what is still asked for."""
+    # Before, noise was as large as these errors: what they had passed for is as stated again, and
+    # what really is another is clear now.
     wide = settle(answer.looks, erring, answer.moving, answer.frames)
     looks = answer.looks
     freed = [looks.shape_of(it) for it in looks.printed] + [
@@ -209,11 +205,9 @@ def _still_asked_for(erring: Side, stated: Fitted, answer: Fitted) -> Fitted:
 
 
 def _still_other_sizes(erring: Side, wide: Fitted) -> tuple[list[IntArray], Fitted]:
-    """The scales of boards that are others than stated, and the fit with these alone free.
-
-    What all boards have in common, links of arms may have, too, and free together none is clear:
-    the least clear one is as stated, and the rest are measured anew beside it.
-    """
+    """The scales of boards that are others than stated, and the fit with these alone free."""
+    # What all boards have in common, links of arms may have, too, and free together none is clear:
+    # the least clear one is as stated, and the rest are measured anew beside it.
     looks = wide.looks
     free = [it for it in looks.printed if np.isin(looks.scale_of(it), wide.moving).all()]
     while free:
@@ -229,12 +223,10 @@ def _still_other_sizes(erring: Side, wide: Fitted) -> tuple[list[IntArray], Fitt
 
 
 def _measured(side: Side, fitted: Fitted, board: int) -> MeasuredScale:
-    """Measures a board's size by the robots' motion, also where the fit is not linear in it.
-
-    A view's line of sight is known much better than its distance. Where views and chain disagree by
-    millimetres, because a board is far off, their lines of sight do, too, and a size that is
-    linear about the views' poses is held by that. The costs of fits with other sizes say more.
-    """
+    """Measures a board's size by the robots' motion, also where the fit is not linear in it."""
+    # A view's line of sight is known much better than its distance. Where views and chain disagree
+    # by millimetres, because a board is far off, their lines of sight do, too, and a size that is
+    # linear about the views' poses is held by that. The costs of fits with other sizes say more.
     found, looks = measured_scale(side, fitted, board), fitted.looks
     noise, place = fitted.fit.noise, looks.scale_of(board)
     if found.is_another or not any(it[1] > _ROUGH_M for it in noise.robots):
@@ -305,10 +297,8 @@ def _freed(side: Side, moving: IntArray, fitted: Fitted) -> Fitted:
 
 
 def _resized(side: Side, answer: Fitted) -> Fitted:
-    """Sets the boards' scales free where the robot measures others than are stated.
-
-    One after the other: a board that is off misleads about the others, too.
-    """
+    """Sets the boards' scales free where the robot measures others than are stated."""
+    # One after the other: a board that is off misleads about the others, too.
     for _ in answer.looks.printed:
         other = _wrongly_sized(side, answer)
         if other is None:
@@ -418,10 +408,8 @@ def _shapes(side: Side, fitted: Fitted) -> Iterator[IntArray]:
 
 
 def _predicts_worse(wider: Fitted, fitted: Fitted) -> bool:
-    """Whether views that are left out are predicted worse, in position and in rotation.
-
-    Intrinsics whose sigma is stated are free to move within that, whatever they predict.
-    """
+    """Whether views that are left out are predicted worse, in position and in rotation."""
+    # Intrinsics whose sigma is stated are free to move within that, whatever they predict.
     looks = wider.looks
     freed = [
         it.scene

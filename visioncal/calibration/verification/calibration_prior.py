@@ -175,11 +175,9 @@ def _read(calibration: Calibration, fit: JointFit) -> CalibrationPrior:
 def _looks(
     calibration: Calibration, fit: JointFit, targets: Mapping[str, Target]
 ) -> tuple[int, ...]:
-    """Places of the fit's free values among the lens's and then the targets'.
-
-    Files of earlier versions know nothing of a board's shear, the last of its values: what follows
-    them lies one place farther for each board.
-    """
+    """Places of the fit's free values among the lens's and then the targets'."""
+    # Files of earlier versions know nothing of a board's shear, the last of its values: what
+    # follows them lies one place farther for each board.
     only, camera = calibration.board, calibration.camera
     boards = [*calibration.boards.values(), *([] if only is None else [only])]
     if camera is None or all("shear" in it.shape for it in boards):
@@ -217,10 +215,8 @@ def _jacobian(placed: FloatArray, looks: int, arm: int) -> FloatArray:
 
 
 def _model(arm: Robot | None, fitted: FittedArm | None) -> ArmModel | None:
-    """The arm's model at what was found, so that no errors are left to be added.
-
-    Its geometry is in the arm; what goes by the loads of a stop is in the values.
-    """
+    """The arm's model at what was found, so that no errors are left to be added."""
+    # Its geometry is in the arm; what goes by the loads of a stop is in the values.
     if fitted is None or fitted.of != "model" or arm is None:
         return None
     reported, weights = fitted.flange_from_reported, fitted.weights

@@ -88,11 +88,9 @@ def _both_possible(seen: PredictedStops, prior_calibration: CalibrationPrior) ->
 
 
 def _jointly(kind: str, first: Cause, second: Cause) -> Cause:
-    """Two changes at once.
-
-    Of camera and board nothing is left of the old hand-eye calibration but the arm; a board of
-    another size that lies elsewhere is another board.
-    """
+    """Two changes at once."""
+    # Of camera and board nothing is left of the old hand-eye calibration but the arm; a board of
+    # another size that lies elsewhere is another board.
     return Cause(
         f"{kind} {second.name.partition(' ')[2]}".strip(),
         np.concatenate([first.by_sensor, second.by_sensor], axis=2),

@@ -213,11 +213,10 @@ def _shares(causes: Sequence[Cause]) -> FloatArray:
 
 
 def _not_separated(suspects: Sequence[Suspect]) -> tuple[Suspect, ...]:
-    """The likeliest, and what explains the stops about as well.
-
-    That is what is about as likely, and what could explain them but for its more unknowns: a
-    turned base looks like a slip of the first joint, however unlikely a turn about just that axis.
-    """
+    """The likeliest, and what explains the stops about as well."""
+    # That is what is about as likely, and what could explain them but for its more unknowns: a
+    # turned base looks like a slip of the first joint, however unlikely a turn about just that
+    # axis.
     best, *others = suspects
     if kind_of(best.name) in (NOISE, *_PAIRS):
         return (best,)

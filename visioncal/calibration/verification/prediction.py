@@ -264,11 +264,9 @@ def _noise_px(known: ObservedPoses) -> float:
 
 
 def _with_its_targets(session: Session, prior_calibration: CalibrationPrior) -> Session:
-    """Numbers the session's targets as the calibration does, by their names.
-
-    The only one of a session has no name: where several were calibrated with, it is the one among
-    them that is printed alike.
-    """
+    """Numbers the session's targets as the calibration does, by their names."""
+    # The only one of a session has no name: where several were calibrated with, it is the one among
+    # them that is printed alike.
     known, shown = prior_calibration.targets, session.boards
     if len(known) < 2 and len(shown) < 2:
         if any(view.image or view.has_corners for view in session.views):

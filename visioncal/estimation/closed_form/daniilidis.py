@@ -15,10 +15,8 @@ from visioncal.estimation.closed_form.translation import complete
 
 
 def _squares() -> FloatArray:
-    """The (36, 16) map from sums of w w^T to sums of S^T S, with w = (a - b, a + b).
-
-    S = [[0, -(a - b)^T], [a - b, skew(a + b)]] is linear in w, hence S^T S in w w^T.
-    """
+    """The (36, 16) map from sums of w w^T to sums of S^T S, with w = (a - b, a + b)."""
+    # S = [[0, -(a - b)^T], [a - b, skew(a + b)]] is linear in w, hence S^T S in w w^T.
     rows = np.zeros((6, 4, 4))
     rows[:3, 0, 1:] = -np.eye(3)
     rows[:3, 1:, 0] = np.eye(3)
@@ -109,13 +107,11 @@ def _dual_products(
 
 
 def _study_point(plane: FloatArray) -> FloatArray:
-    """The (8,) unit vector in the plane of two orthonormal columns that is a rigid transform.
-
-    q . q' is a quadratic form in the combination. In its eigenvectors' frame its zeros are
-    square roots of eigenvalues: no division, and no negative discriminant where noise has left
-    it without real zeros; then the combination nearest to zero is taken. Of the two zeros one is
-    the solution and the other has q = 0. The vector is zero where the form is.
-    """
+    """The (8,) unit vector in the plane of two orthonormal columns that is a rigid transform."""
+    # q . q' is a quadratic form in the combination. In its eigenvectors' frame its zeros are square
+    # roots of eigenvalues: no division, and no negative discriminant where noise has left it
+    # without real zeros; then the combination nearest to zero is taken. Of the two zeros one is the
+    # solution and the other has q = 0. The vector is zero where the form is.
     form = plane[:4].T @ plane[4:]
     (low, high), vectors = np.linalg.eigh(form + form.T)
     weights = np.sqrt([max(high, 0.0), max(-low, 0.0)])

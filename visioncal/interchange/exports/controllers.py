@@ -86,20 +86,16 @@ def _check_identifier(name: str, language: Language) -> str:
 
 
 def _write_ur_tcp(content: Content) -> str:
-    """Writes a call of URScript's set_tcp (script manual, module internals, `set_tcp`).
-
-    Without the name that newer controllers take, so that older ones read it, too.
-    """
+    """Writes a call of URScript's set_tcp (script manual, module internals, `set_tcp`)."""
+    # Without the name that newer controllers take, so that older ones read it, too.
     pose = ur_pose(pose_texts(content.matrix, POSE_FORMS["ur"]))
     return comments("#", content.notes) + f"set_tcp({pose})\n"
 
 
 def _write_ur_feature(content: Content) -> str:
-    """Writes a pose into a variable, as a program uses it with pose_trans.
-
-    PolyScope's features are entered by hand; its programs move in a variable of type pose as in a
-    feature (script manual, "Numbers, Variables, and Types" and "Scoping rules").
-    """
+    """Writes a pose into a variable, as a program uses it with pose_trans."""
+    # PolyScope's features are entered by hand; its programs move in a variable of type pose as in a
+    # feature (script manual, "Numbers, Variables, and Types" and "Scoping rules").
     name = _check_identifier(content.child, URSCRIPT)
     pose = ur_pose(pose_texts(content.matrix, POSE_FORMS["ur"]))
     return comments("#", content.notes) + f"global {name} = {pose}\n"
@@ -132,11 +128,9 @@ def _warn_of_load(content: Content) -> str:
 
 
 def _write_abb_wobj(content: Content) -> str:
-    """Writes RAPID's `wobjdata` with the fixture as its user frame.
-
-    robhold, ufprog, ufmec, uframe, oframe (RAPID reference, data types, `wobjdata`): a fixed frame,
-    and the object's own at its origin.
-    """
+    """Writes RAPID's `wobjdata` with the fixture as its user frame."""
+    # robhold, ufprog, ufmec, uframe, oframe (RAPID reference, data types, `wobjdata`): a fixed
+    # frame, and the object's own at its origin.
     name = _check_identifier(content.child, RAPID)
     pose = abb_pose(pose_texts(content.matrix, POSE_FORMS["abb"]))
     notes = comments("!", content.notes)

@@ -86,11 +86,9 @@ def _array(matrix: FloatArray) -> dict[str, int | list[float]]:
 
 
 def _write_camera_info(content: Content) -> str:
-    """Writes a camera_info file (image_common, camera_calibration_parsers/src/parse_yml.cpp).
-
-    Models by sensor_msgs/distortion_models.hpp. A single camera is not rectified: R is the
-    identity, and P repeats the camera matrix.
-    """
+    """Writes a camera_info file (image_common, camera_calibration_parsers/src/parse_yml.cpp)."""
+    # Models by sensor_msgs/distortion_models.hpp. A single camera is not rectified: R is the
+    # identity, and P repeats the camera matrix.
     camera = camera_of(content)
     matrix = matrix_3x3(camera)
     document = {
@@ -107,11 +105,9 @@ def _write_camera_info(content: Content) -> str:
 
 
 def _write_kalibr(content: Content) -> str:
-    """Writes a camchain.yaml (Kalibr's wiki, "Yaml formats") of one camera.
-
-    Without `T_cam_imu`, which carries points of an inertial sensor into the camera: none was
-    calibrated.
-    """
+    """Writes a camchain.yaml (Kalibr's wiki, "Yaml formats") of one camera."""
+    # Without `T_cam_imu`, which carries points of an inertial sensor into the camera: none was
+    # calibrated.
     camera = camera_of(content)
     coefficients = numbers(camera.distortion)
     if camera.model == "brown":

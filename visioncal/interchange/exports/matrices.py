@@ -22,10 +22,8 @@ def _write_texts(contents: Sequence[Content]) -> str:
 
 
 def _write_opencv(content: Content) -> str:
-    """Writes a FileStorage of OpenCV, by OpenCV itself.
-
-    The lens goes under the names of OpenCV's own calibration (samples/cpp/calibration.cpp).
-    """
+    """Writes a FileStorage of OpenCV, by OpenCV itself."""
+    # The lens goes under the names of OpenCV's own calibration (samples/cpp/calibration.cpp).
     storage = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     for line in (*content.notes, *([content.left_of_field] if content.left_of_field else [])):
         storage.writeComment(one_line(line), append=False)
@@ -45,11 +43,9 @@ def _write_opencv(content: Content) -> str:
 
 
 def _write_zivid(content: Content) -> str:
-    """Writes what Matrix4x4 of Zivid's SDK loads, in millimetres.
-
-    Fields as in zivid-python, Matrix4x4.save, and zivid-python-samples, save_load_matrix.py.
-    Without a comment: the SDK has a reader of its own, which is not public.
-    """
+    """Writes what Matrix4x4 of Zivid's SDK loads, in millimetres."""
+    # Fields as in zivid-python, Matrix4x4.save, and zivid-python-samples, save_load_matrix.py.
+    # Without a comment: the SDK has a reader of its own, which is not public.
     matrix_mm: FloatArray = content.matrix.copy()
     matrix_mm[:3, 3] *= 1e3
     version = yaml_text({"__version__": {"serializer": 1, "data": 1}})

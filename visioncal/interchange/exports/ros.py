@@ -127,12 +127,10 @@ def _write_launches(contents: Sequence[Content]) -> str:
 
 
 def _write_moveit(content: Content) -> str:
-    """Writes a launch file laid out as MoveIt 2's calibration does.
-
-    moveit_calibration, handeye_control_widget.cpp (ROS 2), puts the mount and both frames first.
-    The Euler angles that it adds in a comment are left out: its order is not the one that the
-    publisher's --roll, --pitch and --yaw have.
-    """
+    """Writes a launch file laid out as MoveIt 2's calibration does."""
+    # moveit_calibration, handeye_control_widget.cpp (ROS 2), puts the mount and both frames first.
+    # The Euler angles that it adds in a comment are left out: its order is not the one that the
+    # publisher's --roll, --pitch and --yaw have.
     mount = "" if content.mount is None else f"{content.mount.upper()}: "
     first = f'""" {mount}{content.parent} -> {content.child} """\n'
     return first + comments("#", _ros_notes(content)) + _program([content])
@@ -173,12 +171,10 @@ def _write_transform(content: Content) -> str:
 
 
 def _write_easy_handeye(content: Content) -> str:
-    """Writes what easy_handeye of ROS 1 keeps in its calibrations' folder.
-
-    The fields are those that `to_dict` of its handeye_calibration.py writes and its publisher
-    reads: the pose of `tracking_base_frame` in the effector's frame, or in the base's for a fixed
-    camera.
-    """
+    """Writes what easy_handeye of ROS 1 keeps in its calibrations' folder."""
+    # The fields are those that `to_dict` of its handeye_calibration.py writes and its publisher
+    # reads: the pose of `tracking_base_frame` in the effector's frame, or in the base's for a fixed
+    # camera.
     in_hand = content.mount == "eye-in-hand"
     x, y, z, qx, qy, qz, qw = numbers(write_pose(content.matrix, POSE_FORMS["ros"]))
     document = {
@@ -206,12 +202,10 @@ def _calibrated_frames(content: Content) -> dict[str, str]:
 
 
 def _write_easy_handeye2(content: Content) -> str:
-    """Writes what easy_handeye2 keeps in its calibrations' folder.
-
-    The fields are those of its message HandeyeCalibration (easy_handeye2_msgs, msg/), as
-    `save_calibration` of its handeye_calibration.py writes them and its publisher reads them: the
-    pose of `tracking_base_frame` in the effector's frame, or in the base's for a fixed camera.
-    """
+    """Writes what easy_handeye2 keeps in its calibrations' folder."""
+    # The fields are those of its message HandeyeCalibration (easy_handeye2_msgs, msg/), as
+    # `save_calibration` of its handeye_calibration.py writes them and its publisher reads them: the
+    # pose of `tracking_base_frame` in the effector's frame, or in the base's for a fixed camera.
     in_hand = content.mount == "eye-in-hand"
     document = {
         "parameters": {

@@ -90,10 +90,8 @@ def read_document(path: Path) -> object:
 
 
 def _fields_of_document(document: object, path: Path) -> Fields:
-    """Takes a list of records, the longest such lists inside a mapping, or a mapping of lists.
-
-    In a mapping, names with numbers (`robot_0`, `board_0`, `robot_1`, ...) are rows as well.
-    """
+    """Takes a list of records, the longest such lists inside a mapping, or a mapping of lists."""
+    # In a mapping, names with numbers (`robot_0`, `board_0`, `robot_1`, ...) are rows as well.
     if isinstance(document, Mapping):
         numbered = _numbered(document)
         if len(numbered) > 1:

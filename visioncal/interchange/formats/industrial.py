@@ -38,10 +38,8 @@ def _kinematic_file(path: Path) -> Path | None:
 
 
 def _read_hand_eye(path: Path, requested: ImportOptions) -> Foreign:
-    """Reads cal_data.yaml with a pose file and an image a row.
-
-    The poses are of the robot's flange in its base; `static_camera` gives the mount.
-    """
+    """Reads cal_data.yaml with a pose file and an image a row."""
+    # The poses are of the robot's flange in its base; `static_camera` gives the mount.
     file = _required(_hand_eye_file(path), path, "a cal_data.yaml with pose and image rows")
     document = mapping(read_yaml(file), str(file))
     rows = document.get("data")

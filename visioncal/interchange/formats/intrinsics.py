@@ -164,10 +164,8 @@ def _kalibr(content: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def _visp(root: Element, where: str) -> dict[str, Any]:
-    """ViSP's camera XML (ViSP, vpCameraParameters).
-
-    Its k_ud carries undistorted to distorted points with 1 + k_ud r^2, which is OpenCV's k1.
-    """
+    """ViSP's camera XML (ViSP, vpCameraParameters)."""
+    # Its k_ud carries undistorted to distorted points with 1 + k_ud r^2, which is OpenCV's k1.
     camera = root.child("camera") or root
     models = [it for it in camera.children if it.tag == "model"]
     kinds = [(it.child("type") or it).text for it in models]

@@ -357,10 +357,8 @@ def _check_applies(candidate: Candidate, robot: PoseNumbers) -> None:
 
 
 def _go_together(chain: FloatArray | None, robot: PoseNumbers) -> bool:
-    """Whether each row's joint angles are of its pose: they then change rows with it.
-
-    Without a model of the robot this stays open, and one log is the likelier.
-    """
+    """Whether each row's joint angles are of its pose: they then change rows with it."""
+    # Without a model of the robot this stays open, and one log is the likelier.
     if chain is None or not robot.there.any():
         return True
     # Other units or frames move all rows alike: what differs from row to row shows it.

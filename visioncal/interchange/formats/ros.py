@@ -23,11 +23,9 @@ def _is_easy_handeye(path: Path) -> bool:
 
 
 def _read_easy_handeye(path: Path, requested: ImportOptions) -> Foreign:
-    """Reads a .samples file: a list of `robot` and `tracking` as geometry_msgs/Transform.
-
-    With the camera on the base the sampler stores the robot's pose inverted, so that one solver
-    serves both (easy_handeye2, HandeyeSampler); the file itself does not say which it is.
-    """
+    """Reads a .samples file: a list of `robot` and `tracking` as geometry_msgs/Transform."""
+    # With the camera on the base the sampler stores the robot's pose inverted, so that one solver
+    # serves both (easy_handeye2, HandeyeSampler); the file itself does not say which it is.
     document = mapping(read_yaml(path), str(path))
     samples = _rows(document.get("samples"), f"{path}: samples")
     robot, camera, places = [], [], []
@@ -77,10 +75,8 @@ def _is_moveit(path: Path) -> bool:
 
 
 def _read_moveit(path: Path, requested: ImportOptions) -> Foreign:
-    """Reads MoveIt's samples: the effector in the world, the object in the sensor, as matrices.
-
-    Either a list of mappings, as its panel saves them, or of pairs, as its tests keep them.
-    """
+    """Reads MoveIt's samples: the effector in the world, the object in the sensor, as matrices."""
+    # Either a list of mappings, as its panel saves them, or of pairs, as its tests keep them.
     document = read_json(path) if path.suffix.lower() == ".json" else read_yaml(path)
     robot, camera, places = [], [], []
     for at, sample in enumerate(_rows(document, str(path))):

@@ -74,10 +74,8 @@ def _pose_files(path: Path, name: re.Pattern[str] = _POSE_NAME) -> tuple[Path, .
 
 
 def _read(path: Path, requested: ImportOptions) -> Foreign:
-    """Reads the folder; a pose is tx, ty, tz [m] and theta-u [rad] (ViSP, vpPoseVector).
-
-    Poses of the object in the camera are taken where there are no images.
-    """
+    """Reads the folder; a pose is tx, ty, tz [m] and theta-u [rad] (ViSP, vpPoseVector)."""
+    # Poses of the object in the camera are taken where there are no images.
     files = _pose_files(path)
     if not files:
         raise DataError(f"{path} has no files like franka_pose_rPe_1.yaml.", culprits=[str(path)])

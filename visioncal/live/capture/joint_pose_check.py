@@ -55,11 +55,9 @@ class JointPoseCheck:
         )
 
     def _away(self, robot: Robot, state: ArmState) -> tuple[float, float]:
-        """How far a state is from the nearest other one that it should share a constant with.
-
-        With a tool of whatever kind on the flange, `invert(model) @ pose` is the same for all;
-        with another base, `pose @ invert(model)` is.
-        """
+        """How far a state is from the nearest other one that it should share a constant with."""
+        # With a tool of whatever kind on the flange, `invert(model) @ pose` is the same for all;
+        # with another base, `pose @ invert(model)` is.
         states = [*self._states, state]
         model = robot.base_from_flange(np.array([it.q for it in states]))
         pose = np.array([it.base_from_flange for it in states])

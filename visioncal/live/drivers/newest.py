@@ -166,10 +166,8 @@ class Newest(Generic[T]):
             self._news.notify_all()
 
     def _began_s(self, arrival: Arrival) -> float:
-        """When a picture's exposure may have begun at the earliest.
-
-        Where no times are known that is when the picture before it came, if it was waited for.
-        """
+        """When a picture's exposure may have begun at the earliest."""
+        # Where no times are known that is when the picture before it came, if it was waited for.
         if arrival.began_s is not None:
             return arrival.began_s
         stamps = self._stamps_s

@@ -251,12 +251,10 @@ def _within(robot: Robot, flange: FloatArray) -> Mask:
 
 
 def _unwound(cell: PlanCell, collisions: Collisions, q: FloatArray) -> FloatArray:
-    """Turns joints of postures (k, n) by whole turns, so that ways between them may be straight.
-
-    Where a joint never stands in a wide range of angles, and most postures touch something if it is
-    turned there, as the floor, it cannot pass: its angles are counted from the middle of that range
-    on.
-    """
+    """Turns joints of postures (k, n) by whole turns, so that ways between them may be straight."""
+    # Where a joint never stands in a wide range of angles, and most postures touch something if it
+    # is turned there, as the floor, it cannot pass: its angles are counted from the middle of that
+    # range on.
     chain, margin = cell.robot.chain, cell.limits.joint_margin_rad
     positions = chain.effective(q)
     for joint in np.flatnonzero(~chain.prismatic):

@@ -431,11 +431,9 @@ def _predicted(cell: PlanCell, poses: FloatArray, first_corner: int) -> tuple[Co
 
 
 def _of_sight(cell: PlanCell, arm: int, q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What counts of x: the camera's own place, and as much the places that it looks at.
-
-    A point that it sees comes out wrong by the offset's error and by the rotation's at the point's
-    distance, wherever the arm stands.
-    """
+    """What counts of x: the camera's own place, and as much the places that it looks at."""
+    # A point that it sees comes out wrong by the offset's error and by the rotation's at the
+    # point's distance, wherever the arm stands.
     middle = corner_positions(cell.target).mean(axis=0)
     looked_at = cell.cam_from_target(q) @ [*middle, 1.0]
     place, turn, there = (np.zeros((len(q), 3, 12 + arm)) for _ in range(3))

@@ -292,10 +292,8 @@ def _arm(arm: RobotArm, robot: Robot) -> Robot:
 def _nearest(
     problem: Problem, state: State, noise: Noise, mount: Mount, guess: Guess | None
 ) -> tuple[FloatArray, FloatArray]:
-    """The likeliest edges with what is known beforehand, and the covariance (12, 12) of two.
-
-    These are the camera's and that of the board that is planned for.
-    """
+    """The likeliest edges with what is known beforehand, and the covariance (12, 12) of two."""
+    # These are the camera's and that of the board that is planned for.
     weights = np.zeros((problem.size, problem.size))
     weights[:12, :12] = np.diag(_weights(mount, guess))
     for _ in range(_STEPS):

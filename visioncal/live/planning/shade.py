@@ -86,11 +86,9 @@ class Shade:
 def _meet_box(
     starts: FloatArray, ends: FloatArray, base_from_box: FloatArray, size_m: FloatArray
 ) -> Mask:
-    """Whether one of the lines (k, p) of a row meets a box at (k or 1, 4, 4).
-
-    A line meets a box where the spans in which it is between opposite faces overlap (Kay and Kajiya
-    1986, slabs).
-    """
+    """Whether one of the lines (k, p) of a row meets a box at (k or 1, 4, 4)."""
+    # A line meets a box where the spans in which it is between opposite faces overlap (Kay and
+    # Kajiya 1986, slabs).
     rotation, middle = base_from_box[:, :3, :3], base_from_box[:, None, :3, 3]
     start, along = (starts - middle) @ rotation, (ends - starts) @ rotation
     along = np.where(along == 0.0, _TINY, along)
@@ -103,12 +101,10 @@ def _meet_box(
 def _meet_tube(
     starts: FloatArray, ends: FloatArray, base_from_tube: FloatArray, size_m: FloatArray
 ) -> Mask:
-    """Whether one of the lines (k, p) of a row meets a tube with round ends at (k or 1, 4, 4).
-
-    The nearest points of two lines (Ericson 2005, Real-Time Collision Detection, 5.1.9). A line
-    that begins inside is no line of sight: the camera is beside the tube, whose form is a rough
-    one.
-    """
+    """Whether one of the lines (k, p) of a row meets a tube with round ends at (k or 1, 4, 4)."""
+    # The nearest points of two lines (Ericson 2005, Real-Time Collision Detection, 5.1.9). A line
+    # that begins inside is no line of sight: the camera is beside the tube, whose form is a rough
+    # one.
     radius, length = size_m
     axis = length * base_from_tube[:, None, :3, 2]
     foot = base_from_tube[:, None, :3, 3] - 0.5 * axis

@@ -72,10 +72,8 @@ class Window:
 
 
 def _border_tangents(camera: Camera, edge_px: float, rays: int) -> FloatArray:
-    """(4, rays, 2) x / z and y / z of rays along the image's sides, `edge_px` inside.
-
-    The sides are the upper, lower, left and right one; NaN where the lens has no ray.
-    """
+    """(4, rays, 2) x / z and y / z of rays along the image's sides, `edge_px` inside."""
+    # The sides are the upper, lower, left and right one; NaN where the lens has no ray.
     along = np.linspace(-1.0, 1.0, rays)
     ones = np.ones_like(along)
     sides = [(along, -ones), (along, ones), (-ones, along), (ones, along)]
@@ -269,11 +267,9 @@ def sight_of(cell: PlanCell, seed: int) -> Sight:
 
 
 def _distance_m(cell: PlanCell) -> tuple[float, float]:
-    """Distances at which the board fills the image, and stays in it if the guesses are off [m].
-
-    At a distance d the board is off by the errors of both places, by d times the error of the
-    camera's direction, and by half its own size times the error of its own.
-    """
+    """Distances at which the board fills the image, and stays in it if the guesses are off [m]."""
+    # At a distance d the board is off by the errors of both places, by d times the error of the
+    # camera's direction, and by half its own size times the error of its own.
     border = _border_tangents(cell.camera, cell.limits.edge_px, _BORDER_RAYS)
     half = float(np.nanmin(np.abs(border).max(axis=-1)))
     radius = 0.5 * board_size_m(cell.target)

@@ -191,11 +191,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _end_by(*, ends_with_input: bool) -> None:
-    """Chooses what ends the process; it has nothing to save.
-
-    Ctrl-C goes to all processes of a terminal: one that serves another waits for that one's word,
-    as a real controller does not end with its client.
-    """
+    """Chooses what ends the process; it has nothing to save."""
+    # Ctrl-C goes to all processes of a terminal: one that serves another waits for that one's word,
+    # as a real controller does not end with its client.
     signal.signal(signal.SIGINT, signal.SIG_IGN if ends_with_input else signal.SIG_DFL)
     if ends_with_input:
         threading.Thread(target=_end_with_input, daemon=True).start()

@@ -289,11 +289,9 @@ def _corners_of(
 
 
 def _complete_rows(path: Path, records: _Records) -> list[int]:
-    """The places of the rows that are there with their images.
-
-    Views are written one after the other, so what is missing before the last trace of a view, or
-    from a recording that was closed, was damaged rather than cut off.
-    """
+    """The places of the rows that are there with their images."""
+    # Views are written one after the other, so what is missing before the last trace of a view, or
+    # from a recording that was closed, was damaged rather than cut off.
     rows, images, closed = records.rows, records.images, records.closed
     # The last view of a recording that was cut off may lack its row or its image.
     sure = max([*rows, *images], default=0) if closed is None else closed

@@ -264,10 +264,8 @@ class _Pictures:
     def _of(
         self, view: ViewResult, caption: str, evidence: ViewEvidence | None, magnify: int
     ) -> Thumbnail | None:
-        """A view's picture; None where it has no image, which the table of views says anyway.
-
-        Corners that another detector found are drawn on nothing where there is no image of them.
-        """
+        """A view's picture; None where it has no image, which the table of views says anyway."""
+        # Corners that another detector found are drawn on nothing where there is no image of them.
         shown = next((it for it in self.session.views if it.number == view.view), None)
         if shown is None:
             return None

@@ -173,11 +173,9 @@ class _Handler(BaseHTTPRequestHandler):
                 shutil.copyfileobj(stream, self.wfile)
 
     def _asked_for_here(self) -> bool:
-        """Whether the page's own address was asked for.
-
-        Another name that leads here is how a foreign page would read this server through the
-        browser (DNS rebinding).
-        """
+        """Whether the page's own address was asked for."""
+        # Another name that leads here is how a foreign page would read this server through the
+        # browser (DNS rebinding).
         port = self.connection.getsockname()[1]
         return self.headers.get("Host", "") in (f"{_HOST}:{port}", f"localhost:{port}")
 
@@ -192,10 +190,8 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def _viewer_assets() -> Mapping[str, bytes]:
-    """Fetches the script and the module of the web viewer, by name.
-
-    Rerun's command is let serve them on this machine for the quarter of a second that it takes.
-    """
+    """Fetches the script and the module of the web viewer, by name."""
+    # Rerun's command is let serve them on this machine for the quarter of a second that it takes.
     arguments = ("--serve-web", "--bind", "127.0.0.1", "--web-viewer-port", "0", _NO_RECORDING)
     with viewer_process(*arguments) as process:
         said: list[str] = []

@@ -327,11 +327,9 @@ class _Patches:
         return found
 
     def columns(self, values: FloatArray, shift: FloatArray, *, blurs: bool) -> "Tensor":
-        """(n, c, w w) columns of the fit and the image, zero where pixels do not count.
-
-        They are 1, T, its derivatives by the shift and, if asked for, by blur and tone, and what
-        the slopes leave of the image.
-        """
+        """(n, c, w w) columns of the fit and the image, zero where pixels do not count."""
+        # They are 1, T, its derivatives by the shift and, if asked for, by blur and tone, and what
+        # the slopes leave of the image.
         torch = library("torch")
         found, q = self.images(values, shift, blurs=blurs), float(values[4])
         light = found[:, 0]

@@ -289,10 +289,8 @@ def _lacks(
 def _levels(
     image: Image, corners: FloatArray, inside: FloatArray, homography: FloatArray
 ) -> FloatArray:
-    """(t, k) grey levels at k places from the (t, 2) upper left corners of tags [sides].
-
-    NaN outside the image.
-    """
+    """(t, k) grey levels at k places from the (t, 2) upper left corners of tags [sides]."""
+    # NaN outside the image.
     places = (corners[:, None] + inside).reshape(1, -1, 2)
     px = np.rint(cv2.perspectiveTransform(places, homography)[0])
     shown = ((px >= 0) & (px < image.shape[::-1])).all(axis=1)

@@ -69,11 +69,10 @@ def find_charuco(
 
 
 def _refined(image: Image, px: FloatArray, marker_px: Sequence[Any]) -> FloatArray:
-    """Refines (n, 2) corners [px] in windows that no marker reaches into.
-
-    OpenCV's windows go by the distance of a marker's corner alone: where squares are small, slanted
-    or bent by a lens, a marker's sides lie in them and draw the corner by up to half a pixel.
-    """
+    """Refines (n, 2) corners [px] in windows that no marker reaches into."""
+    # OpenCV's windows go by the distance of a marker's corner alone: where squares are small,
+    # slanted or bent by a lens, a marker's sides lie in them and draw the corner by up to half a
+    # pixel.
     corners = np.reshape(np.array(marker_px, dtype=float), (-1, 4, 2))
     sides = np.roll(corners, -1, axis=1) - corners
     along = corners[:, :, None] + np.linspace(0.0, 1.0, _ALONG)[:, None] * sides[:, :, None]

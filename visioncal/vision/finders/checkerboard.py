@@ -55,11 +55,9 @@ def _right_handed(grid: FloatArray) -> FloatArray:
 
 
 def _dark_corner_first(image: Image, grid: FloatArray) -> FloatArray:
-    """Turns the grid by the least turn that makes its first corner's outward square dark.
-
-    That square has the colour of the one diagonally inside, and the inner squares alternate. Where
-    no turn changes the colour, the board is symmetric and the grid stays as it is.
-    """
+    """Turns the grid by the least turn that makes its first corner's outward square dark."""
+    # That square has the colour of the one diagonally inside, and the inner squares alternate.
+    # Where no turn changes the colour, the board is symmetric and the grid stays as it is.
     turns = (0, 2, 1, 3) if grid.shape[0] == grid.shape[1] else (0, 2)
     turned = (np.rot90(grid, quarter) for quarter in turns)
     return next((it for it in turned if _starts_dark(image, it)), grid)

@@ -629,10 +629,8 @@ def _crossing(
     blurs: bool,
     wide: bool,
 ) -> tuple[_Float32Array, ...]:
-    """Two edges that cross: their product, and its derivatives.
-
-    These are by x and y and, with `blurs`, by the logarithms of the widths.
-    """
+    """Two edges that cross: their product, and its derivatives."""
+    # These are by x and y and, with `blurs`, by the logarithms of the widths.
     signs = np.asarray(pattern.signs, np.float32)[:, None, None]
     edge_x, slope_x, *wider_x = _edges(x, sx, blurs=blurs, wide=wide)
     edge_y, slope_y, *wider_y = _edges(y, sy, blurs=blurs, wide=wide)
@@ -699,10 +697,8 @@ def _edge(t: _Float32Array, sigma: _Float32Array, *, blurs: bool) -> tuple[_Floa
 
 
 def _erf(t: _Float32Array, bell: _Float32Array) -> _Float32Array:
-    """erf(t / sqrt 2), given exp(-t^2 / 2), to 2e-7 (Abramowitz and Stegun 7.1.26).
-
-    Five times as fast as scipy's, which has no vector instructions.
-    """
+    """erf(t / sqrt 2), given exp(-t^2 / 2), to 2e-7 (Abramowitz and Stegun 7.1.26)."""
+    # Five times as fast as scipy's, which has no vector instructions.
     u = np.abs(t)
     u *= np.float32(0.3275911 / np.sqrt(2.0))
     u += 1
