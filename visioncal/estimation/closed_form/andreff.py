@@ -7,11 +7,12 @@ on 3-D Digital Imaging and Modeling, 1999.
 import numpy as np
 
 from visioncal.core.types import FloatArray
-from visioncal.estimation.closed_form.handeye import HandEye, checked
+from visioncal.estimation.closed_form.handeye import HandEye, solver
 from visioncal.estimation.closed_form.kronecker import least_scatter, rotations, turn_maps
 from visioncal.estimation.closed_form.translation import complete, mean_camera
 
 
+@solver
 def andreff(robot: FloatArray, camera: FloatArray) -> HandEye:
     """Solves the linear system of rotation and translation, then makes its rotation one.
 
@@ -22,20 +23,9 @@ def andreff(robot: FloatArray, camera: FloatArray) -> HandEye:
 
     The system is solved up to scale, with t_A times a free factor: solved as it stands it
     collapses to R_X = 0 where the flange turns on the spot. The translation is solved for again
-    once R_X is a rotation, because it was fitted to a matrix that was not.
-
-    Args:
-        robot: (m, 4, 4) robot poses `R_i` [m].
-        camera: (m, 4, 4) `cam_from_target` of the same views [m].
-
-    Returns:
-        X and Z. One metre weighs as much as one radian.
-
-    Raises:
-        DataError: The poses cannot be paired or are not finite.
-        DegenerateError: There are fewer than two views.
+    once R_X is a rotation, because it was fitted to a matrix that was not. One metre weighs
+    as much as one radian.
     """
-    robot, camera = checked(robot, camera)
     m = len(robot)
     seen = camera[:, :3, :3] @ (0.5 * mean_camera(camera)) + camera[:, :3, 3]
     rows = np.empty((m, 3, 13))

@@ -9,7 +9,7 @@ import numpy as np
 from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray
 from visioncal.estimation.closed_form import quaternions
-from visioncal.estimation.closed_form.handeye import HandEye, checked
+from visioncal.estimation.closed_form.handeye import HandEye, solver
 from visioncal.estimation.closed_form.pairs import pair_products, pair_up
 from visioncal.estimation.closed_form.translation import complete
 
@@ -31,6 +31,7 @@ _SQUARES = _squares()
 _SMALLEST_PART = 1e-6
 
 
+@solver
 def daniilidis(robot: FloatArray, camera: FloatArray) -> HandEye:
     """Solves for X's dual quaternion in the null space of the screws' equations.
 
@@ -42,19 +43,8 @@ def daniilidis(robot: FloatArray, camera: FloatArray) -> HandEye:
 
     The rotation is that point's. Its q' would give the translation, too, but carries the noise
     of both screws' moments: the translation is solved for again with the rotation known.
-
-    Args:
-        robot: (m, 4, 4) robot poses `R_i` [m].
-        camera: (m, 4, 4) `cam_from_target` of the same views [m].
-
-    Returns:
-        X and Z. One metre weighs as much as one radian.
-
-    Raises:
-        DataError: The poses cannot be paired or are not finite.
-        DegenerateError: There are fewer than two views.
+    One metre weighs as much as one radian.
     """
-    robot, camera = checked(robot, camera)
     squares = _screw_equations(robot, camera)
     quaternion = _study_point(np.linalg.eigh(squares)[1][:, :2])[:4]
     if quaternion @ quaternion < _SMALLEST_PART:

@@ -11,6 +11,7 @@ Two views i and j eliminate Z: `A @ X = X @ B` with `A = inv(R_j) @ R_i`, `B = C
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import wraps
 from typing import TypeAlias
 
 import numpy as np
@@ -37,20 +38,26 @@ class HandEye:
 Solver: TypeAlias = Callable[[FloatArray, FloatArray], HandEye]
 
 
-def checked(robot: FloatArray, camera: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Makes sure that the views can be paired and are numbers.
+def solver(solve: Solver) -> Solver:
+    """Has a closed form make sure that its views can be paired and are numbers.
 
     Args:
-        robot: (m, 4, 4) robot poses `R_i` [m].
-        camera: (m, 4, 4) `cam_from_target` of the same views [m].
+        solve: The closed form, of (m, 4, 4) robot poses `R_i` and `cam_from_target` of the same
+            views [m]; it gives X and Z.
 
     Returns:
-        Both as float64.
-
-    Raises:
-        DataError: The shapes do not fit, or a pose has an entry that is not a finite number.
-        DegenerateError: There are fewer than two views.
+        The same for views of any numbers. It raises a DataError where shapes do not fit or a pose
+        has an entry that is not a finite number, and a DegenerateError of fewer than two views.
     """
+
+    @wraps(solve)
+    def checking(robot: FloatArray, camera: FloatArray) -> HandEye:
+        return solve(*_checked(robot, camera))
+
+    return checking
+
+
+def _checked(robot: FloatArray, camera: FloatArray) -> tuple[FloatArray, FloatArray]:
     robot, camera = np.asarray(robot, dtype=float), np.asarray(camera, dtype=float)
     if robot.shape != camera.shape or robot.shape[1:] != (4, 4):
         raise DataError(

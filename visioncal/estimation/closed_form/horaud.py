@@ -8,7 +8,7 @@ import numpy as np
 
 from visioncal.core.types import FloatArray
 from visioncal.estimation.closed_form import quaternions
-from visioncal.estimation.closed_form.handeye import HandEye, checked
+from visioncal.estimation.closed_form.handeye import HandEye, solver
 from visioncal.estimation.closed_form.pairs import rotation_pairs
 from visioncal.estimation.closed_form.translation import complete
 
@@ -17,6 +17,7 @@ _VECTORS = quaternions.PRODUCT[:, 1:, :], quaternions.PRODUCT[:, :, 1:]
 _CORRELATION = np.einsum("nkr,ncl->klrc", *_VECTORS).reshape(9, 16)
 
 
+@solver
 def horaud(robot: FloatArray, camera: FloatArray) -> HandEye:
     """Solves for X's quaternion as an eigenvector.
 
@@ -25,19 +26,7 @@ def horaud(robot: FloatArray, camera: FloatArray) -> HandEye:
     eigenvector of sum Q(a)^T W(b), symmetric for pure vectors, that belongs to its largest
     eigenvalue. The paper's a and b are unit axes; here they keep their length sin(angle / 2),
     which weighs the pairs as their noise asks.
-
-    Args:
-        robot: (m, 4, 4) robot poses `R_i` [m].
-        camera: (m, 4, 4) `cam_from_target` of the same views [m].
-
-    Returns:
-        X and Z.
-
-    Raises:
-        DataError: The poses cannot be paired or are not finite.
-        DegenerateError: There are fewer than two views.
     """
-    robot, camera = checked(robot, camera)
     pairs = rotation_pairs(robot, camera)
     matched = (pairs.weight * pairs.robot[1:]) @ pairs.camera[1:].T
     correlation = (matched.reshape(9) @ _CORRELATION).reshape(4, 4)

@@ -7,31 +7,21 @@ and Kronecker product", International Journal of the Physical Sciences 5(10), 20
 import numpy as np
 
 from visioncal.core.types import FloatArray
-from visioncal.estimation.closed_form.handeye import HandEye, checked
+from visioncal.estimation.closed_form.handeye import HandEye, solver
 from visioncal.estimation.closed_form.kronecker import least_scatter, rotations, turn_maps
 from visioncal.estimation.closed_form.translation import complete
 
 
+@solver
 def li(robot: FloatArray, camera: FloatArray) -> HandEye:
     """Solves the linear system of all four unknown parts, then makes its rotations true ones.
 
     With D_i = inv(C_i) a view says kron(R_i, C_i^T) vec(R_X) = vec(R_Z) and
     R_i t_X + t_i = R_Z d_i + t_Z (eq. 19, where A = R_i and B = D_i). R_X and the translations
     are eliminated, which leaves 9 unknowns of the 24. As in `andreff`, the system is solved
-    up to scale and the translations once more when the rotations are known.
-
-    Args:
-        robot: (m, 4, 4) robot poses `R_i` [m].
-        camera: (m, 4, 4) `cam_from_target` of the same views [m].
-
-    Returns:
-        X and Z. One metre weighs as much as one radian.
-
-    Raises:
-        DataError: The poses cannot be paired or are not finite.
-        DegenerateError: There are fewer than two views.
+    up to scale and the translations once more when the rotations are known. One metre weighs
+    as much as one radian.
     """
-    robot, camera = checked(robot, camera)
     m = len(robot)
     # -d_i: from the camera to the target's origin, in the target's axes.
     origins = (camera[:, None, :3, 3] @ camera[:, :3, :3])[:, 0]

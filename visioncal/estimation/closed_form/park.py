@@ -8,11 +8,12 @@ import numpy as np
 
 from visioncal.core.transforms import nearest_rotation
 from visioncal.core.types import FloatArray
-from visioncal.estimation.closed_form.handeye import HandEye, checked
+from visioncal.estimation.closed_form.handeye import HandEye, solver
 from visioncal.estimation.closed_form.pairs import rotation_pairs
 from visioncal.estimation.closed_form.translation import complete
 
 
+@solver
 def park(robot: FloatArray, camera: FloatArray) -> HandEye:
     """Solves for X by matching the logarithms of relative rotations.
 
@@ -20,19 +21,7 @@ def park(robot: FloatArray, camera: FloatArray) -> HandEye:
     differences is (M^T M)^(-1/2) M^T with M = sum beta alpha^T, the paper's closed form for noisy
     pairs. It is taken from the singular value decomposition of M^T, which also serves where M
     has lost its rank.
-
-    Args:
-        robot: (m, 4, 4) robot poses `R_i` [m].
-        camera: (m, 4, 4) `cam_from_target` of the same views [m].
-
-    Returns:
-        X and Z.
-
-    Raises:
-        DataError: The poses cannot be paired or are not finite.
-        DegenerateError: There are fewer than two views.
     """
-    robot, camera = checked(robot, camera)
     pairs = rotation_pairs(robot, camera)
     alpha, beta = _half_logarithms(pairs.robot), _half_logarithms(pairs.camera)
     # The branch below |angle| = 180 degrees has settled the signs: only the fading is left.

@@ -7,11 +7,12 @@ Journal of Mechanisms and Robotics 5(3), 2013.
 import numpy as np
 
 from visioncal.core.types import FloatArray
-from visioncal.estimation.closed_form.handeye import HandEye, checked
+from visioncal.estimation.closed_form.handeye import HandEye, solver
 from visioncal.estimation.closed_form.kronecker import least_scatter, rotations, turn_maps
 from visioncal.estimation.closed_form.translation import complete
 
 
+@solver
 def shah(robot: FloatArray, camera: FloatArray) -> HandEye:
     """Solves for both rotations at once, then for both translations.
 
@@ -21,19 +22,7 @@ def shah(robot: FloatArray, camera: FloatArray) -> HandEye:
     the singular vector is where it is least. It is found as such, because the singular values
     of K themselves are nearly equal where all tilts are small. Both vectors are then made
     rotations by the orthogonal Procrustes solution.
-
-    Args:
-        robot: (m, 4, 4) robot poses `R_i` [m].
-        camera: (m, 4, 4) `cam_from_target` of the same views [m].
-
-    Returns:
-        X and Z.
-
-    Raises:
-        DataError: The poses cannot be paired or are not finite.
-        DegenerateError: There are fewer than two views.
     """
-    robot, camera = checked(robot, camera)
     maps = turn_maps(robot, camera)
     vector_x = least_scatter(maps)
     vector_z = (maps @ vector_x).sum(axis=0)

@@ -8,7 +8,7 @@ import numpy as np
 
 from visioncal.core.types import FloatArray
 from visioncal.estimation.closed_form import quaternions
-from visioncal.estimation.closed_form.handeye import HandEye, checked
+from visioncal.estimation.closed_form.handeye import HandEye, solver
 from visioncal.estimation.closed_form.leastsquares import smallest_solution
 from visioncal.estimation.closed_form.pairs import rotation_pairs
 from visioncal.estimation.closed_form.translation import complete
@@ -21,6 +21,7 @@ _FRAMES = np.array([np.diag(d) for d in ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-
 _ROUNDING = 1e-14
 
 
+@solver
 def tsai(robot: FloatArray, camera: FloatArray) -> HandEye:
     """Solves for X's modified Rodrigues vector, in a frame where it is small.
 
@@ -29,19 +30,7 @@ def tsai(robot: FloatArray, camera: FloatArray) -> HandEye:
     Therefore the camera's vectors are first turned by a known rotation R0, which leaves
     X inv(R0) to solve for: by the best conditioned of four such turns, and then by the X so found,
     so that the outcome does not hang on the choice of the camera's axes.
-
-    Args:
-        robot: (m, 4, 4) robot poses `R_i` [m].
-        camera: (m, 4, 4) `cam_from_target` of the same views [m].
-
-    Returns:
-        X and Z.
-
-    Raises:
-        DataError: The poses cannot be paired or are not finite.
-        DegenerateError: There are fewer than two views.
     """
-    robot, camera = checked(robot, camera)
     pairs = rotation_pairs(robot, camera)
     g, c, trust = pairs.robot[1:], pairs.camera[1:], np.abs(pairs.weight)
     moments = (trust * g) @ g.T, (trust * c) @ c.T, (pairs.weight * g) @ c.T
