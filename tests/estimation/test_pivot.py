@@ -58,6 +58,17 @@ def test_exact_touches_give_the_exact_tool(job):
         assert not fit.covariance[:3].any()
 
 
+def test_three_touches_that_agree_by_chance_are_not_believed():
+    squares = []
+    for seed in range(100):
+        fit = fit_pivot(touched(Job(tips=3), seed).touches)
+        error = fit.flange_from_tool[:3, 3] - TIP
+        squares.append(error @ np.linalg.solve(fit.covariance[3:, 3:], error))
+    # Chi-square of three stays under 31, five sigmas, in all but one case of a million.
+    assert max(squares) < 31.0
+    assert fit_pivot(touched(Job(tips=3), 0).touches, expected_sigma_m=3e-4).sigma_m >= 3e-4
+
+
 @pytest.mark.parametrize("oriented", [False, True])
 def test_derivatives_are_those_of_the_residuals(oriented):
     # Where the touches close: elsewhere the derivatives leave out what noise would add.

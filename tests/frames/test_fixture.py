@@ -197,6 +197,19 @@ def test_few_touches_that_agree_by_chance_are_not_believed(chosen):
     assert "0.1 mm, which is assumed" in reason
 
 
+def test_three_drawn_points_that_agree_by_chance_are_not_believed():
+    squares = []
+    for seed in range(100):
+        frame = drawn(CAD_MM[:3], NAMES[:3], seed=seed)
+        error = away(frame.edge.matrix, FRAME)
+        squares.append(error @ np.linalg.solve(frame.edge.covariance, error))
+    assert max(squares) < 41.0  # as above
+    exact = drawn(CAD_MM[:3], NAMES[:3], noise_m=0.0)
+    assert any("0.1 mm, which is assumed" in it for it in exact.verdict.reasons)
+    stated = drawn(CAD_MM[:3], NAMES[:3], noise_m=0.0, touch_noise_m=3e-4)
+    assert stated.noise_mm == pytest.approx(0.3)
+
+
 # --- What is wrong is named.
 
 

@@ -15,8 +15,10 @@ from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.group_outliers import GroupInliers, agreeing_groups
 from visioncal.estimation.groups import GroupFit, fit_groups
+from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.observability import Direction
 from visioncal.estimation.parts import Noise
+from visioncal.estimation.placing import TOUCH_NOISE_M, counted_noise_m
 from visioncal.estimation.touching import Placed, Touches, TouchProblem, in_tool
 from visioncal.estimation.turning import CARELESS_M, check_counts, check_turning
 
@@ -121,6 +123,11 @@ def _fitted(touches: Touches, noise: Noise, expected: float | None) -> PivotFit:
         problem = TouchProblem(touches, noise, oriented=True)
         found = agreeing_groups(problem, expected, (agreed, problem.turned(found.fit.state)))
         _check_sides(touches, found)
+        worst = check_turning(problem, found.fit)
+    level = counted_noise_m(found.fit, TOUCH_NOISE_M if expected is None else expected)
+    if level > found.fit.sigma:
+        covariance = covariance_from(found.fit.groups.subset(found.fit.used).information(level))
+        found = replace(found, fit=replace(found.fit, sigma=level, covariance=covariance))
         worst = check_turning(problem, found.fit)
     return _result(problem, found, worst)
 

@@ -22,6 +22,9 @@ from visioncal.estimation.observability import (
 LEAST_NOISE_M = 1e-6
 # A careful touch by hand [m]: geometry is judged by it where nothing determines the noise.
 TOUCH_NOISE_M = 1e-4
+# Fewer residuals to spare agree too well by chance to estimate the noise: a single one is within a
+# tenth of its sigma in one frame of twelve. Features that were touched twice leave so many.
+_ENOUGH = 6
 # Squared extents of points whose ratio is under this are a line.
 LEAST_RATIO = 1e-8
 
@@ -31,6 +34,21 @@ def noise_words(sigma_m: float | None) -> str:
     if sigma_m is None:
         return f"at a noise of {1e3 * TOUCH_NOISE_M:g} mm, taken because nothing determines it"
     return f"at a noise of {figure(1e3 * sigma_m)} mm"
+
+
+def counted_noise_m(fit: GroupFit[State], expected_m: float) -> float:
+    """Says what noise of a touch counts [m]: with few to spare no less than is expected."""
+    return fit.sigma if fit.freedom >= _ENOUGH else max(fit.sigma, expected_m)
+
+
+def assumed_words(noise_m: float, stated_m: float | None) -> str:
+    """Says that a sigma rests on a noise that is assumed, as a sentence behind another's blank."""
+    if stated_m is not None or noise_m != TOUCH_NOISE_M:
+        return ""
+    return (
+        f" Its sigma is that of touches that repeat to {1e3 * TOUCH_NOISE_M:g} mm, which is "
+        "assumed: say --touch-noise-mm as it is."
+    )
 
 
 def left_out_words(labels: Sequence[str], used: Mask) -> str:

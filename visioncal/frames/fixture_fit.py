@@ -14,7 +14,7 @@ from visioncal.core.verdict import AGREEMENT, Finding, Verdict
 from visioncal.estimation.group_outliers import GroupInliers
 from visioncal.estimation.groups import State
 from visioncal.estimation.observability import Direction
-from visioncal.estimation.placing import worst_of
+from visioncal.estimation.placing import TOUCH_NOISE_M, worst_of
 from visioncal.frames.measured import MeasuredPoints
 from visioncal.frames.verdicts import disputed, noisy, off_words, placed_name, weak_directions
 from visioncal.results import Edge, Frame, Observation
@@ -55,6 +55,7 @@ class Setting:
         details: Figures of that, for the record.
         options: Where doubt begins.
         words: For what the points are measured by.
+        careful_m: What is taken for that noise where nobody knows it and points are few [m].
     """
 
     touch_noise_m: float | None = None
@@ -62,6 +63,12 @@ class Setting:
     details: Mapping[str, Any] = field(default_factory=dict)
     options: FixtureLimits = field(default_factory=FixtureLimits)
     words: Words = field(default_factory=Words)
+    careful_m: float = TOUCH_NOISE_M
+
+    @property
+    def expected_m(self) -> float:
+        """What a touch is expected to repeat to, per axis [m]."""
+        return self.careful_m if self.touch_noise_m is None else self.touch_noise_m
 
 
 @dataclass(frozen=True, eq=False)

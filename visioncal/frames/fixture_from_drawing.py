@@ -8,6 +8,7 @@ import numpy as np
 from visioncal.core.number_format import figure
 from visioncal.core.types import Mask
 from visioncal.core.verdict import Finding, Step
+from visioncal.estimation.placing import assumed_words, counted_noise_m
 from visioncal.estimation.pointfit import PointFit, fit_points
 from visioncal.estimation.pointpairs import PointPairs
 from visioncal.frames.drawing_points import NominalPoints
@@ -39,7 +40,7 @@ def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Set
     """
     pairs = drawing.beside(measured.names, measured.points, measured.scattered)
     fit = fit_points(pairs, setting.touch_noise_m)
-    fitted = _fitted(fit, measured, pairs)
+    fitted = _fitted(fit, measured, pairs, setting)
     count = len(set(pairs.labels))
     several = f"{len(measured)} {setting.words.things} of " if count < len(measured) else ""
     used = _names_used(pairs, fitted.agrees)
@@ -54,10 +55,11 @@ def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Set
     )
 
 
-def _fitted(fit: PointFit, measured: MeasuredPoints, pairs: PointPairs) -> Fitted:
+def _fitted(fit: PointFit, measured: MeasuredPoints, pairs: PointPairs, setting: Setting) -> Fitted:
     agreement = fit.agreement
+    noise_m = counted_noise_m(agreement.fit, setting.expected_m)
     away = np.linalg.norm(fit.residuals, axis=1)
-    noise = np.hypot(agreement.fit.sigma, pairs.nominal_sigma_m)
+    noise = np.hypot(noise_m, pairs.nominal_sigma_m)
     return Fitted(
         measured,
         _labels(measured, pairs),
@@ -70,7 +72,7 @@ def _fitted(fit: PointFit, measured: MeasuredPoints, pairs: PointPairs) -> Fitte
         agreement.explained,
         tuple(reasons_of(agreement, away, _causes(fit, pairs))),
         away,
-        agreement.fit.sigma,
+        noise_m,
         agreement.fit.sigma_95,
     )
 
@@ -116,7 +118,7 @@ def _doubts(
         yield Finding(
             "few_points",
             f"Only {used} points are used: with {setting.options.points} or more a wrong one can "
-            "be found.",
+            f"be found.{assumed_words(fitted.noise_m, setting.touch_noise_m)}",
         )
 
 

@@ -14,14 +14,11 @@ from visioncal.estimation.features import (
     FeatureTouches,
     fit_features,
 )
-from visioncal.estimation.placing import TOUCH_NOISE_M
+from visioncal.estimation.placing import TOUCH_NOISE_M, assumed_words, counted_noise_m
 from visioncal.frames.fixture_fit import Fitted, Setting, fixture_frame, reasons_of
 from visioncal.frames.measured import MeasuredPoints
 from visioncal.results import Frame
 
-# Touches of each feature twice leave so many numbers to spare. Fewer agree too well by chance to
-# estimate the noise: a single one is within a tenth of its sigma in one fixture of twelve.
-_ENOUGH = 6
 _CAUSE = "the tip had slipped, it is of another kind, or the pose is of another moment"
 _THINGS = {"origin": "the origin", "x": "the x axis", "xy": "the xy plane"}
 
@@ -60,9 +57,7 @@ def featured_fixture(measured: MeasuredPoints, kinds: Sequence[str], setting: Se
 
 def _fitted(fit: FeatureFit, measured: MeasuredPoints, setting: Setting) -> Fitted:
     agreement, matrix = fit.agreement, fit.base_from_fixture
-    noise_m = agreement.fit.sigma
-    if agreement.fit.freedom < _ENOUGH:
-        noise_m = max(noise_m, _expected_m(setting))
+    noise_m = counted_noise_m(agreement.fit, setting.expected_m)
     agrees = agreement.agrees
     away = np.linalg.norm(fit.residuals, axis=1)
     return Fitted(
@@ -84,12 +79,7 @@ def _fitted(fit: FeatureFit, measured: MeasuredPoints, setting: Setting) -> Fitt
 
 def _doubts(fitted: Fitted, kinds: Sequence[str], setting: Setting) -> Iterator[Finding]:
     once = [_THINGS[kind] for kind in FEATURE_KINDS if _count(kinds, kind, fitted.agrees) == 1]
-    assumed = (
-        f" Its sigma is that of touches that repeat to {1e3 * TOUCH_NOISE_M:g} mm, which is "
-        "assumed: say --touch-noise-mm as it is."
-        if setting.touch_noise_m is None and fitted.noise_m == TOUCH_NOISE_M
-        else ""
-    )
+    assumed = assumed_words(fitted.noise_m, setting.touch_noise_m)
     if len(once) == len(FEATURE_KINDS):
         yield Finding(
             "unchecked",
@@ -104,10 +94,6 @@ def _doubts(fitted: Fitted, kinds: Sequence[str], setting: Setting) -> Iterator[
             f"{assumed}",
             Step("Touch again, elsewhere."),
         )
-
-
-def _expected_m(setting: Setting) -> float:
-    return TOUCH_NOISE_M if setting.touch_noise_m is None else setting.touch_noise_m
 
 
 def _count(kinds: Sequence[str], kind: str, agrees: Mask) -> int:

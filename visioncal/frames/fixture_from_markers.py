@@ -101,6 +101,8 @@ def marked_fixture(
         details=_details(shown.target, found, calibration),
         options=options or FixtureLimits(),
         words=_WORDS,
+        # Images tell the noise of each point by themselves.
+        careful_m=0.0,
     )
     return drawn_fixture(measured, drawing, setting)
 

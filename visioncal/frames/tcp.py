@@ -14,6 +14,7 @@ from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import AGAIN, AGREEMENT, Finding, Step, Verdict
 from visioncal.estimation.pivot import PivotFit, fit_pivot
+from visioncal.estimation.placing import assumed_words
 from visioncal.estimation.readings import Reading, readings_that_close
 from visioncal.estimation.touching import Touches, TouchKind
 from visioncal.frames.touches import (
@@ -70,7 +71,8 @@ def touched_tool(
         fit = fit_pivot(touches, robot_noise(calibration), touch_noise_m)
     except (DataError, DegenerateError) as error:
         raise _with_reading(error, touches) from error
-    doubts = list(_doubts(fit, touches, rows.places, options or ToolLimits()))
+    assumed = assumed_words(fit.sigma_m, touch_noise_m)
+    doubts = list(_doubts(fit, touches, rows.places, options or ToolLimits(), assumed))
     doubts += nominal_poses(rows, calibration)
     return Frame(
         Edge(fit.flange_from_tool, fit.covariance),
@@ -161,7 +163,7 @@ def _wrong(fit: PivotFit, touches: Touches, at: int) -> str:
 
 
 def _doubts(
-    fit: PivotFit, touches: Touches, places: Sequence[str], options: ToolLimits
+    fit: PivotFit, touches: Touches, places: Sequence[str], options: ToolLimits, assumed: str
 ) -> Iterator[Finding]:
     for best in readings_that_close(touches)[:1]:
         command = f"{AGAIN} {best.options}" if best.options else ""
@@ -210,7 +212,7 @@ def _doubts(
         yield Finding(
             "few_touches",
             f"Only {used} touches of a point are used: {options.touches} or more give the result "
-            "something to be checked with.",
+            f"something to be checked with.{assumed}",
             Step("Touch the point from more directions."),
         )
 
