@@ -1,6 +1,7 @@
 """`visioncal target make` and `visioncal target check`."""
 
 import json
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
@@ -8,7 +9,7 @@ import typer
 from rich.markup import escape
 
 from visioncal.cli.console import answers, messages
-from visioncal.cli.lazy import PlainCommand
+from visioncal.cli.lazy import PlainCommand, with_fields
 from visioncal.cli.options import AsJson
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, write_atomically
@@ -16,7 +17,7 @@ from visioncal.core.files import check_free, write_atomically
 # Help does not wait for them.
 if TYPE_CHECKING:
     from visioncal.core.types import Target
-    from visioncal.vision.printing import Page
+    from visioncal.vision.printing import Page, Request
 
 target_app = typer.Typer(
     help="Print a board at its exact size, or name the one in a photograph.",
@@ -26,35 +27,76 @@ target_app = typer.Typer(
 
 # The options that describe a board, by its kind.
 _Described: TypeAlias = Literal["charuco", "checkerboard", "aprilgrid", "circles", "marker"]
-_USED: dict[_Described, tuple[str, ...]] = {
-    "charuco": (
-        "--columns",
-        "--rows",
-        "--square-mm",
-        "--marker-mm",
-        "--dictionary",
-        "--legacy",
-        "--name",
-    ),
-    "checkerboard": ("--columns", "--rows", "--square-mm", "--name"),
-    "aprilgrid": (
-        "--columns",
-        "--rows",
-        "--size-mm",
-        "--spacing",
-        "--border",
-        "--dictionary",
-        "--id",
-        "--name",
-    ),
-    "circles": ("--columns", "--rows", "--square-mm", "--diameter-mm", "--asymmetric", "--name"),
-    "marker": ("--id", "--size-mm", "--dictionary", "--name"),
+_USED: dict[_Described, str] = {
+    "charuco": "--columns --rows --square-mm --marker-mm --dictionary --legacy --name",
+    "checkerboard": "--columns --rows --square-mm --name",
+    "aprilgrid": "--columns --rows --size-mm --spacing --border --dictionary --id --name",
+    "circles": "--columns --rows --square-mm --diameter-mm --asymmetric --name",
+    "marker": "--id --size-mm --dictionary --name",
 }
 # Where no page is named, the first of these that has room.
 _PAGES = ("A4", "A3", "A2", "A1", "A0")
 
 
+@dataclass(frozen=True)
+class BoardOptions:
+    """A board as options describe it."""
+
+    kind: Annotated[_Described | None, typer.Option(help="What to print.")] = None
+    columns: Annotated[
+        int | None,
+        typer.Option(help="Squares along x; inner corners of a checkerboard, tags, circles."),
+    ] = None
+    rows: Annotated[int | None, typer.Option(help="The same along y.")] = None
+    square_mm: Annotated[
+        float | None,
+        typer.Option(help="Side of a square, distance of rows of circles; left out: the largest."),
+    ] = None
+    marker_mm: Annotated[
+        float | None, typer.Option(help="Side of the markers of a ChArUco board.")
+    ] = None
+    dictionary: Annotated[str, typer.Option(help="As DICT_5X5_100, DICT_APRILTAG_36h11.")] = ""
+    legacy: Annotated[
+        bool, typer.Option("--legacy", help="The ChArUco layout from before OpenCV 4.6.")
+    ] = False
+    marker_id: Annotated[
+        int | None, typer.Option("--id", help="Id of a single marker; an AprilGrid's first.")
+    ] = None
+    size_mm: Annotated[
+        float | None, typer.Option(help="Side of a single marker or a tag; left out: the largest.")
+    ] = None
+    spacing: Annotated[
+        float | None,
+        typer.Option(help="White between an AprilGrid's tags, as a share of their side: 0.3."),
+    ] = None
+    border: Annotated[
+        int | None, typer.Option(help="Dark modules around their bits: 2, as Kalibr has it.")
+    ] = None
+    diameter_mm: Annotated[float | None, typer.Option(help="Diameter of circles.")] = None
+    asymmetric: Annotated[
+        bool, typer.Option("--asymmetric", help="Every second row of circles is shifted by half.")
+    ] = False
+    name: Annotated[str, typer.Option(help="Name of a board described by options.")] = ""
+
+    @property
+    def given(self) -> list[str]:
+        """The options by which it is described."""
+        chosen = [it.name for it in fields(self) if getattr(self, it.name) != it.default]
+        names = {"marker_id": "id"}
+        return [f"--{names.get(it, it).replace('_', '-')}" for it in chosen if it != "kind"]
+
+    def request(self, kind: _Described) -> "Request":
+        """The same as the printer takes it."""
+        from visioncal.vision.printing import Request
+
+        mine = {it.name: getattr(self, it.name) for it in fields(self) if it.name != "size_mm"}
+        if self.size_mm is not None:
+            mine["square_mm"] = self.size_mm
+        return Request(**mine | {"kind": kind})
+
+
 @target_app.command("make", cls=PlainCommand)
+@with_fields
 def make_command(
     target: Annotated[
         str | None,
@@ -78,41 +120,8 @@ def make_command(
         typer.Option("--landscape/--portrait", help="Left out: as the board fits."),
     ] = None,
     dpi: Annotated[float, typer.Option(help="Pixels an inch of the PNG.")] = 300.0,
-    kind: Annotated[_Described | None, typer.Option(help="What to print.")] = None,
-    columns: Annotated[
-        int | None,
-        typer.Option(help="Squares along x; inner corners of a checkerboard, tags, circles."),
-    ] = None,
-    rows: Annotated[int | None, typer.Option(help="The same along y.")] = None,
-    square_mm: Annotated[
-        float | None,
-        typer.Option(help="Side of a square, distance of rows of circles; left out: the largest."),
-    ] = None,
-    marker_mm: Annotated[
-        float | None, typer.Option(help="Side of the markers of a ChArUco board.")
-    ] = None,
-    dictionary: Annotated[str, typer.Option(help="As DICT_5X5_100, DICT_APRILTAG_36h11.")] = "",
-    legacy: Annotated[
-        bool, typer.Option("--legacy", help="The ChArUco layout from before OpenCV 4.6.")
-    ] = False,
-    marker_id: Annotated[
-        int | None, typer.Option("--id", help="Id of a single marker; an AprilGrid's first.")
-    ] = None,
-    size_mm: Annotated[
-        float | None, typer.Option(help="Side of a single marker or a tag; left out: the largest.")
-    ] = None,
-    spacing: Annotated[
-        float | None,
-        typer.Option(help="White between an AprilGrid's tags, as a share of their side: 0.3."),
-    ] = None,
-    border: Annotated[
-        int | None, typer.Option(help="Dark modules around their bits: 2, as Kalibr has it.")
-    ] = None,
-    diameter_mm: Annotated[float | None, typer.Option(help="Diameter of circles.")] = None,
-    asymmetric: Annotated[
-        bool, typer.Option("--asymmetric", help="Every second row of circles is shifted by half.")
-    ] = False,
-    name: Annotated[str, typer.Option(help="Name of a board described by options.")] = "",
+    *,
+    board: BoardOptions,
     force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
 ) -> None:
     """Draw a board as NAME.pdf, NAME.svg and NAME.png at its exact size, with its NAME.toml.
@@ -120,48 +129,17 @@ def make_command(
     Rulers along both axes show whether the printer kept the size. Exit status 0: all files are
     written; 2: none, because the board does not fit or files are there already.
     """
-    from visioncal.vision.printing import Request, arrange, requested_target, write_board
+    from visioncal.vision.printing import arrange, requested_target, write_board
     from visioncal.vision.targets import load_target, target_names
 
+    kind = board.kind
     if (target is None) == (kind is None):
         raise DataError(
             "Name a board, or describe one by --kind: one of both is needed.",
             next_step=f"The boards are {', '.join(target_names())}.",
         )
-    described = {
-        "--columns": columns,
-        "--rows": rows,
-        "--square-mm": square_mm,
-        "--marker-mm": marker_mm,
-        "--dictionary": dictionary or None,
-        "--legacy": legacy or None,
-        "--id": marker_id,
-        "--size-mm": size_mm,
-        "--spacing": spacing,
-        "--border": border,
-        "--diameter-mm": diameter_mm,
-        "--asymmetric": asymmetric or None,
-        "--name": name or None,
-    }
-    _refuse_unused(kind, [option for option, value in described.items() if value is not None])
-    request = None
-    if kind is not None:
-        side_mm = square_mm if size_mm is None else size_mm
-        request = Request(
-            kind,
-            columns,
-            rows,
-            side_mm,
-            marker_mm,
-            dictionary,
-            legacy,
-            marker_id,
-            name,
-            spacing,
-            border,
-            diameter_mm,
-            asymmetric,
-        )
+    _refuse_unused(kind, board.given)
+    request = None if kind is None else board.request(kind)
     sized = request is None or request.square_mm is not None
     pages = _pages(page, landscape, larger=sized)
     chosen = requested_target(request, pages) if request else load_target(str(target))
@@ -177,7 +155,7 @@ def make_command(
 
 def _refuse_unused(kind: _Described | None, given: list[str]) -> None:
     """Refuses options that would change nothing."""
-    used = _USED[kind] if kind is not None else ()
+    used = _USED[kind].split() if kind is not None else []
     unused = [option for option in given if option not in used]
     if unused:
         what = f"--kind {kind} takes {', '.join(used)}" if used else "A named board is as it is"
