@@ -229,7 +229,7 @@ def test_the_note_names_what_is_sure_and_what_is_not_told(sample):
     assert "| **geometry of the links** | 36 | 0.073 |" in text
     assert "| shoulder pan joint | a | 0 | 1.20 | **+1.20** |" in text
     assert "| elbow joint | d |" in text
-    assert "29 of 30 directions" in text
+    assert "- directions determined: 29 of 30" in text
     assert notes.plain(NOT_TOLD) in text
     assert "- view 5: 31 %" in text
     assert not re.findall(r"(?<!\\)_", text)

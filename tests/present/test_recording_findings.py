@@ -14,6 +14,7 @@ from visioncal.core.errors import DataError
 from visioncal.present.recording import notes, paths, write_recording
 from visioncal.present.recording.overlays import Overlay
 from visioncal.present.viewer import blueprint
+from visioncal.results import Calibration
 from visioncal.vision.targets import corner_positions, load_target
 
 
@@ -29,32 +30,36 @@ def recorded(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+def figures(sample: Sample, calibration: Calibration) -> str:
+    return notes.figures_markdown(calibration, sample.session.boards).replace("\\", "")
+
+
 def test_the_figures_tell_what_a_sick_cell_suffers_from(sample: Sample) -> None:
-    text = notes.figures_markdown(with_findings(sample, sick()))
-    assert r"| errors of the arm's links | 1.2 | 94 % |" in text
+    text = figures(sample, with_findings(sample, sick()))
+    assert "| errors of the arm's links | 1.2 | 94 % |" in text
     assert text.index("arm's links") < text.index("from stop to stop") < text.index("| total | 1.2")
-    assert "placed to 1.2 mm (sigma; 95 % within 0.16 mm)" in text
-    assert "| 0.051 | 0.041 to 0.062 |" in text
-    assert "Size: +0.2 % against the stated one (sigma 0.1 %)." in text
-    assert "its corners lie within 0.29 mm of depth" in text
-    assert "typically off by 0.46 mm and 0.053 deg (likelihood ratio 356" in text
-    assert "These errors were estimated along." in text
+    assert "with a sigma of 1.2 mm; 95 % of such results are right to within 0.16 mm" in text
+    assert "- robot translation: 0.051 mm (95 %: 0.041 to 0.062)" in text
+    assert "- squares, found: 30.045 \N{MULTIPLICATION SIGN} 30.075 mm" in text
+    assert "- bend: 0.29 mm (of depth over its corners)" in text
+    assert "typically off by: 0.46 mm, 0.053 deg\n- likelihood ratio: 356" in text
+    assert "- its errors were: estimated along with the result" in text
 
 
 def test_a_healthy_cell_has_a_flat_board_and_no_word_of_its_arm(sample: Sample) -> None:
     calibration = with_findings(sample, healthy())
-    text = notes.figures_markdown(calibration)
-    assert "Size: as stated. Bend: none: flat within what is seen." in text
+    text = figures(sample, calibration)
+    assert "- squares, found: as stated" in text
+    assert "- bend: none (flat within what is seen)" in text
     assert "# Arm" not in text
-    assert (
-        "placed to 0.1 mm (sigma; 95 % within 0.16 mm); the largest part comes from the robot."
-        in notes.verdict_markdown(calibration)
-    )
+    verdict = notes.verdict_markdown(calibration).replace("\\", "")
+    assert "with a sigma of 0.10 mm; 95 % of such results are right to within 0.16 mm" in verdict
+    assert "comes from the robot; more stops would lower it" in verdict
 
 
 def test_older_calibrations_have_no_findings(sample: Sample) -> None:
-    text = notes.figures_markdown(sample.calibration)
-    assert "| 0.051 |  |" in text
+    text = figures(sample, sample.calibration)
+    assert "- robot translation: 0.051 mm\n" in text
     assert not {"# Where", "# Board", "# Arm"} & set(text.split("\n"))
 
 

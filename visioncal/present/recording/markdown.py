@@ -5,9 +5,11 @@ from collections.abc import Iterator, Sequence
 import rerun as rr
 
 from visioncal.core.number_format import significant
+from visioncal.present.facts import arm_sentences, identifiability_facts, spring_facts
 from visioncal.present.recording import paths
 from visioncal.present.recording.notes import (
     edge_line,
+    fact_lines,
     further_lines,
     plain,
     step_lines,
@@ -17,7 +19,6 @@ from visioncal.present.words import (
     ParameterRow,
     by_joint,
     joint_words,
-    level_reason,
     level_words,
     parameter_row,
     spring_words,
@@ -44,10 +45,8 @@ def markdown(found: ArmResult) -> str:
         [
             "# The arm",
             "",
-            plain(level_reason(found)),
-            "",
+            *(f"{plain(it)}\n" for it in arm_sentences(found)),
             *_levels(found),
-            *_accuracy_over_workspace(found),
             *_parameters(found),
             *_identifiability(found),
             *_stops(found),
@@ -86,19 +85,7 @@ def _springs(found: ElasticResult) -> Iterator[str]:
     yield "|---|---:|---:|---:|"
     for it in found.joints:
         yield f"| {plain(joint_words(it.joint))} | {' | '.join(spring_words(it))} |"
-    median, most = significant(found.sag_mm.median), significant(found.sag_mm.most)
-    yield ""
-    yield f"The loads of the stops move the flange by {median} mm in the median, {most} mm at most."
-
-
-def _accuracy_over_workspace(found: ArmResult) -> Iterator[str]:
-    sigma = found.workspace_sigma_mm
-    if sigma is not None:
-        yield ""
-        yield (
-            f"All over the workspace a tool's place is predicted with a sigma of {sigma.median:.2g}"
-            f" mm (median; 95 % of the places: under {sigma.p95:.2g} mm)."
-        )
+    yield from ("", *fact_lines(spring_facts(found)))
 
 
 def _parameters(found: ArmResult) -> Iterator[str]:
@@ -119,10 +106,9 @@ def _parameter_line(joint: str, row: ParameterRow) -> str:
 
 
 def _identifiability(found: ArmResult) -> Iterator[str]:
-    known = found.observability
-    if known is not None:
+    if found.observability is not None:
         yield from ("", "## What the stops determine", "")
-        yield f"{known.determined} of {known.identifiable} directions that stops can determine."
+        yield from fact_lines(identifiability_facts(found))
     for it in found.not_determined or ():
         yield f"- {plain(it)}"
 

@@ -3,18 +3,27 @@
 import math
 import re
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from types import MappingProxyType
 
 import rerun as rr
 
-from visioncal.core.transforms import pose_difference
+from visioncal.core.number_format import significant
+from visioncal.core.types import Target
 from visioncal.core.verdict import Step, Verdict
+from visioncal.present.facts import (
+    Fact,
+    arm_facts,
+    board_facts,
+    noise_facts,
+    residual_rows,
+    solver_rows,
+    summary,
+)
 from visioncal.present.recording import colours, paths
 from visioncal.present.recording.recorder import send_rows
 from visioncal.present.words import SOURCES, level_reason
-from visioncal.results import Calibration, Edge, Rms, ViewResult
-from visioncal.results.arm import ArmErrorsResult
-from visioncal.results.sections import BoardResult, UncertaintyResult
+from visioncal.results import Calibration, Edge, ViewResult
 
 _PLOTS = {
     paths.POSITION_MM: "residual_mm",
@@ -36,11 +45,13 @@ _MARKS = (
 _ROOM = 1.25
 
 
-def log_static(stream: rr.RecordingStream, calibration: Calibration) -> None:
+def log_static(
+    stream: rr.RecordingStream, calibration: Calibration, targets: Mapping[str, Target]
+) -> None:
     """Logs the verdict, the comparison of the solvers, and how the residuals' plots look."""
     log_verdict(stream, calibration.verdict, verdict_markdown(calibration))
     for entity, text in (
-        (paths.FIGURES, figures_markdown(calibration)),
+        (paths.FIGURES, figures_markdown(calibration, targets)),
         (paths.SOLVERS, solvers_markdown(calibration)),
     ):
         stream.log(entity, markdown(text), static=True)
@@ -115,7 +126,7 @@ def verdict_markdown(calibration: Calibration) -> str:
     lines += [f"| {plain(name)} {edge_line(it)}" for name, it in calibration.placed.items()]
     known = calibration.budget
     if known is not None:
-        lines += ["", _work_line(known)]
+        lines += ["", plain(" ".join(summary(calibration, known)))]
     rejected = [view for view in calibration.views if not view.used]
     used = len(calibration.views) - len(rejected)
     lines += ["", f"{used} of {len(calibration.views)} views used."]
@@ -153,103 +164,58 @@ def edge_line(edge: Edge) -> str:
     return f"| {position} | {turn} | {edge.sigma_mm:.2g} mm, {edge.sigma_deg:.2g} deg |"
 
 
-def _work_line(known: UncertaintyResult) -> str:
-    largest = plain(next(iter(known.parts_mm)))
-    return (
-        f"Where the views look, a point is placed to {known.total_mm:.2g} mm (sigma; 95 % within "
-        f"{known.radius95_mm:.2g} mm); the largest part comes from the "
-        f"{largest.replace('_', ' ')}."
-    )
+def figures_markdown(
+    calibration: Calibration, targets: Mapping[str, Target] = MappingProxyType({})
+) -> str:
+    """The residuals of the fit and of what it had not seen, the noise, and what else was found.
 
-
-def figures_markdown(calibration: Calibration) -> str:
-    """The residuals of the fit and of what it had not seen, the noise, and what else was found."""
+    Args:
+        calibration: The result.
+        targets: The boards by name, as far as they are known.
+    """
     lines = ["# Residuals, rms", "", "| views | mm | deg | px |", "|---|---:|---:|---:|"]
-    validation = calibration.validation
-    lines.append(_rms_line("used, as fitted", calibration.rms))
-    lines.append(_rms_line(f"left out in turn ({plain(validation.method)})", validation.held_out))
-    if validation.holdout is not None:
-        lines.append(_rms_line("declared hold-out", validation.holdout))
-    known = calibration.uncertainty
-    intervals = {} if known is None else known.noise_95
-    lines += ["", "# Noise, per axis", "", "| standard deviation | | 95 % |", "|---|---:|---:|"]
-    for name, value in calibration.noise.items():
-        low_high = " to ".join(f"{it:.2g}" for it in intervals.get(name, ()))
-        lines.append(f"| {_noise_label(name)} | {value:.2g} | {low_high} |")
-    arm = calibration.arm
-    level = [] if arm is None else ["", "# Level of the arm", "", plain(level_reason(arm))]
-    return "\n".join([*lines, *_findings_lines(calibration), *level])
+    for label, rms in residual_rows(calibration):
+        cells = map(significant, (rms.mm, rms.deg, rms.px))
+        lines.append(f"| {plain(label)} | {' | '.join(cells)} |")
+    lines += ["", "# Noise, per axis", "", *fact_lines(noise_facts(calibration))]
+    return "\n".join([*lines, *_findings_lines(calibration, targets)])
 
 
-def _findings_lines(found: Calibration) -> Iterator[str]:
+def _findings_lines(found: Calibration, targets: Mapping[str, Target]) -> Iterator[str]:
     known = found.budget
     if known is not None:
-        yield from ("", "# Where the uncertainty comes from", "", _work_line(known), "")
-        yield from ("| source | sigma mm | of the variance |", "|---|---:|---:|")
+        yield from ("", "# Where the uncertainty comes from", "")
+        yield plain(" ".join(summary(found, known)))
+        yield from ("", "| source | sigma mm | of the variance |", "|---|---:|---:|")
         for name, value in known.parts_mm.items():
             label = plain(SOURCES.get(name, name))
-            yield f"| {label} | {value:.2g} | {known.percent(name)} |"
-        yield f"| total | {known.total_mm:.2g} | |"
+            yield f"| {label} | {significant(value)} | {known.percent(name)} |"
+        yield f"| total | {significant(known.total_mm)} | |"
     for name, board in found.named_boards.items():
-        if board.sigma:
-            yield from ("", f"# Board {plain(name)}".strip(), "", _board_line(board))
+        if facts := board_facts(found, board, targets.get(name)):
+            yield from ("", f"# Board {plain(name)}".strip(), "", *fact_lines(facts))
     if found.arm_errors is not None:
-        yield from ("", "# Arm", "", _arm_line(found.arm_errors))
+        yield from ("", "# Arm", "", *fact_lines(arm_facts(found.arm_errors)))
+    if found.arm is not None:
+        yield from ("", "# Level of the arm", "", plain(level_reason(found.arm)))
 
 
-def _board_line(board: BoardResult) -> str:
-    scale = "as stated"
-    if "scale" in board.estimated:
-        sigma = board.sigma["scale"]
-        away = 100 * board.shape["scale"]
-        scale = f"{away:+.2g} % against the stated one (sigma {100 * sigma:.1g} %)"
-    bend = "none: flat within what is seen"
-    if board.is_bent:
-        bend = f"its corners lie within {board.bend_mm:.2g} mm of depth"
-    return f"Size: {scale}. Bend: {bend}."
-
-
-def _arm_line(arm: ArmErrorsResult) -> str:
-    treated = "were estimated along" if arm.estimated else "could not be estimated along"
-    what = "its links are" if arm.of is None else "its flange is"
-    return (
-        f"Residuals follow the arm's posture: {what} typically off by {arm.sigma_mm:.2g} mm "
-        f"and {arm.sigma_deg:.2g} deg (likelihood ratio {arm.likelihood_ratio:.0f}, noise stays "
-        f"under 15). These errors {treated}."
-    )
-
-
-def _noise_label(name: str) -> str:
-    """`robot_translation_mm` as words with the unit: `robot translation [mm]`."""
-    words, _, unit = name.rpartition("_")
-    return plain(f"{words.replace('_', ' ')} [{unit}]")
-
-
-def _rms_line(label: str, rms: Rms) -> str:
-    px = "" if rms.px is None else f"{rms.px:.2g}"
-    deg = "" if rms.deg is None else f"{rms.deg:.2g}"
-    return f"| {label} | {rms.mm:.2g} | {deg} | {px} |"
+def fact_lines(facts: Iterable[Fact]) -> Iterator[str]:
+    """Facts as a list."""
+    for it in facts:
+        note = f" ({plain(it.note)})" if it.note else ""
+        yield f"- {plain(it.label)}: {plain(it.value)}{note}"
 
 
 def solvers_markdown(calibration: Calibration) -> str:
     """A table of the solvers: their residuals, and how far their edges are from the result's."""
-    edges = list(calibration.edges)
     titles = ["solver", "rms mm", "rms deg"]
-    titles += [f"{plain(name)} off by {unit}" for name in edges for unit in ("mm", "deg")]
+    titles += [f"{plain(it)} off by {unit}" for it in calibration.edges for unit in ("mm", "deg")]
     lines = ["# Solvers compared", "", f"| {' | '.join(titles)} |"]
     lines.append("|---" + "|---:" * (len(titles) - 1) + "|")
-    for solver, result in calibration.solvers.items():
-        deg = "" if result.rms_deg is None else f"{result.rms_deg:.3g}"
-        cells = [plain(solver), f"{result.rms_mm:.3g}", deg]
-        for name in edges:
-            if name in result.transforms:
-                ours, theirs = calibration.transforms[name], result.transforms[name]
-                differences = pose_difference(ours.as_matrix(), theirs.as_matrix())
-                # Rounding errors of the result's own row are no difference.
-                cells += [f"{it:.2g}" if it > 1e-9 else "0" for it in differences]
-            else:
-                cells += ["", ""]
-        lines.append(f"| {' | '.join(cells)} |")
+    for label, found, away in solver_rows(calibration):
+        figures = (found.rms_mm, found.rms_deg, *(it for pair in away for it in pair))
+        lines.append(f"| {' | '.join([plain(label), *map(significant, figures)])} |")
     return "\n".join(lines)
 
 

@@ -158,7 +158,7 @@ def _draw(
     overlay = overlays.Overlay.of(session, calibration, evidence)
     scene.log_static(stream)
     if calibration is not None:
-        notes.log_static(stream, calibration)
+        notes.log_static(stream, calibration, session.boards)
         tools.log_static(stream, calibration)
         markdown.log_static(stream, calibration)
     seen = [evidence.get(it.number, ViewEvidence(it.number)) for it in session.views]

@@ -7,14 +7,13 @@ from markupsafe import Markup
 
 from visioncal.core.number_format import significant
 from visioncal.estimation.arm import SIGNIFICANT
+from visioncal.present.facts import Fact, arm_sentences, identifiability_facts
 from visioncal.present.report import svg
 from visioncal.present.report.axes import Margins, Panel, Scale, boxes, spanning
-from visioncal.present.report.content import Fact
 from visioncal.present.report.svg import Figure
 from visioncal.present.words import (
     by_joint,
     joint_words,
-    level_reason,
 )
 from visioncal.results.arm import (
     ArmResult,
@@ -44,36 +43,17 @@ _ACROSS_IN, _DOWN_IN = 0.75, 0.75
 
 def arm_words(found: ArmResult) -> dict[str, object]:
     """What the page's template says of the arm beside the numbers of its result."""
-    sentences, sigma = [level_reason(found)], found.workspace_sigma_mm
-    if sigma is not None:
-        median, p95 = significant(sigma.median), significant(sigma.p95)
-        sentences.append(
-            f"All over the workspace, a tool's place is predicted with a sigma of {median} mm "
-            f"(median; 95 % of the places: under {p95} mm)."
-        )
-    if found.carries_over is not None:
-        sentences.append(found.carries_over.words)
     known = [it for it in found.parameters if it.sigma is not None]
     sure = sum(it.is_sure for it in known)
     return {
-        "arm_sentences": sentences,
+        "arm_sentences": arm_sentences(found),
         "by_chance": f"{SIGNIFICANT:.0f}",
         "convention": _CONVENTIONS.get(found.convention or "", ""),
         "sure_changes": f"{sure} of {len(found.parameters)}" if known else "",
         "parameters": list(by_joint(found).items()),
-        "identifiability": list(_identifiability(found)),
+        "identifiability": list(identifiability_facts(found)),
         "indices": list(_details(found)),
     }
-
-
-def _identifiability(found: ArmResult) -> Iterator[Fact]:
-    known = found.observability
-    if known is not None:
-        count = f"{known.determined} of {known.identifiable}"
-        yield Fact("directions determined", count, "that any stops could determine")
-        if known.condition is not None:
-            note = "best over worst determined, scaled"
-            yield Fact("condition", significant(known.condition), note)
 
 
 def _details(found: ArmResult) -> Iterator[Fact]:
@@ -127,19 +107,6 @@ def course(found: ThermalResult) -> Markup:
         entries = [(line, svg.ACCENT, "the model"), (dot, svg.INK, "seen by the stops")]
         figure.legend(box.right - 6.0, box.bottom - 6.0, entries)
     return figure.inline("Drift of the flange against time, with its 95 % band")
-
-
-def spring_facts(elastic: ElasticResult) -> Iterator[Fact]:
-    """What the loads of the stops do."""
-    median, most = significant(elastic.sag_mm.median), significant(elastic.sag_mm.most)
-    yield Fact("the flange gives way by", f"{median} mm", f"median; at most {most} mm")
-    low, high = map(significant, elastic.payload_kg)
-    if elastic.payload_kg[1] > 0.0:
-        yield Fact("payload", f"{low} to {high} kg")
-    if elastic.payload_factor is not None:
-        factor = elastic.payload_factor
-        note = f"\N{PLUS-MINUS SIGN} {significant(factor.sigma)}; 1 where load and bend fit"
-        yield Fact("load as stated, times", f"{factor.value:.2f}", note)
 
 
 def deflection_against_load(elastic: ElasticResult) -> Markup:

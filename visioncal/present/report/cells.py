@@ -15,10 +15,11 @@ from visioncal.core.types import FloatArray
 from visioncal.core.version import __version__
 from visioncal.present import cellmap
 from visioncal.present.cellmap import Pair, pairs, places, spans, weakest_frame
+from visioncal.present.facts import Fact
 from visioncal.present.report import bars, content, svg, tools
 from visioncal.present.report.axes import Box, Margins, Panel, Scale, boxes
 from visioncal.present.report.bars import Bar
-from visioncal.present.report.content import Fact, template
+from visioncal.present.report.content import template
 from visioncal.present.report.svg import Figure
 from visioncal.present.words import SOURCES
 from visioncal.results import HELD_BACK, Alignment, Calibration, CameraResult, Sight

@@ -10,16 +10,14 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from visioncal.core.number_format import decimals_for, fixed, matched, percent, significant
-from visioncal.core.transforms import pose_difference
 from visioncal.core.types import FloatArray
+from visioncal.present.facts import PLUS_MINUS, Fact, answering_solver, frame_words
 from visioncal.present.report.advice import contradicts
 from visioncal.present.words import joint_words, level_words, parameter_row, spring_words
 from visioncal.results import (
     Calibration,
     Edge,
     NeedMet,
-    Rms,
-    SolverResult,
     Verdict,
     ViewResult,
 )
@@ -27,22 +25,12 @@ from visioncal.results.compare import intrinsics_names
 from visioncal.results.sections import ClockResult, PointResult
 from visioncal.vision.camera import intrinsics
 
-PLUS_MINUS = "\N{PLUS-MINUS SIGN}"
 _DEPENDENCIES = ("numpy", "scipy", "opencv-contrib-python-headless", "pin", "rerun-sdk")
 _MOUNTS = {
     "eye-in-hand": "the camera rides on the robot",
     "eye-to-hand": "the camera stands still and the robot carries the target",
     "instrument": "a measuring instrument stands still and reads what the robot carries",
 }
-
-
-@dataclass(frozen=True)
-class Fact:
-    """A labelled figure or phrase."""
-
-    label: str
-    value: str
-    note: str = ""
 
 
 @dataclass(frozen=True)
@@ -115,11 +103,6 @@ def _rotation_facts(edge: Edge) -> list[Fact]:
     ]
 
 
-def frame_words(frame: str) -> str:
-    """What a frame is the frame of."""
-    return {"cam": "the camera", "base": "the robot's base"}.get(frame, f"the {frame}")
-
-
 def _rounded(sigma: float) -> str:
     return significant(sigma, 2)
 
@@ -127,49 +110,6 @@ def _rounded(sigma: float) -> str:
 def _matrix_text(matrix: FloatArray) -> str:
     rows = [", ".join(f"{value: .9f}" for value in row) for row in matrix]
     return "[[" + "],\n [".join(rows) + "]]"
-
-
-def answering_solver(calibration: Calibration) -> str | None:
-    """The solver whose transforms are the result; None where none's are."""
-    for name, result in calibration.solvers.items():
-        if all(
-            edge in result.matrices and np.array_equal(result.matrices[edge], it.matrix)
-            for edge, it in calibration.edges.items()
-        ):
-            return name
-    return None
-
-
-def solver_rows(
-    calibration: Calibration,
-) -> Iterator[tuple[str, SolverResult, list[tuple[float | None, float | None]]]]:
-    """The solvers by label, each with its distances from the result's edges [mm], [deg]."""
-    answer = answering_solver(calibration)
-    for name, result in calibration.solvers.items():
-        if name == answer:
-            yield f"{name} (result)", result, [(None, None)] * len(calibration.edges)
-            continue
-        yield (
-            name,
-            result,
-            [
-                pose_difference(edge.matrix, result.matrices[it])
-                if it in result.matrices
-                else (None, None)
-                for it, edge in calibration.edges.items()
-            ],
-        )
-
-
-def residual_rows(calibration: Calibration) -> list[tuple[str, Rms]]:
-    """Residuals of the fit, of views left out in turn, and of the declared hold-out set."""
-    validation = calibration.validation
-    sets = [
-        ("used views, as fitted", calibration.rms),
-        (f"left out in turn ({validation.method})", validation.held_out),
-        ("declared hold-out views", validation.holdout),
-    ]
-    return [(label, rms) for label, rms in sets if rms is not None]
 
 
 def key_figures(calibration: Calibration) -> tuple[Fact, ...]:

@@ -18,9 +18,10 @@ from visioncal.dynamics import (
     left_for_friction,
     stribeck_rows,
 )
+from visioncal.present.facts import PLUS_MINUS, Fact
 from visioncal.present.report import content, svg
 from visioncal.present.report.axes import Box, Margins, Panel, Scale, boxes, spanning
-from visioncal.present.report.content import Fact, template
+from visioncal.present.report.content import template
 from visioncal.present.report.svg import Figure
 
 _UNITS = {
@@ -156,8 +157,8 @@ def _hump_facts(identified: Identified) -> Iterator[Fact]:
         speed, speed_sigma = 1e3 * row["speed_rad_s"], 1e3 * row["speed_sigma_rad_s"]
         yield Fact(
             identified.robot.joint_names[row["joint"] - 1],
-            f"{matched(share, share_sigma)} {content.PLUS_MINUS} {significant(share_sigma)} times",
-            f"fading over {matched(speed, speed_sigma)} {content.PLUS_MINUS} "
+            f"{matched(share, share_sigma)} {PLUS_MINUS} {significant(share_sigma)} times",
+            f"fading over {matched(speed, speed_sigma)} {PLUS_MINUS} "
             f"{significant(speed_sigma)} mrad/s",
         )
 

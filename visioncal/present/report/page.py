@@ -13,6 +13,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import write_atomically
 from visioncal.core.types import Target
 from visioncal.core.version import __version__
+from visioncal.present import facts
 from visioncal.present.report import (
     advice,
     arm,
@@ -21,7 +22,6 @@ from visioncal.present.report import (
     plots,
     sources,
     tools,
-    uncertainty,
 )
 from visioncal.present.report.cells import render_cell
 from visioncal.present.report.content import template
@@ -102,8 +102,8 @@ def _words(calibration: Calibration) -> dict[str, object]:
         "frames": tools.frame_cards(calibration),
         "method": content.method_facts(calibration),
         "lens": content.lens_facts(calibration),
-        "residuals": content.residual_rows(calibration),
-        "solvers": list(content.solver_rows(calibration)),
+        "residuals": facts.residual_rows(calibration),
+        "solvers": list(facts.solver_rows(calibration)),
         "has_pixels": calibration.rms.px is not None,
         "observed": "probe" if calibration.mount == "instrument" else "target",
         "marks": {it.view: content.view_mark(it, outlying) for it in calibration.views},
@@ -114,10 +114,10 @@ def _uncertainty(calibration: Calibration, session: Session | None) -> dict[str,
     arm, known = calibration.arm_errors, calibration.budget
     boards = _board_cards(calibration, {} if session is None else session.boards)
     return {
-        "uncertainty": () if known is None else uncertainty.summary(calibration, known),
-        "noise": uncertainty.noise_facts(calibration),
+        "uncertainty": () if known is None else facts.summary(calibration, known),
+        "noise": facts.noise_facts(calibration),
         "boards": tuple(boards),
-        "arm": () if arm is None else uncertainty.arm_facts(arm),
+        "arm": () if arm is None else facts.arm_facts(arm),
         "arm_is_estimated": arm is not None and arm.estimated,
         "budget_plot": "" if known is None else sources.budget(known),
         "spectrum_plot": "" if known is None else sources.directions(known),
@@ -127,7 +127,7 @@ def _uncertainty(calibration: Calibration, session: Session | None) -> dict[str,
 @dataclass(frozen=True)
 class _BoardCard:
     title: str
-    facts: tuple[content.Fact, ...]
+    facts: tuple[facts.Fact, ...]
     plot: str
 
 
@@ -135,10 +135,10 @@ def _board_cards(calibration: Calibration, targets: Mapping[str, Target]) -> Ite
     """What was found of each board; nothing of one of which nothing was looked for."""
     for name, board in calibration.named_boards.items():
         target = targets.get(name)
-        facts = uncertainty.board_facts(calibration, board, target)
-        if facts:
+        said = facts.board_facts(calibration, board, target)
+        if said:
             plot = "" if target is None else sources.board_shape(board, target, name)
-            yield _BoardCard(f"Board {name}".strip(), facts, plot)
+            yield _BoardCard(f"Board {name}".strip(), said, plot)
 
 
 def _arm(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> dict[str, object]:
@@ -166,7 +166,7 @@ def _springs(calibration: Calibration) -> dict[str, object]:
         return {"springs": (), "spring_facts": (), "spring_plot": ""}
     return {
         "springs": found.joints,
-        "spring_facts": tuple(arm.spring_facts(found)),
+        "spring_facts": tuple(facts.spring_facts(found)),
         "spring_plot": arm.deflection_against_load(found),
     }
 

@@ -6,10 +6,11 @@ from markupsafe import Markup
 
 from visioncal.core.number_format import significant
 from visioncal.present.details import details
+from visioncal.present.facts import Fact
 from visioncal.present.report import bars, svg
 from visioncal.present.report.axes import Margins, boxes
 from visioncal.present.report.bars import Bar
-from visioncal.present.report.content import EdgeCard, Fact, edge_card, readable_time
+from visioncal.present.report.content import EdgeCard, edge_card, readable_time
 from visioncal.present.report.svg import Figure
 from visioncal.results import Calibration, Frame, Observation
 

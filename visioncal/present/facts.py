@@ -1,14 +1,19 @@
-"""Where the uncertainty comes from, in words: sources, noise, board and arm."""
+"""What a result says, as facts and rows that pages and recordings show."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
 from visioncal.core.number_format import decimals_for, matched, significant
+from visioncal.core.transforms import pose_difference
 from visioncal.core.types import Target
-from visioncal.present.report.content import PLUS_MINUS, Fact, answering_solver, frame_words
-from visioncal.results import Calibration
-from visioncal.results.arm import ArmErrorsResult
+from visioncal.present.words import level_reason
+from visioncal.results import Calibration, Rms, SolverResult
+from visioncal.results.arm import ArmErrorsResult, ArmResult, ElasticResult
 from visioncal.results.sections import BoardResult, UncertaintyResult
 
+PLUS_MINUS = "\N{PLUS-MINUS SIGN}"
 _UNITS = {"_px": "px", "_mm": "mm", "_deg": "deg"}
 # What would lower each source's part.
 _REMEDIES = {
@@ -27,6 +32,63 @@ _REMEDIES = {
     "lens_field": "a model that fits the lens would lower it, more views would not",
     "misfit": "a cell that has warmed up and settled would lower it",
 }
+
+
+@dataclass(frozen=True)
+class Fact:
+    """A labelled figure or phrase."""
+
+    label: str
+    value: str
+    note: str = ""
+
+
+def frame_words(frame: str) -> str:
+    """What a frame is the frame of."""
+    return {"cam": "the camera", "base": "the robot's base"}.get(frame, f"the {frame}")
+
+
+def answering_solver(calibration: Calibration) -> str | None:
+    """The solver whose transforms are the result; None where none's are."""
+    for name, result in calibration.solvers.items():
+        if all(
+            edge in result.matrices and np.array_equal(result.matrices[edge], it.matrix)
+            for edge, it in calibration.edges.items()
+        ):
+            return name
+    return None
+
+
+def solver_rows(
+    calibration: Calibration,
+) -> Iterator[tuple[str, SolverResult, list[tuple[float | None, float | None]]]]:
+    """The solvers by label, each with its distances from the result's edges [mm], [deg]."""
+    answer = answering_solver(calibration)
+    for name, result in calibration.solvers.items():
+        if name == answer:
+            yield f"{name} (result)", result, [(None, None)] * len(calibration.edges)
+            continue
+        yield (
+            name,
+            result,
+            [
+                pose_difference(edge.matrix, result.matrices[it])
+                if it in result.matrices
+                else (None, None)
+                for it, edge in calibration.edges.items()
+            ],
+        )
+
+
+def residual_rows(calibration: Calibration) -> list[tuple[str, Rms]]:
+    """Residuals of the fit, of views left out in turn, and of the declared hold-out set."""
+    validation = calibration.validation
+    sets = [
+        ("used views, as fitted", calibration.rms),
+        (f"left out in turn ({validation.method})", validation.held_out),
+        ("declared hold-out views", validation.holdout),
+    ]
+    return [(label, rms) for label, rms in sets if rms is not None]
 
 
 def summary(calibration: Calibration, found: UncertaintyResult) -> tuple[str, ...]:
@@ -139,3 +201,41 @@ def arm_facts(arm: ArmErrorsResult) -> tuple[Fact, ...]:
         Fact("likelihood ratio", f"{arm.likelihood_ratio:.0f}", "noise alone stays under 15"),
         Fact("its errors were", *treated),
     )
+
+
+def arm_sentences(found: ArmResult) -> list[str]:
+    """Which level of the arm was taken and why, and how accurate it is."""
+    sentences, sigma = [level_reason(found)], found.workspace_sigma_mm
+    if sigma is not None:
+        median, p95 = significant(sigma.median), significant(sigma.p95)
+        sentences.append(
+            f"All over the workspace, a tool's place is predicted with a sigma of {median} mm "
+            f"(median; 95 % of the places: under {p95} mm)."
+        )
+    if found.carries_over is not None:
+        sentences.append(found.carries_over.words)
+    return sentences
+
+
+def identifiability_facts(found: ArmResult) -> Iterator[Fact]:
+    """How many directions the stops determine, and how well."""
+    known = found.observability
+    if known is not None:
+        count = f"{known.determined} of {known.identifiable}"
+        yield Fact("directions determined", count, "that any stops could determine")
+        if known.condition is not None:
+            note = "best over worst determined, scaled"
+            yield Fact("condition", significant(known.condition), note)
+
+
+def spring_facts(elastic: ElasticResult) -> Iterator[Fact]:
+    """What the loads of the stops do."""
+    median, most = significant(elastic.sag_mm.median), significant(elastic.sag_mm.most)
+    yield Fact("the flange gives way by", f"{median} mm", f"median; at most {most} mm")
+    low, high = map(significant, elastic.payload_kg)
+    if elastic.payload_kg[1] > 0.0:
+        yield Fact("payload", f"{low} to {high} kg")
+    if elastic.payload_factor is not None:
+        factor = elastic.payload_factor
+        note = f"\N{PLUS-MINUS SIGN} {significant(factor.sigma)}; 1 where load and bend fit"
+        yield Fact("load as stated, times", f"{factor.value:.2f}", note)
