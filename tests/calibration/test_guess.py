@@ -391,6 +391,17 @@ def test_rotations_that_were_never_recorded_are_named(whole):
     assert "how the poses were recorded" in caught.value.next_step
 
 
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_positions_that_were_never_recorded_are_named(mount):
+    poses = cell_poses(mount)
+    told = poses.robot.poses()
+    told[:, :3, 3] = 0.0
+    verdict = visioncal.calibrate(pairs_session(replace(poses, robot=numbers(told)))).verdict
+    assert verdict.status == "bad"
+    assert "All rows have one position of the robot" in verdict.reasons[0]
+    assert "how the poses were recorded" in verdict.reasons[0]
+
+
 def test_a_sound_calibration_is_not_troubled_by_it():
     verdict = visioncal.calibrate(pairs_session(cell_poses("eye-to-hand"))).verdict
     assert not any("--guess" in it for it in verdict.reasons)

@@ -18,6 +18,7 @@ from visioncal.calibration.stages.cause_ranking import (
     MIRRORED_CORNERS,
     read_otherwise,
     unpaired_rows,
+    unrecorded_positions,
     unrecorded_rotations,
     wrong_poses,
 )
@@ -169,7 +170,8 @@ def reading_hint(seen: RunState) -> Finding | None:
     if not guess.stands_out:
         if guess.declared.closes:
             return None
-        return _poses_beside_joints(seen, guess.declared) or _unpaired(seen)
+        beside = _poses_beside_joints(seen, guess.declared)
+        return beside or _one_position(seen) or _unpaired(seen)
     best, views = guess.best, seen.session.views
     is_mirrored = best.hypothesis.robot.signs == "mirror"
     swap = best.hypothesis.swap if len(best.differences) == 1 else ()
@@ -219,6 +221,14 @@ def _unrecorded(seen: RunState) -> Finding | None:
         return None
     is_one_pose = bool(np.abs(moved[0][:, :3, 3]).max() < _STILL_M)
     return unrecorded_rotations(most, half, is_one_pose=is_one_pose)
+
+
+def _one_position(seen: RunState) -> Finding | None:
+    """Says that the robot's positions were not recorded, where they explain nothing."""
+    robot = _at_times(seen)
+    positions = robot.poses()[robot.there, :3, 3]
+    is_one = len(positions) >= FEWEST_ROWS and np.ptp(positions, axis=0).max() < _STILL_M
+    return unrecorded_positions() if is_one else None
 
 
 def _unpaired(seen: RunState) -> Finding | None:

@@ -59,8 +59,9 @@ MIRRORED_CORNERS = Step(
     GUESS_AND_CALIBRATE,
 )
 _UNRECORDED = Step(
-    "Look how the poses were recorded: a logger that repeats one pose, or that writes rotations as "
-    "0, 0, 0, 1, gives no calibration. Record them again, at the same time as the images."
+    "Look how the poses were recorded: a logger that repeats one pose, or that writes positions as "
+    "0, 0, 0 or rotations as 0, 0, 0, 1, gives no calibration. Record them again, at the same time "
+    "as the images."
 )
 _UNPAIRED = Step(
     "Look how rows and images were paired: files sorted by name (10 before 2), rows sorted anew, "
@@ -191,6 +192,15 @@ def unrecorded_rotations(robot_deg: float, camera_deg: float, *, is_one_pose: bo
     words = (
         f"{said}, and between the same views the camera sees the target turn by "
         f"{camera_deg:.2g} deg: the recorded {wrong} are not those of the views."
+    )
+    return Finding("misread_poses", words, _UNRECORDED)
+
+
+def unrecorded_positions() -> Finding:
+    """The finding that the robot's positions do not move, which no frames explain."""
+    words = (
+        "All rows have one position of the robot, and that does not explain "
+        "what the camera sees: the recorded positions are not those of the views."
     )
     return Finding("misread_poses", words, _UNRECORDED)
 
