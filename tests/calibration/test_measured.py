@@ -18,7 +18,7 @@ from visioncal.live.planning.purposes import PURPOSES
 from visioncal.live.planning.recorded import SoFar, begin
 from visioncal.results import Calibration
 from visioncal.robot import Robot
-from visioncal.session import MemoryImages, Session
+from visioncal.session import MemoryImages, Session, View
 from visioncal.simulation import Cell, CellOptions, Second, simulate
 from visioncal.simulation.records import pairs_session
 
@@ -299,3 +299,32 @@ def test_a_size_that_no_arm_explains_is_named_among_poor_poses():
     (named,) = (it for it in verdict.findings if it.kind == "board_size")
     # Four of its sigmas.
     assert float(named.do.words.split()[-1].rstrip(".")) == pytest.approx(0.96, abs=0.02)
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_rotations_that_scatter_with_the_measurement_are_not_blamed_on_the_arm(mount):
+    session = pairs_session(simulate(CellOptions(mount=mount, views=16, seed=3)), "marker")
+    names = [f"cft_{it}" for it in POSE]
+
+    def turned(view: View) -> View:
+        # By how it is seen, as a single marker is by its own errors: its posture shows in them.
+        numbers = [view.numbers[it] for it in names]
+        seen = Rotation.from_quat(numbers[3:])
+        shift = 5e-4 * np.sin(2.0 * seen.as_rotvec())
+        quaternion = (seen * Rotation.from_rotvec(0.02 * np.sin(3.0 * seen.as_rotvec()))).as_quat()
+        new = [*np.add(numbers[:3], shift).tolist(), *quaternion.tolist()]
+        return replace(view, numbers={**view.numbers, **dict(zip(names, new, strict=True))})
+
+    views = tuple(turned(it) for it in session.views)
+    verdict = calibrate(replace(session, views=views)).verdict
+    assert verdict.status != "good"
+    assert verdict.ranked[0].kind == "measured_turns"
+    assert not any("joint angles" in str(it.do) for it in verdict.findings)
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_an_arm_whose_angles_are_off_is_no_bad_measurement_of_rotations(mount):
+    cell = simulate(CellOptions(mount=mount, views=16, dh_sigma_rad=5e-3, seed=1))
+    verdict = calibrate(pairs_session(cell, "measured")).verdict
+    assert verdict.ranked[0].kind == "arm_errors"
+    assert "measured_turns" not in {it.kind for it in verdict.findings}

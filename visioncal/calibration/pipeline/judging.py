@@ -13,9 +13,11 @@ from visioncal.calibration.pipeline.lens_fields import errors_found
 from visioncal.calibration.pipeline.network_ties import robot_motion, untied_words
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.arms import RobotArm
+from visioncal.calibration.stages.cause_ranking import NO_JOINTS
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.distance_scale import distance_scale
 from visioncal.calibration.stages.judge import Arm, Findings, Pair, Place, Sensor
+from visioncal.calibration.stages.measured_turns import measured_turns
 from visioncal.calibration.stages.need import Fitted, picks_of
 from visioncal.calibration.stages.priors import prior_words
 from visioncal.core.files import some_of
@@ -49,6 +51,14 @@ def findings_of(known: RunState) -> Findings:
     tied = [it for it in answer.sights if {it.seer, it.seen} <= tree.branches.keys()]
     explained = {solved.cell.rows[row].view for it in answer.faults for row in it.rows}
     worst, places, warnings = _of_pair(known) if known.mount else _of_cell(known)
+    of_arms = [
+        *doubts_of_arms(
+            solved.arms, answer.misfits, answer.arms, solved.asked, solved.cell.from_when
+        )
+    ]
+    if any(it.kind == "measured_turns" for it in warnings):
+        # They follow what the camera sees, and so the arm's posture, and joint angles do not help.
+        of_arms = [it for it in of_arms if it.do is not NO_JOINTS]
     of_rest = [
         *prior_words(answer.problem, answer.state, answer.covariance, solved.cell.priors),
         *solved.found_of_looks(answer.covariance),
@@ -61,9 +71,7 @@ def findings_of(known: RunState) -> Findings:
         places,
         (
             *(it.found for it in answer.faults),
-            *doubts_of_arms(
-                solved.arms, answer.misfits, answer.arms, solved.asked, solved.cell.from_when
-            ),
+            *of_arms,
             *errors_found(answer.lenses),
             *known.warnings,
             *(it for it in of_rest if it.kind != NOTE),
@@ -120,22 +128,29 @@ def _of_pair(known: RunState) -> _Parts:
     budget = {name.replace("_", " "): mm for name, mm in work.budget_mm.items()}
     place = Place("Where the views look, a point", budget, work.radius95_mm)
     mount = known.session.mount
-    found = _scale_of_measured(known)
+    found = [*_of_measured(known)]
     return directions(answer.problem, answer.state, answer.covariance, mount), [place], found
 
 
-def _scale_of_measured(known: RunState) -> tuple[Finding, ...]:
-    """Whether poses that another program measured have the robot's scale."""
+def _of_measured(known: RunState) -> Iterator[Finding]:
+    """Whether poses that another program measured have the robot's scale, and turn as it does."""
     views = [it for it in known.base_from_flange if it in known.poses and it not in known.reasons]
     if known.cameras or known.mount == "instrument" or not views:
-        return ()
+        return
     poses = np.array([known.base_from_flange[it] for it in views])
     seen = np.array([known.poses[it].cam_from_target[0] for it in views])
-    is_carried = known.mount == "eye-in-hand"
+    parent = poses if known.mount == "eye-in-hand" else invert(poses)
     # The one camera may have a name.
     (edge,) = (it for name, it in known.solved.last_edges.items() if name.startswith("cam"))
-    found = distance_scale(poses if is_carried else invert(poses), seen, edge.matrix)
-    return () if found is None else (found,)
+    if (found := distance_scale(parent, seen, edge.matrix)) is not None:
+        yield found
+    from_seer = edge.matrix @ seen
+    if known.mount == "eye-in-hand":
+        found = measured_turns(poses, from_seer)
+    else:
+        found = measured_turns(np.eye(4), parent @ from_seer)
+    if found is not None:
+        yield found
 
 
 def _of_cell(known: RunState) -> _Parts:

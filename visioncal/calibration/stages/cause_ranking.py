@@ -114,6 +114,7 @@ EVIDENCE: Mapping[str, Evidence] = {
     "clock_changed": Evidence(1e-4, _CHAIN),
     "correlated_errors": Evidence(1e-4, _CHAIN),
     "arm_errors": Evidence(1e-4, _CHAIN),
+    "measured_turns": Evidence(1e-4, _CHAIN),
     "weak_lens": Evidence(_REMARK, "lens"),
     "misread_poses": Evidence(1e-3, _CHAIN),
     "misread_joints": Evidence(1e-3),
@@ -121,6 +122,7 @@ EVIDENCE: Mapping[str, Evidence] = {
 }
 MOVED_AT_ONCE = ("moved_at_once", "joint_slipped")
 _MOVED = ("moved_slowly", *MOVED_AT_ONCE)
+_OF_ROBOT = ("arm_errors", "robot_noise", "robot_noise_of_pick")
 _UNUSED_JOINTS = ("misread_joints", "other_arm")
 # What is measured by way of the robot says nothing where its poses are misread.
 _BY_THE_CHAIN = (
@@ -130,6 +132,7 @@ _BY_THE_CHAIN = (
     "lens_field",
     "corner_noise",
     "arm_errors",
+    "measured_turns",
     "prior",
     *MOVED_AT_ONCE,
 )
@@ -299,6 +302,8 @@ def ranked(
         known |= {"arm_errors"} if known & {*_MOVED} else set()
         # ... and in the calibration's uncertainty.
         known |= {"calibration"} if known & {*MOVED_AT_ONCE} else set()
+        # What was measured badly is in all that the robot seems to err by.
+        known |= {*_OF_ROBOT} if "measured_turns" in known else set()
         found += [it for it in _sources(picks, met, more) if it.kind not in known]
     return tuple(_with_weak_motion(_with_joints_at_hand(found), more))
 
