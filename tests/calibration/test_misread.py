@@ -10,6 +10,7 @@ from support.slips import (
     Identifiability,
     alarms,
     as_built,
+    as_identified,
     in_the_world,
     is_named,
     with_stray_offset,
@@ -67,7 +68,9 @@ def test_slips_are_named(name, with_poses):
         assert is_named(told, name), told.said()
 
 
-@pytest.mark.parametrize("change", [as_built, in_the_world, with_stray_offset, with_tool])
+@pytest.mark.parametrize(
+    "change", [as_built, as_identified, in_the_world, with_stray_offset, with_tool]
+)
 def test_sound_sessions_raise_no_alarm(change):
     for seed, cell in enumerate(CELLS.values()):
         told = change(Identifiability.of(cell, with_poses=True), np.random.default_rng(seed))

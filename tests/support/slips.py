@@ -190,6 +190,13 @@ def as_built(told: Identifiability, _: np.random.Generator) -> Identifiability:
     return replace(told, poses=told.cell.true_base_from_flange)
 
 
+def as_identified(told: Identifiability, rng: np.random.Generator) -> Identifiability:
+    """A model of an earlier calibration; the controller computes with the nominal one."""
+    robot = load_robot(told.cell.options.robot)
+    errors = rng.normal(0.0, np.repeat([5e-4, 3e-4], 3), (robot.joint_count + 1, 6))
+    return replace(told, robot={**robot.corrected(errors).document, "name": "mine"})
+
+
 def with_stray_offset(told: Identifiability, rng: np.random.Generator) -> Identifiability:
     """A joint that was assembled two degrees off; the controller does not know."""
     zeros = np.zeros(told.joints.shape[1])

@@ -15,7 +15,7 @@ from visioncal.core.number_format import figure
 from visioncal.core.transforms import invert, mean_transform, pose_difference
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.core.verdict import CALIBRATE, GUESS, Finding, Step
-from visioncal.robot import Robot, placed_at, with_zeros
+from visioncal.robot import Robot, placed_at, robot_names, with_zeros
 from visioncal.session import View
 from visioncal.session.table import reported_matrices
 
@@ -151,6 +151,8 @@ def _compared(matched: Matched, views: Sequence[int], q: FloatArray, poses: Floa
     robot, guess = matched.robot, None
     if len(q) >= FEWEST_JOINT_ROWS:
         guess = guess_joints(robot, q, poses)
+        if _is_calibrated(robot, guess):
+            guess = replace(guess, best=guess.declared, rivals=())
     if guess is not None and guess.stands_out and guess.zero is None:
         sentence = guess.sentence("the reported poses")
         words = f"The joint angles were not used: they are misread. {sentence}"
@@ -177,6 +179,17 @@ def _compared(matched: Matched, views: Sequence[int], q: FloatArray, poses: Floa
     sound = ~found.out
     tool = mean_transform(invert(matched.arm.base_from_flange(q[sound])) @ poses[sound])
     return _described(replace(matched, flange_from_reported=tool), found)
+
+
+def _is_calibrated(robot: Robot, guess: JointGuess) -> bool:
+    """Whether a model of one's own is a built-in arm's but for what calibration changes.
+
+    Its controller computes with the built-in one, which fits the poses that it reports exactly.
+    """
+    reading, fit = guess.best.reading, guess.declared.fit
+    is_near = np.median(fit.shift) <= _CALIBRATED_M and np.median(fit.angle) <= _CALIBRATED_RAD
+    is_other = not reading.is_zero and np.array_equal(reading.mixing, np.eye(robot.joint_count))
+    return bool(is_near and is_other and robot.name not in robot_names())
 
 
 def _constants(model: FloatArray, poses: FloatArray, guess: JointGuess | None) -> _Constants:
@@ -300,8 +313,8 @@ def _described(matched: Matched, found: _Constants) -> Matched:
         else:
             notes.append(
                 f"Through the model of {robot.name} the joint angles give poses that differ by up "
-                f"to {away} from the reported ones, as where a controller knows its own arm's "
-                "calibration."
+                f"to {away} from the reported ones, as where one of model and controller has the "
+                "arm's calibration, and the other has not."
             )
     offset_mm, turn_deg = pose_difference(np.eye(4), tool)
     if offset_mm > 1e3 * _AGREE_M + shift * 1e3 or turn_deg > np.rad2deg(_AGREE_RAD + angle):
