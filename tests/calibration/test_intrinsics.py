@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from visioncal.calibration.pipeline import calibrate
-from visioncal.calibration.stages.intrinsics import IntrinsicsOptions, estimate_intrinsics
+from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.types import Camera, Corners
 from visioncal.session import Session
@@ -32,9 +32,10 @@ RATIONAL = Camera(
 
 def estimate(cell, model="brown", coefficients="auto", without=()):
     corners = {it.view: it for it in cell.corners if it.view not in without}
-    options = IntrinsicsOptions(coefficients)
     camera = cell.options.camera
-    return estimate_intrinsics(corners, [cell.options.target], camera.resolution, model, options)
+    return estimate_intrinsics(
+        corners, [cell.options.target], camera.resolution, model, coefficients
+    )
 
 
 def cell_with(camera, seed, **changes):

@@ -13,7 +13,7 @@ import numpy as np
 
 from visioncal.core.transforms import distances, invert, mean_transform
 from visioncal.core.types import FloatArray, IntArray, Mount
-from visioncal.estimation.parts import ROBOT, Effect, FramePrior, Observations, State
+from visioncal.estimation.parts import ROBOT, Effect, Observations, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.tree import Branch, Tree
 
@@ -68,7 +68,6 @@ def chain(
     targets: Sequence[str] = (),
     order: Sequence[str] = (),
     effects: Sequence[Effect] = (),
-    priors: Sequence[FramePrior] = (),
 ) -> Problem:
     """Puts the problem of one robot and one camera.
 
@@ -81,7 +80,6 @@ def chain(
         targets: (m,) the frame of the target that each view shows; empty for an only one.
         order: The targets in the order of the unknowns; empty for that of their first views.
         effects: What moves views together.
-        priors: What was measured of frames by hand.
     """
     count = len(cam_from_target)
     (camera, observer), (target, only) = (it.split("_from_") for it in edge_names(mount))
@@ -102,6 +100,5 @@ def chain(
             np.full(count, covariance is None),
         ),
         tuple(it for it in effects if len(it)),
-        tuple(priors),
         is_combined=covariance is None,
     )

@@ -28,7 +28,6 @@ from visioncal.estimation.solve import (
     fitted_covariance,
     normal_equations,
     robot_likelihood,
-    score_gain,
 )
 from visioncal.estimation.variance import Knowledge
 
@@ -379,10 +378,10 @@ class Scores:
         return cls(*scores, problem.moving, columns, seen.free)
 
     def gain(self, moving: IntArray) -> float:
-        """How much the whitened squared error falls when these values are free."""
+        """How much the squared error falls when these values are free (Rao's score test)."""
         among = self.moving.copy()
         among[self.columns] = np.isin(self.places, moving)
-        return score_gain(self.information, self.gradient, among)
+        return float(self.gradient @ covariance_among(self.information, among) @ self.gradient)
 
 
 def _at(side: Side, fitted: Fitted, seen: LinearisedCorners) -> tuple[Problem, State]:

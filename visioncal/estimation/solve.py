@@ -835,18 +835,3 @@ def equations_from(
             columns = every[rows].reshape(-1, every.shape[2])
             total = total + np.linalg.solve(covariance, columns[:, asked]).T @ columns
         yield stop, total[:, :-1], total[:, -1]
-
-
-def score_gain(
-    information: FloatArray, gradient: FloatArray, among: Mask, fewer: Mask | None = None
-) -> float:
-    """By how much the squared error falls when columns are free (Rao's score test).
-
-    Args:
-        information: (p, p).
-        gradient: (p,) of half the squared error.
-        among: (p,) the free columns.
-        fewer: (p,) those that are free already; none where None.
-    """
-    found = float(gradient @ covariance_among(information, among) @ gradient)
-    return found if fewer is None else found - score_gain(information, gradient, fewer)

@@ -35,18 +35,6 @@ _FOCAL_LIMIT, _CENTRE_LIMIT_PX = 0.005, 5.0
 _TILT_SPREAD_DEG, _DISTANCE_SPREAD, _GRID = 10.0, 1.2, 3
 
 
-@dataclass(frozen=True)
-class IntrinsicsOptions:
-    """How to estimate.
-
-    Attributes:
-        coefficients: Brown's model with 5 or 8 coefficients; `auto` takes 8 where that predicts
-            views better that the fit has not seen. A fisheye always has 4.
-    """
-
-    coefficients: Coefficients = "auto"
-
-
 @dataclass(frozen=True, eq=False)
 class Intrinsics:
     """Estimated intrinsics.
@@ -71,7 +59,7 @@ def estimate_intrinsics(
     targets: Sequence[Target],
     resolution: tuple[int, int],
     model: CameraKind,
-    options: IntrinsicsOptions | None = None,
+    coefficients: Coefficients = "auto",
 ) -> Intrinsics:
     """Estimates the intrinsics from views of targets (Zhang 2000 where these are planar).
 
@@ -80,7 +68,8 @@ def estimate_intrinsics(
         targets: What was seen; the corners of several are numbered through.
         resolution: (width, height) [px].
         model: `brown` or `fisheye`.
-        options: How to estimate.
+        coefficients: Brown's model with 5 or 8 coefficients; `auto` takes 8 where that predicts
+            views better that the fit has not seen. A fisheye always has 4.
 
     Returns:
         The intrinsics with covariance.
@@ -90,7 +79,6 @@ def estimate_intrinsics(
         DegenerateError: The views do not determine the focal length at all.
         ConvergenceError: No start converges.
     """
-    options = options or IntrinsicsOptions()
     if len(corners) < _FEWEST_VIEWS:
         raise DataError(
             f"intrinsics: {len(corners)} views show the target, and at least {_FEWEST_VIEWS} are "
@@ -101,7 +89,7 @@ def estimate_intrinsics(
     stack = CornerStack.of(corners, numbered_positions(targets))
     with one_blas_thread():
         fit = _first_fit(stack, model, resolution)
-        if model == "brown" and options.coefficients == 8:
+        if model == "brown" and coefficients == 8:
             # From the polynomial: from nowhere, a pole and a zero may cancel inside the image.
             fit = _fit(stack, _padded(fit.camera), fit.cam_from_target)
         every = stack
@@ -113,7 +101,7 @@ def estimate_intrinsics(
             again = _gated(every, _fit(every, plain, planar_poses(every, plain).first))
             if len(again[2]) < len(reasons):
                 stack, fit, reasons = again
-        if model == "brown" and options.coefficients == "auto":
+        if model == "brown" and coefficients == "auto":
             fit = _with_rational_terms(stack, fit)
     _check(fit)
     return Intrinsics(
