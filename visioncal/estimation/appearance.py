@@ -163,11 +163,6 @@ class LensBoardParameters:
         known = Knowledge(self.information, self.gradient)
         return replace(Effect.free(LENS_AND_BOARD, known, shift), held=self.anchored)
 
-    @property
-    def lens_count(self) -> int:
-        """How many of the appearance's values are the lens's: they come first."""
-        return len(self.appearance.values) - len(self.appearance.board)
-
     def after(self, change: FloatArray) -> "Appearance":
         """The appearance after a (k + p,) change of the free unknowns and of p others."""
         step = np.zeros(len(self.appearance.values))

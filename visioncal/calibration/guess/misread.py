@@ -66,11 +66,6 @@ class FittedJoints:
         return max(self.fit.score, SCORE_FLOOR)
 
     @property
-    def base_from_model(self) -> FloatArray:
-        """(4, 4) the model's base in the base of the poses."""
-        return self.fit.x
-
-    @property
     def flange_from_reported(self) -> FloatArray:
         """(4, 4) the frame of the poses in the model's flange."""
         return invert(self.fit.z)

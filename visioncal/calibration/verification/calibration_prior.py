@@ -43,7 +43,6 @@ class CalibrationPrior:
         covariance: (6 + 6 b + k, 6 + 6 b + k) of edges and values.
         looks: (l,) which values of lens and board are among them.
         arm: What the last of them are errors of.
-        arm_size: How many these are.
         model: The calibrated arm, where they are of its model.
     """
 
@@ -54,7 +53,6 @@ class CalibrationPrior:
     covariance: FloatArray
     looks: tuple[int, ...]
     arm: ArmKind
-    arm_size: int
     model: ArmModel | None
 
     @classmethod
@@ -167,7 +165,6 @@ def _read(calibration: Calibration, fit: JointFit) -> CalibrationPrior:
         jacobian @ fit.covariance @ jacobian.T,
         _looks(calibration, fit, targets),
         "none" if fit.arm is None else fit.arm.of,
-        len(values),
         _model(calibration.calibrated_robot, fit.arm),
     )
 
