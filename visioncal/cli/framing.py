@@ -225,7 +225,6 @@ def report(place: Place, frame: "Frame", written: Written, *, as_json: bool) -> 
         return
     console = answers()
     print_verdict(frame.verdict, place.name)
-    x, y, z = 1e3 * frame.edge.transform.translation
     turn = ", ".join(f"{it:.3f}" for it in frame.edge.transform.rotation.as_rotvec(degrees=True))
     rotation = (
         f"turned by ({turn}) deg, sigma {figure(frame.edge.sigma_deg)} deg"
@@ -233,7 +232,7 @@ def report(place: Place, frame: "Frame", written: Written, *, as_json: bool) -> 
         else "rotation not measured"
     )
     console.print(
-        f"{place.name}: ({x:.3f}, {y:.3f}, {z:.3f}) mm, sigma {figure(frame.edge.sigma_mm)} mm; "
+        f"{place.name}: {frame.edge.place_words(3)}, sigma {figure(frame.edge.sigma_mm)} mm; "
         f"{rotation}"
     )
     console.print(

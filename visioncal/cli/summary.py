@@ -56,15 +56,8 @@ def print_summary(calibration: Calibration, *, verbose: bool) -> None:
     if cell is not None:
         console.print(f"the cell's frame is that of {cell.reference}")
     for name, edge in calibration.edges.items():
-        x, y, z = 1e3 * edge.transform.translation
-        console.print(
-            f"{name}: ({x:.2f}, {y:.2f}, {z:.2f}) mm, sigma {figure(edge.sigma_mm)} mm"
-            + (
-                f" and {figure(edge.sigma_deg)} deg"
-                if edge.oriented
-                else ", its rotation not measured"
-            )
-        )
+        unturned = "" if edge.oriented else ", its rotation not measured"
+        console.print(f"{name}: {edge.place_words()}, {edge.sigma_words}{unturned}")
     if cell is not None:
         _print_cell(cell)
         return

@@ -9,6 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from visioncal.core.codec import Array, Written
 from visioncal.core.errors import DataError
+from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray
 
 # Forms of one pose that were rounded to six places agree to this [m, rad]; no cell is known better.
@@ -49,6 +50,17 @@ class Edge:
     def sigma_deg(self) -> float:
         """Root of the trace of the rotation's covariance [deg]."""
         return float(np.rad2deg(np.sqrt(np.trace(self.covariance[:3, :3]))))
+
+    @property
+    def sigma_words(self) -> str:
+        """How well it is known, in words."""
+        turned = f" and {figure(self.sigma_deg)} deg" if self.oriented else ""
+        return f"sigma {figure(self.sigma_mm)} mm{turned}"
+
+    def place_words(self, decimals: int = 2) -> str:
+        """Where it is, in millimetres with so many decimals."""
+        x, y, z = (f"{1e3 * it:.{decimals}f}" for it in self.transform.translation)
+        return f"({x}, {y}, {z}) mm"
 
 
 def _covariance_fault(matrix: FloatArray) -> str:

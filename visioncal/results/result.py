@@ -194,9 +194,7 @@ class Calibration(CalibrationSections):
             "views used": f"{used} of {len(self.views)}",
             "left out, predicted to": f"{figure(left_out.mm)} mm{turned}",
             **{
-                name: f"({', '.join(f'{1e3 * it:.2f}' for it in edge.transform.translation)}) mm, "
-                f"sigma {figure(edge.sigma_mm)} mm"
-                + (f", {figure(edge.sigma_deg)} deg" if edge.oriented else "")
+                name: f"{edge.place_words()}, {edge.sigma_words}"
                 for name, edge in [*self.placed.items()][:_SHOWN]
             },
         }

@@ -89,12 +89,8 @@ def _result(calibration: Calibration) -> Iterator[tuple[str, str]]:
     for it in need_facts(calibration.need, calibration.verdict):
         yield it.label[0].upper() + it.label[1:], f"{it.value} {it.note}".strip()
     for name, edge in [*calibration.placed.items()][:_MOST_EDGES]:
-        x, y, z = 1e3 * edge.transform.translation
         turn = ", ".join(f"{it:.4f}" for it in edge.transform.rotation.as_rotvec(degrees=True))
-        sigma = f"sigma {figure(edge.sigma_mm)} mm"
-        if edge.oriented:
-            sigma += f" and {figure(edge.sigma_deg)} deg"
-        yield name, f"({x:.3f}, {y:.3f}, {z:.3f}) mm; rotation vector ({turn}) deg; {sigma}"
+        yield name, f"{edge.place_words(3)}; rotation vector ({turn}) deg; {edge.sigma_words}"
     if (test := calibration.touch_test) is not None:
         largest = max(it.gap_mm for it in test.points)
         words = "passed" if test.passed else "not passed"
