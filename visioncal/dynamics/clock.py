@@ -186,13 +186,7 @@ def without_frozen(recorded: Recorded, notes: list[str]) -> Recorded:
         f"{recorded.label}: angles are frozen for up to {figure(float(lasted.max()))} s behind "
         f"{some_of(places, 3)}, though the joints move; these {(~rows).sum()} rows are left out."
     )
-    return replace(
-        recorded,
-        times_s=recorded.times_s[rows],
-        q=recorded.q[rows],
-        dq=None if recorded.dq is None else recorded.dq[rows],
-        torques_nm=recorded.torques_nm[rows],
-    )
+    return recorded.among(rows)
 
 
 def _frozen(times_s: FloatArray, angles: FloatArray) -> Mask:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.types import FloatArray
+from visioncal.core.types import FloatArray, Mask
 from visioncal.session import Stream
 
 _NUMBERED = re.compile(r"(q|tau|current|dq)([1-9][0-9]*)_(rad|nm|a|rad_s)", re.ASCII)
@@ -53,7 +53,10 @@ class Recorded:
 
     def part(self, begin: float, end: float) -> "Recorded":
         """The samples between two shares of the whole, 0 to 1."""
-        rows = slice(round(begin * len(self)), round(end * len(self)))
+        return self.among(slice(round(begin * len(self)), round(end * len(self))))
+
+    def among(self, rows: slice | Mask) -> "Recorded":
+        """Some of the samples."""
         return replace(
             self,
             times_s=self.times_s[rows],

@@ -32,15 +32,7 @@ def maps_about(
     Raises:
         numpy.linalg.LinAlgError: The corners lie as no board's do.
     """
-    middle, scale = px.mean(axis=0), float(np.abs(px - px.mean(axis=0)).max())
-    found = cv2.findHomography((px - middle) / scale, board)[0]
-    if found is None:
-        raise np.linalg.LinAlgError
-    flat_from_px = np.asarray(found, float)
-
-    def flat(places: FloatArray) -> FloatArray:
-        return _mapped(flat_from_px, (places - middle) / scale)
-
+    flat = _homography(px, board)
     own = flat(px[chosen])[:, None]
     distances, around = cKDTree(board).query(board[chosen], min(_AROUND, len(px)))
     off = flat(px)[around] - own
@@ -57,6 +49,16 @@ def maps_about(
         return np.asarray(off + _terms(off) @ bends)
 
     return on_board, around, smoother
+
+
+def _homography(places: FloatArray, board: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """Maps places to a board (n, 2) as a pinhole's image of it is; for numbers about one."""
+    middle, scale = places.mean(axis=0), float(np.abs(places - places.mean(axis=0)).max())
+    found = cv2.findHomography((places - middle) / scale, board)[0]
+    if found is None:
+        raise np.linalg.LinAlgError
+    flat_from_places = np.asarray(found, float)
+    return lambda at: _mapped(flat_from_places, (at - middle) / scale)
 
 
 def _mapped(homography: FloatArray, places: FloatArray) -> FloatArray:
@@ -85,15 +87,11 @@ def map_of_all(board: FloatArray, places: FloatArray) -> Callable[[FloatArray], 
     Raises:
         numpy.linalg.LinAlgError: The corners lie as no board's do.
     """
-    middle, scale = places.mean(axis=0), float(np.abs(places - places.mean(axis=0)).max())
-    found = cv2.findHomography((places - middle) / scale, board)[0]
-    if found is None:
-        raise np.linalg.LinAlgError
-    flat_from_places = np.asarray(found, float)
+    flattened = _homography(places, board)
     centre, size = board.mean(axis=0), float(np.abs(board - board.mean(axis=0)).max())
 
     def flat(at: FloatArray) -> FloatArray:
-        return np.asarray((_mapped(flat_from_places, (at - middle) / scale) - centre) / size)
+        return np.asarray((flattened(at) - centre) / size)
 
     off = (board - centre) / size - flat(places)
     terms = _terms(flat(places))
