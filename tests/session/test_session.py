@@ -601,6 +601,7 @@ WARNINGS = [
     ("session.toml", "ur10e", "kuka", "robot.model: There is no robot named 'kuka'"),
     ("session.toml", "[robot]", "[prior.flange_to_cam]\nz_m=1\nsigma_m=1\n[robot]", "flange_from"),
     ("views.csv", "note", "stamps_s", "stamps_s .* kept as text. Did you mean stamp_s"),
+    ("views.csv", "note", "q1_deg", "q1_deg .* kept as text. Did you mean q1_rad"),
 ]
 
 
@@ -614,6 +615,12 @@ def test_the_suspicious_is_said_and_kept(
     assert re.search(words, session.warnings[0])
     session.save(folder.parent / "copy")
     assert Session.load(folder.parent / "copy").digest() == session.digest()
+
+
+@pytest.mark.parametrize("name", ["status", "pitch", "joint1", "time", "sample_id", "target_id"])
+def test_a_column_of_another_thing_is_no_misspelt_one(folder: Path, name: str) -> None:
+    edit(folder, "views.csv", "note", name)
+    assert not Session.load(folder).warnings
 
 
 def test_millimetres_and_degrees_are_noticed(folder: Path) -> None:

@@ -293,10 +293,10 @@ def _too_deep(where: str) -> DataError:
     )
 
 
-def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Words a hint at the known names nearest to `word`; empty where none is near."""
+def did_you_mean(word: str, known: Iterable[str], least: float = 0.6) -> str:
+    """Words a hint at the known names nearest to `word`; empty where none is as near as `least`."""
     names = {it.lower(): it for it in sorted(known)}
-    near = difflib.get_close_matches(word.lower(), names, n=3, cutoff=0.6)
+    near = difflib.get_close_matches(word.lower(), names, n=3, cutoff=least)
     return f"Did you mean {' or '.join(names[it] for it in near)}?" if near else ""
 
 

@@ -71,6 +71,8 @@ _SIZES: Mapping[str, tuple[float, str]] = {
 _RATE = re.compile(r"d{1,2}q[1-9]\d*_(rad_s2?)", re.ASCII)
 # Squares and products of larger numbers in other columns leave what floats hold.
 _LARGEST = 1e60
+# How alike a name is to the one that it may be, misspelt; `status` and `stamp_s` are 0.62 alike.
+_MISSPELT = 0.76
 # Columns that name one of several cameras, robots or instruments.
 SELECTORS = ("camera", "robot", "instrument")
 
@@ -188,6 +190,8 @@ def column_warnings(columns: Sequence[str], where: str) -> Iterator[str]:
     """Words a hint for every unknown column that looks like a known one misspelt."""
     known = _TEXTS | _PLAIN_NUMBERS | {f"q{number}_rad" for number in range(1, 8)}
     for name in columns:
-        hint = did_you_mean(name, known) if name not in known and not is_number(name) else ""
-        if hint:
+        # Not target_id: more words are another thing.
+        is_other = name in known or is_number(name) or re.split(r"[_.]", name)[0] in known
+        meant = name.replace("_deg", "_rad")
+        if hint := "" if is_other else did_you_mean(meant, known, _MISSPELT):
             yield f"{where}: column {name} is not a known one and is kept as text. {hint}"
