@@ -235,6 +235,53 @@ def matrices_below(folder: Path) -> Recording:
     return _matrices_in_files(folder, np.vstack)
 
 
+def matrices_in_rows(folder: Path) -> Recording:
+    """The upper three rows of a matrix a line."""
+    return _matrices_in_files(folder, lambda poses: poses[:, :3].reshape(-1, 12))
+
+
+def echoed(folder: Path) -> Recording:
+    """What ROS's tf_echo and tf2_echo print."""
+    for name, poses, order in (
+        ("robot", BASE_FROM_FLANGE, ""),
+        ("camera", CAM_FROM_TARGET, " (xyzw)"),
+    ):
+        text = ""
+        for at, row in enumerate(quaternions(poses).tolist()):
+            text += f"At time {at}.25\n- Translation: {row[:3]}\n"
+            text += f"- Rotation: in Quaternion{order} {row[3:]}\n    in RPY (radian) [0, 0, 0]\n"
+        _write(folder / f"{name}.txt", text)
+    requested = ImportOptions(mount="eye-in-hand", camera_file=folder / "camera.txt")
+    return Recording(folder / "robot.txt", requested)
+
+
+def numbered_yaml(folder: Path) -> Recording:
+    """A mapping from numbers to matrices each for the robot and for the camera."""
+    both = {"base_T_ee": BASE_FROM_FLANGE, "cam_T_board": CAM_FROM_TARGET}
+    text = ""
+    for name, poses in both.items():
+        rows = poses.reshape(-1, 16).tolist()
+        text += f"{name}:\n" + "".join(f"  '{at}': {row}\n" for at, row in enumerate(rows, 1))
+    return Recording(_write(folder / "log.yml", text), ImportOptions(mount="eye-in-hand"))
+
+
+def lettered_quaternions(folder: Path) -> Recording:
+    """Records whose names say the unit and the order of quaternions."""
+    rows = [
+        {
+            "robot": {"position_m": robot[:3], "quaternion_wxyz": [robot[6], *robot[3:6]]},
+            "target": {"position_m": target[:3], "quaternion_xyzw": target[3:]},
+        }
+        for robot, target in zip(
+            quaternions(BASE_FROM_FLANGE).tolist(),
+            quaternions(CAM_FROM_TARGET).tolist(),
+            strict=True,
+        )
+    ]
+    document = json.dumps({"samples": rows})
+    return Recording(_write(folder / "log.json", document), ImportOptions(mount="eye-in-hand"))
+
+
 def fanuc_program(folder: Path) -> Recording:
     """A listing of taught positions, each in several lines, beside the images of the stops."""
     text = '/PROG  LOOK\n/ATTR\nCOMMENT = "";\n/MN\n   1:J P[1] 100% FINE ;\n/POS\n'
@@ -433,6 +480,10 @@ RECORDINGS: Mapping[str, Callable[[Path], Recording]] = {
         rows_by_turns,
         matrices_beside,
         matrices_below,
+        matrices_in_rows,
+        echoed,
+        numbered_yaml,
+        lettered_quaternions,
         printed_lists,
         printed_matrices,
         fanuc_program,

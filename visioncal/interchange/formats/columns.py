@@ -18,6 +18,7 @@ from visioncal.core.documents import (
 )
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
+from visioncal.interchange.formats.echoed import echoed_fields
 from visioncal.interchange.formats.fields import (
     Fields,
     fields_of_arrays,
@@ -65,7 +66,7 @@ def read_fields(path: Path) -> Fields:
         return _fields_of_document(read_document(path), path)
     if suffix in PROGRAMS:
         return program_fields(path)
-    lines = pendant_fields(path) or printed_fields(path)
+    lines = pendant_fields(path) or echoed_fields(path) or printed_fields(path)
     if lines is not None:
         return lines
     table = read_table(path)
@@ -117,9 +118,12 @@ def _fields_of_document(document: object, path: Path) -> Fields:
 
 
 def _numbered(document: Mapping[str, object]) -> dict[int, dict[str, object]]:
-    """Groups matrices by the numbers that their names end with."""
+    """Groups matrices by the numbers that their names end with, or that are their names."""
     rows: dict[int, dict[str, object]] = defaultdict(dict)
     for name, value in document.items():
+        if isinstance(value, Mapping) and all(re.fullmatch("[0-9]{1,9}", str(it)) for it in value):
+            for at, it in value.items():
+                rows[int(at)][name] = it
         match = re.fullmatch(r"(.*?)[_-]?([0-9]{1,9})", name)
         # Columns of numbers may have names such as q1; a matrix is a list of lists.
         nested = isinstance(value, list) and bool(value) and isinstance(value[0], list)

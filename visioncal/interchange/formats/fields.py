@@ -297,6 +297,8 @@ def unnamed_columns(fields: Fields) -> Mapping[str, tuple[str, ...]]:
     if not names or list(fields.texts) != names:
         return {"time": (), "robot": (), "camera": ()}
     time, robot, camera = _UNNAMED.get(len(names), (0, 0, 0))
+    if _are_matrices(fields, names):
+        robot = 12
     if len(names) == 7 and set(names) == set(fields.numbers):
         last = np.stack([fields.numbers[it] for it in names[3:]])
         if (np.abs(np.linalg.norm(last, axis=0) - 1.0) > _NO_QUATERNION).all():
@@ -307,6 +309,15 @@ def unnamed_columns(fields: Fields) -> Mapping[str, tuple[str, ...]]:
         "robot": tuple(names[time : time + robot]),
         "camera": tuple(names[time + robot :]) if camera else (),
     }
+
+
+def _are_matrices(fields: Fields, names: Sequence[str]) -> bool:
+    """Whether twelve numbers are the upper three rows of matrices, and not two poses."""
+    if len(names) != 12 or set(names) != set(fields.numbers):
+        return False
+    numbers = np.stack([fields.numbers[it] for it in names], axis=1)
+    rows = numbers.reshape(-1, 3, 4)[..., :3]
+    return bool((np.abs(np.linalg.norm(rows, axis=2) - 1.0) < _NO_QUATERNION).all())
 
 
 def stamp_name(fields: Fields, taken: Collection[str]) -> str:

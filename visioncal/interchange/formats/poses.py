@@ -319,7 +319,7 @@ def _likely_rotation(
     if size == 9:
         return "matrix", ()
     if size == 4:
-        ends = "".join(it[-1].lower() for it in names)
+        ends = names[0][-4:].lower() if len(names) == 1 else "".join(it[-1].lower() for it in names)
         # ABB counts q1 to q4 from the scalar on.
         counted = [it[-2:].lower() for it in names] == ["q1", "q2", "q3", "q4"]
         rotation = f"quaternion-{'wxyz' if counted or ends == 'wxyz' else 'xyzw'}"

@@ -16,7 +16,7 @@ _UNIT = re.compile(
 )
 _POSITIONS = {"translation", "position", "pos", "tvec", "trans", "xyz", "t"}
 _ROTATIONS = {"rotation", "orientation", "quaternion", "quat", "rvec", "rotvec", "rot", "r"}
-_ROTATIONS |= {"rpy", "euler", "vector", "matrix"}
+_ROTATIONS |= {"rpy", "euler", "vector", "matrix", "xyzw", "wxyz"}
 _WHOLE = {"pose", "poses", "transform", "transforms", "t", "h", "matrix"}
 # The frame that stays and the one that is placed in it, for the robot and for the camera.
 _FRAMES = {
