@@ -240,6 +240,21 @@ def matrices_in_rows(folder: Path) -> Recording:
     return _matrices_in_files(folder, lambda poses: poses[:, :3].reshape(-1, 12))
 
 
+def rotations_first(folder: Path) -> Recording:
+    """Six numbers a row, of which the last three are a position in millimetres."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, poses in (("robot", BASE_FROM_FLANGE), ("camera", CAM_FROM_TARGET)):
+        rows = np.roll(vectors(poses) * ([1e3] * 3 + [1.0] * 3), 3, axis=1)
+        np.savetxt(folder / f"{name}.txt", rows, "%.17g")
+    requested = ImportOptions(
+        mount="eye-in-hand",
+        camera_file=folder / "camera.txt",
+        robot=PoseImportOptions(unit="mm"),
+        camera=PoseImportOptions(unit="mm"),
+    )
+    return Recording(folder / "robot.txt", requested)
+
+
 def echoed(folder: Path) -> Recording:
     """What ROS's tf_echo and tf2_echo print."""
     for name, poses, order in (
@@ -481,6 +496,7 @@ RECORDINGS: Mapping[str, Callable[[Path], Recording]] = {
         matrices_beside,
         matrices_below,
         matrices_in_rows,
+        rotations_first,
         echoed,
         numbered_yaml,
         lettered_quaternions,

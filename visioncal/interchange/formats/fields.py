@@ -21,6 +21,7 @@ _UNNAMED = {6: (0, 6, 0), 7: (0, 7, 0), 8: (1, 7, 0), 14: (0, 7, 7), 16: (0, 16,
 _UNNAMED |= {15: (1, 7, 7), 17: (1, 16, 0), 32: (0, 16, 16), 33: (1, 16, 16)}
 _LISTED = 40
 _NO_QUATERNION = 0.01
+_MOST_DEG = 360.5
 # Counts of rows are whole and small; seconds of an epoch are not.
 _LARGEST_COUNT = 1e6
 # What stands before the poses of each where they are in rows by turns.
@@ -304,11 +305,22 @@ def unnamed_columns(fields: Fields) -> Mapping[str, tuple[str, ...]]:
         if (np.abs(np.linalg.norm(last, axis=0) - 1.0) > _NO_QUATERNION).all():
             # A number or a time, and a position with three angles.
             time, robot = 1, 6
+    pose = names[time : time + robot]
+    if robot == 6 and _are_rotations_first(fields, pose):
+        pose = pose[3:] + pose[:3]
     return {
         "time": tuple(names[:time]),
-        "robot": tuple(names[time : time + robot]),
+        "robot": tuple(pose),
         "camera": tuple(names[time + robot :]) if camera else (),
     }
+
+
+def _are_rotations_first(fields: Fields, names: Sequence[str]) -> bool:
+    """Whether the last three of six numbers are no angles, even in degrees; the first may be."""
+    if not set(names) <= set(fields.numbers):
+        return False
+    first, last = np.abs([fields.numbers[it] for it in names]).reshape(2, -1)
+    return bool(np.nanmax(first) <= _MOST_DEG < np.nanmax(last))
 
 
 def _are_matrices(fields: Fields, names: Sequence[str]) -> bool:
