@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
@@ -102,18 +103,40 @@ class Solved:
         """The observations that the fit was made from."""
         return self.agreed.problem.subset(self.agreed.used)
 
+    @property
+    def side(self) -> FramesSide:
+        """The frames' side of the joint fit."""
+        problem, views = self.agreed.problem, [it.view for it in self.cell.rows]
+        used, noise = self.agreed.used, self.agreed.fit.noise
+        return FramesSide(problem, used, views, self.arms, self.late, noise)
+
+    @property
+    def frames(self) -> dict[str, FloatArray]:
+        """Where the unknown frames are."""
+        return dict(zip(self.agreed.problem.unknown, self.agreed.fit.state.edges, strict=True))
+
+    def posed(self) -> Self:
+        """The same with the robots' poses by their arms."""
+        poses = {name: it.poses for name, it in self.arms.items()}
+        problem = self.agreed.problem
+        problem = replace(problem, poses={**problem.poses, **poses})
+        return replace(self, agreed=replace(self.agreed, problem=problem))
+
+    def settled(self, side: FramesSide, fitted: Fitted) -> Self:
+        """The same as lenses, boards and frames were fitted with a side."""
+        agreed = replace(self.agreed, problem=side.whole(fitted.seen), fit=fitted.fit)
+        return replace(self, agreed=agreed, seen=fitted.seen, arms=side.arms)
+
     def found_of_looks(self, covariance: FloatArray) -> Iterator[Finding]:
         """Says what was found of lenses and boards; see `stages.fit_messages`."""
         if self.seen is not None:
-            part = self.agreed.problem.subset(self.agreed.used)
-            side = _side(self.cell, self.agreed, self.arms, self.late)
-            fitted = Fitted(self.seen, part, self.agreed.fit)
+            fitted = Fitted(self.seen, self.part, self.agreed.fit)
             arms, stated = self.arms.values(), None
             if any(it.model is not None for it in arms):
-                stated = part
+                stated = self.part
                 for arm in arms:
                     stated = arm.without_errors(stated)
-            yield from found_of_looks(side, fitted, covariance, stated)
+            yield from found_of_looks(self.side, fitted, covariance, stated)
 
     @property
     def shown_px(self) -> dict[str, float]:
@@ -202,36 +225,34 @@ def solve(
     else:
         agreed, sizes = _agree(cell, problem, state)
     late = clock_effects(cell, looked.clocks)
-    fitted = _agreeing_looks(cell, looked, views, agreed, arms, late, sizes)
-    if turned := {} if looked.is_misread else _turned_images(cell, views, fitted[0], fitted[1]):
+    untied, poses = (*lost, *unplaced), tuple(views)
+    start = Solved(cell, agreed, None, poses, untied, arms, asked, late, looked.turned)
+    found = _agreeing_looks(start, looked, sizes)
+    if turned := {} if looked.is_misread else _turned_images(found):
         # Their corners would pass for a lens that changes from view to view.
         looked = replace(looked, turned=turned)
-        fitted = _agreeing_looks(cell, looked, views, agreed, arms, late, sizes)
-    agreed, seen, arms = fitted
-    arms = with_drifts(arms, agreed.problem.subset(agreed.used), agreed.fit, asked)
-    if any(it.drift is not None for it in arms.values()):
-        agreed, seen, arms = _agreeing_looks(cell, looked, views, agreed, arms, late, sizes)
-    agreed = _levelled(cell, views, agreed)
+        found = _agreeing_looks(replace(start, turned=turned), looked, sizes)
+    found = replace(found, arms=with_drifts(found.arms, found.part, found.agreed.fit, asked))
+    if any(it.drift is not None for it in found.arms.values()):
+        found = _agreeing_looks(found, looked, sizes)
+    found = replace(found, agreed=_levelled(cell, views, found.agreed))
     # Poses that are misread say nothing of the arm, nor which views are outliers.
     for _ in range(0 if looked.is_misread else _ROUNDS):
         if asked != "hand-eye":
-            arms = _levels(cell, agreed, arms, asked)
+            arms = _levels(found)
             erring = [name for name, it in arms.items() if it.frees_errors()]
             late = clock_effects(cell, looked.clocks, erring)
-            agreed, seen, arms = _at_rest(cell, agreed, seen, arms, late)
-        before = agreed.used
-        agreed = _settle(cell, agreed)
-        agreed = _without_misreported(agreed, arms, before)
-        agreed, seen, arms = _at_rest(cell, agreed, seen, arms, late)
+            found = _at_rest(replace(found, arms=arms, late=late))
+        before = found.agreed.used
+        agreed = _without_misreported(_settle(cell, found.agreed), found.arms, before)
+        found = _at_rest(replace(found, agreed=agreed))
         # What agrees by now has a say in how far the arms are calibrated.
-        if np.array_equal(before, agreed.used):
+        if np.array_equal(before, found.agreed.used):
             break
     if asked != "hand-eye" and not looked.is_misread:
-        agreed, seen, arms = _with_functions(cell, agreed, seen, arms, late, asked)
-    agreed = _with_repeats(agreed)
-    arms = with_pose_errors(arms, agreed.problem.subset(agreed.used), agreed.fit)
-    untied = (*lost, *unplaced)
-    found = Solved(cell, agreed, seen, tuple(views), untied, arms, asked, late, looked.turned)
+        found = _with_functions(found)
+    found = replace(found, agreed=_with_repeats(found.agreed))
+    found = replace(found, arms=with_pose_errors(found.arms, found.part, found.agreed.fit))
     return found if solver == "joint" else _by_closed_form(found, solver)
 
 
@@ -316,42 +337,33 @@ def _by_closed_form(solved: Solved, solver: str) -> Solved:
     return replace(solved, agreed=replace(agreed, fit=Solution(state, noise)), solver=solver)
 
 
-def _agreeing_looks(
-    cell: Cell,
-    looked: Observed,
-    views: Sequence[ViewPoses],
-    agreed: Agreed,
-    arms: Mapping[str, RobotArm],
-    late: Sequence[Effect],
-    sizes: Mapping[str, float],
-) -> tuple[Agreed, LinearisedCorners | None, Mapping[str, RobotArm]]:
+def _agreeing_looks(start: Solved, looked: Observed, sizes: Mapping[str, float]) -> Solved:
     """Fits lenses, boards and frames, until the same observations agree under them."""
     # In a whole cell, what moved must not be taken for a wrong view: there it is left to the end,
     # when the arms are calibrated.
-    levels: Mapping[str, LensLevels] = {}
+    found, levels = start, dict[str, LensLevels]()
     for _ in range(_ROUNDS):
-        agreed, seen, fitted = _with_looks(cell, looked, views, agreed, arms, late, levels, sizes)
-        levels = {} if seen is None else seen.looks.levels
-        if cell.mount is None or looked.is_misread:
+        found = _with_looks(replace(found, arms=start.arms), looked, levels, sizes)
+        levels = {} if found.seen is None else dict(found.seen.looks.levels)
+        if found.cell.mount is None or looked.is_misread:
             break
-        before, agreed = agreed.used, settle(agreed)
-        if np.array_equal(before, agreed.used):
+        before = found.agreed.used
+        found = replace(found, agreed=settle(found.agreed))
+        if np.array_equal(before, found.agreed.used):
             break
-    return agreed, seen, fitted
+    return found
 
 
-def _turned_images(
-    cell: Cell, views: Sequence[ViewPoses], agreed: Agreed, seen: LinearisedCorners | None
-) -> dict[int, Turned]:
+def _turned_images(fit: Solved) -> dict[int, Turned]:
     """How images of views that disagree were turned or mirrored, by view."""
-    fit = Solved(cell, agreed, seen, tuple(views), (), {}, "", ())
+    agreed = fit.agreed
     looks, state, problem = fit.looks, agreed.fit.state, agreed.problem
     if looks is None or agreed.used.all():
         return {}
     typical_px = float(np.nanmedian(fit.chain_px(np.flatnonzero(agreed.used), state)))
     predicted, found = problem.predicted(state), {}
     for at in np.flatnonzero(~agreed.used).tolist():
-        seer, view = cell.rows[at].seer, views[at]
+        seer, view = fit.cell.rows[at].seer, fit.poses[at]
         if view.corners is None or seer not in looks.problems:
             continue
         camera = looks.camera(seer)
@@ -363,128 +375,90 @@ def _turned_images(
 
 
 def _with_looks(
-    cell: Cell,
-    looked: Observed,
-    views: Sequence[ViewPoses],
-    agreed: Agreed,
-    arms: Mapping[str, RobotArm],
-    late: Sequence[Effect],
-    levels: Mapping[str, LensLevels],
-    sizes: Mapping[str, float],
-) -> tuple[Agreed, LinearisedCorners | None, Mapping[str, RobotArm]]:
+    found: Solved, looked: Observed, levels: Mapping[str, LensLevels], sizes: Mapping[str, float]
+) -> Solved:
     """Fits lenses, boards and frames, with errors of the arms sought anew beside their drift."""
-    arms = {name: it.erring(None) for name, it in arms.items()}
-    poses = {**agreed.problem.poses, **{name: it.poses for name, it in arms.items()}}
-    agreed = replace(agreed, problem=replace(agreed.problem, poses=poses))
-    if looked.scenes and not agreed.problem.is_combined:
-        side = _side(cell, agreed, arms, late)
-        looks = side.looks(looked.scenes, _views_by_camera(looked, views)).with_levels(levels)
+    found = replace(found, arms={name: it.erring(None) for name, it in found.arms.items()}).posed()
+    if looked.scenes and not found.agreed.problem.is_combined:
+        side, frames = found.side, found.frames
+        views = _views_by_camera(looked, found.poses)
+        looks = side.looks(looked.scenes, views).with_levels(levels)
         if looked.is_misread:
-            fitted = settle_looks(looks, side, looks.first, _frames(agreed))
-            return _settled(agreed, side, fitted), fitted.seen, side.arms
+            return found.settled(side, settle_looks(looks, side, looks.first, frames))
         try:
-            fitted, side = refined(side, looks, _frames(agreed))
+            fitted, side = refined(side, looks, frames)
         except ConvergenceError:
             names = next(iter(looked.scenes.values())).names
-            frames = [frame_name("target", it) for it in names]
-            found = {it: sizes.get(frames[it], 0.0) for it in looks.printed}
-            far = {board: size for board, size in found.items() if abs(size) > _FAR_SIZE}
+            targets = [frame_name("target", it) for it in names]
+            other = {it: sizes.get(targets[it], 0.0) for it in looks.printed}
+            far = {board: size for board, size in other.items() if abs(size) > _FAR_SIZE}
             if not far:
                 raise
-            fitted, side = refined(side, looks.with_sizes(far), _frames(agreed))
-        return _settled(agreed, side, fitted), fitted.seen, side.arms
-    drifts = tuple(effects_of(arms))
-    agreed = _with_effects(agreed, drifts) if drifts else agreed
-    arms = with_errors(arms, agreed.problem.subset(agreed.used), agreed.fit)
-    others = (*late, *effects_of(arms))
-    return _with_effects(agreed, others) if others else agreed, None, arms
+            fitted, side = refined(side, looks.with_sizes(far), frames)
+        return found.settled(side, fitted)
+    found = replace(found, seen=None)
+    if drifts := tuple(effects_of(found.arms)):
+        found = replace(found, agreed=_with_effects(found.agreed, drifts))
+    found = replace(found, arms=with_errors(found.arms, found.part, found.agreed.fit))
+    others = (*found.late, *effects_of(found.arms))
+    return replace(found, agreed=_with_effects(found.agreed, others)) if others else found
 
 
-def _levels(
-    cell: Cell, agreed: Agreed, arms: Mapping[str, RobotArm], asked: str
-) -> dict[str, RobotArm]:
+def _levels(found: Solved) -> dict[str, RobotArm]:
     """Chooses how far each arm is calibrated, beside the errors of the others."""
-    problem, chosen = agreed.problem.subset(agreed.used), dict(arms)
-    views = [cell.rows[it].view for it in np.flatnonzero(agreed.used)]
-    for name, arm in arms.items():
+    problem, chosen, fit = found.part, dict(found.arms), found.agreed.fit
+    views = [found.cell.rows[it].view for it in np.flatnonzero(found.agreed.used)]
+    for name, arm in found.arms.items():
         stated = arm.without_errors(problem)
-        start = State(agreed.fit.state.edges, stated.start_values)
-        chosen[name] = arm.with_level(stated, start, asked, views, agreed.fit.noise)
+        start = State(fit.state.edges, stated.start_values)
+        chosen[name] = arm.with_level(stated, start, found.asked, views, fit.noise)
         problem = chosen[name].put_into(problem)
     return chosen
 
 
-def _with_functions(
-    cell: Cell,
-    agreed: Agreed,
-    seen: LinearisedCorners | None,
-    arms: Mapping[str, RobotArm],
-    late: Sequence[Effect],
-    asked: str,
-) -> tuple[Agreed, LinearisedCorners | None, Mapping[str, RobotArm]]:
-    """Fits with functions of the joints of each arm that has any, beside the errors of the others.
-
-    What agrees is known by then: their many values would make each look for outliers slow. They
-    explain much of what a joint does that slipped: where that alone explains more, there are none.
-    """
-    part, found = agreed.problem.subset(agreed.used), dict(arms)
+def _with_functions(found: Solved) -> Solved:
+    """Fits with functions of the joints of each arm that has any, beside the errors of others."""
+    # What agrees is known by then: their many values would make each look for outliers slow. They
+    # explain much of what a joint does that slipped: where that alone explains more, there are
+    # none.
+    part, fit, wider = found.part, found.agreed.fit, dict(found.arms)
     problem = part
-    for name, arm in arms.items():
+    for name, arm in found.arms.items():
         stated = arm.without_errors(problem)
-        start = State(agreed.fit.state.edges, stated.start_values)
-        wider = arm.with_functions(stated, start, asked, agreed.fit.noise)
-        if wider.gain_of_functions:
-            slip = slipped_joint(part, agreed.fit, joint_offsets({name: arm}))
-            if slip and log_gain(part, agreed.fit, slip.mahalanobis_sq) > wider.gain_of_functions:
+        start = State(fit.state.edges, stated.start_values)
+        more = arm.with_functions(stated, start, found.asked, fit.noise)
+        if more.gain_of_functions:
+            slip = slipped_joint(part, fit, joint_offsets({name: arm}))
+            if slip and log_gain(part, fit, slip.mahalanobis_sq) > more.gain_of_functions:
                 continue
-        found[name] = wider
-        problem = wider.put_into(problem)
-    if all(found[name] is arm for name, arm in arms.items()):
-        return agreed, seen, arms
-    return _at_rest(cell, agreed, seen, found, late)
+        wider[name] = more
+        problem = more.put_into(problem)
+    if all(wider[name] is arm for name, arm in found.arms.items()):
+        return found
+    return _at_rest(replace(found, arms=wider))
 
 
-def _at_rest(
-    cell: Cell,
-    agreed: Agreed,
-    seen: LinearisedCorners | None,
-    arms: Mapping[str, RobotArm],
-    late: Sequence[Effect],
-) -> tuple[Agreed, LinearisedCorners | None, Mapping[str, RobotArm]]:
+def _at_rest(found: Solved) -> Solved:
     """Fits with calibrated arms that are linearised anew until they stay."""
-    for turn in range(_ROUNDS if any(it.model is not None for it in arms.values()) else 0):
-        poses = {**agreed.problem.poses, **{name: it.poses for name, it in arms.items()}}
-        agreed = replace(agreed, problem=replace(agreed.problem, poses=poses))
-        if seen is None:
-            agreed = _with_effects(agreed, (*late, *effects_of(arms)))
+    is_modelled = any(it.model is not None for it in found.arms.values())
+    for turn in range(_ROUNDS if is_modelled else 0):
+        found = found.posed()
+        if found.seen is None:
+            others = (*found.late, *effects_of(found.arms))
+            found = replace(found, agreed=_with_effects(found.agreed, others))
         else:
-            side = _side(cell, agreed, arms, late)
-            fitted = settle_looks(seen.looks, side, seen.moving, _frames(agreed))
+            side, seen = found.side, found.seen
+            fitted = settle_looks(seen.looks, side, seen.moving, found.frames)
             if turn == 0:  # What the arm did wrong may have passed for the lens's doing.
                 looks = fitted.looks.with_levels(lens_levels(side, fitted))
                 fitted = settle_looks(looks, side, fitted.moving, fitted.frames, fitted.others)
-            agreed, seen = _settled(agreed, side, fitted), fitted.seen
-        moved = {name: it.moved(agreed.problem, agreed.fit.state) for name, it in arms.items()}
-        arms = {name: arm for name, (arm, _) in moved.items()}
+            found = found.settled(side, fitted)
+        problem, state = found.agreed.problem, found.agreed.fit.state
+        moved = {name: it.moved(problem, state) for name, it in found.arms.items()}
+        found = replace(found, arms={name: arm for name, (arm, _) in moved.items()})
         if max(step for _, step in moved.values()) < _AT_REST_RAD:
             break
-    return agreed, seen, arms
-
-
-def _side(
-    cell: Cell, agreed: Agreed, arms: Mapping[str, RobotArm], late: Sequence[Effect]
-) -> FramesSide:
-    views = [it.view for it in cell.rows]
-    return FramesSide(agreed.problem, agreed.used, views, arms, late, agreed.fit.noise)
-
-
-def _frames(agreed: Agreed) -> dict[str, FloatArray]:
-    """Where the unknown frames are."""
-    return dict(zip(agreed.problem.unknown, agreed.fit.state.edges, strict=True))
-
-
-def _settled(agreed: Agreed, side: FramesSide, fitted: Fitted) -> Agreed:
-    return replace(agreed, problem=side.whole(fitted.seen), fit=fitted.fit)
+    return found
 
 
 def _views_by_camera(looked: Observed, views: Sequence[ViewPoses]) -> dict[str, list[ViewPoses]]:
