@@ -149,6 +149,22 @@ def test_another_board_is_named_though_blurred(shown, sigma_px, words):
     assert f"than declared: {words}" in found.words
 
 
+@pytest.mark.parametrize(
+    ("declared", "words"),
+    [
+        (circles(9, 5, asymmetric=True), "an asymmetric grid of 9 x 5 circles"),
+        (circles(5, 9), "a symmetric grid of 5 x 9 circles"),
+    ],
+)
+def test_the_declared_grid_is_described_as_the_seen_one_is(declared, words):
+    image, _ = photograph(circles(5, 9, asymmetric=True), Shot(square_px=28))
+    image = np.pad(image, 20, mode="edge")
+    session = Session.from_arrays([image] * 3, np.tile(np.eye(4), (3, 1, 1)), declared)
+    said = visioncal.doctor(session).findings[0].words
+    assert "an asymmetric grid of 5 x 9 circles" in said
+    assert f"is {words}." in said
+
+
 @pytest.mark.parametrize("name", NAMED)
 def test_what_is_wrong_is_named_first(tmp_path, monkeypatch, name):
     folder = broken_session(tmp_path / "session", BROKEN[name])

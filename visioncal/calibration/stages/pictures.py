@@ -277,7 +277,7 @@ def _another(view: View, found: Identity, declared: Target) -> Finding:
     words = (
         "The images show another board than declared: "
         f"{_article(describe(found))} (view {view.number}), "
-        f"and {declared.name} is a {_declared(declared)}.{_miscounted(found, declared)}"
+        f"and {declared.name} is {_article(_declared(declared))}.{_miscounted(found, declared)}"
     )
     return Finding("other_board", words, step, (view.number,))
 
@@ -362,6 +362,12 @@ def _declared(target: Target) -> str:
         return f"ChArUco board of {size}, {target.dictionary}{layout}"
     if target.kind == "marker":
         return f"marker {target.marker_id} of {target.dictionary}"
+    if target.kind == "circles":
+        layout = "asymmetric" if target.asymmetric else "symmetric"
+        return f"{layout} grid of {target.columns} x {target.rows} circles"
+    if target.kind == "aprilgrid":
+        size = f"{target.columns} x {target.rows} tags"
+        return f"AprilGrid of {size}, {target.dictionary} from id {target.marker_id}"
     return f"target of kind {target.kind}"
 
 
