@@ -3,16 +3,15 @@
 A step is one file in `calibration.stages`, or a few lines here that hand it what it needs.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 from visioncal.calibration.pipeline.answer import answer_of
 from visioncal.calibration.pipeline.judging import check_answer, findings_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.solving import solve
-from visioncal.calibration.pipeline.unused_facts import not_used
 from visioncal.calibration.stages.cameras import detect_targets, estimate_lenses, locate_targets
-from visioncal.calibration.stages.cell import read_cell
+from visioncal.calibration.stages.cell import pair_edges, read_cell
 from visioncal.calibration.stages.clocks import set_clocks, waits_for_clock
 from visioncal.calibration.stages.judge import judge
 from visioncal.calibration.stages.kinematics import check_asked
@@ -55,12 +54,36 @@ def _read_robot(known: RunState) -> RunState:
             "dynamics identify.",
         )
     said = map(_suspicious, session.warnings)
-    known = known.noting((), (*pairing(session), *said, *not_used(known)))
+    known = known.noting((), (*pairing(session), *said, *_not_used(known)))
     known = replace(known, notes=(*known.notes, *session.declaration.corrected))
     if len(known.held_back) == len(session.views):
         raise all_held_back(known)
     # Views that have a time alone get their poses once the camera's are known.
     return known if waits_for_clock(session) else _reported(known)
+
+
+def _not_used(known: RunState) -> Iterator[Finding]:
+    """Says what of a session no stage can use."""
+    session = known.session
+    if known.mount is None:
+        return
+    names = pair_edges(session)
+    for edge in session.declaration.prior:
+        is_used = edge in names or session.declaration.has_names
+        if is_used and known.solver == "joint":
+            continue
+        reason = f"what is unknown of this session is {' and '.join(names)}"
+        if known.solver != "joint":
+            reason = f"the closed form {known.solver} cannot"
+        yield Finding("unused", f"[prior.{edge}] was not used: {reason}.")
+    readings = sum(view.reading_m is not None for view in session.views)
+    if readings and session.mount != "instrument":
+        yield Finding(
+            "unused",
+            f"{readings} rows have an instrument's readings (meas_ columns), which were not used: "
+            "where images or measured poses (cft_ columns) are there, these are. A session with "
+            "the readings alone calibrates the arm by the instrument.",
+        )
 
 
 def _suspicious(warning: str) -> Finding:
