@@ -222,14 +222,43 @@ def test_numbers_of_rows_are_no_times(table, step, timed):
     assert any("Column 1 is taken for times" in it for it in foreign.notes) == timed
 
 
-def test_joints_in_degrees_are_no_radians(tmp_path):
+def test_joints_too_large_for_radians_are_taken_for_degrees(tmp_path):
+    degrees = np.array([[168.0, 3.0 * at] for at in range(len(BASE_FROM_FLANGE))])
     rows = [
-        {"joints": [168.0, 3.0 * at], "robot": it.tolist()}
-        for at, it in enumerate(BASE_FROM_FLANGE)
+        {"joints": them, "robot": it.tolist()}
+        for them, it in zip(degrees.tolist(), BASE_FROM_FLANGE, strict=True)
     ]
     (tmp_path / "log.json").write_text(json.dumps(rows))
-    with pytest.raises(DataError, match=r"up to 168 are no radians.*--joint-unit deg"):
-        read_foreign(tmp_path / "log.json", SEEN)
+    found = read_foreign(tmp_path / "log.json", ImportOptions(mount="eye-in-hand"))
+    assert "Joint angles up to 168 are no radians, and are taken for degrees." in found.notes
+    np.testing.assert_allclose(found.joints_rad, np.deg2rad(degrees))
+
+
+@pytest.mark.parametrize(
+    ("name", "count", "degrees"),
+    [
+        ("J{}", 6, False),
+        ("joint_{}_deg", 5, True),
+        ("a{} [deg]", 6, True),
+        ("joint_positions_degrees", 0, True),
+        # They may as well be a quaternion.
+        ("q{}", 4, None),
+    ],
+)
+def test_joints_are_known_by_their_names(tmp_path, name, count, degrees):
+    joints = np.linspace(-0.5, 0.7, len(BASE_FROM_FLANGE) * 6).reshape(-1, 6)[:, : count or 6]
+    written = (np.rad2deg(joints) if degrees else joints).tolist()
+    names = [name.format(at) for at in range(1, count + 1)]
+    rows = [
+        {**(dict(zip(names, them, strict=True)) if count else {name: them}), "robot": pose}
+        for them, pose in zip(written, BASE_FROM_FLANGE.tolist(), strict=True)
+    ]
+    (tmp_path / "log.json").write_text(json.dumps(rows))
+    found = read_foreign(tmp_path / "log.json", ImportOptions(mount="eye-in-hand")).joints_rad
+    if degrees is None:
+        assert found is None
+    else:
+        np.testing.assert_allclose(found, joints)
 
 
 def test_a_robots_model_is_checked_before_anything_is_written(tmp_path, logged):

@@ -34,15 +34,13 @@ from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.pairing import with_camera_file
 from visioncal.interchange.formats.pendants import PROGRAMS, pendant_fields, program_fields
 from visioncal.interchange.formats.poses import (
-    JOINT_KEYS,
+    joint_names,
     joints_from,
-    known_names,
     pose_names,
     poses_from,
 )
 from visioncal.interchange.formats.printed import printed_fields
 from visioncal.interchange.formats.streams import in_seconds
-from visioncal.session.columns import joint_columns
 
 DOCUMENTS = (".json", ".yaml", ".yml", ".xml")
 ENDINGS = (".csv", ".tsv", ".txt", ".log", ".npz", ".npy", *DOCUMENTS, *PROGRAMS)
@@ -174,9 +172,9 @@ def foreign_from(
     used.update(robot_names)
     camera_names = pose_names(fields, requested.camera.names, unnamed["camera"], "camera", used)
     used.update(camera_names)
-    joint_names = requested.joints or _joint_names(fields, used)
-    used.update(joint_names)
-    if not robot_names and not joint_names:
+    of_joints = requested.joints or joint_names(fields, used)
+    used.update(of_joints)
+    if not robot_names and not of_joints:
         raise DataError(
             f"{fields.name}: which of its fields are the robot's poses is not known; it has "
             f"{fields.listing()}.",
@@ -189,6 +187,10 @@ def foreign_from(
         robot, notes = poses_from(fields, robot_names, requested.robot, "robot")
     if camera_names:
         camera, more = poses_from(fields, camera_names, requested.camera, "camera")
+        notes = (*notes, *more)
+    joints = None
+    if of_joints:
+        joints, more = joints_from(fields, of_joints, degrees=requested.joints_deg)
         notes = (*notes, *more)
     # The coordinates of a field that is taken.
     used |= {it for it in fields.texts if it.rpartition(".")[0] in used}
@@ -204,9 +206,7 @@ def foreign_from(
         robot=robot,
         camera=camera,
         images=paths,
-        joints_rad=joints_from(fields, joint_names, degrees=requested.joints_deg)
-        if joint_names
-        else None,
+        joints_rad=joints,
         stamps_s=in_seconds(fields.column(stamps)[:, 0]) if stamps else None,
         views=fields.views or view_numbers(fields),
         columns={it: cells for it, cells in fields.texts.items() if it not in used | {image_name}},
@@ -236,11 +236,6 @@ def view_numbers(fields: Fields) -> tuple[int, ...]:
     cells = fields.texts.get("view", ())
     whole = all(it.isascii() and it.isdecimal() and len(it) < 10 for it in cells)
     return tuple(int(it) for it in cells) if whole and len(set(cells)) == len(cells) else ()
-
-
-def _joint_names(fields: Fields, taken: Collection[str]) -> tuple[str, ...]:
-    ours = joint_columns(tuple(fields.numbers))
-    return ours or known_names(fields, [(it,) for it in JOINT_KEYS], taken)
 
 
 def _images(

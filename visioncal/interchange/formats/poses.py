@@ -1,7 +1,7 @@
 """Poses, joints and images out of named fields."""
 
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.fields import Fields
 from visioncal.interchange.formats.import_options import PoseImportOptions
 from visioncal.interchange.formats.worded import ANGLE_UNITS, without_unit, worded_poses
-from visioncal.session.columns import SELECTORS
+from visioncal.session.columns import SELECTORS, joint_columns
 
 # Names under which pose pairs are commonly stored, the most specific first.
 ROBOT_KEYS: tuple[tuple[str, ...], ...] = (
@@ -61,6 +61,13 @@ JOINT_KEYS: tuple[str, ...] = ("joint_pose", "joints", "joint_angles", "joint_po
 # A turn, and what rounding adds; joints may count some turns.
 _MOST_RAD = 2 * np.pi + 0.01
 _MOST_TURNS_RAD = 10 * 2 * np.pi
+
+_JOINT_NAME = re.compile(
+    r"(?:.*\.)?(joint|axis|j|a|q)[ _]?([1-9])((?:[ _]?(?:pos|position|angle))?(?:[ _]*\W*"
+    r"(?:deg|rad)[a-z]*\W*)?)",
+    re.IGNORECASE,
+)
+_LEAST_JOINTS = 5
 
 _ROTATION_NAME = re.compile(r"rvec|rot|quat|orient|rpy|euler|(^|\.)R(_|$)")
 _ANGLES_NAME = re.compile(r"rpy|roll|euler")
@@ -175,7 +182,7 @@ def poses_from(
         )
     units = {without_unit(it)[1] for it in names}
     rotation, notes = _likely_rotation(
-        rotations.shape[1], turned, requested, whose, degrees="deg" in units
+        rotations.shape[1], turned, requested, whose, degrees=bool(units & {"deg", "degrees"})
     )
     numbers = PoseNumbers(positions, rotations, Reading(rotation), places)
     lengths = units - {"", *ANGLE_UNITS}
@@ -196,27 +203,54 @@ def _with_own_form(fields: Fields, requested: PoseImportOptions) -> PoseImportOp
     return replace(requested, form=fields.form)
 
 
-def joints_from(fields: Fields, names: Sequence[str], *, degrees: bool) -> FloatArray:
-    """Takes joint angles out of fields.
+def joint_names(fields: Fields, taken: Collection[str]) -> tuple[str, ...]:
+    """Finds the fields of joint angles: a list of them, or one a joint that counts from one."""
+    if whole := joint_columns(tuple(fields.numbers)):
+        return whole
+    if listed := known_names(fields, [(it,) for it in JOINT_KEYS], taken):
+        return listed
+    counted: dict[tuple[str, ...], dict[int, str]] = defaultdict(dict)
+    for name, numbers in fields.numbers.items():
+        match = _JOINT_NAME.fullmatch(name)
+        is_whole = numbers.ndim == 1 and bool(np.isfinite(numbers).all())
+        if match and is_whole and name not in taken:
+            counted[match.group(1, 3)][int(match[2])] = name
+    for them in counted.values():
+        # Four numbers q1 ... may be a quaternion.
+        if len(them) >= _LEAST_JOINTS and [*them] == [*range(1, len(them) + 1)]:
+            return tuple(them.values())
+    return ()
+
+
+def joints_from(
+    fields: Fields, names: Sequence[str], *, degrees: bool
+) -> tuple[FloatArray, tuple[str, ...]]:
+    """Takes joint angles out of fields, in degrees where they or their names say so.
 
     Returns:
-        (n, j) angles [rad].
+        (n, j) angles [rad], and what was assumed of them.
 
     Raises:
-        DataError: There are no such fields, or a row lacks some.
+        DataError: There are no such fields, a row lacks some, or they are no radians as named.
     """
     joints = np.hstack([fields.column(it) for it in names])
     bad = ~np.isfinite(joints).all(axis=1)
     if bad.any():
         place = fields.places[int(np.argmax(bad))]
         raise DataError(f"{place}: a joint angle is missing or infinite.", culprits=[place])
-    if not degrees and np.abs(joints).max(initial=0.0) > _MOST_TURNS_RAD:
-        raise DataError(
-            f"{fields.name}: joint angles up to {np.abs(joints).max():.0f} are no radians.",
-            culprits=list(names),
-            next_step="Say --joint-unit deg.",
-        )
-    return np.deg2rad(joints) if degrees else joints
+    ends = [it.rsplit(".", 1)[-1].lower() for it in names]
+    if degrees or all("deg" in it for it in ends):
+        return np.deg2rad(joints), ()
+    if (largest := np.abs(joints).max(initial=0.0)) > _MOST_TURNS_RAD:
+        words = f"Joint angles up to {largest:.0f} are no radians"
+        if any("rad" in it for it in ends):
+            raise DataError(
+                f"{fields.name}: {words.lower()}.",
+                culprits=list(names),
+                next_step="Say --joint-unit deg.",
+            )
+        return np.deg2rad(joints), (f"{words}, and are taken for degrees.",)
+    return joints, ()
 
 
 def check_radians(
