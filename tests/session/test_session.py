@@ -300,10 +300,12 @@ def test_what_the_task_needs_is_read_and_can_be_asked_otherwise(
     assert plain.digest() == asked.digest()
 
 
-@pytest.mark.parametrize("mm", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_need_of_nothing_is_refused(folder: Path, mm: float) -> None:
-    with pytest.raises(DataError, match="a number above 0 is needed"):
-        Session.load(folder).needing(mm)
+@pytest.mark.parametrize("name", ["mm", "deg"])
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_need_of_nothing_is_refused(folder: Path, value: float, name: str) -> None:
+    with pytest.raises(DataError, match="a number above 0 is needed") as caught:
+        Session.load(folder).needing(**{name: value})
+    assert f"--need-{name} 0.5" in caught.value.next_step
 
 
 def test_the_digest_sees_facts_and_not_their_spelling(folder: Path, tmp_path: Path) -> None:

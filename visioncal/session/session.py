@@ -319,7 +319,7 @@ class Session:
                 raise DataError(
                     f"the need in {name} is {value!r}; a number above 0 is needed.",
                     culprits=[f"--need-{name}"],
-                    next_step="Give how near picks have to come, as --need-mm 0.5.",
+                    next_step=f"Give how near picks have to come, as --need-{name} 0.5.",
                 )
         if not asked:
             return self
