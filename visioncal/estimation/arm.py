@@ -138,7 +138,8 @@ def find_arm_errors(
         of_links: Whether it is of this arm's links.
 
     Returns:
-        The errors; None where white noise explains the residuals about as well.
+        The errors; None where white noise explains the residuals about as well: of links, where it
+        does so at least as well.
     """
     # An arm whose links all look like its frames, as one with parallel axes, has no columns.
     stops, size = likelihood.stops[(likelihood.members == robot).any(axis=1)], basis.shape[2]
@@ -146,9 +147,11 @@ def find_arm_errors(
         return None
     levels, unlikely = likelihood.white
     widened = likelihood.beside(robot, basis)
-    sigma, value = _most_likely_size(widened, size, levels, unlikely - 0.5 * _LIKELY)
+    # Every arm's links err: their size counts however little noise alone is less likely.
+    least = 0.0 if of_links else _LIKELY
+    sigma, value = _most_likely_size(widened, size, levels, unlikely - 0.5 * least)
     gain = 2.0 * (unlikely - value)
-    return ArmErrors(basis, sigma, gain, of_links) if gain > _LIKELY else None
+    return ArmErrors(basis, sigma, gain, of_links) if gain > least else None
 
 
 def _most_likely_size(

@@ -163,7 +163,8 @@ def begin(
         arm.joints_rad,
         begun.noise,
         int(first_corners(targets)[begun.board]),
-        arm.errors if arm.is_modelled else None,
+        # Of few stops, sizes of errors that noise alone explains are mostly chance.
+        arm.errors if arm.is_modelled and arm.errors and arm.errors.is_likely else None,
         max((it.factor for it in alike if it is not None and it.is_significant), default=1.0),
         _beside_noise(known, begun),
         _held_pull(known, begun.problem),
