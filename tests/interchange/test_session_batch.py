@@ -130,8 +130,9 @@ def test_sessions_are_found_and_named(fleet, tmp_path):
     assert only.name == "week_0"
     (missing,) = jobs_of([tmp_path / "missing"], tmp_path, Options())
     assert missing.name == "missing"
-    with pytest.raises(DataError, match="there is no session"):
-        jobs_of([str(tmp_path / "*" / "none_*")], tmp_path, Options())
+    for others in ([], [fleet / "robot_0"]):
+        with pytest.raises(DataError, match=r"none_\*: there is no session"):
+            jobs_of([*others, str(tmp_path / "*" / "none_*")], tmp_path, Options())
     (tmp_path / "both").mkdir()
     (tmp_path / "both.rrd").touch()
     with pytest.raises(DataError, match="two sessions are called both"):

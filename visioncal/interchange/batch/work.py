@@ -72,16 +72,17 @@ def jobs_of(sessions: Iterable[Path | str], out: Path, options: Options) -> list
         The jobs. Names are paths below the folder that all sessions share.
 
     Raises:
-        DataError: There are no sessions, or two would have one name.
+        DataError: There are no sessions, a glob finds none, or two would have one name.
     """
-    given = [str(it) for it in sessions]
+    given = {str(it): [*_named(str(it))] for it in sessions}
+    empty = [name for name, found in given.items() if not found]
     paths = sorted(
-        {it.absolute() for one in given for it in _named(one)},
+        {it.absolute() for found in given.values() for it in found},
         key=lambda it: [natural(Path(part)) for part in it.parts],
     )
-    if not paths:
+    if empty or not paths:
         raise DataError(
-            f"{', '.join(given) or 'nothing'}: there is no session.",
+            f"{', '.join(empty) or 'nothing'}: there is no session.",
             next_step="Name folders of sessions, .rrd recordings, or a glob in quotes.",
         )
     shared = Path(os.path.commonpath([it.parent for it in paths]))
