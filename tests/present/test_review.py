@@ -229,7 +229,7 @@ def test_a_browser_draws_it_and_asks_nobody_else(out, tmp_path):
             picture = page.picture_once(drawn, patience_s=90)
             # The viewer goes where the address says.
             page.call("Runtime.evaluate", expression="location.hash = '#when=view@0'")
-            elsewhere = page.picture_once(lambda it: moved(it, picture), patience_s=30)
+            elsewhere = page.picture_once(lambda it: moved(it, picture), patience_s=120)
             requested = page.requested
         process.send_signal(signal.SIGTERM)
         assert process.wait(timeout=60) == 0
