@@ -233,6 +233,15 @@ def test_what_the_stream_does_not_cover_is_left_out_by_name(session):
     assert any("samples are missing in 1 place" in it for it in result.verdict.reasons)
 
 
+def test_frames_that_others_stand_for_do_not_make_a_gap_a_larger_share(session):
+    result = calibrate(cut(session, lambda it: (it < 3.0) | (it > 4.2)))
+    lost = sum("samples of its stream are missing" in view.reason for view in result.views)
+    # A sixth of the frames, but over a quarter of the lost and the chosen together.
+    assert lost < 0.25 * len(result.views)
+    assert lost > 0.25 * (lost + sum(view.used for view in result.views))
+    assert not any("views are not used" in it for it in result.verdict.reasons)
+
+
 def dwelling(ahead_s: float, at_rest: int = 20) -> Session:
     """A cell's stops, each held for 1.2 s: views in the middle of rests, the last ones in moves."""
     cell = simulate(CellOptions(seed=4, pixel_sigma_px=0.1))

@@ -65,7 +65,7 @@ def findings_of(known: RunState) -> Findings:
     ]
     return Findings(
         _pairs(tied, explained, answer, alone=known.mount is not None),
-        _sensors(tied, answer.sigmas, solved.shown_px, known.spared.keys() | known.held_back),
+        _sensors(tied, answer.sigmas, solved.shown_px, known),
         _arms(answer),
         worst,
         places,
@@ -248,14 +248,15 @@ def _sensors(
     sights: Sequence[Sight],
     noise: Mapping[str, Mapping[str, float]],
     shown_px: Mapping[str, float],
-    spared: Collection[int],
+    known: RunState,
 ) -> list[Sensor]:
     seers = dict.fromkeys(it.seer for it in sights)
+    set_aside = known.spared.keys() | known.held_back
     found = []
     for seer in seers:
         mine = [it for it in sights if it.seer == seer]
         lost = [
-            Rejection(it.view, it.reason) for it in mine if not it.used and it.view not in spared
+            Rejection(it.view, it.reason) for it in mine if not it.used and it.view not in set_aside
         ]
         levels = noise.get(seer, {})
         found.append(
@@ -265,6 +266,7 @@ def _sensors(
                 [it.view for it in mine if _disagrees(it)],
                 shown_px.get(seer, levels.get("pixel_px")),
                 levels.get("level", 1.0),
+                sum(it.view in known.spared for it in mine),
                 seer if len(seers) > 1 else "",
             )
         )

@@ -96,6 +96,7 @@ class Sensor:
         disagreeing: How many of these have a robot pose and an image that do not belong together.
         pixel_px: Noise of a corner's coordinate; None without images [px].
         level: By how much more its poses scatter than their noise says.
+        spared: How many were not needed, as others stand for them.
         name: Its frame; empty where there is no other.
     """
 
@@ -104,6 +105,7 @@ class Sensor:
     disagreeing: Sequence[int] = ()
     pixel_px: float | None = None
     level: float = 1.0
+    spared: int = 0
     name: str = ""
 
 
@@ -678,8 +680,9 @@ def _stop_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Find
 
 
 def _lost_doubts(sensor: Sensor, limits: CalibrationLimits) -> Iterator[Finding]:
-    lost, used = sensor.lost, sensor.used
-    share = len(lost) / max(used + len(lost), 1)
+    lost = sensor.lost
+    count_all = sensor.used + sensor.spared + len(lost)
+    share = len(lost) / max(count_all, 1)
     if share > limits.lost_share[0]:
         details, disagree = "", {*sensor.disagreeing}
         others = [it for it in lost if it.view not in disagree]
@@ -689,7 +692,7 @@ def _lost_doubts(sensor: Sensor, limits: CalibrationLimits) -> Iterator[Finding]
         if others:
             details += f"; the first{' but for these' if disagree else ''}: view {others[0].view}, "
             details += others[0].reason
-        words = f"{len(lost)} of {used + len(lost)} views are not used{details}."
+        words = f"{len(lost)} of {count_all} views are not used{details}."
         words_do = "Look at the first of them, and repeat what is missing."
         step = Step(words_do, look_at(others[0].view)) if others else None
         views, is_fatal = tuple(it.view for it in lost), share > limits.lost_share[1]
