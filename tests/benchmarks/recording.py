@@ -20,7 +20,6 @@ from results import few, write_section
 from visioncal.calibration.pipeline import Run, run
 from visioncal.present.recording import (
     RecordingWriter,
-    append_results,
     read_session,
     write_recording,
 )
@@ -65,7 +64,6 @@ def measured(folder: Path, session: Session, found: Run) -> dict[str, float]:
     work: dict[str, Callable[[], object]] = {
         "plainly, a file each": lambda: write_plainly(folder / "files", images),
         "views recorded, as a capture does": lambda: record(captured, session, rows, images),
-        "result drawn and appended": lambda: append_results(captured, session, *result),
         "both in one, as `visioncal calibrate` does": lambda: write_recording(
             whole, session, *result
         ),

@@ -1,13 +1,10 @@
-"""Results in recordings: exact, appended without a touch to what is there, the last one counts."""
+"""Results in recordings: exact, and of several the last one counts."""
 
 import random
-import warnings
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from rerun.chunk import RrdReader
-from rerun.error_utils import RerunWarning
 from support.kept import (
     KEPT,
     assert_same,
@@ -21,15 +18,11 @@ from support.samples import Sample, made_up
 from visioncal.core.errors import DataError
 from visioncal.present.recording import (
     RecordingWriter,
-    append_results,
-    paths,
     read_calibration,
     read_evidence,
     read_session,
     write_recording,
 )
-from visioncal.present.recording.frames import scan
-from visioncal.present.viewer import blueprint
 from visioncal.results import Calibration, Verdict, to_document
 
 
@@ -46,6 +39,17 @@ def captured(sample: Sample, tmp_path: Path) -> Path:
         for view in sample.session.views:
             writer.add_view(cells(sample.session, view), sample.session.images.read(view.image))
     return path
+
+
+def with_results(path: Path, sample: Sample, *results) -> list[int]:
+    """Records a session with some results, each with its evidence; the sizes after each."""
+    sizes = []
+    with RecordingWriter(path, sample.session, announced=9) as writer:
+        writer.add_session(sample.session)
+        for calibration, evidence in results:
+            writer.add_results(sample.session, calibration, evidence)
+            sizes.append(path.stat().st_size)
+    return sizes
 
 
 def test_results_come_back_exactly(sample: Sample, tmp_path: Path) -> None:
@@ -76,71 +80,44 @@ def test_session_alone_has_no_results(captured: Path) -> None:
     assert read_evidence(captured) == ()
 
 
-def test_results_are_appended_and_the_last_one_counts(sample: Sample, captured: Path) -> None:
-    before = captured.read_bytes()[: scan(captured).end]
-    layout = blueprint(sample.session)
-    append_results(captured, sample.session, sample.calibration, sample.evidence, layout)
+def test_the_last_one_of_several_results_counts(sample: Sample, tmp_path: Path) -> None:
     better = replace(sample.calibration, verdict=Verdict("good"))
-    append_results(captured, sample.session, better, sample.evidence[:4])
-    assert captured.read_bytes().startswith(before)
-    calibration = read_calibration(captured)
+    path = tmp_path / "recording.rrd"
+    sizes = with_results(
+        path, sample, (sample.calibration, sample.evidence), (better, sample.evidence[:4])
+    )
+    calibration = read_calibration(path)
     assert calibration is not None
     assert calibration.verdict.status == "good"
-    assert_same_evidence(sample.evidence[:4], read_evidence(captured))
-    session = read_session(captured)
+    assert_same_evidence(sample.evidence[:4], read_evidence(path))
+    session = read_session(path)
     assert_same(sample.session, session)
     assert session.warnings == sample.session.warnings
-    assert list(captured.parent.iterdir()) == [captured]
-
-
-def test_rerun_reads_what_was_appended_as_one_recording(sample: Sample, captured: Path) -> None:
-    layout = blueprint(sample.session)
-    append_results(captured, sample.session, sample.calibration, sample.evidence, layout)
-    with warnings.catch_warnings():
-        # What was appended is not in the footer, so there is none any more.
-        warnings.simplefilter("ignore", RerunWarning)
-        reader = RrdReader(captured)
-    assert len(reader.recordings()) == 1
-    assert len(reader.blueprints()) == 1
-    entities = {chunk.entity_path for chunk in reader.stream()}
-    assert {paths.IMAGE, paths.CALIBRATION, paths.DETECTED} <= entities
-
-
-def test_interrupted_append_leaves_the_results_before(sample: Sample, captured: Path) -> None:
-    append_results(captured, sample.session, sample.calibration, sample.evidence)
-    first = captured.stat().st_size
-    better = replace(sample.calibration, verdict=Verdict("good"))
-    append_results(captured, sample.session, better, sample.evidence[:4])
-    data = captured.read_bytes()
+    # Where the second one is cut, the first one counts.
+    data = path.read_bytes()
     rng = random.Random(6)
-    for size in [first + 1, *(rng.randrange(first, len(data)) for _ in range(8))]:
-        captured.write_bytes(data[:size])
-        assert_same(sample.session, read_session(captured))
-        calibration = read_calibration(captured)
+    for size in [sizes[0] + 1, *(rng.randrange(sizes[0], sizes[1]) for _ in range(8))]:
+        path.write_bytes(data[:size])
+        assert_same(sample.session, read_session(path))
+        calibration = read_calibration(path)
         assert calibration is not None
         assert calibration.verdict == sample.calibration.verdict
-        assert_same_evidence(sample.evidence, read_evidence(captured))
-    # What was cut is dropped by the next one.
-    append_results(captured, sample.session, better, ())
-    assert read_evidence(captured) == ()
-    assert read_session(captured).warnings == sample.session.warnings
+        assert_same_evidence(sample.evidence, read_evidence(path))
 
 
-def test_results_of_another_session_are_refused(sample: Sample, captured: Path) -> None:
-    before = captured.read_bytes()
-    other = made_up(5)
-    with pytest.raises(DataError, match="holds 9 views"):
-        append_results(captured, other.session, other.calibration, other.evidence)
+def test_evidence_of_other_views_is_refused(sample: Sample, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="The evidence names view 9"):
-        append_results(captured, sample.session, None, [replace(sample.evidence[0], view=9)])
-    assert captured.read_bytes() == before
+        with_results(
+            tmp_path / "recording.rrd", sample, (None, [replace(sample.evidence[0], view=9)])
+        )
 
 
-def test_changed_result_is_noticed(sample: Sample, captured: Path) -> None:
-    append_results(captured, sample.session, sample.calibration, sample.evidence)
-    data = captured.read_bytes()
+def test_changed_result_is_noticed(sample: Sample, tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    with_results(path, sample, (sample.calibration, sample.evidence))
+    data = path.read_bytes()
     assert data.count(b"2026-11-20T10:11:12") == 1
-    captured.write_bytes(data.replace(b"2026-11-20T10:11:12", b"2026-11-20T10:11:13"))
+    path.write_bytes(data.replace(b"2026-11-20T10:11:12", b"2026-11-20T10:11:13"))
     with pytest.raises(DataError, match="its last result was changed"):
-        read_calibration(captured)
-    assert_same(sample.session, read_session(captured))
+        read_calibration(path)
+    assert_same(sample.session, read_session(path))

@@ -6,12 +6,11 @@ changed or cut off after it was written is noticed; see `frames`.
 
 from visioncal.present.recording.cells import read_alignment
 from visioncal.present.recording.reader import read_session
-from visioncal.present.recording.results import append_results, read_calibration, read_evidence
+from visioncal.present.recording.results import read_calibration, read_evidence
 from visioncal.present.recording.writer import RecordingWriter, write_recording
 
 __all__ = [
     "RecordingWriter",
-    "append_results",
     "read_alignment",
     "read_calibration",
     "read_evidence",

@@ -6,7 +6,6 @@ chunks are, and 32 bytes that say where that message is. A writer that was kille
 these; a file that was cut ends within a message.
 """
 
-import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,7 +20,6 @@ LAST, STORE_INFO, CHUNK, ACTIVATION = range(4)
 _MAGIC, _CLOSING_MAGIC = b"RRF2", b"RRF2FOOT"
 _START_BYTES, _CLOSING_BYTES = 12, 12
 _HEAD = struct.Struct("<QQ")
-_BLOCK_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -144,29 +142,6 @@ def read_payload(path: Path, frame: Frame) -> bytes:
             next_step="Load it again.",
         )
     return payload
-
-
-def append(path: Path, added: Path) -> None:
-    """Appends the messages of one file to another, behind its last whole message.
-
-    The end that rerun wrote is dropped, as it knows of the first file's messages only. The viewer
-    and `RrdReader.stream` do without it.
-
-    Raises:
-        OSError: A file cannot be read or written; what was in the first one is still there.
-        DataError: One of them is no `.rrd`.
-    """
-    target, source = scan(path), scan(added)
-    with path.open("r+b") as file, added.open("rb") as new:
-        file.seek(target.end)
-        file.truncate()
-        new.seek(_START_BYTES)
-        left = source.end - _START_BYTES
-        while block := new.read(min(left, _BLOCK_BYTES)):
-            file.write(block)
-            left -= len(block)
-        file.flush()
-        os.fsync(file.fileno())
 
 
 def _unreadable(path: Path, error: OSError) -> DataError:

@@ -8,8 +8,7 @@ from collections.abc import Container
 
 import pyarrow as pa
 
-_STORE_ID, _COMPRESSION, _UNPACKED_SIZE, _BODY = 1, 2, 3, 5
-_RECORDING_ID = 2
+_COMPRESSION, _UNPACKED_SIZE, _BODY = 2, 3, 5
 _LZ4 = 2
 # No block of LZ4 unpacks to more than this many times its size.
 _LZ4_RATIO = 255
@@ -41,13 +40,6 @@ def record_batch(payload: bytes, entities: Container[str]) -> tuple[str, pa.Reco
     except (pa.ArrowException, OSError, KeyError, TypeError, StopIteration) as error:
         raise ValueError(f"a chunk cannot be unpacked: {error!r}") from error
     return entity, batch
-
-
-def recording_id(payload: bytes) -> str:
-    """Reads the id of the recording that a chunk belongs to."""
-    _, fields = _fields(payload)
-    _, store_id = _fields(fields[_STORE_ID])
-    return store_id[_RECORDING_ID].decode()
 
 
 def _fields(message: bytes) -> tuple[dict[int, int], dict[int, bytes]]:

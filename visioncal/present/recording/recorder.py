@@ -27,20 +27,17 @@ class Recorder:
         stream: Where to log.
     """
 
-    def __init__(self, path: Path, *, recording_id: str | None = None) -> None:
+    def __init__(self, path: Path) -> None:
         """Begins the file.
 
         Args:
             path: The `.rrd`; one that is there is replaced.
-            recording_id: Of the recording that the file is a part of; None where it is one.
 
         Raises:
             OSError: The file cannot be created.
         """
         self._path, self._is_lost = path, False
-        self.stream = rr.RecordingStream(
-            paths.APPLICATION, recording_id=recording_id, send_properties=recording_id is None
-        )
+        self.stream = rr.RecordingStream(paths.APPLICATION)
         _check_room(path.parent)
         try:
             self.stream.save(path)

@@ -14,11 +14,9 @@ from uuid import uuid4
 import numpy as np
 import pyarrow as pa
 import rerun as rr
-from rerun.blueprint import BlueprintLike
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import named_errors, sha256
-from visioncal.core.temporary_files import aside_file
+from visioncal.core.files import sha256
 from visioncal.core.types import Corners, FloatArray
 from visioncal.present.recording import (
     markdown,
@@ -27,9 +25,8 @@ from visioncal.present.recording import (
     paths,
     tools,
 )
-from visioncal.present.recording.frames import Frame, append, read_payload, scan
-from visioncal.present.recording.messages import recording_id
-from visioncal.present.recording.reader import chunks, read_session
+from visioncal.present.recording.frames import Frame, scan
+from visioncal.present.recording.reader import chunks
 from visioncal.present.recording.recorder import Recorder
 from visioncal.present.recording.scene import Scene
 from visioncal.results import Calibration
@@ -37,35 +34,6 @@ from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
 
 _EVIDENCE, _RESULT = "visioncal.Evidence", "visioncal.Result"
-
-
-def append_results(
-    path: Path,
-    session: Session,
-    calibration: Calibration | None,
-    evidence: Sequence[ViewEvidence],
-    blueprint: BlueprintLike | None = None,
-) -> None:
-    """Adds what was computed to a recording; its images and facts stay as they are, byte by byte.
-
-    Where this is interrupted, the results that were there before still count.
-
-    Args:
-        path: The `.rrd`.
-        session: The session in it.
-        calibration: Its result; None draws the cell as it was recorded.
-        evidence: What was seen and computed of the views, in any order.
-        blueprint: A layout to open it in, in place of the one that it has.
-
-    Raises:
-        DataError: The recording cannot be read or written, or holds another session.
-    """
-    owner = _recording_of(path, session)
-    with named_errors(path), aside_file(path.parent) as aside:
-        with Recorder(aside, recording_id=owner) as recorder:
-            recorder.lay_out(blueprint)
-            log_results(recorder, session, calibration, evidence)
-        append(path, aside)
 
 
 def log_results(
@@ -130,21 +98,6 @@ def read_evidence(path: Path) -> tuple[ViewEvidence, ...]:
     if len(result.evidence) != result.evidence_count:
         raise _damaged(path)
     return result.evidence
-
-
-def _recording_of(path: Path, session: Session) -> str:
-    """The id of a recording, which what is added to it must bear too."""
-    recorded = read_session(path)
-    ours, theirs = ([it.number for it in one.views] for one in (session, recorded))
-    if ours != theirs:
-        raise DataError(
-            f"{path} holds {len(theirs)} views, the session {session.name!r} has {len(ours)} "
-            "or others.",
-            culprits=[str(path)],
-            next_step="Load the session from the recording that its results are added to.",
-        )
-    header, _, _ = next(chunks(scan(path), (paths.SESSION,), []))
-    return recording_id(read_payload(path, header))
 
 
 def _draw(

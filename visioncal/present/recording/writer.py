@@ -109,7 +109,7 @@ class RecordingWriter:
     def add_results(
         self, session: Session, calibration: Calibration | None, evidence: Sequence[ViewEvidence]
     ) -> None:
-        """Adds what was computed, as `append_results` does once the recording is closed.
+        """Adds what was computed.
 
         Args:
             session: The session with all of its views.
