@@ -20,10 +20,11 @@ from support.moved_arms import recorded, robot_with_bodies, true_base
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.base import BaseModel
-from visioncal.dynamics.conditioning import Conditioned, condition
+from visioncal.dynamics.conditioning import Conditioned, Piece, condition
 from visioncal.dynamics.excitation import ExcitationRequest, excite
 from visioncal.dynamics.identify import SLOW_RAD_S, Identification, Options, identify
 from visioncal.dynamics.limits import Share, allowed_motion
+from visioncal.dynamics.lowpass import LowPass
 from visioncal.dynamics.model import DynamicModel, FrictionTerms
 from visioncal.dynamics.motion import Measured, Motion
 from visioncal.dynamics.reading import Recorded
@@ -188,7 +189,7 @@ def figaroh_text() -> str:
     from figaroh_torques import identify as of_figaroh
 
     robot, measured = robot_with_bodies(nominal_dynamics("ur5e")), exact_motion()
-    stream, plain = Conditioned.unfiltered(measured), FrictionTerms(slow_rad_s=SLOW_RAD_S)
+    stream, plain = unfiltered(measured), FrictionTerms(slow_rad_s=SLOW_RAD_S)
     options = Options(terms=plain, stribeck=False, consistent=False, checked=False)
     theirs, ours, whole = [], [], []
     with one_blas_thread():
@@ -213,6 +214,14 @@ def figaroh_text() -> str:
         rms=", ".join(f"{it:.3f}" for it in theirs[0].rms_nm),
         own_rms=", ".join(f"{it:.3f}" for it in rms),
     )
+
+
+def unfiltered(measured: Measured) -> Conditioned:
+    """Samples that need no filter, as they are."""
+    rate_hz = 1.0 / float(np.median(np.diff(measured.motion.times_s)))
+    bad = np.zeros(measured.torques_nm.shape, dtype=bool)
+    piece = Piece(measured, bad, np.ones(len(measured), dtype=bool), LowPass(np.ones(1), 1))
+    return Conditioned("samples", (piece,), 0.5 * rate_hz, 0.5 * rate_hz, rate_hz, ())
 
 
 def exact_motion() -> Measured:

@@ -14,7 +14,7 @@ from multiprocessing import Pool
 import numpy as np
 from results import WORDS, few, first, wished, write_section
 from support.bound import compliance_bound, workspace_bound_m
-from support.cells import calibrated
+from support.cells import arm_found, calibrated
 from support.loaded import COMPLIANCE, HUNG, STRETCHED, deflection_m, loaded, predicted_m
 from support.wrong_arms import WRONG_LINKS, error_m
 
@@ -72,9 +72,9 @@ def world(options: CellOptions) -> tuple[tuple[float, ...], list[tuple[float, fl
     springs = []
     if options.board_bow_m:
         errors.append(workspace_bound_m(cell, postures(robot)[::EVERY]))
-    elif ours.arm_found.springs is not None:
+    elif arm_found(ours).springs is not None:
         bound = compliance_bound(cell)
-        for at, it in enumerate(ours.arm_found.springs.springs):
+        for at, it in enumerate(arm_found(ours).springs.springs):
             if it.determined:
                 off = it.compliance_rad_per_nm - options.compliance_rad_per_nm[at]
                 springs.append((it.sigma_rad_per_nm / bound[at], off / it.sigma_rad_per_nm))
@@ -94,9 +94,9 @@ def weighed(seed: int) -> tuple[float, ...]:
     The last is a share of the deflection under 50 N, at postures of the session and stretched out.
     """
     shop, known = loaded(seed, count=20)
-    if known.arm_found.springs is None:
+    if arm_found(known).springs is None:
         return (np.nan,) * 5
-    springs = [known.arm_found.springs.springs[it] for it in (1, 2)]
+    springs = [arm_found(known).springs.springs[it] for it in (1, 2)]
     pairs = zip(springs, COMPLIANCE[1:3], strict=True)
     off = [(it.compliance_rad_per_nm - true) / it.sigma_rad_per_nm for it, true in pairs]
     q = np.vstack([STRETCHED, shop.joints[::4]])

@@ -21,6 +21,7 @@ import numpy as np
 from results import QUICK, few, first, wished, write_section
 from scipy.spatial.transform import Rotation
 from support import thirdparty
+from support.cells import arm_found
 from support.tracked import known_of
 
 from visioncal import correct
@@ -169,7 +170,7 @@ def carried_over(known: RunState, other: Recording) -> Carried:
     among = None
     if arm.model is not None:
         among = predicted_covariance(known, other.q, edges[1])
-        session = (1e-3 * known.arm_found.carries.session_mm) ** 2
+        session = (1e-3 * arm_found(known).carries.session_mm) ** 2
     for draw in range(few(DRAWS, 1)):
         rows = np.random.default_rng(draw).choice(len(other.q), ANCHORS, replace=False)
         rest = np.setdiff1d(np.arange(len(other.q)), rows)

@@ -16,7 +16,7 @@ from multiprocessing import Pool
 import numpy as np
 from results import first, wished, write_section
 from support.bound import workspace_bound_m
-from support.cells import calibrated, known_of
+from support.cells import arm_found, calibrated, known_of
 from support.wrong_arms import WRONG_LINKS, error_m
 
 from visioncal.calibration.pipeline.run_state import RunState
@@ -62,7 +62,7 @@ def measured(options: CellOptions) -> tuple[float, ...]:
     if model is None:
         return 1e3 * before, 1e3 * before, 1e3 * bound, np.nan, seconds, 0.0
     after = error_m(cell, known, model.robot)
-    predicted = 1e3 * float(np.sqrt(np.mean(known.arm_found.numbers.sigmas_m**2)))
+    predicted = 1e3 * float(np.sqrt(np.mean(arm_found(known).numbers.sigmas_m ** 2)))
     taken = known.robot_arm.kinematics.level == "geometry"
     return 1e3 * before, 1e3 * after, 1e3 * bound, predicted, seconds, float(taken)
 

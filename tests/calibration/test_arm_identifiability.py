@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.arms import ERROR_RAD, NOISE, TOOL, arm_data, erring, problem_of
-from support.cells import calibrated
+from support.cells import arm_found, calibrated
 from support.edges import solved
 from support.wrong_arms import WRONG_LINKS
 
@@ -340,7 +340,7 @@ def calibrated_cell():
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_the_result_is_in_the_convention_that_is_asked_for(calibrated_cell, convention):
     cell, known = calibrated_cell
-    assert known.arm_found.numbers.convention == "hayati"
+    assert arm_found(known).numbers.convention == "hayati"
     asked = replace(known, convention=convention)
     (examine_again,) = (it for it in STAGES if it.name == "examine")
     known = examine_again.run(asked)
@@ -376,11 +376,11 @@ def test_a_missing_direction_is_in_the_verdict():
     """Looking straight at a board leaves the fifth joint of a UR almost where it is."""
     options = replace(WRONG_LINKS, seed=9, tilt_rad=(0.0, 0.03), roll_rad=0.4, views=40)
     known = calibrated(simulate(options))
-    assert known.arm_found.numbers.counts.determined < 30
-    assert known.arm_found.numbers.advice in known.verdict.reasons
-    assert "joint 5 (wrist_2_joint) moved by 3.9 deg only" in known.arm_found.numbers.advice
+    assert arm_found(known).numbers.counts.determined < 30
+    assert arm_found(known).numbers.advice in known.verdict.reasons
+    assert "joint 5 (wrist_2_joint) moved by 3.9 deg only" in arm_found(known).numbers.advice
     rich = calibrated(simulate(replace(WRONG_LINKS, seed=9, views=40)))
-    assert rich.arm_found.numbers.counts.determined == 30
+    assert arm_found(rich).numbers.counts.determined == 30
     assert not any("identifiable values" in it for it in rich.verdict.reasons)
 
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.cells import calibrated
+from support.cells import arm_found, calibrated
 from support.wrong_arms import COBOT, GOOD, SAGGING
 
 from visioncal.calibration.pipeline.result import result_of
@@ -21,12 +21,12 @@ def worn():
 
 def test_play_is_told_and_is_no_stiffness(worn):
     assert worn.robot_arm.kinematics.level == "elastic"
-    plays = worn.arm_found.plays
+    plays = arm_found(worn).plays
     for play, true in zip(plays, PLAY, strict=True):
         assert play.is_sure
         # Six draws, at three and a half sigma.
         assert abs(play.deadband_rad - true) < 3.5 * play.sigma_rad
-    springs = worn.arm_found.springs.springs
+    springs = arm_found(worn).springs.springs
     for at in (1, 2):
         assert (
             abs(springs[at].compliance_rad_per_nm - 1.0 / COBOT[at])
@@ -47,7 +47,7 @@ def test_an_arm_that_is_right_but_for_its_play(way):
     # Some write the side that the joints moved to; a dead-band is a width all the same.
     known = calibrated(replace(cell, approach=way * cell.approach))
     assert known.robot_arm.kinematics.level == "backlash"
-    told = [it.deadband_rad for it in known.arm_found.plays]
+    told = [it.deadband_rad for it in arm_found(known).plays]
     assert told == pytest.approx(PLAY, abs=1.5e-4)
     # In the middle of its play the arm is the one that was stated.
     q = known.robot_arm.joints_rad
@@ -62,4 +62,4 @@ def test_an_arm_that_is_right_but_for_its_play(way):
 def test_stops_from_one_side_tell_no_play():
     cell = simulate(replace(SAGGING, backlash_rad=PLAY, seed=2))
     known = calibrated(replace(cell, approach=np.ones(len(cell.approach))))
-    assert known.arm_found.plays == ()
+    assert arm_found(known).plays == ()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 from scipy.stats import chi2
-from support.cells import calibrated, error_of
+from support.cells import arm_found, calibrated, error_of
 
 from visioncal.calibration.pipeline import run
 from visioncal.calibration.pipeline.guess_inputs import guess_session
@@ -121,12 +121,12 @@ def test_each_board_adds_six_values_that_are_determined():
     """Everett and Hsu (1988): 4 a revolute joint, 6 for the frames, and 6 a further board."""
     cell = simulate(replace(TWO, **WRONG_LINKS, views=24, seed=1))
     known = calibrated(cell)
-    counts = known.arm_found.numbers.counts
+    counts = arm_found(known).numbers.counts
     assert known.robot_arm.kinematics.level == "geometry"
     assert (counts.columns, counts.identifiable, counts.determined) == (54, 36, 36)
     # The first board alone determines thirty.
     one = calibrated(without(cell, set(np.flatnonzero(cell.shown.boards == 1).tolist())))
-    counts = one.arm_found.numbers.counts
+    counts = arm_found(one).numbers.counts
     assert (counts.columns, counts.identifiable) == (48, 30)
 
 

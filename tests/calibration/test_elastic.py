@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.bound import compliance_bound
-from support.cells import calibrated
+from support.cells import arm_found, calibrated
 from support.loaded import COMPLIANCE, HUNG, STRETCHED, deflection_m, loaded, predicted_m
 from support.planned import postures_in_view, true_cell
 from support.wrong_arms import CARRIED, COBOT, GOOD, SAGGING, WRONG_LINKS, error_m
@@ -44,7 +44,7 @@ def test_a_sagging_arm_is_calibrated_all_over_its_workspace():
     assert error_m(cell, rigid, rigid.robot_arm.model) > 0.3 * before
     assert any("speak for more" in it for it in rigid.verdict.reasons)
     # The first axis is upright: no weight turns it.
-    assert known.arm_found.springs.rigid[0] == "shoulder_pan_joint"
+    assert arm_found(known).springs.rigid[0] == "shoulder_pan_joint"
     assert any("taken for rigid" in it for it in known.verdict.reasons)
 
 
@@ -53,7 +53,7 @@ def test_springs_are_told_to_their_bound(carrying):
     # Some disagree with the arm as stated, which does not bend; they come back.
     assert len(known.used) == len(cell.corners)
     bound = compliance_bound(cell)
-    for at, spring in enumerate(known.arm_found.springs.springs[1:5], start=1):
+    for at, spring in enumerate(arm_found(known).springs.springs[1:5], start=1):
         assert spring.determined
         # The bound knows the sizes of all errors; the fit estimates them from forty stops.
         assert spring.sigma_rad_per_nm < 1.2 * bound[at]
@@ -121,11 +121,11 @@ def test_stops_are_planned_that_tell_springs():
 @pytest.mark.slow
 def test_a_payload_that_is_not_as_stated_is_told(carrying):
     cell, known = carrying
-    factor = known.arm_found.springs.payload
+    factor = arm_found(known).springs.payload
     assert abs(factor.value - 1.0) < 3.0 * factor.sigma
     light = tuple(replace(it, kg=it.kg / 2.0) for it in cell.payloads)
     wrong = calibrated(replace(cell, payloads=light))
-    assert wrong.arm_found.springs.payload.value > 1.3
+    assert arm_found(wrong).springs.payload.value > 1.3
     assert any("Load and bend do not fit" in it for it in wrong.verdict.reasons)
     assert wrong.verdict.status != "good"
 
@@ -134,7 +134,7 @@ def test_a_payload_that_is_not_as_stated_is_told(carrying):
 def test_a_stiff_arm_is_not_made_to_bend():
     known = calibrated(simulate(replace(GOOD, views=40, seed=3, payloads=CARRIED)))
     assert known.robot_arm.kinematics.level == "nominal"
-    assert known.arm_found.springs is None
+    assert arm_found(known).springs is None
     asked = calibrated(simulate(replace(WRONG_LINKS, seed=2)), level="elastic")
     assert asked.robot_arm.kinematics.level == "nominal"
     assert any("stays as stated" in it for it in asked.verdict.reasons)
@@ -160,7 +160,7 @@ def test_a_loaded_arm_read_by_a_tracker():
     """Loads of 10, 20 and 50 N on a shoulder of 1.4e6 and an elbow of 9e5 N m/rad."""
     shop, known = loaded(seed=2)
     for joint in (1, 2):
-        spring = known.arm_found.springs.springs[joint]
+        spring = arm_found(known).springs.springs[joint]
         assert abs(spring.compliance_rad_per_nm - COMPLIANCE[joint]) < 3.0 * spring.sigma_rad_per_nm
         assert spring.sigma_rad_per_nm < 0.1 * COMPLIANCE[joint]
     q = np.vstack([STRETCHED, shop.joints[::4]])

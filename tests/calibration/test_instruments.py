@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.cells import arm_found
 from support.commands import visioncal as command
 from support.marks import slow
 from support.tracked import (
@@ -122,7 +123,7 @@ def test_so_many_values_are_told_of_a_six_axis_arm(options, rank):
     Three points have six values more than one, of their places.
     """
     shop = tracked(replace(options, **WRONG))
-    seen = known_of(session_of(shop)).arm_found.numbers.counts
+    seen = arm_found(known_of(session_of(shop))).numbers.counts
     assert (seen.identifiable, seen.determined) == (rank, rank)
     whole = information(shop, arm_columns=True)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(whole), 1e-30))

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.cells import arm_found
 from support.later import ANYHOW, Change, known_again, lot
 from support.marks import slow
 from support.tracked import known_of
@@ -121,7 +122,7 @@ def test_places_alone_tell_of_them():
 
 
 def test_where_it_carries_over_is_what_is_predicted_there(known):
-    found = known.arm_found.carries
+    found = arm_found(known).carries
     assert found.measured_mm == known.robot_arm.kinematics.chosen.left_out.mm
     # The wave's own noise and another session's share come on top of what is not known of the arm.
     squares = [found.session_mm**2, 1e6 * np.mean(sigmas_m(known) ** 2)]
@@ -138,7 +139,7 @@ def test_stops_near_one_another_tell_less_elsewhere_and_the_arm_as_stated_is_wor
     near = q + 0.15 * np.random.default_rng(5).standard_normal((24, 6))
     shop = tracked(options, near)
     known = known_of(session_of(shop), level="kinematics")
-    found = known.arm_found.carries
+    found = arm_found(known).carries
     assert found.sigma_mm > 3.0 * found.measured_mm
     # One arm of errors that few values tell of: its error is within a factor of what is predicted.
     ours = 1e3 * float(np.sqrt(np.mean(np.sum(away_m(shop, known) ** 2, axis=1))))
@@ -161,7 +162,7 @@ def test_the_words_name_where_it_is_no_better():
 
 
 def test_tables_of_the_functions_are_within_their_sigmas(shop, known):
-    found = known.arm_found.functions
+    found = arm_found(known).functions
     assert [it.joint for it in found.joints] == list(known.robot.joint_names)
     angles = np.linspace(-np.pi, np.pi, 180, endpoint=False)
     nodes = np.linspace(0.0, 2 * np.pi, len(shop.true_arm.beyond), endpoint=False)

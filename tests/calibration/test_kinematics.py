@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support.bound import workspace_bound_m
-from support.cells import calibrated, error_of, known_of
+from support.cells import arm_found, calibrated, error_of, known_of
 from support.marks import slow
 from support.wrong_arms import GOOD, WRONG_LINKS, error_m, target_in_camera
 
@@ -150,7 +150,7 @@ def test_an_arm_with_long_links_is_not_taken_for_a_small_board():
     # three sigma; what was measured to a millionth is kept.
     assert known.fitted.seen.free.tolist() == [9]
     assert known.fitted.seen.held.all()
-    sigma = float(np.sqrt(np.mean(known.arm_found.numbers.sigmas_m**2)))
+    sigma = float(np.sqrt(np.mean(arm_found(known).numbers.sigmas_m ** 2)))
     assert error_m(cell, known, known.robot_arm.model.robot) < 2.0 * sigma
 
 
@@ -202,7 +202,7 @@ def test_the_workspace_sigma_is_the_bound_and_holds_the_error(mount):
     sure = replace(WRONG_LINKS.target, square_sigma_m=1e-5 * WRONG_LINKS.target.square_m)
     cell = simulate(replace(WRONG_LINKS, seed=6, mount=mount, target=sure))
     known = calibrated(cell)
-    sigma = float(np.sqrt(np.mean(known.arm_found.numbers.sigmas_m**2)))
+    sigma = float(np.sqrt(np.mean(arm_found(known).numbers.sigmas_m ** 2)))
     bound = workspace_bound_m(cell, postures(known.robot)[::20])
     # The bound knows the size of each error; the fit estimates one size and the noise's levels from
     # 30 views, which tell them to a tenth. Twenty postures stand for all to about as much.

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.cells import calibrated
+from support.cells import arm_found, calibrated
 from support.wrong_arms import CARRIED, COBOT, SAGGING, error_m
 
 from visioncal.calibration.pipeline.result import result_of
@@ -40,7 +40,7 @@ def test_an_arm_of_unknown_weight_is_calibrated_with_its_sag(bare):
     cell = simulate(replace(SAGGING, views=60, seed=4))
     known = calibrated(cell, robot=bare)
     assert known.robot_arm.kinematics.level == "elastic"
-    assert all(it.stiffness_nm_per_rad is None for it in known.arm_found.springs.springs)
+    assert all(it.stiffness_nm_per_rad is None for it in arm_found(known).springs.springs)
     assert any("of which its model states nothing" in it for it in known.verdict.reasons)
     before = error_m(cell, calibrated(cell, joints=False), bare)
     assert error_m(cell, known, known.robot_arm.model) < 0.06 * before
@@ -55,7 +55,7 @@ def test_an_arm_of_unknown_weight_is_calibrated_with_its_sag(bare):
 def test_payloads_tell_its_stiffness(bare):
     known = calibrated(simulate(replace(SAGGING, views=60, payloads=CARRIED, seed=5)), robot=bare)
     for at in (1, 2):
-        spring = known.arm_found.springs.springs[at]
+        spring = arm_found(known).springs.springs[at]
         assert spring.determined
         # One draw, at three and a half sigma.
         assert abs(spring.compliance_rad_per_nm - 1.0 / COBOT[at]) < 3.5 * spring.sigma_rad_per_nm

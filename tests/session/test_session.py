@@ -78,7 +78,7 @@ def test_what_the_folder_holds_is_what_the_session_says(folder: Path) -> None:
     assert (session.camera_name, session.camera.model) == ("oak", "brown")
     assert session.resolution == (1280, 800)
     assert session.camera.matrix.tolist() == [800, 801.5, 640, 400]
-    assert (session.robot_name, session.robot_tip) == ("ur10e", "tool0")
+    assert (session.robot_name, session.declaration.only_robot.tip) == ("ur10e", "tool0")
     assert session.target is not None
     assert session.target.columns == 9
     assert session.columns == tuple(HEADER.split(","))
@@ -570,7 +570,11 @@ def test_the_separators_and_commas_of_spreadsheets_are_read(folder: Path, separa
 def test_a_robot_whose_tip_alone_is_named_goes_by_its_poses(folder: Path) -> None:
     edit(folder, "session.toml", 'model = "ur10e"\n', "")
     session = Session.load(folder)
-    assert (session.robot_name, session.robot_document, session.robot_tip) == (None, None, "tool0")
+    assert (session.robot_name, session.robot_document, session.declaration.only_robot.tip) == (
+        None,
+        None,
+        "tool0",
+    )
     assert session.views[0].base_from_flange() is not None
     assert not session.warnings
 

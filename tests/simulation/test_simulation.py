@@ -25,7 +25,6 @@ from visioncal.simulation import (
     rays,
     read_truth,
     render,
-    render_view,
     simulate,
     truth_path,
     ur_arm,
@@ -185,7 +184,7 @@ def test_same_seed_same_cell_and_each_option_has_its_own_randomness():
     once, again = simulate(options), simulate(options)
     np.testing.assert_array_equal(once.cam_from_target, again.cam_from_target)
     np.testing.assert_array_equal(once.corners[2].px, again.corners[2].px)
-    np.testing.assert_array_equal(render_view(once, 0), render_view(again, 0))
+    np.testing.assert_array_equal(render(prepare_scene(once), 0), render(prepare_scene(again), 0))
     shaken = simulate(dataclasses.replace(options, robot_sigma_m=1e-3, pixel_sigma_px=0.5))
     np.testing.assert_array_equal(shaken.joints, once.joints)
     assert not np.array_equal(shaken.cam_from_target, once.cam_from_target)
@@ -349,7 +348,7 @@ def test_print_is_opencvs_board():
     target = charuco_target()
     cell = simulate(exact(CellOptions(views=1, camera=SMALL, vignetting=0.0)))
     pose = cell.cam_from_target[0]
-    image = render_view(cell, 0).astype(float)
+    image = render(prepare_scene(cell), 0).astype(float)
     board = charuco_board(target).generateImage((900, 600))
     # Centres of a 6x6 grid in each square, where neither image has an edge within a module.
     u, v = np.meshgrid(np.arange(2.5, 900, 5.0), np.arange(2.5, 600, 5.0))
@@ -366,15 +365,15 @@ def test_print_is_opencvs_board():
 
 def test_noise_blur_and_vignetting_are_in_the_picture():
     plain = exact(CellOptions(views=1, camera=SMALL, vignetting=0.0, seed=1))
-    clean = render_view(simulate(plain), 0).astype(float)
-    noisy = render_view(simulate(dataclasses.replace(plain, image_noise=3.0)), 0) - clean
+    clean = render(prepare_scene(simulate(plain)), 0).astype(float)
+    noisy = render(prepare_scene(simulate(dataclasses.replace(plain, image_noise=3.0))), 0) - clean
     # 256,000 draws; rounding to grey levels adds 0.4 to 3.0 in squares.
     assert noisy.std() == pytest.approx(3.0, rel=0.05)
-    dark = render_view(simulate(dataclasses.replace(plain, vignetting=0.4)), 0)
+    dark = render(prepare_scene(simulate(dataclasses.replace(plain, vignetting=0.4))), 0)
     # The outermost pixels are a little inside the corner, and the black level stays.
     ratio = (dark[:8, :8].mean() - 4.0) / (clean[:8, :8].mean() - 4.0)
     assert ratio == pytest.approx(0.6, abs=0.03)
-    soft = render_view(simulate(dataclasses.replace(plain, blur_px=2.0)), 0)
+    soft = render(prepare_scene(simulate(dataclasses.replace(plain, blur_px=2.0))), 0)
     sharpness = [cv2.Laplacian(np.float32(image), cv2.CV_32F).std() for image in (clean, soft)]
     # A Laplacian of sigma 0.7 against 2.0 px: its response falls with the square of the sigma.
     assert sharpness[1] < 0.4 * sharpness[0]
@@ -403,7 +402,7 @@ def test_written_session_loads_and_its_truth_lies_beside_it(tmp_path, quality):
         data = np.frombuffer(session.images.read(view.image), np.uint8)
         image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED).astype(float)
         # JPEG at 90 keeps grey levels to a few; PNG keeps them all.
-        difference = image - render_view(cell, view.number)
+        difference = image - render(prepare_scene(cell), view.number)
         assert np.abs(difference).mean() < (1e-12 if quality is None else 3.0)
     assert not list(folder.rglob("*truth*"))
     truth = read_truth(folder)

@@ -6,6 +6,7 @@ import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.stages.arms import ArmFound
 from visioncal.calibration.stages.cameras import detect_targets
 from visioncal.calibration.stages.joints import Matched
 from visioncal.calibration.stages.reported_poses import Reported
@@ -56,6 +57,11 @@ def session_of(cell: Cell) -> Session:
         MemoryImages({}),
         targets=targets,
     )
+
+
+def arm_found(known: RunState) -> ArmFound:
+    """What the stops determine of the only robot's arm."""
+    return next(iter(known.solved.arms.values()))
 
 
 def known_of(cell: Cell, *, joints: bool = True, robot: Robot | None = None, **changes) -> RunState:

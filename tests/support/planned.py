@@ -13,7 +13,7 @@ from visioncal.estimation.parts import Noise
 from visioncal.live.planning.accuracy import Wish
 from visioncal.live.planning.cell import Limits, PlanCell
 from visioncal.live.planning.design import Design, chosen
-from visioncal.live.planning.improving import Help, helps
+from visioncal.live.planning.improving import helps
 from visioncal.live.planning.information import WORLDS, worlds_of
 from visioncal.live.planning.purposes import Purpose
 from visioncal.live.planning.recorded import Begun, SoFar
@@ -60,7 +60,7 @@ class Additions:
     """Stops to add to a session: which candidates, and what each of them is good for."""
 
     design: Design
-    helps: tuple[Help, ...]
+    helps: tuple[str, ...]
 
 
 def next_best(

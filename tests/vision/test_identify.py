@@ -20,7 +20,6 @@ from visioncal.simulation import (
     fisheye_camera,
     prepare_scene,
     render,
-    render_view,
     simulate,
 )
 from visioncal.vision.finders.circles import seen_grids
@@ -86,7 +85,7 @@ def test_a_print_is_named(target):
 def test_a_tilted_board_is_named(name, tilt_rad):
     target = (SHIPPED | ODD)[name]
     options = CellOptions(target=target, views=2, tilt_rad=tilt_rad, cut_views=0.0, seed=3)
-    identity = identify(render_view(simulate(options), 1))
+    identity = identify(render(prepare_scene(simulate(options)), 1))
     # The steepest rows of the checkerboard are out of the finder's reach.
     if target.kind == "charuco" or tilt_rad[1] < 1.0:
         assert_named(identity, target)
@@ -169,7 +168,7 @@ def test_a_blurred_charuco_board_is_doubted_to_be_a_checkerboard(sigma_px):
 def test_a_checkerboard_whose_blurred_squares_are_round_is_no_grid_of_circles():
     # Seen at a slant, 61 px a square: 35 of its dark squares are round and in staggered rows.
     cell = simulate(CellOptions(views=6, target=SHIPPED["checkerboard_9x6_25mm"], seed=1))
-    image = cv2.GaussianBlur(render_view(cell, 2), (0, 0), 10.0)
+    image = cv2.GaussianBlur(render(prepare_scene(cell), 2), (0, 0), 10.0)
     assert seen_grids(image)
     assert_named(identify(image), cell.options.target)
 

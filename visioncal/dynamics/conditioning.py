@@ -160,15 +160,6 @@ class Conditioned:
         """The same with torques of so much later in the place of theirs [s]."""
         return replace(self, pieces=tuple(it.advanced(lag_s) for it in self.pieces))
 
-    @classmethod
-    def unfiltered(cls, measured: Measured, label: str = "samples") -> Self:
-        """Takes samples that need no filter as they are."""
-        steps = np.diff(measured.motion.times_s)
-        rate_hz = 1.0 / float(np.median(steps))
-        bad = np.zeros(measured.torques_nm.shape, dtype=bool)
-        piece = Piece(measured, bad, np.ones(len(measured), dtype=bool), LowPass.none())
-        return cls(label, (piece,), 0.5 * rate_hz, 0.5 * rate_hz, rate_hz, ())
-
 
 def condition(
     recorded: Recorded, cutoff_hz: float | None = None, limits_nm: FloatArray | None = None

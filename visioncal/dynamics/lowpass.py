@@ -47,11 +47,6 @@ class LowPass:
         taps = np.sinc(2.0 * band_hz / rate_hz * at) * np.kaiser(len(at), _BETA)
         return cls(taps / taps.sum(), step)
 
-    @classmethod
-    def none(cls) -> Self:
-        """Lets all pass as it is."""
-        return cls(np.ones(1), 1)
-
     @property
     def half(self) -> int:
         """Samples on either side of an output that it rests on."""

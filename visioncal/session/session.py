@@ -509,11 +509,6 @@ class Session:
         """The robot's model as the session names it: a built-in name or a path."""
         return None if self.declaration.only_robot is None else self.declaration.only_robot.model
 
-    @property
-    def robot_tip(self) -> str | None:
-        """The frame that the reported poses are of, if declared."""
-        return None if self.declaration.only_robot is None else self.declaration.only_robot.tip
-
 
 def _build(
     document: Mapping[str, Any],

@@ -48,7 +48,7 @@ from visioncal.simulation.records import (
     write_session,
     write_sweep,
 )
-from visioncal.simulation.render import Scene, prepare_scene, render, render_view
+from visioncal.simulation.render import Scene, prepare_scene, render
 from visioncal.simulation.sag import Payload
 from visioncal.simulation.sweep import Sweep, SweepOptions, sweep
 from visioncal.simulation.touching import touch, touch_network, write_touches
@@ -105,7 +105,6 @@ __all__ = [
     "read_cell",
     "read_truth",
     "render",
-    "render_view",
     "simulate",
     "simulate_network",
     "simulate_warm_up",

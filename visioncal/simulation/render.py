@@ -107,19 +107,6 @@ def prepare_scene(cell: Cell, board: int = 0) -> Scene:
     return Scene(cell, draw_sheet(target, texels), backdrop)
 
 
-def render_view(cell: Cell, index: int) -> Image:
-    """Takes the picture of one view; for many views, `prepare_scene` once and `render`.
-
-    Args:
-        cell: The cell.
-        index: Number of the view.
-
-    Returns:
-        (height, width) grey image.
-    """
-    return render(prepare_scene(cell, int(cell.shown.boards[index])), index)
-
-
 def render(scene: Scene, index: int) -> Image:
     """Takes the picture of one view.
 

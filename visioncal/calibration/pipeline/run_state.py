@@ -8,7 +8,7 @@ from typing import TypeVar
 from visioncal.calibration.pipeline.answer import Answer
 from visioncal.calibration.pipeline.budget import Work, work_of
 from visioncal.calibration.pipeline.solving import Solved
-from visioncal.calibration.stages.arms import ArmFound, RobotArm
+from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.judge import Findings
 from visioncal.calibration.stages.observed import Observed
@@ -113,11 +113,6 @@ class RunState(Observed):
         if self.fit is not None and self.fit.seen is not None:
             return self.fit.seen.sigmas_px[0]
         return super().pixel_px
-
-    @property
-    def arm_found(self) -> ArmFound:
-        """What the stops determine of the only robot's arm."""
-        return next(iter(self.solved.arms.values()))
 
     @property
     def used(self) -> tuple[int, ...]:

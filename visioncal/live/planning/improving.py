@@ -1,7 +1,6 @@
 """The next best stops of a recorded session, and what each of them is good for, in words."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -29,23 +28,6 @@ _LITTLE_SHARE = 0.99
 _LEVER_M = 0.5
 
 
-@dataclass(frozen=True)
-class Help:
-    """What an added stop is good for.
-
-    Attributes:
-        row: Which candidate it is.
-        words: Its motion and what that helps, with figures before and after.
-        before_mm: The sigma of the place that the purpose is about, without it [mm].
-        after_mm: The same with it and all before it [mm].
-    """
-
-    row: int
-    words: str
-    before_mm: float
-    after_mm: float
-
-
 def helps(
     cell: PlanCell,
     purpose: Purpose,
@@ -55,7 +37,7 @@ def helps(
     names: Sequence[str],
     *,
     begun: Begun | None = None,
-) -> Iterator[Help]:
+) -> Iterator[str]:
     """Says what each chosen stop is good for, those before it being taken.
 
     Args:
@@ -73,12 +55,11 @@ def helps(
         known = [f"view {it}" for it in begun.views]
     poses = cell.robot.base_from_flange(q[design.rows])
     before = world.covariance([])
-    for place, row in enumerate(design.rows.tolist()):
+    for place in range(len(design.rows)):
         after = world.covariance(design.rows[: place + 1])
         motion = _motion(cell, there, poses[place], known)
-        then, now = history = design.history[place : place + 2]
-        effect = _effect(cell, purpose, before, after, history)
-        yield Help(row, f"{motion}: {effect}", then.mm, now.mm)
+        effect = _effect(cell, purpose, before, after, design.history[place : place + 2])
+        yield f"{motion}: {effect}"
         there = np.concatenate([there, poses[place][None]])
         known = [*known, names[place]]
         before = after

@@ -298,17 +298,8 @@ def _stops(
 ) -> tuple[PlannedStop, ...]:
     """The stops in driving order; `numbers` are their views' in the order of the design."""
     design, route = taken.design, taken.route
-    said = tuple(
-        helps(
-            cell,
-            request.purpose,
-            found.q,
-            world,
-            design,
-            [f"view {it}" for it in numbers],
-            begun=begun,
-        )
-    )
+    names = [f"view {it}" for it in numbers]
+    said = tuple(helps(cell, request.purpose, found.q, world, design, names, begun=begun))
     q = found.q[design.rows]
     flange = cell.robot.base_from_flange(q)
     still = np.zeros((0, q.shape[1]))
@@ -324,7 +315,7 @@ def _stops(
             found.cam_from_target[design.rows[at]],
             float(found.seen[design.rows[at]]),
             at + 1,
-            said[at].words,
+            said[at],
             design.history[at],
             design.history[at + 1],
         )
