@@ -1,6 +1,8 @@
 """Maps from pixels to a board about each of its corners, which those around it determine."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Self
 
 import cv2
 import numpy as np
@@ -12,10 +14,32 @@ from visioncal.core.types import FloatArray, IntArray, Mask
 _AROUND, _NEAR = 25, 1.5
 # Held by so much to a plain homography, a map stays determined where corners are few.
 _RIDGE = np.diag([1e-6, 1e-4, 1e-4, *[1e-2] * 7])
+# Radial distortion has two coefficients of about so much, which so many corners determine in so
+# many steps. A place is never drawn further from the axis than by the inverse of the last.
+_RADIAL_SIGMA, _RADIAL_CORNERS, _RADIAL_STEPS, _LEAST_RADIAL = 0.5, 8, 5, 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class OpticalAxis:
+    """About what a lens distorts radially.
+
+    Attributes:
+        px: (2,) where it is, about the middle of the image [px].
+        reach_px: How far the image reaches from there [px].
+    """
+
+    px: FloatArray
+    reach_px: float
+
+    @classmethod
+    def of(cls, shape: tuple[int, ...], origin: FloatArray | IntArray) -> Self:
+        """That of an image of so many rows and columns, a part of which begins at `origin`."""
+        middle = (np.array(shape[::-1]) - 1) / 2
+        return cls(middle - origin, float(np.linalg.norm(middle)))
 
 
 def maps_about(
-    board: FloatArray, px: FloatArray, good: Mask, chosen: IntArray
+    board: FloatArray, px: FloatArray, good: Mask, chosen: IntArray, axis: OpticalAxis | None = None
 ) -> tuple[Callable[[FloatArray], FloatArray], IntArray, FloatArray]:
     """The maps about the chosen m corners: a homography of all, and a cubic polynomial on top.
 
@@ -24,6 +48,8 @@ def maps_about(
         px: (n, 2) where they are, to a part of a pixel [px].
         good: (n,) those that make the maps.
         chosen: (m,) those about which they are made.
+        axis: The lens's, whose radial distortion is taken off before the homography; None leaves it
+            to the polynomials.
 
     Returns:
         What maps pixels (m, k, 2) to the board, from each corner; the (m, k) corners around each;
@@ -32,7 +58,8 @@ def maps_about(
     Raises:
         numpy.linalg.LinAlgError: The corners lie as no board's do.
     """
-    flat = _homography(px, board)
+    undistorted = None if axis is None else _undistorted(px[good], board[good], axis)
+    flat = undistorted or _homography(px, board)
     own = flat(px[chosen])[:, None]
     distances, around = cKDTree(board).query(board[chosen], min(_AROUND, len(px)))
     off = flat(px)[around] - own
@@ -59,6 +86,58 @@ def _homography(places: FloatArray, board: FloatArray) -> Callable[[FloatArray],
         raise np.linalg.LinAlgError
     flat_from_places = np.asarray(found, float)
     return lambda at: _mapped(flat_from_places, (at - middle) / scale)
+
+
+def _undistorted(
+    px: FloatArray, board: FloatArray, axis: OpticalAxis
+) -> Callable[[FloatArray], FloatArray] | None:
+    """Likewise, the radial distortion of a lens taken off; None where it is not determined.
+
+    A place o from the axis, of length r, goes to o / (1 + a r^2 + b r^4) (Fitzgibbon 2001).
+    """
+    if len(px) < _RADIAL_CORNERS:
+        return None
+
+    def from_axis(at: FloatArray) -> tuple[FloatArray, FloatArray]:
+        off = (at - axis.px) / axis.reach_px
+        squared = np.sum(off**2, axis=-1)
+        return off, np.stack([squared, squared**2], axis=-1)
+
+    off, powers = from_axis(px)
+    homography = np.asarray(cv2.findHomography(off, board)[0], float)
+    radial = np.zeros(2)
+    if homography.shape != (3, 3):
+        return None
+
+    def flattened(at: FloatArray) -> FloatArray:
+        off, powers = from_axis(at)
+        return _mapped(homography, off / (1.0 + powers @ radial)[..., None])
+
+    first = np.linalg.norm(board - flattened(px))
+    for _ in range(_RADIAL_STEPS):
+        shrink = 1.0 + powers @ radial
+        if not np.all(shrink > _LEAST_RADIAL):
+            return None
+        flat = off / shrink[:, None]
+        seen = _mapped(homography, flat)
+        rest = board - seen
+        ahead = flat @ homography[2, :2] + homography[2, 2]
+        ones = np.column_stack([flat, np.ones(len(flat))]) / ahead[:, None]
+        by_flat = (homography[:2, :2] - seen[..., None] * homography[2, :2]) / ahead[:, None, None]
+        by_shrink = -(by_flat @ off[..., None]) / shrink[:, None, None] ** 2
+        jacobian = np.zeros((len(px), 2, 10))
+        jacobian[:, 0, :3] = jacobian[:, 1, 3:6] = ones
+        jacobian[:, :, 6:8] = -seen[..., None] * ones[:, None, :2]
+        jacobian[:, :, 8:] = by_shrink * powers[:, None]
+        held = np.sqrt(np.mean(rest**2)) / _RADIAL_SIGMA * np.eye(2, 10, 8)
+        step = np.linalg.lstsq(
+            np.concatenate([jacobian.reshape(-1, 10), held]),
+            np.concatenate([rest.ravel(), -held[:, 8:] @ radial]),
+        )[0]
+        homography += np.append(step[:8], 0.0).reshape(3, 3)
+        radial += step[8:]
+    is_better = np.linalg.norm(board - flattened(px)) < first
+    return flattened if is_better and np.all(1.0 + powers @ radial > _LEAST_RADIAL) else None
 
 
 def _mapped(homography: FloatArray, places: FloatArray) -> FloatArray:

@@ -6,12 +6,13 @@ Around a corner the print is a product of two edges, so that the image there is
     E(x; s) = erf(x / (sqrt 2 s)) - erf((x - 1) / (sqrt 2 s)) - erf((x + 1) / (sqrt 2 s)),
 
 with the corner's own lines and the next ones at either side, in squares of the board. M maps pixels
-to the board: a homography of all corners, and on top of it, for each, a cubic polynomial that those
-around it determine (where a lens bends squares of 60 px, a homography alone errs by 0.01 px). The
-unknowns of a corner are its shift d, its offset o and its contrast g; those of the image are the
-widths of the edges across its two families of lines, which differ where something moved. They are
-found by Gauss-Newton steps, in which o and g have their least squares given the rest (Golub and
-Pereyra 1973). The slopes a and c of uneven light come from the o and g of the corners around.
+to the board: the lens's radial distortion is taken off, then follow a homography of all corners,
+and for each a cubic polynomial that those around it determine (where a lens bends squares of 60 px,
+a homography alone errs by 0.01 px). The unknowns of a corner are its shift d, its offset o and its
+contrast g; those of the image are the widths of the edges across its two families of lines, which
+differ where something moved. They are found by Gauss-Newton steps, in which o and g have their
+least squares given the rest (Golub and Pereyra 1973). The slopes a and c of uneven light come from
+the o and g of the corners around.
 
 Ink that spreads, a tone curve, and a symmetric blur of another shape are even about the corner:
 they leave residuals but do not move it. The image is smoothed a little first, because demosaicing
@@ -22,7 +23,8 @@ The corners of an AprilGrid's tags are such corners too, for each touches a smal
 white between tags takes the place of the squares' side: within it lie a corner's lines alone, and
 the next ones. A corner of a tag by itself is one dark square before white. Around it neither uneven
 light nor what lies beyond the white is even, so that the slopes of white are unknowns of its own,
-and what blur brings in from beyond is left out. Ink and a tone curve move its two edges.
+and what blur brings in from beyond is left out. Its edges end at it, so that directions of M that
+are off move it, and M is made anew until corners rest. Ink and a tone curve move its two edges.
 
 Around the centre of a printed circle of radius r the product of edges becomes one edge,
 
@@ -43,7 +45,7 @@ import numpy as np
 import numpy.typing as npt
 
 from visioncal.core.types import FloatArray, Image, IntArray, Mask, Target
-from visioncal.vision.finders.maps import maps_about
+from visioncal.vision.finders.maps import OpticalAxis, maps_about
 from visioncal.vision.targets import corner_positions, marked_squares, marker_cells
 
 _Float32Array: TypeAlias = npt.NDArray[np.float32]
@@ -86,6 +88,8 @@ _BLUR_SAMPLE, _BLUR_START_PX, _BLUR_LEAST_PX = 30, 1.5, 0.5
 _BLUR_TURNS, _MOST_TURNS = 8, 8
 _STEADY, _LONE_STEADY = 0.03, 0.01
 _STILL_PX, _LONE_STILL_PX = (0.1, 0.02), (0.004, 0.004)
+# Most turns of the maps about lone corners, and the change of corners that ends them [px].
+_LONE_MAPS, _MAPS_STILL_PX = 4, 0.03
 # Beyond this share of a square, blur brings in the next lines.
 _WIDE = 0.16
 # Pixels nearer to a ChArUco board's marker than this many widths of an edge are left out.
@@ -211,9 +215,10 @@ class _Windows:
         good: Mask,
         chosen: IntArray,
         pattern: _Pattern,
+        axis: OpticalAxis,
     ) -> Self:
         """Cuts the windows of the chosen ones among corners, whose good ones make the maps."""
-        on_board, around, smoother = maps_about(board, px, good, chosen)
+        on_board, around, smoother = maps_about(board, px, good, chosen, axis)
         axes = np.eye(2) if pattern.axes is None else pattern.axes[chosen]
 
         def on_own(places: FloatArray) -> FloatArray:
@@ -412,12 +417,13 @@ def _placed(image: Image, pattern: _Pattern, board: FloatArray, px: FloatArray) 
     """Refines (n, 2) corners at places of the board, in the part of the image that shows them."""
     low = np.maximum(np.floor(px.min(axis=0)).astype(int) - _RIM_PX, 0)
     high = np.ceil(px.max(axis=0)).astype(int) + _RIM_PX + 1
+    axis = OpticalAxis.of(image.shape, low)
     part = np.ascontiguousarray(image[low[1] : high[1], low[0] : high[0]])
     flat = all(np.linalg.matrix_rank(it - it.mean(axis=0)) == 2 for it in (board, px))
     # Corners that cannot be fitted may lead to anything; they are sorted out afterwards.
     with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
         if len(px) >= _FEWEST and flat and part.size:
-            refined = _refined(part, pattern, board, px - low)
+            refined = _refined(part, pattern, board, px - low, axis)
             return replace(refined, px=refined.px + low)
     nothing = np.full(len(px), np.nan)
     reason = "the corners found are too few, or lie as no board's do"
@@ -442,25 +448,33 @@ def _refined_smaller(image: Image, target: Target, ids: IntArray, px: FloatArray
     return Refined(2 * found.px + 0.5, 2 * found.sigma_px, found.reasons, 2 * found.blur_px)
 
 
-def _refined(image: Image, pattern: _Pattern, board: FloatArray, px: FloatArray) -> Refined:
+def _refined(
+    image: Image, pattern: _Pattern, board: FloatArray, px: FloatArray, axis: OpticalAxis
+) -> Refined:
     smooth = np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, _KERNEL, _KERNEL), np.float32)
     every, all_good = np.arange(len(px)), np.ones(len(px), bool)
     some = every[:: -(-len(px) // _BLUR_SAMPLE)]
-    windows = _Windows.cut(smooth, board, px, all_good, every, pattern)
+    windows = _Windows.cut(smooth, board, px, all_good, every, pattern, axis)
     blur_px, radius = _measured_blur(windows.at(some), pattern.at(some))
     if pattern.radius:
         pattern = replace(pattern, radius=radius)
-        windows = _Windows.cut(smooth, board, px, all_good, every, pattern)
+        windows = _Windows.cut(smooth, board, px, all_good, every, pattern, axis)
     is_lone = pattern.lone is not None
     still_px, last_px = (
         (_LONE_STILL_PX, _LONE_LAST_STEP_PX) if is_lone else (_STILL_PX, _LAST_STEP_PX)
     )
     none = np.zeros_like(px)
-    first = _step(windows, pattern, none, blur_px)
-    shift, step = _fitted(windows, pattern, blur_px, None, first, still_px[0])
-    better = windows.moved(shift)
-    good = np.array([not it for it in _reasons(windows, step, better - px, last_px[0])])
-    windows = _Windows.cut(smooth, board, np.where(good[:, None], better, px), good, every, pattern)
+    # The edges of a lone corner lie to one side of it, and it moves with the maps' directions.
+    for _ in range(_LONE_MAPS if is_lone else 1):
+        first = _step(windows, pattern, none, blur_px)
+        shift, step = _fitted(windows, pattern, blur_px, None, first, still_px[0])
+        better = windows.moved(shift)
+        good = np.array([not it for it in _reasons(windows, step, better - px, last_px[0])])
+        better = np.where(good[:, None], better, px)
+        moved_px = np.abs(better - windows.px).max()
+        windows = _Windows.cut(smooth, board, better, good, every, pattern, axis)
+        if moved_px < _MAPS_STILL_PX:
+            break
     slopes = windows.slopes(step.levels)
     # Glare and shadows have edges: where slopes do not explain more of a corner, it has none.
     first, plain = _steps(windows, pattern, none, blur_px, (slopes, None))
