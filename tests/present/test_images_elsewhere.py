@@ -58,7 +58,7 @@ def test_the_session_stays_what_it_is_without_its_images(cell, tmp_path, kept):
     assert read_calibration(path).session_sha256 == session.digest()
 
 
-def test_the_command_leaves_images_where_they_are(cell, tmp_path):
+def test_the_command_leaves_images_where_they_are_and_makes_no_folder_without_them(cell, tmp_path):
     session, _ = cell
     done = visioncal("calibrate", session.images.folder, "-o", tmp_path, "--images", "none")
     assert done.status == 0
@@ -66,3 +66,8 @@ def test_the_command_leaves_images_where_they_are(cell, tmp_path):
     refused = visioncal("calibrate", tmp_path / RECORDING, "-o", tmp_path / "again")
     assert refused.status == 2
     assert "--images none" in refused.err
+    refused = visioncal("convert", tmp_path / RECORDING, tmp_path / "folder")
+    assert refused.status == 2
+    assert "Take the session's folder, which has its images." in refused.err
+    assert not (tmp_path / "folder").exists()
+    assert visioncal("convert", tmp_path / RECORDING, tmp_path / "copy.rrd").status == 0

@@ -42,7 +42,8 @@ def write_folder(
         paths: The images.
 
     Raises:
-        DataError: The folder exists and is not empty, or cannot be written.
+        DataError: The folder exists and is not empty, or cannot be written; or an image is
+            elsewhere.
     """
     folder = folder.absolute()
     refuse_filled(folder)
@@ -52,7 +53,8 @@ def write_folder(
             new = aside / "new"
             new.mkdir()
             for path in paths:
-                if images.exists(path):
+                # One of which no more than its digest is known refuses to be read.
+                if images.exists(path) or images.sha256(path):
                     _write_below(new, path, images.read(path))
             for path, text in texts.items():
                 _write_below(new, path, text)

@@ -340,8 +340,8 @@ class Session:
         stay names. Image files are copied byte by byte; missing ones stay missing.
 
         Raises:
-            DataError: The folder exists and is not empty, or cannot be written; or a recording is
-                named.
+            DataError: The folder exists and is not empty, or cannot be written; a recording is
+                named; or the session is of a recording without its images.
         """
         if Path(folder).suffix == ".rrd":
             raise DataError(
