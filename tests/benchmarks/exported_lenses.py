@@ -18,7 +18,7 @@ from results import first, wished, write_section
 
 import visioncal
 from visioncal.core.types import Camera
-from visioncal.results.refitted_lens import refitted
+from visioncal.results.lens import refitted
 from visioncal.vision.camera import normalise
 
 SEEDS = 6

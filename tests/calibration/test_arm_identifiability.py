@@ -18,7 +18,7 @@ from visioncal.core.choices import CONVENTIONS
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import MOUNTS
-from visioncal.estimation.indices import Indices
+from visioncal.estimation.identifiability import Indices
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.parameters import free_parameters, parameter_moves
 from visioncal.estimation.parts import Effect

@@ -16,7 +16,7 @@ from visioncal.calibration.stages import dense as stage
 from visioncal.calibration.stages.detect import detect
 from visioncal.core.errors import DataError
 from visioncal.results.sections import CornerResiduals
-from visioncal.session.single import is_whole_cell
+from visioncal.session.selecting import is_whole_cell
 from visioncal.simulation import (
     CellOptions,
     NetworkOptions,

@@ -14,7 +14,7 @@ from support.warmed import CELL, drift_of, warmed
 
 from visioncal import Session
 from visioncal.calibration.pipeline import calibrate
-from visioncal.calibration.stages.thermal_inputs import inputs_of
+from visioncal.calibration.stages.thermal import inputs_of
 from visioncal.calibration.verification import verify
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.core.errors import DataError, DegenerateError

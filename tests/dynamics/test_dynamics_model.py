@@ -37,7 +37,7 @@ from visioncal.robot import (
     weighed_urdf,
     with_inertias,
 )
-from visioncal.robot.momentum import weighed_model
+from visioncal.robot.torques import weighed_model
 
 # Sums of some hundred products of numbers about 1 to 100 [N m].
 ROUNDING = 1e-10

@@ -26,8 +26,8 @@ from visioncal.present.report import write_report
 from visioncal.present.report.advice import listed, suspects
 from visioncal.present.report.axes import Scale, tick_words
 from visioncal.present.report.page import render
+from visioncal.present.report.plots import twist_of
 from visioncal.present.report.thumbnails import thumbnail
-from visioncal.present.report.trends import twist_of
 from visioncal.results import (
     Calibration,
     CameraResult,

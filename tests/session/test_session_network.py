@@ -9,7 +9,7 @@ from visioncal.core.errors import DataError
 from visioncal.frames.touches import touches_of
 from visioncal.present.recording import write_recording
 from visioncal.session import Session
-from visioncal.session.single import check_one_of_each
+from visioncal.session.selecting import check_one_of_each
 
 TOML = """schema = 1
 name = "two arms"

@@ -2,16 +2,21 @@
 
 import atexit
 import gc
+import os
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from errno import ENAMETOOLONG
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar, TextIO, cast
 
 import typer
 
 from visioncal.cli.lazy import LazyGroup
-from visioncal.cli.streams import guarded_streams
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.version import __version__
+
+# As a shell reports a program that SIGPIPE ended.
+_EXIT_BROKEN_PIPE = 128 + 13
 
 
 class _Commands(LazyGroup):
@@ -78,7 +83,7 @@ def main() -> None:
     gc.set_threshold(20_000)
     # Nor does Python find any among them as it ends, which takes as long again.
     atexit.register(gc.freeze)
-    with guarded_streams(), _WithoutPandas():
+    with _guarded_streams(), _WithoutPandas():
         try:
             app()
         except VisioncalError as error:
@@ -115,3 +120,64 @@ def _refuse(error: VisioncalError) -> None:
 
     report_error(error, as_json="--json" in sys.argv[1:])
     sys.exit(EXIT_NO_RESULT)
+
+
+@contextmanager
+def _guarded_streams() -> Iterator[None]:
+    """Runs a command whose streams may fail."""
+    messages, results = _guarded(sys.stderr, lambda _: None), _guarded(sys.stdout, _end)
+    with redirect_stderr(messages), redirect_stdout(results):
+        yield
+
+
+def _end(error: OSError) -> None:
+    if isinstance(error, BrokenPipeError):
+        raise SystemExit(_EXIT_BROKEN_PIPE) from error
+    # A console takes longer to import than `--version` takes.
+    from visioncal.cli.console import EXIT_NO_RESULT, report_error
+
+    failure = DataError(
+        f"stdout cannot be written: {error.strerror or error}.",
+        culprits=["stdout"],
+        next_step="Write it to a file where there is room.",
+    )
+    report_error(failure, as_json=False)
+    raise SystemExit(EXIT_NO_RESULT) from error
+
+
+def _guarded(stream: TextIO | None, failed: Callable[[OSError], None]) -> TextIO | None:
+    # There is none where it was closed before the program began.
+    return None if stream is None else cast(TextIO, _Guarded(stream, failed))
+
+
+class _Guarded:
+    """A text stream that goes nowhere once it has failed."""
+
+    def __init__(self, stream: TextIO, failed: Callable[[OSError], None]) -> None:
+        self._stream = stream
+        self._failed = failed
+
+    def write(self, text: str) -> int:
+        """Writes a text; that of a stream that has failed is lost."""
+        try:
+            return self._stream.write(text)
+        except OSError as error:
+            self._give_up(error)
+            return len(text)
+
+    def flush(self) -> None:
+        """Hands on what was written."""
+        try:
+            self._stream.flush()
+        except OSError as error:
+            self._give_up(error)
+
+    def _give_up(self, error: OSError) -> None:
+        # What is left in the buffer would fail once more, without a word, when Python ends.
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, self._stream.fileno())
+        os.close(nowhere)
+        self._failed(error)
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - whatever the stream has
+        return getattr(self._stream, name)

@@ -32,8 +32,7 @@ from visioncal.results import Calibration
 from visioncal.robot import Robot, load_robot
 from visioncal.session import Session
 from visioncal.session.choosing import ANY, LENS, Choice
-from visioncal.session.selecting import select
-from visioncal.session.single import is_to_be_parted
+from visioncal.session.selecting import is_to_be_parted, select
 from visioncal.vision.targets import target_from_document
 
 _SESSION = "session.toml"

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from visioncal.cli.progress import shown_progress
-from visioncal.cli.simulated import Read
+from visioncal.cli.simulate import Read
 from visioncal.core.errors import DataError
 from visioncal.session import frame_name
 from visioncal.simulation import (

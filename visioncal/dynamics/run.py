@@ -19,8 +19,7 @@ from visioncal.dynamics.validate import Prediction, friction_of_known, predict, 
 from visioncal.robot import Robot
 from visioncal.session import STREAMS, Session
 from visioncal.session.choosing import ARM, Choice
-from visioncal.session.selecting import select
-from visioncal.session.single import check_one_of_each
+from visioncal.session.selecting import check_one_of_each, select
 
 # The share of a motion's end that is predicted where no other motion is named.
 HELD_OUT = 0.3

@@ -3,6 +3,7 @@
 Slopes are taken in units of the noise by rows and of the errors' own size by columns, and the
 frames at both ends of the chain, of which nothing is known, are taken out. A singular value is then
 how much better the stops know a direction than it was known before: over one, it is determined.
+Observability indices are of the same singular values.
 """
 
 from dataclasses import dataclass
@@ -98,3 +99,48 @@ def right_vectors(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     padded = np.vstack([matrix, np.zeros((matrix.shape[1],) * 2)])
     _, sizes, turned = np.linalg.svd(np.linalg.qr(padded, mode="r"))
     return sizes, turned
+
+
+@dataclass(frozen=True)
+class Indices:
+    """What has been proposed to compare sets of stops by; all are larger where stops are better.
+
+    With the singular values s_1 >= ... >= s_L of the slopes by what is determined, over m stops:
+
+    Attributes:
+        o1: `(s_1 ... s_L)^(1/L) / sqrt(m)` (Borm and Menq 1991, eq. 14): the volume that noise
+            fills.
+        o2: `s_L / s_1`, one over the condition number (Driels and Pathre 1990).
+        o3: `s_L` (Nahvi, Hollerbach and Hayward 1994).
+        o4: `s_L^2 / s_1`, the noise amplification index (Nahvi and Hollerbach 1996, eq. 9).
+        o5: `1 / (1 / s_1 + ... + 1 / s_L)` (Sun and Hollerbach 2008, of A-optimality).
+    """
+
+    o1: float
+    o2: float
+    o3: float
+    o4: float
+    o5: float
+
+    @property
+    def condition(self) -> float:
+        """Largest over smallest singular value."""
+        return 1.0 / self.o2
+
+    @classmethod
+    def of(cls, values: FloatArray, stops: int) -> "Indices":
+        """Computes the indices.
+
+        Args:
+            values: (L,) singular values of what is determined, none of them zero.
+            stops: How many stops of the arm they are of.
+        """
+        least, greatest = float(values.min()), float(values.max())
+        mean = float(np.exp(np.mean(np.log(values))))
+        return cls(
+            o1=mean / float(np.sqrt(stops)),
+            o2=least / greatest,
+            o3=least,
+            o4=least**2 / greatest,
+            o5=1.0 / float(np.sum(1.0 / values)),
+        )

@@ -1,19 +1,34 @@
-"""A fixture from touches: where the tip was, the fit, and what it rests on."""
+"""A fixture from touches, of a drawing's points or of its origin, its x axis and its xy plane."""
+
+from collections.abc import Iterator, Sequence
+from typing import cast
+
+import numpy as np
 
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.limits import FixtureLimits
-from visioncal.core.verdict import Finding
-from visioncal.estimation.features import FEATURE_KINDS
+from visioncal.core.types import Mask
+from visioncal.core.verdict import Finding, Step
+from visioncal.estimation.features import (
+    FEATURE_KINDS,
+    FeatureFit,
+    FeatureKind,
+    FeatureTouches,
+    fit_features,
+)
+from visioncal.estimation.placing import TOUCH_NOISE_M, assumed_words, counted_noise_m
 from visioncal.frames.drawing_points import NominalPoints
-from visioncal.frames.fixture_fit import Setting
+from visioncal.frames.fixture_fit import Fitted, Setting, fixture_frame, reasons_of
 from visioncal.frames.fixture_from_drawing import drawn_fixture
-from visioncal.frames.fixture_from_features import featured_fixture
-from visioncal.frames.measured import Tool, touched_points
+from visioncal.frames.measured import MeasuredPoints, Tool, touched_points
 from visioncal.frames.touches import TouchRows, robot_noise
 from visioncal.results import Calibration, Frame
 from visioncal.robot import Robot
+
+_CAUSE = "the tip had slipped, it is of another kind, or the pose is of another moment"
+_THINGS = {"origin": "the origin", "x": "the x axis", "xy": "the xy plane"}
 
 
 @typed
@@ -62,7 +77,7 @@ def touched_fixture(
         touch_noise_m, tuple(_doubts(tool)), _details(tool), options or FixtureLimits()
     )
     if drawing is None:
-        return featured_fixture(measured, rows.kinds, setting)
+        return _featured_fixture(measured, rows.kinds, setting)
     return drawn_fixture(measured, drawing, setting)
 
 
@@ -94,3 +109,67 @@ def _details(tool: Tool | None) -> dict[str, object]:
     if tool is None:
         return {"tool": "none: the poses are of the tip"}
     return {"tool": {"name": tool.name, "sigma_mm": tool.edge.sigma_mm}}
+
+
+def _featured_fixture(measured: MeasuredPoints, kinds: Sequence[str], setting: Setting) -> Frame:
+    """Finds the fixture whose origin, x axis and xy plane were touched."""
+    touches = FeatureTouches(
+        measured.labels,
+        cast("tuple[FeatureKind, ...]", tuple(kinds)),
+        measured.points,
+        measured.scattered,
+    )
+    expected = setting.touch_noise_m
+    if expected is None and len(measured) == len(FEATURE_KINDS):
+        # One of each kind leaves no residual to estimate the noise from.
+        expected = TOUCH_NOISE_M
+    fitted = _fitted(fit_features(touches, expected), measured, setting)
+    counts = ", ".join(f"{kinds.count(it)} {it}" for it in FEATURE_KINDS)
+    return fixture_frame(
+        fitted, kinds, f"{counts} touches", tuple(_unchecked(fitted, kinds, setting)), {}, setting
+    )
+
+
+def _fitted(fit: FeatureFit, measured: MeasuredPoints, setting: Setting) -> Fitted:
+    agreement, matrix = fit.agreement, fit.base_from_fixture
+    noise_m = counted_noise_m(agreement.fit, setting.expected_m)
+    agrees = agreement.agrees
+    away = np.linalg.norm(fit.residuals, axis=1)
+    return Fitted(
+        measured,
+        measured.labels,
+        tuple(f"Touch {it}" for it in measured.labels),
+        matrix,
+        measured.carried(fit.by_points, np.full(len(measured), noise_m)),
+        np.asarray((measured.points[agrees].mean(axis=0) - matrix[:3, 3]) @ matrix[:3, :3]),
+        agrees,
+        agreement.doubtful,
+        agreement.explained,
+        tuple(reasons_of(agreement, away, [_CAUSE] * len(measured))),
+        away,
+        noise_m,
+        agreement.fit.sigma_95,
+    )
+
+
+def _unchecked(fitted: Fitted, kinds: Sequence[str], setting: Setting) -> Iterator[Finding]:
+    once = [_THINGS[kind] for kind in FEATURE_KINDS if _count(kinds, kind, fitted.agrees) == 1]
+    assumed = assumed_words(fitted.noise_m, setting.touch_noise_m)
+    if len(once) == len(FEATURE_KINDS):
+        yield Finding(
+            "unchecked",
+            f"Three touches leave nothing to check the fixture with.{assumed}",
+            Step("Touch each feature once more, elsewhere."),
+        )
+    elif once:
+        verb = "was" if len(once) == 1 else "were"
+        yield Finding(
+            "unchecked",
+            f"{' and '.join(once).capitalize()} {verb} touched once only, which nothing checks."
+            f"{assumed}",
+            Step("Touch again, elsewhere."),
+        )
+
+
+def _count(kinds: Sequence[str], kind: str, agrees: Mask) -> int:
+    return sum(it == kind and used for it, used in zip(kinds, agrees.tolist(), strict=True))

@@ -16,8 +16,7 @@ from visioncal.results import Calibration
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.choosing import ARM, Choice
-from visioncal.session.selecting import select
-from visioncal.session.single import check_one_of_each
+from visioncal.session.selecting import check_one_of_each, select
 
 # No arm reaches this far [m], and no joint of one turns this far [rad].
 _FAR_M, _WIDE_RAD = 20.0, 4 * np.pi

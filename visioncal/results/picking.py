@@ -6,8 +6,7 @@ from visioncal.core.errors import DataError
 from visioncal.results.result import Calibration
 from visioncal.session import Session
 from visioncal.session.choosing import PARTS, Choice, Part
-from visioncal.session.selecting import has_several, select
-from visioncal.session.single import check_one_of_each, is_to_be_parted
+from visioncal.session.selecting import check_one_of_each, has_several, is_to_be_parted, select
 
 
 def picked(

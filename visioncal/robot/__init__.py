@@ -9,6 +9,7 @@ from visioncal.robot.conversion import (
     PARALLEL_RAD,
     convert_table,
     has_ur_axes,
+    other_convention,
     parallel_axes,
     placed_at,
     table_of,
@@ -25,6 +26,7 @@ from visioncal.robot.inertia import (
     INERTIA_KEY,
     PARAMETER_NAMES,
     Inertias,
+    LogCholesky,
     entries,
     matrices,
     moving,
@@ -32,17 +34,14 @@ from visioncal.robot.inertia import (
     pseudo_inertias,
 )
 from visioncal.robot.loads import MASS_KEYS, Loads, Masses, bends, bent_joints
-from visioncal.robot.logcholesky import LogCholesky
 from visioncal.robot.model import BODY_KEYS, LINK_KEYS, Robot
-from visioncal.robot.momentum import momenta
 from visioncal.robot.rates import RATE_KEYS, Rates
-from visioncal.robot.recognising import other_convention
 from visioncal.robot.tables import (
     DHTable,
     table_document,
     table_from_document,
 )
-from visioncal.robot.torques import body_regressor, joint_torques, torque_regressor
+from visioncal.robot.torques import body_regressor, joint_torques, momenta, torque_regressor
 from visioncal.robot.urdf_bodies import weighed_urdf
 from visioncal.robot.urdfs import corrected_tip, corrected_urdf
 from visioncal.robot.weighing import with_inertias

@@ -1,4 +1,4 @@
-"""Between the conventions of joint tables, and from any chain to a table.
+"""Between the conventions of joint tables, which one a table is in, and from any chain to a table.
 
 What a row has to say of two consecutive axes is how the next one lies in the frame of the last.
 `_between` finds its numbers; what is left is a turn about and a way along the next axis, which
@@ -15,12 +15,13 @@ import numpy as np
 from visioncal.core.choices import Convention
 from visioncal.core.transforms import compose, invert, skew
 from visioncal.core.types import FloatArray, Mask
-from visioncal.robot.chain import Chain, chain_document
+from visioncal.robot.chain import IDENTITY_FUNCTION, Chain, chain_document
 from visioncal.robot.model import LINK_KEYS, Robot
 from visioncal.robot.tables import (
     DHTable,
     about_x,
     about_z,
+    chain_of_table,
     table_document,
     table_from_document,
 )
@@ -346,3 +347,41 @@ def _last_row(link: FloatArray, hint: _Row, like: DHTable | None) -> tuple[_Row,
     row = replace(hint, theta=theta, d=float(away[2, 3]))
     left = invert(row.transform) @ link
     return row, flange if np.abs(left - flange).max() < _ROUNDING else left
+
+
+def other_convention(robot: Robot) -> tuple[Robot, Convention] | None:
+    """The arm that the numbers of a robot's table are in the convention that was not declared.
+
+    Its base and flange may be other constants than the table's.
+
+    Returns:
+        The arm and its convention; None where the robot is not described by a table.
+    """
+    if "convention" not in robot.document:
+        return None
+    declared = table_from_document(robot.document)
+    standard, modified = _readings(declared)
+    other = standard if declared.convention == "modified" else modified
+    document = chain_document(robot.name, robot.tip, chain_of_table(other))
+    return Robot.from_document(document), other.convention
+
+
+def _readings(table: DHTable) -> tuple[DHTable, DHTable]:
+    """The printed rows as both orders read them."""
+    rows = slice(None, -1) if table.convention == "modified" else slice(1, None)
+    columns = np.array([table.a_m, table.alpha_rad, table.beta_rad])[:, rows]
+    bare = replace(
+        table,
+        base=np.eye(4),
+        flange=np.eye(4),
+        functions=np.tile(IDENTITY_FUNCTION, (len(table), 1)),
+    )
+    standard: Convention = "hayati" if table.convention == "hayati" else "standard"
+    return (
+        _with_across(replace(bare, convention=standard), np.pad(columns, ((0, 0), (1, 0)))),
+        _with_across(replace(bare, convention="modified"), np.pad(columns, ((0, 0), (0, 1)))),
+    )
+
+
+def _with_across(table: DHTable, columns: FloatArray) -> DHTable:
+    return replace(table, a_m=columns[0], alpha_rad=columns[1], beta_rad=columns[2])

@@ -1,12 +1,16 @@
-"""Whether a reading stands out, and under which mount."""
+"""Whether a reading stands out, and under which mount.
+
+Reported poses are `base_from_model @ FK(q) @ flange_from_tool` with two constant transforms: a base
+that is turned, and an inverse that could as well be another mount, show in the robot's own joints
+alone.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.calibration.guess.chain import by_chain, is_half_turned
-from visioncal.calibration.guess.fit import is_about_one_axis
+from visioncal.calibration.guess.fit import Fit, is_about_one_axis, robust_fit
 from visioncal.calibration.guess.given import (
     CLOSING_SCORE,
     FEWEST_ROWS,
@@ -14,9 +18,12 @@ from visioncal.calibration.guess.given import (
     STANDS_OUT,
     Recording,
     Scored,
+    flange_and_cell_m,
+    is_far_likelier,
     is_likely_unit,
+    likeness,
 )
-from visioncal.calibration.guess.likeness import flange_and_cell_m, is_far_likelier, likeness
+from visioncal.calibration.guess.hypothesis import HALF_TURN, Hypothesis
 from visioncal.calibration.guess.messages import notes, sentence
 from visioncal.calibration.guess.result import Candidate, Guess
 from visioncal.calibration.guess.row_exchange import exchanged
@@ -24,7 +31,7 @@ from visioncal.calibration.guess.search import search
 from visioncal.core.conventions import ROTATION_FORMS, PoseNumbers
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.transforms import invert, rotation_angle
+from visioncal.core.transforms import invert, pose_difference, rotation_angle
 from visioncal.core.types import MOUNTS, FloatArray, Mount
 
 # Readings this near to the best are as good; of them, the one with the fewest changes is meant.
@@ -39,6 +46,13 @@ _LISTED = 12
 _ROUGHLY, _FEWEST_ROUGH = 2.0 * CLOSING_SCORE, 8
 # Poses of two readings that differ by less than this share of what is left are the same.
 _SAME = 0.3
+# Nominal models differ from the controller's by a few millimetres; a half turn is far from that.
+_NEAR_MM, _NEAR_DEG = 10.0, 2.0
+# Poses of this many times the scatter of the others are not those of the joints.
+_CLEARLY = 3.0
+_FEWEST_ROWS = 4
+# A reading that is right agrees with the joints within this share of the distances.
+_SAME_CHAIN = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +113,7 @@ def _found(recording: Recording, chain: FloatArray | None) -> _Found:
     if swapped is not None:
         best = swapped
         scored.append(best)
-    if chain is not None and is_half_turned(best.hypothesis, recording.robot, chain):
+    if chain is not None and _is_half_turned(best.hypothesis, recording.robot, chain):
         taken = replace(best.hypothesis.robot, half_turned=True)
         turned = replace(best.hypothesis, robot=taken)
         best = replace(best, hypothesis=turned, labels=())
@@ -115,7 +129,7 @@ def _of_likelier_mount(first: _Found, second: _Found, chain: FloatArray | None) 
     if better.best.score > CLOSING_SCORE or worse.best.score > STANDS_OUT * better.best.score:
         return better
     both = {it.best.hypothesis: it for it in (first, second)}
-    by_joints = None if chain is None else by_chain(tuple(both), first.recording.robot, chain)
+    by_joints = None if chain is None else _by_joints(tuple(both), first.recording.robot, chain)
     if by_joints is not None:
         return both[by_joints]
     other, likelier = sorted(
@@ -177,7 +191,7 @@ def _check(recording: Recording) -> None:
 
 def _by_chain(scored: Scored, recording: Recording, chain: FloatArray) -> Scored:
     """Lets the joints choose among readings that the camera cannot distinguish."""
-    chosen = by_chain(scored.labels, recording.robot, chain)
+    chosen = _by_joints(scored.labels, recording.robot, chain)
     return scored if chosen is None else replace(scored, hypothesis=chosen)
 
 
@@ -273,3 +287,36 @@ def _is_poor(recording: Recording, best: Scored) -> bool:
         return False
     _, camera = best.hypothesis.chain(recording.robot, recording.camera)
     return is_about_one_axis(camera[best.rows[best.fit.kept], :3, :3])
+
+
+def _chain_fit(hypothesis: Hypothesis, robot: PoseNumbers, chain: FloatArray) -> Fit | None:
+    """Compares the poses of a reading with those of the joints."""
+    poses = hypothesis.robot.poses(robot)
+    there = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(chain).all(axis=(1, 2))
+    if there.sum() < _FEWEST_ROWS:
+        return None
+    return robust_fit(invert(poses[there]), chain[there])
+
+
+def _by_joints(
+    labels: Sequence[Hypothesis], robot: PoseNumbers, chain: FloatArray
+) -> Hypothesis | None:
+    """The reading, of several that close the camera's chain alike, that the joints speak for."""
+    scored = [
+        (fit.score, at)
+        for at, label in enumerate(labels)
+        if (fit := _chain_fit(label, robot, chain)) is not None
+    ]
+    scored.sort()
+    if len(scored) < 2 or scored[1][0] < _CLEARLY * scored[0][0]:
+        return None
+    return labels[scored[0][1]]
+
+
+def _is_half_turned(hypothesis: Hypothesis, robot: PoseNumbers, chain: FloatArray) -> bool:
+    """Whether the poses are in a base that is turned by 180 degrees about z against the model's."""
+    fit = _chain_fit(hypothesis, robot, chain)
+    if fit is None or fit.score > _SAME_CHAIN:
+        return False
+    away_mm, away_deg = pose_difference(HALF_TURN, fit.x)
+    return away_mm < _NEAR_MM and away_deg < _NEAR_DEG

@@ -1,4 +1,9 @@
-"""What the search is given, and how it keeps what it finds."""
+"""What the search is given, how it keeps what it finds, and which of it is a cell as cells are.
+
+The inverse of the robot's poses, that of the camera's, and another mount exchange the unknown
+edges: no residual distinguishes them, but what sits on the flange is near it, and a camera looks at
+what is before it.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -23,6 +28,8 @@ CLOSING_SCORE = 0.05
 STANDS_OUT = 3.0
 # Cameras look at boards from here [m].
 _SEEN_FROM_M = (0.02, 30.0)
+# Of edges whose lengths differ by less either may be the one on the flange.
+_CLEARLY = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,3 +134,32 @@ def is_likely_unit(recording: Recording, unit: str) -> bool:
     seen_from = np.nanmedian(np.linalg.norm(recording.camera.positions, axis=1))
     low, high = _SEEN_FROM_M
     return bool(low < UNITS_M[unit] * seen_from < high)
+
+
+def _is_before(recording: Recording, scored: Scored) -> bool:
+    """Whether the target is before the camera."""
+    camera = scored.hypothesis.camera.poses(recording.camera)
+    return bool(np.median(camera[scored.rows, 2, 3]) > 0.0)
+
+
+def flange_and_cell_m(scored: Scored) -> tuple[float, float]:
+    """Lengths of the unknown edge on the flange and of the one at the base [m]."""
+    edges = (scored.fit.x, scored.fit.z)
+    on_flange, at_base = edges if scored.hypothesis.mount == "eye-in-hand" else edges[::-1]
+    return float(np.linalg.norm(on_flange[:3, 3])), float(np.linalg.norm(at_base[:3, 3]))
+
+
+def likeness(recording: Recording, scored: Scored) -> tuple[bool, bool]:
+    """A key by which likely cells come last."""
+    on_flange_m, at_base_m = flange_and_cell_m(scored)
+    return _is_before(recording, scored), on_flange_m < at_base_m
+
+
+def is_far_likelier(recording: Recording, scored: Scored, other: Scored) -> bool:
+    """Whether a reading is that of a cell and another, with its edges exchanged, is not."""
+    before, other_before = _is_before(recording, scored), _is_before(recording, other)
+    if before != other_before:
+        return before
+    on_flange_m, at_base_m = flange_and_cell_m(scored)
+    other_on_flange_m, other_at_base_m = flange_and_cell_m(other)
+    return _CLEARLY * on_flange_m < at_base_m and other_on_flange_m > other_at_base_m

@@ -19,9 +19,16 @@ from visioncal.calibration.guess.forms import (
     robot_forms,
     screen,
 )
-from visioncal.calibration.guess.given import SCORE_FLOOR, Recording, Scored, fitted, is_likely_unit
+from visioncal.calibration.guess.given import (
+    SCORE_FLOOR,
+    Recording,
+    Scored,
+    fitted,
+    is_far_likelier,
+    is_likely_unit,
+    likeness,
+)
 from visioncal.calibration.guess.hypothesis import Hypothesis, Taken, strangeness
-from visioncal.calibration.guess.likeness import is_far_likelier, likeness
 from visioncal.calibration.guess.positions import (
     UNIT_PAIRS,
     Turned,

@@ -13,7 +13,7 @@ from visioncal.core.number_format import figure
 from visioncal.results import Calibration, Rms
 from visioncal.results.sections import CornerResiduals, DenseResult, ImageBlur
 from visioncal.session import Session
-from visioncal.session.single import is_whole_cell
+from visioncal.session.selecting import is_whole_cell
 from visioncal.vision.dense.library import chosen_device
 
 # What is worse by less standard errors is chance.

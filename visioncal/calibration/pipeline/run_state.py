@@ -19,7 +19,7 @@ from visioncal.core.types import Corners, Mount
 from visioncal.results import Verdict
 from visioncal.robot import Loads
 from visioncal.session.loads import loads_of
-from visioncal.session.single import is_whole_cell
+from visioncal.session.selecting import is_whole_cell
 
 _T = TypeVar("_T")
 

@@ -15,11 +15,11 @@ from visioncal.estimation.armpair import ArmData, ArmPair
 from visioncal.estimation.excitation_advice import Move, joints_to_move
 from visioncal.estimation.identifiability import (
     Identifiability,
+    Indices,
     Jacobians,
     count_determined,
     identifiability,
 )
-from visioncal.estimation.indices import Indices
 from visioncal.estimation.null_space import (
     dominant_words,
     imitated,

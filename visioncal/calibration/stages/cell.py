@@ -18,7 +18,7 @@ from visioncal.estimation.tree import Branch, Tree
 from visioncal.results import HELD_BACK
 from visioncal.session import Observation, Session, frame_name
 from visioncal.session.kinds import is_seen
-from visioncal.session.single import is_whole_cell
+from visioncal.session.selecting import is_whole_cell
 from visioncal.session.tables import PriorTable
 
 _CELL = "cell"

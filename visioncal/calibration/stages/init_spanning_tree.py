@@ -4,6 +4,11 @@ Each body of frames (what stands in the cell, what a flange carries) is grown by
 first (Prim 1957). What these do not reach is placed by views of which all else is known. A board
 that looks the same turned does not say which way round it was seen: what is placed by way of such
 a board is tried every way round, and all views together decide which it was.
+
+Where one arm looks at a board in the hand of another, views say `u * first * v * second * w = seen`
+with both arms' poses, and three transforms are unknown. Were one of them known, the two others
+would be a hand-eye calibration: each is solved with the others as they were, in turn (as Wu, Wang,
+Qi and Ren 2016 iterate), from turns of the bases all around.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,19 +16,26 @@ from dataclasses import dataclass, replace
 from itertools import pairwise, product
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from visioncal.calibration.stages.init_instruments import placed_by_points
-from visioncal.calibration.stages.init_two_arms import between_arms
 from visioncal.calibration.stages.pair_observations import Factor, Growth, factors_of, product_of
-from visioncal.calibration.stages.pairwise import FEWEST, common_transform, hand_eye
+from visioncal.calibration.stages.pairwise import FEWEST, Candidates, common_transform, hand_eye
 from visioncal.calibration.stages.pose_ambiguity import CLEAR_RATIO
-from visioncal.core.transforms import invert
+from visioncal.core.transforms import compose, invert, rotation_angle
 from visioncal.core.types import FloatArray
+from visioncal.estimation.arm import LEVER_M
+from visioncal.estimation.closed_form import SOLVERS
 
 # A view that is farther off than this says nothing more about which start is right [m].
 _FAR_M = 0.1
 # So many starts are tried, by turns of boards, and not more.
 _MOST_TRIED = 256
+_FEWEST = 5
+# Rounds of a start, how many starts are followed, and for how long.
+_ROUNDS, _FOLLOWED, _LONG = 6, 4, 40
+# A start is one where views lie within so much of what is predicted, rotations on a lever [m].
+_NEAR_M = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +163,7 @@ def _parted(
                 (u_inverse, v), (sigma_u, sigma_v) = found
                 yield _as_placed(factors[open_ones[0]], invert(u_inverse), sigma_u)
                 yield _as_placed(factors[open_ones[1]], v, sigma_v)
-        elif (middle := between_arms(parts[1], parts[2], there)) is not None:
+        elif (middle := _between_arms(parts[1], parts[2], there)) is not None:
             yield _as_placed(factors[open_ones[1]], *middle)
 
 
@@ -170,3 +182,42 @@ def _score(growth: Growth, placed: Mapping[str, FloatArray]) -> float:
             distances = growth.sighted.candidates.take(rows).distances(product_of(factors, placed))
             away.append(np.minimum(distances.min(axis=1), _FAR_M))
     return float(np.concatenate(away).mean()) if away else 0.0
+
+
+def _between_arms(
+    first: FloatArray, second: FloatArray, candidates: Candidates
+) -> tuple[FloatArray, float] | None:
+    """Finds the transform in the middle."""
+    if len(first) < _FEWEST or candidates.turns.max(initial=0) > 0:
+        return None
+    seen = candidates.poses[:, 0]
+    starts = Rotation.create_group("O").as_matrix()
+    found = []
+    for turn in starts:
+        middle, away = _alternated(first, second, seen, compose(turn, np.zeros(3)), _ROUNDS)
+        found.append((away, middle))
+    found.sort(key=lambda it: it[0])
+    followed = [_alternated(first, second, seen, it, _LONG) for _, it in found[:_FOLLOWED]]
+    middle, away = min(followed, key=lambda it: it[1])
+    return (middle, away) if away < _NEAR_M else None
+
+
+def _alternated(
+    first: FloatArray, second: FloatArray, seen: FloatArray, middle: FloatArray, rounds: int
+) -> tuple[FloatArray, float]:
+    """Solves for two of the three in turn; returns the middle, and the views' median distance."""
+    away = np.inf
+    for _ in range(rounds):
+        # u and w with v as it is; then v and w with u; then u and v with w.
+        u_inverse, w = _park(invert(first @ middle @ second), seen)
+        _, w = _park(invert(second), invert(first) @ u_inverse @ seen)
+        u_inverse, middle = _park(invert(first), seen @ invert(w) @ invert(second))
+        between = invert(invert(u_inverse) @ first @ middle @ second @ w) @ seen
+        apart = np.linalg.norm(between[:, :3, 3], axis=1) + LEVER_M * rotation_angle(between)
+        away = float(np.median(apart))
+    return middle, away
+
+
+def _park(robot: FloatArray, camera: FloatArray) -> tuple[FloatArray, FloatArray]:
+    solution = SOLVERS["park"](robot, camera)
+    return solution.x, solution.z

@@ -6,19 +6,23 @@ from typing import TypeVar
 
 import numpy as np
 
-from visioncal.calibration.stages.joint_consistency import (
-    contradicted_joints,
-    guess_seen_joints,
-    lost_zero,
-    misread_joints,
+from visioncal.calibration.guess.fit import distances
+from visioncal.calibration.guess.joints import JointReading
+from visioncal.calibration.guess.misread import (
+    FEWEST_JOINT_ROWS,
+    FITS_SEEN,
+    JointGuess,
+    guess_joints,
 )
-from visioncal.calibration.stages.joints import Matched
+from visioncal.calibration.stages.joints import ARM_AS_FOUND, Matched, zero_taken
 from visioncal.calibration.stages.motion import is_open
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.reported_poses import Reported, reported_poses
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Mount, Rejection
-from visioncal.core.verdict import remarks
+from visioncal.core.verdict import Finding, Step, remarks
 from visioncal.robot import Robot
 from visioncal.session import Observation, Session, frame_name
 from visioncal.session.kinds import is_seen, name_of
@@ -117,10 +121,10 @@ def _checked(seen: T, name: str, reported: Reported, matched: Matched, how: tupl
     looks = {view: poses[view].cam_from_target[0] for view in views}
     rows = np.array([looks[view] for view in sound])
     q = np.array([joints[view] for view in sound]).reshape(len(sound), matched.robot.joint_count)
-    guess = guess_seen_joints(matched.arm, q, rows, mount)
+    guess = _guess_seen_joints(matched.arm, q, rows, mount)
     if drops:
         both = {it: (reported.base_from_flange[it], looks[it]) for it in views if it in doubted}
-        lost = tuple(contradicted_joints(matched, guess, both, mount))
+        lost = tuple(_contradicted_joints(matched, guess, both, mount))
         reported = reported.without({it.view for it in lost})
         seen = seen.noting(lost).with_robot(name, reported)
     if guess is None or not guess.stands_out:
@@ -132,7 +136,7 @@ def _checked(seen: T, name: str, reported: Reported, matched: Matched, how: tupl
         error = misread_joints(guess, matched.robot, has_poses=has_poses)
         raise error.within(f"robot {name}") if len(session.robots) > 1 else error
     taken = takes and matched.zero is None
-    seen = seen.noting((), (lost_zero(guess, zero, taken=taken).of(_called(session, name)),))
+    seen = seen.noting((), (_lost_zero(guess, zero, taken=taken).of(_called(session, name)),))
     return seen.with_robot(name, reported.with_zero(zero)) if taken else seen
 
 
@@ -155,7 +159,7 @@ def check_read_joints(seen: Observed, probes: Mapping[int, FloatArray]) -> None:
             continue
         q, looks = (np.array([by_view[it] for it in views]) for by_view in (joints, probes))
         # The instrument stands still beside the robot, as a camera does.
-        guess = guess_seen_joints(matched.arm, q, looks, "eye-to-hand")
+        guess = _guess_seen_joints(matched.arm, q, looks, "eye-to-hand")
         if guess is not None and guess.stands_out and guess.zero is None:
             mine = (it for it in seen.session.views if it.number in joints)
             has_poses = any(it.base_from_flange() is not None for it in mine)
@@ -199,3 +203,68 @@ def pairs_of(seen: Observed, robot: str) -> list[Pair]:
         mount: Mount = "eye-in-hand" if on_flange else "eye-to-hand"
         found.append(Pair(camera, target, mount, pairs[camera, target]))
     return found
+
+
+def _guess_seen_joints(
+    robot: Robot, q: FloatArray, cam_from_target: FloatArray, mount: Mount
+) -> JointGuess | None:
+    """Compares joint angles with what the camera sees, where there are enough views."""
+    if len(q) < FEWEST_JOINT_ROWS:
+        return None
+    return guess_joints(robot, q, _as_flange(cam_from_target, mount), FITS_SEEN)
+
+
+def _contradicted_joints(
+    matched: Matched,
+    guess: JointGuess | None,
+    seen: Mapping[int, tuple[FloatArray, FloatArray]],
+    mount: Mount,
+) -> Iterator[Rejection]:
+    """Tells of the views whose pose and angles contradict each other where the angles are wrong."""
+    for view, (pose, cam_from_target) in seen.items():
+        reason = matched.contradicting[view]
+        if guess is None:
+            yield Rejection(view, f"{reason}, and too few views show which of them is right")
+            continue
+        model = guess.best.reading.poses(matched.joints_rad[view][None])[0]
+        both = np.array([model, pose @ invert(matched.flange_from_reported)])
+        of_poses = invert(_as_flange(np.array([cam_from_target, cam_from_target]), mount))
+        fit = guess.best.fit
+        by_joints, by_pose = distances(of_poses, both, fit.lever, (fit.x, fit.z)).away
+        if by_pose < by_joints:
+            yield Rejection(view, f"{reason}, with which the camera agrees")
+
+
+def _as_flange(cam_from_target: FloatArray, mount: Mount) -> FloatArray:
+    """`base_from_flange` up to the two unknown edges."""
+    # It is `cam_from_target` of a camera that does not move, and its inverse where the target does
+    # not.
+    return invert(cam_from_target) if mount == "eye-in-hand" else cam_from_target
+
+
+def misread_joints(
+    guess: JointGuess, robot: Robot, *, has_poses: bool, seen: str = "what the camera sees"
+) -> DataError:
+    """The error of a session whose angles fit what was observed in another reading only."""
+    sentence = guess.sentence(seen)
+    also = " The reported poses are those of the same angles, and as wrong." if has_poses else ""
+    columns = guess.best.reading.columns or range(robot.joint_count)
+    return DataError(
+        f"views.csv: the joint angles are not those of {robot.name} as they are recorded. "
+        f"{sentence}{also}",
+        culprits=[f"views.csv: q{at + 1}_rad" for at in columns],
+        next_step=guess.fix,
+    )
+
+
+def _lost_zero(guess: JointGuess, zero: JointReading, *, taken: bool) -> Finding:
+    """Says which joint's zero is lost, and what becomes of it."""
+    words = (
+        f"The joint angles do not belong to {zero.robot.name} as they are declared. "
+        f"{guess.sentence('what the camera sees')}"
+    )
+    if taken:
+        return Finding(
+            "misread_joints", f"{words} {zero_taken(zero)}", Step(zero.fix, ARM_AS_FOUND)
+        )
+    return Finding("misread_joints", words, Step(zero.fix))

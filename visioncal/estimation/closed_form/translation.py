@@ -15,11 +15,26 @@ import numpy as np
 from visioncal.core.transforms import compose, nearest_rotation
 from visioncal.core.types import FloatArray
 from visioncal.estimation.closed_form.handeye import HandEye
-from visioncal.estimation.closed_form.leastsquares import smallest_solution
 
 # A direction that the views turn by less than this (root mean square) shows the robot's noise,
 # which would move X by metres; noise is up to 0.5 mrad, useful motion begins at 10 mrad.
 _SMALLEST_TURN_RAD = 2e-3
+
+
+def smallest_solution(normal: FloatArray, right: FloatArray, noise: float) -> FloatArray:
+    """Solves `normal @ x = right` for the shortest x.
+
+    Args:
+        normal: (n, n) symmetric and positive semidefinite.
+        right: (n,) or (n, k) right-hand sides.
+        noise: An eigenvalue up to this one says nothing.
+
+    Returns:
+        x of the shape of `right`, without any component along which the eigenvalue is within noise.
+    """
+    values, vectors = np.linalg.eigh(normal)
+    seen = vectors[:, values > noise]
+    return np.asarray((seen / values[values > noise]) @ (seen.T @ right))
 
 
 def mean_camera(camera: FloatArray) -> FloatArray:

@@ -9,9 +9,8 @@ import numpy as np
 from visioncal.core.types import FloatArray
 from visioncal.estimation.closed_form import quaternions
 from visioncal.estimation.closed_form.handeye import HandEye, solver
-from visioncal.estimation.closed_form.leastsquares import smallest_solution
 from visioncal.estimation.closed_form.pairs import rotation_pairs
-from visioncal.estimation.closed_form.translation import complete
+from visioncal.estimation.closed_form.translation import complete, smallest_solution
 
 # The identity and the half turns about x, y, z. The scalar part of X's quaternion, seen from
 # these frames, is w, x, y or z; one of the four is at least 1/2, a turn of at most 120 degrees.

@@ -11,7 +11,7 @@ from visioncal.core.files import one_line
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray, Mount
 from visioncal.results import CameraResult, Edge, Verdict
-from visioncal.results.refitted_lens import RefittedLens, refitted
+from visioncal.results.lens import RefittedLens, refitted
 
 _OF_LENS = "it goes with the lens of that calibration: with other intrinsics, use its ray_frame"
 # Any transform; the camera's alone, in its own direction; the lens alone; where something sits on

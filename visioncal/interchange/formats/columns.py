@@ -18,7 +18,6 @@ from visioncal.core.documents import (
 )
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
-from visioncal.interchange.formats.echoed import echoed_fields
 from visioncal.interchange.formats.fields import (
     Fields,
     fields_of_arrays,
@@ -39,7 +38,7 @@ from visioncal.interchange.formats.poses import (
     pose_names,
     poses_from,
 )
-from visioncal.interchange.formats.printed import printed_fields
+from visioncal.interchange.formats.printed import echoed_fields, printed_fields
 from visioncal.interchange.formats.streams import in_seconds
 
 DOCUMENTS = (".json", ".yaml", ".yml", ".xml")

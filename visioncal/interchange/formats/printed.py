@@ -1,4 +1,8 @@
-"""Matrices as programs print them: four lines each, under a line that says what they are."""
+"""Poses as programs print them.
+
+Matrices of four lines each, under a line that says what they are; and translation [m] and
+quaternion x, y, z, w of ROS (tf_echo, tf2_echo).
+"""
 
 import re
 from collections import defaultdict
@@ -13,6 +17,10 @@ from visioncal.core.files import some_of
 from visioncal.interchange.formats.fields import Fields
 
 _BETWEEN = re.compile(r"[\s,;\[\]()]+")
+_POSE = re.compile(
+    r"- Translation: \[([^\[\]]*)\]\s+- Rotation: in Quaternion(?: \(xyzw\))? \[([^\[\]]*)\]"
+)
+_NAMES = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 
 
 def printed_fields(path: Path) -> Fields | None:
@@ -61,3 +69,30 @@ def _plain(line: str) -> str:
     """A heading without what differs from one to the next: `Pose 3:` is `Pose`."""
     words = re.findall(r"[^\W\d_]+(?:[^\W_]*[^\W\d_])?", line)
     return " ".join(words)[:80]
+
+
+def echoed_fields(path: Path) -> Fields | None:
+    """Takes every pose that was printed; once a second, as the times say, it is no stream.
+
+    Returns:
+        The rows; None where the text has none.
+
+    Raises:
+        DataError: A pose has not three and four numbers.
+    """
+    text = read_plain_text(path)
+    places, rows = list[str](), list[list[float]]()
+    for it in _POSE.finditer(text):
+        at = text.count("\n", 0, it.start()) + 1
+        places.append(f"{path.name}, line {at}")
+        numbers = re.findall(r"[^\s,]+", f"{it[1]},{it[2]}")
+        if len(numbers) != len(_NAMES) or not all(map(is_number, numbers)):
+            raise DataError(
+                f"{places[-1]}: a translation of 3 numbers and a quaternion of 4 are needed.",
+                culprits=[places[-1]],
+            )
+        rows.append([float(number) for number in numbers])
+    if not rows:
+        return None
+    columns = dict(zip(_NAMES, np.array(rows).T, strict=True))
+    return Fields(path.stem, path.parent, tuple(places), columns)

@@ -21,7 +21,7 @@ from visioncal.interchange.formats.ros import EASY_HANDEYE, MOVEIT
 from visioncal.interchange.formats.views import VIEWS
 from visioncal.interchange.formats.yaml_folders import VISP, ZIVID
 from visioncal.session import Session
-from visioncal.session.single import check_one_of_each
+from visioncal.session.selecting import check_one_of_each
 
 # The first that recognises a path reads it: those that look for less come last.
 FOREIGN_FORMATS: tuple[ForeignFormat, ...] = (

@@ -1,19 +1,33 @@
-"""Folders with a file a view, or several kinds of file a view."""
+"""Folders with a file a view, or several kinds of file a view.
 
+Among them poses that HALCON has written: `f 0`, `r` with a rotation, `t` with a place [m].
+"""
+
+import re
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from scipy.spatial.transform import Rotation
+
 from visioncal.core.documents import is_number, read_npy, read_npz, read_table
+from visioncal.core.documents.bounds import read_plain_text
 from visioncal.core.errors import DataError
 from visioncal.core.files import is_inside
+from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.columns import DOCUMENTS, ENDINGS, foreign_from, read_document
 from visioncal.interchange.formats.fields import fields_of_records, flattened
 from visioncal.interchange.formats.finding import is_image_name, kind_of, listed, number_in
 from visioncal.interchange.formats.foreign import Foreign, ForeignFormat
-from visioncal.interchange.formats.halcon import halcon_pose
 from visioncal.interchange.formats.import_options import ImportOptions
+
+_LINE = re.compile(r"^[ \t]*([frt])[ \t]+(\S.*)$", re.MULTILINE)
+# How the rotation is written, by the code of the representation (create_pose): turns about x, y, z
+# in the order of the letters' turns, or a vector as long as the tangent of half the angle.
+_EULER = {0: "XYZ", 2: "xyz"}
+_RODRIGUEZ = 4
 
 
 @dataclass(frozen=True)
@@ -82,7 +96,7 @@ def _record(path: Path) -> dict[str, object]:
     elif suffix in DOCUMENTS:
         document = read_document(path)
     else:
-        pose = halcon_pose(path) if suffix == ".dat" else None
+        pose = _halcon_pose(path) if suffix == ".dat" else None
         document = _table_record(path) if pose is None else pose
     return flattened(document if isinstance(document, Mapping) else {"matrix": document})
 
@@ -105,3 +119,30 @@ VIEWS = ForeignFormat(
     lambda path: _view_folder(path) is not None,
     _read_views,
 )
+
+
+def _halcon_pose(path: Path) -> FloatArray | None:
+    """Reads the (4, 4) pose of one file."""
+    lines = {it[1]: it[2].split() for it in _LINE.finditer(read_plain_text(path))}
+    if lines.keys() != {"f", "r", "t"}:
+        return None
+    counts = {name: len(words) for name, words in lines.items()}
+    if counts != {"f": 1, "r": 3, "t": 3} or not all(
+        is_number(it) for them in lines.values() for it in them
+    ):
+        raise DataError(f"{path}: f, r and t hold 1, 3 and 3 numbers.", culprits=[str(path)])
+    (code,), turns, position = (np.array(lines[it], dtype=float) for it in "frt")
+    if code == _RODRIGUEZ:
+        half = np.arctan(np.linalg.norm(turns))
+        rotation = Rotation.from_rotvec(2.0 * half * turns / max(float(np.tan(half)), 1e-300))
+    elif code in _EULER:
+        rotation = Rotation.from_euler(_EULER[int(code)], turns, degrees=True)
+    else:
+        raise DataError(
+            f"{path}: the pose is of type {code:g}; {_RODRIGUEZ} and {[*_EULER]} are read.",
+            culprits=[str(path)],
+            next_step="Write it with convert_pose_type as 'Rp+T', 'gba', 'point'.",
+        )
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation.as_matrix(), position
+    return pose

@@ -1,16 +1,21 @@
-"""The messages of an `.rrd` file, found without reading what is in them.
+"""The messages of an `.rrd` file, found without reading what is in them, and chunks unpacked.
 
 An `.rrd` is a header of 12 bytes and then messages: kind and length, 8 bytes each with the lowest
 first, and a payload. A finished file ends with a message of kind LAST, which shows rerun where its
 chunks are, and 32 bytes that say where that message is. A writer that was killed leaves none of
 these; a file that was cut ends within a message.
+
+Chunks are read here rather than by rerun, whose reader takes whole files and ends the process on
+some damaged ones. The payload of a chunk is the message `ArrowMsg` of rerun's Protocol Buffers.
 """
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
+
+import pyarrow as pa
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import absence
@@ -20,6 +25,10 @@ LAST, STORE_INFO, CHUNK, ACTIVATION = range(4)
 _MAGIC, _CLOSING_MAGIC = b"RRF2", b"RRF2FOOT"
 _START_BYTES, _CLOSING_BYTES = 12, 12
 _HEAD = struct.Struct("<QQ")
+_COMPRESSION, _UNPACKED_SIZE, _BODY = 2, 3, 5
+_LZ4 = 2
+# No block of LZ4 unpacks to more than this many times its size.
+_LZ4_RATIO = 255
 
 
 @dataclass(frozen=True)
@@ -152,3 +161,67 @@ def _unreadable(path: Path, error: OSError) -> DataError:
         culprits=[str(path)],
         next_step="Check the path and its spelling." if missing else "",
     )
+
+
+def record_batch(payload: bytes, entities: Container[str]) -> tuple[str, pa.RecordBatch] | None:
+    """Unpacks a chunk, if it is of one of the entities that are asked for.
+
+    Returns:
+        The path of its entity, and its rows; None where it is of another entity.
+
+    Raises:
+        ValueError: It is damaged.
+    """
+    try:
+        numbers, fields = _fields(payload)
+        body = fields[_BODY]
+        if numbers.get(_COMPRESSION) == _LZ4:
+            size = numbers[_UNPACKED_SIZE]
+            if size > _LZ4_RATIO * len(body):
+                raise ValueError(f"{len(body)} bytes cannot unpack to {size}")
+            body = pa.decompress(body, size, codec="lz4_raw")
+        reader = pa.ipc.open_stream(body)
+        entity = reader.schema.metadata[b"rerun:entity_path"].decode()
+        if entity not in entities:
+            return None
+        batch = reader.read_next_batch()
+        batch.validate(full=True)
+    except (pa.ArrowException, OSError, KeyError, TypeError, StopIteration) as error:
+        raise ValueError(f"a chunk cannot be unpacked: {error!r}") from error
+    return entity, batch
+
+
+def _fields(message: bytes) -> tuple[dict[int, int], dict[int, bytes]]:
+    """Splits a message of Protocol Buffers into its integers and its other fields, by number."""
+    numbers: dict[int, int] = {}
+    fields: dict[int, bytes] = {}
+    at = 0
+    while at < len(message):
+        key, at = _varint(message, at)
+        number, wire_type = key >> 3, key & 7
+        if wire_type == 0:
+            numbers[number], at = _varint(message, at)
+            continue
+        if wire_type == 2:
+            size, at = _varint(message, at)
+        elif wire_type in (1, 5):
+            size = 8 if wire_type == 1 else 4
+        else:
+            raise ValueError(f"a message has a field of wire type {wire_type}")
+        if at + size > len(message):
+            raise ValueError("a message ends within a field")
+        fields[number] = message[at : at + size]
+        at += size
+    return numbers, fields
+
+
+def _varint(message: bytes, at: int) -> tuple[int, int]:
+    value = 0
+    for shift in range(0, 64, 7):
+        if at >= len(message):
+            raise ValueError("a message ends within a number")
+        value |= (message[at] & 0x7F) << shift
+        at += 1
+        if message[at - 1] < 0x80:
+            return value, at
+    raise ValueError("a number has more than 64 bits")

@@ -13,8 +13,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import parse_toml, sha256
 from visioncal.present.recording import codec, paths
 from visioncal.present.recording.elsewhere import ImagesElsewhere
-from visioncal.present.recording.frames import CHUNK, Frame, Scan, read_payload, scan
-from visioncal.present.recording.messages import record_batch
+from visioncal.present.recording.frames import CHUNK, Frame, Scan, read_payload, record_batch, scan
 from visioncal.session import Session, Stream
 from visioncal.session.corners import CornerTable
 from visioncal.session.images import ImageStore

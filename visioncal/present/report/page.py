@@ -25,8 +25,8 @@ from visioncal.present.report import (
 )
 from visioncal.present.report.cells import render_cell
 from visioncal.present.report.content import template
+from visioncal.present.report.plots import residuals_over_joints
 from visioncal.present.report.thumbnails import Thumbnail, drawn, thumbnail
-from visioncal.present.report.trends import residuals_over_joints
 from visioncal.results import Calibration, ViewResult
 from visioncal.results.evidence import ViewEvidence, magnification
 from visioncal.session import Session

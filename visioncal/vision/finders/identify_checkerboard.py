@@ -6,8 +6,16 @@ import cv2
 import numpy as np
 
 from visioncal.core.types import FloatArray, Image
-from visioncal.vision.finders.identify_plane import BENDS, Plane, bent_plane, lens_of, robust_plane
-from visioncal.vision.finders.identify_saddles import alternating, contrasts, typical_contrast
+from visioncal.vision.finders.identify_plane import (
+    BENDS,
+    Plane,
+    alternating,
+    bent_plane,
+    contrasts,
+    lens_of,
+    robust_plane,
+    typical_contrast,
+)
 
 # The corner finder takes a second for ten million pixels, and needs squares of some ten.
 _SEARCH_PIXELS = 1.5e6

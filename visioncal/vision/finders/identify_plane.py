@@ -2,6 +2,8 @@
 
 The division model (Fitzgibbon 2001) needs no focal length: a pixel at distance r from the image's
 middle belongs at r / (1 + bend r^2). It follows wide and fisheye lenses far enough for counting.
+
+On it, a chessboard's corners, where dark and light squares meet, are told from what lies near.
 """
 
 from dataclasses import dataclass
@@ -19,6 +21,9 @@ _LEAST_BEND, _MOST_BEND = -0.8, 0.3
 _LEAST_POINTS, _LEAST_FOR_BEND = 4, 8
 # So near the image's edge nothing can be concluded [px].
 _BORDER_PX = 3.0
+# The weaker pair of opposite squares must differ from the other by this share of the contrast that
+# a board's corners have.
+_LEAST_CONTRAST = 0.4
 
 
 @dataclass(frozen=True)
@@ -140,3 +145,47 @@ def bent_plane(plane: Plane, board: FloatArray, px: FloatArray) -> Plane:
 
     best = minimize_scalar(misfit, bounds=(_LEAST_BEND, _MOST_BEND), method="bounded")
     return fitted(float(best.x))
+
+
+def contrasts(image: Image, plane: Plane, corners: FloatArray, reach: float) -> FloatArray:
+    """Measures how much corners of squares look like corners of a chessboard.
+
+    Args:
+        image: (h, w) grey image.
+        plane: How the board lies.
+        corners: (n, 2) whole numbers: corners on the board.
+        reach: How far from the corner, along both axes, its four squares are looked at.
+
+    Returns:
+        (n,) the least light less the greatest dark of the four squares [grey levels], positive
+        where the squares up left and down right of the corner are light; negative by as much where
+        they are dark; 0 where they do not alternate.
+    """
+    steps = reach * np.array([[-1.0, -1], [1, 1], [1, -1], [-1, 1]])
+    levels = plane.levels(image, corners[:, None] + steps)
+    first, second = levels[:, :2], levels[:, 2:]
+    light = first.min(axis=1) - second.max(axis=1)
+    dark = second.min(axis=1) - first.max(axis=1)
+    return np.asarray(np.where(light > 0, light, np.where(dark > 0, -dark, 0.0)))
+
+
+def typical_contrast(values: FloatArray, corners: FloatArray) -> float:
+    """The contrast of a board's (n, 2) corners, as it would be at corner (0, 0): signed."""
+    return float(np.median(values * _signs(corners)))
+
+
+def alternating(values: FloatArray, corners: FloatArray, typical: float) -> Mask:
+    """Tells which corners alternate as those of the board do.
+
+    Args:
+        values: (n,) what `contrasts` gave.
+        corners: (n, 2) the corners.
+        typical: What `typical_contrast` gave for corners of the board.
+    """
+    signed = values * _signs(corners) * np.sign(typical)
+    return np.asarray(signed > _LEAST_CONTRAST * abs(typical))
+
+
+def _signs(corners: FloatArray) -> FloatArray:
+    """The colours alternate from corner to corner."""
+    return np.where(corners.sum(axis=1) % 2 == 0, 1.0, -1.0)
