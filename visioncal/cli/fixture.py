@@ -1,6 +1,5 @@
 """`visioncal fixture`."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,7 +8,7 @@ import typer
 from visioncal.cli.framing import FrameOptions, Place, TouchOptions, keep_and_report
 from visioncal.cli.options import AsJson, PartOptions
 from visioncal.cli.parsing import refuse_given
-from visioncal.cli.target_in_images import PointOption, frame_by_images, image_session
+from visioncal.cli.target_in_images import PointOption, kept_by_images
 from visioncal.core.choices import UNITS_M
 from visioncal.core.errors import DataError
 
@@ -59,17 +58,13 @@ def fixture_command(
     """
     from visioncal.frames.fixture import touched_fixture
     from visioncal.interchange.formats.touches import read_nominal, read_touches
-    from visioncal.session.choosing import ARM, EYE, Choice
+    from visioncal.session.choosing import ARM, Choice
 
     drawing = None if cad is None else read_nominal(cad, cad_unit)
-    session = image_session(touches, {"--tool": tool, **written.given()})
-    if session is not None:
-        choice = part.choice
-        place = Place.of(goes, "fixture", replace(choice, target=None), EYE)
-        frame = frame_by_images(
-            session, place, "fixture", point, drawing, choice=choice, quiet=as_json
-        )
-        keep_and_report(place, frame, touches, as_json=as_json)
+    given = {"--tool": tool, **written.given()}
+    if kept_by_images(
+        touches, goes, part.choice, "fixture", point, drawing, for_touches=given, as_json=as_json
+    ):
         return
     refuse_given({"--point-mm": point}, "touches say where the fixture's origin is")
     refuse_given({"--camera": part.camera, "--target": part.target}, "touches need no camera")

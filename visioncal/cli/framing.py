@@ -76,15 +76,9 @@ class TouchOptions(RobotPoseOptions):
 
     def given(self) -> dict[str, object]:
         """By their names; None for those that were not given."""
-        return {
-            "--robot-columns": self.robot_columns,
-            "--robot-form": self.robot_form,
-            "--robot-unit": self.robot_unit,
-            "--robot-inverse": self.robot_inverse,
-            "--joint-columns": self.joint_columns,
-            "--robot-model": self.robot_model,
-            "--touch-noise-mm": self.touch_noise,
-        }
+        own = [it for it in vars(self) if it not in ("joint_unit", "touch_noise")]
+        named = {f"--{it.replace('_', '-')}": getattr(self, it) for it in own}
+        return {**named, "--touch-noise-mm": self.touch_noise}
 
 
 @dataclass(frozen=True)
@@ -231,28 +225,19 @@ def report(place: Place, frame: "Frame", written: Written, *, as_json: bool) -> 
         if frame.oriented
         else "rotation not measured"
     )
-    console.print(
-        f"{place.name}: {frame.edge.place_words(3)}, sigma {figure(frame.edge.sigma_mm)} mm; "
-        f"{rotation}"
-    )
-    console.print(
-        escape(
-            f"{frame.method}: rms {figure(frame.rms_mm)} mm, noise {figure(frame.noise_mm)} mm per "
-            "axis"
-        )
-    )
+    position = f"{frame.edge.place_words(3)}, sigma {figure(frame.edge.sigma_mm)} mm"
+    console.print(f"{place.name}: {position}; {rotation}")
+    fit = f"rms {figure(frame.rms_mm)} mm, noise {figure(frame.noise_mm)} mm per axis"
+    console.print(escape(f"{frame.method}: {fit}"))
     _report_before(place, frame)
     undrawn = [it.file for it in written.undrawn]
-    if place.folder is not None and place.folder / RECORDING not in (*written.files, *undrawn):
-        messages().print(
-            escape(
-                f"{place.folder / RECORDING} was not renewed: it is missing or of another result"
-            )
-        )
+    recording = None if place.folder is None else place.folder / RECORDING
+    if recording is not None and recording not in (*written.files, *undrawn):
+        why = "it is missing or of another result"
+        messages().print(escape(f"{recording} was not renewed: {why}"))
     if not written.files:
-        messages().print(
-            "nothing was written: -c joins it to a calibration, -o puts it into a file"
-        )
+        where = "-c joins it to a calibration, -o puts it into a file"
+        messages().print(f"nothing was written: {where}")
     report_written(written)
 
 

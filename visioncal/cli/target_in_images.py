@@ -1,12 +1,13 @@
 """What `tcp` and `fixture` do with a session of images: a target on the tool or on the fixture."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
 
-from visioncal.cli.framing import Place
+from visioncal.cli.framing import FrameOptions, Place, keep_and_report
 from visioncal.cli.parsing import numbers_in, refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
@@ -29,20 +30,57 @@ PointOption: TypeAlias = Annotated[
 ]
 
 
-def image_session(source: Path, for_touches: Mapping[str, object]) -> "Session | None":
-    """Loads a session whose images are to place something.
+def kept_by_images(
+    source: Path,
+    goes: FrameOptions,
+    choice: "Choice",
+    kind: FrameKind,
+    point_mm: str | None,
+    drawing: "NominalPoints | None" = None,
+    *,
+    for_touches: Mapping[str, object],
+    as_json: bool,
+) -> bool:
+    """Places a tool or a fixture by a session's images, and keeps and reports it.
 
     Args:
         source: What the user named.
+        goes: Where the frame goes.
+        choice: Which camera, robot and target are meant, of the session of a whole cell.
+        kind: What it is.
+        point_mm: Its origin in the target's frame, as the user wrote it.
+        drawing: Where markers on a fixture are; None where the session's target is all.
         for_touches: The options that only touches have a use for, by their names; None for those
             that were not given.
+        as_json: Whether to print JSON.
 
     Returns:
-        The session; None where the source has touches, as a table or as a session without images.
+        Whether it was: not where the source has touches, as a table or as a session without images.
 
     Raises:
-        DataError: The session has both, cannot be read, or options do not fit.
+        DataError: The session has both, cannot be read, does not show what is needed, or options
+            contradict each other.
     """
+    from visioncal.session.choosing import EYE
+
+    session = _image_session(source, for_touches)
+    if session is None:
+        return False
+    place = Place.of(goes, kind, replace(choice, target=None), EYE)
+    if place.calibration is None:
+        raise DataError(
+            f"session {session.name!r} has images, and the camera's calibration (-c) is needed to "
+            "place what they show.",
+            culprits=["-c"],
+            next_step="Name the output folder of visioncal calibrate.",
+        )
+    frame = _frame(session, place.calibration, kind, point_mm, drawing, choice, quiet=as_json)
+    keep_and_report(place, frame, source, as_json=as_json)
+    return True
+
+
+def _image_session(source: Path, for_touches: Mapping[str, object]) -> "Session | None":
+    """Loads a session whose images are to place something; None where it has none."""
     from visioncal.session import Session
 
     if not source.is_dir() and source.suffix.lower() != ".rrd":
@@ -63,53 +101,22 @@ def image_session(source: Path, for_touches: Mapping[str, object]) -> "Session |
     return session
 
 
-def camera_of(place: Place, session: "Session") -> "Calibration":
-    """The calibration of the camera that took the images.
-
-    Raises:
-        DataError: None was named.
-    """
-    if place.calibration is None:
-        raise DataError(
-            f"session {session.name!r} has images, and the camera's calibration (-c) is needed to "
-            "place what they show.",
-            culprits=["-c"],
-            next_step="Name the output folder of visioncal calibrate.",
-        )
-    return place.calibration
-
-
-def frame_by_images(
+def _frame(
     session: "Session",
-    place: Place,
+    calibration: "Calibration",
     kind: FrameKind,
     point_mm: str | None,
-    drawing: "NominalPoints | None" = None,
-    *,
+    drawing: "NominalPoints | None",
     choice: "Choice",
+    *,
     quiet: bool,
 ) -> "Frame":
-    """Places a tool or a fixture by a session's images.
-
-    Args:
-        session: The images.
-        place: Where the frame goes, and what is known.
-        kind: What it is.
-        point_mm: Its origin in the target's frame, as the user wrote it.
-        drawing: Where markers on a fixture are; None where the session's target is all.
-        choice: Which camera, robot and target are meant, of the session of a whole cell.
-        quiet: Whether progress is not to be shown.
-
-    Raises:
-        DataError: The images do not show what is needed, or options contradict each other.
-    """
     import numpy as np
 
     from visioncal.frames.fixture_from_markers import marked_fixture
     from visioncal.frames.frame_from_images import seen_frame
     from visioncal.session.selecting import has_several, select
 
-    calibration = camera_of(place, session)
     if has_several(session):
         session = select(session, choice, parted=False)
     if drawing is not None:

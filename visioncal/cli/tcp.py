@@ -1,6 +1,5 @@
 """`visioncal tcp`."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -9,7 +8,7 @@ import typer
 from visioncal.cli.framing import FrameOptions, Place, TouchOptions, keep_and_report
 from visioncal.cli.options import AsJson, PartOptions
 from visioncal.cli.parsing import refuse_given
-from visioncal.cli.target_in_images import PointOption, frame_by_images, image_session
+from visioncal.cli.target_in_images import PointOption, kept_by_images
 
 
 def tcp_command(
@@ -35,24 +34,17 @@ def tcp_command(
     """
     from visioncal.frames.tcp import touched_tool
     from visioncal.interchange.formats.touches import read_touches
-    from visioncal.session.choosing import ARM, EYE, Choice
+    from visioncal.session.choosing import ARM, Choice
 
-    session = image_session(touches, written.given())
-    if session is not None:
-        choice = part.choice
-        place = Place.of(goes, "tool", replace(choice, target=None), EYE)
-        frame = frame_by_images(session, place, "tool", point, choice=choice, quiet=as_json)
-        keep_and_report(place, frame, touches, as_json=as_json)
+    given = written.given()
+    if kept_by_images(
+        touches, goes, part.choice, "tool", point, for_touches=given, as_json=as_json
+    ):
         return
     refuse_given({"--camera": part.camera, "--target": part.target}, "touches need no camera")
     refuse_given({"--point-mm": point}, "touches say where the tool's point is")
     requested = written.requested()
     place = Place.of(goes, "tool", Choice(robot=part.robot), ARM)
     rows = read_touches(touches, requested, part.robot)
-    frame = touched_tool(
-        rows,
-        place.calibration,
-        written.model,
-        touch_noise_m=written.noise_m,
-    )
+    frame = touched_tool(rows, place.calibration, written.model, touch_noise_m=written.noise_m)
     keep_and_report(place, frame, touches, as_json=as_json)

@@ -1,6 +1,7 @@
 """Whether identified dynamics can be trusted, in sentences with their figures."""
 
 from collections.abc import Iterator
+from typing import TypeAlias
 
 import numpy as np
 
@@ -14,7 +15,12 @@ from visioncal.dynamics.identified import UNKNOWN, Identified, Validation
 from visioncal.robot.files import robot_names
 
 _LIMITS = DynamicsLimits()
+_Judged: TypeAlias = tuple[VerdictStatus, Finding]
 _MOTION = "Record, and fit with this one, a motion"
+
+
+def _check(kind: str, words: str, do: Step | None = None) -> _Judged:
+    return "check", Finding(kind, words, do)
 
 
 def _plan(identified: Identified, words: str) -> Step:
@@ -39,7 +45,7 @@ def judge(identified: Identified) -> Verdict:
     return Verdict(worst, tuple(it for _, it in found))
 
 
-def _of_lag(identified: Identified) -> Iterator[tuple[VerdictStatus, Finding]]:
+def _of_lag(identified: Identified) -> Iterator[_Judged]:
     lag = identified.lag
     if lag is None:
         return
@@ -52,19 +58,16 @@ def _of_lag(identified: Identified) -> Iterator[tuple[VerdictStatus, Finding]]:
         "Record angles and torques by one clock, and filter neither of them, or both alike: a lag "
         "that changes is undone in the mean alone."
     )
-    yield "check", Finding("lag", words, step)
+    yield _check("lag", words, step)
 
 
-def _of_prediction(identified: Identified) -> Iterator[tuple[VerdictStatus, Finding]]:
+def _of_prediction(identified: Identified) -> Iterator[_Judged]:
     validation = identified.validation
     if validation is None:
-        yield (
-            "check",
-            Finding(
-                "unchecked",
-                "Nothing was left to predict: the torques that were fitted are no proof.",
-                _plan(identified, "Record a second motion, and name it with --validate-on"),
-            ),
+        yield _check(
+            "unchecked",
+            "Nothing was left to predict: the torques that were fitted are no proof.",
+            _plan(identified, "Record a second motion, and name it with --validate-on"),
         )
         return
     shares = validation.shares
@@ -85,34 +88,26 @@ def _of_prediction(identified: Identified) -> Iterator[tuple[VerdictStatus, Find
     surprised = validation.rms_nm > _LIMITS.worse * np.maximum(fitted, validation.noise_nm)
     surprised &= shares > _LIMITS.slight_share
     if surprised.any():
-        yield (
-            "check",
-            Finding(
-                "optimism",
-                f"{_joints(surprised)}: torques are predicted "
-                f"{figure(float((validation.rms_nm / fitted)[surprised].max()))} times worse than "
-                "they were fitted: the motion says too little, or something changed.",
-                _plan(identified, _MOTION),
-            ),
+        yield _check(
+            "optimism",
+            f"{_joints(surprised)}: torques are predicted "
+            f"{figure(float((validation.rms_nm / fitted)[surprised].max()))} times worse than "
+            "they were fitted: the motion says too little, or something changed.",
+            _plan(identified, _MOTION),
         )
     yield from _of_known(identified, validation)
 
 
-def _of_known(
-    identified: Identified, validation: Validation
-) -> Iterator[tuple[VerdictStatus, Finding]]:
+def _of_known(identified: Identified, validation: Validation) -> Iterator[_Judged]:
     known, bodies = validation.known_rms_nm, validation.consistent_rms_nm
     if known is not None:
         lost = validation.rms_nm > known
         if lost.any():
-            yield (
-                "check",
-                Finding(
-                    "worse_than_known",
-                    f"{_joints(lost)}: the inertias that {identified.robot.name} comes with "
-                    "predict torques better than the identified ones.",
-                    _plan(identified, _MOTION),
-                ),
+            yield _check(
+                "worse_than_known",
+                f"{_joints(lost)}: the inertias that {identified.robot.name} comes with "
+                "predict torques better than the identified ones.",
+                _plan(identified, _MOTION),
             )
         else:
             times = float(np.median(known / np.maximum(validation.rms_nm, 1e-12)))
@@ -126,33 +121,27 @@ def _of_known(
             )
         strange = known > _LIMITS.known_share * validation.torque_nm
         if strange.any():
-            yield (
-                "check",
-                Finding(
-                    "other_robot",
-                    f"{_joints(strange)}: by the inertias that {identified.robot.name} comes with, "
-                    f"{figure(100.0 * float((known / validation.torque_nm).max()))} % of the "
-                    "torques' range stays unexplained.",
-                    Step(
-                        "Check whether it is the robot that was recorded, whether it stands "
-                        "upright ([robot] gravity_m_s2), and what is on its flange."
-                    ),
+            yield _check(
+                "other_robot",
+                f"{_joints(strange)}: by the inertias that {identified.robot.name} comes with, "
+                f"{figure(100.0 * float((known / validation.torque_nm).max()))} % of the "
+                "torques' range stays unexplained.",
+                Step(
+                    "Check whether it is the robot that was recorded, whether it stands "
+                    "upright ([robot] gravity_m_s2), and what is on its flange."
                 ),
             )
     if bodies is not None:
         worse = bodies > _LIMITS.bodies_worse * validation.rms_nm
         if worse.any():
-            yield (
-                "check",
-                Finding(
-                    "bodies",
-                    f"{_joints(worse)}: no bodies near the known ones explain the torques as "
-                    "well; friction may be of another kind, or a load is on the flange.",
-                ),
+            yield _check(
+                "bodies",
+                f"{_joints(worse)}: no bodies near the known ones explain the torques as "
+                "well; friction may be of another kind, or a load is on the flange.",
             )
 
 
-def _of_range(identified: Identified) -> Iterator[tuple[VerdictStatus, Finding]]:
+def _of_range(identified: Identified) -> Iterator[_Judged]:
     """Whether the parameters predict the torques of fast motions of all joints."""
     base = identified.base
     motion = random_motion(base.model, np.random.default_rng(0))
@@ -161,31 +150,25 @@ def _of_range(identified: Identified) -> Iterator[tuple[VerdictStatus, Finding]]
     sigma = np.sqrt(np.mean(np.einsum("mnp,pq,mnq->mn", x, covariance, x, optimize=True), axis=0))
     share = sigma / np.sqrt(np.mean((x @ identified.values) ** 2, axis=0))
     if share.max() > _LIMITS.range_share[0]:
-        yield (
-            "check",
-            Finding(
-                "weak_motion",
-                f"{_joints(share > _LIMITS.range_share[0])}: what fast motions take (up to "
-                f"{np.abs(motion.dq).max():.0f} rad/s and {np.abs(motion.ddq).max():.0f} rad/s^2) "
-                f"is known to {figure(100.0 * float(share.max()))} % only: this motion was too "
-                "slow, too small or too short.",
-                _plan(identified, _MOTION),
-            ),
+        yield _check(
+            "weak_motion",
+            f"{_joints(share > _LIMITS.range_share[0])}: what fast motions take (up to "
+            f"{np.abs(motion.dq).max():.0f} rad/s and {np.abs(motion.ddq).max():.0f} rad/s^2) "
+            f"is known to {figure(100.0 * float(share.max()))} % only: this motion was too "
+            "slow, too small or too short.",
+            _plan(identified, _MOTION),
         )
 
 
-def _of_parameters(identified: Identified) -> Iterator[tuple[VerdictStatus, Finding]]:
+def _of_parameters(identified: Identified) -> Iterator[_Judged]:
     lost = np.array([it == UNKNOWN for it in identified.determined])
     if lost.mean() > _LIMITS.undetermined_share:
         names = [it for it, is_lost in zip(identified.base.names, lost, strict=True) if is_lost]
-        yield (
-            "check",
-            Finding(
-                "undetermined",
-                f"{lost.sum()} of {len(lost)} base parameters are not determined by this motion, "
-                f"among them {some_of(names, 3)}.",
-                _plan(identified, _MOTION),
-            ),
+        yield _check(
+            "undetermined",
+            f"{lost.sum()} of {len(lost)} base parameters are not determined by this motion, "
+            f"among them {some_of(names, 3)}.",
+            _plan(identified, _MOTION),
         )
 
 
