@@ -62,10 +62,6 @@ def check_mistakes(base: BaseModel, streams: Sequence[Conditioned]) -> None:
     Without inertias a fit has to explain the torques: units and the sign of all of them are open
     then, as a heavier arm needs more.
 
-    Args:
-        base: The model of an arm.
-        streams: The recordings.
-
     Raises:
         DataError: Torques or angles are of another joint, of the other sign, or in other units.
     """

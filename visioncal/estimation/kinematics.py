@@ -181,10 +181,6 @@ def resized(arm: ArmTrials, fit: LevelFit) -> LevelFit:
     """Estimates the size of each block's errors anew, beside those of all others.
 
     They were looked for one after the other: what explains the most takes too much at first.
-
-    Args:
-        arm: The observations of `fit_level`.
-        fit: Its answer.
     """
     if len(fit.errors) < 2:
         return fit

@@ -81,13 +81,7 @@ def imitated(numbers: Jacobians, arm: Jacobians, directions: FloatArray) -> Floa
 
 
 def null_words(null: Null, parameters: Sequence[Parameter], robot: Robot) -> Iterator[str]:
-    """Says what no stops can determine, number by number.
-
-    Args:
-        null: What that is.
-        parameters: The table's numbers.
-        robot: The nominal arm.
-    """
+    """Says what no stops can determine, number by number."""
     for rows in _connected(null.directions):
         involved = np.flatnonzero(null.directions[rows].any(axis=0)).tolist()
         named = [parameters[at] for at in involved]

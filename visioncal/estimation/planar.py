@@ -37,10 +37,6 @@ def planar_poses(stack: CornerStack, camera: Camera) -> PlanarPoses:
     Points of a plane by IPPE (Collins and Bartoli 2014), others by SQPnP (Terzakis and Lourakis
     2020).
 
-    Args:
-        stack: The corners of v views.
-        camera: The intrinsics.
-
     Returns:
         Both solutions. There is none where the lens cannot be inverted at the corners, or where
         they do not determine a pose.

@@ -151,13 +151,6 @@ def left_out_clusters(
     The stops are parted by posture, and each part is predicted from a fit to the others: to first
     order, and with the noise and the errors as they were found from all.
 
-    Args:
-        problem: The observations.
-        state: The answer under white noise.
-        noise: Its levels.
-        robot: The robot.
-        errors: Its errors.
-
     Returns:
         (2, 2) roots of mean squares of rotation [rad] and place [m], as found and as predicted;
         None of too few stops.

@@ -70,9 +70,6 @@ class Mounting:
 def find_mounting(places: Places) -> tuple[Mounting, FloatArray]:
     """Finds where the instrument stands and the points sit, although some stops may be wrong.
 
-    Args:
-        places: The readings.
-
     Returns:
         The mounting, and the (m,) distances [m] between read and predicted places.
     """

@@ -88,9 +88,6 @@ def arm_bodies(robot: Robot) -> tuple[Body, ...]:
     The way on which a prismatic joint slides is left out. A URDF's boxes, cylinders, capsules and
     spheres are taken as they are, for the links that have some; its meshes are files elsewhere.
 
-    Args:
-        robot: The arm.
-
     Returns:
         The bodies, from the base to the flange.
 

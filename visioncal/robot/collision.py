@@ -261,9 +261,6 @@ def _shape(body: Body) -> "coal.ShapeBase":
 def urdf_bodies(robot: Robot) -> tuple[tuple[Body, ...], frozenset[int]]:
     """The boxes, cylinders and spheres that a URDF gives to its links for collisions.
 
-    Args:
-        robot: A robot of a URDF.
-
     Returns:
         The bodies, and the joints with which links move whose form is in files elsewhere.
     """

@@ -186,10 +186,6 @@ def table_from_document(document: Mapping[str, Any]) -> DHTable:
 def table_document(table: DHTable, source: str = "") -> dict[str, Any]:
     """Writes a table as a description that `table_from_document` reads.
 
-    Args:
-        table: The table.
-        source: Where its values come from.
-
     Returns:
         The description. What a convention has no row for goes into `[base]` and `[flange]`.
     """

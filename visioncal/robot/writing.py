@@ -67,10 +67,6 @@ def small_urdf(robot: Robot, notes: Sequence[str] = ()) -> str:
 
     Links have their inertias where the robot states them. Joint offsets go into the origins. A URDF
     has no place for gear ratio, eccentricity and harmonics; a comment says which are missing.
-
-    Args:
-        robot: The robot.
-        notes: Lines for comments at its head.
     """
     chain = robot.chain.with_offsets_placed()
     links = ["base", *(f"link_{place}" for place in range(1, len(chain) + 1))]

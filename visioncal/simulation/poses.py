@@ -46,12 +46,6 @@ def draw_views(
 ) -> FloatArray:
     """Draws views and keeps those in which the board is where it should be in the image.
 
-    Args:
-        options: The cell.
-        sheet: The real board.
-        count: How many views to draw.
-        rng: Source of randomness.
-
     Returns:
         (k, 4, 4) `cam_from_target`, k <= count.
     """

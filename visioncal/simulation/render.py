@@ -110,10 +110,6 @@ def prepare_scene(cell: Cell, board: int = 0) -> Scene:
 def render(scene: Scene, index: int) -> Image:
     """Takes the picture of one view.
 
-    Args:
-        scene: The prepared cell.
-        index: Number of the view.
-
     Returns:
         (height, width) grey image with the cell's blur, vignetting and noise.
 

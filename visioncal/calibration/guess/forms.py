@@ -116,11 +116,6 @@ def _read(numbers: PoseNumbers, turns: Sequence[Turns]) -> Forms:
 def screen(robot: Forms, camera: Forms, rows: IntArray) -> tuple[Pairing, ...]:
     """Compares the relative angles of all forms under all shifts.
 
-    Args:
-        robot: The robot's forms.
-        camera: The camera's.
-        rows: The camera's rows to look at.
-
     Returns:
         All pairings with enough common rows, the declared forms without shift first.
     """

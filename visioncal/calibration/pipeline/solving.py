@@ -280,10 +280,6 @@ def first_agreement(cell: Cell, looked: Observed, mount: Mount) -> tuple[Cell, A
 def agreeing_views(cell: Cell, looked: Observed) -> frozenset[int]:
     """The views that the first consensus of a cell's frames predicts; nothing is fitted.
 
-    Args:
-        cell: A cell.
-        looked: What was observed in it.
-
     Raises:
         DataError: Nothing was seen.
         DegenerateError: A robot is tied to nothing, or a frame may be in two places.

@@ -235,9 +235,6 @@ def _is_offset_of(direction: Direction, frame: str) -> bool:
 def judge(findings: Findings) -> Verdict:
     """Says whether the result can be trusted, why, and what to do next.
 
-    Args:
-        findings: What is known.
-
     Returns:
         `bad` with a reason that settles it, `check` with doubts, `good` without. Where the task
         says what it needs, the chance that picks land within it decides: good from 0.95, check from

@@ -133,9 +133,6 @@ def _unnamed(session: Session) -> list[str]:
 def unseen_cause(seen: Observed) -> Finding | None:
     """Says why images show nothing, once they were looked at: missing files, or another board.
 
-    Args:
-        seen: What is known so far.
-
     Returns:
         It; None where the target is in most of the images, or nothing else is seen.
     """

@@ -61,13 +61,7 @@ def settled(robot: FloatArray, candidates: Candidates, picks: IntArray) -> Float
 
 
 def chosen(view: ViewPoses, pick: int, target: Target | None) -> ViewPoses:
-    """Leaves one pose to a view, and numbers its corners accordingly.
-
-    Args:
-        view: The view.
-        pick: Which of its poses.
-        target: What it shows.
-    """
+    """Leaves one pose to a view, and numbers its corners accordingly."""
     corners, turn = view.corners, view.turns[pick]
     if corners is not None and target is not None and turn:
         # Turned, corner i lies where corner rotations[i] was: what was seen as that one is i.

@@ -85,12 +85,7 @@ def _needs(problem: Problem) -> Mask:
 
 
 def apart(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
-    """How far (n,) [m] and (n,) [rad] observations are from what is predicted.
-
-    Args:
-        problem: The observations.
-        state: The unknowns.
-    """
+    """How far (n,) [m] and (n,) [rad] observations are from what is predicted."""
     away_m, turned = distances(problem.measured(state), problem.predicted(state))
     seen = problem.observations
     # The rotation of what is only a point is a matter of choice.

@@ -335,11 +335,6 @@ def _check_targets(session: Session, prior_calibration: CalibrationPrior) -> Non
 def check_robot(session: Session, stated: Robot, known: Robot) -> None:
     """Refuses another robot than a calibration's; the same model written otherwise passes.
 
-    Args:
-        session: The session.
-        stated: Its robot.
-        known: The calibration's.
-
     Raises:
         DataError: They differ.
     """

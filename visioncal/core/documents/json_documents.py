@@ -39,10 +39,6 @@ class StoredTable(dict[str, Any]):
 def parse_stored(text: bytes | str, label: str) -> StoredTable:
     """Parses a document that visioncal wrote.
 
-    Args:
-        text: The document.
-        label: Its origin, for messages.
-
     Returns:
         Its content; a field that is asked for and missing raises DataError.
 

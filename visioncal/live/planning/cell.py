@@ -284,9 +284,6 @@ def collisions_of(cell: PlanCell) -> Collisions:
     What is only guessed, the camera and the board, is kept away from by what the guess may be off,
     besides the clearance.
 
-    Args:
-        cell: The cell.
-
     Returns:
         The distances between the arm, what it carries, and what stands around it.
     """

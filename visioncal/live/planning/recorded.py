@@ -87,10 +87,6 @@ class SoFar:
 def so_far(session: Session, *, progress: Progress | None = None) -> SoFar:
     """Calibrates the hand-eye level of a session as far as it goes.
 
-    Args:
-        session: What was recorded.
-        progress: Told of long work.
-
     Raises:
         DataError: The input is wrong or shows no target.
     """

@@ -137,10 +137,6 @@ class Sight:
         way about its line of sight; the board's centre is anywhere in the image where the board has
         room.
 
-        Args:
-            count: How many.
-            rng: Source of randomness.
-
         Returns:
             (count, 4, 4) `cam_from_target` [m].
         """

@@ -28,9 +28,6 @@ _DAMAGE = (ValueError, KeyError, IndexError, TypeError, AttributeError)
 def read_session(path: Path) -> Session:
     """Reads the session that a recording holds.
 
-    Args:
-        path: The `.rrd`.
-
     Returns:
         The session, with the same facts and the same digest as the one that was written. Its
         images are read when they are asked for. Where the recording was cut off, the session has

@@ -145,9 +145,6 @@ class RecordingWriter:
     def draw(self, log: Callable[[Recorder], None]) -> None:
         """Adds what is drawn and belongs to no view.
 
-        Args:
-            log: Draws it.
-
         Raises:
             DataError: The file cannot be written.
         """

@@ -43,12 +43,7 @@ class Scale:
         return np.asarray((found - low) / ((high - low) or 1.0))
 
     def ticks(self, most: int, whole: bool = False) -> list[float]:
-        """Round values along it, in at most so many steps.
-
-        Args:
-            most: How many steps.
-            whole: Only whole numbers.
-        """
+        """Round values along it, in at most so many steps."""
         low, high = min(self.low, self.high), max(self.low, self.high)
         if self.decades:
             return _decades(low, high, most)

@@ -24,13 +24,7 @@ _BAR, _MOST_LABELS = 0.38, 20
 
 
 def render_check(check: Check, triggers: Sequence[Outcome], verdict: Verdict) -> str:
-    """Renders the page of a check as HTML text.
-
-    Args:
-        check: The check.
-        triggers: What became of the policy's triggers.
-        verdict: What it found.
-    """
+    """Renders the page of a check as HTML text."""
     undone, order = _undone(check), ("fired", "unknown", "quiet")
     stops = [", ".join(map(str, views)) for views in check.seen.views]
     before, after = _lengths(check.away), _lengths(check.left)

@@ -164,11 +164,7 @@ def _hump_facts(identified: Identified) -> Iterator[Fact]:
 
 
 def torques(found: Prediction) -> Markup:
-    """Measured and predicted torques of each joint over time, and what the prediction is off.
-
-    Args:
-        found: What to show.
-    """
+    """Measured and predicted torques of each joint over time, and what the prediction is off."""
     some = slice(None, None, max(len(found.times_s) // _MOST_POINTS, 1))
     times = (found.times_s - found.times_s[0])[some]
     measured, predicted = found.measured_nm[some], found.predicted_nm[some]
@@ -197,12 +193,7 @@ def torques(found: Prediction) -> Markup:
 
 
 def friction(identified: Identified, found: Sequence[Prediction]) -> Markup:
-    """Each joint's friction over its speed: what the torques leave for it, and the fit.
-
-    Args:
-        identified: The fit.
-        found: The motions.
-    """
+    """Each joint's friction over its speed: what the torques leave for it, and the fit."""
     if not identified.base.model.terms.symbols:
         return Markup("")
     joints = identified.robot.joint_count

@@ -11,9 +11,6 @@ from visioncal.present.viewer.layout import eye_on, series, space_view, with_pan
 def dynamics_blueprint(run: Run) -> rrb.Blueprint:
     """Lays out torques over time beside the moving arm.
 
-    Args:
-        run: What was fitted and predicted.
-
     Returns:
         The layout, to be written into the recording.
     """

@@ -28,9 +28,6 @@ _TITLES = {
 def plan_blueprint(preview: Preview) -> rrb.Blueprint:
     """Lays out the preview of a plan.
 
-    Args:
-        preview: What it shows.
-
     Returns:
         The layout, to be written into the recording.
     """
@@ -96,9 +93,6 @@ def _coverage() -> rrb.Container:
 
 def motion_blueprint(preview: MotionPreview) -> rrb.Blueprint:
     """Lays out the preview of motions.
-
-    Args:
-        preview: What it shows.
 
     Returns:
         The layout, to be written into the recording.

@@ -73,11 +73,7 @@ class OnlineCompensator:
     """
 
     def __init__(self, model: ThermalModel) -> None:
-        """Begins without a sample.
-
-        Args:
-            model: How the arm drifts.
-        """
+        """Begins without a sample."""
         self._model = model
         self._stamps_s: list[float] = []
         self._links: list[FloatArray] = []
