@@ -565,6 +565,10 @@ def test_the_separators_and_commas_of_spreadsheets_are_read(folder: Path, separa
     ]
     (folder / "views.csv").write_text("\n".join(lines))
     assert Session.load(folder).digest() == digest
+    # Where cells at the right and below were filled once, empty ones are written.
+    margin = [*(it + 2 * separator for it in lines), separator * (len(columns) + 1)]
+    (folder / "views.csv").write_text("\n".join(margin))
+    assert Session.load(folder).digest() == digest
 
 
 def test_a_robot_whose_tip_alone_is_named_goes_by_its_poses(folder: Path) -> None:

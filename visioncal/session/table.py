@@ -5,13 +5,13 @@ import io
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from visioncal.core.documents.tables import separator_of, with_points
+from visioncal.core.documents.tables import separator_of, with_points, without_margin
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import READ_AGAIN
@@ -151,7 +151,8 @@ def parse_csv(text: str, label: str) -> tuple[tuple[str, ...], tuple[Row, ...]]:
     """Splits a views.csv into its column names and its rows; blank lines are skipped.
 
     Where the header has semicolons or tabs and no comma, they separate the columns, and a decimal
-    comma is read as a point: so spreadsheets write tables in half of the world.
+    comma is read as a point: so spreadsheets write tables in half of the world. Empty columns
+    behind all others are left aside.
 
     Raises:
         DataError: It is empty, has no rows, or its quotes do not close.
@@ -184,7 +185,10 @@ def parse_csv(text: str, label: str) -> tuple[tuple[str, ...], tuple[Row, ...]]:
             culprits=[label],
             next_step="Add one row for each view.",
         )
-    return tuple(name.strip() for name in rows[0].cells), tuple(rows[1:])
+    header, *filled = without_margin([row.cells for row in rows])
+    return tuple(name.strip() for name in header), tuple(
+        replace(row, cells=cells) for row, cells in zip(rows[1:], filled, strict=True)
+    )
 
 
 def _check_count(rows: Sequence[Row], label: str) -> None:

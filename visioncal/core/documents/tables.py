@@ -17,6 +17,8 @@ _DECIMAL_COMMA = re.compile(r"[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?")
 _LINE_END = re.compile(r"\r\n|\r|\n")
 # Excel writes the separator itself into the first line, for itself.
 _SEPARATOR = re.compile(r"sep=([;\t,])", re.I)
+# All that an empty row has.
+_EMPTY = "; ,\t\r"
 _COMMENTS = ("#", "%", "//")
 # A row as programs print a list, with its name before it: `pose: [1.0, 2.0]`, `array([1, 2]),`.
 _LISTED = re.compile(
@@ -59,7 +61,8 @@ def read_table(path: Path) -> TextTable:
     A comment that has as many words as the table has columns, right before the first row, is the
     header where there is no other, whatever stands before a colon in it; a first line such as
     `sep=;` names the separator. Between semicolons or tabs a decimal comma is read as a point. Rows
-    may be lists in brackets, with a name before them.
+    may be lists in brackets, with a name before them. Empty rows, and empty columns behind all
+    others, are left aside.
 
     Raises:
         DataError: It is missing, no text, too large, empty, its rows differ in length, or two
@@ -76,7 +79,7 @@ def read_table(path: Path) -> TextTable:
         [
             (at, line)
             for at, line in enumerate(every, start=1)
-            if line.strip() and not line.strip().startswith(_COMMENTS)
+            if line.strip(_EMPTY) and not line.strip().startswith(_COMMENTS)
         ]
     )
     if not lines:
@@ -85,7 +88,8 @@ def read_table(path: Path) -> TextTable:
     if sum(line.count(separator) + 1 for _, line in lines) > MAX_VALUES:
         raise too_many(where)
     numbers = [at for at, _ in lines]
-    rows = [_cells(line, separator, f"{where}, line {at}") for at, line in lines]
+    cells = [_cells(line, separator, f"{where}, line {at}") for at, line in lines]
+    rows = without_margin(cells)
     columns = rows[0] if not any(is_number(it) for it in rows[0]) else None
     if columns is not None:
         rows, numbers = rows[1:], numbers[1:]
@@ -121,6 +125,17 @@ def _cells(line: str, separator: str, where: str) -> tuple[str, ...]:
         raise DataError(f"{where}: {error}.", culprits=[where]) from error
     stripped = tuple(it.strip() for it in cells)
     return with_points(stripped) if separator in ";\t" else stripped
+
+
+def without_margin(rows: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """Rows without the first one's columns that are empty in all, behind those that are not.
+
+    Spreadsheets write them where cells were filled once. A single row's cells beyond are kept.
+    """
+    filled = max(
+        (at for row in rows for at, it in enumerate(row, start=1) if it.strip()), default=0
+    )
+    return [row[:filled] + row[max(filled, len(rows[0])) :] for row in rows]
 
 
 def with_points(cells: Sequence[str]) -> tuple[str, ...]:
