@@ -17,6 +17,7 @@ from visioncal.core.types import Target
 from visioncal.session import MemoryImages, Session, View
 from visioncal.simulation import (
     CellOptions,
+    aprilgrid_target,
     charuco_target,
     checkerboard_target,
     prepare_scene,
@@ -163,8 +164,25 @@ def test_too_few_corners_and_corners_on_one_line(charuco):
     assert list(found.corners) == [1]
     assert "on one line" in found.rejections[0].reason
     strict = DetectOptions(min_corners=41)
-    refused = detect(session_of({"whole.png": encoded(images[0])}, target), strict)
-    assert "too few corners: 40 of 40, needs 41" in refused.rejections[0].reason
+    refused = detect(
+        session_of({"row.png": encoded(one_row), "whole.png": encoded(images[0])}, target), strict
+    )
+    assert "too few corners: 8 of 40, needs 40" in refused.rejections[0].reason
+    assert list(refused.corners) == [1]
+
+
+def test_all_corners_of_the_smallest_boards_suffice():
+    charuco = replace(charuco_target(), columns=3, rows=3, square_m=0.06, marker_m=0.045)
+    tag = replace(aprilgrid_target(), columns=1, rows=1, square_m=0.06)
+    for target in (charuco, tag):
+        cell, images = images_of(CellOptions(views=2, target=target, cut_views=0.0, seed=6), 2)
+        seen = detect(
+            session_of({f"{at}.png": encoded(it) for at, it in enumerate(images)}, target)
+        )
+        for view, corners in seen.corners.items():
+            assert corners.ids.tolist() == [0, 1, 2, 3]
+            np.testing.assert_allclose(corners.px, cell.exact_corners[view].px, atol=0.05)
+        assert len(seen.corners) == 2
 
 
 @pytest.mark.parametrize(

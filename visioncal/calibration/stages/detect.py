@@ -44,7 +44,8 @@ class DetectOptions:
     """What a view needs in order to be used.
 
     Attributes:
-        min_corners: Fewest corners of a board; a homography needs 4, the rest are its check.
+        min_corners: Fewest corners of a board, or all that it has; a homography needs 4, the rest
+            are its check.
         max_blur_px: Widest edges, as a Gaussian's sigma [px]. Defocus of this size still gives
             corners to 0.1 px; motion of this size is a pose that changed during the exposure.
         threads: How many images are worked on at a time; 0 for one a core.
@@ -325,10 +326,11 @@ def _given(session: Session, view: View, resolution: tuple[int, int]) -> Corners
 
 
 def _trouble(target: Target, ids: IntArray, blur_px: float, options: DetectOptions) -> str:
-    needed = 4 if target.kind in ("marker", "points") else options.min_corners
+    positions = corner_positions(target)
+    needed = 4 if target.kind in ("marker", "points") else min(options.min_corners, len(positions))
     if len(ids) < needed:
-        return f"too few corners: {len(ids)} of {len(corner_positions(target))}, needs {needed}"
-    if not determines_pose(corner_positions(target)[ids]):
+        return f"too few corners: {len(ids)} of {len(positions)}, needs {needed}"
+    if not determines_pose(positions[ids]):
         return f"corners on one line: all {len(ids)}, or all but one, lie in one row of the board"
     if blur_px > options.max_blur_px:
         return f"blurred: edges are {blur_px:.1f} px wide (limit {options.max_blur_px:.1f})"

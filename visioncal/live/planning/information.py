@@ -414,7 +414,7 @@ def _predicted(cell: PlanCell, poses: FloatArray, first_corner: int) -> tuple[Co
     size = np.array(cell.camera.resolution)
     visible = np.all((px > -0.5) & (px < size - 0.5), axis=2)
     in_part = cell.target.kind in FOUND_IN_PART or cell.target.point_tags
-    fewest = _FEWEST_CORNERS if in_part else len(positions)
+    fewest = min(_FEWEST_CORNERS, len(positions)) if in_part else len(positions)
     seen = visible.sum(axis=1) >= fewest
     view, corner = np.nonzero(visible[seen])
     counts = visible[seen].sum(axis=1)
