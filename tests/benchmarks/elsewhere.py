@@ -15,6 +15,7 @@ import tempfile
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
+from copy import deepcopy
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -291,15 +292,17 @@ WORLDS = {
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One cell, as it truly is."""
+    """One cell, as it truly is; `told` is what is reported of flanges (m, 4, 4), but for noise."""
 
     world: World
     mount: str
     x: np.ndarray
     z: np.ndarray
     robot: np.ndarray
+    told: Callable[[np.ndarray], np.ndarray]
     shift: Callable[[np.ndarray], np.ndarray]
     corners: np.ndarray
+    boards: np.ndarray
     pixels: np.ndarray
     given: np.ndarray
     mean_m: float
@@ -382,6 +385,11 @@ def cell(world: World, mount: str, given: bool, seed: int, folder: Path) -> Case
         ]
     )
     pixels = pixels + world.pixel_px * rng.normal(size=pixels.shape)
+    drawn = deepcopy(rng)
+
+    def told(flanges):
+        return world.robot(flanges, deepcopy(drawn)) if world.robot else flanges
+
     reported = world.robot(robot, rng) if world.robot else robot
     errors = world.noise((len(robot), 6), rng)
     steps = np.array([pose(world.robot_rad * it[:3], world.robot_m * it[3:]) for it in errors])
@@ -392,7 +400,7 @@ def cell(world: World, mount: str, given: bool, seed: int, folder: Path) -> Case
     if given and world.is_said:
         with (folder / "session.toml").open("a") as file:
             file.write(f"matrix_sigma_px = {world.off_px}\n")
-    return Case(world, mount, x, z, reported, shift, corners, pixels, stated, mean_m)
+    return Case(world, mount, x, z, reported, told, shift, corners, boards, pixels, stated, mean_m)
 
 
 def write(folder, mount, matrix, reported, pixels):

@@ -23,6 +23,7 @@ from support.picks import seen_corners
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.stages.need import Picks
 from visioncal.core.errors import VisioncalError
 from visioncal.core.transforms import exp, invert, rotation_angle
 from visioncal.core.types import FloatArray, Need
@@ -74,15 +75,19 @@ def of_one_cell(seed: int) -> Outcome | None:
     except VisioncalError:
         return None
     (picks,) = known.findings.picks
-    quantile, both = float(rng.uniform(0.02, 0.98)), bool(rng.integers(2))
-    mm = 1e3 * radius_within(picks.spreads, quantile, picks.freedom)
-    turned = float(np.sqrt(np.trace(picks.spreads[:, :3, :3], axis1=1, axis2=2).mean()))
-    deg = float(np.rad2deg(turned * rng.uniform(0.7, 1.8))) if both else None
-    need = Need(mm, deg)
+    need = some_need(picks, rng)
     eye = None if seen == POSES else Eye.of(result_of(known))
     landed = [lands(cell, known, eye, need, rng) for _ in range(PICKS)]
     kind = (cell.options.mount, seen)
-    return Outcome(kind, both, picks.probability(need), float(np.mean(landed)))
+    return Outcome(kind, need.deg is not None, picks.probability(need), float(np.mean(landed)))
+
+
+def some_need(picks: Picks, rng: np.random.Generator) -> Need:
+    """A need that some share of picks meets, of place alone or of place and rotation."""
+    quantile, both = float(rng.uniform(0.02, 0.98)), bool(rng.integers(2))
+    mm = 1e3 * radius_within(picks.spreads, quantile, picks.freedom)
+    turned = float(np.sqrt(np.trace(picks.spreads[:, :3, :3], axis1=1, axis2=2).mean()))
+    return Need(mm, float(np.rad2deg(turned * rng.uniform(0.7, 1.8))) if both else None)
 
 
 def of_poses(cell: Cell) -> RunState:

@@ -72,7 +72,9 @@ def write_generation(
         raise DataError(
             f"{folder}: cannot be written: {error.strerror or error}.",
             culprits=[str(folder)],
-            next_step="Make room in it, or choose another folder.",
+            next_step="Make room on its disk, or choose another folder."
+            if error.errno == errno.ENOSPC
+            else "Choose another folder, or one that may be written.",
         ) from error
     return tuple(folder / name for name in reversed(written))
 

@@ -1,0 +1,156 @@
+"""Needs in cells that visioncal has not made: how often picks land, over what is stated of them.
+
+The worlds of `elsewhere.py`, of both mounts, with lenses that are given and estimated. Each cell is
+calibrated from `corners.csv` and `views.csv`, gets a need of its own, and picks: the camera looks
+at a thing as one of its views looked at the board, and the flange goes to where its middle is
+found. What is wrong with the world is so at the pick as well: the lens, its focus, the arm at the
+look and where it goes, and moves of the base, which come as late in the picks as in the session.
+
+    PYTHONPATH=tests python tests/benchmarks/need_elsewhere.py [SEEDS]
+"""
+
+import tempfile
+import time
+import warnings
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
+from multiprocessing import Pool
+from pathlib import Path
+
+import numpy as np
+from elsewhere import COLUMNS, ROWS, SQUARE_M, WORLDS, Case, cell, pose, seen
+from need import PICKS, Outcome, in_bins, some_need, table
+from results import wished, write_section
+
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.core.errors import VisioncalError
+from visioncal.core.transforms import exp, invert, rotation_angle
+from visioncal.core.types import Corners, FloatArray, Need
+from visioncal.frames.camera_chain import Eye
+from visioncal.frames.target_in_image import see
+from visioncal.session import Session
+
+SEEDS = 6
+GRID = np.stack(np.meshgrid(np.arange(COLUMNS), np.arange(ROWS)), axis=-1).reshape(-1, 2)
+THING = SQUARE_M * np.column_stack([GRID, np.zeros(len(GRID))])
+TO_MIDDLE = pose(np.zeros(3), THING.mean(axis=0))
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One cell: its world, what it states of its need and what lands, and its verdict."""
+
+    world: str
+    outcome: Outcome
+    status: str
+
+
+def of_one_cell(at: tuple[str, str, bool, int], folder: Path) -> Trial | None:
+    """Calibrates a cell and picks with it; None where its session is refused."""
+    world, mount, given, seed = at
+    case = cell(WORLDS[world], mount, given, seed, folder / "_".join(map(str, at)))
+    known = RunState(Session.load(folder / "_".join(map(str, at))))
+    rng = np.random.default_rng([seed, [*WORLDS].index(world), len(mount), given])
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            for stage in STAGES:
+                known = stage.run(known)
+    except VisioncalError:
+        return None
+    (picks,) = known.findings.picks
+    need, result = some_need(picks, rng), result_of(known)
+    landed = float(np.mean(lands(case, known, Eye.of(result), need, rng)))
+    kind = (mount, "lens given" if given else "lens estimated")
+    outcome = Outcome(kind, need.deg is not None, picks.probability(need), landed)
+    return Trial(world, outcome, result.verdict.status)
+
+
+def lands(
+    case: Case, known: RunState, eye: Eye, need: Need, rng: np.random.Generator
+) -> FloatArray:
+    """(p,) whether picks at times spread over the session come near enough."""
+    at = rng.integers(len(case.boards), size=PICKS)
+    in_camera, found = case.boards[at], known.solved.state.edges[0]
+    shown = np.array([in_image(case, eye, known, it, rng) for it in in_camera])
+    if case.mount == "eye-in-hand":
+        robot = case.z @ invert(in_camera) @ invert(case.x)
+        meant = robot @ case.x @ in_camera @ TO_MIDDLE
+        goal = case.told(robot) @ noise(case, rng) @ found @ shown @ TO_MIDDLE
+    else:
+        meant, goal = case.x @ in_camera @ TO_MIDDLE, found @ shown @ TO_MIDDLE
+    # Where the robot really is when it reports the goal.
+    went = goal
+    for _ in range(4):
+        went = went @ invert(case.told(went)) @ goal
+    away = invert(meant) @ went @ noise(case, rng)
+    near = need.mm is None or 1e3 * np.linalg.norm(away[:, :3, 3], axis=1) <= need.mm
+    return near & (need.deg is None or np.rad2deg(rotation_angle(away)) <= need.deg)
+
+
+def noise(case: Case, rng: np.random.Generator) -> FloatArray:
+    """(p, 4, 4) the robot's noise."""
+    sigmas = np.repeat([case.world.robot_rad, case.world.robot_m], 3)
+    return np.array([exp(it) for it in sigmas * case.world.noise((PICKS, 6), rng)])
+
+
+def in_image(
+    case: Case, eye: Eye, known: RunState, in_camera: FloatArray, rng: np.random.Generator
+) -> FloatArray:
+    """(4, 4) where the calibrated camera has a thing that stands somewhere, by exact corners."""
+    far = in_camera[2:3, 3] / case.mean_m
+    focal = float(case.world.focus(far, rng)[0]) if case.world.focus else 1.0
+    px = seen(THING @ in_camera[:3, :3].T + in_camera[:3, 3], case.shift, focal)
+    corners = Corners(0, np.arange(len(px)), px, 0.0)
+    return see(eye, corners, known.session.target, "thing", 0.1).cam_from_target[0]
+
+
+def main(seeds: int) -> None:
+    """Prints the tables and keeps them."""
+    every = [
+        it
+        for it in product(WORLDS, ("eye-in-hand", "eye-to-hand"), (True, False), range(seeds))
+        if it[2] or WORLDS[it[0]].off_px == 0.0
+    ]
+    with tempfile.TemporaryDirectory() as folder, Pool(2) as pool:
+        kept = pool.map(partial(of_one_cell, folder=Path(folder)), every, chunksize=2)
+    found = [it for it in kept if it is not None]
+    rows = []
+    for world in WORLDS:
+        mine = [it for it in found if it.world == world]
+        away = np.array([it.outcome.landed - it.outcome.stated for it in mine])
+        good = away[[it.status == "good" for it in mine]]
+        rows.append(
+            (world, str(len(mine)), f"{100 * away.mean():+.1f} ({spread(away)})",
+             f"{100 * good.mean():+.1f} ({spread(good)})" if len(good) else "none is good")
+        )  # fmt: skip
+    text = f"""{len(every)} cells of `elsewhere.py`, {seeds} seeds of each; {PICKS} picks of each.
+{len(every) - len(found)} sessions were refused. The standard error is in brackets.
+
+{
+        table(
+            ("stated", "cells", "mean stated", "picks that land", "difference"),
+            in_bins([it.outcome for it in found]),
+        )
+    }
+
+{table(("world", "cells", "difference", "where the verdict is good"), rows)}
+"""
+    print(text)
+    write_section(
+        "Needs elsewhere", "PYTHONPATH=tests python tests/benchmarks/need_elsewhere.py", text
+    )
+
+
+def spread(away: FloatArray) -> str:
+    """The standard error of a mean, in percent."""
+    return f"{100 * float(np.std(away)) / np.sqrt(len(away)):.1f}"
+
+
+if __name__ == "__main__":
+    started = time.perf_counter()
+    main(wished(SEEDS))
+    print(f"{time.perf_counter() - started:.0f} s")
