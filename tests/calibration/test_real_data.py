@@ -64,7 +64,8 @@ def test_two_exchanged_rows_among_images_of_other_rows_are_named(real_data, came
     unused = {view.view for view in result.views if not view.used}
     assert unused >= ({25, 26} if camera == 1 else {9, 14, 15, 25, 26, 31, 33, 38})
     assert "Views 25 and 26 are exchanged" in result.verdict.top[0]
-    assert result.verdict.status == "check"
+    # A third of the second camera's images is of other rows.
+    assert result.verdict.status == ("check" if camera == 1 else "bad")
     # An image that shows a tenth of its field, 1.3 m away, fixes a camera to some millimetres; its
     # focal length is open to a few per cent, which are 40 mm.
     assert all(1.0 < it.sigma_mm < 40.0 for it in result.placed.values())

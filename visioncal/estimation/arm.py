@@ -42,7 +42,8 @@ class ArmErrors:
 
     Attributes:
         basis: (s, 6, p) how the flange moves with them at each stop, all of them in radians.
-        sigma: Their standard deviation [rad]; lengths are off by 0.5 m times as much.
+        sigma: Their standard deviation [rad], averaged over having none; lengths are off by 0.5 m
+            times as much.
         gain: Twice the gain in log-likelihood over white noise alone.
         of_links: Whether they are errors of this arm's links, which can be estimated along; else
             they have the shape of any arm's, and only their size means something.
@@ -151,7 +152,12 @@ def find_arm_errors(
     least = 0.0 if of_links else _LIKELY
     sigma, value = _most_likely_size(widened, size, levels, unlikely - 0.5 * least)
     gain = 2.0 * (unlikely - value)
-    return ArmErrors(basis, sigma, gain, of_links) if gain > least else None
+    if gain <= least:
+        return None
+    # The variance that is expected of both: one more level costs one of the log-likelihood
+    # (Akaike), by which exact links are weighed against these.
+    weight = 1.0 / (1.0 + np.exp(1.0 - 0.5 * gain))
+    return ArmErrors(basis, float(np.sqrt(weight)) * sigma, gain, of_links)
 
 
 def _most_likely_size(
