@@ -22,7 +22,7 @@ from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.identified import Identified
 from visioncal.dynamics.model import FrictionTerms
 from visioncal.dynamics.motion import Motion
-from visioncal.dynamics.regression import Block, Regression, regress
+from visioncal.dynamics.regression import Block, Regression, regress, rms_of
 from visioncal.robot import Inertias, body_regressor, entries
 
 # A mass that is known no better than to this share of itself is none [-].
@@ -44,7 +44,8 @@ class Payload:
     Attributes:
         values: (10,) its inertial parameters in the flange's frame, in the order of `Inertias`.
         covariance: (10, 10) of these.
-        rms_nm: (n,) torques that it leaves unexplained, as a root mean square [N m].
+        rms_nm: (n,) torques that it leaves unexplained where they count, as a root mean square
+            [N m].
         gains_sigma_kg: What of the mass's standard deviation comes from the drives' gains [kg].
     """
 
@@ -152,7 +153,7 @@ def estimate_payload(
     found = Payload(
         fit.values[:10],
         (fit.covariance + _of_arm(identified, loaded, fit) + of_gains)[:10, :10],
-        np.sqrt(np.mean(np.concatenate(fit.residuals) ** 2, axis=0)),
+        rms_of(np.concatenate(fit.residuals), np.concatenate([it.used for it in fit.blocks])),
         float(np.sqrt(of_gains[0, 0])),
     )
     if not found.mass_sigma_kg < _WORST * found.mass_kg:
