@@ -40,7 +40,8 @@ class Bench:
     def foreign(self) -> list[Any]:
         """What people hand over by mistake."""
         files = [None, BOARD, self.folder / "views.csv", {"a": 1}, 3.5, [1], object()]
-        return [*files, self.session, self.calibration, self.image.astype(float)]
+        in_colour = np.dstack([self.image] * 3)
+        return [*files, self.session, self.calibration, self.image.astype(float), in_colour]
 
     @property
     def sound(self) -> dict[str, Any]:
@@ -118,6 +119,15 @@ def test_what_was_given_and_what_is_needed_is_said(bench):
         ),
         "Sight: seen is an array of float64, of the shape (2, 3); a Corners or an image of uint8 "
         "is needed.": lambda: visioncal.Sight("1", np.zeros((2, 3))),
+        "image: an array of the shape (800, 1280, 3); (h, w) grey levels are needed. "
+        "Give its grey levels: cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).": (
+            lambda: visioncal.identify(np.dstack([bench.image] * 3))
+        ),
+        "out/recording.rrd is a recording; a calibration.json, or the folder with one, is needed. "
+        "Name the output folder of visioncal calibrate. Of a recording alone, "
+        "visioncal.present.recording.read_calibration reads the result.": (
+            lambda: visioncal.Calibration.load("out/recording.rrd")
+        ),
         "Session.from_arrays: mount 'eye-on-hand' is not one of eye-in-hand, eye-to-hand, "
         "instrument. Did you mean eye-to-hand or eye-in-hand?": (
             lambda: visioncal.Session.from_arrays(
@@ -129,6 +139,13 @@ def test_what_was_given_and_what_is_needed_is_said(bench):
         with pytest.raises(DataError) as refused:
             call()
         assert str(refused.value) == expected
+
+
+def test_files_are_taken_by_text_and_a_folder_is_no_file(bench, tmp_path):
+    written = visioncal.convert(str(bench.folder), str(tmp_path / "copy"))
+    assert written.digest() == bench.session.digest()
+    with pytest.raises(DataError, match=r"Is a directory\. Name a file in it\."):
+        bench.calibration.save(str(tmp_path))
 
 
 def test_a_board_is_taken_by_its_name_and_from_its_file(bench, tmp_path):

@@ -79,7 +79,9 @@ def named_errors(path: Path) -> Iterator[None]:
         raise DataError(
             f"{path} cannot be written: {error.strerror or error}.",
             culprits=[str(path)],
-            next_step="Choose a folder that exists, can be written, and has room.",
+            next_step="Name a file in it."
+            if isinstance(error, IsADirectoryError)
+            else "Choose a folder that exists, can be written, and has room.",
         ) from error
 
 

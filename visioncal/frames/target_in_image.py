@@ -25,7 +25,7 @@ from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.planar import determines_pose
 from visioncal.frames.camera_chain import Eye
 from visioncal.vision.finders import NotFound, find_target
-from visioncal.vision.finders.imaging import blur_at_corners, why_hard_to_see
+from visioncal.vision.finders.imaging import GREY, blur_at_corners, why_hard_to_see
 from visioncal.vision.targets import corner_positions, rotations
 
 # Corners scatter more than this by chance in one look of ten thousand.
@@ -120,7 +120,7 @@ def check_size(eye: Eye, image: Image, label: str) -> None:
             f"{label}: it has {shown} pixels, and the calibrated camera has {width} x {height}, "
             "grey.",
             culprits=[label],
-            next_step="Give its grey levels: cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)."
+            next_step=GREY
             if image.shape[:2] == (height, width)
             else "Take the image with the same camera, binning and region as calibrated.",
         )

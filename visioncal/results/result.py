@@ -391,6 +391,13 @@ class Calibration(CalibrationSections):
                     next_step="Its report is the report.html there; name an output folder of "
                     "visioncal calibrate here.",
                 )
+        if file.suffix.lower() == ".rrd":
+            raise DataError(
+                f"{path} is a recording; a calibration.json, or the folder with one, is needed.",
+                culprits=[str(path)],
+                next_step="Name the output folder of visioncal calibrate. Of a recording alone, "
+                "visioncal.present.recording.read_calibration reads the result.",
+            )
         return cls.from_json(read_bytes(file), str(file))
 
     @classmethod

@@ -43,8 +43,8 @@ Choose: TypeAlias = Callable[[InDoubt | Foreign], Candidate]
 
 @typed
 def convert(
-    source: Path,
-    dest: Path,
+    source: Path | str,
+    dest: Path | str,
     *,
     requested: ImportOptions = _DEFAULTS,
     form: str | None = None,
@@ -75,6 +75,7 @@ def convert(
         DataError: `source` is neither, `requested` is not for it, `dest` is taken, cannot be
             written or, read again, is another session.
     """
+    source, dest = Path(source), Path(dest)
     _check_dest(source, dest, force=force)
     if form is not None or not _is_session(source):
         foreign = read_foreign(source, requested, form)

@@ -15,7 +15,7 @@ from visioncal.vision.finders.identify_aprilgrid import find_grid
 from visioncal.vision.finders.identify_charuco import LEAST_MARKERS, Lattice, find_lattices
 from visioncal.vision.finders.identify_checkerboard import find_squares
 from visioncal.vision.finders.identify_markers import Marker, decode_markers, genuine, holding
-from visioncal.vision.finders.imaging import why_hard_to_see
+from visioncal.vision.finders.imaging import check_grey, why_hard_to_see
 from visioncal.vision.finders.result import DetectedCorners
 from visioncal.vision.targets import DEFAULT_RELATIVE_SIGMA
 
@@ -123,8 +123,10 @@ def identify(image: Image) -> Identity:
         The target whose corners are the most; others that are seen too are named in its notes.
 
     Raises:
-        DataError: There is none; the message says what was looked for and what may help.
+        DataError: There is none, and the message says what was looked for and what may help; or
+            the image is not grey.
     """
+    check_grey(image, "image")
     identity = _identity(image)
     if identity is not None:
         return identity

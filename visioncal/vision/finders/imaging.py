@@ -22,6 +22,8 @@ _SAMPLE = 12
 _STRIP = 256
 # Under this many grey levels a picture shows nothing that a detector could use.
 _LEAST_CONTRAST = 12
+# What to do about an image in colour.
+GREY = "Give its grey levels: cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)."
 
 
 def looks_like_image(data: bytes) -> bool:
@@ -64,6 +66,20 @@ def decode_image(data: bytes, *, colour: bool = False) -> Image | str:
     if image is None:
         return "unreadable: not an image that can be decoded"
     return np.asarray(image, dtype=np.uint8) if image.dtype == np.uint8 else _to_eight_bits(image)
+
+
+def check_grey(image: Image, label: str) -> None:
+    """Refuses an image in colour.
+
+    Raises:
+        DataError: It has more than rows and columns, or fewer.
+    """
+    if image.ndim != 2:
+        raise DataError(
+            f"{label}: an array of the shape {image.shape}; (h, w) grey levels are needed.",
+            culprits=[label],
+            next_step=GREY,
+        )
 
 
 def encode_png(image: Image | Image16) -> bytes:
