@@ -77,6 +77,13 @@ class ConvertOptions(RobotPoseOptions):
             help="The column or key that names each row's image.",
         ),
     ] = None
+    corners: Annotated[
+        Path | None,
+        _camera(
+            help="A file with the corners that another program found: mrcal's .vnl or another "
+            "table, OpenCV's image_points, or lists by image in JSON, YAML or .npz."
+        ),
+    ] = None
     intrinsics: Annotated[
         str | None,
         _camera(
@@ -108,6 +115,7 @@ class ConvertOptions(RobotPoseOptions):
             target=self.target,
             intrinsics=self.intrinsics,
             images=self.images,
+            corners=self.corners,
             resolution=None if self.resolution is None else size_in(self.resolution),
             tip=self.tip,
         )

@@ -15,12 +15,14 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_IMAGE_BYTES, absence, read_bytes, sha256, some_of
 from visioncal.core.types import Mount
 from visioncal.interchange.formats.boards import described_target, target_name
+from visioncal.interchange.formats.corner_lists import with_corners
 from visioncal.interchange.formats.foreign import Foreign, Sweep, rows_of
 from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.intrinsics import read_intrinsics
 from visioncal.robot import ROBOT_SUFFIXES, Robot, read_robot_document
 from visioncal.session import MemoryImages, Session, Stream
 from visioncal.session import columns as known
+from visioncal.session.corners import CornerTable
 from visioncal.vision.finders.imaging import decode_image, looks_like_image
 
 
@@ -59,6 +61,8 @@ def wished(foreign: Foreign, requested: ImportOptions) -> Foreign:
         foreign = replace(foreign, mount=requested.mount)
     if requested.target is not None:
         foreign = replace(foreign, target=described_target(requested.target))
+    if requested.corners is not None:
+        foreign = with_corners(foreign, requested.corners)
     if requested.tip is not None and requested.robot_model is None:
         raise DataError("--tip needs the robot that it is of; name it with --robot-model.")
     if requested.robot_model is not None:
@@ -106,8 +110,10 @@ def assemble(foreign: Foreign, *, mount: Mount | None = None) -> Session:
     notes = list(foreign.notes)
     if files:
         _check_images(foreign.name, list(files.values()), notes)
+    shows = bool(files or foreign.corners)
+    if shows:
         document["camera"] = _camera(foreign, list(files.values()))
-    target = foreign.target if files else None
+    target = foreign.target if shows else None
     if target is not None:
         document["target"] = target_name(target) or "target.toml"
     robot = _robot(foreign, document)
@@ -120,6 +126,7 @@ def assemble(foreign: Foreign, *, mount: Mount | None = None) -> Session:
         FileImages(files) if files else MemoryImages({}),
         target_document=target,
         robot_document=robot,
+        corners=_corner_table(foreign) if foreign.corners else None,
     )
     if foreign.sweep is not None:
         session = session.with_streams({"robot": _stream(foreign.sweep)})
@@ -183,7 +190,7 @@ def spoken(foreign: Foreign) -> Foreign:
     foreign = _with_one_witness(foreign, notes)
     points = foreign.columns.get("point", ())
     saw = np.zeros(len(foreign.robot), dtype=bool)
-    for cells in (foreign.images, points):
+    for cells in (foreign.images, foreign.corners, points):
         saw |= np.array([bool(it) for it in cells] or [False])
     if foreign.camera is not None:
         saw |= foreign.camera.there
@@ -206,23 +213,24 @@ def spoken(foreign: Foreign) -> Foreign:
 
 def _with_one_witness(foreign: Foreign, notes: list[str]) -> Foreign:
     """Chooses between images and stored poses of the target where there are both."""
-    if not foreign.images:
+    if not (foreign.images or foreign.corners):
         return foreign
+    what = "corners" if foreign.corners else "images"
     if foreign.target is not None:
         if foreign.camera is not None:
             notes.append(
-                "The stored poses of the target are left aside: the images determine them better."
+                f"The stored poses of the target are left aside: the {what} determine them better."
             )
         return replace(foreign, camera=None)
     if foreign.camera is None:
         raise DataError(
-            f"{foreign.name} has images, but what target they show is not known.",
+            f"{foreign.name} has {what}, but what target they show is not known.",
             culprits=["target"],
             next_step="Say --target with a name in targets/, a .toml, or a description such as "
             "checkerboard_9x6_23.6mm.",
         )
-    notes.append("The images are left aside: no --target says what they show.")
-    return replace(foreign, images=())
+    notes.append(f"The {what} are left aside: no --target says what they show.")
+    return replace(foreign, images=(), corners=())
 
 
 def _written(foreign: Foreign) -> list[_Row]:
@@ -242,6 +250,20 @@ def _written(foreign: Foreign) -> list[_Row]:
         cells |= {name: column[at] for name, column in extra.items()}
         rows.append(_Row(cells, dict([image]) if image is not None else {}))
     return rows
+
+
+def _corner_table(foreign: Foreign) -> CornerTable:
+    views = foreign.views or range(len(foreign.robot))
+    both = zip(views, foreign.corners, strict=True)
+    shown = [(view, it) for view, it in both if it is not None]
+    counts = [len(it.ids) for _, it in shown]
+    return CornerTable(
+        np.repeat([view for view, _ in shown], counts),
+        np.concatenate([it.ids for _, it in shown]),
+        np.concatenate([it.px for _, it in shown]),
+        ("",) * sum(counts),
+        is_file=False,
+    )
 
 
 def _scalars(foreign: Foreign, at: int) -> dict[str, str]:
@@ -319,10 +341,12 @@ def _camera(foreign: Foreign, files: Sequence[Path]) -> dict[str, Any]:
         size = next((it for file in files if (it := _image_size(file)) is not None), None)
         if size is not None:
             lens["resolution"] = list(size)
-        elif "matrix" in lens:
+        elif "matrix" in lens or foreign.corners:
+            seen = "how large the images are is not known"
+            if "matrix" in lens:
+                seen = "the intrinsics do not say for which size of image they hold"
             raise DataError(
-                f"{foreign.name}: the intrinsics do not say for which size of image they hold, and "
-                "no image can be read.",
+                f"{foreign.name}: {seen}, and no image can be read.",
                 culprits=["resolution"],
                 next_step="Say --resolution WIDTH,HEIGHT.",
             )

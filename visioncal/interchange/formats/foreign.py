@@ -28,6 +28,19 @@ class Sweep:
 
 
 @dataclass(frozen=True, eq=False)
+class FoundCorners:
+    """Corners of a target that another program has found in one image.
+
+    Attributes:
+        ids: (k,) their numbers on the target.
+        px: (k, 2) where they are [px].
+    """
+
+    ids: IntArray
+    px: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class Foreign:
     """A recording in somebody else's form: n rows, each what was seen from one pose.
 
@@ -36,6 +49,8 @@ class Foreign:
         robot: `base_from_flange` of each row.
         camera: `cam_from_target` of each row; None where images stand for it.
         images: (n,) the image of each row; None in a row without one, empty where there are none.
+        corners: (n,) what another program found in each row's image; None in a row without, empty
+            where none did.
         joints_rad: (n, j) joint angles [rad], NaN in a row without; None where they were not
             recorded.
         stamps_s: (n,) times [s]; None where they were not recorded.
@@ -54,6 +69,7 @@ class Foreign:
     robot: PoseNumbers
     camera: PoseNumbers | None = None
     images: tuple[Path | None, ...] = ()
+    corners: tuple[FoundCorners | None, ...] = ()
     joints_rad: FloatArray | None = None
     stamps_s: FloatArray | None = None
     mount: Mount | None = None
@@ -74,6 +90,7 @@ def rows_of(foreign: Foreign, rows: IntArray) -> Foreign:
         robot=foreign.robot.rows(rows),
         camera=None if foreign.camera is None else foreign.camera.rows(rows),
         images=tuple(foreign.images[it] for it in rows) if foreign.images else (),
+        corners=tuple(foreign.corners[it] for it in rows) if foreign.corners else (),
         joints_rad=None if foreign.joints_rad is None else foreign.joints_rad[rows],
         stamps_s=None if foreign.stamps_s is None else foreign.stamps_s[rows],
         views=tuple((foreign.views or tuple(range(count)))[it] for it in rows),

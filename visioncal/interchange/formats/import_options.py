@@ -76,6 +76,7 @@ class ImportOptions:
         target: A shipped name, the path of a `.toml`, or a description in one word.
         intrinsics: The path of a file with intrinsics, or `estimate`.
         images: A folder with the images.
+        corners: A file with the corners that another program found in the images.
         resolution: (width, height) [px].
         robot_model: A built-in robot's name, or the path of a .urdf or a DH .toml.
         tip: The frame that the poses are of.
@@ -91,6 +92,7 @@ class ImportOptions:
     target: str | None = None
     intrinsics: str | None = None
     images: Path | None = None
+    corners: Path | None = None
     resolution: tuple[int, int] | None = None
     robot_model: str | None = None
     tip: str | None = None

@@ -1,0 +1,236 @@
+"""Corners that another program has found: a row for each corner, or lists of them for each image.
+
+Tables have the image, the place and perhaps the corner's number in columns, as mrcal's
+`corners.vnl` does: there the corners of an image are all those of the board, row by row, and `-`
+stands for one that was not found. Documents have a list for each image: side by side, as OpenCV's
+samples write `image_points`, or in records with the corners' numbers and the image's name.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from visioncal.core.documents import is_number, read_npz, read_opencv, read_table
+from visioncal.core.documents.arrays import Array
+from visioncal.core.documents.bounds import read_plain_text
+from visioncal.core.errors import DataError
+from visioncal.core.files import natural, some_of
+from visioncal.core.types import FloatArray
+from visioncal.interchange.formats.columns import DOCUMENTS, read_document
+from visioncal.interchange.formats.foreign import Foreign, FoundCorners
+
+# What others call the image, a corner's number and its place; of one corner, and of all.
+_IMAGE = ("image", "img", "filename", "file", "image_name", "image_file", "image_path", "frame")
+_IMAGES = tuple(f"{it}s" for it in _IMAGE)
+_POINT = ("point", "point_id", "corner", "corner_id", "charuco_id", "id")
+_POINTS = ("ids", "charuco_ids", "corner_ids", "point_ids", "all_ids", "allids")
+_U, _V = ("u_px", "x_px", "u", "x", "img_loc_x"), ("v_px", "y_px", "v", "y", "img_loc_y")
+_PLACES = (
+    *("charuco_corners", "image_points", "imagepoints", "img_points", "imgpoints", "corners"),
+    *("all_corners", "allcorners", "uv", "pixels", "points"),
+)
+# mrcal halves an image so many times before it finds a corner; `-` takes one away.
+_LEVEL = "level"
+
+
+@dataclass(frozen=True, eq=False)
+class _Image:
+    """What was found in one image, by its name; empty where the file names none."""
+
+    name: str
+    found: FoundCorners
+
+
+def with_corners(foreign: Foreign, path: Path) -> Foreign:
+    """Joins the corners in a file with the rows of a recording.
+
+    By the images' names where both have them, else in order.
+
+    Raises:
+        DataError: The file holds no corners, or they are not of this recording's images.
+    """
+    is_document = path.suffix.lower() in (*DOCUMENTS, ".npz")
+    images = list(_of_document(path) if is_document else _of_table(path))
+    if not any(it.found.ids.size for it in images):
+        raise DataError(f"{path} holds no corners.", culprits=[str(path)])
+    count, names = len(foreign.robot), [Path(it.name.replace("\\", "/")).name for it in images]
+    rows = [None if it is None else it.name for it in foreign.images]
+    notes = foreign.notes
+    if all(names) and any(rows):
+        found = dict(zip(names, images, strict=True))
+        if len(found) < len(names):
+            twice = next(it for it in names if names.count(it) > 1)
+            raise DataError(
+                f"{path.name} has corners of {twice} twice; each image is needed once.",
+                culprits=[twice],
+                next_step="Leave the other camera's images out.",
+            )
+        if not found.keys() & set(rows):
+            raise DataError(
+                f"{path.name} has corners of {some_of(names, 3)}; the recording's images are "
+                f"{some_of([it for it in rows if it], 3)}.",
+                culprits=[str(path)],
+                next_step="Name the column of the images that it is about with --image-column.",
+            )
+        paired = [found.get(it or "") for it in rows]
+    elif len(images) == count:
+        order = sorted(images, key=lambda it: natural(Path(it.name))) if all(names) else images
+        paired = [*order]
+        notes = (*notes, f"The images of {path.name} are paired with the poses by their order.")
+    else:
+        raise DataError(
+            f"{path.name} has the corners of {len(images)} images, and there are {count} poses of "
+            "the robot.",
+            culprits=[str(path)],
+            next_step="Give as many of both, or a column with each pose's image (--image-column).",
+        )
+    corners = tuple(it.found if it is not None and it.found.ids.size else None for it in paired)
+    # What the other program did not find is not searched, and what is missing not missed.
+    pictures = tuple(
+        it if it is not None and of is not None and it.is_file() else None
+        for it, of in zip(foreign.images, corners, strict=bool(foreign.images))
+    )
+    return replace(foreign, corners=corners, images=pictures if any(pictures) else (), notes=notes)
+
+
+def _of_table(path: Path) -> Iterator[_Image]:
+    """Takes the images of a table in the order of their first rows."""
+    columns, rows, places = _table(path)
+    lower = [it.lower() for it in columns]
+
+    def column(names: Sequence[str]) -> int:
+        return next((lower.index(it) for it in names if it in lower), -1)
+
+    image, point, u, v, level = (column(it) for it in (_IMAGE, _POINT, _U, _V, (_LEVEL,)))
+    if min(image, u, v) < 0:
+        raise DataError(
+            f"{path.name} has the columns {', '.join(columns)}; the image, x and y of each corner "
+            "are needed.",
+            culprits=[str(path)],
+            next_step="Begin it with a header such as filename,id,x,y.",
+        )
+    found: dict[str, list[tuple[float, float, float]]] = {}
+    counts: dict[str, int] = {}
+    for row, place in zip(rows, places, strict=True):
+        number = counts[row[image]] = counts.get(row[image], -1) + 1
+        mine = found.setdefault(row[image], [])
+        if {"-", "nan"} & {row[u], row[v], row[level] if level >= 0 else ""} or not row[u]:
+            continue
+        cells = (str(number) if point < 0 else row[point], row[u], row[v])
+        if not all(is_number(it) for it in cells):
+            raise DataError(
+                f"{place}: {' '.join(cells)[:60]!r}; numbers are needed.", culprits=[place]
+            )
+        mine.append((float(cells[0]), float(cells[1]), float(cells[2])))
+    for name, corners in found.items():
+        numbers = np.array(corners).reshape(-1, 3)
+        yield _Image(name, _checked(numbers[:, 0], numbers[:, 1:], f"{path.name}, {name}"))
+
+
+def _table(path: Path) -> tuple[Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+    """The columns of a table, its rows, and where each stands."""
+    if path.suffix.lower() != ".vnl":
+        table = read_table(path)
+        return table.columns, table.rows, [table.place(at) for at in range(len(table.rows))]
+    lines = [(at, it.strip()) for at, it in enumerate(read_plain_text(path).splitlines(), start=1)]
+    # Comments have two signs, or one and an exclamation mark; the header has one.
+    headers = [it[1:].split() for _, it in lines if it[:1] == "#" and it[1:2] not in ("#", "!")]
+    columns = headers[0] if headers else []
+    rows = [(f"{path.name}, line {at}", it.split()) for at, it in lines if it and it[0] != "#"]
+    short = next((place for place, cells in rows if len(cells) != len(columns)), "")
+    if short:
+        raise DataError(
+            f"{short}: it does not have the columns of the header, {' '.join(columns) or 'none'}.",
+            culprits=[short],
+            next_step="mrcal's header is: # filename x y level",
+        )
+    return columns, [cells for _, cells in rows], [place for place, _ in rows]
+
+
+def _of_document(path: Path) -> Iterator[_Image]:
+    document: object = read_npz(path) if path.suffix.lower() == ".npz" else read_document(path)
+    if path.suffix.lower() == ".json" and isinstance(document, Mapping):
+        document = read_opencv(path)
+    records = list(_records(document))
+    if not records:
+        raise DataError(
+            f"{path.name} has no list of corners; one is called {', '.join(_PLACES[:6])} or the "
+            "like, for each image or in a record of it.",
+            culprits=[str(path)],
+        )
+    for at, record in enumerate(records):
+        name = _named(record, _IMAGE)
+        where = f"{path.name}, {name or f'entry {at}'}"
+        places, ids = _named(record, _PLACES), _named(record, (*_POINTS, *_POINT))
+        try:
+            if isinstance(places, list):
+                places = [[it["x"], it["y"]] if isinstance(it, Mapping) else it for it in places]
+            px = np.array([] if places is None else places, dtype=float)
+            numbers = None if ids is None else np.array(ids, dtype=float)
+        except (KeyError, ValueError, TypeError, OverflowError):
+            px, numbers = np.zeros(1), None
+        if px.size and (not px.ndim or px.shape[-1] % 2):
+            raise DataError(
+                f"{where}: its corners are no list of pairs of numbers.", culprits=[where]
+            )
+        px = px.reshape(-1, 2)
+        numbers = np.arange(len(px), dtype=float) if numbers is None else numbers.ravel()
+        yield _Image("" if name is None else str(name), _checked(numbers, px, where))
+
+
+def _records(document: object) -> Iterator[Mapping[str, object]]:
+    """Finds the records of images in a document: each has a list of corners."""
+    if isinstance(document, list):
+        yield from (it for it in document if isinstance(it, Mapping) and _has_corners(it))
+    if not isinstance(document, Mapping):
+        return
+    places = _named(document, _PLACES)
+    if places is None:
+        for name, value in document.items():
+            if isinstance(value, Mapping) and _has_corners(value):
+                yield {"image": name, **value}
+            elif isinstance(value, list):
+                yield from _records(value)
+    elif not isinstance(places, list | np.ndarray) or not _is_of_images(places):
+        yield document
+    else:
+        ids, names = _named(document, _POINTS), _named(document, _IMAGES)
+        for at, it in enumerate(places):
+            beside = {"ids": ids, "image": names}
+            own = {
+                key: them[at]
+                for key, them in beside.items()
+                if isinstance(them, list | np.ndarray) and len(them) == len(places)
+            }
+            yield {"corners": it, **own}
+
+
+def _is_of_images(places: Sequence[object] | Array) -> bool:
+    """Whether a list has a list of corners for each image, and is not itself one of corners."""
+    some = (it for it in places if isinstance(it, list | np.ndarray) and len(it) > 1)
+    return any(isinstance(it[0], list | np.ndarray) for it in some)
+
+
+def _has_corners(record: Mapping[str, object]) -> bool:
+    return any(it.lower() in _PLACES for it in map(str, record))
+
+
+def _named(record: Mapping[str, object], names: Sequence[str]) -> object:
+    """The value of the first of some names, in whatever case; None where there is none."""
+    lower = {str(name).lower(): value for name, value in record.items()}
+    return next((lower[it] for it in names if it in lower), None)
+
+
+def _checked(ids: FloatArray, px: FloatArray, where: str) -> FoundCorners:
+    if len(ids) != len(px):
+        raise DataError(
+            f"{where}: there are {len(px)} corners and {len(ids)} numbers of them.",
+            culprits=[where],
+        )
+    if not (np.all(np.isfinite(px)) and np.all((ids % 1 == 0) & (np.abs(ids) < 2**31))):
+        raise DataError(
+            f"{where}: a corner has no finite place, or its number is not whole.", culprits=[where]
+        )
+    return FoundCorners(ids.astype(np.int64), px)
