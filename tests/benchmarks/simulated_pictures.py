@@ -18,7 +18,7 @@ from support.commands import visioncal as run
 
 from visioncal.core.transforms import invert, log
 
-SEEDS, WORKERS = wished(10), 2
+SEEDS, WORKERS = wished(20), 2
 BOARDS = few(
     ("charuco", "checkerboard", "aprilgrid", "circles", "symmetric-circles", "tags"), ("charuco",)
 )
