@@ -352,6 +352,39 @@ def test_views_in_milliseconds_are_named(session):
     assert "Divide the column stamp_s" in caught.value.next_step
 
 
+@pytest.mark.parametrize(("per_s", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds")])
+def test_times_of_views_and_robot_in_another_unit_are_named(session, per_s, unit):
+    stream = session.streams["robot"]
+    scaled = stream.values * np.where(np.array(stream.columns) == "stamp_s", per_s, 1.0)
+    rows = [{**it.numbers, "stamp_s": per_s * it.stamp_s} for it in session.views]
+    views = tuple(replace(it, numbers=row) for it, row in zip(session.views, rows, strict=True))
+    both = replace(session, views=views).with_streams({"robot": Stream(stream.columns, scaled)})
+    with pytest.raises(DataError, match=rf"streams/robot\.csv: .* looks like {unit} \(125 samples"):
+        calibrate(both)
+
+
+def test_times_that_are_missing_are_asked_for_where_a_stream_waits_for_them(session):
+    rows = [{k: v for k, v in it.numbers.items() if k != "stamp_s"} for it in session.views]
+    views = tuple(replace(it, numbers=row) for it, row in zip(session.views, rows, strict=True))
+    with pytest.raises(DataError, match=r"Fill in stamp_s.*streams/robot\.csv gives the poses"):
+        calibrate(replace(session, views=views))
+
+
+def test_a_clock_that_was_set_during_the_recording_costs_no_memory(session):
+    """The first samples and frames are of 1970, as of devices that have no clock of their own."""
+    stream, early = session.streams["robot"], 0.5
+    stamps = stream.stamps_s
+    later = np.where(np.array(stream.columns) == "stamp_s", 1.76e9, 0.0) * (stamps > early)[:, None]
+    rows = [
+        {**it.numbers, "stamp_s": it.stamp_s + 1.76e9 * (it.stamp_s > early + AHEAD_S)}
+        for it in session.views
+    ]
+    views = tuple(replace(it, numbers=row) for it, row in zip(session.views, rows, strict=True))
+    moved = replace(session, views=views)
+    found = clocked_of(moved.with_streams({"robot": Stream(stream.columns, stream.values + later)}))
+    assert abs(found.clock.camera_minus_robot_s - AHEAD_S) < 1e-4
+
+
 def test_times_that_images_share_are_named(session):
     for stamp in (lambda s: np.full_like(s, 3.0), np.floor):
         with pytest.raises(DataError, match=r"views have the same stamp_s as others .*: it is"):

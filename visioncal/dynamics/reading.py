@@ -8,15 +8,13 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, Mask
-from visioncal.session import Stream
+from visioncal.session import Stream, too_far_apart
 
 _NUMBERED = re.compile(r"(q|tau|current|dq)([1-9][0-9]*)_(rad|nm|a|rad_s)", re.ASCII)
 # Fewer samples than these are no motion.
 _LEAST_SAMPLES = 200
-# Samples farther apart show no motion: their stamps are of another unit, of which there are so many
-# in a second [s].
+# Samples farther apart show no motion [s].
 _SLOWEST_S = 0.5
-_UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 _HOW = (
     "A stream for dynamics has stamp_s, q1_rad ..., and tau1_nm ... or current1_a ... of every "
     "joint, from the base to the tip; dq1_rad_s ... where the controller reports speeds."
@@ -110,28 +108,11 @@ def read_recorded(
             culprits=[label],
             next_step=_HOW,
         )
-    _check_stamps(label, times_s)
+    usual_s = float(np.median(np.diff(times_s)))
+    if usual_s > _SLOWEST_S:
+        raise too_far_apart(label, usual_s, _SLOWEST_S)
     q, torques, dq = (values[:, at * count : (at + 1) * count] for at in range(3))
     return Recorded(label, times_s, q, dq if with_dq else None, gains * torques, of_currents)
-
-
-def _check_stamps(label: str, times_s: FloatArray) -> None:
-    """Refuses stamps by which nothing could be told of a motion."""
-    usual_s = float(np.median(np.diff(times_s)))
-    if usual_s <= _SLOWEST_S:
-        return
-    # The largest unit that leaves steps of a controller.
-    unit = next((it for it, per_s in _UNITS.items() if usual_s <= _SLOWEST_S * per_s), "")
-    like = "no time in seconds"
-    if unit:
-        like = f"{unit} ({_UNITS[unit] / usual_s:.3g} samples a second)"
-    raise DataError(
-        f"{label}: by stamp_s its samples are {usual_s:.4g} s apart, which looks like {like}.",
-        culprits=[f"{label}, stamp_s"],
-        next_step=f"stamp_s is in seconds: divide it by {_UNITS[unit]:.0f}."
-        if unit
-        else "stamp_s is in seconds.",
-    )
 
 
 def _names(kind: str, count: int) -> list[str]:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask, Mount
 from visioncal.estimation.corners import CornerStack
-from visioncal.estimation.trajectory import Trajectory
+from visioncal.estimation.trajectory import LONGEST_GAP_S, Trajectory
 
 # Clocks that are farther apart are not on one network [s].
 WIDEST_OFFSET_S = 5.0
@@ -93,7 +93,8 @@ def turning_matches(robot: Trajectory, frames: Frames, about_s: float = 0.0) -> 
         about_s: Around which offset to look [s].
 
     Returns:
-        The matches; none where neither turns, or the streams have too little time in common.
+        The matches; none where neither turns, where the streams have too little time in common, or
+            where the robot's samples are too far apart to show a motion.
     """
     frames = replace(frames, stamps_s=frames.stamps_s - about_s)
     later = np.searchsorted(frames.stamps_s, frames.stamps_s + WINDOW_S)
@@ -101,6 +102,8 @@ def turning_matches(robot: Trajectory, frames: Frames, about_s: float = 0.0) -> 
     if len(first) < _FEWEST_PAIRS:
         return ()
     turning = _Turning.of(robot, frames, first, later[first])
+    if not len(turning.steps):
+        return ()
     reach_s = min(WIDEST_OFFSET_S, 0.25 * _common_s(robot, frames))
     lags = np.arange(-int(reach_s / _STEP_S), int(reach_s / _STEP_S) + 1)
     scores = np.zeros(len(lags))
@@ -121,16 +124,16 @@ class _Turning:
         by_camera: (k,) as the camera saw it [rad].
         first: (k,) where each pair's first frame lies on the grid, with clocks that agree.
         second: (k,) where its second one lies.
-        quaternions: (g, 4) of the robot on the grid.
-        known: (g,) where the grid lies within its samples.
+        steps: (g,) the grid's points that lie within the robot's samples, ascending.
+        quaternions: (g, 4) of the robot there.
         per_window: How many pairs share a stretch of time.
     """
 
     by_camera: FloatArray
     first: IntArray
     second: IntArray
+    steps: IntArray
     quaternions: FloatArray
-    known: Mask
     per_window: float
 
     @classmethod
@@ -138,26 +141,33 @@ class _Turning:
         """Compares some frames with others behind them."""
         seen = frames.cam_from_target
         begin_s, end_s = robot.stamps_s[[0, -1]]
+        steps = _steps(robot.stamps_s)
         # Stamps since 1970 are rounded to 0.2 us: a step may end behind the last of them.
-        grid_s = np.minimum(begin_s + np.arange(0.0, end_s - begin_s, _STEP_S), end_s)
+        grid_s = np.minimum(begin_s + _STEP_S * steps, end_s)
+        known = robot.covers(grid_s)
         turned = Slerp(robot.stamps_s, Rotation.from_matrix(robot.poses[:, :3, :3]))
-        places = np.rint((frames.stamps_s - grid_s[0]) / _STEP_S).astype(np.int64)
+        places = np.rint((frames.stamps_s - begin_s) / _STEP_S).astype(np.int64)
         return cls(
             rotation_angle(invert(seen[first]) @ seen[second]),
             places[first],
             places[second],
-            turned(grid_s).as_quat(),
-            robot.covers(grid_s),
+            steps[known],
+            turned(grid_s[known]).as_quat(),
             float(np.median(second - first)),
         )
 
     def by_robot(self, lag: int) -> tuple[Mask, FloatArray]:
         """Which pairs (k,) the robot knows at a lag, and (j,) by how much it turned there [rad]."""
-        one, other = self.first - lag, self.second - lag
-        inside = (one >= 0) & (other < len(self.known))
-        inside[inside] &= self.known[one[inside]] & self.known[other[inside]]
+        one, one_known = self._at(self.first - lag)
+        other, other_known = self._at(self.second - lag)
+        inside = one_known & other_known
         products = self.quaternions[one[inside]] * self.quaternions[other[inside]]
         return inside, 2.0 * np.arccos(np.minimum(np.abs(products.sum(axis=1)), 1.0))
+
+    def _at(self, steps: IntArray) -> tuple[IntArray, Mask]:
+        """Rows of steps (k,) of the grid, and which of them are there."""
+        rows = np.minimum(np.searchsorted(self.steps, steps), len(self.steps) - 1)
+        return rows, self.steps[rows] == steps
 
     def sigma_s(self, lag: int) -> float:
         """Standard deviation of an offset [s]: angles are off by noise, and change with it."""
@@ -175,6 +185,19 @@ class _Turning:
             np.sqrt(np.mean((off - off.mean()) ** 2) * max(self.per_window, 1.0) / information)
         )
         return float(np.hypot(covariance, _LEAST_SIGMA_S))
+
+
+def _steps(stamps_s: FloatArray) -> IntArray:
+    """The grid's steps (g,) between samples that are near each other.
+
+    A clock that was set during a recording leaves samples that are years apart.
+    """
+    places, near = (stamps_s - stamps_s[0]) / _STEP_S, np.diff(stamps_s) < LONGEST_GAP_S
+    low, high = (np.floor(it[near]).astype(np.int64) for it in (places[:-1], places[1:]))
+    counts = high - low + 1
+    starts = np.cumsum(counts) - counts
+    steps = np.unique(np.repeat(low - starts, counts) + np.arange(counts.sum()))
+    return np.asarray(steps[steps < places[-1]])
 
 
 def _common_s(robot: Trajectory, frames: Frames) -> float:

@@ -10,7 +10,7 @@ from visioncal.session.images import FolderImages, ImageStore, MemoryImages
 from visioncal.session.observations import Observation
 from visioncal.session.session import Session
 from visioncal.session.streams import FOLDER as STREAMS
-from visioncal.session.streams import Stream, check_stream, save_stream
+from visioncal.session.streams import Stream, check_stream, save_stream, too_far_apart
 from visioncal.session.table import View
 
 __all__ = [
@@ -26,4 +26,5 @@ __all__ = [
     "check_stream",
     "frame_name",
     "save_stream",
+    "too_far_apart",
 ]

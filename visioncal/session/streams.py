@@ -27,6 +27,8 @@ _GAP_RATIO, _GAP_S = 2.5, 0.02
 _SHOWN_PROBLEMS = 10
 # What stands for no number in other programs' tables.
 _NONE = frozenset({"nan", "-nan", "+nan", "na", "n/a", "null", "none", "inf", "-inf", "+inf", "-"})
+# Units that stamps may be in by mistake, and how many of them are a second.
+_UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 # Half an hour of twenty columns at 500 Hz, of all streams together.
 _MOST_BYTES = 300_000_000
 
@@ -319,6 +321,29 @@ def _wrong_rows(
         f"{label}: {words} in {some_of(named, 3)}.",
         culprits=[f"{label}, {it}" for it in named[:_SHOWN_PROBLEMS]],
         next_step=next_step,
+    )
+
+
+def too_far_apart(label: str, usual_s: float, slowest_s: float) -> DataError:
+    """What to raise of samples that are too far apart to show a motion.
+
+    Args:
+        label: The stream's place, as `streams/robot.csv`.
+        usual_s: How far apart they usually are by their stamps [s].
+        slowest_s: How far apart they may be [s].
+    """
+    # The largest unit that leaves steps of a controller.
+    unit = next((it for it, per_s in _UNITS.items() if usual_s <= slowest_s * per_s), "")
+    like = "no time in seconds"
+    if unit:
+        like = f"{unit} ({_UNITS[unit] / usual_s:.3g} samples a second)"
+    return DataError(
+        f"{label}: by stamp_s its samples are {usual_s:.4g} s apart, which looks like {like}. Over "
+        f"{slowest_s:g} s they show no motion.",
+        culprits=[f"{label}, stamp_s"],
+        next_step=f"stamp_s is in seconds: divide it by {_UNITS[unit]:.0f}."
+        if unit
+        else "stamp_s is in seconds.",
     )
 
 

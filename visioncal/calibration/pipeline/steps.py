@@ -16,6 +16,7 @@ from visioncal.calibration.stages.clocks import set_clocks, waits_for_clock
 from visioncal.calibration.stages.judge import judge
 from visioncal.calibration.stages.kinematics import check_asked
 from visioncal.calibration.stages.loads import check_stops
+from visioncal.calibration.stages.motion import stream_of
 from visioncal.calibration.stages.observed import all_held_back
 from visioncal.calibration.stages.pictures import pairing
 from visioncal.calibration.stages.readings import (
@@ -28,7 +29,7 @@ from visioncal.calibration.stages.robots import check_joints, check_read_joints,
 from visioncal.core.errors import DataError
 from visioncal.core.types import Rejection
 from visioncal.core.verdict import Finding, Step
-from visioncal.session import STREAMS
+from visioncal.session import STREAMS, Session
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,17 @@ def _suspicious(warning: str) -> Finding:
     return Finding("misread_joints", warning, Step("Correct [robot] model in session.toml."))
 
 
+def _without_times(session: Session) -> str:
+    """Asks for the times of views whose poses are in a stream; empty where that is not it."""
+    stream = stream_of(session, "")
+    if not stream or any(it.stamp_s is not None for it in session.views):
+        return ""
+    return (
+        f"Fill in stamp_s, when each image was taken, and {STREAMS}/{stream}.csv gives the poses; "
+        "or x_m to qw."
+    )
+
+
 def _reported(known: RunState) -> RunState:
     """Takes up what is reported of the robots."""
     known = read_robots(known)
@@ -105,7 +117,8 @@ def _reported(known: RunState) -> RunState:
         raise DataError(
             f"session {known.session.name!r}: no view has a pose of the robot.",
             culprits=known.lost_views,
-            next_step=" ".join(known.session.warnings)
+            next_step=_without_times(known.session)
+            or " ".join(known.session.warnings)
             or "Fill in x_m to qw, or joint angles and [robot] model.",
         )
     views, declared = (

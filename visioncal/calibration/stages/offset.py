@@ -16,8 +16,9 @@ from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import GUESS, Finding, Step
 from visioncal.estimation.clock import ClockChange, ClockFit
 from visioncal.estimation.clock_correlation import Match
+from visioncal.estimation.trajectory import LONGEST_GAP_S
 from visioncal.results.sections import ClockResult
-from visioncal.session import View
+from visioncal.session import View, too_far_apart
 
 # Angles that go along by less are of other motions; a larger sigma [s] is no answer.
 LEAST_CORRELATION, LARGEST_SIGMA_S, _ANY_SIGMA_S = 0.5, 0.01, 1.0
@@ -253,6 +254,9 @@ def no_offset(
             culprits=["views.csv: stamp_s"],
             next_step="Divide the column stamp_s of views.csv by 1000; it is in seconds.",
         )
+    if outside and motion.flange.step_s >= LONGEST_GAP_S:
+        label = f"streams/{motion.name}.csv"
+        return too_far_apart(label, motion.flange.step_s, LONGEST_GAP_S)
     if outside:
         return DataError(
             f"No view lies within streams/{motion.name}.csv: it goes from {begin_s:.6f} to "
