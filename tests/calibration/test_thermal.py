@@ -310,6 +310,13 @@ def test_a_session_without_temperatures_is_refused_by_the_columns_that_lack(lear
         DataError, match=r"from 0 to 2990 s, and views were taken from 0 to 57\d\d s"
     ):
         calibrate(session.with_streams({"heat": soon}), level="thermal")
+    # Where nobody asks for the drift, residuals that drift say why it was not found.
+    (drifts,) = (
+        it
+        for it in calibrate(session.with_streams({"heat": soon})).verdict.findings
+        if it.kind == "moved_slowly"
+    )
+    assert "was not looked for: temperatures were read from 0 to 2990 s, and views" in drifts.words
 
 
 def test_kelvin_is_no_celsius(learnt, tmp_path):

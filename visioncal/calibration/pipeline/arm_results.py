@@ -172,7 +172,15 @@ def _doubts(
         yield from doubts(arm.kinematics)
     if found is not None:
         calibrated = arm.model is not None
-        yield from diagnose.doubts(found, arm.errors, from_when, joint, calibrated=calibrated)
+        aside = "" if arm.heat is None else arm.heat.set_aside
+        for it in diagnose.doubts(found, arm.errors, from_when, joint, calibrated=calibrated):
+            if it.kind == "moved_slowly" and aside:
+                words = (
+                    f"{it.words} Whether the arm drifts with its temperature was not looked for: "
+                )
+                yield replace(it, words=f"{words}{aside}.")
+            else:
+                yield it
 
 
 def _called(arms: Mapping[str, RobotArm], robot: str) -> str:

@@ -105,6 +105,11 @@ class Heat:
             )
         return ""
 
+    @property
+    def set_aside(self) -> str:
+        """Why what was recorded of it cannot be used; empty where it can, or none was recorded."""
+        return "" if self._read[0] is None else self.missing
+
 
 def heating(heat: Heat | None, asked: str) -> Inputs | None:
     """What heats an arm; None where that is not asked for, or the session does not determine it.
