@@ -310,6 +310,14 @@ def test_typed_poses_and_pictures_in_a_folder_make_a_session(planned, tmp_path):
         done = visioncal("record", *words, "--resume")
     assert done.status == 2
     assert "begins with its first picture again" in done.err
+    # What is advised where it ends early is possible, too.
+    words[-1] = tmp_path / "ended"
+    with patch.object(sys, "stdin", io.StringIO("\n".join([lines[0], "no pose", ""]))):
+        done = visioncal("record", *words)
+    assert done.status == 2
+    assert "1 view is safe" in done.err
+    assert "record all of it into a new session" in done.err
+    assert "--resume" not in done.err
 
 
 def test_a_recording_is_drawn(tmp_path):

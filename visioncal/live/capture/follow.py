@@ -60,7 +60,7 @@ def follow(capture: Capture, count: int) -> list[Step]:
     """
     capture.catch_up()
     been = _places(capture)
-    with closed_cleanly(capture.cell, capture.journal):
+    with closed_cleanly(capture.cell, capture.journal, capture.options):
         try:
             while not count or len(capture.journal.views) < count:
                 state, took_s = _rest(capture.cell, been, capture.options.still)
@@ -101,7 +101,7 @@ def ask_and_take(
     """
     capture.catch_up()
     camera, clock = capture.cell.camera, capture.cell.clock
-    with closed_cleanly(capture.cell, capture.journal):
+    with closed_cleanly(capture.cell, capture.journal, capture.options):
         while not count or len(capture.journal.views) < count:
             number = _next(capture)
             wish = capture.coach.advice()

@@ -131,7 +131,7 @@ def record(
     done = {it.number for it in journal.views}
     left = [it for it in plan.stops if it.view not in done]
     ways = Ways(plan)
-    with closed_cleanly(cell, journal):
+    with closed_cleanly(cell, journal, options):
         for at, stop in enumerate(left):
             begun = cell.clock.now()
             way = ways.to(stop, joints_of(cell))
@@ -145,8 +145,13 @@ def record(
 
 
 @contextmanager
-def closed_cleanly(cell: LiveCell, journal: Journal) -> Iterator[None]:
+def closed_cleanly(cell: LiveCell, journal: Journal, options: CaptureOptions) -> Iterator[None]:
     """Runs a recording, after which the arm stands still; says what is on the disk if it fails.
+
+    Args:
+        cell: The arm and the camera.
+        journal: What was written.
+        options: How views are taken.
 
     Raises:
         DriverError: A device failed, or Ctrl-C came.
@@ -159,14 +164,21 @@ def closed_cleanly(cell: LiveCell, journal: Journal) -> Iterator[None]:
         raise DriverError(
             f"stopped by Ctrl-C or a signal; the arm was halted. {_kept_words(journal)}",
             culprits=["Ctrl-C"],
-            next_step="Go on with --resume.",
+            next_step=_again(journal, options),
         ) from None
     except VisioncalError as error:
         message = f"{error.message} {_kept_words(journal)}"
         step = error.next_step
         if "--resume" not in step:
-            step = f"{step} Go on with --resume.".strip()
+            step = f"{step} {_again(journal, options)}".strip()
         raise type(error)(message, culprits=error.culprits, next_step=step) from error
+
+
+def _again(journal: Journal, options: CaptureOptions) -> str:
+    """How a recording that failed is continued."""
+    if options.single and journal.views:
+        return "A folder begins with its first picture again: record all of it into a new session."
+    return "Go on with --resume."
 
 
 def _kept_words(journal: Journal) -> str:

@@ -103,10 +103,7 @@ class ManualArm:
         try:
             return self._ask(question)
         except EOFError as error:
-            raise DriverError(
-                "The poses that were typed are at their end.",
-                next_step="Go on with --resume.",
-            ) from error
+            raise DriverError("The poses that were typed are at their end.") from error
 
 
 def pose_words(pose: FloatArray) -> str:
