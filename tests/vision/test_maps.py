@@ -15,9 +15,11 @@ SIDE_M = 0.05
 @pytest.mark.parametrize(
     ("camera", "most_px"), [(wide_camera(), 0.0015), (fisheye_camera(), 0.006)]
 )
-def test_maps_follow_the_sides_of_tags_through_a_lens(camera, most_px):
+@pytest.mark.parametrize("cut_px", [(0, 0), (100, 50)])
+def test_maps_follow_the_sides_of_tags_through_a_lens(camera, most_px, cut_px):
     cell = simulate(CellOptions(target=TAGS, camera=camera, views=20, seed=1))
-    axis = OpticalAxis.of(camera.resolution[::-1], np.zeros(2))
+    # An image that was cut has its middle beside the lens's axis.
+    axis = OpticalAxis.of(camera.resolution[::-1], np.array(cut_px))
     errors = []
     for corners, cam_from_target in zip(cell.exact_corners, cell.cam_from_target, strict=True):
         places = np.array(TAGS.points_m)[corners.ids]

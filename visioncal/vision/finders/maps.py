@@ -14,9 +14,11 @@ from visioncal.core.types import FloatArray, IntArray, Mask
 _AROUND, _NEAR = 25, 1.5
 # Held by so much to a plain homography, a map stays determined where corners are few.
 _RIDGE = np.diag([1e-6, 1e-4, 1e-4, *[1e-2] * 7])
-# Radial distortion has two coefficients of about so much, which so many corners determine in so
-# many steps. A place is never drawn further from the axis than by the inverse of the last.
-_RADIAL_SIGMA, _RADIAL_CORNERS, _RADIAL_STEPS, _LEAST_RADIAL = 0.5, 8, 5, 0.1
+# Radial distortion has two coefficients and an axis near the image's middle, of about so much. So
+# many corners determine it in so many steps, or until the squares change by less than a share of
+# them, and no place is drawn further from the axis than by the inverse of the last.
+_RADIAL_SIGMAS = np.array([0.5, 0.5, 0.1, 0.1])
+_RADIAL_CORNERS, _RADIAL_STEPS, _RADIAL_STEADY, _LEAST_RADIAL = 8, 6, 0.01, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +26,7 @@ class OpticalAxis:
     """About what a lens distorts radially.
 
     Attributes:
-        px: (2,) where it is, about the middle of the image [px].
+        px: (2,) the middle of the image, near which it is [px].
         reach_px: How far the image reaches from there [px].
     """
 
@@ -93,51 +95,48 @@ def _undistorted(
 ) -> Callable[[FloatArray], FloatArray] | None:
     """Likewise, the radial distortion of a lens taken off; None where it is not determined.
 
-    A place o from the axis, of length r, goes to o / (1 + a r^2 + b r^4) (Fitzgibbon 2001).
+    A place o from the axis, of length r, goes to o / (1 + a r^2 + b r^4) (Fitzgibbon 2001). Each
+    Gauss-Newton step of a, b and the axis is followed by the homography's own least squares.
     """
     if len(px) < _RADIAL_CORNERS:
         return None
 
-    def from_axis(at: FloatArray) -> tuple[FloatArray, FloatArray]:
-        off = (at - axis.px) / axis.reach_px
-        squared = np.sum(off**2, axis=-1)
-        return off, np.stack([squared, squared**2], axis=-1)
+    def straight(at: FloatArray, lens: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        off = (at - axis.px) / axis.reach_px - lens[2:]
+        powers = np.sum(off**2, axis=-1, keepdims=True) ** [1, 2]
+        shrink = 1.0 + powers @ lens[:2, None]
+        return off / shrink, powers, shrink
 
-    off, powers = from_axis(px)
-    homography = np.asarray(cv2.findHomography(off, board)[0], float)
-    radial = np.zeros(2)
-    if homography.shape != (3, 3):
-        return None
-
-    def flattened(at: FloatArray) -> FloatArray:
-        off, powers = from_axis(at)
-        return _mapped(homography, off / (1.0 + powers @ radial)[..., None])
-
-    first = np.linalg.norm(board - flattened(px))
+    lens, cost, least, best = np.zeros(4), np.inf, np.inf, None
     for _ in range(_RADIAL_STEPS):
-        shrink = 1.0 + powers @ radial
+        flat, powers, shrink = straight(px, lens)
         if not np.all(shrink > _LEAST_RADIAL):
-            return None
-        flat = off / shrink[:, None]
+            break
+        homography = np.asarray(cv2.findHomography(flat, board)[0], float)
+        if homography.shape != (3, 3):
+            break
         seen = _mapped(homography, flat)
         rest = board - seen
-        ahead = flat @ homography[2, :2] + homography[2, 2]
-        ones = np.column_stack([flat, np.ones(len(flat))]) / ahead[:, None]
-        by_flat = (homography[:2, :2] - seen[..., None] * homography[2, :2]) / ahead[:, None, None]
-        by_shrink = -(by_flat @ off[..., None]) / shrink[:, None, None] ** 2
-        jacobian = np.zeros((len(px), 2, 10))
+        before, cost = cost, float(np.sum(rest**2))
+        if cost < least:
+            least, best = cost, (lens, homography)
+        if abs(before - cost) < _RADIAL_STEADY * before:
+            break
+        ahead = (flat @ homography[2, :2] + homography[2, 2])[:, None]
+        ones = np.column_stack([flat, np.ones(len(flat))]) / ahead
+        by_flat = (homography[:2, :2] - seen[..., None] * homography[2, :2]) / ahead[..., None]
+        outward = 2.0 * (lens[0] + 2.0 * lens[1] * powers[:, :1]) * flat
+        by_axis = flat[..., None] * outward[:, None] - np.eye(2) / shrink[..., None]
+        jacobian = np.zeros((len(px), 2, 12))
         jacobian[:, 0, :3] = jacobian[:, 1, 3:6] = ones
         jacobian[:, :, 6:8] = -seen[..., None] * ones[:, None, :2]
-        jacobian[:, :, 8:] = by_shrink * powers[:, None]
-        held = np.sqrt(np.mean(rest**2)) / _RADIAL_SIGMA * np.eye(2, 10, 8)
-        step = np.linalg.lstsq(
-            np.concatenate([jacobian.reshape(-1, 10), held]),
-            np.concatenate([rest.ravel(), -held[:, 8:] @ radial]),
-        )[0]
-        homography += np.append(step[:8], 0.0).reshape(3, 3)
-        radial += step[8:]
-    is_better = np.linalg.norm(board - flattened(px)) < first
-    return flattened if is_better and np.all(1.0 + powers @ radial > _LEAST_RADIAL) else None
+        jacobian[:, :, 8:10] = by_flat @ flat[..., None] * (-powers / shrink)[:, None]
+        jacobian[:, :, 10:] = by_flat @ by_axis
+        held = np.sqrt(np.mean(rest**2)) / _RADIAL_SIGMAS[:, None] * np.eye(4, 12, 8)
+        system = np.concatenate([jacobian.reshape(-1, 12), held])
+        wanted = np.concatenate([rest.ravel(), -held[:, 8:] @ lens])
+        lens = lens + np.linalg.lstsq(system, wanted)[0][8:]
+    return None if best is None else lambda at: _mapped(best[1], straight(at, best[0])[0])
 
 
 def _mapped(homography: FloatArray, places: FloatArray) -> FloatArray:
