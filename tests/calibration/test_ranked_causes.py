@@ -27,7 +27,7 @@ from visioncal.core.types import Need
 from visioncal.core.verdict import CALIBRATE, GUESS, PLAN, Finding, Step, Verdict, with_paths
 from visioncal.estimation.joint import MeasuredScale
 from visioncal.results import Rms
-from visioncal.results.verdicts import VerdictForm
+from visioncal.results.parts import VerdictForm
 from visioncal.session import Session
 from visioncal.simulation import Cell, CellOptions, simulate
 

@@ -6,7 +6,7 @@ import pytest
 from visioncal.core.types import Corners
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.gating import gate
-from visioncal.estimation.planar import determines_pose
+from visioncal.estimation.poses import determines_pose
 
 GRID = np.array([[x, y, 0.0] for y in range(5) for x in range(8)])
 

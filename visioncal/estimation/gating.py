@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.corners import CornerStack, mean_square_by_view
-from visioncal.estimation.planar import determines_pose
+from visioncal.estimation.poses import determines_pose
 
 # Views differ in noise by two or so, and eight sigma of all are four of the noisiest; a corner that
 # belongs elsewhere is off by a good part of a square.

@@ -26,8 +26,7 @@ from visioncal.core.transforms import adjoint, exp, inverse_right_jacobian, inve
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.parts import Effect, FramePrior, Noise, Observations, State
-from visioncal.estimation.paths import Stride, Ways
-from visioncal.estimation.tree import Step, Tree
+from visioncal.estimation.tree import Step, Stride, Tree, Ways
 from visioncal.estimation.variance import Knowledge
 
 # A rotation that was not measured is supplied, and counts for nothing beside a variance of one.

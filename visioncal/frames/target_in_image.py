@@ -22,7 +22,7 @@ from visioncal.estimation.corners import CornerStack, reproject
 from visioncal.estimation.gating import gate
 from visioncal.estimation.lens_field import depths_m, zooms
 from visioncal.estimation.linalg import covariance_from
-from visioncal.estimation.planar import determines_pose
+from visioncal.estimation.poses import determines_pose
 from visioncal.frames.camera_chain import Eye
 from visioncal.vision.finders import NotFound, find_target
 from visioncal.vision.finders.imaging import GREY, blur_at_corners, why_hard_to_see

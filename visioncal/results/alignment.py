@@ -22,9 +22,15 @@ from visioncal.estimation.tree import Branch, Step, Tree
 from visioncal.results.edge import Edge, JointCovariance, StoredEdge
 from visioncal.results.frame import Frame
 from visioncal.results.lens import CameraResult
-from visioncal.results.parts import SCHEMA, NeedMet, RobotResult, SessionForm, check_schema
+from visioncal.results.parts import (
+    SCHEMA,
+    NeedMet,
+    RobotResult,
+    SessionForm,
+    StoredVerdict,
+    check_schema,
+)
 from visioncal.results.sections import CellDetails, CellSections
-from visioncal.results.verdicts import StoredVerdict
 
 FILE = "alignment.json"
 

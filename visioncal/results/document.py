@@ -17,13 +17,13 @@ from visioncal.results.parts import (
     Rms,
     SessionForm,
     SolverResult,
+    StoredVerdict,
     Validation,
     ViewResult,
     check_schema,
 )
 from visioncal.results.ray_frame import RayFrame
 from visioncal.results.sections import CalibrationSections
-from visioncal.results.verdicts import StoredVerdict
 from visioncal.results.whole import whole_document
 
 if TYPE_CHECKING:

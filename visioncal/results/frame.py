@@ -12,7 +12,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, write_atomically
 from visioncal.core.version import __version__
 from visioncal.results.edge import StoredEdge
-from visioncal.results.verdicts import StoredVerdict
+from visioncal.results.parts import StoredVerdict
 
 _SCHEMA = 1
 

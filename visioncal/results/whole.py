@@ -23,11 +23,11 @@ from visioncal.results.parts import (
     Rms,
     RobotResult,
     SessionForm,
+    StoredVerdict,
     ViewResult,
     check_schema,
 )
 from visioncal.results.sections import CellDetails, CellSections
-from visioncal.results.verdicts import StoredVerdict
 from visioncal.session import frame_name
 from visioncal.session.frames import frames_of_kind, robots_between, thing_name
 

@@ -6,11 +6,10 @@ from typing import Self
 
 import numpy as np
 
-from visioncal.calibration.stages import backlash, elastic, thermal
+from visioncal.calibration.stages import elastic, thermal
 from visioncal.calibration.stages.arm_identifiability import ArmIdentifiability, identify_arm
-from visioncal.calibration.stages.backlash import plays_of
 from visioncal.calibration.stages.carrying import carries_over, functions_of
-from visioncal.calibration.stages.elastic import Elastic, springs_of
+from visioncal.calibration.stages.elastic import Elastic, plays_of, springs_of
 from visioncal.calibration.stages.joints import Matched
 from visioncal.calibration.stages.kinematics import (
     Kinematics,
@@ -90,7 +89,7 @@ class ArmFound:
             yield self.carries.words
         if self.numbers is not None and self.numbers.advice:
             yield self.numbers.advice
-        yield from backlash.remarks(self.plays)
+        yield from elastic.play_remarks(self.plays)
         if self.springs is not None:
             yield from elastic.remarks(self.springs)
 

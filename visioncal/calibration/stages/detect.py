@@ -20,7 +20,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.limits import MAX_BLUR_PX
 from visioncal.core.threads import SharedSetting
 from visioncal.core.types import Corners, Image, IntArray, Progress, Rejection, Target
-from visioncal.estimation.planar import determines_pose
+from visioncal.estimation.poses import determines_pose
 from visioncal.session import Session, View
 from visioncal.session.kinds import name_of
 from visioncal.vision.finders import DetectedCorners, NotFound, find_target, fitting_layouts

@@ -1,4 +1,7 @@
-"""What the stops say of the joints' springs: stiffnesses, and whether loads and bends fit."""
+"""What the stops say of the joints' springs: stiffnesses, and whether loads and bends fit.
+
+And of their play, where stops were approached from both sides.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +13,7 @@ from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import Finding, Step
 from visioncal.estimation.arm import ArmErrors
-from visioncal.estimation.armmodel import COMPLIANCE, WEIGHT, ArmModel
+from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, WEIGHT, ArmModel
 from visioncal.estimation.armpair import ArmData
 from visioncal.estimation.bending import (
     Factor,
@@ -19,7 +22,7 @@ from visioncal.estimation.bending import (
     flange_bends,
     payload_factor,
 )
-from visioncal.results.arm import ElasticResult, JointSpring, LoadedStop, Sag
+from visioncal.results.arm import ElasticResult, JointBacklash, JointSpring, LoadedStop, Sag
 
 # A joint is determined where the stops leave less than this share of its prior sigma.
 _DETERMINED = 0.5
@@ -187,3 +190,37 @@ def doubts(elastic: Elastic) -> Iterator[Finding]:
             "(payload_kg, payload_x_m ...), or the masses of the arm's links are off.",
             Step("Weigh the load, and correct payload_kg and its centre in views.csv."),
         )
+
+
+def plays_of(model: ArmModel, covariance: FloatArray) -> tuple[JointBacklash, ...]:
+    """Tells the play of each joint; nothing where stops did not come from both sides.
+
+    Joints lag. Where they lead as a whole, the column approach says which way they moved.
+
+    Args:
+        model: The arm.
+        covariance: (p, p) covariance of its errors.
+    """
+    if BACKLASH not in model.weights:
+        return ()
+    place = model.place_of(BACKLASH)
+    sigmas = model.weights[BACKLASH] * np.sqrt(np.diag(covariance)[place])
+    names = model.nominal.joint_names
+    sign = np.copysign(1.0, np.sum(model.backlash / sigmas**2))
+    columns = zip(names, (sign * model.backlash).tolist(), sigmas.tolist(), strict=True)
+    return tuple(JointBacklash(name, band, sigma) for name, band, sigma in columns)
+
+
+def play_remarks(plays: Sequence[JointBacklash]) -> Iterator[str]:
+    """Says which joints have play, for the verdict."""
+    sure = [it for it in plays if it.is_sure]
+    if not sure:
+        return
+    words = ", ".join(
+        f"{it.joint} {figure(1e3 * abs(it.deadband_rad))} +- {figure(1e3 * it.sigma_rad)} mrad"
+        for it in sure
+    )
+    yield (
+        f"Joints have play: {words}. The calibrated arm stands in the middle of it: approach every "
+        "stop from the same side where half of that matters."
+    )

@@ -15,8 +15,7 @@ from visioncal.core.verdict import EMPTY_IMAGE, Finding, Step
 from visioncal.estimation.bundle import BundleFit, fit_bundle
 from visioncal.estimation.corners import CornerStack, mean_square_by_view
 from visioncal.estimation.gating import gate
-from visioncal.estimation.planar import planar_poses
-from visioncal.estimation.poses import fit_poses
+from visioncal.estimation.poses import fit_poses, planar_poses
 from visioncal.vision.targets import numbered_positions
 
 Coefficients: TypeAlias = Literal["auto", 5, 8]

@@ -17,8 +17,7 @@ from visioncal.estimation.corners import (
 )
 from visioncal.estimation.gating import gate
 from visioncal.estimation.linalg import covariance_from
-from visioncal.estimation.planar import planar_poses
-from visioncal.estimation.poses import PoseFit, fit_poses
+from visioncal.estimation.poses import PoseFit, fit_poses, planar_poses
 from visioncal.session import Session
 from visioncal.vision.targets import first_corners, numbered_positions, rotation_transforms
 

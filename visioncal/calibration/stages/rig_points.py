@@ -18,7 +18,7 @@ from visioncal.core.transforms import skew
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Target
 from visioncal.core.verdict import CALIBRATE, Finding, Step
 from visioncal.estimation.numbering import find_numbering
-from visioncal.estimation.planar import determines_pose
+from visioncal.estimation.poses import determines_pose
 from visioncal.vision.camera import normalise
 from visioncal.vision.targets import first_corners
 

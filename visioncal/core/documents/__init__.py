@@ -5,8 +5,7 @@ what is needed.
 """
 
 from visioncal.core.documents.arrays import read_npy, read_npz
-from visioncal.core.documents.json_documents import parse_stored
-from visioncal.core.documents.jsons import read_json
+from visioncal.core.documents.jsons import parse_stored, read_json
 from visioncal.core.documents.opencv import read_opencv
 from visioncal.core.documents.tables import TextTable, is_number, read_table
 from visioncal.core.documents.values import as_numbers, mapping, number, shown

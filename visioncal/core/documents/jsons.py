@@ -1,17 +1,41 @@
-"""JSON, with doubled keys, depth and size checked."""
+"""JSON, with doubled keys, depth and size checked.
+
+Of what visioncal wrote, as it may come back from others, every error names its field.
+"""
 
 import json
+import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from visioncal.core.documents.bounds import MAX_VALUES, read_plain_text, too_deep, too_many
-from visioncal.core.documents.values import check_bounds
+from visioncal.core.documents.values import (
+    MAX_VALUES,
+    check_bounds,
+    read_plain_text,
+    shown,
+    too_deep,
+    too_many,
+)
 from visioncal.core.errors import DataError
+from visioncal.core.files import decode_text
 
 # Longer whole numbers are measurements at best; Python's own reading of them takes quadratic time.
 _MAX_DIGITS = 18
+# What fields hold, by their names: quantities carry their unit.
+_UNITS = r"mm|m|deg|rad|mrad|px|s|c|nm|kg|a|n|k|m_s2|rad_s2|kg_m2|sigma"
+_NUMBERS = re.compile(
+    rf".+_({_UNITS})|.+_per_.+|mm|deg|px|sigma|matrix|quaternion_xyzw|covariance|edge_covariance"
+    "|view|corners|resolution|distortion|spectrum|inflation|likelihood_ratio|condition|unknowns"
+    "|median|most|p95|value|nominal|change|misfit|correlation|placement|o[1-5]|bow_[xy]+|aspect|shear"
+)
+# Tables whose fields users name.
+_NAMED = ("frames", "robots", "tree")
+# Files of other kinds, and how much of one is shown.
+_OTHER_KINDS, _SHOWN = (".csv", ".toml", ".txt", ".png", ".urdf", ".xml", ".html", ".rrd"), 40
+# Squares and products of larger numbers leave what floats hold.
+_LARGEST = 1e60
 
 
 def read_json(path: Path) -> object:
@@ -57,3 +81,69 @@ def _unique(pairs: Sequence[tuple[str, Any]], where: str) -> dict[str, Any]:
             f"{where}: the key {twice[:60]!r} is there twice; once is needed.", culprits=[where]
         )
     return content
+
+
+class StoredTable(dict[str, Any]):
+    """A table of a document that names itself where a field is missing."""
+
+    def __init__(self, content: dict[str, Any], path: str) -> None:
+        super().__init__(content)
+        self.path = path
+
+    def __missing__(self, key: str) -> object:
+        """Refuses the document, in which a field is missing."""
+        raise DataError(f"{self.path}{key} is missing.", culprits=[f"{self.path}{key}"])
+
+
+def parse_stored(text: bytes | str, label: str) -> StoredTable:
+    """Parses a document that visioncal wrote.
+
+    Returns:
+        Its content; a field that is asked for and missing raises DataError.
+
+    Raises:
+        DataError: It is no JSON, no table, too large or too deep, or a field whose name says what
+            it holds, as `rms_mm` does, holds something else; the message has its path.
+    """
+    text = decode_text(text, label) if isinstance(text, bytes) else text
+    begins = text.lstrip()[:_SHOWN].partition("\n")[0]
+    if Path(label).suffix in _OTHER_KINDS and not begins.startswith("{"):
+        raise DataError(
+            f"{label} begins with {shown(begins)}; a JSON document that visioncal wrote is needed "
+            "here.",
+            culprits=[label],
+            next_step="Name its file, as calibration.json, or its folder. This one is of another "
+            "kind; nothing need be changed in it.",
+        )
+    found = _checked(parse_json(text, label), f"{label}: ", "")
+    if not isinstance(found, StoredTable):
+        raise DataError(f"{label} is {shown(found)}; a table is needed.", culprits=[label])
+    return found
+
+
+def _checked(value: Any, path: str, key: str) -> Any:  # noqa: ANN401 - what JSON may hold
+    needed = _needed(value, key)
+    if needed:
+        place = path.rstrip(".")
+        raise DataError(f"{place} is {shown(value)}; {needed} is needed.", culprits=[place])
+    if isinstance(value, dict):
+        return StoredTable(
+            {
+                name: _checked(it, f"{path}{name}.", "" if key in _NAMED else name)
+                for name, it in value.items()
+            },
+            path,
+        )
+    if isinstance(value, list):
+        stem = path.rstrip(".")
+        return [_checked(it, f"{stem}[{at}].", key) for at, it in enumerate(value)]
+    return value
+
+
+def _needed(value: object, key: str) -> str:
+    """What a field must hold by its name and does not; empty where it does."""
+    if _NUMBERS.fullmatch(key) and isinstance(value, str | bool):
+        return "a number"
+    if isinstance(value, float) and not abs(value) <= _LARGEST:
+        return "a number that a cell has"
+    return ""

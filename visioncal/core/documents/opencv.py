@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from visioncal.core.documents.jsons import read_json
-from visioncal.core.documents.matrices import matrix_from
 from visioncal.core.documents.tables import is_number
+from visioncal.core.documents.values import matrix_from
 from visioncal.core.documents.xmls import Element, read_xml
 from visioncal.core.documents.yamls import read_yaml
 from visioncal.core.errors import DataError

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
-from visioncal.core.documents.bounds import MAX_VALUES, read_plain_text, too_many
+from visioncal.core.documents.values import MAX_VALUES, read_plain_text, too_many
 from visioncal.core.errors import DataError
 
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[+-]?(nan|inf)", re.I)

@@ -1,15 +1,65 @@
-"""Values of parsed documents: bounded, and turned into numbers with a word on what is wrong."""
+"""Values of parsed documents: bounded, and turned into numbers with a word on what is wrong.
 
+Among them OpenCV's matrices, from the mapping that its three text formats have in common.
+"""
+
+import math
+import re
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from visioncal.core.documents.bounds import MAX_DEPTH, MAX_VALUES, too_deep, too_many
 from visioncal.core.errors import DataError
+from visioncal.core.files import decode_text, read_bytes, save_as_utf8
 from visioncal.core.types import FloatArray
 
+# Each value costs about a hundred bytes in memory once it is read.
+MAX_VALUES = 1_000_000
+# Matrices in lists in tables need six.
+MAX_DEPTH = 40
+
+_COMMENT_LINE = re.compile(rb"^[ \t]*(?:#|%|//).*$", re.MULTILINE)
 _SHOWN = 60  # characters of a value in a message
+_MOST_AXES = 8
+
+
+def read_plain_text(path: Path) -> str:
+    """Reads a bounded UTF-8 text file, with or without a byte-order mark.
+
+    Lines that begin as comments may be in any encoding that leaves ASCII as it is.
+
+    Raises:
+        DataError: As `read_bytes`, or the bytes are not UTF-8 or hold NUL, as binary files do.
+    """
+    data = read_bytes(path)
+    if b"\0" in data:
+        line = data.count(b"\n", 0, data.index(b"\0")) + 1
+        raise DataError(
+            f"{path}, line {line}: a NUL byte; it is no text file in UTF-8.",
+            culprits=[str(path)],
+            next_step=save_as_utf8("UTF-16"),
+        )
+    readable = _COMMENT_LINE.sub(lambda it: it[0].decode("utf-8", "replace").encode(), data)
+    return decode_text(readable, str(path))
+
+
+def too_many(where: str) -> DataError:
+    """Builds the error for a document with more values than are read."""
+    return DataError(
+        f"{where}: more than {MAX_VALUES:,} values; documents of poses up to that size are read.",
+        culprits=[where],
+        next_step="Cut the recording into parts.",
+    )
+
+
+def too_deep(where: str) -> DataError:
+    """Builds the error for a document that is nested deeper than any pose is."""
+    return DataError(
+        f"{where}: nested deeper than {MAX_DEPTH} levels, as no file of poses is.",
+        culprits=[where],
+    )
 
 
 def check_bounds(value: object, where: str) -> None:
@@ -84,3 +134,45 @@ def mapping(value: object, where: str) -> Mapping[str, Any]:
             f"{where} is {shown(value)}; keys with values are needed.", culprits=[where]
         )
     return value
+
+
+def matrix_from(value: object, where: str) -> FloatArray:
+    """Builds a matrix from rows, cols (or sizes), dt and data.
+
+    Args:
+        value: The mapping; `data` is a list of numbers.
+        where: Where it stands, for messages.
+
+    Returns:
+        (rows, cols) numbers, (rows, cols, channels) where dt names several channels, or an array
+        of the stated sizes.
+
+    Raises:
+        DataError: A field is missing, or the data are not as many as the size asks for.
+    """
+    content = mapping(value, where)
+    data = as_numbers(content.get("data"), f"{where}: data").reshape(-1)
+    if "sizes" in content:
+        sides = as_numbers(content["sizes"], f"{where}: sizes").reshape(-1).tolist()
+    else:
+        sides = [number(content.get(it), f"{where}: {it}") for it in ("rows", "cols")]
+    kind = re.fullmatch(r"([0-9]*)[ucwsifdh]", str(content.get("dt", "d")))
+    if kind is None:
+        raise DataError(
+            f"{where}: dt is {content.get('dt')!r}; one of OpenCV's types is needed, such as d.",
+            culprits=[where],
+        )
+    if kind[1] and int(kind[1][:3]) > 1:
+        sides.append(float(kind[1][:3]))
+    whole = len(sides) <= _MOST_AXES and all(0 <= it <= MAX_VALUES and it % 1 == 0 for it in sides)
+    shape = [int(it) for it in sides] if whole else []
+    # A side of none hides the others from the count.
+    if not whole or math.prod(max(it, 1) for it in shape) > MAX_VALUES:
+        words = " x ".join(f"{it:g}" for it in sides[:_MOST_AXES])
+        raise DataError(f"{where}: a matrix of {words} is none that is read.", culprits=[where])
+    if math.prod(shape) != len(data):
+        words = " x ".join(map(str, shape))
+        raise DataError(
+            f"{where}: the matrix has {len(data)} numbers; {words} are needed.", culprits=[where]
+        )
+    return data.reshape(shape)

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from xml.parsers import expat
 
-from visioncal.core.documents.bounds import MAX_DEPTH, MAX_VALUES, too_deep, too_many
+from visioncal.core.documents.values import MAX_DEPTH, MAX_VALUES, too_deep, too_many
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes
 

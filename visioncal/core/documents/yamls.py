@@ -8,14 +8,14 @@ from typing import Any
 
 import yaml
 
-from visioncal.core.documents.bounds import (
+from visioncal.core.documents.values import (
     MAX_DEPTH,
     MAX_VALUES,
+    matrix_from,
     read_plain_text,
     too_deep,
     too_many,
 )
-from visioncal.core.documents.matrices import matrix_from
 from visioncal.core.errors import DataError
 
 _STANDARD = "tag:yaml.org,2002:"

@@ -14,7 +14,7 @@ import numpy as np
 
 from visioncal.core.documents import is_number, read_npz, read_opencv, read_table
 from visioncal.core.documents.arrays import Array
-from visioncal.core.documents.bounds import read_plain_text
+from visioncal.core.documents.values import read_plain_text
 from visioncal.core.errors import DataError
 from visioncal.core.files import natural, some_of
 from visioncal.core.types import FloatArray

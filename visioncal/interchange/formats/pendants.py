@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from visioncal.core.conventions import write_pose
-from visioncal.core.documents.bounds import read_plain_text
 from visioncal.core.documents.pendants import PendantPose, is_marked_pose, read_pose
+from visioncal.core.documents.values import read_plain_text
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.interchange.formats.fields import Fields

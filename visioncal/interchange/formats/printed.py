@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from visioncal.core.documents import is_number
-from visioncal.core.documents.bounds import read_plain_text
+from visioncal.core.documents.values import read_plain_text
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.interchange.formats.fields import Fields

@@ -9,7 +9,7 @@ import numpy as np
 
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.documents import as_numbers, mapping, read_yaml
-from visioncal.core.documents.bounds import read_plain_text
+from visioncal.core.documents.values import read_plain_text
 from visioncal.core.errors import DataError
 from visioncal.core.types import MOUNTS, FloatArray, Mount
 from visioncal.interchange.formats.finding import head, images_beside, listed, number_in
