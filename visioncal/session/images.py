@@ -2,10 +2,10 @@
 
 import os
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_IMAGE_BYTES, absence, is_inside, read_bytes, sha256
@@ -13,9 +13,10 @@ from visioncal.core.files import MOST_IMAGE_BYTES, absence, is_inside, read_byte
 _ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 
 
-class ImageStore(Protocol):
+class ImageStore(ABC):
     """The images of a session, by the paths that views.csv gives them."""
 
+    @abstractmethod
     def read(self, path: str) -> bytes:
         """Reads the bytes of one image file.
 
@@ -23,18 +24,21 @@ class ImageStore(Protocol):
             DataError: There is no such image, or it cannot be read.
         """
 
-    def sha256(self, path: str) -> str:
-        """Digest of the bytes of an image, also of one that is elsewhere; empty of one unknown."""
-
+    @abstractmethod
     def absence(self, path: str) -> str:
         """Says why there is no such image to read, after its name; empty where there is one."""
 
     def exists(self, path: str) -> bool:
         """Tells whether there is such an image to read."""
+        return not self.absence(path)
+
+    def sha256(self, path: str) -> str:
+        """Digest of the bytes of an image, also of one that is elsewhere; empty of one unknown."""
+        return sha256(self.read(path)) if self.exists(path) else ""
 
 
 @dataclass(frozen=True)
-class FolderImages:
+class FolderImages(ImageStore):
     """Images below a session's folder; links that lead out of it are not followed."""
 
     folder: Path
@@ -45,10 +49,6 @@ class FolderImages:
         if why_not:
             raise DataError(f"{self.folder / inside_path(path)} {why_not}.", culprits=[path])
         return read_bytes(self.folder / inside_path(path), MOST_IMAGE_BYTES)
-
-    def sha256(self, path: str) -> str:
-        """Digest of the bytes of an image; empty where there is none."""
-        return sha256(self.read(path)) if self.exists(path) else ""
 
     def absence(self, path: str) -> str:
         """Says why there is no such image to read, after its name; empty where there is one."""
@@ -65,13 +65,9 @@ class FolderImages:
             return f"has more than {MOST_IMAGE_BYTES / 1e6:.0f} MB, as no image has"
         return "" if os.access(file, os.R_OK) else "cannot be read: permission denied"
 
-    def exists(self, path: str) -> bool:
-        """Tells whether there is such an image to read."""
-        return not self.absence(path)
-
 
 @dataclass(frozen=True, eq=False)
-class MemoryImages:
+class MemoryImages(ImageStore):
     """Images held in memory."""
 
     files: Mapping[str, bytes]
@@ -82,17 +78,9 @@ class MemoryImages:
             raise DataError(f"The session has no image {path}.", culprits=[path])
         return self.files[path]
 
-    def sha256(self, path: str) -> str:
-        """Digest of the bytes of an image; empty where there is none."""
-        return sha256(self.files[path]) if path in self.files else ""
-
     def absence(self, path: str) -> str:
         """Says why there is no such image; empty where there is one."""
-        return "" if self.exists(path) else "is missing"
-
-    def exists(self, path: str) -> bool:
-        """Tells whether there is such an image."""
-        return path in self.files
+        return "" if path in self.files else "is missing"
 
 
 def image_path(path: str) -> str:

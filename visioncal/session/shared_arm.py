@@ -28,7 +28,7 @@ _BETWEEN_S = 86_400.0
 
 
 @dataclass(frozen=True, eq=False)
-class JoinedImages:
+class JoinedImages(ImageStore):
     """The images of several sessions, each below a folder of its session's name."""
 
     stores: Mapping[str, ImageStore]
@@ -47,10 +47,6 @@ class JoinedImages:
         """Says why there is no such image; empty where there is one."""
         store, name = self._of(path)
         return store.absence(name)
-
-    def exists(self, path: str) -> bool:
-        """Tells whether there is such an image."""
-        return not self.absence(path)
 
     def _of(self, path: str) -> tuple[ImageStore, str]:
         first, _, rest = path.partition("/")

@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.documents import is_number
 from visioncal.core.errors import DataError
-from visioncal.core.files import MOST_IMAGE_BYTES, absence, read_bytes, sha256, some_of
+from visioncal.core.files import MOST_IMAGE_BYTES, absence, read_bytes, some_of
 from visioncal.core.types import Mount
 from visioncal.interchange.formats.boards import described_target, target_name
 from visioncal.interchange.formats.corner_lists import with_corners
@@ -20,14 +20,14 @@ from visioncal.interchange.formats.foreign import Foreign, Sweep, rows_of
 from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.intrinsics import read_intrinsics
 from visioncal.robot import ROBOT_SUFFIXES, Robot, read_robot_document
-from visioncal.session import MemoryImages, Session, Stream
+from visioncal.session import ImageStore, MemoryImages, Session, Stream
 from visioncal.session import columns as known
 from visioncal.session.corners import CornerTable
 from visioncal.vision.finders.imaging import decode_image, looks_like_image
 
 
 @dataclass(frozen=True, eq=False)
-class FileImages:
+class FileImages(ImageStore):
     """Images that lie anywhere, by the paths that the session gives them."""
 
     files: Mapping[str, Path]
@@ -38,17 +38,9 @@ class FileImages:
             raise DataError(f"The session has no image {path}.", culprits=[path])
         return _image_bytes(self.files[path])
 
-    def sha256(self, path: str) -> str:
-        """Digest of the bytes of an image; empty where there is none."""
-        return sha256(self.read(path)) if self.exists(path) else ""
-
     def absence(self, path: str) -> str:
         """Says why there is no such image; empty where there is one."""
         return absence(self.files[path]) if path in self.files else "is missing"
-
-    def exists(self, path: str) -> bool:
-        """Tells whether there is such an image."""
-        return not self.absence(path)
 
 
 def wished(foreign: Foreign, requested: ImportOptions) -> Foreign:

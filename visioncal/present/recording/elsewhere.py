@@ -8,6 +8,7 @@ import cv2
 
 from visioncal.core.choices import ImagesKept
 from visioncal.core.errors import DataError
+from visioncal.session.images import ImageStore
 from visioncal.vision.finders.imaging import decode_image
 
 # Of the full size, so that corners lie over it where they were found: a twentieth of the bytes.
@@ -15,7 +16,7 @@ _FAINT_QUALITY = 15
 
 
 @dataclass(frozen=True, eq=False)
-class ImagesElsewhere:
+class ImagesElsewhere(ImageStore):
     """Images of a session whose recording was written without them.
 
     Attributes:
@@ -55,10 +56,6 @@ class ImagesElsewhere:
         if path not in self.digests:
             return "is missing"
         return f"is not in {self.path.name}, which was written with --images {self.kept}"
-
-    def exists(self, path: str) -> bool:  # noqa: ARG002 - none is here
-        """Tells that there is no such image to read."""
-        return False
 
 
 def faint_picture(image: bytes) -> bytes | None:

@@ -76,7 +76,7 @@ class _Image:
 
 
 @dataclass(frozen=True, eq=False)
-class RecordedImages:
+class RecordedImages(ImageStore):
     """Images that stay in a recording until they are asked for.
 
     Attributes:
@@ -117,11 +117,7 @@ class RecordedImages:
 
     def absence(self, path: str) -> str:
         """Says why there is no such image; empty where there is one."""
-        return "" if self.exists(path) else "is missing"
-
-    def exists(self, path: str) -> bool:
-        """Tells whether there is such an image."""
-        return path in self.places
+        return "" if path in self.places else "is missing"
 
 
 @dataclass(frozen=True, eq=False)
