@@ -71,7 +71,7 @@ def of_one_sweep(task: tuple[World, int]) -> Outcome:
     how = SweepOptions(stops=8, readout_s=world.readout_s, camera_minus_robot_s=0.037)
     moved = sweep(replace(world.cell, seed=seed), how)
     known = calibrated_sweep(moved)
-    (found,) = known.clock.delays
+    (found,) = next(iter(known.clocks.values())).clock.delays
     error, covariance = x_error(moved, known), known.solved.covariance[:6, :6]
     ignoring = np.full(6, np.nan)
     if seed < IGNORED:

@@ -442,7 +442,7 @@ def test_what_is_open_about_the_clocks_counts(session):
         known = stage.run(known)
     spreads = []
     for sigma_s in (1e-6, 5e-3):
-        clock = replace(known.clock, sigma_s=sigma_s)
+        clock = replace(next(iter(known.clocks.values())).clock, sigma_s=sigma_s)
         clocks = {pair: replace(it, clock=clock) for pair, it in known.clocks.items()}
         later = replace(known, clocks=clocks)
         for stage in STAGES[[it.name for it in STAGES].index("clock") + 1 :]:

@@ -116,7 +116,7 @@ def test_points_that_are_not_where_the_table_has_them_are_named(tmp_path):
     (folder / "target.csv").replace(tmp_path / "fresh" / "target.csv")
     fresh = Session.load(tmp_path / "fresh")
     free = CalibrationPrior.of(again).free
-    moved = (free.basis @ free.after(np.zeros(len(free.columns))).board)[4]
+    moved = (free.basis @ free.appearance.board)[4]
     assert moved == pytest.approx(result.rig.shape[4])
     assert predict_stops(fresh, CalibrationPrior.of(again)).known.pixel_px == pytest.approx(
         NOISE_PX, rel=0.15

@@ -105,7 +105,7 @@ def test_the_simulation_takes_every_row_at_its_own_time():
 def test_the_readout_is_found_and_the_camera_is_where_it_is(seed, mount):
     moved = swept(seed, mount=mount)
     known = calibrated_sweep(moved)
-    (found,) = known.clock.delays
+    (found,) = next(iter(known.clocks.values())).clock.delays
     assert found.is_clear
     # Four sigma, of which none is so large that this were easy: a hundredth of the readout.
     assert abs(found.time_s - READOUT_S) < 4.0 * found.sigma_s
@@ -130,9 +130,9 @@ def test_a_readout_that_is_ignored_moves_the_camera(monkeypatch):
 @pytest.mark.parametrize("seed", [3, slow(4)])
 def test_a_global_shutter_is_not_mistaken(seed):
     known = calibrated_sweep(swept(seed, replace(HURRIED, readout_s=0.0)))
-    (found,) = known.clock.delays
+    (found,) = next(iter(known.clocks.values())).clock.delays
     assert not found.is_clear
-    shutter = known.clock.result().shutter
+    shutter = next(iter(known.clocks.values())).clock.result().shutter
     assert shutter.kind == "global"
     assert abs(shutter.readout_s) < 4.0 * shutter.readout_sigma_s
     assert not any("rolling" in it for it in known.notes)

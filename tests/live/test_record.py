@@ -74,7 +74,7 @@ def test_a_plan_is_read_back_as_it_was_made(planned):
     for path in (folder, folder / "plan.json"):
         read = read_plan(path)
         assert [it.view for it in read.stops] == [it.view for it in plan.stops]
-        assert np.array_equal([it.q for it in read.stops], plan.q)
+        assert np.array_equal([it.q for it in read.stops], [it.q for it in plan.stops])
         for mine, its in zip(read.stops, plan.stops, strict=True):
             assert np.array_equal(mine.via, its.via)
             assert mine.words == its.words

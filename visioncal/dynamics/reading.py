@@ -44,11 +44,6 @@ class Recorded:
     def __len__(self) -> int:
         return len(self.times_s)
 
-    @property
-    def joint_count(self) -> int:
-        """The number n of joints."""
-        return int(self.q.shape[1])
-
     def part(self, begin: float, end: float) -> "Recorded":
         """The samples between two shares of the whole, 0 to 1."""
         return self.among(slice(round(begin * len(self)), round(end * len(self))))

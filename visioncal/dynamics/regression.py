@@ -83,12 +83,6 @@ class Regression:
         """(k, n) torques less the fit, a block."""
         return tuple(it.y - it.predicted(self.values) for it in self.blocks)
 
-    @property
-    def cost(self) -> float:
-        """Sum of the squared residuals in units of the noise."""
-        parts = zip(self.blocks, self.residuals, self.sigmas, strict=True)
-        return float(sum(np.sum((it.used * res / sigma) ** 2) for it, res, sigma in parts))
-
 
 @dataclass(frozen=True, eq=False)
 class _Joint:

@@ -163,12 +163,6 @@ class LensBoardParameters:
         known = Knowledge(self.information, self.gradient)
         return replace(Effect.free(LENS_AND_BOARD, known, shift), held=self.anchored)
 
-    def after(self, change: FloatArray) -> "Appearance":
-        """The appearance after a (k + p,) change of the free unknowns and of p others."""
-        step = np.zeros(len(self.appearance.values))
-        step[self.columns] = np.where(self.anchored, 0.0, change[: len(self.columns)])
-        return self.appearance.moved(step)
-
 
 @dataclass(frozen=True, eq=False)
 class Compressed:

@@ -106,12 +106,6 @@ class FeatureFit:
         return self.agreement.fit.groups.residuals
 
     @property
-    def rms_m(self) -> float:
-        """Root mean square of what the touches that agree are off [m]."""
-        used = self.residuals[self.agreement.agrees]
-        return float(np.sqrt(np.mean(np.sum(used**2, axis=1))))
-
-    @property
     def by_points(self) -> FloatArray:
         """(n, 6, 3) how the frame's right perturbation moves with each touched point."""
         fit = self.agreement.fit

@@ -7,7 +7,7 @@ the answer, until it stays, is Gauss-Newton's method on the whole problem.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, Self
+from typing import Protocol
 
 import numpy as np
 
@@ -70,12 +70,6 @@ class Side(Protocol):
 
     def rows(self, seen: LinearisedCorners) -> IntArray:
         """(n,) which view each observation of this problem is; -1 for none of them."""
-
-    def with_errors(self, fitted: "Fitted") -> Self:
-        """The side with those errors of its arms that a fit shows in which they are not free."""
-
-    def freed(self, *, freely: bool) -> Self:
-        """The side with all errors of arms that were found free, or only those estimated."""
 
 
 @dataclass(frozen=True, eq=False)

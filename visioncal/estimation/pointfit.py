@@ -106,12 +106,6 @@ class PointFit:
         """(n, 3) measured less drawn, in the base, of all points [m]."""
         return self.agreement.fit.groups.residuals
 
-    @property
-    def rms_m(self) -> float:
-        """Root mean square distance of the points that agree [m]."""
-        used = self.residuals[self.agreement.agrees]
-        return float(np.sqrt(np.mean(np.sum(used**2, axis=1))))
-
 
 @dataclass(frozen=True, eq=False)
 class PointProblem:

@@ -43,11 +43,6 @@ class Observation:
     robots: Mapping[str, View]
     lacks: tuple[str, ...] = ()
 
-    @property
-    def is_of_lens(self) -> bool:
-        """Whether it serves the camera's lens alone."""
-        return self.view.is_of_lens or bool(self.lacks)
-
 
 @dataclass(frozen=True, eq=False)
 class _Stop:

@@ -66,11 +66,6 @@ class FittedJoints:
         return max(self.fit.score, SCORE_FLOOR)
 
     @property
-    def flange_from_reported(self) -> FloatArray:
-        """(4, 4) the frame of the poses in the model's flange."""
-        return invert(self.fit.z)
-
-    @property
     def figures(self) -> str:
         """How well the rows that agree best are explained, in words."""
         shift, angle = self.fit.rms

@@ -12,7 +12,6 @@ from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.judge import Findings
 from visioncal.calibration.stages.observed import Observed
-from visioncal.calibration.stages.offset import Clock
 from visioncal.calibration.stages.readings import Readings
 from visioncal.core.choices import Convention, SolverName
 from visioncal.core.types import Corners, Mount
@@ -101,11 +100,6 @@ class RunState(Observed):
     def robot_arm(self) -> RobotArm:
         """The only robot's arm, as far as it is calibrated."""
         return next(iter(self.fitted.arms.values()))
-
-    @property
-    def clock(self) -> Clock | None:
-        """How the clocks of the only pair go together, by the motion that both have seen."""
-        return next((it.clock for it in self.clocks.values()), None)
 
     @property
     def pixel_px(self) -> float | None:

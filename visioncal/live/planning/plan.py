@@ -128,11 +128,6 @@ class Plan:
     map_sigma_m: FloatArray
     need: NeedPlanned | None = None
 
-    @property
-    def q(self) -> FloatArray:
-        """(k, n) joint angles of the stops [rad]."""
-        return np.array([it.q for it in self.stops])
-
 
 @typed
 def make_plan(

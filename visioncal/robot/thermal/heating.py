@@ -32,16 +32,6 @@ class Inputs:
     signal: FloatArray
     ambient_c: FloatArray
 
-    def until(self, stamp_s: float) -> Self:
-        """Returns the samples up to a time."""
-        kept = self.stamps_s <= stamp_s
-        return replace(
-            self,
-            stamps_s=self.stamps_s[kept],
-            signal=self.signal[kept],
-            ambient_c=self.ambient_c[kept],
-        )
-
 
 @dataclass(frozen=True, eq=False)
 class Heating:
