@@ -88,7 +88,7 @@ def named(task: tuple[Job, str, int]) -> tuple[bool, int]:
     touches = made.touches if spoil is None else spoil(made, way / np.linalg.norm(way))
     wrong = np.zeros(len(touches), dtype=bool)
     wrong[3] = spoil is not None
-    agrees = fit_pivot(touches, job.noise).agrees
+    agrees = fit_pivot(touches, job.noise).agreement.agrees
     return bool(np.all(~agrees[wrong])), int(np.sum(~agrees & ~wrong))
 
 

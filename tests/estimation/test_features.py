@@ -33,7 +33,7 @@ def test_exact_touches_give_the_exact_frame(each):
     found = fit_features(touches)
     # Rounding of coordinates near a metre, over a lever of 0.1 m.
     assert np.abs(found.base_from_fixture - frame).max() < 1e-13
-    assert np.abs(found.residuals).max() < 1e-13
+    assert np.abs(found.agreement.fit.groups.residuals).max() < 1e-13
     assert found.agreement.agrees.all()
 
 

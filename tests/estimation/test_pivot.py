@@ -34,7 +34,7 @@ WAY = np.array([0.48, -0.6, 0.64])
 
 
 def rejected(fit):
-    return np.flatnonzero(~fit.agrees).tolist()
+    return np.flatnonzero(~fit.agreement.agrees).tolist()
 
 
 def with_poses(touches, rotations):
@@ -53,7 +53,7 @@ def test_exact_touches_give_the_exact_tool(job):
     turn = TURN.as_matrix() if job.axes else np.eye(3)
     assert fit.flange_from_tool[:3, :3] == pytest.approx(turn, abs=1e-10)
     assert fit.oriented == (job.axes > 0)
-    assert fit.agrees.all()
+    assert fit.agreement.agrees.all()
     if not fit.oriented:
         assert not fit.covariance[:3].any()
 
@@ -157,7 +157,7 @@ def test_one_wrong_touch_in_ten_is_left_out(spoil, seed):
     fit = fit_pivot(spoil(touched(Job(noise=ROBOT), seed).touches), ROBOT)
     assert rejected(fit) == [4]
     assert fit.belongs_to[4] is None
-    assert fit.mahalanobis_sq[4] > fit.limit[4]
+    assert fit.agreement.mahalanobis_sq[4] > fit.agreement.limit[4]
     # What is left errs as ten touches of 0.1 mm do: half of that, and six times it for certain.
     assert np.linalg.norm(fit.flange_from_tool[:3, 3] - TIP) < 6e-4
 
@@ -165,7 +165,7 @@ def test_one_wrong_touch_in_ten_is_left_out(spoil, seed):
 def test_how_far_a_touch_slipped_is_told():
     fit = fit_pivot(slipped(touched(Job(), 1).touches, 4, 5e-3 * WAY))
     # The slip, give or take the noise of the touch and of the prediction.
-    assert fit.residuals_m[4] == pytest.approx(5e-3, abs=6e-4)
+    assert fit.agreement.off_m[4] == pytest.approx(5e-3, abs=6e-4)
 
 
 def test_a_wrong_touch_of_an_axis_is_left_out_where_others_tell():
@@ -178,8 +178,8 @@ def test_a_lone_touch_of_an_axis_is_not_accused():
     made = touched(Job(axes=1), 5)
     aside = 5e-3 * made.truly[10].apply(TURN.apply([1, 0, 0]))
     fit = fit_pivot(slipped(made.touches, 10, aside))
-    assert fit.agrees.all()
-    assert np.isinf(fit.limit[10:]).all()
+    assert fit.agreement.agrees.all()
+    assert np.isinf(fit.agreement.limit[10:]).all()
 
 
 def test_exchanged_labels_are_recognised():
@@ -194,9 +194,9 @@ def test_of_two_touches_of_a_point_neither_is_accused():
     # Of point B there are one touch of its own and one that was slipped.
     few = touches.subset(np.array([True] * 5 + [True, True] + [False] * 3))
     fit = fit_pivot(slipped(few, 5, 2e-3 * WAY))
-    assert fit.agrees.all()
-    assert np.flatnonzero(fit.doubtful).tolist() == [5, 6]
-    assert not fit.explained
+    assert fit.agreement.agrees.all()
+    assert np.flatnonzero(fit.agreement.doubtful).tolist() == [5, 6]
+    assert not fit.agreement.explained
 
 
 def test_two_touches_that_contradict_each_other_grossly_are_refused_by_name():
@@ -208,7 +208,11 @@ def test_two_touches_that_contradict_each_other_grossly_are_refused_by_name():
 
 
 def test_sound_touches_are_kept():
-    lost = [seed for seed in range(40) if not fit_pivot(touched(Job(), seed).touches).agrees.all()]
+    lost = [
+        seed
+        for seed in range(40)
+        if not fit_pivot(touched(Job(), seed).touches).agreement.agrees.all()
+    ]
     # One in a thousand loses one by design: more than one of 40 has a probability of 8e-4.
     assert len(lost) <= 1
 
@@ -317,10 +321,10 @@ def test_five_real_touches():
     assert 1e3 * fit.points[0] == pytest.approx([789.9, 5.2, 133.5], abs=0.06)
     # Root mean square of the distances in space; per axis it is 0.126.
     assert 1e3 * fit.rms_m == pytest.approx(0.219, abs=0.001)
-    assert 1e3 * fit.residuals_m.max() == pytest.approx(0.301, abs=0.001)
-    assert fit.agrees.all()
+    assert 1e3 * fit.agreement.off_m.max() == pytest.approx(0.301, abs=0.001)
+    assert fit.agreement.agrees.all()
     # 15 residuals, 6 unknowns: the level is that of 9 degrees of freedom.
     assert fit.sigma_m == pytest.approx(fit.rms_m * np.sqrt(5 / 9), rel=1e-3)
-    assert fit.sigma_95_m[0] < fit.sigma_m < fit.sigma_95_m[1]
+    assert fit.agreement.fit.sigma_95[0] < fit.sigma_m < fit.agreement.fit.sigma_95[1]
     # Of this geometry, at that level: about 0.1 mm in each direction.
     assert 1e3 * np.sqrt(np.diag(fit.covariance)[3:]) == pytest.approx([0.1] * 3, abs=0.04)

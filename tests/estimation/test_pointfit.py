@@ -45,7 +45,7 @@ def test_exact_points_give_the_exact_frame(count):
     assert found.scale.value == pytest.approx(1.0, abs=1e-13)
     assert not found.scale.differs
     assert found.agreement.agrees.all()
-    assert np.abs(found.residuals).max() < 1e-13
+    assert np.abs(found.agreement.fit.groups.residuals).max() < 1e-13
 
 
 @pytest.mark.parametrize("scaled", [False, True])
@@ -127,7 +127,9 @@ def test_a_wrong_point_is_named(wrong):
         found = fit_points(replace(pairs, measured=points))
         assert np.flatnonzero(~found.agreement.agrees).tolist() == [wrong]
         # The distance from where the others place it: the slip, give or take the noise.
-        assert np.linalg.norm(found.residuals[wrong]) == pytest.approx(2e-3, abs=6 * NOISE_M)
+        assert np.linalg.norm(found.agreement.fit.groups.residuals[wrong]) == pytest.approx(
+            2e-3, abs=6 * NOISE_M
+        )
         assert np.linalg.norm(away(frame, found.base_from_fixture)[3:]) < 1e-3
 
 

@@ -101,11 +101,6 @@ class FeatureFit:
         return None if self.noise_m is None else self.agreement.fit.covariance
 
     @property
-    def residuals(self) -> FloatArray:
-        """(n, 3) what the touches are off, in the fixture's frame [m]."""
-        return self.agreement.fit.groups.residuals
-
-    @property
     def by_points(self) -> FloatArray:
         """(n, 6, 3) how the frame's right perturbation moves with each touched point."""
         fit = self.agreement.fit

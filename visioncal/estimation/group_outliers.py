@@ -43,6 +43,11 @@ class GroupInliers(Generic[State]):
     doubtful: Mask
     explained: bool
 
+    @property
+    def off_m(self) -> FloatArray:
+        """(m,) how far each group is off, in as many directions as are observed [m]."""
+        return np.asarray(np.linalg.norm(self.fit.groups.residuals, axis=1))
+
 
 def agreeing_groups(
     problem: GroupProblem[State],

@@ -12,7 +12,7 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.quantiles import f_limit
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.types import FloatArray, Mask
+from visioncal.core.types import FloatArray
 from visioncal.estimation.group_outliers import GroupInliers, agreeing_groups
 from visioncal.estimation.groups import GroupFit, fit_groups
 from visioncal.estimation.linalg import covariance_from
@@ -32,46 +32,41 @@ class PivotFit:
     """A tool from n touches of k points.
 
     Attributes:
-        flange_from_tool: (4, 4) the answer [m].
+        agreement: Which touches agree, and their fit, in the tool's frame.
         oriented: Whether the rotation was measured; else it is the flange's own.
-        covariance: (6, 6) of its right perturbation (rotation [rad], translation [m]); zero in the
-            rotation where that was not measured.
-        points: (k, 3) the touched points in the base [m].
-        points_covariance: (k, 3, 3) of them [m^2].
-        agrees: (n,) touches that the answer was made from.
-        doubtful: (n,) touches of which some are wrong, not known which: all are used.
-        explained: Whether noise explains the used touches (see `group_outliers.GroupInliers`).
-        mahalanobis_sq: (n,) squared Mahalanobis distance of each touch from what the others
-            predict, one on average where it is noise.
-        limit: (n,) what it may be; infinite where the others do not predict the touch.
-        residuals_m: (n,) how far each touched point is off in the tool [m], in as many directions
-            as its kind observes.
+        covariance: (6, 6) of the tool's right perturbation (rotation [rad], translation [m]); zero
+            in the rotation where that was not measured.
+        points_covariance: (k, 3, 3) of the touched points [m^2].
         belongs_to: (n,) the other point that a touch fits which does not agree; None for none.
-        sigma_m: Noise of a touch per axis [m], beyond what is known of the robot's.
-        sigma_95_m: Its 95 % interval [m].
         worst: The directions that are known worst: the tip's, then the rotation's if measured.
     """
 
-    flange_from_tool: FloatArray
+    agreement: GroupInliers[Placed]
     oriented: bool
     covariance: FloatArray
-    points: FloatArray
     points_covariance: FloatArray
-    agrees: Mask
-    doubtful: Mask
-    explained: bool
-    mahalanobis_sq: FloatArray
-    limit: FloatArray
-    residuals_m: FloatArray
     belongs_to: tuple[int | None, ...]
-    sigma_m: float
-    sigma_95_m: tuple[float, float]
     worst: tuple[Direction, ...]
+
+    @property
+    def flange_from_tool(self) -> FloatArray:
+        """(4, 4) the answer [m]."""
+        return self.agreement.fit.state.flange_from_tool
+
+    @property
+    def points(self) -> FloatArray:
+        """(k, 3) the touched points in the base [m]."""
+        return self.agreement.fit.state.points
+
+    @property
+    def sigma_m(self) -> float:
+        """Noise of a touch per axis [m], beyond what is known of the robot's."""
+        return self.agreement.fit.sigma
 
     @property
     def rms_m(self) -> float:
         """Root mean square of the used touches' distances [m]."""
-        return float(np.sqrt(np.mean(self.residuals_m[self.agrees] ** 2)))
+        return float(np.sqrt(np.mean(self.agreement.off_m[self.agreement.agrees] ** 2)))
 
     @property
     def looks_inverse(self) -> bool:
@@ -179,23 +174,8 @@ def _result(
     count = len(fit.state.points)
     blocks = fit.covariance[edge:, edge:].reshape(count, 3, count, 3)
     at = np.arange(count)
-    return PivotFit(
-        fit.state.flange_from_tool,
-        problem.oriented,
-        covariance,
-        fit.state.points,
-        blocks[at, :, at, :],
-        found.agrees,
-        found.doubtful,
-        found.explained,
-        found.mahalanobis_sq,
-        found.limit,
-        np.linalg.norm(fit.groups.residuals, axis=1),
-        _belonging(problem, found),
-        fit.sigma,
-        fit.sigma_95,
-        worst,
-    )
+    belongs = _belonging(problem, found)
+    return PivotFit(found, problem.oriented, covariance, blocks[at, :, at, :], belongs, worst)
 
 
 def _belonging(problem: TouchProblem, found: GroupInliers[Placed]) -> tuple[int | None, ...]:

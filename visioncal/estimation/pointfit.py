@@ -101,11 +101,6 @@ class PointFit:
         """(n, 6, 3) how the frame's right perturbation moves with each measured point."""
         return self.agreement.fit.gains
 
-    @property
-    def residuals(self) -> FloatArray:
-        """(n, 3) measured less drawn, in the base, of all points [m]."""
-        return self.agreement.fit.groups.residuals
-
 
 @dataclass(frozen=True, eq=False)
 class PointProblem:

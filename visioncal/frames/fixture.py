@@ -9,7 +9,7 @@ from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.limits import FixtureLimits
-from visioncal.core.types import Mask
+from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import Finding, Step
 from visioncal.estimation.features import (
     FEATURE_KINDS,
@@ -20,7 +20,7 @@ from visioncal.estimation.features import (
 )
 from visioncal.estimation.placing import TOUCH_NOISE_M, assumed_words, counted_noise_m
 from visioncal.frames.drawing_points import NominalPoints
-from visioncal.frames.fixture_fit import Fitted, Setting, fixture_frame, reasons_of
+from visioncal.frames.fixture_fit import Fitted, Setting, fixture_frame
 from visioncal.frames.fixture_from_drawing import drawn_fixture
 from visioncal.frames.measured import MeasuredPoints, Tool, touched_points
 from visioncal.frames.touches import TouchRows, robot_noise
@@ -130,29 +130,25 @@ def _featured_fixture(measured: MeasuredPoints, kinds: Sequence[str], setting: S
     )
 
 
-def _fitted(fit: FeatureFit, measured: MeasuredPoints, setting: Setting) -> Fitted:
-    agreement, matrix = fit.agreement, fit.base_from_fixture
-    noise_m = counted_noise_m(agreement.fit, setting.expected_m)
-    agrees = agreement.agrees
-    away = np.linalg.norm(fit.residuals, axis=1)
+def _fitted(fit: FeatureFit, measured: MeasuredPoints, setting: Setting) -> Fitted[FloatArray]:
+    matrix, amid = fit.base_from_fixture, measured.points[fit.agreement.agrees].mean(axis=0)
+    noise_m = counted_noise_m(fit.agreement.fit, setting.expected_m)
     return Fitted(
         measured,
         measured.labels,
         tuple(f"Touch {it}" for it in measured.labels),
         matrix,
         measured.carried(fit.by_points, np.full(len(measured), noise_m)),
-        np.asarray((measured.points[agrees].mean(axis=0) - matrix[:3, 3]) @ matrix[:3, :3]),
-        agrees,
-        agreement.doubtful,
-        agreement.explained,
-        tuple(reasons_of(agreement, away, [_CAUSE] * len(measured))),
-        away,
+        np.asarray((amid - matrix[:3, 3]) @ matrix[:3, :3]),
+        fit.agreement,
+        [_CAUSE] * len(measured),
         noise_m,
-        agreement.fit.sigma_95,
     )
 
 
-def _unchecked(fitted: Fitted, kinds: Sequence[str], setting: Setting) -> Iterator[Finding]:
+def _unchecked(
+    fitted: Fitted[FloatArray], kinds: Sequence[str], setting: Setting
+) -> Iterator[Finding]:
     once = [_THINGS[kind] for kind in FEATURE_KINDS if _count(kinds, kind, fitted.agrees) == 1]
     assumed = assumed_words(fitted.noise_m, setting.touch_noise_m)
     if len(once) == len(FEATURE_KINDS):

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, Generic
 
 import numpy as np
 
@@ -72,7 +72,7 @@ class Setting:
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class Fitted(Generic[State]):
     """A fixture's fit to n points, whatever is known of them.
 
     Attributes:
@@ -82,13 +82,9 @@ class Fitted:
         matrix: (4, 4) `base_from_fixture`.
         covariance: (6, 6) of its right perturbation, what the points share included.
         centre: (3,) amid the points, in the fixture [m].
-        agrees: (n,) which points the answer was made from.
-        doubtful: (n,) of which some are wrong, not known which: all are used.
-        explained: Whether what is stated of a touch explains those that are used.
-        reasons: (n,) what is wrong with each; empty where nothing is.
-        residuals_m: (n,) how far off each is [m].
+        agreement: Which of them agree.
+        causes: (n,) what makes each one disagree, if it does.
         noise_m: Noise of a touch per axis [m].
-        sigma_95_m: Its 95 % interval [m]; (0, inf) where nothing determines it.
     """
 
     measured: MeasuredPoints
@@ -97,13 +93,26 @@ class Fitted:
     matrix: FloatArray
     covariance: FloatArray
     centre: FloatArray
-    agrees: Mask
-    doubtful: Mask
-    explained: bool
-    reasons: tuple[str, ...]
-    residuals_m: FloatArray
+    agreement: GroupInliers[State]
+    causes: Sequence[str]
     noise_m: float
-    sigma_95_m: tuple[float, float]
+
+    @property
+    def agrees(self) -> Mask:
+        """(n,) which points the answer was made from."""
+        return self.agreement.agrees
+
+    @property
+    def reasons(self) -> list[str]:
+        """(n,) what is wrong with each point; empty where nothing is."""
+        words = []
+        for at, cause in enumerate(self.causes):
+            off = off_words(self.agreement, at)
+            if self.agreement.doubtful[at]:
+                words.append(f"{off}: one of those that contradict each other")
+            else:
+                words.append("" if self.agrees[at] else f"{off}: {cause}")
+        return words
 
     @property
     def worst(self) -> tuple[Direction, Direction]:
@@ -120,30 +129,8 @@ class Fitted:
         )
 
 
-def reasons_of(
-    agreement: GroupInliers[State], residuals_m: FloatArray, causes: Sequence[str]
-) -> list[str]:
-    """Says what is wrong with each of n points; empty where nothing is.
-
-    Args:
-        agreement: Of the points.
-        residuals_m: (n,) how far off each is [m].
-        causes: (n,) what makes each one disagree, if it does.
-    """
-    words = []
-    for at in range(len(residuals_m)):
-        off = off_words(
-            float(residuals_m[at]), float(agreement.mahalanobis_sq[at]), float(agreement.limit[at])
-        )
-        if agreement.doubtful[at]:
-            words.append(f"{off}: one of those that contradict each other")
-        else:
-            words.append("" if agreement.agrees[at] else f"{off}: {causes[at]}")
-    return words
-
-
 def fixture_frame(
-    fitted: Fitted,
+    fitted: Fitted[State],
     kinds: Sequence[str],
     method: str,
     more: Sequence[Finding],
@@ -162,8 +149,8 @@ def fixture_frame(
     """
     doubts = [*_doubts(fitted, setting), *more, *setting.doubts]
     offset, rotation = fitted.worst
-    used = fitted.residuals_m[fitted.agrees]
-    noise_95 = [1e3 * it for it in fitted.sigma_95_m]
+    used = fitted.agreement.off_m[fitted.agrees]
+    noise_95 = [1e3 * it for it in fitted.agreement.fit.sigma_95]
     return Frame(
         Edge(fitted.matrix, fitted.covariance),
         True,
@@ -188,31 +175,27 @@ def fixture_frame(
     )
 
 
-def _observations(fitted: Fitted, kinds: Sequence[str]) -> tuple[Observation, ...]:
+def _observations(fitted: Fitted[State], kinds: Sequence[str]) -> tuple[Observation, ...]:
+    off_m = fitted.agreement.off_m.tolist()
+    rows = zip(fitted.labels, fitted.agrees.tolist(), fitted.reasons, kinds, off_m, strict=True)
     return tuple(
-        Observation(
-            fitted.labels[at],
-            used=bool(fitted.agrees[at]),
-            reason=fitted.reasons[at],
-            kind=kinds[at],
-            residual_mm=1e3 * float(fitted.residuals_m[at]),
-        )
-        for at in range(len(fitted.labels))
+        Observation(label, used=used, reason=reason, kind=kind, residual_mm=1e3 * off)
+        for label, used, reason, kind, off in rows
     )
 
 
-def _doubts(fitted: Fitted, setting: Setting) -> list[Finding]:
+def _doubts(fitted: Fitted[State], setting: Setting) -> list[Finding]:
     names = [
         placed_name(name, place)
         for name, place in zip(fitted.names, fitted.measured.places, strict=True)
     ]
     return [
-        *disputed(names, fitted.reasons, fitted.agrees, fitted.doubtful, setting.words.again),
+        *disputed(names, fitted.reasons, fitted.agreement, setting.words.again),
         *noisy(
             1e3 * fitted.noise_m,
             setting.options.noise_mm,
             setting.words.noisy,
-            explained=fitted.explained,
+            explained=fitted.agreement.explained,
             things=setting.words.things,
         ),
         *weak_directions(

@@ -9,10 +9,10 @@ from visioncal.core.number_format import figure
 from visioncal.core.types import Mask
 from visioncal.core.verdict import Finding, Step
 from visioncal.estimation.placing import assumed_words, counted_noise_m
-from visioncal.estimation.pointfit import PointFit, fit_points
+from visioncal.estimation.pointfit import Placed, PointFit, fit_points
 from visioncal.estimation.pointpairs import PointPairs
 from visioncal.frames.drawing_points import NominalPoints
-from visioncal.frames.fixture_fit import Fitted, Setting, fixture_frame, reasons_of
+from visioncal.frames.fixture_fit import Fitted, Setting, fixture_frame
 from visioncal.frames.measured import MeasuredPoints
 from visioncal.results import Frame
 
@@ -55,10 +55,10 @@ def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Set
     )
 
 
-def _fitted(fit: PointFit, measured: MeasuredPoints, pairs: PointPairs, setting: Setting) -> Fitted:
-    agreement = fit.agreement
-    noise_m = counted_noise_m(agreement.fit, setting.expected_m)
-    away = np.linalg.norm(fit.residuals, axis=1)
+def _fitted(
+    fit: PointFit, measured: MeasuredPoints, pairs: PointPairs, setting: Setting
+) -> Fitted[Placed]:
+    noise_m = counted_noise_m(fit.agreement.fit, setting.expected_m)
     noise = np.hypot(noise_m, pairs.nominal_sigma_m)
     return Fitted(
         measured,
@@ -66,14 +66,10 @@ def _fitted(fit: PointFit, measured: MeasuredPoints, pairs: PointPairs, setting:
         tuple(f"Point {it}" for it in pairs.labels),
         fit.base_from_fixture,
         measured.carried(fit.by_points, noise),
-        np.asarray(pairs.nominal[agreement.agrees].mean(axis=0)),
-        agreement.agrees,
-        agreement.doubtful,
-        agreement.explained,
-        tuple(reasons_of(agreement, away, _causes(fit, pairs))),
-        away,
+        np.asarray(pairs.nominal[fit.agreement.agrees].mean(axis=0)),
+        fit.agreement,
+        _causes(fit, pairs),
         noise_m,
-        agreement.fit.sigma_95,
     )
 
 
@@ -98,7 +94,7 @@ def _causes(fit: PointFit, pairs: PointPairs) -> list[str]:
 
 
 def _doubts(
-    fit: PointFit, fitted: Fitted, pairs: PointPairs, setting: Setting
+    fit: PointFit, fitted: Fitted[Placed], pairs: PointPairs, setting: Setting
 ) -> Iterator[Finding]:
     yield from _scaled(fit, pairs)
     if not fit.hand_known:
@@ -147,7 +143,7 @@ def _scaled(fit: PointFit, pairs: PointPairs) -> Iterator[Finding]:
     )
 
 
-def _mirrored(fitted: Fitted, pairs: PointPairs, seen_from: str) -> Iterator[Finding]:
+def _mirrored(fitted: Fitted[Placed], pairs: PointPairs, seen_from: str) -> Iterator[Finding]:
     """Doubts points in a plane, unless the side of the touches determines their handedness."""
     drawn = pairs.nominal[fitted.agrees]
     normal = np.linalg.svd(drawn - drawn.mean(axis=0))[2][2]

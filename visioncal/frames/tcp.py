@@ -138,23 +138,22 @@ def _counted(count: int, word: str) -> str:
 
 
 def _observations(fit: PivotFit, touches: Touches) -> Iterator[Observation]:
+    found = fit.agreement
     for at, label in enumerate(touches.labels):
-        off_mm = 1e3 * float(fit.residuals_m[at])
+        is_wrong = not found.agrees[at] or bool(found.doubtful[at])
         yield Observation(
             label,
-            used=bool(fit.agrees[at]),
-            reason=_wrong(fit, touches, at) if not fit.agrees[at] or fit.doubtful[at] else "",
+            used=bool(found.agrees[at]),
+            reason=_wrong(fit, touches, at) if is_wrong else "",
             kind=touches.kinds[at],
-            residual_mm=off_mm,
+            residual_mm=1e3 * float(found.off_m[at]),
         )
 
 
 def _wrong(fit: PivotFit, touches: Touches, at: int) -> str:
     """Says what is wrong with a touch, or may be."""
-    words = off_words(
-        float(fit.residuals_m[at]), float(fit.mahalanobis_sq[at]), float(fit.limit[at])
-    )
-    if fit.doubtful[at]:
+    words = off_words(fit.agreement, at)
+    if fit.agreement.doubtful[at]:
         return f"{words}: one of the touches that contradict each other"
     belongs = fit.belongs_to[at]
     if belongs is not None:
@@ -174,8 +173,7 @@ def _doubts(
     yield from disputed(
         [placed_name(f"Touch {touches.labels[it]}", places[it]) for it in rows],
         [_wrong(fit, touches, it) for it in rows],
-        fit.agrees,
-        fit.doubtful,
+        fit.agreement,
         "Touch what is named once more, and write the new poses in its rows.",
     )
     yield from noisy(
@@ -183,7 +181,7 @@ def _doubts(
         options.noise_mm,
         "Touch again with a sharp tip; an arm that was never calibrated is off by a millimetre "
         "from posture to posture.",
-        explained=fit.explained,
+        explained=fit.agreement.explained,
     )
     if fit.looks_inverse:
         yield Finding(
@@ -207,7 +205,7 @@ def _doubts(
         options.sigma_deg,
         "Add touches tilted by 30 to 45 degrees about other axes.",
     )
-    used = int(np.sum(fit.agrees & touches.are("point")))
+    used = int(np.sum(fit.agreement.agrees & touches.are("point")))
     if used < options.touches:
         yield Finding(
             "few_touches",
@@ -229,7 +227,7 @@ def _praise(fit: PivotFit, touches: Touches) -> str:
 def _details(fit: PivotFit, touches: Touches) -> dict[str, Any]:
     turns = invert(touches.base_from_flange)[:, None] @ touches.base_from_flange[None]
     return {
-        "noise_95_mm": [1e3 * it for it in fit.sigma_95_m],
+        "noise_95_mm": [1e3 * it for it in fit.agreement.fit.sigma_95],
         "turn_deg": float(np.rad2deg(rotation_angle(turns).max())),
         "points_m": {
             _point_name(name): point.tolist()

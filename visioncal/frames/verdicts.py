@@ -6,8 +6,9 @@ import numpy as np
 
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
-from visioncal.core.types import Mask
 from visioncal.core.verdict import AGAIN, Finding, Step
+from visioncal.estimation.group_outliers import GroupInliers
+from visioncal.estimation.groups import State
 from visioncal.estimation.observability import Direction
 
 
@@ -39,23 +40,22 @@ def weak_directions(
 
 
 def disputed(
-    names: Sequence[str], reasons: Sequence[str], agrees: Mask, doubtful: Mask, again: str
+    names: Sequence[str], reasons: Sequence[str], found: GroupInliers[State], again: str
 ) -> Iterator[Finding]:
     """Doubts for what was left out, and for what stayed although it contradicts.
 
     Args:
         names: (n,) what messages call the touches, points or images.
         reasons: (n,) what is wrong with each.
-        agrees: (n,) mask of those that were used.
-        doubtful: (n,) mask of those of which some are wrong, unknown which.
+        found: Which of them agree.
         again: What to do about either, as a sentence.
     """
-    for at in np.flatnonzero(~agrees).tolist():
+    for at in np.flatnonzero(~found.agrees).tolist():
         end = "" if reasons[at].endswith("?") else "."
         words = f"{names[at]} was left out: {reasons[at]}{end}"
         yield Finding("left_out", words, Step(again, AGAIN))
-    if doubtful.any():
-        some = some_of([names[at] for at in np.flatnonzero(doubtful).tolist()])
+    if found.doubtful.any():
+        some = some_of([names[at] for at in np.flatnonzero(found.doubtful).tolist()])
         words = f"{some} contradict each other, and which is wrong is not known: all are used."
         yield Finding("contradicting", words, Step(again))
 
@@ -98,10 +98,10 @@ def noisy(
         )
 
 
-def off_words(residual_m: float, mahalanobis_sq: float, limit: float) -> str:
+def off_words(found: GroupInliers[State], at: int) -> str:
     """Says how far off something is that does not agree: `2.1 mm off, 5 times what ... allow`."""
-    off = f"{figure(1e3 * residual_m)} mm off"
-    over = float(np.sqrt(mahalanobis_sq / limit))
+    off = f"{figure(1e3 * float(found.off_m[at]))} mm off"
+    over = float(np.sqrt(float(found.mahalanobis_sq[at]) / float(found.limit[at])))
     return f"{off}, {figure(over)} times what the others allow" if over > 1.0 else off
 
 
