@@ -22,7 +22,7 @@ from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.poses import fit_poses
 from visioncal.estimation.solve import solve_problem
-from visioncal.simulation import Cell, CellOptions, charuco_target, fine_camera, simulate
+from visioncal.simulation import BOARDS, Cell, CellOptions, fine_camera, simulate
 from visioncal.vision.targets import corner_positions
 
 need("pyceres", "pyceres")
@@ -33,7 +33,7 @@ REPEATS = few(15, 1)
 
 
 def cell_of(seed: int) -> Cell:
-    target = replace(charuco_target(), columns=11, rows=9, square_m=0.025, marker_m=0.018)
+    target = replace(BOARDS["charuco"], columns=11, rows=9, square_m=0.025, marker_m=0.018)
     return simulate(
         CellOptions(
             views=60,

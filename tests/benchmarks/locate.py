@@ -18,7 +18,7 @@ from support.picks import Pick, calibration_of, pick_by_plane, pick_by_target
 
 from visioncal.core.errors import VisioncalError
 from visioncal.core.types import Target
-from visioncal.simulation import CellOptions, charuco_target, fine_camera, simulate, wide_camera
+from visioncal.simulation import BOARDS, CellOptions, fine_camera, simulate, wide_camera
 
 CELLS = 200
 # Picks of one cell share its calibration; five keep their mean nearly as good as five cells'.
@@ -26,7 +26,7 @@ PICKS = 5
 IN_HAND, TO_HAND = "eye-in-hand", "eye-to-hand"
 GOOD, COARSE = (3e-5, 5e-5), (3e-4, 5e-4)
 # Known to 0.02 %: at the 0.1 % of office printers, nothing else of the chain would show.
-BOARD = replace(charuco_target(), square_sigma_m=6e-6)
+BOARD = replace(BOARDS["charuco"], square_sigma_m=6e-6)
 MARKER = Target("marker", "marker", 1, 1, 0.06, 1.2e-5, dictionary="DICT_5X5_100", marker_id=3)
 
 

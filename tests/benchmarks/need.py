@@ -32,11 +32,11 @@ from visioncal.frames.camera_chain import Eye
 from visioncal.frames.target_in_image import see
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE
-from visioncal.simulation import Cell, CellOptions, charuco_target, simulate
+from visioncal.simulation import BOARDS, Cell, CellOptions, simulate
 from visioncal.vision.targets import corner_positions
 
 CELLS, PICKS, BINS = 1000, 20, 10
-BOARD = charuco_target()
+BOARD = BOARDS["charuco"]
 POSES, GIVEN, ESTIMATED = "poses", "lens given", "lens estimated"
 
 

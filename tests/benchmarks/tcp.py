@@ -68,7 +68,7 @@ def fitted(task: tuple[Job, int]) -> Outcome:
         float(np.trace(least[3:, 3:])),
         float(linear[3:] @ linear[3:]),
         float(error[free] @ np.linalg.solve(covariance, error[free])),
-        int(np.sum(~fit.agrees)),
+        int(np.sum(~fit.agreement.agrees)),
     )
 
 

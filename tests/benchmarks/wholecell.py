@@ -27,7 +27,7 @@ from visioncal.simulation.network import simulate_network
 from visioncal.simulation.network_records import network_session
 from visioncal.simulation.observed_points import Network
 from visioncal.simulation.optics import fine_camera
-from visioncal.simulation.options import checkerboard_target
+from visioncal.simulation.options import BOARDS
 
 CELLS = 50
 STOPS = 40
@@ -49,7 +49,7 @@ def options(seed: int) -> NetworkOptions:
     )
     boards = (
         BoardAt("floor", place_m=(0.0, 0.0, 0.05), scale=SCALE),
-        BoardAt("plate_a", "a", target=checkerboard_target()),
+        BoardAt("plate_a", "a", target=BOARDS["checkerboard"]),
         BoardAt("plate_b", "b"),
     )
     sweep = Swept("left", "a", "plate_a", camera_minus_robot_s=AHEAD_S)

@@ -14,12 +14,11 @@ from visioncal.core.transforms import log
 from visioncal.results import Alignment
 from visioncal.session import Session
 from visioncal.simulation import (
+    BOARDS,
     BoardAt,
     CameraAt,
     NetworkOptions,
     RobotAt,
-    charuco_target,
-    checkerboard_target,
     simulate_network,
     wide_camera,
     write_network,
@@ -27,7 +26,7 @@ from visioncal.simulation import (
 
 SMALL = replace(wide_camera(), resolution=(640, 480), matrix=np.array([560.0, 559.0, 321.0, 238.0]))
 LARGE = replace(wide_camera(), resolution=(800, 600), matrix=np.array([760.0, 761.0, 398.0, 301.0]))
-PLAIN = replace(checkerboard_target(), name="6x5", columns=6, rows=5)
+PLAIN = replace(BOARDS["checkerboard"], name="6x5", columns=6, rows=5)
 OPTIONS = NetworkOptions(
     robots=(RobotAt("a", (-0.6, 0.0, 0.0)), RobotAt("b", (0.6, 0.05, 0.02))),
     cameras=(
@@ -36,9 +35,9 @@ OPTIONS = NetworkOptions(
     ),
     boards=(
         BoardAt(
-            "plate_a", "a", target=replace(checkerboard_target(), name="6x5", columns=6, rows=5)
+            "plate_a", "a", target=replace(BOARDS["checkerboard"], name="6x5", columns=6, rows=5)
         ),
-        BoardAt("plate_b", "b", target=replace(charuco_target(), name="5x4", columns=5, rows=4)),
+        BoardAt("plate_b", "b", target=replace(BOARDS["charuco"], name="5x4", columns=5, rows=4)),
     ),
     stops=8,
     lens_views=6,

@@ -23,10 +23,9 @@ from visioncal.interchange.outputs import write_outputs
 from visioncal.results import Calibration, to_document
 from visioncal.session import Session
 from visioncal.simulation import (
+    BOARDS,
     CellOptions,
     Second,
-    charuco_target,
-    checkerboard_target,
     fine_camera,
     forward,
     simulate,
@@ -107,7 +106,7 @@ def test_two_boards_tell_more_of_an_arm_than_one():
     for seed in range(2):
         options = replace(TWO, **WRONG_LINKS, mount="eye-to-hand", views=24, seed=seed)
         errors = []
-        for second in (None, Second(target=charuco_target())):
+        for second in (None, Second(target=BOARDS["charuco"])):
             cell = simulate(replace(options, second=second))
             known = calibrated(cell)
             assert known.robot_arm.kinematics.level == "geometry"
@@ -182,7 +181,7 @@ def test_files_from_before_boards_were_sheared_mean_the_same_values():
 
 
 def test_one_view_places_a_board():
-    cell = simulate(replace(TWO, second=replace(Second(), target=charuco_target()), seed=6))
+    cell = simulate(replace(TWO, second=replace(Second(), target=BOARDS["charuco"]), seed=6))
     further = np.flatnonzero(cell.shown.boards == 1)
     known = calibrated(without(cell, set(further[1:].tolist())))
     result = result_of(known)
@@ -253,7 +252,7 @@ def test_each_image_is_searched_for_its_own_board(tmp_path):
 
 def test_the_turn_of_a_symmetric_board_is_told_by_its_other_views():
     """Eight by six corners look the same after half a turn."""
-    even = replace(checkerboard_target(), name="even", columns=8)
+    even = replace(BOARDS["checkerboard"], name="even", columns=8)
     cell = simulate(replace(TWO, second=Second(target=even), seed=13))
     known = calibrated(cell)
     assert len(known.used) == len(cell.corners)

@@ -17,8 +17,8 @@ from visioncal.core.transforms import invert, rotation_angle
 from visioncal.results import Calibration, to_document
 from visioncal.session import Session
 from visioncal.simulation import (
+    BOARDS,
     CellOptions,
-    checkerboard_target,
     read_truth,
     simulate,
     write_session,
@@ -218,7 +218,7 @@ def test_exact_pose_pairs_give_the_exact_edges(mount, tmp_path):
 @pytest.mark.slow
 def test_a_checkerboard_and_a_fixed_camera(tmp_path):
     options = CellOptions(
-        mount="eye-to-hand", views=12, target=checkerboard_target(), distance_m=(0.5, 0.8), seed=5
+        mount="eye-to-hand", views=12, target=BOARDS["checkerboard"], distance_m=(0.5, 0.8), seed=5
     )
     folder = write_session(simulate(options), tmp_path / "fixed")
     calibration = visioncal.calibrate(folder)
@@ -494,7 +494,7 @@ def test_options_that_do_not_exist_are_refused(rendered):
 @pytest.mark.slow
 def test_numbers_do_not_depend_on_the_board_turned_round(tmp_path):
     """A board whose two ends look alike gives the same camera, whichever end comes first."""
-    target = replace(checkerboard_target(), name="even", columns=9, rows=7, square_m=0.02)
+    target = replace(BOARDS["checkerboard"], name="even", columns=9, rows=7, square_m=0.02)
     cell = simulate(CellOptions(views=10, target=target, seed=8))
     folder = write_session(cell, tmp_path / "even")
     calibration = visioncal.calibrate(folder)

@@ -15,9 +15,9 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.interchange.formats.exchanging import exchange_views
 from visioncal.session import MemoryImages, Session
 from visioncal.simulation import (
+    BOARDS,
     BoardAt,
     CameraAt,
-    checkerboard_target,
     fine_camera,
     network_session,
     simulate_network,
@@ -182,7 +182,7 @@ def test_a_camera_whose_corners_are_bad_is_named(session):
 
 @pytest.mark.slow
 def test_a_board_of_another_size_is_named():
-    boards = (*CELL.boards[:2], replace(CELL.boards[2], target=checkerboard_target(), scale=1.004))
+    boards = (*CELL.boards[:2], replace(CELL.boards[2], target=BOARDS["checkerboard"], scale=1.004))
     verdict = align(recorded(simulate_network(replace(CELL, boards=boards)))).verdict
     assert verdict.status == "check"
     (reason,) = [it for it in verdict.reasons if "larger than stated" in it]
@@ -315,7 +315,7 @@ def test_noise_refuses_nothing():
 )
 def test_a_board_of_another_size_is_named_with_all_views_used(which, scale, seed, words):
     boards = list(CELL.boards)
-    boards[which] = replace(boards[which], target=checkerboard_target(), scale=scale)
+    boards[which] = replace(boards[which], target=BOARDS["checkerboard"], scale=scale)
     cell = replace(CELL, boards=tuple(boards), stops=24, seed=seed)
     found = align(recorded(simulate_network(cell)))
     assert found.verdict.causes[0].kind == "board_size"

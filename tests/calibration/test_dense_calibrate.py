@@ -25,7 +25,7 @@ from visioncal.simulation import (
     simulate_network,
 )
 from visioncal.simulation.optics import wide_camera
-from visioncal.simulation.options import checkerboard_target
+from visioncal.simulation.options import BOARDS
 from visioncal.simulation.records import pairs_session
 
 CAMERA = wide_camera()
@@ -36,7 +36,7 @@ OPTIONS = CellOptions(
     blur_px=0.5,
     robot_sigma_m=0.0,
     robot_sigma_rad=0.0,
-    target=checkerboard_target(),
+    target=BOARDS["checkerboard"],
     camera=replace(CAMERA, resolution=(640, 400), matrix=CAMERA.matrix / 2),
 )
 

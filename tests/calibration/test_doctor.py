@@ -22,7 +22,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import Camera
 from visioncal.interchange.formats import load_in_doubt
 from visioncal.session import Session
-from visioncal.simulation import checkerboard_target
+from visioncal.simulation import BOARDS
 from visioncal.vision.camera import project
 from visioncal.vision.finders.board import FINDERS
 
@@ -242,7 +242,7 @@ def test_squares_in_the_place_of_inner_corners_are_named_at_once(
     tmp_path, monkeypatch, more, words
 ):
     plain = BROKEN["semicolons"]
-    options = replace(plain.options, target=checkerboard_target(), views=5)
+    options = replace(plain.options, target=BOARDS["checkerboard"], views=5)
     folder = sound_session(tmp_path / "squares", replace(plain, options=options))
     described = (
         f'kind = "checkerboard"\ncolumns = {9 + more}\nrows = {6 + more}\nsquare_m = 0.025\n'

@@ -12,8 +12,8 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.types import Camera, Corners
 from visioncal.session import Session
 from visioncal.simulation import (
+    BOARDS,
     CellOptions,
-    checkerboard_target,
     fisheye_camera,
     simulate,
     wide_camera,
@@ -159,7 +159,7 @@ def test_two_views_are_too_few():
 
 def test_views_whose_poses_began_under_a_wrong_lens_are_no_outliers():
     """Of an uneven rig there is no start by Zhang's method: a poor one turns tilted boards over."""
-    board = checkerboard_target()
+    board = BOARDS["checkerboard"]
     places = np.array([[x, y, 0.3 * ((x + y) % 3 - 1)] for y in range(5) for x in range(6)]) * 0.05
     rig = replace(board, kind="points", square_m=0.25, points_m=tuple(map(tuple, places)))
     rig = replace(rig, columns=len(places), rows=1, point_numbers=tuple(range(len(places))))

@@ -13,8 +13,8 @@ from visioncal.core.types import Corners
 from visioncal.estimation.chain import chain
 from visioncal.estimation.closed_form import SOLVERS
 from visioncal.simulation import (
+    BOARDS,
     CellOptions,
-    checkerboard_target,
     project,
     simulate,
     wide_camera,
@@ -62,7 +62,7 @@ def test_both_planar_solutions_are_kept_while_ambiguous():
         distance_m=(1.2, 1.5),
         tilt_rad=(0.15, 0.4),
         robot="ur10e",
-        target=replace(checkerboard_target(), columns=4, rows=3, name="small"),
+        target=replace(BOARDS["checkerboard"], columns=4, rows=3, name="small"),
     )
     cell = simulate(far)
     result = poses_of(cell)
@@ -109,7 +109,7 @@ def test_wrong_corners_are_left_out_and_wrong_views_named():
 @pytest.mark.parametrize("size", [(9, 7), (7, 7), (6, 6)])
 def test_symmetric_boards_are_made_consistent_by_the_motion(size):
     columns, rows = size
-    target = replace(checkerboard_target(), name="symmetric", columns=columns, rows=rows)
+    target = replace(BOARDS["checkerboard"], name="symmetric", columns=columns, rows=rows)
     cell = simulate(CellOptions(views=14, seed=7, target=target, pixel_sigma_px=0.1))
     turns = rotations(target)
     assert len(turns) > 1
@@ -139,7 +139,7 @@ def test_symmetric_boards_are_made_consistent_by_the_motion(size):
 
 
 def test_corners_of_a_turned_board_behind_another_stay_among_its_own():
-    target = replace(checkerboard_target(), name="symmetric", columns=9, rows=7)
+    target = replace(BOARDS["checkerboard"], name="symmetric", columns=9, rows=7)
     cell = simulate(CellOptions(views=8, seed=9, target=target, pixel_sigma_px=0.1))
     before = replace(target, columns=5, rows=4)
     shifted = {at: replace(it, ids=it.ids + 20) for at, it in corners_of(cell).items()}
@@ -152,7 +152,7 @@ def test_corners_of_a_turned_board_behind_another_stay_among_its_own():
 
 
 def test_a_turn_of_all_views_alike_is_only_a_change_of_the_targets_frame():
-    target = replace(checkerboard_target(), name="symmetric", columns=9, rows=7)
+    target = replace(BOARDS["checkerboard"], name="symmetric", columns=9, rows=7)
     cell = simulate(CellOptions(views=8, seed=9, target=target, pixel_sigma_px=0.1))
     choice = chosen_of(poses_of(cell), cell)
     assert len({view.turns for view in choice.views}) == 1

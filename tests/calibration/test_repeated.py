@@ -12,8 +12,8 @@ from visioncal.core.transforms import exp, invert
 from visioncal.session import MemoryImages, Session
 from visioncal.session.corners import CornerTable
 from visioncal.simulation import (
+    BOARDS,
     CellOptions,
-    charuco_target,
     network_session,
     read_cell,
     simulate,
@@ -23,7 +23,7 @@ from visioncal.simulation.records import pose_row, target_document
 
 SIGMA_PX = 0.05
 # The size of the board is known: else it is most of what transforms are uncertain by.
-BOARD = replace(charuco_target(), square_sigma_m=1e-7)
+BOARD = replace(BOARDS["charuco"], square_sigma_m=1e-7)
 
 
 def table(shown, rng):

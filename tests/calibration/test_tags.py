@@ -15,11 +15,11 @@ from visioncal.core.transforms import invert, log
 from visioncal.core.types import Corners
 from visioncal.session import Session
 from visioncal.simulation import (
+    BOARDS,
     CellOptions,
     prepare_scene,
     render,
     simulate,
-    tags_target,
     write_session,
 )
 from visioncal.vision.finders import NotFound, find_target
@@ -30,7 +30,7 @@ from visioncal.vision.targets import (
     target_from_document,
 )
 
-TAGS = tags_target()
+TAGS = BOARDS["tags"]
 PLATE = replace(TAGS, square_m=0.245, square_sigma_m=0.0)
 
 

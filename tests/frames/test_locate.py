@@ -27,8 +27,8 @@ from visioncal.frames.plane import Plane
 from visioncal.results import Calibration, Edge, Verdict, to_document
 from visioncal.session import Session
 from visioncal.simulation import (
+    BOARDS,
     CellOptions,
-    charuco_target,
     project,
     read_truth,
     simulate,
@@ -39,7 +39,7 @@ from visioncal.vision.camera import intrinsics
 from visioncal.vision.finders.imaging import decode_image
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
-BOARD = charuco_target()
+BOARD = BOARDS["charuco"]
 
 
 @pytest.fixture(scope="module", params=MOUNTS)

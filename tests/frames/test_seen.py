@@ -17,10 +17,10 @@ from visioncal.frames.marker_points import seen_markers
 from visioncal.frames.single_view import Sight, places
 from visioncal.frames.target_in_image import see
 from visioncal.frames.target_pose import place_seen
-from visioncal.simulation import CellOptions, charuco_target, checkerboard_target, simulate
+from visioncal.simulation import BOARDS, CellOptions, simulate
 from visioncal.vision.camera import intrinsics, with_intrinsics
 
-BOARD = charuco_target()
+BOARD = BOARDS["charuco"]
 MARKER = Target("marker", "marker", 1, 1, 0.06, 6e-5, dictionary="DICT_5X5_100", marker_id=3)
 IN_HAND, TO_HAND = "eye-in-hand", "eye-to-hand"
 # Mount, and the frame that the target is placed in.
@@ -226,7 +226,7 @@ def test_a_marker_seen_flat_on_may_be_tilted_the_other_way():
 def test_a_symmetric_board_may_be_turned(cell):
     made, calibration = cell
     parent = "base" if made.options.mount == IN_HAND else "flange"
-    board = replace(checkerboard_target(), columns=7, rows=5)
+    board = replace(BOARDS["checkerboard"], columns=7, rows=5)
     rng = np.random.default_rng(7)
     place = place_of(made, parent, rng)
     sights = sights_of(made, parent, place, rng, 3, board)

@@ -12,11 +12,11 @@ from support.foreign_samples import picture, quaternions
 
 from visioncal.core.errors import DataError
 from visioncal.interchange.formats import ImportOptions, convert
-from visioncal.simulation import CellOptions, checkerboard_target, simulate
+from visioncal.simulation import BOARDS, CellOptions, simulate
 
 VIEWS = 12
 NAMES = [f"shot_{at}.png" for at in range(1, VIEWS + 1)]
-CELL = simulate(CellOptions(target=checkerboard_target(), views=VIEWS, cut_views=0.0, seed=3))
+CELL = simulate(CellOptions(target=BOARDS["checkerboard"], views=VIEWS, cut_views=0.0, seed=3))
 PX = np.array([it.px for it in CELL.corners])
 REQUESTED = ImportOptions(
     mount="eye-in-hand", target="checkerboard_9x6_25mm", resolution=(1280, 800)

@@ -9,20 +9,20 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, pose_difference
 from visioncal.session import Session
 from visioncal.simulation import (
+    BOARDS,
     BoardAt,
     CameraAt,
     InstrumentAt,
     Moved,
     NetworkOptions,
     PointAt,
-    checkerboard_target,
     network_session,
     simulate_network,
     write_network,
 )
 from visioncal.simulation.network import is_symmetric
 
-EVEN = replace(checkerboard_target(), name="even", columns=8, rows=6)
+EVEN = replace(BOARDS["checkerboard"], name="even", columns=8, rows=6)
 OPTIONS = NetworkOptions(
     cameras=(*NetworkOptions().cameras, CameraAt("hand", "a")),
     boards=(*NetworkOptions().boards[1:], BoardAt("even", target=EVEN)),

@@ -12,10 +12,9 @@ from visioncal.core.transforms import invert, log, rotation_angle
 from visioncal.core.types import Camera, Target
 from visioncal.session import Session
 from visioncal.simulation import (
+    BOARDS,
     Cell,
     CellOptions,
-    charuco_target,
-    checkerboard_target,
     fine_camera,
     fisheye_camera,
     forward,
@@ -327,8 +326,8 @@ def detection_errors(options: CellOptions) -> np.ndarray:
     [
         CellOptions(),
         CellOptions(camera=fisheye_camera(), tilt_rad=(0.1, 0.5)),
-        CellOptions(target=checkerboard_target(), blur_px=1.0),
-        CellOptions(target=dataclasses.replace(charuco_target(), legacy=True)),
+        CellOptions(target=BOARDS["checkerboard"], blur_px=1.0),
+        CellOptions(target=dataclasses.replace(BOARDS["charuco"], legacy=True)),
         CellOptions(board_scale=1.01, board_bow_m=0.003),
         CellOptions(mount="eye-to-hand", distance_m=(0.5, 0.8)),
     ],
@@ -345,7 +344,7 @@ def test_pictures_show_the_corners_where_they_are(options):
 
 def test_print_is_opencvs_board():
     # Seen straight and exactly, the print is the image that OpenCV would print.
-    target = charuco_target()
+    target = BOARDS["charuco"]
     cell = simulate(exact(CellOptions(views=1, camera=SMALL, vignetting=0.0)))
     pose = cell.cam_from_target[0]
     image = render(prepare_scene(cell), 0).astype(float)
@@ -381,7 +380,7 @@ def test_noise_blur_and_vignetting_are_in_the_picture():
 
 @pytest.mark.parametrize("quality", [None, 90])
 def test_written_session_loads_and_its_truth_lies_beside_it(tmp_path, quality):
-    target = dataclasses.replace(charuco_target(), name="own", square_m=0.025, marker_m=0.018)
+    target = dataclasses.replace(BOARDS["charuco"], name="own", square_m=0.025, marker_m=0.018)
     options = CellOptions(
         views=2, camera=SMALL, target=target, jpeg_quality=quality, wrong_views=1, seed=3
     )
@@ -414,7 +413,7 @@ def test_written_session_loads_and_its_truth_lies_beside_it(tmp_path, quality):
     np.testing.assert_array_equal(truth.camera.distortion, SMALL.distortion)
 
 
-@pytest.mark.parametrize("target", [charuco_target(), checkerboard_target()])
+@pytest.mark.parametrize("target", [BOARDS["charuco"], BOARDS["checkerboard"]])
 def test_shipped_boards_are_named_and_say_the_same(tmp_path, target):
     options = CellOptions(views=1, camera=SMALL, target=target, state_intrinsics=False)
     session = Session.load(write_session(simulate(options), tmp_path / "cell"))

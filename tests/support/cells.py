@@ -15,7 +15,7 @@ from visioncal.robot import Robot, load_robot
 from visioncal.session import MemoryImages, Session, View
 from visioncal.simulation import Cell, CellOptions, Sweep
 from visioncal.simulation.records import approach_text, load_row, pose_row
-from visioncal.simulation.second import BOARDS
+from visioncal.simulation.second import NAMES
 
 
 def session_of(cell: Cell) -> Session:
@@ -42,14 +42,14 @@ def session_of(cell: Cell) -> Session:
         columns = ("view", "image")
         document["target"] = options.target.name
         return Session(document, columns, tuple(views), options.target, None, MemoryImages({}))
-    targets = {name: it.target for name, it in zip(BOARDS, cell.sheets, strict=True)}
+    targets = {name: it.target for name, it in zip(NAMES, cell.sheets, strict=True)}
     document["targets"] = {name: it.name for name, it in targets.items()}
     shown = zip(views, cell.shown.stops.tolist(), cell.shown.boards, strict=True)
     return Session(
         document,
         ("view", "stop", "target", "image"),
         tuple(
-            replace(view, stop=stop, text={**view.text, "target": BOARDS[board]})
+            replace(view, stop=stop, text={**view.text, "target": NAMES[board]})
             for view, stop, board in shown
         ),
         options.target,

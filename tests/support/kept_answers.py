@@ -40,7 +40,7 @@ from visioncal.simulation.layout import (
 )
 from visioncal.simulation.network import simulate_network
 from visioncal.simulation.network_records import network_session
-from visioncal.simulation.options import Second, checkerboard_target
+from visioncal.simulation.options import BOARDS, Second
 from visioncal.simulation.sag import Payload
 
 KEPT = Path(__file__).parents[1] / "data" / "answers.json"
@@ -54,7 +54,7 @@ _COARSE = replace(_FINE, robot_sigma_m=3e-4, robot_sigma_rad=5e-4)
 _WRONG_ARM = replace(_FINE, views=40, dh_sigma_m=3e-4, dh_sigma_rad=3e-4, branches=True)
 _SPRINGS = (1e-4, 1e-4, 8e-5, 2e-5, 2e-5, 1e-5)
 _LOADS = (Payload(0.0, (0.0, 0.0, 0.0)), Payload(8.0, (0.0, 0.0, 0.08)))
-_SHELF = Second(target=replace(checkerboard_target(), columns=8, rows=5))
+_SHELF = Second(target=replace(BOARDS["checkerboard"], columns=8, rows=5))
 
 
 @dataclass(frozen=True)

@@ -24,13 +24,12 @@ from support.touched import TIP, Job, touched
 from visioncal.core.types import FloatArray
 from visioncal.robot import load_robot
 from visioncal.simulation import (
+    BOARDS,
     BoardAt,
     CameraAt,
     CellOptions,
     NetworkOptions,
     RobotAt,
-    charuco_target,
-    checkerboard_target,
     simulate,
     simulate_network,
     wide_camera,
@@ -130,7 +129,7 @@ def _tracked(_: Inputs, path: Path) -> None:
 
 
 def _network(_: Inputs, path: Path) -> None:
-    plain = replace(checkerboard_target(), name="6x5", columns=6, rows=5)
+    plain = replace(BOARDS["checkerboard"], name="6x5", columns=6, rows=5)
     cameras = (
         CameraAt("left", place_m=(0.0, -0.5, 0.9), camera=CAMERA),
         CameraAt("right", place_m=(0.1, 0.45, 0.95), camera=CAMERA),
@@ -141,7 +140,7 @@ def _network(_: Inputs, path: Path) -> None:
         boards=(
             BoardAt("plate_a", "a", target=plain),
             BoardAt(
-                "plate_b", "b", target=replace(charuco_target(), name="5x4", columns=5, rows=4)
+                "plate_b", "b", target=replace(BOARDS["charuco"], name="5x4", columns=5, rows=4)
             ),
         ),
         stops=6,

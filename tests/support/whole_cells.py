@@ -9,21 +9,20 @@ from visioncal.core.transforms import invert, log
 from visioncal.session import Session
 from visioncal.session.corners import CornerTable
 from visioncal.simulation import (
+    BOARDS,
     BoardAt,
     CameraAt,
     Network,
     NetworkOptions,
     RobotAt,
-    charuco_target,
-    checkerboard_target,
     fine_camera,
     network_session,
     simulate_network,
 )
 
 # Boards whose size is known: else it is most of what a target's place is uncertain by.
-FLOOR = replace(charuco_target(), square_sigma_m=1e-7)
-PLATE = replace(checkerboard_target(), square_sigma_m=1e-7)
+FLOOR = replace(BOARDS["charuco"], square_sigma_m=1e-7)
+PLATE = replace(BOARDS["checkerboard"], square_sigma_m=1e-7)
 OPTIONS = NetworkOptions(
     robots=(RobotAt("a", (-0.6, 0.0, 0.0)), RobotAt("b", (0.6, 0.05, 0.02))),
     cameras=(

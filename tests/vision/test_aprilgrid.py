@@ -15,10 +15,9 @@ from visioncal.core.transforms import invert, log
 from visioncal.interchange.formats.boards import described_target
 from visioncal.session import Session
 from visioncal.simulation import (
+    BOARDS,
     CellOptions,
-    aprilgrid_target,
     simulate,
-    tags_target,
     write_session,
 )
 from visioncal.vision.finders import DetectedCorners, NotFound, find_target
@@ -126,7 +125,7 @@ def test_a_photograph_names_it(target):
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", slow("eye-to-hand")])
 def test_a_cell_is_calibrated_with_it(tmp_path, mount):
-    cell = simulate(CellOptions(target=aprilgrid_target(), views=12, mount=mount, seed=4))
+    cell = simulate(CellOptions(target=BOARDS["aprilgrid"], views=12, mount=mount, seed=4))
     write_session(cell, tmp_path / "s")
     result = run(Session.load(tmp_path / "s")).calibration
     assert result.verdict.status == "good"
@@ -138,7 +137,7 @@ def test_a_cell_is_calibrated_with_it(tmp_path, mount):
 
 
 def test_a_session_of_another_page_is_refused(tmp_path):
-    cell = simulate(CellOptions(target=aprilgrid_target(), views=4))
+    cell = simulate(CellOptions(target=BOARDS["aprilgrid"], views=4))
     write_session(cell, tmp_path / "s")
     path = tmp_path / "s" / "target.toml"
     path.write_text(path.read_text().replace("spacing = 0.3", "spacing = 0.2"))
@@ -152,7 +151,7 @@ def test_a_grid_without_squares_is_to_be_described_as_free_tags(tmp_path):
     around = side * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
     points = np.concatenate([pitch * np.array(it[1:]) + around for it in tags])
     board = replace(
-        tags_target(),
+        BOARDS["tags"],
         points_m=tuple((x, y, 0.0) for x, y in points.tolist()),
         point_numbers=tuple(range(len(points))),
         point_sigmas_m=(),

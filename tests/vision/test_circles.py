@@ -13,10 +13,9 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
 from visioncal.session import Session
 from visioncal.simulation import (
+    BOARDS,
     CellOptions,
-    circles_target,
     simulate,
-    symmetric_circles_target,
     write_session,
 )
 from visioncal.vision.finders import DetectedCorners, NotFound, find_target
@@ -122,10 +121,10 @@ def test_a_photograph_names_it(target):
 @pytest.mark.parametrize(
     ("target", "mount"),
     [
-        (circles_target(), "eye-to-hand"),
-        (symmetric_circles_target(), "eye-in-hand"),
-        slow(circles_target(), "eye-in-hand"),
-        slow(symmetric_circles_target(), "eye-to-hand"),
+        (BOARDS["circles"], "eye-to-hand"),
+        (BOARDS["symmetric-circles"], "eye-in-hand"),
+        slow(BOARDS["circles"], "eye-in-hand"),
+        slow(BOARDS["symmetric-circles"], "eye-to-hand"),
     ],
 )
 def test_a_cell_is_calibrated_with_it(tmp_path, mount, target):
@@ -149,4 +148,4 @@ def test_a_cell_is_calibrated_with_it(tmp_path, mount, target):
 
 
 TURNED = np.diag([-1.0, -1.0, 1.0, 1.0])
-TURNED[:2, 3] = corner_positions(symmetric_circles_target())[-1, :2]
+TURNED[:2, 3] = corner_positions(BOARDS["symmetric-circles"])[-1, :2]

@@ -16,10 +16,8 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import Target
 from visioncal.session import MemoryImages, Session, View
 from visioncal.simulation import (
+    BOARDS,
     CellOptions,
-    aprilgrid_target,
-    charuco_target,
-    checkerboard_target,
     prepare_scene,
     render,
     simulate,
@@ -47,7 +45,7 @@ def charuco():
 
 @pytest.fixture(scope="module")
 def checkerboard():
-    return images_of(CellOptions(views=4, target=checkerboard_target(), seed=3))
+    return images_of(CellOptions(views=4, target=BOARDS["checkerboard"], seed=3))
 
 
 def session_of(files, target, resolution=(1280, 800)):
@@ -130,7 +128,7 @@ def test_every_unusable_view_gets_its_reason(charuco):
         "blurred.png": encoded(blurred),
         "good.jpg": jpeg,
     }
-    found = detect(session_of(files, charuco_target()))
+    found = detect(session_of(files, BOARDS["charuco"]))
     names = list(files)
     assert [names[view] for view in found.corners] == ["good.png", "good.jpg"]
     reasons = {names[it.view]: it.reason for it in found.rejections}
@@ -172,8 +170,8 @@ def test_too_few_corners_and_corners_on_one_line(charuco):
 
 
 def test_all_corners_of_the_smallest_boards_suffice():
-    charuco = replace(charuco_target(), columns=3, rows=3, square_m=0.06, marker_m=0.045)
-    tag = replace(aprilgrid_target(), columns=1, rows=1, square_m=0.06)
+    charuco = replace(BOARDS["charuco"], columns=3, rows=3, square_m=0.06, marker_m=0.045)
+    tag = replace(BOARDS["aprilgrid"], columns=1, rows=1, square_m=0.06)
     for target in (charuco, tag):
         cell, images = images_of(CellOptions(views=2, target=target, cut_views=0.0, seed=6), 2)
         seen = detect(
@@ -197,7 +195,7 @@ def test_another_layout_than_declared_is_named_with_its_fix(charuco, declared, f
 
 
 def test_a_legacy_board_declared_as_one_is_found():
-    target = replace(charuco_target(), name="legacy", legacy=True)
+    target = replace(BOARDS["charuco"], name="legacy", legacy=True)
     cell, images = images_of(CellOptions(views=2, target=target, cut_views=0.0, seed=6), 2)
     seen = find_target(images[0], target)
     exact = cell.exact_corners[0]

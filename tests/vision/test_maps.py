@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from visioncal.simulation import CellOptions, simulate, tags_target
+from visioncal.simulation import BOARDS, CellOptions, simulate
 from visioncal.simulation.optics import fisheye_camera, project, wide_camera
 from visioncal.vision.finders.maps import OpticalAxis, maps_about
 
-TAGS = tags_target()
+TAGS = BOARDS["tags"]
 SIDE_M = 0.05
 
 

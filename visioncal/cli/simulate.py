@@ -14,7 +14,6 @@ from visioncal.core.errors import DataError
 
 # Help does not wait for them.
 if TYPE_CHECKING:
-    from visioncal.core.types import Target
     from visioncal.simulation import CellOptions
     from visioncal.simulation.tracked import Tracked
 Read: TypeAlias = Literal["point", "points", "probe"]
@@ -164,6 +163,7 @@ def simulate_command(
     from visioncal.cli.simulated_cell import CENTRE_M, Along, exercise_options, whole_cell
     from visioncal.session.saving import refuse_filled
     from visioncal.simulation import (
+        BOARDS,
         CAMERAS,
         CellOptions,
         Payload,
@@ -185,8 +185,8 @@ def simulate_command(
         robot=robot,
         mount=mount,
         views=views,
-        target=_target(board),
-        camera=CAMERAS[camera](),
+        target=BOARDS[board],
+        camera=CAMERAS[camera],
         state_intrinsics=with_intrinsics,
         robot_sigma_m=1e-3 * robot_sigma_mm,
         robot_sigma_rad=1e-3 * robot_sigma_mrad,
@@ -222,21 +222,6 @@ def simulate_command(
     else:
         _single(options, folder, images=images, touches=touches)
     messages().print(f"wrote {folder}\nwrote {truth_path(folder)}")
-
-
-def _target(board: str) -> "Target":
-    """What is printed, by its name among the options."""
-    from visioncal import simulation
-
-    boards = {
-        "charuco": simulation.charuco_target,
-        "checkerboard": simulation.checkerboard_target,
-        "aprilgrid": simulation.aprilgrid_target,
-        "circles": simulation.circles_target,
-        "symmetric-circles": simulation.symmetric_circles_target,
-        "tags": simulation.tags_target,
-    }
-    return boards[board]()
 
 
 def _single(options: "CellOptions", folder: Path, *, images: bool, touches: bool) -> None:

@@ -29,15 +29,10 @@ from visioncal.simulation.optics import (
     wide_camera,
 )
 from visioncal.simulation.options import (
+    BOARDS,
     CellOptions,
     Motion,
     Second,
-    aprilgrid_target,
-    charuco_target,
-    checkerboard_target,
-    circles_target,
-    symmetric_circles_target,
-    tags_target,
 )
 from visioncal.simulation.records import (
     Truth,
@@ -62,6 +57,7 @@ from visioncal.simulation.warmup import (
 )
 
 __all__ = [
+    "BOARDS",
     "CAMERAS",
     "Arm",
     "BoardAt",
@@ -87,12 +83,8 @@ __all__ = [
     "Truth",
     "WarmUp",
     "WarmUpOptions",
-    "aprilgrid_target",
     "arm_named",
     "cell_names",
-    "charuco_target",
-    "checkerboard_target",
-    "circles_target",
     "fine_camera",
     "fisheye_camera",
     "forward",
@@ -110,8 +102,6 @@ __all__ = [
     "simulate_warm_up",
     "sweep",
     "sweep_session",
-    "symmetric_circles_target",
-    "tags_target",
     "touch",
     "touch_network",
     "truth_path",

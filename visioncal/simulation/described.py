@@ -157,9 +157,9 @@ class _Reader:
 
     def _value(self, table: Table, key: str, hint: object, kind: type) -> object:
         if hint is Camera:
-            return CAMERAS[table.choice(key, tuple(CAMERAS))]()
+            return CAMERAS[table.choice(key, tuple(CAMERAS))]
         if hint is Target:
-            return TARGETS[table.choice(key, tuple(TARGETS))]()
+            return TARGETS[table.choice(key, tuple(TARGETS))]
         if key == "robot":
             return table.choice(key, self.carriers[1:] if kind is Swept else SIMULATED_ARMS)
         if key == "on":

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from visioncal.core.errors import DataError
 from visioncal.core.types import Camera, Target
 from visioncal.simulation.optics import fine_camera, wide_camera
-from visioncal.simulation.options import charuco_target, checkerboard_target
+from visioncal.simulation.options import BOARDS
 
 # Where robots meet [m].
 MIDDLE_M = (0.0, 0.0, 0.4)
@@ -80,7 +80,7 @@ class BoardAt:
     on: str = CELL
     place_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     tilt_rad: float = 0.0
-    target: Target = field(default_factory=charuco_target)
+    target: Target = BOARDS["charuco"]
     scale: float = 1.0
     bow_m: float = 0.0
 
@@ -174,7 +174,7 @@ def _two_cameras() -> tuple[CameraAt, ...]:
 
 def _three_boards() -> tuple[BoardAt, ...]:
     floor = BoardAt("floor", place_m=(0.0, 0.0, 0.05))
-    return floor, BoardAt("plate_a", "a", target=checkerboard_target()), BoardAt("plate_b", "b")
+    return floor, BoardAt("plate_a", "a", target=BOARDS["checkerboard"]), BoardAt("plate_b", "b")
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ Models: Brown (1971) with the rational radial term that OpenCV uses, and the equ
 polynomial of Kannala and Brandt (2006) in OpenCV's parametrisation. Pixel centres at integers.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -118,10 +118,10 @@ def rays(camera: Camera, px: FloatArray) -> FloatArray:
     return np.asarray(directions / np.linalg.norm(directions, axis=-1, keepdims=True))
 
 
-CAMERAS: Mapping[str, Callable[[], Camera]] = {
-    "wide": wide_camera,
-    "fine": fine_camera,
-    "fisheye": fisheye_camera,
+CAMERAS: Mapping[str, Camera] = {
+    "wide": wide_camera(),
+    "fine": fine_camera(),
+    "fisheye": fisheye_camera(),
 }
 
 

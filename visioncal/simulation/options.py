@@ -1,6 +1,6 @@
 """What a simulated cell is made of, and how good or bad it is."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
@@ -10,79 +10,11 @@ from visioncal.core.types import Camera, Mount, Target
 from visioncal.simulation.optics import wide_camera
 from visioncal.simulation.sag import Payload
 
+_APRILTAGS = "DICT_APRILTAG_36h11"
 Motion: TypeAlias = Literal["free", "one_axis", "translation"]
 
 
-def charuco_target() -> Target:
-    """A ChArUco board of 9x6 squares of 30 mm."""
-    return Target(
-        name="charuco_9x6_30mm",
-        kind="charuco",
-        columns=9,
-        rows=6,
-        square_m=0.030,
-        square_sigma_m=3e-5,
-        marker_m=0.022,
-        dictionary="DICT_5X5_100",
-    )
-
-
-def checkerboard_target() -> Target:
-    """A checkerboard with 9x6 inner corners of 25 mm, whose colours determine corner 0."""
-    return Target(
-        name="checkerboard_9x6_25mm",
-        kind="checkerboard",
-        columns=9,
-        rows=6,
-        square_m=0.025,
-        square_sigma_m=2.5e-5,
-    )
-
-
-def aprilgrid_target() -> Target:
-    """An AprilGrid of 6x4 tags of 32 mm, as Kalibr prints them."""
-    return Target(
-        name="aprilgrid_6x4_32mm",
-        kind="aprilgrid",
-        columns=6,
-        rows=4,
-        square_m=0.032,
-        square_sigma_m=3.2e-5,
-        dictionary="DICT_APRILTAG_36h11",
-        marker_id=0,
-        spacing=0.3,
-        border=2,
-    )
-
-
-def circles_target() -> Target:
-    """An asymmetric grid of 5x9 circles of 14 mm, in rows 20 mm apart."""
-    return Target(
-        name="circles_5x9_20mm_asymmetric",
-        kind="circles",
-        columns=5,
-        rows=9,
-        square_m=0.020,
-        square_sigma_m=2e-5,
-        diameter_m=0.014,
-        asymmetric=True,
-    )
-
-
-def symmetric_circles_target() -> Target:
-    """A symmetric grid of 8x6 circles of 15 mm, 30 mm apart: it looks the same upside down."""
-    return Target(
-        name="circles_8x6_30mm",
-        kind="circles",
-        columns=8,
-        rows=6,
-        square_m=0.030,
-        square_sigma_m=3e-5,
-        diameter_m=0.015,
-    )
-
-
-def tags_target() -> Target:
+def _tags() -> Target:
     """Seven tags of 40 to 60 mm on a plate, whose corners were measured."""
     tags = (
         *((3, 0.000, 0.000, 0.050), (17, 0.085, 0.010, 0.040), (42, 0.160, 0.000, 0.060)),
@@ -101,21 +33,45 @@ def tags_target() -> Target:
         rows=1,
         square_m=0.245,
         square_sigma_m=0.0,
-        dictionary="DICT_APRILTAG_36h11",
+        dictionary=_APRILTAGS,
         points_m=tuple(points),
         point_numbers=tuple(range(len(points))),
         point_tags=tuple((it[0], corner) for it in tags for corner in range(4)),
     )
 
 
-TARGETS: Mapping[str, Callable[[], Target]] = {
-    "charuco_9x6_30mm": charuco_target,
-    "checkerboard_9x6_25mm": checkerboard_target,
-    "aprilgrid_6x4_32mm": aprilgrid_target,
-    "circles_5x9_20mm_asymmetric": circles_target,
-    "circles_8x6_30mm": symmetric_circles_target,
-    "tags": tags_target,
+# Boards with the sides of their squares and how well these are known [m]: a ChArUco board, a
+# checkerboard whose colours determine corner 0, an AprilGrid as Kalibr prints them, circles of
+# 14 mm in shifted rows, and circles of 15 mm that look the same upside down.
+_CHARUCO = Target(
+    "charuco_9x6_30mm", "charuco", 9, 6, 0.030, 3e-5, marker_m=0.022, dictionary="DICT_5X5_100"
+)
+_CHECKERBOARD = Target("checkerboard_9x6_25mm", "checkerboard", 9, 6, 0.025, 2.5e-5)
+_APRILGRID = Target(
+    name="aprilgrid_6x4_32mm",
+    kind="aprilgrid",
+    columns=6,
+    rows=4,
+    square_m=0.032,
+    square_sigma_m=3.2e-5,
+    dictionary=_APRILTAGS,
+    marker_id=0,
+    spacing=0.3,
+    border=2,
+)
+_CIRCLES = Target(
+    "circles_5x9_20mm_asymmetric", "circles", 5, 9, 0.020, 2e-5, diameter_m=0.014, asymmetric=True
+)
+_SYMMETRIC = Target("circles_8x6_30mm", "circles", 8, 6, 0.030, 3e-5, diameter_m=0.015)
+BOARDS: Mapping[str, Target] = {
+    "charuco": _CHARUCO,
+    "checkerboard": _CHECKERBOARD,
+    "aprilgrid": _APRILGRID,
+    "circles": _CIRCLES,
+    "symmetric-circles": _SYMMETRIC,
+    "tags": _tags(),
 }
+TARGETS: Mapping[str, Target] = {it.name: it for it in BOARDS.values()}
 
 
 @dataclass(frozen=True)
@@ -131,7 +87,7 @@ class Second:
         bow_m: How far its corners are bent away from the camera [m].
     """
 
-    target: Target = field(default_factory=checkerboard_target)
+    target: Target = BOARDS["checkerboard"]
     turn_rad: float = 1.4
     tilt_rad: float = 0.3
     scale: float = 1.0
@@ -196,7 +152,7 @@ class CellOptions:
     robot: str = "ur10e"
     mount: Mount = "eye-in-hand"
     views: int = 20
-    target: Target = field(default_factory=charuco_target)
+    target: Target = BOARDS["charuco"]
     camera: Camera = field(default_factory=wide_camera)
     state_intrinsics: bool = True
     distance_m: tuple[float, float] | None = None

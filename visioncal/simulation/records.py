@@ -19,10 +19,10 @@ from visioncal.session.corners import CornerTable
 from visioncal.simulation.boards import corners_m
 from visioncal.simulation.cell import Cell, Stream, stream
 from visioncal.simulation.optics import project
-from visioncal.simulation.options import charuco_target, checkerboard_target
+from visioncal.simulation.options import BOARDS
 from visioncal.simulation.render import encode, prepare_scene, render
 from visioncal.simulation.sag import Payload
-from visioncal.simulation.second import BOARDS
+from visioncal.simulation.second import NAMES
 from visioncal.simulation.sweep import POSE, Sweep
 
 # An operator's pace: a stop every so many seconds [s].
@@ -287,13 +287,13 @@ def _session(
     target = cell.sheets[0].target
     if len(cell.sheets) == 1:
         return Session(document, columns, tuple(views), target, target_document(target), images)
-    targets = {name: it.target for name, it in zip(BOARDS, cell.sheets, strict=True)}
+    targets = {name: it.target for name, it in zip(NAMES, cell.sheets, strict=True)}
     shown = zip(views, cell.shown.stops.tolist(), cell.shown.boards.tolist(), strict=True)
     return Session(
         document,
         ("view", "stop", "target", *columns[1:]),
         tuple(
-            replace(view, stop=stop, text={**view.text, "target": BOARDS[board]})
+            replace(view, stop=stop, text={**view.text, "target": NAMES[board]})
             for view, stop, board in shown
         ),
         target,
@@ -310,14 +310,14 @@ def _targets(cell: Cell) -> dict[str, Any]:
     return {
         "targets": {
             name: {"target": target_place(it.target, f"target_{name}.toml")}
-            for name, it in zip(BOARDS, cell.sheets, strict=True)
+            for name, it in zip(NAMES, cell.sheets, strict=True)
         }
     }
 
 
 def target_place(target: Target, path: str) -> str:
     """Names a board that comes with visioncal, or the file that is written."""
-    return target.name if target in (charuco_target(), checkerboard_target()) else path
+    return target.name if target in (BOARDS["charuco"], BOARDS["checkerboard"]) else path
 
 
 def _document(cell: Cell, name: str) -> dict[str, Any]:

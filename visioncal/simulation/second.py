@@ -13,7 +13,7 @@ from visioncal.simulation.optics import sees
 from visioncal.simulation.options import CellOptions, Second
 
 # What a session calls the boards where there are two.
-BOARDS = ("first", "second")
+NAMES = ("first", "second")
 # A board is looked at in a view that shows this share of its corners, not too much from the side.
 _LEAST_SHARE, _LEAST_COSINE = 0.6, 0.5
 _EDGE_PX = 12.0
@@ -63,8 +63,8 @@ def with_second(
         turn = Rotation.from_rotvec(second.tilt_rad * lean).as_matrix() @ z[:3, :3]
     return {
         x_name: x,
-        f"{z_name}_{BOARDS[0]}": z,
-        f"{z_name}_{BOARDS[1]}": compose(turn, place - turn @ further),
+        f"{z_name}_{NAMES[0]}": z,
+        f"{z_name}_{NAMES[1]}": compose(turn, place - turn @ further),
     }
 
 

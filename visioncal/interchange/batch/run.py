@@ -7,7 +7,6 @@ import io
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -45,8 +44,8 @@ _NUMBERS: Mapping[str, tuple[str, float]] = {
 }
 # That of the names that a key takes, and what they stand for.
 _NAMES: Mapping[str, tuple[str, Mapping[str, Any]]] = {
-    "robot": ("robot", {it: partial(str, it) for it in SIMULATED_ARMS}),
-    "mount": ("mount", {it: partial(str, it) for it in ("eye-in-hand", "eye-to-hand")}),
+    "robot": ("robot", {it: it for it in SIMULATED_ARMS}),
+    "mount": ("mount", {it: it for it in ("eye-in-hand", "eye-to-hand")}),
     "camera": ("camera", CAMERAS),
     "board": ("target", TARGETS),
 }
@@ -259,7 +258,7 @@ def _field(file: Path, key: str, value: object) -> tuple[str, Any]:
     if key in _NAMES:
         field, known = _NAMES[key]
         if value in known:
-            return field, known[str(value)]()
+            return field, known[str(value)]
         raise DataError(
             f"{file}: {key} has {value!r}; known are {', '.join(known)}.",
             culprits=[key],
