@@ -10,6 +10,7 @@ from visioncal.calibration.pipeline import calibrate
 from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.types import Camera, Corners
+from visioncal.core.verdict import EMPTY_IMAGE
 from visioncal.session import Session
 from visioncal.simulation import (
     BOARDS,
@@ -149,6 +150,14 @@ def test_parts_of_the_image_that_were_never_visited_are_named():
     seen = estimate_intrinsics(corners, [cell.options.target], (width, height), "brown")
     assert any("lower right" in it.reason for it in seen.warnings)
     assert not any("lower right" in it.reason for it in estimate(cell).warnings)
+    for view, it in corners.items():
+        inside = (abs(it.px - 0.5 * np.array([width, height])) < 0.2 * height).all(axis=1)
+        corners[view] = replace(it, ids=it.ids[inside], px=it.px[inside])
+    middle = {view: it for view, it in corners.items() if len(it.ids) >= 6}
+    alone = estimate_intrinsics(middle, [cell.options.target], (width, height), "brown")
+    (empty,) = (it for it in alone.warnings if it.kind == EMPTY_IMAGE)
+    assert "in the upper left, upper right, lower left and lower right of the image" in empty.words
+    assert "into those parts" in empty.do.words
 
 
 def test_two_views_are_too_few():
