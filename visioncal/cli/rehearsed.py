@@ -17,6 +17,7 @@ from visioncal.cli.recorded_cell import Scene, facts_of, scene_of, shown_in
 from visioncal.core.choices import Faults
 from visioncal.core.errors import DataError, DriverError, VisioncalError
 from visioncal.core.interrupts import ended_like_ctrl_c
+from visioncal.core.transforms import transform_point
 from visioncal.core.types import FloatArray
 from visioncal.frames.touch_test import judged, touch_points
 from visioncal.interchange.outputs import Written, write_outputs, write_plan
@@ -52,7 +53,7 @@ def touched(folder: Path, calibration: Calibration, base_from_target: FloatArray
         base_from_target: (4, 4) the truth.
     """
     points = touch_points(Session.load(folder), calibration)
-    true = [base_from_target[:3, :3] @ it.board_m + base_from_target[:3, 3] for it in points]
+    true = [transform_point(base_from_target, it.board_m) for it in points]
     gaps = [
         1e3 * float(np.linalg.norm(it.base_m - at)) for it, at in zip(points, true, strict=True)
     ]

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import compose, exp, invert
+from visioncal.core.transforms import compose, exp, invert, transform_points
 from visioncal.core.types import Camera, Corners, FloatArray
 from visioncal.simulation.arms import (
     Arm,
@@ -365,8 +365,7 @@ def seen_by(
     """Where the corners of each view's sheet are in its image, without the ones outside it."""
     seen = []
     for view, (sheet, pose) in enumerate(zip(sheets, cam_from_target, strict=True)):
-        points = corners_m(sheet)
-        points_cam = points @ pose[:3, :3].T + pose[:3, 3]
+        points_cam = transform_points(pose, corners_m(sheet))
         ids = np.flatnonzero(sees(options.camera, points_cam, EDGE_PX))
         px = project(options.camera, points_cam[ids])
         seen.append(Corners(view, ids.astype(np.int64), px, options.blur_px))

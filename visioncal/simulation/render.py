@@ -10,7 +10,7 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.transforms import compose, invert
+from visioncal.core.transforms import compose, invert, transform_points
 from visioncal.core.types import Camera, FloatArray, Image
 from visioncal.simulation.arms import Arm, link_frames, reach_m
 from visioncal.simulation.boards import bow_depth_m, outline_m, unit_m
@@ -272,7 +272,7 @@ def _board_patch(cell: Cell, cam_from_target: FloatArray) -> Patch:
     """Bounds of the sheet and its shadow in the image."""
     camera = cell.options.camera
     points = outline_m(cell.sheet, margin_m(cell.options.target))
-    points_cam = points @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]
+    points_cam = transform_points(cam_from_target, points)
     width, height = camera.resolution
     # A point so far outside that the lens model folds it back says nothing about the bounds; one
     # beside or behind the camera has no place in the image at all.
@@ -334,7 +334,7 @@ def _draw_arm(
     tubes = _tubes(arm, link_frames(arm, joints[None])[0])
     seen = []
     for tube in tubes:
-        ends = np.stack([tube.start, tube.end]) @ cam_from_base[:3, :3].T + cam_from_base[:3, 3]
+        ends = transform_points(cam_from_base, np.stack([tube.start, tube.end]))
         if ends[:, 2].min() > _NEAREST_M:
             seen.append((float(ends[:, 2].mean()), ends, tube))
     for _, ends, tube in sorted(seen, key=lambda each: -each[0]):

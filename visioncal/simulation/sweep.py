@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import invert
+from visioncal.core.transforms import invert, transform_point, transform_points
 from visioncal.core.types import FloatArray
 from visioncal.session import Stream as Recorded
 from visioncal.simulation.arms import forward
@@ -130,13 +130,13 @@ def _by_rows(cell: Cell, way: CubicSpline, taken_s: FloatArray, readout_s: float
     exact = list(cell.exact_corners)
     for at, (stop, board) in enumerate(zip(shown.stops, shown.boards, strict=True)):
         points = corners_m(cell.sheets[board])
-        middle = points @ cell.cam_from_target[at, :3, :3].T + cell.cam_from_target[at, :3, 3]
+        middle = transform_points(cell.cam_from_target[at], points)
         px = project(options.camera, middle)
         for _ in range(_ROUNDS):
             late_s = readout_s * (px[:, 1] / (height - 1) - 0.5)
             flange = cell.flange_at(way(taken_s[stop] + late_s)) @ jitter[at]
             poses = before_camera(boards[board], flange)
-            seen = (poses[:, :3, :3] @ points[:, :, None])[:, :, 0] + poses[:, :3, 3]
+            seen = transform_point(poses, points)
             px = project(options.camera, seen)
         ids = np.flatnonzero(sees(options.camera, seen, EDGE_PX))
         exact[at] = replace(exact[at], ids=ids.astype(np.int64), px=px[ids])

@@ -30,7 +30,7 @@ from visioncal.calibration.stages.validate import HeldOut
 from visioncal.core.limits import NeedLimits
 from visioncal.core.number_format import figure
 from visioncal.core.quantiles import chi2_limit
-from visioncal.core.transforms import adjoint, invert, skew
+from visioncal.core.transforms import adjoint, invert, skew, transform_point
 from visioncal.core.types import FloatArray, IntArray, Need
 from visioncal.estimation.arm import ArmErrors, misfit_jacobian
 from visioncal.estimation.parts import Noise, State
@@ -206,7 +206,7 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
         # The whole chain, in the targets' frames: the noise of its flanges is in it.
         looking, at_m = _of_things(fitted), middles
     else:
-        looking, at_m = _to_base(fitted, base, in_base), _carried(in_base, middles)
+        looking, at_m = _to_base(fitted, base, in_base), transform_point(in_base, middles)
         if need is not None and need.at != "views":
             at_m = np.where(carries[:, None], at_m, np.array(need.at))
     linear, covariance, parts = looking.linear(state, ideal=True), fitted.covariance, {}
@@ -245,7 +245,7 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
         robot,
         {name: it for name, it in placed.items() if it.any()},
         fitted.freedom.get(robot, np.inf),
-        float(np.linalg.norm(_carried(problem.measured(state), middles), axis=1).mean()),
+        float(np.linalg.norm(transform_point(problem.measured(state), middles), axis=1).mean()),
     )
 
 
@@ -326,11 +326,6 @@ def _by_boards(covariance: FloatArray, columns: IntArray) -> FloatArray:
     """(p, p) what would not be of a covariance, were the boards' shapes known."""
     among = covariance[:, columns]
     return np.asarray(among @ np.linalg.pinv(among[columns], hermitian=True) @ among.T)
-
-
-def _carried(poses: FloatArray, points: FloatArray) -> FloatArray:
-    """(n, 3) points by (n, 4, 4) poses."""
-    return np.asarray((poses[:, :3, :3] @ points[:, :, None])[:, :, 0] + poses[:, :3, 3])
 
 
 def _at_points(spreads: FloatArray, points_m: FloatArray) -> FloatArray:

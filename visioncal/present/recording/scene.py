@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 import rerun as rr
 
+from visioncal.core.transforms import transform_points
 from visioncal.core.types import Camera, FloatArray, Target
 from visioncal.present.recording import board, colours, paths
 from visioncal.present.recording.arm import log_arms, log_frames, placed
@@ -229,7 +230,7 @@ class Scene:
     def _carried(self, base_from_flange: FloatArray) -> list[FloatArray]:
         """The same at one stop, in the base."""
         return [
-            shape @ base_from_end[:3, :3].T + base_from_end[:3, 3]
+            transform_points(base_from_end, shape)
             for end, shape in self._shapes
             if (base_from_end := self._base_from(end, base_from_flange)) is not None
         ]
@@ -271,8 +272,7 @@ class Scene:
             strips[row], base_from_cam = [], self._base_from("cam", flange)
             if it.cam_from_target is not None and base_from_cam is not None:
                 base_from_target = base_from_cam @ it.cam_from_target
-                corners = self._outlines[name]
-                strips[row] = [corners @ base_from_target[:3, :3].T + base_from_target[:3, 3]]
+                strips[row] = [transform_points(base_from_target, self._outlines[name])]
         if not strips:
             return
         frame, width = rr.CoordinateFrame(paths.BASE_FRAME), self._radius(_LINE)
