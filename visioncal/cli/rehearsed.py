@@ -116,7 +116,6 @@ def recorded(
     fault: Faults | None,
     *,
     view: bool,
-    resume: bool = False,
 ) -> Recorded:
     """Records the plan's stops; where a fault is wanted, through it and on.
 
@@ -125,13 +124,13 @@ def recorded(
         DataError: The views cannot be written.
     """
     if fault is None:
-        steps = _drive(bench, scene, folder, watchers, resume=resume, view=view)
+        steps = _drive(bench, scene, folder, watchers, view=view)
         return Recorded(tuple(steps), None)
     injection = FaultInjection(bench, fault, after=max(1, len(scene.planned.stops) // 2))
     kept = _Kept()
     every = (*watchers, kept, injection)
     try:
-        _check_all_seen(_drive(bench, scene, folder, every, resume=False, view=view))
+        _check_all_seen(_drive(bench, scene, folder, every, view=view))
     except VisioncalError as error:
         reported_s = kept.missed_s or time.monotonic()
         if injection.injected_s is None:
@@ -168,8 +167,8 @@ def _drive(
     folder: Path,
     watchers: Sequence[Watcher],
     *,
-    resume: bool,
     view: bool,
+    resume: bool = False,
 ) -> list[Step]:
     with ExitStack() as opened, ended_like_ctrl_c():
         cell = opened.enter_context(bench.connected())

@@ -101,14 +101,11 @@ class Declaration(TableModel):
         return self.robot if len(self.robots) != 1 else next(iter(self.robots.values()))
 
 
-def read_declaration(
-    document: Mapping[str, Any], label: str, *, observed: bool = True
-) -> Declaration:
+def read_declaration(document: Mapping[str, Any], *, observed: bool = True) -> Declaration:
     """Checks the content of a session.toml.
 
     Args:
         document: The content, as TOML or JSON gives it.
-        label: The file's name, for messages.
         observed: Whether there are views, which something observed.
 
     Raises:
@@ -120,8 +117,8 @@ def read_declaration(
     if schema is not None and (schema != 1 or isinstance(schema, bool)):
         is_newer = isinstance(schema, int) and schema > 1
         raise DataError(
-            f"{label}: schema is {schema!r}; this version reads schema 1.",
-            culprits=[f"{label}: schema"],
+            f"session.toml: schema is {schema!r}; this version reads schema 1.",
+            culprits=["session.toml: schema"],
             next_step="A newer visioncal may read it." if is_newer else "Write schema = 1.",
         )
     hints: list[str] = []
@@ -131,22 +128,22 @@ def read_declaration(
         problems = list(_misfits(error.errors(), document))
     else:
         problems = list(_contradictions(declaration, observed))
-        hints = [it for it in _unknown_keys(declaration, "", label) if "Did you mean" in it]
+        hints = [it for it in _unknown_keys(declaration) if "Did you mean" in it]
     if problems:
         raise DataError(
-            f"{label}: {'; '.join(f'{field} {words}' for field, words in problems)}.",
-            culprits=[f"{label}: {field}" for field, _ in problems],
-            next_step=_nearest_mount(document, label) or " ".join(hints),
+            f"session.toml: {'; '.join(f'{field} {words}' for field, words in problems)}.",
+            culprits=[f"session.toml: {field}" for field, _ in problems],
+            next_step=_nearest_mount(document) or " ".join(hints),
         )
     return declaration
 
 
-def _nearest_mount(document: Mapping[str, Any], label: str) -> str:
+def _nearest_mount(document: Mapping[str, Any]) -> str:
     """What to write for a mount that is spelt otherwise; empty where that is not it."""
     given = str(document.get("mount", ""))
     spelt = given.lower().replace("_", "-").replace(" ", "-")
     is_meant = spelt in get_args(CameraMount) and spelt != given
-    return f'In {label}, write mount = "{spelt}".' if is_meant else ""
+    return f'In session.toml, write mount = "{spelt}".' if is_meant else ""
 
 
 def _misfits(
@@ -307,18 +304,18 @@ def _camera_contradictions(camera: CameraTable, path: str) -> Iterator[tuple[str
         yield f"{path}.matrix", f"is missing beside {path}.distortion: give both or neither"
 
 
-def declaration_warnings(declaration: Declaration, label: str) -> Iterator[str]:
+def declaration_warnings(declaration: Declaration) -> Iterator[str]:
     """Words what is allowed but suspicious: unknown keys, a principal point off the image."""
-    yield from _unknown_keys(declaration, "", label)
+    yield from _unknown_keys(declaration)
     edges = [*_EDGES, *(f"{it}_{name}" for it in _EDGES for name in declaration.targets)]
     for edge in declaration.prior:
         if not declaration.has_names and edge not in edges:
             hint = did_you_mean(edge, edges)
-            yield f"{label}: prior.{edge} is no unknown edge and is ignored. {hint}".strip()
+            yield f"session.toml: prior.{edge} is no unknown edge and is ignored. {hint}".strip()
     if declaration.camera is not None:
-        yield from _camera_warnings(declaration.camera, f"{label}: camera")
+        yield from _camera_warnings(declaration.camera, "session.toml: camera")
     for name, camera in declaration.cameras.items():
-        yield from _camera_warnings(camera, f"{label}: cameras.{name}")
+        yield from _camera_warnings(camera, f"session.toml: cameras.{name}")
 
 
 def _camera_warnings(camera: CameraTable, path: str) -> Iterator[str]:
@@ -332,16 +329,16 @@ def _camera_warnings(camera: CameraTable, path: str) -> Iterator[str]:
             )
 
 
-def _unknown_keys(table: BaseModel, path: str, label: str) -> Iterator[str]:
+def _unknown_keys(table: BaseModel, path: str = "session.toml: ") -> Iterator[str]:
     fields = type(table).model_fields
     known = [field.alias or name for name, field in fields.items()]
     for key in table.model_extra or {}:
         hint = did_you_mean(key, known)
-        yield f"{label}: {path}{key} is not a known field and is ignored. {hint}".strip()
+        yield f"{path}{key} is not a known field and is ignored. {hint}".strip()
     for name in fields:
         value = getattr(table, name)
         if isinstance(value, BaseModel):
-            yield from _unknown_keys(value, f"{path}{name}.", label)
+            yield from _unknown_keys(value, f"{path}{name}.")
         elif name in ("prior", "clocks", *(f"{it}s" for it in KINDS)):
             for key, entry in cast(Mapping[str, BaseModel], value).items():
-                yield from _unknown_keys(entry, f"{path}{name}.{key}.", label)
+                yield from _unknown_keys(entry, f"{path}{name}.{key}.")
