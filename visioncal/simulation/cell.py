@@ -67,7 +67,6 @@ class Cell:
         options: What was asked for.
         arm: The nominal arm.
         true_arm: The arm as it was built.
-        sheet: The board as it was printed; of two, the first.
         stated_camera: The intrinsics as the session states them.
         transforms: True edges, each (4, 4): `flange_from_cam` and `base_from_target`
             (eye-in-hand), or `base_from_cam` and `flange_from_target` (eye-to-hand); of two boards
@@ -89,7 +88,6 @@ class Cell:
     options: CellOptions
     arm: Arm
     true_arm: Arm
-    sheet: Sheet
     stated_camera: Camera
     transforms: Mapping[str, FloatArray]
     joints: FloatArray
@@ -103,6 +101,11 @@ class Cell:
     shown: Shown
     payloads: tuple[Payload, ...] = ()
     approach: FloatArray | None = None
+
+    @property
+    def sheet(self) -> Sheet:
+        """The board as it was printed; of two, the first."""
+        return self.sheets[0]
 
     def flange_at(self, q: FloatArray, payloads: Sequence[Payload] = ()) -> FloatArray:
         """Where the real arm's flange stands (k, 4, 4) at (k, n) joint angles [rad].
@@ -164,7 +167,6 @@ def simulate(options: CellOptions, postures: FloatArray | None = None) -> Cell:
         options=options,
         arm=arm,
         true_arm=true_arm,
-        sheet=sheets[0],
         stated_camera=mistaken(
             options.camera, options.lens_mismatch_px, stream(options, Stream.LENS)
         ),
