@@ -10,6 +10,7 @@ from support.whole_cells import misfit
 from visioncal import calibrate
 from visioncal.core.transforms import exp, invert
 from visioncal.session import MemoryImages, Session
+from visioncal.session.columns import pose_row
 from visioncal.session.corners import CornerTable
 from visioncal.simulation import (
     BOARDS,
@@ -19,7 +20,7 @@ from visioncal.simulation import (
     simulate,
     simulate_network,
 )
-from visioncal.simulation.records import pose_row, target_document
+from visioncal.simulation.records import target_document
 
 SIGMA_PX = 0.05
 # The size of the board is known: else it is most of what transforms are uncertain by.

@@ -29,7 +29,6 @@ from visioncal.robot.inertia import (
     LogCholesky,
     entries,
     matrices,
-    moving,
     parameters_of,
     pseudo_inertias,
 )
@@ -86,7 +85,6 @@ __all__ = [
     "load_robot",
     "matrices",
     "momenta",
-    "moving",
     "other_convention",
     "parallel_axes",
     "parameters_of",

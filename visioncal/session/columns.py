@@ -4,6 +4,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean
@@ -184,6 +185,12 @@ def _spelt_otherwise(columns: Sequence[str], missing: Sequence[str]) -> str:
     plain = {re.sub(r"[ _]*[\[(].*", "", name).lower(): name for name in columns}
     found = [plain[it] for it in missing if it in plain]
     return f"; {', '.join(found)} may be meant: names are plain and small" if found else ""
+
+
+def pose_row(pose: FloatArray) -> dict[str, float]:
+    """The columns of a pose (4, 4)."""
+    quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
+    return dict(zip(POSE, map(float, [*pose[:3, 3], *quaternion]), strict=True))
 
 
 def column_warnings(columns: Sequence[str]) -> Iterator[str]:

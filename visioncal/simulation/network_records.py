@@ -10,6 +10,7 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.session import MemoryImages, Session, View, frame_name
+from visioncal.session.columns import POSE, pose_row
 from visioncal.simulation.boards import corners_m
 from visioncal.simulation.exercise import Exercised
 from visioncal.simulation.network import first_pushed
@@ -24,14 +25,12 @@ from visioncal.simulation.options import CellOptions
 from visioncal.simulation.records import (
     camera_table,
     noisy_pose,
-    pose_row,
     target_document,
     target_place,
     write_truth,
 )
 from visioncal.simulation.render import Scene, encode, render, scene_of
 from visioncal.simulation.standing import Stream, stream
-from visioncal.simulation.sweep import POSE
 from visioncal.simulation.touching import Touching, write_touches
 
 # What rows have of what was seen: rendered images, the names of images that are not there, or the

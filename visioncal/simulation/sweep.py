@@ -16,6 +16,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, transform_point, transform_points
 from visioncal.core.types import FloatArray
 from visioncal.session import Stream as Recorded
+from visioncal.session.columns import POSE
 from visioncal.simulation.arms import forward
 from visioncal.simulation.boards import corners_m
 from visioncal.simulation.cell import (
@@ -31,7 +32,6 @@ from visioncal.simulation.optics import project, sees
 from visioncal.simulation.options import CellOptions
 from visioncal.simulation.second import Shown, chains
 
-POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 # A frame that shows less of the board gives no pose.
 _FEWEST_CORNERS = 8
 # In which row a corner is depends on when it is taken: by a few thousandths of itself each time.

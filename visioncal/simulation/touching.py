@@ -15,6 +15,7 @@ from visioncal.core.files import write_atomically
 from visioncal.core.transforms import compose, exp, invert, transform_points
 from visioncal.core.types import FloatArray, Mask
 from visioncal.session import frame_name
+from visioncal.session.columns import pose_row
 from visioncal.simulation import standing
 from visioncal.simulation.arms import Arm, forward, inverse, reach_m
 from visioncal.simulation.cell import (
@@ -27,7 +28,6 @@ from visioncal.simulation.cell import (
 )
 from visioncal.simulation.observed_points import Network
 from visioncal.simulation.options import CellOptions
-from visioncal.simulation.records import pose_row
 
 # How far off a contact is, per axis [m], and how far the flange tilts from straight down [rad].
 _CONTACT_M, _CONE_RAD = 5e-5, 0.75
