@@ -106,6 +106,7 @@ def _pickable(known: RunState) -> Fitted:
         columns_of_boards(solved),
         middles_moved(solved),
         answer.problem,
+        {name: it.noise_px * it.levels.jitter for name, it in answer.lenses.items()},
     )
 
 

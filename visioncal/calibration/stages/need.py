@@ -6,7 +6,8 @@ Where the robot arrives differs from the thing by
     calibration   the chain from the robot's base to the camera and the lens: the errors of all
                   unknowns together, through the same slopes that the fit has
     board         by what the uncertainty of its size and shape did to these; the thing is another
-    look          the robot's noise at the look, where it carries the camera
+    look          the robot's noise at the look, where it carries the camera; and the focus, where
+                  that changes from image to image
     arm           errors that follow the arm's posture and were not calibrated
     pick          the noise of the flange when it goes there; a tool's length adds to it
     left out      as far as views that were left out of the fit err by more than is predicted of
@@ -30,7 +31,7 @@ from visioncal.calibration.stages.validate import HeldOut
 from visioncal.core.limits import NeedLimits
 from visioncal.core.number_format import figure
 from visioncal.core.quantiles import chi2_limit
-from visioncal.core.transforms import adjoint, invert, skew, transform_point
+from visioncal.core.transforms import adjoint, invert, skew
 from visioncal.core.types import FloatArray, IntArray, Need
 from visioncal.estimation.arm import ArmErrors, misfit_jacobian
 from visioncal.estimation.parts import Noise, State
@@ -142,6 +143,7 @@ class Fitted:
         of_boards: The problem's columns of boards' shapes.
         moved: (3, b) how the middle of each target moves with these, by its frame [m].
         whole: The observations of all pairs, merged or not, that the fit was made from.
+        jitters: By which share the focal length of each camera changes from image to image.
         inflation: By how much the covariance was multiplied because neighbouring stops err alike.
     """
 
@@ -156,6 +158,7 @@ class Fitted:
     of_boards: IntArray
     moved: Mapping[str, FloatArray]
     whole: Problem
+    jitters: Mapping[str, float]
     inflation: float = 1.0
 
 
@@ -206,7 +209,7 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
         # The whole chain, in the targets' frames: the noise of its flanges is in it.
         looking, at_m = _of_things(fitted), middles
     else:
-        looking, at_m = _to_base(fitted, base, in_base), transform_point(in_base, middles)
+        looking, at_m = _to_base(fitted, base, in_base), _carried(in_base, middles)
         if need is not None and need.at != "views":
             at_m = np.where(carries[:, None], at_m, np.array(need.at))
     linear, covariance, parts = looking.linear(state, ideal=True), fitted.covariance, {}
@@ -235,6 +238,12 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
         look = looking.total_covariance(linear, noise) - looking.covariance(noise)
     parts["look"] = look
     placed = {name: _at_points(it, at_m) for name, it in parts.items()}
+    poses = problem.measured(state)
+    turns = np.swapaxes(poses[:, :3, :3], 1, 2)
+    axes = (turns if whole else in_base[:, :3, :3] @ turns)[:, :, 2]
+    # A focal length that is longer by a share shows a thing nearer by it.
+    nearer_m = fitted.jitters.get(camera, 0.0) * _carried(poses, middles)[:, 2, None] * axes
+    placed["look"][:, 3:, 3:] += nearer_m[:, :, None] * nearer_m[:, None]
     # A camera that is carried looks from another posture than the robot then has; before one that
     # stands still it is the same, and of a whole chain its noise is among the chain's already.
     going = np.where(carries[:, None, None], _axes(level), 0.0 if whole else _axes(white))
@@ -245,7 +254,7 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
         robot,
         {name: it for name, it in placed.items() if it.any()},
         fitted.freedom.get(robot, np.inf),
-        float(np.linalg.norm(transform_point(problem.measured(state), middles), axis=1).mean()),
+        float(np.linalg.norm(_carried(problem.measured(state), middles), axis=1).mean()),
     )
 
 
@@ -326,6 +335,11 @@ def _by_boards(covariance: FloatArray, columns: IntArray) -> FloatArray:
     """(p, p) what would not be of a covariance, were the boards' shapes known."""
     among = covariance[:, columns]
     return np.asarray(among @ np.linalg.pinv(among[columns], hermitian=True) @ among.T)
+
+
+def _carried(poses: FloatArray, points: FloatArray) -> FloatArray:
+    """(n, 3) points by (n, 4, 4) poses."""
+    return np.asarray((poses[:, :3, :3] @ points[:, :, None])[:, :, 0] + poses[:, :3, 3])
 
 
 def _at_points(spreads: FloatArray, points_m: FloatArray) -> FloatArray:
