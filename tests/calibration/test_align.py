@@ -18,7 +18,7 @@ from visioncal.interchange.exports import Selection, document
 from visioncal.results import Alignment, Calibration, to_document
 from visioncal.robot import load_robot
 from visioncal.session import Session
-from visioncal.session.columns import POSE, pose_row
+from visioncal.session.columns import POSE
 from visioncal.simulation import CellOptions, simulate
 from visioncal.simulation.layout import (
     BoardAt,
@@ -32,7 +32,7 @@ from visioncal.simulation.layout import (
 from visioncal.simulation.network import simulate_network
 from visioncal.simulation.network_records import network_session
 from visioncal.simulation.optics import fine_camera
-from visioncal.simulation.records import pairs_session
+from visioncal.simulation.records import pairs_session, pose_row
 from visioncal.simulation.sag import Payload
 
 STOPS = 20

@@ -14,7 +14,6 @@ from visioncal.calibration.pipeline.checkup import doctor
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.interchange.formats.exchanging import exchange_views
 from visioncal.session import MemoryImages, Session
-from visioncal.session.columns import POSE, pose_row
 from visioncal.simulation import (
     BOARDS,
     BoardAt,
@@ -23,6 +22,7 @@ from visioncal.simulation import (
     network_session,
     simulate_network,
 )
+from visioncal.simulation.records import POSE, pose_row
 
 # Three cameras, so that two or more see by way of a robot at most stops.
 CELL = replace(

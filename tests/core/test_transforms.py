@@ -23,18 +23,6 @@ def test_invert_undoes_and_agrees_with_scipy(poses):
     np.testing.assert_allclose(transforms.invert(poses), expected, atol=1e-14)
 
 
-def test_points_are_taken_along_as_by_scipy(poses):
-    points, scipys = (
-        np.random.default_rng(5).normal(size=(30, 3)),
-        RigidTransform.from_matrix(poses),
-    )
-    np.testing.assert_allclose(
-        transforms.transform_point(poses, points), scipys.apply(points), atol=1e-14
-    )
-    by_each = np.array([it.apply(points) for it in scipys])
-    np.testing.assert_allclose(transforms.transform_points(poses, points), by_each, atol=1e-14)
-
-
 def test_exp_and_log_undo_each_other(poses):
     np.testing.assert_allclose(transforms.exp(transforms.log(poses)), poses, atol=1e-12)
 

@@ -265,6 +265,15 @@ def test_intrinsics_that_are_off_by_less_than_images_show_are_no_doubt(off_px, s
     assert mahalanobis_sq(cell, known) < UNLIKELY
 
 
+@pytest.mark.parametrize("seed", [1, 3])
+def test_a_focal_length_that_is_off_by_less_than_shows_beyond_chance_is_in_doubt(seed):
+    # From such distances a focal length shows in the motion alone, and moves the camera by 0.7 mm.
+    cell = simulate(replace(FINE, mount="eye-to-hand", seed=seed, distance_m=(0.6, 0.75)))
+    focal_px = cell.options.camera.matrix * [1.0, 1.0, 0.0, 0.0]
+    known = with_lens(cell, 1e-3 * focal_px)
+    assert mahalanobis_sq(cell, known) < UNLIKELY
+
+
 def test_given_intrinsics_that_do_not_fit_are_refined_or_held_as_asked():
     cell = simulate(replace(FINE, seed=5, views=15))
     off = np.array([6.0, 6.0, -8.0, 5.0])

@@ -20,7 +20,13 @@ from visioncal.estimation.solve import (
     robot_likelihood,
     solve_problem,
 )
-from visioncal.estimation.variance import Components, Knowledge, estimate_sigmas, likelihood
+from visioncal.estimation.variance import (
+    Components,
+    Knowledge,
+    estimate_sigmas,
+    likelihood,
+    likely_sigma,
+)
 from visioncal.simulation import CellOptions, fine_camera, simulate
 
 FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
@@ -245,3 +251,14 @@ def test_a_noise_level_of_nothing_is_found_beside_a_large_one():
     # Forty of them tell a level to a ninth.
     assert sigmas[0] == pytest.approx(1.0, rel=0.4)
     assert sigmas[1] < 1e-5
+
+
+def test_a_size_is_expected_as_large_as_values_are_beyond_their_noise():
+    covariance = np.diag([1.0, 4.0])
+    assert likely_sigma(np.array([0.5, -1.0]), covariance) == 0.0
+    # Values of fifty times their noise: their own root mean square, two of them.
+    values = np.array([50.0, 80.0])
+    expected = np.sqrt(np.mean(values**2))
+    assert likely_sigma(values, covariance) == pytest.approx(expected, rel=0.01)
+    # At twice the noise the size is as likely to be nothing.
+    assert 0.3 < likely_sigma(np.array([2.0]), np.eye(1)) < 1.0

@@ -13,9 +13,8 @@ from visioncal.calibration.stages.reported_poses import Reported
 from visioncal.core.transforms import invert, log
 from visioncal.robot import Robot, load_robot
 from visioncal.session import MemoryImages, Session, View
-from visioncal.session.columns import pose_row
 from visioncal.simulation import Cell, CellOptions, Sweep
-from visioncal.simulation.records import approach_text, load_row
+from visioncal.simulation.records import approach_text, load_row, pose_row
 from visioncal.simulation.second import NAMES
 
 

@@ -17,7 +17,6 @@ from visioncal.cli.recorded_cell import Scene, facts_of, scene_of, shown_in
 from visioncal.core.choices import Faults
 from visioncal.core.errors import DataError, DriverError, VisioncalError
 from visioncal.core.interrupts import ended_like_ctrl_c
-from visioncal.core.transforms import transform_point
 from visioncal.core.types import FloatArray
 from visioncal.frames.touch_test import judged, touch_points
 from visioncal.interchange.outputs import Written, write_outputs, write_plan
@@ -53,7 +52,7 @@ def touched(folder: Path, calibration: Calibration, base_from_target: FloatArray
         base_from_target: (4, 4) the truth.
     """
     points = touch_points(Session.load(folder), calibration)
-    true = [transform_point(base_from_target, it.board_m) for it in points]
+    true = [base_from_target[:3, :3] @ it.board_m + base_from_target[:3, 3] for it in points]
     gaps = [
         1e3 * float(np.linalg.norm(it.base_m - at)) for it, at in zip(points, true, strict=True)
     ]
@@ -116,6 +115,7 @@ def recorded(
     fault: Faults | None,
     *,
     view: bool,
+    resume: bool = False,
 ) -> Recorded:
     """Records the plan's stops; where a fault is wanted, through it and on.
 
@@ -124,13 +124,13 @@ def recorded(
         DataError: The views cannot be written.
     """
     if fault is None:
-        steps = _drive(bench, scene, folder, watchers, view=view)
+        steps = _drive(bench, scene, folder, watchers, resume=resume, view=view)
         return Recorded(tuple(steps), None)
     injection = FaultInjection(bench, fault, after=max(1, len(scene.planned.stops) // 2))
     kept = _Kept()
     every = (*watchers, kept, injection)
     try:
-        _check_all_seen(_drive(bench, scene, folder, every, view=view))
+        _check_all_seen(_drive(bench, scene, folder, every, resume=False, view=view))
     except VisioncalError as error:
         reported_s = kept.missed_s or time.monotonic()
         if injection.injected_s is None:
@@ -167,8 +167,8 @@ def _drive(
     folder: Path,
     watchers: Sequence[Watcher],
     *,
+    resume: bool,
     view: bool,
-    resume: bool = False,
 ) -> list[Step]:
     with ExitStack() as opened, ended_like_ctrl_c():
         cell = opened.enter_context(bench.connected())

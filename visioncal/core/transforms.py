@@ -42,18 +42,6 @@ def compose(rotation: FloatArray, translation: FloatArray) -> FloatArray:
     return matrices
 
 
-def transform_points(a_from_b: FloatArray, points: FloatArray) -> FloatArray:
-    """Takes (..., n, 3) points of frame b to frame a: all of them, by each of (..., 4, 4)."""
-    turned = points @ np.swapaxes(a_from_b[..., :3, :3], -1, -2)
-    return np.asarray(turned + a_from_b[..., None, :3, 3])
-
-
-def transform_point(a_from_b: FloatArray, point: FloatArray) -> FloatArray:
-    """Takes (..., 3) points of frame b to frame a: each by its own of (..., 4, 4)."""
-    turned = (a_from_b[..., :3, :3] @ point[..., None])[..., 0]
-    return np.asarray(turned + a_from_b[..., :3, 3])
-
-
 def skew(vectors: FloatArray) -> FloatArray:
     """Builds the (..., 3, 3) matrices of the cross product with (..., 3) vectors."""
     matrices = np.zeros((*vectors.shape, 3))

@@ -9,7 +9,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.identified import Identified
 from visioncal.dynamics.model import Friction
-from visioncal.robot import Inertias, Robot, joint_torques, momenta, with_inertias
+from visioncal.robot import Inertias, Robot, joint_torques, momenta, moving, with_inertias
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,8 +109,9 @@ class ArmDynamics:
         Args:
             body: (10,) inertial parameters in the flange's frame, in the order of `Inertias`.
         """
-        inertias = self.inertias.carrying(self.robot.chain.placements[-1], body)
-        return replace(self, inertias=inertias)
+        values = self.inertias.values.copy()
+        values[-1] += moving(self.robot.chain.placements[-1]) @ body
+        return replace(self, inertias=Inertias(values))
 
     def weighed(self) -> Robot:
         """The robot whose document states these inertias, as the elastic level uses them."""

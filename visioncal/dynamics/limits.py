@@ -10,7 +10,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.motion import Motion
-from visioncal.robot import Inertias, Robot, joint_torques
+from visioncal.robot import Inertias, Robot, joint_torques, moving
 from visioncal.robot.bodies import Body, arm_bodies
 from visioncal.robot.collision import Collisions
 
@@ -219,8 +219,9 @@ def _check_left(allowed: Allowed) -> None:
 def _carrying(allowed: Allowed, payload: FloatArray) -> Allowed:
     if allowed.inertias is None:
         return allowed
-    inertias = allowed.inertias.carrying(allowed.robot.chain.placements[-1], payload)
-    return replace(allowed, inertias=inertias)
+    values = allowed.inertias.values.copy()
+    values[-1] += moving(allowed.robot.chain.placements[-1]) @ payload
+    return replace(allowed, inertias=Inertias(values))
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.parts import Effect, Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import RobotLikelihood, normal_equations
-from visioncal.estimation.variance import LEAST_SIGMA, Components, Knowledge
+from visioncal.estimation.variance import LEAST_SIGMA, Components, Knowledge, level_weight
 from visioncal.robot import Robot
 
 # Arms are off by some 0.5 mm for each mrad.
@@ -154,10 +154,7 @@ def find_arm_errors(
     gain = 2.0 * (unlikely - value)
     if gain <= least:
         return None
-    # The variance that is expected of both: one more level costs one of the log-likelihood
-    # (Akaike), by which exact links are weighed against these.
-    weight = 1.0 / (1.0 + np.exp(1.0 - 0.5 * gain))
-    return ArmErrors(basis, float(np.sqrt(weight)) * sigma, gain, of_links)
+    return ArmErrors(basis, float(np.sqrt(level_weight(gain))) * sigma, gain, of_links)
 
 
 def _most_likely_size(

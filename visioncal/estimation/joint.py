@@ -377,6 +377,14 @@ class Scores:
         among[self.columns] = np.isin(self.places, moving)
         return float(self.gradient @ covariance_among(self.information, among) @ self.gradient)
 
+    def asked_for(self, places: IntArray) -> tuple[FloatArray, FloatArray]:
+        """By how much (k,) held values would move if they were free, and its (k, k) covariance."""
+        among = self.moving.copy()
+        among[self.columns] |= np.isin(self.places, places)
+        covariance = covariance_among(self.information, among)
+        at = self.columns.start + np.searchsorted(self.places, places)
+        return -covariance[at] @ self.gradient, covariance[np.ix_(at, at)]
+
 
 def _at(side: Side, fitted: Fitted, seen: LinearisedCorners) -> tuple[Problem, State]:
     """The problem with other values free, and a fit's state in it."""

@@ -14,10 +14,9 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from visioncal.core.quantiles import f_limit
-from visioncal.core.transforms import transform_points
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.placing import LEAST_NOISE_M
-from visioncal.estimation.procrustes import align, procrustes_residual
+from visioncal.estimation.procrustes import align, apply, procrustes_residual
 
 # So many orders are all tried: seven points of seven.
 _EXHAUSTIVE = 5040
@@ -152,7 +151,7 @@ def _orders(measured: FloatArray, nominal: FloatArray) -> IntArray:
         triangle = free[_large_triangle(measured[free])]
         free = np.setdiff1d(free, triangle)
         triples = _similar_triples(measured[triangle], nominal)
-        placed = transform_points(align(measured[triangle][None], nominal[triples]), nominal[None])
+        placed = apply(align(measured[triangle][None], nominal[triples]), nominal[None])
         # No order is better than every point's nearest one.
         lower = [float(_squares(measured, it).min(axis=1).sum()) for it in placed]
         nearest = np.argsort(lower, kind="stable")[:_PLACES]
@@ -165,7 +164,7 @@ def _nearest(measured: FloatArray, nominal: FloatArray, placed: FloatArray) -> I
     for _ in range(2):
         order = linear_sum_assignment(_squares(measured, placed))[1]
         # A triangle's few points lay the drawing less well than all of them.
-        placed = transform_points(align(measured, nominal[order]), nominal)
+        placed = apply(align(measured, nominal[order]), nominal)
     return np.asarray(order)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.core.quantiles import t_chance
-from visioncal.core.transforms import exp, skew, transform_points
+from visioncal.core.transforms import exp, skew
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.group_outliers import GroupInliers, agreeing_groups
 from visioncal.estimation.groups import GroupFit, Groups, fit_groups
@@ -29,6 +29,7 @@ from visioncal.estimation.pointpairs import (
 )
 from visioncal.estimation.procrustes import (
     align,
+    apply,
     procrustes_residual,
     scale_between,
     spreads,
@@ -130,7 +131,7 @@ class PointProblem:
         if self.scaled:
             columns.append(-(rotation @ self.pairs.nominal[:, :, None]))
         return Groups(
-            self.pairs.measured - transform_points(state.base_from_fixture, points),
+            self.pairs.measured - apply(state.base_from_fixture, points),
             np.concatenate(columns, axis=2),
             np.ones(points.shape, dtype=bool),
             self.pairs.known,

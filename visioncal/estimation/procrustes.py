@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from visioncal.core.transforms import compose, nearest_rotation, transform_points
+from visioncal.core.transforms import compose, nearest_rotation
 from visioncal.core.types import FloatArray
 
 # One reflection: with a rotation behind it, it is any other.
@@ -28,9 +28,15 @@ def align(measured: FloatArray, nominal: FloatArray) -> FloatArray:
     return compose(rotation, centre_a - (rotation @ centre_b[..., None])[..., 0])
 
 
+def apply(matrices: FloatArray, points: FloatArray) -> FloatArray:
+    """Carries (..., n, 3) points through (..., 4, 4) transforms."""
+    turned = points @ np.swapaxes(matrices[..., :3, :3], -1, -2)
+    return np.asarray(turned + matrices[..., None, :3, 3])
+
+
 def procrustes_residual(measured: FloatArray, nominal: FloatArray) -> FloatArray:
     """Sums (...,) the squared distances [m^2] that the best rigid transform leaves."""
-    left = measured - transform_points(align(measured, nominal), nominal)
+    left = measured - apply(align(measured, nominal), nominal)
     return np.asarray(np.sum(left**2, axis=(-1, -2)))
 
 

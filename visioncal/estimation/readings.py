@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.core.transforms import compose, invert, transform_point
+from visioncal.core.transforms import compose, invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.touching import Touches, linear_tip
 
@@ -83,7 +83,7 @@ def _reordered(poses: FloatArray, shift: int) -> FloatArray:
 
 def _linear_rms(touches: Touches) -> float:
     poses = touches.base_from_flange
-    met = transform_point(poses, linear_tip(poses, touches.points))
+    met = poses[:, :3, :3] @ linear_tip(poses, touches.points) + poses[:, :3, 3]
     away = [
         met[touches.points == it] - met[touches.points == it].mean(axis=0)
         for it in np.unique(touches.points)
@@ -97,9 +97,9 @@ def _axes_rms(touches: Touches) -> float:
     there = touches.subset(touches.are("point"))
     poses = there.base_from_flange
     tip = linear_tip(poses, there.points)
-    point = transform_point(poses, tip).mean(axis=0)
+    point = (poses[:, :3, :3] @ tip + poses[:, :3, 3]).mean(axis=0)
     back = invert(touches.base_from_flange)
-    seen = transform_point(back, point) - tip
+    seen = back[:, :3, :3] @ point + back[:, :3, 3] - tip
     along, beside = seen[touches.are("z")], seen[touches.are("xz")]
     if not len(along):
         return 0.0

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Hashable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -75,6 +75,7 @@ class CornerProblem:
         shares: (m,) as how much of a view each counts for lens and board; see `repeat_shares`.
         contested: Whether given intrinsics are held although the corners speak against them.
         levels: Sizes of what the lens does beyond its model; None before they were estimated.
+        doubted: Places of given intrinsics that may be off by as much as they are known to.
     """
 
     scene: Scene
@@ -85,6 +86,7 @@ class CornerProblem:
     shares: FloatArray
     contested: bool = False
     levels: LensLevels | None = None
+    doubted: IntArray = field(default_factory=lambda: np.zeros(0, dtype=int))
 
     @classmethod
     def of(
@@ -118,6 +120,11 @@ class CornerProblem:
     def without_levels(self) -> "CornerProblem":
         """The same problem, its lens being what its model says."""
         return replace(self, stack=replace(self.stack, zooms=None), levels=None)
+
+    def with_lens_sigma(self, sigma: FloatArray, doubted: IntArray) -> "CornerProblem":
+        """The same problem, the intrinsics being known to (k,), and those in doubt counting."""
+        boards = self.prior_sigma[len(self.lens) :]
+        return replace(self, prior_sigma=np.concatenate([sigma, boards]), doubted=doubted)
 
     def without_prior(self, columns: IntArray) -> "CornerProblem":
         """The same problem, some values of which nobody has stated."""
@@ -210,7 +217,7 @@ class CornerProblem:
         if self.scene.estimated or self.contested:
             return np.concatenate([self.lens, np.union1d(self.scale, self.points)])
         stated = self.scene.matrix_sigma_px is not None
-        lens = self.lens[:4] if stated else self.lens[:0]
+        lens = self.lens[:4] if stated else self.doubted
         return np.concatenate([lens, np.union1d(self.scale, self.points)])
 
 

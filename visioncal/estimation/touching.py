@@ -17,7 +17,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from visioncal.core.transforms import compose, exp, invert, nearest_rotation, skew, transform_point
+from visioncal.core.transforms import compose, exp, invert, nearest_rotation, skew
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.groups import Groups
 from visioncal.estimation.parts import Noise
@@ -105,7 +105,7 @@ class TouchProblem:
         touches = self.touches
         base_from_flange = touches.base_from_flange
         tip = linear_tip(base_from_flange[rows], touches.points[rows])
-        seen = transform_point(base_from_flange, tip)
+        seen = base_from_flange[:, :3, :3] @ tip + base_from_flange[:, :3, 3]
         there = touches.are("point")
         points = np.array(
             [
@@ -194,7 +194,9 @@ def linear_tip(base_from_flange: FloatArray, points: IntArray) -> FloatArray:
 
 def _in_flange(touches: Touches, points: FloatArray) -> FloatArray:
     """Where each touch has its point in the flange's frame: (n, 3) [m]."""
-    return transform_point(invert(touches.base_from_flange), points[touches.points])
+    flange_from_base = invert(touches.base_from_flange)
+    turned = flange_from_base[:, :3, :3] @ points[touches.points][:, :, None]
+    return np.asarray(turned[:, :, 0] + flange_from_base[:, :3, 3])
 
 
 def _main_direction(vectors: FloatArray) -> FloatArray:

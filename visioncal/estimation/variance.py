@@ -28,6 +28,10 @@ _SURELY, _SHORT_STEP = 3.0, 0.5
 # and how far and how exactly it is followed, in logarithms.
 _SURPRISE_95, _FIRST_WIDTH, _WIDEST, _EXACT = 1.96, 0.125, 4.0, 0.02
 
+# Logarithms of the ratio of a value's variance to that of its measurement; and a share of a
+# measurement that is not worth following.
+_LIKELY_RANGE, _FOLLOWED = (-7.0, 12.0), 1e-2
+
 
 @dataclass(frozen=True, eq=False)
 class Components:
@@ -214,6 +218,42 @@ def _bounded_step(
             break
         step, bound = np.clip(step, least, most), bound | beyond
     return step
+
+
+def level_weight(gain: float) -> float:
+    """How likely it is that a level is not zero (Akaike 1974: one more costs one of the logarithm).
+
+    Args:
+        gain: By how much twice the logarithm of the likelihood falls without it.
+    """
+    return float(1.0 / (1.0 + np.exp(1.0 - 0.5 * gain)))
+
+
+def likely_sigma(found: FloatArray, covariance: FloatArray) -> float:
+    """The size of k values that may be zero, averaged over their being so.
+
+    Args:
+        found: (k,) the values, as they were measured.
+        covariance: (k, k) of that.
+
+    Returns:
+        The standard deviation under which the values would be expected where they are on average:
+        those of restricted likelihood, and zero, each as likely as it is.
+    """
+    from scipy.optimize import minimize_scalar
+
+    variances, axes = np.linalg.eigh(covariance)
+    squares, typical = (axes.T @ found) ** 2, float(variances.mean())
+
+    def unlikely(log: float) -> float:
+        total = variances + typical * np.exp(log)
+        return float(np.sum(np.log(total) + squares / total))
+
+    best = minimize_scalar(unlikely, bounds=_LIKELY_RANGE, method="bounded")
+    weight = level_weight(unlikely(-np.inf) - best.fun)
+    ratio = float(np.exp(best.x))
+    followed = weight * ratio / (1.0 + ratio)
+    return float(np.sqrt(typical * followed / (1.0 - followed))) if followed > _FOLLOWED else 0.0
 
 
 def profile_interval(

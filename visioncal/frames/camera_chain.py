@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import adjoint, invert, rigid_fault, skew, transform_point
+from visioncal.core.transforms import adjoint, invert, rigid_fault, skew
 from visioncal.core.types import Camera, FloatArray, Mount
 from visioncal.estimation.arm import pose_basis
 from visioncal.estimation.chain import edge_names
@@ -179,7 +179,7 @@ class Stop:
 
     def point(self, point_cam: FloatArray) -> FloatArray:
         """(3,) a point of the camera's frame in the base [m]."""
-        return transform_point(self.base_from_cam, point_cam)
+        return np.asarray(self.base_from_cam[:3, :3] @ point_cam + self.base_from_cam[:3, 3])
 
     def by_camera(self, point_cam: FloatArray) -> FloatArray:
         """(3, 6) how a point that is fixed to the camera moves with the camera's perturbation."""

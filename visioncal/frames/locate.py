@@ -8,7 +8,6 @@ import numpy as np
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
-from visioncal.core.transforms import transform_point
 from visioncal.core.types import Corners, FloatArray, Image, Target
 from visioncal.estimation.observability import SIGMA_LIMIT_M
 from visioncal.frames.camera_chain import Eye, Pose, Stop, checked_point, point_slope
@@ -240,7 +239,7 @@ def locate_target(
     board = target if isinstance(target, Target) else load_target(target)
     view = see(eye, seen, board, label, sigma_px)
     point = checked_point(point_target_m, "point_target_m")
-    places = transform_point(view.cam_from_target, point)
+    places = view.cam_from_target[:, :3, :3] @ point + view.cam_from_target[:, :3, 3]
     pose, point_cam = view.cam_from_target[0], places[0]
     turned = stop.base_from_cam[:3, :3] @ point_slope(pose, point)
     parts = {

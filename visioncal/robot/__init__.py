@@ -29,6 +29,7 @@ from visioncal.robot.inertia import (
     LogCholesky,
     entries,
     matrices,
+    moving,
     parameters_of,
     pseudo_inertias,
 )
@@ -85,6 +86,7 @@ __all__ = [
     "load_robot",
     "matrices",
     "momenta",
+    "moving",
     "other_convention",
     "parallel_axes",
     "parameters_of",

@@ -60,12 +60,6 @@ class Inertias:
         moments = kg[:, None] * centres_m
         return cls(np.column_stack([kg, moments, entries(about_origin)]))
 
-    def carrying(self, link_from_body: FloatArray, body: FloatArray) -> "Inertias":
-        """The same with a body (10,) on the last link, whose frame (4, 4) is in the link's."""
-        values = self.values.copy()
-        values[-1] += moving(link_from_body) @ body
-        return Inertias(values)
-
     @property
     def masses(self) -> Masses:
         """Masses and their centres; the centre of what weighs nothing is the frame's origin."""

@@ -13,7 +13,6 @@ import numpy as np
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.files import Table
-from visioncal.core.transforms import transform_point
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.robot.chain import number_list
 
@@ -148,7 +147,7 @@ def masses_of_rows(rows: Sequence[Table], joint_from_row: FloatArray) -> Masses 
         if mass < 0.0:
             raise row.refuse("mass_kg", mass, "a mass of 0 kg or more")
         kg.append(mass)
-        centres.append(transform_point(frame, number_list(row, "com_m", 3)))
+        centres.append(frame[:3, :3] @ number_list(row, "com_m", 3) + frame[:3, 3])
     return Masses(np.array(kg), np.array(centres))
 
 

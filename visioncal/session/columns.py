@@ -4,7 +4,6 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean
@@ -187,13 +186,7 @@ def _spelt_otherwise(columns: Sequence[str], missing: Sequence[str]) -> str:
     return f"; {', '.join(found)} may be meant: names are plain and small" if found else ""
 
 
-def pose_row(pose: FloatArray) -> dict[str, float]:
-    """The columns of a pose (4, 4)."""
-    quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
-    return dict(zip(POSE, map(float, [*pose[:3, 3], *quaternion]), strict=True))
-
-
-def column_warnings(columns: Sequence[str]) -> Iterator[str]:
+def column_warnings(columns: Sequence[str], where: str) -> Iterator[str]:
     """Words a hint for every unknown column that looks like a known one misspelt."""
     known = _TEXTS | _PLAIN_NUMBERS | {f"q{number}_rad" for number in range(1, 8)}
     for name in columns:
@@ -201,4 +194,4 @@ def column_warnings(columns: Sequence[str]) -> Iterator[str]:
         is_other = name in known or is_number(name) or re.split(r"[_.]", name)[0] in known
         meant = name.replace("_deg", "_rad")
         if hint := "" if is_other else did_you_mean(meant, known, _MISSPELT):
-            yield f"views.csv: column {name} is not a known one and is kept as text. {hint}"
+            yield f"{where}: column {name} is not a known one and is kept as text. {hint}"

@@ -101,11 +101,14 @@ class Declaration(TableModel):
         return self.robot if len(self.robots) != 1 else next(iter(self.robots.values()))
 
 
-def read_declaration(document: Mapping[str, Any], *, observed: bool = True) -> Declaration:
+def read_declaration(
+    document: Mapping[str, Any], label: str, *, observed: bool = True
+) -> Declaration:
     """Checks the content of a session.toml.
 
     Args:
         document: The content, as TOML or JSON gives it.
+        label: The file's name, for messages.
         observed: Whether there are views, which something observed.
 
     Raises:
@@ -117,8 +120,8 @@ def read_declaration(document: Mapping[str, Any], *, observed: bool = True) -> D
     if schema is not None and (schema != 1 or isinstance(schema, bool)):
         is_newer = isinstance(schema, int) and schema > 1
         raise DataError(
-            f"session.toml: schema is {schema!r}; this version reads schema 1.",
-            culprits=["session.toml: schema"],
+            f"{label}: schema is {schema!r}; this version reads schema 1.",
+            culprits=[f"{label}: schema"],
             next_step="A newer visioncal may read it." if is_newer else "Write schema = 1.",
         )
     hints: list[str] = []
@@ -128,22 +131,22 @@ def read_declaration(document: Mapping[str, Any], *, observed: bool = True) -> D
         problems = list(_misfits(error.errors(), document))
     else:
         problems = list(_contradictions(declaration, observed))
-        hints = [it for it in _unknown_keys(declaration) if "Did you mean" in it]
+        hints = [it for it in _unknown_keys(declaration, "", label) if "Did you mean" in it]
     if problems:
         raise DataError(
-            f"session.toml: {'; '.join(f'{field} {words}' for field, words in problems)}.",
-            culprits=[f"session.toml: {field}" for field, _ in problems],
-            next_step=_nearest_mount(document) or " ".join(hints),
+            f"{label}: {'; '.join(f'{field} {words}' for field, words in problems)}.",
+            culprits=[f"{label}: {field}" for field, _ in problems],
+            next_step=_nearest_mount(document, label) or " ".join(hints),
         )
     return declaration
 
 
-def _nearest_mount(document: Mapping[str, Any]) -> str:
+def _nearest_mount(document: Mapping[str, Any], label: str) -> str:
     """What to write for a mount that is spelt otherwise; empty where that is not it."""
     given = str(document.get("mount", ""))
     spelt = given.lower().replace("_", "-").replace(" ", "-")
     is_meant = spelt in get_args(CameraMount) and spelt != given
-    return f'In session.toml, write mount = "{spelt}".' if is_meant else ""
+    return f'In {label}, write mount = "{spelt}".' if is_meant else ""
 
 
 def _misfits(
@@ -304,18 +307,18 @@ def _camera_contradictions(camera: CameraTable, path: str) -> Iterator[tuple[str
         yield f"{path}.matrix", f"is missing beside {path}.distortion: give both or neither"
 
 
-def declaration_warnings(declaration: Declaration) -> Iterator[str]:
+def declaration_warnings(declaration: Declaration, label: str) -> Iterator[str]:
     """Words what is allowed but suspicious: unknown keys, a principal point off the image."""
-    yield from _unknown_keys(declaration)
+    yield from _unknown_keys(declaration, "", label)
     edges = [*_EDGES, *(f"{it}_{name}" for it in _EDGES for name in declaration.targets)]
     for edge in declaration.prior:
         if not declaration.has_names and edge not in edges:
             hint = did_you_mean(edge, edges)
-            yield f"session.toml: prior.{edge} is no unknown edge and is ignored. {hint}".strip()
+            yield f"{label}: prior.{edge} is no unknown edge and is ignored. {hint}".strip()
     if declaration.camera is not None:
-        yield from _camera_warnings(declaration.camera, "session.toml: camera")
+        yield from _camera_warnings(declaration.camera, f"{label}: camera")
     for name, camera in declaration.cameras.items():
-        yield from _camera_warnings(camera, f"session.toml: cameras.{name}")
+        yield from _camera_warnings(camera, f"{label}: cameras.{name}")
 
 
 def _camera_warnings(camera: CameraTable, path: str) -> Iterator[str]:
@@ -329,16 +332,16 @@ def _camera_warnings(camera: CameraTable, path: str) -> Iterator[str]:
             )
 
 
-def _unknown_keys(table: BaseModel, path: str = "session.toml: ") -> Iterator[str]:
+def _unknown_keys(table: BaseModel, path: str, label: str) -> Iterator[str]:
     fields = type(table).model_fields
     known = [field.alias or name for name, field in fields.items()]
     for key in table.model_extra or {}:
         hint = did_you_mean(key, known)
-        yield f"{path}{key} is not a known field and is ignored. {hint}".strip()
+        yield f"{label}: {path}{key} is not a known field and is ignored. {hint}".strip()
     for name in fields:
         value = getattr(table, name)
         if isinstance(value, BaseModel):
-            yield from _unknown_keys(value, f"{path}{name}.")
+            yield from _unknown_keys(value, f"{path}{name}.", label)
         elif name in ("prior", "clocks", *(f"{it}s" for it in KINDS)):
             for key, entry in cast(Mapping[str, BaseModel], value).items():
-                yield from _unknown_keys(entry, f"{path}{name}.{key}.")
+                yield from _unknown_keys(entry, f"{path}{name}.{key}.", label)

@@ -391,7 +391,7 @@ class Session:
     @cached_property
     def declaration(self) -> Declaration:
         """The content of session.toml, typed: the clock, the priors, the instrument."""
-        return read_declaration(self.document, observed=bool(self.views))
+        return read_declaration(self.document, "session.toml", observed=bool(self.views))
 
     @property
     def name(self) -> str:
@@ -522,7 +522,7 @@ def _build(
     corners: CornerTable | None = None,
 ) -> Session:
     """Checks the facts of a session and puts them together."""
-    declaration = read_declaration(document, observed=bool(rows))
+    declaration = read_declaration(document, "session.toml", observed=bool(rows))
     views = read_views(columns, rows, "views.csv", with_corners=corners is not None)
     targets, target_document = read_targets(declaration, folder, target_document)
     several = targets if len(targets) > 1 else {}
@@ -530,8 +530,8 @@ def _build(
         columns, views, corners = with_corners(columns, views, corners, tuple(several))
     check_images_can_be_used(declaration, views)
     warnings = [
-        *declaration_warnings(declaration),
-        *known.column_warnings(columns),
+        *declaration_warnings(declaration, "session.toml"),
+        *known.column_warnings(columns, "views.csv"),
         *view_warnings(views),
         *kind_warnings(declaration, views),
         *target_warnings(declaration, target_document),

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import compose, exp, invert, transform_points
+from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import Camera, Corners, FloatArray
 from visioncal.simulation.arms import (
     Arm,
@@ -67,6 +67,7 @@ class Cell:
         options: What was asked for.
         arm: The nominal arm.
         true_arm: The arm as it was built.
+        sheet: The board as it was printed; of two, the first.
         stated_camera: The intrinsics as the session states them.
         transforms: True edges, each (4, 4): `flange_from_cam` and `base_from_target`
             (eye-in-hand), or `base_from_cam` and `flange_from_target` (eye-to-hand); of two boards
@@ -88,6 +89,7 @@ class Cell:
     options: CellOptions
     arm: Arm
     true_arm: Arm
+    sheet: Sheet
     stated_camera: Camera
     transforms: Mapping[str, FloatArray]
     joints: FloatArray
@@ -101,11 +103,6 @@ class Cell:
     shown: Shown
     payloads: tuple[Payload, ...] = ()
     approach: FloatArray | None = None
-
-    @property
-    def sheet(self) -> Sheet:
-        """The board as it was printed; of two, the first."""
-        return self.sheets[0]
 
     def flange_at(self, q: FloatArray, payloads: Sequence[Payload] = ()) -> FloatArray:
         """Where the real arm's flange stands (k, 4, 4) at (k, n) joint angles [rad].
@@ -167,6 +164,7 @@ def simulate(options: CellOptions, postures: FloatArray | None = None) -> Cell:
         options=options,
         arm=arm,
         true_arm=true_arm,
+        sheet=sheets[0],
         stated_camera=mistaken(
             options.camera, options.lens_mismatch_px, stream(options, Stream.LENS)
         ),
@@ -367,7 +365,8 @@ def seen_by(
     """Where the corners of each view's sheet are in its image, without the ones outside it."""
     seen = []
     for view, (sheet, pose) in enumerate(zip(sheets, cam_from_target, strict=True)):
-        points_cam = transform_points(pose, corners_m(sheet))
+        points = corners_m(sheet)
+        points_cam = points @ pose[:3, :3].T + pose[:3, 3]
         ids = np.flatnonzero(sees(options.camera, points_cam, EDGE_PX))
         px = project(options.camera, points_cam[ids])
         seen.append(Corners(view, ids.astype(np.int64), px, options.blur_px))

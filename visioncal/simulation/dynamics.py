@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import transform_point
 from visioncal.core.types import FloatArray
 from visioncal.simulation.arms import Arm, link_frames, ur_arm
 
@@ -197,7 +196,7 @@ def drive_torques(built: DynamicArm, q: FloatArray, dq: FloatArray, ddq: FloatAr
         turning = turning + dq[:, joint, None] * np.cross(spin, axis)
         spin = spin + dq[:, joint, None] * axis
         frame = frames[:, joint + 1]
-        at = transform_point(frame, body.centre_m)
+        at = frame[:, :3, :3] @ body.centre_m + frame[:, :3, 3]
         force = body.kg * (push + _carried(at - origins[:, joint], spin, turning))
         inertia = frame[:, :3, :3] @ body.inertia_kg_m2 @ np.swapaxes(frame[:, :3, :3], 1, 2)
         moment = _times(inertia, turning) + np.cross(spin, _times(inertia, spin))

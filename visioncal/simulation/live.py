@@ -4,13 +4,7 @@ import cv2
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import (
-    compose,
-    invert,
-    rotation_angle,
-    transform_point,
-    transform_points,
-)
+from visioncal.core.transforms import compose, invert, rotation_angle
 from visioncal.core.types import FloatArray, Image
 from visioncal.simulation.arms import forward
 from visioncal.simulation.boards import centre_m, corners_m, outline_m
@@ -110,13 +104,13 @@ class LiveView:
         # of every corner everywhere.
         camera = self._cell.options.camera
         raster = trace(camera, Patch(0, 0, *camera.resolution), 1)
-        depth = float(transform_point(middle, centre_m(self._cell.sheet))[2])
+        depth = float((middle[:3, :3] @ centre_m(self._cell.sheet) + middle[:3, 3])[2])
         plane = compose(np.eye(3), np.array([0.0, 0.0, depth if depth > 0.0 else _FAR_M]))
         plane_from_now = invert(now_from_middle @ plane)
         aims = raster.directions @ plane_from_now[:3, :3].T
         start = plane_from_now[:3, 3]
         struck = start - aims * (start[2] / aims[..., 2])[..., None]
-        px = project(camera, transform_points(plane, struck))
+        px = project(camera, struck @ plane[:3, :3].T + plane[:3, 3])
         across, down = between(raster, px[..., 0]), between(raster, px[..., 1])
         moved = cv2.remap(light, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(moved, np.float32)
@@ -124,8 +118,8 @@ class LiveView:
     def _moved_px(self, first: FloatArray, second: FloatArray) -> FloatArray:
         """(k,) bounds on how far the picture moves between poses (k, 4, 4) of the board [px]."""
         centre = centre_m(self._cell.sheet)
-        ahead = transform_point(first, centre)
-        behind = transform_point(second, centre)
+        ahead = first[:, :3, :3] @ centre + first[:, :3, 3]
+        behind = second[:, :3, :3] @ centre + second[:, :3, 3]
         distance = np.maximum(np.linalg.norm(ahead, axis=1), 0.1)
         shift = np.linalg.norm(behind - ahead, axis=1) / distance
         turn = rotation_angle(second @ invert(first))
@@ -137,7 +131,7 @@ def _faces(cell: Cell, cam_from_target: FloatArray) -> bool:
     points = np.concatenate(
         [corners_m(cell.sheet), outline_m(cell.sheet, margin_m(cell.sheet.target))]
     )
-    points_cam = transform_points(cam_from_target, points)
+    points_cam = points @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]
     cosines = points_cam[:, 2] / np.linalg.norm(points_cam, axis=1)
     camera = cell.options.camera
     ends = np.array(np.meshgrid(*((0.0, it - 1.0) for it in camera.resolution))).reshape(2, 4).T

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import exp, invert, transform_points
+from visioncal.core.transforms import exp, invert
 from visioncal.core.types import Corners, FloatArray, IntArray, Target
 from visioncal.session import frame_name
 from visioncal.simulation.arms import ArmErrors, arm_named, disturb, forward
@@ -180,7 +180,7 @@ def _sight(cell: Network, view: int, stop: int, camera: str, board: str, pose: F
     """What a camera sees of a board, corner by corner."""
     options = cell.options
     optics, sheet = camera_named(options, camera).camera, sheet_named(options, board)
-    points = transform_points(pose, corners_m(sheet))
+    points = corners_m(sheet) @ pose[:3, :3].T + pose[:3, 3]
     ids = np.flatnonzero(sees(optics, points, _EDGE_PX)).astype(np.int64)
     px = project(optics, points[ids])
     exact = Corners(view, ids, px, 0.7)

@@ -10,8 +10,8 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.session import MemoryImages, Session, View, frame_name
-from visioncal.session.columns import POSE, pose_row
 from visioncal.simulation.boards import corners_m
+from visioncal.simulation.cell import Cell
 from visioncal.simulation.exercise import Exercised
 from visioncal.simulation.network import first_pushed
 from visioncal.simulation.observed_points import (
@@ -25,12 +25,15 @@ from visioncal.simulation.options import CellOptions
 from visioncal.simulation.records import (
     camera_table,
     noisy_pose,
+    pose_row,
     target_document,
     target_place,
     write_truth,
 )
-from visioncal.simulation.render import Scene, encode, render, scene_of
+from visioncal.simulation.render import Scene, encode, prepare_scene, render
+from visioncal.simulation.second import Shown
 from visioncal.simulation.standing import Stream, stream
+from visioncal.simulation.sweep import POSE
 from visioncal.simulation.touching import Touching, write_touches
 
 # What rows have of what was seen: rendered images, the names of images that are not there, or the
@@ -220,15 +223,41 @@ def _rendered(
 
 
 def _scene(cell: Network, camera: str, board: str, poses: FloatArray) -> Scene:
-    """What all pictures that a camera takes of a board share."""
+    """A cell of one camera and one board, as it is drawn."""
     options = cell.options
+    sheet = sheet_named(options, board)
     places = (
         [it.name for it in options.cameras].index(camera),
         options.boards.index(board_named(options, board)),
     )
-    optics, seed = camera_named(options, camera).camera, seed_of(options.seed, *places)
-    drawing, no_arm = CellOptions(camera=optics, seed=seed), np.empty((len(poses), 0))
-    return scene_of(drawing, sheet_named(options, board), poses, no_arm)
+    drawing = CellOptions(
+        views=len(poses),
+        target=sheet.target,
+        camera=camera_named(options, camera).camera,
+        seed=seed_of(options.seed, *places),
+    )
+    robot = next(iter(cell.arms))
+    exact = tuple(it.exact for it in cell.sights if (it.camera, it.board) == (camera, board))
+    none = np.tile(np.eye(4), (len(poses), 1, 1))
+    return prepare_scene(
+        Cell(
+            options=drawing,
+            arm=cell.arms[robot],
+            true_arm=cell.true_arms[robot],
+            sheet=sheet,
+            stated_camera=drawing.camera,
+            transforms={},
+            joints=np.zeros((len(poses), cell.arms[robot].a.size)),
+            base_from_flange=none,
+            true_base_from_flange=none,
+            cam_from_target=poses,
+            exact_corners=exact,
+            corners=exact,
+            wrong_views=(),
+            sheets=(sheet,),
+            shown=Shown(np.arange(len(poses)), np.zeros(len(poses), dtype=np.int64)),
+        )
+    )
 
 
 def seed_of(*numbers: int) -> int:

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.core.transforms import compose, transform_points
+from visioncal.core.transforms import compose
 from visioncal.core.types import FloatArray
 from visioncal.simulation.boards import (
     Sheet,
@@ -59,10 +59,8 @@ def draw_views(
     )
     centre = distance[:, None] * rays(options.camera, aim)
     cam_from_target = compose(rotation, centre - rotation @ centre_m(sheet))
-    whole = sees(
-        options.camera, transform_points(cam_from_target, outline_m(sheet, 0.0)), _MARGIN_PX
-    )
-    seen = sees(options.camera, transform_points(cam_from_target, corners_m(sheet)), _MARGIN_PX)
+    whole = sees(options.camera, _place(cam_from_target, outline_m(sheet, 0.0)), _MARGIN_PX)
+    seen = sees(options.camera, _place(cam_from_target, corners_m(sheet)), _MARGIN_PX)
     fits = whole.all(axis=1) | (may_be_cut & (seen.mean(axis=1) > _LEAST_SHARE))
     return np.asarray(cam_from_target[fits])
 
@@ -87,3 +85,10 @@ def _rotations(options: CellOptions, count: int, rng: np.random.Generator) -> Fl
     else:
         turned = Rotation.from_rotvec(along_z) * tilted
     return np.asarray(turned.as_matrix(), dtype=float)
+
+
+def _place(cam_from_target: FloatArray, points: FloatArray) -> FloatArray:
+    """(k, n, 3) points in the camera frame, from (n, 3) in the target frame."""
+    return np.asarray(
+        points @ np.swapaxes(cam_from_target[:, :3, :3], 1, 2) + cam_from_target[:, None, :3, 3]
+    )

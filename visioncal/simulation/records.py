@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
@@ -14,7 +15,6 @@ from visioncal.core.files import decode_text, read_bytes, write_atomically
 from visioncal.core.transforms import exp
 from visioncal.core.types import Camera, FloatArray, Target
 from visioncal.session import MemoryImages, Session, View
-from visioncal.session.columns import pose_row
 from visioncal.session.corners import CornerTable
 from visioncal.simulation.boards import corners_m
 from visioncal.simulation.cell import Cell, Stream, stream
@@ -23,7 +23,7 @@ from visioncal.simulation.options import BOARDS
 from visioncal.simulation.render import encode, prepare_scene, render
 from visioncal.simulation.sag import Payload
 from visioncal.simulation.second import NAMES
-from visioncal.simulation.sweep import Sweep
+from visioncal.simulation.sweep import POSE, Sweep
 
 # An operator's pace: a stop every so many seconds [s].
 _PACE_S = 4.0
@@ -386,6 +386,12 @@ def load_row(load: Payload) -> dict[str, float]:
 def approach_text(cell: Cell, view: int) -> dict[str, str]:
     """The column of the side from which a stop was approached, where that is recorded."""
     return {} if cell.approach is None else {"approach": "+" if cell.approach[view] > 0 else "-"}
+
+
+def pose_row(pose: FloatArray) -> dict[str, float]:
+    """Seven columns of a pose (4, 4)."""
+    quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
+    return dict(zip(POSE, map(float, [*pose[:3, 3], *quaternion]), strict=True))
 
 
 def truth_of(cell: Cell) -> dict[str, Any]:

@@ -3,17 +3,17 @@
 The arm that holds a board in front of a fixed camera is drawn as shaded tubes.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.transforms import compose, invert, transform_points
+from visioncal.core.transforms import compose, invert
 from visioncal.core.types import Camera, FloatArray, Image
 from visioncal.simulation.arms import Arm, link_frames, reach_m
-from visioncal.simulation.boards import Sheet, bow_depth_m, outline_m, unit_m
+from visioncal.simulation.boards import bow_depth_m, outline_m, unit_m
 from visioncal.simulation.cell import Cell, Stream, stream
 from visioncal.simulation.optics import project, sees
 from visioncal.simulation.options import CellOptions
@@ -70,22 +70,14 @@ class Scene:
     """What all pictures of one board share.
 
     Attributes:
-        options: The camera and the light.
-        sheet: The board as it was printed.
-        texture: Its texture.
+        cell: The cell.
+        sheet: The board's texture.
         backdrop: What is behind the board.
-        cam_from_target: (m, 4, 4) where the board really stands in each picture.
-        joints: (m, n) the arm's posture [rad].
-        arm: The arm and `cam_from_base` (4, 4) before a camera beside it; None where it carries it.
     """
 
-    options: CellOptions
-    sheet: Sheet
-    texture: SheetTexture
+    cell: Cell
+    sheet: SheetTexture
     backdrop: Backdrop
-    cam_from_target: FloatArray
-    joints: FloatArray
-    arm: tuple[Arm, FloatArray] | None = None
 
 
 def prepare_scene(cell: Cell, board: int = 0) -> Scene:
@@ -98,33 +90,21 @@ def prepare_scene(cell: Cell, board: int = 0) -> Scene:
     Raises:
         DataError: OpenCV does not have the target's dictionary.
     """
-    arm = None
-    if cell.options.mount != "eye-in-hand":
-        arm = cell.arm, invert(cell.transforms["base_from_cam"])
-    return scene_of(cell.options, cell.sheets[board], cell.cam_from_target, cell.joints, arm)
-
-
-def scene_of(
-    options: CellOptions,
-    sheet: Sheet,
-    cam_from_target: FloatArray,
-    joints: FloatArray,
-    arm: tuple[Arm, FloatArray] | None = None,
-) -> Scene:
-    """Draws the textures of a scene; see there for the arguments."""
-    target, nearest = sheet.target, float(np.linalg.norm(cam_from_target[:, :3, 3], axis=1).min())
-    samples = _SAMPLES * float(options.camera.matrix[0]) * unit_m(target) / max(nearest, 0.05)
+    sheet = cell.sheets[board]
+    cell = replace(cell, sheet=sheet, options=replace(cell.options, target=sheet.target))
+    target, camera = cell.options.target, cell.options.camera
+    nearest = float(np.linalg.norm(cell.cam_from_target[:, :3, 3], axis=1).min())
+    samples = _SAMPLES * float(camera.matrix[0]) * unit_m(target) / max(nearest, 0.05)
     texels = 2 ** int(np.clip(np.round(np.log2(samples)), 4, 10))
     # A board of many squares stays within some 30 million texels.
     while target.columns * target.rows * texels**2 > 3e7:
         texels //= 2
-    rng = stream(options, Stream.BACKDROP)
-    if arm is None:
+    rng = stream(cell.options, Stream.BACKDROP)
+    if cell.options.mount == "eye-in-hand":
         backdrop = Backdrop(draw_table(rng, 1024), 0.0008, 0.006, 0.45, True)
     else:
         backdrop = Backdrop(draw_wall(rng, 1024), 0.004, 2.6, 2.0, False)
-    texture = draw_sheet(target, texels)
-    return Scene(options, sheet, texture, backdrop, cam_from_target, joints, arm)
+    return Scene(cell, draw_sheet(target, texels), backdrop)
 
 
 def render(scene: Scene, index: int) -> Image:
@@ -136,10 +116,11 @@ def render(scene: Scene, index: int) -> Image:
     Raises:
         DataError: There is no such view.
     """
-    options, count = scene.options, len(scene.cam_from_target)
+    options = scene.cell.options
+    count = len(scene.cell.corners)
     if not 0 <= index < count:
         raise DataError(f"simulation: there is no view {index} among {count}.")
-    light = light_on(scene, scene.cam_from_target[index], scene.joints[index])
+    light = light_on(scene, scene.cell.cam_from_target[index], scene.cell.joints[index])
     return developed(light, options, stream(options, Stream.IMAGES, index))
 
 
@@ -169,7 +150,7 @@ def light_on(
         if shows_board:
             _cover(light, scene, cam_from_target, samples)
         light *= between(whole, shade)
-    blur_px = scene.options.blur_px
+    blur_px = scene.cell.options.blur_px
     if blur_px > 0.0:
         light = np.asarray(
             cv2.GaussianBlur(light, (0, 0), blur_px, borderType=cv2.BORDER_REPLICATE), np.float32
@@ -205,7 +186,8 @@ def _behind(
     scene: Scene, cam_from_target: FloatArray, joints: FloatArray
 ) -> tuple[Float32Array, Raster, FloatArray]:
     """What is behind the board: its light, knots over the image, and how bright each lies."""
-    camera = scene.options.camera
+    cell = scene.cell
+    camera = cell.options.camera
     whole = trace(camera, Patch(0, 0, *camera.resolution), 1)
     plane_from_cam = _plane_from_cam(scene.backdrop, cam_from_target)
     places = _strike(plane_from_cam, whole.directions, 0.0)
@@ -219,9 +201,8 @@ def _behind(
         ),
         np.uint8,
     )
-    if scene.arm is not None:
-        arm, cam_from_base = scene.arm
-        _draw_arm(behind, camera, arm, joints, cam_from_base)
+    if not scene.backdrop.moves:
+        _draw_arm(behind, camera, cell.arm, joints, invert(cell.transforms["base_from_cam"]))
     offset = (places - scene.backdrop.lamp_m * np.array([-0.3, -0.2])) / scene.backdrop.lamp_m
     distance2 = (offset**2).sum(axis=-1)
     light = behind.astype(np.float32)
@@ -233,7 +214,7 @@ def _behind(
     middle = 0.5 * np.array(camera.resolution) - 0.5
     edge = ((whole.px - middle) ** 2).sum(axis=-1) / (middle**2).sum()
     lamp = 0.78 + 0.30 / (1.0 + distance2)
-    return light, whole, lamp * (1.0 - scene.options.vignetting * edge)
+    return light, whole, lamp * (1.0 - cell.options.vignetting * edge)
 
 
 def _plane_from_cam(backdrop: Backdrop, cam_from_target: FloatArray) -> FloatArray:
@@ -255,25 +236,25 @@ def _facing(scene: Scene, cam_from_target: FloatArray) -> float:
 
 def _cover(light: Float32Array, scene: Scene, cam_from_target: FloatArray, samples: int) -> None:
     """Lays the sheet over what is behind it, in place."""
-    texture = scene.texture
-    patch = _board_patch(scene, cam_from_target)
+    cell, sheet = scene.cell, scene.sheet
+    patch = _board_patch(cell, cam_from_target)
     if min(patch.size) < 1:
         return
     brightness = _facing(scene, cam_from_target)
-    raster = trace(scene.options.camera, patch, samples)
-    flat = _strike_sheet(scene.sheet, raster.directions, cam_from_target)
+    raster = trace(cell.options.camera, patch, samples)
+    flat = _strike_sheet(cell, raster.directions, cam_from_target)
     # The texel that fits the sub-pixels best, over the whole board.
     spacing = _spacing_m(flat, raster.px) / samples
-    level = int(np.argmin(np.abs(np.log(np.array(texture.texel_m) / spacing))))
+    level = int(np.argmin(np.abs(np.log(np.array(sheet.texel_m) / spacing))))
     # Texel centres are half a texel from the texture's outer corner.
-    texels = (flat - texture.origin_m) / texture.texel_m[level] - 0.5
+    texels = (flat - sheet.origin_m) / sheet.texel_m[level] - 0.5
     at_x, at_y = (columns_of(raster, texels[..., it]) for it in range(2))
     width, height = patch.size
     for top in range(0, height, _BAND_PX):
         rows = min(_BAND_PX, height - top)
         band = slice(top * samples, (top + rows) * samples)
         seen = cv2.remap(
-            texture.levels[level],
+            sheet.levels[level],
             between_rows(raster, at_x, band),
             between_rows(raster, at_y, band),
             cv2.INTER_LINEAR,
@@ -287,11 +268,11 @@ def _cover(light: Float32Array, scene: Scene, cam_from_target: FloatArray, sampl
         window += np.float32(brightness) * pixels[..., 0]
 
 
-def _board_patch(scene: Scene, cam_from_target: FloatArray) -> Patch:
+def _board_patch(cell: Cell, cam_from_target: FloatArray) -> Patch:
     """Bounds of the sheet and its shadow in the image."""
-    camera, sheet = scene.options.camera, scene.sheet
-    points = outline_m(sheet, margin_m(sheet.target))
-    points_cam = transform_points(cam_from_target, points)
+    camera = cell.options.camera
+    points = outline_m(cell.sheet, margin_m(cell.options.target))
+    points_cam = points @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]
     width, height = camera.resolution
     # A point so far outside that the lens model folds it back says nothing about the bounds; one
     # beside or behind the camera has no place in the image at all.
@@ -304,16 +285,16 @@ def _board_patch(scene: Scene, cam_from_target: FloatArray) -> Patch:
     return Patch(int(left), int(top), int(right), int(bottom))
 
 
-def _strike_sheet(sheet: Sheet, directions: FloatArray, cam_from_target: FloatArray) -> FloatArray:
+def _strike_sheet(cell: Cell, directions: FloatArray, cam_from_target: FloatArray) -> FloatArray:
     """Where rays hit the bowed sheet, (..., 2) in the flat target frame as stated [m]."""
     target_from_cam = invert(cam_from_target)
     flat = _strike(target_from_cam, directions, 0.0)
-    if sheet.bow_m != 0.0:
+    if cell.sheet.bow_m != 0.0:
         for _ in range(6):
             # The bow is shallow: each turn gains the slope of the sheet over that of the ray.
-            depth = np.clip(bow_depth_m(sheet, flat), -0.05, 0.05)
+            depth = np.clip(bow_depth_m(cell.sheet, flat), -0.05, 0.05)
             flat = _strike(target_from_cam, directions, depth)
-    return flat / sheet.scale
+    return flat / cell.sheet.scale
 
 
 def _strike(
@@ -353,7 +334,7 @@ def _draw_arm(
     tubes = _tubes(arm, link_frames(arm, joints[None])[0])
     seen = []
     for tube in tubes:
-        ends = transform_points(cam_from_base, np.stack([tube.start, tube.end]))
+        ends = np.stack([tube.start, tube.end]) @ cam_from_base[:3, :3].T + cam_from_base[:3, 3]
         if ends[:, 2].min() > _NEAREST_M:
             seen.append((float(ends[:, 2].mean()), ends, tube))
     for _, ends, tube in sorted(seen, key=lambda each: -each[0]):

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import transform_point
 from visioncal.core.types import FloatArray
 from visioncal.simulation.arms import Arm, link_frames
 
@@ -146,7 +145,8 @@ def load_torques(
     frames = link_frames(arm, joints)
     kg, centres = (np.array(it) for it in zip(*_BODIES[arm.name], strict=True))
     weights = giving.mass_share * kg[:, None] * _GRAVITY
-    places = transform_point(frames[:, 1:], centres)
+    at = frames[:, 1:, :3, :3] @ centres[:, :, None]
+    places = at[..., 0] + frames[:, 1:, :3, 3]
     forces = np.broadcast_to(weights, places.shape)
     if payloads:
         tip = frames[:, -1]

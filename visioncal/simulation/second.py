@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.core.transforms import compose, transform_point, transform_points
+from visioncal.core.transforms import compose
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.simulation.boards import Sheet, centre_m, corners_m, found_in_part
 from visioncal.simulation.optics import sees
@@ -49,7 +49,7 @@ def with_second(
     """Adds the second board to the two edges of a cell, and names both boards' edges."""
     (x_name, x), (z_name, z) = transforms.items()
     first, further = (centre_m(it) for it in sheets)
-    middle = transform_point(z, first)
+    middle = z[:3, :3] @ first + z[:3, 3]
     around = Rotation.from_euler("z", second.turn_rad).as_matrix()
     if x_name == "flange_from_cam":
         place = around @ middle
@@ -98,7 +98,8 @@ def shown_at(options: CellOptions, sheets: Sequence[Sheet], poses: Sequence[Floa
 
 def looks_at(camera: Camera, sheet: Sheet, cam_from_target: FloatArray) -> Mask:
     """(s,) in which of the stops a board is in view, not too much from the side."""
-    points = transform_points(cam_from_target, corners_m(sheet))
+    points = corners_m(sheet) @ np.swapaxes(cam_from_target[:, :3, :3], 1, 2)
+    points = points + cam_from_target[:, None, :3, 3]
     towards = points / np.linalg.norm(points, axis=2, keepdims=True)
     facing = np.einsum("mni,mi->mn", towards, cam_from_target[:, :3, 2]) > _LEAST_COSINE
     looks = facing.all(axis=1) & (towards[:, :, 2] > _LEAST_COSINE).all(axis=1)

@@ -13,10 +13,9 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import invert, transform_point, transform_points
+from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray
 from visioncal.session import Stream as Recorded
-from visioncal.session.columns import POSE
 from visioncal.simulation.arms import forward
 from visioncal.simulation.boards import corners_m
 from visioncal.simulation.cell import (
@@ -32,6 +31,7 @@ from visioncal.simulation.optics import project, sees
 from visioncal.simulation.options import CellOptions
 from visioncal.simulation.second import Shown, chains
 
+POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 # A frame that shows less of the board gives no pose.
 _FEWEST_CORNERS = 8
 # In which row a corner is depends on when it is taken: by a few thousandths of itself each time.
@@ -130,13 +130,13 @@ def _by_rows(cell: Cell, way: CubicSpline, taken_s: FloatArray, readout_s: float
     exact = list(cell.exact_corners)
     for at, (stop, board) in enumerate(zip(shown.stops, shown.boards, strict=True)):
         points = corners_m(cell.sheets[board])
-        middle = transform_points(cell.cam_from_target[at], points)
+        middle = points @ cell.cam_from_target[at, :3, :3].T + cell.cam_from_target[at, :3, 3]
         px = project(options.camera, middle)
         for _ in range(_ROUNDS):
             late_s = readout_s * (px[:, 1] / (height - 1) - 0.5)
             flange = cell.flange_at(way(taken_s[stop] + late_s)) @ jitter[at]
             poses = before_camera(boards[board], flange)
-            seen = transform_point(poses, points)
+            seen = (poses[:, :3, :3] @ points[:, :, None])[:, :, 0] + poses[:, :3, 3]
             px = project(options.camera, seen)
         ids = np.flatnonzero(sees(options.camera, seen, EDGE_PX))
         exact[at] = replace(exact[at], ids=ids.astype(np.int64), px=px[ids])

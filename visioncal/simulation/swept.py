@@ -6,7 +6,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import exp, invert, transform_point
+from visioncal.core.transforms import exp, invert
 from visioncal.core.types import Corners, FloatArray
 from visioncal.session import Stream as Recorded
 from visioncal.session import frame_name
@@ -62,7 +62,8 @@ def sweep_network(
         off, late_s = exp(sigma * rng.standard_normal((1, 6))), np.zeros(len(corners))
         for _ in range(_ROUNDS if how.readout_s else 1):
             flanges = forward(cell.true_arms[swept.robot], way(taken_s + late_s)) @ off
-            points = transform_point(seen_from(flanges), corners)
+            poses = seen_from(flanges)
+            points = (poses[:, :3, :3] @ corners[:, :, None])[:, :, 0] + poses[:, :3, 3]
             rows = project(optics, points)[:, 1]
             late_s = how.readout_s * (rows / (optics.resolution[1] - 1) - 0.5)
         middle = seen_from(forward(cell.true_arms[swept.robot], way([taken_s])) @ off)[0]

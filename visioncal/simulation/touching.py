@@ -12,10 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import write_atomically
-from visioncal.core.transforms import compose, exp, invert, transform_points
+from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import FloatArray, Mask
 from visioncal.session import frame_name
-from visioncal.session.columns import pose_row
 from visioncal.simulation import standing
 from visioncal.simulation.arms import Arm, forward, inverse, reach_m
 from visioncal.simulation.cell import (
@@ -28,6 +27,7 @@ from visioncal.simulation.cell import (
 )
 from visioncal.simulation.observed_points import Network
 from visioncal.simulation.options import CellOptions
+from visioncal.simulation.records import pose_row
 
 # How far off a contact is, per axis [m], and how far the flange tilts from straight down [rad].
 _CONTACT_M, _CONE_RAD = 5e-5, 0.75
@@ -168,7 +168,7 @@ def _touching(toucher: _Toucher, rng: np.random.Generator) -> Touching:
     features = ("origin",) * 3 + ("x",) * 3 + ("xy",) * 3
 
     def on_fixture(places: FloatArray, columns: Mapping[str, tuple[str, ...]]) -> Touched:
-        met = transform_points(base_from_fixture, places)
+        met = places @ base_from_fixture[:3, :3].T + base_from_fixture[:3, 3]
         return _touched(toucher, flange_from_tool, met, np.zeros_like(met), columns, rng)
 
     names = tuple(_name(at) for at in range(len(_DRAWN_M)))
@@ -195,7 +195,7 @@ def _touched(
 ) -> Touched:
     """Brings places of the tool (n, 3) to places in the base (n, 3) [m], tilted each its way."""
     met = places + _CONTACT_M * rng.standard_normal(places.shape)
-    reached = transform_points(flange_from_tool, in_tool)
+    reached = in_tool @ flange_from_tool[:3, :3].T + flange_from_tool[:3, 3]
     down = Rotation.from_rotvec([np.pi, 0.0, 0.0])
     straight = compose(down.as_matrix(), met[0] - down.apply(reached[0]))
     home = home_posture(toucher.options, toucher.arm, straight[None], rng)

@@ -8,10 +8,10 @@ import numpy as np
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import FloatArray
 from visioncal.session import MemoryImages, Session
-from visioncal.session.columns import POSE, pose_row
 from visioncal.simulation.arms import Arm, ArmErrors, arm_named, disturb, forward
-from visioncal.simulation.records import load_row, write_truth
+from visioncal.simulation.records import load_row, pose_row, write_truth
 from visioncal.simulation.sag import Payload, giving_of, loads_in_turn, sagging
+from visioncal.simulation.sweep import POSE
 
 
 @dataclass(frozen=True)

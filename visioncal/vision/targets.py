@@ -20,7 +20,6 @@ from visioncal.core.arguments import typed
 from visioncal.core.documents.tables import TextTable, read_table
 from visioncal.core.errors import DataError
 from visioncal.core.files import Table, did_you_mean, find_described, is_inside, read_toml
-from visioncal.core.transforms import transform_points
 from visioncal.core.types import FloatArray, IntArray, Mask, Target, TargetKind
 
 # An undeclared square is known as well as office printers keep their scale: to 0.1 %.
@@ -638,7 +637,7 @@ def rotations(target: Target) -> tuple[IntArray, ...]:
     positions = corner_positions(target)
     permutations = []
     for turn in rotation_transforms(target):
-        turned = transform_points(turn, positions)
+        turned = positions @ turn[:3, :3].T + turn[:3, 3]
         distance = np.linalg.norm(turned[:, None] - positions[None], axis=-1)
         permutations.append(np.asarray(distance.argmin(axis=1), dtype=np.int64))
     return tuple(permutations)

@@ -9,7 +9,6 @@ from visioncal.calibration.pipeline.solving import Solved
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.handeye import closed_form_state
 from visioncal.calibration.stages.validate import HeldOut, validate
-from visioncal.core.transforms import transform_point
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.appearance import shape_basis, shape_slices
 from visioncal.estimation.budget import (
@@ -101,7 +100,7 @@ def work_of(solved: Solved, beside: Mapping[str, FloatArray], covariance: FloatA
     middles = middles_of(solved.cell)
     middle = np.array([middles.get(it, np.zeros(3)) for it in part.observations.observed])
     camera = part.measured(state)
-    seen = transform_point(camera, middle)
+    seen = (camera[:, :3, :3] @ middle[:, :, None])[:, :, 0] + camera[:, :3, 3]
     point = seen.mean(axis=0)
     at_work = {
         name: point_covariance(state.edges[0], it[:6, :6], point)

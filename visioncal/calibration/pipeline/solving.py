@@ -28,10 +28,10 @@ from visioncal.calibration.stages.priors import loosened, without_most_contradic
 from visioncal.calibration.stages.refine import lens_levels, refined
 from visioncal.calibration.stages.side import FramesSide
 from visioncal.calibration.stages.turned_images import Turned, turned_how
-from visioncal.calibration.stages.validate import chain_rms_px
+from visioncal.calibration.stages.validate import chain_rms_px, predict_corners
 from visioncal.core.choices import SolverName
 from visioncal.core.errors import ConvergenceError, DegenerateError
-from visioncal.core.transforms import invert, rotation_angle, transform_points
+from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask, Mount, Target
 from visioncal.core.verdict import Finding
 from visioncal.estimation.arm import LEVER_M, rows_of
@@ -57,7 +57,6 @@ from visioncal.estimation.solve import (
     starting_noise,
 )
 from visioncal.session.frames import frame_name
-from visioncal.vision.camera import project
 
 # Arms are linearised anew so often, or until their errors move by less, which is far below any
 # arm's repeatability.
@@ -364,7 +363,7 @@ def _turned_images(fit: Solved) -> dict[int, Turned]:
         if view.corners is None or seer not in looks.problems:
             continue
         camera = looks.camera(seer)
-        places = project(camera, transform_points(predicted[at], looks.corners[view.board]))
+        places = predict_corners(camera, predicted[at], looks.corners[view.board])
         how = turned_how(view.corners.px, places, camera.resolution, typical_px)
         if how is not None:
             found[view.view] = how

@@ -7,11 +7,10 @@ import numpy as np
 from visioncal.calibration.pipeline.holdout import held_back
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell import robot_key
-from visioncal.core.transforms import transform_points
+from visioncal.calibration.stages.validate import predict_corners
 from visioncal.core.types import Corners, FloatArray
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session.observations import Observation
-from visioncal.vision.camera import project
 from visioncal.vision.targets import first_corners
 
 
@@ -74,4 +73,4 @@ def _predicted(
     if looks is None or seer not in looks.problems:
         return None
     positions = np.concatenate(looks.corners)[corners.ids]
-    return project(looks.camera(seer), transform_points(cam_from_target, positions))
+    return predict_corners(looks.camera(seer), cam_from_target, positions)

@@ -6,7 +6,7 @@ import numpy as np
 
 from visioncal.calibration.stages.kinematics import Kinematics
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.transforms import invert, transform_point
+from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.armpair import ArmData, ArmPair
 from visioncal.estimation.workspace import postures
@@ -110,7 +110,7 @@ def _place(arm: ArmData, pair: ArmPair, flange: FloatArray) -> FloatArray:
     poses = pair.at(flange)[1]
     if pair.is_observer_carried:
         return invert(poses)[:, :3, 3]
-    return transform_point(poses, arm.at)
+    return np.asarray(poses[:, :3, :3] @ arm.at + poses[:, :3, 3])
 
 
 def _regions(places: FloatArray, stops: FloatArray) -> dict[Region, Mask]:

@@ -232,7 +232,8 @@ def _lens_found(fitted: Fitted, camera: str) -> Iterator[Finding]:
             f"{len(problem.stack.views)} views leave too little to judge by."
         )
         yield Finding("remark", words, Step("Show a board with more corners, or more views."))
-    if not problem.scene.estimated and _moved(fitted, lens):
+    moved = np.intersect1d(lens, fitted.moving)
+    if not problem.scene.estimated and len(moved) and _moved(fitted, moved):
         is_exact = problem.scene.matrix_sigma_px is None
         steps = (looks.values - looks.stated)[lens[:4]]
         words, do = other_images(problem.scene.camera, looks.values[lens[:4]])

@@ -11,10 +11,10 @@ from visioncal.calibration.stages.pair_observations import (
     factors_of,
     product_of,
 )
-from visioncal.core.transforms import compose, invert, transform_point, transform_points
+from visioncal.core.transforms import compose, invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.positions import Places, find_mounting
-from visioncal.estimation.procrustes import align, spreads
+from visioncal.estimation.procrustes import align, apply, spreads
 
 # Stops at which points must have been read before they determine their and the instrument's
 # place; points by which an instrument is placed, and how far they must reach to both sides [m].
@@ -65,11 +65,11 @@ def placed_by_points(
         read = growth.sighted.candidates.poses[pair.rows, 0, :3, 3]
         body = product_of(inner, placed)
         if pair.seer in placed and pair.seen not in placed:
-            seen = transform_point(invert(body), transform_points(placed[pair.seer], read))
-            yield pair.seen, compose(np.eye(3), np.median(seen, axis=0))[None], _ROUGH_M
+            seen = apply(invert(body), apply(placed[pair.seer][None], read[:, None]))
+            yield pair.seen, compose(np.eye(3), np.median(seen[:, 0], axis=0))[None], _ROUGH_M
         elif pair.seer not in placed and pair.seen in placed:
-            there = transform_point(body, placed[pair.seen][:3, 3])
-            open_seers.setdefault(pair.seer, []).append((there, read))
+            there = apply(body, np.broadcast_to(placed[pair.seen][:3, 3], (len(read), 1, 3)))
+            open_seers.setdefault(pair.seer, []).append((there[:, 0], read))
     for seer, parts in open_seers.items():
         there, read = (np.concatenate(it) for it in zip(*parts, strict=True))
         if len(read) >= _FEWEST_POINTS and spreads(there)[0][1] > _SPREAD_M:

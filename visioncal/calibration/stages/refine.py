@@ -36,7 +36,9 @@ from visioncal.estimation.lens_levels import are_beyond, estimate_levels
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.estimation.parts import State
+from visioncal.estimation.scene import lens_prior
 from visioncal.estimation.solve import covariance_of, equations_and_cost, left_out_residuals
+from visioncal.estimation.variance import likely_sigma
 
 # A board that is off by so much is beyond what is linear.
 _FAR = 2e-3
@@ -83,7 +85,7 @@ def refined(
         levels = fitted.looks.levels
         sizes = zip(fitted.looks.problems, fitted.seen.sigmas_px, strict=True)
         if not any(name in levels and are_beyond(levels[name], it) for name, it in sizes):
-            return fitted, found
+            return _doubted(found, fitted), found
     except ConvergenceError:
         pass
     # A field of many pixels is none: poses run away with it. Lenses are then what they say.
@@ -165,7 +167,15 @@ def lens_levels(side: Side, fitted: Fitted) -> dict[str, LensLevels]:
         still = {name: replace(it, breathing=0.0) for name, it in levels.items()}
         fitted = again(fitted, side, fitted.moving, fitted.looks.with_levels(still))
     looks = fitted.seen.looks
-    # A size of the board is left to the motion: a wrong one would pass for breathing.
+    # A size of the board is left to the motion: a wrong one would pass for breathing. So would a
+    # focal length.
+    looks = looks.doubting(
+        {
+            name: (lens_prior(it.scene), it.doubted[:0])
+            for name, it in looks.problems.items()
+            if len(it.doubted)
+        }
+    )
     sizes = [looks.scale_of(it) for it in looks.printed]
     unsized = looks.without_prior(np.concatenate([np.zeros(0), *sizes]).tolist())
     seen = fitted.seen.freed(np.arange(len(looks.values)), unsized)
@@ -178,6 +188,44 @@ def lens_levels(side: Side, fitted: Fitted) -> dict[str, LensLevels]:
         name: estimate_levels(seen, problem, side.rows(seen), state, fitted.fit.noise, name)
         for name in looks.problems
     }
+
+
+def _doubted(side: Side, fitted: Fitted) -> Fitted:
+    """Fits given lenses that were held once more, as well known as corners and motion have them.
+
+    A lens that is given may be off by less than shows beyond chance. Where its focal length follows
+    from the motion alone, that moves a camera by many of its sigmas. The focal length and the
+    centre get a prior each, whose size is found by restricted likelihood. They move where the data
+    know them better than that, and count where they do not.
+    """
+    looks, moving = fitted.looks, [fitted.moving]
+    doubts = {}
+    for name, problem in looks.problems.items():
+        scene, lens = problem.scene, looks.lens_of(name)
+        is_exact = not scene.estimated and scene.matrix_sigma_px is None and scene.mode == "auto"
+        if not is_exact or not problem.has_spare_corners or np.isin(lens, fitted.moving).any():
+            continue
+        focal_px, sigma = looks.values[lens[:2]], lens_prior(scene)
+        step, covariance = Scores.of(side, fitted, lens[:4]).asked_for(lens[:4])
+        # Both focal lengths have one factor: what parts them shows, and is not in doubt.
+        factors = np.zeros((4, 3))
+        factors[:2, 0], factors[2, 1], factors[3, 2] = focal_px, 1.0, 1.0
+        information = covariance_from(covariance)
+        open_ = covariance_from(factors.T @ information @ factors)
+        asked = open_ @ (factors.T @ information @ step)
+        counting = [lens[:0]]
+        for of, places, unit in ((slice(1), slice(2), focal_px), (slice(1, 3), slice(2, 4), 1.0)):
+            known = likely_sigma(asked[of], open_[of, of])
+            if known > 0.0:
+                sigma[places] = unit * known
+                counting.append(problem.lens[places])
+            if known**2 > np.diag(open_)[of].mean():
+                moving.append(lens[places])
+        doubts[name] = sigma, np.concatenate(counting)
+    if not any(len(places) for _, places in doubts.values()):
+        return fitted
+    together = np.unique(np.concatenate(moving))
+    return _contesting(side, again(fitted, side, together, looks.doubting(doubts)))
 
 
 def _still_asked_for(erring: Side, stated: Fitted, answer: Fitted) -> Fitted:

@@ -14,7 +14,7 @@ import numpy as np
 
 from visioncal.calibration.stages.observed import Observed
 from visioncal.core.number_format import figure
-from visioncal.core.transforms import skew, transform_point
+from visioncal.core.transforms import skew
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Target
 from visioncal.core.verdict import CALIBRATE, Finding, Step
 from visioncal.estimation.numbering import find_numbering
@@ -157,7 +157,7 @@ def _triangulated(rows: Sequence[tuple[_Look, int]]) -> tuple[FloatArray, float]
     place = np.linalg.lstsq(np.concatenate(factors), np.concatenate(values), rcond=None)[0]
     left = []
     for look, row in rows:
-        there = transform_point(look.cam_from_target, place)
+        there = look.cam_from_target[:3, :3] @ place + look.cam_from_target[:3, 3]
         left.append(look.focal_px * np.linalg.norm(there[:2] / there[2] - look.rays[row, :2]))
     return place, float(np.median(left))
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.transforms import distances, transform_point
+from visioncal.core.transforms import distances
 from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Mask
 from visioncal.estimation.parts import State
 from visioncal.estimation.problem import Problem
@@ -117,10 +117,17 @@ def chain_rms_px(
         counts = [len(it.ids) for _, _, it in views]
         of = np.repeat(rows, counts)
         points = positions[np.concatenate([it.ids for _, _, it in views])]
-        points = transform_point(poses[of], points)
+        points = (poses[of, :3, :3] @ points[:, :, None])[:, :, 0] + poses[of, :3, 3]
         away = project(camera, points) - np.concatenate([it.px for _, _, it in views])
         # A corner behind the camera counts as a whole image away.
         away = np.nan_to_num(away, nan=float(max(camera.resolution)))
         squares = np.bincount(of, np.sum(away**2, axis=1), minlength=len(poses))
         rms[rows] = np.sqrt(squares[rows] / counts)
     return rms
+
+
+def predict_corners(
+    camera: Camera, cam_from_target: FloatArray, positions: FloatArray
+) -> FloatArray:
+    """Projects a target's (n, 3) corners [m] at a pose, to (n, 2) [px]."""
+    return project(camera, positions @ cam_from_target[:3, :3].T + cam_from_target[:3, 3])

@@ -6,7 +6,6 @@ on 3-D Digital Imaging and Modeling, 1999.
 
 import numpy as np
 
-from visioncal.core.transforms import transform_point
 from visioncal.core.types import FloatArray
 from visioncal.estimation.closed_form.handeye import HandEye, solver
 from visioncal.estimation.closed_form.kronecker import least_scatter, rotations, turn_maps
@@ -28,7 +27,7 @@ def andreff(robot: FloatArray, camera: FloatArray) -> HandEye:
     as much as one radian.
     """
     m = len(robot)
-    seen = transform_point(camera, 0.5 * mean_camera(camera))
+    seen = camera[:, :3, :3] @ (0.5 * mean_camera(camera)) + camera[:, :3, 3]
     rows = np.empty((m, 3, 13))
     rows[:, :, :4] = robot[:, :3, :]
     rows[:, :, 4:] = (robot[:, :3, :3, None] * seen[:, None, None, :]).reshape(m, 3, 9)

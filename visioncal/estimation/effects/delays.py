@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.core.transforms import adjoint, exp, invert, transform_point
+from visioncal.core.transforms import adjoint, exp, invert
 from visioncal.core.types import Camera, FloatArray, Mount
 from visioncal.estimation.appearance import Compressed, compress_points
 from visioncal.estimation.corners import CornerStack
@@ -74,7 +74,7 @@ def delayed_points(
     """
     of_corner = twists[stack.view_of]
     moves = exp((shares @ times_s)[:, None] * of_corner)
-    points = transform_point(moves, stack.points)
+    points = (moves[:, :3, :3] @ stack.points[:, :, None])[:, :, 0] + moves[:, :3, 3]
     speeds = np.cross(of_corner[:, :3], points) + of_corner[:, 3:]
     return points, speeds[:, :, None] * shares[:, None, :]
 

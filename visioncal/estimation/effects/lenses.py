@@ -159,6 +159,18 @@ class CameraParameters:
         }
         return replace(self, problems=problems)
 
+    def doubting(self, lenses: Mapping[str, tuple[FloatArray, IntArray]]) -> "CameraParameters":
+        """The same, given intrinsics of cameras being known to (k,), and those in doubt counting.
+
+        Args:
+            lenses: Both by camera, places being those among its own intrinsics.
+        """
+        problems = {
+            name: it.with_lens_sigma(*lenses[name]) if name in lenses else it
+            for name, it in self.problems.items()
+        }
+        return replace(self, problems=problems)
+
     def with_sizes(self, scales: Mapping[int, float]) -> "CameraParameters":
         """The same, printed boards being larger than stated by some shares, free from the start."""
         places = [int(self.scale_of(it)[0]) for it in scales]

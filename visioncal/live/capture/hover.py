@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from visioncal.core.errors import DataError, DriverError
-from visioncal.core.transforms import invert, pose_difference, transform_point
+from visioncal.core.transforms import invert, pose_difference
 from visioncal.core.types import FloatArray
 from visioncal.live.capture.drive import travel_s
 from visioncal.live.drivers.protocols import MovingArm
@@ -98,7 +98,7 @@ class Hovering:
 
     def _heights(self, base_from_flange: FloatArray) -> FloatArray:
         """(m,) how high the tip is above the plane, of (m, 4, 4) poses of the flange [m]."""
-        tips = transform_point(base_from_flange, self.tip_m)
+        tips = base_from_flange[:, :3, :3] @ self.tip_m + base_from_flange[:, :3, 3]
         return np.asarray((self.point_m - tips) @ self.normal)
 
     def _check(self, way: FloatArray) -> None:

@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 
 from visioncal.core.errors import DataError
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.transforms import invert, skew, transform_points
+from visioncal.core.transforms import invert, skew
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.appearance import (
     SCALE,
@@ -409,7 +409,7 @@ def _arm_size(robot: Robot, purpose: Purpose, recorded: Recorded | None = None) 
 def _predicted(cell: PlanCell, poses: FloatArray, first_corner: int) -> tuple[CornerStack, Mask]:
     """The corners at (k, 4, 4) poses as they would be found, and which of these show the board."""
     positions = corner_positions(cell.target)
-    points = transform_points(poses, positions)
+    points = positions @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
     px = project(cell.camera, points.reshape(-1, 3)).reshape(*points.shape[:2], 2)
     size = np.array(cell.camera.resolution)
     visible = np.all((px > -0.5) & (px < size - 0.5), axis=2)

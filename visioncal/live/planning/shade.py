@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.core.transforms import transform_points
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.live.planning.cell import PlanCell
 from visioncal.robot.batch import chain_frames
@@ -80,7 +79,8 @@ class Shade:
         in_hand = cell.mount == "eye-in-hand"
         base_from_cam = base_from_flange @ cell.x if in_hand else cell.x[None]
         base_from_target = cell.z[None] if in_hand else base_from_flange @ cell.z
-        return base_from_cam[:, None, :3, 3], transform_points(base_from_target, self.points)
+        ends = self.points @ np.swapaxes(base_from_target[:, :3, :3], 1, 2)
+        return base_from_cam[:, None, :3, 3], ends + base_from_target[:, None, :3, 3]
 
 
 def _meet_box(

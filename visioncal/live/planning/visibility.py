@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import compose, invert, transform_point, transform_points
+from visioncal.core.transforms import compose, invert
 from visioncal.core.types import Camera, FloatArray, Mask, Target
 from visioncal.live.planning.cell import PlanCell, board_size_m
 from visioncal.vision.camera import normalise, project_with_jacobian
@@ -179,7 +179,7 @@ class Sight:
 
     def shows(self, cam_from_target: FloatArray) -> Mask:
         """Whether the whole print is in the image (k,) of views (k, 4, 4)."""
-        return self.window.holds(transform_points(cam_from_target, self.outline))
+        return self.window.holds(_moved(cam_from_target, self.outline))
 
     def share(self, base_from_flange: FloatArray, wanted: float) -> FloatArray:
         """In what share of the guesses' draws poses show the whole print.
@@ -206,22 +206,22 @@ class Sight:
         in_hand = self.cell.mount == "eye-in-hand"
         flange = invert(base_from_flange) if in_hand else base_from_flange
         # Its corners do for a share, and sides between them are nearly straight.
-        outlines = transform_points(self.z[which], self.outline[:_CORNERS])
-        points = transform_points(flange, outlines.reshape(-1, 3))
+        outlines = _moved(self.z[which], self.outline[:_CORNERS])
+        points = _moved(flange, outlines.reshape(-1, 3))
         cam_from_here = invert(self.x[which])
         return self.window.holds(
-            transform_points(cam_from_here, points.reshape(len(flange), *outlines.shape))
+            _moved(cam_from_here, points.reshape(len(flange), *outlines.shape))
         )
 
     def tilt_rad(self, cam_from_target: FloatArray) -> FloatArray:
         """Angles (k,) between the line of sight to the board's centre and its normal [rad]."""
-        centre = transform_point(cam_from_target, self.centre)
+        centre = cam_from_target[:, :3, :3] @ self.centre + cam_from_target[:, :3, 3]
         along = np.einsum("ki,ki->k", centre, cam_from_target[:, :3, 2])
         return np.asarray(np.arccos(np.clip(along / np.linalg.norm(centre, axis=1), -1.0, 1.0)))
 
     def distances_m(self, cam_from_target: FloatArray) -> FloatArray:
         """Distances (k,) between the camera and the board's centre [m]."""
-        centre = transform_point(cam_from_target, self.centre)
+        centre = cam_from_target[:, :3, :3] @ self.centre + cam_from_target[:, :3, 3]
         return np.asarray(np.linalg.norm(centre, axis=1))
 
     def sharp(self, cam_from_target: FloatArray) -> Mask:
@@ -276,6 +276,12 @@ def _distance_m(cell: PlanCell) -> tuple[float, float]:
         if half * d > radius + _SURELY * np.sqrt(2.0 * cell.sigma_m**2 + turned**2):
             return _NEAREST * full, max(farthest, 1.15 * float(d))
     return _NEAREST * full, _NEVER_BEYOND * full
+
+
+def _moved(a_from_b: FloatArray, points: FloatArray) -> FloatArray:
+    """Moves (..., p, 3) points by (..., 4, 4) transforms."""
+    turned = points @ np.swapaxes(a_from_b[..., :3, :3], -1, -2)
+    return np.asarray(turned + a_from_b[..., None, :3, 3])
 
 
 def _outline(target: Target) -> FloatArray:

@@ -15,7 +15,6 @@ import rerun as rr
 from visioncal.core.errors import DataError
 from visioncal.core.files import sha256
 from visioncal.core.number_format import significant
-from visioncal.core.transforms import transform_point
 from visioncal.core.types import FloatArray, Target
 from visioncal.present.cellmap import pairs, places, spans
 from visioncal.present.recording import board, colours, paths
@@ -332,7 +331,7 @@ def _middle(scene: CellScene, frame: str, cell_from_frame: FloatArray) -> FloatA
     """The middle of what was seen, in the cell."""
     target = scene.targets.get(frame)
     middle = np.zeros(3) if target is None else board.outline(target).mean(axis=0)
-    return transform_point(cell_from_frame, middle)
+    return np.asarray(cell_from_frame[:3, :3] @ middle + cell_from_frame[:3, 3])
 
 
 def _log_robot(stream: rr.RecordingStream, scene: CellScene, flange: str, view: View) -> None:

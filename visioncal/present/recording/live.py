@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 import numpy as np
 import rerun as rr
 
-from visioncal.core.transforms import transform_points
 from visioncal.core.types import Camera, FloatArray, Image, Mount, Target
 from visioncal.present.recording import board, colours, paths
 from visioncal.present.recording.arm import log_arm, log_frames
@@ -144,4 +143,4 @@ class LiveDrawing:
             pose = flange @ np.asarray(cell.x)
         else:
             shapes, pose = [board.closed_outline(cell.target)], flange @ np.asarray(cell.z)
-        return [transform_points(pose, it) for it in shapes]
+        return [it @ pose[:3, :3].T + pose[:3, 3] for it in shapes]

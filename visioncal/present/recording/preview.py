@@ -10,7 +10,7 @@ import rerun as rr
 from rerun.blueprint import BlueprintLike
 
 from visioncal.core.files import written_beside
-from visioncal.core.transforms import invert, transform_points
+from visioncal.core.transforms import invert
 from visioncal.core.types import Camera, FloatArray, Mount, Target
 from visioncal.present.recording import board, colours, paths
 from visioncal.present.recording.arm import log_arm, log_frames
@@ -141,7 +141,7 @@ def _charts(preview: Preview) -> Charts:
 
 
 def _corners_px(preview: Preview, cam_from_target: FloatArray) -> FloatArray:
-    points = transform_points(cam_from_target, corner_positions(preview.target))
+    points = corner_positions(preview.target) @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]
     return project(preview.camera, points)
 
 
@@ -188,7 +188,7 @@ def _log_carried(stream: rr.RecordingStream, preview: Preview, size_m: float) ->
             base_from_carried = base_from_target
             shapes = [board.closed_outline(preview.target)]
         centres.append(base_from_carried[:3, 3])
-        strips += [transform_points(base_from_carried, it) for it in shapes]
+        strips += [it @ base_from_carried[:3, :3].T + centres[-1] for it in shapes]
     lines = rr.LineStrips3D(strips, colors=colours.USED, radii=0.5 * _LINE * size_m)
     stream.log(f"{paths.STOPS}/{paths.USED}/carried", frame, lines, static=True)
     points = rr.Points3D(
@@ -243,7 +243,7 @@ def _log_image(stream: rr.RecordingStream, preview: Preview, cam_from_target: Fl
     outline = board.closed_outline(preview.target)
     shares = np.linspace(0.0, 1.0, _SIDE_POINTS)[:, None]
     sides = np.concatenate([begin + shares * (end - begin) for begin, end in pairwise(outline)])
-    seen = transform_points(cam_from_target, sides)
+    seen = sides @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]
     # Rerun counts from the image's corner, not from the first pixel's centre.
     rim = rr.LineStrips2D([project(preview.camera, seen) + 0.5], colors=colours.DETECTED)
     stream.log(f"{paths.IMAGE}/board", frame, rim)

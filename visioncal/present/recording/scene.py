@@ -7,7 +7,6 @@ from functools import cached_property
 import numpy as np
 import rerun as rr
 
-from visioncal.core.transforms import transform_points
 from visioncal.core.types import Camera, FloatArray, Target
 from visioncal.present.recording import board, colours, paths
 from visioncal.present.recording.arm import log_arms, log_frames, placed
@@ -230,7 +229,7 @@ class Scene:
     def _carried(self, base_from_flange: FloatArray) -> list[FloatArray]:
         """The same at one stop, in the base."""
         return [
-            transform_points(base_from_end, shape)
+            shape @ base_from_end[:3, :3].T + base_from_end[:3, 3]
             for end, shape in self._shapes
             if (base_from_end := self._base_from(end, base_from_flange)) is not None
         ]
@@ -272,7 +271,8 @@ class Scene:
             strips[row], base_from_cam = [], self._base_from("cam", flange)
             if it.cam_from_target is not None and base_from_cam is not None:
                 base_from_target = base_from_cam @ it.cam_from_target
-                strips[row] = [transform_points(base_from_target, self._outlines[name])]
+                corners = self._outlines[name]
+                strips[row] = [corners @ base_from_target[:3, :3].T + base_from_target[:3, 3]]
         if not strips:
             return
         frame, width = rr.CoordinateFrame(paths.BASE_FRAME), self._radius(_LINE)

@@ -60,11 +60,11 @@ class Scale:
         return [low, high]
 
 
-def spanning(values: FloatArray) -> Scale:
+def spanning(values: FloatArray, room: float = 0.05) -> Scale:
     """A scale that holds values, with some room at both ends; NaN are passed over."""
     known = values[np.isfinite(values)]
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
-    spare = 0.05 * (high - low) or 0.5
+    spare = room * (high - low) or 0.5
     return Scale(low - spare, high + spare)
 
 
@@ -248,10 +248,11 @@ class Panel:
         data = f"M{box.left:.1f} {box.top:.1f}H{box.right:.1f}V{box.bottom:.1f}"
         self.figure.path(data + f"H{box.left:.1f}z", stroke=svg.LINE, width=0.8)
 
-    def title(self, words: str) -> None:
+    def title(self, words: str, anchor: str = "middle") -> None:
         """Writes above it."""
-        middle = 0.5 * (self.box.left + self.box.right)
-        self.figure.text(middle, self.box.top - 5.0, words, anchor="middle")
+        box = self.box
+        x = 0.5 * (box.left + box.right) if anchor == "middle" else box.left
+        self.figure.text(x, box.top - 5.0, words, anchor=anchor)
 
     def line(
         self,
