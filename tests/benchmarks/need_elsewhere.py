@@ -12,6 +12,7 @@ look and where it goes, and moves of the base, which come as late in the picks a
 import tempfile
 import time
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -21,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from elsewhere import COLUMNS, ROWS, SQUARE_M, WORLDS, Case, cell, pose, seen
 from need import PICKS, Outcome, in_bins, some_need, table
-from results import wished, write_section
+from results import first, wished, write_section
 
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
@@ -110,34 +111,31 @@ def in_image(
 
 def main(seeds: int) -> None:
     """Prints the tables and keeps them."""
+    worlds = first(list(WORLDS))
     every = [
         it
-        for it in product(WORLDS, ("eye-in-hand", "eye-to-hand"), (True, False), range(seeds))
+        for it in product(worlds, ("eye-in-hand", "eye-to-hand"), (True, False), range(seeds))
         if it[2] or WORLDS[it[0]].off_px == 0.0
     ]
     with tempfile.TemporaryDirectory() as folder, Pool(2) as pool:
         kept = pool.map(partial(of_one_cell, folder=Path(folder)), every, chunksize=2)
     found = [it for it in kept if it is not None]
     rows = []
-    for world in WORLDS:
+    for world in worlds:
         mine = [it for it in found if it.world == world]
-        away = np.array([it.outcome.landed - it.outcome.stated for it in mine])
-        good = away[[it.status == "good" for it in mine]]
-        rows.append(
-            (world, str(len(mine)), f"{100 * away.mean():+.1f} ({spread(away)})",
-             f"{100 * good.mean():+.1f} ({spread(good)})" if len(good) else "none is good")
-        )  # fmt: skip
+        rows.append((world, *(in_words(it) for it in (
+            mine,
+            [it for it in mine if it.outcome.kind[0] == "eye-in-hand"],
+            [it for it in mine if it.outcome.kind[0] == "eye-to-hand"],
+            [it for it in mine if it.status == "good"],
+        ))))  # fmt: skip
+    bins = in_bins([it.outcome for it in found])
     text = f"""{len(every)} cells of `elsewhere.py`, {seeds} seeds of each; {PICKS} picks of each.
 {len(every) - len(found)} sessions were refused. The standard error is in brackets.
 
-{
-        table(
-            ("stated", "cells", "mean stated", "picks that land", "difference"),
-            in_bins([it.outcome for it in found]),
-        )
-    }
+{table(("stated", "cells", "mean stated", "picks that land", "difference"), bins)}
 
-{table(("world", "cells", "difference", "where the verdict is good"), rows)}
+{table(("world", "difference", "in hand", "to hand", "where the verdict is good"), rows)}
 """
     print(text)
     write_section(
@@ -145,9 +143,12 @@ def main(seeds: int) -> None:
     )
 
 
-def spread(away: FloatArray) -> str:
-    """The standard error of a mean, in percent."""
-    return f"{100 * float(np.std(away)) / np.sqrt(len(away)):.1f}"
+def in_words(trials: Sequence[Trial]) -> str:
+    """By how much picks land more often than stated, with its standard error [percent points]."""
+    if not trials:
+        return "none"
+    away = 100 * np.array([it.outcome.landed - it.outcome.stated for it in trials])
+    return f"{away.mean():+.1f} ({float(np.std(away)) / np.sqrt(len(away)):.1f})"
 
 
 if __name__ == "__main__":

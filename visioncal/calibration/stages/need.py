@@ -9,7 +9,8 @@ Where the robot arrives differs from the thing by
     look          the robot's noise at the look, where it carries the camera; and the focus, where
                   that changes from image to image
     arm           errors that follow the arm's posture and were not calibrated
-    pick          the noise of the flange when it goes there; a tool's length adds to it
+    pick          the noise of the flange when it goes there, and what the arm errs by in that
+                  posture, where it looked from another; a tool's length adds to it
     left out      as far as views that were left out of the fit err by more than is predicted of
                   them and than chance explains
 
@@ -246,8 +247,12 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
     placed["look"][:, 3:, 3:] += nearer_m[:, :, None] * nearer_m[:, None]
     # A camera that is carried looks from another posture than the robot then has; before one that
     # stands still it is the same, and of a whole chain its noise is among the chain's already.
-    going = np.where(carries[:, None, None], _axes(level), 0.0 if whole else _axes(white))
+    is_posture = unfitted is not None and not unfitted.of_links
+    another = _axes(white if is_posture else level)
+    going = np.where(carries[:, None, None], another, 0.0 if whole else _axes(white))
     placed["pick"] = _of_flange(problem, robot, in_base, going)
+    if is_posture:
+        placed["pick"] = placed["pick"] + carries[:, None, None] * placed["arm"]
     placed["left out"] = np.broadcast_to(_unpredicted(fitted), parts["look"].shape)
     return Picks(
         camera,
