@@ -390,7 +390,10 @@ def cell(world: World, mount: str, given: bool, seed: int, folder: Path) -> Case
     def told(flanges):
         return world.robot(flanges, deepcopy(drawn)) if world.robot else flanges
 
-    reported = world.robot(robot, rng) if world.robot else robot
+    try:
+        reported = world.robot(robot, rng) if world.robot else robot
+    except RuntimeError:  # Other views instead of those that the arm does not reach.
+        return cell(world, mount, given, seed + 1000, folder)
     errors = world.noise((len(robot), 6), rng)
     steps = np.array([pose(world.robot_rad * it[:3], world.robot_m * it[3:]) for it in errors])
     reported = reported @ steps
