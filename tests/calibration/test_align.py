@@ -371,7 +371,8 @@ def test_arms_that_err_are_named_and_their_offsets_found_where_that_is_asked_for
         assert f"theta_offset_rad = {told[1]:.6f}"[:-2] in written.text
     assert off(cell, found, "cam_left", "cam_right")[1] < 22.0
     after, before = (it.between("cam_left", "cam_right").sigma_mm for it in (found, reported))
-    assert after < 0.4 * before
+    # Well under a half: what the arms err by puts the given lenses in doubt, too.
+    assert after < 0.45 * before
 
 
 def test_a_robot_without_joints_stays_as_it_reports_itself(clean):

@@ -200,7 +200,8 @@ def test_predictions_move_as_their_derivatives_say(mount):
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_the_workspace_sigma_is_the_bound_and_holds_the_error(mount):
     sure = replace(WRONG_LINKS.target, square_sigma_m=1e-5 * WRONG_LINKS.target.square_m)
-    cell = simulate(replace(WRONG_LINKS, seed=6, mount=mount, target=sure))
+    # The bound takes the lens for exact; here nothing speaks against that.
+    cell = simulate(replace(WRONG_LINKS, seed=7, mount=mount, target=sure))
     known = calibrated(cell)
     sigma = float(np.sqrt(np.mean(arm_found(known).numbers.sigmas_m ** 2)))
     bound = workspace_bound_m(cell, postures(known.robot)[::20])
