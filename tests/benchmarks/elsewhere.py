@@ -292,14 +292,14 @@ WORLDS = {
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One cell, as it truly is; `told` is what is reported of flanges (m, 4, 4), but for noise."""
+    """One cell, as it truly is; `reported_of` flanges (m, 4, 4) leaves noise out."""
 
     world: World
     mount: str
     x: np.ndarray
     z: np.ndarray
     robot: np.ndarray
-    told: Callable[[np.ndarray], np.ndarray]
+    reported_of: Callable[[np.ndarray], np.ndarray]
     shift: Callable[[np.ndarray], np.ndarray]
     corners: np.ndarray
     boards: np.ndarray
@@ -387,7 +387,7 @@ def cell(world: World, mount: str, given: bool, seed: int, folder: Path) -> Case
     pixels = pixels + world.pixel_px * rng.normal(size=pixels.shape)
     drawn = deepcopy(rng)
 
-    def told(flanges):
+    def reported_of(flanges):
         return world.robot(flanges, deepcopy(drawn)) if world.robot else flanges
 
     try:
@@ -403,7 +403,9 @@ def cell(world: World, mount: str, given: bool, seed: int, folder: Path) -> Case
     if given and world.is_said:
         with (folder / "session.toml").open("a") as file:
             file.write(f"matrix_sigma_px = {world.off_px}\n")
-    return Case(world, mount, x, z, reported, told, shift, corners, boards, pixels, stated, mean_m)
+    return Case(
+        world, mount, x, z, reported, reported_of, shift, corners, boards, pixels, stated, mean_m
+    )
 
 
 def write(folder, mount, matrix, reported, pixels):

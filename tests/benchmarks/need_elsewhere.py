@@ -80,13 +80,13 @@ def lands(
     if case.mount == "eye-in-hand":
         robot = case.z @ invert(in_camera) @ invert(case.x)
         meant = robot @ case.x @ in_camera @ TO_MIDDLE
-        goal = case.told(robot) @ noise(case, rng) @ found @ shown @ TO_MIDDLE
+        goal = case.reported_of(robot) @ noise(case, rng) @ found @ shown @ TO_MIDDLE
     else:
         meant, goal = case.x @ in_camera @ TO_MIDDLE, found @ shown @ TO_MIDDLE
     # Where the robot really is when it reports the goal.
     went = goal
     for _ in range(4):
-        went = went @ invert(case.told(went)) @ goal
+        went = went @ invert(case.reported_of(went)) @ goal
     away = invert(meant) @ went @ noise(case, rng)
     near = need.mm is None or 1e3 * np.linalg.norm(away[:, :3, 3], axis=1) <= need.mm
     return near & (need.deg is None or np.rad2deg(rotation_angle(away)) <= need.deg)

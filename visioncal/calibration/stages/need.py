@@ -239,19 +239,21 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
         look = looking.total_covariance(linear, noise) - looking.covariance(noise)
     parts["look"] = look
     placed = {name: _at_points(it, at_m) for name, it in parts.items()}
-    poses = problem.measured(state)
-    turns = np.swapaxes(poses[:, :3, :3], 1, 2)
-    axes = (turns if whole else in_base[:, :3, :3] @ turns)[:, :, 2]
+    at_camera = problem.measured(state)
+    in_camera = _carried(at_camera, middles)
+    axes = np.swapaxes(at_camera[:, :3, :3], 1, 2)[:, :, 2]
+    if not whole:
+        axes = (in_base[:, :3, :3] @ axes[:, :, None])[:, :, 0]
     # A focal length that is longer by a share shows a thing nearer by it.
-    nearer_m = fitted.jitters.get(camera, 0.0) * _carried(poses, middles)[:, 2, None] * axes
+    nearer_m = fitted.jitters.get(camera, 0.0) * in_camera[:, 2, None] * axes
     placed["look"][:, 3:, 3:] += nearer_m[:, :, None] * nearer_m[:, None]
     # A camera that is carried looks from another posture than the robot then has; before one that
     # stands still it is the same, and of a whole chain its noise is among the chain's already.
-    is_posture = unfitted is not None and not unfitted.of_links
-    another = _axes(white if is_posture else level)
+    by_posture = unfitted is not None and not unfitted.of_links
+    another = _axes(white if by_posture else level)
     going = np.where(carries[:, None, None], another, 0.0 if whole else _axes(white))
     placed["pick"] = _of_flange(problem, robot, in_base, going)
-    if is_posture:
+    if by_posture:
         placed["pick"] = placed["pick"] + carries[:, None, None] * placed["arm"]
     placed["left out"] = np.broadcast_to(_unpredicted(fitted), parts["look"].shape)
     return Picks(
@@ -259,7 +261,7 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
         robot,
         {name: it for name, it in placed.items() if it.any()},
         fitted.freedom.get(robot, np.inf),
-        float(np.linalg.norm(_carried(problem.measured(state), middles), axis=1).mean()),
+        float(np.linalg.norm(in_camera, axis=1).mean()),
     )
 
 
