@@ -411,7 +411,10 @@ _SOURCES: Mapping[str, tuple[str, str, Step | None]] = {
     "board": (
         "unmeasured_board",
         "the board, whose size is not known better",
-        Step("Measure it over many squares, and state square_m and square_sigma_m in its .toml."),
+        Step(
+            "Measure the board over many squares, and state square_m and square_sigma_m in its "
+            ".toml."
+        ),
     ),
     "look": (
         "robot_noise",
