@@ -45,8 +45,8 @@ def write_drawn(folder: Path, number: int) -> None:
 
 def numbers_drawn(folder: Path) -> set[str]:
     """The generations that the files in a folder are of."""
+    from visioncal.present.facts import readable_time
     from visioncal.present.recording import read_calibration
-    from visioncal.present.report.content import readable_time
     from visioncal.results import Calibration
 
     created = Calibration.load(folder).created

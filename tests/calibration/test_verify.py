@@ -27,6 +27,7 @@ from visioncal.calibration.verification.check import check
 from visioncal.calibration.verification.messages import _signed_axis
 from visioncal.calibration.verification.prediction import known_before, predict_stops, seen_by
 from visioncal.core.errors import DataError
+from visioncal.core.number_format import significant
 from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.present.report.check import render_check
 from visioncal.results import Calibration
@@ -211,7 +212,7 @@ def test_the_page_shows_what_is_left_with_the_change_undone(place):
     page = Page(render_check(found, policy, verdict_of(found)))
     assert "does not hold any more" in page.words
     assert "with the likeliest change undone: the camera moved by" in page.words
-    assert [f"{1e3 * it:.3f}" in page.words for it in (*before, *after)] == [True] * 10
+    assert [significant(1e3 * it) in page.words for it in (*before, *after)] == [True] * 10
     assert "now a collision" in page.words
     passed = checked(place, np.random.default_rng(0))
     assert (passed.left == passed.away).all()

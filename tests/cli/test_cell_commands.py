@@ -9,10 +9,10 @@ from support.arm_documents import arm_of
 from support.commands import turned_poses, visioncal, write_poses
 from support.whole_cells import LATER, OPTIONS, misfit, part, recorded, saved, simulated, truth
 
-from visioncal.cli.summary import unused_words
 from visioncal.frames.frame_from_images import seen_frame
 from visioncal.frames.locate import locate
 from visioncal.frames.plane import Plane
+from visioncal.present.advice import left_out
 from visioncal.results import Calibration, RobotResult
 from visioncal.results.compare import compare
 from visioncal.results.compensation import correct
@@ -159,11 +159,12 @@ def test_many_rows_that_are_left_out_for_one_reason_share_a_line(place):
     sight = Calibration.load(place / "out").cell.sights[0]
     lost = [replace(sight, view=it, used=False, reason="not needed") for it in range(30)]
     of = f"({sight.seer} of {sight.seen})"
-    assert list(unused_words([*lost, sight])) == [
-        f"30 views (0, 1, 2 and 27 more) {of}: not needed"
+    named = ", ".join(map(str, range(12)))
+    assert [it.words for it in left_out([*lost, sight])] == [
+        f"30 views, as {named} {of}: not needed"
     ]
     alone = replace(lost[5], reason="blurred")
-    assert f"view 5 {of}: blurred" in unused_words([*lost[:5], alone])
+    assert f"view 5 {of}: blurred" in [it.words for it in left_out([*lost[:5], alone])]
 
 
 def test_a_fixture_of_one_robot_is_known_in_the_base_of_the_other(cell, place, tmp_path):

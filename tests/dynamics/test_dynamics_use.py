@@ -241,7 +241,8 @@ def test_the_report_says_what_was_found(written, run):
     for text in ("shoulder_pan_joint", "Fc1", "kg m", "Base parameters", "m6*cx6"):
         assert text in page
     # One row a parameter, a plot a motion and one of friction.
-    assert page.count('class="combination"') == identified.base.rank
+    parameters = page[page.index("Base parameters</h2>") :]
+    assert parameters.count('<tr class="') == identified.base.rank
     assert page.count("<svg role") == len(run.predictions) + 1
     assert "http://" not in page.replace("http://www.w3.org", "")
 

@@ -1,5 +1,7 @@
 """Recordings of aligned cells: the session and the result lie in them without loss."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
@@ -10,10 +12,10 @@ from visioncal.core.transforms import invert, pose_difference
 from visioncal.interchange.exports import Selection, export
 from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import load_exportable
-from visioncal.present.recording import paths, read_alignment, read_session
-from visioncal.present.recording.cells import CellScene
+from visioncal.present.recording import paths, read_calibration, read_evidence, read_session
 from visioncal.present.recording.frames import scan
 from visioncal.present.recording.reader import chunks
+from visioncal.present.recording.scene import Scene
 from visioncal.results import Alignment, Calibration, Edge, Sight, Verdict
 from visioncal.session import MemoryImages, Session
 from visioncal.simulation import (
@@ -24,6 +26,7 @@ from visioncal.simulation import (
     simulate_network,
 )
 
+KEPT = Path(__file__).parents[1] / "data"
 OPTIONS = NetworkOptions(
     cameras=(CameraAt("top"), CameraAt("hand", "a")),
     boards=(BoardAt("plate", "b"), BoardAt("floor")),
@@ -74,7 +77,7 @@ def true_alignment(cell, session) -> Alignment:
 
 
 def test_frames_are_drawn_where_they_were(cell, session):
-    scene = CellScene(session, true_alignment(cell, session))
+    scene = Scene.of(session, Calibration.whole(true_alignment(cell, session)), {})
     for it in session.observations:
         seer = scene.in_cell(it.seer, it.view.number)
         seen = scene.in_cell(it.seen, it.view.number)
@@ -95,27 +98,37 @@ def test_session_and_result_come_back_from_the_recording(cell, session, tmp_path
     ]
     recording = tmp_path / "out" / "recording.rrd"
     assert read_session(recording).digest() == session.digest()
-    assert read_alignment(recording).document() == found.document()
+    assert read_calibration(recording).cell.document() == found.document()
     selection = Selection("base_a_from_cam_top")
     assert export(load_exportable(recording), "text", selection) == export(
         load_exportable(tmp_path / "out"), "text", selection
     )
     drawn = {chunk.entity_path for chunk in RrdReader(recording).stream()}
-    for entity in ("/cell/cam_top", "/cell/target_plate/sheet", "/robots/flange_b/links", "/sight"):
+    for entity in ("/cameras/top", "/targets/plate/sheet", "/robots/b/links", "/sight"):
         assert entity in drawn
     assert "/network" in drawn
+
+
+def test_recordings_of_cells_by_earlier_versions_open():
+    kept = KEPT / "recording_of_cell.rrd"
+    calibration = read_calibration(kept)
+    assert calibration.cell.frames["target_plate"] == "flange_b"
+    assert calibration.verdict.status == "good"
+    assert calibration.session_sha256 == read_session(kept).digest()
+    assert len(calibration.views) == len(read_session(kept).views)
+    assert read_evidence(kept) == ()
 
 
 def test_a_changed_result_is_noticed(cell, session, tmp_path):
     write_outputs(tmp_path, session, Run(Calibration.whole(true_alignment(cell, session)), ()))
     recording = tmp_path / "recording.rrd"
-    ((frame, _, _),) = chunks(scan(recording), (paths.ALIGNMENT,), [])
+    ((frame, _, _),) = chunks(scan(recording), (paths.CALIBRATION,), [])
     data = bytearray(recording.read_bytes())
     for at in range(frame.offset + (frame.end - frame.offset) // 2, frame.end, 200):
         data[at] ^= 0x10
     recording.write_bytes(data)
     with pytest.raises(DataError, match="is damaged"):
-        read_alignment(recording)
+        read_calibration(recording)
 
 
 def test_images_that_are_missing_leave_the_rest(cell, tmp_path):

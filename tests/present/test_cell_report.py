@@ -9,11 +9,16 @@ from support.aligned_cells import made_up_cell
 from visioncal.core.number_format import significant
 from visioncal.present.cellmap import pairs, weakest_frame
 from visioncal.present.report import write_report
-from visioncal.present.report.cells import pair_table, render_cell
-from visioncal.results import Calibration, Moved, RobotResult, Sight, Untied
+from visioncal.present.report.network import known_in_each_other
+from visioncal.present.report.page import render
+from visioncal.results import Alignment, Calibration, Moved, RobotResult, Sight, Untied
 from visioncal.results.arm import ArmLevel, ArmResult
 
 CELL = made_up_cell(5)
+
+
+def render_cell(found: Alignment) -> str:
+    return render(Calibration.whole(found), None, ())
 
 
 def text_of(html: str) -> str:
@@ -41,19 +46,21 @@ def test_observations_are_counted_by_who_saw_whom():
         Sight(3, 2, "cam_hand", "target_plate", False, "blurred"),
     )
     first, second = pairs(replace(CELL, sights=sights))
-    assert (first.used, first.left_out, first.rms_mm) == (2, 1, 12.5**0.5)
-    assert (second.used, second.rms_mm) == (0, None)
+    assert (first.used, first.left_out, first.rms.mm) == (2, 1, 12.5**0.5)
+    assert (second.used, second.rms) == (0, None)
     words = text_of(render_cell(replace(CELL, sights=sights)))
     assert "2 (\N{MINUS SIGN}1)" in words
-    assert "2 cam_top of target_plate disagrees" in words
+    assert "view 2 not used cam_top of target_plate: disagrees" in words
 
 
 def test_the_table_has_any_frame_in_any_other():
-    table = pair_table(CELL, "cell")
-    assert list(table.rows) == ["base_a", "base_b", "cam_top"]
+    table = next(known_in_each_other(CELL))
+    assert table.titles == ("the cell", "base_a", "base_b", "cam_top")
+    rows = {it.cells[0]: it.cells[1:] for it in table.rows}
+    assert list(rows) == ["base_a", "base_b", "cam_top"]
     edge = CELL.between("cam_top", "base_b")
-    assert table.rows["cam_top"][1].startswith(f"{significant(edge.sigma_mm)} mm")
-    assert table.rows["cam_top"][2] == ""
+    assert rows["cam_top"][1].startswith(f"{significant(edge.sigma_mm)} mm")
+    assert rows["cam_top"][2] == ""
 
 
 def test_errors_of_robots_are_told_where_they_were_estimated():
@@ -63,8 +70,9 @@ def test_errors_of_robots_are_told_where_they_were_estimated():
     )
     arm = RobotResult(arm=ArmResult(level="offsets", levels=levels))
     words = text_of(render_cell(replace(CELL, arms={"a": arm})))
-    assert "robot a offsets stops left out: 0.17 mm, as stated 0.31 mm" in words
-    assert "The robots themselves" not in render_cell(CELL)
+    assert "The arm of a Taken: offsets of the joints." in words
+    assert "left out of the fit to 0.17 mm, the arm as stated to 0.31 mm." in words
+    assert "The arm" not in text_of(render_cell(CELL))
 
 
 def test_what_moved_and_what_is_untied_is_told(tmp_path):

@@ -30,12 +30,12 @@ from visioncal.present.recording import (
     paths,
     read_calibration,
     read_evidence,
-    tools,
     write_recording,
 )
 from visioncal.present.recording.uncertainty import SIGMAS_95
+from visioncal.present.report.content import edge_facts
 from visioncal.present.report.page import render
-from visioncal.present.report.tools import frame_cards
+from visioncal.present.report.tools import frame_plot
 from visioncal.results import Calibration, Frame, Verdict, to_document
 
 
@@ -97,7 +97,7 @@ def test_sigmas_are_along_the_axes_of_the_parent(sample):
     frame = sample.calibration.frames["flange_from_tool"]
     turn, covariance = frame.edge.matrix[:3, :3], frame.edge.covariance
     expected_mm = 1e3 * np.sqrt(np.diag(turn @ covariance[3:, 3:] @ turn.T))
-    shown = [it.note for it in frame_cards(sample.calibration)[0].pose.rows[:3]]
+    shown = [it.note for it in edge_facts("flange_from_tool", frame.edge)[:3]]
     found_mm = [float(re.search(r"[\d.]+", it)[0]) for it in shown]
     # Two digits are shown.
     np.testing.assert_allclose(found_mm, expected_mm, rtol=0.05)
@@ -115,8 +115,9 @@ def test_wrong_observations_are_named_and_red(sample, page):
     for mark in ("left-out", "look"):
         assert len(re.findall(f'<tr class="{mark}">', frames)) == 2
     # The bar of the wrong touch ends at the scale of the others and says how far it reaches.
-    assert "var(--bad)" in str(frame_cards(sample.calibration)[0].plot)
-    assert ">6.4<" in str(frame_cards(sample.calibration)[0].plot)
+    plot = str(frame_plot("tool", sample.calibration.frames["flange_from_tool"]))
+    assert "var(--bad)" in plot
+    assert ">6.4<" in plot
 
 
 def test_a_rotation_that_was_not_measured_is_not_given_as_one(page):
@@ -153,13 +154,13 @@ def test_frames_without_observations_or_residuals_still_have_a_report(sample):
     assert "off by [mm]" not in words
 
 
-def test_many_points_with_long_names_have_upright_labels(sample):
+def test_many_points_with_long_names_have_upright_labels():
     one = tool_frame().observations[0]
     many = [replace(one, name=f"a bore of the plate {number}") for number in range(60)]
-    card = frame_cards(with_frame(sample, replace(tool_frame(), observations=tuple(many))))[0]
-    labels = re.findall(r">(a bore of t\S*)<", str(card.plot))
+    plot = str(frame_plot("tool", replace(tool_frame(), observations=tuple(many))))
+    labels = re.findall(r">(a bore of t\S*)<", plot)
     assert 10 < len(labels) <= 24
-    assert "rotate(-90" in str(card.plot)
+    assert "rotate(-90" in plot
 
 
 def test_recordings_give_the_frames_back(sample, recorded):
@@ -229,14 +230,14 @@ def test_exact_frames_have_no_ellipsoid(sample, tmp_path):
 
 
 def test_the_notes_tell_of_frames(sample):
-    text = tools.markdown(sample.calibration).replace("\\", "")
+    text = notes.tools_markdown(sample.calibration).replace("\\", "")
     assert text.startswith("# flange_from_tool: Check before use")
     assert f"- **point {WRONG_TOUCH} not used**: {WRONG_REASON}" in text
-    assert f"| {WRONG_TOUCH} | point | 6.4 | **no** |" in text
+    assert f"| {WRONG_TOUCH} | point | 6.4 | left out |" in text
     assert "- cone: 43.71 deg" in text
     assert "| -620.00, -50.00, 20.00 | not measured | 0.15 mm |" in text
     # The viewer would follow what looks like Markdown or HTML.
-    assert r"touches \<b\>1" in tools.markdown(sample.calibration)
+    assert r"touches \<b\>1" in notes.tools_markdown(sample.calibration)
     verdict = notes.verdict_markdown(sample.calibration).replace("\\", "")
     assert "- flange_from_tool: Check before use, see Tools and fixtures." in verdict
     assert "- base_from_fixture" not in verdict

@@ -18,6 +18,7 @@ from support.samples import Sample, made_up
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import Corners
+from visioncal.present.parts import sights
 from visioncal.present.recording import codec, notes, paths, read_session, write_recording
 from visioncal.present.viewer import blueprint
 from visioncal.results.evidence import ViewEvidence, magnification
@@ -239,13 +240,14 @@ def test_corners_are_drawn_where_the_viewer_has_the_pixels(sample: Sample, recor
 
 
 def test_camera_is_drawn_at_the_end_of_the_chain(sample: Sample, recorded: Path) -> None:
-    drawn = column(recorded, paths.CAMERA, "Transform3D:translation")
-    edge = sample.calibration.transforms["flange_from_cam"].as_matrix()
-    for position, seen in zip(drawn, sample.evidence, strict=True):
+    flanges = column(recorded, paths.FLANGE, "Transform3D:translation")
+    (camera,) = column(recorded, paths.CAMERA, "Transform3D:translation")
+    edge = sample.calibration.transforms["flange_from_cam"]
+    # Single precision holds 1 m to 6e-8.
+    np.testing.assert_allclose(camera[0], edge.translation, atol=1e-6)
+    for position, seen in zip(flanges, sample.evidence, strict=True):
         assert seen.base_from_flange is not None
-        base_from_cam = seen.base_from_flange @ edge
-        # Single precision holds 1 m to 6e-8.
-        np.testing.assert_allclose(position[0], base_from_cam[:3, 3], atol=1e-6)
+        np.testing.assert_allclose(position[0], seen.base_from_flange[:3, 3], atol=1e-6)
 
 
 def test_session_without_images_can_be_recorded(tmp_path: Path) -> None:
@@ -259,7 +261,7 @@ def test_session_without_images_can_be_recorded(tmp_path: Path) -> None:
 
 
 def test_notes_cannot_load_or_link_anything(sample: Sample) -> None:
-    view = sample.calibration.views[6]
+    view = sights(sample.calibration)[6]
     assert "](http" not in notes.view_markdown(view)
     assert r"\[it\]\(http://example\.org\)" in notes.view_markdown(view)
     assert "| park | " in notes.solvers_markdown(sample.calibration)

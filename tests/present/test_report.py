@@ -20,10 +20,11 @@ from visioncal.core.number_format import matched, significant
 from visioncal.core.types import Target
 from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import load_stored
+from visioncal.present.advice import listed, suspects
+from visioncal.present.parts import sights
 from visioncal.present.recording import write_recording
 from visioncal.present.recording.notes import view_markdown
 from visioncal.present.report import write_report
-from visioncal.present.report.advice import listed, suspects
 from visioncal.present.report.axes import Scale, tick_words
 from visioncal.present.report.page import render
 from visioncal.present.report.plots import twist_of
@@ -329,7 +330,7 @@ def test_views_lead_to_the_recording_and_back(sample: Sample, outputs: Path) -> 
     page = (outputs / "report.html").read_text(encoding="utf-8")
     worst = worst_view(sample.calibration.views, sample.calibration.rms)
     assert f"visioncal review '{outputs}' --view {worst}" in unescape(page)
-    for it in sample.calibration.views:
+    for it in sights(sample.calibration):
         anchor = f"view-{it.view}"
         assert f'id="{anchor}"' in page
         assert f"(report.html#{anchor})" in view_markdown(it)

@@ -81,15 +81,12 @@ def load_result(path: Path) -> Calibration:
                 ) from error
             raise
     # The codec takes half a second to import, which a calibration.json need not wait for.
-    from visioncal.present.recording import read_alignment, read_calibration
+    from visioncal.present.recording import read_calibration
 
     calibration = read_calibration(path)
-    if calibration is not None:
-        return calibration
-    cell = read_alignment(path)
-    if cell is None:
+    if calibration is None:
         raise _uncalibrated(path, "the recording of a session")
-    return Calibration.whole(cell)
+    return calibration
 
 
 def load_placed(path: Path, robot: str | None = None) -> Calibration | FrameFile:

@@ -1,9 +1,11 @@
 """The network of an aligned cell as it is drawn: its bodies side by side, and who saw whom."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
-from visioncal.results import Alignment
+from visioncal.present.parts import former_frames
+from visioncal.results import Alignment, Rms, Sight
+from visioncal.results.whole import left_out_rms, rms_of
 
 # How far frames stand apart, and the gap between bodies, in the units of the drawing.
 STEP, GAP = 1.5, 0.8
@@ -21,40 +23,30 @@ class Pair:
         seen: The other.
         used: How many observations the fit used.
         left_out: How many it did not.
-        rms_mm: Root mean square of what those used are off [mm]; None where none was used.
-        rms_deg: The same in rotation [deg].
-        unseen_mm: The same of fits that were made without their stops [mm].
-        unseen_deg: And in rotation [deg].
+        rms: Residuals of those used; None where none was.
+        unseen: The same by fits that were made without their stops; None where that is not known.
     """
 
     seer: str
     seen: str
     used: int
     left_out: int
-    rms_mm: float | None
-    rms_deg: float | None
-    unseen_mm: float | None
-    unseen_deg: float | None
+    rms: Rms | None
+    unseen: Rms | None
 
 
 def pairs(found: Alignment) -> tuple[Pair, ...]:
     """Lists who saw whom, and how well that fits."""
-    rows: dict[tuple[str, str], list[int]] = {}
-    for at, it in enumerate(found.sights):
-        rows.setdefault((it.seer, it.seen), []).append(at)
+    rows: dict[tuple[str, str], list[Sight]] = {}
+    for it in found.sights:
+        rows.setdefault((it.seer, it.seen), []).append(it)
     listed = []
     for (seer, seen), mine in rows.items():
-        used = [found.sights[at] for at in mine if found.sights[at].used]
-        names = ("residual_mm", "residual_deg", "left_out_mm", "left_out_deg")
-        away = (rms([getattr(it, name) for it in used]) for name in names)
-        listed.append(Pair(seer, seen, len(used), len(mine) - len(used), *away))
+        used = sum(it.used for it in mine)
+        unseen = any(it.used and it.left_out_mm is not None for it in mine)
+        rms = (rms_of(mine) if used else None, left_out_rms(mine) if unseen else None)
+        listed.append(Pair(seer, seen, used, len(mine) - used, *rms))
     return tuple(listed)
-
-
-def rms(values: Sequence[float | None]) -> float | None:
-    """Root mean square of those that are known; None of none."""
-    known = [it for it in values if it is not None]
-    return float(sum(it * it for it in known) / len(known)) ** 0.5 if known else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,23 +74,22 @@ class Body:
 
 def weakest_frame(found: Alignment) -> str:
     """The frame whose place on its parent is known worst, of those as they hang last."""
-    former = {it.before for it in found.moved}
-    edges = {it: found.edge_of(it) for it in _edged(found) if it not in former}
+    edges = {it: found.edge_of(it) for it in _edged(found)}
     return max(edges, key=lambda it: edges[it].sigma_mm, default="")
 
 
 def _edged(found: Alignment) -> list[str]:
-    return [it for it in found.frames if it not in found.robots]
+    former = former_frames(found)
+    return [it for it in found.frames if it not in found.robots and it not in former]
 
 
 def bodies(found: Alignment) -> list[Body]:
     """The flanges with the cell in their middle; frames as they hung before are left out."""
-    former = {it.before for it in found.moved}
     flanges = list(found.robots)
     half = (len(flanges) + 1) // 2
     found_bodies = []
     for name in [*flanges[:half], "cell", *flanges[half:]]:
-        mine = [it for it in _edged(found) if found.frames[it] == name and it not in former]
+        mine = [it for it in _edged(found) if found.frames[it] == name]
         top = tuple(it for it in mine if it.startswith(_SEERS))
         bottom = tuple(it for it in mine if it.startswith("base"))
         middle = tuple(it for it in mine if it not in top and it not in bottom)

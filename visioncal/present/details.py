@@ -1,7 +1,12 @@
-"""Further figures of a tool's or a fixture's method, in words."""
+"""What is said of a tool or a fixture: its figures, and what was observed of it."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
+
+from visioncal.core.number_format import significant
+from visioncal.present.facts import readable_time
+from visioncal.present.tables import Fact, Row, Table
+from visioncal.results import Frame
 
 _UNITS = {"_px": "px", "_mm": "mm", "_deg": "deg", "_rad": "rad", "_m": "m", "_percent": "%"}
 # What keys mean, by their path; {} is the name of a point. Others are shown as they are written.
@@ -34,6 +39,30 @@ _LABELS = {
 _RANGES = {"noise_95_mm"}
 # Ratios near one: what counts are their last digits.
 _RATIOS = {"scale.value"}
+
+
+def frame_facts(frame: Frame) -> tuple[Fact, ...]:
+    """How a tool or a fixture was found, and how well."""
+    used = sum(it.used for it in frame.observations)
+    return (
+        Fact("method", frame.method),
+        Fact("source", frame.source),
+        Fact("created", readable_time(frame.created)),
+        Fact("observations", f"{used} used of {len(frame.observations)}"),
+        Fact("residual, rms", f"{significant(frame.rms_mm)} mm", "over those used"),
+        Fact("noise, per axis", f"{significant(frame.noise_mm)} mm"),
+        *(Fact(label, f"{value} {unit}".strip()) for label, value, unit in details(frame.details)),
+    )
+
+
+def observation_table(frame: Frame) -> Table:
+    """How far each observation is off, and what became of it."""
+    rows = []
+    for it in frame.observations:
+        mark = "left-out" if not it.used else "look" if it.reason else "used"
+        words = {"left-out": "left out", "look": "look", "used": "yes"}[mark]
+        rows.append(Row((it.name, it.kind, significant(it.residual_mm), words), mark))
+    return Table.of(("observation", "kind", "mm", "used"), rows, (0, 1, 3))
 
 
 def details(document: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:

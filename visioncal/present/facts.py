@@ -1,20 +1,40 @@
-"""What a result says, as facts and rows that pages and recordings show."""
+"""What a result says, as facts and tables that pages and recordings show."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from datetime import datetime
 
 import numpy as np
 
 from visioncal.core.number_format import decimals_for, matched, significant
 from visioncal.core.transforms import pose_difference
 from visioncal.core.types import Target
-from visioncal.present.words import level_reason
-from visioncal.results import Calibration, Rms, SolverResult
-from visioncal.results.arm import ArmErrorsResult, ArmResult, ElasticResult
+from visioncal.present import parts
+from visioncal.present.cellmap import pairs
+from visioncal.present.tables import Fact, Row, Table
+from visioncal.results import Alignment, Calibration, Edge, Rms
 from visioncal.results.sections import BoardResult, UncertaintyResult
 
-PLUS_MINUS = "\N{PLUS-MINUS SIGN}"
-_UNITS = {"_px": "px", "_mm": "mm", "_deg": "deg"}
+PLUS_MINUS, DEGREE = "\N{PLUS-MINUS SIGN}", "\N{DEGREE SIGN}"
+# Endings of names on disk, and what they are for people.
+_UNITS = {"_px": "px", "_mm": "mm", "_deg": "deg", "level": "times what is said of it"}
+# What each source of uncertainty is, for people.
+SOURCES = {
+    "pixels": "noise of the corners",
+    "instrument": "the instrument's readings",
+    "robot": "the robot, from stop to stop",
+    "poses": "noise of the poses",
+    "intrinsics": "uncertainty of the lens",
+    "board": "uncertainty of the board",
+    "arm": "errors of the arm's links",
+    "temperature": "uncertainty of the arm's drift with temperature",
+    "priors": "what was measured by hand",
+    "held_values": "values that are held",
+    "noise_level": "how well the robot's noise is known",
+    "lens_field": "the lens beyond its model",
+    "misfit": "neighbouring stops that err alike",
+}
+# Of a frame's sigma, as it counts in its square.
+_LEAST_SHARE = 0.1
 # What would lower each source's part.
 _REMEDIES = {
     "pixels": "sharper images, or a board that fills more of them, would lower it",
@@ -34,13 +54,18 @@ _REMEDIES = {
 }
 
 
-@dataclass(frozen=True)
-class Fact:
-    """A labelled figure or phrase."""
+def readable_time(created: str) -> str:
+    """When something was computed, for people; it stands in ISO 8601."""
+    try:
+        time = datetime.fromisoformat(created)
+    except ValueError:
+        return created
+    return f"{time:%Y-%m-%d %H:%M %Z}".strip()
 
-    label: str
-    value: str
-    note: str = ""
+
+def of(name: str) -> str:
+    """Whose something is, behind its name; of one without a name, nothing."""
+    return f" of {name}" if name else ""
 
 
 def frame_words(frame: str) -> str:
@@ -59,36 +84,118 @@ def answering_solver(calibration: Calibration) -> str | None:
     return None
 
 
-def solver_rows(
-    calibration: Calibration,
-) -> Iterator[tuple[str, SolverResult, list[tuple[float | None, float | None]]]]:
-    """The solvers by label, each with its distances from the result's edges [mm], [deg]."""
-    answer = answering_solver(calibration)
+def edge_table(edges: Mapping[str, Edge]) -> Table:
+    """Position, rotation and sigma of transforms."""
+    rows = []
+    for name, edge in edges.items():
+        position = ", ".join(f"{value:.2f}" for value in 1e3 * edge.transform.translation)
+        turn, sigma = "not measured", f"{significant(edge.sigma_mm)} mm"
+        if edge.oriented:
+            degrees = edge.transform.rotation.as_rotvec(degrees=True)
+            turn = ", ".join(f"{value:.3f}" for value in degrees)
+            sigma += f", {significant(edge.sigma_deg)} deg"
+        rows.append((name, position, turn, sigma))
+    titles = ("transform", "x, y, z [mm]", "rotation vector [deg]", "sigma")
+    return Table.of(titles, rows, (0, 1, 2, 3))
+
+
+def solver_table(calibration: Calibration) -> Table | None:
+    """What each solver left, and how far its edges are from the result's; None without solvers."""
+    if not calibration.solvers:
+        return None
+    titles = ("solver", "rms, mm", "rms, deg", *(f"{it} off by" for it in calibration.edges))
+    answer, rows = answering_solver(calibration), []
     for name, result in calibration.solvers.items():
-        if name == answer:
-            yield f"{name} (result)", result, [(None, None)] * len(calibration.edges)
-            continue
-        yield (
-            name,
-            result,
-            [
-                pose_difference(edge.matrix, result.matrices[it])
-                if it in result.matrices
-                else (None, None)
-                for it, edge in calibration.edges.items()
-            ],
+        away = [
+            f"{significant(mm)} mm, {significant(deg)}{DEGREE}"
+            if name != answer and it in result.matrices
+            else significant(None)
+            for it, edge in calibration.edges.items()
+            for mm, deg in [pose_difference(edge.matrix, result.matrices.get(it, edge.matrix))]
+        ]
+        label = f"{name} (result)" if name == answer else name
+        rows.append((label, significant(result.rms_mm), significant(result.rms_deg), *away))
+    return Table.of(titles, rows)
+
+
+def moved_table(cell: Alignment) -> Table:
+    """What moved while the session was taken, and what nothing ties to the rest."""
+    rows = []
+    for it in cell.moved:
+        how_far = f"{significant(it.shift_mm)} mm, {significant(it.turn_deg)}{DEGREE}"
+        rivals = f" It may have been {', '.join(it.rivals)} instead." if it.rivals else ""
+        words = (
+            f"Between stops {it.last_stop} and {it.first_stop}. {it.frame} is where it stood last, "
+            f"{it.before} where it stood before.{rivals}"
         )
+        rows.append(Row((it.frame, how_far, words), "look"))
+    rows += [Row((it.frame, "not tied", it.remedy), "left-out") for it in cell.untied]
+    return Table(("", "", ""), tuple(rows), (0, 1, 2))
 
 
-def residual_rows(calibration: Calibration) -> list[tuple[str, Rms]]:
+def residual_table(calibration: Calibration) -> Table:
     """Residuals of the fit, of views left out in turn, and of the declared hold-out set."""
-    validation = calibration.validation
-    sets = [
+    validation, cell = calibration.validation, calibration.cell
+    left_out = None if cell is not None and not cell.left_out else validation.held_out
+    sets = (
         ("used views, as fitted", calibration.rms),
-        (f"left out in turn ({validation.method})", validation.held_out),
+        (f"left out in turn ({validation.method})", left_out),
         ("declared hold-out views", validation.holdout),
+    )
+    return Table.of(
+        ("views", "mm", "deg", "px"),
+        [(label, *_rms_cells(rms)) for label, rms in sets if rms is not None],
+    )
+
+
+def _rms_cells(rms: Rms) -> Iterator[str]:
+    return map(significant, (rms.mm, rms.deg, rms.px))
+
+
+def pair_table(calibration: Calibration) -> Table | None:
+    """How well what each camera saw of each target fits; None of one camera and one robot."""
+    cell = calibration.cell
+    if cell is None:
+        return None
+    titles = ["who", "saw", "used", "left out", "rms, mm", "rms, deg", "rms, px"]
+    if cell.left_out:
+        titles += ["unseen, mm", "unseen, deg", "unseen, px"]
+    rows = []
+    for it in pairs(cell):
+        figures = [*_rms_cells(it.rms)] if it.rms else [significant(None)] * 3
+        if cell.left_out:
+            figures += [*_rms_cells(it.unseen)] if it.unseen else [significant(None)] * 3
+        rows.append((it.seer, it.seen, str(it.used), str(it.left_out), *figures))
+    return Table.of(titles, rows, (0, 1))
+
+
+def source_table(calibration: Calibration) -> Table | None:
+    """What the place of a point, or of each frame of a whole cell, is uncertain by [mm].
+
+    Of a cell, a source that counts for less than a hundredth of every frame's variance is left out.
+
+    Returns:
+        The table; None where that is unknown.
+    """
+    cell, known = calibration.cell, calibration.budget
+    if known is not None:
+        found = [
+            (SOURCES.get(name, name), significant(value), known.percent(name))
+            for name, value in known.parts_mm.items()
+        ]
+        total = ("total", significant(known.total_mm), "")
+        return Table.of(("source", "sigma, mm", "of the variance"), [*found, total])
+    if cell is None or cell.uncertainty is None or not cell.uncertainty.budget_mm:
+        return None
+    budgets = cell.uncertainty.budget_mm
+    names = dict.fromkeys(name for it in budgets.values() for name in it)
+    shown = [
+        name
+        for name in names
+        if any(it.get(name, 0.0) > _LEAST_SHARE * it["total"] for it in budgets.values())
     ]
-    return [(label, rms) for label, rms in sets if rms is not None]
+    rows = [(edge, *(significant(it.get(name)) for name in shown)) for edge, it in budgets.items()]
+    return Table.of(("", *(SOURCES.get(it, it) for it in shown)), rows)
 
 
 def summary(calibration: Calibration, found: UncertaintyResult) -> tuple[str, ...]:
@@ -113,23 +220,21 @@ def summary(calibration: Calibration, found: UncertaintyResult) -> tuple[str, ..
 
 def noise_facts(calibration: Calibration) -> tuple[Fact, ...]:
     """The noise's levels, with the intervals that they lie in with 95 % where these are known."""
-    known = calibration.uncertainty
-    intervals = {} if known is None else known.noise_95
     return tuple(
-        _noise_fact(name, value, intervals.get(name)) for name, value in calibration.noise.items()
+        _noise_fact(of, name, value, levels.intervals.get(name))
+        for of, levels in parts.noise(calibration).items()
+        for name, value in levels.sigmas.items()
     )
 
 
-def _noise_fact(name: str, value: float, interval: tuple[float, float] | None) -> Fact:
-    stem, unit = name, ""
-    for suffix, word in _UNITS.items():
-        if name.endswith(suffix):
-            stem, unit = name.removesuffix(suffix), word
+def _noise_fact(of: str, name: str, value: float, interval: tuple[float, float] | None) -> Fact:
+    suffix = next((it for it in _UNITS if name.endswith(it)), "")
+    label = f"{of} {name.removesuffix(suffix).replace('_', ' ')}".strip()
     note = ""
     if interval is not None:
         low, high = interval
         note = f"95 %: {significant(low)} to {significant(high)}"
-    return Fact(stem.replace("_", " "), f"{significant(value)} {unit}".strip(), note)
+    return Fact(label, f"{significant(value)} {_UNITS.get(suffix, '')}".strip(), note)
 
 
 def board_facts(
@@ -171,71 +276,3 @@ def _size_facts(board: BoardResult, target: Target) -> tuple[Fact, ...]:
         note += ", between what is stated and what the robot's motion measures"
     found = f"{x_mm} \N{MULTIPLICATION SIGN} {y_mm} mm"
     return (stated, Fact("squares, found", found, note))
-
-
-def arm_facts(arm: ArmErrorsResult) -> tuple[Fact, ...]:
-    """The size of the errors that follow the arm's posture."""
-    treated = (
-        ("estimated along with the result", "what looks the same in all views is left, see above")
-        if arm.estimated
-        else ("not taken out", "no joint angles with a known robot model: only their size is known")
-    )
-    away: tuple[Fact, ...] = ()
-    if arm.away_mm is not None and arm.away_deg is not None:
-        predicted = (
-            f"{significant(arm.away_predicted_mm)} mm, {significant(arm.away_predicted_deg)} deg"
-        )
-        away = (
-            Fact(
-                "at postures away from the views it errs by",
-                f"{significant(arm.away_mm)} mm, {significant(arm.away_deg)} deg",
-                f"parts of the postures left out in turn; predicted {predicted}",
-            ),
-        )
-    return (
-        Fact(
-            f"{'the flange' if arm.of else 'a link'} is typically off by",
-            f"{significant(arm.sigma_mm)} mm, {significant(arm.sigma_deg)} deg",
-        ),
-        *away,
-        Fact("likelihood ratio", f"{arm.likelihood_ratio:.0f}", "noise alone stays under 15"),
-        Fact("its errors were", *treated),
-    )
-
-
-def arm_sentences(found: ArmResult) -> list[str]:
-    """Which level of the arm was taken and why, and how accurate it is."""
-    sentences, sigma = [level_reason(found)], found.workspace_sigma_mm
-    if sigma is not None:
-        median, p95 = significant(sigma.median), significant(sigma.p95)
-        sentences.append(
-            f"All over the workspace, a tool's place is predicted with a sigma of {median} mm "
-            f"(median; 95 % of the places: under {p95} mm)."
-        )
-    if found.carries_over is not None:
-        sentences.append(found.carries_over.words)
-    return sentences
-
-
-def identifiability_facts(found: ArmResult) -> Iterator[Fact]:
-    """How many directions the stops determine, and how well."""
-    known = found.observability
-    if known is not None:
-        count = f"{known.determined} of {known.identifiable}"
-        yield Fact("directions determined", count, "that any stops could determine")
-        if known.condition is not None:
-            note = "best over worst determined, scaled"
-            yield Fact("condition", significant(known.condition), note)
-
-
-def spring_facts(elastic: ElasticResult) -> Iterator[Fact]:
-    """What the loads of the stops do."""
-    median, most = significant(elastic.sag_mm.median), significant(elastic.sag_mm.most)
-    yield Fact("the flange gives way by", f"{median} mm", f"median; at most {most} mm")
-    low, high = map(significant, elastic.payload_kg)
-    if elastic.payload_kg[1] > 0.0:
-        yield Fact("payload", f"{low} to {high} kg")
-    if elastic.payload_factor is not None:
-        factor = elastic.payload_factor
-        note = f"\N{PLUS-MINUS SIGN} {significant(factor.sigma)}; 1 where load and bend fit"
-        yield Fact("load as stated, times", f"{factor.value:.2f}", note)

@@ -5,9 +5,9 @@ from visioncal.session import Session
 
 
 def target_frames(calibration: Calibration, session: Session | None) -> dict[int, str]:
-    """The frame of the target that each view shows, where the calibration places it."""
+    """The frame of the target that each view of an only camera shows, where it is placed."""
     placed = [name.rpartition("_from_")[2] for name in calibration.edges][1:]
-    if session is None:
+    if session is None or calibration.cell is not None:
         return {}
     if not session.targets:
         # A target, or what an instrument reads in its place.

@@ -4,14 +4,12 @@ The facts of the session lie in it without loss, beside what is drawn of them; s
 changed or cut off after it was written is noticed; see `frames`.
 """
 
-from visioncal.present.recording.cells import read_alignment
 from visioncal.present.recording.reader import read_session
 from visioncal.present.recording.results import read_calibration, read_evidence
 from visioncal.present.recording.writer import RecordingWriter, write_recording
 
 __all__ = [
     "RecordingWriter",
-    "read_alignment",
     "read_calibration",
     "read_evidence",
     "read_session",

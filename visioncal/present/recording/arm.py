@@ -71,18 +71,21 @@ def log_frames(
         stream.log(f"{paths.ROBOT}/{part}", frame_of_arm, static=True)
 
 
-def log_arms(stream: rr.RecordingStream, views: Sequence[FloatArray | None]) -> None:
-    """Draws a session's arm in all views.
+def log_arms(
+    stream: rr.RecordingStream, views: Sequence[FloatArray | None], entity: str = paths.ROBOT
+) -> None:
+    """Draws an arm in all views of a session.
 
     Args:
         stream: Where to.
         views: (n, 4, 4) of each as of `log_arm`; None where the arm is not known, which takes
             that of the view before off the screen.
+        entity: Under which entity.
     """
     known = [it for it in views if it is not None]
     link_frames, rows = np.array(known or [np.zeros((0, 4, 4))]), range(len(views))
     drawn = [it is not None for it in views]
-    it, links, joints = _Shapes.of(link_frames), f"{paths.ROBOT}/links", f"{paths.ROBOT}/joints"
+    it, links, joints = _Shapes.of(link_frames), f"{entity}/links", f"{entity}/joints"
     capsules = rr.Capsules3D.from_fields(colors=colours.LINK, fill_mode="solid")
     stream.log(links, capsules, static=True)
     columns = rr.Capsules3D.columns(

@@ -187,7 +187,9 @@ def _from_buffers(
 
 
 def _joint_charts(session: Session, calibration: Calibration) -> tuple[JointChart, ...]:
-    """Charts of the used views that have joint angles."""
+    """Charts of the used views of one robot that have joint angles."""
+    if calibration.cell is not None:
+        return ()
     residual_mm = {
         it.view: it.residual_mm
         for it in calibration.views

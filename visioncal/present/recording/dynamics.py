@@ -9,14 +9,17 @@ import rerun as rr
 from rerun.blueprint import BlueprintLike
 
 from visioncal.core.files import written_beside
-from visioncal.core.number_format import matched, significant
 from visioncal.core.types import FloatArray
 from visioncal.dynamics import Identified, Prediction, Run
 from visioncal.present.recording import colours, paths
-from visioncal.present.recording.arm import log_arm
+from visioncal.present.recording.arm import log_arm, log_frames
+from visioncal.present.recording.markdown import markdown, plain, table_lines
 from visioncal.present.recording.recorder import Recorder
 from visioncal.present.recording.writer import RecordingWriter
+from visioncal.present.torques import base_parameter_table, torque_note, torque_table
 
+# The flange's axes are so long [m].
+_AXIS_M = 0.08
 # One motion follows the other after so long [s]; the arm is drawn so often [Hz].
 _PAUSE_S, _DRAWN_HZ = 1.0, 20.0
 _LINES = (
@@ -66,11 +69,7 @@ def _log(run: Run, recorder: Recorder) -> None:
 def _log_static(
     stream: rr.RecordingStream, identified: Identified, found: Sequence[Prediction]
 ) -> None:
-    base = rr.Transform3D(parent_frame="cell", child_frame=paths.BASE_FRAME)
-    stream.log(paths.BASE, base, rr.CoordinateFrame(paths.BASE_FRAME), static=True)
-    for part in ("links", "joints"):
-        entity = f"{paths.ROBOT}/{part}"
-        stream.log(entity, rr.CoordinateFrame(paths.BASE_FRAME), static=True)
+    log_frames(stream, _AXIS_M)
     with_known = any(it.known_nm is not None for it in found)
     for joint in range(identified.robot.joint_count):
         torque = paths.of_joint(paths.TORQUES, joint)
@@ -83,9 +82,9 @@ def _log_static(
             stream.log(paths.of_joint(group, joint), line, static=True)
     for entity, text in (
         (paths.DYNAMICS_NOTE, "\n".join(_torque_lines(identified))),
-        (paths.PARAMETERS_NOTE, "\n".join(_parameter_lines(identified))),
+        (paths.PARAMETERS_NOTE, "\n".join(table_lines(base_parameter_table(identified)))),
     ):
-        stream.log(entity, rr.TextDocument(text, media_type="text/markdown"), static=True)
+        stream.log(entity, markdown(text), static=True)
 
 
 def _log_series(stream: rr.RecordingStream, found: Prediction, times_s: FloatArray) -> None:
@@ -127,36 +126,9 @@ def _log_motion(
 
 
 def _torque_lines(identified: Identified) -> Iterator[str]:
-    """A table of torques and errors, in Markdown."""
-    (first, *_), found = identified.streams, identified.validation
-    yield f"## {identified.robot.name}: {identified.base.rank} base parameters"
-    yield ""
-    yield "| joint | torque [N m] | noise [N m] | error, unseen motion [N m] | of the torque |"
-    yield "| --- | --- | --- | --- | --- |"
-    for at, joint in enumerate(identified.robot.joint_names):
-        error, share = "\N{EN DASH}", "\N{EN DASH}"
-        if found is not None:
-            error = significant(float(found.rms_nm[at]))
-            share = f"{significant(100.0 * float(found.shares[at]))} %"
-        torque, noise = (significant(float(it[at])) for it in (first.torque_nm, first.noise_nm))
-        yield f"| {joint} | {torque} | {noise} | {error} | {share} |"
+    """How well torques are predicted, in Markdown."""
+    yield f"## {plain(identified.robot.name)}: {identified.base.rank} base parameters"
+    yield from (*table_lines(torque_table(identified)), "", plain(torque_note(identified)))
     for stream in identified.streams:
         for note in stream.notes:
-            yield ""
-            yield note
-
-
-def _parameter_lines(identified: Identified) -> Iterator[str]:
-    """The base parameters, in Markdown."""
-    yield "| base parameter | value | sigma | known to |"
-    yield "| --- | --- | --- | --- |"
-    for name, value, sigma, share in zip(
-        identified.base.names,
-        identified.values.tolist(),
-        identified.sigmas.tolist(),
-        identified.determined,
-        strict=True,
-    ):
-        # A star is Markdown's own.
-        plain = name.replace("*", r"\*")
-        yield f"| {plain} | {matched(value, sigma)} | {significant(sigma)} | {share} |"
+            yield from ("", plain(note))

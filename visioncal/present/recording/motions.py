@@ -14,7 +14,7 @@ from visioncal.core.types import FloatArray
 from visioncal.dynamics.motion import Motion
 from visioncal.present.recording import colours, paths
 from visioncal.present.recording.arm import log_arm, log_frames
-from visioncal.present.recording.notes import markdown
+from visioncal.present.recording.markdown import markdown
 from visioncal.present.recording.obstacles import Obstacle, log_obstacles
 from visioncal.present.recording.recorder import Recorder
 from visioncal.present.recording.scene import log_pose

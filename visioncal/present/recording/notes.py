@@ -1,29 +1,24 @@
-"""Text and plots of a result: the verdict, the solvers, and the residuals of every view."""
+"""Text and plots of a result: the verdict, its figures, and the residuals of every view."""
 
 import math
-import re
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 from types import MappingProxyType
 
 import rerun as rr
 
 from visioncal.core.number_format import significant
 from visioncal.core.types import Target
-from visioncal.core.verdict import Step, Verdict
-from visioncal.present.facts import (
-    Fact,
-    arm_facts,
-    board_facts,
-    noise_facts,
-    residual_rows,
-    solver_rows,
-    summary,
-)
+from visioncal.core.verdict import Verdict
+from visioncal.present import advice, arms, facts, parts
+from visioncal.present.details import frame_facts, observation_table
 from visioncal.present.recording import colours, paths
+from visioncal.present.recording.markdown import fact_lines, markdown, plain, table_lines
 from visioncal.present.recording.recorder import send_rows
-from visioncal.present.words import SOURCES, level_reason
-from visioncal.results import Calibration, Edge, ViewResult
+from visioncal.results import Calibration, Frame, Sight
+from visioncal.results.arm import ArmResult, ArmSections
+from visioncal.session import View
 
 _PLOTS = {
     paths.POSITION_MM: "residual_mm",
@@ -48,17 +43,23 @@ _ROOM = 1.25
 def log_static(
     stream: rr.RecordingStream, calibration: Calibration, targets: Mapping[str, Target]
 ) -> None:
-    """Logs the verdict, the comparison of the solvers, and how the residuals' plots look."""
+    """Logs the verdict, what else is to be said, and how the residuals' plots look."""
     log_verdict(stream, calibration.verdict, verdict_markdown(calibration))
     for entity, text in (
         (paths.FIGURES, figures_markdown(calibration, targets)),
         (paths.SOLVERS, solvers_markdown(calibration)),
+        (paths.TOOLS, tools_markdown(calibration)),
+        (paths.ARM_NOTE, arms_markdown(calibration)),
     ):
-        stream.log(entity, markdown(text), static=True)
-    for plot in _PLOTS:
-        for name, label, colour, marker, size in _MARKS:
-            points = rr.SeriesPoints(colors=colour, markers=marker, marker_sizes=size, names=label)
-            stream.log(f"{plot}/{name}", points, static=True)
+        if text:
+            stream.log(entity, markdown(text), static=True)
+    for seer in dict.fromkeys(it.seer for it in parts.sights(calibration)):
+        for plot in _PLOTS:
+            for name, label, colour, marker, size in _MARKS:
+                points = rr.SeriesPoints(
+                    colors=colour, markers=marker, marker_sizes=size, names=label
+                )
+                stream.log(f"{paths.part_of(plot, seer)}/{name}", points, static=True)
 
 
 def log_verdict(stream: rr.RecordingStream, verdict: Verdict, text: str) -> None:
@@ -68,38 +69,55 @@ def log_verdict(stream: rr.RecordingStream, verdict: Verdict, text: str) -> None
     stream.log(paths.VERDICT_STRIP, point, static=True)
 
 
-def _scales(views: Collection[ViewResult]) -> dict[str, float]:
-    """By plot, where its scale ends: views that were not used must not flatten the others."""
-    ends = {}
-    for plot, attribute in _PLOTS.items():
-        known = [getattr(view, attribute) for view in views if view.used]
-        ends[plot] = _ROOM * max((it for it in known if it is not None), default=math.inf)
-    return ends
-
-
-def log_views(stream: rr.RecordingStream, views: Mapping[int, ViewResult]) -> None:
+def log_views(
+    stream: rr.RecordingStream,
+    sights: Mapping[int, Sight],
+    rows: Mapping[int, View],
+    unposed: Mapping[int, Sequence[str]] = MappingProxyType({}),
+) -> None:
     """Logs the views' residuals and what became of them.
 
     Args:
         stream: Where to.
-        views: What became of each view, by its place in the session.
+        sights: What became of each view, by its place in the session.
+        rows: All views, by their places.
+        unposed: The robots whose pose is not known at a view, by its place.
     """
-    ends, marks = _scales(views.values()), defaultdict[str, dict[int, float]](dict)
-    for row, view in views.items():
+    by_seer: dict[str, dict[int, Sight]] = defaultdict(dict)
+    for row, it in sights.items():
+        by_seer[it.seer][row] = it
+    for seer, mine in by_seer.items():
         for plot, attribute in _PLOTS.items():
-            name, value = paths.USED if view.used else paths.REJECTED, getattr(view, attribute)
-            if value is None and not view.used:
-                # Marked on the axis: a gap would look as if there were no such view.
-                value = 0.0
-            if not view.used and value > ends[plot]:
-                name, value = paths.BEYOND, ends[plot]
-            if value is not None:
-                marks[f"{plot}/{name}"][row] = float(value)
-    for entity, values in marks.items():
-        log_scalars(stream, entity, values)
-    texts = [view_markdown(it) for it in views.values()]
+            _log_residuals(stream, paths.part_of(plot, seer), mine, attribute)
+    texts = [
+        view_markdown(sights[row], () if it.is_of_lens else unposed.get(row, ()))
+        if row in sights
+        else _unseen_markdown(it)
+        for row, it in rows.items()
+    ]
     columns = rr.TextDocument.columns(text=texts, media_type=["text/markdown"] * len(texts))
-    send_rows(stream, paths.VIEW_NOTE, views, columns)
+    send_rows(stream, paths.VIEW_NOTE, rows, columns)
+
+
+def _log_residuals(
+    stream: rr.RecordingStream, plot: str, sights: Mapping[int, Sight], attribute: str
+) -> None:
+    """Logs a residual of the views, by their places in the session."""
+    values = {row: getattr(it, attribute) for row, it in sights.items()}
+    used = [it for row, it in values.items() if it is not None and sights[row].used]
+    # Views that were not used must not flatten the others.
+    end, marks = _ROOM * max(used, default=math.inf), defaultdict[str, dict[int, float]](dict)
+    for row, value in values.items():
+        if sights[row].used:
+            if value is not None:
+                marks[paths.USED][row] = float(value)
+        # Marked on the axis where it is unknown: a gap would look as if there were no such view.
+        elif (value or 0.0) > end:
+            marks[paths.BEYOND][row] = end
+        else:
+            marks[paths.REJECTED][row] = float(value or 0.0)
+    for name, marked in marks.items():
+        log_scalars(stream, f"{plot}/{name}", marked)
 
 
 def log_scalars(stream: rr.RecordingStream, entity: str, values: Mapping[int, float]) -> None:
@@ -110,58 +128,35 @@ def log_scalars(stream: rr.RecordingStream, entity: str, values: Mapping[int, fl
 
 def verdict_markdown(calibration: Calibration) -> str:
     """The verdict with its reasons, the transforms, and the views that were left out."""
-    verdict = calibration.verdict
-    lines = [*verdict_lines(verdict), *step_lines(calibration.next_steps)]
-    lines += [
-        f"- {plain(name)}: {it.verdict.headline}, see Tools and fixtures."
-        for name, it in calibration.frames.items()
-        if it.verdict.status != "good"
-    ]
-    lines += further_lines(verdict)
-    lines += [
-        "",
-        "| transform | x, y, z [mm] | rotation vector [deg] | sigma |",
-        "|---|---|---|---|",
-    ]
-    lines += [f"| {plain(name)} {edge_line(it)}" for name, it in calibration.placed.items()]
-    known = calibration.budget
-    if known is not None:
-        lines += ["", plain(" ".join(summary(calibration, known)))]
-    rejected = [view for view in calibration.views if not view.used]
-    used = len(calibration.views) - len(rejected)
-    lines += ["", f"{used} of {len(calibration.views)} views used."]
-    lines += [f"- View {view.view}: {plain(view.reason)}" for view in rejected]
-    return "\n".join(lines)
+    return "\n".join(_verdict_lines(calibration))
 
 
-def verdict_lines(verdict: Verdict) -> Iterator[str]:
-    """The verdict in a few words, and what is read first."""
-    yield from (f"# {verdict.headline}", "")
-    yield from (f"- {plain(it)}" for it in verdict.top)
-
-
-def step_lines(steps: Sequence[Step]) -> Iterator[str]:
-    """What to do next, commands as they are typed."""
-    if steps:
+def _verdict_lines(calibration: Calibration) -> Iterator[str]:
+    verdict, cell, known = calibration.verdict, calibration.cell, calibration.budget
+    yield from (f"# {verdict.headline}", "", *_list(verdict.top))
+    if calibration.next_steps:
         yield from ("", "## What to do next", "")
-    for at, it in enumerate(steps, 1):
+    for at, it in enumerate(calibration.next_steps, 1):
         yield f"{at}. {plain(it.words)}" + (f"  \n   `{it.command}`" if it.command else "")
-
-
-def further_lines(verdict: Verdict) -> Iterator[str]:
-    """What else was found."""
+    for name, frame in calibration.frames.items():
+        if frame.verdict.status != "good":
+            yield f"- {plain(name)}: {frame.verdict.headline}, see Tools and fixtures."
     if verdict.rest:
-        yield from ("", "## What else was found", "")
-    yield from (f"- {plain(it)}" for it in verdict.rest)
+        yield from ("", "## What else was found", "", *_list(verdict.rest))
+    if cell is not None:
+        yield from ("", plain(cell.weakest), "")
+        yield from _list(": ".join(it.cells) for it in facts.moved_table(cell).rows)
+        yield f"The frame of the cell is that of {plain(cell.reference)}."
+    yield from table_lines(facts.edge_table(calibration.placed))
+    if known is not None:
+        yield from ("", plain(" ".join(facts.summary(calibration, known))))
+    used = sum(it.used for it in calibration.views)
+    yield from ("", f"{used} of {len(calibration.views)} views used.")
+    yield from _list(it.words for it in advice.left_out(parts.sights(calibration)))
 
 
-def edge_line(edge: Edge) -> str:
-    """A row of a table: position, rotation and sigma of a transform."""
-    position = ", ".join(f"{value:.2f}" for value in 1e3 * edge.transform.translation)
-    if not edge.oriented:
-        return f"| {position} | not measured | {edge.sigma_mm:.2g} mm |"
-    turn = ", ".join(f"{value:.3f}" for value in edge.transform.rotation.as_rotvec(degrees=True))
-    return f"| {position} | {turn} | {edge.sigma_mm:.2g} mm, {edge.sigma_deg:.2g} deg |"
+def _list(sentences: Iterable[str]) -> Iterator[str]:
+    return (f"- {plain(it)}" for it in sentences)
 
 
 def figures_markdown(
@@ -173,73 +168,132 @@ def figures_markdown(
         calibration: The result.
         targets: The boards by name, as far as they are known.
     """
-    lines = ["# Residuals, rms", "", "| views | mm | deg | px |", "|---|---:|---:|---:|"]
-    for label, rms in residual_rows(calibration):
-        cells = map(significant, (rms.mm, rms.deg, rms.px))
-        lines.append(f"| {plain(label)} | {' | '.join(cells)} |")
-    lines += ["", "# Noise, per axis", "", *fact_lines(noise_facts(calibration))]
-    return "\n".join([*lines, *_findings_lines(calibration, targets)])
+    return "\n".join(_figure_lines(calibration, targets))
 
 
-def _findings_lines(found: Calibration, targets: Mapping[str, Target]) -> Iterator[str]:
-    known = found.budget
-    if known is not None:
+def _figure_lines(found: Calibration, targets: Mapping[str, Target]) -> Iterator[str]:
+    yield from ("# Residuals, rms", *table_lines(facts.residual_table(found)))
+    yield from table_lines(facts.pair_table(found))
+    yield from ("", "# Noise, per axis", "", *fact_lines(facts.noise_facts(found)))
+    sources, known = facts.source_table(found), found.budget
+    if sources is not None:
         yield from ("", "# Where the uncertainty comes from", "")
-        yield plain(" ".join(summary(found, known)))
-        yield from ("", "| source | sigma mm | of the variance |", "|---|---:|---:|")
-        for name, value in known.parts_mm.items():
-            label = plain(SOURCES.get(name, name))
-            yield f"| {label} | {significant(value)} | {known.percent(name)} |"
-        yield f"| total | {significant(known.total_mm)} | |"
-    for name, board in found.named_boards.items():
-        if facts := board_facts(found, board, targets.get(name)):
-            yield from ("", f"# Board {plain(name)}".strip(), "", *fact_lines(facts))
-    if found.arm_errors is not None:
-        yield from ("", "# Arm", "", *fact_lines(arm_facts(found.arm_errors)))
-    if found.arm is not None:
-        yield from ("", "# Level of the arm", "", plain(level_reason(found.arm)))
-
-
-def fact_lines(facts: Iterable[Fact]) -> Iterator[str]:
-    """Facts as a list."""
-    for it in facts:
-        note = f" ({plain(it.note)})" if it.note else ""
-        yield f"- {plain(it.label)}: {plain(it.value)}{note}"
+        if known is not None:
+            yield plain(" ".join(facts.summary(found, known)))
+        yield from table_lines(sources)
+    for name, board in parts.boards(found).items():
+        if said := facts.board_facts(found, board, targets.get(name)):
+            yield from ("", f"# Board {plain(name)}".strip(), "", *fact_lines(said))
+    for name, arm in parts.arms(found).items():
+        of = plain(facts.of(name))
+        if arm.arm_errors is not None:
+            yield from ("", f"# Arm{of}", "", *fact_lines(arms.error_facts(arm.arm_errors)))
+        if arm.arm is not None:
+            yield from ("", f"# Level of the arm{of}", "", plain(arms.level_reason(arm.arm)))
 
 
 def solvers_markdown(calibration: Calibration) -> str:
     """A table of the solvers: their residuals, and how far their edges are from the result's."""
-    titles = ["solver", "rms mm", "rms deg"]
-    titles += [f"{plain(it)} off by {unit}" for it in calibration.edges for unit in ("mm", "deg")]
-    lines = ["# Solvers compared", "", f"| {' | '.join(titles)} |"]
-    lines.append("|---" + "|---:" * (len(titles) - 1) + "|")
-    for label, found, away in solver_rows(calibration):
-        figures = (found.rms_mm, found.rms_deg, *(it for pair in away for it in pair))
-        lines.append(f"| {' | '.join([plain(label), *map(significant, figures)])} |")
+    table = facts.solver_table(calibration)
+    return "" if table is None else "\n".join(["# Solvers compared", *table_lines(table)])
+
+
+def view_markdown(sight: Sight, unposed: Sequence[str] = ()) -> str:
+    """What became of one view.
+
+    Args:
+        sight: That.
+        unposed: The robots without a pose at its stop.
+    """
+    state = "used" if sight.used else "not used"
+    lines = [f"# View {sight.view}: {state} ([report](report.html#view-{sight.view}))", ""]
+    if sight.seer:
+        lines += [f"Stop {sight.stop}: {plain(sight.seer)} saw {plain(sight.seen)}.", ""]
+    if sight.reason:
+        lines += [plain(sight.reason), ""]
+    figures = (
+        ("reprojection", sight.rms_px, "px"),
+        ("position residual", sight.residual_mm, "mm"),
+        ("orientation residual", sight.residual_deg, "deg"),
+    )
+    known = [] if sight.corners is None else [f"corners {sight.corners}"]
+    known += [
+        f"{label} {significant(it, 3)} {unit}" for label, it, unit in figures if it is not None
+    ]
+    lines.append(", ".join(known))
+    if unposed:
+        names = ", ".join(map(plain, unposed))
+        lines += ["", f"The pose of {names} is not known at this stop: drawn as it was last."]
     return "\n".join(lines)
 
 
-def view_markdown(view: ViewResult) -> str:
-    """What became of one view."""
-    state = "used" if view.used else "not used"
-    lines = [f"# View {view.view}: {state} ([report](report.html#view-{view.view}))", ""]
-    if view.reason:
-        lines += [plain(view.reason), ""]
-    figures = (
-        ("corners", view.corners, ""),
-        ("reprojection", view.rms_px, " px"),
-        ("position residual", view.residual_mm, " mm"),
-        ("orientation residual", view.residual_deg, " deg"),
+def _unseen_markdown(view: View) -> str:
+    """A view in which nothing of the cell was observed."""
+    what = "for the lens alone" if view.is_of_lens else "it has a robot's pose alone"
+    return f"# View {view.number}\n\n{what}"
+
+
+def tools_markdown(calibration: Calibration) -> str:
+    """All tools and fixtures, each with its verdict, its pose, its observations and its figures."""
+    return "\n".join(chain.from_iterable(_tool(*it) for it in calibration.frames.items()))
+
+
+def _tool(name: str, frame: Frame) -> Iterator[str]:
+    yield from (f"# {plain(name)}: {frame.verdict.headline}", "", *_list(frame.verdict.reasons))
+    yield from (*table_lines(facts.edge_table({name: frame.edge})), "")
+    for it in frame.observations:
+        if it.reason or not it.used:
+            reason = f": {plain(it.reason)}" if it.reason else ""
+            state = "used" if it.used else "not used"
+            yield f"- **{plain(f'{it.kind} {it.name}'.strip())} {state}**{reason}"
+    if frame.observations:
+        yield from table_lines(observation_table(frame))
+    yield from ("", *fact_lines(frame_facts(frame)), "")
+
+
+def arms_markdown(calibration: Calibration) -> str:
+    """What is known of each arm of which levels were tried, and of its drift."""
+    return "\n".join(
+        chain.from_iterable(
+            _arm(facts.of(name), it) for name, it in parts.arms(calibration).items()
+        )
     )
-    known = [f"{label} {value:.3g}{unit}" for label, value, unit in figures if value is not None]
-    return "\n".join([*lines, ", ".join(known)])
 
 
-def plain(text: str) -> str:
-    """Escapes text from outside: the viewer would load pictures and follow links in Markdown."""
-    return re.sub(r"([\\`*_{}\[\]()#+\-.!|<>~&])", r"\\\1", " ".join(text.split()))
+def _arm(of: str, found: ArmSections) -> Iterator[str]:
+    if found.arm is not None:
+        yield from (f"# The arm{plain(of)}", "", *_levels(found.arm))
+    if found.arm is not None and found.elastic is not None:
+        yield from ("", "## Joints that bend", *table_lines(arms.spring_table(found.elastic)))
+        yield from ("", *fact_lines(arms.spring_facts(found.elastic)))
+    if found.thermal is not None:
+        yield from ("", f"# Drift with temperature{plain(of)}", "")
+        yield plain(arms.drift_sentence(found.thermal))
+        yield from table_lines(arms.drift_table(found.thermal))
 
 
-def markdown(text: str) -> rr.TextDocument:
-    """A text that viewers render as Markdown."""
-    return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
+def _levels(found: ArmResult) -> Iterator[str]:
+    """Which level was taken and why, and what is known of the arm then."""
+    yield from (f"{plain(it)}\n" for it in arms.arm_sentences(found))
+    yield from table_lines(arms.level_table(found))
+    yield from ("", "Ratio: twice the gain in log-likelihood over the arm as stated.")
+    if found.left_out:
+        yield ""
+        yield (
+            "The plots show the views that were left out in turn, and as diamonds those that the "
+            "session holds back: in orange by the arm as stated, in blue by the calibrated one. "
+            "The orange line in the cell is the arm as stated, its departure magnified as its "
+            "entity says."
+        )
+    if found.parameters:
+        yield from ("", "## Parameters", "", plain(arms.parameter_note(found)))
+        for it in arms.parameter_tables(found):
+            yield from table_lines(it)
+    if found.observability is not None:
+        yield from ("", "## What the stops determine", "")
+        yield from fact_lines(arms.identifiability_facts(found))
+    yield from _list(found.not_determined or ())
+    if found.stops:
+        yield from ("", "## Influence of each stop", "")
+        yield "By how much the mean variance over the workspace would grow without it:"
+        yield from table_lines(arms.stop_table(found))

@@ -1,8 +1,10 @@
 """Where things are in a recording: the names of its entities, its frames and its timeline.
 
-The frames of the cell are rerun's named frames, all placed in the base frame; tools alone are
-placed in the flange's, which takes them along.
+The frames of the cell are rerun's named frames, each placed on what it hangs on. Of several robots,
+cameras or targets, the entities have their names: /cameras/top in the place of /camera.
 """
+
+import rerun as rr
 
 TIMELINE = "view"
 APPLICATION = "visioncal"
@@ -30,8 +32,6 @@ FLANGE = "/flange"
 STOPS = "/stops"
 CAMERA = "/camera"
 TARGET = "/target"
-# Of several targets, by their names.
-TARGETS = "/targets"
 FRAMES = "/frames"
 SEEN_TARGET = "/target_as_this_view_sees_it"
 
@@ -61,13 +61,13 @@ ARM_NOTE = "/notes/arm"
 DRIFT_MM = "/arm/warming/drift_mm"
 RISE_K = "/arm/warming/rise_k"
 
-# A whole cell of several robots: its result's text, its frames, and who saw whom.
-ALIGNMENT = "/results/alignment"
+# A whole cell of several robots: its frame, and who saw whom.
 CELL_FRAME = "cell"
 CELL = "/cell"
-ROBOTS = "/robots"
 SIGHT_LINE = "/sight"
 NETWORK = "/network"
+# Where earlier versions kept the text of its result.
+ALIGNMENT = "/results/alignment"
 
 # A plan: what is in the way, and how far the joints go.
 OBSTACLES = "/obstacles"
@@ -111,11 +111,30 @@ USED, REJECTED, THIS_VIEW = "used", "rejected", "this_view"
 BEYOND = "rejected_beyond_the_scale"
 
 
+_ENTITIES = {BASE_FRAME: BASE, FLANGE_FRAME: FLANGE, CAM_FRAME: CAMERA, TARGET_FRAME: TARGET}
+
+
 def entity_of(frame: str) -> str:
-    """The entity of a frame of the calibration: the camera's, a target's, a tool's."""
-    if frame.startswith(f"{TARGET_FRAME}_"):
-        return f"{TARGETS}/{frame.removeprefix(f'{TARGET_FRAME}_')}"
-    return {CAM_FRAME: CAMERA, TARGET_FRAME: TARGET}.get(frame, f"{FRAMES}/{frame}")
+    """The entity of a frame: a robot's base or flange, a camera's, a target's, a tool's."""
+    kind, _, name = frame.partition("_")
+    if kind in _ENTITIES:
+        return named(_ENTITIES[kind], name)
+    return f"{FRAMES}/{rr.escape_entity_path_part(frame)}"
+
+
+def named(entity: str, name: str) -> str:
+    """The entity of one of several things by its name: /robots/a of /robot; of an only one, it."""
+    return f"{entity}s/{rr.escape_entity_path_part(name)}" if name else entity
+
+
+def image_frame(camera: str) -> str:
+    """The frame of the images of a camera, by its frame."""
+    return IMAGE_FRAME if camera == CAM_FRAME else f"{IMAGE_FRAME}_of_{camera}"
+
+
+def part_of(plot: str, name: str) -> str:
+    """The part of a plot that is of one camera or robot by its name; of an only one, the plot."""
+    return f"{plot}/{rr.escape_entity_path_part(name)}" if name else plot
 
 
 def magnified_residuals(factor: int) -> str:

@@ -20,7 +20,7 @@ from visioncal.present.recording.coverage import (
     directions_chart,
     rotation_axes_chart,
 )
-from visioncal.present.recording.notes import markdown
+from visioncal.present.recording.markdown import markdown
 from visioncal.present.recording.obstacles import Obstacle, log_obstacles
 from visioncal.present.recording.recorder import Recorder
 from visioncal.present.recording.scene import SMALL_FRUSTUM, frustum, log_image_plane, log_pose

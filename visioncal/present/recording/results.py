@@ -18,13 +18,8 @@ import rerun as rr
 from visioncal.core.errors import DataError
 from visioncal.core.files import sha256
 from visioncal.core.types import Corners, FloatArray
-from visioncal.present.recording import (
-    markdown,
-    notes,
-    overlays,
-    paths,
-    tools,
-)
+from visioncal.present import parts
+from visioncal.present.recording import notes, overlays, paths
 from visioncal.present.recording.frames import Frame, scan
 from visioncal.present.recording.reader import chunks
 from visioncal.present.recording.recorder import Recorder
@@ -34,6 +29,7 @@ from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
 
 _EVIDENCE, _RESULT = "visioncal.Evidence", "visioncal.Result"
+_ALIGNMENT = "visioncal.Alignment"
 
 
 def log_results(
@@ -112,8 +108,6 @@ def _draw(
     scene.log_static(stream)
     if calibration is not None:
         notes.log_static(stream, calibration, session.boards)
-        tools.log_static(stream, calibration)
-        markdown.log_static(stream, calibration)
     seen = [evidence.get(it.number, ViewEvidence(it.number)) for it in session.views]
     scene.log_views(stream, seen)
     overlay.log_views(stream, seen)
@@ -121,18 +115,26 @@ def _draw(
         for row, it in enumerate(seen):
             recorder.at(row)
             _log_explained(stream, it)
-    rows = {it.view: row for row, it in enumerate(seen)}
     if calibration is not None:
-        found = {it.view: it for it in calibration.views}
-        known = {row: found[view] for view, row in rows.items() if view in found}
-        notes.log_views(stream, known)
-    warming = None if calibration is None else calibration.thermal
-    if warming is not None:
-        drifts = {rows[it.view]: it for it in warming.views if it.view in rows}
-        for entity, attribute in ((paths.DRIFT_MM, "drift_mm"), (paths.RISE_K, "rise_k")):
-            values = {row: float(getattr(it, attribute)) for row, it in drifts.items()}
-            notes.log_scalars(stream, entity, values)
+        _log_views(stream, session, calibration, scene)
     recorder.keep()
+
+
+def _log_views(
+    stream: rr.RecordingStream, session: Session, calibration: Calibration, scene: Scene
+) -> None:
+    """Logs what became of each view, and how the arms had drifted."""
+    views = dict(enumerate(session.views))
+    rows = {view.number: row for row, view in views.items()}
+    sights = {rows[it.view]: it for it in parts.sights(calibration) if it.view in rows}
+    unposed = {row: scene.unposed(view.number) for row, view in views.items()}
+    notes.log_views(stream, sights, views, unposed)
+    for name, arm in parts.arms(calibration).items():
+        drifts = () if arm.thermal is None else arm.thermal.views
+        for plot, attribute in ((paths.DRIFT_MM, "drift_mm"), (paths.RISE_K, "rise_k")):
+            values = {rows[it.view]: float(getattr(it, attribute)) for it in drifts
+                      if it.view in rows}  # fmt: skip
+            notes.log_scalars(stream, paths.part_of(plot, name), values)
 
 
 def _log_evidence(stream: rr.RecordingStream, seen: ViewEvidence, result: str, place: int) -> None:
@@ -194,7 +196,7 @@ def _read_result(path: Path) -> _Result:
     last: dict[str, Any] = {}
     evidence: dict[str, dict[int, ViewEvidence]] = {}
     damaged: list[Frame] = []
-    entities = (paths.CALIBRATION, paths.EVIDENCE)
+    entities = (paths.CALIBRATION, paths.EVIDENCE, paths.ALIGNMENT)
     try:
         for _, entity, batch in chunks(scan(path), entities, damaged):
             for place in range(batch.num_rows):
@@ -203,7 +205,10 @@ def _read_result(path: Path) -> _Result:
                     seen = _evidence(values)
                     evidence.setdefault(values["result"][0], {})[values["place"][0]] = seen
                 else:
-                    last = _values(batch, place, _RESULT) | _values(batch, place, "TextDocument")
+                    # Of a whole cell, earlier versions kept no evidence.
+                    none = {"result": [""], "evidence_count": [0]}
+                    last = none | _values(batch, place, _ALIGNMENT)
+                    last |= _values(batch, place, _RESULT) | _values(batch, place, "TextDocument")
                     # What was damaged before this one is no newer result.
                     damaged.clear()
         if damaged or (last and sha256(last["text"][0].encode()) != last["seal"][0]):

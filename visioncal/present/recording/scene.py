@@ -1,4 +1,4 @@
-"""The cell in 3D: robot, camera and target, as the calibration puts them."""
+"""The cell in 3D: robots, cameras and targets, as the calibration puts them."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,34 +8,39 @@ import numpy as np
 import rerun as rr
 
 from visioncal.core.types import Camera, FloatArray, Target
-from visioncal.present.recording import board, colours, paths
-from visioncal.present.recording.arm import log_arms, log_frames, placed
+from visioncal.present import parts
+from visioncal.present.recording import board, colours, network, paths
+from visioncal.present.recording.arm import log_arms, placed
 from visioncal.present.recording.charts import Charts
 from visioncal.present.recording.recorder import send_rows
+from visioncal.present.recording.robot_states import RobotState, robot_states
 from visioncal.present.recording.uncertainty import Uncertainty
 from visioncal.present.recording.workspace import ArmPicture
 from visioncal.present.target_frames import target_frames
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
-from visioncal.session import Session
-from visioncal.session.table import reported_matrices
+from visioncal.session import Session, frame_name
 from visioncal.vision.camera import matrix_3x3
 
-# Sizes of what is drawn, as shares of the cell's size: how far the flange is from the base.
+# Sizes of what is drawn, as shares of the cell's size: how far flanges are from their bases.
 _AXIS, _FRUSTUM, _LINE, _POINT = 0.12, 0.18, 0.002, 0.004
+# Axes of what is neither a base, a flange nor a tool are so large beside the flange's.
+_AXES = {paths.BASE_FRAME: 2.0, paths.FLANGE_FRAME: 1.0}
+_OTHER_AXES, _TOOL_AXES = 0.7, 0.5
 # The views that are not the current one, drawn as small frusta or boards.
 SMALL_FRUSTUM = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What is drawn of the cell. All poses are logged in the base frame.
+    """What is drawn of the cell. Frames are placed on what they hang on.
 
     Attributes:
         session: The session.
         calibration: Its result, if there is one; without it only the flange is drawn.
-        base_from_flange: (4, 4) by the view's number, where known.
-        size_m: Typical distance of the flange from the base [m].
+        frames: What hangs on what.
+        states: By flange and by the view's number, how its robot stands, where that is known.
+        size_m: Typical distance of a flange from its base [m].
         uncertainty: What is drawn of the result's uncertainty.
         charts: The charts over all views.
         arm: What is drawn of a calibrated arm.
@@ -43,7 +48,8 @@ class Scene:
 
     session: Session
     calibration: Calibration | None
-    base_from_flange: Mapping[int, FloatArray]
+    frames: parts.Frames
+    states: Mapping[str, Mapping[int, RobotState]]
     size_m: float
     uncertainty: Uncertainty | None
     charts: Charts | None
@@ -56,24 +62,19 @@ class Scene:
         calibration: Calibration | None,
         evidence: Mapping[int, ViewEvidence],
     ) -> "Scene":
-        """Collects the poses of the flange, from the evidence or else as they were recorded."""
-        # Of several robots, each pose is in a base of its own, which nothing places.
-        reported = {} if session.is_network else reported_matrices(session.views)
-        poses: dict[int, FloatArray] = {}
-        for number in (it.number for it in session.views):
-            seen = evidence.get(number)
-            if seen is not None and seen.base_from_flange is not None:
-                poses[number] = seen.base_from_flange
-            elif number in reported:
-                poses[number] = reported[number]
-        distances = [float(np.linalg.norm(pose[:3, 3])) for pose in poses.values()]
+        """Collects the poses of the flanges, from the evidence or else as they were recorded."""
+        frames = parts.frames(calibration)
+        states = robot_states(session, calibration, evidence)
+        poses = [it.pose for mine in states.values() for it in mine.values()]
+        distances = [float(np.linalg.norm(it[:3, 3])) for it in poses]
         size_m = float(np.median(distances)) if distances else 1.0
         if calibration is None:
-            return cls(session, None, poses, size_m, None, None, None)
+            return cls(session, None, frames, states, size_m, None, None, None)
         return cls(
             session,
             calibration,
-            poses,
+            frames,
+            states,
             size_m,
             Uncertainty.of(calibration, evidence, size_m, target_frames(calibration, session)),
             Charts.of(session, calibration, evidence),
@@ -82,29 +83,37 @@ class Scene:
 
     def log_static(self, stream: rr.RecordingStream) -> None:
         """Logs what does not change from view to view."""
-        # The edge to the cell keeps the base known in views that know no other frame.
-        log_frames(stream, _AXIS * self.size_m)
-        in_base = rr.CoordinateFrame(paths.BASE_FRAME)
-        stream.log(f"{paths.ROBOT}/reach", in_base, static=True)
-        if self.calibration is None:
-            self._log_stops(stream)
-            return
-        for end in self._ends:
-            self._log_axes(stream, paths.entity_of(end), end, 0.7)
-        if self.calibration.camera is not None:
-            log_image_plane(stream, self.calibration.camera.camera, self.size_m)
-        for end, target in self._boards.items():
-            frame, sheet = rr.CoordinateFrame(end), board.sheet(target)
-            stream.log(f"{paths.entity_of(end)}/sheet", frame, sheet, static=True)
-        self._log_mount(stream)
-        self._log_frames(stream, self.calibration)
-        self._log_stops(stream)
-        if self.uncertainty is not None:
-            self.uncertainty.log_static(stream)
-        if self.charts is not None:
-            self.charts.log_static(stream)
-        if self.arm is not None:
-            self.arm.log_static(stream)
+        for frame, parent in self.frames.parents.items():
+            entity = paths.entity_of(frame)
+            if frame in self.frames.matrices:
+                pose = placed(self.frames.matrices[frame], parent, frame)
+                stream.log(entity, pose, static=True)
+            self._log_axes(stream, entity, frame)
+        for flange, name in self.frames.robots.items():
+            base = rr.CoordinateFrame(self.frames.parents[flange])
+            for part in ("links", "joints", "reach"):
+                stream.log(f"{paths.named(paths.ROBOT, name)}/{part}", base, static=True)
+            self._log_mount(stream, flange)
+            self._log_stops(stream, flange)
+        if self.calibration is not None:
+            self._log_things(stream, self.calibration)
+        for drawn in (self.uncertainty, self.charts, self.arm):
+            if drawn is not None:
+                drawn.log_static(stream)
+
+    def _log_things(self, stream: rr.RecordingStream, calibration: Calibration) -> None:
+        """Draws the images' planes, the boards, and the network of a whole cell."""
+        for frame, camera in parts.cameras(calibration).items():
+            log_image_plane(stream, camera.camera, self.size_m, frame or paths.CAM_FRAME)
+        for frame, target in self._boards.items():
+            sheet = board.sheet(target)
+            stream.log(
+                f"{paths.entity_of(frame)}/sheet", rr.CoordinateFrame(frame), sheet, static=True
+            )
+        if calibration.cell is not None:
+            axes = rr.TransformAxes3D(2.0 * _AXIS * self.size_m, show_frame=False)
+            stream.log(paths.CELL, rr.CoordinateFrame(paths.CELL_FRAME), axes, static=True)
+            network.log_network(stream, calibration.cell)
 
     def log_views(self, stream: rr.RecordingStream, seen: Sequence[ViewEvidence]) -> None:
         """Logs where everything is in each view.
@@ -113,15 +122,15 @@ class Scene:
             stream: Where to.
             seen: What was seen in each, in the order of the session.
         """
-        flanges = [self.base_from_flange.get(it.view) for it in seen]
-        _log_poses(stream, paths.FLANGE, paths.FLANGE_FRAME, flanges)
-        self._log_arms(stream)
+        for flange in self.frames.robots:
+            states = [self.states[flange].get(it.view) for it in seen]
+            poses = [None if it is None else it.pose for it in states]
+            _log_poses(stream, self.frames.parents[flange], flange, poses)
+            self._log_arm(stream, flange, states)
         if self.calibration is None:
             return
-        for end in self._ends:
-            poses = [self._base_from(end, it) for it in flanges]
-            _log_poses(stream, paths.entity_of(end), end, poses)
-        self._log_seen_targets(stream, flanges, seen)
+        self._log_seen_targets(stream, seen)
+        self._log_sights(stream)
         rows = {it.view: row for row, it in enumerate(seen)}
         if self.uncertainty is not None:
             self.uncertainty.log_views(stream, list(rows))
@@ -130,184 +139,199 @@ class Scene:
         if self.arm is not None:
             self.arm.log_views(stream, rows)
 
-    @property
-    def _ends(self) -> list[str]:
-        """The frames that the calibration places: camera and targets, or instrument and probe."""
-        edges = {} if self.calibration is None else self.calibration.edges
-        return [name.rpartition("_from_")[2] for name in edges]
+    def in_cell(self, frame: str, view: int) -> FloatArray | None:
+        """(4, 4) where a frame is in the cell in a view; None where that is unknown."""
+        matrix = np.eye(4)
+        while frame != paths.CELL_FRAME:
+            if frame in self.frames.robots:
+                state = self.states[frame].get(view)
+                edge = None if state is None else state.pose
+            else:
+                edge = self.frames.matrices.get(frame)
+            if edge is None:
+                return None
+            matrix, frame = edge @ matrix, self.frames.parents[frame]
+        return matrix
 
-    @property
-    def _boards(self) -> dict[str, Target]:
+    def unposed(self, view: int) -> list[str]:
+        """The robots of a whole cell without a pose at the stop of a view."""
+        if self.calibration is None or self.calibration.cell is None:
+            return []
+        found = {robot: self.states[it].get(view) for it, robot in self.frames.robots.items()}
+        return [robot for robot, it in found.items() if it is None or it.is_past]
+
+    @cached_property
+    def _boards(self) -> Mapping[str, Target]:
         """The targets by their frames, as far as the calibration places them."""
-        boards = self.session.boards.items()
-        frames = {f"target_{name}" if name else paths.TARGET_FRAME: it for name, it in boards}
-        return {frame: it for frame, it in frames.items() if frame in self._ends}
-
-    @cached_property
-    def _edges(self) -> Mapping[str, FloatArray]:
-        """(4, 4) by name, exactly orthonormal."""
-        edges = {} if self.calibration is None else self.calibration.transforms
-        return {name: edge.as_matrix() for name, edge in edges.items()}
-
-    @cached_property
-    def _outlines(self) -> Mapping[str, FloatArray]:
-        """(k, 3) of each board."""
-        return {name: board.closed_outline(it) for name, it in self.session.boards.items()}
+        is_cell = self.calibration is not None and self.calibration.cell is not None
+        boards = self.session.plates if is_cell else self.session.boards
+        frames = {frame_name("target", name): it for name, it in boards.items()}
+        return {frame: it for frame, it in frames.items() if frame in self.frames.parents}
 
     @cached_property
     def _rejected(self) -> frozenset[int]:
         views = () if self.calibration is None else self.calibration.views
         return frozenset(view.view for view in views if not view.used)
 
-    def _base_from(self, end: str, base_from_flange: FloatArray | None) -> FloatArray | None:
-        """Where the calibration puts `cam` or `target` in one view; None where it is unknown."""
-        if f"base_from_{end}" in self._edges:
-            return self._edges[f"base_from_{end}"]
-        if base_from_flange is not None and f"flange_from_{end}" in self._edges:
-            return np.asarray(base_from_flange @ self._edges[f"flange_from_{end}"])
-        return None
-
     def _radius(self, share: float) -> float:
         return share * self.size_m
 
-    def _log_axes(self, stream: rr.RecordingStream, entity: str, frame: str, times: float) -> None:
+    def _log_axes(self, stream: rr.RecordingStream, entity: str, frame: str) -> None:
         """Draws a frame's axes with its name."""
-        axes = rr.TransformAxes3D(times * _AXIS * self.size_m, show_frame=True)
+        tools = () if self.calibration is None else self.calibration.frames
+        is_tool = any(it.endswith(f"_from_{frame}") for it in tools)
+        share = _TOOL_AXES if is_tool else _AXES.get(frame.partition("_")[0], _OTHER_AXES)
+        axes = rr.TransformAxes3D(share * _AXIS * self.size_m, show_frame=True)
         stream.log(entity, rr.CoordinateFrame(frame), axes, static=True)
 
-    def _log_frames(self, stream: rr.RecordingStream, calibration: Calibration) -> None:
-        """Draws tools, which the flange takes along, and fixtures, which stand in the base."""
-        for name, frame in calibration.frames.items():
-            parent, _, child = name.partition("_from_")
-            pose = placed(frame.edge.matrix, parent, child)
-            stream.log(paths.entity_of(child), pose, static=True)
-            self._log_axes(stream, paths.entity_of(child), child, 0.5)
+    def _carried_by(self, flange: str) -> list[str]:
+        return [it for it, on in self.frames.parents.items() if on == flange]
 
-    def _log_mount(self, stream: rr.RecordingStream) -> None:
-        """Draws the edges that hang on the flange, as lines."""
-        for name, edge in self._edges.items():
-            if name.startswith("flange_from_"):
-                line = rr.LineStrips3D(
-                    [[np.zeros(3), edge[:3, 3]]],
-                    colors=colours.JOINT,
-                    radii=self._radius(2 * _LINE),
-                )
-                frame = rr.CoordinateFrame(paths.FLANGE_FRAME)
-                stream.log(f"{paths.FLANGE}/{name}", frame, line, static=True)
+    def _log_mount(self, stream: rr.RecordingStream, flange: str) -> None:
+        """Draws the edges that hang on a flange, as lines."""
+        for child in self._carried_by(flange):
+            line = rr.LineStrips3D(
+                [[np.zeros(3), self.frames.matrices[child][:3, 3]]],
+                colors=colours.JOINT,
+                radii=self._radius(2 * _LINE),
+            )
+            entity = f"{paths.entity_of(flange)}/{flange}_from_{child}"
+            stream.log(entity, rr.CoordinateFrame(flange), line, static=True)
 
-    def _log_stops(self, stream: rr.RecordingStream) -> None:
-        """All places of the flange; those of views that were not used in another colour."""
+    def _log_stops(self, stream: rr.RecordingStream, flange: str) -> None:
+        """All places of a flange; those of views that were not used in another colour."""
+        stops = paths.part_of(paths.STOPS, self.frames.robots[flange])
+        frame = rr.CoordinateFrame(self.frames.parents[flange])
+        own = {view: it.pose for view, it in self.states[flange].items() if not it.is_past}
         for name, colour in ((paths.USED, colours.USED), (paths.REJECTED, colours.REJECTED)):
-            poses = [
-                pose
-                for view, pose in self.base_from_flange.items()
-                if (view in self._rejected) is (name == paths.REJECTED)
-            ]
+            is_rejected = name == paths.REJECTED
+            poses = [it for view, it in own.items() if (view in self._rejected) is is_rejected]
             if not poses:
                 continue
-            frame = rr.CoordinateFrame(paths.BASE_FRAME)
             points = rr.Points3D(
                 [pose[:3, 3] for pose in poses], colors=colour, radii=self._radius(_POINT)
             )
-            stream.log(f"{paths.STOPS}/{name}", frame, points, static=True)
-            strips = [strip for pose in poses for strip in self._carried(pose)]
+            stream.log(f"{stops}/{name}", frame, points, static=True)
+            shapes = self._shapes_on(flange)
+            strips = [it @ pose[:3, :3].T + pose[:3, 3] for pose in poses for it in shapes]
             if strips:
                 lines = rr.LineStrips3D(strips, colors=colour, radii=self._radius(0.3 * _LINE))
-                stream.log(f"{paths.STOPS}/{name}/carried", frame, lines, static=True)
+                stream.log(f"{stops}/{name}/carried", frame, lines, static=True)
 
-    @cached_property
-    def _shapes(self) -> Sequence[tuple[str, FloatArray]]:
-        """What the flange carries, camera or boards, as (k, 3) lines in their frames."""
-        if self.calibration is None:
-            return []
-        if self.calibration.mount == "eye-in-hand":
-            camera = self.calibration.camera
-            rim = [] if camera is None else frustum(camera.camera, SMALL_FRUSTUM * self.size_m)
-            return [("cam", it) for it in rim]
-        return [(end, board.closed_outline(it)) for end, it in self._boards.items()]
-
-    def _carried(self, base_from_flange: FloatArray) -> list[FloatArray]:
-        """The same at one stop, in the base."""
+    def _shapes_on(self, flange: str) -> list[FloatArray]:
+        """What a flange carries, cameras and boards, as (k, 3) lines in its frame."""
+        cameras = {} if self.calibration is None else parts.cameras(self.calibration)
+        shapes = {
+            frame or paths.CAM_FRAME: frustum(it.camera, SMALL_FRUSTUM * self.size_m)
+            for frame, it in cameras.items()
+        }
+        shapes |= {frame: [board.closed_outline(it)] for frame, it in self._boards.items()}
         return [
-            shape @ base_from_end[:3, :3].T + base_from_end[:3, 3]
-            for end, shape in self._shapes
-            if (base_from_end := self._base_from(end, base_from_flange)) is not None
+            shape @ matrix[:3, :3].T + matrix[:3, 3]
+            for child in self._carried_by(flange)
+            for matrix in [self.frames.matrices[child]]
+            for shape in shapes.get(child, ())
         ]
 
-    def _log_arms(self, stream: rr.RecordingStream) -> None:
-        """Draws the robot, or only a line to its flange where its joints are not known."""
-        robot = None if self.calibration is None else self.calibration.calibrated_robot
+    def _log_arm(
+        self, stream: rr.RecordingStream, flange: str, states: Sequence[RobotState | None]
+    ) -> None:
+        """Draws a robot, or only a line to its flange where its joints are not known."""
+        name = self.frames.robots[flange]
+        known = {} if self.calibration is None else parts.calibrated_robots(self.calibration)
+        robot, entity = known.get(name), paths.named(paths.ROBOT, name)
         arms: list[FloatArray | None] = []
         strips: list[list[FloatArray]] = []
-        for view in self.session.views:
-            arm, line, q = None, [], view.joints_rad
-            base_from_flange = self.base_from_flange.get(view.number)
-            if robot is not None and q is not None and len(q) == robot.joint_count:
-                arm = robot.link_frames(q)
-            elif base_from_flange is not None:
-                line = [np.array([np.zeros(3), base_from_flange[:3, 3]])]
-            arms.append(arm)
-            strips.append(line)
-        log_arms(stream, arms)
-        reach = f"{paths.ROBOT}/reach"
+        for it in states:
+            arms.append(None if it is None else it.link_frames(robot))
+            is_line = it is not None and arms[-1] is None
+            strips.append([np.array([np.zeros(3), it.pose[:3, 3]])] if it and is_line else [])
+        log_arms(stream, arms, entity)
         style = rr.LineStrips3D.from_fields(colors=colours.JOINT, radii=self._radius(2 * _LINE))
-        stream.log(reach, style, static=True)
-        _send_strips(stream, reach, dict(enumerate(strips)))
+        stream.log(f"{entity}/reach", style, static=True)
+        _send_strips(stream, f"{entity}/reach", dict(enumerate(strips)))
 
-    def _log_seen_targets(
-        self,
-        stream: rr.RecordingStream,
-        flanges: Sequence[FloatArray | None],
-        seen: Sequence[ViewEvidence],
-    ) -> None:
-        """Draws the target's outline where each view alone sees it."""
+    def _log_seen_targets(self, stream: rr.RecordingStream, seen: Sequence[ViewEvidence]) -> None:
+        """Draws the target's outline where each view of the only camera alone sees it."""
         # A part without strips takes those of the view before off the screen.
         strips: dict[int, list[FloatArray]] = {}
-        for row, (view, flange, it) in enumerate(
-            zip(self.session.views, flanges, seen, strict=True)
-        ):
-            if (name := self.session.board_of(view)) not in self.session.boards:
+        boards = self.session.boards if any(it.cam_from_target is not None for it in seen) else {}
+        outlines = {name: board.closed_outline(it) for name, it in boards.items()}
+        for row, (view, it) in enumerate(zip(self.session.views, seen, strict=True)):
+            if (name := self.session.board_of(view)) not in boards:
                 continue
-            strips[row], base_from_cam = [], self._base_from("cam", flange)
-            if it.cam_from_target is not None and base_from_cam is not None:
-                base_from_target = base_from_cam @ it.cam_from_target
-                corners = self._outlines[name]
-                strips[row] = [corners @ base_from_target[:3, :3].T + base_from_target[:3, 3]]
+            strips[row], cell_from_cam = [], self.in_cell(paths.CAM_FRAME, it.view)
+            if it.cam_from_target is not None and cell_from_cam is not None:
+                pose = cell_from_cam @ it.cam_from_target
+                strips[row] = [outlines[name] @ pose[:3, :3].T + pose[:3, 3]]
+        rejected = {row: seen[row].view in self._rejected for row in strips}
+        self._send_lines(stream, paths.SEEN_TARGET, strips, rejected)
+
+    def _log_sights(self, stream: rr.RecordingStream) -> None:
+        """Draws who saw whom in each view of a whole cell, as a line from one to the other."""
+        cell = None if self.calibration is None else self.calibration.cell
+        if cell is None:
+            return
+        sights = {it.view: it for it in cell.sights}
+        strips: dict[int, list[FloatArray]] = {}
+        images: dict[int, str] = {}
+        rejected: dict[int, bool] = {}
+        for row, view in enumerate(self.session.views):
+            sight, strips[row] = sights.get(view.number), []
+            rejected[row] = sight is None or not sight.used
+            if sight is None:
+                continue
+            ends = [self.in_cell(it, view.number) for it in (sight.seer, sight.seen)]
+            if ends[0] is not None and ends[1] is not None:
+                strips[row] = [np.array([ends[0][:3, 3], self._middle(sight.seen, ends[1])])]
+            if sight.seer in cell.cameras:
+                images[row] = paths.image_frame(sight.seer)
+        self._send_lines(stream, paths.SIGHT_LINE, strips, rejected)
+        if images:
+            frames = rr.CoordinateFrame.columns(frame=list(images.values()))
+            send_rows(stream, paths.IMAGE, images, frames)
+
+    def _middle(self, frame: str, cell_from_frame: FloatArray) -> FloatArray:
+        """The middle of what was seen, in the cell."""
+        target = self._boards.get(frame)
+        middle = np.zeros(3) if target is None else board.outline(target).mean(axis=0)
+        return np.asarray(cell_from_frame[:3, :3] @ middle + cell_from_frame[:3, 3])
+
+    def _send_lines(
+        self,
+        stream: rr.RecordingStream,
+        entity: str,
+        strips: Mapping[int, Sequence[FloatArray]],
+        rejected: Mapping[int, bool],
+    ) -> None:
+        """Draws lines in the cell by the places of views, by whether these were not used."""
         if not strips:
             return
-        frame, width = rr.CoordinateFrame(paths.BASE_FRAME), self._radius(_LINE)
-        style = rr.LineStrips3D.from_fields(radii=width)
-        stream.log(paths.SEEN_TARGET, frame, style, static=True)
-        rejected = [seen[row].view in self._rejected for row in strips]
-        colour = [colours.REJECTED if it else colours.DETECTED for it in rejected]
-        _send_strips(stream, paths.SEEN_TARGET, strips, rr.LineStrips3D.columns(colors=colour))
+        frame = rr.CoordinateFrame(paths.CELL_FRAME)
+        style = rr.LineStrips3D.from_fields(radii=self._radius(_LINE))
+        stream.log(entity, frame, style, static=True)
+        colour = [colours.REJECTED if rejected[it] else colours.DETECTED for it in strips]
+        _send_strips(stream, entity, strips, rr.LineStrips3D.columns(colors=colour))
 
 
-def log_image_plane(stream: rr.RecordingStream, camera: Camera, size_m: float) -> None:
-    """Hangs the image into the camera's frame, as large as a cell of some size [m] asks for."""
-    plane = image_plane(camera, size_m, (paths.CAM_FRAME, paths.IMAGE_FRAME))
-    stream.log(paths.IMAGE, rr.CoordinateFrame(paths.IMAGE_FRAME), plane, static=True)
-
-
-def image_plane(camera: Camera, size_m: float, frames: tuple[str, str]) -> rr.Pinhole:
-    """How an image hangs in a camera's frame.
-
-    Args:
-        camera: The lens.
-        size_m: Of the cell [m].
-        frames: Of the camera, and of its image.
-    """
+def log_image_plane(
+    stream: rr.RecordingStream, camera: Camera, size_m: float, frame: str = paths.CAM_FRAME
+) -> None:
+    """Hangs the image into a camera's frame, as large as a cell of some size [m] asks for."""
+    image = paths.image_frame(frame)
     matrix = matrix_3x3(camera)
     # Rerun puts the image's corner, not the first pixel's centre, at the origin.
     matrix[:2, 2] += 0.5
-    return rr.Pinhole(
+    plane = rr.Pinhole(
         image_from_camera=matrix,
         resolution=camera.resolution,
         camera_xyz=rr.ViewCoordinates.RDF,
         image_plane_distance=_FRUSTUM * size_m,
-        parent_frame=frames[0],
-        child_frame=frames[1],
+        parent_frame=frame,
+        child_frame=image,
     )
+    entity = f"{paths.entity_of(frame)}/image"
+    stream.log(entity, rr.CoordinateFrame(image), plane, static=True)
 
 
 def frustum(camera: Camera, depth_m: float) -> list[FloatArray]:
@@ -331,19 +355,20 @@ def log_pose(
 
 
 def _log_poses(
-    stream: rr.RecordingStream, entity: str, frame: str, poses: Sequence[FloatArray | None]
+    stream: rr.RecordingStream, parent: str, frame: str, poses: Sequence[FloatArray | None]
 ) -> None:
-    """Places a frame in each view of a session, as `log_pose` in one."""
+    """Places a frame on its parent in each view of a session, as `log_pose` in one."""
+    entity = paths.entity_of(frame)
     known = {row: pose for row, pose in enumerate(poses) if pose is not None}
     for row in (it for it in range(len(poses)) if it not in known):
         stream.set_time(paths.TIMELINE, sequence=row)
-        log_pose(stream, entity, frame, None)
+        stream.log(entity, rr.Clear(recursive=False))
     if known:
         matrices, count = np.array(list(known.values())), len(known)
         columns = rr.Transform3D.columns(
             translation=matrices[:, :3, 3],
             mat3x3=matrices[:, :3, :3],
-            parent_frame=[paths.BASE_FRAME] * count,
+            parent_frame=[parent] * count,
             child_frame=[frame] * count,
         )
         send_rows(stream, entity, known, columns)

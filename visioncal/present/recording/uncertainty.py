@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.core.transforms import invert, mean_transform
 from visioncal.core.types import FloatArray
+from visioncal.present import parts
 from visioncal.present.recording import colours, paths
 from visioncal.present.recording.recorder import send_rows
 from visioncal.results import Calibration, Edge
@@ -71,7 +72,12 @@ class Uncertainty:
         for frame in sorted(set(frames.values())):
             some = {view: it for view, it in evidence.items() if frames.get(view) == frame}
             scatter_m |= _scatter_m(calibration, some, used)
-        edges = {name: it for name, it in calibration.placed.items() if it.covariance.any()}
+        last = parts.frames(calibration).matrices
+        edges = {
+            name: it
+            for name, it in calibration.placed.items()
+            if it.covariance.any() and name.rpartition("_from_")[2] in last
+        }
         sizes_m = [SIGMAS_95 * _axes(edge)[0].max() for edge in edges.values()]
         sizes_m += [float(np.linalg.norm(scatter_m[view])) for view in scatter_m.keys() & used]
         factor = round_factor(_SHARE * size_m, max(sizes_m, default=0.0))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import rerun as rr
 
+from visioncal.core.number_format import significant
 from visioncal.core.types import FloatArray
 from visioncal.present.recording import colours, paths
 from visioncal.present.recording.notes import log_scalars
@@ -118,7 +119,7 @@ def log_map(
         places_m,
         colors=_colours(sigma_mm, low, high),
         radii=_PLACE * size_m,
-        labels=[f"{it:.2g} mm" for it in sigma_mm],
+        labels=[f"{significant(it)} mm" for it in sigma_mm],
         show_labels=False,
     )
     stream.log(f"{paths.WORKSPACE}/sigma_of_a_tool_s_place", frame, places, static=True)
@@ -128,7 +129,7 @@ def log_map(
     column = np.zeros((_LEGEND_STEPS, 3))
     column[:, :2] = places_m[:, :2].min(axis=0)
     column[:, 2] = np.linspace(bottom, top, _LEGEND_STEPS)
-    words = [f"{it:.2g} mm" for it in steps_mm]
+    words = [f"{significant(it)} mm" for it in steps_mm]
     words[-1] += " sigma of a tool's place"
     legend = rr.Points3D(
         column,

@@ -10,7 +10,6 @@ from visioncal.core.choices import ImagesKept
 from visioncal.core.errors import DataError
 from visioncal.core.files import named_errors, sha256, written_beside
 from visioncal.present.recording import codec
-from visioncal.present.recording.cells import log_cell
 from visioncal.present.recording.elsewhere import ImagesElsewhere, faint_picture
 from visioncal.present.recording.recorder import Recorder
 from visioncal.present.recording.results import log_results
@@ -120,11 +119,7 @@ class RecordingWriter:
             DataError: The file cannot be written.
         """
         with named_errors(self._label):
-            cell = None if calibration is None else calibration.whole_cell
-            if cell is not None:
-                log_cell(self._recorder, session, cell)
-            else:
-                log_results(self._recorder, session, calibration, evidence)
+            log_results(self._recorder, session, calibration, evidence)
 
     def add_session(self, session: Session) -> None:
         """Adds all views of a session.

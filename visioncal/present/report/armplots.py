@@ -1,4 +1,4 @@
-"""The arm's plots: before and after it was calibrated, and its uncertainty over the workspace."""
+"""An arm's plots: before and after it was calibrated, its uncertainty, its springs and drift."""
 
 from collections.abc import Callable
 
@@ -7,10 +7,11 @@ from markupsafe import Markup
 
 from visioncal.core.number_format import significant
 from visioncal.core.types import FloatArray
+from visioncal.present.arms import hours, joint_words
 from visioncal.present.report import svg
-from visioncal.present.report.axes import Margins, Panel, Scale, boxes
+from visioncal.present.report.axes import Margins, Panel, Scale, boxes, spanning
 from visioncal.present.report.svg import Figure
-from visioncal.results.arm import ArmResult, UnseenView
+from visioncal.results.arm import ArmResult, ElasticResult, ThermalResult, UnseenView
 
 _WIDE_IN, _MAP_IN = 9.2, 5.0
 # Places left free between the views that were left out in turn and those that are held back.
@@ -25,6 +26,11 @@ _LEAST = 1e-6
 _TALLEST, _SHADES = 1.0, 32
 # Above and below marks on a scale of decades, as a factor.
 _SPARE = 1.25
+
+# Height of the drift's figure, and how wide its band is: it holds 95 % of cases.
+_DRIFT_IN, _BAND = 2.6, 1.96
+# Panels side by side, their height, and room between them for their labels.
+_PANELS, _PANEL_IN, _ACROSS_IN, _DOWN_IN = 3, 2.3, 0.75, 0.75
 
 _BEFORE, _AFTER = svg.CHECK, svg.ACCENT
 
@@ -157,3 +163,60 @@ def _map(
     panel.colour_bar(Scale(low, high), svg.PLASMA, "sigma [mm]")
     sigmas = f"{significant(low)} to {significant(high)} mm"
     return figure.inline(f"The workspace from the {name}, sigma {sigmas}")
+
+
+def course(found: ThermalResult) -> Markup:
+    """The drift over time, with the band in which it is predicted to lie."""
+    times_h = [hours(found, it.stamp_s) for it in found.course]
+    drift_mm = np.array([it.drift_mm for it in found.course])
+    band_mm = _BAND * np.array([it.sigma_mm for it in found.course])
+    low, high = drift_mm - band_mm, drift_mm + band_mm
+    seen = [(hours(found, it.stamp_s), it.drift_mm) for it in found.seen or ()]
+    values_mm = np.concatenate([low, high, [mm for _, mm in seen]])
+    least, most = 1.1 * min(0.0, float(values_mm.min())), float(values_mm.max())
+    figure = Figure(_WIDE_IN, _DRIFT_IN)
+    ((box,),) = boxes(figure, 1, 1, Margins())
+    scale = Scale(least, most + 0.05 * (most - least))
+    panel = Panel(figure, box, Scale(times_h[0], times_h[-1]), scale)
+    panel.x_axis("time since the start [h]")
+    panel.y_axis("drift of the flange [mm]", 6)
+    panel.band(np.array(times_h), low, high, svg.ACCENT)
+    panel.line(times_h, drift_mm, svg.ACCENT)
+    if seen:
+        panel.marks([at for at, _ in seen], [mm for _, mm in seen], "dot", svg.INK)
+        line, dot = 2 * "\N{BOX DRAWINGS HEAVY HORIZONTAL}", "\N{BLACK CIRCLE}"
+        entries = [(line, svg.ACCENT, "the model"), (dot, svg.INK, "seen by the stops")]
+        figure.legend(box.right - 6.0, box.bottom - 6.0, entries)
+    return figure.inline("Drift of the flange against time, with its 95 % band")
+
+
+def deflection_against_load(elastic: ElasticResult) -> Markup:
+    """How far each stop sees each determined joint bend, over the torque on it.
+
+    Returns:
+        The figure; empty where no joint is determined.
+    """
+    bending = {
+        spring: np.array(seen)
+        for at, spring in enumerate(elastic.joints)
+        if spring.stiffness_nm_per_rad is not None and (seen := elastic.bends(at))
+    }
+    if not bending:
+        return Markup("")
+    rows = -(-len(bending) // _PANELS)
+    figure = Figure(_WIDE_IN, _PANEL_IN * rows)
+    gaps_in = (_ACROSS_IN, _DOWN_IN)
+    grid = boxes(figure, rows, _PANELS, Margins(top=0.25), gaps_in)
+    panels = (box for row in grid for box in row)
+    for box, (spring, points) in zip(panels, bending.items(), strict=False):
+        torques_nm, bends_mrad = points.T
+        ends = np.array([min(torques_nm.min(), 0.0), max(torques_nm.max(), 0.0)])
+        line = 1e3 * spring.compliance_rad_per_nm * ends
+        heights = spanning(np.concatenate([bends_mrad, line]))
+        panel = Panel(figure, box, spanning(ends), heights)
+        panel.x_axis("torque [N m]", 5)
+        panel.y_axis("bend [mrad]", 5)
+        panel.title(joint_words(spring.joint))
+        panel.line(ends, line, svg.LINE)
+        panel.marks(torques_nm, bends_mrad, "dot", svg.ACCENT, 4.0)
+    return figure.inline("How far each joint bends over the torque on it")

@@ -8,7 +8,9 @@ from visioncal.core.files import write_atomically
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure
 from visioncal.core.version import __version__
-from visioncal.present.report.content import need_facts, readable_time, template
+from visioncal.present.facts import readable_time
+from visioncal.present.report.content import need_facts
+from visioncal.present.report.templates import template
 from visioncal.results import Calibration
 from visioncal.session import Session
 

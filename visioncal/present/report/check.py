@@ -1,22 +1,23 @@
 """The page of a check: one HTML file that says whether a calibration still holds."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from markupsafe import Markup
 
 from visioncal.calibration.verification.change_hypotheses import NOISE
-from visioncal.calibration.verification.check import Check, Suspect
+from visioncal.calibration.verification.check import Check
 from visioncal.calibration.verification.document import listed_suspects
 from visioncal.calibration.verification.messages import thing
 from visioncal.calibration.verification.policy import Outcome
+from visioncal.core.number_format import significant
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Verdict
-from visioncal.core.version import __version__
 from visioncal.present.report import svg
 from visioncal.present.report.axes import Margins, Panel, Scale, boxes
-from visioncal.present.report.content import template
 from visioncal.present.report.svg import Figure
+from visioncal.present.report.templates import template
+from visioncal.present.tables import Row, Table
 
 _WIDE_IN, _HIGH_IN = 9.2, 3.6
 # Bars of a stop, side by side, and how many labels have room below them.
@@ -25,23 +26,42 @@ _BAR, _MOST_LABELS = 0.38, 20
 
 def render_check(check: Check, triggers: Sequence[Outcome], verdict: Verdict) -> str:
     """Renders the page of a check as HTML text."""
-    undone, order = _undone(check), ("fired", "unknown", "quiet")
+    undone = _undone(check)
     stops = [", ".join(map(str, views)) for views in check.seen.views]
     before, after = _lengths(check.away), _lengths(check.left)
     return template("check.html.j2").render(
         check=check,
-        verdict=verdict,
-        version=__version__,
+        kind="Check of a calibration",
+        name=check.seen.known.session.name,
+        subtitle=f"against {check.calibration.session_name}, {check.calibration.created}",
+        notes=(),
+        judged=verdict,
+        provenance={},
         undone=undone,
-        changes=[] if check.passed else [_change(check, it) for it in listed_suspects(check)],
-        triggers=sorted(triggers, key=lambda it: order.index(it.state)),
-        not_used=sorted(check.seen.known.reasons.items()),
-        rows=[
-            (name, *(f"{it:.3f}" for it in (was[0], left[0], was[1], left[1])))
-            for name, was, left in zip(stops, before, after, strict=True)
-        ],
-        rms=[f"{it:.3f}" for it in np.sqrt(np.mean(np.square([before, after]), axis=1)).T.ravel()],
-        plot=_residuals(stops, before, after if undone else None),
+        changes=_change_table(check),
+        triggers=_trigger_table(triggers),
+        not_used=_reasons(
+            Row((str(view), "not used", reason), "rejected")
+            for view, reason in sorted(check.seen.known.reasons.items())
+        ),
+        residuals=_residual_table(stops, before, after if undone else None),
+        figure=_residuals(stops, before, after if undone else None),
+    )
+
+
+def _residual_table(stops: Sequence[str], before: FloatArray, after: FloatArray | None) -> Table:
+    """Residuals stop by stop, and of all of them; see `_residuals`."""
+    sides = {"as calibrated": before} | ({} if after is None else {"undone": after})
+    # Positions first, then rotations.
+    columns = {
+        f"{name} [{unit}]": values[:, at]
+        for at, unit in enumerate(("mm", "deg"))
+        for name, values in sides.items()
+    }
+    rms = [np.sqrt(np.mean(np.square(it))) for it in columns.values()]
+    rows = [*zip(stops, *columns.values(), strict=True), ("rms", *rms)]
+    return Table.of(
+        ("stop (views)", *columns), [(name, *map(significant, row)) for name, *row in rows]
     )
 
 
@@ -77,11 +97,32 @@ def _undone(check: Check) -> str:
     return "" if found is None or found.name == NOISE else thing(check, found)
 
 
-def _change(check: Check, suspect: Suspect) -> tuple[str, str, bool]:
-    """A change that was compared: in words, its share, and whether the check takes it for true."""
-    share = 100.0 * suspect.probability
-    words = f"{share:.0f} %" if share >= 1.0 else f"{share:.1g} %"
-    return thing(check, suspect), words, suspect in check.named
+def _change_table(check: Check) -> Table:
+    """The changes that were compared, with their shares, and which the check takes for true."""
+    rows = []
+    for it in [] if check.passed else listed_suspects(check):
+        share, named = 100.0 * it.probability, it in check.named
+        cells = (
+            f"{share:.0f} %" if share >= 1.0 else f"{share:.1g} %",
+            "found" if named else "ruled out",
+            thing(check, it),
+        )
+        rows.append(Row(cells, "left-out" if named else "rejected"))
+    return _reasons(rows, ("share", "", "change"))
+
+
+def _trigger_table(triggers: Sequence[Outcome]) -> Table:
+    """When to calibrate again: what says so first."""
+    words = {"fired": "now", "unknown": "not known", "quiet": "not yet"}
+    states = [*words]
+    return _reasons(
+        Row((words[it.state], "", it.words), "look" if it.state == "fired" else "rejected")
+        for it in sorted(triggers, key=lambda it: states.index(it.state))
+    )
+
+
+def _reasons(rows: Iterable[Row], titles: tuple[str, str, str] = ("", "", "")) -> Table:
+    return Table(titles, tuple(rows), (0, 1, 2))
 
 
 def _lengths(twists: FloatArray) -> FloatArray:

@@ -1,31 +1,24 @@
 """What the report says: rows of ready text, made from a calibration, for the templates."""
 
-from collections.abc import Collection, Iterator
-from dataclasses import dataclass
-from datetime import datetime
-from functools import cache
-from importlib import metadata
+from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from visioncal.core.number_format import decimals_for, fixed, matched, percent, significant
-from visioncal.core.types import FloatArray
-from visioncal.present.facts import PLUS_MINUS, Fact, answering_solver, frame_words
-from visioncal.present.report.advice import contradicts
-from visioncal.present.words import joint_words, level_words, parameter_row, spring_words
-from visioncal.results import (
-    Calibration,
-    Edge,
-    NeedMet,
-    Verdict,
-    ViewResult,
-)
+from visioncal.core.types import FloatArray, Target
+from visioncal.present import parts
+from visioncal.present.advice import mark_of
+from visioncal.present.cellmap import weakest_frame
+from visioncal.present.facts import DEGREE, PLUS_MINUS, answering_solver, frame_words, of
+from visioncal.present.tables import Fact, Row, Table
+from visioncal.results import Alignment, Calibration, CameraResult, Edge, NeedMet, Verdict
 from visioncal.results.compare import intrinsics_names
-from visioncal.results.sections import ClockResult, PointResult
+from visioncal.results.evidence import ViewEvidence
+from visioncal.results.sections import ClockResult, PointResult, TouchTest
+from visioncal.session import Session
+from visioncal.session.frames import CELL, frames_of_kind
 from visioncal.vision.camera import intrinsics
 
-_DEPENDENCIES = ("numpy", "scipy", "opencv-contrib-python-headless", "pin", "rerun-sdk")
 _MOUNTS = {
     "eye-in-hand": "the camera rides on the robot",
     "eye-to-hand": "the camera stands still and the robot carries the target",
@@ -33,60 +26,30 @@ _MOUNTS = {
 }
 
 
-@dataclass(frozen=True)
-class EdgeCard:
-    """One estimated transform, as text.
-
-    Attributes:
-        name: Its name, such as `flange_from_cam`.
-        meaning: What it is, in words.
-        sigma_mm: Standard deviation of its translation [mm].
-        sigma_deg: Standard deviation of its rotation [deg]; empty where that was not measured.
-        rows: The components with their deviations and units.
-        matrix: The 4x4 matrix, to be copied.
-    """
-
-    name: str
-    meaning: str
-    sigma_mm: str
-    sigma_deg: str
-    rows: tuple[Fact, ...]
-    matrix: str
-
-
-def readable_time(created: str) -> str:
-    """When something was computed, for people; it stands in ISO 8601."""
-    try:
-        time = datetime.fromisoformat(created)
-    except ValueError:
-        return created
-    return f"{time:%Y-%m-%d %H:%M %Z}".strip()
-
-
-def edge_card(name: str, edge: Edge) -> EdgeCard:
-    """Writes a transform of some name, such as `flange_from_cam`, as text."""
+def edge_meaning(name: str) -> str:
+    """What a transform of some name, such as `flange_from_cam`, is."""
     parent, _, child = name.partition("_from_")
+    return f"The pose of {frame_words(child)} in the frame of {frame_words(parent)}."
+
+
+def edge_facts(name: str, edge: Edge) -> list[Fact]:
+    """A transform's components with their deviations and units."""
     rotation = edge.matrix[:3, :3]
     # The perturbation is in the child's frame; the components are along the parent's axes.
     covariance_m2 = rotation @ edge.covariance[3:, 3:] @ rotation.T
     sigmas_mm = 1e3 * np.sqrt(np.clip(np.diag(covariance_m2), 0.0, None))
     translation_mm = 1e3 * edge.transform.translation
     rows = [
-        Fact(axis, matched(value, sigma), f"{PLUS_MINUS} {_rounded(sigma)} mm")
+        Fact(axis, matched(value, sigma), f"{PLUS_MINUS} {significant(sigma)} mm")
         for axis, value, sigma in zip("xyz", translation_mm, sigmas_mm, strict=True)
     ]
     if edge.oriented:
         rows += _rotation_facts(edge)
     else:
-        rows.append(Fact("rotation", "not measured", f"taken as that of {frame_words(parent)}"))
-    return EdgeCard(
-        name,
-        f"The pose of {frame_words(child)} in the frame of {frame_words(parent)}.",
-        _rounded(edge.sigma_mm),
-        _rounded(edge.sigma_deg) if edge.oriented else "",
-        tuple(rows),
-        _matrix_text(edge.matrix),
-    )
+        parent = frame_words(name.partition("_from_")[0])
+        rows.append(Fact("rotation", "not measured", f"taken as that of {parent}"))
+    turned = f", {significant(edge.sigma_deg)} deg" if edge.oriented else ""
+    return [*rows, Fact("sigma", f"{significant(edge.sigma_mm)} mm{turned}")]
 
 
 def _rotation_facts(edge: Edge) -> list[Fact]:
@@ -103,46 +66,79 @@ def _rotation_facts(edge: Edge) -> list[Fact]:
     ]
 
 
-def _rounded(sigma: float) -> str:
-    return significant(sigma, 2)
-
-
-def _matrix_text(matrix: FloatArray) -> str:
+def matrix_text(matrix: FloatArray) -> str:
+    """A (4, 4) transform, to be copied."""
     rows = [", ".join(f"{value: .9f}" for value in row) for row in matrix]
     return "[[" + "],\n [".join(rows) + "]]"
 
 
 def key_figures(calibration: Calibration) -> tuple[Fact, ...]:
     """The handful of figures that most readers come for."""
+    validation, cell = calibration.validation, calibration.cell
+    facts = [*need_facts(calibration.need, calibration.verdict)]
+    facts += _camera_sigmas(calibration) if cell is None else _cell_sigmas(cell)
+    for name, it in parts.arms(calibration).items():
+        if it.arm is not None and it.arm.workspace_sigma_mm is not None:
+            sigma = f"{significant(it.arm.workspace_sigma_mm.median)} mm"
+            facts.append(Fact(f"all over the workspace{of(name)}, sigma", sigma))
+    if cell is None or cell.left_out:
+        turned = validation.held_out.deg
+        note = "" if turned is None else f"{significant(turned)}{DEGREE}"
+        facts.append(Fact("held-out residual", f"{significant(validation.held_out.mm)} mm", note))
+    if calibration.rms.px is not None:
+        facts.append(Fact("reprojection, rms", f"{significant(calibration.rms.px)} px"))
+    return (*facts, views_used(calibration))
+
+
+def views_used(calibration: Calibration) -> Fact:
+    """How many views the fit used."""
+    used = sum(it.used for it in calibration.views)
+    return Fact("views used", f"{used} of {len(calibration.views)}")
+
+
+def _camera_sigmas(calibration: Calibration) -> list[Fact]:
     edge = next(iter(calibration.edges.values()))
     sensor = "instrument" if calibration.mount == "instrument" else "camera"
-    used = sum(view.used for view in calibration.views)
-    facts = [
-        Fact(f"{sensor} position, sigma", f"{_rounded(edge.sigma_mm)} mm"),
-        Fact(f"{sensor} orientation, sigma", f"{_rounded(edge.sigma_deg)}\N{DEGREE SIGN}"),
-        Fact(
-            "held-out residual",
-            f"{significant(calibration.validation.held_out.mm)} mm",
-            ""
-            if calibration.validation.held_out.deg is None
-            else f"{significant(calibration.validation.held_out.deg)}\N{DEGREE SIGN}",
-        ),
-        Fact("views used", f"{used} of {len(calibration.views)}"),
+    return [
+        Fact(f"{sensor} position, sigma", f"{significant(edge.sigma_mm)} mm"),
+        Fact(f"{sensor} orientation, sigma", f"{significant(edge.sigma_deg)}{DEGREE}"),
     ]
-    if calibration.rms.px is not None:
-        facts.insert(3, Fact("reprojection, rms", f"{significant(calibration.rms.px)} px"))
-    arm = calibration.arm
-    if arm is not None and arm.workspace_sigma_mm is not None:
-        sigma = f"{significant(arm.workspace_sigma_mm.median)} mm"
-        facts.insert(2, Fact("all over the workspace, sigma", sigma))
-    return (*need_facts(calibration.need, calibration.verdict), *facts)
+
+
+def _cell_sigmas(cell: Alignment) -> list[Fact]:
+    """How well the robots' bases are known in the first one's, and what is known worst."""
+    bases = [it for it in frames_of_kind(cell.frames, "base") if cell.frames[it] == CELL]
+    facts = []
+    for base in bases[1:]:
+        edge = cell.between(bases[0], base)
+        sigma, turned = f"{significant(edge.sigma_mm)} mm", f"{significant(edge.sigma_deg)}{DEGREE}"
+        facts.append(Fact(f"{base} in {bases[0]}, sigma", sigma, turned))
+    worst = weakest_frame(cell)
+    if worst:
+        facts.append(Fact("least known", worst, f"{significant(cell.edge_of(worst).sigma_mm)} mm"))
+    return facts
+
+
+def stops_m(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> FloatArray:
+    """(m, 3) where the flange was in the used views [m]."""
+    used = {it.view for it in calibration.views if it.used}
+    poses = [it.base_from_flange for it in evidence if it.view in used]
+    return np.reshape([it[:3, 3] for it in poses if it is not None], (-1, 3))
+
+
+def board_target(session: Session | None, name: str) -> Target | None:
+    """The board of a name as the session states it; None where that is not at hand."""
+    if session is None:
+        return None
+    stated = {**session.plates, **session.boards}
+    return stated.get(name, stated.get("") if name == "target" else None)
 
 
 def need_facts(met: NeedMet | None, verdict: Verdict) -> tuple[Fact, ...]:
     """What the task needs and how likely that is met, and what the result is good for."""
     facts = []
     if met is not None:
-        both = ((met.need.mm, " mm"), (met.need.deg, "\N{DEGREE SIGN}"))
+        both = ((met.need.mm, " mm"), (met.need.deg, DEGREE))
         asked = " and ".join(f"{value:g}{unit}" for value, unit in both if value is not None)
         facts.append(Fact(f"picks within {asked}", percent(met.probability)))
     if verdict.good_for_mm is not None:
@@ -154,11 +150,9 @@ def need_facts(met: NeedMet | None, verdict: Verdict) -> tuple[Fact, ...]:
 
 def method_facts(calibration: Calibration) -> tuple[Fact, ...]:
     """How the result was obtained."""
-    used = sum(view.used for view in calibration.views)
-    facts = [
-        Fact("mount", calibration.mount, _MOUNTS[calibration.mount]),
-        Fact("views", f"{used} used of {len(calibration.views)}"),
-    ]
+    facts = [views_used(calibration)]
+    if calibration.cell is None:
+        facts.insert(0, Fact("mount", calibration.mount, _MOUNTS[calibration.mount]))
     answer = answering_solver(calibration)
     if answer is not None:
         note = (
@@ -167,30 +161,43 @@ def method_facts(calibration: Calibration) -> tuple[Fact, ...]:
             else "a closed form"
         )
         facts.append(Fact("solver", answer, note))
-    if calibration.robot is not None:
-        facts.append(Fact("robot model", str(calibration.robot.document.get("name", "given"))))
-    if calibration.camera is not None:
-        camera = calibration.camera.camera
-        width, height = camera.resolution
-        facts.append(Fact("camera", f"{camera.model}, {width} \N{MULTIPLICATION SIGN} {height} px"))
+    for name, robot in parts.robots(calibration).items():
+        model = str(robot.document.get("name", "given"))
+        facts.append(Fact(f"robot model{of(name)}", model))
+    for name, it in parts.cameras(calibration).items():
+        width, height = it.camera.resolution
+        size = f"{it.camera.model}, {width} \N{MULTIPLICATION SIGN} {height} px"
+        facts.append(Fact(name or "camera", size))
     if calibration.instrument is not None:
         read = f"it read {calibration.instrument.reads}"
         facts.append(Fact("instrument", calibration.instrument.words, read))
         facts += [_point_fact(it) for it in calibration.points]
-    if calibration.clock is not None:
-        facts += _clock_facts(calibration.clock)
+    for name, clock in parts.clocks(calibration).items():
+        facts += _clock_facts(clock, f"clock{of(name)}" if name else "camera's clock")
     return tuple(facts)
 
 
-def _clock_facts(clock: ClockResult) -> Iterator[Fact]:
-    """How far the camera's clock is ahead of the robot's, and when an image's rows are taken."""
+def touch_table(test: TouchTest) -> Table:
+    """The gaps at the points of a touch test, and those that were predicted."""
+    rows = [
+        Row(
+            (it.name, significant(it.gap_mm), significant(it.radius95_mm)),
+            "left-out" if it.gap_mm > it.radius95_mm else "",
+        )
+        for it in test.points
+    ]
+    return Table.of(("point", "gap [mm]", "predicted, 95 % [mm]"), rows)
+
+
+def _clock_facts(clock: ClockResult, label: str) -> Iterator[Fact]:
+    """How far a camera's clock is ahead of its robot's, and when an image's rows are taken."""
     ahead_ms = 1e3 * clock.camera_minus_robot_s
     if clock.sigma_s is None:
-        yield Fact("camera's clock", f"{ahead_ms:+.4g} ms", "taken so: views at rest")
+        yield Fact(label, f"{ahead_ms:+.4g} ms", "taken so: views at rest")
     else:
         sigma_ms = 1e3 * clock.sigma_s
         note = f"{PLUS_MINUS} {significant(sigma_ms)}, ahead of the robot's, by {clock.method}"
-        yield Fact("camera's clock", f"{matched(ahead_ms, sigma_ms)} ms", note)
+        yield Fact(label, f"{matched(ahead_ms, sigma_ms)} ms", note)
     shutter = clock.shutter
     if shutter is not None:
         sigma_ms = 1e3 * shutter.readout_sigma_s
@@ -206,52 +213,36 @@ def _point_fact(point: PointResult) -> Fact:
     return Fact(f"point {point.point}", f"[{place}] mm", note)
 
 
-def lens_facts(calibration: Calibration) -> tuple[Fact, ...]:
+def lens_facts(result: CameraResult) -> tuple[Fact, ...]:
     """The intrinsics, each with its standard deviation where it was estimated."""
-    result = calibration.camera
-    if result is None:
-        return ()
-    values = intrinsics(result.camera)
-    names = intrinsics_names(result.camera)
-    units = ["px"] * len(result.camera.matrix) + [""] * len(result.camera.distortion)
-    if result.covariance is None or len(result.covariance) != len(values):
-        shown = [f"{value:.2f}" for value in result.camera.matrix]
-        shown += [f"{value:.5g}" for value in result.camera.distortion]
-        return tuple(Fact(*it) for it in zip(names, shown, units, strict=True))
-    sigmas = np.sqrt(np.clip(np.diag(result.covariance), 0.0, None))
-    return tuple(
-        Fact(name, matched(value, sigma), f"{PLUS_MINUS} {matched(sigma, sigma)} {unit}".strip())
-        for name, value, sigma, unit in zip(names, values, sigmas, units, strict=True)
-    )
+    values, count = intrinsics(result.camera), len(result.camera.matrix)
+    sigmas = np.zeros(len(values))
+    if result.covariance is not None and len(result.covariance) == len(values):
+        sigmas = np.sqrt(np.clip(np.diag(result.covariance), 0.0, None))
+    facts = []
+    for at, (name, value, sigma) in enumerate(
+        zip(intrinsics_names(result.camera), values, sigmas, strict=True)
+    ):
+        unit = "px" if at < count else ""
+        stated = f"{value:.2f}" if at < count else f"{value:.5g}"
+        known = f"{PLUS_MINUS} {matched(sigma, sigma)} {unit}".strip()
+        facts.append(
+            Fact(name, matched(value, sigma), known) if sigma else Fact(name, stated, unit)
+        )
+    return tuple(facts)
 
 
-def view_mark(view: ViewResult, outlying: Collection[int]) -> str:
-    """What became of a view: `used`, `look` (at it), `left-out` or `rejected`."""
-    if view.used:
-        return "look" if view.view in outlying else "used"
-    return "left-out" if contradicts(view) else "rejected"
-
-
-def dependency_versions() -> tuple[Fact, ...]:
-    """Versions of the libraries that compute the result, as installed here."""
-    return tuple(Fact(name, metadata.version(name)) for name in _DEPENDENCIES)
-
-
-def template(name: str) -> Template:
-    """A template by its name, in which what is not given is an error."""
-    return _environment().get_template(name)
-
-
-@cache
-def _environment() -> Environment:
-    # It keeps the templates, which take longer to be compiled than a page to be made.
-    found = Environment(
-        loader=PackageLoader("visioncal", "present/report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    forms = (significant, joint_words, level_words, parameter_row, spring_words)
-    found.filters |= {it.__name__: it for it in forms}
-    return found
+def view_table(calibration: Calibration, outlying: Collection[int]) -> Table:
+    """What became of each view; rows have the names to which the recording's notes lead."""
+    rows, words = [], {"used": "yes", "look": "look", "left-out": "left out", "rejected": "no"}
+    for it in parts.sights(calibration):
+        figures = (it.rms_px, it.residual_mm, it.residual_deg)
+        corners = significant(None) if it.corners is None else str(it.corners)
+        mark = "look" if it.used and it.view in outlying else mark_of(it)
+        cells = (str(it.view), corners, *map(significant, figures), words[mark])
+        names = (it.seer, it.seen) if it.seer else ()
+        rows.append(Row((cells[0], *names, *cells[1:]), mark, f"view-{it.view}"))
+    titles = ("view", "corners", "px", "mm", "deg", "used")
+    if calibration.cell is None:
+        return Table.of(titles, rows, (5,))
+    return Table.of((titles[0], "who", "saw", *titles[1:]), rows, (1, 2, 7))

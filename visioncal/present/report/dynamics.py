@@ -1,6 +1,5 @@
 """The report of a dynamic identification: one HTML file, as that of a calibration."""
 
-import platform
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -8,7 +7,6 @@ from markupsafe import Markup
 
 from visioncal.core.number_format import matched, significant
 from visioncal.core.types import FloatArray
-from visioncal.core.version import __version__
 from visioncal.dynamics import (
     Identified,
     Prediction,
@@ -18,20 +16,20 @@ from visioncal.dynamics import (
     left_for_friction,
     stribeck_rows,
 )
-from visioncal.present.facts import PLUS_MINUS, Fact
-from visioncal.present.report import content, svg
+from visioncal.present import facts
+from visioncal.present.facts import PLUS_MINUS
+from visioncal.present.report import svg
 from visioncal.present.report.axes import Box, Margins, Panel, Scale, boxes, spanning
-from visioncal.present.report.content import template
 from visioncal.present.report.svg import Figure
+from visioncal.present.report.templates import template
+from visioncal.present.tables import Fact
+from visioncal.present.torques import (
+    base_parameter_table,
+    link_table,
+    torque_note,
+    torque_table,
+)
 
-_UNITS = {
-    "m": "kg",
-    "I": "kg m\N{SUPERSCRIPT TWO}",
-    "Fc": "N m",
-    "Fv": "N m s/rad",
-    "offset": "N m",
-}
-_FIRST_MOMENT = "kg m"
 # So many of the fitted motions are shown: more look alike.
 _MOST_FITTED = 2
 _WIDE_IN, _PANEL_IN, _SQUARE_IN = 9.2, 1.15, 3.0
@@ -51,25 +49,26 @@ def render_dynamics(run: Run) -> str:
     source = identified.facts.get("session", {})
     shown = [] if run.predicted is None else [(run.predicted, "not fitted")]
     shown += [(it, "fitted") for it in run.fitted[:_MOST_FITTED]]
+    origin = {"session": source.get("name", ""), "sha256": source.get("sha256", "")}
+    created = facts.readable_time(str(identified.facts.get("created", "")))
+    judged = judge(identified)
     return template("dynamics.html.j2").render(
-        robot=identified.robot.name,
-        session=source.get("name", ""),
-        sha256=source.get("sha256", ""),
-        created=content.readable_time(str(identified.facts.get("created", ""))),
-        judged=judge(identified),
-        key_figures=tuple(_key_figures(identified)),
+        kind="Dynamic identification",
+        name=identified.robot.name,
+        subtitle=" \N{MIDDLE DOT} ".join(it for it in (origin["session"], created) if it),
         notes=tuple(note for it in identified.streams for note in it.notes),
-        torques=tuple(_torque_rows(identified)),
-        unseen="" if identified.validation is None else identified.validation.label,
-        parameters=tuple(_parameter_rows(identified)),
+        judged=judged,
+        steps=judged.next_steps,
+        key_figures=tuple(_key_figures(identified)),
+        provenance={name: it for name, it in origin.items() if it},
+        torques=torque_table(identified),
+        torque_note=torque_note(identified),
+        parameters=base_parameter_table(identified),
         counts=_counts(identified),
-        links=tuple(_link_rows(identified)),
+        links=link_table(identified),
         humps=tuple(_hump_facts(identified)),
         plots=tuple(_plots(shown)),
         friction_plot=friction(identified, run.predictions),
-        version=__version__,
-        python=platform.python_version(),
-        versions=content.dependency_versions(),
     )
 
 
@@ -93,62 +92,10 @@ def _key_figures(identified: Identified) -> Iterator[Fact]:
     yield Fact("samples", str(samples), f"{identified.robot.joint_count} torques each")
 
 
-def _torque_rows(identified: Identified) -> Iterator[tuple[str, list[str]]]:
-    """Each joint, with its torques as they were fitted and as they were predicted."""
-    (first, *_), found = identified.streams, identified.validation
-    figures: list[FloatArray | None] = [first.torque_nm, first.noise_nm, first.rms_nm]
-    if found is None:
-        figures += [None] * 4
-    else:
-        figures += [found.rms_nm, 100.0 * found.shares]
-        figures += [found.consistent_rms_nm, found.known_rms_nm]
-    for at, joint in enumerate(identified.robot.joint_names):
-        yield joint, [_at(it, at) for it in figures]
-
-
-def _at(values: FloatArray | None, place: int) -> str:
-    return significant(None if values is None else float(values[place]))
-
-
-def _parameter_rows(identified: Identified) -> Iterator[tuple[str, list[str]]]:
-    """What is known of each base parameter, as a mark and cells."""
-    marks = {"2 %": "sure", "10 %": "used"}
-    base = identified.base
-    for name, own, value, sigma, share in zip(
-        base.names,
-        base.independent,
-        identified.values.tolist(),
-        identified.sigmas.tolist(),
-        identified.determined,
-        strict=True,
-    ):
-        unit = _unit_of(base.model.names[own])
-        cells = [name, matched(value, sigma), significant(sigma), unit, share]
-        yield marks.get(share, "rejected"), cells
-
-
-def _unit_of(name: str) -> str:
-    """The unit of a standard parameter."""
-    if "*" in name:
-        return _FIRST_MOMENT
-    return next(unit for start, unit in _UNITS.items() if name.startswith(start))
-
-
 def _counts(identified: Identified) -> str:
     shares = identified.determined
     kinds = dict.fromkeys(("2 %", "10 %", *shares))
     return "; ".join(f"{it}: {shares.count(it)}" for it in kinds)
-
-
-def _link_rows(identified: Identified) -> Iterator[tuple[str, ...]]:
-    """Each link as a body: its joint, mass, the mass that was known before, and its centre."""
-    if identified.inertias is None:
-        return
-    found, known = identified.inertias.masses, identified.robot.masses
-    for at, joint in enumerate(identified.robot.joint_names):
-        centre = ", ".join(f"{it:.1f}" for it in 1e3 * found.centres_m[at])
-        before = significant(None if known is None else float(known.kg[at]), 3)
-        yield joint, significant(float(found.kg[at]), 3), before, centre
 
 
 def _hump_facts(identified: Identified) -> Iterator[Fact]:

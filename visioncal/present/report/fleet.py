@@ -1,15 +1,20 @@
 """The page of a batch: what stands out among many sessions, and the results of all."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
 from visioncal.core.number_format import significant
-from visioncal.core.version import __version__
-from visioncal.present.report.content import template
+from visioncal.present.report.templates import template
+from visioncal.present.tables import Row, Table
 from visioncal.results.fleet import CellFigures, FleetRow
 
+_ERRORS = {
+    "DataError": "input",
+    "DegenerateError": "not determined",
+    "ConvergenceError": "not settled",
+}
 _ICONS = {"good": "good", "check": "check"}
 # So many of the sessions of one robot are named by what stands out of them.
 _MOST_NAMED = 6
@@ -35,17 +40,52 @@ def fleet_page(rows: Sequence[FleetRow], cells: Sequence[CellFigures] = ()) -> s
     """
     states = Counter(it.verdict or it.state for it in rows)
     return template("fleet.html.j2").render(
+        kind="Batch",
+        name=f"{len(rows)} sessions",
+        subtitle="",
+        notes=(),
         rows=rows,
-        cells=cells,
+        cells=_cell_table(cells),
         odd=list(_odd(rows)),
         states=[(name, states[name]) for name in ("good", "check", "bad", "failed")],
-        changed=[it for it in rows if it.changed],
+        changes=_reasons((it.name, "", it.change, "look") for it in rows if it.changed),
         is_compared=any(it.changed is not None for it in rows),
-        failed=[it for it in rows if it.state == "failed"],
+        failures=_reasons(
+            (it.name, _ERRORS.get(it.error, it.error), f"{it.words} {it.next_step}", "rejected")
+            for it in rows
+            if it.state == "failed"
+        ),
         icon_of=lambda it: _ICONS.get(it.verdict, "bad"),
-        figure=lambda value: "" if value is None else significant(value),
-        version=__version__,
+        figure=_figure,
     )
+
+
+def _cell_table(cells: Sequence[CellFigures]) -> Table:
+    """What simulated sessions came to, by what they have in common."""
+    titles = (
+        "cell",
+        "results",
+        "good",
+        "95 % of picks within [mm]",
+        "sigma of the camera [mm]",
+        "95 % of cameras off by [mm]",
+    )
+    rows = (
+        (it.name, f"{it.results} of {it.count}", str(it.good),
+         *map(_figure, (it.radius95_mm, it.sigma_mm, it.error_mm)))
+        for it in cells
+    )  # fmt: skip
+    return Table.of(titles, rows)
+
+
+def _reasons(rows: Iterable[tuple[str, str, str, str]]) -> Table:
+    """Sessions by name, with what is said of them and how that is marked."""
+    marked = (Row((name, kind, words.strip()), mark) for name, kind, words, mark in rows)
+    return Table(("", "", ""), tuple(marked), (0, 1, 2))
+
+
+def _figure(value: float | None) -> str:
+    return "" if value is None else significant(value)
 
 
 def _odd(rows: Sequence[FleetRow]) -> Iterator[_Odd]:

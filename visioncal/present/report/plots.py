@@ -2,6 +2,7 @@
 
 import base64
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -11,14 +12,16 @@ from scipy.spatial.transform import Rotation
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.transforms import invert, log, nearest_rotation
 from visioncal.core.types import FloatArray, IntArray
+from visioncal.present.advice import contradicts
+from visioncal.present.parts import sights
 from visioncal.present.report import bars, svg
-from visioncal.present.report.advice import contradicts
 from visioncal.present.report.axes import Box, Margins, Panel, Scale, boxes, spanning
 from visioncal.present.report.bars import Bar
 from visioncal.present.report.svg import Figure
 from visioncal.present.target_frames import target_frames
-from visioncal.results import Calibration, ViewResult
+from visioncal.results import Calibration, Rms, Sight
 from visioncal.results.evidence import ViewEvidence
+from visioncal.results.whole import rms_of
 from visioncal.session import Session
 
 # Beyond this many marks a bitmap is smaller than the vectors.
@@ -35,8 +38,35 @@ _ROOM, _KEPT_PERCENT = 1.3, 95.0
 _DASH_PT = 2.4
 
 
+@dataclass(frozen=True)
+class _Measure:
+    """A kind of residual: its label, its value of a view and of many, and where doubt begins."""
+
+    label: str
+    value_of: Callable[[Sight], float | None]
+    rms_of: Callable[[Rms], float | None]
+    limit: float | None
+
+
+_MEASURES = (
+    _Measure(
+        "position [mm]",
+        lambda view: view.residual_mm,
+        lambda rms: rms.mm,
+        CalibrationLimits().scatter_mm[0],
+    ),
+    _Measure(
+        "orientation [deg]",
+        lambda view: view.residual_deg,
+        lambda rms: rms.deg,
+        CalibrationLimits().scatter_deg[0],
+    ),
+    _Measure("reprojection [px]", lambda view: view.rms_px, lambda rms: rms.px, None),
+)
+
+
 def residuals(calibration: Calibration, outlying: Collection[int] = ()) -> Markup:
-    """Position, orientation and reprojection residual of every view.
+    """Residuals of every view: of one camera all, of a whole cell its positions by camera.
 
     Args:
         calibration: The result.
@@ -45,32 +75,37 @@ def residuals(calibration: Calibration, outlying: Collection[int] = ()) -> Marku
     Returns:
         The figure; empty where there are no residuals.
     """
-    limits = CalibrationLimits()
-    panels: list[tuple[str, Callable[[ViewResult], float | None], float | None, float | None]] = [
-        ("position [mm]", lambda view: view.residual_mm, calibration.rms.mm, limits.scatter_mm[0]),
-        (
-            "orientation [deg]",
-            lambda view: view.residual_deg,
-            calibration.rms.deg,
-            limits.scatter_deg[0],
-        ),
-        ("reprojection [px]", lambda view: view.rms_px, calibration.rms.px, None),
+    measures: tuple[_Measure, ...] = _MEASURES
+    if calibration.cell is not None:
+        measures = (replace(_MEASURES[0], limit=None),)
+    by_seer: dict[str, list[Sight]] = {}
+    for it in sights(calibration):
+        by_seer.setdefault(it.seer, []).append(it)
+    shown = [
+        (seer, mine, measure)
+        for seer, mine in by_seer.items()
+        for measure in measures
+        if any(measure.value_of(it) is not None for it in mine)
     ]
-    shown = [it for it in panels if any(it[1](view) is not None for view in calibration.views)]
     if not shown:
         return Markup("")
-    figure = Figure(_WIDE_IN, 1.3 * len(shown) + 0.25)
-    rows = boxes(figure, len(shown), 1, Margins(0.75, 0.75))
-    for (box,), (label, value_of, rms, limit) in zip(rows, shown, strict=True):
+    named = 0.3 if calibration.cell is not None else 0.0
+    figure = Figure(_WIDE_IN, (1.3 + named) * len(shown) + 0.25)
+    rows = boxes(figure, len(shown), 1, Margins(0.75, 0.75, top=0.1 + named), (0.0, 0.15 + named))
+    for (box,), (seer, mine, measure) in zip(rows, shown, strict=True):
         last = box is rows[-1][0]
-        marked = [Bar(str(it.view), value_of(it), it.used, _colour(it, outlying))
-                  for it in calibration.views]  # fmt: skip
-        bars.draw(figure, box, marked, rms, limit=limit, labelled=last,
-                  titles=("view" if last else "", label))  # fmt: skip
+        rms = calibration.rms if calibration.cell is None else rms_of(mine)
+        marked = [Bar(str(it.view), measure.value_of(it), it.used, _colour(it, outlying))
+                  for it in mine]  # fmt: skip
+        # Views of several cameras are other ones in each panel.
+        labelled = last or calibration.cell is not None
+        bars.draw(figure, box, marked, measure.rms_of(rms), limit=measure.limit,
+                  labelled=labelled, titles=("view" if last else "", measure.label))  # fmt: skip
+        figure.text(box.left, box.top - 5.0, seer)
     return figure.inline("Bars: residuals of each view")
 
 
-def _colour(view: ViewResult, outlying: Collection[int]) -> str:
+def _colour(view: Sight, outlying: Collection[int]) -> str:
     if view.used:
         return svg.CHECK if view.view in outlying else svg.ACCENT
     return svg.BAD if contradicts(view) else svg.MUTED

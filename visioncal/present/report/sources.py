@@ -7,10 +7,10 @@ from markupsafe import Markup
 
 from visioncal.core.number_format import significant
 from visioncal.core.types import FloatArray, IntArray, Target
+from visioncal.present.facts import SOURCES
 from visioncal.present.report import svg
 from visioncal.present.report.axes import Margins, Panel, Scale, boxes
 from visioncal.present.report.svg import Figure
-from visioncal.present.words import SOURCES
 from visioncal.results.sections import BoardResult, UncertaintyResult
 
 _WIDTH_IN = 5.0

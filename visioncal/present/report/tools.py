@@ -1,18 +1,12 @@
-"""What the report says of tools and fixtures."""
-
-from dataclasses import dataclass
+"""Plots of tools and fixtures."""
 
 from markupsafe import Markup
 
-from visioncal.core.number_format import significant
-from visioncal.present.details import details
-from visioncal.present.facts import Fact
 from visioncal.present.report import bars, svg
 from visioncal.present.report.axes import Margins, boxes
 from visioncal.present.report.bars import Bar
-from visioncal.present.report.content import EdgeCard, edge_card, readable_time
 from visioncal.present.report.svg import Figure
-from visioncal.results import Calibration, Frame, Observation
+from visioncal.results import Frame, Observation
 
 _WIDTH_IN, _HEIGHT_IN = 5.0, 1.7
 # More characters than this below the bars run into each other, so their labels stand upright.
@@ -22,45 +16,7 @@ _MOST_LABELS = 24
 _LETTER_IN = 0.068
 
 
-@dataclass(frozen=True)
-class FrameCard:
-    """A tool or a fixture.
-
-    Attributes:
-        pose: Where it is.
-        frame: How it was found.
-        facts: The figures of that.
-        plot: How far each observation is off; empty where that is not known of any.
-    """
-
-    pose: EdgeCard
-    frame: Frame
-    facts: tuple[Fact, ...]
-    plot: Markup
-
-
-def frame_cards(calibration: Calibration) -> tuple[FrameCard, ...]:
-    """The tools and fixtures of a calibration, in its order."""
-    return tuple(
-        FrameCard(edge_card(name, it.edge), it, _facts(it), _plot(name, it))
-        for name, it in calibration.frames.items()
-    )
-
-
-def _facts(frame: Frame) -> tuple[Fact, ...]:
-    used = sum(it.used for it in frame.observations)
-    return (
-        Fact("method", frame.method),
-        Fact("source", frame.source),
-        Fact("created", readable_time(frame.created)),
-        Fact("observations", f"{used} used of {len(frame.observations)}"),
-        Fact("residual, rms", f"{significant(frame.rms_mm)} mm", "over those used"),
-        Fact("noise, per axis", f"{significant(frame.noise_mm)} mm"),
-        *(Fact(*it) for it in details(frame.details)),
-    )
-
-
-def _plot(name: str, frame: Frame) -> Markup:
+def frame_plot(name: str, frame: Frame) -> Markup:
     """Bars of what each observation is off; the wrong ones in red."""
     if all(it.residual_mm is None for it in frame.observations):
         return Markup("")

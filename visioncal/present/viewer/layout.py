@@ -9,9 +9,10 @@ import rerun.blueprint as rrb
 
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Verdict
+from visioncal.present import parts
 from visioncal.present.recording import colours, paths
 from visioncal.present.recording.coverage import AXES_RINGS_DEG, DIRECTIONS_RINGS_DEG
-from visioncal.results import Calibration
+from visioncal.results import Alignment, Calibration
 from visioncal.results.arm import ArmResult
 from visioncal.session import Session
 from visioncal.session.table import reported_matrices
@@ -24,21 +25,40 @@ MAP_DISTANCE = 0.55
 
 @dataclass(frozen=True)
 class _Contents:
-    """What a session has to show."""
+    """What a session and its result have to show."""
 
     images: bool
     joints: int
     unused: bool
     frames: bool
-    turns: bool = True
-    sight: bool = True
+    turns: bool
+    sight: bool
+    seers: tuple[str, ...]
+    cell: Alignment | None
+
+    @classmethod
+    def of(cls, session: Session, calibration: Calibration | None) -> "_Contents":
+        """Collects it."""
+        joints = [len(view.joints_rad) for view in session.views if view.joints_rad is not None]
+        cell = None if calibration is None else calibration.cell
+        sights = () if calibration is None else parts.sights(calibration)
+        return cls(
+            any(view.image or view.has_corners for view in session.views),
+            min(joints, default=0) if cell is None else 0,
+            not all(it.used for it in sights),
+            calibration is not None and bool(calibration.frames),
+            not sights or any(it.residual_deg is not None for it in sights),
+            session.mount != "instrument",
+            tuple(dict.fromkeys(it.seer for it in sights)) or ("",),
+            cell,
+        )
 
 
 def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.Blueprint:
     """Lays out a recording of a session and its result.
 
-    The first tab shows the verdict, the cell and the image; others the calibrated arm, the
-    residuals, what the views cover, and the solvers.
+    The first tab shows the verdict, the cell and the image; others the network of a whole cell, the
+    calibrated arm, the residuals, what the views cover, and the solvers.
 
     Args:
         session: The session; what it does not have gets no room.
@@ -47,40 +67,26 @@ def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.B
     Returns:
         The layout, to be written into the recording.
     """
-    if calibration is not None and calibration.cell is not None:
-        # It is made of what is here.
-        from visioncal.present.viewer.cells import cell_blueprint
+    contents, eye = _Contents.of(session, calibration), _eye(session, calibration)
+    tabs: list[rrb.Container | rrb.View] = [_overview(contents, eye, calibration)]
+    if contents.cell is not None:
+        tabs.append(rrb.GraphView(name="Network: frames with their sigmas", origin=paths.NETWORK))
+    tabs += [] if calibration is None else _arms(calibration, eye)
+    if calibration is not None and calibration.dense is not None:
+        tabs.append(_explained())
+    tabs.append(_residuals(contents))
+    if contents.cell is None:
+        tabs.append(_coverage(contents))
+    tabs.append(_figures(calibration))
+    return with_panels(rrb.Tabs(*tabs, active_tab=0))
 
-        return cell_blueprint(session, calibration.cell)
-    joints = [len(view.joints_rad) for view in session.views if view.joints_rad is not None]
-    results = () if calibration is None else calibration.views
-    contents = _Contents(
-        any(view.image or view.has_corners for view in session.views),
-        min(joints, default=0),
-        not all(view.used for view in results),
-        calibration is not None and bool(calibration.frames),
-        not results or any(view.residual_deg is not None for view in results),
-        session.mount != "instrument",
-    )
-    verdict = None if calibration is None else calibration.verdict
-    eye = _eye(session, calibration)
-    arm = None if calibration is None else calibration.arm
-    tabs = rrb.Tabs(
-        _overview(contents, eye, verdict),
-        *([] if arm is None or not arm.is_calibrated else [_arm(arm, eye)]),
-        *([] if calibration is None or calibration.thermal is None else [_warming()]),
-        *([_explained()] if calibration is not None and calibration.dense is not None else []),
-        _residuals(contents),
-        _coverage(contents),
-        rrb.Horizontal(
-            rrb.TextDocumentView(name="Residuals, noise and uncertainty", origin=paths.FIGURES),
-            rrb.TextDocumentView(name="Solvers", origin=paths.SOLVERS),
-            name="Figures",
-            column_shares=[2, 3],
-        ),
-        active_tab=0,
-    )
-    return with_panels(tabs)
+
+def _figures(calibration: Calibration | None) -> rrb.Container:
+    figures = rrb.TextDocumentView(name="Residuals, noise and uncertainty", origin=paths.FIGURES)
+    if calibration is not None and not calibration.solvers:
+        return rrb.Horizontal(figures, name="Figures")
+    solvers = rrb.TextDocumentView(name="Solvers", origin=paths.SOLVERS)
+    return rrb.Horizontal(figures, solvers, name="Figures", column_shares=[2, 3])
 
 
 def with_panels(content: rrb.Container, timeline: str = paths.TIMELINE) -> rrb.Blueprint:
@@ -130,19 +136,34 @@ def series(name: str, entity: str) -> rrb.TimeSeriesView:
 
 
 def _overview(
-    contents: _Contents, eye: rrb.EyeControls3D | None, found: Verdict | None
+    contents: _Contents, eye: rrb.EyeControls3D | None, calibration: Calibration | None
 ) -> rrb.Container:
-    cell = space_view("Cell", _cell_contents(contents), eye)
-    plots = _plots(contents)
-    left = rrb.Vertical(cell, rrb.Horizontal(*plots[:1], *plots[1:][-1:]), row_shares=[3, 1])
-    verdict = _verdict(contents, found)
+    frame = paths.BASE_FRAME if contents.cell is None else paths.CELL_FRAME
+    cell = space_view("Cell", _cell_contents(contents), eye, frame)
+    # The residuals of one camera fit below the cell, those of several have a tab.
+    plots = _plots(contents, "") if contents.cell is None else []
+    left: rrb.Container | rrb.View = cell
+    if plots:
+        left = rrb.Vertical(cell, rrb.Horizontal(*plots[:1], *plots[1:][-1:]), row_shares=[3, 1])
+    verdict = _verdict(contents, None if calibration is None else calibration.verdict)
     note = rrb.TextDocumentView(name="This view", origin=paths.VIEW_NOTE)
     if not contents.images:
         right = rrb.Vertical(verdict, note, row_shares=[2, 1])
         return rrb.Horizontal(left, right, name="Overview", column_shares=[1.3, 1])
-    image = image_view("Image: green detected, blue predicted, red residual", paths.IMAGE)
+    words = "Image: green detected, blue predicted, red residual"
+    image = image_view(words if contents.cell is None else "Image", paths.IMAGE, _bounds(contents))
     right = rrb.Vertical(verdict, image, note, row_shares=[3.7, 4.2, 1.5])
     return rrb.Horizontal(left, right, name="Overview", column_shares=[1.2, 1])
+
+
+def _bounds(contents: _Contents) -> rrb.VisualBounds2D | None:
+    """What holds the largest image of several cameras; None of one, whose image is alone."""
+    cameras = {} if contents.cell is None else contents.cell.cameras
+    sizes = [it.camera.resolution for it in cameras.values()]
+    if not sizes:
+        return None
+    width, height = (float(max(it)) for it in zip(*sizes, strict=True))
+    return rrb.VisualBounds2D(x_range=(0.0, width), y_range=(0.0, height))
 
 
 def _explained() -> rrb.Container:
@@ -159,6 +180,21 @@ def _explained() -> rrb.Container:
     )
     note = rrb.TextDocumentView(name="What blurs it", origin=paths.BLUR_NOTE)
     return rrb.Vertical(images, note, name="Images explained", row_shares=[4, 1])
+
+
+def _arms(calibration: Calibration, eye: rrb.EyeControls3D | None) -> list[rrb.Container]:
+    """The calibrated arms: one with its workspace, several in words; and their drift."""
+    arms = parts.arms(calibration).values()
+    found = [it.arm for it in arms if it.arm is not None and it.arm.is_calibrated]
+    tabs: list[rrb.Container] = []
+    if found and calibration.cell is None:
+        tabs.append(_arm(found[0], eye))
+    elif found:
+        note = rrb.TextDocumentView(name="The arms", origin=paths.ARM_NOTE)
+        tabs.append(rrb.Horizontal(note, name="Arm"))
+    if any(it.thermal is not None for it in arms):
+        tabs.append(_warming())
+    return tabs
 
 
 def _warming() -> rrb.Container:
@@ -210,9 +246,9 @@ def _verdict(contents: _Contents, found: Verdict | None) -> rrb.Container | rrb.
 
 
 def _residuals(contents: _Contents) -> rrb.Container:
-    over_views = rrb.Horizontal(*_plots(contents))
+    over_views = [rrb.Horizontal(*_plots(contents, it)) for it in contents.seers]
     if contents.joints == 0:
-        return rrb.Vertical(over_views, name="Residuals")
+        return rrb.Vertical(*over_views, name="Residuals")
     over_joints = rrb.Grid(
         *(
             rrb.BarChartView(
@@ -224,7 +260,7 @@ def _residuals(contents: _Contents) -> rrb.Container:
         ),
         grid_columns=min(contents.joints, 4) if contents.joints != 6 else 3,
     )
-    return rrb.Vertical(over_views, over_joints, name="Residuals", row_shares=[1, 2])
+    return rrb.Vertical(*over_views, over_joints, name="Residuals", row_shares=[1, 2])
 
 
 def _coverage(contents: _Contents) -> rrb.Container:
@@ -263,12 +299,13 @@ def _disc(name: str, entity: str, rings_deg: tuple[int, ...]) -> rrb.Spatial2DVi
 
 def _eye(session: Session, calibration: Calibration | None) -> rrb.EyeControls3D | None:
     """Looks at the cell from the side, from where all of it fills the view."""
-    poses = reported_matrices(session.views)
-    if not poses:
-        return None
-    edges = {} if calibration is None else calibration.transforms
-    fixed = [edge.translation for name, edge in edges.items() if name.startswith("base_from_")]
-    return eye_on(np.array([np.zeros(3), *(it[:3, 3] for it in poses.values()), *fixed]))
+    frames = parts.frames(calibration)
+    bases = {paths.CELL_FRAME, paths.BASE_FRAME}
+    fixed = [it[:3, 3] for frame, it in frames.matrices.items() if frames.parents[frame] in bases]
+    # Of several robots, each pose is in a base of its own.
+    poses = {} if session.is_network else reported_matrices(session.views)
+    places = np.array([np.zeros(3), *(it[:3, 3] for it in poses.values()), *fixed])
+    return eye_on(places) if len(places) > 2 else None
 
 
 def eye_on(places: FloatArray, distance: float = EYE_DISTANCE) -> rrb.EyeControls3D:
@@ -282,23 +319,22 @@ def eye_on(places: FloatArray, distance: float = EYE_DISTANCE) -> rrb.EyeControl
 
 
 def _cell_contents(contents: _Contents) -> list[str]:
+    several = (paths.BASE, paths.ROBOT, paths.FLANGE, paths.CAMERA, paths.TARGET)
     entities = [
-        paths.BASE,
-        paths.ROBOT,
-        paths.FLANGE,
+        *(it for entity in several for it in (entity, f"{entity}s")),
         paths.STOPS,
-        paths.CAMERA,
-        paths.TARGET,
-        paths.TARGETS,
         paths.FRAMES,
         paths.SEEN_TARGET,
+        paths.CELL,
+        paths.SIGHT_LINE,
     ]
     # The image's overlays would float as a crowd of points in the frustum.
     hidden = [f"- {paths.IMAGE}/**", f"+ {paths.IMAGE}"] if contents.images else []
     return [*(f"+ {entity}/**" for entity in entities), *hidden]
 
 
-def _plots(contents: _Contents) -> list[rrb.TimeSeriesView]:
+def _plots(contents: _Contents, seer: str) -> list[rrb.TimeSeriesView]:
+    """The residuals of the views of one camera."""
     wanted = [
         ("Position residual [mm]", paths.POSITION_MM),
         *([("Orientation residual [deg]", paths.ORIENTATION_DEG)] if contents.turns else []),
@@ -308,4 +344,5 @@ def _plots(contents: _Contents) -> list[rrb.TimeSeriesView]:
     # A legend would hide the marks at the top and at the bottom, of just these views; a longer
     # title would be cut beside a plot's buttons.
     legend = "; red: not used" if contents.unused else ""
-    return [series(f"{name}{legend}", entity) for name, entity in wanted]
+    of = f"{seer}: " if seer else ""
+    return [series(f"{of}{name}{legend}", paths.part_of(it, seer)) for name, it in wanted]

@@ -1,18 +1,19 @@
 """Which views to look at."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import significant
-from visioncal.results import Calibration, ViewResult
+from visioncal.present.parts import sights
+from visioncal.results import Calibration, Sight, ViewResult
 
 # Views whose residual is this many times the median are named, as by the verdict.
 _STANDS_OUT = CalibrationLimits.outlier
 # So begins the reason of a view that was left out because pose and image do not go together.
-_CONTRADICTS = "disagrees with the other views"
+_CONTRADICTS = "disagrees with "
 
 # So many views of one reason are named.
 _MOST_LISTED = 12
@@ -26,16 +27,24 @@ class Suspects:
         views: Their numbers.
         used: Whether they are in the fit nevertheless.
         why: What is wrong with them, in words.
+        of: Who saw whom in them; empty of one camera.
     """
 
     views: tuple[int, ...]
     used: bool
     why: str
+    of: str = ""
 
     @property
     def contradict(self) -> bool:
         """Whether they were left out because they contradict the others."""
         return not self.used and self.why.startswith(_CONTRADICTS)
+
+    @property
+    def words(self) -> str:
+        """Them, with what is wrong: `views 3 and 6 (cam_top of target): blurred`."""
+        of = f" ({self.of})" if self.of else ""
+        return f"{listed(self.views)}{of}: {self.why}"
 
 
 def suspects(calibration: Calibration) -> tuple[Suspects, ...]:
@@ -44,15 +53,29 @@ def suspects(calibration: Calibration) -> tuple[Suspects, ...]:
     In a good result none stands out: that one view sees the board less well than others is no
     doubt.
     """
-    outlying = {} if calibration.verdict.status == "good" else _outlying(calibration.views)
-    by_reason: dict[str, list[int]] = {}
-    for view in calibration.views:
-        if not view.used:
-            by_reason.setdefault(view.reason, []).append(view.view)
-    return (
-        *(Suspects((view,), used=True, why=why) for view, why in outlying.items()),
-        *(Suspects(tuple(it), used=False, why=why) for why, it in by_reason.items()),
+    found, by_pair = sights(calibration), dict[str, list[Sight]]()
+    for it in found if calibration.verdict.status != "good" else ():
+        by_pair.setdefault(_of(it), []).append(it)
+    outlying = (
+        Suspects((view,), used=True, why=why, of=of)
+        for of, mine in by_pair.items()
+        for view, why in _outlying(mine).items()
     )
+    return (*outlying, *left_out(found))
+
+
+def left_out(found: Iterable[Sight]) -> Iterator[Suspects]:
+    """Those of some views that were not used, by their reasons."""
+    by_reason: dict[tuple[str, str], list[int]] = {}
+    for it in found:
+        if not it.used:
+            by_reason.setdefault((_of(it), it.reason), []).append(it.view)
+    for (of, why), views in by_reason.items():
+        yield Suspects(tuple(views), used=False, why=why, of=of)
+
+
+def _of(sight: Sight) -> str:
+    return f"{sight.seer} of {sight.seen}" if sight.seer else ""
 
 
 def outlying_views(found: Sequence[Suspects]) -> tuple[int, ...]:
@@ -60,14 +83,21 @@ def outlying_views(found: Sequence[Suspects]) -> tuple[int, ...]:
     return tuple(sorted(view for it in found if it.used for view in it.views))
 
 
-def contradicts(view: ViewResult) -> bool:
+def contradicts(view: ViewResult | Sight) -> bool:
     """Whether a view was left out because it contradicts the others."""
     return not view.used and view.reason.startswith(_CONTRADICTS)
 
 
-def _outlying(views: Sequence[ViewResult]) -> dict[int, str]:
+def mark_of(view: Sight) -> str:
+    """What became of a view: `used`, `left-out` for contradicting others, or `rejected`."""
+    if view.used:
+        return "used"
+    return "left-out" if contradicts(view) else "rejected"
+
+
+def _outlying(views: Sequence[Sight]) -> dict[int, str]:
     """Words for the used views whose residual is many times as long as the median, by view."""
-    kinds: list[tuple[str, Callable[[ViewResult], float | None]]] = [
+    kinds: list[tuple[str, Callable[[Sight], float | None]]] = [
         ("mm", lambda view: view.residual_mm),
         ("deg", lambda view: view.residual_deg),
     ]

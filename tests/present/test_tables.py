@@ -1,0 +1,96 @@
+"""Tables say the same on the page and in the recording, and one camera is a cell of one."""
+
+from dataclasses import replace
+
+import numpy as np
+from support.aligned_cells import made_up_cell
+from support.pages import Page
+from support.samples import made_up
+
+from visioncal.core.number_format import significant
+from visioncal.present import facts, parts
+from visioncal.present.recording.markdown import table_lines
+from visioncal.present.recording.notes import figures_markdown, verdict_markdown
+from visioncal.present.report.page import render
+from visioncal.present.tables import Row, Table
+from visioncal.results import Calibration, Moved, Sight
+
+CELL = made_up_cell(3)
+
+
+def test_columns_in_which_nothing_is_known_are_left_out():
+    unknown = significant(None)
+    rows = [("a", unknown, "1", ""), Row(("a heading",)), ("b", unknown, "2", "")]
+    table = Table.of(("what", "deg", "mm", "note"), rows, (0, 3))
+    assert table.titles == ("what", "mm")
+    assert table.words == (0,)
+    assert [it.cells for it in table.rows] == [("a", "1"), ("a heading",), ("b", "2")]
+
+
+def test_tables_side_by_side_have_all_rows_in_their_order():
+    table = Table.of(("view",), [(str(it),) for it in range(7)])
+    found = list(table.parts(3))
+    assert [len(it.rows) for it in found] == [3, 3, 1]
+    assert [row for it in found for row in it.rows] == list(table.rows)
+
+
+def test_cells_of_a_table_are_text_in_markdown():
+    table = Table.of(("a|b", "mm"), [Row(("[x](y)", "1"), "taken"), Row(("joint_1",))])
+    assert list(table_lines(table)) == [
+        "",
+        r"| a\|b | mm |",
+        "| --- | ---: |",
+        r"| **\[x\]\(y\)** | 1 |",
+        r"| **joint\_1** |  |",
+    ]
+
+
+def test_page_and_recording_have_the_same_figures():
+    sample = made_up()
+    for calibration in (sample.calibration, Calibration.whole(CELL)):
+        words = Page(render(calibration, None, ())).words
+        text = figures_markdown(calibration).replace("\\", "")
+        for fact in facts.noise_facts(calibration):
+            assert f"{fact.label} {fact.value}" in words
+            assert f"- {fact.label}: {fact.value}" in text
+        for row in facts.residual_table(calibration).rows:
+            assert " ".join(row.cells) in words
+            assert f"| {' | '.join(row.cells)} |" in text
+
+
+def test_one_camera_has_one_of_each_without_a_name():
+    calibration = made_up().calibration
+    assert parts.cameras(calibration) == {"": calibration.camera}
+    assert parts.arms(calibration) == {"": calibration}
+    assert [it.view for it in parts.sights(calibration)] == [it.view for it in calibration.views]
+    frames = parts.frames(calibration)
+    assert frames.parents == {
+        "base": "cell", "flange": "base", "cam": "flange", "target": "base"
+    }  # fmt: skip
+    assert frames.robots == {"flange": ""}
+    edge = calibration.edges["flange_from_cam"]
+    np.testing.assert_array_equal(frames.matrices["cam"], edge.matrix)
+
+
+def test_frames_of_a_cell_hang_as_they_did_last():
+    former = "cam_top_until_stop_4"
+    moved = replace(
+        CELL,
+        frames={**CELL.frames, former: "cell"},
+        edges={**CELL.edges, f"cell_from_{former}": CELL.edge_of("cam_top")},
+        joint_covariance=np.pad(CELL.joint_covariance, (0, 6)),
+        moved=(Moved("cam_top", former, 4, 5, 0.58, 0.03),),
+    )
+    frames = parts.frames(Calibration.whole(moved))
+    assert frames.parents == CELL.frames
+    assert frames.matrices.keys() == CELL.frames.keys() - CELL.robots.keys()
+    # The frame of the cell is that of its reference.
+    np.testing.assert_array_equal(frames.matrices[CELL.reference], np.eye(4))
+    assert "Between stops 4 and 5." in verdict_markdown(Calibration.whole(moved)).replace("\\", "")
+
+
+def test_views_left_out_of_a_cell_say_who_saw_whom():
+    sights = tuple(Sight(it, it, "cam_top", "target_plate", False, "blurred") for it in (3, 4))
+    text = verdict_markdown(Calibration.whole(replace(CELL, sights=sights)))
+    assert "- views 3 and 4 (cam_top of target_plate): blurred" in text.replace("\\", "")
+    assert "0 of 2 views used" in text

@@ -1,0 +1,302 @@
+"""What a result says of an arm: its levels, parameters, springs and drift."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from visioncal.core.number_format import decimals_for, fixed, signed, significant
+from visioncal.estimation.arm import SIGNIFICANT
+from visioncal.present.facts import PLUS_MINUS
+from visioncal.present.tables import Fact, Row, Table
+from visioncal.results.arm import (
+    NOMINAL,
+    ArmErrorsResult,
+    ArmLevel,
+    ArmParameter,
+    ArmResult,
+    ElasticResult,
+    ThermalResult,
+)
+
+# What each level frees, for people.
+LEVELS = {
+    NOMINAL: "the arm as stated",
+    "backlash": "play of the joints",
+    "offsets": "offsets of the joints",
+    "geometry": "geometry of the links",
+    "eccentricity": "geometry and eccentric gears",
+    "elastic": "geometry, gears, and joints that bend",
+    "functions": "geometry, gears, gravity, and functions of the joints",
+}
+_SYMBOLS = {
+    "theta": "\N{GREEK SMALL LETTER THETA}",
+    "alpha": "\N{GREEK SMALL LETTER ALPHA}",
+    "beta": "\N{GREEK SMALL LETTER BETA}",
+    "sine": "eccentricity, sine",
+    "cosine": "eccentricity, cosine",
+    "ratio": "gear ratio",
+}
+# Units on disk with those for people, and how many of these one of them is.
+_UNITS = {"_m": ("mm", 1e3), "_rad": ("\N{DEGREE SIGN}", float(np.rad2deg(1.0)))}
+# Without a sigma: about a hundredth of what an arm repeats to.
+_DECIMALS = {"mm": 3, "\N{DEGREE SIGN}": 4}
+
+
+_CONVENTIONS = {
+    "standard": "Denavit and Hartenberg's form, each joint's link behind it",
+    "modified": "Craig's modified form, each joint's link before it",
+    "hayati": "Hayati's form, which has no leap where axes are parallel",
+}
+_INDICES = (
+    ("o1", "O1", "geometric mean, over the root of the number of stops (Borm and Menq 1991)"),
+    ("o2", "O2", "smallest over largest (Driels and Pathre 1990)"),
+    ("o3", "O3", "smallest (Nahvi, Hollerbach and Hayward 1994)"),
+    ("o4", "O4", "square of the smallest over the largest (Nahvi and Hollerbach 1996)"),
+    ("o5", "O5", "inverse of the sum of their inverses (Sun and Hollerbach 2008)"),
+)
+# So many of the most influential stops are named, and the least.
+_MOST_INFLUENTIAL = 5
+
+
+def joint_words(name: str) -> str:
+    """A joint's name for people."""
+    return name.replace("_", " ")
+
+
+def level_words(name: str) -> str:
+    """What a level of the arm's model frees."""
+    return LEVELS.get(name, name.replace("_", " "))
+
+
+def level_reason(arm: ArmResult) -> str:
+    """Why this level was taken, or none, in one sentence."""
+    if not arm.is_calibrated:
+        return (
+            "No level was taken: none predicts stops that are left out of the fit better than "
+            "the arm as stated does, beyond chance."
+        )
+    return (
+        f"Taken: {level_words(arm.level)}. It predicts stops that are left out of the fit to "
+        f"{_held_out(arm.chosen)}, the arm as stated to {_held_out(arm.nominal)}."
+    )
+
+
+def _held_out(level: ArmLevel) -> str:
+    turned = "" if level.held_out_deg is None else f" and {significant(level.held_out_deg)} deg"
+    return f"{significant(level.held_out_mm)} mm{turned}"
+
+
+def arm_sentences(found: ArmResult) -> list[str]:
+    """Which level of the arm was taken and why, and how accurate it is."""
+    sentences, sigma = [level_reason(found)], found.workspace_sigma_mm
+    if sigma is not None:
+        median, p95 = significant(sigma.median), significant(sigma.p95)
+        sentences.append(
+            f"All over the workspace, a tool's place is predicted with a sigma of {median} mm "
+            f"(median; 95 % of the places: under {p95} mm)."
+        )
+    if found.carries_over is not None:
+        sentences.append(found.carries_over.words)
+    return sentences
+
+
+def error_facts(errors: ArmErrorsResult) -> tuple[Fact, ...]:
+    """The size of the errors that follow the arm's posture."""
+    treated = (
+        ("estimated along with the result", "what looks the same in all views is left, see above")
+        if errors.estimated
+        else ("not taken out", "no joint angles with a known robot model: only their size is known")
+    )
+    away: tuple[Fact, ...] = ()
+    if errors.away_mm is not None and errors.away_deg is not None:
+        predicted = _size(errors.away_predicted_mm, errors.away_predicted_deg)
+        away = (
+            Fact(
+                "at postures away from the views it errs by",
+                _size(errors.away_mm, errors.away_deg),
+                f"parts of the postures left out in turn; predicted {predicted}",
+            ),
+        )
+    return (
+        Fact(
+            f"{'the flange' if errors.of else 'a link'} is typically off by",
+            _size(errors.sigma_mm, errors.sigma_deg),
+        ),
+        *away,
+        Fact("likelihood ratio", f"{errors.likelihood_ratio:.0f}", "noise alone stays under 15"),
+        Fact("its errors were", *treated),
+    )
+
+
+def _size(mm: float | None, deg: float | None) -> str:
+    return f"{significant(mm)} mm, {significant(deg)} deg"
+
+
+def level_table(found: ArmResult) -> Table | None:
+    """The levels that were tried, each with its residuals; None of one alone."""
+    if len(found.levels) < 2:
+        return None
+    titles = ("what is free", "values", "fit, mm", "fit, deg", "left out, mm", "left out, deg",
+              "likelihood ratio")  # fmt: skip
+    return Table.of(titles, [_level(it, taken=it.level == found.level) for it in found.levels])
+
+
+def level_note(observed: str) -> str:
+    """What the figures of the levels are, of a target's pose or the like."""
+    return (
+        f"Residuals of the {observed}, root mean square: of all stops in the fit, and of "
+        "stops left out of it in turn. Likelihood ratio: twice the gain in log-likelihood over the "
+        f"arm as stated; chance stays under {SIGNIFICANT:.0f}. Levels that explain no more than "
+        "chance are not listed."
+    )
+
+
+def _level(it: ArmLevel, *, taken: bool) -> Row:
+    words = level_words(it.level) + (" (taken)" if taken else "")
+    residuals = map(significant, (it.rms_mm, it.rms_deg, it.held_out_mm, it.held_out_deg))
+    ratio = significant(None) if it.level == NOMINAL else f"{it.likelihood_ratio:.0f}"
+    return Row((words, str(it.unknowns), *residuals, ratio), "taken" if taken else "")
+
+
+def parameter_tables(found: ArmResult, count: int = 1) -> list[Table]:
+    """The numbers of the arm's model, joint by joint, in so many tables."""
+    joints: dict[str, list[Row]] = {}
+    for it in found.parameters:
+        joints.setdefault(it.joint, [Row((joint_words(it.joint),))]).append(_parameter(it))
+    titles, rows = ("parameter", "nominal", "identified", "change", "sigma", "unit"), [*joints]
+    size = max(-(-len(rows) // count), 1)
+    parts = [rows[at : at + size] for at in range(0, len(rows), size)]
+    return [Table(titles, tuple(it for name in part for it in joints[name]), (0, 4, 5))
+            for part in parts]  # fmt: skip
+
+
+def _parameter(it: ArmParameter) -> Row:
+    """Writes a number of the arm's model with as many digits as its change is known to."""
+    suffix = next((end for end in _UNITS if it.name.endswith(end)), "")
+    unit, scale = _UNITS.get(suffix, ("", 1.0))
+    stem = it.name.removesuffix(suffix)
+    sigma = None if it.sigma is None else scale * it.sigma
+    decimals = decimals_for(sigma) if sigma else _DECIMALS.get(unit, 5)
+    cells = (
+        _SYMBOLS.get(stem, stem.replace("_", " ")),
+        # As stated, whatever is known of it now.
+        f"{scale * it.nominal + 0.0:.7g}",
+        fixed(scale * it.identified, decimals),
+        signed(scale * it.change, decimals),
+        f"{PLUS_MINUS} {significant(sigma)}" if sigma else "",
+        unit,
+    )
+    return Row(cells, "sure" if it.is_sure else "")
+
+
+def parameter_note(found: ArmResult) -> str:
+    """In which form the parameters are, and how many changes are beyond chance."""
+    form = _CONVENTIONS.get(found.convention or "", "")
+    words = f"In {form}. " if form else ""
+    if any(it.sigma is not None for it in found.parameters):
+        sure = sum(it.is_sure for it in found.parameters)
+        words += (
+            f"{sure} of {len(found.parameters)} changes are beyond three sigma, in bold; "
+            f"{PLUS_MINUS} is one standard deviation."
+        )
+    return words
+
+
+def identifiability_facts(found: ArmResult) -> Iterator[Fact]:
+    """How many directions the stops determine, and how well."""
+    known = found.observability
+    if known is not None:
+        count = f"{known.determined} of {known.identifiable}"
+        yield Fact("directions determined", count, "that any stops could determine")
+        if known.condition is not None:
+            note = "best over worst determined, scaled"
+            yield Fact("condition", significant(known.condition), note)
+
+
+def spring_facts(elastic: ElasticResult) -> Iterator[Fact]:
+    """What the loads of the stops do."""
+    median, most = significant(elastic.sag_mm.median), significant(elastic.sag_mm.most)
+    yield Fact("the flange gives way by", f"{median} mm", f"median; at most {most} mm")
+    low, high = map(significant, elastic.payload_kg)
+    if elastic.payload_kg[1] > 0.0:
+        yield Fact("payload", f"{low} to {high} kg")
+    if elastic.payload_factor is not None:
+        factor = elastic.payload_factor
+        note = f"\N{PLUS-MINUS SIGN} {significant(factor.sigma)}; 1 where load and bend fit"
+        yield Fact("load as stated, times", f"{factor.value:.2f}", note)
+
+
+def spring_table(elastic: ElasticResult) -> Table:
+    """The joints' stiffness, and the torques on them."""
+    rows = []
+    for it in elastic.joints:
+        stiffness, sigma = it.stiffness_nm_per_rad, it.stiffness_sigma_nm_per_rad
+        low, high = (f"{round(end, 1) + 0.0:g}" for end in it.torque_nm)
+        words = "taken for rigid" if stiffness is None else f"{1e-3 * stiffness:.4g}"
+        known = "" if sigma is None else f"{PLUS_MINUS} {significant(1e-3 * sigma)}"
+        rows.append((joint_words(it.joint), words, known, f"{low} to {high}"))
+    return Table.of(("joint", "stiffness [kN m/rad]", "sigma", "torque [N m]"), rows, (0, 2))
+
+
+def stop_table(found: ArmResult) -> Table | None:
+    """By how much the variance would grow without the most influential stops, and the least."""
+    first, rest = found.stops[:_MOST_INFLUENTIAL], found.stops[_MOST_INFLUENTIAL:][-1:]
+    named = [*((it, "") for it in first), *((it, ", the least") for it in rest)]
+    rows = [
+        (f"view {it.view}{words}", f"{significant(100.0 * max(it.influence, 0.0))} %")
+        for it, words in named
+    ]
+    return Table.of(("without", "grows by"), rows) if rows else None
+
+
+def index_facts(found: ArmResult) -> Iterator[Fact]:
+    """Indices of observability."""
+    known = found.observability
+    if known is not None:
+        note = "both transforms' and the arm's, redundant ones among them"
+        yield Fact("values carried", str(known.columns), note)
+        for name, label, note in _INDICES:
+            value = getattr(known, name)
+            if value is not None:
+                yield Fact(label, f"{value:.3g}", note)
+
+
+def drift_sentence(found: ThermalResult) -> str:
+    """How far the flange drifted, and what it brings to count that."""
+    source = "measured temperatures" if found.heated_by == "temperatures" else "motor currents"
+    last, residual = found.course[-1], found.residual_mm
+    return (
+        f"By {source}, the flange had moved by {significant(last.drift_mm)} mm at the end, "
+        f"{significant(hours(found, last.stamp_s))} h after the start. Counted with, it takes the "
+        f"views' residuals from {significant(residual.without)} to "
+        f"{significant(residual.with_drift)} mm."
+    )
+
+
+def hours(found: ThermalResult, stamp_s: float) -> float:
+    """Since the start of the course."""
+    return (stamp_s - found.course[0].stamp_s) / 3600.0
+
+
+def drift_table(found: ThermalResult) -> Table:
+    """How each joint and its link follow their temperature."""
+    titles = (
+        "joint and its link",
+        "growth [\N{MICRO SIGN}m/(m K)]",
+        "drift of the zero [\N{MICRO SIGN}rad/K]",
+        "time constant [min]",
+        "",
+    )
+    rows = []
+    for it in found.joints:
+        known = f"growth of {it.joint}" in found.not_determined
+        rows.append(
+            (
+                it.joint,
+                f"{1e6 * it.growth_per_k:.1f} {PLUS_MINUS} {1e6 * it.growth_sigma_per_k:.1f}",
+                f"{1e6 * it.drift_rad_per_k:.1f} {PLUS_MINUS} {1e6 * it.drift_sigma_rad_per_k:.1f}",
+                significant(it.tau_s / 60.0),
+                "growth as known before" if known else "",
+            )
+        )
+    return Table.of(titles, rows, (0, 4))

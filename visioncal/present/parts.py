@@ -1,0 +1,126 @@
+"""What a result has of each kind, by name.
+
+A whole cell has cameras, arms and boards with names; one camera with one robot is the case of one
+of each, whose name is empty.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.core.types import FloatArray
+from visioncal.results import Alignment, Calibration, CameraResult, Sight
+from visioncal.results.arm import ArmSections
+from visioncal.results.sections import BoardResult, ClockResult, Intervals
+from visioncal.robot import Robot
+from visioncal.session.frames import CELL
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """What hangs on what.
+
+    Attributes:
+        parents: What each frame hangs on, the cell the first of them.
+        matrices: (4, 4) `parent_from_frame` of those that no robot moves there.
+        robots: The robot's name of each flange, by its frame.
+    """
+
+    parents: Mapping[str, str]
+    matrices: Mapping[str, FloatArray]
+    robots: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Levels of noise by name, as `pixel_px`, and those of their 95 % intervals that are known."""
+
+    sigmas: Mapping[str, float]
+    intervals: Intervals
+
+
+def cameras(calibration: Calibration) -> Mapping[str, CameraResult]:
+    """The cameras by their frames."""
+    if calibration.cell is not None:
+        return calibration.cell.cameras
+    return {} if calibration.camera is None else {"": calibration.camera}
+
+
+def arms(calibration: Calibration) -> Mapping[str, ArmSections]:
+    """What was found of the arms."""
+    return {"": calibration} if calibration.cell is None else calibration.cell.arms
+
+
+def robots(calibration: Calibration) -> dict[str, Robot]:
+    """The nominal models of the robots, as far as they are known."""
+    cell = calibration.cell
+    models = {"": calibration.robot}
+    if cell is not None:
+        models = {name: it.model for name, it in cell.arms.items()}
+    return {name: it for name, it in models.items() if it is not None}
+
+
+def calibrated_robots(calibration: Calibration) -> dict[str, Robot]:
+    """The robots as they were calibrated, or else their nominal models."""
+    found = ((name, it.arm) for name, it in arms(calibration).items())
+    calibrated = {name: it.robot for name, it in found if it is not None and it.robot is not None}
+    return {**robots(calibration), **calibrated}
+
+
+def boards(calibration: Calibration) -> Mapping[str, BoardResult]:
+    """The boards as they were found to be."""
+    cell = calibration.cell
+    return calibration.named_boards if cell is None else cell.boards
+
+
+def clocks(calibration: Calibration) -> Mapping[str, ClockResult]:
+    """The cameras' clocks, by whose they are."""
+    if calibration.cell is not None:
+        return calibration.cell.details.clocks
+    return {} if calibration.clock is None else {"": calibration.clock}
+
+
+def noise(calibration: Calibration) -> dict[str, Levels]:
+    """The levels of noise of each sensor and each robot."""
+    cell, known = calibration.cell, calibration.uncertainty
+    if cell is None:
+        return {"": Levels(calibration.noise, {} if known is None else known.noise_95)}
+    intervals = {} if cell.uncertainty is None else cell.uncertainty.noise_95
+    robots = cell.robots.values()
+    return {
+        f"robot {name}" if name in robots else name: Levels(levels, intervals.get(name, {}))
+        for name, levels in cell.noise.items()
+    }
+
+
+def sights(calibration: Calibration) -> tuple[Sight, ...]:
+    """What became of each observation; of one camera, without names of who saw whom."""
+    if calibration.cell is not None:
+        return calibration.cell.sights
+    return tuple(Sight(stop=it.view, seer="", seen="", **vars(it)) for it in calibration.views)
+
+
+def frames(calibration: Calibration | None) -> Frames:
+    """The frames of a result as they hang last, tools and fixtures among them.
+
+    Without a result, base and flange of one robot.
+    """
+    cell = None if calibration is None else calibration.cell
+    if cell is None:
+        parents, robots = {"base": CELL, "flange": "base"}, {"flange": ""}
+        left, matrices = frozenset[str](), {"base": np.eye(4)}
+    else:
+        left, robots = former_frames(cell), dict(cell.robots)
+        parents = {name: on for name, on in cell.frames.items() if name not in left}
+        matrices = {cell.reference: np.eye(4)}
+    for name, edge in ({} if calibration is None else calibration.placed).items():
+        parent, _, child = name.partition("_from_")
+        if child not in left:
+            parents[child], matrices[child] = parent, edge.matrix
+    return Frames(parents, matrices, robots)
+
+
+def former_frames(cell: Alignment) -> frozenset[str]:
+    """Frames as they hung before they moved."""
+    return frozenset(it.before for it in cell.moved)

@@ -1,0 +1,49 @@
+"""The templates of pages, and what they call to say and draw a result."""
+
+import platform
+from functools import cache
+from importlib import metadata
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+
+from visioncal.core.number_format import significant
+from visioncal.core.version import __version__
+from visioncal.present import advice, arms, details, facts, parts
+from visioncal.present.report import armplots, content, network, plots, sources, tools
+
+_DEPENDENCIES = ("numpy", "scipy", "opencv-contrib-python-headless", "pin", "rerun-sdk")
+# Whose functions they call.
+_CALLED = (parts, facts, arms, details, advice, content, network, plots, armplots, sources, tools)
+
+
+@cache
+def _software() -> str:
+    """The versions of this program, of Python, and of the libraries that compute the result."""
+    versions = "".join(f", {name} {metadata.version(name)}" for name in _DEPENDENCIES)
+    return f"visioncal {__version__}, Python {platform.python_version()}{versions}"
+
+
+def template(name: str) -> Template:
+    """A template by its name, in which what is not given is an error."""
+    return _environment().get_template(name)
+
+
+@cache
+def _environment() -> Environment:
+    # It keeps the templates, which take longer to be compiled than a page to be made.
+    found = Environment(
+        loader=PackageLoader("visioncal", "present/report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    found.filters["significant"] = significant
+    named = {
+        name: it
+        for module in _CALLED
+        for name, it in vars(module).items()
+        if getattr(it, "__module__", "") == module.__name__
+    }
+    found.globals |= named | {"software": _software, "version": __version__}
+    return found
