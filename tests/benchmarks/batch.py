@@ -1,8 +1,8 @@
 """A fleet at once: how many sessions an hour, what a killed worker costs, and what stands out.
 
 Ten simulated robots with twenty sessions each, of which one has a loose camera (it shakes at every
-stop) and one is another model; twenty of the sessions are broken. Rates are of one of
-the robots, between the first row and the last: a cluster starts in some seconds.
+stop) and one is another model; twenty of the sessions are broken. Rates are between the first row
+and the last: a cluster starts in some seconds.
 
     PYTHONPATH=tests python tests/benchmarks/batch.py [--quick] [--keep FOLDER]
 """
@@ -100,17 +100,16 @@ def main() -> None:
         "| engine | workers | sessions an hour | times one worker | results | rows with a reason |",
         "| --- | ---: | ---: | ---: | ---: | ---: |",
     ]
-    some = sorted(sessions.glob("robot_00"))
     for engine, there in engines.items():
         workers.find_spec = lambda _, there=there: there  # type: ignore[attr-defined]
         one = 0.0
         for count in (2,) if asked.quick else (1, 2, 4):
-            rate, rows = rated(some, folder / f"{engine}_{count}", count)
+            rate, rows = rated(sessions, folder / f"{engine}_{count}", count)
             one = one or rate
             done = sum(it.state == "done" for it in rows)
             lines.append(f"| {engine} | {count} | {rate:.0f} | {rate / one:.2f} | {done} "
                          f"| {len(rows) - done} |")  # fmt: skip
-        rate, rows = rated(some, folder / f"{engine}_killed", 2, kill=True)
+        rate, rows = rated(sessions, folder / f"{engine}_killed", 2, kill=True)
         done = [it for it in rows if it.state == "done"]
         lines.append(f"| {engine}, one of them killed | 2 | {rate:.0f} | {rate / one:.2f} "
                      f"| {len(done)} | {len(rows) - len(done)} |")  # fmt: skip

@@ -7,7 +7,9 @@ The generator is numpy and OpenCV alone; corners travel through `corners.csv`, p
 covariance per degree of freedom, of the camera's pose in the frame of the ray of its image's centre
 (X) and of picks (a point of the table that `visioncal.locate` finds by one pixel), the median
 errors of the camera's place and of picks, those by Park's X and the lens that
-Park had (OpenCV), the share of each verdict, and refusals.
+Park had (OpenCV), the share of each verdict, and refusals. Base and flange are those of which the
+robot reports: what of an arm's errors is one twist of the base and one of the flange at all
+postures is in no residual, and an arm that goes where it was told does it again.
 """
 
 import sys
@@ -16,11 +18,14 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import count
 from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 import visioncal
@@ -31,6 +36,10 @@ MATRIX = np.array([[1150.0, 0.0, 644.0], [0.0, 1152.0, 508.0], [0.0, 0.0, 1.0]])
 DISTORTION = np.array([-0.11, 0.09, 0.0004, -0.0006, -0.01])
 COLUMNS, ROWS, SQUARE_M = 11, 8, 0.02
 WINDOW_M = np.array([0.22, 0.16])
+# A turn by a radian counts as a shift by so much where base and flange are fitted.
+LEVER_M = 0.3
+# Picks of each cell.
+LOOKS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +55,7 @@ class World:
         focus: By distance over the mean one, and by view: factors of the focal length.
         board: (c, 3) corners to where they really are, drawn by a seed.
         robot: (m, 4, 4) poses to what is reported of them, drawn by a seed, before noise.
+        lift: By what a share of the session, from -0.5 to 0.5, gives the robot's base has risen.
         off_px: Standard deviation of what given fx, fy, cx, cy are off by [px].
         is_said: Whether the session says so.
     """
@@ -58,6 +68,7 @@ class World:
     focus: Callable[[np.ndarray, np.random.Generator], np.ndarray] | None = None
     board: Callable[[np.ndarray, np.random.Generator], np.ndarray] | None = None
     robot: Callable[[np.ndarray, np.random.Generator], np.ndarray] | None = None
+    lift: Callable[[np.ndarray], np.ndarray] | None = None
     off_px: float = 0.0
     is_said: bool = False
     noise: Callable[[tuple[int, int], np.random.Generator], np.ndarray] = field(
@@ -135,15 +146,11 @@ def breathing(share: float):
     return lambda far, _: 1 + share * (far - 1)
 
 
-def lifted(by_m):
-    """The robot's base rises about its mean, by what a share from -0.5 to 0.5 gives."""
-
-    def moved(poses, _):
-        found = poses.copy()
-        found[:, 2, 3] += by_m(np.linspace(-0.5, 0.5, len(poses)))
-        return found
-
-    return moved
+def lifted(poses, by_m):
+    """(m, 4, 4) poses of a robot whose base rises meanwhile."""
+    found = poses.copy()
+    found[:, 2, 3] += by_m(np.linspace(-0.5, 0.5, len(poses)))
+    return found
 
 
 # Denavit-Hartenberg rows (theta, d, a, alpha) of an arm of six joints that reaches 1.75 m.
@@ -275,12 +282,12 @@ WORLDS = {
     "board 0.2 % too large": World(board=stretched(1.002, 1.002)),
     "board 0.1 % longer one way": World(board=stretched(1.0005, 0.9995)),
     "board sheared by 1.5 mrad": World(board=sheared(1.5e-3)),
-    "drift 0.5 mm": World(robot=lifted(lambda share: 5e-4 * share)),
+    "drift 0.5 mm": World(lift=lambda share: 5e-4 * share),
     "given lens off by 0.5 px": World(off_px=0.5),
     "given lens off by 2 px": World(off_px=2.0),
     "given lens off by 0.5 px, said": World(off_px=0.5, is_said=True),
     "given lens off by 2 px, said": World(off_px=2.0, is_said=True),
-    "camera bumped 1 mm": World(robot=lifted(lambda share: 1e-3 * ((share > 0) - 0.5))),
+    "camera bumped 1 mm": World(lift=lambda share: 1e-3 * ((share > 0) - 0.5)),
     "arm off by 0.05 mm": World(robot=arm_off_by(5e-5)),
     "arm off by 0.1 mm": World(robot=arm_off_by(1e-4)),
     "arm off by 0.3 mm": World(robot=arm_off_by(3e-4)),
@@ -306,6 +313,43 @@ class Case:
     pixels: np.ndarray
     given: np.ndarray
     mean_m: float
+
+    def flanges(self, boards):
+        """(m, 4, 4) where the flange is when the camera sees its board so."""
+        if self.mount == "eye-in-hand":
+            return self.z @ np.linalg.inv(boards) @ np.linalg.inv(self.x)
+        return self.x @ boards @ np.linalg.inv(self.z)
+
+    @property
+    def reported_x(self):
+        """The camera in the flange or the base of which the robot reports."""
+        base, flange = self.frames
+        return (np.linalg.inv(flange) if self.mount == "eye-in-hand" else base) @ self.x
+
+    @cached_property
+    def frames(self):
+        """(4, 4) twice: the base that is in the one reported, the flange reported in the other.
+
+        As other views of that cell have them, by least squares.
+        """
+        if self.world.robot is None:
+            return np.eye(4), np.eye(4)
+        for seed in count():
+            robot = self.flanges(np.array([*views_of(22, np.random.default_rng([seed, 47]))]))
+            try:
+                reported = np.linalg.inv(self.reported_of(robot))
+                break
+            except RuntimeError:  # Out of the arm's reach.
+                continue
+
+        def away(twists):
+            found = reported @ pose(*twists[:6].reshape(2, 3)) @ robot
+            found = found @ pose(*twists[6:].reshape(2, 3))
+            turns = Rotation.from_matrix(found[:, :3, :3]).as_rotvec()
+            return np.append(LEVER_M * turns, found[:, :3, 3])
+
+        best = least_squares(away, np.zeros(12), x_scale=1e-3).x.reshape(4, 3)
+        return pose(*best[:2]), pose(*best[2:])
 
 
 def pose(turn, place):
@@ -337,10 +381,10 @@ def centre_ray(shift) -> np.ndarray:
     return np.arctan(np.linalg.norm(ray)) * about / np.linalg.norm(about)
 
 
-def views_of(count, rng) -> Iterator[np.ndarray]:
+def views_of(views, rng) -> Iterator[np.ndarray]:
     """cam_from_target: the board in the image, tilted by up to 40 degrees about any axis."""
     corner = np.array([[0, 0, 0], [WINDOW_M[0], 0, 0], [0, WINDOW_M[1], 0], [*WINDOW_M, 0]])
-    while count:
+    while views:
         tilt = np.deg2rad(rng.uniform(5, 40)) * np.array([*_unit(rng), 0.0])
         turn = Rotation.from_rotvec(tilt) * Rotation.from_rotvec([0, 0, rng.uniform(-1, 1)])
         far = rng.uniform(0.3, 0.7)
@@ -350,7 +394,7 @@ def views_of(count, rng) -> Iterator[np.ndarray]:
         found[:3, 3] = at - found[:3, :3] @ np.array([*(WINDOW_M / 2), 0])
         px = seen(corner @ found[:3, :3].T + found[:3, 3], np.zeros_like)
         if np.all((px > 25) & (px < np.array(SIZE) - 25)):
-            count -= 1
+            views -= 1
             yield found
 
 
@@ -394,6 +438,7 @@ def cell(world: World, mount: str, given: bool, seed: int, folder: Path) -> Case
         reported = world.robot(robot, rng) if world.robot else robot
     except RuntimeError:  # Other views instead of those that the arm does not reach.
         return cell(world, mount, given, seed + 1000, folder)
+    reported = lifted(reported, world.lift) if world.lift else reported
     errors = world.noise((len(robot), 6), rng)
     steps = np.array([pose(world.robot_rad * it[:3], world.robot_m * it[3:]) for it in errors])
     reported = reported @ steps
@@ -472,11 +517,11 @@ def trial(world: World, mount: str, given: bool, seed: int, folder: Path) -> dic
     except visioncal.VisioncalError as error:
         return {"refused": str(error)}
     found, covariance = result.ray_frame.transform.matrix, result.ray_frame.transform.covariance
-    truth = case.x @ pose(centre_ray(case.shift), np.zeros(3))
+    truth = case.reported_x @ pose(centre_ray(case.shift), np.zeros(3))
     turned = Rotation.from_matrix(truth[:3, :3].T @ found[:3, :3]).as_rotvec()
     shifted = truth[:3, :3].T @ (found[:3, 3] - truth[:3, 3])
     error = np.concatenate([turned, shifted])
-    looks = [*looks_of(case, seed)]
+    looks = looks_of(case, seed)
     picks = [pick(case, result, it) for it in looks]
     theirs = [pick_by(case, *park(case, given), it) for it in looks]
     x = park(case, given)[0]
@@ -486,7 +531,7 @@ def trial(world: World, mount: str, given: bool, seed: int, folder: Path) -> dic
         "pick": float(np.mean([it[0] for it in picks])),
         "pick_mm": float(np.median([it[1] for it in picks])),
         "park_mm": float(np.median(theirs)),
-        "park_x_mm": 1e3 * float(np.linalg.norm(x[:3, 3] - case.x[:3, 3])),
+        "park_x_mm": 1e3 * float(np.linalg.norm(x[:3, 3] - case.reported_x[:3, 3])),
         "status": result.verdict.status,
         "cause": [it.kind for it in result.verdict.causes][:1],
     }
@@ -498,7 +543,7 @@ class Look:
 
     Attributes:
         px: (2,) its pixel.
-        point: (3,) where it is in the base.
+        point: (3,) where it is in the base of which the robot reports.
         normal: (3,) of the plane that it lies in: across the camera's axis.
         reported: (4, 4) where the robot says that it was.
     """
@@ -509,18 +554,26 @@ class Look:
     reported: np.ndarray
 
 
-def looks_of(case: Case, seed: int, count: int = 4) -> Iterator[Look]:
+def looks_of(case: Case, seed: int) -> list[Look]:
     rng, world = np.random.default_rng([seed, 43]), case.world
-    for board in views_of(count, rng):
+    base, looks, robots = case.frames[0], [], []
+    for board in views_of(LOOKS, rng):
         there = board @ np.array([*(WINDOW_M / 2), 0.0, 1.0])
         noise = rng.normal(size=6)
         error = pose(world.robot_rad * noise[:3], world.robot_m * noise[3:])
-        robot = case.z @ np.linalg.inv(board) @ np.linalg.inv(case.x)
-        camera = robot @ case.x if case.mount == "eye-in-hand" else case.x
+        robots.append(case.flanges(board))
+        camera = base @ (robots[-1] @ case.x if case.mount == "eye-in-hand" else case.x)
         far = board[2:3, 3] / case.mean_m
         focal = float(world.focus(far, rng)[0]) if world.focus else 1.0
         px = seen(there[None, :3], case.shift, focal)[0] + world.pixel_px * rng.normal(size=2)
-        yield Look(px, (camera @ there)[:3], camera[:3, 2], robot @ error)
+        looks.append(Look(px, (camera @ there)[:3], camera[:3, 2], error))
+    try:
+        reported = case.reported_of(np.array(robots))
+    except RuntimeError:  # Other looks instead of those that the arm does not reach.
+        return looks_of(case, seed + 1000)
+    return [
+        replace(look, reported=at @ look.reported) for look, at in zip(looks, reported, strict=True)
+    ]
 
 
 def pick(case: Case, result: visioncal.Calibration, look: Look) -> tuple[float, float]:

@@ -2,9 +2,11 @@
 
 The worlds of `elsewhere.py`, of both mounts, with lenses that are given and estimated. Each cell is
 calibrated from `corners.csv` and `views.csv`, gets a need of its own, and picks: the camera looks
-at a thing as one of its views looked at the board, and the flange goes to where its middle is
-found. What is wrong with the world is so at the pick as well: the lens, its focus, the arm at the
-look and where it goes, and moves of the base, which come as late in the picks as in the session.
+at a thing as one of its views looked at the board, and the tool goes to where its middle is found.
+What is wrong with the world is so at the pick as well: the lens, its focus, the arm at the look and
+where it goes, and moves of the base, which come as late in the picks as in the session. The tool is
+where the arm itself taught it to be: what of an arm's error is the same twist of the flange at all
+stops is in no residual, and in the taught tool too.
 
     PYTHONPATH=tests python tests/benchmarks/need_elsewhere.py [SEEDS]
 """
@@ -20,7 +22,7 @@ from multiprocessing import Pool
 from pathlib import Path
 
 import numpy as np
-from elsewhere import COLUMNS, ROWS, SQUARE_M, WORLDS, Case, cell, pose, seen
+from elsewhere import COLUMNS, ROWS, SQUARE_M, WORLDS, Case, cell, lifted, pose, seen
 from need import PICKS, Outcome, in_bins, some_need, table
 from results import first, wished, write_section
 
@@ -74,28 +76,34 @@ def lands(
     case: Case, known: RunState, eye: Eye, need: Need, rng: np.random.Generator
 ) -> FloatArray:
     """(p,) whether picks at times spread over the session come near enough."""
-    at = rng.integers(len(case.boards), size=PICKS)
+    at, noise = rng.integers(len(case.boards), size=PICKS), noise_of(case, rng)
     in_camera, found = case.boards[at], known.solved.state.edges[0]
     shown = np.array([in_image(case, eye, known, it, rng) for it in in_camera])
     if case.mount == "eye-in-hand":
-        robot = case.z @ invert(in_camera) @ invert(case.x)
+        robot = case.flanges(in_camera)
         meant = robot @ case.x @ in_camera @ TO_MIDDLE
-        goal = case.reported_of(robot) @ noise(case, rng) @ found @ shown @ TO_MIDDLE
+        goal = reported(case, robot) @ noise[::2] @ found @ shown @ TO_MIDDLE
     else:
         meant, goal = case.x @ in_camera @ TO_MIDDLE, found @ shown @ TO_MIDDLE
     # Where the robot really is when it reports the goal.
     went = goal
     for _ in range(4):
-        went = went @ invert(case.reported_of(went)) @ goal
-    away = invert(meant) @ went @ noise(case, rng)
+        went = went @ invert(reported(case, went)) @ goal
+    away = invert(meant) @ went @ case.frames[1] @ noise[1::2]
     near = need.mm is None or 1e3 * np.linalg.norm(away[:, :3, 3], axis=1) <= need.mm
     return near & (need.deg is None or np.rad2deg(rotation_angle(away)) <= need.deg)
 
 
-def noise(case: Case, rng: np.random.Generator) -> FloatArray:
-    """(p, 4, 4) the robot's noise."""
+def reported(case: Case, flanges: FloatArray) -> FloatArray:
+    """(p, 4, 4) what the robot says of its flange without noise, over the time of a session."""
+    found, lift = case.reported_of(flanges), case.world.lift
+    return lifted(found, lift) if lift else found
+
+
+def noise_of(case: Case, rng: np.random.Generator) -> FloatArray:
+    """(2 p, 4, 4) the robot's noise, at each look and behind it at its pick."""
     sigmas = np.repeat([case.world.robot_rad, case.world.robot_m], 3)
-    return np.array([exp(it) for it in sigmas * case.world.noise((PICKS, 6), rng)])
+    return np.array([exp(it) for it in sigmas * case.world.noise((2 * PICKS, 6), rng)])
 
 
 def in_image(

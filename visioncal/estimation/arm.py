@@ -54,6 +54,8 @@ class ArmErrors:
         away: (2, 2) what postures err by of which the fit has seen none near: of rotation [rad] and
             place [m], as found and as predicted; see `pose_errors.left_out_clusters`. None where
             that is not known.
+        lasting: How many of the errors, the last ones, are alike at stops near in time; the others
+            at postures that are near. At another time they are others.
     """
 
     basis: FloatArray
@@ -63,6 +65,13 @@ class ArmErrors:
     white: FloatArray | None = None
     look: FloatArray | None = None
     away: FloatArray | None = None
+    lasting: int = 0
+
+    @property
+    def last(self) -> Mask:
+        """(p,) which of the errors are alike at stops near in time."""
+        count = self.basis.shape[2]
+        return np.asarray(np.arange(count) >= count - self.lasting)
 
     @property
     def is_significant(self) -> bool:

@@ -62,11 +62,13 @@ class _Process:
         kernel: (s, s) how alike they are.
         at: (s, 6, q) how each of q independent ones moves the flange at each stop.
         size: Their standard deviation, in units of `at`.
+        lasts: Whether they are alike by the time of stops, not by their postures.
     """
 
     kernel: FloatArray
     at: FloatArray
     size: float
+    lasts: bool = False
 
     def between(self, some: IntArray, others: IntArray) -> FloatArray:
         """(a, b, 6, 6) the covariance of what is at some stops and at others."""
@@ -135,11 +137,17 @@ def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -
     processes = [
         replace(it, size=weight**0.5 * it.size) for model, weight in pairs for it in model.processes
     ]
-    columns, left = _columns(processes, len(stood), np.searchsorted(stood, observed))
-    squares = sum((weight * model.white**2 for model, weight in pairs), left)
+    kinds = [[it for it in processes if it.lasts is lasts] for lasts in (False, True)]
+    most = _MOST_COLUMNS // 6 // max(sum(map(bool, kinds)), 1)
+    by_posture, in_time = (
+        _columns(some, len(stood), np.searchsorted(stood, observed), most) for some in kinds
+    )
+    squares = sum((weight * model.white**2 for model, weight in pairs), by_posture[1] + in_time[1])
+    columns, lasting = np.concatenate([by_posture[0], in_time[0]], axis=2), in_time[0].shape[2]
     basis = np.zeros((len(poses), 6, columns.shape[2]))
     basis[stood] = columns
-    found = ArmErrors(basis, 1.0, gain, of_links=False, white=np.sqrt(squares), look=levels)
+    beside = np.sqrt(squares)
+    found = ArmErrors(basis, 1.0, gain, of_links=False, white=beside, look=levels, lasting=lasting)
     return replace(found, away=left_out_clusters(problem, state, noise, robot, found))
 
 
@@ -213,7 +221,7 @@ def _models(poses: FloatArray, white: FloatArray) -> Iterator[_Model]:
     order = np.arange(len(poses))
     for memory in _MEMORIES:
         kernel = np.exp(-np.abs(order[:, None] - order) / memory)
-        process = _Process(kernel, flange, _BEGINS)
+        process = _Process(kernel, flange, _BEGINS, lasts=True)
         yield _Model("time", _PRIOR["time"] / len(_MEMORIES), (process,), white)
 
 
@@ -225,7 +233,7 @@ def _squared_distances(poses: FloatArray) -> FloatArray:
 
 
 def _columns(
-    processes: Sequence[_Process], count: int, observed: IntArray
+    processes: Sequence[_Process], count: int, observed: IntArray, most: int
 ) -> tuple[FloatArray, FloatArray]:
     """Factors the covariance of processes by blocks of stops, those that leave most first.
 
@@ -233,6 +241,7 @@ def _columns(
         processes: The processes.
         count: How many stops s there are.
         observed: (m,) those that were observed.
+        most: How many stops may have columns.
 
     Returns:
         (s, 6, c) columns, and (2,) the variance that they leave, in the mean of those observed.
@@ -243,7 +252,7 @@ def _columns(
         left += it.size**2 * it.at @ np.swapaxes(it.at, 1, 2)
     whole = np.diagonal(left[observed].mean(axis=0)).reshape(2, 3).mean(axis=1)
     scale = np.repeat(np.sqrt(np.maximum(whole, LEAST_SIGMA**2)), 3)
-    for _ in range(min(len(observed), _MOST_COLUMNS // 6) if processes else 0):
+    for _ in range(min(len(observed), most) if processes else 0):
         sizes = np.diagonal(left[observed], axis1=1, axis2=2) / scale**2
         at = int(observed[np.argmax(sizes.sum(axis=1))])
         values, vectors = np.linalg.eigh(left[at] / np.outer(scale, scale))

@@ -8,7 +8,8 @@ Where the robot arrives differs from the thing by
     board         by what the uncertainty of its size and shape did to these; the thing is another
     look          the robot's noise at the look, where it carries the camera; and the focus, where
                   that changes from image to image
-    arm           errors that follow the arm's posture and were not calibrated
+    arm           errors that follow the arm's posture and were not calibrated, and errors that last
+                  from stop to stop, which are others at another time
     pick          the noise of the flange when it goes there, and what the arm errs by in that
                   posture, where it looked from another; a tool's length adds to it
     left out      as far as views that were left out of the fit err by more than is predicted of
@@ -215,17 +216,20 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
             at_m = np.where(carries[:, None], at_m, np.array(need.at))
     linear, covariance, parts = looking.linear(state, ideal=True), fitted.covariance, {}
     turned, at = adjoint(in_base), problem.robots.index(robot)
-    level = white = noise.robots[at]
+    white = again = noise.robots[at]
     if unfitted is not None:
         off = unfitted.sigma * misfit_jacobian(fitted.whole, state, noise, robot, unfitted)
         # Errors that follow the posture are why neighbours err alike.
         covariance = covariance - fitted.inflation * off @ off.T
-        left = _left_by_arm(fitted, robot, unfitted, off)
-        parts["arm"] = left if whole else turned @ left @ np.swapaxes(turned, 1, 2)
+        by_posture, in_time = _left_by_arm(fitted, robot, unfitted, off)
+        if not whole:
+            by_posture, in_time = (turned @ it @ turned.mT for it in (by_posture, in_time))
+        parts["arm"] = by_posture + in_time
         if unfitted.white is not None:
             white, levels = unfitted.white, noise.robots.copy()
             levels[at] = white
             noise = replace(noise, robots=levels)
+        again = np.hypot(white, _lasting(unfitted))
     elif errors is not None:
         parts["arm"] = _of_arm(problem, robot, errors)
     of_boards = _by_boards(covariance, fitted.of_boards)
@@ -249,12 +253,11 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
     placed["look"][:, 3:, 3:] += nearer_m[:, :, None] * nearer_m[:, None]
     # A camera that is carried looks from another posture than the robot then has; before one that
     # stands still it is the same, and of a whole chain its noise is among the chain's already.
-    by_posture = unfitted is not None and not unfitted.of_links
-    another = _axes(white if by_posture else level)
-    going = np.where(carries[:, None, None], another, 0.0 if whole else _axes(white))
+    alike = 0.0 if whole else _axes(white)
+    going = np.where(carries[:, None, None], _axes(again), alike)
     placed["pick"] = _of_flange(problem, robot, in_base, going)
-    if by_posture:
-        placed["pick"] = placed["pick"] + carries[:, None, None] * placed["arm"]
+    if unfitted is not None and not unfitted.of_links:
+        placed["pick"] = placed["pick"] + carries[:, None, None] * _at_points(by_posture, at_m)
     placed["left out"] = np.broadcast_to(_unpredicted(fitted), parts["look"].shape)
     return Picks(
         camera,
@@ -356,22 +359,41 @@ def _at_points(spreads: FloatArray, points_m: FloatArray) -> FloatArray:
     return np.asarray(jacobian @ spreads @ np.swapaxes(jacobian, 1, 2))
 
 
-def _left_by_arm(fitted: Fitted, robot: str, errors: ArmErrors, off: FloatArray) -> FloatArray:
-    """(n, 6, 6) what errors that a fit takes for noise leave of each observation.
+def _left_by_arm(
+    fitted: Fitted, robot: str, errors: ArmErrors, off: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """What errors that a fit takes for noise make of each observation.
 
     Args:
         fitted: The fit.
         robot: Whose they are.
         errors: The errors.
         off: (p, q) by how much the fit is off with each of them, in its own size.
+
+    Returns:
+        (n, 6, 6) twice: of those that follow the posture, and of those that last. These are others
+        than at the stops of the fit: as much as they have changed among these.
     """
     problem, state = fitted.problem, fitted.state
     widened = problem.with_effects([*problem.effects, errors.effect(robot)])
     values = np.concatenate([state.values, np.zeros(off.shape[1])])
     jacobian = widened.linear(replace(state, values=values), ideal=True).jacobian
-    size = problem.size
-    left = jacobian[:, :, :size] @ off - errors.sigma * jacobian[:, :, size:]
-    return np.asarray(left @ np.swapaxes(left, 1, 2))
+    size, last = problem.size, errors.last
+    by_fit, own = jacobian[:, :, :size] @ off, errors.sigma * jacobian[:, :, size:]
+    left = by_fit[:, :, ~last] - own[:, :, ~last]
+    changing = own[:, :, last] - own[:, :, last].mean(axis=0)
+    in_time = np.concatenate([by_fit[:, :, last], changing], axis=2)
+    return left @ left.mT, in_time @ in_time.mT
+
+
+def _lasting(errors: ArmErrors) -> FloatArray:
+    """(2,) how much errors that last change among stops, of rotation [rad] and place [m]."""
+    if not errors.lasting:
+        return np.zeros(2)
+    stood = errors.basis.any(axis=(1, 2))
+    moved = errors.sigma * errors.basis[stood][:, :, errors.last]
+    squares = np.sum((moved - moved.mean(axis=0)) ** 2, axis=2).reshape(-1, 2, 3)
+    return np.asarray(np.sqrt(squares.mean(axis=(0, 2))))
 
 
 def _of_arm(problem: Problem, robot: str, errors: ArmErrors) -> FloatArray:
