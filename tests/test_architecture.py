@@ -106,6 +106,12 @@ def test_heavy_libraries_enter_in_one_place():
             "visioncal.present.report, visioncal.present.recording, visioncal.cli.recorded",
             {"depthai", "rtde_control", "rtde_receive", "torch", "kornia", "matplotlib"},
         ),
+        # Calibrating a session drives no robot, and simulates none.
+        (
+            "visioncal.calibration.pipeline, visioncal.interchange.outputs, "
+            "visioncal.present.report, visioncal.present.recording, visioncal.cli.summary",
+            {"visioncal.dynamics", "visioncal.live", "visioncal.simulation"},
+        ),
         # A report by itself waits for no library of recordings.
         ("visioncal.interchange.outputs, visioncal.present.report.page", {"rerun", "pyarrow"}),
         # Every command waits for what is loaded here, `--help` and `--version` too.

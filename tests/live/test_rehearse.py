@@ -19,7 +19,8 @@ from visioncal.live.capture.take import Missed
 from visioncal.live.planning.purposes import purpose_of
 from visioncal.live.planning.read_back import PlanFile, Stop
 from visioncal.live.rehearsal.cell import GUESS_M, GUESS_RAD, RehearsalOptions, rehearsed_cell
-from visioncal.live.rehearsal.witness import edge_errors, explained, pace_of
+from visioncal.live.rehearsal.witness import explained, pace_of
+from visioncal.results.compare import edge_errors
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate
 

@@ -23,12 +23,12 @@ from visioncal.live.rehearsal.witness import (
     Explained,
     Pace,
     Witness,
-    edge_errors,
     explained,
     pace_of,
 )
 from visioncal.results import Calibration
 from visioncal.results.arm import NOMINAL
+from visioncal.results.compare import edge_errors
 from visioncal.results.sections import TouchTest
 
 _NEAR_RAD = 2e-3

@@ -9,11 +9,11 @@ from rich.table import Column, Table
 from visioncal.cli.console import answers
 from visioncal.core.number_format import figure
 from visioncal.core.types import Camera, FloatArray
-from visioncal.live.rehearsal.witness import edge_errors
 from visioncal.present.advice import left_out
 from visioncal.present.facts import solver_table
 from visioncal.present.parts import sights
 from visioncal.results import Alignment, Calibration, Sight, Step, Verdict
+from visioncal.results.compare import edge_errors
 
 _COLOURS = {"good": "bold green", "check": "bold yellow", "bad": "bold red"}
 # Beyond any image, what is predicted is nowhere [px].

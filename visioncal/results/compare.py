@@ -438,3 +438,36 @@ def _significance_document(it: Significance) -> dict[str, Any]:
 
 def _present(values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
+
+
+@dataclass(frozen=True)
+class EdgeError:
+    """How far an edge is from the truth, beside what the calibration says of it.
+
+    Attributes:
+        mm: Its place [mm].
+        deg: Its rotation [deg].
+        sigma_mm: The calibration's sigma [mm].
+        sigma_deg: Likewise [deg].
+    """
+
+    mm: float
+    deg: float
+    sigma_mm: float
+    sigma_deg: float
+
+
+def edge_errors(
+    calibration: Calibration, transforms: Mapping[str, FloatArray]
+) -> dict[str, EdgeError]:
+    """How far each edge is from its truth.
+
+    Args:
+        calibration: The result.
+        transforms: (4, 4) true edges by name.
+    """
+    found = {}
+    for name, edge in calibration.edges.items():
+        mm, deg = pose_difference(transforms[name], edge.matrix)
+        found[name] = EdgeError(mm, deg, edge.sigma_mm, edge.sigma_deg)
+    return found

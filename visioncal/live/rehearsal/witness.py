@@ -101,23 +101,6 @@ def pace_of(
 
 
 @dataclass(frozen=True)
-class EdgeError:
-    """How far an edge is from the truth, beside what the calibration says of it.
-
-    Attributes:
-        mm: Its place [mm].
-        deg: Its rotation [deg].
-        sigma_mm: The calibration's sigma [mm].
-        sigma_deg: Likewise [deg].
-    """
-
-    mm: float
-    deg: float
-    sigma_mm: float
-    sigma_deg: float
-
-
-@dataclass(frozen=True)
 class Explained:
     """Whether the errors of all edges together are what their covariance lets expect.
 
@@ -135,22 +118,6 @@ class Explained:
     def passed(self) -> bool:
         """Whether they are believed."""
         return self.chi_square <= self.limit
-
-
-def edge_errors(
-    calibration: Calibration, transforms: Mapping[str, FloatArray]
-) -> dict[str, EdgeError]:
-    """How far each edge is from its truth.
-
-    Args:
-        calibration: The result.
-        transforms: (4, 4) true edges by name.
-    """
-    found = {}
-    for name, edge in calibration.edges.items():
-        mm, deg = pose_difference(transforms[name], edge.matrix)
-        found[name] = EdgeError(mm, deg, edge.sigma_mm, edge.sigma_deg)
-    return found
 
 
 def explained(calibration: Calibration, transforms: Mapping[str, FloatArray]) -> Explained:
