@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from visioncal.core.number_format import significant
 from visioncal.present.parts import former_frames
 from visioncal.results import Alignment, Rms, Sight
 from visioncal.results.whole import left_out_rms, rms_of
@@ -76,6 +77,15 @@ def weakest_frame(found: Alignment) -> str:
     """The frame whose place on its parent is known worst, of those as they hang last."""
     edges = {it: found.edge_of(it) for it in _edged(found)}
     return max(edges, key=lambda it: edges[it].sigma_mm, default="")
+
+
+def sigma_words(found: Alignment, frame: str) -> str:
+    """How well the place of a frame on what it hangs on is known."""
+    if frame == found.reference:
+        return "the reference"
+    edge = found.edge_of(frame)
+    turned = f", {significant(edge.sigma_deg)}\N{DEGREE SIGN}" if edge.oriented else ""
+    return f"{significant(edge.sigma_mm)} mm{turned}"
 
 
 def _edged(found: Alignment) -> list[str]:

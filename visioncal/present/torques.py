@@ -1,11 +1,16 @@
 """What an identification of dynamics says, as tables that page and recording show."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from visioncal.core.number_format import matched, significant
 from visioncal.core.types import FloatArray
-from visioncal.dynamics import Identified
 from visioncal.present.tables import Row, Table
+
+# A tenth of a second to import, which reports of calibrations need not wait for.
+if TYPE_CHECKING:
+    from visioncal.dynamics import Identified
 
 _UNITS = {
     "m": "kg",
@@ -18,7 +23,7 @@ _FIRST_MOMENT = "kg m"
 _MARKS = {"2 %": "sure", "10 %": "used"}
 
 
-def torque_table(identified: Identified) -> Table:
+def torque_table(identified: "Identified") -> Table:
     """How well the torques of each joint are fitted, and predicted of a motion not fitted."""
     (first, *_), found = identified.streams, identified.validation
     figures: dict[str, FloatArray | None] = {
@@ -43,7 +48,7 @@ def torque_table(identified: Identified) -> Table:
     return Table.of(("joint", *figures), list(rows))
 
 
-def torque_note(identified: Identified) -> str:
+def torque_note(identified: "Identified") -> str:
     """What the columns of `torque_table` are."""
     found = identified.validation
     unseen = "There is no motion beside the fitted one." if found is None else f"{found.label}."
@@ -55,7 +60,7 @@ def torque_note(identified: Identified) -> str:
     )
 
 
-def base_parameter_table(identified: Identified) -> Table:
+def base_parameter_table(identified: "Identified") -> Table:
     """What is known of each base parameter."""
     base, rows = identified.base, []
     for name, own, value, sigma, share in zip(
@@ -79,7 +84,7 @@ def _unit_of(name: str) -> str:
     return next(unit for start, unit in _UNITS.items() if name.startswith(start))
 
 
-def link_table(identified: Identified) -> Table | None:
+def link_table(identified: "Identified") -> Table | None:
     """Each link as a body, with the mass that was known before; None where none was found."""
     if identified.inertias is None:
         return None

@@ -2,8 +2,7 @@
 
 import rerun as rr
 
-from visioncal.core.number_format import significant
-from visioncal.present.cellmap import pairs, places, spans
+from visioncal.present.cellmap import pairs, places, sigma_words, spans
 from visioncal.present.recording import colours, paths
 from visioncal.results import Alignment
 
@@ -17,7 +16,9 @@ def log_network(stream: rr.RecordingStream, found: Alignment) -> None:
     for body, (left, right) in spans(found).items():
         nodes[body] = (0.5 * (left + right), _BODY_HEIGHT)
     nodes |= places(found)
-    labels = [f"{it}\n{_sigma(found, it)}" for it in nodes]
+    words = {flange: f"robot {robot}" for flange, robot in found.robots.items()}
+    words[paths.CELL_FRAME] = f"the frame of {found.reference}"
+    labels = [f"{it}\n{words.get(it) or sigma_words(found, it)}" for it in nodes]
     bodies = {paths.CELL_FRAME, *found.robots}
     seen = [(it.seer, it.seen) for it in pairs(found) if it.used]
     hangs = [(found.frames[it], it) for it in nodes if it != paths.CELL_FRAME]
@@ -32,11 +33,3 @@ def log_network(stream: rr.RecordingStream, found: Alignment) -> None:
         rr.GraphEdges([*hangs, *seen], graph_type="undirected"),
         static=True,
     )
-
-
-def _sigma(found: Alignment, frame: str) -> str:
-    if frame in found.robots:
-        return f"robot {found.robots[frame]}"
-    if frame in (paths.CELL_FRAME, found.reference):
-        return "the reference"
-    return f"{significant(found.edge_of(frame).sigma_mm)} mm"

@@ -207,8 +207,6 @@ def view_markdown(sight: Sight, unposed: Sequence[str] = ()) -> str:
     """
     state = "used" if sight.used else "not used"
     lines = [f"# View {sight.view}: {state} ([report](report.html#view-{sight.view}))", ""]
-    if sight.seer:
-        lines += [f"Stop {sight.stop}: {plain(sight.seer)} saw {plain(sight.seen)}.", ""]
     if sight.reason:
         lines += [plain(sight.reason), ""]
     figures = (
@@ -220,7 +218,8 @@ def view_markdown(sight: Sight, unposed: Sequence[str] = ()) -> str:
     known += [
         f"{label} {significant(it, 3)} {unit}" for label, it, unit in figures if it is not None
     ]
-    lines.append(", ".join(known))
+    of = f"Stop {sight.stop}, {plain(sight.seer)} of {plain(sight.seen)}: " if sight.seer else ""
+    lines.append(of + ", ".join(known))
     if unposed:
         names = ", ".join(map(plain, unposed))
         lines += ["", f"The pose of {names} is not known at this stop: drawn as it was last."]

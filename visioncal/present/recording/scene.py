@@ -40,7 +40,7 @@ class Scene:
         calibration: Its result, if there is one; without it only the flange is drawn.
         frames: What hangs on what.
         states: By flange and by the view's number, how its robot stands, where that is known.
-        size_m: Typical distance of a flange from its base [m].
+        size_m: By which sizes are chosen [m].
         uncertainty: What is drawn of the result's uncertainty.
         charts: The charts over all views.
         arm: What is drawn of a calibrated arm.
@@ -65,9 +65,7 @@ class Scene:
         """Collects the poses of the flanges, from the evidence or else as they were recorded."""
         frames = parts.frames(calibration)
         states = robot_states(session, calibration, evidence)
-        poses = [it.pose for mine in states.values() for it in mine.values()]
-        distances = [float(np.linalg.norm(it[:3, 3])) for it in poses]
-        size_m = float(np.median(distances)) if distances else 1.0
+        size_m = _size_m(frames, states)
         if calibration is None:
             return cls(session, None, frames, states, size_m, None, None, None)
         return cls(
@@ -219,8 +217,11 @@ class Scene:
                 stream.log(f"{stops}/{name}/carried", frame, lines, static=True)
 
     def _shapes_on(self, flange: str) -> list[FloatArray]:
-        """What a flange carries, cameras and boards, as (k, 3) lines in its frame."""
-        cameras = {} if self.calibration is None else parts.cameras(self.calibration)
+        """What the flange of an only robot carries, as (k, 3) lines in its frame."""
+        # Those of several would hide each other.
+        if self.calibration is None or self.calibration.cell is not None:
+            return []
+        cameras = parts.cameras(self.calibration)
         shapes = {
             frame or paths.CAM_FRAME: frustum(it.camera, SMALL_FRUSTUM * self.size_m)
             for frame, it in cameras.items()
@@ -265,7 +266,7 @@ class Scene:
                 pose = cell_from_cam @ it.cam_from_target
                 strips[row] = [outlines[name] @ pose[:3, :3].T + pose[:3, 3]]
         rejected = {row: seen[row].view in self._rejected for row in strips}
-        self._send_lines(stream, paths.SEEN_TARGET, strips, rejected)
+        self._send_lines(stream, paths.SEEN_TARGET, strips, rejected, _LINE)
 
     def _log_sights(self, stream: rr.RecordingStream) -> None:
         """Draws who saw whom in each view of a whole cell, as a line from one to the other."""
@@ -286,7 +287,7 @@ class Scene:
                 strips[row] = [np.array([ends[0][:3, 3], self._middle(sight.seen, ends[1])])]
             if sight.seer in cell.cameras:
                 images[row] = paths.image_frame(sight.seer)
-        self._send_lines(stream, paths.SIGHT_LINE, strips, rejected)
+        self._send_lines(stream, paths.SIGHT_LINE, strips, rejected, 2.0 * _LINE)
         if images:
             frames = rr.CoordinateFrame.columns(frame=list(images.values()))
             send_rows(stream, paths.IMAGE, images, frames)
@@ -303,15 +304,26 @@ class Scene:
         entity: str,
         strips: Mapping[int, Sequence[FloatArray]],
         rejected: Mapping[int, bool],
+        width: float,
     ) -> None:
         """Draws lines in the cell by the places of views, by whether these were not used."""
         if not strips:
             return
         frame = rr.CoordinateFrame(paths.CELL_FRAME)
-        style = rr.LineStrips3D.from_fields(radii=self._radius(_LINE))
+        style = rr.LineStrips3D.from_fields(radii=self._radius(width))
         stream.log(entity, frame, style, static=True)
         colour = [colours.REJECTED if rejected[it] else colours.DETECTED for it in strips]
         _send_strips(stream, entity, strips, rr.LineStrips3D.columns(colors=colour))
+
+
+def _size_m(frames: parts.Frames, states: Mapping[str, Mapping[int, RobotState]]) -> float:
+    """How far flanges are from their bases, or half of how far apart things stand in the cell."""
+    poses = [it.pose for mine in states.values() for it in mine.values()]
+    distances = [float(np.linalg.norm(it[:3, 3])) for it in poses]
+    fixed = (paths.CELL_FRAME, paths.BASE_FRAME)
+    places = [it[:3, 3] for frame, it in frames.matrices.items() if frames.parents[frame] in fixed]
+    extent_m = float(np.linalg.norm(np.ptp([np.zeros(3), *places], axis=0)))
+    return max(float(np.median(distances)) if distances else 1.0, 0.5 * extent_m)
 
 
 def log_image_plane(

@@ -23,12 +23,6 @@ from visioncal.present.report.axes import Box, Margins, Panel, Scale, boxes, spa
 from visioncal.present.report.svg import Figure
 from visioncal.present.report.templates import template
 from visioncal.present.tables import Fact
-from visioncal.present.torques import (
-    base_parameter_table,
-    link_table,
-    torque_note,
-    torque_table,
-)
 
 # So many of the fitted motions are shown: more look alike.
 _MOST_FITTED = 2
@@ -61,11 +55,8 @@ def render_dynamics(run: Run) -> str:
         steps=judged.next_steps,
         key_figures=tuple(_key_figures(identified)),
         provenance={name: it for name, it in origin.items() if it},
-        torques=torque_table(identified),
-        torque_note=torque_note(identified),
-        parameters=base_parameter_table(identified),
+        identified=identified,
         counts=_counts(identified),
-        links=link_table(identified),
         humps=tuple(_hump_facts(identified)),
         plots=tuple(_plots(shown)),
         friction_plot=friction(identified, run.predictions),

@@ -7,7 +7,14 @@ from markupsafe import Markup
 
 from visioncal.core.number_format import significant
 from visioncal.core.types import FloatArray
-from visioncal.present.cellmap import Pair, pairs, places, spans, weakest_frame
+from visioncal.present.cellmap import (
+    Pair,
+    pairs,
+    places,
+    sigma_words,
+    spans,
+    weakest_frame,
+)
 from visioncal.present.facts import DEGREE
 from visioncal.present.parts import former_frames
 from visioncal.present.report import svg
@@ -122,14 +129,8 @@ def _draw_frame(
     outline = _box(panel, x - half_w, y - half_h, x + half_w, y + half_h, 0.02)
     panel.figure.path(outline, fill=svg.CARD, stroke=colour, width=1.8 if is_worst else 0.9)
     size = min(_NAME_SIZE, _NAME_SIZE * _NAME_LENGTH / len(name))
-    sigma = "the reference"
-    if name != found.reference:
-        edge = found.edge_of(name)
-        sigma = f"{significant(edge.sigma_mm)} mm"
-        if edge.oriented:
-            sigma += f", {significant(edge.sigma_deg)}{DEGREE}"
     at = float(panel.x_at(x))
-    lines = ((0.1, name, size, svg.INK), (-0.1, sigma, _SMALL, colour))
+    lines = ((0.1, name, size, svg.INK), (-0.1, sigma_words(found, name), _SMALL, colour))
     for rise, words, letters, ink in lines:
         height = float(panel.y_at(y + rise))
         panel.figure.text(at, height, words, size=letters, colour=ink, anchor="middle",

@@ -8,12 +8,15 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from visioncal.core.number_format import significant
 from visioncal.core.version import __version__
-from visioncal.present import advice, arms, details, facts, parts
+from visioncal.present import advice, arms, details, facts, parts, torques
 from visioncal.present.report import armplots, content, network, plots, sources, tools
 
 _DEPENDENCIES = ("numpy", "scipy", "opencv-contrib-python-headless", "pin", "rerun-sdk")
 # Whose functions they call.
-_CALLED = (parts, facts, arms, details, advice, content, network, plots, armplots, sources, tools)
+_CALLED = (
+    *(parts, facts, arms, details, torques, advice),
+    *(content, network, plots, armplots, sources, tools),
+)
 
 
 @cache

@@ -121,17 +121,16 @@ def _around(px: FloatArray, width: int, height: int) -> tuple[int, int, int, int
 
 
 def _jpeg_uri(image: Image) -> str:
-    scale = min(1.0, _WIDTH_PX / image.shape[1])
-    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    _, encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode("ascii")
+    encoded = _jpeg(image, min(1.0, _WIDTH_PX / image.shape[1]))
+    return "data:image/jpeg;base64," + base64.b64encode(encoded).decode("ascii")
 
 
 def small_picture(image_bytes: bytes) -> bytes | None:
     """A JPEG of an image for a listing; None where the bytes are no image that can be shown."""
     pixels = decode_image(image_bytes, colour=True)
-    if isinstance(pixels, str):
-        return None
-    scale = _SMALL_PX / pixels.shape[1]
-    small = cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return None if isinstance(pixels, str) else _jpeg(pixels, _SMALL_PX / pixels.shape[1])
+
+
+def _jpeg(image: Image, scale: float) -> bytes:
+    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     return bytes(cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1])
