@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from visioncal.core.documents import (
     as_numbers,
     parse_stored,
+    parse_xml,
     read_json,
     read_npy,
     read_npz,
@@ -136,6 +137,23 @@ def test_xml_has_no_document_type(file):
         read_xml(file("cut.xml", "<a>\n<b>"))
     root = read_xml(file("good.xml", "<a>x<!-- no --><b c='1'> 2 </b>y</a>"))
     assert (root.text, root.child("b").text, root.child("b").attributes) == ("xy", "2", {"c": "1"})
+
+
+def test_xml_knows_where_its_elements_stand():
+    text = b"""<a><b c='1>2'>x</b><d e="f" /><g></g></a>"""
+    root = parse_xml(text, "it")
+    pieces = {
+        it.tag: (text[it.begin : it.inside], text[it.inside : it.close], text[it.begin : it.end])
+        for it in (root, root.child("b"), root.child("g"))
+    }
+    assert pieces == {
+        "a": (b"<a>", text[3:-4], text),
+        "b": (b"<b c='1>2'>", b"x", b"<b c='1>2'>x</b>"),
+        "g": (b"<g>", b"", b"<g></g>"),
+    }
+    empty = root.child("d")
+    assert [it.is_empty for it in root.children] == [False, True, False]
+    assert text[empty.begin : empty.end] == b'<d e="f" />' == text[empty.begin : empty.inside]
 
 
 @pytest.mark.parametrize("suffix", ["yml", "xml", "json"])

@@ -1,6 +1,7 @@
 """The torques of an arm, the parameters that they tell, and what follows from these."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -328,3 +329,13 @@ def test_a_urdf_gets_the_inertias_and_keeps_the_rest():
     assert "<!-- identified - - yesterday -->" in written
     with pytest.raises(DataError, match="a robot of a URDF is needed"):
         weighed_urdf(load_robot("ur5e"), found)
+
+
+def test_a_link_of_one_tag_gets_its_inertia_inside():
+    robot = Robot.from_document(urdf_of(load_robot("ur5e")))
+    whole = str(robot.document["urdf"])
+    text = re.sub(r'<link name="link_2">.*?</link>', '<link name="link_2"/>', whole, flags=re.S)
+    assert text != whole
+    written = weighed_urdf(Robot.from_document(robot.document | {"urdf": text}), robot.inertias)
+    again = Robot.from_document(robot.document | {"urdf": written})
+    assert again.inertias.values == pytest.approx(robot.inertias.values, abs=1e-12)

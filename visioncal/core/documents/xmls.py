@@ -1,5 +1,6 @@
 """XML without document types, so without entities."""
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.parsers import expat
@@ -8,10 +9,12 @@ from visioncal.core.documents.values import MAX_DEPTH, MAX_VALUES, too_deep, too
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes
 
+_TAG = re.compile(rb"""<[^\s/>]+(\s+[^\s=]+\s*=\s*("[^"]*"|'[^']*'))*\s*/?>""")
+
 
 @dataclass
 class Element:
-    """An element.
+    """An element; its places count bytes of the text.
 
     Attributes:
         tag: Its name.
@@ -19,6 +22,10 @@ class Element:
         attributes: Its attributes.
         text: The text directly inside it, without surrounding blanks.
         children: The elements in it.
+        begin: Where its first tag begins.
+        inside: What follows that.
+        close: Where its last tag begins; `begin` where one tag is all of it.
+        end: What follows that.
     """
 
     tag: str
@@ -26,6 +33,15 @@ class Element:
     attributes: dict[str, str]
     text: str = ""
     children: list["Element"] = field(default_factory=list)
+    begin: int = 0
+    inside: int = 0
+    close: int = 0
+    end: int = 0
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether one tag is all of it: `<a/>`."""
+        return self.close == self.begin
 
     def child(self, tag: str) -> "Element | None":
         """Finds the first child of a name; None where there is none."""
@@ -41,7 +57,18 @@ def read_xml(path: Path) -> Element:
     Raises:
         DataError: It is missing, no XML, declares a document type, or is too large or too deep.
     """
-    data, where = read_bytes(path), str(path)
+    return parse_xml(read_bytes(path), str(path))
+
+
+def parse_xml(data: bytes, where: str) -> Element:
+    """Parses XML; `where` names its origin in errors.
+
+    Returns:
+        Its root.
+
+    Raises:
+        DataError: It is no XML, declares a document type, or is too large or too deep.
+    """
     parser = expat.ParserCreate()
     parser.buffer_text = True
     root = Element("", 0, {})
@@ -58,13 +85,17 @@ def read_xml(path: Path) -> Element:
         counted(5)  # values' worth of memory
         if len(stack) > MAX_DEPTH:
             raise too_deep(f"{where}, line {parser.CurrentLineNumber}")
-        element = Element(tag, parser.CurrentLineNumber, attributes)
+        begin = parser.CurrentByteIndex
+        element = Element(tag, parser.CurrentLineNumber, attributes, begin=begin)
+        element.inside = _after_tag(data, begin)
         stack[-1].children.append(element)
         stack.append(element)
         texts.append([])
 
     def end(_: str) -> None:
-        stack.pop().text = "".join(texts.pop()).strip()
+        element = stack.pop()
+        element.text = "".join(texts.pop()).strip()
+        element.close, element.end = _last_tag(data, element, parser.CurrentByteIndex)
 
     def text(part: str) -> None:
         # Parts are a few kilobytes each: their words are counted before all are split.
@@ -93,3 +124,16 @@ def read_xml(path: Path) -> Element:
     except (ValueError, LookupError) as error:
         raise DataError(f"{where} is no XML: {error}.", culprits=[where]) from error
     return root.children[0]
+
+
+def _after_tag(data: bytes, begin: int) -> int:
+    """What follows the first tag of an element."""
+    tag = _TAG.match(data, begin)
+    return tag.end() if tag else begin
+
+
+def _last_tag(data: bytes, element: Element, at: int) -> tuple[int, int]:
+    """Where the last tag of an element that is over at some place begins, and what follows it."""
+    if data[element.inside - 2 : element.inside] == b"/>":
+        return element.begin, element.inside
+    return at, data.find(b">", at) + 1
