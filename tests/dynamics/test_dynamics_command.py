@@ -179,7 +179,7 @@ def test_validation_needs_a_result(folder, tmp_path):
     (tmp_path / "dynamics.json").write_text("{}")
     done = run("dynamics", "validate", folder, "--against", tmp_path)
     assert done.status == 2
-    assert "is no dynamics.json" in done.err
+    assert "dynamics.json: schema is None, this version reads 1" in done.err
 
 
 def test_results_of_the_one_kind_are_no_results_of_the_other(tmp_path):

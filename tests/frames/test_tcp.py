@@ -331,7 +331,7 @@ def test_a_file_of_frames_is_made_extended_and_kept(tmp_path):
     replaced = FrameFile.load(path).frames["flange_from_tool"]
     assert not np.array_equal(replaced.edge.matrix, first.edge.matrix)
     path.write_text("{}")
-    refused(tcp(tmp_path, touches, "-o", path), "no frames that this version can read")
+    refused(tcp(tmp_path, touches, "-o", path), "not frames that this version can read")
 
 
 def test_nothing_is_written_unless_it_is_said_where(tmp_path):

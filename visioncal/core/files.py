@@ -2,6 +2,7 @@
 
 import difflib
 import hashlib
+import json
 import math
 import os
 import re
@@ -39,6 +40,16 @@ def write_atomically(path: Path | str, data: bytes | str) -> None:
         file.write(data.encode("utf-8") if isinstance(data, str) else data)
         file.flush()
         os.fsync(file.fileno())
+
+
+def write_json(path: Path | str, document: Mapping[str, Any]) -> None:
+    """Writes a document as `json_text` has it, whole or not at all; see `write_atomically`."""
+    write_atomically(path, json_text(document))
+
+
+def json_text(document: Mapping[str, Any]) -> str:
+    """The lines of a JSON file for people and programs; what is no number is refused."""
+    return json.dumps(document, indent=2, allow_nan=False) + "\n"
 
 
 @contextmanager

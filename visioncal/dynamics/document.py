@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from visioncal.core.codec import read, write
+from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.core.version import __version__
 from visioncal.dynamics.base import BaseModel
@@ -107,10 +108,15 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
     """Reads the fields of a result from what `to_document` built.
 
     Raises:
-        LookupError, TypeError, ValueError, AttributeError: It is none of this schema.
+        DataError: It is of another schema.
+        LookupError, TypeError, ValueError, AttributeError: It is none of this one.
     """
     if document.get("schema") != SCHEMA:
-        raise ValueError(f"schema is {document.get('schema')!r}, this version reads {SCHEMA}")
+        raise DataError(
+            f"schema is {document.get('schema')!r}, this version reads {SCHEMA}.",
+            culprits=["schema"],
+            next_step="Write one with visioncal dynamics identify.",
+        )
     robot = Robot.from_document(document["robot"])
     terms = FrictionTerms(**document["friction"])
     base = _base(DynamicModel(robot, terms), [str(row["name"]) for row in document["base"]])

@@ -1,6 +1,5 @@
 """The result of dynamic identification."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -10,10 +9,10 @@ from typing import Annotated, Any, Self
 import numpy as np
 
 from visioncal.core.choices import DYNAMICS_FILE
-from visioncal.core.codec import KEPT, Key, Vector
+from visioncal.core.codec import KEPT, Key, Vector, reading
 from visioncal.core.documents import parse_stored
 from visioncal.core.errors import DataError
-from visioncal.core.files import read_bytes, write_atomically
+from visioncal.core.files import read_bytes, write_json
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.base import BaseModel
@@ -156,16 +155,10 @@ class Identified:
                 "identify --help",
             )
         path = path / DYNAMICS_FILE if path.is_dir() else path
-        try:
+        with reading(
+            str(path), f"a {DYNAMICS_FILE}", "Write one with visioncal dynamics identify."
+        ):
             return cls(**fields_from_document(parse_stored(read_bytes(path), str(path))))
-        except DataError as error:
-            raise error.within(str(path)) from error
-        except (LookupError, TypeError, ValueError, AttributeError) as error:
-            raise DataError(
-                f"{path} is no {DYNAMICS_FILE} of this version: {error}.",
-                culprits=[str(path)],
-                next_step="Write one with visioncal dynamics identify.",
-            ) from error
 
     def save(self, path: Path | str) -> None:
         """Writes it, whole or not at all.
@@ -175,8 +168,7 @@ class Identified:
         """
         from visioncal.dynamics.document import to_document
 
-        text = json.dumps(to_document(self), indent=2, allow_nan=False)
-        write_atomically(Path(path), f"{text}\n")
+        write_json(path, to_document(self))
 
     @property
     def sigmas(self) -> FloatArray:

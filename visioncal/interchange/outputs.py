@@ -1,6 +1,5 @@
 """What `calibrate`, `align`, `verify`, `plan` and `dynamics` write into a folder."""
 
-import json
 import shlex
 import traceback
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from visioncal.core.choices import DYNAMICS_FILE
 from visioncal.core.errors import DataError
-from visioncal.core.files import write_atomically
+from visioncal.core.files import json_text, write_atomically
 from visioncal.core.output_generations import write_generation
 
 # Whoever writes one kind of result need not wait for the imports of all the others.
@@ -191,7 +190,7 @@ def write_plan(folder: Path, plan: "Plan", document: Mapping[str, Any]) -> Writt
 
     from visioncal.live.planning.written import program_of, stops_table
 
-    texts = {PLAN: _json(document), STOPS: stops_table(plan)}
+    texts = {PLAN: json_text(document), STOPS: stops_table(plan)}
     if program := program_of(plan):
         texts[PROGRAM] = program
     results = {name: _text(text) for name, text in texts.items()}
@@ -228,7 +227,7 @@ def write_motions(
 
     from visioncal.dynamics.written import MOTION_FILES, motion_files
 
-    texts = {PLAN: _json(document), **motion_files(plan, rate_hz)}
+    texts = {PLAN: json_text(document), **motion_files(plan, rate_hz)}
     results = {name: _text(text) for name, text in texts.items()}
     return _write(folder, results, {PREVIEW: draw}, MOTION_FILES)
 
@@ -301,10 +300,6 @@ def _write(
 def _cause(error: Exception) -> str:
     place = traceback.extract_tb(error.__traceback__)[-1]
     return f"{type(error).__name__} at {Path(place.filename).name}:{place.lineno}: {error}"
-
-
-def _json(document: Mapping[str, Any]) -> str:
-    return json.dumps(document, indent=2, allow_nan=False) + "\n"
 
 
 def _text(content: str) -> _Writer:

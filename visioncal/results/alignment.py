@@ -1,6 +1,5 @@
 """The result of aligning a whole cell: every frame of it, with respect to every other."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +12,7 @@ from visioncal.core.arguments import typed
 from visioncal.core.codec import KEPT, names_but, read, reading, write
 from visioncal.core.documents import parse_stored
 from visioncal.core.errors import DataError
-from visioncal.core.files import did_you_mean, read_bytes, write_atomically
+from visioncal.core.files import did_you_mean, read_bytes, write_json
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Verdict
@@ -268,8 +267,7 @@ class Alignment(CellSections):
     @typed
     def save(self, path: Path | str) -> None:
         """Writes alignment.json, whole or not at all."""
-        text = json.dumps(self.document(), indent=2, allow_nan=False) + "\n"
-        write_atomically(Path(path), text)
+        write_json(path, self.document())
 
     @classmethod
     @typed
@@ -302,8 +300,7 @@ class Alignment(CellSections):
         """Reads what `document` built.
 
         Raises:
-            DataError: It is another; the message names the place.
-            DataError: It is of another schema.
+            DataError: It is another, or of another schema; the message names the place.
         """
         check_schema(document)
         form = read(AlignmentForm, document, "")

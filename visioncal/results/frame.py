@@ -1,15 +1,13 @@
 """A tool's or a fixture's frame, and the file of frames that belong to no calibration."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from visioncal.core.codec import INLINE, KEPT, read, write
+from visioncal.core.codec import INLINE, KEPT, read, reading, write
 from visioncal.core.documents import parse_stored
-from visioncal.core.errors import DataError
-from visioncal.core.files import read_bytes, write_atomically
+from visioncal.core.files import read_bytes, write_json
 from visioncal.core.version import __version__
 from visioncal.results.edge import StoredEdge
 from visioncal.results.parts import StoredVerdict
@@ -83,7 +81,7 @@ class FrameFile:
             "visioncal": __version__,
             "frames": frames_document(self.frames),
         }
-        write_atomically(Path(path), json.dumps(document, indent=2, allow_nan=False) + "\n")
+        write_json(path, document)
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
@@ -92,17 +90,8 @@ class FrameFile:
         Raises:
             DataError: It is missing, or no file of frames of a known schema.
         """
-        content = read_bytes(path)
-        try:
-            return cls(_read_file(parse_stored(content, str(path))))
-        except DataError as error:
-            raise error.within(str(path)) from error
-        except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
-            raise DataError(
-                f"{path}: no frames that this version can read: {error!r}.",
-                culprits=[str(path)],
-                next_step="Run visioncal tcp or visioncal fixture again.",
-            ) from error
+        with reading(str(path), "frames", "Run visioncal tcp or visioncal fixture again."):
+            return cls(_read_file(parse_stored(read_bytes(path), str(path))))
 
 
 def frames_document(frames: Mapping[str, Frame]) -> dict[str, Any]:
