@@ -1,7 +1,7 @@
 """What there is to export of a calibrated arm, and what a file of others cannot hold of it."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -11,7 +11,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray
 from visioncal.estimation.workspace import postures
-from visioncal.interchange.exports.content import Selection, Takes
+from visioncal.interchange.exports.content import Format, Selection
 from visioncal.interchange.exports.sources import Source
 from visioncal.results import Calibration, Verdict
 from visioncal.results.arm import JointFunctions, JointRange, WorkspaceSigma
@@ -202,23 +202,13 @@ class ArmContent:
 
 
 @dataclass(frozen=True)
-class ArmFormat:
+class ArmFormat(Format[ArmContent]):
     """A form in which others read an arm.
 
     Attributes:
-        name: As the command line has it.
-        words: What it is and who reads it, with its units, in one line.
-        write: Builds the document.
-        takes: Its further options.
-        warn: Words what the user should know before the document serves; empty for nothing.
         holds: All that was found; links and offsets alone; or joints' functions beside such links.
     """
 
-    name: str
-    words: str
-    write: Callable[[ArmContent], str]
-    takes: frozenset[Takes] = frozenset()
-    warn: Callable[[ArmContent], tuple[str, ...]] = field(default=lambda _: ())
     holds: Literal["all", "links", "functions"] = "all"
 
 
@@ -234,7 +224,7 @@ def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmCont
         DataError: The source has no calibrated arm, or something was said for which the format
             has no use.
     """
-    check_said(selection, form)
+    form.check(selection)
     nominal = source.robot if isinstance(source, Calibration) else None
     arm = source.arm if isinstance(source, Calibration) else None
     if not isinstance(source, Calibration) or nominal is None or arm is None or arm.robot is None:
@@ -312,33 +302,6 @@ def omission_mm(robot: Robot) -> float:
     q = postures(robot, _POSTURES)
     away = robot.base_from_flange(q) - without_functions(robot).base_from_flange(q)
     return LeftBehind.of(away[:, :3, 3]).most_mm
-
-
-def check_said(selection: Selection, form: ArmFormat) -> None:
-    """Refuses what belongs to a transform, or to another format of arms.
-
-    Raises:
-        DataError: Something of the kind was said.
-    """
-    given = {
-        "--edge": selection.edge is not None,
-        "--inverse": selection.inverse,
-        "--parent": selection.parent is not None,
-        "--child": selection.child is not None,
-        "--number": selection.number is not None,
-        "--mass-kg and --cog-mm": selection.load is not None,
-        "--convention": selection.convention is not None and "convention" not in form.takes,
-        "--hash": selection.calibration_hash is not None and "hash" not in form.takes,
-        "--onto": selection.onto is not None,
-        "--with-corrections": selection.with_corrections and form.holds != "links",
-    }
-    said = [option for option, there in given.items() if there]
-    if said:
-        raise DataError(
-            f"{form.name} writes the calibrated arm and has no place for {', '.join(said)}.",
-            culprits=said,
-            next_step="Leave it out.",
-        )
 
 
 def _convention(name: str) -> Convention:

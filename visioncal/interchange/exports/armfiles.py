@@ -3,15 +3,14 @@
 An arm whose dynamics were identified is a URDF, or a chain for a session.
 """
 
-import json
-
 import numpy as np
 
 from visioncal.core.errors import DataError
+from visioncal.core.files import json_text
 from visioncal.core.transforms import log
 from visioncal.core.types import IntArray
 from visioncal.dynamics import ArmDynamics, Identified
-from visioncal.interchange.exports.arm import ArmContent, ArmFormat, check_said, omission_mm
+from visioncal.interchange.exports.arm import ArmContent, ArmFormat, omission_mm
 from visioncal.interchange.exports.content import Selection
 from visioncal.robot import (
     DHTable,
@@ -109,7 +108,7 @@ def _warn_ur(content: ArmContent) -> tuple[str, ...]:
 
 def _write_chain(content: ArmContent) -> str:
     document = {**content.robot.document, "source": "; ".join(content.notes)}
-    return json.dumps(document, indent=2, allow_nan=False) + "\n"
+    return json_text(document)
 
 
 def _write_corrections(content: ArmContent) -> str:
@@ -167,6 +166,7 @@ ROBOT_URDF = ArmFormat(
     "robot-urdf",
     "the calibrated arm as a URDF: the session's own with other origins, or a small one [m, rad]",
     _write_urdf,
+    takes=frozenset({"with-corrections"}),
     warn=_warn_urdf,
     holds="links",
 )
@@ -174,7 +174,7 @@ ROBOT_DH = ArmFormat(
     "robot-dh",
     "the calibrated arm as a DH table (.toml), --convention standard, modified or hayati [m, rad]",
     _write_table,
-    takes=frozenset({"convention"}),
+    takes=frozenset({"convention", "with-corrections"}),
     warn=_warn_table,
     holds="links",
 )
@@ -182,7 +182,7 @@ UR_KINEMATICS = ArmFormat(
     "ur-kinematics",
     "the calibrated UR as ur_description's kinematics_params_file (YAML), --hash its hash [m, rad]",
     _write_ur,
-    takes=frozenset({"hash"}),
+    takes=frozenset({"hash", "with-corrections"}),
     warn=_warn_ur,
     holds="links",
 )
@@ -220,14 +220,13 @@ def write_dynamics(identified: Identified, to: str, selection: Selection) -> str
             inertias were identified.
     """
     form = _of_inertias(to)
-    check_said(selection, form)
+    form.check(selection)
     arm = ArmDynamics.of(identified)
     session = identified.facts["session"]["name"]
     notes = [f"dynamics identified by visioncal from {session!r}, {identified.facts['created']}"]
     if form is ROBOT_JSON:
         document = with_inertias(arm.robot.corrected(), arm.inertias).document
-        text = json.dumps({**document, "source": notes[0]}, indent=2, allow_nan=False)
-        return f"{text}\n"
+        return json_text({**document, "source": notes[0]})
     if "urdf" in arm.robot.document:
         return weighed_urdf(arm.robot, arm.inertias, notes)
     return small_urdf(arm.weighed(), notes)

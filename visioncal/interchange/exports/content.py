@@ -1,12 +1,13 @@
 """What is asked for of a result, what a format is, and what it then writes."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Literal, TypeAlias
+from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
 import yaml
 
+from visioncal.core.errors import DataError
 from visioncal.core.files import one_line
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray, Mount
@@ -17,8 +18,13 @@ _OF_LENS = "it goes with the lens of that calibration: with other intrinsics, us
 # Any transform; the camera's alone, in its own direction; the lens alone; where something sits on
 # the flange; or where something stands in the base.
 Holds: TypeAlias = Literal["any edge", "hand-eye", "lens", "tool", "fixture"]
-# What of a selection a format has a use for, beside the transform and its frames' names.
-Takes: TypeAlias = Literal["number", "load", "convention", "hash", "onto"]
+# What of a selection formats have a use for, by its options: of transforms, and of some forms.
+OfTransforms: TypeAlias = Literal["edge", "inverse", "parent", "child"]
+Takes: TypeAlias = (
+    OfTransforms | Literal["number", "load", "convention", "hash", "onto", "with-corrections"]
+)
+_OPTIONS: Mapping[Takes, str] = {"load": "--mass-kg and --cog-mm"}
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -68,6 +74,23 @@ class Selection:
     robot: str | None = None
     target: str | None = None
     with_corrections: bool = False
+
+    @property
+    def said(self) -> tuple[Takes, ...]:
+        """What was asked for beside which camera, robot and target are meant."""
+        options: Mapping[Takes, object] = {
+            "edge": self.edge,
+            "inverse": self.inverse,
+            "parent": self.parent,
+            "child": self.child,
+            "number": self.number,
+            "load": self.load,
+            "convention": self.convention,
+            "hash": self.calibration_hash,
+            "onto": self.onto,
+            "with-corrections": self.with_corrections,
+        }
+        return tuple(name for name, it in options.items() if it not in (None, False))
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,35 +170,59 @@ class Content:
         return [self.origin, self.quality, self.direction, *([_OF_LENS] if is_of_lens else [])]
 
 
-def _nothing_amiss(_: Content) -> str:
-    return ""
-
-
 @dataclass(frozen=True)
-class ExportFormat:
+class Format(Generic[_T]):
     """A form in which others read a result.
 
     Attributes:
         name: As the command line has it.
         words: What it is and who reads it, with its units, in one line.
         write: Builds the document.
-        holds: What of a result it can hold.
-        frames: What its readers call our frames; ours keep their names where it says nothing.
-        takes: Its further options.
-        counterpart: The maker's format of fixtures, for one of tools; and the other way round.
-        write_all: Builds the document of all transforms of a cell; None where it holds one.
-        warn: Words what the user must still do before the document serves; empty for nothing.
+        takes: What of a selection it has a use for; see `check`.
+        warn: What its user should know or do before the document serves, in sentences.
     """
 
     name: str
     words: str
-    write: Callable[[Content], str]
+    write: Callable[[_T], str]
+    takes: frozenset[Takes] = frozenset()
+    warn: Callable[[_T], Iterable[str]] = field(default=lambda _: ())
+
+    def check(self, selection: Selection, also: Collection[str] = ()) -> None:
+        """Refuses what it has no place for.
+
+        Args:
+            selection: What is asked for.
+            also: What it has a use for beside what it takes.
+
+        Raises:
+            DataError: Something of the kind was said.
+        """
+        unused = [it for it in selection.said if it not in (*self.takes, *also)]
+        if unused:
+            raise DataError(
+                f"{self.name} has no place for "
+                f"{', '.join(_OPTIONS.get(it, f'--{it}') for it in unused)}.",
+                culprits=[f"--{it}" for it in unused],
+                next_step="Leave it out.",
+            )
+
+
+@dataclass(frozen=True)
+class ExportFormat(Format[Content]):
+    """A form in which others read a transform or a lens.
+
+    Attributes:
+        holds: What of a result it can hold.
+        frames: What its readers call our frames; ours keep their names where it says nothing.
+        counterpart: The maker's format of fixtures, for one of tools; and the other way round.
+        write_all: Builds the document of all transforms of a cell; None where it holds one.
+    """
+
     holds: Holds = "any edge"
     frames: Mapping[str, str] = field(default_factory=dict)
-    takes: frozenset[Takes] = frozenset()
     counterpart: str = ""
     write_all: Callable[[Sequence[Content]], str] | None = None
-    warn: Callable[[Content], str] = _nothing_amiss
 
 
 def numbers(values: FloatArray) -> list[float]:

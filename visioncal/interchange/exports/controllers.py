@@ -5,6 +5,7 @@ poses that were reported while no tool and no base were active.
 """
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal
@@ -117,14 +118,13 @@ def _write_abb_tool(content: Content) -> str:
     return f"{notes}PERS tooldata {name}:=[TRUE,{pose},{load}];\n"
 
 
-def _warn_of_load(content: Content) -> str:
-    if content.load is not None:
-        return ""
-    return (
-        "touches determine no load: the tool's mass is written as -1, ABB's mark of a load that is "
-        "still to be given. Give it with --mass-kg and --cog-mm, or run LoadIdentify before the "
-        "robot moves with this tool."
-    )
+def _warn_of_load(content: Content) -> Iterator[str]:
+    if content.load is None:
+        yield (
+            "touches determine no load: the tool's mass is written as -1, ABB's mark of a load "
+            "that is still to be given. Give it with --mass-kg and --cog-mm, or run LoadIdentify "
+            "before the robot moves with this tool."
+        )
 
 
 def _write_abb_wobj(content: Content) -> str:
@@ -149,21 +149,21 @@ CONTROLLERS = (
         "ur-tcp",
         "a tool for Universal Robots: set_tcp(p[...]) [m, rotation vector in rad]",
         _write_ur_tcp,
-        "tool",
+        holds="tool",
         counterpart="ur-feature",
     ),
     ExportFormat(
         "ur-feature",
         "a fixture for Universal Robots: a pose in a variable [m, rotation vector in rad]",
         _write_ur_feature,
-        "fixture",
+        holds="fixture",
         counterpart="ur-tcp",
     ),
     ExportFormat(
         "abb-tooldata",
         "a tool for ABB: PERS tooldata, with --mass-kg and --cog-mm [mm, quaternion w first]",
         _write_abb_tool,
-        "tool",
+        holds="tool",
         takes=frozenset({"load"}),
         warn=_warn_of_load,
         counterpart="abb-wobjdata",
@@ -172,14 +172,14 @@ CONTROLLERS = (
         "abb-wobjdata",
         "a fixture for ABB: PERS wobjdata [mm, quaternion w first]",
         _write_abb_wobj,
-        "fixture",
+        holds="fixture",
         counterpart="abb-tooldata",
     ),
     ExportFormat(
         "kuka-tool",
         "a tool for KUKA: $TOOL, or TOOL_DATA[n] with --number n [mm, deg]",
         partial(_write_kuka, "TOOL"),
-        "tool",
+        holds="tool",
         takes=frozenset({"number"}),
         counterpart="kuka-base",
     ),
@@ -187,7 +187,7 @@ CONTROLLERS = (
         "kuka-base",
         "a fixture for KUKA: $BASE, or BASE_DATA[n] with --number n [mm, deg]",
         partial(_write_kuka, "BASE"),
-        "fixture",
+        holds="fixture",
         takes=frozenset({"number"}),
         counterpart="kuka-tool",
     ),

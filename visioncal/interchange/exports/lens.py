@@ -1,5 +1,7 @@
 """The lens alone: ROS's camera_info, Kalibr's camera chain, the calibration of a Luxonis OAK."""
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from visioncal.core.errors import DataError
@@ -24,25 +26,23 @@ def _write(content: Content) -> str:
     return calibration_json(camera_of(content), content.child, content.onto)
 
 
-def _warn(content: Content) -> str:
-    said = warn_of_field(content)
-    if content.onto is not None:
-        return said
-    board = (
-        "this calibration holds one camera and nothing of its board. Before a device is given it, "
-        "write it onto the device's own: --onto FILE, as CalibrationHandler.eepromToJsonFile saves "
-        "it."
-    )
-    return f"{said} {board}".strip()
+def _warn(content: Content) -> Iterator[str]:
+    yield from warn_of_field(content)
+    if content.onto is None:
+        yield (
+            "this calibration holds one camera and nothing of its board. Before a device is given "
+            "it, write it onto the device's own: --onto FILE, as "
+            "CalibrationHandler.eepromToJsonFile saves it."
+        )
 
 
 OAK = ExportFormat(
     "oak",
     "the lens as the calibration JSON of an OAK [px]; --child names the socket",
     _write,
-    "lens",
-    {"cam": "CAM_A"},
-    frozenset({"onto"}),
+    holds="lens",
+    frames={"cam": "CAM_A"},
+    takes=frozenset({"onto"}),
     warn=_warn,
 )
 
@@ -76,9 +76,10 @@ def _notes(content: Content) -> list[str]:
     return [content.origin, f"verdict {content.verdict.status}; the lens is {how}", *said]
 
 
-def warn_of_field(content: Content) -> str:
-    """Says what coefficients leave of the lens's field; empty for nothing."""
-    return f"{content.left_of_field}." if content.left_of_field else ""
+def warn_of_field(content: Content) -> Iterator[str]:
+    """Says what coefficients leave of the lens's field."""
+    if content.left_of_field:
+        yield f"{content.left_of_field}."
 
 
 def _array(matrix: FloatArray) -> dict[str, int | list[float]]:
@@ -142,15 +143,15 @@ CAMERA_INFO = ExportFormat(
     "camera-info",
     "the lens as ROS's camera_info YAML [px]",
     _write_camera_info,
-    "lens",
-    _CAMERA,
+    holds="lens",
+    frames=_CAMERA,
     warn=warn_of_field,
 )
 KALIBR = ExportFormat(
     "kalibr",
     "the lens as Kalibr's camchain.yaml [px]",
     _write_kalibr,
-    "lens",
-    _CAMERA,
+    holds="lens",
+    frames=_CAMERA,
     warn=warn_of_field,
 )

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import dataclass, replace
+from typing import get_args
 
 import numpy as np
 
@@ -12,7 +13,12 @@ from visioncal.core.transforms import adjoint, invert
 from visioncal.dynamics import Identified
 from visioncal.interchange.exports.arm import ArmFormat, select_arm
 from visioncal.interchange.exports.armfiles import ARMS, write_dynamics
-from visioncal.interchange.exports.content import Content, ExportFormat, Selection
+from visioncal.interchange.exports.content import (
+    Content,
+    ExportFormat,
+    OfTransforms,
+    Selection,
+)
 from visioncal.interchange.exports.controllers import CONTROLLERS
 from visioncal.interchange.exports.lens import CAMERA_INFO, KALIBR, OAK
 from visioncal.interchange.exports.matrices import OPENCV, TEXT, ZIVID
@@ -61,7 +67,6 @@ _EVERYTHING = Selection()
 _ALL = "all"
 # Such a name needs no quotes in YAML, XML, Python or a shell, and is no option of a command.
 _FRAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_/.\-]*", re.ASCII)
-_OPTIONS = {"load": "--mass-kg and --cog-mm"}
 
 
 @dataclass(frozen=True)
@@ -116,10 +121,7 @@ def document(source: Source | Identified, to: str, selection: Selection = _EVERY
         written = "" if form.write_all is None else form.write_all(contents)
         return Document(written, _of_verdict(contents[0].verdict))
     content = select(source, selection, form)
-    warning = form.warn(content)
-    return Document(
-        form.write(content), (*_of_verdict(content.verdict), *([warning] if warning else []))
-    )
+    return Document(form.write(content), (*_of_verdict(content.verdict), *form.warn(content)))
 
 
 def _of_whole(
@@ -270,20 +272,7 @@ def _check_kind(form: ExportFormat, kind: Kind, name: str, *, inverse: bool) -> 
 
 
 def _check_takes(form: ExportFormat, selection: Selection) -> None:
-    given = {
-        "number": selection.number is not None,
-        "load": selection.load is not None,
-        "convention": selection.convention is not None,
-        "hash": selection.calibration_hash is not None,
-        "onto": selection.onto is not None,
-        "with-corrections": selection.with_corrections,
-    }
-    for what in sorted(it for it, there in given.items() if there and it not in form.takes):
-        raise DataError(
-            f"{form.name} has no place for {_OPTIONS.get(what, f'--{what}')}.",
-            culprits=[form.name],
-            next_step="Leave it out.",
-        )
+    form.check(selection, get_args(OfTransforms))
     if selection.number is not None and selection.number < 1:
         raise DataError(
             f"The number is {selection.number}; controllers count tools and bases from 1.",
