@@ -252,7 +252,7 @@ def test_what_cannot_be_checked_is_said(tmp_path):
     ("options", "words"),
     [
         (("--duration", 3), "a motion of 3 s is too short"),
-        (("--friction", "coulomb,stiction"), "--friction is 'coulomb,stiction'"),
+        (("--friction", "coulomb,stiction"), "--friction names stiction"),
         (("--payload", "2,0,0"), "--payload is '2,0,0'; kg,x,y,z is needed"),
         (("--payload", "-2,0,0,0"), "a mass of 0 kg or more"),
         (("--tool", "100,0"), "a length and a radius above zero"),

@@ -77,11 +77,10 @@ def calibrate_command(
     --robot, --target).
     """
     # What help and a mistyped option need not wait for.
-    from rich.markup import escape
 
     from visioncal.calibration.pipeline import run, run_dense
     from visioncal.calibration.pipeline.running import Asked
-    from visioncal.cli.console import messages, naming, report_written
+    from visioncal.cli.console import naming, report_written, say
     from visioncal.cli.progress import shown_progress
     from visioncal.cli.summary import print_summary
     from visioncal.interchange.merge_results import leftover
@@ -112,7 +111,7 @@ def calibrate_command(
     else:
         print_summary(result.calibration, verbose=verbose)
     if left is not None:
-        messages().print(escape(left.words))
+        say(left.words)
     report_written(written, quiet=as_json)
 
 

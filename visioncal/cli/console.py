@@ -31,6 +31,23 @@ def messages() -> "Console":
     return Console(stderr=True, highlight=False, soft_wrap=True)
 
 
+def say(words: str) -> None:
+    """Prints a message as it is."""
+    messages().print(words, markup=False)
+
+
+def warn(words: str) -> None:
+    """Prints what to know before the result is used."""
+    from rich.markup import escape
+
+    messages().print(f"[bold yellow]warning:[/] {escape(words)}")
+
+
+def print_json(document: object) -> None:
+    """Prints a result for programs."""
+    typer.echo(json.dumps(document, indent=2))
+
+
 def answers(*, markup: bool = True) -> "Console":
     """The console for results as people read them: stdout."""
     from rich.console import Console
@@ -66,7 +83,7 @@ def report_error(error: VisioncalError, *, as_json: bool) -> None:
             "culprits": list(error.culprits),
             "next": next_step,
         }
-        typer.echo(json.dumps({"error": document}, indent=2))
+        print_json({"error": document})
     console = messages()
     console.print(f"[bold red]error:[/] {escape(error.message)}")
     unsaid = [it for it in error.culprits if it not in error.message]
@@ -94,11 +111,10 @@ def report_written(written: "Written", *, quiet: bool = False, status: int = 0) 
     """
     from rich.markup import escape
 
-    console = messages()
     for file in () if quiet else written.files:
-        console.print(escape(f"wrote {file}"))
+        say(f"wrote {file}")
     for it in written.undrawn:
-        console.print(
+        messages().print(
             f"[bold red]bug:[/] {escape(f'{it.file} could not be drawn ({it.cause}).')}\n"
             f"The result is safe in {escape(str(written.files[0]))}. Please report this, with the "
             "session if it can be given away."

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import messages
+from visioncal.cli.console import messages, say
 from visioncal.cli.options import Force
 from visioncal.cli.parsing import pair_in, size_in
 from visioncal.cli.pose_options import UNITS, RobotPoseOptions, names_in, poses_option
@@ -169,8 +169,8 @@ def convert_command(
         exchange=None if exchange is None else pair_in(exchange, "--exchange"),
     )
     for warning in session.warnings:
-        messages().print(escape(f"note: {warning}"))
-    messages().print(escape(f"wrote {dest}\nsha256 {session.digest()}"))
+        say(f"note: {warning}")
+    say(f"wrote {dest}\nsha256 {session.digest()}")
 
 
 def _chosen(recorded: "InDoubt | Foreign", *, yes: bool) -> "Candidate":

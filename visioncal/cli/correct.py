@@ -13,8 +13,26 @@ from visioncal.core.choices import WIDEST_RAD
 
 @dataclass(frozen=True)
 class CorrectOptions:
-    """What the targets are of, and what the arm carries on its way through them."""
+    """Which targets are corrected, what they are of, and what the arm carries through them."""
 
+    targets: Annotated[
+        Path,
+        typer.Argument(
+            help="A table with the columns of views.csv: x_m, y_m, z_m, qx, qy, qz, qw of "
+            "base_from_flange; q1_rad ... may say which posture is meant; others are kept.",
+        ),
+    ]
+    calibration: Annotated[
+        Path,
+        typer.Option(
+            "-c",
+            "--against",
+            "--calibration",
+            help="Of the calibrated arm: an output folder of calibrate, or its .rrd.",
+        ),
+    ]
+    part: PartOptions
+    out: OutFile = None
     tool: Annotated[
         str | None,
         typer.Option(
@@ -50,36 +68,20 @@ class CorrectOptions:
             "whose drift was calibrated; else as warm as it was when its session began.",
         ),
     ] = None
-
-
-def correct_command(
-    targets: Annotated[
-        Path,
-        typer.Argument(
-            help="A table with the columns of views.csv: x_m, y_m, z_m, qx, qy, qz, qw of "
-            "base_from_flange; q1_rad ... may say which posture is meant; others are kept.",
-        ),
-    ],
-    calibration: Annotated[
-        Path,
-        typer.Option(
-            "-c",
-            "--against",
-            "--calibration",
-            help="Of the calibrated arm: an output folder of calibrate, or its .rrd.",
-        ),
-    ],
-    part: PartOptions,
-    out: OutFile = None,
-    *,
-    asked: CorrectOptions,
     skip: Annotated[
         bool,
         typer.Option("--skip-unreachable", help="Write the other targets where some are refused."),
-    ] = False,
-    force: Force = False,
-    as_json: AsJson = False,
-) -> None:
+    ] = False
+    force: Force = False
+    as_json: AsJson = False
+
+    @property
+    def file(self) -> Path | None:
+        """The file to write; None to print the table."""
+        return None if self.out == Path("-") else self.out
+
+
+def correct_command(asked: CorrectOptions) -> None:
     """Correct targets so that the arm reaches them by its nominal controller.
 
     Exit status 2: nothing was written, for the reason given; targets out of reach are named.
@@ -87,7 +89,4 @@ def correct_command(
     # Help does not wait for it.
     from visioncal.cli.corrected import correct_table
 
-    written_to = None if out is None or out == Path("-") else out
-    correct_table(
-        targets, calibration, part, written_to, asked, skip=skip, force=force, as_json=as_json
-    )
+    correct_table(asked)

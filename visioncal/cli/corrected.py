@@ -1,17 +1,14 @@
 """The targets of `visioncal correct`: read, corrected, written and reported."""
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import answers, messages
+from visioncal.cli.console import answers, messages, print_json, say, warn
 from visioncal.cli.correct import CorrectOptions
-from visioncal.cli.options import PartOptions
 from visioncal.cli.parsing import numbers_in
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, did_you_mean, some_of, write_atomically
@@ -40,39 +37,19 @@ _SINGULAR_DEG, _MOST_TURN_DEG = 5.0, 90.0
 _TOOLS = "flange_from_"
 
 
-def correct_table(
-    targets: Path,
-    calibration: Path,
-    part: PartOptions,
-    written_to: Path | None,
-    asked: CorrectOptions,
-    *,
-    skip: bool,
-    force: bool,
-    as_json: bool,
-) -> None:
+def correct_table(asked: CorrectOptions) -> None:
     """Corrects a table of targets, and writes and prints what comes of it.
-
-    Args:
-        targets: The table.
-        calibration: That of the calibrated arm: an output folder, or a recording.
-        part: Which camera and robot of a whole cell are meant.
-        written_to: The file to write; None to print the table.
-        asked: How they are to be reached.
-        skip: Whether the others are written where some are out of reach.
-        force: Whether a file that is there is replaced.
-        as_json: Whether to print JSON.
 
     Raises:
         DataError: Something cannot be read or written, or targets are out of reach.
     """
     needs = EYE if asked.tool is not None and asked.tool.removeprefix(_TOOLS) == "cam" else ARM
-    chosen = load_calibration(calibration, part.choice, needs)
+    chosen = load_calibration(asked.calibration, asked.part.choice, needs)
     known = _warm(chosen, asked.temperatures)
     arm = CalibratedArm.of(known)
-    if written_to is not None:
-        check_free(written_to, force=force)
-    wanted = read_targets(targets, arm.real)
+    if asked.file is not None:
+        check_free(asked.file, force=asked.force)
+    wanted = read_targets(asked.targets, arm.real)
     flange_from_tool = _tool(known, asked.tool)
     base_from_flange = wanted.base_from_tool @ invert(flange_from_tool)
     corrected = correct(
@@ -84,7 +61,7 @@ def correct_table(
     )
     lost = tuple(_unreachable(wanted, corrected))
     rows = np.flatnonzero(corrected.reached)
-    if lost and (not skip or not len(rows)):
+    if lost and not (asked.skip and len(rows)):
         raise _refusal(lost, len(wanted))
     sigma_mm = predicted_sigma_mm(known, base_from_flange[:, :3, 3], corrected.q)
     base_from_tool = corrected.base_from_flange @ flange_from_tool
@@ -95,19 +72,19 @@ def correct_table(
         *_turns(arm, wanted, corrected, asked.widest_deg),
         *_singular(arm, wanted, corrected.q, rows),
     ]
-    if written_to is not None:
-        write_atomically(written_to, table_to_send(wanted, columns, rows))
-    if as_json:
+    if asked.file is not None:
+        write_atomically(asked.file, table_to_send(wanted, columns, rows))
+    if asked.as_json:
         document = _document(wanted, columns, rows, lost) | {"warnings": warnings}
-        typer.echo(json.dumps(document, indent=2))
+        print_json(document)
         return
-    if written_to is None:
+    if asked.file is None:
         typer.echo(table_to_send(wanted, columns, rows), nl=False)
-    _report(columns, rows, lost, warnings, is_answer=written_to is not None)
+    _report(columns, rows, lost, warnings, is_answer=asked.file is not None)
     if np.isnan(wanted.q_seed).all() and asked.seed_joints is None:
-        messages().print(escape(_posture(arm, corrected.q[rows[0]])))
-    if written_to is not None:
-        messages().print(escape(f"wrote {written_to}"))
+        say(_posture(arm, corrected.q[rows[0]]))
+    if asked.file is not None:
+        say(f"wrote {asked.file}")
 
 
 def _warm(calibration: Calibration, words: str | None) -> Calibration:
@@ -279,7 +256,7 @@ def _report(
     if len(lost) > _SHOWN:
         console.print(f"  and {len(lost) - _SHOWN} more")
     for it in warnings:
-        console.print(f"[bold yellow]warning:[/] {escape(it)}")
+        warn(it)
 
 
 def _document(

@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.markup import escape
 
-from visioncal.cli.console import answers, messages, report_written
+from visioncal.cli.console import answers, report_written, say
 from visioncal.cli.options import OutFolder, Seed
 from visioncal.cli.progress import shown_progress
 from visioncal.interchange.outputs import write_outputs
@@ -46,9 +45,9 @@ def demo_command(
     truth = read_truth(session)
     answers().print(truth_table(done.calibration, truth.transforms, truth.camera))
     for file in (session, truth_path(session)):
-        messages().print(escape(f"wrote {file}"))
+        say(f"wrote {file}")
     report_written(written)
-    messages().print(escape(f"Open {result / 'report.html'} in a browser to see it all."))
+    say(f"Open {result / 'report.html'} in a browser to see it all.")
 
 
 def _replace_session(

@@ -1,12 +1,11 @@
 """`visioncal diff`."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from visioncal.cli.console import answers
+from visioncal.cli.console import answers, print_json
 from visioncal.cli.options import AsJson, PartOptions
 from visioncal.core.number_format import figure
 
@@ -45,7 +44,7 @@ def diff_command(
         target=part.target,
     )
     if as_json:
-        typer.echo(json.dumps(to_document(comparison), indent=2))
+        print_json(to_document(comparison))
         return
     _print(comparison, (str(first), str(second)))
 

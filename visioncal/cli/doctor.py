@@ -1,13 +1,12 @@
 """`visioncal doctor`."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import answers, naming
+from visioncal.cli.console import answers, naming, print_json
 from visioncal.cli.options import AsJson, SessionArgument
 from visioncal.cli.progress import shown_progress
 
@@ -34,7 +33,7 @@ def doctor_command(
     with naming(session), shown_progress(quiet=as_json) as progress:
         found = doctor(session, progress=progress)
     if as_json:
-        typer.echo(json.dumps(to_document(found), indent=2))
+        print_json(to_document(found))
     else:
         _print(found, session)
     if not found.is_sound:

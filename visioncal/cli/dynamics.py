@@ -1,5 +1,6 @@
 """What the commands of `visioncal dynamics` share: which samples, and what was identified."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, TypeAlias
@@ -10,10 +11,12 @@ from visioncal.cli.lazy import LazyGroup
 from visioncal.cli.options import RobotName
 from visioncal.core.choices import DYNAMICS_FILE
 from visioncal.core.errors import DataError
+from visioncal.core.files import some_of
 
 # Help does not wait for them.
 if TYPE_CHECKING:
     from visioncal.dynamics.identified import Identified
+    from visioncal.dynamics.model import FrictionTerms
     from visioncal.dynamics.run import Request
 
 MotionsArgument: TypeAlias = Annotated[
@@ -90,6 +93,28 @@ class StreamOptions:
             gains_nm_a=gains,
             robot=self.robot,
         )
+
+
+def friction_terms(words: str, known: Sequence[str]) -> "FrictionTerms":
+    """Reads the option --friction.
+
+    Args:
+        words: What the user wrote: names with commas between, or none.
+        known: The names that there are, in the order of the terms.
+
+    Raises:
+        DataError: There is no such term.
+    """
+    from visioncal.dynamics.model import FrictionTerms
+
+    wanted = [] if words.strip().lower() == "none" else [it.strip() for it in words.split(",")]
+    wrong = [it for it in wanted if it not in known]
+    if wrong:
+        raise DataError(
+            f"--friction names {some_of(wrong)[:80]}; the terms are {some_of(known)}, or none.",
+            culprits=["--friction"],
+        )
+    return FrictionTerms(*(it in wanted for it in known))
 
 
 def identified_of(against: Path | None, command: str) -> "Identified":

@@ -1,5 +1,6 @@
 """`visioncal dynamics gains`."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -9,27 +10,31 @@ from visioncal.cli.dynamics import CutoffOption, MotionsArgument
 from visioncal.cli.options import AsJson, RobotName
 
 
-def dynamics_gains_command(
-    session: MotionsArgument,
-    loaded: Annotated[Path, typer.Option(help="A session of the same arm with the body on it.")],
-    mass_kg: Annotated[float, typer.Option(help="Of the body (kg).")],
+@dataclass(frozen=True)
+class GainsOptions:
+    """Two sessions of an arm, and the body that it carries in one of them."""
+
+    session: MotionsArgument
+    loaded: Annotated[Path, typer.Option(help="A session of the same arm with the body on it.")]
+    mass_kg: Annotated[float, typer.Option(help="Of the body (kg).")]
     com_mm: Annotated[
         str, typer.Option(metavar="X,Y,Z", help="Its centre of mass in the flange's frame (mm).")
-    ],
+    ]
     inertia: Annotated[
         str,
         typer.Option(metavar="XX,XY,YY,XZ,YZ,ZZ", help="Its inertia about that centre (kg m^2)."),
-    ] = "0,0,0,0,0,0",
-    cutoff_hz: CutoffOption = None,
-    named: RobotName = None,
-    as_json: AsJson = False,
-) -> None:
+    ] = "0,0,0,0,0,0"
+    cutoff_hz: CutoffOption = None
+    named: RobotName = None
+    as_json: AsJson = False
+
+
+def dynamics_gains_command(asked: GainsOptions) -> None:
     """Find how much torque a drive's current makes, by a body that is known.
 
     Exit status 0: there are gains; 2: there are none, for the reason given.
     """
     # Help does not wait for it.
-    from visioncal.cli.weighed import body_of, print_gains
+    from visioncal.cli.weighed import print_gains
 
-    body = body_of(mass_kg, com_mm, inertia)
-    print_gains(session, loaded, body, cutoff_hz=cutoff_hz, named=named, as_json=as_json)
+    print_gains(asked)

@@ -1,6 +1,6 @@
 """`visioncal dynamics identify`."""
 
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -13,13 +13,16 @@ from visioncal.core.choices import DYNAMICS_FILE
 FRICTION = ("coulomb", "viscous", "offset")
 
 
-def dynamics_identify_command(
-    session: MotionsArgument,
-    streams: StreamOptions,
+@dataclass(frozen=True)
+class IdentifyOptions:
+    """What is identified, and what is written of it."""
+
+    session: MotionsArgument
+    streams: StreamOptions
     validate_on: Annotated[
         str | None,
         typer.Option(help="A stream to predict. Default: the last 30 % of the fastest motion."),
-    ] = None,
+    ] = None
     output: Annotated[
         Path | None,
         typer.Option(
@@ -28,11 +31,11 @@ def dynamics_identify_command(
             file_okay=False,
             help=f"A folder for {DYNAMICS_FILE}, report and recording.",
         ),
-    ] = None,
+    ] = None
     friction: Annotated[
         str,
         typer.Option(help=f"What joints have of their own: {', '.join(FRICTION)}; or none."),
-    ] = "coulomb,viscous,offset",
+    ] = "coulomb,viscous,offset"
     rotors: Annotated[
         bool | None,
         typer.Option(
@@ -40,23 +43,23 @@ def dynamics_identify_command(
             help="Motors' inertia in the torques, or none in those of sensors behind the gears. "
             "Default: as unseen torques have it.",
         ),
-    ] = None,
+    ] = None
     stribeck: Annotated[
         bool, typer.Option("--stribeck/--no-stribeck", help="Look for humps of dry friction.")
-    ] = True,
+    ] = True
     unchecked: Annotated[
         bool,
         typer.Option("--unchecked", help="Take torques that contradict the robot's inertias."),
-    ] = False,
-    as_json: AsJson = False,
-) -> None:
+    ] = False
+    as_json: AsJson = False
+
+
+def dynamics_identify_command(asked: IdentifyOptions) -> None:
     """Identify an arm's inertias and friction from the torques of its motions.
 
     Exit status 0: there is a result, with a verdict; 2: there is none, for the reason given.
     """
     # Help does not wait for it.
-    from visioncal.cli.identified import identify_into, options_of
+    from visioncal.cli.identified import identify_into
 
-    request = replace(streams.request(), validate_on=validate_on or "", rotors=rotors)
-    options = options_of(friction, stribeck=stribeck, checked=not unchecked)
-    identify_into(output, session, replace(request, options=options), as_json=as_json)
+    identify_into(asked)

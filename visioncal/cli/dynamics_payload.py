@@ -1,5 +1,6 @@
 """`visioncal dynamics payload`."""
 
+from dataclasses import dataclass
 from typing import Annotated
 
 import typer
@@ -9,21 +10,26 @@ from visioncal.cli.options import AsJson
 from visioncal.core.choices import GAIN_SIGMA
 
 
-def dynamics_payload_command(
-    session: MotionsArgument,
-    streams: StreamOptions,
-    against: AgainstOption = None,
+@dataclass(frozen=True)
+class PayloadOptions:
+    """What the arm did with the payload, and what is known of it without."""
+
+    session: MotionsArgument
+    streams: StreamOptions
+    against: AgainstOption = None
     same_friction: Annotated[
         bool,
         typer.Option(
             "--same-friction", help="Friction is as it was without the payload, however it presses."
         ),
-    ] = False,
+    ] = False
     gains_sigma: Annotated[
         float, typer.Option(min=0.0, help="What each of the --gains is known to, in percent.")
-    ] = 100.0 * GAIN_SIGMA,
-    as_json: AsJson = False,
-) -> None:
+    ] = 100.0 * GAIN_SIGMA
+    as_json: AsJson = False
+
+
+def dynamics_payload_command(asked: PayloadOptions) -> None:
     """Weigh what the arm carries, by how much more its drives gave than without it.
 
     Exit status 0: there are figures; 2: there are none, for the reason given.
@@ -31,11 +37,4 @@ def dynamics_payload_command(
     # Help does not wait for it.
     from visioncal.cli.weighed import print_payload
 
-    print_payload(
-        session,
-        streams,
-        against,
-        same_friction=same_friction,
-        gains_sigma=gains_sigma,
-        as_json=as_json,
-    )
+    print_payload(asked)

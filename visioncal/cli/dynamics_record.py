@@ -32,9 +32,8 @@ def dynamics_record_command(
     pendant once this command waits for it. Exit status 0: it is recorded; 2: it is not.
     """
     # What help and a mistyped option need not wait for.
-    from rich.markup import escape
 
-    from visioncal.cli.console import messages
+    from visioncal.cli.console import messages, say
     from visioncal.core.interrupts import ended_like_ctrl_c
     from visioncal.live.capture.motions import record_motion
     from visioncal.live.drivers.ur_motion import UrMotion
@@ -54,11 +53,9 @@ def dynamics_record_command(
         model = robot or joints.model
     check_stream(stream, found)
     _keep(out, stream, found, model)
-    messages().print(
-        escape(
-            f"wrote {len(found)} samples to {path}. They hold currents: identify needs --gains, "
-            "which visioncal dynamics gains finds"
-        )
+    say(
+        f"wrote {len(found)} samples to {path}. They hold currents: identify needs --gains, "
+        "which visioncal dynamics gains finds"
     )
 
 

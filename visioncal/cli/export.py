@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, get_args
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import messages
+from visioncal.cli.console import messages, say
 from visioncal.cli.options import Force, OutFile, PartOptions
 from visioncal.core.choices import EXPORT_NAMES, Convention
 from visioncal.core.errors import DataError
@@ -130,7 +130,7 @@ def export_command(
         return
     check_free(out, force=force)
     write_atomically(out, written.text)
-    messages().print(escape(f"wrote {out}"))
+    say(f"wrote {out}")
 
 
 def _load(mass_kg: float | None, cog_mm: tuple[float, float, float] | None) -> "Load | None":

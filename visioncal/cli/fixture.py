@@ -5,17 +5,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from visioncal.cli.framing import FrameOptions, Place, TouchOptions, keep_and_report
+from visioncal.cli.framing import FrameOptions, TouchOptions
 from visioncal.cli.options import AsJson, PartOptions
-from visioncal.cli.parsing import refuse_given
-from visioncal.cli.target_in_images import PointOption, kept_by_images
+from visioncal.cli.target_in_images import Asked, PointOption, place_frame
 from visioncal.core.choices import UNITS_M
 from visioncal.core.errors import DataError
 
 # Help does not wait for them.
 if TYPE_CHECKING:
     from visioncal.frames.measured import Tool
-    from visioncal.results import Calibration
+    from visioncal.results import Calibration, Frame
 
 
 def fixture_command(
@@ -58,28 +57,21 @@ def fixture_command(
     """
     from visioncal.frames.fixture import touched_fixture
     from visioncal.interchange.formats.touches import read_nominal, read_touches
-    from visioncal.session.choosing import ARM, Choice
 
     drawing = None if cad is None else read_nominal(cad, cad_unit)
-    given = {"--tool": tool, **written.given()}
-    if kept_by_images(
-        touches, goes, part.choice, "fixture", point, drawing, for_touches=given, as_json=as_json
-    ):
-        return
-    refuse_given({"--point-mm": point}, "touches say where the fixture's origin is")
-    refuse_given({"--camera": part.camera, "--target": part.target}, "touches need no camera")
-    place = Place.of(goes, "fixture", Choice(robot=part.robot), ARM)
-    touched_with = _tool(tool, place.calibration, part.robot)
-    requested = written.requested()
-    frame = touched_fixture(
-        read_touches(touches, requested, part.robot, positions=touched_with is None),
-        touched_with,
-        drawing,
-        place.calibration,
-        written.model,
-        touch_noise_m=written.noise_m,
-    )
-    keep_and_report(place, frame, touches, as_json=as_json)
+
+    def by_touches(known: "Calibration | None") -> "Frame":
+        touched_with = _tool(tool, known, part.robot)
+        rows = read_touches(
+            touches, written.requested(), part.robot, positions=touched_with is None
+        )
+        noise_m = written.noise_m
+        return touched_fixture(
+            rows, touched_with, drawing, known, written.model, touch_noise_m=noise_m
+        )
+
+    asked = Asked("fixture", touches, goes, written, part, point, as_json)
+    place_frame(asked, by_touches, drawing, tool)
 
 
 def _tool(said: str | None, calibration: "Calibration | None", robot: str | None) -> "Tool | None":

@@ -1,6 +1,5 @@
 """What the commands that place a frame share: options, where the frame goes, how it is reported."""
 
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import answers, messages, report_written
+from visioncal.cli.console import answers, print_json, report_written, say
 from visioncal.cli.options import Force
 from visioncal.cli.pose_options import RobotPoseOptions
 from visioncal.core.errors import DataError
@@ -214,7 +213,7 @@ def report(place: Place, frame: "Frame", written: Written, *, as_json: bool) -> 
     from visioncal.results.frame import frames_document
 
     if as_json:
-        typer.echo(json.dumps(frames_document({place.name: frame}), indent=2))
+        print_json(frames_document({place.name: frame}))
         report_written(written, quiet=True)
         return
     console = answers()
@@ -234,10 +233,10 @@ def report(place: Place, frame: "Frame", written: Written, *, as_json: bool) -> 
     recording = None if place.folder is None else place.folder / RECORDING
     if recording is not None and recording not in (*written.files, *undrawn):
         why = "it is missing or of another result"
-        messages().print(escape(f"{recording} was not renewed: {why}"))
+        say(f"{recording} was not renewed: {why}")
     if not written.files:
         where = "-c joins it to a calibration, -o puts it into a file"
-        messages().print(f"nothing was written: {where}")
+        say(f"nothing was written: {where}")
     report_written(written)
 
 
@@ -247,6 +246,4 @@ def _report_before(place: Place, frame: "Frame") -> None:
     before = None if place.result is None else place.result.frames.get(place.name)
     if before is not None:
         mm, deg = pose_difference(before.edge.matrix, frame.edge.matrix)
-        messages().print(
-            f"it replaces the one of {before.created}, {figure(mm)} mm and {figure(deg)} deg away"
-        )
+        say(f"it replaces the one of {before.created}, {figure(mm)} mm and {figure(deg)} deg away")

@@ -1,56 +1,55 @@
 """The dynamics of `visioncal dynamics identify` and `validate`: found, written and reported."""
 
-import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
-import typer
 from rich.markup import escape
 from rich.table import Table
 
-from visioncal.cli.console import answers, messages, report_written
-from visioncal.cli.dynamics import StreamOptions, identified_of
-from visioncal.cli.dynamics_identify import FRICTION
+from visioncal.cli.console import answers, print_json, report_written, say
+from visioncal.cli.dynamics import StreamOptions, friction_terms, identified_of
+from visioncal.cli.dynamics_identify import FRICTION, IdentifyOptions
 from visioncal.cli.summary import print_verdict
-from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.dynamics.document import stribeck_rows, to_document
 from visioncal.dynamics.identified import CLASSES, UNKNOWN, Identified
 from visioncal.dynamics.identify import SLOW_RAD_S, Options
 from visioncal.dynamics.judge import judge
-from visioncal.dynamics.model import FrictionTerms
-from visioncal.dynamics.run import Request, identify_session, validate_session
+from visioncal.dynamics.run import identify_session, validate_session
 from visioncal.dynamics.validate import Prediction, validate
 from visioncal.interchange.outputs import write_dynamics
 from visioncal.session import Session
 
 
-def options_of(friction: str, *, stribeck: bool, checked: bool) -> Options:
-    """How the dynamics are identified.
-
-    Raises:
-        DataError: There is no such term of friction.
-    """
-    return Options(terms=_terms(friction), stribeck=stribeck, checked=checked)
-
-
-def identify_into(output: Path | None, session: Path, request: Request, *, as_json: bool) -> None:
+def identify_into(asked: IdentifyOptions) -> None:
     """Identifies the dynamics by a session's streams, writes them where asked, and reports them.
 
     Raises:
-        DataError: The session cannot be read, or its streams determine nothing.
+        DataError: The session cannot be read, its streams determine nothing, or there is no such
+            term of friction.
     """
-    run = identify_session(Session.load(session), request)
+    request = replace(
+        asked.streams.request(),
+        validate_on=asked.validate_on or "",
+        rotors=asked.rotors,
+        options=Options(
+            terms=replace(friction_terms(asked.friction, FRICTION), slow_rad_s=SLOW_RAD_S),
+            stribeck=asked.stribeck,
+            checked=not asked.unchecked,
+        ),
+    )
+    run = identify_session(Session.load(asked.session), request)
     identified = run.identified
-    written = None if output is None else write_dynamics(output, run)
-    if as_json:
-        typer.echo(json.dumps(to_document(identified), indent=2, allow_nan=False))
+    written = None if asked.output is None else write_dynamics(asked.output, run)
+    if asked.as_json:
+        print_json(to_document(identified))
     else:
         _report(identified, () if run.predicted is None else run.predicted.notes)
     if written is not None:
-        report_written(written, quiet=as_json)
-    elif not as_json:
-        messages().print("nothing was written: -o names a folder for it")
+        report_written(written, quiet=asked.as_json)
+    elif not asked.as_json:
+        say("nothing was written: -o names a folder for it")
 
 
 def print_predictions(
@@ -64,24 +63,11 @@ def print_predictions(
     identified = identified_of(against, "validate")
     predictions = validate_session(Session.load(session), identified, streams.request())
     if as_json:
-        typer.echo(json.dumps([_figures(it) for it in predictions], indent=2))
+        print_json([_figures(it) for it in predictions])
         return
     for prediction in predictions:
         answers().print(escape("\n".join([prediction.label, *prediction.notes])))
         _report_prediction(identified, prediction)
-
-
-def _terms(words: str) -> FrictionTerms:
-    """The terms of friction that the user names."""
-    names = [] if words == "none" else [it.strip() for it in words.split(",")]
-    wrong = [it for it in names if it not in FRICTION]
-    if wrong:
-        raise DataError(
-            f"--friction names {', '.join(wrong)}; the terms are {', '.join(FRICTION)}, or none.",
-            culprits=["--friction"],
-        )
-    coulomb, viscous, offset = (it in names for it in FRICTION)
-    return FrictionTerms(coulomb, viscous, offset, slow_rad_s=SLOW_RAD_S)
 
 
 def _report(identified: Identified, proof: Sequence[str]) -> None:

@@ -9,7 +9,7 @@ from functools import wraps
 from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, ClassVar, get_type_hints
+from typing import Any, ClassVar, TypeGuard, get_type_hints
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -136,28 +136,40 @@ class LazyGroup(TyperGroup):
 
 
 def with_fields(command: Callable[..., None]) -> Callable[..., None]:
-    """A command whose parameters that are dataclasses are given field by field."""
+    """A command whose parameters that are dataclasses are given field by field, at any depth."""
+    parameters = inspect.signature(command).parameters.values()
     hints = get_type_hints(command, include_extras=True)
-    grouped = {name: it for name, it in hints.items() if isinstance(it, type) and is_dataclass(it)}
-    flat = []
-    for it in inspect.signature(command).parameters.values():
-        if it.name not in grouped:
-            flat.append(it.replace(annotation=hints[it.name], kind=it.KEYWORD_ONLY))
-            continue
-        own = get_type_hints(grouped[it.name], include_extras=True)
-        for field in fields(grouped[it.name]):
-            default = it.empty if field.default is MISSING else field.default
-            flat.append(it.replace(name=field.name, annotation=own[field.name], default=default))
-            flat[-1] = flat[-1].replace(kind=it.KEYWORD_ONLY)
+    flat = [one for it in parameters for one in _each(it.name, hints[it.name], it.default)]
 
     @wraps(command)
     def taking_each(**given: Any) -> None:  # noqa: ANN401 - of any type
-        for name, options in grouped.items():
-            own = {field.name: given.pop(field.name) for field in fields(options)}
-            given[name] = options(**own)
-        command(**given)
+        command(**{it.name: _taken(it.name, hints[it.name], given) for it in parameters})
 
     del taking_each.__wrapped__
     taking_each.__signature__ = inspect.Signature(flat)  # type: ignore[attr-defined]
     taking_each.__annotations__ = {it.name: it.annotation for it in flat}
     return taking_each
+
+
+def _each(name: str, kind: Any, default: Any) -> Iterator[inspect.Parameter]:  # noqa: ANN401 - any
+    """What the command line has of a parameter: itself, or the fields of a dataclass."""
+    if not _has_fields(kind):
+        at = inspect.Parameter.KEYWORD_ONLY
+        yield inspect.Parameter(name, at, annotation=kind, default=default)
+        return
+    own = get_type_hints(kind, include_extras=True)
+    for it in fields(kind):
+        given = inspect.Parameter.empty if it.default is MISSING else it.default
+        yield from _each(it.name, own[it.name], given)
+
+
+def _taken(name: str, kind: Any, given: Mapping[str, Any]) -> Any:  # noqa: ANN401 - of any type
+    """A parameter out of what the command line gave."""
+    if not _has_fields(kind):
+        return given[name]
+    own = get_type_hints(kind, include_extras=True)
+    return kind(**{it.name: _taken(it.name, own[it.name], given) for it in fields(kind)})
+
+
+def _has_fields(kind: object) -> TypeGuard[type]:
+    return isinstance(kind, type) and is_dataclass(kind)

@@ -1,17 +1,15 @@
 """`visioncal locate`."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.markup import escape
 
-from visioncal.cli.console import messages
+from visioncal.cli.console import print_json, say, warn
 from visioncal.cli.options import AsJson, CameraName, RobotName
-from visioncal.cli.parsing import FORMS, numbers_in, plane_of, refuse_given
+from visioncal.cli.parsing import FORMS, named_result, numbers_in, plane_of, refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
@@ -106,12 +104,14 @@ def locate_command(
 
     from visioncal.frames.camera_chain import Eye
     from visioncal.frames.target_in_image import check_size
+    from visioncal.interchange.result_files import load_result
     from visioncal.results.selecting import boards_before
     from visioncal.session.choosing import EYE, Choice
     from visioncal.session.selecting import has_several, select
     from visioncal.vision.finders.imaging import read_image
 
-    result, session = _result(calibration), _session(source)
+    result = load_result(named_result(calibration, "-c", "locate: the camera's calibration"))
+    session = _session(source)
     several = session is not None and has_several(session)
     if session is not None and several:
         own = target in session.plates
@@ -152,18 +152,6 @@ def locate_command(
         else:
             found = _by_image(source, known, wanted, origin_m, flange, sigma_px)
     _report(found, as_json=as_json)
-
-
-def _result(path: Path | None) -> "Calibration":
-    from visioncal.interchange.result_files import load_result
-
-    if path is None:
-        raise DataError(
-            "locate: the camera's calibration (-c) is needed.",
-            culprits=["-c"],
-            next_step="Name the output folder of visioncal calibrate.",
-        )
-    return load_result(path)
 
 
 def _session(source: Path | None) -> "Session | None":
@@ -284,7 +272,7 @@ def _by_views(
             session, calibration, point_m, among=views, sigma_px=sigma_px, progress=progress
         )
     for words in (*by_reason(picks.lost), *picks.warnings):
-        messages().print(escape(words))
+        say(words)
     return tuple(
         _Found(f"view {view}", {"view": view}, located) for view, located in picks.found.items()
     )
@@ -324,20 +312,20 @@ def _target(words: str, result: "Calibration") -> "Target":
 
     if result.cell is not None and words in result.cell.targets:
         return target_from_document(result.cell.targets[words], words)
-    from visioncal.interchange.formats.boards import described_target
+    from visioncal.interchange.formats.boards import target_named
 
-    return target_from_document(described_target(words), Path(words).stem)
+    return target_named(words, Path(words).stem)
 
 
 def _report(found: Sequence[_Found], *, as_json: bool) -> None:
     if as_json:
-        typer.echo(json.dumps([_document(it) for it in found], indent=2))
+        print_json([_document(it) for it in found])
         return
     for it in found:
         typer.echo(f"{it.words}: {_line(it.located)}")
         for warning in it.located.warnings:
             words = warning if warning.startswith(it.words) else f"{it.words}: {warning}"
-            messages().print(f"[bold yellow]warning:[/] {escape(words)}")
+            warn(words)
 
 
 def _line(located: "Located") -> str:

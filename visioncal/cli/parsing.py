@@ -9,10 +9,12 @@ from visioncal.core.files import did_you_mean, some_of
 
 # Help does not wait for them.
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from visioncal.frames.plane import Plane
     from visioncal.results import Calibration, Edge
 
-# Digits of the width or height of an image, and more than any has.
+# Digits of a view's number, or of the width or height of an image, and more than any has.
 _MOST_DIGITS = 6
 FORMS = (
     "z=20 (of the base, in mm), base_from_fixture or base_from_fixture:z=-5 (of a frame, whose z "
@@ -51,8 +53,8 @@ def pair_in(words: str, option: str) -> tuple[int, int]:
     Raises:
         DataError: It is not two whole numbers.
     """
-    numbers = [int(it) for it in words.split(",") if it.strip().isdecimal()]
-    if len(numbers) != 2 or words.count(",") != 1:
+    numbers = _whole_numbers(words)
+    if len(numbers) != 2:
         raise DataError(
             f"{option} is {words[:40]!r}; the numbers of two views are needed, as 8,17.",
             culprits=[option],
@@ -66,17 +68,21 @@ def size_in(words: str) -> tuple[int, int]:
     Raises:
         DataError: It is not two whole numbers above 0.
     """
-    sides = words.replace("x", ",").split(",")
-    numbers = [
-        int(it) for it in sides if it.strip().isdecimal() and len(it.strip()) <= _MOST_DIGITS
-    ]
-    if len(sides) != 2 or len(numbers) != 2 or min(numbers) < 1:
+    numbers = _whole_numbers(words.replace("x", ","))
+    if len(numbers) != 2 or min(numbers) < 1:
         raise DataError(
             f"--resolution is {words[:40]!r}; width and height of the images are needed [px], two "
             "whole numbers above 0, as 1280,800.",
             culprits=["--resolution"],
         )
     return numbers[0], numbers[1]
+
+
+def _whole_numbers(words: str) -> list[int]:
+    """The whole numbers between commas; none where something else is among them."""
+    cells = [it.strip() for it in words.split(",")]
+    are_whole = all(it.isdecimal() and len(it) <= _MOST_DIGITS for it in cells)
+    return [int(it) for it in cells] if are_whole else []
 
 
 def refuse_given(options: Mapping[str, object], why: str, next_step: str = "Leave it out.") -> None:
@@ -93,6 +99,26 @@ def refuse_given(options: Mapping[str, object], why: str, next_step: str = "Leav
     given = [name for name, value in options.items() if value is not None]
     if given:
         raise DataError(f"{some_of(given)}: {why}.", culprits=given, next_step=next_step)
+
+
+def named_result(path: "Path | None", option: str, what: str) -> "Path":
+    """The path of a result, which an option has to name.
+
+    Args:
+        path: What the user wrote; None where nothing is named.
+        option: The option's name.
+        what: What it is, for messages: `verify: the calibration to check`.
+
+    Raises:
+        DataError: None is named.
+    """
+    if path is None:
+        raise DataError(
+            f"{what} ({option}) is needed.",
+            culprits=[option],
+            next_step="Name the output folder of visioncal calibrate.",
+        )
+    return path
 
 
 def plane_of(

@@ -1,13 +1,12 @@
 """`visioncal plan`."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import answers, messages, report_written
+from visioncal.cli.console import answers, print_json, report_written, warn
 from visioncal.cli.options import AsJson, OutFolder
 from visioncal.cli.plan_options import CellOptions, ClearanceOptions, PlanOptions, SightOptions
 from visioncal.cli.progress import shown_progress
@@ -59,8 +58,8 @@ def plan_command(
     with shown_progress(quiet=as_json) as progress:
         cell, begun = _begin(start, words, (limits, boxes), wanted, progress)
         if words.board is not None and cell.mount == "eye-in-hand" and cell.z[2, 2] > _FACE_DOWN:
-            messages().print(
-                "[bold yellow]warning:[/] this --board lies face down: its z points into the "
+            warn(
+                "this --board lies face down: its z points into the "
                 "paper, and a board that lies face up ends in 180 0 0"
             )
         plan = make_plan(cell, wanted.request(cell), begun=begun, progress=progress)
@@ -68,7 +67,7 @@ def plan_command(
         document = plan_document(plan, {"kind": start.words})
         written = write_plan(out, plan, document)
     if as_json:
-        typer.echo(json.dumps(document, indent=2, allow_nan=False))
+        print_json(document)
     else:
         _report(plan)
     report_written(written, quiet=as_json)

@@ -13,9 +13,9 @@ from visioncal.cli.plan_options import CellOptions
 from visioncal.core.errors import DataError
 from visioncal.core.files import absence, read_bytes, some_of
 from visioncal.core.transforms import compose
-from visioncal.core.types import Camera, FloatArray, Progress, Target
+from visioncal.core.types import Camera, FloatArray, Progress
 from visioncal.estimation.parts import Noise
-from visioncal.interchange.formats.boards import described_target
+from visioncal.interchange.formats.boards import target_named
 from visioncal.interchange.formats.intrinsics import read_intrinsics
 from visioncal.interchange.outputs import CALIBRATION
 from visioncal.interchange.result_files import load_calibration, load_stored
@@ -159,7 +159,7 @@ def cell_of(source: Source, words: CellOptions, kept: Kept) -> PlanCell:
         words.mount or "eye-in-hand",
         source.robot,
         camera,
-        _target(str(words.target)),
+        target_named(str(words.target)),
         guess.x,
         guess.z,
         guess.sigma_rad,
@@ -209,7 +209,7 @@ def _calibrated(
     calibration: Calibration, session: Session | None, words: CellOptions, kept: Kept
 ) -> PlanCell:
     if words.target is not None:
-        target = _target(words.target)
+        target = target_named(words.target)
     elif session is not None and session.target is not None:
         target = session.target
     elif calibration.joint_fit is not None and "" in calibration.joint_fit.targets:
@@ -263,10 +263,6 @@ def _with_noise(cell: PlanCell, words: CellOptions) -> PlanCell:
     sigma_rad = sigma_rad if words.noise_deg is None else float(np.deg2rad(words.noise_deg))
     pixel_px = cell.pixel_px if words.noise_px is None else words.noise_px
     return replace(cell, noise=Noise.of_robot(sigma_rad, sigma_m), pixel_px=pixel_px)
-
-
-def _target(words: str) -> Target:
-    return target_from_document(described_target(words), words)
 
 
 def _camera(words: str, resolution: str | None) -> Camera:

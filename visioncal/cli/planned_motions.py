@@ -1,24 +1,21 @@
 """The motions of `visioncal dynamics plan`: planned, written and reported."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import typer
 from rich.markup import escape
 
-from visioncal.cli.console import answers, report_written
+from visioncal.cli.console import answers, print_json, report_written
+from visioncal.cli.dynamics import friction_terms
 from visioncal.cli.dynamics_plan import FRICTION, ArmOptions, ExcitationOptions
 from visioncal.cli.parsing import numbers_in
 from visioncal.cli.plan_options import ClearanceOptions
 from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
-from visioncal.core.files import some_of
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.excitation import ExcitationRequest, excite
 from visioncal.dynamics.limits import Missing, Share, allowed_motion
-from visioncal.dynamics.model import FrictionTerms
 from visioncal.dynamics.sweeps import SweepRequest, plan_sweeps
 from visioncal.dynamics.written import MotionPlan, motion_document
 from visioncal.interchange.outputs import write_motions
@@ -62,7 +59,7 @@ def plan_motions(
     wished = ExcitationRequest(
         motion.duration,
         motion.harmonics,
-        _terms(motion.friction),
+        friction_terms(motion.friction, FRICTION),
         motion.starts,
         motion.seed,
         seconds=np.inf if motion.seconds is None else motion.seconds,
@@ -77,7 +74,7 @@ def plan_motions(
     document = motion_document(plan)
     written = write_motions(out, plan, motion.rate_hz, document)
     if as_json:
-        typer.echo(json.dumps(document, indent=2, allow_nan=False))
+        print_json(document)
     else:
         _report(plan)
     report_written(written, quiet=as_json)
@@ -100,18 +97,6 @@ def _radians(degrees: float | None) -> float | None:
             culprits=["--range-deg", "--speed-deg", "--acceleration-deg"],
         )
     return float(np.deg2rad(degrees))
-
-
-def _terms(words: str) -> FrictionTerms:
-    wanted = [] if words.strip().lower() == "none" else [it.strip() for it in words.split(",")]
-    unknown = [it for it in wanted if it not in FRICTION]
-    if unknown:
-        raise DataError(
-            f"--friction is {words[:80]!r}; of {some_of(FRICTION)} is needed, with commas "
-            "between, or none.",
-            culprits=["--friction"],
-        )
-    return FrictionTerms(*(it in wanted for it in FRICTION))
 
 
 def _bodies(arm: Robot, boxes: Sequence[Box], tool: str | None) -> tuple[Body, ...]:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from visioncal.cli.console import asked, messages
+from visioncal.cli.console import asked, say
 from visioncal.cli.options import AsJson, View
 from visioncal.cli.record_options import CellOptions, DeviceOptions, TakingOptions
 from visioncal.core.interrupts import ended_like_ctrl_c
@@ -96,7 +96,7 @@ def record_command(
         scene.check(cell.camera.resolution, drives=drives)
         if dry_run:
             report_departure(departure(cell, scene.planned, (), taking), cell, taking)
-            messages().print("Nothing was moved (--dry-run).")
+            say("Nothing was moved (--dry-run).")
             return
         start = Journal.resume if resume else Journal.begin
         count = len(scene.planned.stops) if drives else views

@@ -1,6 +1,5 @@
 """The parts of `visioncal record`: its devices, its stops, and what it says of them."""
 
-import json
 import math
 import sys
 from collections.abc import Iterator, Sequence
@@ -10,7 +9,7 @@ from typing import Any
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import messages
+from visioncal.cli.console import messages, print_json, say
 from visioncal.cli.recorded_cell import Scene
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.number_format import figure
@@ -42,7 +41,7 @@ class ViewLines:
 
     def stepped(self, step: Step) -> None:
         """Prints the line."""
-        messages().print(escape(line_of(step)))
+        say(line_of(step))
 
 
 def driven(
@@ -119,14 +118,12 @@ def check_all(journal: Journal, steps: Sequence[Step]) -> None:
 def finish(journal: Journal, steps: Sequence[Step], *, as_json: bool) -> None:
     """Says what there is now."""
     if as_json:
-        typer.echo(json.dumps(_summary(journal, steps), indent=2, allow_nan=False))
+        print_json(_summary(journal, steps))
         return
     count = len(journal.views)
-    messages().print(
-        escape(
-            f"{count} view{'s' if count != 1 else ''} in {journal.folder}; next: visioncal "
-            f"calibrate {journal.folder} -o out"
-        )
+    say(
+        f"{count} view{'s' if count != 1 else ''} in {journal.folder}; next: visioncal "
+        f"calibrate {journal.folder} -o out"
     )
 
 

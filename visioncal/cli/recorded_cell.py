@@ -5,13 +5,11 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from rich.markup import escape
-
-from visioncal.cli.console import messages
+from visioncal.cli.console import say
 from visioncal.cli.record_options import CellOptions
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.types import Camera, Mount, Target
-from visioncal.interchange.formats.boards import described_target
+from visioncal.interchange.formats.boards import target_named
 from visioncal.live.capture.coach import Coach
 from visioncal.live.capture.core import Capture, Step, Watcher
 from visioncal.live.capture.facts import Facts
@@ -24,7 +22,6 @@ from visioncal.live.capture.predict import RecordedAccuracy
 from visioncal.live.drivers.protocols import MovingArm
 from visioncal.live.planning.read_back import PlanFile, read_plan
 from visioncal.robot import Robot, load_robot
-from visioncal.vision.targets import target_from_document
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +104,7 @@ def scene_of(plan: Path | None, described: CellOptions | None = None) -> Scene:
         )
     return Scene(
         mount or "eye-in-hand",
-        _findable(target_from_document(described_target(target), target)),
+        _findable(target_named(target)),
         None if robot is None else load_robot(robot),
         None,
     )
@@ -171,9 +168,7 @@ def guided(
     try:
         if not isinstance(cell.arm, MovingArm):
             return ask_and_take(capture, cell.arm, views, ask)
-        messages().print(
-            "Guide the arm: a view is taken wherever it rests at a new place; Ctrl-C ends."
-        )
+        say("Guide the arm: a view is taken wherever it rests at a new place; Ctrl-C ends.")
         return follow(capture, views)
     finally:
         prediction.close()
@@ -208,5 +203,5 @@ def shown_in(scene: Scene, cell: LiveCell, *, wanted: bool) -> Iterator[list[Wat
             drawing.begin()
             watchers = [Shown(drawing)]
         except DriverError as error:
-            messages().print(escape(f"{error} The recording goes on without it."))
+            say(f"{error} The recording goes on without it.")
         yield watchers

@@ -10,7 +10,7 @@ from typing import Any
 
 from rich.markup import escape
 
-from visioncal.cli.console import answers, messages
+from visioncal.cli.console import answers, say
 from visioncal.cli.rehearsed import TAKING, Recorded, calibrated, planned, recorded, touched
 from visioncal.cli.summary import print_summary, truth_table
 from visioncal.core.choices import Faults
@@ -181,11 +181,11 @@ class Rehearsal:
 
 def _report_devices(bench: Bench) -> None:
     host = bench.controller.host
-    messages().print(f"simulated controller at {host}, driven by ur-rtde {version('ur-rtde')}")
+    say(f"simulated controller at {host}, driven by ur-rtde {version('ur-rtde')}")
     if bench.through_depthai:
-        messages().print(f"pictures through the pipeline of depthai {version('depthai')}")
+        say(f"pictures through the pipeline of depthai {version('depthai')}")
         return
-    messages().print(
+    say(
         "depthai is not installed, so pictures are taken without its pipeline: "
         "pip install 'depthai>=3.12,<4'"
     )

@@ -1,18 +1,16 @@
 """`visioncal rehearse`."""
 
-import json
 import shutil
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
 import typer
-from rich.markup import escape
 
-from visioncal.cli.console import messages, report_written
+from visioncal.cli.console import print_json, report_written, say
 from visioncal.cli.options import AsJson, OutFolder, Seed, View
 from visioncal.core.choices import CameraMount, Faults
 from visioncal.core.errors import DataError
-from visioncal.core.files import write_atomically
+from visioncal.core.files import write_json
 from visioncal.core.version import __version__
 from visioncal.live.drivers.extras import refuse_without
 
@@ -54,12 +52,12 @@ def rehearse_command(
     _make_place(out)
     whole = rehearse(RehearsalOptions(robot, mount, views, seed), out, fault, view=view)
     document = whole.document()
-    write_atomically(out / _SUMMARY, json.dumps(document, indent=2, allow_nan=False) + "\n")
+    write_json(out / _SUMMARY, document)
     if as_json:
-        typer.echo(json.dumps(document, indent=2, allow_nan=False))
+        print_json(document)
     else:
         whole.report()
-    messages().print(escape(f"wrote {out / _SUMMARY}; look: visioncal review {out / 'result'}"))
+    say(f"wrote {out / _SUMMARY}; look: visioncal review {out / 'result'}")
     report_written(whole.written, quiet=True, status=0 if whole.error.passed else EXIT_WRONG)
 
 
@@ -76,4 +74,4 @@ def _make_place(out: Path) -> None:
         shutil.rmtree(session)
     out.mkdir(parents=True, exist_ok=True)
     # Until it is over there is no more to say; an interrupted one is replaced by the next.
-    write_atomically(mark, json.dumps({"schema": 1, "visioncal": __version__}) + "\n")
+    write_json(mark, {"schema": 1, "visioncal": __version__})

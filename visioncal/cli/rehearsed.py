@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from visioncal.calibration.pipeline import Run, run
-from visioncal.cli.console import messages, report_error, report_written
+from visioncal.cli.console import report_error, report_written, say
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.recorded import ViewLines, driven
 from visioncal.cli.recorded_cell import Scene, facts_of, scene_of, shown_in
@@ -103,7 +103,7 @@ def planned(cell: RehearsedCell, options: RehearsalOptions, folder: Path) -> Sce
         plan = make_plan(cell.known, request, progress=progress)
         written = write_plan(folder, plan, plan_document(plan, {"kind": "rehearsal"}))
     report_written(written, quiet=True)
-    messages().print(f"plan: {summary_of(plan)}")
+    say(f"plan: {summary_of(plan)}")
     return scene_of(folder)
 
 
@@ -146,7 +146,7 @@ def recorded(
         )
     else:
         raise DriverError(f"rehearse: {fault} did not happen before all views were taken.")
-    messages().print(f"  ({fault} is mended; on with --resume)")
+    say(f"  ({fault} is mended; on with --resume)")
     injection.mend()
     rest = _drive(bench, scene, folder, watchers, resume=True, view=view)
     return Recorded((*kept.steps, *rest), suffered)

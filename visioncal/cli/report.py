@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import answers, messages
+from visioncal.cli.console import answers, say
 from visioncal.cli.parsing import refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
@@ -76,7 +76,7 @@ def report_command(
         page = out or Path("certificate.html")
         signed = Signed(operator, dict(map(_pair, serial or ())))
         write_certificate(page, stored.calibration, stored.session, signed)
-        messages().print(f"wrote {escape(str(page))}")
+        say(f"wrote {page}")
         return
     out = out or Path("report.html")
     write_report(
@@ -89,8 +89,8 @@ def report_command(
     )
     # The page of a whole cell shows nothing of what a recording has.
     if stored.note and stored.calibration.cell is None:
-        messages().print(escape(stored.note))
-    messages().print(f"wrote {escape(str(out))}")
+        say(stored.note)
+    say(f"wrote {out}")
 
 
 def _recompute(stored: "Stored") -> None:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from visioncal.cli.console import messages
+from visioncal.cli.console import say
 from visioncal.core.errors import DataError
 from visioncal.core.files import absence, some_of
 from visioncal.interchange.outputs import PREVIEW, RECORDING
@@ -52,10 +52,10 @@ def review_command(
 
     def opened(url: str) -> None:
         # The URL last: who reads it may end the server at once, and an import would be cut off.
-        messages().print("Ctrl-C ends.")
+        say("Ctrl-C ends.")
         typer.echo(url)
         if not no_open and not webbrowser.open(url):
-            messages().print("No browser could be opened; visit the address above.")
+            say("No browser could be opened; visit the address above.")
 
     review_web(file, port or 0, opened, row)
 

@@ -1,12 +1,13 @@
 """`visioncal simulate`."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 import typer
 
-from visioncal.cli.console import messages
+from visioncal.cli.console import say
 from visioncal.cli.options import Seed
 from visioncal.cli.progress import shown_progress
 from visioncal.core.choices import SIMULATED_ARMS, SIMULATED_CELLS, CameraMount
@@ -41,83 +42,81 @@ _TAKES: Mapping[str, frozenset[str]] = {
 }
 
 
-def simulate_command(
-    context: typer.Context,
-    folder: Annotated[Path, typer.Argument(help="Where to write the session.")],
-    mount: Annotated[CameraMount, typer.Option(help="Where the camera is.")] = "eye-in-hand",
-    views: Annotated[int, typer.Option(min=1, help="Number of views.")] = 20,
-    robot: Annotated[
-        str, typer.Option(metavar="|".join(SIMULATED_ARMS), help="The arm.")
-    ] = "ur10e",
+@dataclass(frozen=True)
+class SimulateOptions:
+    """What is simulated, and what is recorded of it."""
+
+    folder: Annotated[Path, typer.Argument(help="Where to write the session.")]
+    mount: Annotated[CameraMount, typer.Option(help="Where the camera is.")] = "eye-in-hand"
+    views: Annotated[int, typer.Option(min=1, help="Number of views.")] = 20
+    robot: Annotated[str, typer.Option(metavar="|".join(SIMULATED_ARMS), help="The arm.")] = "ur10e"
     camera: Annotated[
         Literal["wide", "fine", "fisheye"],
         typer.Option(help="1280 x 800, 2448 x 2048, or a fisheye."),
-    ] = "wide",
+    ] = "wide"
     board: Annotated[
         Literal["charuco", "checkerboard", "aprilgrid", "circles", "symmetric-circles", "tags"],
         typer.Option(help="What is printed."),
-    ] = "charuco",
+    ] = "charuco"
     second_board: Annotated[
         bool, typer.Option("--second-board", help="A second board, a checkerboard, beside it.")
-    ] = False,
+    ] = False
     robot_sigma_mm: Annotated[
         float, typer.Option(min=0.0, max=100.0, help="Repeatability of the robot (mm).")
-    ] = 0.03,
+    ] = 0.03
     robot_sigma_mrad: Annotated[
         float, typer.Option(min=0.0, max=100.0, help="Repeatability of its rotation (mrad).")
-    ] = 0.05,
+    ] = 0.05
     arm_sigma_mm: Annotated[
         float, typer.Option(min=0.0, max=100.0, help="Departure of the arm's lengths (mm).")
-    ] = 0.0,
+    ] = 0.0
     arm_sigma_mrad: Annotated[
         float, typer.Option(min=0.0, max=100.0, help="Departure of its angles (mrad).")
-    ] = 0.0,
-    wrong_views: Annotated[
-        int, typer.Option(min=0, help="Views whose reported pose is wrong.")
-    ] = 0,
+    ] = 0.0
+    wrong_views: Annotated[int, typer.Option(min=0, help="Views whose reported pose is wrong.")] = 0
     board_scale: Annotated[
         float, typer.Option(min=0.5, max=2.0, help="Printed over stated size of the board.")
-    ] = 1.0,
+    ] = 1.0
     with_intrinsics: Annotated[
         bool, typer.Option(help="Whether the session states the camera's intrinsics.")
-    ] = True,
+    ] = True
     images: Annotated[
         bool, typer.Option(help="Whether to render images; pose pairs are written otherwise.")
-    ] = True,
+    ] = True
     sweep: Annotated[
         bool,
         typer.Option(help="A sweep without stops: pose pairs by one clock, the robot by another."),
-    ] = False,
+    ] = False
     clock_offset_ms: Annotated[
         float, typer.Option(help="With --sweep: what the camera's clock is ahead (ms).")
-    ] = 37.0,
+    ] = 37.0
     readout_ms: Annotated[
         float,
         typer.Option(
             help="With --sweep: how long after its first row an image's last is taken (ms); other "
             "than 0, the frames have corners (corners.csv) in the place of poses."
         ),
-    ] = 0.0,
+    ] = 0.0
     warm_up: Annotated[
         bool,
         typer.Option(
             help="A cold arm that works for 100 minutes: pose pairs, and its joints' temperatures."
         ),
-    ] = False,
+    ] = False
     cell: Annotated[
         str | None,
         typer.Option(
             metavar="NAME|FILE.toml",
             help=f"A whole cell: {', '.join(SIMULATED_CELLS)}, or a file that describes one.",
         ),
-    ] = None,
+    ] = None
     instrument: Annotated[
         Read | None,
         typer.Option(
             help="A tracker that reads one point or three on the flange, or a probe; of a whole "
             "cell on every flange."
         ),
-    ] = None,
+    ] = None
     torques: Annotated[
         bool,
         typer.Option(
@@ -125,42 +124,44 @@ def simulate_command(
             help="Streams of a moving arm's torques, without views; of a whole cell beside its "
             "views.",
         ),
-    ] = False,
+    ] = False
     touches: Annotated[
         bool,
         typer.Option(
             "--touches",
             help="Also touches of a tool and a fixture by every robot, in touches.csv ...",
         ),
-    ] = False,
+    ] = False
     currents: Annotated[
         bool,
         typer.Option(
             help="Motor currents: with --warm-up for temperatures, with --torques for torques."
         ),
-    ] = False,
+    ] = False
     stiffness_knm: Annotated[
         float | None,
         typer.Option(min=0.1, help="Stiffness of every joint (kN m/rad); rigid if left out."),
-    ] = None,
+    ] = None
     payload_kg: Annotated[
         list[float] | None,
         typer.Option(min=0.0, help="What the arm carries; several times for stops in turn."),
-    ] = None,
+    ] = None
     recording: Annotated[
         int,
         typer.Option(
             min=0, help="Another recording of the same cell: fresh stops, for verify and locate."
         ),
-    ] = 0,
+    ] = 0
     camera_moved_mm: Annotated[
         float,
         typer.Option(min=0.0, max=100.0, help="How far the camera was knocked (mm); the first."),
-    ] = 0.0,
-    seed: Seed = 0,
-) -> None:
+    ] = 0.0
+    seed: Seed = 0
+
+
+def simulate_command(context: typer.Context, asked: SimulateOptions) -> None:
     """Write a simulated session, and its truth in a file beside it."""
-    from visioncal.cli.simulated_cell import CENTRE_M, Along, exercise_options, whole_cell
+    from visioncal.cli.simulated_cell import CENTRE_M, exercise_options, whole_cell
     from visioncal.session.saving import refuse_filled
     from visioncal.simulation import (
         BOARDS,
@@ -180,63 +181,62 @@ def simulate_command(
     from visioncal.simulation.exercise import write_exercise
     from visioncal.simulation.tracked import Tracked, tracked, write_tracked
 
-    given = _given_for(context)
+    given, folder = _given_for(context), asked.folder
     options = CellOptions(
-        robot=robot,
-        mount=mount,
-        views=views,
-        target=BOARDS[board],
-        camera=CAMERAS[camera],
-        state_intrinsics=with_intrinsics,
-        robot_sigma_m=1e-3 * robot_sigma_mm,
-        robot_sigma_rad=1e-3 * robot_sigma_mrad,
-        dh_sigma_m=1e-3 * arm_sigma_mm,
-        dh_sigma_rad=1e-3 * arm_sigma_mrad,
-        wrong_views=wrong_views,
-        board_scale=board_scale,
-        compliance_rad_per_nm=_compliance(robot, stiffness_knm),
-        payloads=tuple(Payload(it, CENTRE_M) for it in payload_kg or ()),
-        second=Second() if second_board else None,
-        recording=recording,
-        camera_moved_m=1e-3 * camera_moved_mm,
-        seed=seed,
+        robot=asked.robot,
+        mount=asked.mount,
+        views=asked.views,
+        target=BOARDS[asked.board],
+        camera=CAMERAS[asked.camera],
+        state_intrinsics=asked.with_intrinsics,
+        robot_sigma_m=1e-3 * asked.robot_sigma_mm,
+        robot_sigma_rad=1e-3 * asked.robot_sigma_mrad,
+        dh_sigma_m=1e-3 * asked.arm_sigma_mm,
+        dh_sigma_rad=1e-3 * asked.arm_sigma_mrad,
+        wrong_views=asked.wrong_views,
+        board_scale=asked.board_scale,
+        compliance_rad_per_nm=_compliance(asked.robot, asked.stiffness_knm),
+        payloads=tuple(Payload(it, CENTRE_M) for it in asked.payload_kg or ()),
+        second=Second() if asked.second_board else None,
+        recording=asked.recording,
+        camera_moved_m=1e-3 * asked.camera_moved_mm,
+        seed=asked.seed,
     )
     # Rendering takes its time.
     refuse_filled(folder.absolute())
-    if cell is not None:
-        along = Along(touches, instrument, torques, currents, payload_kg)
-        whole_cell(cell, folder, options, given, along, images=images)
-    elif instrument is not None:
-        stops = views if "views" in given else Tracked.stops
-        write_tracked(tracked(_read_by(instrument, options, stops)), folder)
-    elif torques:
-        write_exercise(exercise_options(robot, payload_kg, seed, currents=currents), folder)
-    elif warm_up:
-        how = WarmUpOptions(options, round=Round(first=views))
-        write_warm_up(simulate_warm_up(how), folder, temperatures=not currents)
-    elif sweep:
+    if asked.cell is not None:
+        whole_cell(asked.cell, asked, options, given)
+    elif asked.instrument is not None:
+        stops = asked.views if "views" in given else Tracked.stops
+        write_tracked(tracked(_read_by(asked.instrument, options, stops)), folder)
+    elif asked.torques:
+        write_exercise(exercise_options(asked, asked.robot, asked.seed), folder)
+    elif asked.warm_up:
+        how = WarmUpOptions(options, round=Round(first=asked.views))
+        write_warm_up(simulate_warm_up(how), folder, temperatures=not asked.currents)
+    elif asked.sweep:
         clocks = SweepOptions(
-            camera_minus_robot_s=1e-3 * clock_offset_ms, readout_s=1e-3 * readout_ms
+            camera_minus_robot_s=1e-3 * asked.clock_offset_ms, readout_s=1e-3 * asked.readout_ms
         )
         write_sweep(swept(options, clocks), folder)
     else:
-        _single(options, folder, images=images, touches=touches)
-    messages().print(f"wrote {folder}\nwrote {truth_path(folder)}")
+        _single(options, asked)
+    say(f"wrote {folder}\nwrote {truth_path(folder)}")
 
 
-def _single(options: "CellOptions", folder: Path, *, images: bool, touches: bool) -> None:
+def _single(options: "CellOptions", asked: SimulateOptions) -> None:
     """Writes a cell of one robot, and what its tool touched."""
     from visioncal.simulation import simulate, touch, write_session, write_touches
     from visioncal.simulation.records import truth_of, write_truth
 
-    cell = simulate(options)
-    touched = touch(cell) if touches else None
+    cell, folder = simulate(options), asked.folder
+    touched = touch(cell) if asked.touches else None
     with shown_progress(quiet=False) as progress:
         write_session(
             cell,
             folder,
             lambda share: progress("render", round(share * options.views), options.views),
-            images=images,
+            images=asked.images,
         )
     if touched is not None:
         write_touches({"": touched}, folder)

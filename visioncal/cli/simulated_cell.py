@@ -1,12 +1,11 @@
 """Whole cells of `visioncal simulate`, and what is recorded of them beside the cameras' views."""
 
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 
 from visioncal.cli.progress import shown_progress
-from visioncal.cli.simulate import Read
+from visioncal.cli.simulate import Read, SimulateOptions
 from visioncal.core.errors import DataError
 from visioncal.session import frame_name
 from visioncal.simulation import (
@@ -33,28 +32,11 @@ _HALF_M = 0.05
 _GAINS_NM_A = (10.0, 10.0, 9.0, 7.0, 7.0, 7.0)
 
 
-@dataclass(frozen=True)
-class Along:
-    """What is recorded of a whole cell beside what its cameras see; as the options have it."""
-
-    touches: bool
-    instrument: Read | None
-    torques: bool
-    currents: bool
-    payload_kg: list[float] | None
-
-
 def whole_cell(
-    name: str,
-    folder: Path,
-    options: CellOptions,
-    given: frozenset[str],
-    along: Along,
-    *,
-    images: bool,
+    name: str, asked: SimulateOptions, options: CellOptions, given: frozenset[str]
 ) -> None:
     """Writes a whole cell; what the user gives comes before what is described."""
-    described = _described(name, options, given, along.instrument)
+    described = _described(name, options, given, asked.instrument)
     cell = simulate_network(described)
     if not (cell.sights or cell.readings):
         raise DataError(
@@ -63,21 +45,17 @@ def whole_cell(
             next_step="Give it a camera that sees a target, or an instrument and points.",
         )
     exercised = {
-        it.name: exercise(
-            exercise_options(
-                it.robot, along.payload_kg, seed_of(described.seed, at), currents=along.currents
-            )
-        )
-        for at, it in enumerate(described.robots if along.torques else ())
+        it.name: exercise(exercise_options(asked, it.robot, seed_of(described.seed, at)))
+        for at, it in enumerate(described.robots if asked.torques else ())
     }
-    touched = touch_network(cell) if along.touches else {}
+    touched = touch_network(cell) if asked.touches else {}
     with shown_progress(quiet=False) as progress:
         count = len(cell.sights)
         write_network(
             cell,
-            folder,
+            asked.folder,
             lambda share: progress("render", round(share * count), count),
-            seen="images" if images else "poses",
+            seen="images" if asked.images else "poses",
             touched=touched,
             exercised=exercised,
         )
@@ -140,11 +118,9 @@ def _tracked_too(name: str, described: NetworkOptions, instrument: Read) -> Netw
     return replace(described, instruments=(tracker,), points=points)
 
 
-def exercise_options(
-    robot: str, payload_kg: list[float] | None, seed: int, *, currents: bool
-) -> ExerciseOptions:
+def exercise_options(asked: SimulateOptions, robot: str, seed: int) -> ExerciseOptions:
     """An arm's motions, empty or with a cube on its flange."""
-    loads = payload_kg or [0.0]
+    loads = asked.payload_kg or [0.0]
     if len(loads) > 1:
         raise DataError(
             f"--payload-kg is given {len(loads)} times; with --torques the arm carries one load.",
@@ -153,5 +129,5 @@ def exercise_options(
         )
     inertia = loads[0] * 2.0 / 3.0 * _HALF_M**2 * np.eye(3)
     load = Body(loads[0], np.array(CENTRE_M), inertia) if loads[0] else None
-    senses = Senses(gains_nm_a=_GAINS_NM_A if currents else ())
+    senses = Senses(gains_nm_a=_GAINS_NM_A if asked.currents else ())
     return ExerciseOptions(robot, load, senses, seed=seed)

@@ -1,6 +1,5 @@
 """`visioncal target make` and `visioncal target check`."""
 
-import json
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
@@ -8,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import answers, messages
+from visioncal.cli.console import answers, print_json, say
 from visioncal.cli.lazy import PlainCommand, with_fields
 from visioncal.cli.options import AsJson
 from visioncal.core.errors import DataError
@@ -146,11 +145,11 @@ def make_command(
     sheet = arrange(chosen, pages)
     files = write_board(out, sheet, dpi=dpi, force=force)
     for file in files:
-        messages().print(escape(f"wrote {file}"))
+        say(f"wrote {file}")
     description = files[0].with_name(f"{chosen.name}.toml")
     if description not in files:
-        messages().print(escape(f"kept {description}, which describes this board already"))
-    messages().print(escape(f"Print it on {sheet.page} at 100 %, and check both rulers."))
+        say(f"kept {description}, which describes this board already")
+    say(f"Print it on {sheet.page} at 100 %, and check both rulers.")
 
 
 def _refuse_unused(kind: _Described | None, given: list[str]) -> None:
@@ -215,15 +214,15 @@ def check_command(
     if out is not None:
         write_atomically(out, description)
     if as_json:
-        typer.echo(json.dumps(to_document(identity, square_m), indent=2))
+        print_json(to_document(identity, square_m))
     elif out is None:
         typer.echo(description, nl=False)
     if out is not None:
         if not as_json:
             answers().print(escape(describe(identity)))
         for note in identity.notes:
-            messages().print(escape(note))
-        messages().print(escape(f"wrote {out}"))
+            say(note)
+        say(f"wrote {out}")
 
 
 def _checked(target: "Target") -> None:

@@ -1,13 +1,14 @@
-"""What `tcp` and `fixture` do with a session of images: a target on the tool or on the fixture."""
+"""What `tcp` and `fixture` do alike: a frame by touches, or by the images of a target on it."""
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
 
-from visioncal.cli.framing import FrameOptions, Place, keep_and_report
+from visioncal.cli.framing import FrameOptions, Place, TouchOptions, keep_and_report
+from visioncal.cli.options import PartOptions
 from visioncal.cli.parsing import numbers_in, refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from visioncal.frames.drawing_points import NominalPoints
     from visioncal.results import Calibration, Frame
     from visioncal.session import Session
-    from visioncal.session.choosing import Choice
 
 PointOption: TypeAlias = Annotated[
     str | None,
@@ -30,53 +30,68 @@ PointOption: TypeAlias = Annotated[
 ]
 
 
-def kept_by_images(
-    source: Path,
-    goes: FrameOptions,
-    choice: "Choice",
-    kind: FrameKind,
-    point_mm: str | None,
+@dataclass(frozen=True)
+class Asked:
+    """What `tcp` or `fixture` is asked for.
+
+    Attributes:
+        kind: What is to be placed.
+        source: What the user named: touches, as a table or a session, or a session of images.
+        goes: Where its frame goes.
+        written: How touches are written.
+        part: Which camera, robot and target of a whole cell are meant.
+        point_mm: Of images: the frame's origin in the target's frame, as the user wrote it.
+        as_json: Whether to print JSON.
+    """
+
+    kind: FrameKind
+    source: Path
+    goes: FrameOptions
+    written: TouchOptions
+    part: PartOptions
+    point_mm: str | None
+    as_json: bool
+
+
+def place_frame(
+    asked: Asked,
+    by_touches: "Callable[[Calibration | None], Frame]",
     drawing: "NominalPoints | None" = None,
-    *,
-    for_touches: Mapping[str, object],
-    as_json: bool,
-) -> bool:
-    """Places a tool or a fixture by a session's images, and keeps and reports it.
+    tool: str | None = None,
+) -> None:
+    """Places a tool or a fixture by touches or by a session's images, and keeps and reports it.
 
     Args:
-        source: What the user named.
-        goes: Where the frame goes.
-        choice: Which camera, robot and target are meant, of the session of a whole cell.
-        kind: What it is.
-        point_mm: Its origin in the target's frame, as the user wrote it.
-        drawing: Where markers on a fixture are; None where the session's target is all.
-        for_touches: The options that only touches have a use for, by their names; None for those
-            that were not given.
-        as_json: Whether to print JSON.
-
-    Returns:
-        Whether it was: not where the source has touches, as a table or as a session without images.
+        asked: What is asked for.
+        by_touches: Places it by touches, with what is known of the robot.
+        drawing: Where points or markers on a fixture are; None where none is given.
+        tool: What touched a fixture, as the user wrote it.
 
     Raises:
-        DataError: The session has both, cannot be read, does not show what is needed, or options
-            contradict each other.
+        DataError: The source cannot be read or does not show what is needed, or options contradict
+            each other.
     """
-    from visioncal.session.choosing import EYE
+    from visioncal.session.choosing import ARM, EYE, Choice
 
-    session = _image_session(source, for_touches)
+    kind, part = asked.kind, asked.part
+    session = _image_session(asked.source, {"--tool": tool, **asked.written.given()})
     if session is None:
-        return False
-    place = Place.of(goes, kind, replace(choice, target=None), EYE)
-    if place.calibration is None:
-        raise DataError(
-            f"session {session.name!r} has images, and the camera's calibration (-c) is needed to "
-            "place what they show.",
-            culprits=["-c"],
-            next_step="Name the output folder of visioncal calibrate.",
-        )
-    frame = _frame(session, place.calibration, kind, point_mm, drawing, choice, quiet=as_json)
-    keep_and_report(place, frame, source, as_json=as_json)
-    return True
+        own = "the tool's point" if kind == "tool" else "the fixture's origin"
+        refuse_given({"--point-mm": asked.point_mm}, f"touches say where {own} is")
+        refuse_given({"--camera": part.camera, "--target": part.target}, "touches need no camera")
+        place = Place.of(asked.goes, kind, Choice(robot=part.robot), ARM)
+        frame = by_touches(place.calibration)
+    else:
+        place = Place.of(asked.goes, kind, replace(part.choice, target=None), EYE)
+        if place.calibration is None:
+            raise DataError(
+                f"session {session.name!r} has images, and the camera's calibration (-c) is needed "
+                "to place what they show.",
+                culprits=["-c"],
+                next_step="Name the output folder of visioncal calibrate.",
+            )
+        frame = _by_images(asked, session, place.calibration, drawing)
+    keep_and_report(place, frame, asked.source, as_json=asked.as_json)
 
 
 def _image_session(source: Path, for_touches: Mapping[str, object]) -> "Session | None":
@@ -101,15 +116,11 @@ def _image_session(source: Path, for_touches: Mapping[str, object]) -> "Session 
     return session
 
 
-def _frame(
+def _by_images(
+    asked: Asked,
     session: "Session",
     calibration: "Calibration",
-    kind: FrameKind,
-    point_mm: str | None,
     drawing: "NominalPoints | None",
-    choice: "Choice",
-    *,
-    quiet: bool,
 ) -> "Frame":
     import numpy as np
 
@@ -118,10 +129,12 @@ def _frame(
     from visioncal.session.selecting import has_several, select
 
     if has_several(session):
-        session = select(session, choice, parted=False)
+        session = select(session, asked.part.choice, parted=False)
     if drawing is not None:
-        refuse_given({"--point-mm": point_mm}, "beside --cad the drawing's origin is the frame's")
+        refuse_given(
+            {"--point-mm": asked.point_mm}, "beside --cad the drawing's origin is the frame's"
+        )
         return marked_fixture(session, calibration, drawing)
-    point = numbers_in(point_mm or "0,0,0", "--point-mm", "x,y,z")
-    with shown_progress(quiet=quiet) as progress:
-        return seen_frame(session, calibration, kind, 1e-3 * np.array(point), progress=progress)
+    point = 1e-3 * np.array(numbers_in(asked.point_mm or "0,0,0", "--point-mm", "x,y,z"))
+    with shown_progress(quiet=asked.as_json) as progress:
+        return seen_frame(session, calibration, asked.kind, point, progress=progress)

@@ -1,14 +1,17 @@
 """`visioncal tcp`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from visioncal.cli.framing import FrameOptions, Place, TouchOptions, keep_and_report
+from visioncal.cli.framing import FrameOptions, TouchOptions
 from visioncal.cli.options import AsJson, PartOptions
-from visioncal.cli.parsing import refuse_given
-from visioncal.cli.target_in_images import PointOption, kept_by_images
+from visioncal.cli.target_in_images import Asked, PointOption, place_frame
+
+# Help does not wait for them.
+if TYPE_CHECKING:
+    from visioncal.results import Calibration, Frame
 
 
 def tcp_command(
@@ -34,17 +37,9 @@ def tcp_command(
     """
     from visioncal.frames.tcp import touched_tool
     from visioncal.interchange.formats.touches import read_touches
-    from visioncal.session.choosing import ARM, Choice
 
-    given = written.given()
-    if kept_by_images(
-        touches, goes, part.choice, "tool", point, for_touches=given, as_json=as_json
-    ):
-        return
-    refuse_given({"--camera": part.camera, "--target": part.target}, "touches need no camera")
-    refuse_given({"--point-mm": point}, "touches say where the tool's point is")
-    requested = written.requested()
-    place = Place.of(goes, "tool", Choice(robot=part.robot), ARM)
-    rows = read_touches(touches, requested, part.robot)
-    frame = touched_tool(rows, place.calibration, written.model, touch_noise_m=written.noise_m)
-    keep_and_report(place, frame, touches, as_json=as_json)
+    def by_touches(known: "Calibration | None") -> "Frame":
+        rows = read_touches(touches, written.requested(), part.robot)
+        return touched_tool(rows, known, written.model, touch_noise_m=written.noise_m)
+
+    place_frame(Asked("tool", touches, goes, written, part, point, as_json), by_touches)

@@ -1,6 +1,5 @@
 """`visioncal touch-test`."""
 
-import json
 import sys
 from collections.abc import Sequence
 from contextlib import closing, suppress
@@ -12,9 +11,17 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from visioncal.cli.console import answers, asked, messages, report_error, report_written
+from visioncal.cli.console import (
+    answers,
+    asked,
+    messages,
+    print_json,
+    report_error,
+    report_written,
+    say,
+)
 from visioncal.cli.options import AsJson, SessionArgument
-from visioncal.cli.parsing import numbers_in
+from visioncal.cli.parsing import named_result, numbers_in
 from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.number_format import figure
@@ -77,12 +84,7 @@ def touch_test_command(
     from visioncal.session import Session
 
     loaded = Session.load(session)
-    if calibration is None:
-        raise DataError(
-            "touch-test: the calibration to prove (-c) is needed.",
-            culprits=["-c"],
-            next_step="Name the output folder of visioncal calibrate.",
-        )
+    calibration = named_result(calibration, "-c", "touch-test: the calibration to prove")
     known = load_result(calibration)
     if known.cell is not None:
         raise DataError("touch-test is for one camera and one robot.", culprits=["-c"])
@@ -114,7 +116,7 @@ def touch_test_command(
     written = rewrite(calibration if calibration.is_dir() else calibration.parent, proved)
     if as_json:
         document = {"points": targets, "touch_test": to_document(proved)["touch_test"]}
-        typer.echo(json.dumps(document, indent=2))
+        print_json(document)
     else:
         answers().print(escape(finding_of(test).reason))
     report_written(written, quiet=as_json, status=0 if test.passed else _EXIT_LARGER)
@@ -147,7 +149,7 @@ def _report(
     points: "Sequence[TouchPoint]", targets: Sequence[dict[str, Any]], *, as_json: bool
 ) -> None:
     if as_json:
-        typer.echo(json.dumps({"points": targets}, indent=2))
+        print_json({"points": targets})
         return
     console = answers()
     console.print(_FORM)
@@ -249,7 +251,7 @@ def _gap() -> float:
             gap = float(line.replace(",", "."))
             if 0.0 <= gap < np.inf:
                 return gap
-        messages().print("  A length of 0 mm or more is needed, as 0.2.")
+        say("  A length of 0 mm or more is needed, as 0.2.")
 
 
 def _line(question: str) -> str:

@@ -10,8 +10,8 @@ from rich.markup import escape
 
 from visioncal.cli.console import answers, report_written
 from visioncal.cli.options import AsJson, PartOptions
+from visioncal.cli.parsing import named_result
 from visioncal.cli.progress import shown_progress
-from visioncal.core.errors import DataError
 from visioncal.interchange.outputs import REPORT, VERIFY, Written, refuse_calibration, write_check
 
 # Help does not wait for them.
@@ -72,17 +72,11 @@ def verify_command(
     from visioncal.results import picked
     from visioncal.session import Session
 
-    if against is None:
-        raise DataError(
-            "verify: the calibration to check (--against) is needed.",
-            culprits=["--against"],
-            next_step="Name the output folder of visioncal calibrate.",
-        )
+    against = named_result(against, "--against", "verify: the calibration to check")
     if output is not None:
         refuse_calibration(output)
     triggers = load_policy(policy)
-    choice = part.choice
-    loaded, calibration = picked(Session.load(session), load_result(against), choice)
+    loaded, calibration = picked(Session.load(session), load_result(against), part.choice)
     with shown_progress(quiet=as_json) as progress:
         check = verify(loaded, calibration, board_placed_anew=board_moved, progress=progress)
     facts = facts_of(loaded, calibration, failed=not check.passed, collision=collision)

@@ -1,14 +1,12 @@
 """What `visioncal dynamics payload` and `gains` find by a body on the flange, and its report."""
 
-import json
-from pathlib import Path
-
 import numpy as np
 import typer
-from rich.markup import escape
 
-from visioncal.cli.console import messages
-from visioncal.cli.dynamics import StreamOptions, identified_of
+from visioncal.cli.console import print_json, say
+from visioncal.cli.dynamics import identified_of
+from visioncal.cli.dynamics_gains import GainsOptions
+from visioncal.cli.dynamics_payload import PayloadOptions
 from visioncal.cli.parsing import numbers_in
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import matched, significant
@@ -27,66 +25,47 @@ from visioncal.robot import Inertias, matrices
 from visioncal.session import Session
 
 
-def print_payload(
-    session: Path,
-    streams: StreamOptions,
-    against: Path | None,
-    *,
-    same_friction: bool,
-    gains_sigma: float,
-    as_json: bool,
-) -> None:
+def print_payload(asked: PayloadOptions) -> None:
     """Weighs what the flange carries.
 
     Raises:
         DataError: Nothing was identified before, or the streams do not determine the payload.
     """
-    identified = identified_of(against, "payload")
-    loaded = conditioned_streams(Session.load(session), identified, streams.request())
+    identified = identified_of(asked.against, "payload")
+    loaded = conditioned_streams(Session.load(asked.session), identified, asked.streams.request())
     found = estimate_payload(
-        identified, loaded, friction_changes=not same_friction, gain_sigma=0.01 * gains_sigma
+        identified,
+        loaded,
+        friction_changes=not asked.same_friction,
+        gain_sigma=0.01 * asked.gains_sigma,
     )
-    if as_json:
-        typer.echo(json.dumps(found.document(), indent=2))
+    if asked.as_json:
+        print_json(found.document())
         return
     for note in (note for it in loaded for note in it.notes):
-        messages().print(escape(note))
+        say(note)
     typer.echo("\n".join(_lines(found)))
 
 
-def print_gains(
-    session: Path,
-    loaded: Path,
-    body: FloatArray,
-    *,
-    cutoff_hz: float | None,
-    named: str | None,
-    as_json: bool,
-) -> None:
+def print_gains(asked: GainsOptions) -> None:
     """Finds the gains of an arm's drives by a body on its flange.
 
-    Args:
-        session: A session of the arm without the body.
-        loaded: One with it.
-        body: (10,) The body's inertial parameters in the flange's frame.
-        cutoff_hz: Of the low-pass, where it is given [Hz].
-        named: Which robot of a whole cell is meant.
-        as_json: Prints the document in the place of words.
-
     Raises:
-        DataError: The sessions cannot be read, or have no currents.
+        DataError: There is no such body, or the sessions cannot be read or have no currents.
     """
-    without = of_one_arm(Session.load(session), named)
+    body = _body(asked)
+    without = of_one_arm(Session.load(asked.session), asked.named)
     robot = robot_of(without)
-    empty = current_streams(without, robot, cutoff_hz)
+    empty = current_streams(without, robot, asked.cutoff_hz)
     full = current_streams(
-        of_one_arm(Session.load(loaded), named), robot, cutoff_hz or empty[0].cutoff_hz
+        of_one_arm(Session.load(asked.loaded), asked.named),
+        robot,
+        asked.cutoff_hz or empty[0].cutoff_hz,
     )
     base = BaseModel.reduce(DynamicModel(robot, FrictionTerms(motor_inertia=True)))
     found = drive_gains(base, empty, full, body)
-    if as_json:
-        document = [_row(name, found, at) for at, name in enumerate(robot.joint_names)]
-        typer.echo(json.dumps(document, indent=2))
+    if asked.as_json:
+        print_json([_row(name, found, at) for at, name in enumerate(robot.joint_names)])
         return
     _report_gains(robot.joint_names, found)
 
@@ -130,18 +109,14 @@ def _ur_words(found: Payload) -> str:
     return f"set_target_payload({found.mass_kg:.4f}, [{centre}], [{inertia}])"
 
 
-def body_of(mass_kg: float, com_mm: str, inertia: str) -> FloatArray:
-    """(10,) the body's inertial parameters in the flange's frame.
-
-    Raises:
-        DataError: There is no such body.
-    """
-    centre = 1e-3 * np.array(numbers_in(com_mm, "--com-mm", "x,y,z"))
-    about = matrices(np.array(numbers_in(inertia, "--inertia", "xx,xy,yy,xz,yz,zz")))
-    body = Inertias.of_bodies(np.array([mass_kg]), centre[None], about[None])
-    if not (mass_kg > 0.0 and body.consistent):
+def _body(asked: GainsOptions) -> FloatArray:
+    """(10,) the body's inertial parameters in the flange's frame."""
+    centre = 1e-3 * np.array(numbers_in(asked.com_mm, "--com-mm", "x,y,z"))
+    about = matrices(np.array(numbers_in(asked.inertia, "--inertia", "xx,xy,yy,xz,yz,zz")))
+    body = Inertias.of_bodies(np.array([asked.mass_kg]), centre[None], about[None])
+    if not (asked.mass_kg > 0.0 and body.consistent):
         raise DataError(
-            f"--mass-kg {mass_kg:g} and --inertia {inertia} are those of no body.",
+            f"--mass-kg {asked.mass_kg:g} and --inertia {asked.inertia} are those of no body.",
             culprits=["--mass-kg", "--inertia"],
             next_step="A mass above 0 kg is needed, and an inertia about its centre; none stands "
             "for a body as small as a point.",
@@ -164,12 +139,12 @@ def _report_gains(names: tuple[str, ...], found: Gains) -> None:
         words = "not determined: the body hardly moves it"
         if determined:
             words = f"{matched(gain, sigma)} N m/A (sigma {significant(sigma)})"
-        messages().print(escape(f"{name}: {words}"))
+        say(f"{name}: {words}")
     if found.determined.all():
         gains = ",".join(f"{it:.5g}" for it in found.nm_per_a)
         typer.echo(f"--gains {gains}")
     else:
-        messages().print(
+        say(
             "--gains needs all joints: move those that are not determined more, or take a body "
             "that is heavier or whose centre is farther from their axes."
         )

@@ -8,6 +8,7 @@ from typing import Any
 from visioncal.core.documents.yamls import read_yaml
 from visioncal.core.errors import DataError
 from visioncal.core.files import Table
+from visioncal.core.types import Target
 from visioncal.vision.targets import metres, read_target, target_from_document, target_names
 
 _MM = r"([0-9]{1,5}(?:\.[0-9]{1,9})?)mm"
@@ -49,6 +50,11 @@ def described_target(words: str) -> Mapping[str, Any]:
         return read_target(words, None)[1]
     target_from_document(document, words)
     return document
+
+
+def target_named(words: str, name: str = "") -> Target:
+    """The target that `described_target` finds, called by its words where it has no other name."""
+    return target_from_document(described_target(words), name or words)
 
 
 def _of_kalibr(path: Path) -> dict[str, Any]:
