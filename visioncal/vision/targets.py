@@ -411,29 +411,20 @@ def metres(millimetres: float) -> float:
     return float(Decimal(str(millimetres)) / 1000)
 
 
+# What a description says of each kind beside that, and where a target calls it otherwise.
+_OF_SQUARES = "columns rows square_m square_sigma_m"
+_FORMS: Mapping[TargetKind, str] = {
+    "checkerboard": _OF_SQUARES,
+    "charuco": f"{_OF_SQUARES} marker_m dictionary legacy",
+    "circles": f"{_OF_SQUARES} diameter_m asymmetric",
+    "aprilgrid": "columns rows size_m square_sigma_m spacing dictionary id border",
+    "marker": "id size_m square_sigma_m dictionary",
+}
+_NAMES = {"id": "marker_id", "size_m": "square_m"}
+
+
 def target_document(target: Target) -> dict[str, Any]:
     """Writes a target as the content of a `.toml`, which `target_from_document` reads back."""
-    document: dict[str, Any]
-    if target.kind == "marker":
-        return {
-            "kind": "marker",
-            "id": target.marker_id,
-            "size_m": target.square_m,
-            "square_sigma_m": target.square_sigma_m,
-            "dictionary": target.dictionary,
-        }
-    if target.kind == "aprilgrid":
-        return {
-            "kind": "aprilgrid",
-            "columns": target.columns,
-            "rows": target.rows,
-            "size_m": target.square_m,
-            "square_sigma_m": target.square_sigma_m,
-            "spacing": target.spacing,
-            "dictionary": target.dictionary,
-            "id": target.marker_id,
-            "border": target.border,
-        }
     if target.kind == "points":
         x_m, y_m, z_m = corner_positions(target).T.tolist()
         tags = np.reshape(target.point_tags, (-1, 2)).T.astype(int).tolist()
@@ -441,22 +432,32 @@ def target_document(target: Target) -> dict[str, Any]:
         rig = dict(zip(RIG_COLUMNS, columns, strict=True))
         document = {"kind": "points", "points": {name: it for name, it in rig.items() if it}}
         return document | ({"dictionary": target.dictionary} if target.point_tags else {})
-    document = {
-        "kind": target.kind,
-        "columns": target.columns,
-        "rows": target.rows,
-        "square_m": target.square_m,
-        "square_sigma_m": target.square_sigma_m,
-    }
-    if target.kind == "circles":
-        document |= {"diameter_m": target.diameter_m, "asymmetric": target.asymmetric}
-    if target.kind == "charuco":
-        document |= {
-            "marker_m": target.marker_m,
-            "dictionary": target.dictionary,
-            "legacy": target.legacy,
-        }
-    return document
+    fields = {key: getattr(target, _NAMES.get(key, key)) for key in _FORMS[target.kind].split()}
+    return {"kind": target.kind, **fields}
+
+
+def board_words(target: Target, least: str = "") -> str:
+    """Names a target in a few words, but for its size.
+
+    Args:
+        target: It.
+        least: What stands before its columns and rows, where it may have more.
+    """
+    size = f"{least}{target.columns} x {target.rows}"
+    match target.kind:
+        case "checkerboard":
+            return f"checkerboard of {size} inner corners"
+        case "charuco":
+            layout = ", legacy layout" if target.legacy else ""
+            return f"ChArUco board of {size} squares, {target.dictionary}{layout}"
+        case "marker":
+            return f"marker {target.marker_id} of {target.dictionary}"
+        case "circles":
+            return f"{'asymmetric' if target.asymmetric else 'symmetric'} grid of {size} circles"
+        case "aprilgrid":
+            return f"AprilGrid of {size} tags, {target.dictionary} from id {target.marker_id}"
+        case _:
+            return f"target of kind {target.kind}"
 
 
 def corner_positions(target: Target) -> FloatArray:

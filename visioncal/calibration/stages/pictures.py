@@ -17,7 +17,7 @@ from visioncal.session.images import FolderImages
 from visioncal.vision.finders.identify import Identity, identify
 from visioncal.vision.finders.identify_text import describe
 from visioncal.vision.finders.imaging import blur_of_edges, decode_image, why_hard_to_see
-from visioncal.vision.targets import load_target, marker_cells, target_names
+from visioncal.vision.targets import board_words, load_target, marker_cells, target_names
 
 # So many names are listed, and so many images are searched for whatever board they show.
 _LISTED, _LOOKED_AT = 6, 3
@@ -274,7 +274,7 @@ def _another(view: View, found: Identity, declared: Target) -> Finding:
     words = (
         "The images show another board than declared: "
         f"{_article(describe(found))} (view {view.number}), "
-        f"and {declared.name} is {_article(_declared(declared))}.{_miscounted(found, declared)}"
+        f"and {declared.name} is {_article(board_words(declared))}.{_miscounted(found, declared)}"
     )
     return Finding("other_board", words, step, (view.number,))
 
@@ -348,24 +348,6 @@ def _made_from(view: View, declared: Target) -> str:
 
 def _as_large(one: Target, other: Target) -> bool:
     return abs(one.square_m / other.square_m - 1.0) < _SAME_SIZE
-
-
-def _declared(target: Target) -> str:
-    if target.kind == "checkerboard":
-        return f"checkerboard of {target.columns} x {target.rows} inner corners"
-    if target.kind == "charuco":
-        layout = ", legacy layout" if target.legacy else ""
-        size = f"{target.columns} x {target.rows} squares"
-        return f"ChArUco board of {size}, {target.dictionary}{layout}"
-    if target.kind == "marker":
-        return f"marker {target.marker_id} of {target.dictionary}"
-    if target.kind == "circles":
-        layout = "asymmetric" if target.asymmetric else "symmetric"
-        return f"{layout} grid of {target.columns} x {target.rows} circles"
-    if target.kind == "aprilgrid":
-        size = f"{target.columns} x {target.rows} tags"
-        return f"AprilGrid of {size}, {target.dictionary} from id {target.marker_id}"
-    return f"target of kind {target.kind}"
 
 
 def _mirrored(view: View) -> Finding:

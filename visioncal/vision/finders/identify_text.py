@@ -4,7 +4,7 @@ from typing import Any
 
 from visioncal.core.files import one_line
 from visioncal.vision.finders.identify import Identity
-from visioncal.vision.targets import target_document
+from visioncal.vision.targets import board_words, target_document
 
 
 def to_document(identity: Identity, square_m: float | None) -> dict[str, Any]:
@@ -88,27 +88,17 @@ def to_toml(identity: Identity, square_m: float | None, source: str) -> str:
 
 def describe(identity: Identity) -> str:
     """Names a target in a few words."""
-    seen = f"{identity.corners_seen} of {identity.corners} corners seen"
+    words = board_words(identity.target("board", 1.0), "" if identity.whole else "at least ")
     if identity.kind == "marker":
-        return f"marker {identity.marker_ids[0]} of {identity.dictionary}"
-    least = "" if identity.whole else "at least "
-    size = f"{least}{identity.columns} x {identity.rows}"
-    if identity.kind == "checkerboard":
-        return f"checkerboard of {size} inner corners, {seen}"
-    if identity.kind == "circles":
-        layout = "asymmetric" if identity.asymmetric else "symmetric"
-        share = f"diameter of {identity.diameter_share:.2f} of their rows' distance"
-        return f"{layout} grid of {size} circles, {share}, {seen}"
-    if identity.kind == "aprilgrid":
-        return (
-            f"AprilGrid of {size} tags, {identity.dictionary} from id {identity.first_id}, "
-            f"{identity.spacing:g} of a tag apart, {seen}"
-        )
-    layout = ", legacy layout" if identity.legacy else ""
-    return (
-        f"ChArUco board of {size} squares, {identity.dictionary}{layout}, "
-        f"markers of {identity.marker_share:.3f} of a square, {seen}"
-    )
+        return words
+    more = {
+        "circles": f"diameter of {identity.diameter_share:.2f} of their rows' distance",
+        "aprilgrid": f"{identity.spacing:g} of a tag apart",
+        "charuco": f"markers of {identity.marker_share:.3f} of a square",
+    }
+    own = (more[identity.kind],) if identity.kind in more else ()
+    seen = f"{identity.corners_seen} of {identity.corners} corners seen"
+    return ", ".join([words, *own, seen])
 
 
 def _remark(identity: Identity, key: str) -> str:
