@@ -109,10 +109,10 @@ def arm_row(options: Tracked, worlds: int) -> str:
         seconds = time.process_time() - begun
         q = postures(known.robot)
         error = rms(np.linalg.norm(places(known, q) - true_places(shop, q), axis=1))
-        level = known.robot_arm.kinematics.levels[0]
+        level = known.robot_arm.kinematics.result.levels[0]
         predicted = known.findings.arms[0].workspace_mm or float("nan")
         found.append(
-            (level.inside.mm, 1e3 * error, 1e3 * workspace_bound(shop, q), predicted, seconds)
+            (level.rms_mm, 1e3 * error, 1e3 * workspace_bound(shop, q), predicted, seconds)
         )
         levels.append(known.robot_arm.kinematics.level)
     before, after, bound, predicted, seconds = np.array(found).T
@@ -151,7 +151,7 @@ def example_a(worlds: int) -> str:
         known = known_of(session_of(shop))
         q = postures(known.robot)
         held.append(1e3 * rms(np.linalg.norm(places(known, q) - true_places(shop, q), axis=1)))
-        before.append(known.robot_arm.kinematics.levels[0].inside.mm)
+        before.append(known.robot_arm.kinematics.result.nominal.rms_mm)
         conditions.append(parameter_conditions(shop))
         taken.append(known.robot_arm.kinematics.level)
     stated, metres, millimetres, scaled = np.median(conditions, axis=0)
@@ -291,12 +291,12 @@ def rokae() -> str:
     """A laser's poses of a six-axis arm."""
     known = known_of(thirdparty.rokae(DATA))
     folds = cross_validated(lambda held: thirdparty.rokae(DATA, held), 30)
-    levels = [it for it in known.robot_arm.kinematics.levels if it.name == "geometry"]
+    levels = [it for it in known.robot_arm.kinematics.result.levels if it.level == "geometry"]
     found = known.findings.rms
     return prose(
         f"""**ROKAE-type arm**: 30 poses by a laser that is taken as of 0.02 mm and 0.1 mrad.
         {told(known)} In sample {found.mm:.3f} mm and {found.deg:.3f} deg rms
-        ({levels[0].inside.mm:.3f} mm with the geometry alone); in ten folds, with the level chosen
+        ({levels[0].rms_mm:.3f} mm with the geometry alone); in ten folds, with the level chosen
         anew, {rms(folds[:, 0]):.3f} mm and {rms(folds[:, 1]):.3f} deg rms, in the median
         {np.median(folds[:, 0]):.3f} mm."""
     )
@@ -315,10 +315,10 @@ def talos() -> str:
 
 def told(known: RunState) -> str:
     """What the method says of its trust."""
-    held, levels = known.findings.held_out, known.robot_arm.kinematics.levels
+    held, levels = known.findings.held_out, known.robot_arm.kinematics.result.levels
     workspace_mm = known.findings.arms[0].workspace_mm
     return (
-        f"Level {known.robot_arm.kinematics.level} ({levels[0].inside.mm:.2f} mm with the nominal "
+        f"Level {known.robot_arm.kinematics.level} ({levels[0].rms_mm:.2f} mm with the nominal "
         f"arm); left out in turn, readings are predicted to {held.mm:.3f} mm rms; all over the "
         f"workspace to {workspace_mm:.2g} mm (sigma, median); verdict {known.verdict.status}."
     )

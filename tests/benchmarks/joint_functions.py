@@ -220,7 +220,7 @@ def cross_row(words: str, session: Session, other: Recording) -> str:
     levels = [it.robot_arm.kinematics for it in (before, ours)]
     return (
         f"| {words} | {levels[1].level} "
-        f"| {levels[0].chosen.left_out.mm:.3f}, {levels[1].chosen.left_out.mm:.3f} "
+        f"| {levels[0].result.chosen.held_out_mm:.3f}, {levels[1].result.chosen.held_out_mm:.3f} "
         f"| {found.nominal_mm:.2f} | {was.mm:.3f} | {was.ratio:.1f} | {found.mm:.3f} "
         f"| {found.ratio:.2f} | {found.framed_mm:.3f} | {seconds:.0f} |"
     )
@@ -252,10 +252,10 @@ def crossings(folder: Path) -> list[str]:
 def within(words: str, session: Session) -> str:
     """One line of the second table: stops left out, before and now."""
     before, ours = without_functions(session), known_of(session)
-    was, now = before.robot_arm.kinematics, ours.robot_arm.kinematics
+    was, now = (it.robot_arm.kinematics.result for it in (before, ours))
     return (
-        f"| {words} | {was.levels[0].left_out.mm:.3f} | {was.level}, {was.chosen.left_out.mm:.3f} "
-        f"| {now.level}, {now.chosen.left_out.mm:.3f} | {ours.verdict.status} |"
+        f"| {words} | {was.nominal.held_out_mm:.3f} | {was.level}, {was.chosen.held_out_mm:.3f} "
+        f"| {now.level}, {now.chosen.held_out_mm:.3f} | {ours.verdict.status} |"
     )
 
 
@@ -340,7 +340,7 @@ class World:
         known = known_of(session_of(shop))
         result, arm = result_of(known), known.robot_arm
         edges = known.solved.state.edges
-        stated = arm.kinematics.fits[0].fit.state.edges
+        stated = arm.kinematics.nominal.fit.state.edges
         written = document(result, "robot-dh")
         beside = document(result, "robot-dh", Selection(with_corrections=True))
         alone, plain = (Robot.from_document(tomllib.loads(it.text)) for it in (written, beside))

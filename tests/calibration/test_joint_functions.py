@@ -86,9 +86,9 @@ def test_the_predicted_error_is_the_error(shop, known):
 
 
 def test_left_out_stops_fit_worse_and_no_one_complains(known):
-    chosen = known.robot_arm.kinematics.levels[-1]
-    assert chosen.left_out.mm > chosen.inside.mm
-    assert chosen.left_out.mm < 0.3 * known.robot_arm.kinematics.levels[0].left_out.mm
+    chosen = known.robot_arm.kinematics.result.levels[-1]
+    assert chosen.held_out_mm > chosen.rms_mm
+    assert chosen.held_out_mm < 0.3 * known.robot_arm.kinematics.result.levels[0].held_out_mm
     assert "optimism" not in [it.kind for it in known.verdict.findings]
 
 
@@ -123,7 +123,7 @@ def test_places_alone_tell_of_them():
 
 def test_where_it_carries_over_is_what_is_predicted_there(known):
     found = arm_found(known).carries
-    assert found.measured_mm == known.robot_arm.kinematics.chosen.left_out.mm
+    assert found.measured_mm == known.robot_arm.kinematics.result.chosen.held_out_mm
     # The wave's own noise and another session's share come on top of what is not known of the arm.
     squares = [found.session_mm**2, 1e6 * np.mean(sigmas_m(known) ** 2)]
     assert found.sigma_mm**2 > squares[0]
@@ -237,7 +237,7 @@ def test_a_check_of_an_unchanged_cell_passes_and_a_bump_is_seen(tmp_path):
 def test_corrected_targets_reach_where_functions_would_have_led_them_astray(shop, known):
     result, q = result_of(known), 0.9 * Q[:40]
     x, z = known.solved.state.edges[:2]
-    stated = known.robot_arm.kinematics.fits[0].fit.state.edges
+    stated = known.robot_arm.kinematics.nominal.fit.state.edges
     wanted = known.robot.base_from_flange(q)
     sent = correct(result, wanted, q)
     assert sent.reached.all()

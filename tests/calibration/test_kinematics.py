@@ -44,9 +44,9 @@ def test_offsets_alone_are_told_from_wrong_links():
     cell = simulate(replace(GOOD, offset_sigma_rad=1e-3, seed=1))
     known = calibrated(cell)
     assert known.robot_arm.kinematics.level == "offsets"
-    by_name = {it.name: it for it in known.robot_arm.kinematics.levels}
-    assert by_name["offsets"].left_out.mm < 0.3 * by_name["nominal"].left_out.mm
-    assert by_name["offsets"].left_out.mm < 1.05 * by_name["geometry"].left_out.mm
+    by_name = {it.level: it for it in known.robot_arm.kinematics.result.levels}
+    assert by_name["offsets"].held_out_mm < 0.3 * by_name["nominal"].held_out_mm
+    assert by_name["offsets"].held_out_mm < 1.05 * by_name["geometry"].held_out_mm
     # Those of the first and the last joint hide in base and tool; the others are told to 0.1 mrad.
     found = known.robot_arm.model.robot.chain.functions[1:5, 0]
     true = (cell.true_arm.offset - cell.arm.offset)[1:5]
@@ -158,7 +158,7 @@ def test_a_right_arm_stays_nominal():
     known = calibrated(simulate(replace(GOOD, seed=3)))
     assert known.robot_arm.kinematics.level == "nominal"
     assert known.robot_arm.model is None
-    assert [it.name for it in known.robot_arm.kinematics.levels] == ["nominal"]
+    assert [it.level for it in known.robot_arm.kinematics.result.levels] == ["nominal"]
 
 
 def test_without_joints_no_level_can_be_asked_for():

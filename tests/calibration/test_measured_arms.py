@@ -10,7 +10,7 @@ from support.tracked import known_of
 def test_an_irb_120_by_a_measuring_arm(real_data):
     known = known_of(thirdparty.irb120(real_data))
     # 4.67 mm in the mean, the frames fitted.
-    assert known.robot_arm.kinematics.levels[0].inside.mm > 4.0
+    assert known.robot_arm.kinematics.result.nominal.rms_mm > 4.0
     assert known.findings.held_out.mm < 0.3
     assert known.verdict.status == "good"
     for joints, read, limit in (
@@ -30,7 +30,7 @@ def test_an_irb_120_by_a_measuring_arm(real_data):
 
 def test_a_six_axis_arm_by_a_laser(real_data):
     known = known_of(thirdparty.rokae(real_data))
-    assert known.robot_arm.kinematics.levels[0].inside.mm > 2.0
+    assert known.robot_arm.kinematics.result.nominal.rms_mm > 2.0
     # Plain least squares leave 0.099 mm and 0.038 deg in the fit; left out they are at 0.12 mm.
     assert known.findings.rms.mm < 0.1
     assert known.findings.rms.deg < 0.03

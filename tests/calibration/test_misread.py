@@ -160,9 +160,9 @@ def test_a_lost_encoder_is_found_and_not_thrown_away(with_poses):
     poses = load_robot("ur5e").base_from_flange(joints) if with_poses else None
     known = finished(replace(told, joints=joints, poses=poses))
     assert known.robot_arm.kinematics.level != "nominal"
-    nominal, *others = known.robot_arm.kinematics.levels
-    assert nominal.left_out.mm > 10.0
-    assert others[-1].left_out.mm < 0.5
+    nominal, *others = known.robot_arm.kinematics.result.levels
+    assert nominal.held_out_mm > 10.0
+    assert others[-1].held_out_mm < 0.5
     (lost,) = (it for it in known.verdict.findings if it.kind == "misread_joints")
     assert lost.do.words.startswith("Home elbow_joint anew")
     assert "visioncal export OUT --to robot-urdf" in lost.do.command

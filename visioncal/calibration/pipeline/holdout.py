@@ -102,7 +102,7 @@ def held_by_both_arms(solved: Solved, looked: Observed, robot: str) -> tuple[Uns
     was, now = (
         np.stack(apart(problem, _in(problem, state))[::-1], axis=1)
         for problem, state in (
-            (stated, arm.kinematics.fits[0].fit.state),
+            (stated, arm.kinematics.nominal.fit.state),
             (held.problem, solved.agreed.fit.state),
         )
     )

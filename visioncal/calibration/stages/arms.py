@@ -184,8 +184,8 @@ class RobotArm:
         """Twice what functions of its joints gain of the log-likelihood; zero without any."""
         if self.kinematics is None or self.kinematics.functions is None:
             return 0.0
-        level, ratios = self.kinematics, [it.likelihood_ratio for it in self.kinematics.levels]
-        return level.chosen.likelihood_ratio - max(ratios[:-1])
+        *others, functions = (it.gain for it in self.kinematics.fits.values())
+        return functions - max(others)
 
     def at(self, stops: IntArray) -> Self:
         """The arm at (k,) of its stops."""
@@ -405,7 +405,7 @@ class RobotArm:
         sections = ArmSections(
             arm_errors=_size_of(self.errors) if self.errors and self.errors.is_likely else None,
             thermal=found.drift,
-            arm=None if self.kinematics is None else self.kinematics.result(),
+            arm=None if self.kinematics is None else self.kinematics.result,
         )
         if sections.arm is None or self.kinematics is None or self.model is None:
             return sections
@@ -481,7 +481,7 @@ class RobotArm:
         if self.model is None:
             return arm
         # Fewer views agree than when it was calibrated: its errors are sought as of a stated one.
-        fit = found.fits[0].fit
+        fit = found.nominal.fit
         likelihood = robot_likelihood(problem, fit.state, fit.noise)
         return replace(arm, model=None).with_errors(likelihood, problem.robots.index(self.robot))
 

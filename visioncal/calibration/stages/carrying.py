@@ -61,8 +61,8 @@ def carries_over(arm: ArmData, kinematics: Kinematics) -> CarriesOver:
     away = ~boxed if (~boxed).any() else boxed
     sigma_mm, nominal_mm = (1e3 * _rms(it[away]) for it in (found.sigmas_m, found.nominal_m))
     return CarriesOver(
-        measured_mm=kinematics.chosen.left_out.mm,
-        measured_nominal_mm=kinematics.levels[0].left_out.mm,
+        measured_mm=kinematics.result.chosen.held_out_mm,
+        measured_nominal_mm=kinematics.result.nominal.held_out_mm,
         sigma_mm=sigma_mm,
         nominal_mm=nominal_mm,
         session_mm=1e3 * found.session_m,
@@ -96,7 +96,7 @@ def _predicted(arm: ArmData, kinematics: Kinematics) -> Predicted:
     session_m = _SESSION_SHARE * float(np.linalg.norm(places, axis=1).max())
     known = arm.place_sigmas_m(q) ** 2
     variances = known + np.einsum("mij,j,mij->m", moved, noise, moved) + session_m**2
-    stated = ArmPair.of(arm.problem, kinematics.fits[0].fit.state, arm.robot)
+    stated = ArmPair.of(arm.problem, kinematics.nominal.fit.state, arm.robot)
     away = _place(arm, arm.pair, arm.model.base_from_flange(q)) - _place(
         arm, stated, arm.model.nominal.base_from_flange(q) @ arm.model.flange_from_reported
     )

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -49,74 +50,46 @@ FUNCTIONS, _FEWEST_STOPS = "functions", 20
 _ALL = ("auto", "thermal")
 
 
-@dataclass(frozen=True)
-class Level:
-    """What a level of the arm's model makes of the views.
-
-    Attributes:
-        name: `nominal`, or a name among `LEVELS`.
-        unknowns: How many columns it carries.
-        inside: Residuals of the target's pose in the fit.
-        left_out: Residuals of stops that are left out in turn.
-        likelihood_ratio: Twice the gain in log-likelihood over the nominal arm.
-        sizes: How many sizes of errors were estimated for it, one a block.
-    """
-
-    name: str
-    unknowns: int
-    inside: Rms
-    left_out: Rms
-    likelihood_ratio: float
-    sizes: int
-
-    def result(self) -> ArmLevel:
-        """The level as a section of a calibration."""
-        return ArmLevel(
-            level=self.name,
-            unknowns=self.unknowns,
-            rms_mm=self.inside.mm,
-            rms_deg=self.inside.deg,
-            held_out_mm=self.left_out.mm,
-            held_out_deg=self.left_out.deg,
-            likelihood_ratio=self.likelihood_ratio,
-        )
-
-
 @dataclass(frozen=True, eq=False)
 class Kinematics:
     """The level of the arm's model that the views speak for.
 
     Attributes:
         level: Its name; `nominal` where none explains more than chance.
-        levels: All that were tried, the nominal arm first.
-        errors: Its errors by block.
+        fits: Those of all that were tried, the nominal arm's first.
         was_asked: Whether the user named the level.
-        fits: The fits of the nominal arm and of that level.
         views: (m,) by which view each residual of these goes.
         functions: Of its joints; None where they are not beyond chance.
     """
 
     level: str
-    levels: tuple[Level, ...]
-    errors: Mapping[str, ArmErrors]
+    fits: Mapping[str, LevelFit]
     was_asked: bool
-    fits: tuple[LevelFit, LevelFit]
     views: tuple[int, ...] = ()
     functions: JointFunctions | None = None
 
     @property
-    def chosen(self) -> Level:
-        """The level that was taken."""
-        return next(it for it in self.levels if it.name == self.level)
+    def nominal(self) -> LevelFit:
+        """The fit of the nominal arm."""
+        return self.fits[NOMINAL]
+
+    @property
+    def errors(self) -> Mapping[str, ArmErrors]:
+        """The arm's errors by block, as the level has them."""
+        return self.fits[self.level].errors
 
     def left_out(self) -> tuple[UnseenView, ...]:
         """How far stops that are left out in turn are off by both arms, by view."""
-        before, after = (np.linalg.norm(it.left_out.reshape(-1, 2, 3), axis=2) for it in self.fits)
-        return unseen_views(self.views, before, after, self.fits[0].has_rotation)
+        before, after = (
+            np.linalg.norm(it.left_out.reshape(-1, 2, 3), axis=2)
+            for it in (self.nominal, self.fits[self.level])
+        )
+        return unseen_views(self.views, before, after, self.nominal.has_rotation)
 
+    @cached_property
     def result(self) -> ArmResult:
         """The levels that were compared, as a section of a calibration."""
-        return ArmResult(level=self.level, levels=tuple(it.result() for it in self.levels))
+        return ArmResult(level=self.level, levels=tuple(map(_level, self.fits, self.fits.values())))
 
 
 def unseen_views(
@@ -175,16 +148,11 @@ def choose_level(
             nominal = fit_level(ArmTrials(stated, state, robot, bases, noise))
             fits = _with_lost_zero(fits, problem, stated, nominal, bases)
     found = {name: fit for name, fit in fits.items() if fit is not None}
-    levels = tuple(_level(name, fit) for name, fit in found.items())
     least = (NOMINAL,) if stated is None else (NOMINAL, "offsets")
-    best = _best([it for it in levels if it.name in (*least, *ASKED[asked])])
+    best = _best({name: it for name, it in found.items() if name in (*least, *ASKED[asked])})
     with one_blas_thread():
-        chosen = resized(arm, found[best.name])
-    levels = tuple(
-        _level(it, chosen) if it == best.name else was
-        for it, was in zip(found, levels, strict=True)
-    )
-    return Kinematics(best.name, levels, chosen.errors, asked not in _ALL, (found[NOMINAL], chosen))
+        found[best] = resized(arm, found[best])
+    return Kinematics(best, found, asked not in _ALL)
 
 
 def with_functions(
@@ -231,9 +199,7 @@ def with_functions(
     return replace(
         found,
         level=FUNCTIONS,
-        levels=(*found.levels, _level(FUNCTIONS, fit)),
-        errors=fit.errors,
-        fits=(found.fits[0], fit),
+        fits={**found.fits, FUNCTIONS: fit},
         functions=functions,
     )
 
@@ -264,24 +230,34 @@ def _unlikeliness(problem: Problem, fit: LevelFit) -> float:
     return robot_levels(problem, fit.fit.state, starting_noise(problem), from_above=True)[1]
 
 
-def _best(levels: Sequence[Level]) -> Level:
+def _best(fits: Mapping[str, LevelFit]) -> str:
     """The likeliest level that predicts better than the first one, by more than chance each."""
     # The price of all its columns is in a level's likelihood, but for that of their size. Of two
     # levels with as many sizes, such as offsets or links, neither is the simpler one: to prefer
     # offsets would leave links that are off by as little out of the covariance.
-    best = levels[0]
-    for level in levels[1:]:
-        better = level.left_out.mm < levels[0].left_out.mm
-        margin = SIGNIFICANT if level.sizes > best.sizes else 0.0
-        if better and level.likelihood_ratio - best.likelihood_ratio > margin:
-            best = level
+    best, *others = fits
+    off_mm = {name: _rms(it.left_out, it.has_rotation).mm for name, it in fits.items()}
+    nominal_mm = off_mm[best]
+    for name in others:
+        more_sizes = len(fits[name].errors) > len(fits[best].errors)
+        margin = SIGNIFICANT if more_sizes else 0.0
+        if off_mm[name] < nominal_mm and fits[name].gain - fits[best].gain > margin:
+            best = name
     return best
 
 
-def _level(name: str, fit: LevelFit) -> Level:
+def _level(name: str, fit: LevelFit) -> ArmLevel:
     """Writes a fit as figures."""
     inside, left_out = (_rms(it, fit.has_rotation) for it in (fit.inside, fit.left_out))
-    return Level(name, fit.size, inside, left_out, fit.gain, len(fit.errors))
+    return ArmLevel(
+        level=name,
+        unknowns=fit.size,
+        rms_mm=inside.mm,
+        rms_deg=inside.deg,
+        held_out_mm=left_out.mm,
+        held_out_deg=left_out.deg,
+        likelihood_ratio=fit.gain,
+    )
 
 
 def _rms(residuals: FloatArray, turned: Mask) -> Rms:
@@ -328,14 +304,14 @@ def check_asked(asked: str, *, can: bool, misread: str = "") -> None:
 
 def doubts(kinematics: Kinematics) -> Iterator[Finding]:
     """Says where another level explains the views far better than the one that was asked for."""
-    best = _best(kinematics.levels)
-    chosen = kinematics.chosen
+    chosen, likeliest = kinematics.result.chosen, _best(kinematics.fits)
+    best = replace(kinematics.result, level=likeliest).chosen
     if best.likelihood_ratio - chosen.likelihood_ratio > SIGNIFICANT:
         yield Finding(
             "level",
-            f"The views speak for more than the arm's {chosen.name}: with its {best.name} stops "
-            f"left out are predicted to {figure(best.left_out.mm)} mm instead of "
-            f"{figure(chosen.left_out.mm)} mm.",
+            f"The views speak for more than the arm's {chosen.level}: with its {best.level} stops "
+            f"left out are predicted to {figure(best.held_out_mm)} mm instead of "
+            f"{figure(chosen.held_out_mm)} mm.",
             Step("Leave --level out.", CALIBRATE),
         )
 
@@ -347,12 +323,11 @@ def findings(kinematics: Kinematics) -> Iterator[str]:
             "The arm stays as stated: what was asked to be found of it explains the views no "
             "better than chance, or there are too few stops to show it."
         )
-    nominal = kinematics.levels[0]
-    chosen = kinematics.chosen
-    if chosen is not nominal:
+    found = kinematics.result
+    if found.is_calibrated:
         yield (
-            f"The arm was calibrated along ({chosen.name}): stops left out are predicted to "
-            f"{figure(chosen.left_out.mm)} mm, with the nominal arm to "
-            f"{figure(nominal.left_out.mm)} mm. The transforms go with this arm: take its poses "
-            "(calibration.base_from_flange), not the controller's."
+            f"The arm was calibrated along ({found.level}): stops left out are predicted to "
+            f"{figure(found.chosen.held_out_mm)} mm, with the nominal arm to "
+            f"{figure(found.nominal.held_out_mm)} mm. The transforms go with this arm: take its "
+            "poses (calibration.base_from_flange), not the controller's."
         )
