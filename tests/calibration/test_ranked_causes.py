@@ -15,16 +15,25 @@ from visioncal.calibration.pipeline import calibrate
 from visioncal.calibration.stages.cause_ranking import (
     MEASURE_BOARD,
     NO_JOINTS,
-    read_otherwise,
     with_misread,
 )
 from visioncal.calibration.stages.fit_messages import scale_found
-from visioncal.calibration.stages.judge import Place, judge
+from visioncal.calibration.stages.judge import judge
+from visioncal.calibration.stages.judged import Place
 from visioncal.calibration.stages.need import Picks
 from visioncal.core.codec import read, write
 from visioncal.core.transforms import exp, invert, pose_difference
 from visioncal.core.types import Need
-from visioncal.core.verdict import CALIBRATE, GUESS, PLAN, Finding, Step, Verdict, with_paths
+from visioncal.core.verdict import (
+    CALIBRATE,
+    GUESS,
+    PLAN,
+    READ_AGAIN,
+    Finding,
+    Step,
+    Verdict,
+    with_paths,
+)
 from visioncal.estimation.joint import MeasuredScale
 from visioncal.results import Rms
 from visioncal.results.parts import VerdictForm
@@ -156,14 +165,13 @@ def test_errors_that_are_too_large_come_from_their_sources(need) -> None:
 
 def test_poses_that_are_misread_explain_the_rest() -> None:
     before = judge(changed(SOUND, warnings=(DRIFT,)))
-    after = with_misread(before, read_otherwise("The quaternions are w, x, y, z."))
+    after = with_misread(
+        before, Finding("misread_poses", "The quaternions are w, x, y, z.", READ_AGAIN)
+    )
     assert ids(after) == ["misread_poses", "moved_slowly"]
     assert sum(it.probability for it in after.causes) <= 1.0
     assert after.top[0].startswith("Most likely (98 %): The quaternions are w, x, y, z.")
     assert after.reasons[1:] == before.reasons
-    # Mirrored images fit as well, and no reading of the poses helps these.
-    mirrored = with_misread(before, read_otherwise("One axis is mirrored.", is_mirrored=True))
-    assert mirrored.causes[0].do.words.startswith("Look at an image first: where it is mirrored")
 
 
 def test_joints_that_are_there_but_misread_come_before_the_errors_they_would_explain() -> None:

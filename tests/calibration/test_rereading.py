@@ -170,6 +170,8 @@ def test_mirrored_corners_are_turned_back_by_what_is_typed(tmp_path):
 def test_poses_are_mirrored_only_when_that_is_asked_for(tmp_path):
     mirrored_cell(tmp_path / "cell", corners=False)
     done = typed("calibrate", tmp_path / "cell", "-o", tmp_path / "out")
+    # Mirrored images fit as well, and no reading of the poses helps these.
+    assert "Look at an image first: where it is mirrored" in done.said
     assert "--mirror-poses" in done.said
     assert not any("--guess" in it for it in printed_commands(done.said))
     with pytest.raises(DataError, match="mirrored images are the usual cause"):

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from support.cells import session_of
 
-from visioncal.calibration.pipeline.guess_inputs import reading_hint
+from visioncal.calibration.pipeline.reading_hints import reading_hint
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.cameras import detect_targets

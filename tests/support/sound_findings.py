@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from visioncal.calibration.stages.judge import Arm, Findings, Pair, Place, Sensor
+from visioncal.calibration.stages.judged import Arm, Findings, Pair, Place, Sensor
 from visioncal.core.types import Rejection
 from visioncal.estimation.observability import Direction
 from visioncal.results import Rms, ViewResult

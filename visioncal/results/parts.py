@@ -8,6 +8,7 @@ from scipy.spatial.transform import RigidTransform
 
 from visioncal.core.codec import DROPPED, INLINE, KEPT, REST, Written
 from visioncal.core.errors import DataError
+from visioncal.core.number_format import figure
 from visioncal.core.types import Need
 from visioncal.core.verdict import Finding, Step, Verdict, VerdictStatus
 from visioncal.results.arm import ArmSections
@@ -114,6 +115,12 @@ class Rms:
     mm: float
     deg: float | None = None
     px: float | None = None
+
+    @property
+    def words(self) -> str:
+        """In position and, where that is known, in rotation."""
+        turned = "" if self.deg is None else f" and {figure(self.deg)} deg"
+        return f"{figure(self.mm)} mm{turned}"
 
 
 def worst_view(views: Sequence[ViewResult], rms: Rms) -> int | None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from visioncal.calibration.pipeline.exchanged_names import exchanged_names
-from visioncal.calibration.pipeline.guess_inputs import reading_hint, readings_in_cell
+from visioncal.calibration.pipeline.reading_hints import reading_hint, readings_in_cell
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.running import known_at_first
 from visioncal.calibration.pipeline.solving import first_agreement

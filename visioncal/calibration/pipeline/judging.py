@@ -16,7 +16,7 @@ from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cause_ranking import NO_JOINTS
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.distance_scale import distance_scale
-from visioncal.calibration.stages.judge import Arm, Findings, Pair, Place, Sensor
+from visioncal.calibration.stages.judged import Arm, Findings, Pair, Place, Sensor
 from visioncal.calibration.stages.measured_turns import measured_turns
 from visioncal.calibration.stages.need import Fitted, picks_of
 from visioncal.calibration.stages.priors import prior_words

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import TypedDict, Unpack
 
 from visioncal.calibration.pipeline.exchanged_names import exchanged_names
-from visioncal.calibration.pipeline.guess_inputs import (
+from visioncal.calibration.pipeline.judging import poor_motion
+from visioncal.calibration.pipeline.reading_hints import (
     closes_as_declared,
     is_suspect,
     reading_hint,
     readings_in_cell,
 )
-from visioncal.calibration.pipeline.judging import poor_motion
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES

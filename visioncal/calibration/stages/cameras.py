@@ -8,7 +8,6 @@ from typing import TypeVar
 
 import numpy as np
 
-from visioncal.calibration.stages.cause_ranking import COUNTED_BACKWARDS
 from visioncal.calibration.stages.dense import fit_densely
 from visioncal.calibration.stages.detect import Detections, DetectOptions, detect
 from visioncal.calibration.stages.image_size import other_images
@@ -37,6 +36,11 @@ _WRONG_LENS_PX, _MUCH_BETTER = 2.0, 0.1
 # bent board makes, and that leaves the corners much less.
 _DOUBTFUL_PX, _CLEARLY_BETTER = 0.5, 0.5
 _OTHER_FOCAL, _OTHER_SIGMAS = 0.1, 20.0
+# Of corners without images.
+COUNTED_BACKWARDS = (
+    "In corners.csv, u_px counts to the right and v_px down: exchange the two columns where they "
+    "are exchanged, or count from the other side where one runs backwards."
+)
 
 
 def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:

@@ -23,12 +23,9 @@ from visioncal.calibration.stages.need import Picks
 from visioncal.core.limits import CalibrationLimits, NeedLimits
 from visioncal.core.number_format import figure, percent
 from visioncal.core.verdict import (
-    CALIBRATE,
     EXCHANGED,
     GOOD_FOR,
-    GUESS_AND_CALIBRATE,
     PLAN,
-    READ_AGAIN,
     REVIEW,
     SOURCES,
     Finding,
@@ -39,34 +36,6 @@ from visioncal.results import NeedMet
 
 # The limits of tests that are passed by chance: none is behind the first, the last is a fact.
 _REMARK, _FACT = float(np.exp(-1.0)), 1e-12
-
-# No copy mirrors sound poses unasked: another sign of y would look as good.
-_LEFT_HANDED = "Only where the robot's frame is left-handed, convert with --guess --mirror-poses."
-MIRRORED = Step(
-    "Look at an image first: where it is mirrored (a flip in the camera's driver, a mirror before "
-    "the lens), turn the images back (and find the corners anew), and calibrate anew. "
-    f"{_LEFT_HANDED}"
-)
-
-# Of corners without images.
-COUNTED_BACKWARDS = (
-    "In corners.csv, u_px counts to the right and v_px down: exchange the two columns where they "
-    "are exchanged, or count from the other side where one runs backwards."
-)
-MIRRORED_CORNERS = Step(
-    f"{COUNTED_BACKWARDS} As they are, the board would be seen from behind. Write a copy of the "
-    "session whose u_px are mirrored back, and calibrate it.",
-    GUESS_AND_CALIBRATE,
-)
-_UNRECORDED = Step(
-    "Look how the poses were recorded: a logger that repeats one pose, or that writes positions as "
-    "0, 0, 0 or rotations as 0, 0, 0, 1, gives no calibration. Record them again, at the same time "
-    "as the images."
-)
-_UNPAIRED = Step(
-    "Look how rows and images were paired: files sorted by name (10 before 2), rows sorted anew, "
-    "views.csv of another run. Write into column image which file belongs to each row."
-)
 
 
 @dataclass(frozen=True)
@@ -166,79 +135,6 @@ def adding(words: str, *, modelled: bool, purpose: str = "") -> Step:
         return Step(words, f"{PLAN}{purpose}")
     model = "With [robot] model in session.toml, visioncal plan proposes them."
     return Step(f"{words} {model}")
-
-
-def read_otherwise(
-    sentence: str, exchanged: tuple[int, ...] = (), *, is_mirrored: bool = False
-) -> Finding:
-    """The finding that poses are misread.
-
-    Args:
-        sentence: How they are better read.
-        exchanged: The views whose poses are exchanged, where the others are as they are declared.
-        is_mirrored: Whether mirrored images are as good an explanation.
-    """
-    return Finding("misread_poses", sentence, MIRRORED if is_mirrored else READ_AGAIN, exchanged)
-
-
-def unrecorded_rotations(robot_deg: float, camera_deg: float, *, is_one_pose: bool) -> Finding:
-    """The finding that the robot's poses do not turn where the camera sees that they do.
-
-    Args:
-        robot_deg: How far they turn at most [deg].
-        camera_deg: How far the target turns in half of the views or more [deg].
-        is_one_pose: Whether the positions are the same, too.
-    """
-    said, wrong = f"The robot's poses turn by {robot_deg:.2g} deg at most", "rotations"
-    if is_one_pose:
-        said, wrong = "All rows have one pose of the robot", "poses"
-    words = (
-        f"{said}, and between the same views the camera sees the target turn by "
-        f"{camera_deg:.2g} deg: the recorded {wrong} are not those of the views."
-    )
-    return Finding("misread_poses", words, _UNRECORDED)
-
-
-def unrecorded_positions() -> Finding:
-    """The finding that the robot's positions do not move, which no frames explain."""
-    words = (
-        "All rows have one position of the robot, and that does not explain "
-        "what the camera sees: the recorded positions are not those of the views."
-    )
-    return Finding("misread_poses", words, _UNRECORDED)
-
-
-def unpaired_rows(share: float, chance: float) -> Finding:
-    """The finding that rows and images have nothing in common.
-
-    Args:
-        share: Of the pairs of views, those between which robot and camera turn alike.
-        chance: The same where rows are shuffled.
-    """
-    words = (
-        "The robot's poses are not those of the images: of all pairs of views, robot and camera "
-        f"turn alike in {percent(share)}, and in {percent(chance)} if rows are shuffled."
-    )
-    return Finding("misread_poses", words, _UNPAIRED)
-
-
-def wrong_poses(by_poses: str, by_joints: str) -> Finding:
-    """The finding that poses are wrong, in whatever way, beside joint angles that are right.
-
-    Args:
-        by_poses: What the chain closes to with the poses, in words.
-        by_joints: The same with the joint angles and the robot's model.
-    """
-    return Finding(
-        "misread_poses",
-        f"The reported poses are wrong: with them the chain closes to {by_poses} only, with the "
-        f"joint angles and the robot's model to {by_joints}.",
-        Step(
-            "Look for exchanged columns and shifted rows among x_m to qw in views.csv; or delete "
-            "these columns, and the poses are those of the joint angles.",
-            CALIBRATE,
-        ),
-    )
 
 
 def with_misread(verdict: Verdict, found: Finding) -> Verdict:

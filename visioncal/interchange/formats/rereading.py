@@ -15,8 +15,8 @@ from visioncal.calibration.pipeline.guess_inputs import (
     numbers_in,
     reported_or_chained,
     seen_poses,
-    session_is_mirrored,
 )
+from visioncal.calibration.pipeline.reading_hints import session_is_mirrored
 from visioncal.core.conventions import UNITS_M, PoseNumbers, Reading
 from visioncal.core.documents.tables import is_number
 from visioncal.core.errors import DataError, VisioncalError

@@ -1,0 +1,476 @@
+"""What speaks against a result: of what views, motion, corners and arms show."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from visioncal.calibration.stages.cause_ranking import (
+    MEASURE_BOARD,
+    MOVED_AT_ONCE,
+    NO_JOINTS,
+    adding,
+)
+from visioncal.calibration.stages.judged import Arm, Findings, Pair, Sensor
+from visioncal.core.limits import CalibrationLimits
+from visioncal.core.number_format import figure
+from visioncal.core.types import Mount
+from visioncal.core.verdict import EXCHANGED, NOT_USABLE, REVIEW, Finding, Step, look_at
+from visioncal.results import Rms, ViewResult
+
+# Scatters under a nanometre and a micro-degree are rounding, and their ratios say nothing.
+_ROUNDING = 1e-6
+_LISTED_VIEWS, _LISTED_PARTS = 3, 3
+_CAMERA_CAUSES = (
+    "a board that moved, images paired with other poses, units or conventions of the poses, "
+    "intrinsics, a warped board"
+)
+_CAUSES: Mapping[Mount, str] = {
+    "eye-in-hand": _CAMERA_CAUSES,
+    "eye-to-hand": _CAMERA_CAUSES,
+    "instrument": "an instrument or a tool that moved, readings paired with other poses, units or "
+    "conventions of the poses",
+}
+# Limits of views whose poses were measured, over those of views with corners: of a board that is
+# seen squarely, sound ones are off by 8 times the median now and then.
+_UNEVEN = 1.5
+# So many views in a row are not left out by chance.
+_LEAST_RUN = 3
+# Kinds of findings about views that are left out.
+_LEFT_OUT = (EXCHANGED, "turned_images", "wrong_pose", "something_moved")
+# Views that disagree by less than so many times what their sensor's noise makes are explained: of a
+# small board far away, nothing better is to be had.
+_OF_NOISE = 1.5
+
+
+def doubts_of(findings: Findings) -> list[Finding]:
+    """All that speaks against a result, in the order in which it is looked for."""
+    limits = CalibrationLimits()
+    scatter = list(_scatter_doubts(findings, limits))
+    pairs, sensors = findings.pairs, findings.sensors
+    return [
+        *scatter,
+        *(doubt for it in pairs for doubt in _disagreement_doubts(it)),
+        *_outlier_doubts(findings, limits),
+        *(doubt for it in pairs for doubt in _holdout_doubts(it, findings.mount, limits)),
+        # Sigmas of views that disagree wildly say nothing about the motion.
+        *([] if any(it.is_fatal for it in scatter) else _accuracy_doubts(findings, limits)),
+        *_stop_doubts(findings, limits),
+        *(doubt for it in sensors for doubt in _lost_doubts(it, limits)),
+        *(doubt for it in sensors for doubt in _noise_doubts(it, limits)),
+        *([] if scatter else _robot_doubts(findings, limits)),
+        *(_warned(it, findings) for it in findings.warnings if it.kind not in NOT_USABLE),
+    ]
+
+
+def is_scattered(findings: Findings) -> bool:
+    """Whether views disagree with each other by more than a sound cell's do."""
+    return any(_scatter_doubts(findings, CalibrationLimits()))
+
+
+def _warned(found: Finding, findings: Findings) -> Finding:
+    """A stage's warning, with what the result is without the views that it has left out."""
+    left_out = found.kind in _LEFT_OUT
+    without_it = _without(found.views, findings.held_out)
+    return replace(found, without_it=without_it) if left_out else found
+
+
+def _without(views: Sequence[int], held_out: Rms) -> str:
+    left_out = f"view {views[0]}" if len(views) == 1 else "these views"
+    return f"Without {left_out}, the others predict each other to {held_out.words}."
+
+
+def _pairs(one: Rms, other: Rms) -> list[tuple[float, float]]:
+    """Two sets' residuals side by side: of position and, where both are known, of rotation."""
+    pairs = [(one.mm, other.mm)]
+    if one.deg is not None and other.deg is not None:
+        pairs.append((one.deg, other.deg))
+    return pairs
+
+
+def _scatter_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
+    yield from _pair_doubts(findings, limits)
+    ratios = [
+        outside / within
+        for outside, within in _pairs(findings.held_out, findings.rms)
+        if outside > _ROUNDING and within > 0.0
+    ]
+    ratio = max(ratios, default=0.0)
+    followed = any(it.by_functions for it in findings.arms)
+    if ratio > limits.optimism[0] and not followed:
+        yield Finding(
+            "optimism",
+            f"Views left out fit {ratio:.1f} times worse than views in the fit: there are too few "
+            "views for their noise.",
+            _tilted(findings),
+            is_fatal=ratio > limits.optimism[1],
+            until_mm=0.0,
+        )
+
+
+def _is_of_arm(findings: Findings) -> bool:
+    """Whether what is uncertain is mostly what an arm does wrong whose joints are not known."""
+    has_no_joints = any(it.do is NO_JOINTS for it in findings.warnings)
+    return has_no_joints and _is_mostly_of(findings, "arm", "robot", "poses")
+
+
+def _is_of_board(findings: Findings) -> bool:
+    """Whether it is mostly how well boards are known, which no view tells."""
+    # A lens that is held has a part in what held values cost.
+    names = {name.partition(" of ")[0] for it in findings.places for name in it.budget_mm}
+    held = () if "lens" in names else ("held values",)
+    return _is_mostly_of(findings, "board", *held)
+
+
+def _is_mostly_of(findings: Findings, *sources: str) -> bool:
+    of_these = of_all = 0.0
+    for place in findings.places:
+        for name, mm in place.budget_mm.items():
+            of_these += mm**2 * name.startswith(sources)
+            of_all += mm**2 * (name == "total")
+    return of_these > 0.5 * of_all
+
+
+def helping(findings: Findings) -> Step | None:
+    """What makes a result less uncertain; None where that is said of the arm already."""
+    if _is_of_board(findings):
+        return MEASURE_BOARD
+    if any(it.do is NO_JOINTS for it in findings.warnings):
+        return None
+    words = "Add views from other poses of the robot."
+    return adding(words, modelled=findings.plannable, purpose=findings.of_camera)
+
+
+def _tilted(findings: Findings) -> Step:
+    words = "Add 5 views or more, tilted by 20 to 40 degrees about different axes."
+    if not all(it.can_tilt for it in findings.arms):
+        words = "Add 5 views or more, all over the workspace and turned as far as the arm turns."
+    return adding(words, modelled=findings.plannable, purpose=findings.of_camera)
+
+
+def _pair_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
+    words, views, is_fatal = [], list[ViewResult](), False
+    for pair in findings.pairs:
+        held = pair.away or pair.held_out
+        beyond = [
+            (f"{figure(value)} {unit} (doubt begins at {check:g})", value > bad)
+            for value, unit, (check, bad), noise in zip(
+                (held.mm, held.deg),
+                ("mm", "deg"),
+                (limits.scatter_mm, limits.scatter_deg),
+                (pair.noise.mm, pair.noise.deg or 0.0),
+                strict=True,
+            )
+            if value is not None and value > max(check, _OF_NOISE * noise)
+        ]
+        if beyond:
+            away = " and ".join(it for it, _ in beyond)
+            words.append(f"{away} ({pair.name})" if pair.name else away)
+            views += pair.views
+            is_fatal |= any(it for _, it in beyond)
+    if words:
+        worst = _worst_views(views)
+        named = ", ".join(f"view {view.view} ({_residual(view)})" for view in worst)
+        yield Finding(
+            "unexplained",
+            f"Left out of the fit, views disagree with the others by "
+            f"{', '.join(words)}, rms; the worst are {named}.",
+            Step(
+                f"Look at the worst views for possible causes: {_CAUSES[findings.mount]}, or an "
+                "arm with large model errors.",
+                REVIEW,
+            ),
+            tuple(it.view for it in worst),
+            is_fatal=is_fatal,
+            until_mm=0.0,
+        )
+
+
+def _worst_views(views: Sequence[ViewResult]) -> list[ViewResult]:
+    measured = [view for view in views if view.used and view.residual_mm is not None]
+    return sorted(measured, key=lambda view: -(view.residual_mm or 0.0))[:_LISTED_VIEWS]
+
+
+def _disagreement_doubts(pair: Pair) -> Iterator[Finding]:
+    """Names the views that were left out because they contradict the others."""
+    out = pair.disagreeing
+    if not out:
+        return
+    views, run = tuple(it.view for it in out), _run(pair)
+    if len(out) == 1:
+        named, them, rows = f"view {views[0]}", "it", "its row"
+        words = f"View {views[0]} was left out. It {out[0].reason}."
+    else:
+        named, them, rows = f"views {', '.join(map(str, views))}", "them", "their rows"
+        words = f"V{named[1:]} were left out. View {views[0]} {out[0].reason}.{run}"
+    step = (
+        Step("Fasten what moved, and calibrate the views before and after it apart.")
+        if run
+        else Step(
+            f"Compare image and pose of {named}: record {them} again, or in views.csv, delete "
+            f"{rows}.",
+            look_at(views[0]),
+        )
+    )
+    kind, without_it = "something_moved" if run else "wrong_views", _without(views, pair.held_out)
+    yield Finding(kind, words, step, views, without_it=without_it).of(pair.name)
+
+
+def _run(pair: Pair) -> str:
+    """Says so where the views that were left out follow each other, with no other between them."""
+    out = [it.view for it in pair.disagreeing]
+    compared = [it.view for it in pair.views if it.used or it.view in out]
+    first = compared.index(out[0])
+    end = first + len(out)
+    if len(out) < _LEAST_RUN or compared[first:end] != out or compared == out:
+        return ""
+    when = f"from view {out[0]} on" if first else f"before view {compared[end]}"
+    if first and end < len(compared):
+        when = f"from view {out[0]} to view {out[-1]}"
+    return f" They follow each other: {when}, something had moved."
+
+
+def _outlier_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
+    """Names single views whose residual stands out from the others'."""
+    # Where the corners show how well each view sees the board, the consensus has judged them
+    # better.
+    if any(it.away_mm is not None for it in findings.arms):
+        return
+    for pair in findings.pairs:
+        for view, ratio in _outlying_views(pair.views, limits.outlier):
+            words = (
+                f"View {view.view} stands out: it places the target {_residual(view, ' and ')} "
+                f"from the others, {ratio:.0f} times what is typical. It is in the fit and pulls "
+                "at it."
+            )
+            step = Step(
+                "Look at its image and its pose, and take it out of views.csv if one is wrong.",
+                look_at(view.view),
+            )
+            yield Finding("wrong_views", words, step, (view.view,)).of(pair.name)
+
+
+def _outlying_views(
+    views: Sequence[ViewResult], limit: float
+) -> tuple[tuple[ViewResult, float], ...]:
+    """The used views whose residual is over so many times the median, with their ratios."""
+    used = [view for view in views if view.used]
+    if not used:
+        return ()
+    away = np.array([[view.residual_mm or 0.0, view.residual_deg or 0.0] for view in used])
+    ratios = (away / np.maximum(np.median(away, axis=0), _ROUNDING)).max(axis=1)
+    pairs = zip(used, ratios.tolist(), strict=True)
+    return tuple(
+        (view, it)
+        for view, it in pairs
+        if it > (limit if view.rms_px is not None else _UNEVEN * limit)
+    )
+
+
+def _residual(view: ViewResult, between: str = ", ") -> str:
+    turned = "" if view.residual_deg is None else f"{between}{figure(view.residual_deg)} deg"
+    return f"{figure(view.residual_mm or 0.0)} mm{turned}"
+
+
+def _holdout_doubts(pair: Pair, mount: Mount, limits: CalibrationLimits) -> Iterator[Finding]:
+    holdout, held = pair.holdout, pair.held_out
+    if holdout is None:
+        return
+    pairs = _pairs(holdout, held)
+    ratio = max(back / max(left, _ROUNDING) for back, left in pairs)
+    if ratio > limits.holdout and max(back for back, _ in pairs) > _ROUNDING:
+        observed = "readings" if mount == "instrument" else "images"
+        words = (
+            f"The views that the session holds back are missed by {holdout.words}, {ratio:.0f} "
+            "times worse than views left out in turn. They lie where the result does not hold, or "
+            f"their poses or {observed} are wrong."
+        )
+        step = Step("Record views where the result is to hold, with role = fit.")
+        yield Finding("holdout", words, step).of(pair.name)
+
+
+def _accuracy_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
+    """Judges the answer where it counts."""
+    # Edges are known in the arm's own frames. Those of a calibrated arm are as open as the errors
+    # of the first and the last link, which its poses make up for.
+    # What moved at once is in all that is known, and more views do not help.
+    if any(it.kind in MOVED_AT_ONCE for it in findings.warnings):
+        return
+    if any(it.workspace_mm is None for it in findings.arms):
+        yield from _sigma_doubts(findings, limits)
+        yield from _budget_doubts(findings, limits)
+    for it in findings.arms:
+        if it.workspace_mm is not None and it.workspace_mm > limits.sigma_mm[0]:
+            seen = any(sensor.pixel_px is not None for sensor in findings.sensors)
+            board = (
+                " The board's size counts in it, as no view shows when an arm and a board are "
+                "both too large: measure its squares, and state square_sigma_m."
+            )
+            words = (
+                "All over the workspace the calibrated arm places its tool to "
+                f"{figure(it.workspace_mm)} mm (sigma, in the median; doubt begins at "
+                f"{limits.sigma_mm[0]:g}).{board if seen else ''}"
+            )
+            step = adding(
+                "Add views with other postures of the arm, all over the workspace.",
+                modelled=findings.plannable,
+                purpose=f" --for kinematics{findings.of_camera}",
+            )
+            is_fatal = it.workspace_mm > limits.sigma_mm[1]
+            found = Finding("workspace", words, step, is_fatal=is_fatal, until_mm=0.0)
+            yield found.of(_robot(it))
+
+
+def _sigma_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
+    weak, is_fatal = [], False
+    for direction in findings.worst:
+        scale, unit, (check, bad) = (
+            (np.rad2deg(1.0), "deg", limits.sigma_deg)
+            if direction.is_rotation
+            else (1e3, "mm", limits.sigma_mm)
+        )
+        sigma = direction.sigma * scale
+        if sigma > check:
+            weak.append(f"{direction.words} ({figure(sigma)} {unit})")
+            is_fatal |= bool(sigma > bad)
+    if weak:
+        of_arm, of_board = _is_of_arm(findings), _is_of_board(findings)
+        least = f"{limits.sigma_mm[0]:g} mm and {limits.sigma_deg[0]:g} deg"
+        known = f"known to {', '.join(weak)} (sigma; doubt begins at {least}): most of that"
+        words = (
+            f"As mounts, {known} is the arm's, and is the same in every recording."
+            if of_arm
+            else f"Frames are {known} is the board's, as well as its size is stated."
+            if of_board
+            else f"Weakly determined by the motion, with their sigmas: {', '.join(weak)}; doubt "
+            f"begins at {least}."
+        )
+        yield Finding(
+            "weak_motion",
+            words,
+            NO_JOINTS if of_arm else MEASURE_BOARD if of_board else _tilted(findings),
+            is_fatal=is_fatal,
+            until_mm=0.0,
+        )
+
+
+def _budget_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
+    """Says what makes the result uncertain where it is to be used."""
+    beyond = [it for it in findings.places if it.budget_mm["total"] > limits.sigma_mm[0]]
+    if not beyond:
+        return
+    worst = max(beyond, key=lambda it: it.budget_mm["total"])
+    budget = worst.budget_mm
+    parts = sorted((at for at in budget.items() if at[0] != "total"), key=lambda at: -at[1])
+    others = [
+        f"{it.words} ({figure(it.budget_mm['total'])} mm)" for it in beyond if it is not worst
+    ]
+    yield Finding(
+        "place",
+        f"{worst.words} is placed to {figure(budget['total'])} mm (sigma; 95 % "
+        f"within {figure(worst.radius95_mm)} mm): "
+        + ", ".join(f"{figure(mm)} mm from the {name}" for name, mm in parts[:_LISTED_PARTS])
+        + "."
+        + (f" Over {limits.sigma_mm[0]:g} mm are also {', '.join(others)}." if others else ""),
+        MEASURE_BOARD if _is_of_board(findings) else None,
+        is_fatal=budget["total"] > limits.sigma_mm[1],
+        until_mm=0.0,
+    )
+
+
+def _stop_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
+    used = sum(view.used for it in findings.pairs for view in it.views)
+    check, bad = limits.stops
+    for it in findings.arms:
+        if it.stops < check:
+            counted = f"{used} views" if it.stops == used else f"{it.stops} stops"
+            words = f"Only {counted} are used; {check} or more are needed to check the result."
+            step, is_fatal = _tilted(findings), it.stops < bad
+            kind = "too_few_stops" if is_fatal else "few_stops"
+            found = Finding(kind, words, step, is_fatal=is_fatal, until_mm=0.0)
+            yield found.of(_robot(it))
+
+
+def _lost_doubts(sensor: Sensor, limits: CalibrationLimits) -> Iterator[Finding]:
+    lost = sensor.lost
+    count_all = sensor.used + sensor.spared + len(lost)
+    share = len(lost) / max(count_all, 1)
+    if share > limits.lost_share[0]:
+        details, disagree = "", {*sensor.disagreeing}
+        others = [it for it in lost if it.view not in disagree]
+        if disagree:
+            count = len(disagree) if others else "all"
+            details = f"; {count} of them disagree with the others"
+        if others:
+            details += f"; the first{' but for these' if disagree else ''}: view {others[0].view}, "
+            details += others[0].reason
+        words = f"{len(lost)} of {count_all} views are not used{details}."
+        words_do = "Look at the first of them, and repeat what is missing."
+        step = Step(words_do, look_at(others[0].view)) if others else None
+        views, is_fatal = tuple(it.view for it in lost), share > limits.lost_share[1]
+        # Those that disagree have a finding of their own.
+        kind = "lost_views" if others else "left_out"
+        yield Finding(kind, words, step, views, is_fatal=is_fatal).of(sensor.name)
+
+
+def _noise_doubts(sensor: Sensor, limits: CalibrationLimits) -> Iterator[Finding]:
+    check, bad = limits.pixel_px
+    noise = sensor.pixel_px
+    if noise is None:
+        return
+    if noise > check:
+        words = (
+            f"Corners deviate by {figure(noise)} px from any pose of a flat board (doubt begins at "
+            f"{check:g}): the intrinsics do not fit this camera, the board is not flat, or images "
+            "are blurred."
+        )
+        step = Step("Look for blur, glare, and a lens or a board that is not as stated.")
+        yield Finding("corner_noise", words, step, is_fatal=noise > bad).of(sensor.name)
+    if sensor.level > limits.level:
+        words = (
+            f"Its poses scatter {figure(sensor.level)} times as much as its corners say: squares "
+            "of few pixels, blur, or a lens that is not as stated."
+        )
+        step = Step("Go nearer, or show it larger squares.")
+        yield Finding("corner_noise", words, step).of(sensor.name)
+
+
+def _robot(arm: Arm) -> str:
+    return f"Robot {arm.name}" if arm.name else ""
+
+
+def _robot_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
+    """An arm is a good instrument: what looks like its error is often something else's."""
+    # What chance makes of a good arm's noise, where poses are coarse, is no error. A task that
+    # needs ten times as much has an arm that is as good as it has to be.
+    for it in findings.arms:
+        if it.away_mm is None or it.away_deg is None or it.errs:
+            continue
+        found_mm, found_deg = it.surely or (it.away_mm, it.away_deg)
+        beyond = max(it.away_mm / limits.robot_mm, it.away_deg / limits.robot_deg)
+        if max(found_mm / limits.robot_mm, found_deg / limits.robot_deg) > 1.0:
+            cause, step = (
+                (
+                    "the instrument reads worse than is stated of it, was moved, or the arm's "
+                    "model is off by as much.",
+                    Step("Read a few stops twice to see how well readings repeat."),
+                )
+                if findings.mount == "instrument"
+                else (
+                    "the board is of another size than stated, or warped, the intrinsics are not "
+                    "this camera's, the arm's model is off by as much, or poses were read before "
+                    "the arm stood still.",
+                    Step(
+                        "Stand still before each image, and read one pose twice to see how well it "
+                        "repeats; measure the board over many squares; check the lens and the "
+                        "arm's model."
+                    ),
+                )
+            )
+            words = (
+                f"The residuals would take a flange that is off by {figure(it.away_mm)} mm and "
+                f"{figure(it.away_deg)} deg from stop to stop; arms repeat to 0.1 mm. More likely "
+                f"{cause}"
+            )
+            until_mm = 10.0 * beyond * limits.robot_mm
+            yield Finding("unexplained", words, step, until_mm=until_mm).of(_robot(it))

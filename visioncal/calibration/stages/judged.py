@@ -1,0 +1,184 @@
+"""What a verdict is made of: cameras, robots and targets as the fit has them."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from visioncal.calibration.stages.need import Picks
+from visioncal.core.types import Mount, Need, Rejection
+from visioncal.core.verdict import Finding
+from visioncal.estimation.observability import Direction
+from visioncal.results import Rms, ViewResult
+from visioncal.session.frames import thing_name
+
+
+@dataclass(frozen=True)
+class Pair:
+    """What one camera or instrument saw of one target.
+
+    Attributes:
+        views: What became of each view.
+        rms: Residuals of the used ones.
+        held_out: Residuals of these, left out in turn.
+        holdout: Residuals of those held back by the session; None where there are none.
+        disagreeing: Those whose robot pose and image do not belong together.
+        name: Both, by name; empty where there are no others.
+        noise: What the sensor's own noise makes of its views.
+        away: `held_out` with the same weights as `noise`; None where all views weigh alike.
+    """
+
+    views: Sequence[ViewResult]
+    rms: Rms
+    held_out: Rms
+    holdout: Rms | None = None
+    disagreeing: Sequence[Rejection] = ()
+    name: str = ""
+    noise: Rms = field(default_factory=lambda: Rms(0.0, 0.0))
+    away: Rms | None = None
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A camera or an instrument.
+
+    Attributes:
+        used: How many of its views are used.
+        lost: Those that could not be; those held back on purpose are not among them.
+        disagreeing: How many of these have a robot pose and an image that do not belong together.
+        pixel_px: Noise of a corner's coordinate; None without images [px].
+        level: By how much more its poses scatter than their noise says.
+        spared: How many were not needed, as others stand for them.
+        name: Its frame; empty where there is no other.
+    """
+
+    used: int
+    lost: Sequence[Rejection] = ()
+    disagreeing: Sequence[int] = ()
+    pixel_px: float | None = None
+    level: float = 1.0
+    spared: int = 0
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A robot.
+
+    Attributes:
+        stops: At how many stops it has a part in the fit.
+        away_mm: Noise of its flange; None where that cannot be separated from the cameras' [mm].
+        away_deg: The same in rotation [deg].
+        surely: Ends of their 95 % intervals below [mm, deg]; as found where None.
+        errs: Whether its errors follow its posture, which is said elsewhere.
+        workspace_mm: Predicted sigma of a tool's place all over a calibrated arm's workspace, in
+            the median; None for a nominal arm [mm].
+        modelled: Whether its model is known.
+        by_functions: Whether functions of its joints follow the very stops of the fit.
+        can_tilt: Whether its flange turns about more than one direction.
+        name: Its name; empty where there is no other.
+    """
+
+    stops: int
+    away_mm: float | None = None
+    away_deg: float | None = None
+    surely: tuple[float, float] | None = None
+    errs: bool = False
+    workspace_mm: float | None = None
+    modelled: bool = False
+    by_functions: bool = False
+    can_tilt: bool = True
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class Place:
+    """How well a place is known where it counts.
+
+    Attributes:
+        words: What it is, in words.
+        budget_mm: Its standard deviation by source, and as a `total` [mm].
+        radius95_mm: It is right to within this in 95 % of cases [mm].
+    """
+
+    words: str
+    budget_mm: Mapping[str, float]
+    radius95_mm: float
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What the verdict is made of.
+
+    Attributes:
+        pairs: What each camera saw of each target.
+        sensors: The cameras and instruments.
+        arms: The robots.
+        worst: The worst directions of all unknown edges; the first is named in a good verdict.
+        places: How well places are known.
+        warnings: What earlier stages had to say.
+        notes: What of it is no reason for doubt.
+        mount: What observed whom.
+        need: What the task needs; None where that is not said.
+        picks: What picks err by, by each camera and robot; empty where that is not predicted.
+    """
+
+    pairs: Sequence[Pair]
+    sensors: Sequence[Sensor]
+    arms: Sequence[Arm]
+    worst: Sequence[Direction]
+    places: Sequence[Place]
+    warnings: Sequence[Finding] = ()
+    notes: Sequence[str] = ()
+    mount: Mount = "eye-in-hand"
+    need: Need | None = None
+    picks: Sequence[Picks] = ()
+
+    @property
+    def plannable(self) -> bool:
+        """Whether views can be proposed: of cameras, by arms whose models are known."""
+        has_images = any(it.pixel_px is not None for it in self.sensors)
+        return has_images and all(it.modelled for it in self.arms)
+
+    @property
+    def of_camera(self) -> str:
+        """The option that names, of several cameras that a robot looks with, the least known."""
+        cameras = dict.fromkeys(it.camera for it in self.picks)
+        if len({it.name for it in self.sensors}) < 2 or not cameras:
+            return ""
+        weak_m = {
+            camera: max((it.sigma for it in self.worst if _is_offset_of(it, camera)), default=0.0)
+            for camera in cameras
+        }
+        return f" --camera {thing_name(max(cameras, key=weak_m.__getitem__), 'camera')}"
+
+    @property
+    def rms(self) -> Rms:
+        """Residuals of all used views."""
+        return self._pooled(lambda it: it.rms)
+
+    @property
+    def held_out(self) -> Rms:
+        """Residuals of all of them, left out in turn."""
+        return self._pooled(lambda it: it.held_out)
+
+    def _pooled(self, of: Callable[[Pair], Rms]) -> Rms:
+        if len(self.pairs) == 1:
+            return of(self.pairs[0])
+        counts = np.array([sum(view.used for view in it.views) for it in self.pairs])
+
+        def pooled(values: Sequence[float | None]) -> float | None:
+            known = [
+                (it, count) for it, count in zip(values, counts, strict=True) if it is not None
+            ]
+            if not any(count for _, count in known):
+                return None
+            squares, weights = np.array(known).T
+            return float(np.sqrt(np.average(squares**2, weights=weights)))
+
+        each = [of(it) for it in self.pairs]
+        return Rms(pooled([it.mm for it in each]) or 0.0, pooled([it.deg for it in each]))
+
+
+def _is_offset_of(direction: Direction, frame: str) -> bool:
+    return not direction.is_rotation and direction.words.startswith(f"{frame}'s ")
