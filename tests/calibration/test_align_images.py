@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from support.broken_sessions import edit_rows
 from support.commands import visioncal
+from support.drawn import column
 
 from visioncal.core.transforms import log
+from visioncal.present.recording import paths, read_evidence
 from visioncal.results import Alignment
 from visioncal.session import Session
 from visioncal.simulation import (
@@ -81,6 +83,16 @@ def test_cameras_exchanged_in_all_rows_are_told_by_the_size_of_their_images(fold
     assert done.status == 2
     assert "that is the size of camera right's" in done.err
     assert "Where left and right are exchanged in the column camera of views.csv" in done.err
+
+
+def test_what_was_detected_lies_over_the_image_of_the_camera_that_saw_it(folder, out):
+    recording, views = out / "recording.rrd", Session.load(folder).views
+    seen = read_evidence(recording)
+    assert [it.view for it in seen] == [it.number for it in views]
+    frames = column(recording, paths.DETECTED, "CoordinateFrame:frame")
+    of_camera = {row: f"image_of_cam_{it.text['camera']}" for row, it in enumerate(views)}
+    assert {row: str(it[0]) for row, it in frames.items()} == of_camera
+    assert "Worst used view" in (out / "report.html").read_text()
 
 
 @pytest.mark.slow

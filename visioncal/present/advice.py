@@ -8,7 +8,7 @@ import numpy as np
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import significant
 from visioncal.present.parts import sights
-from visioncal.results import Calibration, Sight, ViewResult
+from visioncal.results import Calibration, Sight
 
 # Views whose residual is this many times the median are named, as by the verdict.
 _STANDS_OUT = CalibrationLimits.outlier
@@ -83,9 +83,15 @@ def outlying_views(found: Sequence[Suspects]) -> tuple[int, ...]:
     return tuple(sorted(view for it in found if it.used for view in it.views))
 
 
-def contradicts(view: ViewResult | Sight) -> bool:
+def contradicts(view: Sight) -> bool:
     """Whether a view was left out because it contradicts the others."""
     return not view.used and view.reason.startswith(_CONTRADICTS)
+
+
+def named(sight: Sight) -> str:
+    """The number of a view, and who saw whom where that has names."""
+    of = _of(sight)
+    return f"{sight.view} ({of})" if of else str(sight.view)
 
 
 def mark_of(view: Sight) -> str:

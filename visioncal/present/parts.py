@@ -47,6 +47,12 @@ def cameras(calibration: Calibration) -> Mapping[str, CameraResult]:
     return {} if calibration.camera is None else {"": calibration.camera}
 
 
+def image_width(calibration: Calibration) -> int | None:
+    """Width of the images, of several cameras that of the widest [px]; None without a camera."""
+    widths = [it.camera.resolution[0] for it in cameras(calibration).values()]
+    return max(widths, default=None)
+
+
 def arms(calibration: Calibration) -> Mapping[str, ArmSections]:
     """What was found of the arms."""
     return {"": calibration} if calibration.cell is None else calibration.cell.arms

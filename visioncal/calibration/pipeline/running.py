@@ -74,9 +74,7 @@ def run(
     held = known.solved.held_out
     pairs = zip(held.away_m.tolist(), held.rms_px.tolist(), strict=True)
     left_out = dict(zip(known.used, pairs, strict=True))
-    # A whole cell is drawn by its result alone.
-    evidence = () if known.mount is None else view_evidence(known)
-    return Run(result_of(known), evidence, known.dense, left_out)
+    return Run(result_of(known), view_evidence(known), known.dense, left_out)
 
 
 def known_at_first(session: Session | Path | str, **asked: Unpack[Asked]) -> RunState:

@@ -96,8 +96,11 @@ class Charts:
     def of(
         cls, session: Session, calibration: Calibration, evidence: Mapping[int, ViewEvidence]
     ) -> "Charts":
-        """Collects what there is to draw."""
+        """Collects what there is to draw of one camera and one robot."""
         used = frozenset(view.view for view in calibration.views if view.used)
+        if calibration.cell is not None:
+            # One chart has no room for several cameras, boards or robots.
+            return cls((), (), used)
         found = (
             coverage.image_chart(calibration, evidence),
             None if calibration.mount == "instrument" else coverage.directions_chart(evidence),
@@ -187,9 +190,7 @@ def _from_buffers(
 
 
 def _joint_charts(session: Session, calibration: Calibration) -> tuple[JointChart, ...]:
-    """Charts of the used views of one robot that have joint angles."""
-    if calibration.cell is not None:
-        return ()
+    """Charts of the used views that have joint angles."""
     residual_mm = {
         it.view: it.residual_mm
         for it in calibration.views

@@ -7,6 +7,7 @@ import numpy as np
 import rerun as rr
 
 from visioncal.core.types import FloatArray
+from visioncal.present import parts
 from visioncal.present.recording import colours, paths
 from visioncal.present.recording.recorder import send_rows
 from visioncal.results import Calibration
@@ -28,12 +29,14 @@ class Overlay:
             other views, which may be anything, are drawn to scale.
         used: The views that the fit used.
         width: Width of the images [px].
+        frames: Of the images, by the places of their views.
         active: Whether there is anything to draw in any view.
     """
 
     factor: int
     used: frozenset[int]
     width: float
+    frames: Mapping[int, str]
     active: bool
 
     @classmethod
@@ -44,15 +47,20 @@ class Overlay:
         evidence: Mapping[int, ViewEvidence],
     ) -> "Overlay":
         """Chooses the factor by the used views."""
-        resolution = session.resolution
-        if calibration is not None and calibration.camera is not None:
-            resolution = calibration.camera.camera.resolution
-        width = 1280 if resolution is None else resolution[0]
-        views = () if calibration is None else calibration.views
-        used = frozenset(it.view for it in views if it.used)
+        sights = () if calibration is None else parts.sights(calibration)
+        width = None if calibration is None else parts.image_width(calibration)
+        if width is None:
+            width = 1280 if session.resolution is None else session.resolution[0]
+        used = frozenset(it.view for it in sights if it.used)
         shown = [it for view, it in evidence.items() if view in used]
         active = any(it.corners is not None for it in evidence.values())
-        return cls(magnification(shown, width), used, float(width), active)
+        return cls(
+            magnification(shown, width),
+            used,
+            float(width),
+            image_frames(session, calibration),
+            active,
+        )
 
     def log_views(self, stream: rr.RecordingStream, seen: Sequence[ViewEvidence]) -> None:
         """Logs corners and residuals of all views, in the order of the session."""
@@ -93,5 +101,26 @@ class Overlay:
         parts: Sequence[FloatArray],
     ) -> None:
         """Sends what is drawn in the image; empty parts take back what the view before has left."""
-        stream.log(entity, rr.CoordinateFrame(paths.IMAGE_FRAME), look, static=True)
+        stream.log(entity, look, static=True)
+        log_image_frames(stream, entity, self.frames)
         send_rows(stream, entity, range(len(parts)), columns.partition([len(it) for it in parts]))
+
+
+def image_frames(session: Session, calibration: Calibration | None) -> dict[int, str]:
+    """The frames of the images, by the places of their views; of an only camera, its one."""
+    cell = None if calibration is None else calibration.cell
+    if cell is None:
+        return dict.fromkeys(range(len(session.views)), paths.IMAGE_FRAME)
+    seers = {it.view.number: it.seer for it in session.observations}
+    seen_by = {row: seers.get(view.number, "") for row, view in enumerate(session.views)}
+    return {row: paths.image_frame(it) for row, it in seen_by.items() if it in cell.cameras}
+
+
+def log_image_frames(stream: rr.RecordingStream, entity: str, frames: Mapping[int, str]) -> None:
+    """Says in which image's frame an entity is, by the places of views."""
+    names = set(frames.values())
+    if len(names) == 1:
+        stream.log(entity, rr.CoordinateFrame(*names), static=True)
+    elif names:
+        columns = rr.CoordinateFrame.columns(frame=list(frames.values()))
+        send_rows(stream, entity, frames, columns)

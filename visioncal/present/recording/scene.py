@@ -12,6 +12,7 @@ from visioncal.present import parts
 from visioncal.present.recording import board, colours, network, paths
 from visioncal.present.recording.arm import log_arms, placed
 from visioncal.present.recording.charts import Charts
+from visioncal.present.recording.overlays import image_frames, log_image_frames
 from visioncal.present.recording.recorder import send_rows
 from visioncal.present.recording.robot_states import RobotState, robot_states
 from visioncal.present.recording.uncertainty import Uncertainty
@@ -20,6 +21,7 @@ from visioncal.present.target_frames import target_frames
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session, frame_name
+from visioncal.session.frames import frames_of_kind
 from visioncal.vision.camera import matrix_3x3
 
 # Sizes of what is drawn, as shares of the cell's size: how far flanges are from their bases.
@@ -253,16 +255,22 @@ class Scene:
         _send_strips(stream, f"{entity}/reach", dict(enumerate(strips)))
 
     def _log_seen_targets(self, stream: rr.RecordingStream, seen: Sequence[ViewEvidence]) -> None:
-        """Draws the target's outline where each view of the only camera alone sees it."""
+        """Draws the target's outline where each view alone sees it."""
         # A part without strips takes those of the view before off the screen.
         strips: dict[int, list[FloatArray]] = {}
         boards = self.session.boards if any(it.cam_from_target is not None for it in seen) else {}
         outlines = {name: board.closed_outline(it) for name, it in boards.items()}
+        sights = () if self.calibration is None else parts.sights(self.calibration)
+        seers = {it.view: it.seer or paths.CAM_FRAME for it in sights}
+        cameras = frames_of_kind(seers.values(), "camera")
         for row, (view, it) in enumerate(zip(self.session.views, seen, strict=True)):
             if (name := self.session.board_of(view)) not in boards:
                 continue
-            strips[row], cell_from_cam = [], self.in_cell(paths.CAM_FRAME, it.view)
-            if it.cam_from_target is not None and cell_from_cam is not None:
+            strips[row] = []
+            if it.cam_from_target is None or seers.get(it.view) not in cameras:
+                continue
+            cell_from_cam = self.in_cell(seers[it.view], it.view)
+            if cell_from_cam is not None:
                 pose = cell_from_cam @ it.cam_from_target
                 strips[row] = [outlines[name] @ pose[:3, :3].T + pose[:3, 3]]
         rejected = {row: seen[row].view in self._rejected for row in strips}
@@ -275,7 +283,6 @@ class Scene:
             return
         sights = {it.view: it for it in cell.sights}
         strips: dict[int, list[FloatArray]] = {}
-        images: dict[int, str] = {}
         rejected: dict[int, bool] = {}
         for row, view in enumerate(self.session.views):
             sight, strips[row] = sights.get(view.number), []
@@ -285,12 +292,8 @@ class Scene:
             ends = [self.in_cell(it, view.number) for it in (sight.seer, sight.seen)]
             if ends[0] is not None and ends[1] is not None:
                 strips[row] = [np.array([ends[0][:3, 3], self._middle(sight.seen, ends[1])])]
-            if sight.seer in cell.cameras:
-                images[row] = paths.image_frame(sight.seer)
         self._send_lines(stream, paths.SIGHT_LINE, strips, rejected, 2.0 * _LINE)
-        if images:
-            frames = rr.CoordinateFrame.columns(frame=list(images.values()))
-            send_rows(stream, paths.IMAGE, images, frames)
+        log_image_frames(stream, paths.IMAGE, image_frames(self.session, self.calibration))
 
     def _middle(self, frame: str, cell_from_frame: FloatArray) -> FloatArray:
         """The middle of what was seen, in the cell."""

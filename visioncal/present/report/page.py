@@ -11,11 +11,12 @@ from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.files import write_atomically
 from visioncal.core.number_format import significant
-from visioncal.present import advice, facts
+from visioncal.present import advice, facts, parts
+from visioncal.present.advice import named
 from visioncal.present.report import content, network
 from visioncal.present.report.templates import template
 from visioncal.present.report.thumbnails import Thumbnail, drawn, thumbnail
-from visioncal.results import Calibration, ViewResult
+from visioncal.results import Calibration, Sight
 from visioncal.results.evidence import ViewEvidence, magnification
 from visioncal.session import Session
 
@@ -76,7 +77,8 @@ def render(
         calibration=calibration,
         cell=cell,
         session=session,
-        evidence=evidence,
+        # Coverage and joints are those of one camera, one board and one robot.
+        evidence=evidence if cell is None else (),
         review=f"{review} --view" if review else "",
         suspects=suspects,
         outlying=advice.outlying_views(suspects),
@@ -89,30 +91,27 @@ def _pictures(
     calibration: Calibration, session: Session | None, evidence: Sequence[ViewEvidence]
 ) -> dict[str, object]:
     seen = {it.view: it for it in evidence}
-    extremes = _extremes(calibration, seen)
+    sights = parts.sights(calibration)
+    extremes = _extremes(sights, seen)
     magnify = _magnification(calibration, [seen[view.view] for _, view in extremes])
     pictures = None if session is None else _Pictures(session, seen)
     return {
         "used_pictures": pictures.of_used(extremes, magnify) if pictures else [],
-        "rejected_pictures": pictures.of_rejected(calibration.views) if pictures else [],
+        "rejected_pictures": pictures.of_rejected(sights) if pictures else [],
         "magnify": magnify,
     }
 
 
 def _magnification(calibration: Calibration, shown: Sequence[ViewEvidence]) -> int:
     """One factor for all pictures, so that they can be compared."""
-    if calibration.camera is None:
-        return 1
-    return magnification(shown, calibration.camera.camera.resolution[0])
+    return magnification(shown, parts.image_width(calibration) or 0)
 
 
-def _extremes(
-    calibration: Calibration, seen: Mapping[int, ViewEvidence]
-) -> list[tuple[str, ViewResult]]:
+def _extremes(sights: Sequence[Sight], seen: Mapping[int, ViewEvidence]) -> list[tuple[str, Sight]]:
     """The used views with the smallest and the largest reprojection error, and words for them."""
     drawn = [
         (view.rms_px, view)
-        for view in calibration.views
+        for view in sights
         if view.used
         and view.rms_px is not None
         and view.view in seen
@@ -121,7 +120,7 @@ def _extremes(
     ranked = sorted(drawn, key=lambda it: it[0])
     picked = [ranked[0], ranked[-1]] if len(ranked) > 1 else ranked
     return [
-        (f"{which} used view: {view.view}, {significant(rms_px)} px rms", view)
+        (f"{which} used view: {named(view)}, {significant(rms_px)} px rms", view)
         for which, (rms_px, view) in zip(("Best", "Worst"), picked, strict=False)
     ]
 
@@ -133,7 +132,7 @@ class _Pictures:
     session: Session
     seen: Mapping[int, ViewEvidence]
 
-    def of_used(self, captioned: Sequence[tuple[str, ViewResult]], magnify: int) -> list[Thumbnail]:
+    def of_used(self, captioned: Sequence[tuple[str, Sight]], magnify: int) -> list[Thumbnail]:
         """Pictures with what was detected and predicted over them."""
         found = [
             self._of(view, caption, self.seen.get(view.view), magnify)
@@ -141,12 +140,12 @@ class _Pictures:
         ]
         return [it for it in found if it is not None]
 
-    def of_rejected(self, views: Sequence[ViewResult]) -> list[Thumbnail]:
+    def of_rejected(self, views: Sequence[Sight]) -> list[Thumbnail]:
         """The first few of the views that were not used, with their reasons."""
         found = (
             self._of(
                 view,
-                f"View {view.view}: {view.reason}",
+                f"View {named(view)}: {view.reason}",
                 self.seen.get(view.view) if advice.contradicts(view) else None,
                 1,
             )
@@ -156,7 +155,7 @@ class _Pictures:
         return list(islice((it for it in found if it is not None), _MAX_REJECTED_PICTURES))
 
     def _of(
-        self, view: ViewResult, caption: str, evidence: ViewEvidence | None, magnify: int
+        self, view: Sight, caption: str, evidence: ViewEvidence | None, magnify: int
     ) -> Thumbnail | None:
         """A view's picture; None where it has no image, which the table of views says anyway."""
         # Corners that another detector found are drawn on nothing where there is no image of them.

@@ -274,7 +274,7 @@ def residuals_over_joints(
     Returns:
         The figure; empty where there are no joint angles.
     """
-    if session is None:
+    if session is None or not evidence:
         return Markup("")
     joints_rad = {view.number: view.joints_rad for view in session.views}
     shown = {it.view for it in calibration.views if it.used and it.view not in outlying}

@@ -151,7 +151,7 @@ def _overview(
         right = rrb.Vertical(verdict, note, row_shares=[2, 1])
         return rrb.Horizontal(left, right, name="Overview", column_shares=[1.3, 1])
     words = "Image: green detected, blue predicted, red residual"
-    image = image_view(words if contents.cell is None else "Image", paths.IMAGE, _bounds(contents))
+    image = image_view(words, paths.IMAGE, _bounds(contents))
     right = rrb.Vertical(verdict, image, note, row_shares=[3.7, 4.2, 1.5])
     return rrb.Horizontal(left, right, name="Overview", column_shares=[1.2, 1])
 
