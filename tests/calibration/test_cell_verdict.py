@@ -9,7 +9,7 @@ from support.commands import visioncal
 from support.problems import observed, pose, world
 from support.whole_cells import FLOOR, OPTIONS, PLATE, part, recorded
 
-from visioncal.calibration.pipeline import align, guess_inputs, running
+from visioncal.calibration.pipeline import align, reading_hints, running
 from visioncal.calibration.pipeline.checkup import doctor
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.interchange.formats.exchanging import exchange_views
@@ -376,7 +376,7 @@ def test_exchanged_names_are_the_cause_that_is_said_first(session, kind, names, 
 
 def test_exchanges_are_tried_only_where_views_disagree(session, monkeypatch):
     # A cell that is sound has no pair that does not close.
-    monkeypatch.setattr(guess_inputs, "exchanged_names", None)
+    monkeypatch.setattr(reading_hints, "exchanged_names", None)
     monkeypatch.setattr(running, "exchanged_names", None)
     assert align(session).verdict.status == "good"
     assert not [it for it in doctor(session).findings if it.kind == "exchanged_names"]
