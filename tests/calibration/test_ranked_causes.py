@@ -122,6 +122,14 @@ def test_what_moves_with_the_time_passes_for_a_focus_and_not_the_other_way() -> 
     assert ids(judge(changed(SOUND, warnings=(focus,)))) == ["focus"]
 
 
+def test_a_held_lens_that_is_wrong_is_no_arm_that_errs() -> None:
+    held = Finding("lens", "The given intrinsics do not fit.", mahalanobis_sq=2000.0)
+    verdict = judge(changed(SOUND, warnings=(POSTURE, held), away_mm=2.0))
+    assert ids(verdict)[0] == "lens"
+    # It is the first reason, too, before how large the errors are.
+    assert verdict.reasons[0] == held.words
+
+
 def test_what_nothing_explains_is_the_cause_itself() -> None:
     (only,) = judge(changed(SOUND, away_mm=1.0)).causes
     assert (only.kind, only.probability) == ("unexplained", 1.0)
@@ -212,7 +220,8 @@ def test_findings_are_kept_and_name_the_session(tmp_path: Path) -> None:
     named = verdict.with_paths(tmp_path / "my cell", "out")
     command = f"visioncal calibrate '{tmp_path}/my cell' -o out"
     assert named.next_steps[0].command == command
-    assert command in named.reasons[-1]
+    # Too few stops were found before it, and are no cause.
+    assert command in named.reasons[0]
     folder = tmp_path / "cell"
     # An apostrophe of a sentence is no quotation.
     assert with_paths("Look at the camera's driver.", folder) == "Look at the camera's driver."

@@ -5,7 +5,7 @@ import pytest
 
 from visioncal.core.transforms import exp, invert, log
 from visioncal.estimation import pose_errors
-from visioncal.estimation.arm import misfit_covariance
+from visioncal.estimation.arm import SIGNIFICANT, misfit_covariance
 from visioncal.estimation.chain import chain
 from visioncal.estimation.parts import ROBOT
 from visioncal.estimation.pose_errors import find_pose_errors, left_out_clusters
@@ -76,6 +76,30 @@ def test_noise_is_no_error_of_the_arm_and_what_lasts_is():
             gains[errors] = find_pose_errors(problem, fit.state, fit.noise, ROBOT)
         assert not gains[white].is_likely
         assert gains[lasting].is_significant
+
+
+def observed(errors, seed, stops=20):
+    """As `fitted`, of poses of the target with noise of their own, of which nothing is known."""
+    rng = np.random.default_rng(seed)
+    turned = rng.normal(size=(stops, 6)) * np.repeat([0.4, 0.1], 3)
+    views = exp(turned + np.array([0, 0, 0, 0, 0, 0.6]))
+    reported = Z @ invert(views) @ invert(X)
+    reported = reported @ exp(np.repeat([1.7e-4, 5e-5], 3) * errors(rng, reported))
+    measured = views @ exp(np.repeat([3.5e-4, 3e-5], 3) * rng.normal(size=(stops, 6)))
+    problem = chain("eye-in-hand", reported, measured)
+    return problem, fit_problem(problem, problem.start({"cam": X, "target": Z}))
+
+
+def test_noise_at_both_ends_is_no_error_of_the_arm():
+    # The flange's turns it about itself, and shifts a far target with that: no one level of noise
+    # at the target is like it, and errors that hardly any two stops have in common are.
+    def gain(errors, seed):
+        problem, fit = observed(errors, seed)
+        return find_pose_errors(problem, fit.state, fit.noise, ROBOT).gain
+
+    assert max(gain(white, seed) for seed in range(30)) < SIGNIFICANT
+    lasts = [gain(lambda rng, poses: 4.0 * lasting(rng, poses), seed) for seed in range(6)]
+    assert np.median(lasts) > SIGNIFICANT
 
 
 def test_the_slope_is_that_of_the_likelihood():

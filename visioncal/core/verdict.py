@@ -181,8 +181,9 @@ class Verdict:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """All findings in sentences, with what to do about them."""
-        return tuple(it.reason for it in self.findings)
+        """All findings in sentences, with what to do; what is most likely wrong stands first."""
+        wrong = (it for it in self.causes[:1] if it.kind not in SOURCES)
+        return tuple(it.reason for it in {id(it): it for it in (*wrong, *self.findings)}.values())
 
     @property
     def causes(self) -> tuple[Finding, ...]:

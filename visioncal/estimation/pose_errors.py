@@ -5,6 +5,8 @@ noise, and the mean of many is not as good as their number says. Several models 
 their restricted likelihood (Bayesian model averaging; Hoeting et al. 1999), and none is chosen:
 
     white       nothing but noise from stop to stop
+    scatter     the same of the flange as well, where that of observed poses is one with it; both
+                then share a weight
     basis       smooth functions of the posture, see `arm.pose_basis`
     posture     Gaussian processes over the posture, one of the flange and one of the base, over a
                 short or a long range (Rasmussen and Williams 2006)
@@ -121,7 +123,11 @@ def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -
     likelihood = _Likelihood.of(problem, state, noise, robot, stood)
     levels = np.maximum(noise.robots[problem.robots.index(robot)], LEAST_SIGMA)
     white = likelihood.maximised(_Model("white", _PRIOR["white"], (), levels))
-    models = [white, *map(likelihood.maximised, _models(poses[stood], white.white))]
+    independent = [white]
+    if problem.is_combined:
+        scatter = likelihood.maximised(_scatter(len(stood), white.white))
+        independent = [replace(it, prior=_PRIOR["white"] / 2) for it in (white, scatter)]
+    models = [*independent, *map(likelihood.maximised, _models(poses[stood], white.white))]
     likeliest = [
         max((it for it in models if it.kind == kind), key=lambda it: it.evidence)
         for kind in ("posture", "time")
@@ -130,7 +136,8 @@ def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -
     models.append(likelihood.maximised(_Model("both", _PRIOR["both"], both, white.white)))
     logs = np.array([it.evidence for it in models])
     shares = np.exp(logs - logs.max())
-    gain = 2.0 * float(logs.max() + np.log(shares.sum()) + white.value)
+    unlikely = min(it.value + len(it.processes) for it in independent)
+    gain = 2.0 * float(logs.max() + np.log(shares.sum()) + unlikely)
     weights = np.where(shares / shares.sum() > _NO_WEIGHT, shares, 0.0)
     weights /= weights.sum()
     pairs = [pair for pair in zip(models, weights.tolist(), strict=True) if pair[1]]
@@ -205,8 +212,15 @@ def posture_clusters(poses: FloatArray) -> IntArray:
     return np.asarray(np.argmin(away[seeds], axis=0))
 
 
+def _scatter(count: int, white: FloatArray) -> _Model:
+    """Noise of the flange from stop to stop, which turns and shifts what is far from it alike."""
+    flange = np.broadcast_to(np.diag(np.repeat(white, 3)), (count, 6, 6))
+    process = _Process(np.eye(count), flange, _BEGINS)
+    return _Model("scatter", _PRIOR["white"], (process,), white)
+
+
 def _models(poses: FloatArray, white: FloatArray) -> Iterator[_Model]:
-    """All models but white noise alone, and both kinds of processes at once."""
+    """All models but independent noise, and both kinds of processes at once."""
     flange = np.broadcast_to(np.diag(np.repeat(white, 3)), (len(poses), 6, 6))
     level = float(np.sqrt(np.mean(np.square(white / TWIST_UNITS[[0, 3]]))))
     base = level * adjoint(invert(poses)) * TWIST_UNITS

@@ -258,8 +258,9 @@ def _feigned(first: Mapping[str, Finding]) -> set[str]:
     # a focus that changes does not go by the time, and is found moving in one session of ten
     # thousand. Before and after a step, errors by posture and time are alike because of it. What a
     # held lens that the corners contradict does to views passes for a board of another size or
-    # shape; the corners alone do not show the size, and the lens is tested beside both. What is
-    # left of a clock's jump passes for motion.
+    # shape, and, with the views' postures, for an arm that errs; the corners alone do not show the
+    # size, and the lens is tested beside all three. What is left of a clock's jump passes for
+    # motion.
     feigned: set[str] = set()
     if moved := [first[it].mahalanobis_sq for it in _MOVED if it in first]:
         feigned.add("focus")
@@ -268,7 +269,7 @@ def _feigned(first: Mapping[str, Finding]) -> set[str]:
     if "clock_changed" in first:
         feigned |= {*_MOVED, "arm_errors", "correlated_errors"}
     if "lens" in first and first["lens"].mahalanobis_sq:
-        feigned |= {"board_size", "board_shape"}
+        feigned |= {"board_size", "board_shape", "arm_errors"}
     return feigned
 
 
