@@ -41,7 +41,7 @@ from visioncal.simulation.arms import ArmErrors
 ALLOWED_S = 0.5
 STOPS, KILLS = few((30, 20), (3, 1))
 # The told pose is compared with the true one, so that the arm has no errors but its repeatability.
-CONTROLLER = ControllerOptions(errors=ArmErrors(0.0, 0.0, 0.0))
+CONTROLLER = ControllerOptions(errors=ArmErrors())
 CELL = CellOptions(robot="ur10e", views=1)
 TAKING = CaptureOptions(speed=1.0, acceleration=1.5)
 FAULTS = ("die", "freeze", "protective-stop", "emergency-stop", "local-control", "power-off")

@@ -23,7 +23,7 @@ from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.simulation import CellOptions, fine_camera, simulate
 from visioncal.simulation.layout import CameraAt, Moved, NetworkOptions
 from visioncal.simulation.network import simulate_network
-from visioncal.simulation.network_records import network_session
+from visioncal.simulation.records import network_session
 
 VIEWS = (20, 60, 125, 250, 500, 1000)
 CAMERAS = (2, 4, 6, 8, 10)

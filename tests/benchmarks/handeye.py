@@ -1,7 +1,8 @@
 """The joint estimator against its bound, OpenCV's solvers, wrong views, wrong arms and boards.
 
 Simulated cells from their corners on (no images are rendered): the stages behind detection run as
-in a calibration, without being told the noise. The bound is `tests/bound.py`'s.
+in a calibration, without being told the noise. The bound is that of
+`tests/support/networkbound.py`.
 
     PYTHONPATH=tests python tests/benchmarks/handeye.py [SEEDS [SEEDS OF THE SMALLER TABLES]]
 """
@@ -15,8 +16,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 from results import few, first, wished, write_section
-from support.bound import edge_bound
 from support.cells import calibrated, error_of
+from support.networkbound import network_bound
 from support.worlds import BOTH_AT_ONCE, Problem, opencv
 
 from visioncal.core.errors import VisioncalError
@@ -25,6 +26,7 @@ from visioncal.core.types import FloatArray
 from visioncal.session import Session
 from visioncal.simulation import Cell, CellOptions, fine_camera, simulate, wide_camera
 from visioncal.simulation.boards import Sheet, corners_m
+from visioncal.simulation.observed_points import Network, whole
 
 SEEDS, FEW = 1000, 50
 IN_HAND, TO_HAND = "eye-in-hand", "eye-to-hand"
@@ -116,6 +118,11 @@ def mahalanobis_sq(error: FloatArray, covariance: FloatArray) -> float:
     return float(error @ np.linalg.solve(covariance, error)) / len(error)
 
 
+def edge_bound(cell: Network) -> FloatArray:
+    """Least covariance (12, 12) of x and z of a cell whose board is as stated."""
+    return network_bound(cell, "base", sizes=False).covariance
+
+
 def against_the_bound(task: tuple[World, int]) -> list[float] | None:
     """Squared errors, their bound, the covariance's word, and OpenCV's squared errors."""
     row, seed = task
@@ -124,7 +131,7 @@ def against_the_bound(task: tuple[World, int]) -> list[float] | None:
         known = calibrated(cell)
     except VisioncalError:
         return None
-    bound, error = edge_bound(cell), error_of(cell, known)
+    bound, error = edge_bound(whole(cell)), error_of(cell, known)
     return [
         *squared(error),
         float(np.trace(bound[:3, :3])),
@@ -166,8 +173,9 @@ def with_wrong_views(task: tuple[World, int, int]) -> list[float] | None:
         known = calibrated(cell)
     except VisioncalError:
         return None
-    right = [it for it in range(row.options.views) if it not in cell.wrong_views]
-    bound, error = edge_bound(cell, right), error_of(cell, known)
+    world = whole(cell)
+    right = tuple(it for it in world.sights if it.view not in cell.wrong_views)
+    bound, error = edge_bound(replace(world, sights=right)), error_of(cell, known)
     out = set(range(row.options.views)) - set(known.used)
     return [
         *squared(error),

@@ -39,7 +39,7 @@ KINDS = {
     "one point": Tracked(),
     "three points": Tracked(points=THREE),
 }
-WRONG = {"dh_sigma_m": 5e-4, "dh_sigma_rad": 1e-3}
+WRONG = {"dh_sigma_m": 5e-4, "dh_sigma_rad": 1e-3, "offset_sigma_rad": 1e-3}
 # Example A: errors of lengths and angles in this ratio, as large as its arm's.
 EXAMPLE = Tracked(robot="generic-6r-1800", stops=30, robot_sigma_m=0.0, robot_sigma_rad=0.0)
 BEFORE_MM = 1.6
@@ -183,7 +183,8 @@ def example_a(worlds: int) -> str:
 
 def example(size: float, seed: int) -> Tracked:
     """Example A with errors of this size, in half millimetres and milliradians."""
-    return replace(EXAMPLE, dh_sigma_m=size * 5e-4, dh_sigma_rad=size * 1e-3, seed=seed)
+    errors = {name: size * sigma for name, sigma in WRONG.items()}
+    return replace(EXAMPLE, **errors, seed=seed)
 
 
 def before_mm(size: float, seed: int) -> float:

@@ -288,6 +288,7 @@ class World:
             poses=True,
             dh_sigma_m=5e-4,
             dh_sigma_rad=7e-4,
+            offset_sigma_rad=7e-4,
             function_sigma_rad=self.function_rad,
             function_length_rad=self.length_rad,
             seed=seed,

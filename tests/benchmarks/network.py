@@ -21,7 +21,7 @@ from visioncal.core.types import FloatArray
 from visioncal.results import Alignment
 from visioncal.simulation.layout import CameraAt, Moved, NetworkOptions
 from visioncal.simulation.network import Network, simulate_network
-from visioncal.simulation.network_records import network_session
+from visioncal.simulation.records import network_session
 
 CELLS = 50
 STOPS = 30

@@ -24,10 +24,10 @@ from visioncal.results import Alignment
 from visioncal.session import Session
 from visioncal.simulation.layout import BoardAt, CameraAt, NetworkOptions, RobotAt, Swept
 from visioncal.simulation.network import simulate_network
-from visioncal.simulation.network_records import network_session
 from visioncal.simulation.observed_points import Network
 from visioncal.simulation.optics import fine_camera
 from visioncal.simulation.options import BOARDS
+from visioncal.simulation.records import network_session
 
 CELLS = 50
 STOPS = 40

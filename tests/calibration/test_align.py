@@ -30,9 +30,9 @@ from visioncal.simulation.layout import (
     RobotAt,
 )
 from visioncal.simulation.network import simulate_network
-from visioncal.simulation.network_records import network_session
 from visioncal.simulation.optics import fine_camera
-from visioncal.simulation.records import pairs_session, pose_row
+from visioncal.simulation.records import cell_session, network_session
+from visioncal.simulation.rows import pose_row
 from visioncal.simulation.sag import Payload
 
 STOPS = 20
@@ -412,12 +412,12 @@ def test_few_stops_are_said_to_be_few():
 
 
 def one_camera(cell):
-    return pairs_session(cell, "cell")
+    return cell_session(cell, "cell", seen="poses")
 
 
 def two_cameras(cell):
     """What two fixed cameras say of the board on a robot's flange, one of them a metre beside."""
-    session = pairs_session(cell, "cell")
+    session = cell_session(cell, "cell", seen="poses")
     columns, rows = ("camera", "stop", *session.columns), []
     beside = exp(np.array([[0.0, 0.3, 0.0, 1.0, 0.0, 0.0]]))[0]
     for view in session.views:
@@ -611,7 +611,7 @@ def test_an_arm_that_bends_is_as_elastic_in_a_cell_as_by_itself(tmp_path):
     springs = (1e-4, 1e-4, 8e-5, 2e-5, 2e-5, 1e-5)
     loads = (Payload(0.0, (0.0, 0.0, 0.0)), Payload(8.0, (0.0, 0.0, 0.08)))
     bending = CellOptions(compliance_rad_per_nm=springs, payloads=loads, branches=True, views=30)
-    pairs_session(simulate(bending), "pairs").save(tmp_path / "pairs")
+    cell_session(simulate(bending), "pairs", seen="poses").save(tmp_path / "pairs")
     session = Session.load(tmp_path / "pairs")
     alone, cell = calibrate(session), Calibration.whole(align(session)).of()
     assert cell.arm.level == "elastic"

@@ -44,16 +44,7 @@ MOUNTS = ("eye-in-hand", "eye-to-hand")
 
 def without(cell, views):
     """A cell that lacks some views."""
-    kept = np.array([at for at in range(len(cell.corners)) if at not in views])
-    shown = replace(cell.shown, stops=cell.shown.stops[kept], boards=cell.shown.boards[kept])
-    corners = tuple(replace(cell.corners[at], view=now) for now, at in enumerate(kept))
-    return replace(
-        cell,
-        corners=corners,
-        shown=shown,
-        joints=cell.joints[kept],
-        base_from_flange=cell.base_from_flange[kept],
-    )
+    return cell.only([at for at in range(len(cell.corners)) if at not in views])
 
 
 @pytest.mark.slow

@@ -11,8 +11,8 @@ from visioncal.core.transforms import invert, log
 from visioncal.results import Calibration
 from visioncal.simulation.layout import CameraAt, NetworkOptions, RobotAt
 from visioncal.simulation.network import Network, simulate_network
-from visioncal.simulation.network_records import network_session
 from visioncal.simulation.optics import fine_camera
+from visioncal.simulation.records import network_session
 from visioncal.simulation.warmup import Heat
 
 # Chi-square of six and of twelve degrees of freedom is below these but for one in a thousand.

@@ -12,7 +12,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
 from visioncal.simulation.layout import CameraAt, NetworkOptions
 from visioncal.simulation.network import simulate_network
-from visioncal.simulation.network_records import network_session
+from visioncal.simulation.records import network_session
 
 STOPS = 14
 

@@ -22,7 +22,7 @@ from visioncal.simulation import (
     network_session,
     simulate_network,
 )
-from visioncal.simulation.records import POSE, pose_row
+from visioncal.simulation.rows import POSE, pose_row
 
 # Three cameras, so that two or more see by way of a robot at most stops.
 CELL = replace(

@@ -26,7 +26,7 @@ from visioncal.simulation import (
 )
 from visioncal.simulation.optics import wide_camera
 from visioncal.simulation.options import BOARDS
-from visioncal.simulation.records import pairs_session
+from visioncal.simulation.records import cell_session
 
 CAMERA = wide_camera()
 # A quarter of the pixels, a robot without noise.
@@ -172,7 +172,7 @@ def test_without_the_extra_the_command_that_installs_it_is_told(session, tmp_pat
 @pytest.mark.usefixtures("torch")
 def test_what_has_no_images_of_a_board_is_refused(cell):
     with pytest.raises(DataError, match="--dense needs images of a checkerboard or a ChArUco"):
-        run_dense(pairs_session(cell, "pairs"))
+        run_dense(cell_session(cell, "pairs", seen="poses"))
 
 
 def test_a_whole_cell_is_refused():

@@ -28,7 +28,7 @@ from visioncal.robot import Robot
 from visioncal.session import MemoryImages, Session
 from visioncal.session.instruments import instrument_names, known_instrument, stated_instrument
 from visioncal.simulation.arms import forward
-from visioncal.simulation.records import POSE
+from visioncal.simulation.rows import POSE
 from visioncal.simulation.tracked import THREE, Tracked, session_of, tracked
 
 PROBE, POINT, POINTS = Tracked(poses=True), Tracked(), Tracked(points=THREE)
@@ -38,7 +38,7 @@ PROBE_FIRST = pytest.mark.parametrize(
     [PROBE, *(slow(it) for it in (POINT, POINTS))],
     ids=["probe", "point", "three"],
 )
-WRONG = {"dh_sigma_m": 5e-4, "dh_sigma_rad": 1e-3}
+WRONG = {"dh_sigma_m": 5e-4, "dh_sigma_rad": 1e-3, "offset_sigma_rad": 1e-3}
 
 
 def test_known_instruments_grow_noisy_with_distance():

@@ -34,6 +34,7 @@ OPTIONS = Tracked(
     poses=True,
     dh_sigma_m=5e-4,
     dh_sigma_rad=7e-4,
+    offset_sigma_rad=7e-4,
     function_sigma_rad=3e-4,
     function_length_rad=0.25,
 )
@@ -134,7 +135,8 @@ def test_where_it_carries_over_is_what_is_predicted_there(known):
 
 
 def test_stops_near_one_another_tell_less_elsewhere_and_the_arm_as_stated_is_worse():
-    options = replace(OPTIONS, function_sigma_rad=0.0, dh_sigma_m=2e-4, dh_sigma_rad=2e-4)
+    small = dict.fromkeys(("dh_sigma_m", "dh_sigma_rad", "offset_sigma_rad"), 2e-4)
+    options = replace(OPTIONS, function_sigma_rad=0.0, **small)
     q = np.array([0.3, -1.2, 1.4, -0.4, 1.2, 0.1])
     near = q + 0.15 * np.random.default_rng(5).standard_normal((24, 6))
     shop = tracked(options, near)

@@ -20,7 +20,7 @@ from visioncal.results import Calibration
 from visioncal.robot import Robot
 from visioncal.session import MemoryImages, Session, View
 from visioncal.simulation import Cell, CellOptions, Second, simulate
-from visioncal.simulation.records import pairs_session
+from visioncal.simulation.records import cell_session
 
 SIGMA_M = 5e-4
 X = exp(np.array([0.02, -0.03, 0.4, 0.06, -0.02, 0.081]))
@@ -271,7 +271,7 @@ def test_a_plan_counts_what_was_measured():
 @pytest.mark.parametrize("scale", [1.0, 1.01, 0.995])
 def test_measured_distances_of_another_scale_are_named(mount, scale):
     cell = simulate(CellOptions(mount=mount, views=16, board_scale=scale, seed=2))
-    verdict = calibrate(pairs_session(cell, "measured")).verdict
+    verdict = calibrate(cell_session(cell, "measured", seen="poses")).verdict
     named = [it for it in verdict.findings if it.kind == "board_size"]
     if scale == 1.0:
         assert verdict.status == "good"
@@ -287,7 +287,7 @@ def test_measured_distances_of_another_scale_are_named(mount, scale):
 @pytest.mark.parametrize("seed", range(4))
 def test_an_arm_that_is_off_is_no_board_of_another_size(seed):
     arm = CellOptions(views=10, dh_sigma_m=2e-3, seed=seed)
-    verdict = calibrate(pairs_session(simulate(arm), "measured")).verdict
+    verdict = calibrate(cell_session(simulate(arm), "measured", seen="poses")).verdict
     assert "board_size" not in {it.kind for it in verdict.findings}
 
 
@@ -295,7 +295,7 @@ def test_a_size_that_no_arm_explains_is_named_among_poor_poses():
     # As of a single marker: what the size leaves is more than a tenth of what it explains.
     noise = {"robot_sigma_m": 2e-3, "robot_sigma_rad": 0.01}
     cell = simulate(CellOptions(views=20, board_scale=0.96, seed=1, **noise))
-    verdict = calibrate(pairs_session(cell, "measured")).verdict
+    verdict = calibrate(cell_session(cell, "measured", seen="poses")).verdict
     (named,) = (it for it in verdict.findings if it.kind == "board_size")
     # Four of its sigmas.
     assert float(named.do.words.split()[-1].rstrip(".")) == pytest.approx(0.96, abs=0.02)
@@ -303,7 +303,9 @@ def test_a_size_that_no_arm_explains_is_named_among_poor_poses():
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 def test_rotations_that_scatter_with_the_measurement_are_not_blamed_on_the_arm(mount):
-    session = pairs_session(simulate(CellOptions(mount=mount, views=16, seed=3)), "marker")
+    session = cell_session(
+        simulate(CellOptions(mount=mount, views=16, seed=3)), "marker", seen="poses"
+    )
     names = [f"cft_{it}" for it in POSE]
 
     def turned(view: View) -> View:
@@ -325,6 +327,8 @@ def test_rotations_that_scatter_with_the_measurement_are_not_blamed_on_the_arm(m
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 def test_an_arm_whose_angles_are_off_is_no_bad_measurement_of_rotations(mount):
     cell = simulate(CellOptions(mount=mount, views=16, dh_sigma_rad=5e-3, seed=1))
-    verdict = calibrate(pairs_session(cell, "measured")).verdict
+    # Without the arm's model, which would be calibrated.
+    session = replace(cell_session(cell, "measured", seen="poses"), robot_document=None)
+    verdict = calibrate(session).verdict
     assert verdict.ranked[0].kind == "arm_errors"
     assert "measured_turns" not in {it.kind for it in verdict.findings}

@@ -9,7 +9,7 @@ from support.whole_cells import misfit
 
 from visioncal import calibrate
 from visioncal.core.transforms import exp, invert
-from visioncal.session import MemoryImages, Session
+from visioncal.session import MemoryImages, Session, target_document
 from visioncal.session.corners import CornerTable
 from visioncal.simulation import (
     BOARDS,
@@ -19,7 +19,7 @@ from visioncal.simulation import (
     simulate,
     simulate_network,
 )
-from visioncal.simulation.records import pose_row, target_document
+from visioncal.simulation.rows import pose_row
 
 SIGMA_PX = 0.05
 # The size of the board is known: else it is most of what transforms are uncertain by.
@@ -80,7 +80,7 @@ def of_a_cell(images, *, stops, seed, bias_px=0.0):
         replace(it, target=replace(it.target, square_sigma_m=1e-7)) for it in options.boards
     )
     # Beside such a robot, corners are nearly exact.
-    robots = tuple(replace(it, sigma_m=1e-4) for it in options.robots)
+    robots = tuple(replace(it, robot_sigma_m=1e-4) for it in options.robots)
     cell = simulate_network(replace(options, stops=14, boards=boards, robots=robots, seed=seed))
     told = network_session(cell, "repeated", seen="names")
     columns = [it for it in told.columns if it != "image" and (stops or it != "stop")]

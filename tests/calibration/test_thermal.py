@@ -414,7 +414,7 @@ def test_a_posture_that_is_come_back_to_is_another_stop(learnt):
 def test_an_instrument_that_reads_points_sees_the_drift(learnt, points):
     """A place alone does not part a flange's rotation from its own: nothing fails at that."""
     truth = learnt["temperatures"].truth
-    shop = tracked(Tracked("ur10e", points=points), truth.cell.joints)
+    shop = tracked(Tracked(points=points), truth.cell.joints)
     moved = truth.cell.true_base_from_flange @ invert(truth.cell.base_from_flange)
     base = shop.base_from_instrument
     read = [(stop, at, invert(base) @ moved[stop] @ base @ it) for stop, at, it in shop.rows]

@@ -9,7 +9,7 @@ import pytest
 from support.beyond import with_field
 from support.cells import calibrated, known_of, session_of
 from support.commands import visioncal
-from support.later import ANYHOW, FITTED, Change, again, knock, known_again, part, usual
+from support.later import ANYHOW, FITTED, Change, again, knock, known_again, usual
 from support.marks import slow
 from support.pages import Page
 
@@ -148,7 +148,7 @@ def test_one_stop_is_no_robot_that_scatters(place):
 
 
 def test_a_board_that_was_turned_by_much_is_told(place):
-    middle = compose(np.eye(3), centre_m(place.cell.sheet))
+    middle = compose(np.eye(3), centre_m(place.cell.sheets[0]))
     turn = exp(np.array([0.02, -0.05, 2.5, 0.0, 0.02, 0.0]))
     moved = log(middle @ turn @ invert(middle))
     found = checked(place, np.random.default_rng(4), Change(board=moved))
@@ -232,7 +232,7 @@ def test_two_slips_are_more_than_one_change_explains():
 def test_an_arm_off_by_its_posture_raises_no_alarm_near_the_calibration():
     options = CellOptions(dh_sigma_m=5e-4, dh_sigma_rad=1e-3, seed=3)
     cell = simulate(replace(options, views=FITTED + 20))
-    calibration = result_of(calibrated(part(cell, range(FITTED)), joints=False))
+    calibration = result_of(calibrated(cell.only(range(FITTED)), joints=False))
     prior_calibration = CalibrationPrior.of(calibration)
     # Without joint angles, its errors are in the noise of a look.
     assert prior_calibration.arm == "none"
@@ -250,7 +250,7 @@ def test_a_bent_arm_under_its_loads_is_no_change(weighed):
     springs = {"compliance_rad_per_nm": (6e-5,) * 6, "payloads": loads}
     cell = simulate(replace(ANYHOW, robot="ur10e", views=FITTED + 20, seed=2, **springs))
     robot = load_robot("ur10e") if weighed else replace(load_robot("ur10e"), masses=None)
-    lot = result_of(calibrated(part(cell, range(FITTED)), robot=robot))
+    lot = result_of(calibrated(cell.only(range(FITTED)), robot=robot))
     assert lot.arm.level == "elastic"
     rng, prior_calibration = np.random.default_rng(4), CalibrationPrior.of(lot)
     found = check(
@@ -371,7 +371,7 @@ def test_triggers_fire_by_their_limits_and_say_what_is_not_known(tmp_path):
     calibration = replace(
         place.calibration, conditions={"ambient_c": 21.0}, created=created.isoformat()
     )
-    session = session_of(part(place.cell, range(5)))
+    session = session_of(place.cell.only(range(5)))
     warm = tuple(replace(it, numbers={"ambient_c": 33.0}) for it in session.views)
     facts = facts_of(
         replace(session, views=warm),

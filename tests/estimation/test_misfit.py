@@ -25,7 +25,8 @@ from visioncal.estimation.residual_tests import drift, lens_field, neighbours
 from visioncal.estimation.solve import covariance_of, fit_problem
 from visioncal.estimation.variance import profile_interval
 from visioncal.simulation import CellOptions, fine_camera, simulate
-from visioncal.simulation.records import POSE, pairs_session
+from visioncal.simulation.records import cell_session
+from visioncal.simulation.rows import POSE
 
 FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
 MOUNTS = ("eye-in-hand", "eye-to-hand")
@@ -133,7 +134,7 @@ def test_a_bump_is_in_the_covariance(mount):
 @pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
 def test_a_joint_that_slips_between_images_is_named(mount, tmp_path):
     cell = simulate(CellOptions(mount=mount, views=24, seed=3))
-    session = pairs_session(cell, "slipped")
+    session = cell_session(cell, "slipped", seen="poses")
     views = []
     for at, view in enumerate(session.views):
         numbers = {name: it for name, it in view.numbers.items() if name not in POSE}
@@ -393,7 +394,7 @@ def test_one_image_that_was_turned_is_named_and_no_lens_that_refocuses(mount):
     assert [it.kind for it in known.findings.warnings] == ["turned_images"]
     (found,) = known.findings.warnings
     assert (found.views, "turned by 180 deg" in found.words) == ((5,), True)
-    assert "mogrify -rotate 180 SESSION/5.png" in found.do.command
+    assert "mogrify -rotate 180 SESSION/images/005.png" in found.do.command
     assert "its image is turned by 180 deg" in known.solved.sights[5].reason
     # 3 components: 5.4 is one in a thousand.
     assert mahalanobis_sq_of_place(cell, known) / 3 < 5.4

@@ -224,6 +224,20 @@ def test_another_recording_of_a_whole_cell_is_that_of_a_cell_whose_camera_was_kn
     assert after["moved"] == [{"frame": "cam_left", "from_stop": 0}]
 
 
+def test_errors_that_are_asked_for_are_those_of_all_robots_and_cameras_of_a_cell(place):
+    folder = place / "soft"
+    errs = ("--stiffness-knm", 10, "--payload-kg", 5, "--board-scale", 1.01, "--no-with-intrinsics")
+    done("simulate", folder, "--cell", "two-arms", "--no-images", "--views", 3, *errs)
+    content, _ = truth_of(folder)
+    for robot in content["options"]["robots"]:
+        assert robot["compliance_rad_per_nm"] == [1e-4] * 6
+        assert [it["kg"] for it in robot["payloads"]] == [5.0]
+    assert {it["scale"] for it in content["options"]["boards"]} == {1.01}
+    session = Session.load(folder)
+    assert all(it.matrix is None for it in session.cameras.values())
+    assert {it.numbers.get("payload_kg") for it in session.views if "robot" in it.text} == {5.0}
+
+
 @pytest.mark.parametrize("read", ["points", "probe"])
 def test_a_tracker_beside_a_cell_ties_its_robots(read, place):
     folder, out = place / f"cell-{read}", place / f"cell-{read}-out"
@@ -362,7 +376,11 @@ def test_the_page_s_cell_can_be_made(tmp_path):
         ('camera = "top"', 'camera = "left"', "a sweep is of camera 'left'; there are top"),
         ("[[moved]]", "[moved]", r"own.toml: moved is .*; a table \[\[moved\]\] for each"),
         ("stops = 6", "share_seen = 2", "own.toml: share_seen is 2.0; a share above 0"),
-        ('robot = "ur10e"', "sigma_m = -1e-5", "own.toml, robots.a: sigma_m is -1e-05; a number"),
+        (
+            'robot = "ur10e"',
+            "robot_sigma_m = -1e-5",
+            "own.toml, robots.a: robot_sigma_m is -1e-05; a number",
+        ),
     ],
 )
 def test_a_description_with_a_mistake_is_refused_by_its_field(old, new, words, tmp_path):
@@ -378,7 +396,8 @@ def test_a_description_with_a_mistake_is_refused_by_its_field(old, new, words, t
         (("--cell", "two-arms", "--board", "charuco"), "--board goes with"),
         (("--cell", "to-arms"), "Did you mean two-arms"),
         (("--cell", "two-arms", "--sweep"), "and --cell: each makes a session of its own"),
-        (("--cell", "two-arms", "--payload-kg", 1), "--payload-kg goes with"),
+        (("--cell", "two-arms", "--mount", "eye-to-hand"), "--mount goes with"),
+        (("--cell", "two-arms", "--warm-up"), "and --cell: each makes a session of its own"),
         (("--cell", "camera-and-tracker", "--instrument", "point"), "instruments or points"),
         (("--sweep", "--touches"), "goes with a plain cell of one robot or --cell, not"),
         (("--clock-offset-ms", 3), "--clock-offset-ms goes with --sweep"),

@@ -12,15 +12,21 @@ from visioncal.simulation import (
     BOARDS,
     BoardAt,
     CameraAt,
+    CellOptions,
     InstrumentAt,
     Moved,
     NetworkOptions,
+    Payload,
     PointAt,
+    RobotAt,
+    Second,
     network_session,
+    simulate,
     simulate_network,
     write_network,
 )
 from visioncal.simulation.network import is_symmetric
+from visioncal.simulation.observed_points import whole
 
 EVEN = replace(BOARDS["checkerboard"], name="even", columns=8, rows=6)
 OPTIONS = NetworkOptions(
@@ -30,6 +36,12 @@ OPTIONS = NetworkOptions(
     points=(PointAt("nest", "cell", (0.2, 0.1, 0.0)), PointAt("ball", "b", (0.0, 0.05, 0.1))),
     stops=8,
     lens_views=3,
+)
+
+
+STOPS = 8
+ONE_ARM = NetworkOptions(
+    robots=(RobotAt("a", (-0.6, 0.0, 0.0)),), boards=(BoardAt("plate", "a"),), stops=STOPS
 )
 
 
@@ -128,6 +140,88 @@ def test_it_is_written_whole_with_pictures_and_truth(tmp_path):
     ]
     assert session.cameras["low"].matrix is None
     assert (tmp_path / "cell.truth.json").is_file()
+
+
+def test_robots_of_a_whole_cell_give_way_and_carry_what_rows_say():
+    loads = (Payload(), Payload(5.0, (0.0, 0.0, 0.1)))
+    soft = RobotAt(
+        "a",
+        (-0.6, 0.0, 0.0),
+        robot_sigma_m=0.0,
+        robot_sigma_rad=0.0,
+        compliance_rad_per_nm=(1e-5,) * 6,
+        backlash_rad=(0.0, 1e-3, 0.0, 0.0, 0.0, 0.0),
+        payloads=loads,
+    )
+    cell = simulate_network(replace(ONE_ARM, robots=(soft,)))
+    for robot in (soft, replace(soft, payloads=())):
+        expected = robot.flange_at(
+            cell.true_arms["a"],
+            cell.joints["a"],
+            robot.loads(STOPS),
+            np.resize([-1.0, 1.0], STOPS),
+        )
+        away = np.abs(expected - cell.true_base_from_flange["a"]).max(axis=(1, 2))
+        # The second load of 5 kg bends the arm by some tenths of a millimetre.
+        assert (away[::2] < 1e-12).all()
+        assert (away[1::2] > 1e-5).all() == (not robot.payloads)
+    for view in network_session(cell, "cell", seen="corners").views:
+        if view.text.get("robot"):
+            assert view.numbers["payload_kg"] == loads[view.stop % 2].kg
+            assert view.text["approach"] == "-+"[view.stop % 2]
+
+
+def test_stops_of_a_whole_cell_are_misreported_where_the_truth_says():
+    exact = RobotAt("a", (-0.6, 0.0, 0.0), robot_sigma_m=0.0, robot_sigma_rad=0.0, wrong_stops=2)
+    cell = simulate_network(replace(ONE_ARM, robots=(exact,)))
+    mm, deg = np.array(
+        [
+            pose_difference(*both)
+            for both in zip(
+                cell.base_from_flange["a"], cell.true_base_from_flange["a"], strict=True
+            )
+        ]
+    ).T
+    wrong = np.isin(np.arange(STOPS), cell.wrong_stops["a"])
+    assert wrong.sum() == 2
+    assert ((mm > 4.9) == wrong).all()
+    assert ((deg > 0.9) == wrong).all()
+    with pytest.raises(DataError, match="wrong_stops of a is 9, 0 to 8 are possible"):
+        replace(ONE_ARM, robots=(replace(exact, wrong_stops=9),))
+
+
+def test_cameras_of_a_whole_cell_are_misstated_and_write_their_own_images(tmp_path):
+    low = CameraAt("low", place_m=(0.0, -0.5, 0.7), lens_mismatch_px=0.5, jpeg_quality=80)
+    cell = simulate_network(replace(ONE_ARM, cameras=(low,), stops=1))
+    session = Session.load(write_network(cell, tmp_path / "cell"))
+    assert {it.image.rpartition(".")[2] for it in session.views} == {"jpg"}
+    assert all(session.images.exists(it.image) for it in session.views)
+    off = np.array(session.cameras["low"].matrix) - low.camera.matrix
+    assert 0.01 < np.abs(off).max() < 20.0
+
+
+def test_corners_stand_in_for_images():
+    cell = simulate_network(replace(ONE_ARM, lens_views=2))
+    session = network_session(cell, "cell", seen="corners")
+    assert "image" not in session.columns
+    assert [it.has_corners for it in session.views] == [True] * len(cell.sights)
+    assert session.corner_table is not None
+    np.testing.assert_array_equal(
+        session.corner_table.px, np.concatenate([it.px for it in cell.corners])
+    )
+
+
+def test_one_robot_with_one_camera_is_a_cell_whose_things_have_no_names():
+    cell = simulate(CellOptions(views=4, second=Second()))
+    single = whole(cell)
+    assert single.robot_of("cam") == ""
+    assert single.robot_of("target_first") is None
+    for sight in single.sights:
+        board = single.transforms[f"target_{sight.board}"]
+        flange = single.true_base_from_flange[""][sight.stop]
+        seen = invert(flange @ single.transforms["cam"]) @ board
+        # A product of matrices of order one.
+        np.testing.assert_allclose(seen, sight.cam_from_target, atol=1e-12)
 
 
 def test_what_is_nowhere_is_refused():

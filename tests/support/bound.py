@@ -1,11 +1,9 @@
-"""The Cramer-Rao bound of a simulated cell, by code of its own.
+"""The Cramer-Rao bound of a simulated cell whose arm is unknown, by code of its own.
 
-Unknown are both edges, the flange's error at every view (with its variance as a prior), and the
-lens where the session does not state it; the board is as stated. Derivatives are central
-differences of the simulation's projection, which shares nothing with the application's. Where the
-arm is unknown too, its parameters are those of the simulation, with the variances they were drawn
-from (van Trees 1968, section 2.4); then lens and board are unknown as well where they are not as
-stated.
+Unknown are both edges, the flange's error at every view (with its variance as a prior), lens and
+board where they are not as stated, and the parameters of the arm, which are those of the
+simulation, with the variances they were drawn from (van Trees 1968, section 2.4). Derivatives are
+central differences of the simulation's projection, which shares nothing with the application's.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,50 +26,11 @@ _TORQUE_NM = 100.0
 _BENDS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 
 
-def edge_bound(cell: Cell, views: Sequence[int] | None = None) -> FloatArray:
-    """Least covariance (12, 12) of x and z (rotation, translation; right perturbations).
-
-    Args:
-        cell: The cell.
-        views: Those that count; all where None.
-    """
-    options = cell.options
-    lens = 0 if options.state_intrinsics else 4 + len(options.camera.distortion)
-    shared = 12 + lens
-    information = np.zeros((shared, shared))
-    prior = np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3) ** -2.0
-    for at in range(len(cell.corners)) if views is None else views:
-        slope = (
-            _jacobian(lambda it, at=at: _pixels(cell, at, it), shared + 6) / options.pixel_sigma_px
-        )
-        by_shared, by_slack = slope[:, :shared], slope[:, shared:]
-        between = by_slack.T @ by_shared
-        own = by_slack.T @ by_slack + np.diag(prior)
-        information += by_shared.T @ by_shared - between.T @ np.linalg.solve(own, between)
-    scale = 1.0 / np.sqrt(np.diag(information))
-    scaled = np.linalg.inv(information * np.outer(scale, scale))
-    return np.asarray((scaled * np.outer(scale, scale))[:12, :12])
-
-
 def _jacobian(function: Callable[[FloatArray], FloatArray], size: int) -> FloatArray:
     if not size:
         return np.zeros((len(function(np.zeros(0))), 0))
     steps = _STEP * np.eye(size)
     return np.stack([(function(it) - function(-it)) / (2 * _STEP) for it in steps], axis=1)
-
-
-def _pixels(cell: Cell, view: int, change: FloatArray) -> FloatArray:
-    """Flat pixels of one view's corners when x, z, lens and slack change by (18 + k,)."""
-    camera = cell.options.camera
-    if len(change) > 18:
-        camera = _other_lens(camera, change[12:-6])
-    x, z = cell.transforms.values()
-    flange = cell.true_base_from_flange[view] @ exp(change[-6:])
-    robot = flange if cell.options.mount == "eye-in-hand" else invert(flange)
-    cam_from_target = invert(robot @ x @ exp(change[:6])) @ z @ exp(change[6:12])
-    stated = Sheet(cell.options.target, 1.0, 0.0)
-    points = corners_m(stated)[cell.corners[view].ids]
-    return project(camera, points @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]).ravel()
 
 
 def workspace_bound_m(cell: Cell, q: FloatArray) -> float:
@@ -87,7 +46,7 @@ def workspace_bound_m(cell: Cell, q: FloatArray) -> float:
         q: (k, n) postures at which the error counts, as the encoders have them [rad].
     """
     covariance = _arm_bound(cell)
-    at = np.zeros(3) if cell.options.mount == "eye-in-hand" else centre_m(cell.sheet)
+    at = np.zeros(3) if cell.options.mount == "eye-in-hand" else centre_m(cell.sheets[0])
     turn = np.concatenate([np.cross(at, np.eye(3)), np.eye(3)], axis=1)
     stood = [_held(cell, it) for it in q]
     jacobian = [turn @ _carried(cell, it) @ _pose_jacobian(cell, it) for it in stood]
@@ -229,7 +188,7 @@ def _seen(cell: Cell, pose: FloatArray, ids: IntArray, look: Sequence[float] = (
         own, (scale, aspect, *bends) = np.split(look, [4 + len(camera.distortion)])
         camera = _other_lens(camera, own)
         points = points * [1.0 + scale - 0.5 * aspect, 1.0 + scale + 0.5 * aspect, 1.0]
-        u, v = (points - centre_m(cell.sheet))[:, :2].T / np.abs(points[:, :2]).max()
+        u, v = (points - centre_m(cell.sheets[0]))[:, :2].T / np.abs(points[:, :2]).max()
         points[:, 2] += sum(by * u**a * v**b for by, (a, b) in zip(bends, _BENDS, strict=True))
     return project(camera, points @ pose[:3, :3].T + pose[:3, 3]).ravel()
 

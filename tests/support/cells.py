@@ -12,50 +12,22 @@ from visioncal.calibration.stages.joints import Matched
 from visioncal.calibration.stages.reported_poses import Reported
 from visioncal.core.transforms import invert, log
 from visioncal.robot import Robot, load_robot
-from visioncal.session import MemoryImages, Session, View
-from visioncal.simulation import Cell, CellOptions, Sweep
-from visioncal.simulation.records import approach_text, load_row, pose_row
-from visioncal.simulation.second import NAMES
+from visioncal.session import Session
+from visioncal.simulation import Cell, CellOptions, Sweep, cell_session
+from visioncal.simulation.rows import POSE
 
 
 def session_of(cell: Cell) -> Session:
-    """The session of a cell as it stands in memory, its images not rendered."""
-    options = cell.options
-    camera = cell.stated_camera
-    table = {"resolution": list(camera.resolution), "model": camera.model}
-    if options.state_intrinsics:
-        table |= {"matrix": camera.matrix.tolist(), "distortion": camera.distortion.tolist()}
-    document = {"schema": 1, "name": "cell", "mount": options.mount, "camera": table}
-    views = [
-        View(
-            at,
-            image=f"{at}.png",
-            numbers={
-                **pose_row(cell.base_from_flange[at]),
-                **(load_row(cell.payloads[at]) if cell.payloads else {}),
-            },
-            text=approach_text(cell, at),
-        )
-        for at in range(len(cell.corners))
-    ]
-    if len(cell.sheets) == 1:
-        columns = ("view", "image")
-        document["target"] = options.target.name
-        return Session(document, columns, tuple(views), options.target, None, MemoryImages({}))
-    targets = {name: it.target for name, it in zip(NAMES, cell.sheets, strict=True)}
-    document["targets"] = {name: it.name for name, it in targets.items()}
-    shown = zip(views, cell.shown.stops.tolist(), cell.shown.boards, strict=True)
-    return Session(
+    """The session of a cell as it stands in memory, its images not rendered, without joints."""
+    session = cell_session(cell, "cell", seen="names")
+    document = {name: it for name, it in session.document.items() if name != "robot"}
+    columns = [it for it in session.columns if it in POSE or (it[0] != "q" and it != "stamp_s")]
+    return Session.assemble(
         document,
-        ("view", "stop", "target", "image"),
-        tuple(
-            replace(view, stop=stop, text={**view.text, "target": NAMES[board]})
-            for view, stop, board in shown
-        ),
-        options.target,
-        None,
-        MemoryImages({}),
-        targets=targets,
+        columns,
+        [[view.cell(it) for it in columns] for view in session.views],
+        session.images,
+        target_document=session.target_document,
     )
 
 

@@ -39,8 +39,8 @@ from visioncal.simulation.layout import (
     RobotAt,
 )
 from visioncal.simulation.network import simulate_network
-from visioncal.simulation.network_records import network_session
 from visioncal.simulation.options import BOARDS, Second
+from visioncal.simulation.records import network_session
 from visioncal.simulation.sag import Payload
 
 KEPT = Path(__file__).parents[1] / "data" / "answers.json"
@@ -218,7 +218,7 @@ def cases() -> dict[str, Callable[[], Answer]]:
     shop = tracked.Tracked(points=tracked.THREE)
     found["tracker, places"] = _tracked(shop)
     found["tracker, places, wrong arm"] = _tracked(
-        replace(shop, dh_sigma_m=3e-4, dh_sigma_rad=3e-4, stops=50)
+        replace(shop, dh_sigma_m=3e-4, dh_sigma_rad=3e-4, offset_sigma_rad=3e-4, stops=50)
     )
     found["tracker, poses"] = _tracked(replace(shop, points=shop.points[:1], poses=True))
     found["tracker, one place, poses alone"] = _tracked(

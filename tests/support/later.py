@@ -1,6 +1,5 @@
 """Later looks at a simulated cell that was calibrated: fresh stops, after some change or none."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
@@ -49,21 +48,7 @@ def usual(mount: Mount) -> Lot:
 def lot(options: CellOptions = ANYHOW, further: int = 60) -> Lot:
     """A calibrated cell, and as many further postures from which the board is in view."""
     cell = simulate(replace(options, views=FITTED + further))
-    return Lot(cell, result_of(calibrated(part(cell, range(FITTED)))))
-
-
-def part(cell: Cell, views: Sequence[int]) -> Cell:
-    """Some views of a cell with one board, numbered anew."""
-    rows = list(views)
-    return replace(
-        cell,
-        joints=cell.joints[rows],
-        base_from_flange=cell.base_from_flange[rows],
-        true_base_from_flange=cell.true_base_from_flange[rows],
-        cam_from_target=cell.cam_from_target[rows],
-        corners=tuple(replace(cell.corners[it], view=at) for at, it in enumerate(rows)),
-        payloads=tuple(cell.payloads[it] for it in rows if cell.payloads),
-    )
+    return Lot(cell, result_of(calibrated(cell.only(range(FITTED)))))
 
 
 def again(
@@ -79,7 +64,7 @@ def again(
     """
     change = change or Change()
     rows = FITTED + rng.choice(len(cell.joints) - FITTED, stops, replace=False)
-    fresh, options = part(cell, rows.tolist()), cell.options
+    fresh, options = cell.only(rows.tolist()), cell.options
     sigma = np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3)
     jitter = exp(change.noise_factor * sigma * rng.standard_normal((stops, 6)))
     flange = cell.flange_at(fresh.joints + change.joints_rad, fresh.payloads) @ jitter
@@ -97,7 +82,7 @@ def _detected(
 ) -> Corners:
     """The board as it was printed, as a detector reports it."""
     camera = cell.options.camera
-    px = project(camera, scale * corners_m(cell.sheet) @ pose[:3, :3].T + pose[:3, 3])
+    px = project(camera, scale * corners_m(cell.sheets[0]) @ pose[:3, :3].T + pose[:3, 3])
     ids = np.flatnonzero(np.all((px > 0) & (px < np.array(camera.resolution) - 1), axis=1))
     noise = cell.options.pixel_sigma_px * rng.standard_normal((len(ids), 2))
     return Corners(view, ids, px[ids] + noise, cell.options.blur_px)

@@ -1,4 +1,4 @@
-"""The Cramer-Rao bound of a simulated cell of several robots, by code of its own.
+"""The Cramer-Rao bound of the frames of a simulated cell, by code of its own.
 
 Unknown are where every frame hangs but one base, each flange's error at every stop (with its
 variance as a prior), every board's size (likewise), and each lens that the session does not state.
@@ -15,7 +15,7 @@ from visioncal.core.transforms import exp, invert
 from visioncal.core.types import FloatArray
 from visioncal.session import frame_name
 from visioncal.simulation.boards import corners_m
-from visioncal.simulation.network import Network, Sight, camera_named, sheet_named
+from visioncal.simulation.observed_points import Network, Sight, camera_named, sheet_named
 from visioncal.simulation.optics import project
 
 # Small enough for central differences to be exact to 1e-8, large enough for rounding.
@@ -42,12 +42,19 @@ class Bound:
         return self.covariance[at : at + 6, at : at + 6]
 
 
-def network_bound(cell: Network, reference: str = "base_a") -> Bound:
-    """Computes the bound; `reference` stands for the cell."""
+def network_bound(cell: Network, reference: str = "base_a", *, sizes: bool = True) -> Bound:
+    """Computes the bound; `reference` stands for the cell.
+
+    Args:
+        cell: The cell.
+        reference: The base that stands for it.
+        sizes: Whether boards' sizes are unknown; else they are as stated.
+    """
     frames = tuple(it for it in cell.transforms if it != reference)
     places = {name: slice(6 * at, 6 * at + 6) for at, name in enumerate(frames)}
     size = 6 * len(frames)
-    for board in cell.options.boards:
+    boards = cell.options.boards if sizes else ()
+    for board in boards:
         places[f"size {board.name}"] = slice(size, size + 1)
         size += 1
     for camera in cell.options.cameras:
@@ -56,14 +63,12 @@ def network_bound(cell: Network, reference: str = "base_a") -> Bound:
             places[f"lens {camera.name}"] = slice(size, size + count)
             size += count
     information = np.zeros((size, size))
-    for board in cell.options.boards:
+    for board in boards:
         at = places[f"size {board.name}"].start
         target = board.target
         information[at, at] = (target.square_m / target.square_sigma_m) ** 2
     robots = [it.name for it in cell.options.robots]
-    sigmas = np.concatenate(
-        [np.repeat([it.sigma_rad, it.sigma_m], 3) for it in cell.options.robots]
-    )
+    sigmas = np.concatenate([it.sigma for it in cell.options.robots])
     for stop in range(-1, cell.options.stops):
         between = np.zeros((len(sigmas), size))
         own = np.diag(sigmas**-2.0)

@@ -15,15 +15,7 @@ from visioncal.simulation import Cell
 def halves(cell: Cell) -> tuple[Cell, Cell]:
     """Two cells with the same mountings: the first half of the views, and the second."""
     middle = len(cell.corners) // 2
-    return _part(cell, slice(0, middle)), _part(cell, slice(middle, 2 * middle))
-
-
-def _part(cell: Cell, views: slice) -> Cell:
-    return replace(
-        cell,
-        base_from_flange=cell.base_from_flange[views],
-        corners=tuple(replace(it, view=at) for at, it in enumerate(cell.corners[views])),
-    )
+    return cell.only(range(middle)), cell.only(range(middle, 2 * middle))
 
 
 def with_moved_camera(cell: Cell, twist: np.ndarray) -> Cell:

@@ -24,7 +24,7 @@ def smeared(cell: Cell, *, disc_px: float = 0.0, motion_px: float = 0.0) -> Sess
         motion_px: How far everything moves during an exposure, in each image into a direction of
             its own.
     """
-    scene, files = prepare_scene(cell), {}
+    scene, session, files = prepare_scene(cell), session_of(cell), {}
     for at, (pose, joints) in enumerate(zip(cell.cam_from_target, cell.joints, strict=True)):
         light = light_on(scene, pose, joints, samples=SAMPLES)
         rng = np.random.default_rng([cell.options.seed, at])
@@ -33,8 +33,5 @@ def smeared(cell: Cell, *, disc_px: float = 0.0, motion_px: float = 0.0) -> Sess
         for kernel in (disc_kernel(disc_px), line_kernel(half)):
             if kernel.size > 1:
                 light = cv2.filter2D(light, -1, kernel, borderType=cv2.BORDER_REPLICATE)
-        files[f"{at}.png"] = encode(developed(light, cell.options, rng), None)
-    session = session_of(cell)
-    document = {**session.document, "target": cell.options.target.name}
-    columns = ("view", "image", *session.views[0].numbers)
-    return replace(session, document=document, columns=columns, images=MemoryImages(files))
+        files[session.views[at].image] = encode(developed(light, cell.options, rng), None)
+    return replace(session, images=MemoryImages(files))

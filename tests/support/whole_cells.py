@@ -7,7 +7,6 @@ import numpy as np
 
 from visioncal.core.transforms import invert, log
 from visioncal.session import Session
-from visioncal.session.corners import CornerTable
 from visioncal.simulation import (
     BOARDS,
     BoardAt,
@@ -42,22 +41,7 @@ LATER = 20
 
 def recorded(cell: Network) -> Session:
     """The session of a cell, with its corners in the place of images."""
-    session = network_session(cell, "two arms", seen="names")
-    counts = [len(it.ids) for it in cell.corners]
-    return Session.assemble(
-        session.document,
-        [it for it in session.columns if it != "image"],
-        [[view.cell(it) for it in session.columns if it != "image"] for view in session.views],
-        session.images,
-        target_document=session.target_document,
-        robot_document=session.robot_document,
-        corners=CornerTable(
-            np.repeat([it.view for it in cell.corners], counts),
-            np.concatenate([it.ids for it in cell.corners]),
-            np.concatenate([it.px for it in cell.corners]),
-            ("",) * sum(counts),
-        ),
-    )
+    return network_session(cell, "two arms", seen="corners")
 
 
 def part(session: Session, first: int, end: int) -> Session:

@@ -27,7 +27,12 @@ _SINGLE = frozenset(
         *("images", "stiffness_knm", "payload_kg", "recording", "camera_moved_mm", "seed"),
     )
 )
-_ARM = frozenset(("robot_sigma_mm", "robot_sigma_mrad", "arm_sigma_mm", "arm_sigma_mrad"))
+_ARM = frozenset(
+    (
+        *("robot_sigma_mm", "robot_sigma_mrad", "arm_sigma_mm", "arm_sigma_mrad"),
+        *("stiffness_knm", "payload_kg"),
+    )
+)
 # What a whole cell takes along, which are kinds of their own without one.
 _ALONG = frozenset(("instrument", "torques"))
 _TAKES: Mapping[str, frozenset[str]] = {
@@ -36,8 +41,9 @@ _TAKES: Mapping[str, frozenset[str]] = {
     "warm_up": _SINGLE | {"currents"},
     "cell": _ARM
     | _ALONG
-    | {"views", "wrong_views", "images", "seed", "recording", "camera_moved_mm", "touches"},
-    "instrument": _ARM | {"views", "robot", "stiffness_knm", "payload_kg", "seed"},
+    | {"views", "wrong_views", "images", "seed", "recording", "camera_moved_mm", "touches"}
+    | {"board_scale", "with_intrinsics"},
+    "instrument": _ARM | {"views", "robot", "seed"},
     "torques": frozenset(("robot", "payload_kg", "currents", "seed")),
 }
 
@@ -226,23 +232,17 @@ def simulate_command(context: typer.Context, asked: SimulateOptions) -> None:
 
 def _single(options: "CellOptions", asked: SimulateOptions) -> None:
     """Writes a cell of one robot, and what its tool touched."""
-    from visioncal.simulation import simulate, touch, write_session, write_touches
-    from visioncal.simulation.records import truth_of, write_truth
+    from visioncal.simulation import simulate, touch, write_session
 
-    cell, folder = simulate(options), asked.folder
-    touched = touch(cell) if asked.touches else None
+    cell = simulate(options)
     with shown_progress(quiet=False) as progress:
         write_session(
             cell,
-            folder,
+            asked.folder,
             lambda share: progress("render", round(share * options.views), options.views),
             images=asked.images,
+            touched=touch(cell) if asked.touches else None,
         )
-    if touched is not None:
-        write_touches({"": touched}, folder)
-        truth = truth_of(cell)
-        truth["transforms"] |= touched.transforms()
-        write_truth(folder, truth)
 
 
 def _read_by(instrument: Read, options: "CellOptions", stops: int) -> "Tracked":
@@ -250,17 +250,11 @@ def _read_by(instrument: Read, options: "CellOptions", stops: int) -> "Tracked":
     from visioncal.simulation.tracked import THREE, Tracked
 
     return Tracked(
-        robot=options.robot,
         stops=stops,
         points=THREE if instrument == "points" else THREE[:1],
         poses=instrument == "probe",
-        robot_sigma_m=options.robot_sigma_m,
-        robot_sigma_rad=options.robot_sigma_rad,
-        dh_sigma_m=options.dh_sigma_m,
-        dh_sigma_rad=options.dh_sigma_rad,
-        compliance=options.compliance_rad_per_nm,
-        payloads=options.payloads,
         seed=options.seed,
+        **options.of_arm,
     )
 
 
@@ -285,12 +279,14 @@ def _given_for(context: typer.Context) -> frozenset[str]:
         raise DataError(
             f"{' and '.join(named)}: each makes a session of its own kind.",
             culprits=named,
-            next_step="Give one of them, and make the others into folders of their own.",
+            next_step="A whole cell's own file says which robots warm up, and what is swept."
+            if "cell" in kinds
+            else "Give one of them, and make the others into folders of their own.",
         )
     kind = kinds[0] if kinds else ""
     takes = _TAKES[kind]
     if kind == "cell" and context.params.get("torques"):
-        takes = takes | {"currents", "payload_kg"}
+        takes = takes | {"currents"}
     for unfit in sorted(given - takes - {"folder", kind}):
         fit = [_option(it) for it, taken in _TAKES.items() if unfit in taken]
         raise DataError(

@@ -1,6 +1,8 @@
 """Whole cells of `visioncal simulate`, and what is recorded of them beside the cameras' views."""
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -9,6 +11,7 @@ from visioncal.cli.simulate import Read, SimulateOptions
 from visioncal.core.errors import DataError
 from visioncal.session import frame_name
 from visioncal.simulation import (
+    CameraAt,
     CellOptions,
     InstrumentAt,
     Moved,
@@ -21,10 +24,21 @@ from visioncal.simulation import (
     write_network,
 )
 from visioncal.simulation.dynamics import Body
-from visioncal.simulation.exercise import ExerciseOptions, Senses, exercise
-from visioncal.simulation.network_records import seed_of
+from visioncal.simulation.exercise import ExerciseOptions, Senses, exercise, seed_of
 from visioncal.simulation.tracked import THREE, Tracked
 
+_T = TypeVar("_T", RobotAt, CameraAt)
+
+# Fields of robots and cameras, as of a cell of one of each, by the parameters that state them.
+_FIELDS: Mapping[str, str] = {
+    "robot_sigma_mm": "robot_sigma_m",
+    "robot_sigma_mrad": "robot_sigma_rad",
+    "arm_sigma_mm": "dh_sigma_m",
+    "arm_sigma_mrad": "dh_sigma_rad",
+    "stiffness_knm": "compliance_rad_per_nm",
+    "payload_kg": "payloads",
+    "with_intrinsics": "state_intrinsics",
+}
 # Where the centre of a simulated load is, in the flange's frame [m].
 CENTRE_M = (0.0, 0.0, 0.1)
 # Half of the side of a load that is a cube [m], and torque for a current of each drive [N m/A].
@@ -71,8 +85,15 @@ def _described(
     described = replace(
         described, **{own: getattr(options, it) for it, own in changes.items() if it in given}
     )
-    robots = tuple(_robot(it, options, given) for it in described.robots)
-    described = replace(described, robots=robots)
+    described = replace(
+        described,
+        robots=tuple(_with_given(it, options, given) for it in described.robots),
+        cameras=tuple(_with_given(it, options, given) for it in described.cameras),
+        boards=tuple(
+            replace(it, scale=options.board_scale) if "board_scale" in given else it
+            for it in described.boards
+        ),
+    )
     if "camera_moved_mm" in given:
         if not described.cameras:
             raise DataError(
@@ -84,18 +105,11 @@ def _described(
     return described if instrument is None else _tracked_too(name, described, instrument)
 
 
-def _robot(robot: RobotAt, options: CellOptions, given: frozenset[str]) -> RobotAt:
-    """A robot that errs as the user says."""
-    if "robot_sigma_mm" in given:
-        robot = replace(robot, sigma_m=options.robot_sigma_m)
-    if "robot_sigma_mrad" in given:
-        robot = replace(robot, sigma_rad=options.robot_sigma_rad)
-    if "arm_sigma_mm" in given:
-        robot = replace(robot, dh_sigma_m=options.dh_sigma_m)
-    if "arm_sigma_mrad" in given:
-        sigma = options.dh_sigma_rad
-        robot = replace(robot, dh_sigma_rad=sigma, offset_sigma_rad=sigma)
-    return robot
+def _with_given(thing: _T, options: CellOptions, given: frozenset[str]) -> _T:
+    """A robot or a camera with what the user says of it."""
+    mine = {it.name for it in fields(thing)}
+    changed = {_FIELDS[it] for it in given & _FIELDS.keys()} & mine
+    return replace(thing, **{name: getattr(options, name) for name in changed})
 
 
 def _tracked_too(name: str, described: NetworkOptions, instrument: Read) -> NetworkOptions:

@@ -12,6 +12,7 @@ from visioncal.session.session import Session
 from visioncal.session.streams import FOLDER as STREAMS
 from visioncal.session.streams import Stream, check_stream, save_stream, too_far_apart
 from visioncal.session.table import View
+from visioncal.vision.targets import target_document
 
 __all__ = [
     "STREAMS",
@@ -26,5 +27,6 @@ __all__ = [
     "check_stream",
     "frame_name",
     "save_stream",
+    "target_document",
     "too_far_apart",
 ]

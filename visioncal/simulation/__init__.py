@@ -18,7 +18,6 @@ from visioncal.simulation.layout import (
     Swept,
 )
 from visioncal.simulation.network import simulate_network
-from visioncal.simulation.network_records import network_session, write_network
 from visioncal.simulation.observed_points import Network, Sight
 from visioncal.simulation.optics import (
     CAMERAS,
@@ -30,23 +29,27 @@ from visioncal.simulation.optics import (
 )
 from visioncal.simulation.options import (
     BOARDS,
+    CameraOptions,
     CellOptions,
     Motion,
     Second,
+    SweepOptions,
 )
+from visioncal.simulation.real_arm import ArmOptions
 from visioncal.simulation.records import (
-    Truth,
+    cell_session,
     measured_poses,
-    read_truth,
+    network_session,
     sweep_session,
-    truth_path,
+    write_network,
     write_session,
     write_sweep,
 )
 from visioncal.simulation.render import Scene, prepare_scene, render
 from visioncal.simulation.sag import Payload
-from visioncal.simulation.sweep import Sweep, SweepOptions, sweep
+from visioncal.simulation.sweep import Sweep, sweep
 from visioncal.simulation.touching import touch, touch_network, write_touches
+from visioncal.simulation.truth import Truth, read_truth, truth_path
 from visioncal.simulation.warmup import (
     Heat,
     Round,
@@ -60,8 +63,10 @@ __all__ = [
     "BOARDS",
     "CAMERAS",
     "Arm",
+    "ArmOptions",
     "BoardAt",
     "CameraAt",
+    "CameraOptions",
     "Cell",
     "CellOptions",
     "Heat",
@@ -85,6 +90,7 @@ __all__ = [
     "WarmUpOptions",
     "arm_named",
     "cell_names",
+    "cell_session",
     "fine_camera",
     "fisheye_camera",
     "forward",

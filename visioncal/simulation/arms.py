@@ -53,26 +53,27 @@ class Arm:
     beyond: FloatArray | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ArmErrors:
     """How a real arm departs from its data sheet, as standard deviations per parameter.
 
     Attributes:
-        length_m: Of every a and d [m].
-        angle_rad: Of every alpha, beta and joint offset [rad].
-        offset_rad: Of the joint offsets, on top of `angle_rad` [rad].
-        eccentricity_rad: Of the sine and the cosine of one turn of each joint [rad].
-        ripple_rad: The same for the gear's ripple [rad].
-        function_rad: Of what each joint turns beyond all that, as a function of its angle [rad].
-        function_length_rad: Over which change of the angle that changes [rad].
+        dh_sigma_m: Of every length a and d [m].
+        dh_sigma_rad: Of every alpha, beta and joint offset [rad].
+        offset_sigma_rad: Of the joint offsets, on top of `dh_sigma_rad` [rad].
+        eccentricity_sigma_rad: How far each joint turns with the sine and the cosine of its angle
+            beyond what its encoder says [rad].
+        ripple_sigma_rad: The same for the ripple of its gear, many times a turn [rad].
+        function_sigma_rad: How far each joint turns beyond that by any function of its angle [rad].
+        function_length_rad: Over which change of the angle that function changes [rad].
     """
 
-    length_m: float
-    angle_rad: float
-    offset_rad: float
-    eccentricity_rad: float = 0.0
-    ripple_rad: float = 0.0
-    function_rad: float = 0.0
+    dh_sigma_m: float = 0.0
+    dh_sigma_rad: float = 0.0
+    offset_sigma_rad: float = 0.0
+    eccentricity_sigma_rad: float = 0.0
+    ripple_sigma_rad: float = 0.0
+    function_sigma_rad: float = 0.0
     function_length_rad: float = 0.06
 
 
@@ -163,16 +164,16 @@ def disturb(arm: Arm, errors: ArmErrors, rng: np.random.Generator) -> Arm:
     The same generator state gives the same directions of error whatever their size.
     """
     draws, waves = rng.standard_normal((6, arm.a.size)), rng.standard_normal((4, arm.a.size))
-    sizes = np.repeat([errors.eccentricity_rad, errors.ripple_rad], 2)
+    sizes = np.repeat([errors.eccentricity_sigma_rad, errors.ripple_sigma_rad], 2)
     # Nothing is drawn for nothing: what others draw behind it stays.
-    beyond = _functions(errors, arm.a.size, rng) if errors.function_rad else arm.beyond
+    beyond = _functions(errors, arm.a.size, rng) if errors.function_sigma_rad else arm.beyond
     return replace(
         arm,
-        a=arm.a + errors.length_m * draws[0],
-        d=arm.d + errors.length_m * draws[1],
-        alpha=arm.alpha + errors.angle_rad * draws[2],
-        beta=arm.beta + errors.angle_rad * draws[3],
-        offset=arm.offset + errors.angle_rad * draws[4] + errors.offset_rad * draws[5],
+        a=arm.a + errors.dh_sigma_m * draws[0],
+        d=arm.d + errors.dh_sigma_m * draws[1],
+        alpha=arm.alpha + errors.dh_sigma_rad * draws[2],
+        beta=arm.beta + errors.dh_sigma_rad * draws[3],
+        offset=arm.offset + errors.dh_sigma_rad * draws[4] + errors.offset_sigma_rad * draws[5],
         waves=arm.waves + sizes[:, None] * waves,
         beyond=beyond,
     )
@@ -184,7 +185,7 @@ def _functions(errors: ArmErrors, joints: int, rng: np.random.Generator) -> Floa
     near = np.exp(-2.0 * np.sin(0.5 * turned) ** 2 / errors.function_length_rad**2)
     power = np.sqrt(np.maximum(np.fft.rfft(near).real, 0.0))[:, None]
     white = np.fft.rfft(rng.standard_normal((_NODES, joints)), axis=0)
-    return np.asarray(errors.function_rad * np.fft.irfft(power * white, _NODES, axis=0))
+    return np.asarray(errors.function_sigma_rad * np.fft.irfft(power * white, _NODES, axis=0))
 
 
 def reach_m(arm: Arm) -> float:

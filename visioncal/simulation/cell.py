@@ -2,61 +2,27 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from enum import IntEnum
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import compose, exp, invert
+from visioncal.core.transforms import compose, invert
 from visioncal.core.types import Camera, Corners, FloatArray
-from visioncal.simulation.arms import (
-    Arm,
-    ArmErrors,
-    arm_named,
-    disturb,
-    forward,
-    inverse,
-    link_frames,
-    reach_m,
-)
+from visioncal.simulation.arms import Arm, arm_named, forward, inverse, link_frames, reach_m
 from visioncal.simulation.boards import Sheet, centre_m, corners_m
-from visioncal.simulation.optics import mistaken, project, sees
-from visioncal.simulation.options import CellOptions
+from visioncal.simulation.draws import Stream
+from visioncal.simulation.optics import project, sees
+from visioncal.simulation.options import CameraOptions, CellOptions
 from visioncal.simulation.poses import draw_views, mean_view
-from visioncal.simulation.sag import Payload, giving_of, loads_in_turn, sagging
+from visioncal.simulation.sag import Payload
 from visioncal.simulation.second import Shown, chains, sheets_of, shown_at, with_second
 
 # Postures with a smaller dexterity are so near a singularity that no operator would choose them.
 LEAST_DEXTERITY = 0.04
 # A corner nearer to the image's edge is not detected [px].
 EDGE_PX = 2.0
-
-
-class Stream(IntEnum):
-    """Independent sources of randomness of one cell."""
-
-    MOUNTING = 0
-    POSES = 1
-    ARM = 2
-    ROBOT = 3
-    WRONG = 4
-    PIXELS = 5
-    IMAGES = 6
-    BACKDROP = 7
-    PAIRS = 8
-    LENS = 9
-    SWEEP = 10
-    BUMP = 11
-    TOUCHES = 12
-
-
-# What another draw of the same cell draws anew, and what another recording of it.
-_DRAWN_ANEW = (Stream.ARM, Stream.ROBOT, Stream.PIXELS)
-_RECORDED_ANEW = tuple(it for it in Stream if it not in (Stream.MOUNTING, Stream.ARM, Stream.LENS))
-# Sets a recording's randomness apart from a draw's.
-_RECORDING = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +33,6 @@ class Cell:
         options: What was asked for.
         arm: The nominal arm.
         true_arm: The arm as it was built.
-        sheet: The board as it was printed; of two, the first.
         stated_camera: The intrinsics as the session states them.
         transforms: True edges, each (4, 4): `flange_from_cam` and `base_from_target`
             (eye-in-hand), or `base_from_cam` and `flange_from_target` (eye-to-hand); of two boards
@@ -79,7 +44,7 @@ class Cell:
         exact_corners: Where the corners really are in each image.
         corners: The same as a detector with `pixel_sigma_px` would report them.
         wrong_views: Views whose report is wrong, ascending.
-        sheets: All boards as they were printed.
+        sheets: The boards as they were printed.
         shown: Which stop and which board each view is of: a stop that shows two has two views.
         payloads: What the arm carried, view by view; empty where nothing.
         approach: (m,) the side from which each stop was approached, +1 or -1; None where that is
@@ -89,7 +54,6 @@ class Cell:
     options: CellOptions
     arm: Arm
     true_arm: Arm
-    sheet: Sheet
     stated_camera: Camera
     transforms: Mapping[str, FloatArray]
     joints: FloatArray
@@ -109,7 +73,49 @@ class Cell:
 
         With k loads, or none but its own weight; from the middle of its play.
         """
-        return _stands(self.options, self.true_arm, q, payloads)
+        return self.options.flange_at(self.true_arm, q, payloads)
+
+    def only(self, views: Sequence[int]) -> "Cell":
+        """The cell with some of its views, numbered anew; stops keep their numbers."""
+        kept = list(views)
+        exact, found = (
+            tuple(replace(corners[at], view=view) for view, at in enumerate(kept))
+            for corners in (self.exact_corners, self.corners)
+        )
+        return replace(
+            self,
+            joints=self.joints[kept],
+            base_from_flange=self.base_from_flange[kept],
+            true_base_from_flange=self.true_base_from_flange[kept],
+            cam_from_target=self.cam_from_target[kept],
+            exact_corners=exact,
+            corners=found,
+            wrong_views=tuple(at for at, it in enumerate(kept) if it in self.wrong_views),
+            shown=Shown(self.shown.stops[kept], self.shown.boards[kept]),
+            payloads=tuple(self.payloads[at] for at in kept if self.payloads),
+            approach=None if self.approach is None else self.approach[kept],
+        )
+
+    def standing_at(self, true_base_from_flange: FloatArray) -> "Cell":
+        """The cell as its views look where the flange really stands at (m, 4, 4)."""
+        boards = self.shown.boards
+        poses = [before_camera(it, true_base_from_flange) for it in chains(self.transforms)]
+        seen = np.array(poses)[boards, np.arange(len(boards))]
+        exact = tuple(
+            seen_in(self.options, self.sheets[board], pose, view)
+            for view, (board, pose) in enumerate(zip(boards, seen, strict=True))
+        )
+        return replace(
+            self,
+            true_base_from_flange=true_base_from_flange,
+            cam_from_target=seen,
+        ).showing(exact)
+
+    def showing(self, exact_corners: Sequence[Corners]) -> "Cell":
+        """The cell with corners elsewhere in the images of its views, and found anew."""
+        noise, sigma_px = self.options.stream(Stream.PIXELS), self.options.pixel_sigma_px
+        found = tuple(detected(it, sigma_px, noise) for it in exact_corners)
+        return replace(self, exact_corners=tuple(exact_corners), corners=found)
 
 
 @typed
@@ -131,16 +137,7 @@ def simulate(options: CellOptions, postures: FloatArray | None = None) -> Cell:
     arm = arm_named(options.robot)
     if postures is not None:
         options = replace(options, views=len(postures))
-    errors = ArmErrors(
-        options.dh_sigma_m,
-        options.dh_sigma_rad,
-        options.offset_sigma_rad,
-        options.eccentricity_sigma_rad,
-        options.ripple_sigma_rad,
-        options.function_sigma_rad,
-        options.function_length_rad,
-    )
-    true_arm = disturb(arm, errors, stream(options, Stream.ARM))
+    true_arm = options.built(options.stream(Stream.ARM))
     sheets = sheets_of(options)
     transforms = _mountings(options, arm, sheets[0])
     if options.second is not None:
@@ -150,68 +147,37 @@ def simulate(options: CellOptions, postures: FloatArray | None = None) -> Cell:
     else:
         moved = np.array(postures, dtype=float)
     transforms = _bumped(options, transforms)
-    sigma = np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3)
-    jitter = stream(options, Stream.ROBOT).standard_normal((options.views, 6)) * sigma
-    payloads = loads_in_turn(options.payloads, options.views)
-    approach = _approach(options)
-    true_base_from_flange = _stands(options, true_arm, moved, payloads, approach) @ exp(jitter)
-    joints, wrong_stops = _misreport(options, arm, moved)
+    payloads, approach = options.loads(options.views), options.approach(options.views)
+    jitter = options.jitter(options.views, options.stream(Stream.ROBOT))
+    true_base_from_flange = options.flange_at(true_arm, moved, payloads, approach) @ jitter
+    rng = options.stream(Stream.WRONG)
+    joints, wrong_stops = misreported(arm, moved, options.wrong_views, rng)
     poses = [before_camera(chain, true_base_from_flange) for chain in chains(transforms)]
     shown = shown_at(options, sheets, poses)
-    cam_from_target = np.array(poses)[shown.boards, shown.stops]
-    exact_corners = seen_by(options, [sheets[board] for board in shown.boards], cam_from_target)
-    return Cell(
+    cell = Cell(
         options=options,
         arm=arm,
         true_arm=true_arm,
-        sheet=sheets[0],
-        stated_camera=mistaken(
-            options.camera, options.lens_mismatch_px, stream(options, Stream.LENS)
-        ),
+        stated_camera=options.stated(options.stream(Stream.LENS)),
         transforms=transforms,
         joints=joints[shown.stops],
         base_from_flange=forward(arm, joints)[shown.stops],
-        true_base_from_flange=true_base_from_flange[shown.stops],
-        cam_from_target=cam_from_target,
-        exact_corners=exact_corners,
-        corners=detected(options, exact_corners),
+        true_base_from_flange=np.empty(0),
+        cam_from_target=np.empty(0),
+        exact_corners=(),
+        corners=(),
         wrong_views=tuple(np.flatnonzero(np.isin(shown.stops, wrong_stops)).tolist()),
         sheets=sheets,
         shown=shown,
         payloads=tuple(payloads[at] for at in shown.stops if payloads),
-        approach=approach[shown.stops] if options.backlash_rad else None,
+        approach=None if approach is None else approach[shown.stops],
     )
-
-
-def _stands(
-    options: CellOptions,
-    arm: Arm,
-    q: FloatArray,
-    payloads: Sequence[Payload],
-    approach: FloatArray | None = None,
-) -> FloatArray:
-    """Where the flange of an arm that gives way stands, (m, 4, 4), at (m, n) joint angles [rad]."""
-    giving = giving_of(arm, options.compliance_rad_per_nm, options.mass_share, options.backlash_rad)
-    return forward(arm, sagging(arm, giving, q, payloads, approach))
-
-
-def _approach(options: CellOptions) -> FloatArray:
-    """(m,) the sides from which stops are approached: from either in turn where there is play."""
-    sides = np.where(np.arange(options.views) % 2, 1.0, -1.0)
-    return sides if options.backlash_rad else np.zeros(options.views)
-
-
-def stream(options: CellOptions, purpose: Stream, *index: int) -> np.random.Generator:
-    """The generator of one source of randomness; `index` is of the view."""
-    again: tuple[int, ...] = (options.draw,) if options.draw and purpose in _DRAWN_ANEW else ()
-    if options.recording and purpose in _RECORDED_ANEW:
-        again += (_RECORDING, options.recording)
-    return np.random.default_rng([options.seed, int(purpose), *again, *index])
+    return cell.standing_at(true_base_from_flange[shown.stops])
 
 
 def _mountings(options: CellOptions, arm: Arm, sheet: Sheet) -> dict[str, FloatArray]:
     """The two constant edges of the cell, plausible for the arm's size."""
-    rng = stream(options, Stream.MOUNTING)
+    rng = options.stream(Stream.MOUNTING)
     front, spin = rng.uniform(-0.5, 0.5), rng.uniform(-0.4, 0.4)
     radius = 0.6 * reach_m(arm)
     skewed = Rotation.from_rotvec(rng.normal(0.0, 0.05, 3))
@@ -237,7 +203,7 @@ def _mountings(options: CellOptions, arm: Arm, sheet: Sheet) -> dict[str, FloatA
 
 def _bumped(options: CellOptions, transforms: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
     """The edges once the camera was pushed, in a direction of chance."""
-    away = stream(options, Stream.BUMP).standard_normal(3)
+    away = options.stream(Stream.BUMP).standard_normal(3)
     away *= options.camera_moved_m / np.linalg.norm(away)
     push = compose(np.eye(3), away)
     return {name: it @ push if name.endswith("cam") else it for name, it in transforms.items()}
@@ -277,7 +243,7 @@ def _postures(
     for board, (sheet, chain) in enumerate(zip(sheets, chains(transforms), strict=True)):
         mine = np.arange(board, options.views, len(sheets))
         part = replace(options, target=sheet.target, views=len(mine), wrong_views=0)
-        rng = stream(options, Stream.POSES, *([board] if board else []))
+        rng = options.stream(Stream.POSES, *([board] if board else []))
         joints[mine] = _reachable_joints(part, arm, sheet, chain, rng)
     return joints
 
@@ -292,7 +258,7 @@ def _reachable_joints(
     """(m, n) postures of the nominal arm that bring the board into the image."""
     # Nothing of the arm may sink into the table under the board, or under the robot.
     floor = min(0.0, transforms.get("base_from_target", np.eye(4))[2, 3]) + 0.05
-    home = home_posture(options, arm, _flange(transforms, mean_view(options, sheet)[None]), rng)
+    home = home_posture(arm, _flange(transforms, mean_view(options, sheet)[None]), rng)
     kept: list[FloatArray] = []
     for _ in range(50):
         views = draw_views(options, sheet, 4 * options.views, rng)
@@ -314,9 +280,7 @@ def _reachable_joints(
     )
 
 
-def home_posture(
-    options: CellOptions, arm: Arm, base_from_flange: FloatArray, rng: np.random.Generator
-) -> FloatArray:
+def home_posture(arm: Arm, base_from_flange: FloatArray, rng: np.random.Generator) -> FloatArray:
     """(n,) the most dexterous posture at one pose (1, 4, 4); all views start from it."""
     starts = rng.uniform(-np.pi, np.pi, size=(64, arm.a.size))
     reach = inverse(arm, np.tile(base_from_flange, (64, 1, 1)), starts)
@@ -324,7 +288,7 @@ def home_posture(
     merit = np.where(reach.solved & elbow_up, reach.dexterity, 0.0)
     if not merit.any():
         raise DataError(
-            f"simulation: the {arm.name} cannot reach the middle of the {options.mount} views.",
+            f"simulation: the {arm.name} cannot reach the middle of the views.",
             next_step="Take another working distance, board or robot.",
         )
     best = reach.joints[np.argmax(merit)]
@@ -337,51 +301,44 @@ def lowest_m(arm: Arm, joints: FloatArray) -> FloatArray:
     return np.asarray(link_frames(arm, joints)[:, 2:, 2, 3].min(axis=1))
 
 
-def _misreport(
-    options: CellOptions, arm: Arm, moved: FloatArray
+def misreported(
+    arm: Arm, moved: FloatArray, count: int, rng: np.random.Generator
 ) -> tuple[FloatArray, tuple[int, ...]]:
-    """Joints as reported: those moved to, but for views whose report belongs elsewhere."""
-    rng = stream(options, Stream.WRONG)
-    chosen = np.sort(rng.permutation(options.views)[: options.wrong_views])
+    """Joints as reported: those moved to, but for some stops whose report belongs elsewhere.
+
+    Args:
+        arm: The nominal arm.
+        moved: (s, n) joint angles moved to [rad].
+        count: How many stops are reported 5 to 30 mm and 1 to 5 degrees away.
+        rng: Source of randomness.
+
+    Returns:
+        (s, n) joint angles as reported [rad], and those stops, ascending.
+    """
+    chosen = np.sort(rng.permutation(len(moved))[:count])
     joints = moved.copy()
-    for view in chosen:
+    for stop in chosen:
         for _ in range(20):
             turn, shift = rng.normal(size=(2, 3))
             turn *= np.deg2rad(rng.uniform(1.0, 5.0)) / np.linalg.norm(turn)
             shift *= rng.uniform(0.005, 0.030) / np.linalg.norm(shift)
             error = compose(Rotation.from_rotvec(turn).as_matrix(), shift)
-            reach = inverse(arm, forward(arm, moved[view, None]) @ error, moved[view, None])
+            reach = inverse(arm, forward(arm, moved[stop, None]) @ error, moved[stop, None])
             if reach.solved[0]:
-                joints[view] = reach.joints[0]
+                joints[stop] = reach.joints[0]
                 break
         else:
-            raise DataError(f"simulation: no wrong report is in the arm's reach in view {view}.")
-    return joints, tuple(int(view) for view in chosen)
+            raise DataError(f"simulation: no wrong report is in the arm's reach at stop {stop}.")
+    return joints, tuple(chosen.tolist())
 
 
-def seen_by(
-    options: CellOptions, sheets: Sequence[Sheet], cam_from_target: FloatArray
-) -> tuple[Corners, ...]:
-    """Where the corners of each view's sheet are in its image, without the ones outside it."""
-    seen = []
-    for view, (sheet, pose) in enumerate(zip(sheets, cam_from_target, strict=True)):
-        points = corners_m(sheet)
-        points_cam = points @ pose[:3, :3].T + pose[:3, 3]
-        ids = np.flatnonzero(sees(options.camera, points_cam, EDGE_PX))
-        px = project(options.camera, points_cam[ids])
-        seen.append(Corners(view, ids.astype(np.int64), px, options.blur_px))
-    return tuple(seen)
+def seen_in(camera: CameraOptions, sheet: Sheet, cam_from_target: FloatArray, view: int) -> Corners:
+    """Where the corners of a sheet are in the image of one view, without the ones outside it."""
+    points = corners_m(sheet) @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]
+    ids = np.flatnonzero(sees(camera.camera, points, EDGE_PX)).astype(np.int64)
+    return Corners(view, ids, project(camera.camera, points[ids]), camera.blur_px)
 
 
-def detected(options: CellOptions, exact_corners: tuple[Corners, ...]) -> tuple[Corners, ...]:
-    """The corners with the noise of their detection."""
-    noise = stream(options, Stream.PIXELS)
-    return tuple(
-        Corners(
-            each.view,
-            each.ids,
-            each.px + options.pixel_sigma_px * noise.standard_normal(each.px.shape),
-            each.blur_px,
-        )
-        for each in exact_corners
-    )
+def detected(exact: Corners, sigma_px: float, noise: np.random.Generator) -> Corners:
+    """The corners of a view with the noise of their detection."""
+    return replace(exact, px=exact.px + sigma_px * noise.standard_normal(exact.px.shape))

@@ -26,9 +26,10 @@ from visioncal.simulation.layout import (
 )
 from visioncal.simulation.optics import CAMERAS
 from visioncal.simulation.options import TARGETS
+from visioncal.simulation.sag import Payload
 
 Thing: TypeAlias = (
-    RobotAt | CameraAt | BoardAt | InstrumentAt | PointAt | Moved | Swept | NetworkOptions
+    RobotAt | CameraAt | BoardAt | InstrumentAt | PointAt | Moved | Swept | Payload | NetworkOptions
 )
 _T = TypeVar("_T", bound=Thing)
 
@@ -46,6 +47,10 @@ _TABLES = (*_KINDS, "moved", "sweeps")
 _MOST_BOW_M = 0.05
 # Whole numbers go up to this.
 _MOST = 1_000_000
+# Numbers that may be below zero.
+_SIGNED = ("tilt_rad", "turn_rad", "shift_m", "bow_m", "camera_minus_robot_s")
+# Every simulated arm has so many joints.
+_JOINTS = 6
 
 
 def cell_names() -> tuple[str, ...]:
@@ -88,18 +93,10 @@ def read_cell(name_or_path: str) -> NetworkOptions:
             culprits=[f"{path.name}: points"],
             next_step="Add a table [instruments.NAME], or leave the points out.",
         )
-    moved = _listed(reader, document, "moved", Moved, path.name)
-    sweeps = _listed(reader, document, "sweeps", Swept, path.name)
+    table = Table(document, path.name)
+    moved = reader.listed(Moved, table, "moved")
+    sweeps = reader.listed(Swept, table, "sweeps")
     return reader.read(NetworkOptions, own, "", moved=moved, sweeps=sweeps, **things)
-
-
-def _listed(
-    reader: "_Reader", document: Mapping[str, Any], key: str, kind: type[_T], label: str
-) -> tuple[_T, ...]:
-    rows = document.get(key, [])
-    if not isinstance(rows, list):
-        raise Table(document, label).refuse(key, rows, f"a table [[{key}]] for each")
-    return tuple(reader.read(kind, row, f"{key} {at}") for at, row in enumerate(rows, start=1))
 
 
 def _shipped() -> dict[str, Path]:
@@ -149,17 +146,23 @@ class _Reader:
         needed = {it.name for it in fields(kind) if _has_no_default(it)}
         table = Table(row, label)
         values: dict[str, Any] = {
-            key: self._value(table, key, hint, kind)
+            key: self._value(table, key, hint, kind, path)
             for key, hint in types.items()
             if key in row or key in needed
         }
         return kind(**values | given)
 
-    def _value(self, table: Table, key: str, hint: object, kind: type) -> object:
-        if hint is Camera:
-            return CAMERAS[table.choice(key, tuple(CAMERAS))]
-        if hint is Target:
-            return TARGETS[table.choice(key, tuple(TARGETS))]
+    def listed(self, kind: type[_T], table: Table, key: str, path: str = "") -> tuple[_T, ...]:
+        """A list of tables as objects of a dataclass."""
+        rows, path = table.content.get(key, []), f"{path}.{key}".lstrip(".")
+        if not isinstance(rows, list):
+            raise table.refuse(key, rows, f"a table [[{path}]] for each")
+        return tuple(self.read(kind, row, f"{path} {at}") for at, row in enumerate(rows, start=1))
+
+    def _value(self, table: Table, key: str, hint: object, kind: type, path: str) -> object:
+        if hint in (Camera, Target):
+            named: Mapping[str, object] = CAMERAS if hint is Camera else TARGETS
+            return named[table.choice(key, tuple(named))]
         if key == "robot":
             return table.choice(key, self.carriers[1:] if kind is Swept else SIMULATED_ARMS)
         if key == "on":
@@ -172,19 +175,23 @@ class _Reader:
             return _number(table, key)
         if int in (hint, *get_args(hint)):
             return table.integer(key, 1 if key == "stops" else 0, _MOST)
+        if hint == tuple[Payload, ...]:
+            return self.listed(Payload, table, key, path)
+        if hint == tuple[float, ...]:
+            return tuple(table.numbers(key, _JOINTS))
         return tuple(table.numbers(key, 3))
 
 
 def _number(table: Table, key: str) -> float:
-    """A number, which is no standard deviation below zero and no share above one."""
-    value = table.number(key, positive=key == "scale")
+    """A number within the range of its field."""
+    value = table.number(key, positive=key in ("scale", "mass_share", "function_length_rad"))
     if key == "scale" and not 0.5 <= value <= 2.0:
         raise table.refuse(key, value, "a number from 0.5 to 2")
     if key == "bow_m" and abs(value) > _MOST_BOW_M:
         raise table.refuse(key, value, f"a number from -{_MOST_BOW_M} to {_MOST_BOW_M}")
     if key == "share_seen" and not 0.0 < value <= 1.0:
         raise table.refuse(key, value, "a share above 0, up to 1,")
-    if "sigma" in key and value < 0.0:
+    if key not in _SIGNED and value < 0.0:
         raise table.refuse(key, value, "a number of 0 or more")
     return value
 

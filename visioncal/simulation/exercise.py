@@ -9,7 +9,7 @@ import numpy as np
 from visioncal.core.types import FloatArray
 from visioncal.session import Session, Stream
 from visioncal.simulation.dynamics import Body, DynamicArm, drive_torques, real_dynamics
-from visioncal.simulation.records import write_truth
+from visioncal.simulation.truth import write_truth
 
 _HARMONICS = 5
 
@@ -148,6 +148,11 @@ class Exercised:
 
     streams: Mapping[str, Stream]
     arm: DynamicArm
+
+
+def seed_of(*numbers: int) -> int:
+    """One seed of several numbers."""
+    return int(np.random.SeedSequence(numbers).generate_state(1)[0])
 
 
 def exercise(options: ExerciseOptions) -> Exercised:

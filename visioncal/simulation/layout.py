@@ -3,9 +3,11 @@
 from dataclasses import dataclass, field
 
 from visioncal.core.errors import DataError
-from visioncal.core.types import Camera, Target
-from visioncal.simulation.optics import fine_camera, wide_camera
-from visioncal.simulation.options import BOARDS
+from visioncal.core.types import Target
+from visioncal.simulation.draws import DrawOptions
+from visioncal.simulation.optics import fine_camera
+from visioncal.simulation.options import BOARDS, CameraOptions, SweepOptions
+from visioncal.simulation.real_arm import ArmOptions
 
 # Where robots meet [m].
 MIDDLE_M = (0.0, 0.0, 0.4)
@@ -13,42 +15,31 @@ CELL = "cell"
 
 
 @dataclass(frozen=True)
-class RobotAt:
+class RobotAt(ArmOptions):
     """A robot that stands in the cell and turns its front to the middle.
 
     Attributes:
         name: What the session calls it.
         place_m: Where its base stands in the cell [m].
-        robot: `ur3e`, `ur5e`, `ur10e` or `generic-6r-1800`.
-        sigma_m: Repeatability of its flange, per axis [m].
-        sigma_rad: The same for its rotation [rad].
-        offset_sigma_rad: Departure of its joint offsets from the nominal ones [rad].
-        dh_sigma_m: Departure of its lengths [m].
-        dh_sigma_rad: Departure of its angles [rad].
         warms_up: Whether it is cold at the first stop, and warms up by work.
+        wrong_stops: Number of stops at which its report is off by 5 to 30 mm and 1 to 5 degrees.
     """
 
     name: str
     place_m: tuple[float, float, float]
-    robot: str = "ur5e"
-    sigma_m: float = 3e-5
-    sigma_rad: float = 5e-5
-    offset_sigma_rad: float = 0.0
-    dh_sigma_m: float = 0.0
-    dh_sigma_rad: float = 0.0
+    robot: str = field(default="ur5e", kw_only=True)
     warms_up: bool = False
+    wrong_stops: int = 0
 
 
 @dataclass(frozen=True, eq=False)
-class CameraAt:
+class CameraAt(CameraOptions):
     """A camera on a robot's flange, or one that stands in the cell and looks at a place of it.
 
     Attributes:
         name: What the session calls it.
         on: The robot on whose flange it is, or `cell`.
         place_m: Where it stands in the cell, if it does [m].
-        camera: Its optics.
-        state_intrinsics: Whether the session states them.
         looks_at_m: The place at which one in the cell looks [m].
         at_stops: Whether it takes images at the robots' stops, and not in sweeps alone.
     """
@@ -56,8 +47,6 @@ class CameraAt:
     name: str
     on: str = CELL
     place_m: tuple[float, float, float] = (0.0, -1.0, 1.1)
-    camera: Camera = field(default_factory=wide_camera)
-    state_intrinsics: bool = True
     looks_at_m: tuple[float, float, float] = MIDDLE_M
     at_stops: bool = True
 
@@ -139,28 +128,20 @@ class Moved:
 
 
 @dataclass(frozen=True)
-class Swept:
+class Swept(SweepOptions):
     """A camera that sees a target while a robot, which carries one of the two, moves.
 
     Attributes:
         camera: The camera.
         robot: The robot, which goes through its stops on a smooth way.
         target: The target.
-        camera_minus_robot_s: What the camera's clock is ahead of the robot's [s].
-        stops: Through how many of its stops the robot goes.
-        pace_s: How long it takes from one to the next [s].
-        frames_hz: Frames of the camera in a second.
-        readout_s: How long after an image's first row its last is taken [s].
     """
 
     camera: str
     robot: str
     target: str
-    camera_minus_robot_s: float = 0.0
-    stops: int = 10
-    pace_s: float = 1.7
-    frames_hz: float = 10.0
-    readout_s: float = 0.0
+    stops: int = field(default=10, kw_only=True)
+    frames_hz: float = field(default=10.0, kw_only=True)
 
 
 def _two_robots() -> tuple[RobotAt, ...]:
@@ -178,7 +159,7 @@ def _three_boards() -> tuple[BoardAt, ...]:
 
 
 @dataclass(frozen=True, eq=False)
-class NetworkOptions:
+class NetworkOptions(DrawOptions):
     """A simulated cell with several of a kind: two robots, two fixed cameras and three boards.
 
     Nothing hides anything else: what is in a camera's image is seen.
@@ -193,13 +174,10 @@ class NetworkOptions:
         pace_s: Time from one stop to the next [s]; 0 for rows without a time.
         share_seen: Share of what could be seen that is recorded; the rest is left out by chance.
         lens_views: Images of each camera that are of its lens alone, as the board is held by hand.
-        pixel_sigma_px: Noise of the corners, per axis [px].
         moved: What is pushed in the course of the recording.
         sweeps: What cameras see of robots in motion, after the stops.
         swapped_rows: Pairs of rows of one camera and board whose images are exchanged.
         stray_images: Rows whose image is from another stop.
-        recording: Which recording of the same cell: each has stops and noise of its own.
-        seed: Of everything random; each source of randomness has a stream of its own.
     """
 
     robots: tuple[RobotAt, ...] = field(default_factory=_two_robots)
@@ -211,19 +189,22 @@ class NetworkOptions:
     pace_s: float = 0.0
     share_seen: float = 1.0
     lens_views: int = 0
-    pixel_sigma_px: float = 0.05
     moved: tuple[Moved, ...] = ()
     sweeps: tuple[Swept, ...] = ()
     swapped_rows: int = 0
     stray_images: int = 0
-    recording: int = 0
-    seed: int = 0
 
     def __post_init__(self) -> None:
         if self.stops < 1:
             raise DataError(f"simulation: stops is {self.stops}, at least 1 is needed.")
         if any(it.warms_up for it in self.robots) and self.pace_s <= 0.0:
             raise DataError("simulation: a robot that warms up needs pace_s, from stop to stop.")
+        for robot in self.robots:
+            if robot.wrong_stops > self.stops:
+                raise DataError(
+                    f"simulation: wrong_stops of {robot.name} is {robot.wrong_stops}, 0 to "
+                    f"{self.stops} are possible."
+                )
         for moved in self.moved:
             if moved.from_stop is not None and moved.from_stop >= self.stops:
                 raise DataError(
@@ -241,3 +222,7 @@ class NetworkOptions:
                 raise DataError(
                     f"simulation: {name} is on {carrier!r}; there are {', '.join(sorted(known))}."
                 )
+
+    def first_pushed(self, moved: Moved) -> int:
+        """The first stop after a push."""
+        return self.stops // 2 if moved.from_stop is None else moved.from_stop

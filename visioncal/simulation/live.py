@@ -8,7 +8,8 @@ from visioncal.core.transforms import compose, invert, rotation_angle
 from visioncal.core.types import FloatArray, Image
 from visioncal.simulation.arms import forward
 from visioncal.simulation.boards import centre_m, corners_m, outline_m
-from visioncal.simulation.cell import Cell, Stream, before_camera, stream
+from visioncal.simulation.cell import Cell, before_camera
+from visioncal.simulation.draws import Stream
 from visioncal.simulation.optics import project, rays
 from visioncal.simulation.rasters import Float32Array, Patch, between, trace
 from visioncal.simulation.render import developed, light_on, prepare_scene
@@ -63,7 +64,7 @@ class LiveView:
             light = self._smeared(joints, smear_px)
         self._count += 1
         options = self._cell.options
-        return developed(light, options, stream(options, Stream.IMAGES, 1, self._count))
+        return developed(light, options, options.stream(Stream.IMAGES, 1, self._count))
 
     def cam_from_target(self, joints: FloatArray) -> FloatArray:
         """Where the board really is before the camera: (k, n) joints [rad] to (k, 4, 4)."""
@@ -104,7 +105,7 @@ class LiveView:
         # of every corner everywhere.
         camera = self._cell.options.camera
         raster = trace(camera, Patch(0, 0, *camera.resolution), 1)
-        depth = float((middle[:3, :3] @ centre_m(self._cell.sheet) + middle[:3, 3])[2])
+        depth = float((middle[:3, :3] @ centre_m(self._cell.sheets[0]) + middle[:3, 3])[2])
         plane = compose(np.eye(3), np.array([0.0, 0.0, depth if depth > 0.0 else _FAR_M]))
         plane_from_now = invert(now_from_middle @ plane)
         aims = raster.directions @ plane_from_now[:3, :3].T
@@ -117,7 +118,7 @@ class LiveView:
 
     def _moved_px(self, first: FloatArray, second: FloatArray) -> FloatArray:
         """(k,) bounds on how far the picture moves between poses (k, 4, 4) of the board [px]."""
-        centre = centre_m(self._cell.sheet)
+        centre = centre_m(self._cell.sheets[0])
         ahead = first[:, :3, :3] @ centre + first[:, :3, 3]
         behind = second[:, :3, :3] @ centre + second[:, :3, 3]
         distance = np.maximum(np.linalg.norm(ahead, axis=1), 0.1)
@@ -129,7 +130,7 @@ class LiveView:
 def _faces(cell: Cell, cam_from_target: FloatArray) -> bool:
     """Tells whether the board's printed side may be in the picture, at least in part."""
     points = np.concatenate(
-        [corners_m(cell.sheet), outline_m(cell.sheet, margin_m(cell.sheet.target))]
+        [corners_m(cell.sheets[0]), outline_m(cell.sheets[0], margin_m(cell.sheets[0].target))]
     )
     points_cam = points @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]
     cosines = points_cam[:, 2] / np.linalg.norm(points_cam, axis=1)

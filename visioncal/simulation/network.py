@@ -8,11 +8,13 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert
-from visioncal.core.types import Corners, FloatArray, IntArray, Target
+from visioncal.core.types import Corners, FloatArray, Target
 from visioncal.session import frame_name
-from visioncal.simulation.arms import ArmErrors, arm_named, disturb, forward
-from visioncal.simulation.boards import Sheet, corners_m
-from visioncal.simulation.layout import Moved, NetworkOptions
+from visioncal.simulation.arms import arm_named, forward
+from visioncal.simulation.boards import Sheet
+from visioncal.simulation.cell import detected, misreported, seen_in
+from visioncal.simulation.draws import Stream
+from visioncal.simulation.layout import NetworkOptions
 from visioncal.simulation.observed_points import (
     Network,
     Reading,
@@ -21,16 +23,12 @@ from visioncal.simulation.observed_points import (
     sheet_named,
     with_faults,
 )
-from visioncal.simulation.optics import project, sees
 from visioncal.simulation.options import CellOptions
 from visioncal.simulation.poses import draw_views
 from visioncal.simulation.second import looks_at
-from visioncal.simulation.standing import Stream, mounted, parents_of, postures, sheet_of, stream
-from visioncal.simulation.swept import sweep_network
-from visioncal.simulation.warmup import Heat, heated_poses, warm_up
-
-# A corner nearer to the image's edge is not detected [px].
-_EDGE_PX = 2.0
+from visioncal.simulation.standing import mounted, parents_of, postures, sheet_of
+from visioncal.simulation.sweep import sweep_network
+from visioncal.simulation.warmup import Heat, heated_flanges, warm_up
 
 
 def simulate_network(options: NetworkOptions) -> Network:
@@ -43,29 +41,35 @@ def simulate_network(options: NetworkOptions) -> Network:
         DataError: A robot cannot reach enough poses at which it shows a board to a camera.
     """
     parents, transforms = parents_of(options), mounted(options)
-    joints = postures(options, transforms)
+    moved = postures(options, transforms)
     arms = {it.name: arm_named(it.robot) for it in options.robots}
-    true_arms, flanges, heat = {}, {}, {}
+    true_arms, flanges, joints, heat = {}, {}, {}, {}
+    wrong_stops: dict[str, tuple[int, ...]] = {}
     stamps_s = np.arange(options.stops, dtype=np.float64) * options.pace_s
     for at, robot in enumerate(options.robots):
-        errors = ArmErrors(robot.dh_sigma_m, robot.dh_sigma_rad, robot.offset_sigma_rad)
-        true = disturb(arms[robot.name], errors, stream(options, Stream.ARM, at))
-        sigma = np.repeat([robot.sigma_rad, robot.sigma_m], 3)
-        jitter = stream(options, Stream.ROBOT, at).standard_normal((options.stops, 6)) * sigma
-        true_arms[robot.name] = true
-        stood = forward(true, joints[robot.name])
+        name, q = robot.name, moved[robot.name]
+        true = robot.built(options.stream(Stream.ARMS, at))
+        loads, approach = robot.loads(options.stops), robot.approach(options.stops)
+        stood = robot.flange_at(true, q, loads, approach)
         if robot.warms_up:
             heats, hours = Heat.drawn(options.seed + at), stamps_s[-1] / 3600.0
             warming = warm_up(heats, hours, seed=options.seed + at)
-            stood = heated_poses(true, heats, joints[robot.name], warming.at(stamps_s))
-            heat[f"{robot.name}_heat"] = warming.recorded(temperatures=True)
-        flanges[robot.name] = stood @ exp(jitter)
+            stood = heated_flanges(true, heats, q, warming.at(stamps_s), stood)
+            heat[f"{name}_heat"] = warming.recorded(temperatures=True)
+        true_arms[name] = true
+        flanges[name] = stood @ robot.jitter(options.stops, options.stream(Stream.ROBOTS, at))
+        rng = options.stream(Stream.WRONG, at)
+        joints[name], wrong_stops[name] = misreported(arms[name], q, robot.wrong_stops, rng)
     cell = Network(
         options=options,
         parents=parents,
         transforms=transforms,
         arms=arms,
         true_arms=true_arms,
+        stated={
+            it.name: it.stated(options.stream(Stream.LENS, at))
+            for at, it in enumerate(options.cameras)
+        },
         joints=joints,
         base_from_flange={name: forward(arm, joints[name]) for name, arm in arms.items()},
         true_base_from_flange=flanges,
@@ -73,6 +77,14 @@ def simulate_network(options: NetworkOptions) -> Network:
         readings=(),
         pose_rows=(),
         wrong_views=(),
+        wrong_stops=wrong_stops,
+        stamps_s=stamps_s if options.pace_s else None,
+        loads={it.name: it.loads(options.stops) for it in options.robots if it.payloads},
+        approach={
+            it.name: sides
+            for it in options.robots
+            if (sides := it.approach(options.stops)) is not None
+        },
         streams=heat,
     )
     cell = with_faults(_observed(cell))
@@ -137,8 +149,8 @@ def _hanging(cell: Network) -> dict[str, FloatArray]:
             raise DataError(
                 f"simulation: {moved.frame!r} cannot be pushed; there are {', '.join(hangs)}."
             )
-        start = first_pushed(cell.options, moved)
-        twist = stream(cell.options, Stream.FAULTS, 10 + at).standard_normal((2, 3))
+        start = cell.options.first_pushed(moved)
+        twist = cell.options.stream(Stream.FAULTS, 10 + at).standard_normal((2, 3))
         twist *= np.array([[moved.turn_rad], [moved.shift_m]]) / np.linalg.norm(
             twist, axis=1, keepdims=True
         )
@@ -159,11 +171,6 @@ def _places(cell: Network) -> dict[str, FloatArray]:
     return hangs
 
 
-def first_pushed(options: NetworkOptions, moved: Moved) -> int:
-    """The first stop after a push."""
-    return options.stops // 2 if moved.from_stop is None else moved.from_stop
-
-
 def _shown(cell: Network, camera: str, board: str, pose: FloatArray) -> FloatArray:
     """(s,) at which stops a camera has a board in its image, and it is recorded."""
     options = cell.options
@@ -172,30 +179,27 @@ def _shown(cell: Network, camera: str, board: str, pose: FloatArray) -> FloatArr
         [it.name for it in options.cameras].index(camera),
         [it.name for it in options.boards].index(board),
     )
-    kept = stream(options, Stream.SHARE, *places).random(options.stops) < options.share_seen
+    kept = options.stream(Stream.SHARE, *places).random(options.stops) < options.share_seen
     return np.asarray(seen & kept)
 
 
 def _sight(cell: Network, view: int, stop: int, camera: str, board: str, pose: FloatArray) -> Sight:
     """What a camera sees of a board, corner by corner."""
     options = cell.options
-    optics, sheet = camera_named(options, camera).camera, sheet_named(options, board)
-    points = corners_m(sheet) @ pose[:3, :3].T + pose[:3, 3]
-    ids = np.flatnonzero(sees(optics, points, _EDGE_PX)).astype(np.int64)
-    px = project(optics, points[ids])
-    exact = Corners(view, ids, px, 0.7)
-    noise = stream(options, Stream.PIXELS, view).standard_normal(px.shape)
-    found = _as_detected(sheet, exact, px + options.pixel_sigma_px * noise)
-    return Sight(view, stop, camera, board, pose, exact, found)
+    sheet = sheet_named(options, board)
+    exact = seen_in(camera_named(options, camera), sheet, pose, view)
+    found = detected(exact, options.pixel_sigma_px, options.stream(Stream.CORNERS, view))
+    found = _as_detected(sheet, found)
+    draws = options.stream(Stream.MEASURED, view).standard_normal(6)
+    return Sight(view, stop, camera, board, pose, exact, found, draws)
 
 
-def _as_detected(sheet: Sheet, exact: Corners, px: FloatArray) -> Corners:
+def _as_detected(sheet: Sheet, found: Corners) -> Corners:
     """A detector begins a board that looks alike from both ends at the upper left."""
-    ids: IntArray = exact.ids
-    if is_symmetric(sheet.target) and px[0].sum() > px[-1].sum():
-        count = sheet.target.columns * sheet.target.rows
-        ids, px = (count - 1 - ids)[::-1], px[::-1]
-    return Corners(exact.view, ids, px, exact.blur_px)
+    if not is_symmetric(sheet.target) or found.px[0].sum() <= found.px[-1].sum():
+        return found
+    last = sheet.target.columns * sheet.target.rows - 1
+    return replace(found, ids=(last - found.ids)[::-1], px=found.px[::-1])
 
 
 def is_symmetric(target: Target) -> bool:
@@ -210,7 +214,7 @@ def _of_lenses(cell: Network, first_view: int) -> list[Sight]:
     options = cell.options
     found: list[Sight] = []
     for place, camera in enumerate(options.cameras):
-        board, rng = options.boards[0], stream(options, Stream.LENS, place)
+        board, rng = options.boards[0], options.stream(Stream.LENS_VIEWS, place)
         views = np.empty((0, 4, 4))
         drawing = CellOptions(target=board.target, camera=camera.camera, cut_views=0.0)
         while len(views) < options.lens_views:
@@ -231,7 +235,7 @@ def _read(
         instrument_from_cell = invert(where[frame_name("instrument", instrument.name)][stop])
         for point in cell.options.points:
             view = first_view + len(found)
-            rng = stream(cell.options, Stream.READINGS, view)
+            rng = cell.options.stream(Stream.READINGS, view)
             read = instrument_from_cell @ where[frame_name("point", point.name)][stop]
             read[:3, 3] += instrument.sigma_m * rng.standard_normal(3)
             turn = instrument.sigma_rad * rng.standard_normal(3)

@@ -1,19 +1,27 @@
 """What was seen in a simulated cell of several robots, and the faults of images."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert
-from visioncal.core.types import Corners, FloatArray
+from visioncal.core.types import Camera, Corners, FloatArray
 from visioncal.session import Stream as Recorded
 from visioncal.session import frame_name
 from visioncal.simulation.arms import Arm
 from visioncal.simulation.boards import Sheet
-from visioncal.simulation.layout import BoardAt, CameraAt, NetworkOptions
-from visioncal.simulation.standing import Stream, sheet_of, stream
+from visioncal.simulation.cell import Cell
+from visioncal.simulation.draws import DrawOptions, Stream
+from visioncal.simulation.layout import CELL, BoardAt, CameraAt, NetworkOptions, RobotAt
+from visioncal.simulation.options import CameraOptions
+from visioncal.simulation.sag import Payload
+from visioncal.simulation.second import NAMES
+from visioncal.simulation.standing import parents_of, sheet_of
+
+# An operator's pace: a stop every so many seconds [s].
+_PACE_S = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +37,7 @@ class Sight:
         exact: Where its corners are in that image.
         corners: The same as a detector would report them; which end of a board that looks alike
             from both it takes for the first, hangs on how it lies in the image.
+        draws: (6,) white noise of the board's pose, where that is measured.
         stamp_s: When it was taken in a sweep, by the camera's clock [s]; None at a stop.
     """
 
@@ -39,7 +48,13 @@ class Sight:
     cam_from_target: FloatArray
     exact: Corners
     corners: Corners
+    draws: FloatArray
     stamp_s: float | None = None
+
+    @property
+    def is_of_lens(self) -> bool:
+        """Whether it serves the camera's lens alone."""
+        return self.stop < 0 and self.stamp_s is None
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +73,7 @@ class Reading:
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """A simulated cell of several robots, and what was seen in it.
+    """A simulated cell of robots, cameras and boards, and what was seen in it.
 
     Attributes:
         options: What was asked for.
@@ -66,6 +81,7 @@ class Network:
         transforms: (4, 4) where each of them hangs in it, before anything is pushed.
         arms: The nominal arms by the robots' names.
         true_arms: The arms as they were built.
+        stated: The cameras' intrinsics as the session states them, by the cameras' names.
         joints: (s, n) what each robot reports [rad].
         base_from_flange: (s, 4, 4) the poses that it reports.
         true_base_from_flange: (s, 4, 4) where its flange really stood.
@@ -73,7 +89,11 @@ class Network:
         readings: What instruments read.
         pose_rows: The row with a robot's pose, for those of which no other row of their stop
             has it: (view, stop, robot).
-        wrong_views: Rows with another row's image, ascending.
+        wrong_views: Rows with another row's image or a wrong report, ascending.
+        wrong_stops: Stops at which each robot's report is wrong.
+        stamps_s: (s,) when each stop was made [s]; None where rows have no time.
+        loads: What robots carried, stop by stop; of those alone that carried something.
+        approach: (s,) the sides from which robots with play came to each stop, +1 or -1.
         streams: Robots' states in sweeps, by the robots' names, and temperatures.
     """
 
@@ -82,6 +102,7 @@ class Network:
     transforms: Mapping[str, FloatArray]
     arms: Mapping[str, Arm]
     true_arms: Mapping[str, Arm]
+    stated: Mapping[str, Camera]
     joints: Mapping[str, FloatArray]
     base_from_flange: Mapping[str, FloatArray]
     true_base_from_flange: Mapping[str, FloatArray]
@@ -89,6 +110,10 @@ class Network:
     readings: tuple[Reading, ...]
     pose_rows: tuple[tuple[int, int, str], ...]
     wrong_views: tuple[int, ...]
+    wrong_stops: Mapping[str, tuple[int, ...]]
+    stamps_s: FloatArray | None = None
+    loads: Mapping[str, Sequence[Payload]] = field(default_factory=dict)
+    approach: Mapping[str, FloatArray] = field(default_factory=dict)
     streams: Mapping[str, Recorded] = field(default_factory=dict)
 
     @property
@@ -111,7 +136,83 @@ class Network:
     def robot_of(self, frame: str) -> str | None:
         """The robot whose pose the rows of a camera, board or point have; None for none."""
         on = self.parents[frame]
-        return on.removeprefix("flange_") if on.startswith("flange_") else None
+        return next((it for it in self.arms if frame_name("flange", it) == on), None)
+
+    @property
+    def is_named(self) -> bool:
+        """Whether its things have names: else there is one of each kind."""
+        options = self.options
+        return any([*(it.name for it in options.robots), *(it.name for it in options.boards)])
+
+
+def whole(
+    cell: Cell, *, stamps_s: FloatArray | None = None, taken_s: FloatArray | None = None
+) -> Network:
+    """A cell of one robot and one camera as one whose robot and camera have no names.
+
+    Args:
+        cell: The cell.
+        stamps_s: (s,) when its stops were made [s]; None for an operator's pace.
+        taken_s: (m,) when its views were taken in a sweep, by the camera's clock [s]; None for
+            views of stops.
+    """
+    options, shown = cell.options, cell.shown
+    names = NAMES if len(cell.sheets) > 1 else ("",)
+    camera_on, board_on = ("", CELL) if options.mount == "eye-in-hand" else (CELL, "")
+    optics = {it.name: getattr(options, it.name) for it in fields(CameraOptions)}
+    described = NetworkOptions(
+        robots=(RobotAt("", (0.0, 0.0, 0.0), **options.of_arm),),
+        cameras=(CameraAt("", camera_on, **optics),),
+        boards=tuple(
+            BoardAt(name, board_on, target=it.target, scale=it.scale, bow_m=it.bow_m)
+            for name, it in zip(names, cell.sheets, strict=True)
+        ),
+        stops=int(shown.stops.max()) + 1,
+        **{it.name: getattr(options, it.name) for it in fields(DrawOptions)},
+    )
+    # The first view of each stop has what is the same for all of them.
+    stops, first = np.unique(shown.stops, return_index=True)
+
+    def by_stop(of_views: FloatArray) -> Mapping[str, FloatArray]:
+        found = np.zeros((described.stops, *of_views.shape[1:]))
+        found[stops] = of_views[first]
+        return {"": found}
+
+    draws = options.stream(Stream.PAIRS).standard_normal((len(cell.corners), 6))
+    loads = dict(zip(shown.stops.tolist(), cell.payloads, strict=False))
+    parents = parents_of(described)
+    return Network(
+        options=described,
+        parents=parents,
+        transforms=dict(zip(parents, (np.eye(4), *cell.transforms.values()), strict=True)),
+        arms={"": cell.arm},
+        true_arms={"": cell.true_arm},
+        stated={"": cell.stated_camera},
+        joints=by_stop(cell.joints),
+        base_from_flange=by_stop(cell.base_from_flange),
+        true_base_from_flange=by_stop(cell.true_base_from_flange),
+        sights=tuple(
+            Sight(
+                view=exact.view,
+                stop=int(shown.stops[at]) if taken_s is None else -1,
+                camera="",
+                board=names[shown.boards[at]],
+                cam_from_target=cell.cam_from_target[at],
+                exact=exact,
+                corners=cell.corners[at],
+                draws=draws[at],
+                stamp_s=None if taken_s is None else float(taken_s[at]),
+            )
+            for at, exact in enumerate(cell.exact_corners)
+        ),
+        readings=(),
+        pose_rows=(),
+        wrong_views=cell.wrong_views,
+        wrong_stops={},
+        stamps_s=_PACE_S * np.arange(float(described.stops)) if stamps_s is None else stamps_s,
+        loads={"": [loads.get(it, Payload()) for it in range(described.stops)]} if loads else {},
+        approach={} if cell.approach is None else by_stop(cell.approach),
+    )
 
 
 def camera_named(options: NetworkOptions, name: str) -> CameraAt:
@@ -131,7 +232,7 @@ def sheet_named(options: NetworkOptions, name: str) -> Sheet:
 
 def with_faults(cell: Network) -> Network:
     """Exchanges images of rows, and takes some from other stops."""
-    options, rng = cell.options, stream(cell.options, Stream.FAULTS)
+    options, rng = cell.options, cell.options.stream(Stream.FAULTS)
     sights = list(cell.sights)
     groups: dict[tuple[str, str], list[int]] = {}
     for at, sight in enumerate(sights):

@@ -4,11 +4,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
+import numpy as np
+
 from visioncal.core.arguments import check_fields
 from visioncal.core.errors import DataError
 from visioncal.core.types import Camera, Mount, Target
-from visioncal.simulation.optics import wide_camera
-from visioncal.simulation.sag import Payload
+from visioncal.simulation.draws import DrawOptions
+from visioncal.simulation.optics import mistaken, wide_camera
+from visioncal.simulation.real_arm import ArmOptions
 
 _APRILTAGS = "DICT_APRILTAG_36h11"
 Motion: TypeAlias = Literal["free", "one_axis", "translation"]
@@ -74,6 +77,64 @@ BOARDS: Mapping[str, Target] = {
 TARGETS: Mapping[str, Target] = {it.name: it for it in BOARDS.values()}
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CameraOptions:
+    """A camera, what a session states of it, and how well it takes images.
+
+    Attributes:
+        camera: Its true optics.
+        state_intrinsics: Whether the session states them.
+        lens_mismatch_px: How far the stated intrinsics put pixels elsewhere, as a root mean square
+            over the image [px].
+        blur_px: Defocus of rendered images, as a Gaussian's sigma [px].
+        image_noise: Noise of rendered images [grey levels].
+        vignetting: Loss of light in the image's corners, as a share.
+        jpeg_quality: 1 to 100; None writes lossless PNG.
+    """
+
+    camera: Camera = field(default_factory=wide_camera)
+    state_intrinsics: bool = True
+    lens_mismatch_px: float = 0.0
+    blur_px: float = 0.7
+    image_noise: float = 2.0
+    vignetting: float = 0.2
+    jpeg_quality: int | None = None
+
+    def stated(self, rng: np.random.Generator) -> Camera:
+        """The optics as the session states them."""
+        return mistaken(self.camera, self.lens_mismatch_px, rng)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepOptions:
+    """How a sweep is made.
+
+    Attributes:
+        stops: Through how many postures it goes.
+        pace_s: How long it takes from one to the next [s].
+        robot_hz: Samples of the controller in a second.
+        frames_hz: Frames of the camera in a second.
+        readout_s: How long after the image's first row the last is taken, the stamp being that of
+            the middle [s]; 0 for a global shutter.
+        camera_minus_robot_s: What the camera's stamps are ahead of the controller's [s].
+        jitter_s: Noise of the camera's stamps, as a standard deviation [s].
+        encoder_sigma_rad: Noise of the joint angles that the controller reports [rad].
+    """
+
+    stops: int = 12
+    pace_s: float = 1.7
+    robot_hz: float = 125.0
+    frames_hz: float = 30.0
+    readout_s: float = 0.0
+    camera_minus_robot_s: float = 0.0
+    jitter_s: float = 0.0
+    encoder_sigma_rad: float = 2e-6
+
+    def __post_init__(self) -> None:
+        if self.stops < 2 or min(self.pace_s, self.robot_hz, self.frames_hz) <= 0.0:
+            raise DataError("simulation: a sweep needs two stops, and times and rates above 0.")
+
+
 @dataclass(frozen=True)
 class Second:
     """A second board of a cell. Every other stop looks at it; it is seen wherever it is in view.
@@ -94,17 +155,14 @@ class Second:
     bow_m: float = 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class CellOptions:
-    """A simulated cell. The defaults are a well-kept one; `exact` has no error at all.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CellOptions(ArmOptions, CameraOptions, DrawOptions):
+    """A simulated cell of one robot and one camera. The defaults are a well-kept one.
 
     Attributes:
-        robot: `ur3e`, `ur5e`, `ur10e` or `generic-6r-1800`.
         mount: Where the camera is.
         views: Number of views.
         target: The board as its file states it.
-        camera: The true camera.
-        state_intrinsics: Whether the session states the camera's intrinsics.
         distance_m: Least and greatest distance of the camera from the board's centre [m]; None
             takes a range in which the board fills the image well, for a camera beside the robot
             within 0.7 to 1.2 m.
@@ -115,78 +173,26 @@ class CellOptions:
         branches: Whether the arm takes its elbow, shoulder and wrist either way, from view to view;
             else all postures are near one another, as an operator would teach them.
         cut_views: Share of the views in which the image's edge may cut a ChArUco board.
-        pixel_sigma_px: Noise of the simulated detections `Cell.corners`, per axis [px].
-        blur_px: Defocus of rendered images, as a Gaussian's sigma [px].
-        image_noise: Noise of rendered images [grey levels].
-        vignetting: Loss of light in the image's corners, as a share.
-        jpeg_quality: 1 to 100; None writes lossless PNG.
-        robot_sigma_m: Repeatability: where the flange really stood, per axis [m].
-        robot_sigma_rad: The same for its rotation [rad].
-        dh_sigma_m: Departure of the real arm's lengths from the nominal ones [m].
-        dh_sigma_rad: Departure of its angles, joint offsets included [rad].
-        offset_sigma_rad: Departure of its joint offsets alone [rad].
-        eccentricity_sigma_rad: How far each joint turns with the sine and the cosine of its angle
-            beyond what its encoder says [rad].
-        ripple_sigma_rad: The same for the ripple of its gear, many times a turn [rad].
-        function_sigma_rad: How far each joint turns beyond that by any function of its angle [rad].
-        function_length_rad: Over which change of the angle that function changes [rad].
-        compliance_rad_per_nm: What each joint yields to a torque; empty for a rigid arm.
-        payloads: What the arm carries, view by view in turn; empty for nothing.
-        mass_share: Real over published masses of the links.
-        backlash_rad: Play of each joint; empty for none. With play, stops are approached from
-            either side in turn.
-        lens_mismatch_px: How far the stated intrinsics put pixels elsewhere, as a root mean square
-            over the image [px].
         wrong_views: Number of views whose report is off by 5 to 30 mm and 1 to 5 degrees.
         board_scale: Printed size over stated size.
         board_bow_m: How far the board's corners are bent away from the camera [m].
         second: A second board; None for a cell with one.
-        seed: Of everything random. Each source of randomness has a stream of its own, so that a
-            change of one option leaves the others' draws as they were.
-        draw: Which draw of the real arm and of all noise; the cell, and what the robot moves to,
-            are the same for all.
-        recording: Which recording of the same cell and arm: each has stops and noise of its own.
         camera_moved_m: How far the camera was pushed from where it sits in this cell [m].
     """
 
-    robot: str = "ur10e"
     mount: Mount = "eye-in-hand"
     views: int = 20
     target: Target = BOARDS["charuco"]
-    camera: Camera = field(default_factory=wide_camera)
-    state_intrinsics: bool = True
     distance_m: tuple[float, float] | None = None
     tilt_rad: tuple[float, float] = (0.1, 0.75)
     roll_rad: float = 1.3
     motion: Motion = "free"
     branches: bool = False
     cut_views: float = 0.1
-    pixel_sigma_px: float = 0.05
-    blur_px: float = 0.7
-    image_noise: float = 2.0
-    vignetting: float = 0.2
-    jpeg_quality: int | None = None
-    robot_sigma_m: float = 3e-5
-    robot_sigma_rad: float = 5e-5
-    dh_sigma_m: float = 0.0
-    dh_sigma_rad: float = 0.0
-    offset_sigma_rad: float = 0.0
-    eccentricity_sigma_rad: float = 0.0
-    ripple_sigma_rad: float = 0.0
-    function_sigma_rad: float = 0.0
-    function_length_rad: float = 0.06
-    compliance_rad_per_nm: tuple[float, ...] = ()
-    payloads: tuple[Payload, ...] = ()
-    mass_share: float = 1.0
-    backlash_rad: tuple[float, ...] = ()
-    lens_mismatch_px: float = 0.0
     wrong_views: int = 0
     board_scale: float = 1.0
     board_bow_m: float = 0.0
     second: Second | None = None
-    seed: int = 0
-    draw: int = 0
-    recording: int = 0
     camera_moved_m: float = 0.0
 
     def __post_init__(self) -> None:

@@ -1,59 +1,48 @@
-"""Simulated cells on disk: the session that calibration reads, and the truth beside it."""
+"""Simulated cells on disk: the session that calibration reads, and the truth beside it.
 
-import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+One robot with one camera is a cell whose things have no names: its session has the singular tables.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
-from visioncal.core.files import decode_text, read_bytes, write_atomically
 from visioncal.core.transforms import exp
-from visioncal.core.types import Camera, FloatArray, Target
-from visioncal.session import MemoryImages, Session, View
+from visioncal.core.types import Camera, FloatArray
+from visioncal.session import MemoryImages, Session, View, frame_name, target_document
 from visioncal.session.corners import CornerTable
 from visioncal.simulation.boards import corners_m
-from visioncal.simulation.cell import Cell, Stream, stream
+from visioncal.simulation.cell import Cell
+from visioncal.simulation.exercise import Exercised
+from visioncal.simulation.layout import CELL, BoardAt, CameraAt
+from visioncal.simulation.observed_points import (
+    Network,
+    Sight,
+    camera_named,
+    sheet_named,
+    whole,
+)
 from visioncal.simulation.optics import project
 from visioncal.simulation.options import BOARDS
-from visioncal.simulation.render import encode, prepare_scene, render
-from visioncal.simulation.sag import Payload
-from visioncal.simulation.second import NAMES
-from visioncal.simulation.sweep import POSE, Sweep
+from visioncal.simulation.render import Scene, encode, network_scene, render
+from visioncal.simulation.rows import POSE, load_row, pose_row
+from visioncal.simulation.sweep import Sweep
+from visioncal.simulation.touching import Touching, write_touches
+from visioncal.simulation.truth import truth_of, write_truth
 
-# An operator's pace: a stop every so many seconds [s].
-_PACE_S = 4.0
+# What rows have of what was seen: rendered images, the names of images that are not there, the
+# corners that a detector found, or the board's pose as it was measured.
+Seen: TypeAlias = Literal["images", "names", "corners", "poses"]
+Progress: TypeAlias = Callable[[float], None]
+
 # A step of a pose for differences, and it ahead and behind along each axis: (2, 6, 4, 4).
 _STEP = 1e-6
 _STEPS = exp(_STEP * np.stack([np.eye(6), -np.eye(6)]))
-
-
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """What a simulated session should yield.
-
-    Attributes:
-        transforms: True edges by their contract names, each (4, 4).
-        camera: The true intrinsics.
-        base_from_flange: (m, 4, 4) where the flange really stood.
-        cam_from_target: (m, 4, 4) where the board really stood.
-        wrong_views: Views whose reported pose is wrong.
-        arm: The arm as it was built, Denavit-Hartenberg tables by their names; a, d [m],
-            alpha, beta, offset [rad], each (n,).
-        options: The cell's options as plain numbers and words, noise levels among them.
-    """
-
-    transforms: Mapping[str, FloatArray]
-    camera: Camera
-    base_from_flange: FloatArray
-    cam_from_target: FloatArray
-    wrong_views: tuple[int, ...]
-    arm: Mapping[str, FloatArray]
-    options: Mapping[str, Any]
 
 
 @typed
@@ -63,15 +52,17 @@ def write_session(
     progress: Callable[[float], None] | None = None,
     *,
     images: bool = True,
+    touched: Touching | None = None,
 ) -> Path:
     """Writes a cell as a session's folder, and its truth as `<folder>.truth.json` beside it.
 
     Args:
         cell: The cell.
         folder: The session's folder; it must not hold anything yet.
-        progress: Called with the share that is done, 0 to 1, after each view.
+        progress: Called with the share of the images that is done, 0 to 1.
         images: Whether to render images. Without them the session holds pose pairs: cam_from_target
             as a PnP with `pixel_sigma_px` of noise would measure it, and neither camera nor target.
+        touched: What its robot touched.
 
     Returns:
         The session's folder.
@@ -80,14 +71,9 @@ def write_session(
         DataError: The folder cannot be written, or the target cannot be drawn.
     """
     folder = Path(folder)
-    session = (
-        _image_session(cell, folder.name, progress) if images else pairs_session(cell, folder.name)
-    )
-    session.save(folder)
-    write_truth(folder, truth_of(cell))
-    if progress is not None:
-        progress(1.0)
-    return folder
+    seen: Seen = "images" if images else "poses"
+    session = cell_session(cell, folder.name, progress, seen=seen)
+    return _write(session, folder, truth_of(cell), {} if touched is None else {"": touched})
 
 
 def write_sweep(moved: Sweep, folder: Path | str) -> Path:
@@ -103,91 +89,248 @@ def write_sweep(moved: Sweep, folder: Path | str) -> Path:
     Raises:
         DataError: The folder cannot be written.
     """
-    folder = Path(folder)
-    sweep_session(moved, folder.name).save(folder)
-    how = moved.options
+    folder, how = Path(folder), moved.options
     clock = {"camera_minus_robot_s": how.camera_minus_robot_s, "readout_s": how.readout_s}
-    write_truth(folder, truth_of(moved.cell) | clock)
+    return _write(sweep_session(moved, folder.name), folder, truth_of(moved.cell) | clock, {})
+
+
+def write_network(
+    cell: Network,
+    folder: Path | str,
+    progress: Progress | None = None,
+    *,
+    seen: Seen = "images",
+    touched: Mapping[str, Touching] | None = None,
+    exercised: Mapping[str, Exercised] | None = None,
+) -> Path:
+    """Writes a cell as a session's folder, and its truth as `<folder>.truth.json` beside it.
+
+    Args:
+        cell: The cell.
+        folder: The session's folder; it must not hold anything yet.
+        progress: Called with the share of the images that is done, 0 to 1.
+        seen: What rows have of what was seen.
+        touched: What its robots touched, by their names.
+        exercised: What their controllers recorded of motions; streams are `ROBOT_MOTION`.
+
+    Returns:
+        The session's folder.
+
+    Raises:
+        DataError: The folder cannot be written, or a target cannot be drawn.
+    """
+    folder = Path(folder)
+    streams = {
+        f"{robot}_{motion}": it
+        for robot, done in (exercised or {}).items()
+        for motion, it in done.streams.items()
+    }
+    session = network_session(cell, folder.name, progress, seen=seen)
+    truth = _truth_of_network(cell)
+    if exercised:
+        truth["dynamics"] = {robot: asdict(it.arm) for robot, it in exercised.items()}
+    every = session.with_streams({**session.streams, **streams})
+    return _write(every, folder, truth, touched or {})
+
+
+def _write(
+    session: Session, folder: Path, truth: dict[str, Any], touched: Mapping[str, Touching]
+) -> Path:
+    """Writes a session, what robots touched, and the truth of both."""
+    session.save(folder)
+    if touched:
+        write_touches(touched, folder)
+    for robot, it in touched.items():
+        truth["transforms"] |= it.transforms(robot)
+    write_truth(folder, truth)
     return folder
+
+
+def cell_session(
+    cell: Cell, name: str, progress: Progress | None = None, *, seen: Seen = "images"
+) -> Session:
+    """The session of a cell of one robot and one camera.
+
+    With poses it has neither camera nor target, but for the names of two boards.
+    """
+    return network_session(whole(cell), name, progress, seen=seen)
 
 
 def sweep_session(moved: Sweep, name: str) -> Session:
     """The session of a sweep: frames with measured poses or corners, and the robot's stream."""
-    if moved.options.readout_s:
-        return _sweep_of_corners(moved, name)
-    numbers = [
-        {"stamp_s": stamp_s} | {f"cft_{key}": value for key, value in pose_row(pose).items()}
-        for stamp_s, pose in zip(moved.frames_s.tolist(), measured_poses(moved.cell), strict=True)
-    ]
-    views = tuple(View(at, numbers=row) for at, row in enumerate(numbers))
-    columns, document = ("view", *numbers[0]), _document(moved.cell, name)
-    session = Session(document, columns, views, None, None, MemoryImages({}))
-    return session.with_streams({"robot": moved.robot})
+    frames = whole(moved.cell, taken_s=moved.frames_s)
+    seen: Seen = "corners" if moved.options.readout_s else "poses"
+    return network_session(frames, name, seen=seen).with_streams({"robot": moved.robot})
 
 
-def _sweep_of_corners(moved: Sweep, name: str) -> Session:
-    """The session of a sweep whose frames have the corners that a detector found in them."""
-    cell = moved.cell
-    document = {**_document(cell, name), **_targets(cell), "camera": _camera_table(cell)}
-    views = [
-        View(at, numbers={"stamp_s": it}, has_corners=True)
-        for at, it in enumerate(moved.frames_s.tolist())
-    ]
-    found = CornerTable(
-        np.repeat([it.view for it in cell.corners], [len(it.ids) for it in cell.corners]),
-        np.concatenate([it.ids for it in cell.corners]),
-        np.concatenate([it.px for it in cell.corners]),
-        ("",) * sum(len(it.ids) for it in cell.corners),
-    )
-    session = _session(cell, document, ("view", "stamp_s"), views, MemoryImages({}))
-    return replace(session, corner_table=found).with_streams({"robot": moved.robot})
+def network_session(
+    cell: Network, name: str, progress: Progress | None = None, *, seen: Seen = "images"
+) -> Session:
+    """The session of a cell of several robots; see `write_network`.
 
-
-def truth_path(folder: Path | str) -> Path:
-    """Where the truth of a simulated session lies: beside its folder, never inside."""
-    folder = Path(folder)
-    return folder.with_name(f"{folder.name}.truth.json")
-
-
-def read_truth(path: Path | str) -> Truth:
-    """Reads the truth of a simulated session.
-
-    Args:
-        path: The session's folder, or its `.truth.json`.
-
-    Raises:
-        DataError: The file is missing or is not such a truth.
+    With `seen="names"`, `Network.corners` is what was detected in the images that are not there.
     """
-    path = Path(path)
-    if path.suffix != ".json":
-        path = truth_path(path)
-    text = decode_text(read_bytes(path), str(path))
-    try:
-        content = json.loads(text)
-        camera = content["camera"]
-        width, height = camera["resolution"]
-        return Truth(
-            transforms={key: np.array(value) for key, value in content["transforms"].items()},
-            camera=Camera(
-                "fisheye" if camera["model"] == "fisheye" else "brown",
-                (int(width), int(height)),
-                np.array(camera["matrix"], dtype=float),
-                np.array(camera["distortion"], dtype=float),
-            ),
-            base_from_flange=np.array(content["base_from_flange"]),
-            cam_from_target=np.array(content["cam_from_target"]),
-            wrong_views=tuple(content["wrong_views"]),
-            arm={key: np.array(value) for key, value in content["arm"].items()},
-            options=content["options"],
-        )
-    except (ValueError, KeyError, TypeError) as error:
+    if seen in ("images", "poses") and any(it.readout_s for it in cell.options.sweeps):
         raise DataError(
-            f"{path} is not the truth of a simulated session: {error!r}.", culprits=[str(path)]
-        ) from error
+            "simulation: images and poses are those of a moment, and a sweep has readout_s.",
+            next_step="Leave readout_s out.",
+        )
+    sights = [it for it in cell.sights if not it.is_of_lens or seen != "poses"]
+    rows = _rows(cell, sights, seen)
+    numbers = dict.fromkeys(key for row in rows for key in row.numbers)
+    texts = dict.fromkeys(key for row in rows for key in row.text)
+    last = [it for it in texts if it == "approach"]
+    stops = ("stop",) if cell.is_named else ()
+    images = ("image",) if any(row.image for row in rows) else ()
+    columns = ("view", *stops, *(it for it in texts if it not in last), *images, *numbers, *last)
+    boards = [it for it in cell.options.boards if it.name or seen != "poses"]
+    documents = {it.name: target_document(it.target) for it in boards}
+    single = next(iter(documents.values()), None)
+    return Session.assemble(
+        _document(cell, name, seen),
+        columns,
+        [[row.cell(column) for column in columns] for row in rows],
+        MemoryImages(_rendered(cell, progress) if seen == "images" else {}),
+        target_document=documents if len(documents) > 1 else single,
+        corners=_corners(sights) if seen == "corners" else None,
+    ).with_streams(cell.streams)
+
+
+def _rows(cell: Network, sights: Sequence[Sight], seen: Seen) -> list[View]:
+    """The rows of what cameras saw, of what instruments read, and of poses alone."""
+    views = {it.view: _row(cell, it, seen) for it in sights}
+    turned = {it.name for it in cell.options.instruments if it.sigma_rad}
+    for reading in cell.readings:
+        robot = cell.robot_of(frame_name("point", reading.point))
+        keys = POSE if reading.instrument in turned else POSE[:3]
+        read = pose_row(reading.instrument_from_point)
+        numbers = {f"meas_{key}": read[key] for key in keys}
+        text = {"instrument": reading.instrument, "point": reading.point}
+        views[reading.view] = _view(cell, reading.view, reading.stop, robot, numbers, text)
+    for number, stop, robot in cell.pose_rows:
+        views[number] = _view(cell, number, stop, robot, {}, {})
+    return [views[number] for number in sorted(views)]
+
+
+def _document(cell: Network, name: str, seen: Seen) -> dict[str, Any]:
+    """What session.toml says."""
+    options = cell.options
+    document: dict[str, Any] = {"schema": 1, "name": name}
+    if any(not it.name for it in options.cameras):
+        in_hand = cell.parents[frame_name("camera", "")] != CELL
+        document["mount"] = "eye-in-hand" if in_hand else "eye-to-hand"
+    robots = {it.name: {"model": it.robot, "tip": "flange"} for it in options.robots}
+    cameras = {it.name: _camera_table(it, cell.stated[it.name]) for it in options.cameras}
+    boards = {it.name: {"target": _target_place(it)} for it in options.boards}
+    if seen == "poses":
+        # Of the only camera and the only board, measured poses say all.
+        cameras.pop("", None)
+        boards.pop("", None)
+    document |= _tables("robot", robots)
+    document |= boards[""] if "" in boards else _tables("target", boards)
+    document |= _tables("camera", cameras)
+    if any(it.name for it in options.robots):
+        document["frames"] = {
+            it: on for it, on in cell.parents.items() if not it.startswith("base")
+        }
+    instruments = {
+        it.name: {"sigma_m": it.sigma_m} | ({"sigma_rad": it.sigma_rad} if it.sigma_rad else {})
+        for it in options.instruments
+    }
+    return document | _tables("instrument", instruments)
+
+
+def _tables(kind: str, tables: Mapping[str, Any]) -> dict[str, Any]:
+    """The tables of one kind: of the only one, which has no name, or by names."""
+    if not tables:
+        return {}
+    return {kind: tables[""]} if "" in tables else {f"{kind}s": dict(tables)}
+
+
+def _camera_table(camera: CameraAt, stated: Camera) -> dict[str, Any]:
+    table: dict[str, Any] = {} if camera.name else {"name": "simulated"}
+    table |= {"resolution": list(stated.resolution), "model": stated.model}
+    if camera.state_intrinsics:
+        table |= {"matrix": stated.matrix.tolist(), "distortion": stated.distortion.tolist()}
+    return table
+
+
+def _target_place(board: BoardAt) -> str:
+    """Names a board that comes with visioncal, or the file that is written."""
+    shipped = board.target in (BOARDS["charuco"], BOARDS["checkerboard"])
+    return board.target.name if shipped else f"{frame_name('target', board.name)}.toml"
+
+
+def _row(cell: Network, sight: Sight, seen: Seen) -> View:
+    """The row of what a camera saw."""
+    text = {"camera": sight.camera, "target": sight.board}
+    numbers = {} if sight.stamp_s is None else {"stamp_s": sight.stamp_s}
+    if seen == "poses":
+        measured = measured_pose(cell, sight)
+        numbers |= {f"cft_{key}": value for key, value in pose_row(measured).items()}
+    image = _image(cell, sight) if seen in ("images", "names") else ""
+    if sight.stamp_s is not None:
+        return View(sight.view, image, numbers=numbers, text=_named(text))
+    if sight.is_of_lens:
+        return View(sight.view, image, text=_named(text | {"role": "intrinsics"}))
+    frames = frame_name("camera", sight.camera), frame_name("target", sight.board)
+    robots = [it for frame in frames if (it := cell.robot_of(frame)) is not None]
+    robot = robots[0] if len(set(robots)) == len(robots) > 0 else None
+    return _view(cell, sight.view, sight.stop, robot, numbers, text, image)
+
+
+def _view(
+    cell: Network,
+    number: int,
+    stop: int,
+    robot: str | None,
+    numbers: Mapping[str, float],
+    text: Mapping[str, str],
+    image: str = "",
+) -> View:
+    """A row of a stop, with a robot's pose and joints."""
+    state = {} if cell.stamps_s is None else {"stamp_s": float(cell.stamps_s[stop])}
+    words = dict(text)
+    if robot is not None:
+        state |= pose_row(cell.base_from_flange[robot][stop])
+        joints = cell.joints[robot][stop].tolist()
+        state |= {f"q{at}_rad": angle for at, angle in enumerate(joints, start=1)}
+        if robot in cell.loads:
+            state |= load_row(cell.loads[robot][stop])
+        words = {"robot": robot, **words}
+        if robot in cell.approach:
+            words["approach"] = "+" if cell.approach[robot][stop] > 0 else "-"
+    return View(number, image, stop=stop, numbers={**state, **numbers}, text=_named(words))
+
+
+def _named(text: Mapping[str, str]) -> dict[str, str]:
+    """A row's words but for those of the only one of its kind, which has no name."""
+    return {column: it for column, it in text.items() if it}
+
+
+def _corners(sights: Sequence[Sight]) -> CornerTable:
+    """The table of the corners that a detector found."""
+    counts = [len(it.corners.ids) for it in sights]
+    return CornerTable(
+        np.repeat([it.view for it in sights], counts),
+        np.concatenate([it.corners.ids for it in sights]),
+        np.concatenate([it.corners.px for it in sights]),
+        ("",) * sum(counts),
+    )
 
 
 def measured_poses(cell: Cell) -> FloatArray:
     """(m, 4, 4) `cam_from_target` as a PnP on the noisy corners of each view would give it.
+
+    Raises:
+        DataError: A view shows too few corners for a pose.
+    """
+    single = whole(cell)
+    return np.array([measured_pose(single, it) for it in single.sights])
+
+
+def measured_pose(cell: Network, sight: Sight) -> FloatArray:
+    """(4, 4) `cam_from_target` as a PnP on the noisy corners of an image would give it.
 
     It knows the board by its stated size: one that is larger is seen so much nearer.
 
@@ -195,42 +338,19 @@ def measured_poses(cell: Cell) -> FloatArray:
     are seen, `pixel_sigma_px` squared times the inverse of their Gram matrix.
 
     Raises:
-        DataError: A view shows too few corners for a pose.
+        DataError: The image shows too few corners for a pose.
     """
-    rng = stream(cell.options, Stream.PAIRS)
-    draws = rng.standard_normal((len(cell.corners), 6))
-    measured = cell.cam_from_target.copy()
-    for view, pose in enumerate(cell.cam_from_target):
-        sheet = cell.sheets[cell.shown.boards[view]]
-        points = corners_m(sheet)
-        ids = cell.exact_corners[view].ids
-        if ids.size < 4:
-            raise DataError(f"simulation: view {view} shows {ids.size} corners, a pose needs 4.")
-        camera, sigma_px = cell.options.camera, cell.options.pixel_sigma_px
-        measured[view] = noisy_pose(camera, pose, points[ids], sigma_px, draws[view])
-        measured[view, :3, 3] /= sheet.scale
-    return measured
-
-
-def noisy_pose(
-    camera: Camera,
-    cam_from_target: FloatArray,
-    points: FloatArray,
-    sigma_px: float,
-    draws: FloatArray,
-) -> FloatArray:
-    """A pose (4, 4) with the error of a fit to (n, 3) points that are seen.
-
-    Args:
-        camera: The camera.
-        cam_from_target: (4, 4) the true pose.
-        points: In the target frame [m].
-        sigma_px: Noise of the points in the image, per axis [px].
-        draws: (6,) white noise.
-    """
+    ids, sheet = sight.exact.ids, sheet_named(cell.options, sight.board)
+    if ids.size < 4:
+        raise DataError(f"simulation: view {sight.view} shows {ids.size} corners, a pose needs 4.")
+    camera = camera_named(cell.options, sight.camera).camera
+    jacobian = _pose_jacobian(camera, sight.cam_from_target, corners_m(sheet)[ids])
     # R^-1 maps white noise to noise with the covariance (R^T R)^-1.
-    factor = np.linalg.qr(_pose_jacobian(camera, cam_from_target, points), mode="r")
-    return cam_from_target @ exp(sigma_px * np.linalg.solve(factor, draws))
+    factor = np.linalg.qr(jacobian, mode="r")
+    off = exp(cell.options.pixel_sigma_px * np.linalg.solve(factor, sight.draws))
+    measured = sight.cam_from_target @ off
+    measured[:3, 3] /= sheet.scale
+    return np.asarray(measured)
 
 
 def _pose_jacobian(camera: Camera, cam_from_target: FloatArray, points: FloatArray) -> FloatArray:
@@ -241,178 +361,41 @@ def _pose_jacobian(camera: Camera, cam_from_target: FloatArray, points: FloatArr
     return np.asarray((ahead - behind).T / (2.0 * _STEP))
 
 
-def _image_session(cell: Cell, name: str, progress: Callable[[float], None] | None) -> Session:
-    suffix = "png" if cell.options.jpeg_quality is None else "jpg"
-    scenes = [prepare_scene(cell, board) for board in range(len(cell.sheets))]
-    files = {}
-    for view, board in enumerate(cell.shown.boards):
-        picture = encode(render(scenes[board], view), cell.options.jpeg_quality)
-        files[f"images/{view:03d}.{suffix}"] = picture
-        if progress is not None:
-            progress((view + 1.0) / (len(cell.corners) + 1.0))
-    document = {**_document(cell, name), **_targets(cell), "camera": _camera_table(cell)}
-    numbers = list(_report_rows(cell))
-    views = [
-        View(at, image=path, numbers=numbers[at], text=approach_text(cell, at))
-        for at, path in enumerate(files)
-    ]
-    columns = ("view", "image", *numbers[0], *approach_text(cell, 0))
-    return _session(cell, document, columns, views, MemoryImages(files))
+def _image(cell: Network, sight: Sight) -> str:
+    quality = camera_named(cell.options, sight.camera).jpeg_quality
+    suffix = "png" if quality is None else "jpg"
+    if not sight.camera:
+        return f"images/{sight.view:03d}.{suffix}"
+    folder = f"lens_{sight.camera}" if sight.is_of_lens else f"images/{sight.camera}"
+    return f"{folder}/{sight.view:04d}.{suffix}"
 
 
-def pairs_session(cell: Cell, name: str) -> Session:
-    """The session of a cell with `cam_from_target` as measured, and neither camera nor target."""
-    numbers = [
-        {**row, **{f"cft_{key}": value for key, value in pose_row(pose).items()}}
-        for row, pose in zip(_report_rows(cell), measured_poses(cell), strict=True)
-    ]
-    views = [
-        View(view, numbers=row, text=approach_text(cell, view)) for view, row in enumerate(numbers)
-    ]
-    columns = ("view", *numbers[0], *approach_text(cell, 0))
-    document = _document(cell, name)
-    if len(cell.sheets) > 1:
-        return _session(cell, document | _targets(cell), columns, views, MemoryImages({}))
-    return Session(document, columns, tuple(views), None, None, MemoryImages({}))
+def _rendered(cell: Network, progress: Progress | None) -> dict[str, bytes]:
+    """Takes the pictures, each of which shows one board."""
+    scenes: dict[tuple[str, str], Scene] = {}
+    files: dict[str, bytes] = {}
+    for camera in cell.options.cameras:
+        for at, sight in enumerate(it for it in cell.sights if it.camera == camera.name):
+            seen = sight.camera, sight.board
+            scene = scenes.get(seen) or scenes.setdefault(seen, network_scene(cell, *seen))
+            files[_image(cell, sight)] = encode(render(scene, at), camera.jpeg_quality)
+            if progress is not None:
+                progress(len(files) / len(cell.sights))
+    return files
 
 
-def _session(
-    cell: Cell,
-    document: Mapping[str, Any],
-    columns: tuple[str, ...],
-    views: Sequence[View],
-    images: MemoryImages,
-) -> Session:
-    """The session of a cell with its board, or with both of them."""
-    target = cell.sheets[0].target
-    if len(cell.sheets) == 1:
-        return Session(document, columns, tuple(views), target, target_document(target), images)
-    targets = {name: it.target for name, it in zip(NAMES, cell.sheets, strict=True)}
-    shown = zip(views, cell.shown.stops.tolist(), cell.shown.boards.tolist(), strict=True)
-    return Session(
-        document,
-        ("view", "stop", "target", *columns[1:]),
-        tuple(
-            replace(view, stop=stop, text={**view.text, "target": NAMES[board]})
-            for view, stop, board in shown
-        ),
-        target,
-        {name: target_document(it) for name, it in targets.items()},
-        images,
-        targets=targets,
-    )
-
-
-def _targets(cell: Cell) -> dict[str, Any]:
-    """What session.toml says of the boards."""
-    if len(cell.sheets) == 1:
-        return {"target": target_place(cell.sheets[0].target, "target.toml")}
-    return {
-        "targets": {
-            name: {"target": target_place(it.target, f"target_{name}.toml")}
-            for name, it in zip(NAMES, cell.sheets, strict=True)
-        }
-    }
-
-
-def target_place(target: Target, path: str) -> str:
-    """Names a board that comes with visioncal, or the file that is written."""
-    return target.name if target in (BOARDS["charuco"], BOARDS["checkerboard"]) else path
-
-
-def _document(cell: Cell, name: str) -> dict[str, Any]:
+def _truth_of_network(cell: Network) -> dict[str, Any]:
     return {
         "schema": 1,
-        "name": name,
-        "mount": cell.options.mount,
-        "robot": {"model": cell.arm.name, "tip": "flange"},
-    }
-
-
-def _camera_table(cell: Cell) -> dict[str, Any]:
-    stated = camera_table(cell.stated_camera, with_intrinsics=cell.options.state_intrinsics)
-    return {"name": "simulated", **stated}
-
-
-def camera_table(camera: Camera, *, with_intrinsics: bool) -> dict[str, Any]:
-    """What session.toml says of a camera."""
-    table: dict[str, Any] = {"resolution": list(camera.resolution), "model": camera.model}
-    if with_intrinsics:
-        table |= {"matrix": camera.matrix.tolist(), "distortion": camera.distortion.tolist()}
-    return table
-
-
-def target_document(target: Target) -> dict[str, Any]:
-    """What the file of a board says."""
-    if target.kind == "points":
-        x_m, y_m, z_m = map(list, zip(*target.points_m, strict=True))
-        tags, corners = map(list, zip(*target.point_tags, strict=True))
-        points = {"point": list(target.point_numbers), "x_m": x_m, "y_m": y_m, "z_m": z_m}
-        points |= {"tag": tags, "corner": corners}
-        return {"kind": "points", "dictionary": target.dictionary, "points": points}
-    document: dict[str, Any] = {"kind": target.kind}
-    if target.kind != "marker":
-        document |= {"columns": target.columns, "rows": target.rows}
-    document["size_m" if target.kind in ("marker", "aprilgrid") else "square_m"] = target.square_m
-    document["square_sigma_m"] = target.square_sigma_m
-    if target.dictionary:
-        document["dictionary"] = target.dictionary
-    if target.marker_id >= 0:
-        document["id"] = target.marker_id
-    if target.kind == "charuco":
-        document |= {"marker_m": target.marker_m, "legacy": target.legacy}
-    if target.kind == "circles":
-        document |= {"diameter_m": target.diameter_m, "asymmetric": target.asymmetric}
-    if target.kind == "aprilgrid":
-        document |= {"spacing": target.spacing, "border": target.border}
-    return document
-
-
-def _report_rows(cell: Cell) -> Iterator[dict[str, float]]:
-    """The numeric columns of each view: when, with which joints, at which reported pose."""
-    for view in range(len(cell.corners)):
-        joints = {f"q{i + 1}_rad": float(q) for i, q in enumerate(cell.joints[view])}
-        load = load_row(cell.payloads[view]) if cell.payloads else {}
-        yield {"stamp_s": _PACE_S * view} | pose_row(cell.base_from_flange[view]) | joints | load
-
-
-def load_row(load: Payload) -> dict[str, float]:
-    """The columns of what the flange carries and is pushed by."""
-    centre = {f"payload_{it}_m": at for it, at in zip("xyz", load.centre_m, strict=True)}
-    force = {f"force_{it}_n": at for it, at in zip("xyz", load.force_n, strict=True)}
-    return {"payload_kg": load.kg} | centre | force
-
-
-def approach_text(cell: Cell, view: int) -> dict[str, str]:
-    """The column of the side from which a stop was approached, where that is recorded."""
-    return {} if cell.approach is None else {"approach": "+" if cell.approach[view] > 0 else "-"}
-
-
-def pose_row(pose: FloatArray) -> dict[str, float]:
-    """Seven columns of a pose (4, 4)."""
-    quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
-    return dict(zip(POSE, map(float, [*pose[:3, 3], *quaternion]), strict=True))
-
-
-def truth_of(cell: Cell) -> dict[str, Any]:
-    """What a truth's file says of a cell."""
-    options = asdict(cell.options)
-    camera = options.pop("camera")
-    arm = asdict(cell.true_arm)
-    del arm["name"]
-    return {
-        "schema": 1,
+        "parents": cell.parents,
         "transforms": dict(cell.transforms),
-        "camera": camera,
         "wrong_views": cell.wrong_views,
-        "options": options,
-        "arm": arm,
+        "wrong_stops": cell.wrong_stops,
+        "moved": [
+            {"frame": it.frame, "from_stop": cell.options.first_pushed(it)}
+            for it in cell.options.moved
+        ],
+        "options": asdict(cell.options),
+        "arms": {name: asdict(arm) for name, arm in cell.true_arms.items()},
         "base_from_flange": cell.true_base_from_flange,
-        "cam_from_target": cell.cam_from_target,
     }
-
-
-def write_truth(folder: Path, content: Mapping[str, Any]) -> None:
-    """Writes the truth of a session beside its folder; arrays as lists."""
-    text = json.dumps(content, indent=1, default=np.ndarray.tolist)
-    write_atomically(truth_path(folder), text + "\n")

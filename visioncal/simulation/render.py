@@ -3,7 +3,9 @@
 The arm that holds a board in front of a fixed camera is drawn as shaded tubes.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -12,11 +14,20 @@ from visioncal.core.errors import DataError
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import compose, invert
 from visioncal.core.types import Camera, FloatArray, Image
+from visioncal.session import frame_name
 from visioncal.simulation.arms import Arm, link_frames, reach_m
-from visioncal.simulation.boards import bow_depth_m, outline_m, unit_m
-from visioncal.simulation.cell import Cell, Stream, stream
+from visioncal.simulation.boards import Sheet, bow_depth_m, outline_m, unit_m
+from visioncal.simulation.cell import Cell
+from visioncal.simulation.draws import Stream
+from visioncal.simulation.observed_points import (
+    Network,
+    Sight,
+    camera_named,
+    sheet_named,
+    whole,
+)
 from visioncal.simulation.optics import project, sees
-from visioncal.simulation.options import CellOptions
+from visioncal.simulation.options import CameraOptions
 from visioncal.simulation.rasters import (
     Float32Array,
     Patch,
@@ -67,17 +78,29 @@ class Backdrop:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What all pictures of one board share.
+    """What all pictures of one board by one camera share.
 
     Attributes:
-        cell: The cell.
-        sheet: The board's texture.
+        camera: The camera.
+        board: The board as it was printed.
+        sheet: Its texture.
         backdrop: What is behind the board.
+        sights: All that the camera saw.
+        arm: The arm with the board, which a camera beside it sees; None where it sees none.
+        joints: (s, n) its postures, stop by stop [rad].
+        cam_from_base: (4, 4) where it stands.
+        noise: The source of a view's noise.
     """
 
-    cell: Cell
+    camera: CameraOptions
+    board: Sheet
     sheet: SheetTexture
     backdrop: Backdrop
+    sights: Sequence[Sight]
+    arm: Arm | None
+    joints: FloatArray
+    cam_from_base: FloatArray
+    noise: Callable[[int], np.random.Generator]
 
 
 def prepare_scene(cell: Cell, board: int = 0) -> Scene:
@@ -90,44 +113,80 @@ def prepare_scene(cell: Cell, board: int = 0) -> Scene:
     Raises:
         DataError: OpenCV does not have the target's dictionary.
     """
-    sheet = cell.sheets[board]
-    cell = replace(cell, sheet=sheet, options=replace(cell.options, target=sheet.target))
-    target, camera = cell.options.target, cell.options.camera
-    nearest = float(np.linalg.norm(cell.cam_from_target[:, :3, 3], axis=1).min())
+    single = whole(cell)
+    return network_scene(single, "", single.options.boards[board].name)
+
+
+def network_scene(cell: Network, camera: str, board: str) -> Scene:
+    """Draws the textures of what one camera sees of one board; see `prepare_scene`."""
+    options, optics = cell.options, camera_named(cell.options, camera)
+    sights = [it for it in cell.sights if it.camera == camera]
+    sheet = sheet_named(options, board)
+    place = [it.name for it in options.cameras].index(camera)
+    # The first draws as the only one does.
+    rng = options.stream(Stream.BACKDROP, *((place,) if place else ()))
+    seer, holder = frame_name("camera", camera), cell.robot_of(frame_name("target", board))
+    arm, joints, cam_from_base = None, np.zeros((0, 0)), np.eye(4)
+    if holder is not None and cell.robot_of(seer) is None:
+        arm, joints = cell.arms[holder], cell.joints[holder]
+        cam_from_cell = invert(cell.transforms[seer])
+        cam_from_base = cam_from_cell @ cell.transforms[frame_name("base", holder)]
+    return Scene(
+        camera=optics,
+        board=sheet,
+        sheet=_textured(optics.camera, sheet, np.array([it.cam_from_target for it in sights])),
+        backdrop=_table(rng) if arm is None else _wall(rng),
+        sights=sights,
+        arm=arm,
+        joints=joints,
+        cam_from_base=cam_from_base,
+        noise=partial(options.stream, Stream.IMAGES),
+    )
+
+
+def _textured(camera: Camera, sheet: Sheet, cam_from_target: FloatArray) -> SheetTexture:
+    """Draws a board as finely as the nearest of its pictures needs."""
+    target = sheet.target
+    nearest = float(np.linalg.norm(cam_from_target[:, :3, 3], axis=1).min())
     samples = _SAMPLES * float(camera.matrix[0]) * unit_m(target) / max(nearest, 0.05)
     texels = 2 ** int(np.clip(np.round(np.log2(samples)), 4, 10))
     # A board of many squares stays within some 30 million texels.
     while target.columns * target.rows * texels**2 > 3e7:
         texels //= 2
-    rng = stream(cell.options, Stream.BACKDROP)
-    if cell.options.mount == "eye-in-hand":
-        backdrop = Backdrop(draw_table(rng, 1024), 0.0008, 0.006, 0.45, True)
-    else:
-        backdrop = Backdrop(draw_wall(rng, 1024), 0.004, 2.6, 2.0, False)
-    return Scene(cell, draw_sheet(target, texels), backdrop)
+    return draw_sheet(target, texels)
+
+
+def _table(rng: np.random.Generator) -> Backdrop:
+    return Backdrop(draw_table(rng, 1024), 0.0008, 0.006, 0.45, True)
+
+
+def _wall(rng: np.random.Generator) -> Backdrop:
+    return Backdrop(draw_wall(rng, 1024), 0.004, 2.6, 2.0, False)
 
 
 def render(scene: Scene, index: int) -> Image:
     """Takes the picture of one view.
 
     Returns:
-        (height, width) grey image with the cell's blur, vignetting and noise.
+        (height, width) grey image with the camera's blur, vignetting and noise.
 
     Raises:
         DataError: There is no such view.
     """
-    options = scene.cell.options
-    count = len(scene.cell.corners)
+    count = len(scene.sights)
     if not 0 <= index < count:
         raise DataError(f"simulation: there is no view {index} among {count}.")
-    light = light_on(scene, scene.cell.cam_from_target[index], scene.cell.joints[index])
-    return developed(light, options, stream(options, Stream.IMAGES, index))
+    sight = scene.sights[index]
+    stands = scene.arm is not None and sight.stop >= 0
+    joints = scene.joints[sight.stop] if stands else None
+    light = light_on(scene, sight.cam_from_target, joints)
+    return developed(light, scene.camera, scene.noise(sight.view))
 
 
 def light_on(
     scene: Scene,
     cam_from_target: FloatArray,
-    joints: FloatArray,
+    joints: FloatArray | None,
     *,
     samples: int = _SAMPLES,
     shows_board: bool = True,
@@ -135,9 +194,10 @@ def light_on(
     """Computes what falls on the sensor.
 
     Args:
-        scene: The prepared cell.
+        scene: The prepared scene.
         cam_from_target: (4, 4) the board before the camera.
-        joints: (n,) the arm's posture, which a camera beside the arm sees [rad].
+        joints: (n,) the arm's posture, which a camera beside the arm sees [rad]; None for an arm
+            that is not in the picture.
         samples: Sub-pixels along a pixel's side.
         shows_board: Whether the board's face is before the camera, at least in part.
 
@@ -150,7 +210,7 @@ def light_on(
         if shows_board:
             _cover(light, scene, cam_from_target, samples)
         light *= between(whole, shade)
-    blur_px = scene.cell.options.blur_px
+    blur_px = scene.camera.blur_px
     if blur_px > 0.0:
         light = np.asarray(
             cv2.GaussianBlur(light, (0, 0), blur_px, borderType=cv2.BORDER_REPLICATE), np.float32
@@ -159,11 +219,11 @@ def light_on(
     return light
 
 
-def developed(light: Float32Array, options: CellOptions, noise: np.random.Generator) -> Image:
-    """Reads the sensor out: light (height, width) with the cell's noise, in whole grey levels."""
-    if options.image_noise > 0.0:
+def developed(light: Float32Array, camera: CameraOptions, noise: np.random.Generator) -> Image:
+    """Reads the sensor out: light (height, width) with the camera's noise, in whole grey levels."""
+    if camera.image_noise > 0.0:
         grain = noise.standard_normal(light.shape, dtype=np.float32)
-        light = light + np.float32(options.image_noise) * grain
+        light = light + np.float32(camera.image_noise) * grain
     return np.asarray(np.clip(np.rint(light), 0.0, 255.0), np.uint8)
 
 
@@ -183,11 +243,10 @@ def encode(image: Image, jpeg_quality: int | None) -> bytes:
 
 
 def _behind(
-    scene: Scene, cam_from_target: FloatArray, joints: FloatArray
+    scene: Scene, cam_from_target: FloatArray, joints: FloatArray | None
 ) -> tuple[Float32Array, Raster, FloatArray]:
     """What is behind the board: its light, knots over the image, and how bright each lies."""
-    cell = scene.cell
-    camera = cell.options.camera
+    camera = scene.camera.camera
     whole = trace(camera, Patch(0, 0, *camera.resolution), 1)
     plane_from_cam = _plane_from_cam(scene.backdrop, cam_from_target)
     places = _strike(plane_from_cam, whole.directions, 0.0)
@@ -201,8 +260,8 @@ def _behind(
         ),
         np.uint8,
     )
-    if not scene.backdrop.moves:
-        _draw_arm(behind, camera, cell.arm, joints, invert(cell.transforms["base_from_cam"]))
+    if scene.arm is not None and joints is not None:
+        _draw_arm(behind, camera, scene.arm, joints, scene.cam_from_base)
     offset = (places - scene.backdrop.lamp_m * np.array([-0.3, -0.2])) / scene.backdrop.lamp_m
     distance2 = (offset**2).sum(axis=-1)
     light = behind.astype(np.float32)
@@ -214,7 +273,7 @@ def _behind(
     middle = 0.5 * np.array(camera.resolution) - 0.5
     edge = ((whole.px - middle) ** 2).sum(axis=-1) / (middle**2).sum()
     lamp = 0.78 + 0.30 / (1.0 + distance2)
-    return light, whole, lamp * (1.0 - cell.options.vignetting * edge)
+    return light, whole, lamp * (1.0 - scene.camera.vignetting * edge)
 
 
 def _plane_from_cam(backdrop: Backdrop, cam_from_target: FloatArray) -> FloatArray:
@@ -236,13 +295,13 @@ def _facing(scene: Scene, cam_from_target: FloatArray) -> float:
 
 def _cover(light: Float32Array, scene: Scene, cam_from_target: FloatArray, samples: int) -> None:
     """Lays the sheet over what is behind it, in place."""
-    cell, sheet = scene.cell, scene.sheet
-    patch = _board_patch(cell, cam_from_target)
+    sheet, camera = scene.sheet, scene.camera.camera
+    patch = _board_patch(camera, scene.board, cam_from_target)
     if min(patch.size) < 1:
         return
     brightness = _facing(scene, cam_from_target)
-    raster = trace(cell.options.camera, patch, samples)
-    flat = _strike_sheet(cell, raster.directions, cam_from_target)
+    raster = trace(camera, patch, samples)
+    flat = _strike_sheet(scene.board, raster.directions, cam_from_target)
     # The texel that fits the sub-pixels best, over the whole board.
     spacing = _spacing_m(flat, raster.px) / samples
     level = int(np.argmin(np.abs(np.log(np.array(sheet.texel_m) / spacing))))
@@ -268,10 +327,9 @@ def _cover(light: Float32Array, scene: Scene, cam_from_target: FloatArray, sampl
         window += np.float32(brightness) * pixels[..., 0]
 
 
-def _board_patch(cell: Cell, cam_from_target: FloatArray) -> Patch:
+def _board_patch(camera: Camera, board: Sheet, cam_from_target: FloatArray) -> Patch:
     """Bounds of the sheet and its shadow in the image."""
-    camera = cell.options.camera
-    points = outline_m(cell.sheet, margin_m(cell.options.target))
+    points = outline_m(board, margin_m(board.target))
     points_cam = points @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]
     width, height = camera.resolution
     # A point so far outside that the lens model folds it back says nothing about the bounds; one
@@ -285,16 +343,16 @@ def _board_patch(cell: Cell, cam_from_target: FloatArray) -> Patch:
     return Patch(int(left), int(top), int(right), int(bottom))
 
 
-def _strike_sheet(cell: Cell, directions: FloatArray, cam_from_target: FloatArray) -> FloatArray:
+def _strike_sheet(board: Sheet, directions: FloatArray, cam_from_target: FloatArray) -> FloatArray:
     """Where rays hit the bowed sheet, (..., 2) in the flat target frame as stated [m]."""
     target_from_cam = invert(cam_from_target)
     flat = _strike(target_from_cam, directions, 0.0)
-    if cell.sheet.bow_m != 0.0:
+    if board.bow_m != 0.0:
         for _ in range(6):
             # The bow is shallow: each turn gains the slope of the sheet over that of the ray.
-            depth = np.clip(bow_depth_m(cell.sheet, flat), -0.05, 0.05)
+            depth = np.clip(bow_depth_m(board, flat), -0.05, 0.05)
             flat = _strike(target_from_cam, directions, depth)
-    return flat / cell.sheet.scale
+    return flat / board.scale
 
 
 def _strike(

@@ -69,11 +69,6 @@ class Payload:
     force_n: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
-def loads_in_turn(payloads: Sequence[Payload], count: int) -> list[Payload]:
-    """What the flange carries at so many stops, one load after the other; empty for nothing."""
-    return [payloads[at % len(payloads)] for at in range(count)] if payloads else []
-
-
 @dataclass(frozen=True, eq=False)
 class Giving:
     """How an arm gives way.

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from enum import IntEnum
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -14,6 +13,7 @@ from visioncal.session import frame_name
 from visioncal.simulation.arms import Arm, arm_named, forward, inverse
 from visioncal.simulation.boards import Sheet, centre_m
 from visioncal.simulation.cell import LEAST_DEXTERITY, home_posture, looking_at, lowest_m
+from visioncal.simulation.draws import Stream
 from visioncal.simulation.layout import CELL, MIDDLE_M, BoardAt, CameraAt, NetworkOptions, RobotAt
 from visioncal.simulation.options import CellOptions
 from visioncal.simulation.poses import draw_views, mean_view
@@ -27,33 +27,6 @@ _CHANGE = 6
 _STOPS_TRIED = 6
 # A board on a flange is looked at from as near or as far as this from the middle [m].
 _DEPTH_M = 0.15
-
-
-class Stream(IntEnum):
-    """Independent sources of randomness of one cell of several robots."""
-
-    MOUNTING = 100
-    POSES = 101
-    ARM = 102
-    ROBOT = 103
-    PIXELS = 104
-    PAIRS = 105
-    FAULTS = 106
-    SHARE = 107
-    LENS = 108
-    READINGS = 109
-    TOUCHES = 110
-    SWEEP = 111
-
-
-# What another recording of the same cell has in common with it.
-_KEPT = (Stream.MOUNTING, Stream.ARM, Stream.LENS)
-
-
-def stream(options: NetworkOptions, purpose: Stream, *index: int) -> np.random.Generator:
-    """The generator of one source of randomness; `index` is of the thing."""
-    again = (options.recording,) if options.recording and purpose not in _KEPT else ()
-    return np.random.default_rng([options.seed, int(purpose), *again, *index])
 
 
 def sheet_of(board: BoardAt) -> Sheet:
@@ -77,7 +50,7 @@ def parents_of(options: NetworkOptions) -> dict[str, str]:
 
 def mounted(options: NetworkOptions) -> dict[str, FloatArray]:
     """(4, 4) where each frame hangs in its parent, before anything is pushed."""
-    rng = stream(options, Stream.MOUNTING)
+    rng = options.stream(Stream.MOUNTINGS)
     placed = {frame_name("base", it.name): _base(it, rng) for it in options.robots}
     placed |= {frame_name("camera", it.name): _camera(it, rng) for it in options.cameras}
     placed |= {frame_name("target", it.name): _board(it, rng) for it in options.boards}
@@ -191,7 +164,7 @@ def postures(options: NetworkOptions, placed: Mapping[str, FloatArray]) -> dict[
     flanges: dict[str, FloatArray] = {}
     for at, robot in enumerate(options.robots):
         aims = _aims(options, robot, list(found))
-        arm, rng = arm_named(robot.robot), stream(options, Stream.POSES, at)
+        arm, rng = arm_named(robot.robot), options.stream(Stream.POSTURES, at)
         if aims:
             joints = _reached(options, robot, arm, aims, placed, flanges, rng)
         else:
@@ -259,7 +232,7 @@ def _home(
     for stop in range(min(stops, 1 if aim.other == CELL else _STOPS_TRIED)):
         middle = _flanges(robot, aim, placed, flanges, np.array([stop]), straight)
         try:
-            return home_posture(aim.cell, arm, middle, rng)
+            return home_posture(arm, middle, rng)
         except DataError:
             continue
     return None

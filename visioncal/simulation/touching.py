@@ -2,9 +2,8 @@
 
 import csv
 import io
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,19 +14,17 @@ from visioncal.core.files import write_atomically
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import FloatArray, Mask
 from visioncal.session import frame_name
-from visioncal.simulation import standing
 from visioncal.simulation.arms import Arm, forward, inverse, reach_m
 from visioncal.simulation.cell import (
     LEAST_DEXTERITY,
     Cell,
-    Stream,
     home_posture,
     lowest_m,
-    stream,
 )
-from visioncal.simulation.observed_points import Network
-from visioncal.simulation.options import CellOptions
-from visioncal.simulation.records import pose_row
+from visioncal.simulation.draws import Stream
+from visioncal.simulation.observed_points import Network, whole
+from visioncal.simulation.real_arm import ArmOptions
+from visioncal.simulation.rows import pose_row
 
 # How far off a contact is, per axis [m], and how far the flange tilts from straight down [rad].
 _CONTACT_M, _CONE_RAD = 5e-5, 0.75
@@ -55,16 +52,14 @@ class _Toucher:
     """An arm that touches.
 
     Attributes:
-        options: The robot and its repeatability.
+        options: How it gives way, and its repeatability.
         arm: The nominal arm.
         true_arm: The arm as it was built.
-        flange_at: Where the real arm's flange stands (k, 4, 4) at (k, n) joint angles [rad].
     """
 
-    options: CellOptions
+    options: ArmOptions
     arm: Arm
     true_arm: Arm
-    flange_at: Callable[[FloatArray], FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,8 +121,7 @@ def touch(cell: Cell) -> Touching:
     Raises:
         DataError: The arm does not reach enough postures.
     """
-    arm = _Toucher(cell.options, cell.arm, cell.true_arm, cell.flange_at)
-    return _touching(arm, stream(cell.options, Stream.TOUCHES))
+    return touch_network(whole(cell))[""]
 
 
 def touch_network(cell: Network) -> dict[str, Touching]:
@@ -138,13 +132,10 @@ def touch_network(cell: Network) -> dict[str, Touching]:
     """
     found = {}
     for at, it in enumerate(cell.options.robots):
-        options = CellOptions(
-            robot=it.robot, robot_sigma_m=it.sigma_m, robot_sigma_rad=it.sigma_rad
-        )
-        true_arm = cell.true_arms[it.name]
-        arm = _Toucher(options, cell.arms[it.name], true_arm, partial(forward, true_arm))
-        rng = standing.stream(cell.options, standing.Stream.TOUCHES, at)
-        found[it.name] = _touching(arm, rng)
+        toucher = _Toucher(it, cell.arms[it.name], cell.true_arms[it.name])
+        # The first draws as the only one does.
+        rng = cell.options.stream(Stream.TOUCHES, *((at,) if at else ()))
+        found[it.name] = _touching(toucher, rng)
     return found
 
 
@@ -198,9 +189,7 @@ def _touched(
     reached = in_tool @ flange_from_tool[:3, :3].T + flange_from_tool[:3, 3]
     down = Rotation.from_rotvec([np.pi, 0.0, 0.0])
     straight = compose(down.as_matrix(), met[0] - down.apply(reached[0]))
-    home = home_posture(toucher.options, toucher.arm, straight[None], rng)
-    options = toucher.options
-    sigma = np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3)
+    home = home_posture(toucher.arm, straight[None], rng)
     joints = np.zeros((len(met), toucher.arm.a.size))
     left = np.ones(len(met), dtype=bool)
     for _ in range(_TRIES):
@@ -214,7 +203,7 @@ def _touched(
         goals[:, :3, :3] = turns.as_matrix()
         goals[:, :3, 3] = met[left] - turns.apply(reached[left])
         # Once the joints are where they read, the flange stands off by its repeatability.
-        goals = goals @ exp(-sigma * rng.standard_normal((count, 6)))
+        goals = goals @ exp(-toucher.options.sigma * rng.standard_normal((count, 6)))
         found, good = _standing(toucher, goals, home)
         joints[np.flatnonzero(left)[good]] = found[good]
         left[left] = np.logical_not(good)
@@ -233,7 +222,7 @@ def _standing(toucher: _Toucher, goals: FloatArray, home: FloatArray) -> tuple[F
     for _ in range(_ROUNDS):
         reach = inverse(toucher.true_arm, aims, joints)
         joints = reach.joints
-        stands = toucher.flange_at(joints)
+        stands = toucher.options.flange_at(toucher.true_arm, joints)
         aims = goals @ invert(stands) @ aims
     good = reach.solved & (reach.dexterity > LEAST_DEXTERITY)
     good &= np.abs(stands - goals).max(axis=(1, 2)) < _EXACT

@@ -8,48 +8,31 @@ import numpy as np
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import FloatArray
 from visioncal.session import MemoryImages, Session
-from visioncal.simulation.arms import Arm, ArmErrors, arm_named, disturb, forward
-from visioncal.simulation.records import load_row, pose_row, write_truth
-from visioncal.simulation.sag import Payload, giving_of, loads_in_turn, sagging
-from visioncal.simulation.sweep import POSE
+from visioncal.simulation.arms import Arm, arm_named, forward
+from visioncal.simulation.real_arm import ArmOptions
+from visioncal.simulation.rows import POSE, load_row, pose_row
+from visioncal.simulation.truth import write_truth
 
 
-@dataclass(frozen=True)
-class Tracked:
+@dataclass(frozen=True, kw_only=True)
+class Tracked(ArmOptions):
     """What a session is drawn from.
 
     Attributes:
-        robot: Its name.
         stops: How many.
         points: Places of the points on the flange [m]; one alone where poses are read.
         poses: Whether the first point is a probe whose rotation is read, too.
         sigma_m: Noise of a coordinate [m].
         sigma_rad: Noise of a probe's rotation [rad].
-        robot_sigma_m: Repeatability of the flange [m].
-        robot_sigma_rad: The same of its rotation [rad].
-        dh_sigma_m: Errors of the arm's lengths [m].
-        dh_sigma_rad: Errors of its angles [rad].
-        function_sigma_rad: Errors of each joint as a function of its angle [rad].
-        function_length_rad: Over which change of the angle these change [rad].
-        compliance: What each joint yields to a torque [rad/(N m)]; empty for a rigid arm.
-        payloads: What hangs on the flange, stop by stop in turn.
         seed: Of everything random.
     """
 
-    robot: str = "ur10e"
     stops: int = 30
     points: tuple[tuple[float, float, float], ...] = ((0.03, -0.02, 0.12),)
     poses: bool = False
     sigma_m: float = 2e-5
     sigma_rad: float = 5e-5
-    robot_sigma_m: float = 3e-5
     robot_sigma_rad: float = 3e-5
-    dh_sigma_m: float = 0.0
-    dh_sigma_rad: float = 0.0
-    function_sigma_rad: float = 0.0
-    function_length_rad: float = 0.06
-    compliance: tuple[float, ...] = ()
-    payloads: tuple[Payload, ...] = ()
     seed: int = 0
 
 
@@ -83,23 +66,15 @@ def tracked(options: Tracked, joints: FloatArray | None = None) -> Shop:
     """Moves the arm all over its workspace, or to (s, n) joints [rad], and reads."""
     rng = np.random.default_rng([7, options.seed])
     arm = arm_named(options.robot)
-    errors = ArmErrors(
-        options.dh_sigma_m,
-        options.dh_sigma_rad,
-        options.dh_sigma_rad,
-        function_rad=options.function_sigma_rad,
-        function_length_rad=options.function_length_rad,
-    )
-    true_arm = disturb(arm, errors, rng)
+    true_arm = options.built(rng)
     x = compose(exp(np.array([[0.1, -0.2, 2.5, 0, 0, 0]]))[0, :3, :3], np.array([2.5, -1.0, 0.4]))
     turn = exp(np.array([[0.5, 1.0, -0.3, 0, 0, 0]]))[0, :3, :3] if options.poses else np.eye(3)
     z = compose(turn, np.array(options.points[0]))
     if joints is None:
         joints = above(arm, options.stops, rng)
-    sigmas = np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3)
-    giving = giving_of(true_arm, options.compliance, 1.0, ())
-    standing = sagging(true_arm, giving, joints, loads_in_turn(options.payloads, len(joints)))
-    flange = forward(true_arm, standing) @ exp(rng.normal(size=(len(joints), 6)) * sigmas)
+    count = len(joints)
+    loads, approach = options.loads(count), options.approach(count)
+    flange = options.flange_at(true_arm, joints, loads, approach) @ options.jitter(count, rng)
     rows = []
     for stop, pose in enumerate(flange):
         for point, place in enumerate(options.points):
@@ -134,7 +109,7 @@ def session_of(
     """
     options = shop.options
     nominal = forward(shop.arm, shop.joints)
-    payloads = loads_in_turn(options.payloads, len(shop.joints))
+    payloads = options.loads(len(shop.joints))
     rows = []
     for view, (stop, point, read) in enumerate(shop.rows):
         keys = POSE if options.poses else POSE[:3]

@@ -18,10 +18,14 @@ from visioncal.core.types import FloatArray
 from visioncal.session import Session
 from visioncal.session import Stream as Recorded
 from visioncal.simulation.arms import Arm, forward
-from visioncal.simulation.cell import Cell, before_camera, detected, seen_by, simulate
+from visioncal.simulation.cell import (
+    Cell,
+    simulate,
+)
+from visioncal.simulation.observed_points import whole
 from visioncal.simulation.options import CellOptions
-from visioncal.simulation.records import pairs_session, truth_of, write_truth
-from visioncal.simulation.second import chains
+from visioncal.simulation.records import network_session
+from visioncal.simulation.truth import truth_of, write_truth
 
 _JOINTS = 6
 # What a metre of steel and of aluminium grows by for a kelvin.
@@ -139,6 +143,13 @@ def heated_poses(arm: Arm, heat: Heat, q: FloatArray, links_c: FloatArray) -> Fl
     return np.array(poses)
 
 
+def heated_flanges(
+    arm: Arm, heat: Heat, q: FloatArray, links_c: FloatArray, cold: FloatArray
+) -> FloatArray:
+    """Where a flange stands (m, 4, 4) once warm that stood at `cold` (m, 4, 4), by its joints."""
+    return heated_poses(arm, heat, q, links_c) @ (invert(forward(arm, q)) @ cold)
+
+
 @dataclass(frozen=True, eq=False)
 class WarmUp:
     """A session while the arm warms up.
@@ -162,14 +173,8 @@ class WarmUp:
             name: Its name.
             temperatures: Whether the controller reports temperatures; else currents.
         """
-        plain = pairs_session(self.cell, name)
-        views = tuple(
-            replace(view, numbers={**view.numbers, "stamp_s": float(stamp_s)})
-            for view, stamp_s in zip(plain.views, self.stamps_s, strict=True)
-        )
+        session = network_session(whole(self.cell, stamps_s=self.stamps_s), name, seen="poses")
         stream = self.warming.recorded(temperatures=temperatures, until_s=self.stamps_s[-1])
-        cells = [[view.cell(it) for it in plain.columns] for view in views]
-        session = Session.assemble(plain.document, plain.columns, cells, plain.images)
         return session.with_streams({"heat": stream})
 
 
@@ -231,7 +236,9 @@ def simulate_warm_up(options: WarmUpOptions) -> WarmUp:
     postures = simulate(replace(options.cell, views=options.round.first)).joints
     cold = simulate(options.cell, postures[list(shown)])
     warming = warm_up(heat, options.hours, seed=seed)
-    return WarmUp(_warm(cold, heat, warming.at(stamps_s)), stamps_s, warming, heat)
+    links_c, stood = warming.at(stamps_s), cold.true_base_from_flange
+    warm = cold.standing_at(heated_flanges(cold.true_arm, heat, cold.joints, links_c, stood))
+    return WarmUp(warm, stamps_s, warming, heat)
 
 
 def write_warm_up(moved: WarmUp, folder: Path | str, *, temperatures: bool = True) -> Path:
@@ -252,20 +259,3 @@ def write_warm_up(moved: WarmUp, folder: Path | str, *, temperatures: bool = Tru
     moved.session(folder.name, temperatures=temperatures).save(folder)
     write_truth(folder, truth_of(moved.cell) | {"heat": asdict(moved.heat)})
     return folder
-
-
-def _warm(cell: Cell, heat: Heat, links_c: FloatArray) -> Cell:
-    """The cell as it looks when its arm is as warm as (m, n) view by view."""
-    jitter = invert(forward(cell.true_arm, cell.joints)) @ cell.true_base_from_flange
-    flange = heated_poses(cell.true_arm, heat, cell.joints, links_c) @ jitter
-    seen = np.array([before_camera(it, flange) for it in chains(cell.transforms)])
-    boards = cell.shown.boards
-    cam_from_target = seen[boards, np.arange(len(boards))]
-    exact = seen_by(cell.options, [cell.sheets[it] for it in boards], cam_from_target)
-    return replace(
-        cell,
-        true_base_from_flange=flange,
-        cam_from_target=cam_from_target,
-        exact_corners=exact,
-        corners=detected(cell.options, exact),
-    )

@@ -15,7 +15,7 @@ from visioncal.simulation.arms import ArmErrors
 # How far the user's guesses of both edges are off: as measured by a ruler and by eye [m, rad].
 GUESS_M, GUESS_RAD = 0.02, float(np.deg2rad(5.0))
 # An arm whose joints' zeros have moved since its maker measured it [m, rad and rad].
-_WORN = ArmErrors(0.0, 0.0, 3e-4)
+_WORN = ArmErrors(offset_sigma_rad=3e-4)
 # The floor is so far below base and board [m].
 _BELOW_M = 0.1
 # Of the guesses; other numbers belong to the cell and to the controller.

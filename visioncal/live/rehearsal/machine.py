@@ -50,7 +50,9 @@ class ControllerOptions:
 
     robot: str = "ur10e"
     seed: int = 0
-    errors: ArmErrors = field(default_factory=lambda: ArmErrors(3e-4, 3e-4, 5e-4))
+    errors: ArmErrors = field(
+        default_factory=lambda: ArmErrors(dh_sigma_m=3e-4, dh_sigma_rad=3e-4, offset_sigma_rad=5e-4)
+    )
     q: tuple[float, ...] = _HOME
     tcp: tuple[float, ...] = (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)
     payload_kg: float = 0.6

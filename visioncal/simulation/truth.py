@@ -1,0 +1,105 @@
+"""The truth of a simulated session, in a file beside its folder."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from visioncal.core.errors import DataError
+from visioncal.core.files import decode_text, read_bytes, write_atomically
+from visioncal.core.types import Camera, FloatArray
+from visioncal.simulation.cell import Cell
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What a simulated session should yield.
+
+    Attributes:
+        transforms: True edges by their contract names, each (4, 4).
+        camera: The true intrinsics.
+        base_from_flange: (m, 4, 4) where the flange really stood.
+        cam_from_target: (m, 4, 4) where the board really stood.
+        wrong_views: Views whose reported pose is wrong.
+        arm: The arm as it was built, Denavit-Hartenberg tables by their names; a, d [m],
+            alpha, beta, offset [rad], each (n,).
+        options: The cell's options as plain numbers and words, noise levels among them.
+    """
+
+    transforms: Mapping[str, FloatArray]
+    camera: Camera
+    base_from_flange: FloatArray
+    cam_from_target: FloatArray
+    wrong_views: tuple[int, ...]
+    arm: Mapping[str, FloatArray]
+    options: Mapping[str, Any]
+
+
+def truth_path(folder: Path | str) -> Path:
+    """Where the truth of a simulated session lies: beside its folder, never inside."""
+    folder = Path(folder)
+    return folder.with_name(f"{folder.name}.truth.json")
+
+
+def read_truth(path: Path | str) -> Truth:
+    """Reads the truth of a simulated session.
+
+    Args:
+        path: The session's folder, or its `.truth.json`.
+
+    Raises:
+        DataError: The file is missing or is not such a truth.
+    """
+    path = Path(path)
+    if path.suffix != ".json":
+        path = truth_path(path)
+    text = decode_text(read_bytes(path), str(path))
+    try:
+        content = json.loads(text)
+        camera = content["camera"]
+        width, height = camera["resolution"]
+        return Truth(
+            transforms={key: np.array(value) for key, value in content["transforms"].items()},
+            camera=Camera(
+                "fisheye" if camera["model"] == "fisheye" else "brown",
+                (int(width), int(height)),
+                np.array(camera["matrix"], dtype=float),
+                np.array(camera["distortion"], dtype=float),
+            ),
+            base_from_flange=np.array(content["base_from_flange"]),
+            cam_from_target=np.array(content["cam_from_target"]),
+            wrong_views=tuple(content["wrong_views"]),
+            arm={key: np.array(value) for key, value in content["arm"].items()},
+            options=content["options"],
+        )
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(
+            f"{path} is not the truth of a simulated session: {error!r}.", culprits=[str(path)]
+        ) from error
+
+
+def truth_of(cell: Cell) -> dict[str, Any]:
+    """What a truth's file says of a cell."""
+    options = asdict(cell.options)
+    camera = options.pop("camera")
+    arm = asdict(cell.true_arm)
+    del arm["name"]
+    return {
+        "schema": 1,
+        "transforms": dict(cell.transforms),
+        "camera": camera,
+        "wrong_views": cell.wrong_views,
+        "options": options,
+        "arm": arm,
+        "base_from_flange": cell.true_base_from_flange,
+        "cam_from_target": cell.cam_from_target,
+    }
+
+
+def write_truth(folder: Path, content: Mapping[str, Any]) -> None:
+    """Writes the truth of a session beside its folder; arrays as lists."""
+    text = json.dumps(content, indent=1, default=np.ndarray.tolist)
+    write_atomically(truth_path(folder), text + "\n")
