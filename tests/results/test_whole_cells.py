@@ -116,7 +116,7 @@ def test_the_file_says_how_well_the_noise_of_each_robot_is_known(folder, found):
     assert part.uncertainty.noise_95.keys() < part.noise.keys()
     assert 20.0 < part.noise_dof < 120.0
     low = written["uncertainty"]["noise_95"]["b"]["translation_mm"][0]
-    assert f"(95 %: {significant(low)} to" in (folder / "out" / "report.html").read_text()
+    assert f"95 %: {significant(low)} to" in (folder / "out" / "report.html").read_text()
 
 
 def test_what_was_left_out_is_predicted_as_by_a_fit_without_it(cell, found, folder):
