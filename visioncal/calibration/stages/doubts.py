@@ -357,6 +357,11 @@ def _sigma_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Fin
 def _budget_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
     """Says what makes the result uncertain where it is to be used."""
     beyond = [it for it in findings.places if it.budget_mm["total"] > limits.sigma_mm[0]]
+    # Where a lens and its mount make up for each other, what a camera sees is known better than
+    # what is stated in its frame.
+    if len(findings.places) == len(findings.picks) == 1:
+        (picks,) = findings.picks
+        beyond = beyond if picks.budget_mm["total"] > limits.sigma_mm[0] else []
     if not beyond:
         return
     worst = max(beyond, key=lambda it: it.budget_mm["total"])
