@@ -18,7 +18,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from support.samples import Sample, made_up, with_frames
 
 from visioncal.core.transforms import exp, invert
-from visioncal.present.recording import arm, board, coverage, paths, write_recording
+from visioncal.present import coverage
+from visioncal.present.recording import arm, board, paths, write_recording
 from visioncal.present.recording.uncertainty import SIGMAS_95, Uncertainty
 from visioncal.present.viewer import blueprint
 from visioncal.present.viewer.process import viewer_process

@@ -8,8 +8,9 @@ import pyarrow as pa
 import rerun as rr
 
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.present.recording import colours, coverage, paths
-from visioncal.present.recording.coverage import PointChart
+from visioncal.present import coverage
+from visioncal.present.coverage import PointChart
+from visioncal.present.recording import colours, paths
 from visioncal.present.recording.recorder import send_rows
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
@@ -113,13 +114,13 @@ class Charts:
         """Draws all views."""
         for chart in self.points:
             lines = rr.LineStrips2D(chart.lines, colors=colours.GRID, radii=_LINE)
-            stream.log(f"{chart.entity}/grid", lines, static=True)
+            stream.log(f"{paths.COVERAGE}/{chart.name}/grid", lines, static=True)
             places = [place for place, _ in chart.words]
             labels = [word for _, word in chart.words]
             words = rr.Points2D(
                 places, labels=labels, show_labels=True, colors=colours.WORDS, radii=0.0
             )
-            stream.log(f"{chart.entity}/words", words, static=True)
+            stream.log(f"{paths.COVERAGE}/{chart.name}/words", words, static=True)
             for name, colour, wanted in (
                 (paths.USED, colours.USED, True),
                 (paths.REJECTED, colours.REJECTED, False),
@@ -127,11 +128,11 @@ class Charts:
                 some = [it for view, it in chart.points.items() if (view in self.used) is wanted]
                 if some:
                     points = rr.Points2D(np.vstack(some), colors=colour, radii=_POINT)
-                    stream.log(f"{chart.entity}/{name}", points, static=True)
+                    stream.log(f"{paths.COVERAGE}/{chart.name}/{name}", points, static=True)
             style = rr.Points2D.from_fields(
                 colors=colours.THIS_VIEW, radii=_MARK, draw_order=_ABOVE
             )
-            stream.log(f"{chart.entity}/{paths.THIS_VIEW}", style, static=True)
+            stream.log(f"{paths.COVERAGE}/{chart.name}/{paths.THIS_VIEW}", style, static=True)
         for joint in self.joints:
             joint.log(stream)
 
@@ -145,7 +146,7 @@ class Charts:
         for chart in self.points:
             marked = [chart.points.get(view, np.zeros((0, 2))) for view in rows]
             points = rr.Points2D.columns(positions=np.vstack(marked))
-            entity = f"{chart.entity}/{paths.THIS_VIEW}"
+            entity = f"{paths.COVERAGE}/{chart.name}/{paths.THIS_VIEW}"
             parts = points.partition([len(it) for it in marked])
             send_rows(stream, entity, rows.values(), parts)
         for joint in self.joints:
@@ -156,7 +157,7 @@ class Charts:
         for chart in self.points:
             positions = chart.points.get(view, np.zeros((0, 2)))
             points = rr.Points2D.from_fields(positions=positions)
-            stream.log(f"{chart.entity}/{paths.THIS_VIEW}", points)
+            stream.log(f"{paths.COVERAGE}/{chart.name}/{paths.THIS_VIEW}", points)
 
 
 def _single_tensors(values: Sequence[float | None]) -> pa.Array:

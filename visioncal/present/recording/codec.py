@@ -222,6 +222,13 @@ def log_end(stream: rr.RecordingStream, rows: int) -> None:
     stream.log(paths.END, rr.DynamicArchetype(_END, components=components), static=True)
 
 
+def values_of(batch: pa.RecordBatch, archetype: str, place: int = 0) -> dict[str, Any]:
+    """The components of an archetype that one row of a chunk has."""
+    columns = [name for name in batch.schema.names if name.startswith(f"{archetype}:")]
+    values = {name.removeprefix(f"{archetype}:"): batch.column(name)[place] for name in columns}
+    return {name: value.as_py() for name, value in values.items() if value.is_valid}
+
+
 def read_header(batch: pa.RecordBatch, path: Path) -> tuple[int, Header]:
     """Reads the format and what holds for all rows; `path` names the recording in messages.
 
@@ -229,11 +236,7 @@ def read_header(batch: pa.RecordBatch, path: Path) -> tuple[int, Header]:
         DataError: The format is newer than this version.
         ValueError: It was changed after it was written.
     """
-    values = {
-        name.removeprefix(f"{_HEADER}:"): batch.column(name)[0].as_py()
-        for name in batch.schema.names
-        if name.startswith(f"{_HEADER}:")
-    }
+    values = values_of(batch, _HEADER)
     (found,) = values["format"]
     if found > FORMAT:
         writer = values["visioncal"][0]
@@ -246,7 +249,7 @@ def read_header(batch: pa.RecordBatch, path: Path) -> tuple[int, Header]:
     header = Header(
         int(values["rows"][0]),
         tuple(values["columns"]),
-        tuple(values["number_columns"] or ()),
+        tuple(values.get("number_columns") or ()),
         values["session_toml"][0],
         values["target_json"][0],
         values["robot_json"][0],
@@ -263,12 +266,9 @@ def read_rows(batch: pa.RecordBatch) -> dict[int, Row]:
     """Reads those rows whose seal holds, by their place in the session."""
     rows = {}
     for place, index in enumerate(places(batch)):
-        numbers, texts, image_sha256, seal = (
-            batch.column(f"{_ROW}:{name}")[place].as_py()
-            for name in ("numbers", "texts", "image_sha256", "seal")
-        )
-        row = Row(tuple(numbers or ()), tuple(texts), image_sha256[0])
-        if row.seal() == seal[0]:
+        it = values_of(batch, _ROW, place)
+        row = Row(tuple(it.get("numbers") or ()), tuple(it["texts"]), it["image_sha256"][0])
+        if row.seal() == it["seal"][0]:
             rows[index] = row
     return rows
 
@@ -289,10 +289,9 @@ def read_samples(batch: pa.RecordBatch) -> dict[str, Stream]:
 
 def read_corners(batch: pa.RecordBatch) -> CornerTable:
     """Reads the corners that another detector found."""
-    views, points, px, targets, sigmas_px = (
-        batch.column(f"{_CORNERS}:{it}")[0].as_py() or ()
-        for it in ("views", "points", "px", "targets", "sigmas_px")
-    )
+    found = values_of(batch, _CORNERS)
+    names = ("views", "points", "px", "targets", "sigmas_px")
+    views, points, px, targets, sigmas_px = (found.get(it) or () for it in names)
     return CornerTable(
         np.array(views, dtype=np.int64),
         np.array(points, dtype=np.int64),

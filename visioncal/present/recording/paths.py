@@ -36,9 +36,10 @@ FRAMES = "/frames"
 SEEN_TARGET = "/target_as_this_view_sees_it"
 
 # Charts over all views.
-IMAGE_COVERAGE = "/coverage/image"
-DIRECTIONS = "/coverage/directions"
-ROTATION_AXES = "/coverage/rotation_axes"
+COVERAGE = "/coverage"
+IMAGE_COVERAGE = f"{COVERAGE}/image"
+DIRECTIONS = f"{COVERAGE}/directions"
+ROTATION_AXES = f"{COVERAGE}/rotation_axes"
 
 # In the image.
 DETECTED = f"{IMAGE}/detected"

@@ -12,14 +12,14 @@ from rerun.blueprint import BlueprintLike
 from visioncal.core.files import written_beside
 from visioncal.core.transforms import invert
 from visioncal.core.types import Camera, FloatArray, Mount, Target
-from visioncal.present.recording import board, colours, paths
-from visioncal.present.recording.arm import log_arm, log_frames
-from visioncal.present.recording.charts import Charts
-from visioncal.present.recording.coverage import (
+from visioncal.present.coverage import (
     corners_chart,
     directions_chart,
     rotation_axes_chart,
 )
+from visioncal.present.recording import board, colours, paths
+from visioncal.present.recording.arm import log_arm, log_frames
+from visioncal.present.recording.charts import Charts
 from visioncal.present.recording.markdown import markdown
 from visioncal.present.recording.obstacles import Obstacle, log_obstacles
 from visioncal.present.recording.recorder import Recorder

@@ -19,7 +19,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import sha256
 from visioncal.core.types import Corners, FloatArray
 from visioncal.present import parts
-from visioncal.present.recording import notes, overlays, paths
+from visioncal.present.recording import codec, notes, overlays, paths
 from visioncal.present.recording.frames import Frame, scan
 from visioncal.present.recording.reader import chunks
 from visioncal.present.recording.recorder import Recorder
@@ -201,14 +201,16 @@ def _read_result(path: Path) -> _Result:
         for _, entity, batch in chunks(scan(path), entities, damaged):
             for place in range(batch.num_rows):
                 if entity == paths.EVIDENCE:
-                    values = _values(batch, place, _EVIDENCE)
+                    values = codec.values_of(batch, _EVIDENCE, place)
                     seen = _evidence(values)
                     evidence.setdefault(values["result"][0], {})[values["place"][0]] = seen
                 else:
                     # Of a whole cell, earlier versions kept no evidence.
                     none = {"result": [""], "evidence_count": [0]}
-                    last = none | _values(batch, place, _ALIGNMENT)
-                    last |= _values(batch, place, _RESULT) | _values(batch, place, "TextDocument")
+                    last = none | codec.values_of(batch, _ALIGNMENT, place)
+                    last |= codec.values_of(batch, _RESULT, place) | codec.values_of(
+                        batch, "TextDocument", place
+                    )
                     # What was damaged before this one is no newer result.
                     damaged.clear()
         if damaged or (last and sha256(last["text"][0].encode()) != last["seal"][0]):
@@ -243,13 +245,6 @@ def _evidence(values: Mapping[str, Any]) -> ViewEvidence:
         floats("base_from_flange", 4, 4),
         floats("cam_from_target", 4, 4),
     )
-
-
-def _values(batch: pa.RecordBatch, place: int, archetype: str) -> dict[str, Any]:
-    """The components of an archetype that one row of a chunk has."""
-    columns = [name for name in batch.schema.names if name.startswith(f"{archetype}:")]
-    values = {name.removeprefix(f"{archetype}:"): batch.column(name)[place] for name in columns}
-    return {name: value.as_py() for name, value in values.items() if value.is_valid}
 
 
 def _damaged(path: Path) -> DataError:

@@ -13,6 +13,7 @@ from visioncal.core.limits import CalibrationLimits
 from visioncal.core.transforms import invert, log, nearest_rotation
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.present.advice import contradicts
+from visioncal.present.coverage import directions_chart
 from visioncal.present.parts import sights
 from visioncal.present.report import bars, svg
 from visioncal.present.report.axes import Box, Margins, Panel, Scale, boxes, spanning
@@ -173,27 +174,27 @@ def _corner_errors(evidence: ViewEvidence) -> FloatArray:
 
 def viewing_directions(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> Markup:
     """Where the camera looked at the target from: tilt against its normal, and azimuth."""
-    poses = {it.view: it.cam_from_target for it in evidence if it.cam_from_target is not None}
-    if not poses or calibration.mount == "instrument":
+    chart = directions_chart({it.view: it for it in evidence})
+    if chart is None or calibration.mount == "instrument":
         return Markup("")
     used = {view.view for view in calibration.views if view.used}
     seen = [
-        (mark, colour, words, *_tilt(np.stack(some)))
+        (mark, colour, words, np.vstack(some))
         for is_used, mark, colour, words in (
             (True, "dot", svg.ACCENT, "used"),
             (False, "x", svg.BAD, "not used"),
         )
-        if (some := [pose for view, pose in poses.items() if (view in used) is is_used])
+        if (some := [places for view, places in chart.points.items() if (view in used) is is_used])
     ]
-    top = max(45.0, *(5.0 + float(tilt_deg.max()) for *_, tilt_deg in seen))
+    farthest_deg = max(float(np.linalg.norm(places, axis=1).max()) for *_, places in seen)
+    top = max(45.0, 5.0 + farthest_deg)
     figure = Figure(_SMALL_IN, 3.0)
     middle, radius = 0.5 * figure.width, 0.5 * figure.height - 24.0
     box = Box(middle - radius, 24.0, middle + radius, 24.0 + 2.0 * radius)
     panel = Panel(figure, box, Scale(-top, top), Scale(top, -top))
     _draw_rings(panel, [it for it in Scale(0.0, top).ticks(4, whole=True) if it > 0.0], top)
-    for mark, colour, _, azimuth, tilt_deg in seen:
-        # Azimuths go clockwise, as y of the target goes down.
-        panel.marks(tilt_deg * np.cos(azimuth), tilt_deg * np.sin(azimuth), mark, colour)
+    for mark, colour, _, places in seen:
+        panel.marks(places[:, 0], places[:, 1], mark, colour)
     if len(seen) > 1:
         signs = {"dot": "\N{BLACK CIRCLE}", "x": "\N{MULTIPLICATION SIGN}"}
         entries = [(signs[mark], colour, words) for mark, colour, words, *_ in seen]
@@ -224,13 +225,6 @@ def _draw_rings(panel: Panel, rings_deg: Sequence[float], top_deg: float) -> Non
         ("-y", 0.0, -radius - 9.0, "middle"),
     ):
         figure.text(x + across, y + down, words, colour=svg.MUTED, anchor=anchor, rise="middle")
-
-
-def _tilt(cam_from_target: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Azimuth [rad] and tilt [deg] of the place the camera looks from, in the target's frame."""
-    optical_axis = cam_from_target[:, 2, :3]
-    azimuth = np.arctan2(-optical_axis[:, 1], -optical_axis[:, 0])
-    return azimuth, np.rad2deg(np.arccos(np.clip(optical_axis[:, 2], -1.0, 1.0)))
 
 
 def flange_rotations(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> Markup:

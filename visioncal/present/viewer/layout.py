@@ -10,8 +10,8 @@ import rerun.blueprint as rrb
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Verdict
 from visioncal.present import parts
+from visioncal.present.coverage import AXES_RINGS_DEG, DIRECTIONS_RINGS_DEG
 from visioncal.present.recording import colours, paths
-from visioncal.present.recording.coverage import AXES_RINGS_DEG, DIRECTIONS_RINGS_DEG
 from visioncal.results import Alignment, Calibration
 from visioncal.results.arm import ArmResult
 from visioncal.session import Session

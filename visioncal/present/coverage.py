@@ -7,7 +7,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.types import FloatArray
-from visioncal.present.recording import paths
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 
@@ -25,13 +24,13 @@ class PointChart:
     """Points of views in a plane whose x goes to the right and whose y goes down.
 
     Attributes:
-        entity: Where it is in the recording.
+        name: What it is of: `image`, `directions` or `rotation_axes`.
         points: By view, (k, 2).
         lines: What is drawn behind them, (k, 2) each.
         words: Texts with their places.
     """
 
-    entity: str
+    name: str
     points: Mapping[int, FloatArray]
     lines: Sequence[FloatArray]
     words: Sequence[tuple[tuple[float, float], str]]
@@ -55,7 +54,7 @@ def corners_chart(resolution: tuple[int, int], points: Mapping[int, FloatArray])
     y = np.linspace(0, height, _CELLS[1] + 1) - 0.5
     lines = [np.array([[it, y[0]], [it, y[-1]]]) for it in x]
     lines += [np.array([[x[0], it], [x[-1], it]]) for it in y]
-    return PointChart(paths.IMAGE_COVERAGE, points, lines, [])
+    return PointChart("image", points, lines, [])
 
 
 def directions_chart(evidence: Mapping[int, ViewEvidence]) -> PointChart | None:
@@ -68,7 +67,7 @@ def directions_chart(evidence: Mapping[int, ViewEvidence]) -> PointChart | None:
     }
     if not points:
         return None
-    return _disc_chart(paths.DIRECTIONS, points, DIRECTIONS_RINGS_DEG)
+    return _disc_chart("directions", points, DIRECTIONS_RINGS_DEG)
 
 
 def rotation_axes_chart(evidence: Sequence[ViewEvidence]) -> PointChart | None:
@@ -87,7 +86,7 @@ def rotation_axes_chart(evidence: Sequence[ViewEvidence]) -> PointChart | None:
         if angle_rad > _LEAST_TURN_RAD:
             axis = turn / (angle_rad if turn[2] > 0 else -angle_rad)
             points[view] = _disc(axis[None])
-    return _disc_chart(paths.ROTATION_AXES, points, AXES_RINGS_DEG) if points else None
+    return _disc_chart("rotation_axes", points, AXES_RINGS_DEG) if points else None
 
 
 def _disc(towards: FloatArray) -> FloatArray:
@@ -98,7 +97,7 @@ def _disc(towards: FloatArray) -> FloatArray:
 
 
 def _disc_chart(
-    entity: str, points: Mapping[int, FloatArray], rings_deg: Sequence[int]
+    name: str, points: Mapping[int, FloatArray], rings_deg: Sequence[int]
 ) -> PointChart:
     """A chart with rings of equal angle, and the axes x and y."""
     turn = np.linspace(0.0, 2 * np.pi, 73)
@@ -113,4 +112,4 @@ def _disc_chart(
         # Of the rim alone: words would hide the points of the middle.
         ((diagonal, -diagonal), f"{rim:g}\N{DEGREE SIGN}"),
     ]
-    return PointChart(entity, points, lines, words)
+    return PointChart(name, points, lines, words)
