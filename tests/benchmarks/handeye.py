@@ -74,7 +74,7 @@ ROBUST = (WORLDS[0], WORLDS[4])
 def opencv_poses(cell: Cell) -> FloatArray:
     """(m, 4, 4) `cam_from_target` by OpenCV: calibrateCamera or solvePnP."""
     options = cell.options
-    points = corners_m(Sheet(options.target, 1.0, 0.0))
+    points = corners_m(Sheet(target=options.target))
     stated = [points[it.ids].astype(np.float32) for it in cell.corners]
     px = [it.px.astype(np.float32) for it in cell.corners]
     if options.state_intrinsics:

@@ -31,7 +31,7 @@ BOXES = (
 
 def board_plate(cell: PlanCell) -> tuple[FloatArray, FloatArray]:
     """The print as a box (pose in the target's frame, size) of a hair's thickness."""
-    print_m = outline_m(Sheet(cell.target, 1.0, 0.0), 0.0)
+    print_m = outline_m(Sheet(target=cell.target), 0.0)
     low, high = print_m.min(axis=0), print_m.max(axis=0)
     return compose(np.eye(3), 0.5 * (low + high)), high - low + [0, 0, 1e-6]
 
@@ -67,12 +67,12 @@ def test_all_stops_and_ways_keep_limits_and_clearances(mount):
     seen = views(cell, stops.q)
     np.testing.assert_allclose(stops.cam_from_target, seen, atol=1e-9)
     assert whole(cell, stops.q, limits.edge_px).all()
-    centre = centre_m(Sheet(cell.target, 1.0, 0.0))
+    centre = centre_m(Sheet(target=cell.target))
     sight = seen[:, :3, :3] @ centre + seen[:, :3, 3]
     cosine = np.einsum("ki,ki->k", sight, seen[:, :3, 2]) / np.linalg.norm(sight, axis=1)
     # Rounding of the arc's cosine at its end.
     assert np.arccos(cosine).max() < limits.tilt_rad + 1e-6
-    outline = outline_m(Sheet(cell.target, 1.0, 0.0), 0.0)
+    outline = outline_m(Sheet(target=cell.target), 0.0)
     depth = outline @ seen[:, 2, :3].T + seen[:, 2, 3]
     assert depth.min() > 0.3
     assert depth.max() < 0.75
@@ -175,7 +175,7 @@ def test_what_leaves_too_few_stops_is_named(changes, culprit):
 
 def test_boxes_do_not_hide_the_board():
     cell = cell_of(CellOptions(robot="ur5e"))
-    centre = (cell.z @ np.append(centre_m(Sheet(cell.target, 1.0, 0.0)), 1.0))[:3]
+    centre = (cell.z @ np.append(centre_m(Sheet(target=cell.target)), 1.0))[:3]
     # A shelf over a half of the board, out of the arm's way.
     shelf = Box(
         "shelf", compose(np.eye(3), centre + np.array([0.2, 0, 0.25])), np.array([0.3, 0.5, 0.01])
@@ -187,7 +187,7 @@ def test_boxes_do_not_hide_the_board():
     stops = candidates(shelved, 30, seed=2)
     assert stops.lost["a free line of sight (shelf)"] > 0
     assert "a free line of sight (table)" not in stops.lost
-    outline = outline_m(Sheet(cell.target, 1.0, 0.0), 0.0) @ cell.z[:3, :3].T + cell.z[:3, 3]
+    outline = outline_m(Sheet(target=cell.target), 0.0) @ cell.z[:3, :3].T + cell.z[:3, 3]
     shares = np.linspace(0.0, 1.0, 300)[:, None, None]
     for eye in (forward(ur_arm("ur5e"), stops.q) @ cell.x)[:, :3, 3]:
         on_the_way = eye + shares * (outline - eye)
@@ -203,7 +203,7 @@ def test_the_arm_itself_does_not_hide_the_board():
     cell = replace(cell_of(CellOptions(robot="ur5e", mount="eye-to-hand")), x=behind)
     stops = candidates(cell, 100, seed=2)
     assert any(it.startswith("a line of sight past the arm (link ") for it in stops.lost)
-    outline = outline_m(Sheet(cell.target, 1.0, 0.0), 0.0)
+    outline = outline_m(Sheet(target=cell.target), 0.0)
     arm = ur_arm("ur5e")
     found = tubes(arm, stops.q)
     board = forward(arm, stops.q) @ cell.z

@@ -183,7 +183,7 @@ def _pose(cell: Cell, held: _Held, change: FloatArray) -> FloatArray:
 def _seen(cell: Cell, pose: FloatArray, ids: IntArray, look: Sequence[float] = ()) -> FloatArray:
     """Flat pixels of some corners, where lens and board (`_look_sigmas`) change."""
     camera = cell.options.camera
-    points = corners_m(Sheet(cell.options.target, 1.0, 0.0))[ids]
+    points = corners_m(Sheet(target=cell.options.target))[ids]
     if len(look):
         own, (scale, aspect, *bends) = np.split(look, [4 + len(camera.distortion)])
         camera = _other_lens(camera, own)

@@ -15,7 +15,7 @@ from visioncal.core.transforms import exp, invert
 from visioncal.core.types import FloatArray
 from visioncal.session import frame_name
 from visioncal.simulation.boards import corners_m
-from visioncal.simulation.observed_points import Network, Sight, camera_named, sheet_named
+from visioncal.simulation.observed_points import Network, Sight, board_named, camera_named
 from visioncal.simulation.optics import project
 
 # Small enough for central differences to be exact to 1e-8, large enough for rounding.
@@ -127,7 +127,7 @@ def _differences(cell: Network, sight: Sight, key: str, width: int) -> FloatArra
 def _pixels(cell: Network, sight: Sight, key: str, change: FloatArray) -> FloatArray:
     """Flat pixels of a sight when one thing changes."""
     camera = camera_named(cell.options, sight.camera).camera
-    sheet = sheet_named(cell.options, sight.board)
+    sheet = board_named(cell.options, sight.board)
     kind, _, name = key.partition(" ")
     if kind == "lens" and name == sight.camera:
         matrix = camera.matrix + _THOUSAND * change[:4]

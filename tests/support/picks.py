@@ -121,7 +121,9 @@ def seen_corners(
     """The noisy corners, in the image, of a target that is printed so many times too large."""
     camera = cell.options.camera
     stated = corner_positions(target)
-    real = scale * stated if target.kind == "marker" else corners_m(Sheet(target, scale, 0.0))
+    real = (
+        scale * stated if target.kind == "marker" else corners_m(Sheet(target=target, scale=scale))
+    )
     px = project(camera, real @ cam_from_target[:3, :3].T + cam_from_target[:3, 3])
     ids = np.flatnonzero(np.all((px > 0) & (px < np.array(camera.resolution) - 1), axis=1))
     px = px[ids] + cell.options.pixel_sigma_px * rng.standard_normal((len(ids), 2))

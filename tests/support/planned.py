@@ -118,7 +118,7 @@ def views(cell: PlanCell, q: FloatArray) -> FloatArray:
 
 def whole(cell: PlanCell, q: FloatArray, edge_px: float) -> FloatArray:
     """Whether the simulation's camera sees the whole print."""
-    outline = outline_m(Sheet(cell.target, 1.0, 0.0), 0.0)
+    outline = outline_m(Sheet(target=cell.target), 0.0)
     seen = views(cell, q)
     points = outline @ np.swapaxes(seen[:, :3, :3], 1, 2) + seen[:, None, :3, 3]
     return sees(cell.camera, points, edge_px).all(axis=1)

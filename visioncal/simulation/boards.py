@@ -7,7 +7,7 @@ import numpy as np
 from visioncal.core.types import FloatArray, Target
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Sheet:
     """A target as it came out of the printer and lies on its plate.
 
@@ -19,8 +19,8 @@ class Sheet:
     """
 
     target: Target
-    scale: float
-    bow_m: float
+    scale: float = 1.0
+    bow_m: float = 0.0
 
 
 def pattern_box(target: Target) -> tuple[float, float, float, float]:

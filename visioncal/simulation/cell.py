@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, invert
-from visioncal.core.types import Camera, Corners, FloatArray
+from visioncal.core.types import Camera, Corners, FloatArray, Mask
 from visioncal.simulation.arms import Arm, arm_named, forward, inverse, link_frames, reach_m
 from visioncal.simulation.boards import Sheet, centre_m, corners_m
 from visioncal.simulation.draws import Stream
@@ -267,10 +267,8 @@ def _reachable_joints(
         starts = np.tile(home, (len(views), 1))
         if options.branches:
             starts = rng.uniform(-np.pi, np.pi, starts.shape)
-        reach = inverse(arm, _flange(transforms, views), starts)
-        good = reach.solved & (reach.dexterity > LEAST_DEXTERITY)
-        good &= lowest_m(arm, reach.joints) > floor
-        kept.extend(reach.joints[good])
+        joints, good = reached(arm, _flange(transforms, views), starts, floor)
+        kept.extend(joints[good])
         if len(kept) >= options.views:
             return np.array(kept[: options.views])
     raise DataError(
@@ -294,6 +292,18 @@ def home_posture(arm: Arm, base_from_flange: FloatArray, rng: np.random.Generato
     best = reach.joints[np.argmax(merit)]
     # All joints within half a turn: the middle of their range.
     return np.asarray((best + np.pi) % (2.0 * np.pi) - np.pi)
+
+
+def reached(
+    arm: Arm, base_from_flange: FloatArray, starts: FloatArray, floor_m: float
+) -> tuple[FloatArray, Mask]:
+    """(m, n) postures [rad] at (m, 4, 4) poses, and (m,) which an operator would choose.
+
+    They are sought from (m, n) starts [rad]; no link comes lower over the base than the floor.
+    """
+    reach = inverse(arm, base_from_flange, starts)
+    good = reach.solved & (reach.dexterity > LEAST_DEXTERITY)
+    return reach.joints, np.asarray(good & (lowest_m(arm, reach.joints) > floor_m))
 
 
 def lowest_m(arm: Arm, joints: FloatArray) -> FloatArray:

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import Target
+from visioncal.simulation.boards import Sheet
 from visioncal.simulation.draws import DrawOptions
 from visioncal.simulation.optics import fine_camera
 from visioncal.simulation.options import BOARDS, CameraOptions, SweepOptions
@@ -52,7 +53,7 @@ class CameraAt(CameraOptions):
 
 
 @dataclass(frozen=True)
-class BoardAt:
+class BoardAt(Sheet):
     """A board on a robot's flange, or one that lies in the cell.
 
     Attributes:
@@ -60,18 +61,13 @@ class BoardAt:
         on: The robot on whose flange it is, or `cell`.
         place_m: Where its middle lies in the cell, if it does [m].
         tilt_rad: How far it leans towards the middle of the cell [rad].
-        target: The board as its file states it.
-        scale: Printed size over stated size.
-        bow_m: How far its corners are bent away from the camera [m].
     """
 
     name: str
     on: str = CELL
     place_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     tilt_rad: float = 0.0
-    target: Target = BOARDS["charuco"]
-    scale: float = 1.0
-    bow_m: float = 0.0
+    target: Target = field(default=BOARDS["charuco"], kw_only=True)
 
 
 @dataclass(frozen=True)

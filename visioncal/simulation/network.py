@@ -19,14 +19,14 @@ from visioncal.simulation.observed_points import (
     Network,
     Reading,
     Sight,
+    board_named,
     camera_named,
-    sheet_named,
     with_faults,
 )
 from visioncal.simulation.options import CellOptions
 from visioncal.simulation.poses import draw_views
 from visioncal.simulation.second import looks_at
-from visioncal.simulation.standing import mounted, parents_of, postures, sheet_of
+from visioncal.simulation.standing import mounted, parents_of, postures
 from visioncal.simulation.sweep import sweep_network
 from visioncal.simulation.warmup import Heat, heated_flanges, warm_up
 
@@ -174,7 +174,7 @@ def _places(cell: Network) -> dict[str, FloatArray]:
 def _shown(cell: Network, camera: str, board: str, pose: FloatArray) -> FloatArray:
     """(s,) at which stops a camera has a board in its image, and it is recorded."""
     options = cell.options
-    seen = looks_at(camera_named(options, camera).camera, sheet_named(options, board), pose)
+    seen = looks_at(camera_named(options, camera).camera, board_named(options, board), pose)
     places = (
         [it.name for it in options.cameras].index(camera),
         [it.name for it in options.boards].index(board),
@@ -186,7 +186,7 @@ def _shown(cell: Network, camera: str, board: str, pose: FloatArray) -> FloatArr
 def _sight(cell: Network, view: int, stop: int, camera: str, board: str, pose: FloatArray) -> Sight:
     """What a camera sees of a board, corner by corner."""
     options = cell.options
-    sheet = sheet_named(options, board)
+    sheet = board_named(options, board)
     exact = seen_in(camera_named(options, camera), sheet, pose, view)
     found = detected(exact, options.pixel_sigma_px, options.stream(Stream.CORNERS, view))
     found = _as_detected(sheet, found)
@@ -218,7 +218,7 @@ def _of_lenses(cell: Network, first_view: int) -> list[Sight]:
         views = np.empty((0, 4, 4))
         drawing = CellOptions(target=board.target, camera=camera.camera, cut_views=0.0)
         while len(views) < options.lens_views:
-            more = draw_views(drawing, sheet_of(board), 4 * options.lens_views, rng)
+            more = draw_views(drawing, board, 4 * options.lens_views, rng)
             views = np.concatenate([views, more])
         for pose in views[: options.lens_views]:
             view = first_view + len(found)

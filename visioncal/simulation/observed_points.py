@@ -11,14 +11,13 @@ from visioncal.core.types import Camera, Corners, FloatArray
 from visioncal.session import Stream as Recorded
 from visioncal.session import frame_name
 from visioncal.simulation.arms import Arm
-from visioncal.simulation.boards import Sheet
 from visioncal.simulation.cell import Cell
 from visioncal.simulation.draws import DrawOptions, Stream
 from visioncal.simulation.layout import CELL, BoardAt, CameraAt, NetworkOptions, RobotAt
 from visioncal.simulation.options import CameraOptions
 from visioncal.simulation.sag import Payload
 from visioncal.simulation.second import NAMES
-from visioncal.simulation.standing import parents_of, sheet_of
+from visioncal.simulation.standing import parents_of
 
 # An operator's pace: a stop every so many seconds [s].
 _PACE_S = 4.0
@@ -223,11 +222,6 @@ def camera_named(options: NetworkOptions, name: str) -> CameraAt:
 def board_named(options: NetworkOptions, name: str) -> BoardAt:
     """The board of that name."""
     return next(it for it in options.boards if it.name == name)
-
-
-def sheet_named(options: NetworkOptions, name: str) -> Sheet:
-    """The board of that name, as it was printed."""
-    return sheet_of(board_named(options, name))
 
 
 def with_faults(cell: Network) -> Network:

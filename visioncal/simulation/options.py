@@ -9,6 +9,7 @@ import numpy as np
 from visioncal.core.arguments import check_fields
 from visioncal.core.errors import DataError
 from visioncal.core.types import Camera, Mount, Target
+from visioncal.simulation.boards import Sheet
 from visioncal.simulation.draws import DrawOptions
 from visioncal.simulation.optics import mistaken, wide_camera
 from visioncal.simulation.real_arm import ArmOptions
@@ -135,24 +136,19 @@ class SweepOptions:
             raise DataError("simulation: a sweep needs two stops, and times and rates above 0.")
 
 
-@dataclass(frozen=True)
-class Second:
+@dataclass(frozen=True, kw_only=True)
+class Second(Sheet):
     """A second board of a cell. Every other stop looks at it; it is seen wherever it is in view.
 
     Attributes:
-        target: The board as its file states it.
         turn_rad: How far around the base it lies from the first (eye-in-hand), or to which side of
             the flange it leans (eye-to-hand) [rad].
         tilt_rad: How far it leans: towards the base, or aside [rad].
-        scale: Printed size over stated size.
-        bow_m: How far its corners are bent away from the camera [m].
     """
 
     target: Target = BOARDS["checkerboard"]
     turn_rad: float = 1.4
     tilt_rad: float = 0.3
-    scale: float = 1.0
-    bow_m: float = 0.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -17,9 +17,9 @@ from visioncal.simulation.optics import rays, sees
 from visioncal.simulation.options import CellOptions
 
 # The print stays this far from the image's edge in views that show it whole [px].
-_MARGIN_PX = 12.0
+MARGIN_PX = 12.0
 # A view that the image's edge may cut still shows this share of the corners.
-_LEAST_SHARE = 0.6
+LEAST_SHARE = 0.6
 
 
 def _working_distance_m(options: CellOptions) -> tuple[float, float]:
@@ -59,9 +59,9 @@ def draw_views(
     )
     centre = distance[:, None] * rays(options.camera, aim)
     cam_from_target = compose(rotation, centre - rotation @ centre_m(sheet))
-    whole = sees(options.camera, _place(cam_from_target, outline_m(sheet, 0.0)), _MARGIN_PX)
-    seen = sees(options.camera, _place(cam_from_target, corners_m(sheet)), _MARGIN_PX)
-    fits = whole.all(axis=1) | (may_be_cut & (seen.mean(axis=1) > _LEAST_SHARE))
+    whole = sees(options.camera, _place(cam_from_target, outline_m(sheet, 0.0)), MARGIN_PX)
+    seen = sees(options.camera, _place(cam_from_target, corners_m(sheet)), MARGIN_PX)
+    fits = whole.all(axis=1) | (may_be_cut & (seen.mean(axis=1) > LEAST_SHARE))
     return np.asarray(cam_from_target[fits])
 
 

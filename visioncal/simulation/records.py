@@ -23,8 +23,8 @@ from visioncal.simulation.layout import CELL, BoardAt, CameraAt
 from visioncal.simulation.observed_points import (
     Network,
     Sight,
+    board_named,
     camera_named,
-    sheet_named,
     whole,
 )
 from visioncal.simulation.optics import project
@@ -340,7 +340,7 @@ def measured_pose(cell: Network, sight: Sight) -> FloatArray:
     Raises:
         DataError: The image shows too few corners for a pose.
     """
-    ids, sheet = sight.exact.ids, sheet_named(cell.options, sight.board)
+    ids, sheet = sight.exact.ids, board_named(cell.options, sight.board)
     if ids.size < 4:
         raise DataError(f"simulation: view {sight.view} shows {ids.size} corners, a pose needs 4.")
     camera = camera_named(cell.options, sight.camera).camera

@@ -22,8 +22,8 @@ from visioncal.simulation.draws import Stream
 from visioncal.simulation.observed_points import (
     Network,
     Sight,
+    board_named,
     camera_named,
-    sheet_named,
     whole,
 )
 from visioncal.simulation.optics import project, sees
@@ -121,7 +121,7 @@ def network_scene(cell: Network, camera: str, board: str) -> Scene:
     """Draws the textures of what one camera sees of one board; see `prepare_scene`."""
     options, optics = cell.options, camera_named(cell.options, camera)
     sights = [it for it in cell.sights if it.camera == camera]
-    sheet = sheet_named(options, board)
+    sheet = board_named(options, board)
     place = [it.name for it in options.cameras].index(camera)
     # The first draws as the only one does.
     rng = options.stream(Stream.BACKDROP, *((place,) if place else ()))

@@ -11,12 +11,12 @@ from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.simulation.boards import Sheet, centre_m, corners_m, found_in_part
 from visioncal.simulation.optics import sees
 from visioncal.simulation.options import CellOptions, Second
+from visioncal.simulation.poses import LEAST_SHARE, MARGIN_PX
 
 # What a session calls the boards where there are two.
 NAMES = ("first", "second")
-# A board is looked at in a view that shows this share of its corners, not too much from the side.
-_LEAST_SHARE, _LEAST_COSINE = 0.6, 0.5
-_EDGE_PX = 12.0
+# A board is not looked at from farther aside.
+_LEAST_COSINE = 0.5
 # How far aside the flange carries its second board [m].
 _ASIDE_M = 0.10
 
@@ -36,11 +36,8 @@ class Shown:
 
 def sheets_of(options: CellOptions) -> tuple[Sheet, ...]:
     """The boards as they were printed."""
-    first = Sheet(options.target, options.board_scale, options.board_bow_m)
-    second = options.second
-    if second is None:
-        return (first,)
-    return first, Sheet(second.target, second.scale, second.bow_m)
+    first = Sheet(target=options.target, scale=options.board_scale, bow_m=options.board_bow_m)
+    return (first,) if options.second is None else (first, options.second)
 
 
 def with_second(
@@ -105,6 +102,6 @@ def looks_at(camera: Camera, sheet: Sheet, cam_from_target: FloatArray) -> Mask:
     looks = facing.all(axis=1) & (towards[:, :, 2] > _LEAST_COSINE).all(axis=1)
     if not looks.any():
         return np.asarray(looks)
-    share = sees(camera, points[looks], _EDGE_PX).mean(axis=1)
-    looks[looks] = share >= (_LEAST_SHARE if found_in_part(sheet.target) else 1.0)
+    share = sees(camera, points[looks], MARGIN_PX).mean(axis=1)
+    looks[looks] = share >= (LEAST_SHARE if found_in_part(sheet.target) else 1.0)
     return np.asarray(looks)

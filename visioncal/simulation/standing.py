@@ -10,9 +10,9 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, invert
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.session import frame_name
-from visioncal.simulation.arms import Arm, arm_named, forward, inverse
-from visioncal.simulation.boards import Sheet, centre_m
-from visioncal.simulation.cell import LEAST_DEXTERITY, home_posture, looking_at, lowest_m
+from visioncal.simulation.arms import Arm, arm_named, forward
+from visioncal.simulation.boards import centre_m
+from visioncal.simulation.cell import home_posture, looking_at, reached
 from visioncal.simulation.draws import Stream
 from visioncal.simulation.layout import CELL, MIDDLE_M, BoardAt, CameraAt, NetworkOptions, RobotAt
 from visioncal.simulation.options import CellOptions
@@ -27,11 +27,6 @@ _CHANGE = 6
 _STOPS_TRIED = 6
 # A board on a flange is looked at from as near or as far as this from the middle [m].
 _DEPTH_M = 0.15
-
-
-def sheet_of(board: BoardAt) -> Sheet:
-    """A board as it was printed."""
-    return Sheet(board.target, board.scale, board.bow_m)
 
 
 def parents_of(options: NetworkOptions) -> dict[str, str]:
@@ -89,7 +84,7 @@ def _camera(camera: CameraAt, rng: np.random.Generator) -> FloatArray:
 
 
 def _board(board: BoardAt, rng: np.random.Generator) -> FloatArray:
-    centre = centre_m(sheet_of(board))
+    centre = centre_m(board)
     # The board's z points into its plate.
     turn = Rotation.from_euler("ZX", [rng.uniform(-0.5, 0.5), np.pi])
     if board.on != CELL:
@@ -199,15 +194,14 @@ def _reached(
             chosen[left] = rng.choice(reachable, int(left.sum()))
         for at in np.unique(chosen[left]):
             aim, stops = aims[at], np.flatnonzero(left & (chosen == at))
-            views = draw_views(aim.cell, sheet_of(aim.board), 4 * len(stops), rng)
+            views = draw_views(aim.cell, aim.board, 4 * len(stops), rng)
             if not len(views):
                 continue
             stops = stops[: len(views)]
             goals = _flanges(robot, aim, placed, flanges, stops, views[: len(stops)])
-            reach = inverse(arm, goals, np.tile(homes[at], (len(stops), 1)))
-            good = reach.solved & (reach.dexterity > LEAST_DEXTERITY)
-            good &= lowest_m(arm, reach.joints) > _LEAST_HEIGHT_M
-            joints[stops[good]] = reach.joints[good]
+            starts = np.tile(homes[at], (len(stops), 1))
+            moved, good = reached(arm, goals, starts, _LEAST_HEIGHT_M)
+            joints[stops[good]] = moved[good]
             left[stops[good]] = False
         if not left.any():
             return joints
@@ -228,7 +222,7 @@ def _home(
     stops: int,
 ) -> FloatArray | None:
     """(n,) a posture in the middle of an aim's; None where the robot does not reach that."""
-    straight = mean_view(aim.cell, sheet_of(aim.board))[None]
+    straight = mean_view(aim.cell, aim.board)[None]
     for stop in range(min(stops, 1 if aim.other == CELL else _STOPS_TRIED)):
         middle = _flanges(robot, aim, placed, flanges, np.array([stop]), straight)
         try:

@@ -29,7 +29,7 @@ from visioncal.simulation.cell import (
 )
 from visioncal.simulation.draws import Stream
 from visioncal.simulation.layout import CELL, Swept
-from visioncal.simulation.observed_points import Network, Sight, camera_named, sheet_named
+from visioncal.simulation.observed_points import Network, Sight, board_named, camera_named
 from visioncal.simulation.optics import project, sees
 from visioncal.simulation.options import CameraOptions, CellOptions, SweepOptions
 from visioncal.simulation.rows import POSE
@@ -213,7 +213,7 @@ def sweep_network(
     ticks = options.stream(Stream.SWEEPS, at, 1)
     passage = Passage.through(cell.joints[swept.robot][: swept.stops], swept)
     reported = passage.reported(cell.arms[swept.robot], rng)
-    camera, sheet = camera_named(options, swept.camera), sheet_named(options, swept.target)
+    camera, sheet = camera_named(options, swept.camera), board_named(options, swept.target)
     fewest = _FEWEST_OF_CELL if found_in_part(sheet.target) else len(corners_m(sheet))
     sights: list[Sight] = []
 
