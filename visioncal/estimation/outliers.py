@@ -10,6 +10,7 @@ moved yet.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -87,6 +88,15 @@ class Agreed:
     used: Mask
     distances: Distances
     moves: tuple[Move, ...]
+
+    @property
+    def part(self) -> Problem:
+        """The observations that agree."""
+        return self.problem.subset(self.used)
+
+    def refitted(self) -> Self:
+        """The same fitted anew, from the state and the noise that are there."""
+        return replace(self, fit=fit_problem(self.part, self.fit.state, self.fit.noise))
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,8 @@ from visioncal.calibration.pipeline.fault_messages import (
 )
 from visioncal.calibration.pipeline.holdout import held_sights
 from visioncal.calibration.pipeline.lens_fields import LensErrors, lens_errors
-from visioncal.calibration.pipeline.solving import Solved, sensors_of
+from visioncal.calibration.pipeline.solved import Solved
+from visioncal.calibration.pipeline.starting import sensors_of
 from visioncal.calibration.stages.arms import ArmFound
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.clock import Pair

@@ -4,7 +4,7 @@ from dataclasses import replace
 from itertools import combinations
 
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.pipeline.solving import agreeing_views
+from visioncal.calibration.pipeline.starting import agreeing_views
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.cell import read_cell
 from visioncal.calibration.stages.pnp import given_poses

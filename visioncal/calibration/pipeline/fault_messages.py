@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.calibration.pipeline.solving import Solved
+from visioncal.calibration.pipeline.solved import Solved
 from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
 from visioncal.calibration.stages.turned_images import Turned
 from visioncal.calibration.stages.validate import apart

@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.calibration.pipeline.solving import Solved, problem_of, targets_of
+from visioncal.calibration.pipeline.solved import Solved
+from visioncal.calibration.pipeline.starting import problem_of, targets_of
 from visioncal.calibration.stages.cell import Row
 from visioncal.calibration.stages.clocks import clock_effects
 from visioncal.calibration.stages.kinematics import unseen_views

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.calibration.pipeline.solving import Solved
+from visioncal.calibration.pipeline.solved import Solved
 from visioncal.core.number_format import figure
 from visioncal.core.types import Camera, FloatArray, IntArray
 from visioncal.core.verdict import Finding, Step

@@ -7,7 +7,7 @@ from typing import TypeVar
 
 from visioncal.calibration.pipeline.answer import Answer
 from visioncal.calibration.pipeline.budget import Work, work_of
-from visioncal.calibration.pipeline.solving import Solved
+from visioncal.calibration.pipeline.solved import Solved
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.judged import Findings

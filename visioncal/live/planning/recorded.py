@@ -6,7 +6,7 @@ import numpy as np
 
 from visioncal.calibration.pipeline.observed_poses import ObservedPoses
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.pipeline.solving import Solved
+from visioncal.calibration.pipeline.solved import Solved
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.pose_ambiguity import choose_by

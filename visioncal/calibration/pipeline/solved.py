@@ -1,0 +1,145 @@
+"""The fit of a whole cell, as the solver hands it on."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Self
+
+import numpy as np
+
+from visioncal.calibration.stages.arms import RobotArm
+from visioncal.calibration.stages.cell import Cell
+from visioncal.calibration.stages.fit_messages import found_of_looks
+from visioncal.calibration.stages.pnp import ViewPoses
+from visioncal.calibration.stages.side import FramesSide
+from visioncal.calibration.stages.turned_images import Turned
+from visioncal.calibration.stages.validate import chain_rms_px
+from visioncal.core.types import FloatArray, IntArray
+from visioncal.core.verdict import Finding
+from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
+from visioncal.estimation.joint import Fitted
+from visioncal.estimation.outliers import Agreed
+from visioncal.estimation.parts import Effect, State
+from visioncal.estimation.problem import Problem
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """The fit of a whole cell.
+
+    Attributes:
+        cell: The cell; its rows are the observations in the fit's order.
+        agreed: The fit, what it uses, and what moved.
+        seen: What all corners say of lenses and boards; None without images.
+        poses: Each row's one pose.
+        untied: Frames that nothing ties to the rest.
+        arms: The robots' arms, as far as they were calibrated.
+        asked: How far that was to be.
+        late: The errors of clocks, as effects.
+        turned: How images of views that disagree were turned or mirrored, by view.
+        solver: By which solver the edges are.
+    """
+
+    cell: Cell
+    agreed: Agreed
+    seen: LinearisedCorners | None
+    poses: tuple[ViewPoses, ...]
+    untied: tuple[str, ...]
+    arms: Mapping[str, RobotArm]
+    asked: str
+    late: tuple[Effect, ...]
+    turned: Mapping[int, Turned] = field(default_factory=dict)
+    solver: str = "joint"
+
+    @property
+    def part(self) -> Problem:
+        """The observations that the fit was made from."""
+        return self.agreed.part
+
+    @property
+    def side(self) -> FramesSide:
+        """The frames' side of the joint fit."""
+        problem, views = self.agreed.problem, [it.view for it in self.cell.rows]
+        used, noise = self.agreed.used, self.agreed.fit.noise
+        return FramesSide(problem, used, views, self.arms, self.late, noise)
+
+    @property
+    def frames(self) -> dict[str, FloatArray]:
+        """Where the unknown frames are."""
+        return dict(zip(self.agreed.problem.unknown, self.agreed.fit.state.edges, strict=True))
+
+    def posed(self) -> Self:
+        """The same with the robots' poses by their arms."""
+        poses = {name: it.poses for name, it in self.arms.items()}
+        problem = self.agreed.problem
+        problem = replace(problem, poses={**problem.poses, **poses})
+        return replace(self, agreed=replace(self.agreed, problem=problem))
+
+    def settled(self, side: FramesSide, fitted: Fitted) -> Self:
+        """The same as lenses, boards and frames were fitted with a side."""
+        agreed = replace(self.agreed, problem=side.whole(fitted.seen), fit=fitted.fit)
+        return replace(self, agreed=agreed, seen=fitted.seen, arms=side.arms)
+
+    def found_of_looks(self, covariance: FloatArray) -> Iterator[Finding]:
+        """Says what was found of lenses and boards; see `stages.fit_messages`."""
+        if self.seen is not None:
+            fitted = Fitted(self.seen, self.part, self.agreed.fit)
+            arms, stated = self.arms.values(), None
+            if any(it.model is not None for it in arms):
+                stated = self.part
+                for arm in arms:
+                    stated = arm.without_errors(stated)
+            yield from found_of_looks(self.side, fitted, covariance, stated)
+
+    @property
+    def shown_px(self) -> dict[str, float]:
+        """Each camera's noise of a corner by its residuals, per axis, whatever is stated [px]."""
+        if self.seen is None:
+            return {}
+        looks, found = self.seen.looks, {}
+        for (camera, it), corners in zip(looks.problems.items(), self.seen.compressed, strict=True):
+            moving = np.flatnonzero(np.isin(looks.places(camera), self.seen.moving))
+            unknowns = it.unknowns(corners, moving)
+            found[camera] = it.stack.shown_px(corners.residuals, unknowns)
+        return found
+
+    @property
+    def looks(self) -> CameraParameters | None:
+        """Lenses and boards as they were found; None without images."""
+        return self.looks_at(self.agreed.fit.state)
+
+    def looks_at(self, state: State) -> CameraParameters | None:
+        """Lenses and boards as some state has them; None without images."""
+        if self.seen is None:
+            return None
+        free = self.seen.free
+        found = self.agreed.problem.values_of(LENSES, state)[: len(free)]
+        return self.seen.looks.with_values(free, found)
+
+    def chain_px(self, rows: IntArray, state: State) -> FloatArray:
+        """Reprojection errors (m,) [px] of some observations through the chain; NaN for none.
+
+        Args:
+            rows: (m,) the observations.
+            state: The unknowns of the fit, or those of another one to a part of them.
+        """
+        looks, chosen = self.looks_at(state), np.isin(np.arange(len(self.cell.rows)), rows)
+        if looks is None:
+            return np.full(len(rows), np.nan)
+        poses = self.agreed.problem.subset(chosen).predicted(state)
+        lenses = {it: looks.camera(it) for it in looks.problems}
+        seen = [self.poses[it].corners for it in rows]
+        cameras = [lenses.get(self.cell.rows[it].seer) for it in rows]
+        return chain_rms_px(seen, poses, cameras, np.concatenate(looks.corners))
+
+    @property
+    def field_columns(self) -> IntArray:
+        """The problem's columns of what lenses do beyond their models."""
+        mine = self.agreed.problem.effect_columns.get(LENSES, slice(0, 0))
+        free = 0 if self.seen is None else len(self.seen.free)
+        return np.arange(mine.start + free, mine.stop)
+
+    def columns_of(self, places: IntArray) -> IntArray:
+        """The problem's columns of free values of lenses and boards, by their places."""
+        first = self.agreed.problem.effect_columns.get(LENSES, slice(0, 0)).start
+        free = np.zeros(0) if self.seen is None else self.seen.free
+        return np.asarray(first + np.searchsorted(free, places))

@@ -1,0 +1,201 @@
+"""Where the fit of a cell starts: its problem, a start of all frames, each view with one pose."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.calibration.pipeline.network_ties import ambiguous_error, untied_robots
+from visioncal.calibration.stages.cell import Cell
+from visioncal.calibration.stages.init_frames import init_frames
+from visioncal.calibration.stages.observed import Observed, nothing_seen
+from visioncal.calibration.stages.pairwise import AGREE_M
+from visioncal.calibration.stages.pnp import ViewPoses
+from visioncal.core.errors import DegenerateError
+from visioncal.core.transforms import invert, rotation_angle
+from visioncal.core.types import Target
+from visioncal.estimation.arm import LEVER_M
+from visioncal.estimation.observability import FEWEST_VIEWS, refuse_too_few
+from visioncal.estimation.parts import Observations, State
+from visioncal.estimation.problem import Problem
+
+# Covariance of a pose that was given without one, but for its level [rad^2, m^2].
+_NOMINAL = np.diag(np.repeat([1e-3, 5e-4], 3) ** 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where a fit starts.
+
+    Attributes:
+        cell: The part of the cell that observations tie together; its rows are in the fit's order.
+        poses: Each row's one pose.
+        problem: What they measured.
+        state: Where the frames are to begin with.
+        untied: Frames that nothing ties to the rest.
+    """
+
+    cell: Cell
+    poses: tuple[ViewPoses, ...]
+    problem: Problem
+    state: State
+    untied: tuple[str, ...]
+
+
+def with_poses(cell: Cell, looked: Observed) -> Cell:
+    """The cell without the observations that gave no pose.
+
+    Raises:
+        DataError: None is left.
+    """
+    missing = {
+        it.view: cell.reasons.get(it.view, "nothing was found in its image")
+        for it in cell.rows
+        if it.view not in looked.poses
+    }
+    cell = cell.without(missing)
+    if not cell.rows:
+        raise nothing_seen(looked)
+    return cell
+
+
+def started(cell: Cell, looked: Observed) -> Start:
+    """Finds a start, and gives each view its one pose by it.
+
+    Args:
+        cell: The cell; each of its rows has a pose.
+        looked: What was observed in it.
+
+    Raises:
+        DegenerateError: A robot is tied to nothing, or a frame may be in two places.
+    """
+    cell, lost = _tied_part(cell)
+    views = [looked.poses[it.view] for it in cell.rows]
+    problem = problem_of(cell, views)
+    if cell.mount is not None:
+        refuse_too_few(problem, cell.mount, len(cell.rows))
+        _refuse_few_of_each(cell)
+    placed = init_frames(problem, views, targets_of(cell))
+    tied, clear = placed.tied, {it.view: it for it in placed.views}
+    if tied.untied:
+        untied_robots(cell, tied.untied, seen=True)
+        cell = _without_frames(cell, tied.untied)
+    if tied.ambiguous:
+        raise ambiguous_error(cell, tied.ambiguous)
+    cell, more = _tied_part(cell.without({it.view: it.reason for it in placed.rejections}))
+    poses = tuple(clear[it.view] for it in cell.rows)
+    problem = problem_of(cell, poses)
+    return Start(cell, poses, problem, problem.start(tied.edges), (*lost, *tied.untied, *more))
+
+
+def agreeing_views(cell: Cell, looked: Observed) -> frozenset[int]:
+    """The views that the first consensus of a cell's frames predicts; nothing is fitted.
+
+    Raises:
+        DataError: Nothing was seen.
+        DegenerateError: A robot is tied to nothing, or a frame may be in two places.
+    """
+    start = started(with_poses(cell, looked), looked)
+    between = invert(start.problem.predicted(start.state)) @ start.problem.observations.measured
+    away = np.linalg.norm(between[:, :3, 3], axis=1) + LEVER_M * rotation_angle(between)
+    near = (away < AGREE_M).tolist()
+    return frozenset(it.view for it, is_near in zip(start.poses, near, strict=True) if is_near)
+
+
+def targets_of(cell: Cell) -> dict[str, Target]:
+    """The printed targets by their frames."""
+    return {f"target_{name}" if name else "target": it for name, it in cell.session.plates.items()}
+
+
+def problem_of(cell: Cell, views: Sequence[ViewPoses]) -> Problem:
+    """The problem of views with one pose each, lenses and boards as they are taken to be."""
+    given = np.array([not it.covariance.any() for it in views])
+    levels = {it: at for at, it in enumerate(sensors_of(cell, views))}
+    sensors = [
+        levels.get(row.seer, -1) if _is_sensed(row.seer, view) else -1
+        for row, view in zip(cell.rows, views, strict=True)
+    ]
+    covariance = np.array([it.covariance[0] for it in views])
+    places = np.array([it.is_place for it in cell.rows], dtype=bool)
+    covariance[given] = _NOMINAL
+    turned = {it.seen for it in cell.rows if not it.is_place}
+    # What one camera measured with one robot, without a word of its noise, has that of both as one.
+    is_combined = cell.mount is not None and cell.mount != "instrument" and bool(given.any())
+    is_uneven = given & [not row.seer.startswith("instrument") for row in cell.rows]
+    if is_combined:
+        is_uneven |= True
+        sensors, covariance = [-1] * len(views), np.zeros((len(views), 6, 6))
+    return Problem(
+        cell.tree,
+        cell.poses,
+        Observations(
+            tuple(it.seer for it in cell.rows),
+            tuple(it.seen for it in cell.rows),
+            np.array([it.station for it in cell.rows]),
+            np.array(sensors, dtype=np.int64),
+            np.array([it.cam_from_target[0] for it in views]),
+            covariance,
+            ~places,
+            is_uneven,
+        ),
+        priors=cell.priors,
+        points=frozenset(it.seen for it in cell.rows) - turned,
+        is_combined=is_combined,
+    )
+
+
+def sensors_of(cell: Cell, views: Sequence[ViewPoses]) -> tuple[str, ...]:
+    """The frames whose observations' noise is known up to a level; other cameras come behind.
+
+    Of one camera or instrument with one robot it is the stated noise: the rest is the robot's.
+    """
+    if cell.mount is not None:
+        return ()
+    pairs = zip(cell.rows, views, strict=True)
+    return tuple(dict.fromkeys(row.seer for row, view in pairs if _is_sensed(row.seer, view)))
+
+
+def _is_sensed(seer: str, view: ViewPoses) -> bool:
+    """Whether an observation's noise is known up to a level: those of corners is known."""
+    return seer.startswith("instrument") or not view.covariance.any()
+
+
+def _tied_part(cell: Cell) -> tuple[Cell, tuple[str, ...]]:
+    """The part of a cell that observations tie together, and the frames outside."""
+    tied = cell.tied()
+    lost = tuple(it for it in cell.tree.branches if it not in tied)
+    untied_robots(cell, lost)
+    return _without_frames(cell, lost), tuple(it for it in lost if not _is_flange(cell, it))
+
+
+def _is_flange(cell: Cell, frame: str) -> bool:
+    return bool(cell.tree.branches[frame].robot)
+
+
+def _without_frames(cell: Cell, frames: Sequence[str]) -> Cell:
+    tree = cell.tree.without(frames)
+    reasons = {
+        it.view: f"nothing ties {it.seer if it.seer in frames else it.seen} to the rest of the cell"
+        for it in cell.rows
+        if it.seer not in tree.branches or it.seen not in tree.branches
+    }
+    robots = set(tree.robots)
+    poses = {name: it for name, it in cell.poses.items() if name in robots}
+    priors = tuple(
+        it for it in cell.priors if it.first in tree.branches and it.second in tree.branches
+    )
+    return replace(cell.without(reasons), tree=tree, poses=poses, priors=priors)
+
+
+def _refuse_few_of_each(cell: Cell) -> None:
+    """Refuses several targets of which none is seen often enough to begin with."""
+    shown = [it.seen for it in cell.rows]
+    counts = {it: shown.count(it) for it in dict.fromkeys(shown)}
+    if len(counts) > 1 and max(counts.values()) < FEWEST_VIEWS and cell.mount != "instrument":
+        shares = ", ".join(f"{it.partition('_')[2]} in {count}" for it, count in counts.items())
+        raise DegenerateError(
+            f"hand-eye: of several targets, at least one must be seen in {FEWEST_VIEWS} views, to "
+            f"begin with; here {shares}.",
+            culprits=[it.replace("_", " ", 1) for it in counts],
+            next_step="Add views of one of them, tilted about different axes.",
+        )
