@@ -115,8 +115,7 @@ class ArmPair:
 
     def frame_jacobian(self, base_from_flange: FloatArray) -> FloatArray:
         """(k, 6, 12) how the flange moves with the frames of its base and of what it carries."""
-        branches = self.problem.tree.branches
-        flange = next(name for name, it in branches.items() if it.robot == self.robot)
+        flange = self.problem.tree.flanges[self.robot]
         carried = self.observer if self.is_observer_carried else self.observed
         flange_from_end = self.problem.between(flange, carried, self.state, self.rows[:1])[0]
         of_end = np.broadcast_to(adjoint(flange_from_end), (len(base_from_flange), 6, 6))

@@ -259,7 +259,7 @@ def _steps(problem: Problem, fit: Solution, agrees: Mask, movable: Sequence[str]
 def _pushed_gain(problem: Problem, fit: Solution, agrees: Mask) -> int:
     """How many more observations the step of a robot's base explains that explains most."""
     gains = [0]
-    for base in {branch.parent for branch in problem.tree.branches.values() if branch.robot}:
+    for base in set(problem.tree.bases.values()):
         if base not in problem.unknown:
             continue
         rows = np.flatnonzero(np.isfinite(problem.change_of(base, fit.state)[:, 0, 0]))

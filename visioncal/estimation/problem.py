@@ -280,6 +280,13 @@ class Problem:
             rows.setdefault(pair, []).append(at)
         return tuple(_Group(np.array(at), self.tree.path(*pair)) for pair, at in rows.items())
 
+    def through(self, frame: str) -> Mask:
+        """(n,) the observations on whose way a frame's edge is, a robot's where it is a flange."""
+        found = np.zeros(len(self), dtype=bool)
+        for group in self.groups:
+            found[group.rows] = any(step.frame == frame for step in group.path)
+        return found
+
     @cached_property
     def units(self) -> tuple[IntArray, IntArray]:
         """Observations whose errors belong together: by the robots at one stop, or as repeats.

@@ -202,8 +202,7 @@ def drift(problem: Problem, state: State, noise: Noise, robot: str) -> Drift | N
 
 def _where_it_looks(problem: Problem, state: State, robot: str) -> FloatArray:
     """(3,) the mean place, in a robot's base, of what is observed by way of it [m]."""
-    branches = problem.tree.branches.values()
-    base = next(it.parent for it in branches if it.robot == robot)
+    base = problem.tree.bases[robot]
     rows, observed = rows_of(problem, robot), np.array(problem.observations.observed)
     places = [
         problem.between(base, frame, state, np.flatnonzero(rows & (observed == frame)))[:, :3, 3]

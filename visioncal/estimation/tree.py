@@ -70,7 +70,17 @@ class Tree:
     @property
     def robots(self) -> tuple[str, ...]:
         """The robots, in the tree's order."""
-        return tuple(it.robot for it in self.branches.values() if it.robot)
+        return tuple(self.flanges)
+
+    @property
+    def flanges(self) -> dict[str, str]:
+        """The frame of each robot's flange."""
+        return {it.robot: name for name, it in self.branches.items() if it.robot}
+
+    @property
+    def bases(self) -> dict[str, str]:
+        """The frame of each robot's base."""
+        return {it.robot: it.parent for it in self.branches.values() if it.robot}
 
     def with_known(self, frame: str, matrix: FloatArray) -> "Tree":
         """Returns the tree with one edge that is no longer asked for."""

@@ -132,5 +132,5 @@ def _movable(cell: Cell, problem: Problem) -> tuple[str, ...]:
     # One camera that sees one robot move cannot distinguish what slipped from a wrong pose.
     if cell.mount is not None:
         return ()
-    bases = {branch.parent for branch in problem.tree.branches.values() if branch.robot}
+    bases = problem.tree.bases.values()
     return tuple(it for it in problem.tree.unknown if it not in bases)

@@ -14,9 +14,8 @@ from visioncal.calibration.stages.validate import apart
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import distances, invert, mean_transform, pose_difference
-from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import CALIBRATE, EXCHANGED, Finding, Step, exchanging, look_at
-from visioncal.estimation.problem import Problem
 from visioncal.results import Moved
 
 # A robot is pushed where it is seen elsewhere at so many stops, which agree to such a share.
@@ -253,14 +252,6 @@ def _exchanged_views(solved: Solved, mutual: Mapping[int, int]) -> Iterator[Pose
             yield PoseFault(found, (first, second))
 
 
-def by_way_of(problem: Problem, robot: str) -> Mask:
-    """(n,) the observations between whose frames a robot is."""
-    found = np.zeros(len(problem), dtype=bool)
-    for group in problem.groups:
-        found[group.rows] = any(step.robot == robot for step in group.path)
-    return found
-
-
 def _numbers(solved: Solved, rows: Sequence[int]) -> tuple[int, ...]:
     return tuple(solved.cell.rows[it].view for it in rows)
 
@@ -275,20 +266,19 @@ def _pushed_bases(solved: Solved) -> list[PoseFault]:
     # may be two, because all that its robot carries hangs on it.
     problem, used = solved.agreed.problem, solved.agreed.used
     stops, found = problem.observations.stops, []
-    for flange, branch in problem.tree.branches.items():
-        if not branch.robot:
-            continue
-        mine = by_way_of(problem, branch.robot)
+    for robot, base in problem.tree.bases.items():
+        flange = problem.tree.flanges[robot]
+        mine = problem.through(flange)
         first = int(stops[mine & used].max(initial=-1)) + 1
         after = np.flatnonzero(mine & ~used & (stops >= first))
         if len(np.unique(stops[after])) < _FEWEST_STOPS:
             continue
-        moved = _moved_by(solved, branch.parent, after)
-        as_if = f", as if {branch.parent} had been pushed by {moved}" if moved else ""
+        moved = _moved_by(solved, base, after)
+        as_if = f", as if {base} had been pushed by {moved}" if moved else ""
         words = (
             f"All {len(after)} views by way of {flange} from stop "
             f"{solved.cell.stops[int(stops[after].min())]} on disagree with those before{as_if}: "
-            f"{branch.parent} is where it stood before."
+            f"{base} is where it stood before."
         )
         views = _numbers(solved, after.tolist())
         step = Step("Fasten it, and align the stops from there on alone.", look_at(views[0]))
@@ -312,19 +302,16 @@ def _wrong_poses(solved: Solved, explained: set[int]) -> Iterator[PoseFault]:
     """Stops at which all that was seen by way of a robot asks for it to stand elsewhere."""
     problem, used = solved.agreed.problem, solved.agreed.used
     stops = problem.observations.stops
-    for branch in problem.tree.branches.values():
-        if not branch.robot:
-            continue
-        mine = by_way_of(problem, branch.robot)
+    for robot, base in problem.tree.bases.items():
+        mine = problem.through(problem.tree.flanges[robot])
         for stop in np.unique(stops[mine & ~used]).tolist():
             rows = np.flatnonzero(mine & (stops == stop))
             if len(rows) < _FEWEST or used[rows].any() or not explained.isdisjoint(rows.tolist()):
                 continue
-            flange = problem.poses[branch.robot][stop]
-            moved = _moved_by(solved, branch.parent, rows, flange)
+            moved = _moved_by(solved, base, rows, problem.poses[robot][stop])
             if moved:
                 words = (
-                    f"Robot {branch.robot} did not stand at stop {solved.cell.stops[stop]} where "
+                    f"Robot {robot} did not stand at stop {solved.cell.stops[stop]} where "
                     f"its pose says: all {len(rows)} views by way of it disagree with the others, "
                     f"as if the flange had been moved by {moved}, and were left out "
                     f"({_views(solved, rows.tolist())})."
@@ -332,9 +319,7 @@ def _wrong_poses(solved: Solved, explained: set[int]) -> Iterator[PoseFault]:
                 views = _numbers(solved, rows.tolist())
                 fix = "Correct its pose there in views.csv, or leave the stop out."
                 found = Finding("wrong_pose", words, Step(fix, look_at(views[0])), views)
-                short = (
-                    f"the pose of robot {branch.robot} at stop {solved.cell.stops[stop]} is wrong"
-                )
+                short = f"the pose of robot {robot} at stop {solved.cell.stops[stop]} is wrong"
                 yield PoseFault(found, tuple(rows.tolist()), short)
 
 
@@ -430,7 +415,7 @@ def _exchanged(solved: Solved, mutual: Mapping[int, int]) -> list[PoseFault]:
     rows, problem, used = solved.cell.rows, solved.agreed.problem, solved.agreed.used
     found = []
     for robot in problem.robots:
-        mine = np.flatnonzero(by_way_of(problem, robot)).tolist()
+        mine = np.flatnonzero(problem.through(problem.tree.flanges[robot])).tolist()
         pairs: dict[tuple[int, int], list[int]] = defaultdict(list)
         for at in mine:
             if at in mutual:

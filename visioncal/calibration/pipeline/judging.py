@@ -8,7 +8,7 @@ import numpy as np
 from visioncal.calibration.pipeline.answer import Answer
 from visioncal.calibration.pipeline.arm_results import doubts_of_arms, notes_on_arms
 from visioncal.calibration.pipeline.budget import columns_of_boards, middles_moved, middles_of
-from visioncal.calibration.pipeline.fault_messages import by_way_of, moved_found
+from visioncal.calibration.pipeline.fault_messages import moved_found
 from visioncal.calibration.pipeline.lens_fields import errors_found
 from visioncal.calibration.pipeline.network_ties import robot_motion, untied_words
 from visioncal.calibration.pipeline.run_state import RunState
@@ -24,7 +24,7 @@ from visioncal.core.files import some_of
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import invert
-from visioncal.core.types import FloatArray, Mask, Mount, Rejection
+from visioncal.core.types import FloatArray, Mount, Rejection
 from visioncal.core.verdict import NOTE, Finding, Step
 from visioncal.estimation.arm import stops_of
 from visioncal.estimation.budget import radius95
@@ -334,12 +334,12 @@ def check_answer(known: RunState) -> None:
     lost = agreed.problem.subset(~agreed.used)
 
     def motion(frame: str) -> str:
-        if not _of_frame(part, frame).any() and (count := int(_of_frame(lost, frame).sum())):
+        if not part.through(frame).any() and (count := int(lost.through(frame).sum())):
             return f"all {count} observations of it disagree with the rest of the cell"
         return _motion(cell, part, frame)
 
     def advice(frame: str, _: str) -> str:
-        if _of_frame(part, frame).any() or not len(lost):
+        if part.through(frame).any() or not len(lost):
             return _more(cell, frame)
         return (
             "Look whether the board that ties it has the stated size, and whether images and poses "
@@ -356,21 +356,12 @@ def _names(tree: Tree, frame: str) -> tuple[str, str]:
     return frame.partition("@")[0], "the cell" if parent == tree.root else parent
 
 
-def _of_frame(problem: Problem, frame: str) -> Mask:
-    """(n,) the observations on whose way an edge is."""
-    rows = np.zeros(len(problem), dtype=bool)
-    for group in problem.groups:
-        rows[group.rows] = any(step.frame == frame for step in group.path)
-    return rows
-
-
 def _motion(cell: Cell, part: Problem, frame: str) -> str:
     """Says how the robots stood by way of which a frame was observed."""
-    rows, words = _of_frame(part, frame), []
-    for branch in part.tree.branches.values():
-        if branch.robot:
-            stops = np.unique(part.observations.stops[rows & by_way_of(part, branch.robot)])
-            words += [robot_motion(cell, branch.parent, stops)] if len(stops) > 1 else []
+    rows, words = part.through(frame), []
+    for robot, base in part.tree.bases.items():
+        stops = np.unique(part.observations.stops[rows & part.through(part.tree.flanges[robot])])
+        words += [robot_motion(cell, base, stops)] if len(stops) > 1 else []
     return "; ".join(words) or f"{int(rows.sum())} observations are too few or too poor"
 
 

@@ -67,8 +67,7 @@ def _open_part(cell: Cell, base: str) -> str:
 
 
 def _robot_on(cell: Cell, base: str) -> str:
-    branches = cell.tree.branches.values()
-    return next(it.robot for it in branches if it.robot and it.parent == base)
+    return next(robot for robot, it in cell.tree.bases.items() if it == base)
 
 
 def robot_motion(cell: Cell, base: str, stations: IntArray) -> str:
@@ -95,7 +94,7 @@ def _stations(cell: Cell, base: str) -> IntArray:
 
 def untied_words(cell: Cell, frame: str) -> str:
     """What would tie a frame to the rest, in a sentence."""
-    carried = [*_carried(cell, frame)]
+    tree, carried = cell.tree, [*_carried(cell, frame)]
     cameras = [it for it in carried if it.startswith("cam")]
     boards = [it for it in carried if it.startswith("target")]
     others = [it for it in cell.tied() if it not in carried]
@@ -106,9 +105,7 @@ def untied_words(cell: Cell, frame: str) -> str:
         ways.append(f"let {some_of(seeing)} see {some_of(boards)} at 5 stops or more")
     if cameras and lying:
         ways.append(f"let {some_of(cameras)} see {some_of(lying)} at 5 stops or more")
-    flange = next(
-        (it for it, up in cell.tree.branches.items() if up.parent == frame and up.robot), ""
-    )
+    flange = next((it for it in tree.flanges.values() if tree.branches[it].parent == frame), "")
     if not ways and flange and seeing:
         ways.append(f"put a board on {flange} and let {some_of(seeing)} see it at 5 stops or more")
     if not ways and flange and lying:

@@ -47,7 +47,7 @@ def alignment_of(known: RunState) -> Alignment:
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         reference=cell.reference,
         frames=kept | parents,
-        robots={name: it.robot for name, it in solved.cell.tree.branches.items() if it.robot},
+        robots={flange: robot for robot, flange in solved.cell.tree.flanges.items()},
         edges={f"{parents[name]}_from_{name}": edge for name, edge in edges.items()},
         joint_covariance=answer.covariance[:size, :size],
         cameras=cameras_of(known),

@@ -83,7 +83,7 @@ def _choices(counts: Sequence[int]) -> Iterator[tuple[int, ...]]:
 def _grown(growth: Growth, chosen: Sequence[int]) -> _Grown:
     tree = growth.tree
     placed = {tree.root: np.eye(4)}
-    placed |= {name: np.eye(4) for name, branch in tree.branches.items() if branch.robot}
+    placed |= dict.fromkeys(tree.flanges.values(), np.eye(4))
     by_turn: list[str] = []
     counts: list[int] = []
     while options := (
