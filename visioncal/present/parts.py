@@ -9,11 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.core.types import FloatArray
+from visioncal.core.types import FloatArray, Target
 from visioncal.results import Alignment, Calibration, CameraResult, Sight
 from visioncal.results.arm import ArmSections
 from visioncal.results.sections import BoardResult, ClockResult, Intervals
 from visioncal.robot import Robot
+from visioncal.session import Session
 from visioncal.session.frames import CELL
 
 
@@ -78,6 +79,14 @@ def boards(calibration: Calibration) -> Mapping[str, BoardResult]:
     """The boards as they were found to be."""
     cell = calibration.cell
     return calibration.named_boards if cell is None else cell.boards
+
+
+def stated_boards(session: Session | None) -> dict[str, Target]:
+    """The boards as the session states them, by the names that results give them."""
+    if session is None:
+        return {}
+    found = {**session.plates, **session.boards}
+    return {"target": found[""], **found} if "" in found else found
 
 
 def clocks(calibration: Calibration) -> Mapping[str, ClockResult]:

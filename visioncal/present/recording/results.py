@@ -107,7 +107,7 @@ def _draw(
     overlay = overlays.Overlay.of(session, calibration, evidence)
     scene.log_static(stream)
     if calibration is not None:
-        notes.log_static(stream, calibration, session.boards)
+        notes.log_static(stream, calibration, parts.stated_boards(session))
     seen = [evidence.get(it.number, ViewEvidence(it.number)) for it in session.views]
     scene.log_views(stream, seen)
     overlay.log_views(stream, seen)

@@ -163,9 +163,8 @@ class Scene:
     @cached_property
     def _boards(self) -> Mapping[str, Target]:
         """The targets by their frames, as far as the calibration places them."""
-        is_cell = self.calibration is not None and self.calibration.cell is not None
-        boards = self.session.plates if is_cell else self.session.boards
-        frames = {frame_name("target", name): it for name, it in boards.items()}
+        boards = parts.stated_boards(self.session).items()
+        frames = {frame_name("target", name): it for name, it in boards}
         return {frame: it for frame, it in frames.items() if frame in self.frames.parents}
 
     @cached_property

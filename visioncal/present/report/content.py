@@ -5,7 +5,7 @@ from collections.abc import Collection, Iterator, Sequence
 import numpy as np
 
 from visioncal.core.number_format import decimals_for, fixed, matched, percent, significant
-from visioncal.core.types import FloatArray, Target
+from visioncal.core.types import FloatArray
 from visioncal.present import parts
 from visioncal.present.advice import mark_of
 from visioncal.present.cellmap import weakest_frame
@@ -15,7 +15,6 @@ from visioncal.results import Alignment, Calibration, CameraResult, Edge, NeedMe
 from visioncal.results.compare import intrinsics_names
 from visioncal.results.evidence import ViewEvidence
 from visioncal.results.sections import ClockResult, PointResult, TouchTest
-from visioncal.session import Session
 from visioncal.session.frames import CELL, frames_of_kind
 from visioncal.vision.camera import intrinsics
 
@@ -124,14 +123,6 @@ def stops_m(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> Float
     used = {it.view for it in calibration.views if it.used}
     poses = [it.base_from_flange for it in evidence if it.view in used]
     return np.reshape([it[:3, 3] for it in poses if it is not None], (-1, 3))
-
-
-def board_target(session: Session | None, name: str) -> Target | None:
-    """The board of a name as the session states it; None where that is not at hand."""
-    if session is None:
-        return None
-    stated = {**session.plates, **session.boards}
-    return stated.get(name, stated.get("") if name == "target" else None)
 
 
 def need_facts(met: NeedMet | None, verdict: Verdict) -> tuple[Fact, ...]:
