@@ -10,11 +10,13 @@ session. Simulated arms are judged with the frames of the calibration.
 
 import csv
 import re
+import resource
 import tempfile
 import time
 import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -212,9 +214,9 @@ def without_functions(session: Session) -> RunState:
 
 def cross_row(words: str, session: Session, other: Recording) -> str:
     """One line of the first table."""
-    begun = time.perf_counter()
+    begun = time.process_time()
     ours = known_of(session)
-    seconds = time.perf_counter() - begun
+    seconds = time.process_time() - begun
     before = without_functions(session)
     found, was = carried_over(ours, other), carried_over(before, other)
     levels = [it.robot_arm.kinematics for it in (before, ours)]
@@ -304,9 +306,9 @@ class World:
     def tried(self, seed: int) -> tuple[bool, float, float, float, float, float, float]:
         """Whether functions were taken; errors inside and outside [mm]; over predicted; seconds."""
         shop, inside, outside = self.drawn(seed)
-        session, begun = session_of(shop), time.perf_counter()
+        session, begun = session_of(shop), time.process_time()
         ours = known_of(session)
-        seconds = time.perf_counter() - begun
+        seconds = time.process_time() - begun
         before = without_functions(session)
 
         def away(known: RunState, q: FloatArray) -> FloatArray:
@@ -467,6 +469,23 @@ WORLD_ROWS = (
 )
 
 
+# How many stops the costs are of.
+COSTS = (60, 300, 1000)
+
+
+def cost(stops: int) -> str:
+    """A row: processor time with and without functions of the joints, and memory."""
+    session = session_of(World(stops, 2.5, 3e-4, 0.06).drawn(0)[0])
+    without_functions(session)
+    begun = time.process_time()
+    without_functions(session)
+    plain_s, begun = time.process_time() - begun, time.process_time()
+    known_of(session)
+    whole_s = time.process_time() - begun
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return f"| {stops} | {plain_s:.1f} | {whole_s:.1f} | {most:.0f} |"
+
+
 def main(worlds: int) -> None:
     """Prints the tables and keeps them."""
     with tempfile.TemporaryDirectory() as folder:
@@ -478,6 +497,8 @@ def main(worlds: int) -> None:
     simulated = [it.row(worlds) for it in rows]
     surely = [it.sigmas(wished(20, place=1)) for it in first(SIGMA_ROWS)]
     uses = [line for it in first(USED_ROWS) for line in it.uses(worlds)]
+    with get_context("spawn").Pool(1, maxtasksperchild=1) as pool:
+        costs = pool.map(cost, few(COSTS, (30,)), chunksize=1)
     text = "\n".join(
         [
             "One recording by another: RMS of places [mm], the frames fitted on 12 stops. Left",
@@ -522,6 +543,13 @@ def main(worlds: int) -> None:
             "| stops | range | functions | in it | posture | map | all over | posture | map |",
             "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
             *surely,
+            "",
+            "Processor time of a whole calibration [s], by all levels but functions and with them,",
+            "and the most memory of the process [MB].",
+            "",
+            "| stops | without | with functions | MB |",
+            "| ---: | ---: | ---: | ---: |",
+            *costs,
         ]
     )
     command = f"PYTHONPATH=tests python tests/benchmarks/joint_functions.py {worlds}"
