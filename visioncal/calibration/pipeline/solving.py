@@ -86,18 +86,7 @@ def solve(
         found = _agreeing_looks(found, looked, sizes)
     found = replace(found, agreed=levelled(cell, poses, found.agreed))
     # Poses that are misread say nothing of the arm, nor which views are outliers.
-    for _ in range(0 if looked.is_misread else _ROUNDS):
-        if asked != "hand-eye":
-            arms = _levels(found)
-            erring = [name for name, it in arms.items() if it.frees_errors()]
-            late = clock_effects(cell, looked.clocks, erring)
-            found = _at_rest(replace(found, arms=arms, late=late))
-        before = found.agreed.used
-        agreed = _without_misreported(settled(cell, found.agreed), found.arms, before)
-        found = _at_rest(replace(found, agreed=agreed))
-        # What agrees by now has a say in how far the arms are calibrated.
-        if np.array_equal(before, found.agreed.used):
-            break
+    found = found if looked.is_misread else _alternating(found, looked)
     if asked != "hand-eye" and not looked.is_misread:
         found = _with_functions(found)
     found = replace(found, agreed=with_repeats(found.agreed))
@@ -117,6 +106,31 @@ def _without_misreported(agreed: Agreed, arms: Mapping[str, RobotArm], before: M
     if np.array_equal(used, agreed.used):
         return agreed
     return replace(agreed, used=used).refitted()
+
+
+def _alternating(found: Solved, looked: Observed) -> Solved:
+    """Calibrates the arms by what agrees, and sees what agrees with these, until both stay."""
+    for turn in range(_ROUNDS + 1):
+        if found.asked != "hand-eye":
+            arms = _levels(found)
+            erring = [name for name, it in arms.items() if it.frees_errors()]
+            late = clock_effects(found.cell, looked.clocks, erring)
+            found = _at_rest(replace(found, arms=arms, late=late))
+        before = found.agreed
+        if turn == _ROUNDS:  # The arms are calibrated by what agreed last.
+            break
+        agreed = _without_misreported(settled(found.cell, before), found.arms, before.used)
+        found = _at_rest(replace(found, agreed=agreed))
+        # What agrees by now, and what moved, has a say in how far the arms are calibrated.
+        if _are_alike(before, agreed):
+            break
+    return found
+
+
+def _are_alike(one: Agreed, other: Agreed) -> bool:
+    """Whether the same observations agree, and the same frames are unknown."""
+    alike = one.problem.unknown.keys() == other.problem.unknown.keys()
+    return alike and np.array_equal(one.used, other.used)
 
 
 def _by_closed_form(solved: Solved, solver: str) -> Solved:
