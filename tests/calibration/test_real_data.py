@@ -1,6 +1,8 @@
 """Real measurements, against what a plain OpenCV and scipy script gets from them."""
 
 import json
+import re
+import shutil
 
 import cv2
 import numpy as np
@@ -69,6 +71,32 @@ def test_two_exchanged_rows_among_images_of_other_rows_are_named(real_data, came
     # An image that shows a tenth of its field, 1.3 m away, fixes a camera to some millimetres; its
     # focal length is open to a few per cent, which are 40 mm.
     assert all(1.0 < it.sigma_mm < 40.0 for it in result.placed.values())
+
+
+@pytest.mark.slow
+def test_two_cameras_of_one_arm_are_one_cell(real_data, tmp_path):
+    """What moved is found once the arm is calibrated, and the exchanged rows come first."""
+    rows, cameras = ["view,stop,camera,image,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad"], ""
+    for camera in (1, 4):
+        alone = real_data / f"sessions/ur3e_checkerboard_to_hand_cam{camera}"
+        shutil.copytree(alone / "images", tmp_path / f"images_{camera}")
+        text = (alone / "session.toml").read_text()
+        lens = re.findall(r"(?:matrix|distortion|resolution) = .*", text)
+        cameras += "\n".join([f"[cameras.c{camera}]", *lens, ""])
+        for line in (alone / "views.csv").read_text().splitlines()[1:]:
+            _, stop, _, image, *joints = line.split(",")
+            image = image.replace("images", f"images_{camera}")
+            rows.append(",".join([str(len(rows)), stop, f"c{camera}", image, *joints]))
+    shutil.copy(alone / "target.toml", tmp_path)
+    (tmp_path / "views.csv").write_text("\n".join([*rows, ""]))
+    (tmp_path / "session.toml").write_text(
+        f'schema = 1\nname = "both"\n{cameras}[robots.a]\nmodel = "ur3e"\ntip = "tool0"\n'
+        '[targets.board]\ntarget = "target.toml"\n'
+        '[frames]\ncam_c1 = "cell"\ncam_c4 = "cell"\ntarget_board = "flange_a"\n'
+    )
+    result = visioncal.align(tmp_path)
+    assert "stops 25 and 26 are exchanged" in result.verdict.top[0]
+    assert any(it.frame == "cam_c4" for it in result.moved)
 
 
 def test_eight_views_of_a_poor_set_are_not_called_good(real_data):

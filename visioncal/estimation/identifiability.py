@@ -9,6 +9,7 @@ Observability indices are of the same singular values.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import svd
 
 from visioncal.core.types import FloatArray
 
@@ -71,7 +72,7 @@ def identifiability(stops: Jacobians, anywhere: Jacobians) -> Identifiability:
     can = turned[sizes > LEAST_SHARE * sizes[0]]
     seen, values, here = _determined(stops)
     # What is identifiable and not among what is determined; both are spanned by unit vectors.
-    missing = np.linalg.svd(can.T - here.T @ (here @ can.T), full_matrices=False)[0]
+    missing = _singular(can.T - here.T @ (here @ can.T))[0]
     return Identifiability(
         columns=stops.frames.shape[1] + stops.arm.shape[1],
         identifiable=most + len(can) + stops.frames.shape[1] - anywhere.frames.shape[1],
@@ -97,8 +98,15 @@ def _determined(jacobian: Jacobians) -> tuple[int, FloatArray, FloatArray]:
 def right_vectors(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Singular values (k,) of an (r, k) matrix, zeros among them, and (k, k) right vectors."""
     padded = np.vstack([matrix, np.zeros((matrix.shape[1],) * 2)])
-    _, sizes, turned = np.linalg.svd(np.linalg.qr(padded, mode="r"))
+    _, sizes, turned = _singular(np.asarray(np.linalg.qr(padded, mode="r")))
     return sizes, turned
+
+
+def _singular(matrix: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The thin singular value decomposition of a matrix that may lack directions."""
+    # Divide and conquer, which numpy has, does not converge on some of these.
+    left, sizes, right = svd(matrix, full_matrices=False, lapack_driver="gesvd")
+    return left, sizes, right
 
 
 @dataclass(frozen=True)
