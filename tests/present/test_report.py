@@ -17,17 +17,18 @@ from support.samples import CAMERA, REJECTED, Sample, made_up
 from visioncal.calibration.pipeline import Run, run
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import matched, significant
+from visioncal.core.transforms import log
 from visioncal.core.types import Target
 from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import load_stored
 from visioncal.present.advice import listed, suspects
 from visioncal.present.parts import sights
+from visioncal.present.placements import placement
 from visioncal.present.recording import write_recording
 from visioncal.present.recording.notes import view_markdown
 from visioncal.present.report import write_report
 from visioncal.present.report.axes import Scale, tick_words
 from visioncal.present.report.page import render
-from visioncal.present.report.plots import twist_of
 from visioncal.present.report.thumbnails import thumbnail
 from visioncal.results import (
     Calibration,
@@ -260,12 +261,12 @@ def test_an_error_of_one_joint_is_a_slope_in_its_column(sample: Sample) -> None:
     q = np.array([view.joints_rad for view in sample.session.views])
     wrong = load_robot("ur10e").base_from_flange(q + offset_rad * np.eye(6)[3])
     residuals = [
-        twist_of(sample.calibration, replace(it, base_from_flange=pose))
+        log(placement(sample.calibration, replace(it, base_from_flange=pose)))
         for it, pose in zip(sample.evidence, wrong, strict=True)
         if it.cam_from_target is not None
     ]
     # Without the error, rounding alone is left.
-    exact = [twist_of(sample.calibration, it) for it in sample.evidence if it.corners is not None]
+    exact = [log(placement(sample.calibration, it)) for it in sample.evidence if it.corners]
     np.testing.assert_allclose(exact, 0.0, atol=1e-9)
     # Every residual turns by the joint's error, whatever the pose.
     turned_rad = np.linalg.norm(np.array(residuals)[:, :3], axis=1)

@@ -9,6 +9,7 @@ import rerun as rr
 
 from visioncal.core.types import Camera, FloatArray, Target
 from visioncal.present import parts
+from visioncal.present.placements import target_frames
 from visioncal.present.recording import board, colours, network, paths
 from visioncal.present.recording.arm import log_arms, placed
 from visioncal.present.recording.charts import Charts
@@ -17,7 +18,6 @@ from visioncal.present.recording.recorder import send_rows
 from visioncal.present.recording.robot_states import RobotState, robot_states
 from visioncal.present.recording.uncertainty import Uncertainty
 from visioncal.present.recording.workspace import ArmPicture
-from visioncal.present.target_frames import target_frames
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session, frame_name

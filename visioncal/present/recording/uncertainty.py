@@ -11,9 +11,9 @@ import numpy as np
 import rerun as rr
 from scipy.spatial.transform import Rotation
 
-from visioncal.core.transforms import invert, mean_transform
 from visioncal.core.types import FloatArray
 from visioncal.present import parts
+from visioncal.present.placements import placement
 from visioncal.present.recording import colours, paths
 from visioncal.present.recording.recorder import send_rows
 from visioncal.results import Calibration, Edge
@@ -35,7 +35,7 @@ class Uncertainty:
 
     Attributes:
         edges: The edges that have a covariance, by name; tools and fixtures among them.
-        scatter_m: By view, how far from the mean it puts its target: (3,) in the target's frame.
+        scatter_m: By view, how far from the result it puts its target: (3,) in the target's frame.
         frames: By view, the frame of its target.
         used: The views that the fit used.
         factor: How many times larger than it is everything is drawn.
@@ -68,10 +68,11 @@ class Uncertainty:
         used = frozenset(view.view for view in calibration.views if view.used)
         if frames is None:
             frames = dict.fromkeys(evidence, list(calibration.edges)[1].rpartition("_from_")[2])
-        scatter_m: dict[int, FloatArray] = {}
-        for frame in sorted(set(frames.values())):
-            some = {view: it for view, it in evidence.items() if frames.get(view) == frame}
-            scatter_m |= _scatter_m(calibration, some, used)
+        scatter_m = {
+            view: placed[:3, 3]
+            for view, it in evidence.items()
+            if view in frames and (placed := placement(calibration, it, frames[view])) is not None
+        }
         last = parts.frames(calibration).matrices
         edges = {
             name: it
@@ -179,26 +180,6 @@ def _axes(edge: Edge) -> tuple[FloatArray, FloatArray]:
     """Standard deviations (3,) [m] along the columns of a (3, 3) rotation, in the child's frame."""
     variances_m2, axes = np.linalg.eigh(edge.covariance[3:, 3:])
     return np.sqrt(np.clip(variances_m2, 0.0, None)), axes * np.sign(np.linalg.det(axes))
-
-
-def _scatter_m(
-    calibration: Calibration, evidence: Mapping[int, ViewEvidence], used: frozenset[int]
-) -> dict[int, FloatArray]:
-    """By view, the target's place less its mean over the used views, in the target's frame."""
-    # The camera's edge, or the instrument's, is the first.
-    edge = next(iter(calibration.edges.values())).transform.as_matrix()
-    in_hand = calibration.mount == "eye-in-hand"
-    placed = {
-        view: np.asarray(robot @ edge @ it.cam_from_target)
-        for view, it in evidence.items()
-        if it.base_from_flange is not None and it.cam_from_target is not None
-        for robot in [it.base_from_flange if in_hand else invert(it.base_from_flange)]
-    }
-    some = [placed[view] for view in used if view in placed]
-    if not some:
-        return {}
-    mean_from_parent = invert(mean_transform(np.stack(some)))
-    return {view: (mean_from_parent @ pose)[:3, 3] for view, pose in placed.items()}
 
 
 def round_factor(wanted_m: float, size_m: float) -> int:

@@ -10,16 +10,16 @@ from markupsafe import Markup
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.limits import CalibrationLimits
-from visioncal.core.transforms import invert, log, nearest_rotation
+from visioncal.core.transforms import log, nearest_rotation
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.present.advice import contradicts
 from visioncal.present.coverage import directions_chart
 from visioncal.present.parts import sights
+from visioncal.present.placements import placement, target_frames
 from visioncal.present.report import bars, svg
 from visioncal.present.report.axes import Box, Margins, Panel, Scale, boxes, spanning
 from visioncal.present.report.bars import Bar
 from visioncal.present.report.svg import Figure
-from visioncal.present.target_frames import target_frames
 from visioncal.results import Calibration, Rms, Sight
 from visioncal.results.evidence import ViewEvidence
 from visioncal.results.whole import rms_of
@@ -274,41 +274,17 @@ def residuals_over_joints(
     shown = {it.view for it in calibration.views if it.used and it.view not in outlying}
     frames = target_frames(calibration, session)
     pairs = [
-        (joints, residual)
+        (joints, log(placed))
         for it in evidence
         if it.view in shown
         and (joints := joints_rad.get(it.view)) is not None
-        and (residual := twist_of(calibration, it, frames.get(it.view))) is not None
+        and (placed := placement(calibration, it, frames.get(it.view))) is not None
     ]
     if len(pairs) < 3:
         return Markup("")
     joints_deg = np.rad2deg([joints for joints, _ in pairs])
     twists = np.array([residual for _, residual in pairs])
     return _figure(joints_deg, 1e3 * twists[:, 3:], np.rad2deg(twists[:, :3]))
-
-
-def twist_of(
-    calibration: Calibration, seen: ViewEvidence, frame: str | None = None
-) -> FloatArray | None:
-    """Where a view places its target against where the result does.
-
-    Args:
-        calibration: The result.
-        seen: The view's poses.
-        frame: The frame of the target that it shows; that of an only one where None.
-
-    Returns:
-        (6,) of (rotation [rad], translation [m]) in the target's frame; None without poses.
-    """
-    if seen.base_from_flange is None or seen.cam_from_target is None:
-        return None
-    # The camera's edge is the first, targets' follow.
-    x, *targets = calibration.edges
-    eye_in_hand = calibration.mount == "eye-in-hand"
-    z = next((it for it in targets if it.endswith(f"_from_{frame}")), targets[0])
-    robot = seen.base_from_flange if eye_in_hand else invert(seen.base_from_flange)
-    edges = calibration.edges
-    return log(invert(edges[z].matrix) @ robot @ edges[x].matrix @ seen.cam_from_target)
 
 
 def _figure(joints_deg: FloatArray, away_mm: FloatArray, away_deg: FloatArray) -> Markup:
