@@ -238,6 +238,24 @@ def test_errors_that_are_asked_for_are_those_of_all_robots_and_cameras_of_a_cell
     assert {it.numbers.get("payload_kg") for it in session.views if "robot" in it.text} == {5.0}
 
 
+@pytest.mark.slow
+def test_joints_of_every_robot_of_a_cell_bend_as_was_asked_for(place):
+    folder, out = place / "bending", place / "bending-out"
+    loads = ("--payload-kg", 0, "--payload-kg", 5)
+    some = ("--cell", "two-arms", "--no-images", "--views", 40, "--stiffness-knm", 12)
+    done("simulate", folder, *some, *loads)
+    done("calibrate", folder, "-o", out)
+    found = Calibration.load(out)
+    for robot in ("a", "b"):
+        springs = found.of("left", robot, f"plate_{robot}").elastic.joints
+        determined = [it for it in springs if it.determined]
+        assert len(determined) >= 3
+        for it in determined:
+            # Four sigma: one joint in fifteen thousand.
+            most = 4.0 * it.sigma_rad_per_nm
+            assert it.compliance_rad_per_nm == pytest.approx(1.0 / 12e3, abs=most)
+
+
 @pytest.mark.parametrize("read", ["points", "probe"])
 def test_a_tracker_beside_a_cell_ties_its_robots(read, place):
     folder, out = place / f"cell-{read}", place / f"cell-{read}-out"
@@ -322,6 +340,19 @@ def test_a_sweep_of_a_cell_tells_the_clock_of_its_camera(place):
     clock = clocks["cam_top and robot a"]
     # Four sigma: one run in fifteen thousand.
     assert abs(clock.camera_minus_robot_s - 0.04) < 4.0 * clock.sigma_s < 4e-3
+
+
+def test_a_sweep_of_a_cell_with_a_rolling_shutter_has_corners(place):
+    rolling = OWN.replace("stops = 6", "stops = 12") + SWEPT + "readout_s = 0.012\n"
+    (place / "rolling.toml").write_text(rolling)
+    some = ("simulate", place / "rolling", "--cell", place / "rolling.toml")
+    refused = visioncal(*some)
+    assert refused.status == 2
+    assert "--no-images" in refused.err
+    done(*some, "--no-images")
+    session = Session.load(place / "rolling")
+    assert all(it.has_corners or it.reading_m is not None for it in session.views)
+    assert sum(it.stamp_s is not None for it in session.views) > 10
 
 
 def test_a_sweep_comes_after_what_was_pushed(place):

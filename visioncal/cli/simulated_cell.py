@@ -25,6 +25,7 @@ from visioncal.simulation import (
 )
 from visioncal.simulation.dynamics import Body
 from visioncal.simulation.exercise import ExerciseOptions, Senses, exercise, seed_of
+from visioncal.simulation.records import Seen
 from visioncal.simulation.tracked import THREE, Tracked
 
 _T = TypeVar("_T", RobotAt, CameraAt)
@@ -63,13 +64,16 @@ def whole_cell(
         for at, it in enumerate(described.robots if asked.torques else ())
     }
     touched = touch_network(cell) if asked.touches else {}
+    # Rows of an image that are not of one moment have no pose.
+    row_by_row = any(it.readout_s for it in described.sweeps)
+    without_images: Seen = "corners" if row_by_row else "poses"
     with shown_progress(quiet=False) as progress:
         count = len(cell.sights)
         write_network(
             cell,
             asked.folder,
             lambda share: progress("render", round(share * count), count),
-            seen="images" if asked.images else "poses",
+            seen="images" if asked.images else without_images,
             touched=touched,
             exercised=exercised,
         )

@@ -4,7 +4,7 @@ Nothing here uses the application's camera, robot, targets, solvers or estimator
 projection or a wrong chain cannot hide by being wrong in both.
 """
 
-from visioncal.simulation.arms import Arm, arm_named, forward, industrial_arm, ur_arm
+from visioncal.simulation.arms import Arm, arm_named, forward, ur_arm
 from visioncal.simulation.cell import Cell, simulate
 from visioncal.simulation.described import cell_names, read_cell
 from visioncal.simulation.layout import (
@@ -31,7 +31,6 @@ from visioncal.simulation.options import (
     BOARDS,
     CameraOptions,
     CellOptions,
-    Motion,
     Second,
     SweepOptions,
 )
@@ -48,7 +47,7 @@ from visioncal.simulation.records import (
 from visioncal.simulation.render import Scene, prepare_scene, render
 from visioncal.simulation.sag import Payload
 from visioncal.simulation.sweep import Sweep, sweep
-from visioncal.simulation.touching import touch, touch_network, write_touches
+from visioncal.simulation.touching import touch, touch_network
 from visioncal.simulation.truth import Truth, read_truth, truth_path
 from visioncal.simulation.warmup import (
     Heat,
@@ -71,7 +70,6 @@ __all__ = [
     "CellOptions",
     "Heat",
     "InstrumentAt",
-    "Motion",
     "Moved",
     "Network",
     "NetworkOptions",
@@ -94,7 +92,6 @@ __all__ = [
     "fine_camera",
     "fisheye_camera",
     "forward",
-    "industrial_arm",
     "measured_poses",
     "network_session",
     "prepare_scene",
@@ -116,6 +113,5 @@ __all__ = [
     "write_network",
     "write_session",
     "write_sweep",
-    "write_touches",
     "write_warm_up",
 ]

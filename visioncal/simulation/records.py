@@ -173,7 +173,7 @@ def network_session(
     if seen in ("images", "poses") and any(it.readout_s for it in cell.options.sweeps):
         raise DataError(
             "simulation: images and poses are those of a moment, and a sweep has readout_s.",
-            next_step="Leave readout_s out.",
+            next_step="Leave readout_s out, or write corners: visioncal simulate --no-images.",
         )
     sights = [it for it in cell.sights if not it.is_of_lens or seen != "poses"]
     rows = _rows(cell, sights, seen)
