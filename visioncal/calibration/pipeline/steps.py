@@ -121,10 +121,8 @@ def _reported(known: RunState) -> RunState:
             or " ".join(known.session.warnings)
             or "Fill in x_m to qw, or joint angles and [robot] model.",
         )
-    views, declared = (
-        tuple(known.base_from_flange),
-        {it.number: it.stop for it in known.session.views},
-    )
+    views = tuple(known.base_from_flange)
+    declared = {it.number: it.stop for it in known.session.views}
     check_stops(known.loads(views), views, [declared[it] for it in views])
     return known
 
