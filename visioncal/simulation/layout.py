@@ -140,20 +140,6 @@ class Swept(SweepOptions):
     frames_hz: float = field(default=10.0, kw_only=True)
 
 
-def _two_robots() -> tuple[RobotAt, ...]:
-    return RobotAt("a", (-0.6, 0.0, 0.0)), RobotAt("b", (0.6, 0.05, 0.02))
-
-
-def _two_cameras() -> tuple[CameraAt, ...]:
-    left = CameraAt("left", place_m=(0.0, -1.0, 1.1))
-    return left, CameraAt("right", place_m=(0.15, 0.95, 1.25), camera=fine_camera())
-
-
-def _three_boards() -> tuple[BoardAt, ...]:
-    floor = BoardAt("floor", place_m=(0.0, 0.0, 0.05))
-    return floor, BoardAt("plate_a", "a", target=BOARDS["checkerboard"]), BoardAt("plate_b", "b")
-
-
 @dataclass(frozen=True, eq=False)
 class NetworkOptions(DrawOptions):
     """A simulated cell with several of a kind: two robots, two fixed cameras and three boards.
@@ -176,9 +162,19 @@ class NetworkOptions(DrawOptions):
         stray_images: Rows whose image is from another stop.
     """
 
-    robots: tuple[RobotAt, ...] = field(default_factory=_two_robots)
-    cameras: tuple[CameraAt, ...] = field(default_factory=_two_cameras)
-    boards: tuple[BoardAt, ...] = field(default_factory=_three_boards)
+    robots: tuple[RobotAt, ...] = (
+        RobotAt("a", (-0.6, 0.0, 0.0)),
+        RobotAt("b", (0.6, 0.05, 0.02)),
+    )
+    cameras: tuple[CameraAt, ...] = (
+        CameraAt("left", place_m=(0.0, -1.0, 1.1)),
+        CameraAt("right", place_m=(0.15, 0.95, 1.25), camera=fine_camera()),
+    )
+    boards: tuple[BoardAt, ...] = (
+        BoardAt("floor", place_m=(0.0, 0.0, 0.05)),
+        BoardAt("plate_a", "a", target=BOARDS["checkerboard"]),
+        BoardAt("plate_b", "b"),
+    )
     instruments: tuple[InstrumentAt, ...] = ()
     points: tuple[PointAt, ...] = ()
     stops: int = 30
