@@ -301,3 +301,22 @@ def test_what_is_written_of_the_fit_is_read_back(given):
     # Slopes there and back undo each other up to rounding.
     scale = np.outer(sigmas, sigmas)
     np.testing.assert_allclose(prior_calibration.covariance / scale, covariance / scale, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", [34, 46])
+def test_a_board_within_its_stated_size_is_no_other_lens(seed):
+    """Views from about one distance determine neither alone, and its size is known to 0.1 %."""
+    options = CellOptions(
+        views=14,
+        seed=seed,
+        board_scale=1.0007,
+        camera=fine_camera(),
+        tilt_rad=(0.15, 0.5),
+        roll_rad=3.1,
+        distance_m=(0.45, 0.7),
+        cut_views=0.0,
+        pixel_sigma_px=0.1,
+        robot_sigma_rad=9e-5,
+    )
+    known = calibrated(simulate(options))
+    assert "lens" not in {it.kind for it in known.verdict.findings}

@@ -190,8 +190,10 @@ def test_the_whole_chain_states_its_errors_honestly(mount, given, coarse):
 
 
 def test_a_stop_counts_once_however_often_it_is_looked_at():
-    cell = simulate(CellOptions(seed=4, views=12, pixel_sigma_px=0.1))
-    problem = calibrated(cell).solved.problem.with_effects([])
+    coarse = CellOptions(
+        seed=4, views=12, pixel_sigma_px=0.1, robot_sigma_m=2e-4, robot_sigma_rad=4e-4
+    )
+    problem = calibrated(simulate(coarse)).solved.problem.with_effects([])
     once = solved(problem)
     again = np.repeat(np.arange(12), 3)
     looks = problem.observations.take(again)
@@ -208,7 +210,8 @@ def test_a_stop_counts_once_however_often_it_is_looked_at():
             observations=replace(looks, stops=np.arange(len(again))),
         )
     )
-    assert np.trace(unmerged.covariance) < 0.6 * np.trace(once.covariance)
+    # The robot's noise is most of it: of three stops a third would be left.
+    assert np.trace(unmerged.covariance) < 0.45 * np.trace(once.covariance)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)

@@ -199,6 +199,8 @@ def _doubted(side: Side, fitted: Fitted) -> Fitted:
     know them better than that, and count where they do not.
     """
     looks, moving = fitted.looks, [fitted.moving]
+    # A board that is larger by less than it is known to looks like another focal length.
+    scales = np.array([it for board in looks.printed for it in looks.scale_of(board)], dtype=int)
     doubts = {}
     for name, problem in looks.problems.items():
         scene, lens = problem.scene, looks.lens_of(name)
@@ -206,7 +208,9 @@ def _doubted(side: Side, fitted: Fitted) -> Fitted:
         if not is_exact or not problem.has_spare_corners or np.isin(lens, fitted.moving).any():
             continue
         focal_px, sigma = looks.values[lens[:2]], lens_prior(scene)
-        step, covariance = Scores.of(side, fitted, lens[:4]).asked_for(lens[:4])
+        asked_of = np.append(lens[:4], scales)
+        step, covariance = Scores.of(side, fitted, asked_of).asked_for(asked_of)
+        step, covariance = step[:4], covariance[:4, :4]
         # Both focal lengths have one factor: what parts them shows, and is not in doubt.
         factors = np.zeros((4, 3))
         factors[:2, 0], factors[2, 1], factors[3, 2] = focal_px, 1.0, 1.0
@@ -220,7 +224,7 @@ def _doubted(side: Side, fitted: Fitted) -> Fitted:
                 sigma[places] = unit * known
                 counting.append(problem.lens[places])
             if known**2 > np.diag(open_)[of].mean():
-                moving.append(lens[places])
+                moving += [lens[places], scales]
         doubts[name] = sigma, np.concatenate(counting)
     if not any(len(places) for _, places in doubts.values()):
         return fitted
