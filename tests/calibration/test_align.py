@@ -162,6 +162,18 @@ def test_all_that_is_wrong_is_named_and_the_answer_is_that_of_a_sound_cell():
     assert np.linalg.norm(away[3:]) < 2.5e-4
 
 
+def test_a_frame_that_moved_twice_has_three_places_however_its_moves_were_found():
+    """The later push is found first."""
+    pushes = (Moved("target_floor", 4), Moved("target_floor", 10))
+    found = aligned(simulate_network(NetworkOptions(stops=STOPS, moved=pushes, seed=3)))
+    frame = "target_floor"
+    befores = [f"{frame}_until_stop_3", f"{frame}_until_stop_9"]
+    assert [it.before for it in found.moved] == befores
+    assert [(it.last_stop, it.first_stop) for it in found.moved] == [(3, 4), (9, 10)]
+    places = {it for it in found.edges if frame in it}
+    assert places == {f"cell_from_{it}" for it in (*befores, frame)}
+
+
 def test_a_robot_that_was_pushed_is_named_and_counts_as_it_stood_before():
     cell = simulate_network(NetworkOptions(stops=STOPS, moved=(Moved("base_b", 10),)))
     found = aligned(cell)

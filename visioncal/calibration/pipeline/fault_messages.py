@@ -76,16 +76,9 @@ def versions(solved: Solved) -> dict[str, Version]:
         for at, (start, key) in enumerate(ordered):
             name = frame
             if at + 1 < len(ordered):
-                last = _last_seen(solved, ordered[at + 1][1])
-                name = f"{frame}_until_stop_{last}"
+                name = f"{frame}_until_stop_{_stops_of(solved, key)[-1]}"
             found[key] = Version(key, frame, name, start)
     return found
-
-
-def _last_seen(solved: Solved, twin: str) -> int:
-    """The last stop at which a frame was seen before it moved."""
-    move = next(it for it in solved.agreed.moves if it.twin == twin)
-    return _stops_of(solved, move.frame)[-1]
 
 
 def _stops_of(solved: Solved, key: str) -> list[int]:
@@ -113,7 +106,7 @@ def movements(solved: Solved) -> tuple[Moved, ...]:
             Moved(
                 after.frame,
                 before.name,
-                _last_seen(solved, move.twin),
+                _stops_of(solved, before.key)[-1],
                 _stops_of(solved, move.twin)[0],
                 mm,
                 deg,
