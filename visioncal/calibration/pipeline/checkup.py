@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from visioncal.calibration.pipeline.agreement import first_agreement
 from visioncal.calibration.pipeline.exchanged_names import exchanged_names
+from visioncal.calibration.pipeline.inliers import first_agreement
 from visioncal.calibration.pipeline.reading_hints import reading_hint, readings_in_cell
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.running import known_at_first

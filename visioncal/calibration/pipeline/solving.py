@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.calibration.pipeline.agreement import agreement, levelled, settled, with_repeats
 from visioncal.calibration.pipeline.arm_results import (
     arms_of,
     joint_offsets,
@@ -13,6 +12,7 @@ from visioncal.calibration.pipeline.arm_results import (
     with_errors,
     with_pose_errors,
 )
+from visioncal.calibration.pipeline.inliers import agreement, levelled, settled, with_repeats
 from visioncal.calibration.pipeline.solved import Solved
 from visioncal.calibration.pipeline.starting import started, with_poses
 from visioncal.calibration.stages.arms import RobotArm, check_arms, effects_of

@@ -1,4 +1,4 @@
-"""What of a cell agrees: views, moved frames and priors, before and between the fits."""
+"""Which views, moved frames and priors of a cell are inliers, before and between the fits."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
