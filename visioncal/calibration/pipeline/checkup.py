@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from visioncal.calibration.pipeline.exchanged_names import exchanged_names
-from visioncal.calibration.pipeline.inliers import first_agreement
+from visioncal.calibration.pipeline.inliers import first_inliers
 from visioncal.calibration.pipeline.reading_hints import reading_hint, readings_in_cell
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.running import known_at_first
@@ -206,7 +206,7 @@ def _measured_px(look: CameraLook) -> float:
 def _motion(known: RunState, mount: Mount) -> Iterator[Finding]:
     """Motion that is too poor, and views that disagree."""
     try:
-        cell, agreed = first_agreement(read_cell(known), known, mount)
+        cell, agreed = first_inliers(read_cell(known), known, mount)
     except VisioncalError as error:
         yield _refused("motion", error)
         return

@@ -23,7 +23,7 @@ from visioncal.estimation.solve import Solution, covariance_of, solve_problem, s
 _SIZE_SIGMA = 0.03
 
 
-def first_agreement(cell: Cell, looked: Observed, mount: Mount) -> tuple[Cell, Agreed]:
+def first_inliers(cell: Cell, looked: Observed, mount: Mount) -> tuple[Cell, Agreed]:
     """Takes the first steps of `solve`: which views agree, before lens, board or arm are fitted.
 
     Args:
@@ -39,10 +39,10 @@ def first_agreement(cell: Cell, looked: Observed, mount: Mount) -> tuple[Cell, A
     """
     start = started(with_poses(cell, looked), looked)
     check_observability(start.problem, start.state, starting_noise(start.problem), mount)
-    return start.cell, agreement(start)[0]
+    return start.cell, find_inliers(start)[0]
 
 
-def agreement(start: Start) -> tuple[Agreed, Mapping[str, float]]:
+def find_inliers(start: Start) -> tuple[Agreed, Mapping[str, float]]:
     """Finds what belongs together, and what of the priors the observations do not contradict.
 
     Returns:

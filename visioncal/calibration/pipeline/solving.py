@@ -12,7 +12,7 @@ from visioncal.calibration.pipeline.arm_results import (
     with_errors,
     with_pose_errors,
 )
-from visioncal.calibration.pipeline.inliers import agreement, levelled, settled, with_repeats
+from visioncal.calibration.pipeline.inliers import find_inliers, levelled, settled, with_repeats
 from visioncal.calibration.pipeline.solved import Solved
 from visioncal.calibration.pipeline.starting import started, with_poses
 from visioncal.calibration.stages.arms import RobotArm, check_arms, effects_of
@@ -73,7 +73,7 @@ def solve(
     if looked.is_misread:
         agreed = all_as_inliers(begun.problem, begun.state)
     else:
-        agreed, sizes = agreement(begun)
+        agreed, sizes = find_inliers(begun)
     late = clock_effects(cell, looked.clocks)
     start = Solved(cell, agreed, None, poses, begun.untied, arms, asked, late, looked.turned)
     found = _agreeing_looks(start, looked, sizes)
