@@ -117,7 +117,9 @@ def _toml_written(folder: Path, said: str) -> bool:
     """Writes and deletes fields of .toml files."""
     found = False
     board = re.search(r'target = "(\w+\.toml)"', (folder / "session.toml").read_text("utf-8"))
-    said = said.replace("its .toml", board[1]) if board else said
+    if board:
+        said = re.sub(r"write (\w+ = \S+) in the board's \.toml", rf"in {board[1]}, write \1", said)
+        said = said.replace("its .toml", board[1])
     for name, text in re.findall(_WRITTEN, said):
         document = tomllib.loads((folder / name).read_text("utf-8"))
         table = re.match(r"\[(\w+)\] ", text)

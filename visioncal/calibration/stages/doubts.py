@@ -198,7 +198,7 @@ def _disagreement_doubts(pair: Pair) -> Iterator[Finding]:
         return
     views, run = tuple(it.view for it in out), _run(pair)
     if len(out) == 1:
-        named, them, rows = f"view {views[0]}", "it", "its row"
+        named, them, rows = f"view {views[0]}", "it", f"the row of view {views[0]}"
         words = f"View {views[0]} was left out. It {out[0].reason}."
     else:
         named, them, rows = f"views {', '.join(map(str, views))}", "them", "their rows"
