@@ -9,7 +9,7 @@ covariance per degree of freedom, of the camera's pose in the frame of the ray o
 errors of the camera's place and of picks, those by Park's X and the lens that
 Park had (OpenCV), the share of each verdict, and refusals. Base and flange are those of which the
 robot reports: what of an arm's errors is one twist of the base and one of the flange at all
-postures is in no residual, and an arm that goes where it was told does it again.
+postures is in no residual, and an arm that goes where it is sent does it again.
 """
 
 import sys

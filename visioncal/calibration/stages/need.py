@@ -195,9 +195,7 @@ def _part(fitted: Fitted, rows: Sequence[int]) -> Fitted:
 def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
     """Picks of what one camera sees by one robot, from the observations that it parts."""
     problem, state, noise = fitted.problem, fitted.state, fitted.noise
-    seen, tree = problem.observations, problem.tree
-    branch = next(name for name, it in tree.branches.items() if it.robot == robot)
-    base, arm = tree.branches[branch].parent, fitted.arms.get(robot)
+    seen, base, arm = problem.observations, problem.tree.bases[robot], fitted.arms.get(robot)
     in_base = _in_base(problem, state, base)
     middles = np.array(
         [fitted.middles.get(it.partition("@")[0], np.zeros(3)) for it in seen.observed]
@@ -237,7 +235,7 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
     parts["board"] = linear.covariance(of_boards)
     if problem.is_combined:
         # Noise of both as one counts as the robot's, where it carries the camera.
-        alone = turned @ _axes(white) @ np.swapaxes(turned, 1, 2)
+        alone = turned @ _axes(white) @ turned.mT
         look = carries[:, None, None] * alone
     else:
         look = looking.total_covariance(linear, noise) - looking.covariance(noise)
