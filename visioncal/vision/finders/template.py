@@ -95,6 +95,9 @@ _STILL_PX, _LONE_STILL_PX = (0.1, 0.02), (0.004, 0.004)
 _LONE_MAPS, _MAPS_STILL_PX = 4, 0.03
 # Beyond this share of a square, blur brings in the next lines.
 _WIDE = 0.16
+# Where its exponent is below this, an edge's slope is zero: single precision has denormal numbers
+# there, which take a processor a hundred times as long, and sums do not show them.
+_FAINT = np.float32(-80.0)
 # Pixels nearer to a ChArUco board's marker than this many widths of an edge are left out.
 _CLEAR = 1.5
 # No step is longer [squares].
@@ -704,6 +707,7 @@ def _edge(t: _Float32Array, sigma: _Float32Array, *, blurs: bool) -> tuple[_Floa
     """One line's share of `_edges`."""
     bell = np.float32(-0.5) * t
     bell *= t
+    np.copyto(bell, -np.inf, where=bell < _FAINT)
     np.exp(bell, out=bell)
     edge = _erf(t, bell)
     bell *= np.float32(np.sqrt(2.0 / np.pi))
