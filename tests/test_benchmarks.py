@@ -11,10 +11,10 @@ sys.path.append(str(FOLDER))
 
 import results  # noqa: E402
 
-SCRIPTS = [it for it in sorted(FOLDER.glob("*.py")) if "__main__" in it.read_text("utf-8")]
+SCRIPTS = [path for path in sorted(FOLDER.glob("*.py")) if "__main__" in path.read_text("utf-8")]
 
 
-@pytest.mark.parametrize("script", SCRIPTS, ids=lambda it: it.stem)
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda value: value.stem)
 def test_every_benchmark_does_less_with_quick(script):
     assert re.search(r'"--quick"|\b(few|first|wished|QUICK)\b', script.read_text("utf-8"))
 

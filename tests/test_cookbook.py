@@ -31,17 +31,17 @@ QUICK = (
 
 
 # The quicker ones are run each time.
-RUN = [pytest.param(it, marks=() if it.stem in QUICK else pytest.mark.slow) for it in PAGES]
+RUN = [pytest.param(path, marks=() if path.stem in QUICK else pytest.mark.slow) for path in PAGES]
 
 
-@pytest.mark.parametrize("page", RUN, ids=lambda it: it.stem)
+@pytest.mark.parametrize("page", RUN, ids=lambda value: value.stem)
 def test_a_recipe_prints_what_it_shows(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run(page)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", EXAMPLES, ids=lambda it: it.parent.name)
+@pytest.mark.parametrize("page", EXAMPLES, ids=lambda value: value.parent.name)
 def test_an_example_prints_what_its_page_shows(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for block in EXAMPLES[page]:
@@ -51,7 +51,7 @@ def test_an_example_prints_what_its_page_shows(page, tmp_path, monkeypatch):
         assert json.loads(path.read_text("utf-8")).keys() <= documented
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda it: it.stem)
+@pytest.mark.parametrize("page", PAGES, ids=lambda value: value.stem)
 def test_a_recipe_is_a_page(page):
     assert len(page.read_text(encoding="utf-8").splitlines()) <= 60
 

@@ -16,7 +16,9 @@ SLOW = {
     "cell, wrong arms as reported", "cell, wrong rows", "springs, 1",
     "sweep to hand", "tracker, places, wrong arm",
 }  # fmt: skip
-NAMES = [pytest.param(it, marks=pytest.mark.slow if it in SLOW else ()) for it in sorted(cases())]
+NAMES = [
+    pytest.param(case, marks=pytest.mark.slow if case in SLOW else ()) for case in sorted(cases())
+]
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -10,7 +10,7 @@ QUICK = {
     "frames.json", "policy.toml", "arm.toml", "target.toml", "photo.png", "plan", "tracked",
     "foreign/kuka_csv", "foreign/visp", "foreign/views_npz",
 }  # fmt: skip
-READ = [it for it in READINGS if it.input in QUICK and "_out]" not in it.words]
+READ = [reading for reading in READINGS if reading.input in QUICK and "_out]" not in reading.words]
 SOUND = 3
 
 
@@ -23,11 +23,11 @@ def test_every_command_that_reads_is_called():
 def test_broken_inputs_end_in_a_result_or_a_clear_refusal(tmp_path, count):
     ended = list(walk(range(-SOUND, count), tmp_path, readings=READ))
     assert len(ended) == SOUND + count
-    assert [str(it) for it in ended if it.faults] == []
-    assert all(it.status == it.reading.sound for it in ended if it.number < 0)
+    assert [str(item) for item in ended if item.faults] == []
+    assert all(item.status == item.reading.sound for item in ended if item.number < 0)
     # Some changes are none, such as a row in another place; most are not survived.
-    assert count / 4 < sum(it.status == 2 for it in ended) < count
-    commands = {it.reading.command for it in ended}
+    assert count / 4 < sum(item.status == 2 for item in ended) < count
+    commands = {item.reading.command for item in ended}
     assert count < 40 or commands > {
         "calibrate",
         "convert",

@@ -83,27 +83,31 @@ def test_figures_of_the_report_are_drawn_on_their_own(tmp_path):
     text = (tmp_path / "residuals.svg").read_text("utf-8")
     assert text.startswith("<svg xmlns=")
     # Each view's bar, in two panels at least.
-    bars = [it.get("d", "") for it in ElementTree.fromstring(text) if it.tag.endswith("path")]
-    assert sum(it.count("z") for it in bars) >= 2 * sum(it.used for it in calibration.views)
+    bars = [
+        element.get("d", "")
+        for element in ElementTree.fromstring(text)
+        if element.tag.endswith("path")
+    ]
+    assert sum(bar.count("z") for bar in bars) >= 2 * sum(view.used for view in calibration.views)
     assert "--ink:" in drawing._repr_html_()
     with pytest.raises(DataError, match="no figure 'colours'") as caught:
         calibration.plot("colours")
-    assert all(it in caught.value.next_step for it in FIGURES)
+    assert all(figure in caught.value.next_step for figure in FIGURES)
 
 
 def test_views_are_a_frame_of_pandas():
     pytest.importorskip("pandas", reason="the extra pandas is not installed")
     calibration = made_up().calibration
     table = calibration.views_table()
-    assert [*table.index] == [it.view for it in calibration.views]
-    assert [*table[table.used].rms_px] == [it.rms_px for it in calibration.views if it.used]
+    assert [*table.index] == [view.view for view in calibration.views]
+    assert [*table[table.used].rms_px] == [view.rms_px for view in calibration.views if view.used]
 
 
 def test_views_are_records_where_pandas_is_not_installed(monkeypatch):
     calibration = made_up().calibration
     monkeypatch.setattr("visioncal.results.result.find_spec", lambda _: None)
     table = calibration.views_table()
-    assert [it["view"] for it in table] == [it.view for it in calibration.views]
+    assert [value["view"] for value in table] == [view.view for view in calibration.views]
 
 
 def test_arrays_that_do_not_match_are_refused():
@@ -184,6 +188,6 @@ def test_poses_that_are_no_rigid_transforms_are_refused_with_the_likely_cause(sp
 def test_joint_angles_of_other_views_are_refused_and_rounded_rotations_are_not():
     with pytest.raises(DataError, match=r"^q has the shape \(2, 6\) beside 3 poses"):
         from_corners(SEEN, q=np.zeros((2, 6)))
-    assert len(from_corners(SEEN, [RigidTransform.from_matrix(it) for it in POSES]).views) == 3
+    assert len(from_corners(SEEN, [RigidTransform.from_matrix(pose) for pose in POSES]).views) == 3
     # As a print with three decimals has them.
     assert len(from_corners(SEEN, POSES.round(3)).views) == 3

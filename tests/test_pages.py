@@ -20,15 +20,15 @@ from visioncal import dynamics
 ROOT = Path(__file__).parents[1]
 COMMANDS = dict(every_command())
 FRONT = ROOT / "README.md"
-PACKAGES = sorted(it.parent for it in (ROOT / "visioncal").glob("*/__init__.py"))
+PACKAGES = sorted(path.parent for path in (ROOT / "visioncal").glob("*/__init__.py"))
 PAGES = [
     FRONT,
     ROOT / "visioncal" / "README.md",
-    *(it / "README.md" for it in PACKAGES),
+    *(package / "README.md" for package in PACKAGES),
     *sorted(FOLDER.glob("*.md")),
     *sorted((ROOT / ".github").glob("*.md")),
 ]
-every_page = pytest.mark.parametrize("page", PAGES, ids=lambda it: str(it.relative_to(ROOT)))
+every_page = pytest.mark.parametrize("page", PAGES, ids=lambda value: str(value.relative_to(ROOT)))
 
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 # An indented line after an empty one, or within an indented block, is code.
@@ -56,32 +56,32 @@ def code_of(page: Path) -> tuple[str, ...]:
 def spans_of(page: Path) -> tuple[str, ...]:
     """What a page has between single backticks, line breaks taken out."""
     plain = re.sub(r"^ *```.*?^ *```", "", text_of(page), flags=re.MULTILINE | re.DOTALL)
-    return tuple(" ".join(it.split()) for it in SPAN.findall(INDENTED.sub("", plain)))
+    return tuple(" ".join(value.split()) for value in SPAN.findall(INDENTED.sub("", plain)))
 
 
 def anchors(page: Path) -> set[str]:
     """Names of a page's headings, as links call them."""
     heads = re.findall(r"^#+ (.*)$", text_of(page), re.MULTILINE)
-    return {re.sub(r"[^\w\- ]", "", it.lower()).replace(" ", "-") for it in heads}
+    return {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads}
 
 
 def words_of(line: str) -> list[str]:
-    return [it for it in shlex.split(SHELL.split(line)[0], comments=True) if it != "..."]
+    return [part for part in shlex.split(SHELL.split(line)[0], comments=True) if part != "..."]
 
 
 @cache
 def commands_of(page: Path) -> tuple[tuple[str, ...], ...]:
     """The words of each command line in the code of a page."""
     lines = "\n".join(code_of(page)).replace("\\\n", " ").splitlines()
-    found = [COMMAND.search(it.strip()) for it in lines]
-    return tuple(tuple(words_of(it[1])) for it in found if it)
+    found = [COMMAND.search(line.strip()) for line in lines]
+    return tuple(tuple(words_of(match[1])) for match in found if match)
 
 
 @cache
 def mentions_of(page: Path) -> tuple[tuple[str, ...], ...]:
     """The words of each command that a page has in its sentences."""
-    found = [COMMAND.match(it) for it in spans_of(page)]
-    return tuple(tuple(words_of(it[1])) for it in found if it)
+    found = [COMMAND.match(span) for span in spans_of(page)]
+    return tuple(tuple(words_of(match[1])) for match in found if match)
 
 
 def command_of(words: tuple[str, ...]) -> tuple[typer.core.TyperCommand, list[str], str]:
@@ -138,7 +138,7 @@ def test_what_a_page_names_is_there(page):
         if re.fullmatch(r"visioncal(\.\w+)+", name):
             assert found(name), f"{page}: {name}"
         elif re.fullmatch(r"[\w/]+/\w+\.py", name):
-            assert any((it / name).is_file() for it in (ROOT, ROOT / "visioncal")), (
+            assert any((path / name).is_file() for path in (ROOT, ROOT / "visioncal")), (
                 f"{page}: {name}"
             )
     for block in code_of(page):
@@ -163,25 +163,27 @@ def found(name: str) -> bool:
 
 def test_every_command_and_option_is_on_a_page():
     text = "\n".join(map(text_of, PAGES))
-    words = [it for page in PAGES for it in (*commands_of(page), *mentions_of(page))]
-    named = {command_of(it)[2] for it in words if it[0] != "COMMAND"}
+    words = [command for page in PAGES for command in (*commands_of(page), *mentions_of(page))]
+    named = {command_of(word)[2] for word in words if word[0] != "COMMAND"}
     for name, command in COMMANDS.items():
         assert name in named, f"no page has visioncal {name}"
-        for it in command.params:
-            flags = [*it.opts, *it.secondary_opts]
-            assert flags == [it.name] or any(
+        for param in command.params:
+            flags = [*param.opts, *param.secondary_opts]
+            assert flags == [param.name] or any(
                 re.search(rf"(?<![\w-]){flag}(?![\w-])", text) for flag in flags
             ), f"no page has {flags} of visioncal {name}"
 
 
 def test_every_field_of_a_result_is_on_its_page():
     words = set(re.findall(r"\w+", text_of(ROOT / "visioncal" / "results" / "README.md")))
-    assert {it.name for it in fields(visioncal.Calibration)} <= words
+    assert {field.name for field in fields(visioncal.Calibration)} <= words
 
 
 def test_the_architecture_has_every_package():
-    (order,) = [it for it in code_of(ROOT / "visioncal" / "README.md") if it.split()[0] == "core"]
-    assert sorted(order.split()) == [it.name for it in PACKAGES]
+    (order,) = [
+        name for name in code_of(ROOT / "visioncal" / "README.md") if name.split()[0] == "core"
+    ]
+    assert sorted(order.split()) == [package.name for package in PACKAGES]
 
 
 def test_the_front_page_is_short():
@@ -218,8 +220,8 @@ def test_the_front_page_shows_what_recipes_print():
         if language == "text"
     ]
     assert len(shown) >= 7
-    for it in shown:
-        assert any(it in text for text in expected), it
+    for name in shown:
+        assert any(name in text for text in expected), name
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ CREATED = "2026-11-21T00:00:00+00:00"
 
 
 def settings():
-    blas = sorted((it["filepath"], it["num_threads"]) for it in threadpool_info())
+    blas = sorted((value["filepath"], value["num_threads"]) for value in threadpool_info())
     return cv2.getNumThreads(), blas
 
 
@@ -73,7 +73,7 @@ def test_threads_change_no_digit(tmp_path, monkeypatch):
 
     monkeypatch.setattr(detect, "ThreadPoolExecutor", Pool)
     one, three = (
-        replace(calibrate(tmp_path / "cell", threads=it), created=CREATED) for it in (1, 3)
+        replace(calibrate(tmp_path / "cell", threads=name), created=CREATED) for name in (1, 3)
     )
     assert asked == [1, 3]
     assert to_document(one) == to_document(three)

@@ -20,10 +20,10 @@ OTHERS = (13, 19, 21, 34, 36, 37, 38, 40, 43, 48, 54, 56, 59, 62, 64)
 SURPRISING = 5.0
 
 
-@pytest.mark.parametrize("seed", [*FIRST, *(slow(it) for it in OTHERS)])
+@pytest.mark.parametrize("seed", [*FIRST, *(slow(other) for other in OTHERS)])
 def test_an_ordinary_cell_goes_through_all_commands(seed, tmp_path):
     done = walk(seed, tmp_path, whole=False)
-    assert not [it.trace for it in done.steps if it.status == 1]
+    assert not [step.trace for step in done.steps if step.status == 1]
     assert not done.missing
     assert not done.warned
     for step in done.steps:
@@ -37,7 +37,7 @@ def test_a_seed_is_always_the_same_cell(tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
     one, two = (write(cell(3), tmp_path / name).folder for name in ("a", "b"))
-    files = sorted(it.relative_to(one) for it in one.rglob("*") if it.is_file())
+    files = sorted(path.relative_to(one) for path in one.rglob("*") if path.is_file())
     assert len(files) > 8
     for file in files:
         assert (one / file).read_bytes() == (two / file).read_bytes()
@@ -45,9 +45,9 @@ def test_a_seed_is_always_the_same_cell(tmp_path):
 
 def test_both_kinematics_agree(tmp_path):
     rng = np.random.default_rng(1)
-    arms = [built_in(it) for it in built_in_names()]
-    arms += [urdf_arm(rng, f"{it}.urdf", "it") for it in range(4)]
-    arms += [table_arm(rng, f"{it}.toml", "it") for it in range(4)]
+    arms = [built_in(name) for name in built_in_names()]
+    arms += [urdf_arm(rng, f"{index}.urdf", "it") for index in range(4)]
+    arms += [table_arm(rng, f"{index}.toml", "it") for index in range(4)]
     for arm in arms:
         if arm.text:
             (tmp_path / arm.model).write_text(arm.text, encoding="utf-8")

@@ -39,13 +39,13 @@ def of_session(folder: Path) -> tuple[str, Answer]:
 def line(name: str, answer: Answer, before: Mapping[str, Any]) -> str:
     """One row: the largest differences, and the facts that are others."""
     words = dict(answer.words)
-    others = {it: (before["words"].get(it), at) for it, at in words.items()
-              if before["words"].get(it) != at}  # fmt: skip
+    others = {word: (before["words"].get(word), at) for word, at in words.items()
+              if before["words"].get(word) != at}  # fmt: skip
     if answer.edges.keys() != before["edges"].keys():
         return f"| {name} | - | - | - | {others} |"
     figures = (away_in_sigmas(answer, before), sigmas_apart(answer, before),
                levels_apart(answer, before))  # fmt: skip
-    return f"| {name} | {' | '.join(f'{it:.1e}' for it in figures)} | {others or 'same'} |"
+    return f"| {name} | {' | '.join(f'{figure:.1e}' for figure in figures)} | {others or 'same'} |"
 
 
 def compared(pool, run: Callable, items: list, before: Mapping[str, Any]) -> dict[str, Any]:
@@ -74,7 +74,7 @@ def main() -> None:
             KEPT.write_text("{\n" + ",\n".join(rows) + "\n}\n", encoding="utf-8")
         if asked.real is not None and SESSIONS.is_dir():
             then = json.loads(asked.real.read_text()) if asked.real.exists() else None
-            folders = sorted(it for it in SESSIONS.iterdir() if (it / "views.csv").exists())
+            folders = sorted(path for path in SESSIONS.iterdir() if (path / "views.csv").exists())
             real = compared(pool, of_session, folders, then or {})
             if then is None:
                 asked.real.write_text(json.dumps(real, indent=1))

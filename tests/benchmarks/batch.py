@@ -77,7 +77,7 @@ def worker_of() -> int:
     while below:
         found = children.get(below.pop(), [])
         below += found
-        leaves += [it for it in found if it not in children and is_worker(it)]
+        leaves += [index for index in found if index not in children and is_worker(index)]
     return leaves[-1]
 
 
@@ -106,25 +106,25 @@ def main() -> None:
         for count in (2,) if asked.quick else (1, 2, 4):
             rate, rows = rated(sessions, folder / f"{engine}_{count}", count)
             one = one or rate
-            done = sum(it.state == "done" for it in rows)
+            done = sum(row.state == "done" for row in rows)
             lines.append(f"| {engine} | {count} | {rate:.0f} | {rate / one:.2f} | {done} "
                          f"| {len(rows) - done} |")  # fmt: skip
         rate, rows = rated(sessions, folder / f"{engine}_killed", 2, kill=True)
-        done = [it for it in rows if it.state == "done"]
+        done = [row for row in rows if row.state == "done"]
         lines.append(f"| {engine}, one of them killed | 2 | {rate:.0f} | {rate / one:.2f} "
                      f"| {len(done)} | {len(rows) - len(done)} |")  # fmt: skip
     whole = folder / "page"
     rows = list(batch(sessions, whole, workers=4, without=(RECORDING,)).rows)
-    sample = [it for it in rows if it.state == "done"][
+    sample = [row for row in rows if row.state == "done"][
         :: max(1, len(rows) // (2 if asked.quick else 10))
     ]
     same = 0
-    for it in sample:
-        alone = run(sessions / it.name).calibration
-        verdict = alone.verdict.with_paths(sessions / it.name, whole / it.name)
-        same += facts(Calibration.load(whole / it.name)) == facts(replace(alone, verdict=verdict))
-    counts = [sum(it.state == state for it in rows) for state in ("done", "failed")]
-    first = list(dict.fromkeys(it.group for it in rows if it.score > 0.0))
+    for row in sample:
+        alone = run(sessions / row.name).calibration
+        verdict = alone.verdict.with_paths(sessions / row.name, whole / row.name)
+        same += facts(Calibration.load(whole / row.name)) == facts(replace(alone, verdict=verdict))
+    counts = [sum(row.state == state for row in rows) for state in ("done", "failed")]
+    first = list(dict.fromkeys(row.group for row in rows if row.score > 0.0))
     said = [
         f"Of {len(rows)} sessions {counts[0]} have results and {counts[1]} rows a reason.",
         f"Equal to `calibrate`'s to the bit: {same} of {len(sample)} that were compared.",

@@ -35,10 +35,12 @@ from visioncal.vision.targets import charuco_board
 VIEWS, MANY = few((40, 1000), (5, 10))
 # As many as are wished on the command line.
 REPEATS = wished(3)
-THREADS = [it for it in (1, 2, 4) if it <= (os.cpu_count() or 1)]
+THREADS = [name for name in (1, 2, 4) if name <= (os.cpu_count() or 1)]
 COMMAND = [sys.executable, "-m", "visioncal"]
 # Installed packages have their byte code beside them.
-ENVIRONMENT = {it: value for it, value in os.environ.items() if it != "PYTHONDONTWRITEBYTECODE"}
+ENVIRONMENT = {
+    name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"
+}
 
 
 def opencv_alone(files: list[Path], board: cv2.aruco.CharucoBoard, threads: int) -> int:
@@ -73,7 +75,7 @@ def of_program(command: list[str]) -> np.ndarray:
 def medians(*works: Callable[[], np.ndarray]) -> np.ndarray:
     """The medians of each over interleaved repetitions, after one that is not counted, (n, 2)."""
     warm = few(1, 0)
-    rounds = [[it() for it in works] for _ in range(REPEATS + warm)][warm:]
+    rounds = [[work() for work in works] for _ in range(REPEATS + warm)][warm:]
     return np.median(rounds, axis=0)
 
 
@@ -99,9 +101,9 @@ def rows_of(ending: str, quality: int | None, level: str, folder: Path) -> list[
             lambda threads=threads: seconds(lambda: opencv_alone(files, board, threads)),
         )
         ratios = times[:2] / times[2]
-        rows.append([ending, level, str(threads), *(f"{it:.2f}" for it in times[:, 1]),
-                     *(f"{it:.2f}" for it in ratios[:, 1]),
-                     *(f"{it:.2f}" for it in ratios[:, 0])])  # fmt: skip
+        rows.append([ending, level, str(threads), *(f"{number:.2f}" for number in times[:, 1]),
+                     *(f"{ratio:.2f}" for ratio in ratios[:, 1]),
+                     *(f"{ratio:.2f}" for ratio in ratios[:, 0])])  # fmt: skip
     return rows
 
 
@@ -115,10 +117,12 @@ def started() -> list[list[str]]:
         "import typer": [*python, "import typer"],
         "nothing": [*python, "pass"],
     }
-    found = medians(*(lambda it=it: of_program(it) for it in commands.values()))[:, 1]
+    found = medians(*(lambda number=command: of_program(number) for command in commands.values()))[
+        :, 1
+    ]
     *_, typer, _ = found
-    return [[name, f"{it:.2f}", f"{it / typer:.1f}"]
-            for name, it in zip(commands, found, strict=True)]  # fmt: skip
+    return [[name, f"{number:.2f}", f"{number / typer:.1f}"]
+            for name, number in zip(commands, found, strict=True)]  # fmt: skip
 
 
 def small(folder: Path) -> list[list[str]]:
@@ -132,8 +136,10 @@ def small(folder: Path) -> list[list[str]]:
         "the same, corners kept": ["--no-report", "--no-recording", "--keep-corners"],
     }
     kinds = dict(first(list(kinds.items())))
-    found = medians(*(lambda it=it: of_program([*command, *it]) for it in kinds.values()))[:, 1]
-    return [[name, f"{it:.2f}"] for name, it in zip(kinds, found, strict=True)]
+    found = medians(
+        *(lambda number=kind: of_program([*command, *number]) for kind in kinds.values())
+    )[:, 1]
+    return [[name, f"{number:.2f}"] for name, number in zip(kinds, found, strict=True)]
 
 
 def outputs(folder: Path) -> float:
@@ -151,12 +157,16 @@ def outputs(folder: Path) -> float:
 
 
 def table(head: list[str], rows: list[list[str]]) -> str:
-    return "\n".join("| " + " | ".join(it) + " |" for it in [head, ["---"] * len(head), *rows])
+    return "\n".join(
+        "| " + " | ".join(group) + " |" for group in [head, ["---"] * len(head), *rows]
+    )
 
 
 def main() -> None:
     """Prints the tables and keeps them."""
-    kinds = [(*it, level) for it in (("png", None), ("jpg", 95)) for level in ("hand-eye", "arm")]
+    kinds = [
+        (*pair, level) for pair in (("png", None), ("jpg", 95)) for level in ("hand-eye", "arm")
+    ]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         rows = [row for kind in first(kinds) for row in rows_of(*kind, folder)]

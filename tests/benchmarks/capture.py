@@ -100,7 +100,9 @@ def planned(stops: int) -> PlanFile:
     cell = replace(true_cell(CELL), sigma_rad=0.01, sigma_m=0.005)
     start_q = np.array(CONTROLLER.q)
     request = Request(purpose_of("hand-eye"), stops, start_q=start_q, candidates=200)
-    found = tuple(Stop(it.view, it.q, it.via, it.words) for it in make_plan(cell, request).stops)
+    found = tuple(
+        Stop(stop.view, stop.q, stop.via, stop.words) for stop in make_plan(cell, request).stops
+    )
     return PlanFile(cell, request.purpose, found, start_q, "0" * 64)
 
 
@@ -130,9 +132,9 @@ def times_of_views(folder: Path) -> str:
         compared, begun = Compared(truth), time.perf_counter()
         steps = recorded(live, plan, folder / "views", compared)
         took_s = time.perf_counter() - begun
-    worked = np.array([it.times.worked_s for it in steps])
-    moved_s = sum(it.times.moved_s for it in steps)
-    settled_s = sum(it.times.settled_s for it in steps)
+    worked = np.array([step.times.worked_s for step in steps])
+    moved_s = sum(step.times.moved_s for step in steps)
+    settled_s = sum(step.times.settled_s for step in steps)
     rest_s = (took_s - moved_s - settled_s) / len(steps)
     repeats = CONTROLLER.repeatability_rad
     return (
@@ -162,7 +164,7 @@ def losses_of_kills(folder: Path) -> str:
     """Kills recordings, and says what was lost."""
     stops = 3 * KILLS
     ends = kill_and_resume(folder / "killed", stops=stops, kills=KILLS, seed=1, most_s=2.5)
-    killed = sum(not it.done for it in ends)
+    killed = sum(not end.done for end in ends)
     return (
         f"{killed} kills at random moments of one recording of {stops} views, resumed each time: "
         "every view that was acknowledged was in the session after every kill, and all were there "
@@ -174,7 +176,7 @@ def main() -> None:
     """Measures, and writes the section."""
     with tempfile.TemporaryDirectory() as name:
         folder, plan = Path(name), planned(4)
-        rows = [time_of_fault(it, plan, folder) for it in first((*FAULTS, "unplugged"))]
+        rows = [time_of_fault(name, plan, folder) for name in first((*FAULTS, "unplugged"))]
         table = [
             "| fault on the way | told after [s] | views | words |",
             "| --- | ---: | ---: | --- |",

@@ -77,9 +77,9 @@ def of_one_sweep(task: tuple[World, int]) -> Outcome | None:
 
 
 def row(world: World, found: list[Outcome | None]) -> str:
-    kept = [it for it in found if it is not None]
-    errors_ms = 1e3 * np.array([it.error_s for it in kept])
-    sigmas_ms = 1e3 * np.array([it.sigma_s for it in kept])
+    kept = [outcome for outcome in found if outcome is not None]
+    errors_ms = 1e3 * np.array([outcome.error_s for outcome in kept])
+    sigmas_ms = 1e3 * np.array([outcome.sigma_s for outcome in kept])
     over = float(np.sqrt(np.mean((errors_ms / sigmas_ms) ** 2)))
     cells = (
         world.words,
@@ -88,8 +88,8 @@ def row(world: World, found: list[Outcome | None]) -> str:
         f"{np.abs(errors_ms).max():.3f}",
         f"{np.median(sigmas_ms):.3f}",
         f"{over:.2f}",
-        f"{np.median([it.away_mm for it in kept]):.3f}",
-        f"{np.mean([it.mahalanobis_sq for it in kept]) / 6:.2f}",
+        f"{np.median([outcome.away_mm for outcome in kept]):.3f}",
+        f"{np.mean([outcome.mahalanobis_sq for outcome in kept]) / 6:.2f}",
         str(len(found) - len(kept)),
     )
     return "| " + " | ".join(cells) + " |"
@@ -99,7 +99,7 @@ def main(sweeps: int) -> None:
     """Prints the table and keeps it."""
     rows = []
     with Pool() as pool:
-        for world in few(WORLDS, [it for it in WORLDS if it.words == "7 s"]):
+        for world in few(WORLDS, [world for world in WORLDS if world.words == "7 s"]):
             tasks = [(world, seed) for seed in range(sweeps)]
             rows.append(row(world, pool.map(of_one_sweep, tasks, chunksize=1)))
             print(rows[-1], flush=True)

@@ -82,7 +82,7 @@ def measured(mount: Mount, noise: tuple[float, float], *, given: bool) -> list[s
     )
     found = [outcome(replace(options, seed=seed)) for seed in range(PAIRS)]
     counts = [
-        sum(getattr(it, name) for it in found)
+        sum(getattr(item, name) for item in found)
         for name in ("false_alarm", "shift", "worst_shift", "turn", "camera_alone")
     ]
     lens = "given" if given else "estimated"

@@ -122,21 +122,21 @@ def compared(target: Target, words: str, shot: Shot) -> Row | None:
         for name, px in peers(image, target, seen, shot.square_px):
             errors.setdefault(name, []).append(px - truth)
         refined = refine(image, target, seen.ids, seen.px)
-        fitted = np.array([not it for it in refined.reasons])
+        fitted = np.array([not reason for reason in refined.reasons])
         core.append(refined.px[fitted] - truth[fitted])
         scaled.append(core[-1] / refined.sigma_px[fitted, None])
         left.extend(~fitted)
     if not core:
         return None
-    best = min(errors.values(), key=lambda it: rms(np.concatenate(it)))
+    best = min(errors.values(), key=lambda error: rms(np.concatenate(error)))
     both = (best, core)
     return Row(
         words,
         shot,
         len(left),
-        *(rms(np.concatenate(it)) for it in both),
-        tuple(rms([each.mean(axis=0) for each in it]) for it in both),
-        tuple(far(np.concatenate(it)) for it in both),
+        *(rms(np.concatenate(group)) for group in both),
+        tuple(rms([each.mean(axis=0) for each in group]) for group in both),
+        tuple(far(np.concatenate(group)) for group in both),
         float(np.mean(left)),
         rms(np.concatenate(scaled)) ** 2,
     )
@@ -181,14 +181,15 @@ def table(rows: list[Row]) -> str:
     head = "| squares px | disc px | noise | else | corners | OpenCV px | core px | ratio "
     head += "| shared px | outliers | not fitted | NEES |"
     lines = [head, "| ---: | ---: | ---: | --- |" + " ---: |" * 8]
-    for it in rows:
-        shot, (bias, own), (out, few_out) = it.shot, it.bias_px, it.outliers
+    for row in rows:
+        shot, (bias, own), (out, few_out) = row.shot, row.bias_px, row.outliers
         lines.append(
-            f"| {shot.square_px:.0f} | {shot.disc_px:.0f} | {shot.noise:.0f} | {it.words} "
-            f"| {it.corners} | {it.peer_px:.4f} | {it.core_px:.4f} | {it.ratio:.2f} "
-            f"| {bias:.4f}, {own:.4f} | {out:.1%}, {few_out:.1%} | {it.left:.1%} | {it.nees:.2f} |"
+            f"| {shot.square_px:.0f} | {shot.disc_px:.0f} | {shot.noise:.0f} | {row.words} "
+            f"| {row.corners} | {row.peer_px:.4f} | {row.core_px:.4f} | {row.ratio:.2f} "
+            f"| {bias:.4f}, {own:.4f} | {out:.1%}, {few_out:.1%} | {row.left:.1%} "
+            f"| {row.nees:.2f} |"
         )
-    ratios = [it.ratio for it in rows]
+    ratios = [row.ratio for row in rows]
     worst, median = max(ratios), statistics.median(ratios)
     summary = f"{len(rows)} rows; ratio at most {worst:.2f}, median {median:.2f}."
     return f"{summary}\n\n" + "\n".join(lines)
@@ -227,7 +228,7 @@ def speed() -> str:
             took_ms(lambda: find_board(image, target)),  # noqa: B023
         ]
         name = f"{target.kind}, {len(seen.ids)} corners"
-        lines.append(f"| {name} | " + " | ".join(f"{it:.0f} ms" for it in times) + " |")
+        lines.append(f"| {name} | " + " | ".join(f"{value:.0f} ms" for value in times) + " |")
     return "\n".join(lines)
 
 
@@ -264,7 +265,7 @@ def wave_px(
     views: list[tuple[FloatArray, FloatArray]], size: tuple[int, int]
 ) -> tuple[float, float, float]:
     """Root mean square of a coordinate's residuals, the wave's amplitude, and that by chance."""
-    objects, images = [it for it, _ in views], [it for _, it in views]
+    objects, images = [item for item, _ in views], [item for _, item in views]
     _, matrix, distortion, turns, shifts = cv2.calibrateCamera(objects, images, size, None, None)
     residuals = np.concatenate([
         px - cv2.projectPoints(places, turn, shift, matrix, distortion)[0][:, 0]
@@ -290,8 +291,8 @@ def main() -> None:
     for target in (CHECKERBOARD, CHARUCO, APRILGRID, CIRCLES):
         every = list(shots(target.kind))
         # With `--quick` a picture in which each kind of board is found.
-        rows = [compared(target, *it) for it in few(every, every[24:25])]
-        found = [it for it in rows if it is not None]
+        rows = [compared(target, *pair) for pair in few(every, every[24:25])]
+        found = [row for row in rows if row is not None]
         missing = len(rows) - len(found)
         parts.append(
             f"**{target.kind}**; in {missing} rows more OpenCV finds no board.\n\n{table(found)}"

@@ -41,7 +41,7 @@ def world(options) -> tuple[Cell, visioncal.Calibration, tuple[float, float, flo
     result, told = result_of(calibrated(cell)), result_of(calibrated(cell, joints=False))
     mount, true = options.mount, cell.transforms.values()
     q = postures(result.robot)
-    edges, told_edges = ([it.matrix for it in c.edges.values()] for c in (result, told))
+    edges, told_edges = ([edge.matrix for edge in c.edges.values()] for c in (result, told))
     flange = result.robot.base_from_flange(q)
     wanted = target_in_camera(mount, *edges, flange)
     sent = visioncal.correct(result, flange, q)
@@ -50,9 +50,9 @@ def world(options) -> tuple[Cell, visioncal.Calibration, tuple[float, float, flo
     goals = z @ np.linalg.inv(wanted) @ np.linalg.inv(x)
     inverse = Inverse(result.robot)
     nominal = [inverse.solve(goal, near) for goal, near in zip(goals, q, strict=True)]
-    both = sent.reached & np.array([it.reached for it in nominal])
+    both = sent.reached & np.array([posture.reached for posture in nominal])
     found = []
-    for joints in (np.array([it.positions for it in nominal]), sent.q):
+    for joints in (np.array([posture.positions for posture in nominal]), sent.q):
         seen = target_in_camera(mount, *true, forward(cell.true_arm, joints[both]))
         away = np.linalg.inv(wanted[both]) - np.linalg.inv(seen)
         found.append(rms_mm(away[:, :3, 3]))

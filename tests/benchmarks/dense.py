@@ -77,7 +77,7 @@ def compared(target: Target, words: str, shot: Shot) -> Row | None:
             continue
         start = refine(image, target, seen.ids, seen.px)
         given = (image, target, seen.ids, start.px, start.blur_px)
-        fits = [fit_corners(*given, smooth_px=it) for it in (0.0, SMOOTH_PX)]
+        fits = [fit_corners(*given, smooth_px=value) for value in (0.0, SMOOTH_PX)]
         if None in fits:
             continue
         fit = fits[fits[1].scatter_px < HELPS * fits[0].scatter_px]
@@ -93,7 +93,7 @@ def compared(target: Target, words: str, shot: Shot) -> Row | None:
         freedom.append(left.size - 6.0)
     if not core or min(freedom) <= 0:
         return None
-    best = min(rms(np.concatenate(it)) for it in peer.values())
+    best = min(rms(np.concatenate(group)) for group in peer.values())
     return Row(
         words,
         shot,
@@ -101,7 +101,7 @@ def compared(target: Target, words: str, shot: Shot) -> Row | None:
         rms(np.concatenate(scaled)) ** 2,
         tuple(squares),
         tuple(freedom),
-        tuple(rms(it) ** 2 for it in scaled),
+        tuple(rms(value) ** 2 for value in scaled),
     )
 
 
@@ -110,16 +110,16 @@ def table(rows: list[Row]) -> str:
     head = "| squares px | disc px | noise | else | OpenCV px | template px | dense px | ratio "
     head += "| NEES |"
     lines = [head, "| ---: | ---: | ---: | --- |" + " ---: |" * 5]
-    for it in rows:
-        shot, (peer, core, dense) = it.shot, it.rms_px
+    for row in rows:
+        shot, (peer, core, dense) = row.shot, row.rms_px
         lines.append(
-            f"| {shot.square_px:.0f} | {shot.disc_px:.0f} | {shot.noise:.0f} | {it.words} "
-            f"| {peer:.4f} | {core:.4f} | {dense:.4f} | {dense / peer:.2f} | {it.nees:.2f} |"
+            f"| {shot.square_px:.0f} | {shot.disc_px:.0f} | {shot.noise:.0f} | {row.words} "
+            f"| {peer:.4f} | {core:.4f} | {dense:.4f} | {dense / peer:.2f} | {row.nees:.2f} |"
         )
-    ratios = [it.rms_px[2] / it.rms_px[0] for it in rows]
-    by_core = statistics.median(it.rms_px[2] / it.rms_px[1] for it in rows)
+    ratios = [row.rms_px[2] / row.rms_px[0] for row in rows]
+    by_core = statistics.median(row.rms_px[2] / row.rms_px[1] for row in rows)
     squares, freedom, errors = (
-        np.concatenate([getattr(it, name) for it in rows])
+        np.concatenate([getattr(row, name) for row in rows])
         for name in ("squares", "freedom", "errors")
     )
     weights = weights_by_view(squares, freedom)
@@ -139,7 +139,10 @@ def table(rows: list[Row]) -> str:
 
 def corners_by_kind(session) -> dict[str, dict[int, Corners]]:
     """What OpenCV, the template, and all pixels find in a session's images."""
-    target, images = session.target, {it.number: image_of(session, it) for it in session.views}
+    target, images = (
+        session.target,
+        {view.number: image_of(session, view) for view in session.views},
+    )
     plain, fine = {}, {}
     for view, image in images.items():
         seen, found = detected(image, target), look_for(image, target, view)[0]
@@ -167,7 +170,7 @@ def worlds() -> str:
     """X in three worlds."""
     lines = [
         "| world | robot's noise mm | "
-        + " | ".join(f"{it}: median, rms mm" for it in KINDS)
+        + " | ".join(f"{kind}: median, rms mm" for kind in KINDS)
         + " |",
         "| --- | ---: |" + " ---: |" * len(KINDS),
     ]
@@ -178,11 +181,11 @@ def worlds() -> str:
             cell = simulate(replace(CellOptions(), views=VIEWS, seed=seed, blur_px=0.5))
             for kind, noise, error in errors_mm(cell, corners_by_kind(smeared(cell, **blur))):
                 found.setdefault((noise, kind), []).append(error)
-            print(world, seed, {it: round(values[-1], 4) for it, values in found.items()})
+            print(world, seed, {key: round(values[-1], 4) for key, values in found.items()})
         for noise in NOISES_MM:
             cells = [
-                f"{statistics.median(it):.4f}, {rms(it):.4f}"
-                for it in (found[noise, kind] for kind in KINDS)
+                f"{statistics.median(group):.4f}, {rms(group):.4f}"
+                for group in (found[noise, kind] for kind in KINDS)
             ]
             lines.append(f"| {world} | {noise:g} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
@@ -216,9 +219,9 @@ def main() -> None:
     parts = []
     for target in (CHECKERBOARD, CHARUCO):
         # The largest squares take half of the time and have the least to gain.
-        wanted = [it for it in shots(target.kind) if it[1].square_px < LARGEST_PX]
-        rows = [compared(target, *it) for it in few(wanted, wanted[24:26])]
-        found = [it for it in rows if it is not None]
+        wanted = [shot for shot in shots(target.kind) if shot[1].square_px < LARGEST_PX]
+        rows = [compared(target, *pair) for pair in few(wanted, wanted[24:26])]
+        found = [row for row in rows if row is not None]
         missing = len(rows) - len(found)
         parts.append(
             f"**{target.kind}**; in {missing} rows more OpenCV finds no board.\n\n{table(found)}"

@@ -74,7 +74,8 @@ def world(job: tuple[int, Exercise]) -> World:
     rng = np.random.default_rng(seed)
     built = real_dynamics("ur5e", rng, stribeck=True)
     streams = [
-        recorded(built, it, rng) for it in (motion, slow_sweep(6, rng, seconds=few(60.0, 15.0)))
+        recorded(built, exercise, rng)
+        for exercise in (motion, slow_sweep(6, rng, seconds=few(60.0, 15.0)))
     ]
     found = identify(load_robot("ur5e"), streams, Options(terms=WITH_ROTORS))
     result = found.identified
@@ -128,11 +129,11 @@ def fresh_errors(found: Identification, built, rng) -> tuple[FloatArray, FloatAr
 
 def worlds_text(found: list[World]) -> str:
     """What the simulated arms came to."""
-    shares = np.array([it.share for it in found])
-    humps = np.array([it.humps for it in found])
-    noise = max(float(it.noise.max()) for it in found)
-    consistent = max(float(it.consistent.max()) for it in found)
-    known = np.array([it.known for it in found])
+    shares = np.array([item.share for item in found])
+    humps = np.array([item.humps for item in found])
+    noise = max(float(item.noise.max()) for item in found)
+    consistent = max(float(item.consistent.max()) for item in found)
+    known = np.array([item.known for item in found])
     return WORLD_TEXT.format(
         worlds=len(found),
         share=shares.mean(),
@@ -141,7 +142,7 @@ def worlds_text(found: list[World]) -> str:
         missed=int(np.isnan(humps).sum()),
         noise=noise,
         consistent=consistent,
-        bodies=sum(it.bodies for it in found),
+        bodies=sum(item.bodies for item in found),
         known=float(np.median(known)),
     )
 
@@ -152,8 +153,8 @@ def ranks_text() -> str:
     lines = ["| robot | links alone | with friction |", "| --- | ---: | ---: |"]
     for name in ("ur5e", "ur10e", "panda"):
         ranks = [
-            BaseModel.reduce(DynamicModel(load_robot(name), it)).rank
-            for it in (none, FrictionTerms())
+            BaseModel.reduce(DynamicModel(load_robot(name), friction_terms)).rank
+            for friction_terms in (none, FrictionTerms())
         ]
         lines.append(f"| {name} | {ranks[0]} | {ranks[1]} |")
     return "\n".join(lines)
@@ -164,11 +165,11 @@ def panda_text() -> str:
     if not PANDA.is_dir():
         return "The recording of a Panda is not there."
     q, dq, torques = (
-        np.loadtxt(PANDA / f"{it}.txt").reshape(-1, 7)
-        for it in ("positions", "velocity", "torques")
+        np.loadtxt(PANDA / f"{name}.txt").reshape(-1, 7)
+        for name in ("positions", "velocity", "torques")
     )
     whole = Recorded("panda", np.loadtxt(PANDA / "time.txt"), q, dq, torques)
-    train, test = (condition(whole.part(*it), 8.0) for it in ((0.0, 0.7), (0.7, 1.0)))
+    train, test = (condition(whole.part(*pair), 8.0) for pair in ((0.0, 0.7), (0.7, 1.0)))
     found = identify(load_robot("panda"), [train])
     result = validate(found.identified, predict(found.identified, test, friction_of_known(found)))
     rows = {
@@ -177,7 +178,9 @@ def panda_text() -> str:
         "bodies": 100.0 * result.consistent_rms_nm / result.torque_nm,
         "published inertias, friction fitted": 100.0 * result.known_rms_nm / result.torque_nm,
     }
-    lines = [f"| {name} | {' | '.join(f'{it:.1f}' for it in row)} |" for name, row in rows.items()]
+    lines = [
+        f"| {name} | {' | '.join(f'{value:.1f}' for value in row)} |" for name, row in rows.items()
+    ]
     head = ["| error over the range of the torque, % | 1 | 2 | 3 | 4 | 5 | 6 | 7 |"]
     return "\n".join([*head, "| --- |" + " ---: |" * 7, *lines])
 
@@ -201,7 +204,7 @@ def figaroh_text() -> str:
                 timed(partial(identify, robot, [stream], replace(options, consistent=True)))[0]
             )
     rms = np.sqrt(np.mean(found.fit.residuals[0] ** 2, axis=0))
-    full, bare = min(it.seconds for it in theirs), min(it.bare_seconds for it in theirs)
+    full, bare = min(their.seconds for their in theirs), min(their.bare_seconds for their in theirs)
     return FIGAROH_TEXT.format(
         parameters=theirs[0].parameters,
         own=found.identified.base.rank,
@@ -211,8 +214,8 @@ def figaroh_text() -> str:
         whole=min(whole),
         faster=full / min(ours),
         bare_faster=bare / min(ours),
-        rms=", ".join(f"{it:.3f}" for it in theirs[0].rms_nm),
-        own_rms=", ".join(f"{it:.3f}" for it in rms),
+        rms=", ".join(f"{rm:.3f}" for rm in theirs[0].rms_nm),
+        own_rms=", ".join(f"{rm:.3f}" for rm in rms),
     )
 
 

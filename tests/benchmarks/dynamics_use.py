@@ -74,7 +74,10 @@ def gains_off(built: DynamicArm, done: Exercise, rng) -> np.ndarray:
     """Errors of the drives' gains by the largest payload [%]."""
     load = body(PAYLOADS_KG[-1])
     known = Inertias.of_bodies(np.array([load.kg]), CENTRE_M[None], load.inertia_kg_m2[None])
-    runs = [[conditioned(it, done, rng, GAINS)] for it in (built, built.carrying(load))]
+    runs = [
+        [conditioned(dynamic_arm, done, rng, GAINS)]
+        for dynamic_arm in (built, built.carrying(load))
+    ]
     base = BaseModel.reduce(DynamicModel(load_robot(ROBOT), TERMS))
     told = drive_gains(base, *runs, known.values[0])
     return 100.0 * np.abs(told.nm_per_a / np.array(GAINS) - 1.0)
@@ -104,16 +107,19 @@ def fed_forward(found: Identified, built: DynamicArm, done: Exercise) -> np.ndar
     """Shares of the torques' range that the identified arm leaves, and the maker's [%]."""
     arm, wanted = ArmDynamics.of(found), drive_torques(built, done.q, done.dq, done.ddq)
     known = ArmDynamics(arm.robot, arm.robot.inertias, arm.friction)
-    off = [it.torques(done.q, done.dq, done.ddq) - wanted for it in (arm, known)]
+    off = [
+        arm_dynamics.torques(done.q, done.dq, done.ddq) - wanted for arm_dynamics in (arm, known)
+    ]
     return np.array(
-        [100.0 * np.sqrt(np.mean(it**2, axis=0) / np.var(wanted, axis=0)) for it in off]
+        [100.0 * np.sqrt(np.mean(array**2, axis=0) / np.var(wanted, axis=0)) for array in off]
     )
 
 
 def text(found: list[dict[str, np.ndarray]]) -> str:
     """The section."""
     payload, gains, collision, fed = (
-        np.array([it[name] for it in found]) for name in ("payload", "gains", "collision", "fed")
+        np.array([mapping[name] for mapping in found])
+        for name in ("payload", "gains", "collision", "fed")
     )
     lines = [
         f"{len(found)} simulated UR10e whose masses and inertias are 20 % off from the maker's, "
@@ -141,7 +147,8 @@ def text(found: list[dict[str, np.ndarray]]) -> str:
         f"maker's inertias and the same friction {np.median(fed[:, 1]):.1f} % "
         f"({fed[:, 1].max():.0f} %).",
         f"- Collisions, an observer of {GAIN_PER_S:g}/s while all joints move: without one the "
-        f"residuals stay under {', '.join(f'{it:.1f}' for it in np.median(limits, axis=0))} N m "
+        f"residuals stay under "
+        f"{', '.join(f'{value:.1f}' for value in np.median(limits, axis=0))} N m "
         f"(99.9 %, joints 1 to 6); {PUSH_N:g} N on the flange are above 1.2 times that after "
         f"{np.median(soon):.0f} ms in the median, {soon.max():.0f} ms at worst.",
     ]

@@ -66,19 +66,23 @@ def world(options: CellOptions) -> tuple[tuple[float, ...], list[tuple[float, fl
     rigid = calibrated(cell, level="kinematics")
     edges = error_m(cell, calibrated(cell, joints=False), robot)
     errors = [edges] + [
-        error_m(cell, it, robot if it.robot_arm.model is None else it.robot_arm.model)
-        for it in (rigid, ours)
+        error_m(
+            cell,
+            run_state,
+            robot if run_state.robot_arm.model is None else run_state.robot_arm.model,
+        )
+        for run_state in (rigid, ours)
     ]
     springs = []
     if options.board_bow_m:
         errors.append(workspace_bound_m(cell, postures(robot)[::EVERY]))
     elif arm_found(ours).springs is not None:
         bound = compliance_bound(cell)
-        for at, it in enumerate(arm_found(ours).springs.springs):
-            if it.determined:
-                off = it.compliance_rad_per_nm - options.compliance_rad_per_nm[at]
-                springs.append((it.sigma_rad_per_nm / bound[at], off / it.sigma_rad_per_nm))
-    return tuple(1e3 * it for it in errors), springs
+        for at, spring in enumerate(arm_found(ours).springs.springs):
+            if spring.determined:
+                off = spring.compliance_rad_per_nm - options.compliance_rad_per_nm[at]
+                springs.append((spring.sigma_rad_per_nm / bound[at], off / spring.sigma_rad_per_nm))
+    return tuple(1e3 * error for error in errors), springs
 
 
 def dirty(options: CellOptions) -> tuple[tuple[float, ...], list[tuple[float, float]]]:
@@ -96,21 +100,27 @@ def weighed(seed: int) -> tuple[float, ...]:
     shop, known = loaded(seed, count=20)
     if arm_found(known).springs is None:
         return (np.nan,) * 5
-    springs = [arm_found(known).springs.springs[it] for it in (1, 2)]
+    springs = [arm_found(known).springs.springs[name] for name in (1, 2)]
     pairs = zip(springs, COMPLIANCE[1:3], strict=True)
-    off = [(it.compliance_rad_per_nm - true) / it.sigma_rad_per_nm for it, true in pairs]
+    off = [
+        (joint_spring.compliance_rad_per_nm - true) / joint_spring.sigma_rad_per_nm
+        for joint_spring, true in pairs
+    ]
     q = np.vstack([STRETCHED, shop.joints[::4]])
     before = deflection_m(shop, q, HUNG[-1])
     after = before - predicted_m(known, q, HUNG[-1])
-    shares = [it.sigma_rad_per_nm / true for it, true in zip(springs, COMPLIANCE[1:3], strict=True)]
+    shares = [
+        spring.sigma_rad_per_nm / true
+        for spring, true in zip(springs, COMPLIANCE[1:3], strict=True)
+    ]
     return (*off, *shares, float(np.linalg.norm(after) / np.linalg.norm(before)))
 
 
 def row(words: str, options: CellOptions, found: list[tuple[tuple[float, ...], list]]) -> str:
     """One line of the first table."""
-    errors = np.array([it for it, _ in found])
-    springs = np.array([it for _, them in found for it in them]).reshape(-1, 2)
-    rigid, ours = (100 * errors[:, it] / errors[:, 0] for it in (1, 2))
+    errors = np.array([pair for pair, _ in found])
+    springs = np.array([value for _, them in found for value in them]).reshape(-1, 2)
+    rigid, ours = (100 * errors[:, name] / errors[:, 0] for name in (1, 2))
     bound, told = "| | ", "| | | |"
     if errors.shape[1] > 3:
         share, ratio = 100 * errors[:, 3] / errors[:, 0], np.mean(errors[:, 2:] ** 2, axis=0)
@@ -143,8 +153,8 @@ def main(worlds: int, processes: int | None) -> None:
     rows = first(kinds)
     with Pool(processes) as pool:
         lines = [
-            row(words, base, pool.map(it, [replace(base, seed=at) for at in range(worlds)]))
-            for words, it, base in rows
+            row(words, base, pool.map(item, [replace(base, seed=at) for at in range(worlds)]))
+            for words, item, base in rows
         ]
         example = np.array(pool.map(weighed, range(worlds)))
     off, shares, left = example[:, :2], example[:, 2:4], example[:, 4]

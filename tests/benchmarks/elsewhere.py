@@ -255,7 +255,7 @@ def bending(size_m):
     def moved(poses, rng):
         down = poses[:, 2, :3]
         turn, shift = size_m / 0.1 * rng.normal(size=(3, 3)), size_m * rng.normal(size=(3, 3))
-        bends = [pose(turn @ it, shift @ it) for it in down]
+        bends = [pose(turn @ value, shift @ value) for value in down]
         return poses @ np.linalg.inv(np.array(bends))
 
     return moved
@@ -424,8 +424,8 @@ def cell(world: World, mount: str, given: bool, seed: int, folder: Path) -> Case
     focal = world.focus(far, rng) if world.focus else np.ones(len(far))
     pixels = np.array(
         [
-            seen(real @ it[:3, :3].T + it[:3, 3], shift, zoom)
-            for it, zoom in zip(boards, focal, strict=True)
+            seen(real @ board[:3, :3].T + board[:3, 3], shift, zoom)
+            for board, zoom in zip(boards, focal, strict=True)
         ]
     )
     pixels = pixels + world.pixel_px * rng.normal(size=pixels.shape)
@@ -440,7 +440,9 @@ def cell(world: World, mount: str, given: bool, seed: int, folder: Path) -> Case
         return cell(world, mount, given, seed + 1000, folder)
     reported = lifted(reported, world.lift) if world.lift else reported
     errors = world.noise((len(robot), 6), rng)
-    steps = np.array([pose(world.robot_rad * it[:3], world.robot_m * it[3:]) for it in errors])
+    steps = np.array(
+        [pose(world.robot_rad * error[:3], world.robot_m * error[3:]) for error in errors]
+    )
     reported = reported @ steps
     stated = MATRIX.copy()
     stated[[0, 1, 0, 1], [0, 1, 2, 2]] += world.off_px * rng.normal(size=4)
@@ -470,9 +472,9 @@ def write(folder, mount, matrix, reported, pixels):
         f"resolution = {list(SIZE)}\n{lens}"
     )
     rows = ["view,x_m,y_m,z_m,qx,qy,qz,qw"]
-    for view, it in enumerate(reported):
-        q = Rotation.from_matrix(it[:3, :3]).as_quat()
-        rows.append(",".join([str(view), *(f"{v:.9f}" for v in (*it[:3, 3], *q))]))
+    for view, value in enumerate(reported):
+        q = Rotation.from_matrix(value[:3, :3]).as_quat()
+        rows.append(",".join([str(view), *(f"{v:.9f}" for v in (*value[:3, 3], *q))]))
     (folder / "views.csv").write_text("\n".join(rows) + "\n")
     lines = ["view,point,u_px,v_px"]
     for view, px in enumerate(pixels):
@@ -499,7 +501,7 @@ def park(case: Case, given: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     turn, place = cv2.calibrateHandEye(
         [*robot[:, :3, :3]],
         [*robot[:, :3, 3]],
-        [cv2.Rodrigues(it)[0] for it in turns],
+        [cv2.Rodrigues(turn)[0] for turn in turns],
         [*places],
         method=cv2.CALIB_HAND_EYE_PARK,
     )
@@ -522,18 +524,18 @@ def trial(world: World, mount: str, given: bool, seed: int, folder: Path) -> dic
     shifted = truth[:3, :3].T @ (found[:3, 3] - truth[:3, 3])
     error = np.concatenate([turned, shifted])
     looks = looks_of(case, seed)
-    picks = [pick(case, result, it) for it in looks]
-    theirs = [pick_by(case, *park(case, given), it) for it in looks]
+    picks = [pick(case, result, look) for look in looks]
+    theirs = [pick_by(case, *park(case, given), look) for look in looks]
     x = park(case, given)[0]
     return {
         "x": float(error @ np.linalg.solve(covariance, error) / 6),
         "x_mm": 1e3 * float(np.linalg.norm(shifted)),
-        "pick": float(np.mean([it[0] for it in picks])),
-        "pick_mm": float(np.median([it[1] for it in picks])),
+        "pick": float(np.mean([pair[0] for pair in picks])),
+        "pick_mm": float(np.median([pair[1] for pair in picks])),
         "park_mm": float(np.median(theirs)),
         "park_x_mm": 1e3 * float(np.linalg.norm(x[:3, 3] - case.reported_x[:3, 3])),
         "status": result.verdict.status,
-        "cause": [it.kind for it in result.verdict.causes][:1],
+        "cause": [cause.kind for cause in result.verdict.causes][:1],
     }
 
 
@@ -606,20 +608,20 @@ def row(name: str, mount: str, given: bool, seeds: int) -> str:
             trial(WORLDS[name], mount, given, seed, Path(folder) / str(seed))
             for seed in range(seeds)
         ]
-    done = [it for it in found if "refused" not in it]
+    done = [mapping for mapping in found if "refused" not in mapping]
     if not done:
         return f"| {name} | {mount} | {'given' if given else 'estimated'} | all refused |"
 
     def mean(key):
-        return np.mean([it[key] for it in done])
+        return np.mean([mapping[key] for mapping in done])
 
     def middle(key):
-        return np.median([it[key] for it in done])
+        return np.median([mapping[key] for mapping in done])
 
     verdicts = "/".join(
-        str(sum(it["status"] == word for it in done)) for word in ("good", "check", "bad")
+        str(sum(mapping["status"] == word for mapping in done)) for word in ("good", "check", "bad")
     )
-    causes = Counter(cause for it in done for cause in it["cause"])
+    causes = Counter(cause for mapping in done for cause in mapping["cause"])
     first = ", ".join(f"{cause} {count}" for cause, count in causes.most_common(2))
     return (
         f"| {name} | {mount} | {'given' if given else 'estimated'} | {mean('x'):.2f} "
@@ -630,10 +632,10 @@ def row(name: str, mount: str, given: bool, seeds: int) -> str:
 
 
 def main() -> None:
-    words = [it for it in sys.argv[1:] if not it.startswith("-")]
+    words = [argument for argument in sys.argv[1:] if not argument.startswith("-")]
     quick = "--quick" in sys.argv
     seeds = int(words[0]) if words and words[0].isdigit() else 1 if quick else SEEDS
-    names = [it for it in words if it in WORLDS] or list(WORLDS)[: 2 if quick else None]
+    names = [word for word in words if word in WORLDS] or list(WORLDS)[: 2 if quick else None]
     print(
         "| world | mount | lens | X | pick | X [mm], Park's | pick [mm], Park's "
         "| good/check/bad | likeliest causes | refused |"

@@ -33,7 +33,7 @@ def figures(job: tuple[str, int]) -> tuple[float, ...]:
         condition.raw,
         links_alone(found),
         found.random.scaled,
-        *(max(kept.shares[it]) for it in ("range", "speed", "acceleration", "torque")),
+        *(max(kept.shares[name]) for name in ("range", "speed", "acceleration", "torque")),
         broken(allowed, found),
         1e3 * kept.clearance_m,
         found.starts,
@@ -56,7 +56,7 @@ def broken(allowed: Allowed, found: Excitation) -> int:
         np.any(np.abs(np.diff(q, axis=0)) * 1e3 > robot.velocity_rad_s, axis=1),
         np.any(np.abs(np.diff(q, 2, axis=0)) * 1e6 > robot.acceleration_rad_s2, axis=1),
     ]
-    return int(sum(it.sum() for it in beyond))
+    return int(sum(value.sum() for value in beyond))
 
 
 def row(name: str, found: np.ndarray) -> str:
@@ -65,10 +65,10 @@ def row(name: str, found: np.ndarray) -> str:
     cells = [
         name,
         f"{middle[13]:.0f}",
-        *(f"{middle[it]:.1f} / {worst[it]:.1f}" for it in (0, 1, 3)),
+        *(f"{middle[value]:.1f} / {worst[value]:.1f}" for value in (0, 1, 3)),
         f"{middle[2]:.0f} / {worst[2]:.0f}",
         f"{middle[4]:.0f}",
-        *(f"{100 * worst[it]:.0f}" for it in (5, 6, 7, 8)),
+        *(f"{100 * worst[value]:.0f}" for value in (5, 6, 7, 8)),
         f"{worst[9]:.0f}",
         f"{found[:, 10].min():.0f}",
         f"{middle[11]:.0f}",
@@ -96,7 +96,7 @@ def main() -> None:
         "| robot | base | weighted | plain | links alone | raw | random | range % | speed % | "
         "acceleration % | torque % | beyond | nearest mm | starts | s |",
         "| --- |" + " ---: |" * 14,
-        *(row(name, it) for name, it in zip(robots, found, strict=True)),
+        *(row(name, array) for name, array in zip(robots, found, strict=True)),
     ]
     text = "\n".join(lines)
     print(text)

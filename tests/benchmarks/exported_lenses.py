@@ -71,8 +71,8 @@ def tried(world: str, given: bool, seed: int, folder: Path) -> list[float]:
 def row(world: str, given: bool, seeds: int) -> str:
     """One line of the table."""
     with tempfile.TemporaryDirectory() as folder:
-        found = [tried(world, given, it, Path(folder) / str(it)) for it in range(seeds)]
-    figures = " | ".join(f"{it:.3f}" for it in np.median(found, axis=0))
+        found = [tried(world, given, index, Path(folder) / str(index)) for index in range(seeds)]
+    figures = " | ".join(f"{value:.3f}" for value in np.median(found, axis=0))
     return f"| {world} | {'given' if given else 'estimated'} | {figures} |"
 
 
@@ -86,14 +86,17 @@ def verified(world: str, given: bool, mount: str, seed: int, folder: Path) -> li
     result = visioncal.calibrate(visioncal.Session.load(folder / "first"))
     later = visioncal.Session.load(folder / "later")
     bare = replace(result, camera=replace(result.camera, field=None))
-    found = [visioncal.verify(later, it) for it in (bare, result)]
-    return [it for check in found for it in (check.misfit / check.freedom, not check.passed)]
+    found = [visioncal.verify(later, calibration) for calibration in (bare, result)]
+    return [value for check in found for value in (check.misfit / check.freedom, not check.passed)]
 
 
 def later_row(world: str, mount: str, given: bool, seeds: int) -> str:
     """One line of the second table."""
     with tempfile.TemporaryDirectory() as folder:
-        found = [verified(world, given, mount, it, Path(folder) / str(it)) for it in range(seeds)]
+        found = [
+            verified(world, given, mount, index, Path(folder) / str(index))
+            for index in range(seeds)
+        ]
     before, failed_before, now, failed = np.sum(found, axis=0)
     return (
         f"| {world} | {mount} | {'given' if given else 'estimated'} | {before / seeds:.2f} "
@@ -110,14 +113,14 @@ def main(seeds: int) -> None:
             "",
             "| world | lens | fit | exported | lens and field | said |",
             "| --- | --- | ---: | ---: | ---: | ---: |",
-            *(row(*it, seeds) for it in first(ROWS)),
+            *(row(*pair, seeds) for pair in first(ROWS)),
             "",
             "Eight later stops where nothing has changed: squared distance from the prediction",
             "over its mean, and how often `verify` fails, without the field and with it.",
             "",
             "| world | mount | lens | without | fails | with | fails |",
             "| --- | --- | --- | ---: | ---: | ---: | ---: |",
-            *(later_row(*it, seeds) for it in first(LATER)),
+            *(later_row(*pair, seeds) for pair in first(LATER)),
         ]
     )
     command = f"PYTHONPATH=tests python tests/benchmarks/exported_lenses.py {seeds}"

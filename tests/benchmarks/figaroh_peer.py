@@ -117,7 +117,7 @@ def of_figaroh(world: World) -> dict[str, Found]:
             calibrate(robot, world.cell.joints, world.world_from_marker, chosen)
             for _ in range(1 if name == UNTOLD[0] else REPEATS)
         ]
-        found[name] = world_view(world, runs[0].predict), min(it.seconds for it in runs)
+        found[name] = world_view(world, runs[0].predict), min(run.seconds for run in runs)
     return found
 
 
@@ -210,7 +210,7 @@ def table(found: dict[str, list[dict[str, tuple[float, float]]]]) -> str:
     lines, said = [], []
     for mount, worlds in found.items():
         errors, seconds = (
-            {name: np.array([it[name][which] for it in worlds]) for name in ROWS}
+            {name: np.array([world[name][which] for world in worlds]) for name in ROWS}
             for which in (0, 1)
         )
         lines += [
@@ -241,7 +241,7 @@ def main(worlds: int) -> None:
     with Pool() as pool:
         for mount in first(("eye-in-hand", "eye-to-hand")):
             row = replace(WRONG_LINKS, robot="ur10e", mount=mount, views=60)
-            found[mount] = pool.map(measured, [replace(row, seed=it) for it in range(worlds)])
+            found[mount] = pool.map(measured, [replace(row, seed=index) for index in range(worlds)])
     text = TEXT.format(worlds=worlds) + table(found)
     print(text)
     command = "PYTHONPATH=tests python tests/benchmarks/figaroh_peer.py"

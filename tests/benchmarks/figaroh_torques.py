@@ -61,7 +61,9 @@ class _Given(BaseIdentification):
     def filter_kinematics_data(self, filter_config: dict | None = None) -> None:
         """Leaves an exact motion as it is."""
         del filter_config
-        self.processed_data = {name: it for name, it in self.raw_data.items() if name != "torques"}
+        self.processed_data = {
+            name: value for name, value in self.raw_data.items() if name != "torques"
+        }
 
 
 def identify(robot: Robot, urdf: str, measured: Measured) -> Found:

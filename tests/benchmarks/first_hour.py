@@ -51,9 +51,9 @@ def walked(mistake: Mistake, folder: Path) -> Walked:
     doctored = time.perf_counter()
     done = visioncal("calibrate", session, "-o", folder / "out")
     seconds = time.perf_counter() - doctored
-    said = [it.strip() for it in done.said.splitlines() if it.strip()]
-    is_good = done.status == 0 and any(it.startswith("good ") for it in said)
-    lines = [it for it in said if it.startswith(("error:", "- "))]
+    said = [line.strip() for line in done.said.splitlines() if line.strip()]
+    is_good = done.status == 0 and any(name.startswith("good ") for name in said)
+    lines = [name for name in said if name.startswith(("error:", "- "))]
     sentence = re.sub(r"^(error:|- )\s*(Most likely \([^)]*\):)?\s*", "", lines[0])
     sentence = sentence.replace(f"{session}/", "").replace(str(session), "SESSION")
     nothing = is_good and not re.search(mistake.names, sentence, re.I)
@@ -74,18 +74,18 @@ def main() -> None:
     found = []
     for name, mistake in first(list(BROKEN.items())):
         with tempfile.TemporaryDirectory() as folder:
-            it = walked(mistake, Path(folder))
-        found.append(it)
-        cut = it.sentence if len(it.sentence) < _LONGEST else f"{it.sentence[:_LONGEST]} ..."
-        named, after = "yes" if it.is_named else "no", it.after or "(nothing to type)"
+            walk = walked(mistake, Path(folder))
+        found.append(walk)
+        cut = walk.sentence if len(walk.sentence) < _LONGEST else f"{walk.sentence[:_LONGEST]} ..."
+        named, after = "yes" if walk.is_named else "no", walk.after or "(nothing to type)"
         row = (
-            f"| {name} | {it.status} | {cut.replace('|', '/')} | {named} | {after} | "
-            f"{it.seconds:.1f} | {it.found_s:.1f} |"
+            f"| {name} | {walk.status} | {cut.replace('|', '/')} | {named} | {after} | "
+            f"{walk.seconds:.1f} | {walk.found_s:.1f} |"
         )
         print(row, flush=True)
         rows.append(row)
-    named = sum(it.is_named for it in found)
-    good = sum(it.after == "good" for it in found)
+    named = sum(item.is_named for item in found)
+    good = sum(item.after == "good" for item in found)
     text = "\n".join(
         [
             f"{len(found)} sessions of 15 rendered views, each with one mistake of the first hour: "

@@ -120,13 +120,13 @@ def feature_trial(seed: int, kinds: Sequence[str]) -> Trial:
 
 
 def accuracy_row(name: str, trials: Sequence[Trial], expected: str) -> str:
-    bounds = np.mean([it.bounds for it in trials], axis=0)
-    share = np.sqrt(np.mean([it.squares for it in trials], axis=0) / bounds)
-    plain = np.sqrt(np.mean([it.plain for it in trials], axis=0) / bounds)
+    bounds = np.mean([item.bounds for item in trials], axis=0)
+    share = np.sqrt(np.mean([item.squares for item in trials], axis=0) / bounds)
+    plain = np.sqrt(np.mean([item.plain for item in trials], axis=0) / bounds)
     beside = "-" if np.isnan(plain[0]) else f"{plain[0]:.2f}, {plain[1]:.2f}"
-    mahalanobis_sq = np.mean([it.mahalanobis_sq for it in trials])
-    alarms = sum(it.accused > 0 for it in trials)
-    inside = 100 * np.mean([it.inside for it in trials])
+    mahalanobis_sq = np.mean([item.mahalanobis_sq for item in trials])
+    alarms = sum(item.accused > 0 for item in trials)
+    inside = 100 * np.mean([item.inside for item in trials])
     return (
         f"| {name} | {share[0]:.2f}, {share[1]:.2f} | {beside} "
         f"| {mahalanobis_sq:.2f} ({expected}) | {inside:.1f} % | {alarms} in {len(trials)} |"
@@ -173,7 +173,7 @@ def reordered(count: int, order: Callable[[int], Sequence[int]]) -> str:
         points = placed(frame, nominal[chosen]) + EVEN_M * rng.normal(size=(count, 3))
         left_out, message = outcome(pairs_of(nominal, points))
         moved = tuple(np.flatnonzero(np.array(chosen) != np.arange(count)))
-        named += any(it in message for it in ("exchanged", "shifted")) or left_out == moved
+        named += any(name in message for name in ("exchanged", "shifted")) or left_out == moved
     return percent(named)
 
 
@@ -205,7 +205,7 @@ def accuracy() -> list[str]:
         rows.append(accuracy_row(f"{count} points, even noise, unknown", unknown, expected))
     for name, kinds in FEATURES.items():
         touched = [feature_trial(seed, kinds) for seed in range(SEEDS)]
-        freedom = sum({"origin": 3, "x": 2, "xy": 1}[it] for it in kinds) - 6
+        freedom = sum({"origin": 3, "x": 2, "xy": 1}[kind] for kind in kinds) - 6
         rows.append(
             accuracy_row(
                 f"origin, x, xy: {name}, unknown", touched, expected_mahalanobis_sq(freedom)
@@ -215,13 +215,13 @@ def accuracy() -> list[str]:
 
 
 def mistakes() -> list[str]:
-    slips = [f"slip of {1e3 * it:g} mm: named (another accused, refused)" for it in SLIPS_M]
+    slips = [f"slip of {1e3 * slip:g} mm: named (another accused, refused)" for slip in SLIPS_M]
     rows = [
         f"| points | {' | '.join(slips)} | two exchanged | all shifted | mirrored |",
         "| --- | --- | --- | --- | --- | --- |",
     ]
     for count in COUNTS:
-        cells = [slipped(count, it) for it in SLIPS_M]
+        cells = [slipped(count, slip) for slip in SLIPS_M]
         cells.append(reordered(count, lambda n: [1, 0, *range(2, n)]))
         cells.append(reordered(count, lambda n: [*range(1, n), 0]))
         cells.append("in one plane: cannot be told" if count == 3 else mirrored(count))

@@ -43,16 +43,16 @@ def _stripped(place: Path) -> None:
         writer = csv.writer(table)
         writer.writerow(["file", "X", "Y", "Z", "RX", "RY", "RZ"])
         for row in csv.DictReader(source):
-            turn = Rotation.from_quat([float(row[it]) for it in ("qx", "qy", "qz", "qw")])
-            mm = [f"{1e3 * float(row[it]):.2f}" for it in ("x_m", "y_m", "z_m")]
-            vector = [f"{it:.4f}" for it in turn.as_rotvec()]
+            turn = Rotation.from_quat([float(row[name]) for name in ("qx", "qy", "qz", "qw")])
+            mm = [f"{1e3 * float(row[name]):.2f}" for name in ("x_m", "y_m", "z_m")]
+            vector = [f"{value:.4f}" for value in turn.as_rotvec()]
             writer.writerow([Path(row["image"]).name, *mm, *vector])
     shutil.rmtree(session)
 
 
 def _walked(place: Path) -> list[str]:
     """Types the commands in one shell's environment, and those that are printed: rows of times."""
-    outside = {key: it for key, it in os.environ.items() if key != "PYTHONPATH"}
+    outside = {key: name for key, name in os.environ.items() if key != "PYTHONPATH"}
     environment = outside | {"PATH": f"{place / 'venv/bin'}:{os.environ['PATH']}"}
     rows, todo = [], [*_TYPED]
     while todo:

@@ -48,7 +48,7 @@ def seconds_of(options: CellOptions, *, joints: bool) -> dict[str, float]:
 def of_views(task: tuple[CellOptions, bool]) -> dict[str, float]:
     options, joints = task
     taken = seconds_of(options, joints=joints)
-    return {"all": sum(taken.values()), **{it: taken[it] for it in NAMED if it in taken}}
+    return {"all": sum(taken.values()), **{name: taken[name] for name in NAMED if name in taken}}
 
 
 def of_cameras(task: tuple[int, int, bool]) -> dict[str, float]:
@@ -56,8 +56,8 @@ def of_cameras(task: tuple[int, int, bool]) -> dict[str, float]:
     cameras, stops, faulty = task
     turns = 2 * np.pi * np.arange(cameras) / cameras
     around = tuple(
-        CameraAt(f"c{at}", place_m=(1.1 * np.cos(it), 1.1 * np.sin(it), 1.1))
-        for at, it in enumerate(turns.tolist())
+        CameraAt(f"c{at}", place_m=(1.1 * np.cos(turn), 1.1 * np.sin(turn), 1.1))
+        for at, turn in enumerate(turns.tolist())
     )
     faults = {
         "moved": (Moved("target_floor", stops // 2), Moved("cam_c1", stops // 3)),
@@ -67,7 +67,7 @@ def of_cameras(task: tuple[int, int, bool]) -> dict[str, float]:
     options = NetworkOptions(cameras=around, stops=stops, seed=1, **(faults if faulty else {}))
     cell = simulate_network(options)
     session = network_session(cell, "network", seen="names")
-    corners = {it.view: it for it in cell.corners}
+    corners = {view_corners.view: view_corners for view_corners in cell.corners}
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     begin = time.process_time()
     found = align(session, corners=corners)
@@ -90,14 +90,14 @@ def exponent(sizes: Sequence[float], taken: Sequence[float]) -> float:
 def run_each(run: Callable, tasks: list, *, quick: bool) -> list[dict[str, float]]:
     """Runs every task in a fresh process, one after the other; quickly, all in this one."""
     if quick:
-        return [run(it) for it in tasks]
+        return [run(task) for task in tasks]
     with get_context("spawn").Pool(1, maxtasksperchild=1) as pool:
         return pool.map(run, tasks, chunksize=1)
 
 
 def views_table(views: Sequence[int], *, quick: bool) -> str:
     lines = [
-        f"| cell | {' | '.join(f'{it} views [s]' for it in views)} | exponent |",
+        f"| cell | {' | '.join(f'{view} views [s]' for view in views)} | exponent |",
         f"| --- | {' | '.join('---:' for _ in views)} | ---: |",
     ]
     kinds = (
@@ -107,30 +107,34 @@ def views_table(views: Sequence[int], *, quick: bool) -> str:
         ("with an arm", WRONG_ARM, True),
     )  # fmt: skip
     for words, options, joints in first(kinds):
-        tasks = [(replace(options, views=it), joints) for it in views]
+        tasks = [(replace(options, views=view), joints) for view in views]
         found = run_each(of_views, tasks, quick=quick)
         for name in ("all", *NAMED):
-            taken = [it.get(name, 0.0) for it in found]
+            taken = [one.get(name, 0.0) for one in found]
             if min(taken) > 1e-3:
-                figures = " | ".join(f"{it:.3f}" for it in taken)
+                figures = " | ".join(f"{value:.3f}" for value in taken)
                 label = words if name == "all" else f"of it: {name}"
                 lines.append(f"| {label} | {figures} | {exponent(views, taken):.2f} |")
     return "\n".join(lines)
 
 
 def cameras_table(cameras: Sequence[int], stops: int, small: int, *, quick: bool) -> str:
-    tasks = [(it, stops, False) for it in cameras] + [(it, stops, True) for it in first(cameras)]
+    tasks = [(camera, stops, False) for camera in cameras] + [
+        (item, stops, True) for item in first(cameras)
+    ]
     tasks += [(4, small, False)]
     found = run_each(of_cameras, tasks, quick=quick)
     lines = [
         "| cameras x stops | rows | s | MB | moves named |",
         "| --- | ---: | ---: | ---: | ---: |",
     ]
-    for (count, stops_of, faulty), it in zip(tasks, found, strict=True):
+    for (count, stops_of, faulty), taken in zip(tasks, found, strict=True):
         words = f"{count} x {stops_of}{', faults' if faulty else ''}"
-        lines.append(f"| {words} | {it['rows']:.0f} | {it['all']:.2f} | {it['memory']:.0f} "
-                     f"| {it['moved']:.0f} |")  # fmt: skip
-    slope = exponent(cameras, [it["all"] for it in found[: len(cameras)]])
+        lines.append(
+            f"| {words} | {taken['rows']:.0f} | {taken['all']:.2f} | {taken['memory']:.0f} "
+            f"| {taken['moved']:.0f} |"
+        )
+    slope = exponent(cameras, [taken["all"] for taken in found[: len(cameras)]])
     return "\n".join([*lines, "", f"Exponent over the number of cameras: {slope:.2f}."])
 
 

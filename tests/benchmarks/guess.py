@@ -78,8 +78,10 @@ def accused(world: str) -> tuple[int, float]:
     for poses in cells(world, SOUND):
         guess = guessed(poses)
         count += guess.stands_out
-        others = [it.score for it in guess.candidates if it is not guess.declared]
-        most = max([most, *(guess.declared.score / it for it in others)])
+        others = [
+            candidate.score for candidate in guess.candidates if candidate is not guess.declared
+        ]
+        most = max([most, *(guess.declared.score / other for other in others)])
     return count, most
 
 

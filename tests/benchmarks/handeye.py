@@ -75,8 +75,8 @@ def opencv_poses(cell: Cell) -> FloatArray:
     """(m, 4, 4) `cam_from_target` by OpenCV: calibrateCamera or solvePnP."""
     options = cell.options
     points = corners_m(Sheet(target=options.target))
-    stated = [points[it.ids].astype(np.float32) for it in cell.corners]
-    px = [it.px.astype(np.float32) for it in cell.corners]
+    stated = [points[view_corners.ids].astype(np.float32) for view_corners in cell.corners]
+    px = [view_corners.px.astype(np.float32) for view_corners in cell.corners]
     if options.state_intrinsics:
         fx, fy, cx, cy = options.camera.matrix
         matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
@@ -86,7 +86,7 @@ def opencv_poses(cell: Cell) -> FloatArray:
     else:
         *_, turns, shifts = cv2.calibrateCamera(stated, px, options.camera.resolution, None, None)
     poses = np.tile(np.eye(4), (len(px), 1, 1))
-    poses[:, :3, :3] = [cv2.Rodrigues(it)[0] for it in turns]
+    poses[:, :3, :3] = [cv2.Rodrigues(turn)[0] for turn in turns]
     poses[:, :3, 3] = np.reshape(shifts, (-1, 3))
     return poses
 
@@ -99,7 +99,7 @@ def opencv_errors(cell: Cell) -> FloatArray:
         robot if cell.options.mount == IN_HAND else invert(robot), opencv_poses(cell), x, z
     )
     away = [log(invert(x) @ _rigid(opencv(name, problem))) for name in METHODS]
-    return np.array([[np.linalg.norm(it[:3]), np.linalg.norm(it[3:])] for it in away])
+    return np.array([[np.linalg.norm(array[:3]), np.linalg.norm(array[3:])] for array in away])
 
 
 def _rigid(matrix: FloatArray) -> FloatArray:
@@ -149,7 +149,9 @@ def bound_table(pool, seeds: int) -> str:
     for row in first(WORLDS):
         kept = _run(pool, against_the_bound, [(row, seed) for seed in range(seeds)])
         mean = np.mean(kept, axis=0)
-        best = np.mean(np.reshape([it[6:] for it in kept], (len(kept), -1, 2)), axis=0).min(axis=0)
+        best = np.mean(np.reshape([value[6:] for value in kept], (len(kept), -1, 2)), axis=0).min(
+            axis=0
+        )
         rows.append(
             (
                 row.words,
@@ -174,7 +176,7 @@ def with_wrong_views(task: tuple[World, int, int]) -> list[float] | None:
     except VisioncalError:
         return None
     world = whole(cell)
-    right = tuple(it for it in world.sights if it.view not in cell.wrong_views)
+    right = tuple(sight for sight in world.sights if sight.view not in cell.wrong_views)
     bound, error = edge_bound(replace(world, sights=right)), error_of(cell, known)
     out = set(range(row.options.views)) - set(known.used)
     return [
@@ -219,7 +221,7 @@ def with_a_wrong_arm(task: tuple[CellOptions, bool, int]) -> list[float] | None:
     except VisioncalError:
         return None
     error, covariance = error_of(cell, known), known.solved.covariance[:12, :12]
-    flagged = any("the arm" in it.lower() for it in known.verdict.reasons)
+    flagged = any("the arm" in reason.lower() for reason in known.verdict.reasons)
     return [*squared(error), mahalanobis_sq(error, covariance), float(flagged)]
 
 
@@ -338,7 +340,7 @@ def real_folds(path: Path, repeats: int) -> tuple[float, float]:
             seen = stage.run(seen)
     cell, away = read_cell(seen), []
     whole = solve(cell, seen, "hand-eye")
-    views = np.array([it.view for it in whole.cell.rows])[whole.agreed.used]
+    views = np.array([row.view for row in whole.cell.rows])[whole.agreed.used]
     problem = whole.part.with_effects([])
     rng = np.random.default_rng(0)
     for _ in range(repeats):
@@ -368,7 +370,7 @@ def real_table() -> str:
 
 
 def _run(pool, function: Callable, tasks: Sequence) -> list:
-    return [it for it in pool.map(function, tasks, chunksize=4) if it is not None]
+    return [value for value in pool.map(function, tasks, chunksize=4) if value is not None]
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -78,7 +78,8 @@ def workspace_bound(shop: Shop, q: FloatArray) -> float:
     first = slice(3, 6) if shop.options.poses else slice(0, 3)
     steps = 1e-5 * np.eye(len(whole))
     jacobian = np.stack(
-        [(reads(shop, it, q=q) - reads(shop, -it, q=q))[:, first] / 2e-5 for it in steps], axis=-1
+        [(reads(shop, step, q=q) - reads(shop, -step, q=q))[:, first] / 2e-5 for step in steps],
+        axis=-1,
     )
     return float(np.sqrt(np.mean(np.sum((jacobian @ root) ** 2, axis=(1, 2)))))
 
@@ -125,8 +126,8 @@ def arm_row(options: Tracked, worlds: int) -> str:
 def simulated(worlds: int) -> str:
     """The table of simulated arms."""
     rows = [
-        f"| {name} | {frames_row(it, worlds)} | {arm_row(it, worlds)} |"
-        for name, it in first(tuple(KINDS.items()))
+        f"| {name} | {frames_row(item, worlds)} | {arm_row(item, worlds)} |"
+        for name, item in first(tuple(KINDS.items()))
     ]
     text = f"""A UR10e of which 30 stops are read, by an instrument of 20 um (50 urad where a
     probe's rotation is read); the arm repeats to 0.03 mm and 0.03 mrad. {worlds} worlds a row.
@@ -176,7 +177,7 @@ def example_a(worlds: int) -> str:
         ("typical errors, 0.5 mm and 1 mrad", stated),
         ("each column of length one", scaled),
     )
-    table = [f"| {name} | {it:.1e} | {np.sqrt(it):.0f} |" for name, it in rows]
+    table = [f"| {name} | {value:.1e} | {np.sqrt(value):.0f} |" for name, value in rows]
     head = ("| units | of Phi^T Phi | of Phi |", "| --- | --- | --- |")
     return "\n".join((prose(text), "", prose(parameters), "", *head, *table, "", prose(explained)))
 
@@ -233,14 +234,14 @@ def parameter_jacobian(shop: Shop) -> FloatArray:
         return (forward(moved, shop.joints) @ shop.flange_from_probe)[:, :3, 3].ravel()
 
     steps = step * np.eye(28)
-    return np.stack([(place(it) - place(-it)) / (2 * step) for it in steps], axis=1)
+    return np.stack([(place(value) - place(-value)) / (2 * step) for value in steps], axis=1)
 
 
 def real() -> str:
     """The tables of real data; a line that says so where these are not here."""
     if not DATA.is_dir():
         return "The folder of real measurements is not here (../shared/data)."
-    return "\n\n".join(it() for it in first((irb120, rokae, talos)))
+    return "\n\n".join(item() for item in first((irb120, rokae, talos)))
 
 
 def irb120() -> str:
@@ -292,7 +293,9 @@ def rokae() -> str:
     """A laser's poses of a six-axis arm."""
     known = known_of(thirdparty.rokae(DATA))
     folds = cross_validated(lambda held: thirdparty.rokae(DATA, held), 30)
-    levels = [it for it in known.robot_arm.kinematics.result.levels if it.level == "geometry"]
+    levels = [
+        level for level in known.robot_arm.kinematics.result.levels if level.level == "geometry"
+    ]
     found = known.findings.rms
     return prose(
         f"""**ROKAE-type arm**: 30 poses by a laser that is taken as of 0.02 mm and 0.1 mrad.

@@ -48,8 +48,8 @@ SESSIONS = Path(__file__).parents[3] / "shared" / "data" / "sessions"
 # Stops on which the frames of another recording are fitted, and how often these are drawn.
 ANCHORS, DRAWS = 12, 6
 _STEPS = 40
-SERIES = {it: f"ur10_tracker_series_{it}" for it in "ac"}
-MECA = {it: f"meca500_tracker_{it}" for it in ("small", "large")}
+SERIES = {name: f"ur10_tracker_series_{name}" for name in "ac"}
+MECA = {name: f"meca500_tracker_{name}" for name in ("small", "large")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ def recording(name: str) -> Recording:
         quaternions = [[float(row[f"meas_q{axis}"]) for axis in "xyzw"] for row in rows]
         read[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix()
     stops = [row.get("stop", str(at)) for at, row in enumerate(rows)]
-    firsts = [stops.index(it) for it in dict.fromkeys(stops)]
+    firsts = [stops.index(stop) for stop in dict.fromkeys(stops)]
     for at in firsts:
         mine = [row for row, stop in enumerate(stops) if stop == stops[at]]
         read[at, :3, 3] = read[mine, :3, 3].mean(axis=0)
@@ -84,11 +84,11 @@ def recording(name: str) -> Recording:
 def part_of(name: str, count: int, seed: int, folder: Path) -> Session:
     """So many stops of a recording, drawn from those that its session does not hold back."""
     lines = (SESSIONS / name / "views.csv").read_text().splitlines()
-    rows = [it for it in lines[1:] if "holdout" not in it]
+    rows = [line for line in lines[1:] if "holdout" not in line]
     chosen = np.sort(np.random.default_rng(seed).choice(len(rows), count, replace=False))
     folder.mkdir(parents=True)
     (folder / "session.toml").write_text((SESSIONS / name / "session.toml").read_text())
-    (folder / "views.csv").write_text("\n".join([lines[0], *(rows[it] for it in chosen), ""]))
+    (folder / "views.csv").write_text("\n".join([lines[0], *(rows[index] for index in chosen), ""]))
     return Session.load(folder)
 
 
@@ -190,8 +190,8 @@ def carried_over(known: RunState, other: Recording) -> Carried:
         own = np.sum((taken @ among[np.ix_(mine, mine)]) * taken, axis=1)
         variances = np.diag(among)[places] + 2.0 * cross + own
         predicted.append(variances.reshape(-1, 3).sum(axis=1) + session)
-    found = {name: np.concatenate(it) for name, it in squares.items()}
-    rms = {name: 1e3 * float(np.sqrt(it.mean())) for name, it in found.items()}
+    found = {name: np.concatenate(square) for name, square in squares.items()}
+    rms = {name: 1e3 * float(np.sqrt(array.mean())) for name, array in found.items()}
     every = np.arange(len(other.q))
     x, z, _ = placed(calibrated, other, every, (edges[0], edges[1]))
     left = residuals(calibrated, other, x, z)[:, 3:]
@@ -219,7 +219,7 @@ def cross_row(words: str, session: Session, other: Recording) -> str:
     seconds = time.process_time() - begun
     before = without_functions(session)
     found, was = carried_over(ours, other), carried_over(before, other)
-    levels = [it.robot_arm.kinematics for it in (before, ours)]
+    levels = [run_state.robot_arm.kinematics for run_state in (before, ours)]
     return (
         f"| {words} | {levels[1].level} "
         f"| {levels[0].result.chosen.held_out_mm:.3f}, {levels[1].result.chosen.held_out_mm:.3f} "
@@ -254,7 +254,7 @@ def crossings(folder: Path) -> list[str]:
 def within(words: str, session: Session) -> str:
     """One line of the second table: stops left out, before and now."""
     before, ours = without_functions(session), known_of(session)
-    was, now = (it.robot_arm.kinematics.result for it in (before, ours))
+    was, now = (run_state.robot_arm.kinematics.result for run_state in (before, ours))
     return (
         f"| {words} | {was.nominal.held_out_mm:.3f} | {was.level}, {was.chosen.held_out_mm:.3f} "
         f"| {now.level}, {now.chosen.held_out_mm:.3f} | {ours.verdict.status} |"
@@ -326,7 +326,7 @@ class World:
         for q in (inside, outside):
             variances = data.place_sigmas_m(q) ** 2 if data else np.array([np.nan])
             ratios.append(away(ours, q).mean() / variances.mean())
-        errors = [away(it, outside).mean() for it in (before, ours)]
+        errors = [away(run_state, outside).mean() for run_state in (before, ours)]
         return (
             ours.robot_arm.kinematics.level == FUNCTIONS,
             1e3 * float(np.sqrt(away(ours, inside).mean())),
@@ -346,12 +346,13 @@ class World:
         stated = arm.kinematics.nominal.fit.state.edges
         written = document(result, "robot-dh")
         beside = document(result, "robot-dh", Selection(with_corrections=True))
-        alone, plain = (Robot.from_document(tomllib.loads(it.text)) for it in (written, beside))
+        alone, plain = (Robot.from_document(tomllib.loads(item.text)) for item in (written, beside))
         text = document(result, "joint-corrections").text
-        lines = [it.split(",") for it in text.splitlines() if not it.startswith("#")][1:]
+        lines = [line.split(",") for line in text.splitlines() if not line.startswith("#")][1:]
         joints = result.robot.joint_names
         tables = [
-            np.array([it[1:3] for it in lines if it[0] == joint], dtype=float).T for joint in joints
+            np.array([line[1:3] for line in lines if line[0] == joint], dtype=float).T
+            for joint in joints
         ]
         inverse = Inverse(plain)
 
@@ -366,11 +367,13 @@ class World:
             nominal = arm.matched.arm
             wanted = nominal.base_from_flange(q)
             sent = correct(result, wanted, q).q
-            angles = np.array([inverse.solve(*it).positions for it in zip(wanted, q, strict=True)])
+            angles = np.array(
+                [inverse.solve(*pair).positions for pair in zip(wanted, q, strict=True)]
+            )
             by_table = np.column_stack(
                 [
-                    it + np.deg2rad(np.interp(np.rad2deg(it), *table))
-                    for it, table in zip(angles.T, tables, strict=True)
+                    column + np.deg2rad(np.interp(np.rad2deg(column), *table))
+                    for column, table in zip(angles.T, tables, strict=True)
                 ]
             )
             apart = result.standing(sent) - result.standing(by_table)
@@ -384,9 +387,9 @@ class World:
                     1e6 * float(np.linalg.norm(apart[:, :3, 3], axis=1).max()),
                 ]
             )
-        said = [it for it in written.warnings if "leave the least" in it]
+        said = [warning for warning in written.warnings if "leave the least" in warning]
         figures = re.findall(r"([\d.]+) mm rms", said[0]) if said else ["0", "0"]
-        return [[*row, float(it)] for row, it in zip(rows, figures, strict=True)]
+        return [[*row, float(figure)] for row, figure in zip(rows, figures, strict=True)]
 
     def uses(self, worlds: int) -> list[str]:
         """Lines of the fourth table."""
@@ -494,9 +497,9 @@ def main(worlds: int) -> None:
     rows = first(WORLD_ROWS)
     if QUICK:
         rows = [replace(rows[0], length_rad=0.25)]
-    simulated = [it.row(worlds) for it in rows]
-    surely = [it.sigmas(wished(20, place=1)) for it in first(SIGMA_ROWS)]
-    uses = [line for it in first(USED_ROWS) for line in it.uses(worlds)]
+    simulated = [row.row(worlds) for row in rows]
+    surely = [world.sigmas(wished(20, place=1)) for world in first(SIGMA_ROWS)]
+    uses = [line for world in first(USED_ROWS) for line in world.uses(worlds)]
     with get_context("spawn").Pool(1, maxtasksperchild=1) as pool:
         costs = pool.map(cost, few(COSTS, (30,)), chunksize=1)
     text = "\n".join(

@@ -116,8 +116,13 @@ def main() -> None:
     for seed in range(few(3, 1)):
         cell = cell_of(seed)
         positions = corner_positions(cell.options.target)
-        stack = CornerStack.of({it.view: it for it in cell.corners}, positions)
-        stacks = [CornerStack.of({it.view: it}, positions) for it in cell.corners]
+        stack = CornerStack.of(
+            {view_corners.view: view_corners for view_corners in cell.corners}, positions
+        )
+        stacks = [
+            CornerStack.of({view_corners.view: view_corners}, positions)
+            for view_corners in cell.corners
+        ]
         rng = np.random.default_rng(seed)
         start = State(np.stack([*cell.transforms.values()]), np.zeros(0))
         start = start.moved(2e-3 * rng.standard_normal(12))

@@ -98,16 +98,18 @@ def main(share: float) -> None:
             folder = Path(place)
             for _ in range(kills):
                 killed(kind, folder, rng.uniform(0.0, MOST_S[kind]))
-                hidden = [it.name for it in folder.iterdir() if it.name.startswith(".")]
+                hidden = [path.name for path in folder.iterdir() if path.name.startswith(".")]
                 found["in a switch"] += ".visioncal-switch" in hidden
                 found["leftovers"] += bool(hidden)
                 found["mixed"] += len(numbers(folder)) != 1
                 write(folder, 0)
                 found["left after the next"] += sorted(FILES) != sorted(
-                    it.name for it in folder.iterdir() if not it.is_symlink()
+                    path.name for path in folder.iterdir() if not path.is_symlink()
                 )
         columns = ("in a switch", "leftovers", "mixed", "left after the next")
-        lines.append(f"| {kind} | {kills} | {' | '.join(str(found[it]) for it in columns)} |")
+        lines.append(
+            f"| {kind} | {kills} | {' | '.join(str(found[column]) for column in columns)} |"
+        )
         print(lines[-1])
     if share == 1.0:
         table = [

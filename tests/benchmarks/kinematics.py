@@ -77,7 +77,7 @@ def dirty(options: CellOptions) -> tuple[float, ...]:
     for known in (ours, links, corners_alone(links)):
         model = known.robot_arm.model
         errors.append(errors[0] if model is None else error_m(cell, known, model.robot))
-    return tuple(1e3 * it for it in errors)
+    return tuple(1e3 * error for error in errors)
 
 
 def without_blocks(cell: Cell, **changes: object) -> RunState:
@@ -86,7 +86,7 @@ def without_blocks(cell: Cell, **changes: object) -> RunState:
     camera = told.document["camera"] | {"intrinsics": "hold"}
     session = replace(told, document=told.document | {"camera": camera})
     known, all_levels = known_of(cell, session=session, **changes), levels.LEVELS
-    levels.LEVELS = {it: all_levels[it] for it in ("offsets", "geometry")}
+    levels.LEVELS = {name: all_levels[name] for name in ("offsets", "geometry")}
     for stage in STAGES:
         if stage.name not in ("robot", "detect"):
             known = stage.run(known)
@@ -153,7 +153,9 @@ def main(worlds: int) -> None:
     with Pool() as pool:
 
         def run(function, options: CellOptions) -> np.ndarray:
-            return np.array(pool.map(function, [replace(options, seed=it) for it in range(worlds)]))
+            return np.array(
+                pool.map(function, [replace(options, seed=index) for index in range(worlds)])
+            )
 
         ideal = [ideal_row(words, row, run(measured, row)) for words, row in first(rows)]
         mixed = [dirty_row(row, run(dirty, row)) for row in first(worst)]

@@ -121,13 +121,13 @@ def main(cells: int) -> None:
     with Pool() as pool:
         for row in first(WORLDS):
             kept = pool.map(of_one_cell, [(row, seed) for seed in range(cells)], chunksize=2)
-            found = [it for it in kept if it is not None]
+            found = [mapping for mapping in kept if mapping is not None]
             for way in ("plane", "board", "marker"):
-                picks = [it for cell in found for it in cell[way]]
+                picks = [item for cell in found for item in cell[way]]
                 everything += picks
                 rows.append((row.words, way, str(len(picks)), *figures(picks),
                              str(len(kept) - len(found))))  # fmt: skip
-    share = 100 * np.mean([it.in_region for it in everything])
+    share = 100 * np.mean([item.in_region for item in everything])
     text = f"""Simulated UR10e cells of 20 views and {PICKS} picks each, at a new stop, with the
 noise of robot and pixels drawn anew. A good robot errs by 0.03 mm and 0.05 mrad a stop, a coarse
 one by 0.3 mm and 0.5 mrad. Planes are tilted against the view by 30 degrees or so, and half of them
@@ -146,11 +146,11 @@ Of all {len(everything)} picks the region holds {share:.1f} %.
 
 def figures(picks: Sequence[Outcome]) -> tuple[str, ...]:
     return (
-        f"{100 * np.mean([it.in_region for it in picks]):.1f} %",
-        f"{100 * np.mean([it.in_ball for it in picks]):.1f} %",
-        f"{np.median([it.error_mm for it in picks]):.2f}",
-        f"{np.median([it.radius95_mm for it in picks]):.2f}",
-        f"{1e3 * np.median([it.taken_s for it in picks]):.1f}",
+        f"{100 * np.mean([pick.in_region for pick in picks]):.1f} %",
+        f"{100 * np.mean([pick.in_ball for pick in picks]):.1f} %",
+        f"{np.median([pick.error_mm for pick in picks]):.2f}",
+        f"{np.median([pick.radius95_mm for pick in picks]):.2f}",
+        f"{1e3 * np.median([pick.taken_s for pick in picks]):.1f}",
     )
 
 

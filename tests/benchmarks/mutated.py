@@ -48,25 +48,25 @@ def by_command(ended: Sequence[Ended]) -> list[str]:
         f"| command | {' | '.join(_COLUMNS)} | slowest [s] | most memory [MB] |",
         "| --- |" + " --- |" * len(_COLUMNS) + " ---: | ---: |",
     ]
-    for command in sorted({it.reading.command for it in ended}):
-        mine = [it for it in ended if it.reading.command == command]
+    for command in sorted({item.reading.command for item in ended}):
+        mine = [item for item in ended if item.reading.command == command]
         cells = []
         for kind in _COLUMNS:
-            counts = Counter(it.status for it in mine if it.kind == kind)
-            cells.append(", ".join(f"{counts[it]} x {it}" for it in sorted(counts)))
-        slowest = max(it.seconds for it in mine)
-        most = max(it.peak_bytes for it in mine) / 1e6
+            counts = Counter(item.status for item in mine if item.kind == kind)
+            cells.append(", ".join(f"{counts[count]} x {count}" for count in sorted(counts)))
+        slowest = max(item.seconds for item in mine)
+        most = max(item.peak_bytes for item in mine) / 1e6
         rows.append(f"| {command} | {' | '.join(cells)} | {slowest:.1f} | {most:.0f} |")
     return rows
 
 
 def reasons(ended: Sequence[Ended]) -> list[str]:
     """The rows of a table: why inputs were refused."""
-    found = Counter(reason(it.message) for it in ended if it.status == 2)
-    often = [(words, it) for words, it in found.most_common() if it * RARE > len(ended)]
+    found = Counter(reason(item.message) for item in ended if item.status == 2)
+    often = [(words, index) for words, index in found.most_common() if index * RARE > len(ended)]
     rows = ["| refused because | times |", "| --- | ---: |"]
-    rows += [f"| {words} | {it} |" for words, it in often]
-    rest = found.total() - sum(it for _, it in often)
+    rows += [f"| {words} | {index} |" for words, index in often]
+    rest = found.total() - sum(index for _, index in often)
     return [*rows, f"| {len(found) - len(often)} other reasons | {rest} |"]
 
 
@@ -80,18 +80,20 @@ def main() -> None:
     ended: list[Ended] = []
     with tempfile.TemporaryDirectory() as folder:
         numbers = quick if asked.quick else whole
-        for it in walk(numbers, Path(folder), seed=asked.seed, processes=asked.processes):
-            ended.append(it)
-            if it.faults or (it.number < 0 and it.status != it.reading.sound):
-                print(it, flush=True)
-    mutants = [it for it in ended if it.number >= 0]
-    wrong = [it for it in ended if it.faults]
-    statuses = Counter(it.status for it in mutants)
-    slowest, largest = max(it.seconds for it in ended), max(it.peak_bytes for it in ended)
+        for item in walk(numbers, Path(folder), seed=asked.seed, processes=asked.processes):
+            ended.append(item)
+            if item.faults or (item.number < 0 and item.status != item.reading.sound):
+                print(item, flush=True)
+    mutants = [item for item in ended if item.number >= 0]
+    wrong = [item for item in ended if item.faults]
+    statuses = Counter(mutant.status for mutant in mutants)
+    slowest, largest = max(item.seconds for item in ended), max(item.peak_bytes for item in ended)
     text = "\n".join(
         [
             f"{len(mutants)} mutants of {len(READINGS)} readings, seed {asked.seed}: "
-            + ", ".join(f"{statuses[it]} with exit status {it}" for it in sorted(statuses))
+            + ", ".join(
+                f"{statuses[statuse]} with exit status {statuse}" for statuse in sorted(statuses)
+            )
             + f"; {len(wrong)} with a traceback, another status, an earlier output that changed, "
             "an unclear refusal, JSON that is none, or beyond the limits of "
             f"{LONGEST_S:.0f} s and {MOST_BYTES / 1024**3:.0f} GiB. The slowest took "

@@ -109,7 +109,7 @@ def of_poses(cell: Cell) -> RunState:
 def numbers(matrix: FloatArray) -> list[str]:
     """The cells of a pose."""
     pose = RigidTransform.from_matrix(matrix)
-    return [repr(float(it)) for it in (*pose.translation, *pose.rotation.as_quat())]
+    return [repr(float(value)) for value in (*pose.translation, *pose.rotation.as_quat())]
 
 
 def lands(
@@ -151,10 +151,15 @@ def in_bins(found: Sequence[Outcome]) -> list[tuple[str, ...]]:
     """By ten bins of what is stated: cells, means of stated and landed, and the difference."""
     rows = []
     for low in np.arange(BINS) / BINS:
-        mine = [it for it in found if low <= it.stated < low + 1.0 / BINS or it.stated == low == 1]
+        mine = [
+            outcome
+            for outcome in found
+            if low <= outcome.stated < low + 1.0 / BINS or outcome.stated == low == 1
+        ]
         if mine:
             stated, landed = (
-                np.array([getattr(it, name) for it in mine]) for name in ("stated", "landed")
+                np.array([getattr(outcome, name) for outcome in mine])
+                for name in ("stated", "landed")
             )
             error = float(np.std(landed - stated) / np.sqrt(len(mine)))
             rows.append(
@@ -168,15 +173,21 @@ def in_bins(found: Sequence[Outcome]) -> list[tuple[str, ...]]:
 def by_kinds(found: Sequence[Outcome]) -> list[tuple[str, ...]]:
     """The same over all bins, by mount, by what was seen, and by what is needed."""
     rows = []
-    kinds = {f"{mount}, {seen}": (mount, seen) for mount, seen in sorted({it.kind for it in found})}
-    groups = {words: [it for it in found if it.kind == kind] for words, kind in kinds.items()}
+    kinds = {
+        f"{mount}, {seen}": (mount, seen)
+        for mount, seen in sorted({outcome.kind for outcome in found})
+    }
+    groups = {
+        words: [outcome for outcome in found if outcome.kind == kind]
+        for words, kind in kinds.items()
+    }
     groups |= {
-        "need of place": [it for it in found if not it.both],
-        "need of place and rotation": [it for it in found if it.both],
+        "need of place": [outcome for outcome in found if not outcome.both],
+        "need of place and rotation": [outcome for outcome in found if outcome.both],
     }
     for words, mine in groups.items():
         if mine:
-            away = np.array([it.landed - it.stated for it in mine])
+            away = np.array([outcome.landed - outcome.stated for outcome in mine])
             error = float(np.std(away) / np.sqrt(len(mine)))
             rows.append((words, str(len(mine)), f"{100 * away.mean():+.1f} ({100 * error:.1f})"))
     return rows
@@ -186,7 +197,7 @@ def main(cells: int) -> None:
     """Prints the tables and keeps them."""
     with Pool(2) as pool:
         kept = pool.map(of_one_cell, range(cells), chunksize=2)
-    found = [it for it in kept if it is not None]
+    found = [outcome for outcome in kept if outcome is not None]
     text = f"""{cells} simulated UR10e cells of 8 to 30 views, both mounts; robots that err by 0.02
 to 0.4 mm and 0.01 to 1.2 mrad a stop; corners with 0.05 to 0.3 px of noise, the lens given
 or estimated, or poses; tilts from 0.1 to 0.7 rad; the board known to 0.1 %. Of each, {PICKS} picks

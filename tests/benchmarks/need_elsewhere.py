@@ -78,7 +78,7 @@ def lands(
     """(p,) whether picks at times spread over the session come near enough."""
     at, noise = rng.integers(len(case.boards), size=PICKS), noise_of(case, rng)
     in_camera, found = case.boards[at], known.solved.state.edges[0]
-    shown = np.array([in_image(case, eye, known, it, rng) for it in in_camera])
+    shown = np.array([in_image(case, eye, known, value, rng) for value in in_camera])
     if case.mount == "eye-in-hand":
         robot = case.flanges(in_camera)
         meant = robot @ case.x @ in_camera @ TO_MIDDLE
@@ -103,7 +103,7 @@ def reported(case: Case, flanges: FloatArray) -> FloatArray:
 def noise_of(case: Case, rng: np.random.Generator) -> FloatArray:
     """(2 p, 4, 4) the robot's noise, at each look and behind it at its pick."""
     sigmas = np.repeat([case.world.robot_rad, case.world.robot_m], 3)
-    return np.array([exp(it) for it in sigmas * case.world.noise((2 * PICKS, 6), rng)])
+    return np.array([exp(value) for value in sigmas * case.world.noise((2 * PICKS, 6), rng)])
 
 
 def in_image(
@@ -121,23 +121,23 @@ def main(seeds: int) -> None:
     """Prints the tables and keeps them."""
     worlds = first(list(WORLDS))
     every = [
-        it
-        for it in product(worlds, ("eye-in-hand", "eye-to-hand"), (True, False), range(seeds))
-        if it[2] or WORLDS[it[0]].off_px == 0.0
+        pair
+        for pair in product(worlds, ("eye-in-hand", "eye-to-hand"), (True, False), range(seeds))
+        if pair[2] or WORLDS[pair[0]].off_px == 0.0
     ]
     with tempfile.TemporaryDirectory() as folder, Pool(2) as pool:
         kept = pool.map(partial(of_one_cell, folder=Path(folder)), every, chunksize=2)
-    found = [it for it in kept if it is not None]
+    found = [trial for trial in kept if trial is not None]
     rows = []
     for world in worlds:
-        mine = [it for it in found if it.world == world]
-        rows.append((world, *(in_words(it) for it in (
+        mine = [trial for trial in found if trial.world == world]
+        rows.append((world, *(in_words(group) for group in (
             mine,
-            [it for it in mine if it.outcome.kind[0] == "eye-in-hand"],
-            [it for it in mine if it.outcome.kind[0] == "eye-to-hand"],
-            [it for it in mine if it.status == "good"],
+            [trial for trial in mine if trial.outcome.kind[0] == "eye-in-hand"],
+            [trial for trial in mine if trial.outcome.kind[0] == "eye-to-hand"],
+            [trial for trial in mine if trial.status == "good"],
         ))))  # fmt: skip
-    bins = in_bins([it.outcome for it in found])
+    bins = in_bins([trial.outcome for trial in found])
     text = f"""{len(every)} cells of `elsewhere.py`, {seeds} seeds of each; {PICKS} picks of each.
 {len(every) - len(found)} sessions were refused. The standard error is in brackets.
 
@@ -155,7 +155,7 @@ def in_words(trials: Sequence[Trial]) -> str:
     """By how much picks land more often than stated, with its standard error [percent points]."""
     if not trials:
         return "none"
-    away = 100 * np.array([it.outcome.landed - it.outcome.stated for it in trials])
+    away = 100 * np.array([trial.outcome.landed - trial.outcome.stated for trial in trials])
     return f"{away.mean():+.1f} ({float(np.std(away)) / np.sqrt(len(away)):.1f})"
 
 

@@ -32,18 +32,20 @@ def drawn(options: NetworkOptions, seed: int) -> NetworkOptions:
     rng = np.random.default_rng([seed, 41])
     boards = tuple(
         replace(
-            it,
+            board,
             scale=1.0
-            + it.target.square_sigma_m / it.target.square_m * float(rng.standard_normal()),
+            + board.target.square_sigma_m / board.target.square_m * float(rng.standard_normal()),
         )
-        for it in options.boards
+        for board in options.boards
     )
     return replace(options, boards=boards, seed=seed)
 
 
 def aligned(cell: Network) -> Alignment:
     session = network_session(cell, "network", seen="names")
-    return align(session, corners={it.view: it for it in cell.corners})
+    return align(
+        session, corners={view_corners.view: view_corners for view_corners in cell.corners}
+    )
 
 
 def away(cell: Network, found: Alignment, frames: Sequence[str]) -> FloatArray:
@@ -75,7 +77,7 @@ def clean(seed: int) -> Clean:
     taken = time.process_time() - begin
     bound = network_bound(cell)
     error, covariance = away(cell, found, ["base_b"]), found.edge_of("base_b").covariance
-    frames = [it.partition("_from_")[2] for it in found.edges]
+    frames = [edge.partition("_from_")[2] for edge in found.edges]
     every = away(cell, found, frames)
     return Clean(
         error,
@@ -109,10 +111,10 @@ def faulty(seed: int) -> Faulty:
     cell = simulate_network(replace(options, moved=(half, bumped), swapped_rows=1, stray_images=6))
     good = simulate_network(options)
     found, before = aligned(cell), aligned(good)
-    told = [_tells(found, it) for it in (half, bumped)]
-    reasons = {it.view: it.reason for it in found.sights if not it.used}
-    wrong = [it for it in cell.wrong_views if it in reasons]
-    exchanged = [it for it in wrong if "exchanged" in reasons[it]]
+    told = [_tells(found, move) for move in (half, bumped)]
+    reasons = {sight.view: sight.reason for sight in found.sights if not sight.used}
+    wrong = [view for view in cell.wrong_views if view in reasons]
+    exchanged = [index for index in wrong if "exchanged" in reasons[index]]
     besides = len(found.moved) - sum(told) + len(reasons) - len(wrong)
     return Faulty(
         *told,
@@ -127,8 +129,8 @@ def faulty(seed: int) -> Faulty:
 def _tells(found: Alignment, push: Moved) -> bool:
     """Whether a push is named, and between which stops it happened."""
     return any(
-        it.frame == push.frame and it.last_stop < (push.from_stop or 0) <= it.first_stop
-        for it in found.moved
+        move.frame == push.frame and move.last_stop < (push.from_stop or 0) <= move.first_stop
+        for move in found.moved
     )
 
 
@@ -153,15 +155,17 @@ def four_cameras_s() -> float:
 
 
 def report(cells: Sequence[Clean], faults: Sequence[Faulty], four_s: float) -> str:
-    errors = np.array([it.error for it in cells])
-    bound = np.array([it.bound for it in cells]).mean(axis=0)
+    errors = np.array([cell.error for cell in cells])
+    bound = np.array([cell.bound for cell in cells]).mean(axis=0)
     over = [
         float(np.sqrt(np.mean(np.sum(errors[:, at] ** 2, axis=1)) / bound[at].sum()))
         for at in (slice(3, 6), slice(0, 3))
     ]
-    nees = [float(np.mean([getattr(it, name) for it in cells])) for name in ("nees", "nees_all")]
-    rms = [float(np.sqrt(np.mean(np.square(it)))) for it in
-           ([it.error_mm for it in faults], [it.clean_mm for it in faults])]  # fmt: skip
+    nees = [
+        float(np.mean([getattr(cell, name) for cell in cells])) for name in ("nees", "nees_all")
+    ]
+    errors = ([fault.error_mm for fault in faults], [fault.clean_mm for fault in faults])
+    rms = [float(np.sqrt(np.mean(np.square(group)))) for group in errors]
 
     def share(values: Sequence[bool]) -> str:
         return f"{sum(values)} of {len(values)}"
@@ -182,17 +186,18 @@ def report(cells: Sequence[Clean], faults: Sequence[Faulty], four_s: float) -> s
             "",
             "| named | cells |",
             "| --- | ---: |",
-            f"| the board that moved, and when | {share([it.board for it in faults])} |",
-            f"| the camera that was bumped, and when | {share([it.camera for it in faults])} |",
-            f"| the two rows as exchanged | {share([it.swap for it in faults])} |",
-            f"| all six images of other stops | {share([it.strays == 6 for it in faults])} |",
-            f"| nothing besides | {share([it.false == 0 for it in faults])} |",
+            f"| the board that moved, and when | {share([fault.board for fault in faults])} |",
+            "| the camera that was bumped, and when "
+            f"| {share([fault.camera for fault in faults])} |",
+            f"| the two rows as exchanged | {share([fault.swap for fault in faults])} |",
+            f"| all six images of other stops | {share([fault.strays == 6 for fault in faults])} |",
+            f"| nothing besides | {share([fault.false == 0 for fault in faults])} |",
             "",
             f"Base b is off by {rms[0]:.3f} mm (root mean square), in the same cells without "
             f"faults by {rms[1]:.3f} mm.",
             "",
             f"Four cameras at 40 stops, corners found: {four_s:.2f} s; a clean cell above: "
-            f"{np.median([it.taken_s for it in cells]):.2f} s.",
+            f"{np.median([cell.taken_s for cell in cells]):.2f} s.",
         ]
     )
 

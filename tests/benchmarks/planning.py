@@ -57,8 +57,8 @@ def duel(name: str, options: CellOptions) -> tuple[FloatArray, FloatArray]:
     truth = worlds_of([true_cell(options)], purpose, q)[0]
     errors, expected = [], []
     for rows in (planned, random):
-        real = [simulate(replace(options, draw=it), q[rows]) for it in range(DRAWS)]
-        errors.append([error(it, calibrated(it)) for it in real])
+        real = [simulate(replace(options, draw=index), q[rows]) for index in range(DRAWS)]
+        errors.append([error(cell, calibrated(cell)) for cell in real])
         expected.append(expected_mm(truth, rows))
     return np.array(errors), np.array(expected)
 
@@ -82,7 +82,7 @@ def edge_error(cell: Cell, known: RunState) -> FloatArray:
 
 def duels_row(name: str, options: CellOptions, found: list[tuple[FloatArray, FloatArray]]) -> str:
     """One line of the first table."""
-    errors, expected = (np.array(it) for it in zip(*found, strict=True))
+    errors, expected = (np.array(pair) for pair in zip(*found, strict=True))
     # Worlds and draws alike.
     errors = np.concatenate(np.moveaxis(errors, 2, 1))
     rms, ratios = np.sqrt(np.mean(errors**2, axis=0)), expected[:, 1] / expected[:, 0]
@@ -106,7 +106,7 @@ def criteria(options: CellOptions, name: str) -> str:
     rng = np.random.default_rng(0)
     draws = [expected_mm(truth, rng.choice(len(q), count, replace=False)) for _ in range(100)]
     cells = [
-        f"{expected_mm(truth, chosen(worlds, count, criterion=it).rows):.3g}" for it in CRITERIA
+        f"{expected_mm(truth, chosen(worlds, count, criterion=word).rows):.3g}" for word in CRITERIA
     ]
     return f"| {name} | {count} | {' | '.join(cells)} | {np.median(draws):.3g} | {min(draws):.3g} |"
 
@@ -237,7 +237,7 @@ def at_noise(begun: Begun, added: FloatArray, known: RunState) -> tuple[float, f
 
 def one_axis_row(mount: str, found: FloatArray) -> str:
     """One line of the last table."""
-    predicted, equal, obtained, error = (found[:, it : it + 2] for it in range(0, 8, 2))
+    predicted, equal, obtained, error = (found[:, index : index + 2] for index in range(0, 8, 2))
     ratios, first = obtained / equal, obtained / predicted
     honest = np.sqrt(np.mean((error / obtained) ** 2, axis=0))
     return (
@@ -251,19 +251,24 @@ def one_axis_row(mount: str, found: FloatArray) -> str:
 
 def main(worlds: int) -> None:
     """Prints the tables and keeps them."""
-    rows = [("kinematics", replace(ARM, mount=it)) for it in MOUNTS]
-    rows += [("hand-eye", replace(HAND_EYE, mount=it)) for it in MOUNTS]
+    rows = [("kinematics", replace(ARM, mount=mount)) for mount in MOUNTS]
+    rows += [("hand-eye", replace(HAND_EYE, mount=mount)) for mount in MOUNTS]
     with Pool() as pool:
 
         def run(function: partial, options: CellOptions | None = None) -> list:
             if options is None:
                 return pool.map(function, range(worlds), 1)
-            return pool.map(function, [replace(options, seed=it) for it in range(worlds)], 1)
+            return pool.map(function, [replace(options, seed=index) for index in range(worlds)], 1)
 
-        duels = [duels_row(name, it, run(partial(duel, name), it)) for name, it in first(rows)]
-        axes = [one_axis_row(it, np.array(run(partial(one_axis, it)))) for it in first(MOUNTS)]
+        duels = [
+            duels_row(name, cell_options, run(partial(duel, name), cell_options))
+            for name, cell_options in first(rows)
+        ]
+        axes = [
+            one_axis_row(name, np.array(run(partial(one_axis, name)))) for name in first(MOUNTS)
+        ]
         seen = [
-            bad_guess_row(arm, {it: run(partial(bad_guess, it, arm)) for it in MOUNTS})
+            bad_guess_row(arm, {mount: run(partial(bad_guess, mount, arm)) for mount in MOUNTS})
             for arm in first(ARMS)
         ]
     text = "\n".join(
@@ -291,7 +296,7 @@ def main(worlds: int) -> None:
             f"\nCPU seconds to find {CANDIDATES} possible stops (how many there were):\n",
             "| arm | eye-in-hand, fair guess | bad guess | eye-to-hand, fair guess | bad guess |",
             "| --- | --- | --- | --- | --- |",
-            *(search_row(it) for it in first(ARMS)),
+            *(search_row(name) for name in first(ARMS)),
             "\nOf 20 planned stops, those that see the whole board [%] where both guesses are off",
             f"by {1e2 * BAD_M:.0f} cm and {np.rad2deg(BAD_RAD):.0f} deg, and are said to be:\n",
             "| arm | eye-in-hand, mean | worst world | eye-to-hand, mean | worst world |",

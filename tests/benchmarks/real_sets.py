@@ -37,9 +37,9 @@ def row_of(session: Path) -> tuple[str, ...]:
         result = visioncal.calibrate(session)
     except VisioncalError as refused:
         return session.name, "refused", *[""] * 4, first_words(str(refused))
-    unused = [it.view for it in result.views if not it.used]
+    unused = [view.view for view in result.views if not view.used]
     words = " ".join(map(str, unused)) if len(unused) < 15 else f"{len(unused)} views"
-    sigmas = [both(it.sigma_mm, it.sigma_deg) for it in result.placed.values()]
+    sigmas = [both(edge.sigma_mm, edge.sigma_deg) for edge in result.placed.values()]
     held_out, park = result.validation.held_out, result.solvers.get("park")
     return (
         session.name,
@@ -54,12 +54,12 @@ def row_of(session: Path) -> tuple[str, ...]:
 
 def main() -> None:
     """Prints the table and keeps it."""
-    sessions = [it for it in sorted(SESSIONS.iterdir()) if (it / "session.toml").is_file()]
-    wished = [it for it in sessions if it.name in WORDS] if WORDS else sessions
+    sessions = [path for path in sorted(SESSIONS.iterdir()) if (path / "session.toml").is_file()]
+    wished = [session for session in sessions if session.name in WORDS] if WORDS else sessions
     with Pool(WORKERS) as pool:
         rows = pool.map(row_of, wished[-1:] if QUICK else wished, chunksize=1)
     lines = [HEAD, ["---"] * len(HEAD), *rows]
-    table = "\n".join("| " + " | ".join(it) + " |" for it in lines)
+    table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
     print(table)
     if not WORDS:
         text = f"""Sigmas are those of the camera and of the board or, by an instrument, of its

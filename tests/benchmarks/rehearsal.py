@@ -116,7 +116,7 @@ def faults(folder: Path) -> str:
         _, scene, bench = stage(place, FAULT_STOPS)
         with closing(bench):
             taken = recorded(bench, scene, place / "session", [], fault, view=False)
-        suffered, views = taken.fault, sum(isinstance(it.found, Taken) for it in taken.steps)
+        suffered, views = taken.fault, sum(isinstance(step.found, Taken) for step in taken.steps)
         stood = "" if suffered.stood_after_s is None else f"{suffered.stood_after_s:.2f}"
         message = suffered.message.replace(str(place), "...")
         lines.append(
@@ -211,8 +211,8 @@ def kills(folder: Path) -> str:
         program = [sys.executable, str(_PROGRAM), "record", bench.controller.host]
         session = folder / "session"
         ends = kill_and_resume(session, KILL_STOPS, KILLS, SEED, LATEST_KILL_S, program)
-    killed = [it for it in ends if not it.done]
-    moments = ", ".join(f"{it.after_s:.1f} s ({it.acknowledged})" for it in killed)
+    killed = [end for end in ends if not end.done]
+    moments = ", ".join(f"{item.after_s:.1f} s ({item.acknowledged})" for item in killed)
     return (
         f"{len(killed)} recordings killed with SIGKILL, at random moments after they had begun "
         f"(views acknowledged by then): {moments}. After each the session opened with every "

@@ -17,7 +17,7 @@ RESULTS = Path(__file__).with_name("RESULTS.md")
 _OPTION = "--quick"
 QUICK = _OPTION in sys.argv[1:]
 # What else is said behind the script's name.
-WORDS = tuple(it for it in sys.argv[1:] if it != _OPTION)
+WORDS = tuple(argument for argument in sys.argv[1:] if argument != _OPTION)
 
 _Any = TypeVar("_Any")
 _HEAD = """# What the benchmarks measured

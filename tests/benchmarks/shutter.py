@@ -95,20 +95,20 @@ def x_error(moved: Sweep, known: RunState) -> FloatArray:
 
 
 def row(world: World, found: list[Outcome]) -> str:
-    errors_ms = 1e3 * np.array([it.error_s for it in found])
-    sigmas_ms = 1e3 * np.array([it.sigma_s for it in found])
+    errors_ms = 1e3 * np.array([outcome.error_s for outcome in found])
+    sigmas_ms = 1e3 * np.array([outcome.sigma_s for outcome in found])
     cells = (
         world.words,
-        f"{sum(it.is_found for it in found)} of {len(found)}",
+        f"{sum(outcome.is_found for outcome in found)} of {len(found)}",
         f"{errors_ms.mean():+.3f}",
         f"{np.abs(errors_ms).max():.3f}",
         f"{np.median(sigmas_ms):.3f}",
         f"{np.sqrt(np.mean((errors_ms / sigmas_ms) ** 2)):.2f}",
-        f"{np.median([it.away_mm for it in found]):.3f}",
-        f"{np.median([it.sigma_mm for it in found]):.3f}",
-        f"{np.mean([it.mahalanobis_sq for it in found]):.2f}",
-        f"{np.nanmedian([it.ignoring_mm for it in found]):.3f}",
-        f"{np.nanmedian([it.ignoring_mm / it.sigma_mm for it in found]):.1f}",
+        f"{np.median([outcome.away_mm for outcome in found]):.3f}",
+        f"{np.median([outcome.sigma_mm for outcome in found]):.3f}",
+        f"{np.mean([outcome.mahalanobis_sq for outcome in found]):.2f}",
+        f"{np.nanmedian([outcome.ignoring_mm for outcome in found]):.3f}",
+        f"{np.nanmedian([outcome.ignoring_mm / outcome.sigma_mm for outcome in found]):.1f}",
     )
     return "| " + " | ".join(cells) + " |"
 

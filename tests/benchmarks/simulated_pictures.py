@@ -62,7 +62,7 @@ def main() -> None:
                 f"{np.mean(nees):.2f}, {np.sqrt(np.mean(np.square(mm))):.3f}"
                 for nees, mm in np.transpose(found, (1, 2, 0))
             ]
-            words = ", ".join(f"{count} {it}" for it, count in Counter(verdicts).items())
+            words = ", ".join(f"{count} {key}" for key, count in Counter(verdicts).items())
             lines.append(f"| {board} | {mount} | {' | '.join(cells)} | {words} |")
             print(lines[-1], flush=True)
     text = (

@@ -75,7 +75,7 @@ def fitted(task: tuple[Job, int]) -> Outcome:
 def linear_tip(made: Made) -> np.ndarray:
     """The textbook's: tip and point by linear least squares over the touches of kind `point`."""
     poses = made.touches.base_from_flange[: made.job.tips]
-    system = np.concatenate([np.hstack([it[:3, :3], -np.eye(3)]) for it in poses])
+    system = np.concatenate([np.hstack([pose[:3, :3], -np.eye(3)]) for pose in poses])
     return np.linalg.lstsq(system, -poses[:, :3, 3].ravel(), rcond=None)[0][:3]
 
 
@@ -97,15 +97,16 @@ def accuracy(run: Callable[..., Iterator[Outcome]]) -> list[str]:
     for name, job in JOBS.items():
         done = list(run(fitted, [(job, seed) for seed in range(SEEDS)]))
         tip, least, linear, turn, least_turn = (
-            np.sqrt(np.mean([getattr(it, part) for it in done]))
+            np.sqrt(np.mean([getattr(outcome, part) for outcome in done]))
             for part in ("tip", "least_tip", "linear", "turn", "least_turn")
         )
         rotation = f"{np.rad2deg(turn):.4f} | {turn / least_turn:.3f}" if job.axes else "- | -"
         size = 6 if job.axes else 3
-        lost = sum(it.lost > 0 for it in done)
+        lost = sum(outcome.lost > 0 for outcome in done)
+        squares = [outcome.mahalanobis_sq for outcome in done if not outcome.lost]
         rows.append(
             f"| {name} | {1e3 * tip:.4f} | {tip / least:.3f} | {linear / least:.3f} | {rotation} | "
-            f"{np.mean([it.mahalanobis_sq for it in done if not it.lost]) / size:.2f} | {lost} |"
+            f"{np.mean(squares) / size:.2f} | {lost} |"
         )
     return rows
 
@@ -114,7 +115,7 @@ def wrong_touches(run: Callable[..., Iterator[tuple[bool, int]]]) -> list[str]:
     rows = []
     for slip in SLIPS:
         done = list(run(named, [(Job(noise=ROBOT), slip, seed) for seed in range(SLIP_SEEDS)]))
-        found = "-" if SLIPS[slip] is None else f"{100 * np.mean([it for it, _ in done]):.1f} %"
+        found = "-" if SLIPS[slip] is None else f"{100 * np.mean([flag for flag, _ in done]):.1f} %"
         rows.append(f"| {slip} | {found} | {sum(lost > 0 for _, lost in done)} |")
     return rows
 

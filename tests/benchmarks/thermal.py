@@ -35,13 +35,14 @@ def main() -> None:
                 known = warmed(world, temperatures=temperatures)
                 seconds.append(time.perf_counter() - begun)
                 found.append(drift_of(known))
-            shares = np.array([it.share for it in found])
-            drifts = [1e3 * np.sqrt(np.mean(it.true**2)) for it in found]
-            left = [1e3 * np.sqrt(np.mean(it.left**2)) for it in found]
+            shares = np.array([drift.share for drift in found])
+            drifts = [1e3 * np.sqrt(np.mean(drift.true**2)) for drift in found]
+            left = [1e3 * np.sqrt(np.mean(drift.left**2)) for drift in found]
             rows.append(
                 f"| {arm} | {'temperatures' if temperatures else 'currents'} | "
                 f"{np.median(drifts):.2f} | {np.median(left):.3f} | {np.median(shares):.2f} | "
-                f"{shares.max():.2f} | {np.median([it.error_over_sigma for it in found]):.2f} | "
+                f"{shares.max():.2f} | "
+                f"{np.median([drift.error_over_sigma for drift in found]):.2f} | "
                 f"{np.median(seconds):.1f} |"
             )
             print(rows[-1], flush=True)

@@ -39,14 +39,14 @@ def of_one_cell(seed: int) -> Walk:
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
-    return "\n".join("| " + " | ".join(map(str, it)) + " |" for it in lines)
+    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
 
 
 def traits(walks: Sequence[Walk]) -> str:
     """What the cells were."""
     counts: dict[str, Counter[str]] = {}
-    for it in walks:
-        for trait, value in it.facts.items():
+    for item in walks:
+        for trait, value in item.facts.items():
             counts.setdefault(trait, Counter())[value] += 1
     rows = [
         (trait, ", ".join(f"{value} {count}" for value, count in of.most_common()))
@@ -57,13 +57,13 @@ def traits(walks: Sequence[Walk]) -> str:
 
 def ends(walks: Sequence[Walk]) -> str:
     """How the commands ended."""
-    steps = [step for it in walks for step in it.steps]
+    steps = [step for item in walks for step in item.steps]
     rows = []
-    for command in dict.fromkeys(it.command for it in steps):
-        of = [it for it in steps if it.command == command]
-        states = Counter(it.status for it in of)
-        taken = [it.seconds for it in of if it.seconds]
-        rows.append((command, len(of), *(states[it] for it in (0, 2, 3, 1)),
+    for command in dict.fromkeys(step.command for step in steps):
+        of = [step for step in steps if step.command == command]
+        states = Counter(step.status for step in of)
+        taken = [step.seconds for step in of if step.seconds]
+        rows.append((command, len(of), *(states[name] for name in (0, 2, 3, 1)),
                      f"{np.median(taken):.2f}" if taken else ""))  # fmt: skip
     return table(("command", "runs", "result", "refused", "said no", "bug", "median s"), rows)
 
@@ -72,11 +72,11 @@ def refusals(walks: Sequence[Walk]) -> str:
     """What was refused, by command, class and the beginning of the message."""
     found = Counter(
         (step.command, step.error, reason(step))
-        for it in walks
-        for step in it.steps
+        for item in walks
+        for step in item.steps
         if step.status == 2
     )
-    rows = [(*key, count) for key, count in sorted(found.items(), key=lambda it: -it[1])]
+    rows = [(*key, count) for key, count in sorted(found.items(), key=lambda pair: -pair[1])]
     return table(("command", "class", "message", "count"), rows)
 
 
@@ -84,7 +84,7 @@ def reason(step: Step) -> str:
     """The beginning of a message, without the names and figures of its cell."""
     words = []
     for word in step.message.replace("|", "/").split():
-        plain = word.isascii() and not any(it in "'\"0123456789" for it in word)
+        plain = word.isascii() and not any(name in "'\"0123456789" for name in word)
         kept = word if plain else "..."
         if not (kept == "..." and words and words[-1] == "..."):
             words.append(kept)
@@ -93,23 +93,23 @@ def reason(step: Step) -> str:
 
 def errors(walks: Sequence[Walk]) -> str:
     """Error over sigma, by verdict and by what may spoil it."""
-    found = [it for it in walks if it.error is not None]
+    found = [item for item in walks if item.error is not None]
     rows = [
-        _errors(verdict, [it for it in found if it.verdict == verdict])
+        _errors(verdict, [item for item in found if item.verdict == verdict])
         for verdict in ("good", "check", "bad")
     ]
-    good = [it for it in found if it.verdict == "good"]
+    good = [item for item in found if item.verdict == "good"]
     for trait in ("corners", "boards", "intrinsics", "motion", "seen"):
-        for value in sorted({it.facts[trait] for it in good}):
-            of = [it for it in good if it.facts[trait] == value]
+        for value in sorted({item.facts[trait] for item in good}):
+            of = [item for item in good if item.facts[trait] == value]
             rows.append(_errors(f"good, {trait}: {value}", of))
     head = ("cells", "number", "mean chi2 / dof", "median", f"beyond {SURPRISING:g} sigma")
     return table(head, rows)
 
 
 def _errors(words: str, of: Sequence[Walk]) -> tuple[object, ...]:
-    per_dof = [it.error.per_dof for it in of if it.error is not None]
-    beyond = sum(it.error.sigmas > SURPRISING for it in of if it.error is not None)
+    per_dof = [item.error.per_dof for item in of if item.error is not None]
+    beyond = sum(item.error.sigmas > SURPRISING for item in of if item.error is not None)
     if not per_dof:
         return words, 0, "", "", 0
     return words, len(of), f"{np.mean(per_dof):.2f}", f"{np.median(per_dof):.2f}", beyond
@@ -117,22 +117,28 @@ def _errors(words: str, of: Sequence[Walk]) -> tuple[object, ...]:
 
 def tell(walks: Sequence[Walk]) -> str:
     """All tables, and what should not be, cell by cell."""
-    bugs = [(it.seed, step) for it in walks for step in it.steps if step.status == 1]
-    missing = [(it.seed, words) for it in walks for words in it.missing]
-    mute = [(it.seed, step.command) for it in walks for step in it.steps
+    bugs = [(item.seed, step) for item in walks for step in item.steps if step.status == 1]
+    missing = [(item.seed, words) for item in walks for words in item.missing]
+    mute = [(item.seed, step.command) for item in walks for step in item.steps
             if step.status == 2 and not (step.culprits or step.message)]  # fmt: skip
-    beyond = [it for it in walks if it.verdict == "good" and it.error is not None
-              and it.error.sigmas > SURPRISING]  # fmt: skip
-    warned = Counter(words for it in walks for words in it.warned)
+    beyond = [item for item in walks if item.verdict == "good" and item.error is not None
+              and item.error.sigmas > SURPRISING]  # fmt: skip
+    warned = Counter(words for item in walks for words in item.warned)
     for seed, step in bugs:
         print(f"BUG seed {seed}, {step.command}:\n{step.trace}", file=sys.stderr)
-    lines = [f"- seed {it.seed}: {it.error.sigmas:.1f} sigma, {it.error.per_dof:.1f} per dof; "
-             + ", ".join(it.facts.values()) for it in beyond if it.error is not None]  # fmt: skip
+    lines = [
+        f"- seed {item.seed}: {item.error.sigmas:.1f} sigma, {item.error.per_dof:.1f} per dof; "
+        + ", ".join(item.facts.values())
+        for item in beyond
+        if item.error is not None
+    ]
     lines += [f"- seed {seed}: {words}" for seed, words in missing]
     lines += [
         f"- seed {seed}: `{step.trace.strip().splitlines()[-1][:200]}`" for seed, step in bugs
     ]
-    median_s = np.median([it.drawn_s + sum(step.seconds for step in it.steps) for it in walks])
+    median_s = np.median(
+        [item.drawn_s + sum(step.seconds for step in item.steps) for item in walks]
+    )
     return f"""{len(walks)} cells, seeds from {walks[0].seed} on; the median cell takes
 {median_s:.1f} s. Exit status 1: {len(bugs)}. Files or messages missing:
 {len(missing) + len(mute)}. "good" and beyond {SURPRISING:g} sigma: {len(beyond)}. Warnings of
@@ -172,22 +178,24 @@ def main() -> None:
     parser.add_argument("--kept", type=Path, help="a file that keeps cells, to go on from")
     chosen = parser.parse_args()
     walks = _known(chosen.kept)
-    known = {it.seed for it in walks}
+    known = {item.seed for item in walks}
     seeds = range(chosen.seed, chosen.seed + (QUICK if chosen.quick else chosen.cells))
     begun = time.perf_counter()
     # Spawned, since OpenCV's threads do not survive a fork; renewed, since pictures fill memory.
     with get_context("spawn").Pool(chosen.processes, maxtasksperchild=50) as pool:
-        left = [it for it in seeds if it not in known]
-        for done, it in enumerate(pool.imap_unordered(of_one_cell, left), 1):
-            walks.append(it)
+        left = [seed for seed in seeds if seed not in known]
+        for done, item in enumerate(pool.imap_unordered(of_one_cell, left), 1):
+            walks.append(item)
             if chosen.kept is not None:
                 with chosen.kept.open("ab") as file:
-                    pickle.dump(it, file)
+                    pickle.dump(item, file)
             if done % 50 == 0:
                 print(
                     f"{done} of {len(left)} cells, {time.perf_counter() - begun:.0f} s", flush=True
                 )
-    text = tell(sorted((it for it in walks if it.seed in seeds), key=lambda it: it.seed))
+    text = tell(
+        sorted((item for item in walks if item.seed in seeds), key=lambda value: value.seed)
+    )
     print(text)
     if not chosen.quick:
         write_section("Ordinary cells", "PYTHONPATH=tests python tests/benchmarks/variety.py", text)

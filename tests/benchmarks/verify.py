@@ -87,7 +87,8 @@ def _tallied(place: Lot, name: str, checks: int) -> tuple[np.ndarray, float]:
         known = known_again(place.cell, rng, case.draw(rng))
         begun = time.process_time()
         named = [
-            it.name for it in check(seen_by(known, prior_calibration), prior_calibration).named
+            suspect.name
+            for suspect in check(seen_by(known, prior_calibration), prior_calibration).named
         ] or ["none"]
         seconds += time.process_time() - begun
         tally += [named[0] == case.right, named == [case.right], named != ["none"]]
@@ -96,9 +97,9 @@ def _tallied(place: Lot, name: str, checks: int) -> tuple[np.ndarray, float]:
 
 def row(words: str, name: str, checks: int, found: list[tuple[np.ndarray, float]]) -> str:
     """One line of the table."""
-    tally = np.sum([it[0] for it in found], axis=0)
-    right, alone, failed = (f"{100 * it / checks:.1f} %" for it in tally)
-    seconds = sum(it[1] for it in found) / checks
+    tally = np.sum([pair[0] for pair in found], axis=0)
+    right, alone, failed = (f"{100 * value / checks:.1f} %" for value in tally)
+    seconds = sum(pair[1] for pair in found) / checks
     return f"| {words} | {name} | {right} | {alone} | {failed} | {seconds:.2f} |"
 
 
@@ -112,7 +113,9 @@ def main(checks: int) -> None:
         for words, options in first(worlds):
             cells = [(replace(options, seed=seed), each) for seed in range(CELLS)]
             found = pool.map(counted, cells, chunksize=1)
-            rows += [row(words, it, CELLS * each, [cell[it] for cell in found]) for it in CASES]
+            rows += [
+                row(words, case, CELLS * each, [cell[case] for cell in found]) for case in CASES
+            ]
             print("\n".join(rows[-len(CASES) :]), flush=True)
     text = "\n".join(
         (

@@ -84,7 +84,7 @@ def world(seed: int) -> World:
         session.images,
         target_document=session.target_document,
     )
-    corners = {it.view: it for it in cell.corners}
+    corners = {view_corners.view: view_corners for view_corners in cell.corners}
     return World(cell, built.with_streams(session.streams), corners)
 
 
@@ -114,19 +114,19 @@ class Outcome:
 
 
 def outcome(seed: int) -> Outcome:
-    it = world(seed)
-    found = align(it.session, corners=it.corners)
+    made = world(seed)
+    found = align(made.session, corners=made.corners)
     names = [edge.partition("_from_")[2] for edge in found.edges]
-    rows = np.array([name in it.cell.parents for name in names])
+    rows = np.array([name in made.cell.parents for name in names])
     covariance = found.joint_covariance[np.ix_(*[np.repeat(rows, 6)] * 2)]
     error = np.concatenate(
         [
-            log(invert(_true(it.cell, name, found.reference)) @ found.edge_of(name).matrix)
+            log(invert(_true(made.cell, name, found.reference)) @ found.edge_of(name).matrix)
             for name, is_there in zip(names, rows.tolist(), strict=True)
             if is_there
         ]
     )
-    offsets = [_zeros(found, it.cell, robot) for robot in ("a", "b")]
+    offsets = [_zeros(found, made.cell, robot) for robot in ("a", "b")]
     (clock,) = found.details.clocks.values()
     floor = found.boards["floor"]
     return Outcome(
@@ -144,9 +144,9 @@ def outcome(seed: int) -> Outcome:
 def _zeros(found: Alignment, cell: Network, robot: str) -> FloatArray:
     """(k,) errors over their sigmas of the joints' zeros."""
     rows = found.arms[robot].arm.parameters
-    zeros = [it for it in rows if it.name == "theta_rad"]
-    away = [it.change for it in zeros] - cell.true_arms[robot].offset
-    return np.asarray(away / [it.sigma for it in zeros])
+    zeros = [row for row in rows if row.name == "theta_rad"]
+    away = [zero.change for zero in zeros] - cell.true_arms[robot].offset
+    return np.asarray(away / [zero.sigma for zero in zeros])
 
 
 def _true(cell: Network, name: str, reference: str) -> FloatArray:
@@ -159,18 +159,18 @@ def report(cells: Sequence[Outcome], taken_s: float) -> str:
     """The section's text."""
 
     def squares(values: Iterable[FloatArray | float]) -> str:
-        found = np.array([np.asarray(it) for it in values])
+        found = np.array([np.asarray(value) for value in values])
         return f"{float(np.mean(found**2)):.2f}"
 
-    frames = float(np.mean([it.frames for it in cells]))
+    frames = float(np.mean([cell.frames for cell in cells]))
     rows = (
         ("all frames, jointly", f"{frames:.2f}"),
-        ("zeros of the joints", squares(it.offsets for it in cells)),
-        ("offset of the clock", squares(it.clock for it in cells)),
-        ("size of the board", squares(it.scale for it in cells)),
+        ("zeros of the joints", squares(cell.offsets for cell in cells)),
+        ("offset of the clock", squares(cell.clock for cell in cells)),
+        ("size of the board", squares(cell.scale for cell in cells)),
     )
-    away = float(np.median([it.frames_mm for it in cells]))
-    doubted = Counter(it.verdict for it in cells)
+    away = float(np.median([cell.frames_mm for cell in cells]))
+    doubted = Counter(cell.verdict for cell in cells)
     verdicts = ", ".join(f"{count} {status}" for status, count in doubted.most_common())
     return "\n".join(
         [
@@ -187,9 +187,9 @@ def report(cells: Sequence[Outcome], taken_s: float) -> str:
             "the size counts that, and these cells have no need of it.",
             "",
             f"The frames' places are off by {away:.3f} mm (median, per axis). The height is taken "
-            f"in {sum(it.prior_used for it in cells)} of {len(cells)}; verdicts: {verdicts}. In "
-            f"{sum(it.moved > 0 for it in cells)} a frame is said to have moved that did not. One "
-            f"cell takes {taken_s:.1f} s of one core.",
+            f"in {sum(cell.prior_used for cell in cells)} of {len(cells)}; verdicts: {verdicts}. "
+            f"In {sum(cell.moved > 0 for cell in cells)} a frame is said to have moved that did "
+            f"not. One cell takes {taken_s:.1f} s of one core.",
         ]
     )
 

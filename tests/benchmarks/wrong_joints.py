@@ -93,11 +93,15 @@ def counted(
     """A table of how often."""
     kinds = [(arm, with_poses) for arm in arms for with_poses in (True, False)]
     title = {True: "with poses", False: "joints alone"}
-    rows = [[head, *(f"arm off by {arm}, {title[it]}" for arm, it in kinds)]]
+    rows = [[head, *(f"arm off by {arm}, {title[flag]}" for arm, flag in kinds)]]
     for name in names:
         cells = []
         for arm, with_poses in kinds:
-            told = [it[name, arm, with_poses] for it in found if (name, arm, with_poses) in it]
+            told = [
+                mapping[name, arm, with_poses]
+                for mapping in found
+                if (name, arm, with_poses) in mapping
+            ]
             cells.append(str(sum(told)) if told else "")
         rows.append([name, *cells])
     return table(rows)
@@ -107,7 +111,11 @@ def main(count: int) -> None:
     """Prints the tables and keeps them."""
     started = time.perf_counter()
     with Pool(2) as pool:
-        found = [it for arm in ARMS for it in pool.map(partial(looked_at, arm), range(count), 1)]
+        found = [
+            mapping
+            for arm in ARMS
+            for mapping in pool.map(partial(looked_at, arm), range(count), 1)
+        ]
     text = (
         f"Sessions, of {count} each, in which the planted slip was named. Both mounts, three arms, "
         "10 to 40 views, corners of 0.1 px. Without poses, the camera is what tells.\n\n"

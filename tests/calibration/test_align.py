@@ -45,7 +45,7 @@ RIGHT = CameraAt("right", place_m=(0.15, 0.95, 1.25), camera=fine_camera())
 
 def aligned(cell):
     session = network_session(cell, "cell", seen="names")
-    return align(session, corners={it.view: it for it in cell.corners})
+    return align(session, corners={corner.view: corner for corner in cell.corners})
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def test_bases_are_as_near_as_their_covariance_says(clean):
     assert squared < 22.0
     assert found.edge_of("base_b").sigma_mm < 0.1
     assert found.verdict.status == "good"
-    assert all(it.used for it in found.sights)
+    assert all(sight.used for sight in found.sights)
     assert not found.moved
     assert found.reference == "base_a"
 
@@ -135,7 +135,7 @@ def test_it_is_the_same_after_it_was_saved(clean, tmp_path):
 
 def test_the_weakest_link_is_the_frame_that_is_known_worst(clean):
     _, found = clean
-    worst = max(found.edges, key=lambda it: found.edges[it].sigma_mm).partition("_from_")[2]
+    worst = max(found.edges, key=lambda index: found.edges[index].sigma_mm).partition("_from_")[2]
     assert found.weakest.startswith(f"The weakest link is {worst}: sigma ")
 
 
@@ -144,19 +144,21 @@ def test_all_that_is_wrong_is_named_and_the_answer_is_that_of_a_sound_cell():
     options = NetworkOptions(stops=STOPS, moved=pushes, swapped_rows=1, stray_images=3, seed=3)
     cell = simulate_network(options)
     found = aligned(cell)
-    assert [(it.frame, it.first_stop) for it in found.moved] == [
+    assert [(value.frame, value.first_stop) for value in found.moved] == [
         ("target_floor", 9),
         ("cam_right", 12),
     ]
-    for it in found.moved:
+    for value in found.moved:
         # A pushed frame's own place is known to 0.1 mm.
-        assert it.shift_mm == pytest.approx(5.0, abs=0.4)
-    reasons = {it.view: it.reason for it in found.sights if not it.used}
+        assert value.shift_mm == pytest.approx(5.0, abs=0.4)
+    reasons = {sight.view: sight.reason for sight in found.sights if not sight.used}
     assert sorted(reasons) == list(cell.wrong_views)
-    assert sum("exchanged" in it for it in reasons.values()) == 2
-    assert sum("its image is of stop" in it for it in reasons.values()) == 3
+    assert sum("exchanged" in reason for reason in reasons.values()) == 2
+    assert sum("its image is of stop" in reason for reason in reasons.values()) == 3
     assert found.verdict.status == "check"
-    assert any("cam_right was bumped between stops 11 and 12" in it for it in found.verdict.reasons)
+    assert any(
+        "cam_right was bumped between stops 11 and 12" in reason for reason in found.verdict.reasons
+    )
     away, squared = off(cell, found, "base_a", "base_b")
     assert squared < 22.0
     assert np.linalg.norm(away[3:]) < 2.5e-4
@@ -168,16 +170,16 @@ def test_a_frame_that_moved_twice_has_three_places_however_its_moves_were_found(
     found = aligned(simulate_network(NetworkOptions(stops=STOPS, moved=pushes, seed=3)))
     frame = "target_floor"
     befores = [f"{frame}_until_stop_3", f"{frame}_until_stop_9"]
-    assert [it.before for it in found.moved] == befores
-    assert [(it.last_stop, it.first_stop) for it in found.moved] == [(3, 4), (9, 10)]
-    places = {it for it in found.edges if frame in it}
-    assert places == {f"cell_from_{it}" for it in (*befores, frame)}
+    assert [value.before for value in found.moved] == befores
+    assert [(value.last_stop, value.first_stop) for value in found.moved] == [(3, 4), (9, 10)]
+    places = {edge for edge in found.edges if frame in edge}
+    assert places == {f"cell_from_{before}" for before in (*befores, frame)}
 
 
 def test_a_robot_that_was_pushed_is_named_and_counts_as_it_stood_before():
     cell = simulate_network(NetworkOptions(stops=STOPS, moved=(Moved("base_b", 10),)))
     found = aligned(cell)
-    (words,) = [it for it in found.verdict.reasons if "pushed" in it]
+    (words,) = [reason for reason in found.verdict.reasons if "pushed" in reason]
     assert "by way of flange_b from stop 10 on" in words
     assert "as if base_b had been pushed by 5" in words
     assert not found.moved
@@ -192,7 +194,7 @@ def test_boards_that_look_alike_from_both_ends_are_told_apart_across_cameras():
     )
     cell = simulate_network(NetworkOptions(boards=boards, stops=STOPS))
     found = aligned(cell)
-    assert all(it.used for it in found.sights)
+    assert all(sight.used for sight in found.sights)
     for frames in (("base_a", "base_b"), ("cam_left", "cam_right")):
         assert off(cell, found, *frames)[1] < 22.0
 
@@ -234,9 +236,14 @@ def test_a_lens_that_is_stated_wrong_is_refined_or_kept_as_asked(clean, mode):
     wrong = np.add(stated["matrix"], [8.0, 8.0, -3.0, 4.0])
     left = {**stated, "matrix": wrong.tolist(), "intrinsics": mode}
     document = {**session.document, "cameras": {**session.document["cameras"], "left": left}}
-    found = align(replace(session, document=document), corners={it.view: it for it in cell.corners})
+    found = align(
+        replace(session, document=document),
+        corners={corner.view: corner for corner in cell.corners},
+    )
     got = found.cameras["cam_left"]
-    (said,) = [it for it in found.verdict.reasons if "the given intrinsics do not fit" in it]
+    (said,) = [
+        reason for reason in found.verdict.reasons if "the given intrinsics do not fit" in reason
+    ]
     assert said.startswith("cam_left: ")
     if mode == "auto":
         sigma = np.sqrt(np.diag(got.covariance))[:4]
@@ -263,11 +270,13 @@ def test_noise_of_corners_refuses_no_lens(pixel_px):
     session = network_session(cell, "cell", seen="names")
     given = ("matrix", "distortion", "matrix_sigma_px")
     cameras = {
-        name: {key: it for key, it in table.items() if key not in given}
+        name: {key: value for key, value in table.items() if key not in given}
         for name, table in session.document["cameras"].items()
     }
     session = replace(session, document={**session.document, "cameras": cameras})
-    found = align(session, corners={it.view: it for it in cell.corners})
+    found = align(
+        session, corners={view_corners.view: view_corners for view_corners in cell.corners}
+    )
     # The same stops: at 1 px a camera's place is open by 7 mm, which nobody can use.
     assert (found.verdict.status == "bad") == (pixel_px == 1.0)
 
@@ -297,13 +306,17 @@ def test_instruments_and_the_points_that_they_share_tie_robots_without_a_camera(
         NetworkOptions(cameras=(), instruments=TRACKERS, points=POINTS, stops=12)
     )
     # The second stands alone but for the points in the cell.
-    kept = [it for it in cell.readings if it.instrument == "t1" or it.point.startswith("n")]
+    kept = [
+        reading
+        for reading in cell.readings
+        if reading.instrument == "t1" or reading.point.startswith("n")
+    ]
     found = aligned(replace(cell, readings=tuple(kept)))
     for frames in (("base_a", "base_b"), ("instrument_t1", "instrument_t2")):
         assert off(cell, found, *frames)[1] < 22.0
     # Places alone were read: a point's axes are its parent's by choice.
     assert not found.edge_of("point_n1").oriented
-    assert all(it.residual_deg is None for it in found.sights)
+    assert all(sight.residual_deg is None for sight in found.sights)
     # Some 250 coordinates tell what a tracker's noise is of what is said of it, to 5 %.
     assert found.noise["instrument_t1"]["level"] == pytest.approx(1.0, rel=0.25)
 
@@ -313,15 +326,15 @@ def test_readings_of_one_instrument_in_millimetres_are_refused_in_a_cell():
     session = network_session(cell, "cell", seen="names")
     views = tuple(
         replace(
-            it,
+            view,
             numbers={
                 name: 1e3 * at if name.startswith("meas_") else at
-                for name, at in it.numbers.items()
+                for name, at in view.numbers.items()
             },
         )
-        if it.text.get("instrument") == "t2"
-        else it
-        for it in session.views
+        if view.text.get("instrument") == "t2"
+        else view
+        for view in session.views
     )
     # Its images are not there, either, which is said before.
     with pytest.raises(DataError, match="no instrument reads farther than 160 m"):
@@ -333,7 +346,7 @@ def test_an_instrument_that_reads_nothing_in_common_is_reported_with_what_would_
         NetworkOptions(instruments=TRACKERS[:1], points=POINTS[:3], stops=STOPS)
     )
     found = aligned(cell)
-    (remedy,) = {it.remedy for it in found.untied if it.frame == "instrument_t1"}
+    (remedy,) = {value.remedy for value in found.untied if value.frame == "instrument_t1"}
     assert "read points on a robot's flange" in remedy
 
 
@@ -347,9 +360,9 @@ ERRING = (
 def test_arms_that_err_are_named_and_their_offsets_found_where_that_is_asked_for():
     cell = simulate_network(NetworkOptions(robots=ERRING, stops=STOPS))
     session = network_session(cell, "cell", seen="names")
-    corners = {it.view: it for it in cell.corners}
+    corners = {view_corners.view: view_corners for view_corners in cell.corners}
     reported = align(session, corners=corners, level="hand-eye")
-    assert sum("follow the arm's posture" in it for it in reported.verdict.reasons) == 2
+    assert sum("follow the arm's posture" in reason for reason in reported.verdict.reasons) == 2
     found = align(session, corners=corners)
     assert found.verdict.status == "good"
     for robot in ("a", "b"):
@@ -362,16 +375,20 @@ def test_arms_that_err_are_named_and_their_offsets_found_where_that_is_asked_for
         # as stated. Others are known to some 0.05 mrad by this many stops.
         assert told[[0, -1]] == pytest.approx(0.0, abs=1e-6)
         assert told[1:-1] == pytest.approx(true[1:-1], abs=2.5e-4)
-        zeros = [it for it in kinematics.parameters if it.name == "theta_rad"]
-        surprises = ([it.change for it in zeros] - true) / [it.sigma for it in zeros]
+        zeros = [parameter for parameter in kinematics.parameters if parameter.name == "theta_rad"]
+        surprises = ([zero.change for zero in zeros] - true) / [zero.sigma for zero in zeros]
         assert np.abs(surprises).max() < 4.5  # one of twelve in ten thousand sessions
-        seen = {it.view for it in found.sights if it.seen == f"target_plate_{robot}" and it.used}
+        seen = {
+            sight.view
+            for sight in found.sights
+            if sight.seen == f"target_plate_{robot}" and sight.used
+        }
         rows = kinematics.left_out
-        assert {it.view for it in rows} == seen
+        assert {row.view for row in rows} == seen
         before, after = (
-            np.sqrt(np.mean([getattr(it, of) ** 2 for it in rows])) for of in ("nominal_mm", "mm")
+            np.sqrt(np.mean([getattr(row, of) ** 2 for row in rows])) for of in ("nominal_mm", "mm")
         )
-        held_out = {it.level: it.held_out_mm for it in kinematics.levels}
+        held_out = {level.level: level.held_out_mm for level in kinematics.levels}
         # The same residuals, written twice.
         assert before == pytest.approx(held_out["nominal"], rel=1e-9)
         assert after == pytest.approx(held_out["offsets"], rel=1e-9)
@@ -382,7 +399,9 @@ def test_arms_that_err_are_named_and_their_offsets_found_where_that_is_asked_for
         written = document(Calibration.whole(found), "robot-dh", Selection(robot=robot))
         assert f"theta_offset_rad = {told[1]:.6f}"[:-2] in written.text
     assert off(cell, found, "cam_left", "cam_right")[1] < 22.0
-    after, before = (it.between("cam_left", "cam_right").sigma_mm for it in (found, reported))
+    after, before = (
+        alignment.between("cam_left", "cam_right").sigma_mm for alignment in (found, reported)
+    )
     # Well under a half: what the arms err by puts the given lenses in doubt, too.
     assert after < 0.45 * before
 
@@ -390,18 +409,18 @@ def test_arms_that_err_are_named_and_their_offsets_found_where_that_is_asked_for
 def test_a_robot_without_joints_stays_as_it_reports_itself(clean):
     cell, _ = clean
     session = network_session(cell, "cell", seen="names")
-    columns = [it for it in session.columns if not it.startswith("q")]
+    columns = [column for column in session.columns if not column.startswith("q")]
     columns += ["qx", "qy", "qz", "qw"]
     bare = Session.assemble(
         session.document,
         columns,
-        [[view.cell(it) for it in columns] for view in session.views],
+        [[view.cell(column) for column in columns] for view in session.views],
         session.images,
         target_document=session.target_document,
         robot_document=session.robot_document,
     )
-    found = align(bare, corners={it.view: it for it in cell.corners}, level="offsets")
-    assert sum("stays as it reports itself" in it for it in found.verdict.reasons) == 2
+    found = align(bare, corners={corner.view: corner for corner in cell.corners}, level="offsets")
+    assert sum("stays as it reports itself" in reason for reason in found.verdict.reasons) == 2
     with pytest.raises(DataError, match="level 'all'"):
         align(bare, level="all")
 
@@ -435,9 +454,9 @@ def two_cameras(cell):
     for view in session.views:
         seen = view.cam_from_target().as_matrix()
         for camera, pose in (("left", seen), ("right", beside @ seen)):
-            row = view.numbers | {f"cft_{it}": value for it, value in pose_row(pose).items()}
+            row = view.numbers | {f"cft_{name}": value for name, value in pose_row(pose).items()}
             row |= {"view": len(rows), "camera": camera, "stop": view.number}
-            rows.append([str(row[it]) for it in columns])
+            rows.append([str(row[column]) for column in columns])
     cameras = {name: {"resolution": [640, 480]} for name in ("left", "right")}
     document = {"schema": 1, "name": "cell", "mount": "eye-to-hand", "cameras": cameras}
     return Session.assemble(document, columns, rows, session.images)
@@ -477,16 +496,18 @@ def test_a_view_of_a_whole_cell_that_allows_two_poses_is_left_out():
     found = align(session_of(cell), corners=dict(enumerate(cell.corners)))
     reasons = calibrated(cell, joints=False).reasons
     assert reasons[4] == "ambiguous: two poses of the target fit image and motion alike"
-    assert {it.view: it.reason for it in found.sights}[4] == reasons[4]
+    assert {sight.view: sight.reason for sight in found.sights}[4] == reasons[4]
 
 
 def test_two_stops_of_an_only_robot_are_too_few():
     cell = simulate(CellOptions(mount="eye-to-hand", views=2))
     with pytest.raises(DegenerateError, match="2 usable stops of the robot, at least 3"):
         align(one_camera(cell))
-    with pytest.raises(DegenerateError, match=r"too few, .* all 2 stops of the robot turn") as it:
+    with pytest.raises(
+        DegenerateError, match=r"too few, .* all 2 stops of the robot turn"
+    ) as caught:
         align(two_cameras(cell))
-    assert "see target at 5 stops or more" in it.value.next_step
+    assert "see target at 5 stops or more" in caught.value.next_step
 
 
 def test_a_camera_that_sees_nothing_but_its_own_board_is_reported():
@@ -495,10 +516,10 @@ def test_a_camera_that_sees_nothing_but_its_own_board_is_reported():
     boards = (FLOOR, BoardAt("plate_a", "a"), BoardAt("plate_b", "b"), wall)
     cell = simulate_network(NetworkOptions(cameras=(LEFT, RIGHT, apart), boards=boards, stops=12))
     found = aligned(cell)
-    assert {it.frame for it in found.untied} == {"cam_apart", "target_wall"}
+    assert {value.frame for value in found.untied} == {"cam_apart", "target_wall"}
     assert found.verdict.status == "check"
-    assert all(not it.used for it in found.sights if it.seer == "cam_apart")
-    (reason,) = {it.reason for it in found.sights if it.seer == "cam_apart"}
+    assert all(not sight.used for sight in found.sights if sight.seer == "cam_apart")
+    (reason,) = {sight.reason for sight in found.sights if sight.seer == "cam_apart"}
     assert reason == "nothing ties cam_apart to the rest of the cell"
 
 
@@ -513,7 +534,9 @@ def test_a_camera_that_a_board_ties_either_way_round_is_refused():
             stops=12,
         )
     )
-    kept = [it for it in cell.sights if not (it.camera == "right" and it.board == "plate_a")]
+    kept = [
+        sight for sight in cell.sights if not (sight.camera == "right" and sight.board == "plate_a")
+    ]
     cell = replace(cell, sights=tuple(kept))
     with pytest.raises(DegenerateError, match="cam_right may be in two places: target_floor looks"):
         aligned(cell)
@@ -523,25 +546,30 @@ def test_a_camera_that_a_board_ties_either_way_round_is_refused():
 def test_rows_held_back_have_no_part_in_frames_lenses_and_noise(clean):
     cell, _ = clean
     session = network_session(cell, "cell", seen="names")
-    corners = {it.view: it for it in cell.corners}
+    corners = {corner.view: corner for corner in cell.corners}
     held = set(list(corners)[::7])
-    views = [replace(it, holdout=it.number in held) for it in session.views]
+    views = [replace(view, holdout=view.number in held) for view in session.views]
     rng = np.random.default_rng(0)
     spoilt = {
-        view: replace(it, px=it.px + rng.normal(0.0, 3.0, it.px.shape)) if view in held else it
-        for view, it in corners.items()
+        view: replace(corner, px=corner.px + rng.normal(0.0, 3.0, corner.px.shape))
+        if view in held
+        else corner
+        for view, corner in corners.items()
     }
     kept, without = (
-        align(replace(session, views=tuple(views)), corners=it)
-        for it in (spoilt, {view: it for view, it in corners.items() if view not in held})
+        align(replace(session, views=tuple(views)), corners=mapping)
+        for mapping in (
+            spoilt,
+            {view: corner for view, corner in corners.items() if view not in held},
+        )
     )
-    assert {it.view for it in kept.sights if not it.used} == held
+    assert {sight.view for sight in kept.sights if not sight.used} == held
     assert kept.noise == without.noise
     for name, edge in without.edges.items():
         np.testing.assert_array_equal(kept.edges[name].matrix, edge.matrix)
         np.testing.assert_array_equal(kept.edges[name].covariance, edge.covariance)
     # Their residuals are told all the same: three pixels in each coordinate.
-    px = [it.rms_px for it in kept.sights if not it.used]
+    px = [sight.rms_px for sight in kept.sights if not sight.used]
     assert np.sqrt(np.mean(np.square(px))) == pytest.approx(3.0 * np.sqrt(2.0), rel=0.1)
     sound = align(replace(session, views=tuple(views)), corners=corners)
     found = Calibration.whole(sound)
@@ -552,13 +580,17 @@ def test_rows_held_back_have_no_part_in_frames_lenses_and_noise(clean):
     assert found.of("left", "b").validation.holdout is not None
     assert sound.verdict.status == "good"
     assert kept.verdict.status == "check"
-    assert any("that the session holds back are missed by" in it for it in kept.verdict.reasons)
+    assert any(
+        "that the session holds back are missed by" in reason for reason in kept.verdict.reasons
+    )
 
 
 def with_elbow_of_b(session, change):
     """The session with no more than joints of one robot, the third of them changed."""
     views = [
-        replace(view, numbers=change({k: it for k, it in view.numbers.items() if k not in POSE}))
+        replace(
+            view, numbers=change({k: number for k, number in view.numbers.items() if k not in POSE})
+        )
         if view.text.get("robot") == "b"
         else view
         for view in session.views
@@ -570,15 +602,15 @@ def with_elbow_of_b(session, change):
 def test_joints_of_one_robot_are_held_against_what_the_cameras_see(clean):
     cell, _ = clean
     session, corners = network_session(cell, "cell", seen="names"), dict(enumerate(cell.corners))
-    moved = with_elbow_of_b(session, lambda it: it | {"q3_rad": it["q3_rad"] + 0.2})
+    moved = with_elbow_of_b(session, lambda value: value | {"q3_rad": value["q3_rad"] + 0.2})
     found = align(moved, corners=corners)
-    (words,) = [it for it in found.verdict.reasons if "elbow_joint" in it]
+    (words,) = [reason for reason in found.verdict.reasons if "elbow_joint" in reason]
     assert words.startswith("Robot b: the joint angles do not belong to ur5e as they are declared.")
     assert "moved by -11.4" in words
     _, squared = off(cell, found, "base_a", "base_b")
     # Chi-square of 6 beyond 22 is 0.1 %.
     assert squared < 22.0
-    turned = with_elbow_of_b(session, lambda it: it | {"q3_rad": -it["q3_rad"]})
+    turned = with_elbow_of_b(session, lambda value: value | {"q3_rad": -value["q3_rad"]})
     with pytest.raises(DataError, match=r"^robot b: .* not those of ur5e .* of the opposite sign"):
         align(turned, corners=corners)
 
@@ -628,7 +660,7 @@ def test_an_arm_that_bends_is_as_elastic_in_a_cell_as_by_itself(tmp_path):
     alone, cell = calibrate(session), Calibration.whole(align(session)).of()
     assert cell.arm.level == "elastic"
     assert alone.arm.level == "elastic"
-    rows = zip(*(it.elastic.joints for it in (alone, cell)), springs, strict=True)
+    rows = zip(*(calibration.elastic.joints for calibration in (alone, cell)), springs, strict=True)
     for one, other, true in rows:
         sigma = other.sigma_rad_per_nm
         # Of the same views, but for what a frame beside the arm takes up: within a sigma or so.
@@ -639,7 +671,7 @@ def test_an_arm_that_bends_is_as_elastic_in_a_cell_as_by_itself(tmp_path):
             assert other.compliance_rad_per_nm == pytest.approx(true, abs=4.5 * sigma)
     assert sum(other.determined for other in cell.elastic.joints) >= 2
     np.testing.assert_allclose(
-        cell.compliance, [it.compliance_rad_per_nm for it in cell.elastic.joints]
+        cell.compliance, [joint.compliance_rad_per_nm for joint in cell.elastic.joints]
     )
 
 
@@ -647,7 +679,7 @@ def reported(cell, robot, poses):
     """A session in which one robot reports other poses, and what was seen in its images."""
     told = {**cell.base_from_flange, robot: poses}
     session = network_session(replace(cell, base_from_flange=told), "cell", seen="names")
-    return session, {it.view: it for it in cell.corners}
+    return session, {corner.view: corner for corner in cell.corners}
 
 
 @pytest.mark.slow
@@ -656,7 +688,9 @@ def test_what_is_no_noise_of_a_robot_is_said_of_that_robot():
     share = np.linspace(-0.5, 0.5, 40)[:, None]
     crept = exp(share * np.array([0, 0, 0, 0, 6e-4, 0])) @ cell.base_from_flange["a"]
     session, corners = reported(cell, "a", crept)
-    (said,) = [it for it in align(session, corners=corners).verdict.reasons if "drift" in it]
+    (said,) = [
+        reason for reason in align(session, corners=corners).verdict.reasons if "drift" in reason
+    ]
     assert said.startswith("Robot a: residuals drift with time")
     # Forty stops that repeat to 0.03 mm leave some 0.03 mm of what crept by 0.6 mm.
     assert float(said.split("moved by ")[1].split(" mm")[0]) == pytest.approx(0.6, abs=0.1)
@@ -664,8 +698,8 @@ def test_what_is_no_noise_of_a_robot_is_said_of_that_robot():
     alike = np.repeat(rng.standard_normal((10, 6)) * np.repeat([4e-4, 2e-4], 3), 4, axis=0)
     session, corners = reported(cell, "b", cell.base_from_flange["b"] @ exp(alike))
     found = align(session, corners=corners)
-    assert any(it.startswith("Robot b: neighbouring stops") for it in found.verdict.reasons)
-    assert not any(it.startswith("Robot a:") for it in found.verdict.reasons)
+    assert any(reason.startswith("Robot b: neighbouring stops") for reason in found.verdict.reasons)
+    assert not any(reason.startswith("Robot a:") for reason in found.verdict.reasons)
     _, squared = off(cell, found, "base_a", "base_b")
     assert squared < 22.0
 
@@ -685,15 +719,15 @@ def test_a_board_of_another_size_is_found_beside_arms_that_err():
     assert abs(floor.shape["scale"] - 0.002) < 4 * floor.sigma["scale"] < 4e-4
     assert set(found.boards["plate_a"].sigma) == {"scale"}
     assert not found.moved
-    assert {found.arms[it].arm.level for it in "ab"} == {"offsets"}
+    assert {found.arms[name].arm.level for name in "ab"} == {"offsets"}
 
 
 @pytest.mark.slow
 def test_boards_of_three_sizes_are_found_beside_arms_that_err():
     """What all three have in common the arms' links may have, too: free together none is clear."""
-    robots = (replace(it, offset_sigma_rad=1e-3) for it in NetworkOptions().robots)
+    robots = (replace(robot, offset_sigma_rad=1e-3) for robot in NetworkOptions().robots)
     scales = {"floor": 1.002, "plate_a": 0.999, "plate_b": 1.001}
-    boards = (replace(it, scale=scales[it.name]) for it in NetworkOptions().boards)
+    boards = (replace(board, scale=scales[board.name]) for board in NetworkOptions().boards)
     found = aligned(
         simulate_network(NetworkOptions(tuple(robots), boards=tuple(boards), stops=STOPS, seed=5))
     )
@@ -702,7 +736,7 @@ def test_boards_of_three_sizes_are_found_beside_arms_that_err():
     assert shapes["floor"] - shapes["plate_a"] == pytest.approx(0.003, abs=1e-4)
     assert shapes["floor"] - shapes["plate_b"] == pytest.approx(0.001, abs=1e-4)
     # 0.03 mm is planted: sizes that stay wrong count as ten times that.
-    assert max(found.noise[it]["translation_mm"] for it in "ab") < 0.06
+    assert max(found.noise[name]["translation_mm"] for name in "ab") < 0.06
 
 
 @pytest.mark.slow
@@ -710,8 +744,8 @@ def test_errors_of_an_arm_that_are_free_on_the_way_may_be_no_unknowns_at_the_end
     """Boards of slightly other sizes look like errors of both arms, until they are free."""
     scales = 1.0 + 1e-3 * np.random.default_rng([47, 41]).standard_normal(3)
     boards = [
-        replace(it, scale=float(scale))
-        for it, scale in zip(NetworkOptions().boards, scales, strict=True)
+        replace(board, scale=float(scale))
+        for board, scale in zip(NetworkOptions().boards, scales, strict=True)
     ]
     cell = simulate_network(NetworkOptions(boards=tuple(boards), stops=30, seed=47))
     found = aligned(cell)

@@ -67,7 +67,7 @@ def test_pictures_of_several_cameras_are_one_cell(out):
         # Six squared sigmas are exceeded once in 4e5; pictures of small boards are not ideal.
         assert off @ np.linalg.solve(edge.covariance, off) < 60.0, frame
     # Both rows whose pictures were exchanged are left out.
-    left_out = {it.view: it.reason for it in found.sights if not it.used}
+    left_out = {sight.view: sight.reason for sight in found.sights if not sight.used}
     for view in cell.wrong_views:
         assert "disagrees" in left_out[view]
     assert found.cameras["cam_right"].estimated
@@ -78,7 +78,7 @@ def test_cameras_exchanged_in_all_rows_are_told_by_the_size_of_their_images(fold
     wrong = tmp_path / "wrong"
     shutil.copytree(folder, wrong)
     other = {"left": "right", "right": "left"}
-    edit_rows(wrong, lambda rows: [it | {"camera": other[it["camera"]]} for it in rows])
+    edit_rows(wrong, lambda rows: [row | {"camera": other[row["camera"]]} for row in rows])
     done = visioncal("align", wrong, "-o", tmp_path / "out")
     assert done.status == 2
     assert "that is the size of camera right's" in done.err
@@ -88,10 +88,10 @@ def test_cameras_exchanged_in_all_rows_are_told_by_the_size_of_their_images(fold
 def test_what_was_detected_lies_over_the_image_of_the_camera_that_saw_it(folder, out):
     recording, views = out / "recording.rrd", Session.load(folder).views
     seen = read_evidence(recording)
-    assert [it.view for it in seen] == [it.number for it in views]
+    assert [view.view for view in seen] == [view.number for view in views]
     frames = column(recording, paths.DETECTED, "CoordinateFrame:frame")
-    of_camera = {row: f"image_of_cam_{it.text['camera']}" for row, it in enumerate(views)}
-    assert {row: str(it[0]) for row, it in frames.items()} == of_camera
+    of_camera = {row: f"image_of_cam_{view.text['camera']}" for row, view in enumerate(views)}
+    assert {row: str(frame[0]) for row, frame in frames.items()} == of_camera
     assert "Worst used view" in (out / "report.html").read_text()
 
 
@@ -100,13 +100,13 @@ def test_the_recording_is_the_session_and_holds_the_result(folder, out, tmp_path
     recording = out / "recording.rrd"
     assert Session.load(recording).digest() == Session.load(folder).digest()
     assert visioncal("align", recording, "-o", tmp_path / "again").status == 0
-    texts = [(it / "alignment.json").read_text() for it in (out, tmp_path / "again")]
+    texts = [(value / "alignment.json").read_text() for value in (out, tmp_path / "again")]
     # Commands name the session that each was made from, and the folder that it was written to.
     paths = {str(recording): str(folder), str(tmp_path / "again"): str(out)}
     for path, same in paths.items():
-        texts = [it.replace(path, same) for it in texts]
+        texts = [text.replace(path, same) for text in texts]
     one, other = map(json.loads, texts)
     assert one | {"created": ""} == other | {"created": ""}
     assert visioncal("report", recording, "-o", tmp_path / "report.html").status == 0
-    pages = [it.read_text() for it in (tmp_path / "report.html", out / "report.html")]
+    pages = [value.read_text() for value in (tmp_path / "report.html", out / "report.html")]
     assert pages[0].replace(str(tmp_path), str(out)) == pages[1]

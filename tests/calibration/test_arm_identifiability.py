@@ -66,7 +66,7 @@ def rows_of(table):
     """(n, 5) theta, d, a, alpha and beta of each Z_i X_i."""
     n = len(table)
     names = ("theta_rad", "d_m", "a_m", "alpha_rad", "beta_rad")
-    return np.stack([getattr(table, it)[-n:] for it in names], axis=1)
+    return np.stack([getattr(table, name)[-n:] for name in names], axis=1)
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
@@ -84,8 +84,8 @@ def test_a_table_moves_as_its_derivatives_say(name, convention):
         table_moves(arm, table, twists, functions), twists, functions, strict=True
     ):
         ends = [
-            rows_of(table_of(arm.corrected(it * turn, it * way), convention, like=like))
-            for it in (step, -step)
+            rows_of(table_of(arm.corrected(value * turn, value * way), convention, like=like))
+            for value in (step, -step)
         ]
         # Base and flange are tilted by some mrad, whose product with a step is left out.
         assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(by, rel=0.01, abs=0.01)
@@ -187,7 +187,11 @@ def test_beta_is_chosen_for_parallel_axes(name):
     data = arm_data(robot, postures(robot)[:40])
     by_default, standard = identify_arm(data), identify_arm(data, "standard")
     assert (by_default.convention, standard.convention) == ("hayati", "standard")
-    betas = [it.parameter.joint for it in by_default.estimates if it.parameter.kind == "beta"]
+    betas = [
+        estimate.parameter.joint
+        for estimate in by_default.estimates
+        if estimate.parameter.kind == "beta"
+    ]
     assert betas == [1, 2]
     # Four numbers a joint, six of which hide in the frames at both ends.
     assert len(by_default.estimates) == 24
@@ -200,11 +204,11 @@ def test_beta_is_chosen_for_parallel_axes(name):
 def test_what_hides_in_the_frames_depends_on_the_convention():
     robot = load_robot("panda")
     data = arm_data(robot, postures(robot)[:40])
-    lost = {it: identify_arm(data, it).not_determined for it in CONVENTIONS}
+    lost = {convention: identify_arm(data, convention).not_determined for convention in CONVENTIONS}
     # Craig's first row lies before the first axis; Denavit and Hartenberg's last behind the last.
-    assert any(it.startswith("the twist alpha of joint 1 ") for it in lost["modified"])
-    assert any(it.startswith("the twist alpha of joint 7 ") for it in lost["standard"])
-    assert all(len(it) == 6 for it in lost.values())
+    assert any(name.startswith("the twist alpha of joint 1 ") for name in lost["modified"])
+    assert any(name.startswith("the twist alpha of joint 7 ") for name in lost["standard"])
+    assert all(len(pair) == 6 for pair in lost.values())
 
 
 def test_a_joint_that_hardly_moved_is_named():
@@ -231,7 +235,7 @@ def test_two_joints_that_stood_still_are_named():
     numbers = identify_arm(arm_data(robot, q))
     assert numbers.counts.determined < 30
     named = {"joint 3 (joint_3)", "joint 4 (joint_4)"}
-    assert {it for it in named if it in numbers.not_determined[-1]} == named
+    assert {name for name in named if name in numbers.not_determined[-1]} == named
     assert numbers.not_determined[-1].count("by 0 deg") == 2
     assert numbers.not_determined[-1].endswith(" and others")
 
@@ -259,7 +263,7 @@ def test_better_stops_have_better_indices():
     q = postures(robot)[:60]
     # Near one posture all slopes look alike.
     near = q.mean(axis=0) + 0.3 * (q - q.mean(axis=0))
-    wide, narrow = (identify_arm(arm_data(robot, it)).indices for it in (q, near))
+    wide, narrow = (identify_arm(arm_data(robot, array)).indices for array in (q, near))
     for name in ("o1", "o2", "o3", "o4", "o5"):
         assert getattr(wide, name) > 1.5 * getattr(narrow, name)
 
@@ -314,8 +318,14 @@ def test_sigmas_hold_the_errors_of_the_numbers(name, convention):
         like = convert_table(table_from_document(robot.document), convention)
         wanted = table_of(true.bare, convention, like=like)
         # What the frames hide keeps what was stated, which says nothing of the sigma.
-        counts = [it for it in numbers.estimates if it.sigma < 0.4 * ERROR_RAD * it.parameter.unit]
-        surprises += [(it.identified - it.parameter.value(wanted)) / it.sigma for it in counts]
+        counts = [
+            estimate
+            for estimate in numbers.estimates
+            if estimate.sigma < 0.4 * ERROR_RAD * estimate.parameter.unit
+        ]
+        surprises += [
+            (count.identified - count.parameter.value(wanted)) / count.sigma for count in counts
+        ]
     assert len(surprises) > 20 * 14
     # Some four hundred squares, of which a few numbers of each arm hang together: 10 % each.
     assert np.mean(np.square(surprises)) == pytest.approx(1.0, abs=0.25)
@@ -324,7 +334,7 @@ def test_sigmas_hold_the_errors_of_the_numbers(name, convention):
 def test_parameters_of_the_level_alone_are_told():
     model = erring(load_robot("ur5e"), ("offsets", "eccentricity"))
     table = convert_table(table_from_document(model.nominal.document), "hayati")
-    kinds = {it.kind for it in free_parameters(model, table)}
+    kinds = {parameter.kind for parameter in free_parameters(model, table)}
     assert kinds == {"theta", "sine", "cosine"}
     moves = parameter_moves(model, table, free_parameters(model, table))
     # Each value is one number of the table.
@@ -342,11 +352,11 @@ def test_the_result_is_in_the_convention_that_is_asked_for(calibrated_cell, conv
     cell, known = calibrated_cell
     assert arm_found(known).numbers.convention == "hayati"
     asked = replace(known, convention=convention)
-    (examine_again,) = (it for it in STAGES if it.name == "examine")
+    (examine_again,) = (stage for stage in STAGES if stage.name == "examine")
     known = examine_again.run(asked)
     found = json.loads(json.dumps(to_document(result_of(known)), allow_nan=False))["kinematics"]
     assert found["convention"] == convention
-    changes = {(it["joint"], it["name"]): it for it in found["parameters"]}
+    changes = {(value["joint"], value["name"]): value for value in found["parameters"]}
     assert (("elbow_joint", "beta_rad") in changes) == (convention == "hayati")
     # Across from the first axis to the second, which every convention tells to 0.1 mrad.
     row = "shoulder_lift_joint" if convention == "modified" else "shoulder_pan_joint"
@@ -355,10 +365,10 @@ def test_the_result_is_in_the_convention_that_is_asked_for(calibrated_cell, conv
     assert alpha["identified"] == pytest.approx(cell.true_arm.alpha[0], abs=4 * alpha["sigma"])
     places = found["workspace_map"]
     assert 150 < len(places) <= 200
-    assert all(0.0 < it["sigma_mm"] < 5.0 and it["z_m"] > 0.0 for it in places)
-    worths = [it["worth"] for it in found["stops"]]
+    assert all(0.0 < place["sigma_mm"] < 5.0 and place["z_m"] > 0.0 for place in places)
+    worths = [value["worth"] for value in found["stops"]]
     assert worths == sorted(worths, reverse=True)
-    assert {it["view"] for it in found["stops"]} == set(known.used)
+    assert {value["view"] for value in found["stops"]} == set(known.used)
     counts = found["observability"]
     assert (counts["columns"], counts["identifiable"], counts["told"]) == (48, 30, 30)
     assert counts["condition"] == pytest.approx(1.0 / counts["o2"])
@@ -368,7 +378,9 @@ def test_a_tool_on_the_flange_is_no_change_of_the_arm():
     model = erring(load_robot("ur5e"))
     assert np.abs(TOOL - np.eye(4)).max() > 0.05
     numbers = identify_arm(arm_data(model.nominal, postures(model.nominal)[:40]))
-    assert max(abs(it.identified - it.nominal) for it in numbers.estimates) < 1e-12
+    assert (
+        max(abs(estimate.identified - estimate.nominal) for estimate in numbers.estimates) < 1e-12
+    )
 
 
 @pytest.mark.slow
@@ -381,7 +393,7 @@ def test_a_missing_direction_is_in_the_verdict():
     assert "joint 5 (wrist_2_joint) moved by 3.9 deg only" in arm_found(known).numbers.advice
     rich = calibrated(simulate(replace(WRONG_LINKS, seed=9, views=40)))
     assert arm_found(rich).numbers.counts.determined == 30
-    assert not any("identifiable values" in it for it in rich.verdict.reasons)
+    assert not any("identifiable values" in reason for reason in rich.verdict.reasons)
 
 
 def test_an_unknown_convention_is_refused(rendered):

@@ -32,7 +32,7 @@ def test_play_is_told_and_is_no_stiffness(worn):
             abs(springs[at].compliance_rad_per_nm - 1.0 / COBOT[at])
             < 3.5 * springs[at].sigma_rad_per_nm
         )
-    assert any("Joints have play: shoulder_pan_joint" in it for it in worn.verdict.reasons)
+    assert any("Joints have play: shoulder_pan_joint" in reason for reason in worn.verdict.reasons)
 
 
 def test_play_is_in_the_result(worn):
@@ -47,7 +47,7 @@ def test_an_arm_that_is_right_but_for_its_play(way):
     # Some write the side that the joints moved to; a dead-band is a width all the same.
     known = calibrated(replace(cell, approach=way * cell.approach))
     assert known.robot_arm.kinematics.level == "backlash"
-    told = [it.deadband_rad for it in arm_found(known).plays]
+    told = [play.deadband_rad for play in arm_found(known).plays]
     assert told == pytest.approx(PLAY, abs=1.5e-4)
     # In the middle of its play the arm is the one that was stated.
     q = known.robot_arm.joints_rad

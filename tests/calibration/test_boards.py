@@ -143,12 +143,12 @@ def test_a_wrong_view_of_one_board_is_named():
     known = calibrated(replace(cell, corners=tuple(corners)))
     assert set(range(len(corners))) - set(known.used) == {slipped}
     assert "disagrees with the other views" in known.reasons[slipped]
-    assert any(f"View {slipped} was left out" in it for it in known.verdict.reasons)
+    assert any(f"View {slipped} was left out" in reason for reason in known.verdict.reasons)
 
 
 def test_a_board_of_another_size_is_named():
     known = calibrated(simulate(replace(TWO, second=Second(scale=1.01), seed=5)))
-    told = [it for it in known.verdict.reasons if "By the robot's motion" in it]
+    told = [reason for reason in known.verdict.reasons if "By the robot's motion" in reason]
     assert len(told) == 1
     assert "the board second is 1 % larger than stated" in told[0]
     shapes = result_of(known).boards
@@ -202,7 +202,7 @@ def test_a_board_that_is_never_seen_is_told():
     further = set(np.flatnonzero(cell.shown.boards == 1).tolist())
     known = calibrated(without(cell, further))
     assert list(result_of(known).edges) == ["flange_from_cam", "base_from_target_first"]
-    assert any("No usable view shows target second" in it for it in known.verdict.reasons)
+    assert any("No usable view shows target second" in reason for reason in known.verdict.reasons)
 
 
 def test_too_few_views_of_any_board_are_refused():
@@ -278,11 +278,13 @@ def test_every_output_shows_all_boards(tmp_path):
     report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "base_from_target_first" in report
     assert "base_from_target_second" in report
-    logged = {str(it.entity_path) for it in RrdReader(file).stream()}
-    placements = [it for it in logged if "placements_magnified" in it and it.endswith("/used")]
+    logged = {str(chunk.entity_path) for chunk in RrdReader(file).stream()}
+    placements = [
+        name for name in logged if "placements_magnified" in name and name.endswith("/used")
+    ]
     for name in ("first", "second"):
         assert f"/targets/{name}/sheet" in logged
-        assert any(it.startswith(f"/targets/{name}/") for it in placements)
+        assert any(placement.startswith(f"/targets/{name}/") for placement in placements)
     with pytest.raises(DataError, match=r"several targets \(first, second\)"):
         session_looks(session, written.calibration, "base")
 
@@ -319,4 +321,4 @@ def test_a_board_within_its_stated_size_is_no_other_lens(seed):
         robot_sigma_rad=9e-5,
     )
     known = calibrated(simulate(options))
-    assert "lens" not in {it.kind for it in known.verdict.findings}
+    assert "lens" not in {finding.kind for finding in known.verdict.findings}

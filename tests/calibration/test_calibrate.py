@@ -130,7 +130,7 @@ def test_a_pose_whose_forms_contradict_each_other_is_refused(result, place, form
         DataError, match=r"^cal\.json: flange_from_cam: \w+ is .* another pose"
     ) as no:
         Calibration.from_json(json.dumps(document), "cal.json")
-    assert form == "matrix" or any(form in it for it in no.value.culprits)
+    assert form == "matrix" or any(form in culprit for culprit in no.value.culprits)
 
 
 @pytest.mark.parametrize(
@@ -157,7 +157,7 @@ def test_a_pose_that_was_rounded_to_six_places_is_the_same(result):
     document = to_document(result)
     pose = document["transforms"]["flange_from_cam"]
     for form in ("translation_m", "quaternion_xyzw"):
-        pose[form] = [round(-it if form[0] == "q" else it, 6) for it in pose[form]]
+        pose[form] = [round(-value if form[0] == "q" else value, 6) for value in pose[form]]
     again = Calibration.from_json(json.dumps(document), "cal.json")
     np.testing.assert_array_equal(
         again.edges["flange_from_cam"].matrix, result.edges["flange_from_cam"].matrix
@@ -252,7 +252,9 @@ def test_poses_that_disagree_with_the_joints_are_reported(session_copy):
     (session_copy / "session.toml").write_text(text.replace('"ur10e"', '"ur5e"'), encoding="utf-8")
     calibration = visioncal.calibrate(session_copy)
     assert calibration.verdict.status == "check"
-    assert any("With the arm a ur10e and not a ur5e" in it for it in calibration.verdict.reasons)
+    assert any(
+        "With the arm a ur10e and not a ur5e" in reason for reason in calibration.verdict.reasons
+    )
 
 
 def test_a_view_held_out_by_the_session_is_in_no_fit(session_copy):
@@ -300,8 +302,9 @@ def test_missing_cut_and_empty_images_are_named_and_left_out(session_copy, resul
     assert set(unused) == {1, 4, 7, 9}
     assert "640 x 400 px, and the camera's images are 1280 x 800" in unused[9]
     assert any(
-        it.startswith("1 image is of another size, and not used: images/") and "view 9." in it
-        for it in calibration.verdict.reasons
+        reason.startswith("1 image is of another size, and not used: images/")
+        and "view 9." in reason
+        for reason in calibration.verdict.reasons
     )
     assert "missing" in unused[1]
     assert "cut short" in unused[4]
@@ -339,7 +342,7 @@ def test_a_wrong_view_spoils_the_verdict(tmp_path):
     folder = write_session(simulate(options), tmp_path / "wrong", images=False)
     verdict = visioncal.calibrate(folder).verdict
     assert verdict.status != "good"
-    assert any("were left out" in it for it in verdict.reasons)
+    assert any("were left out" in reason for reason in verdict.reasons)
 
 
 @pytest.mark.slow
@@ -376,7 +379,7 @@ def test_one_view_off_by_five_millimetres_is_named(tmp_path):
     with_rows(folder, shifted)
     verdict = visioncal.calibrate(folder).verdict
     assert verdict.status != "good"
-    assert any("View 4 was left out" in it and "5.1 mm" in it for it in verdict.reasons)
+    assert any("View 4 was left out" in reason and "5.1 mm" in reason for reason in verdict.reasons)
 
 
 def test_looking_again_and_again_from_one_stop_adds_no_views(tmp_path):
@@ -390,13 +393,13 @@ def test_looking_again_and_again_from_one_stop_adds_no_views(tmp_path):
     with_rows(folder, repeated)
     again = visioncal.calibrate(folder)
     assert again.verdict.status == "bad"
-    assert any("Only 4 stops are used" in it for it in again.verdict.reasons)
+    assert any("Only 4 stops are used" in reason for reason in again.verdict.reasons)
     assert "over stops" in again.validation.method
 
 
 def test_images_and_measured_poses_in_one_session(session_copy, result):
     """Some rows bring the target's pose themselves, the lens being estimated from the others."""
-    evidence = {it.view: it for it in run(session_copy).evidence}
+    evidence = {view.view: view for view in run(session_copy).evidence}
     names = [f"cft_{name}" for name in ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")]
 
     def measured(header, rows):
@@ -409,7 +412,7 @@ def test_images_and_measured_poses_in_one_session(session_copy, result):
                 matrix = evidence[at].cam_from_target
                 cells[image] = ""
                 quaternion = Rotation.from_matrix(matrix[:3, :3]).as_quat()
-                pose = [repr(float(it)) for it in (*matrix[:3, 3], *quaternion)]
+                pose = [repr(float(value)) for value in (*matrix[:3, 3], *quaternion)]
             out.append(",".join([*cells, *pose]))
         return ",".join([header, *names]), out
 
@@ -451,7 +454,7 @@ def test_joints_of_another_robot_do_not_stop_a_session_with_poses(session_copy):
 
     with_rows(session_copy, without_the_last_joint)
     verdict = visioncal.calibrate(session_copy).verdict
-    assert any("Joint angles were not used: there are 5" in it for it in verdict.reasons)
+    assert any("Joint angles were not used: there are 5" in reason for reason in verdict.reasons)
 
 
 def test_a_refusal_tells_what_became_of_the_views(session_copy):
@@ -459,7 +462,7 @@ def test_a_refusal_tells_what_became_of_the_views(session_copy):
         path.unlink()
     with pytest.raises(DataError, match="2 views show the target") as caught:
         visioncal.calibrate(session_copy)
-    assert any("images/002.png is missing" in it for it in caught.value.culprits)
+    assert any("images/002.png is missing" in culprit for culprit in caught.value.culprits)
 
 
 @pytest.mark.parametrize(

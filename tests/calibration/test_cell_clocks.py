@@ -17,7 +17,7 @@ CLOCK = "cam_side and robot b"
 
 @pytest.fixture(scope="module")
 def swept():
-    arms = (replace(it, offset_sigma_rad=1e-3) for it in NetworkOptions().robots)
+    arms = (replace(robot, offset_sigma_rad=1e-3) for robot in NetworkOptions().robots)
     cell = cell_of(NetworkOptions(tuple(arms), stops=16, seed=4))
     return cell, *swept_session(cell)
 
@@ -36,7 +36,7 @@ def test_the_offset_of_one_camera_is_found_by_the_motion(found):
     assert abs(clock.camera_minus_robot_s - AHEAD_S) < 3 * clock.sigma_s
     ahead_ms = 1e3 * clock.camera_minus_robot_s
     said = f"{CLOCK}: the fit of the whole cell has the camera's clock {ahead_ms:+.2f} ms ahead"
-    assert any(it.startswith(said) for it in found.verdict.reasons)
+    assert any(reason.startswith(said) for reason in found.verdict.reasons)
 
 
 def test_the_clock_of_one_camera_and_robot_goes_with_them(found):
@@ -53,7 +53,7 @@ def test_a_camera_that_saw_nothing_else_is_placed_as_its_covariance_says(swept, 
     assert away @ np.linalg.solve(edge.covariance, away) < 22.0
     # Its lens is estimated, with a field and a focus of its own.
     assert edge.sigma_mm < 0.3
-    used = [it for it in found.sights if it.seer == "cam_side" and it.used]
+    used = [sight for sight in found.sights if sight.seer == "cam_side" and sight.used]
     assert len(used) > 30
     assert found.session_sha256 == session.digest()
 
@@ -63,7 +63,7 @@ def test_what_is_stated_of_one_camera_is_contradicted_by_name(swept):
     _, session, corners = swept
     document = {**session.document, "clocks": {"side": {"camera_minus_robot_s": 0.02}}}
     found = align(replace(session, document=document), corners=corners)
-    (doubt,) = [it for it in found.verdict.reasons if "is stated as +20.00 ms" in it]
+    (doubt,) = [reason for reason in found.verdict.reasons if "is stated as +20.00 ms" in reason]
     assert doubt.startswith(CLOCK)
     assert found.details.clocks[CLOCK].stated_s == 0.02
     assert found.verdict.status == "check"
@@ -80,11 +80,11 @@ def test_a_clock_of_no_camera_is_refused(swept):
 def test_rows_whose_motion_tells_no_offset_are_left_out_and_say_so(swept):
     """Some frames of the sweep: too few to say when."""
     _, session, corners = swept
-    timed = [it for it in session.views if it.stamp_s is not None]
-    views = tuple(it for it in session.views if it.stamp_s is None or it in timed[:5])
+    timed = [view for view in session.views if view.stamp_s is not None]
+    views = tuple(view for view in session.views if view.stamp_s is None or view in timed[:5])
     found = align(replace(session, views=views), corners=corners)
-    lost = [it for it in found.sights if it.seer == "cam_side"]
+    lost = [sight for sight in found.sights if sight.seer == "cam_side"]
     assert len(lost) == 5
-    assert all(not it.used and "clock" in it.reason for it in lost)
-    assert "cam_side" in {it.frame for it in found.untied}
-    assert any(it.startswith(CLOCK) for it in found.verdict.reasons)
+    assert all(not sight.used and "clock" in sight.reason for sight in lost)
+    assert "cam_side" in {untied.frame for untied in found.untied}
+    assert any(reason.startswith(CLOCK) for reason in found.verdict.reasons)

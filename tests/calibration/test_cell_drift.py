@@ -44,7 +44,7 @@ def session(cell):
 
 
 def aligned(cell, session, level):
-    return align(session, corners={it.view: it for it in cell.corners}, level=level)
+    return align(session, corners={corner.view: corner for corner in cell.corners}, level=level)
 
 
 @pytest.fixture(scope="module")
@@ -85,8 +85,8 @@ def test_coefficients_are_within_their_sigmas(found, tmp_path):
 def test_a_robot_without_temperatures_stays_and_is_named(found):
     assert found.arms["b"].thermal is None
     reasons = found.verdict.reasons
-    assert any(it.startswith("Robot a: the arm drifts with its temp") for it in reasons)
-    assert any(it.startswith("Robot b: no data show how it drifts") for it in reasons)
+    assert any(reason.startswith("Robot a: the arm drifts with its temp") for reason in reasons)
+    assert any(reason.startswith("Robot b: no data show how it drifts") for reason in reasons)
     budget = found.uncertainty.budget_mm["flange_a_from_target_plate_a"]
     assert 0.0 < budget["temperature of a"] < budget["total"]
 

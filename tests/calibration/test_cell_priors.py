@@ -25,7 +25,7 @@ def cell():
 def aligned(cell, prior, **columns):
     session = network_session(cell, "cell", seen="names")
     session = replace(session, document={**session.document, "prior": prior}, **columns)
-    return align(session, corners={it.view: it for it in cell.corners})
+    return align(session, corners={corner.view: corner for corner in cell.corners})
 
 
 def whole(matrix, sigma_m, sigma_rad):
@@ -60,7 +60,7 @@ def test_a_prior_that_is_wrong_is_named_with_what_the_observations_say(cell):
     height = float(cell.between("base_a", "base_b")[2, 3])
     prior = {"base_a_from_base_b": {"z_m": height + 0.02, "sigma_m": 1e-3}}
     found = aligned(cell, prior)
-    (doubt,) = [it for it in found.verdict.reasons if "contradicted" in it]
+    (doubt,) = [reason for reason in found.verdict.reasons if "contradicted" in reason]
     assert "z_m of base_a_from_base_b" in doubt
     said_mm, sigma_mm = map(float, re.search(r"alone say (\S+) mm to (\S+) mm", doubt).groups())
     # Four of the sigmas that are stated: one run in fifteen thousand.
@@ -75,16 +75,18 @@ def test_a_camera_that_sees_nothing_of_the_rest_is_tied_by_a_drawing():
     session = network_session(cell, "cell", seen="names")
     # Of the right camera, only what it sees of the floor is left.
     kept = [
-        it
-        for it in session.views
-        if it.text.get("camera") != "right" or it.text.get("target") == "floor"
+        view
+        for view in session.views
+        if view.text.get("camera") != "right" or view.text.get("target") == "floor"
     ]
     kept = [
-        it for it in kept if it.text.get("camera") != "left" or it.text.get("target") != "floor"
+        view
+        for view in kept
+        if view.text.get("camera") != "left" or view.text.get("target") != "floor"
     ]
-    corners = {it.view: it for it in cell.corners}
+    corners = {view_corners.view: view_corners for view_corners in cell.corners}
     loose = align(replace(session, views=tuple(kept)), corners=corners)
-    assert {it.frame for it in loose.untied} == {"cam_right", "target_floor"}
+    assert {untied.frame for untied in loose.untied} == {"cam_right", "target_floor"}
     rig = cell.between("cam_left", "cam_right")
     prior = {"cam_left_from_cam_right": whole(rig, 1e-4, 1e-4)}
     document = {**session.document, "prior": prior}
@@ -95,7 +97,7 @@ def test_a_camera_that_sees_nothing_of_the_rest_is_tied_by_a_drawing():
     # Chi-square of 6 beyond 22 is 0.1 %.
     assert away @ np.linalg.solve(edge.covariance, away) < 22.0
     # Nobody moves before the right camera: its board may be of any size.
-    assert not any("than stated" in it for it in found.verdict.reasons)
+    assert not any("than stated" in reason for reason in found.verdict.reasons)
     assert 0.1 < found.between("cam_left", "cam_right").sigma_mm < 0.2
 
 

@@ -49,7 +49,7 @@ def rewritten(session, change, document=None):
     """The session with its rows as `change` makes them: a function of the view and its texts."""
     rows = []
     for view in session.views:
-        row = {it: view.cell(it) for it in session.columns}
+        row = {column: view.cell(column) for column in session.columns}
         change(view, row)
         rows.append(list(row.values()))
     return Session.assemble(
@@ -65,12 +65,14 @@ def rewritten(session, change, document=None):
 
 def of_plate(session, plate, stop):
     """The views of a plate at a stop, one of which has the pose of its robot."""
-    return [it.number for it in session.views if it.stop == stop and it.text["target"] == plate]
+    return [
+        view.number for view in session.views if view.stop == stop and view.text["target"] == plate
+    ]
 
 
 def seen_often(session, plate):
     """The stops at which several cameras see a plate, after the first ones."""
-    return [it for it in range(3, CELL.stops) if len(of_plate(session, plate, it)) > 1]
+    return [index for index in range(3, CELL.stops) if len(of_plate(session, plate, index)) > 1]
 
 
 def poses(session, robot):
@@ -78,8 +80,8 @@ def poses(session, robot):
     rows = {}
     for view in session.views:
         if view.text.get("robot") == robot and view.cell("x_m"):
-            row = {it: view.cell(it) for it in session.columns[5:]}
-            rows[view.stop] = row | {it: "" for it in row if it.endswith("_rad")}
+            row = {column: view.cell(column) for column in session.columns[5:]}
+            rows[view.stop] = row | {value: "" for value in row if value.endswith("_rad")}
     return rows
 
 
@@ -88,7 +90,7 @@ def test_a_sound_cell_is_good_and_says_how_good(session):
     assert found.verdict.status == "good"
     good_for, reason = found.verdict.reasons
     assert good_for.startswith("It is good for tasks of ")
-    used = sum(it.used for it in found.sights)
+    used = sum(sight.used for sight in found.sights)
     assert reason.startswith(
         f"All {used} used views agree: left out of the fit, they are predicted"
     )
@@ -104,25 +106,25 @@ def test_one_wrong_pose_of_a_robot_is_named(session):
             row.update(pose | {"x_m": repr(float(pose["x_m"]) + 0.02)})
 
     found = align(rewritten(session, push))
-    (reason,) = [it for it in found.verdict.reasons if "Robot b did not stand" in it]
+    (reason,) = [reason for reason in found.verdict.reasons if "Robot b did not stand" in reason]
     assert f"at stop {stop} where its pose says: all {len(mine)} views" in reason
     assert "moved by 20 mm" in reason
-    assert all(str(it) in reason for it in mine)
+    assert all(str(value) in reason for value in mine)
     assert found.verdict.status == "check"
     # What a fault explains is not said once more of each camera.
-    assert not any("were left out; view" in it for it in found.verdict.reasons)
-    why = {it.view: it.reason for it in found.sights if not it.used}
+    assert not any("were left out; view" in reason for reason in found.verdict.reasons)
+    why = {sight.view: sight.reason for sight in found.sights if not sight.used}
     assert sorted(why) == mine
-    assert all(f"the pose of robot b at stop {stop} is wrong" in it for it in why.values())
+    assert all(f"the pose of robot b at stop {stop} is wrong" in name for name in why.values())
 
 
 def test_a_robot_whose_poses_are_misread_is_named_first(session):
     def turn(view, row):
         # w first: what other programs write into the same columns.
         if view.text.get("robot") == "b" and row["qx"]:
-            turned = [row[it] for it in ("qw", "qx", "qy", "qz")]
+            turned = [row[name] for name in ("qw", "qx", "qy", "qz")]
             row.update(zip(POSE[3:], turned, strict=True))
-        row.update({it: "" for it in row if it.endswith("_rad")})
+        row.update({value: "" for value in row if value.endswith("_rad")})
 
     misread = rewritten(session, turn)
     with pytest.raises(DegenerateError) as refused:
@@ -144,40 +146,40 @@ def test_poses_of_a_robot_that_are_exchanged_are_named(session):
 
     found = align(rewritten(session, exchange))
     words = f"The poses of robot b at stops {first} and {second} are exchanged: views"
-    assert any(it.startswith(words) for it in found.verdict.reasons)
-    out = [it.view for it in found.sights if not it.used]
+    assert any(reason.startswith(words) for reason in found.verdict.reasons)
+    out = [sight.view for sight in found.sights if not sight.used]
     assert out == [*of_plate(session, "plate_b", first), *of_plate(session, "plate_b", second)]
 
 
 def test_two_images_that_are_exchanged_have_a_command_that_mends_them(session):
     # The images of one camera at two stops.
-    views = [it for it in session.views if it.text["target"] == "plate_b"]
-    of_one = [it.number for it in views if it.text["camera"] == views[0].text["camera"]]
+    views = [view for view in session.views if view.text["target"] == "plate_b"]
+    of_one = [view.number for view in views if view.text["camera"] == views[0].text["camera"]]
     first, second = of_one[1], of_one[3]
     swapped = exchange_views(session, first, second)
     found = align(swapped)
-    (wrong,) = (it for it in found.verdict.findings if it.kind == "exchanged_views")
+    (wrong,) = (finding for finding in found.verdict.findings if finding.kind == "exchanged_views")
     assert set(wrong.views) == {first, second}
     assert f"--exchange {first},{second}" in wrong.do.command
     mended = exchange_views(swapped, first, second)
     assert len(mended.declaration.corrected) == 2
     again = align(mended)
-    assert all(it.used for it in again.sights if it.view in (first, second))
-    other = next(it.number for it in session.views if it.text["target"] != "plate_b")
+    assert all(sight.used for sight in again.sights if sight.view in (first, second))
+    other = next(view.number for view in session.views if view.text["target"] != "plate_b")
     with pytest.raises(DataError, match=r"of another .*target"):
         exchange_views(session, first, other)
 
 
 def test_a_camera_whose_corners_are_bad_is_named(session):
     table = session.corner_table
-    mine = {it.number for it in session.views if it.text.get("camera") == "right"}
+    mine = {view.number for view in session.views if view.text.get("camera") == "right"}
     noise = np.random.default_rng(0).normal(0.0, 1.5, table.px.shape)
     blurred = np.where(np.isin(table.views, list(mine))[:, None], table.px + noise, table.px)
     verdict = align(replace(session, corner_table=replace(table, px=blurred))).verdict
     assert verdict.status == "check"
-    (reason,) = [it for it in verdict.reasons if "corners deviate" in it]
+    (reason,) = [reason for reason in verdict.reasons if "corners deviate" in reason]
     assert reason.startswith("cam_right: corners deviate by 1.5 px")
-    assert not any(it.startswith(("cam_left: ", "cam_hand: ")) for it in verdict.reasons)
+    assert not any(reason.startswith(("cam_left: ", "cam_hand: ")) for reason in verdict.reasons)
 
 
 @pytest.mark.slow
@@ -185,7 +187,7 @@ def test_a_board_of_another_size_is_named():
     boards = (*CELL.boards[:2], replace(CELL.boards[2], target=BOARDS["checkerboard"], scale=1.004))
     verdict = align(recorded(simulate_network(replace(CELL, boards=boards)))).verdict
     assert verdict.status == "check"
-    (reason,) = [it for it in verdict.reasons if "larger than stated" in it]
+    (reason,) = [reason for reason in verdict.reasons if "larger than stated" in reason]
     assert reason.startswith("By the robot's motion the board plate_b is 0.4 % larger than stated")
     assert "squares of 25.1 mm, not of 25 mm" in reason
 
@@ -193,8 +195,8 @@ def test_a_board_of_another_size_is_named():
 def test_a_board_that_is_bent_is_named():
     boards = (*CELL.boards[:2], replace(CELL.boards[2], bow_m=1e-3))
     verdict = align(recorded(simulate_network(replace(CELL, boards=boards)))).verdict
-    assert any(it.startswith("The board plate_b is not flat") for it in verdict.reasons)
-    assert sum("not flat" in it for it in verdict.reasons) == 1
+    assert any(reason.startswith("The board plate_b is not flat") for reason in verdict.reasons)
+    assert sum("not flat" in reason for reason in verdict.reasons) == 1
 
 
 @pytest.mark.slow
@@ -204,8 +206,8 @@ def test_a_lens_that_is_not_as_stated_is_named(session):
     document["cameras"]["right"]["matrix"] = [1.005 * matrix[0], 1.005 * matrix[1], *matrix[2:]]
     verdict = align(rewritten(session, lambda *_: None, document)).verdict
     words = "cam_right: the given intrinsics do not fit these images and were refined: fx, fy"
-    assert any(it.startswith(words) for it in verdict.reasons)
-    assert sum("given intrinsics" in it for it in verdict.reasons) == 1
+    assert any(reason.startswith(words) for reason in verdict.reasons)
+    assert sum("given intrinsics" in reason for reason in verdict.reasons) == 1
 
 
 def test_two_targets_that_are_exchanged_are_named_by_their_points(session):
@@ -216,7 +218,7 @@ def test_two_targets_that_are_exchanged_are_named_by_their_points(session):
         Session.assemble(
             session.document,
             session.columns,
-            [[view.cell(it) for it in session.columns] for view in session.views],
+            [[view.cell(column) for column in session.columns] for view in session.views],
             session.images,
             target_document=targets,
             corners=session.corner_table,
@@ -230,18 +232,20 @@ def test_a_lens_of_half_the_resolution_is_named_where_corners_hardly_deviate_by_
     """Small boards before a long lens look nearly as well by another: the rest would not agree."""
     document = deepcopy(dict(session.document))
     matrix = document["cameras"]["right"]["matrix"]
-    document["cameras"]["right"]["matrix"] = [0.5 * it for it in matrix]
+    document["cameras"]["right"]["matrix"] = [0.5 * value for value in matrix]
     found = align(rewritten(session, lambda *_: None, document))
     assert found.verdict.causes[0].kind == "other_lens"
     assert found.verdict.causes[0].words.startswith("cam_right: the stated matrix is for images")
-    assert all(it.used for it in found.sights)
+    assert all(sight.used for sight in found.sights)
 
 
 def test_few_stops_are_told_by_robot(session):
     verdict = align(part(session, 0, 8)).verdict
     assert verdict.status == "check"
     for robot in ("a", "b"):
-        assert any(it.startswith(f"Robot {robot}: only 8 stops are used") for it in verdict.reasons)
+        assert any(
+            reason.startswith(f"Robot {robot}: only 8 stops are used") for reason in verdict.reasons
+        )
 
 
 def turned(tilt_deg, stops=14, noise=1.0):
@@ -250,7 +254,7 @@ def turned(tilt_deg, stops=14, noise=1.0):
     cell = world(rng, stops, seen=1.0)
     angles = rng.uniform(-1.0, 1.0, (stops, 3)) * [tilt_deg, tilt_deg, 35.0]
     places = np.array([0.9, 0.1, 0.45]) + rng.uniform(-0.2, 0.2, (stops, 3))
-    flanges = [pose(*it) for it in zip(angles, places, strict=True)]
+    flanges = [pose(*pair) for pair in zip(angles, places, strict=True)]
     cell.flanges["b"] = np.linalg.inv(cell.truth["base_b"]) @ np.array(flanges)
     problem = observed(cell, rng, noise=noise)
     seen, rows, told = problem.observations, [], set()
@@ -262,14 +266,14 @@ def turned(tilt_deg, stops=14, noise=1.0):
         told.add((robot, stop))
         row["robot"] = robot if fresh else ""
         row |= pose_row(problem.poses[robot][stop]) if fresh else dict.fromkeys(POSE, "")
-        row |= {f"cft_{it}": value for it, value in pose_row(seen.measured[at]).items()}
+        row |= {f"cft_{name}": value for name, value in pose_row(seen.measured[at]).items()}
         rows.append(row)
     document = {
         "schema": 1,
         "name": "turned",
         "cameras": {"left": {}, "right": {}},
         "robots": {"a": {}, "b": {}},
-        "targets": {it: {"target": "charuco_9x6_30mm"} for it in ("floor", "a", "b")},
+        "targets": {name: {"target": "charuco_9x6_30mm"} for name in ("floor", "a", "b")},
         "frames": {
             **dict.fromkeys(("cam_left", "cam_right", "target_floor"), "cell"),
             "target_a": "flange_a",
@@ -283,25 +287,27 @@ def turned(tilt_deg, stops=14, noise=1.0):
 def test_motion_about_one_axis_is_refused_with_what_it_leaves_open():
     with pytest.raises(
         DegenerateError, match="all 14 stops of robot b turn about base_b's z"
-    ) as it:
+    ) as caught:
         align(turned(0.0))
-    assert it.value.culprits == ("base_b's offset along base_b's z",)
-    assert "Add 3 or more stops in which flange_b is tilted" in it.value.next_step
+    assert caught.value.culprits == ("base_b's offset along base_b's z",)
+    assert "Add 3 or more stops in which flange_b is tilted" in caught.value.next_step
 
 
 def test_poor_motion_is_refused_with_the_direction_that_it_leaves_open():
-    with pytest.raises(DegenerateError, match="offset along the cell's z has a predicted") as it:
+    with pytest.raises(
+        DegenerateError, match="offset along the cell's z has a predicted"
+    ) as caught:
         align(turned(0.3))
-    assert "base_b's offset along the cell's z" in it.value.culprits
-    assert "all 14 stops of robot b turn about base_b's z to within 0." in it.value.message
+    assert "base_b's offset along the cell's z" in caught.value.culprits
+    assert "all 14 stops of robot b turn about base_b's z to within 0." in caught.value.message
 
 
 def test_noise_refuses_nothing():
     # Thirty times a usual camera's and robot's.
     verdict = align(turned(35.0, noise=30.0)).verdict
     assert verdict.status == "bad"
-    assert any("Weakly determined by the motion" in it for it in verdict.reasons)
-    assert sum("Left out of the fit, views disagree" in it for it in verdict.reasons) == 1
+    assert any("Weakly determined by the motion" in reason for reason in verdict.reasons)
+    assert sum("Left out of the fit, views disagree" in reason for reason in verdict.reasons) == 1
 
 
 @pytest.mark.slow
@@ -320,31 +326,31 @@ def test_a_board_of_another_size_is_named_with_all_views_used(which, scale, seed
     found = align(recorded(simulate_network(cell)))
     assert found.verdict.causes[0].kind == "board_size"
     assert words in found.verdict.causes[0].words
-    assert all(it.used for it in found.sights)
+    assert all(sight.used for sight in found.sights)
 
 
 def test_a_robot_in_millimetres_is_named_with_its_reading(session):
     def in_millimetres(_, row):
         if row["robot"] == "a" and row["x_m"]:
-            row.update({it: repr(1e3 * float(row[it])) for it in ("x_m", "y_m", "z_m")})
+            row.update({name: repr(1e3 * float(row[name])) for name in ("x_m", "y_m", "z_m")})
 
     misread = rewritten(session, in_millimetres)
     with pytest.raises(DegenerateError) as caught:
         align(misread)
     assert caught.value.message.startswith("Robot a: With the robot's positions in mm, the chain")
     assert "base_from_flange in metres" in caught.value.next_step
-    (found,) = [it for it in doctor(misread).findings if it.kind == "misread_poses"]
+    (found,) = [finding for finding in doctor(misread).findings if finding.kind == "misread_poses"]
     assert found.words.startswith("Robot a: With the robot's positions in mm")
 
 
 def test_a_mirrored_camera_beside_the_robots_is_named(session):
-    mine = [it.number for it in session.views if it.text.get("camera") == "right"]
+    mine = [view.number for view in session.views if view.text.get("camera") == "right"]
     table = session.corner_table
     width = session.declaration.cameras["right"].resolution[0]
     px, mirrored = table.px.copy(), np.isin(table.views, mine)
     px[mirrored, 0] = width - 1 - px[mirrored, 0]
     turned = replace(session, corner_table=replace(table, px=px))
-    (found,) = [it for it in doctor(turned).findings if it.kind == "misread_poses"]
+    (found,) = [finding for finding in doctor(turned).findings if finding.kind == "misread_poses"]
     assert found.words.startswith("Camera cam_right: With the images mirrored")
     # There are no images to look at.
     assert str(found.do).startswith("In corners.csv, u_px counts to the right")
@@ -370,7 +376,7 @@ def test_exchanged_names_are_the_cause_that_is_said_first(session, kind, names, 
     assert f"In the column {kind} of views.csv, write {names[1]} for {names[0]}" in (
         caught.value.next_step
     )
-    (found,) = [it for it in doctor(wrong).findings if it.kind == "exchanged_names"]
+    (found,) = [finding for finding in doctor(wrong).findings if finding.kind == "exchanged_names"]
     assert found.words.startswith(words)
 
 
@@ -379,7 +385,9 @@ def test_exchanges_are_tried_only_where_views_disagree(session, monkeypatch):
     monkeypatch.setattr(reading_hints, "exchanged_names", None)
     monkeypatch.setattr(running, "exchanged_names", None)
     assert align(session).verdict.status == "good"
-    assert not [it for it in doctor(session).findings if it.kind == "exchanged_names"]
+    assert not [
+        finding for finding in doctor(session).findings if finding.kind == "exchanged_names"
+    ]
 
 
 @pytest.mark.parametrize("seed", [6, 7])
@@ -388,7 +396,7 @@ def test_poses_that_were_measured_worse_than_others_are_no_outliers(seed):
     poses = network_session(simulate_network(replace(CELL, seed=seed)), "two arms", seen="poses")
     found = align(poses)
     assert found.verdict.status == "good"
-    assert all(it.used for it in found.sights)
+    assert all(sight.used for sight in found.sights)
 
 
 def test_a_few_uneven_poses_are_no_move(tmp_path):

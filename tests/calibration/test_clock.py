@@ -76,9 +76,9 @@ def sound(long) -> Calibration:
 
 def restamped(session: Session, stamp) -> Session:
     """The session with the views' times as `stamp` makes them of (n,) times [s]."""
-    before_s = np.array([it.stamp_s for it in session.views])
+    before_s = np.array([view.stamp_s for view in session.views])
     pairs = zip(session.views, stamp(before_s).tolist(), strict=True)
-    views = tuple(replace(it, numbers={**it.numbers, "stamp_s": s}) for it, s in pairs)
+    views = tuple(replace(view, numbers={**view.numbers, "stamp_s": s}) for view, s in pairs)
     return replace(session, views=views)
 
 
@@ -97,7 +97,7 @@ def test_a_clock_that_changes_is_named_and_taken_out(long, sound, stamp, words):
     assert cause.kind == "clock_changed"
     assert words in cause.words
     assert sound.verdict.status == "good"
-    (x, again) = (it.transforms["flange_from_cam"].as_matrix() for it in (sound, known))
+    (x, again) = (value.transforms["flange_from_cam"].as_matrix() for value in (sound, known))
     # Some frames about the jump are stamped in a mixed order; the rest is as without it.
     assert np.linalg.norm(x[:3, 3] - again[:3, 3]) < 3e-4
 
@@ -135,8 +135,8 @@ def x_error(cell, result) -> tuple[np.ndarray, np.ndarray]:
     [(1, "eye-in-hand", AHEAD_S), (2, "eye-to-hand", -0.61), (3, "eye-in-hand", 0.0)],
 )
 def test_the_offset_is_told_by_a_sweep(seed, mount, ahead_s):
-    it = swept(seed, mount, replace(SHORT, camera_minus_robot_s=ahead_s))
-    result = calibrate(sweep_session(it, "swept"))
+    sweep = swept(seed, mount, replace(SHORT, camera_minus_robot_s=ahead_s))
+    result = calibrate(sweep_session(sweep, "swept"))
     clock = result.clock
     error_s = clock.camera_minus_robot_s - ahead_s
     assert clock.method == "motion"
@@ -145,7 +145,7 @@ def test_the_offset_is_told_by_a_sweep(seed, mount, ahead_s):
     assert abs(error_s) < 2e-4
     assert abs(error_s) < 4 * clock.sigma_s
     assert clock.sigma_s < 1e-4
-    error, covariance = x_error(it.cell, result)
+    error, covariance = x_error(sweep.cell, result)
     # Six degrees of freedom: one in ten thousand is beyond.
     assert error @ np.linalg.solve(covariance, error) < 27.9
 
@@ -191,12 +191,12 @@ def test_joints_are_placed_in_time_too(moved, session):
 def test_a_folder_and_its_recording_give_the_same(session, tmp_path):
     session.save(tmp_path / "folder")
     write_recording(tmp_path / "session.rrd", session, None, (), None)
-    one, other = (calibrate(tmp_path / it) for it in ("folder", "session.rrd"))
+    one, other = (calibrate(tmp_path / name) for name in ("folder", "session.rrd"))
     assert one.session_sha256 == other.session_sha256
     assert one.clock == other.clock
     for name, edge in one.edges.items():
         np.testing.assert_array_equal(edge.matrix, other.edges[name].matrix)
-    (fact,) = [it for it in method_facts(one) if it.label == "camera's clock"]
+    (fact,) = [fact for fact in method_facts(one) if fact.label == "camera's clock"]
     assert fact.value.startswith("37.2")
     assert fact.note.endswith("by motion")
 
@@ -212,34 +212,39 @@ def test_a_sweep_is_written_with_its_truth(moved, tmp_path):
 
 
 def test_a_stated_offset_is_compared(session):
-    right, wrong = (calibrate(stating(session, it)) for it in (AHEAD_S + 1e-3, 0.0))
+    right, wrong = (calibrate(stating(session, value)) for value in (AHEAD_S + 1e-3, 0.0))
     told = "camera_minus_robot_s is stated as +0.00 ms, but the motion gives +37.2"
     # A millisecond is a thirtieth of a frame: nobody stamps better.
-    assert not any("is stated as" in it for it in right.verdict.reasons)
-    assert any(told in it for it in wrong.verdict.reasons)
+    assert not any("is stated as" in reason for reason in right.verdict.reasons)
+    assert any(told in reason for reason in wrong.verdict.reasons)
     assert wrong.verdict.status == "check"
     assert wrong.clock.stated_s == 0.0
     assert abs(wrong.clock.camera_minus_robot_s - AHEAD_S) < 1e-4
 
 
 def test_what_the_stream_does_not_cover_is_left_out_by_name(session):
-    gapped = cut(session, lambda it: ((it < 3.0) | (it > 3.4)) & (it < 6.3))
+    gapped = cut(session, lambda value: ((value < 3.0) | (value > 3.4)) & (value < 6.3))
     result = calibrate(gapped)
     reasons = [view.reason for view in result.views]
     assert abs(result.clock.camera_minus_robot_s - AHEAD_S) < 1e-4
     # 12 frames in the gap of 0.4 s, give or take those at its ends.
-    assert sum("samples of its stream are missing" in it for it in reasons) in (11, 12, 13, 14)
-    assert sum("before or after the robot's stream" in it for it in reasons) > 8
-    assert any("samples are missing in 1 place" in it for it in result.verdict.reasons)
+    assert sum("samples of its stream are missing" in reason for reason in reasons) in (
+        11,
+        12,
+        13,
+        14,
+    )
+    assert sum("before or after the robot's stream" in reason for reason in reasons) > 8
+    assert any("samples are missing in 1 place" in reason for reason in result.verdict.reasons)
 
 
 def test_frames_that_others_stand_for_do_not_make_a_gap_a_larger_share(session):
-    result = calibrate(cut(session, lambda it: (it < 3.0) | (it > 4.2)))
+    result = calibrate(cut(session, lambda value: (value < 3.0) | (value > 4.2)))
     lost = sum("samples of its stream are missing" in view.reason for view in result.views)
     # A sixth of the frames, but over a quarter of the lost and the chosen together.
     assert lost < 0.25 * len(result.views)
     assert lost > 0.25 * (lost + sum(view.used for view in result.views))
-    assert not any("views are not used" in it for it in result.verdict.reasons)
+    assert not any("views are not used" in reason for reason in result.verdict.reasons)
 
 
 def dwelling(ahead_s: float, at_rest: int = 20) -> Session:
@@ -277,7 +282,9 @@ def test_at_rest_the_clocks_do_not_matter(ahead_s):
     result = calibrate(dwelling(ahead_s))
     assert result.clock.method == "rest"
     assert result.clock.sigma_s is None
-    assert any("taken at rest, where this does not count" in it for it in result.verdict.reasons)
+    assert any(
+        "taken at rest, where this does not count" in reason for reason in result.verdict.reasons
+    )
     assert result.verdict.status == "good"
     assert sum(view.used for view in result.views) == 20
 
@@ -287,8 +294,8 @@ def test_views_in_motion_are_left_out_where_nothing_tells_the_offset():
     # Views that no fit may use tell nothing of the clocks either.
     held = [replace(view, holdout=view.number >= 14) for view in session.views]
     clocked = clocked_of(replace(session, views=tuple(held)))
-    assert sorted(it.view for it in clocked.rejections) == list(range(14, 20))
-    assert all("taken in motion" in it.reason for it in clocked.rejections)
+    assert sorted(rejection.view for rejection in clocked.rejections) == list(range(14, 20))
+    assert all("taken in motion" in rejection.reason for rejection in clocked.rejections)
     assert [view.number for view in clocked.views] == list(range(14))
     assert "6 views that were taken in motion are left out" in clocked.warnings[0].words
 
@@ -307,8 +314,8 @@ def streamed(name: str, camera, robot) -> Session:
     """A session of what a camera saw, and a stream of the robot: times and poses of either."""
     rows = quaternions(camera[1]).tolist()
     views = [
-        View(at, numbers={"stamp_s": float(it)} | dict(zip(MEASURED_CAM_POSE, row, strict=True)))
-        for at, (it, row) in enumerate(zip(camera[0], rows, strict=True))
+        View(at, numbers={"stamp_s": float(value)} | dict(zip(MEASURED_CAM_POSE, row, strict=True)))
+        for at, (value, row) in enumerate(zip(camera[0], rows, strict=True))
     ]
     document = {"schema": 1, "name": name, "mount": "eye-in-hand"}
     columns = ("view", "stamp_s", *MEASURED_CAM_POSE)
@@ -328,7 +335,9 @@ def periodic() -> Session:
     frames_s = np.arange(3, 17, 1 / 15)
     turns = np.pi * np.array([1, 2, 1, 2, 1, 2])
     sizes = np.array([0.4, 0.5, 0.3, 0.1, 0.1, 0.1])
-    way = [exp(np.sin(np.outer(it, turns) + np.arange(6)) * sizes) for it in (times_s, frames_s)]
+    way = [
+        exp(np.sin(np.outer(array, turns) + np.arange(6)) * sizes) for array in (times_s, frames_s)
+    ]
     x, z = exp(rng.normal(size=(2, 6)))
     seen = invert(way[1] @ x) @ z @ exp(1e-4 * rng.normal(size=(len(frames_s), 6)))
     return streamed("periodic", (frames_s, seen), (times_s, way[0]))
@@ -345,8 +354,8 @@ def test_motion_that_repeats_itself_is_told_by_what_is_stated():
 
 
 def test_views_in_milliseconds_are_named(session):
-    rows = [{**it.numbers, "stamp_s": 1e3 * it.stamp_s} for it in session.views]
-    views = [replace(it, numbers=row) for it, row in zip(session.views, rows, strict=True)]
+    rows = [{**view.numbers, "stamp_s": 1e3 * view.stamp_s} for view in session.views]
+    views = [replace(view, numbers=row) for view, row in zip(session.views, rows, strict=True)]
     with pytest.raises(DataError, match="times look like milliseconds") as caught:
         calibrate(replace(session, views=tuple(views)))
     assert "Divide the column stamp_s" in caught.value.next_step
@@ -356,16 +365,16 @@ def test_views_in_milliseconds_are_named(session):
 def test_times_of_views_and_robot_in_another_unit_are_named(session, per_s, unit):
     stream = session.streams["robot"]
     scaled = stream.values * np.where(np.array(stream.columns) == "stamp_s", per_s, 1.0)
-    rows = [{**it.numbers, "stamp_s": per_s * it.stamp_s} for it in session.views]
-    views = tuple(replace(it, numbers=row) for it, row in zip(session.views, rows, strict=True))
+    rows = [{**view.numbers, "stamp_s": per_s * view.stamp_s} for view in session.views]
+    views = tuple(replace(view, numbers=row) for view, row in zip(session.views, rows, strict=True))
     both = replace(session, views=views).with_streams({"robot": Stream(stream.columns, scaled)})
     with pytest.raises(DataError, match=rf"streams/robot\.csv: .* looks like {unit} \(125 samples"):
         calibrate(both)
 
 
 def test_times_that_are_missing_are_asked_for_where_a_stream_waits_for_them(session):
-    rows = [{k: v for k, v in it.numbers.items() if k != "stamp_s"} for it in session.views]
-    views = tuple(replace(it, numbers=row) for it, row in zip(session.views, rows, strict=True))
+    rows = [{k: v for k, v in view.numbers.items() if k != "stamp_s"} for view in session.views]
+    views = tuple(replace(view, numbers=row) for view, row in zip(session.views, rows, strict=True))
     with pytest.raises(DataError, match=r"Fill in stamp_s.*streams/robot\.csv gives the poses"):
         calibrate(replace(session, views=views))
 
@@ -376,10 +385,10 @@ def test_a_clock_that_was_set_during_the_recording_costs_no_memory(session):
     stamps = stream.stamps_s
     later = np.where(np.array(stream.columns) == "stamp_s", 1.76e9, 0.0) * (stamps > early)[:, None]
     rows = [
-        {**it.numbers, "stamp_s": it.stamp_s + 1.76e9 * (it.stamp_s > early + AHEAD_S)}
-        for it in session.views
+        {**view.numbers, "stamp_s": view.stamp_s + 1.76e9 * (view.stamp_s > early + AHEAD_S)}
+        for view in session.views
     ]
-    views = tuple(replace(it, numbers=row) for it, row in zip(session.views, rows, strict=True))
+    views = tuple(replace(view, numbers=row) for view, row in zip(session.views, rows, strict=True))
     moved = replace(session, views=views)
     found = clocked_of(moved.with_streams({"robot": Stream(stream.columns, stream.values + later)}))
     assert abs(found.clock.camera_minus_robot_s - AHEAD_S) < 1e-4
@@ -396,7 +405,7 @@ def test_times_that_images_share_are_named(session):
 
 def test_at_rest_images_may_share_a_time():
     resting = dwelling(0.0)
-    again = [replace(it, number=it.number + 100) for it in resting.views]
+    again = [replace(view, number=view.number + 100) for view in resting.views]
     assert clocked_of(replace(resting, views=(*resting.views, *again))).clock.method == "rest"
 
 
@@ -407,7 +416,7 @@ def test_times_out_of_order_are_named_where_the_motion_contradicts_them(session)
     assert caught.value.culprits == ("views.csv: stamp_s",)
     # Rows in any order are as good, where each has the time of its own image.
     numbers = shuffled(len(session.views)).tolist()
-    views = [replace(it, number=at) for it, at in zip(session.views, numbers, strict=True)]
+    views = [replace(view, number=at) for view, at in zip(session.views, numbers, strict=True)]
     clock = clocked_of(replace(session, views=tuple(views))).clock
     assert abs(clock.camera_minus_robot_s - AHEAD_S) < 1e-4
 
@@ -438,14 +447,14 @@ def test_a_stated_offset_stands_where_motion_does_not_tell_it():
 
 def test_what_is_open_about_the_clocks_counts(session):
     known = RunState(session)
-    for stage in STAGES[: [it.name for it in STAGES].index("clock") + 1]:
+    for stage in STAGES[: [stage.name for stage in STAGES].index("clock") + 1]:
         known = stage.run(known)
     spreads = []
     for sigma_s in (1e-6, 5e-3):
         clock = replace(next(iter(known.clocks.values())).clock, sigma_s=sigma_s)
-        clocks = {pair: replace(it, clock=clock) for pair, it in known.clocks.items()}
+        clocks = {pair: replace(clocked, clock=clock) for pair, clocked in known.clocks.items()}
         later = replace(known, clocks=clocks)
-        for stage in STAGES[[it.name for it in STAGES].index("clock") + 1 :]:
+        for stage in STAGES[[stage.name for stage in STAGES].index("clock") + 1 :]:
             later = stage.run(later)
         budget = result_of(later).uncertainty.budget_mm
         spreads.append((budget["clock"], budget["total"]))

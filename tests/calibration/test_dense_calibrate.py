@@ -65,10 +65,14 @@ def both(session):
 
 def off_px(cell, found):
     """Rms of what all corners are off."""
-    exact = {it.view: dict(zip(it.ids.tolist(), it.px, strict=True)) for it in cell.exact_corners}
+    exact = {
+        corners_.view: dict(zip(corners_.ids.tolist(), corners_.px, strict=True))
+        for corners_ in cell.exact_corners
+    }
     off = [
-        it.corners.px - np.array([exact[it.view][number] for number in it.corners.ids.tolist()])
-        for it in found.evidence
+        value.corners.px
+        - np.array([exact[value.view][number] for number in value.corners.ids.tolist()])
+        for value in found.evidence
     ]
     return np.sqrt(np.mean(np.concatenate(off) ** 2))
 
@@ -84,16 +88,18 @@ def test_dense_corners_are_nearer_to_the_truth_and_both_predictions_are_told(cel
     held = found.calibration.validation.held_out
     assert document.held_out["dense"] == CornerResiduals(mm=held.mm, px=held.px)
     assert document.held_out["template"].px == plain.calibration.validation.held_out.px
-    (told,) = [it for it in found.calibration.verdict.reasons if it.startswith("Dense corners")]
+    (told,) = [
+        reason for reason in found.calibration.verdict.reasons if reason.startswith("Dense corners")
+    ]
     assert told.startswith("Dense corners are kept: with them, views that were left out are")
     assert told.count(" px and ") == told.count(" mm") == 2
 
 
 def test_blur_is_told_with_its_cause(both):
     found = both[1].calibration
-    (told,) = [it for it in found.verdict.reasons if "Motion smears" in it]
+    (told,) = [reason for reason in found.verdict.reasons if "Motion smears" in reason]
     assert told.startswith("Motion smears 10 of 10 images, by up to 6.")
-    lengths = [it.motion_px for it in found.dense.images]
+    lengths = [image.motion_px for image in found.dense.images]
     np.testing.assert_allclose(lengths, 6.0, atol=0.5)
 
 
@@ -101,8 +107,8 @@ def test_every_image_is_explained(session, both):
     found = both[1]
     for seen in found.evidence:
         drawn, rest = (
-            cv2.imdecode(np.frombuffer(it, np.uint8), cv2.IMREAD_GRAYSCALE)
-            for it in (seen.explained.drawn, seen.explained.rest)
+            cv2.imdecode(np.frombuffer(value, np.uint8), cv2.IMREAD_GRAYSCALE)
+            for value in (seen.explained.drawn, seen.explained.rest)
         )
         assert drawn.shape == rest.shape == session.resolution[::-1]
         # An exact robot and exact images: JPEG and the noise are left, four times as strong.
@@ -132,7 +138,7 @@ def test_dense_corners_that_predict_worse_are_not_kept(session, both, monkeypatc
         plain.edges["flange_from_cam"].transform.translation, abs=1e-12
     )
     assert not found.dense.kept
-    assert any(it.startswith("Dense corners are not kept") for it in found.verdict.reasons)
+    assert any(reason.startswith("Dense corners are not kept") for reason in found.verdict.reasons)
 
 
 @pytest.mark.usefixtures("torch")
@@ -148,7 +154,7 @@ def test_an_image_that_cannot_be_fitted_keeps_the_corners_of_the_template(sessio
     read = stage.image_of
     image = read(session, views[0])
     monkeypatch.setattr(
-        stage, "image_of", lambda it, view: image if view is views[0] else read(it, view)
+        stage, "image_of", lambda value, view: image if view is views[0] else read(value, view)
     )
     monkeypatch.setattr(stage, "fit_corners", first_fails)
     corners, dense = stage.fit_densely(session, views, found, stage.Dense("cpu"))

@@ -77,7 +77,7 @@ def test_rows_that_no_image_shows_are_counted(sound, tmp_path):
     found = visioncal.doctor(folder)
     # Another row is no mistake of what is there.
     assert found.is_sound
-    (said,) = (it for it in found.seen if "rows of squares" in it)
+    (said,) = (name for name in found.seen if "rows of squares" in name)
     assert re.match(r"6 rows of squares, where 7 are declared and \d+ images have room", said)
     assert "rows of squares" not in str(visioncal.doctor(sound))
 
@@ -96,7 +96,7 @@ def test_markers_too_small_to_read_are_no_mirror_and_no_other_board(tmp_path):
     first, *rest = visioncal.doctor(folder).findings
     assert first.kind == "unread_markers"
     assert re.search(r"markers cannot be read: they are \d+ px wide", first.words)
-    assert not {it.kind for it in rest} & {"mirrored_images", "other_board"}
+    assert not {finding.kind for finding in rest} & {"mirrored_images", "other_board"}
 
 
 def first_of_blurred(shown, sigma_px):
@@ -183,12 +183,14 @@ def test_what_is_wrong_is_named_first(tmp_path, monkeypatch, name):
 def test_rows_in_another_unit_are_corrected_and_not_taken_again(tmp_path):
     def in_mm(rows):
         for row in rows[3:6]:
-            row.update({it: repr(1e3 * float(row[it])) for it in ("x_m", "y_m", "z_m")})
+            row.update({name: repr(1e3 * float(row[name])) for name in ("x_m", "y_m", "z_m")})
         return rows
 
     folder = sound_session(tmp_path / "session", BROKEN["an image twice"])
     edit_rows(folder, in_mm)
-    (found,) = (it for it in visioncal.doctor(folder).findings if it.kind == "lost_views")
+    (found,) = (
+        finding for finding in visioncal.doctor(folder).findings if finding.kind == "lost_views"
+    )
     assert "divide its x_m, y_m, z_m by 1000" in found.words
     assert found.do.words == "In views.csv, correct the rows that are named, or delete them."
 

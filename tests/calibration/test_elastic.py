@@ -42,10 +42,10 @@ def test_a_sagging_arm_is_calibrated_all_over_its_workspace():
     assert error_m(cell, known, known.robot_arm.model) < 0.06 * before
     # A rigid arm cannot follow.
     assert error_m(cell, rigid, rigid.robot_arm.model) > 0.3 * before
-    assert any("speak for more" in it for it in rigid.verdict.reasons)
+    assert any("speak for more" in reason for reason in rigid.verdict.reasons)
     # The first axis is upright: no weight turns it.
     assert arm_found(known).springs.rigid[0] == "shoulder_pan_joint"
-    assert any("taken for rigid" in it for it in known.verdict.reasons)
+    assert any("taken for rigid" in reason for reason in known.verdict.reasons)
 
 
 def test_springs_are_told_to_their_bound(carrying):
@@ -97,17 +97,18 @@ def test_files_of_others_say_that_they_hold_no_springs(carrying):
     arm = result_of(carrying[1])
     written = document(arm, "robot-dh")
     assert any(
-        "its joints bend under its own weight, and under a load" in it for it in written.warnings
+        "its joints bend under its own weight, and under a load" in warning
+        for warning in written.warnings
     )
     assert "its joints bend under its own weight, and under a load" in written.text
     rigid = replace(arm, elastic=None)
-    assert not any("bend" in it for it in document(rigid, "robot-dh").warnings)
+    assert not any("bend" in warning for warning in document(rigid, "robot-dh").warnings)
 
 
 def test_stops_are_planned_that_tell_springs():
     options = CellOptions(robot="ur10e")
     cell, q = true_cell(options), postures_in_view(options, 12)
-    springs, rigid = (stop_factors(cell, PURPOSES[it], q) for it in ("elastic", "kinematics"))
+    springs, rigid = (stop_factors(cell, PURPOSES[name], q) for name in ("elastic", "kinematics"))
     # One unknown a joint more; the upright first axis bears no weight, wherever the arm stands.
     assert springs.shape[2] == rigid.shape[2] + 6
     told = np.abs(springs[:, :, -6:]).max(axis=(0, 1))
@@ -123,10 +124,10 @@ def test_a_payload_that_is_not_as_stated_is_told(carrying):
     cell, known = carrying
     factor = arm_found(known).springs.payload
     assert abs(factor.value - 1.0) < 3.0 * factor.sigma
-    light = tuple(replace(it, kg=it.kg / 2.0) for it in cell.payloads)
+    light = tuple(replace(payload, kg=payload.kg / 2.0) for payload in cell.payloads)
     wrong = calibrated(replace(cell, payloads=light))
     assert arm_found(wrong).springs.payload.value > 1.3
-    assert any("Load and bend do not fit" in it for it in wrong.verdict.reasons)
+    assert any("Load and bend do not fit" in reason for reason in wrong.verdict.reasons)
     assert wrong.verdict.status != "good"
 
 
@@ -137,7 +138,7 @@ def test_a_stiff_arm_is_not_made_to_bend():
     assert arm_found(known).springs is None
     asked = calibrated(simulate(replace(WRONG_LINKS, seed=2)), level="elastic")
     assert asked.robot_arm.kinematics.level == "nominal"
-    assert any("stays as stated" in it for it in asked.verdict.reasons)
+    assert any("stays as stated" in reason for reason in asked.verdict.reasons)
 
 
 def test_predictions_move_with_springs_as_their_derivatives_say():
@@ -149,7 +150,8 @@ def test_predictions_move_with_springs_as_their_derivatives_say():
     for at in range(6):
         change = step * np.eye(6)[at]
         ends = [
-            log(middle @ model.moved(it).base_from_flange(q, loads)) for it in (change, -change)
+            log(middle @ model.moved(value).base_from_flange(q, loads))
+            for value in (change, -change)
         ]
         # An arm that bends more has other levers, by as much as it bends: left out.
         assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(jacobian[:, :, at], abs=0.02)

@@ -111,7 +111,9 @@ def test_a_wrong_mount_and_a_wrong_size_are_both_named():
     poses = cell_poses("eye-to-hand")
     stated = replace(poses.camera, positions=3.0 * poses.camera.positions)
     guess = guess_reading(poses.robot, stated, "eye-in-hand")
-    assert any(it.startswith("the target 0.33 times") for it in guess.best.differences)
+    assert any(
+        difference.startswith("the target 0.33 times") for difference in guess.best.differences
+    )
     assert "mounted eye-to-hand" in guess.sentence
 
 
@@ -142,7 +144,9 @@ def test_mirrored_images_are_named_before_a_left_handed_frame():
     poses = MISTAKES["one axis left-handed"](cell_poses("eye-in-hand"), np.random.default_rng(0))
     guess = guessed(poses)
     assert guess.best.words.startswith("the images mirrored, or the robot's poses in a left-handed")
-    assert any("Mirrored images look the same, and are the usual cause" in it for it in guess.notes)
+    assert any(
+        "Mirrored images look the same, and are the usual cause" in note for note in guess.notes
+    )
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
@@ -249,8 +253,8 @@ def test_the_cameras_own_poses_may_be_inverse():
     guess = guess_reading(poses.robot, numbers(invert(camera)), poses.mount)
     assert guess.stands_out
     # Another mount closes the chain as well: the note says so whichever is chosen.
-    assert any("camera's poses inverse" in it for it in (guess.best.words, *guess.notes))
-    assert any("mounted" in it for it in (guess.best.words, *guess.notes))
+    assert any("camera's poses inverse" in name for name in (guess.best.words, *guess.notes))
+    assert any("mounted" in name for name in (guess.best.words, *guess.notes))
 
 
 def test_a_shift_of_four_rows_is_found():
@@ -404,7 +408,7 @@ def test_positions_that_were_never_recorded_are_named(mount):
 
 def test_a_sound_calibration_is_not_troubled_by_it():
     verdict = visioncal.calibrate(pairs_session(cell_poses("eye-to-hand"))).verdict
-    assert not any("--guess" in it for it in verdict.reasons)
+    assert not any("--guess" in reason for reason in verdict.reasons)
 
 
 def test_a_session_of_images_is_read_by_its_joints_as_well(rendered):
@@ -425,8 +429,13 @@ def test_a_board_that_looks_the_same_turned_does_not_hide_sound_poses():
     target = Target("even", "checkerboard", 8, 6, 0.025, 2.5e-5)
     cell = simulate(CellOptions(views=12, seed=5, target=target))
     seen = [
-        Corners(it.view, it.ids, it.px[::-1] if it.view % 2 else it.px, it.blur_px)
-        for it in cell.corners
+        Corners(
+            view_corners.view,
+            view_corners.ids,
+            view_corners.px[::-1] if view_corners.view % 2 else view_corners.px,
+            view_corners.blur_px,
+        )
+        for view_corners in cell.corners
     ]
     known = measured(replace(cell, corners=tuple(seen)))
     assert len(known.poses[0].cam_from_target) > 1
@@ -448,7 +457,7 @@ def doosan(data):
     folder = data / "doosan_a0509_charuco/poses"
     robot = np.array([np.loadtxt(folder / f"pose_{at:03d}.txt") for at in range(31)])
     boards = [np.load(folder / f"boardpose_{at:03d}.npz") for at in range(31)]
-    return robot, np.array([from_rvec(it["rvec"], it["tvec"]) for it in boards])
+    return robot, np.array([from_rvec(board["rvec"], board["tvec"]) for board in boards])
 
 
 def real_sets(data):
@@ -459,8 +468,10 @@ def real_sets(data):
     yield "moveit", sound(whole(pairs[:, 0]), whole(pairs[:, 1]), "eye-to-hand")
     paths = sorted((data / "pose_pairs_small/franka_charuco_joint_angles").glob("*.json"))
     views = [json.loads(path.read_text()) for path in paths]
-    robot = np.array([np.reshape(it["O_T_EE"], (4, 4)) for it in views])
-    camera = np.array([from_rvec(it["T_cam_target_rvec"], it["T_cam_target_tvec"]) for it in views])
+    robot = np.array([np.reshape(view["O_T_EE"], (4, 4)) for view in views])
+    camera = np.array(
+        [from_rvec(view["T_cam_target_rvec"], view["T_cam_target_tvec"]) for view in views]
+    )
     yield "franka", sound(whole(robot), camera, "eye-in-hand")
     robot, camera = ethz(data)
     yield "ethz", sound(robot, invert(camera), "eye-in-hand")

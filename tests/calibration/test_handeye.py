@@ -70,7 +70,7 @@ def test_jacobian_agrees_with_central_differences(mount):
         shift = np.zeros(15)
         shift[axis] = step
         moved = [state.moved(sign * shift) for sign in (1, -1)]
-        ahead, behind = (problem.linear(it).residuals for it in moved)
+        ahead, behind = (problem.linear(state).residuals for state in moved)
         # Truncation step^2, rounding 1e-16 / step = 1e-10, and the series' own cut of 1e-9.
         np.testing.assert_allclose(analytic[:, :, axis], (ahead - behind) / (2 * step), atol=5e-9)
 
@@ -107,7 +107,7 @@ def test_rounds_of_a_calibration_solve_each_closed_form_once(monkeypatch):
 
         return call
 
-    forms = {name: counted(name, it) for name, it in SOLVERS.items()}
+    forms = {name: counted(name, solver) for name, solver in SOLVERS.items()}
     monkeypatch.setattr("visioncal.calibration.stages.handeye.SOLVERS", forms)
     # Errors of the arm are taken up by several rounds.
     cell = simulate(CellOptions(views=40, dh_sigma_m=1e-3, dh_sigma_rad=1e-3, branches=True))
@@ -200,9 +200,9 @@ def test_a_stop_counts_once_however_often_it_is_looked_at():
     looks = replace(looks, covariance=3.0 * looks.covariance)
     thrice = replace(problem, observations=looks)
     # Three looks of three times the variance are one look.
-    for it in (thrice, thrice.merged()):
-        np.testing.assert_allclose(solved(it).state.edges, once.state.edges, atol=1e-9)
-        np.testing.assert_allclose(solved(it).covariance, once.covariance, rtol=1e-5, atol=1e-14)
+    for item in (thrice, thrice.merged()):
+        np.testing.assert_allclose(solved(item).state.edges, once.state.edges, atol=1e-9)
+        np.testing.assert_allclose(solved(item).covariance, once.covariance, rtol=1e-5, atol=1e-14)
     unmerged = solved(
         replace(
             thrice,
@@ -306,7 +306,7 @@ def test_noise_that_the_data_show_refuses_nothing():
         x, z = some_edges(seed)
         motion = some_motion(12, seed, np.deg2rad(5.0))
         result = solved(made_up(motion, x, z, Noise.of_robot(np.deg2rad(3.0), 2e-2), seed=seed))
-        assert max(it.sigma / it.limit for it in result.worst) > 2.0
+        assert max(direction.sigma / direction.limit for direction in result.worst) > 2.0
 
 
 def test_small_tilts_are_refused_at_a_typical_noise():
@@ -336,7 +336,9 @@ def test_views_of_a_moved_target_frame_give_the_same_camera():
     poses = measured_poses(cell)
     turned = compose(Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix(), np.zeros(3))
     # Turning the target's frame about its origin leaves lengths and angles of residuals alone.
-    first, second = (solved(problem_of(cell, it)).state.edges for it in (poses, poses @ turned))
+    first, second = (
+        solved(problem_of(cell, array)).state.edges for array in (poses, poses @ turned)
+    )
     np.testing.assert_allclose(second[0], first[0], atol=1e-7)
     np.testing.assert_allclose(second[1], first[1] @ turned, atol=1e-7)
 

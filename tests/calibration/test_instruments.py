@@ -35,7 +35,7 @@ PROBE, POINT, POINTS = Tracked(poses=True), Tracked(), Tracked(points=THREE)
 KINDS = pytest.mark.parametrize("options", [PROBE, POINT, POINTS], ids=["probe", "point", "three"])
 PROBE_FIRST = pytest.mark.parametrize(
     "options",
-    [PROBE, *(slow(it) for it in (POINT, POINTS))],
+    [PROBE, *(slow(item) for item in (POINT, POINTS))],
     ids=["probe", "point", "three"],
 )
 WRONG = {"dh_sigma_m": 5e-4, "dh_sigma_rad": 1e-3, "offset_sigma_rad": 1e-3}
@@ -145,11 +145,11 @@ def test_without_a_model_poses_give_the_frames_alone(tmp_path):
     result = visioncal.calibrate(tmp_path / "shop")
     assert list(result.transforms) == ["base_from_instrument", "flange_from_probe"]
     assert result.arm is None
-    places = np.array([[it.x_m, it.y_m, it.z_m] for it in result.points])
+    places = np.array([[point.x_m, point.y_m, point.z_m] for point in result.points])
     # Known to 0.012 mm each, by what the result says of them.
     assert places == pytest.approx(np.array(THREE), abs=5e-5)
-    assert [it.point for it in result.points] == ["a", "b", "c"]
-    assert all(it.sigma_mm < 0.02 for it in result.points)
+    assert [point.point for point in result.points] == ["a", "b", "c"]
+    assert all(point.sigma_mm < 0.02 for point in result.points)
 
 
 @PROBE_FIRST
@@ -219,7 +219,7 @@ def test_an_instrument_that_sinks_is_told(options):
         sunk[2, 3] -= 5e-4 * stop / 29
         rows.append((stop, point, sunk))
     known = known_of(session_of(replace(shop, rows=tuple(rows))), level="hand-eye")
-    told = [it.words for it in known.warnings if it.kind == "moved_slowly"]
+    told = [warning.words for warning in known.warnings if warning.kind == "moved_slowly"]
     assert len(told) == 1
     moved = float(told[0].split("moved by ")[1].split(" mm")[0])
     # Told to some 15 %: the arm repeats to 0.03 mm.
@@ -230,7 +230,7 @@ def test_an_instrument_that_sinks_is_told(options):
 def test_views_that_are_held_back_are_predicted():
     shop = tracked(replace(POINTS, **WRONG, stops=36))
     session = session_of(shop)
-    views = tuple(replace(it, holdout=it.stop % 6 == 0) for it in session.views)
+    views = tuple(replace(view, holdout=view.stop % 6 == 0) for view in session.views)
     known = known_of(replace(session, views=views))
     assert len(known.used) == 90
     # Left out in turn, stops are predicted to 0.07 mm.
@@ -242,32 +242,34 @@ def test_measured_poses_of_a_target_come_before_readings():
     session = session_of(tracked(PROBE))
     views = tuple(
         replace(
-            it,
-            numbers=it.numbers
-            | {f"cft_{name[5:]}": it.numbers[name] for name in it.numbers if "meas_" in name},
+            view,
+            numbers=view.numbers
+            | {f"cft_{name[5:]}": view.numbers[name] for name in view.numbers if "meas_" in name},
         )
-        for it in session.views
+        for view in session.views
     )
     document = {**session.document, "mount": "eye-to-hand"}
-    columns = (*session.columns, *(f"cft_{it}" for it in POSE))
+    columns = (*session.columns, *(f"cft_{name}" for name in POSE))
     both = replace(session, columns=columns, views=views, document=document)
     known = known_of(both)
     assert both.mount == "eye-to-hand"
     assert known.readings is None
-    assert any("30 rows have an instrument's readings" in it.reason for it in known.warnings)
+    assert any(
+        "30 rows have an instrument's readings" in warning.reason for warning in known.warnings
+    )
 
 
 def edited(session: Session, column: str, change) -> Session:
     """The session with a column's cells changed, by row."""
     place = session.columns.index(column)
-    rows = [[view.cell(it) for it in session.columns] for view in session.views]
+    rows = [[view.cell(name) for name in session.columns] for view in session.views]
     for at, row in enumerate(rows):
         row[place] = change(at, row[place])
     return Session.assemble(session.document, session.columns, rows, MemoryImages({}))
 
 
 def test_what_cannot_be_calibrated_is_refused_by_name():
-    point, probe, points = (session_of(tracked(it)) for it in (POINT, PROBE, POINTS))
+    point, probe, points = (session_of(tracked(item)) for item in (POINT, PROBE, POINTS))
     for session, words in (
         (edited(point, "meas_x_m", lambda _, cell: str(1e3 * float(cell))), "millimetres"),
         (edited(points, "point", lambda at, cell: "" if at == 7 else cell), "of view 7 do not"),
@@ -305,8 +307,8 @@ def test_a_misspelt_point_is_named():
 
 def test_a_session_that_does_not_say_how_good_its_readings_are_is_refused():
     session = session_of(tracked(POINT))
-    document = {it: value for it, value in session.document.items() if it != "instrument"}
-    rows = [[view.cell(it) for it in session.columns] for view in session.views]
+    document = {name: value for name, value in session.document.items() if name != "instrument"}
+    rows = [[view.cell(column) for column in session.columns] for view in session.views]
     silent = Session.assemble(
         document | {"mount": "eye-to-hand"}, session.columns, rows, MemoryImages({})
     )
@@ -363,7 +365,7 @@ def test_a_joint_that_slips_between_readings_is_named(options, joint, slip_deg):
     slipped[20:, joint - 1] += np.deg2rad(slip_deg)
     known = known_of(session_of(replace(shop, joints=slipped)))
     assert known.verdict.status != "good"
-    (found,) = (it for it in known.verdict.findings if it.kind == "joint_slipped")
+    (found,) = (finding for finding in known.verdict.findings if finding.kind == "joint_slipped")
     assert found == known.verdict.causes[0]
     assert f"joint {joint} (" in found.words
     assert "from stop 20 on" in found.words
@@ -375,7 +377,7 @@ def test_a_joint_that_slips_between_readings_is_named(options, joint, slip_deg):
 
 def _steps_deg(words):
     found = re.findall(r"it reads ([+-][0-9.]+) deg \(sigma ([0-9.]+)\)", words)
-    return [tuple(map(float, it)) for it in found]
+    return [tuple(map(float, value)) for value in found]
 
 
 def test_an_arm_that_cannot_tilt_is_asked_for_a_measured_height():
@@ -402,7 +404,9 @@ def test_an_arm_that_cannot_tilt_is_asked_for_a_measured_height():
     )
     document["prior"] = {"flange_from_probe": {"z_m": 0.05, "sigma_m": 5e-4}}
     found = calibrate(Session.assemble(document, columns, rows, images, robot_document=model))
-    assert not [it for it in found.verdict.findings if it.do and "tilt" in it.do.words]
+    assert not [
+        finding for finding in found.verdict.findings if finding.do and "tilt" in finding.do.words
+    ]
     height = found.edges["flange_from_probe"].matrix[2, 3]
     # Readings alone leave it open: it is where it was measured.
     assert height == pytest.approx(0.05, abs=1e-5)

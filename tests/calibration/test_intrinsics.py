@@ -32,7 +32,7 @@ RATIONAL = Camera(
 
 
 def estimate(cell, model="brown", coefficients="auto", without=()):
-    corners = {it.view: it for it in cell.corners if it.view not in without}
+    corners = {corner.view: corner for corner in cell.corners if corner.view not in without}
     camera = cell.options.camera
     return estimate_intrinsics(
         corners, [cell.options.target], camera.resolution, model, coefficients
@@ -75,8 +75,8 @@ def test_agrees_with_opencv():
     cell = cell_with(wide_camera(), 1)
     places = corner_positions(cell.options.target)
     _, matrix, distortion, *_ = cv2.calibrateCamera(
-        [places[it.ids].astype(np.float32) for it in cell.corners],
-        [it.px.astype(np.float32) for it in cell.corners],
+        [places[corner.ids].astype(np.float32) for corner in cell.corners],
+        [corner.px.astype(np.float32) for corner in cell.corners],
         cell.options.camera.resolution,
         None,
         None,
@@ -99,14 +99,14 @@ def test_the_rational_model_is_taken_where_it_is_needed_and_only_there():
 
 def test_a_few_wrong_corners_do_no_harm_and_a_wrong_view_is_named():
     cell = cell_with(wide_camera(), 3)
-    corners = {it.view: it for it in cell.corners}
+    corners = {corner.view: corner for corner in cell.corners}
     for view in (2, 5):
         corners[view].px[3] += 6.0
     rng = np.random.default_rng(0)
     corners[7].px[:] += rng.normal(0.0, 12.0, corners[7].px.shape)
     result = estimate(cell)
     clean = estimate(cell_with(wide_camera(), 3), without=(7,))
-    assert [it.view for it in result.rejections] == [7]
+    assert [rejection.view for rejection in result.rejections] == [7]
     assert "residual too large" in result.rejections[0].reason
     # Two corners of 700 less: the estimate moves by a small part of its sigma.
     sigma = np.sqrt(np.diag(clean.covariance))
@@ -117,7 +117,7 @@ def test_a_few_wrong_corners_do_no_harm_and_a_wrong_view_is_named():
 def test_frontal_views_are_warned_of_or_refused():
     frontal = {"tilt_rad": (0.0, 0.05), "distance_m": (0.5, 0.6)}
     result = estimate(cell_with(wide_camera(), 4, **frontal))
-    assert any("frontal" in it.reason for it in result.warnings)
+    assert any("frontal" in warning.reason for warning in result.warnings)
     flat = {"tilt_rad": (0.0, 0.002), "distance_m": (0.5, 0.505), "roll_rad": 0.0}
     with pytest.raises(DegenerateError, match="focal length open to"):
         estimate(cell_with(wide_camera(), 4, **flat))
@@ -144,18 +144,18 @@ def test_parts_of_the_image_that_were_never_visited_are_named():
     cell = cell_with(wide_camera(), 5)
     width, height = cell.options.camera.resolution
     corners = {}
-    for it in cell.corners:
-        inside = (it.px[:, 0] < 0.6 * width) | (it.px[:, 1] < 0.6 * height)
-        corners[it.view] = replace(it, ids=it.ids[inside], px=it.px[inside])
+    for corner in cell.corners:
+        inside = (corner.px[:, 0] < 0.6 * width) | (corner.px[:, 1] < 0.6 * height)
+        corners[corner.view] = replace(corner, ids=corner.ids[inside], px=corner.px[inside])
     seen = estimate_intrinsics(corners, [cell.options.target], (width, height), "brown")
-    assert any("lower right" in it.reason for it in seen.warnings)
-    assert not any("lower right" in it.reason for it in estimate(cell).warnings)
-    for view, it in corners.items():
-        inside = (abs(it.px - 0.5 * np.array([width, height])) < 0.2 * height).all(axis=1)
-        corners[view] = replace(it, ids=it.ids[inside], px=it.px[inside])
-    middle = {view: it for view, it in corners.items() if len(it.ids) >= 6}
+    assert any("lower right" in warning.reason for warning in seen.warnings)
+    assert not any("lower right" in warning.reason for warning in estimate(cell).warnings)
+    for view, corner in corners.items():
+        inside = (abs(corner.px - 0.5 * np.array([width, height])) < 0.2 * height).all(axis=1)
+        corners[view] = replace(corner, ids=corner.ids[inside], px=corner.px[inside])
+    middle = {view: corner for view, corner in corners.items() if len(corner.ids) >= 6}
     alone = estimate_intrinsics(middle, [cell.options.target], (width, height), "brown")
-    (empty,) = (it for it in alone.warnings if it.kind == EMPTY_IMAGE)
+    (empty,) = (warning for warning in alone.warnings if warning.kind == EMPTY_IMAGE)
     assert "in the upper left, upper right, lower left and lower right of the image" in empty.words
     assert "into those parts" in empty.do.words
 

@@ -76,7 +76,7 @@ def test_they_are_found_and_make_the_arm_better_where_it_never_was(shop, known):
     assert kinematics.functions.sigma_rad == pytest.approx(3e-4, rel=0.4)
     assert 0.12 <= kinematics.functions.length_rad <= 0.5
     without = known_of(session_of(shop), level="offsets")
-    ours, theirs = (float(np.sqrt(np.mean(away_m(shop, it) ** 2))) for it in (known, without))
+    ours, theirs = (float(np.sqrt(np.mean(away_m(shop, value) ** 2))) for value in (known, without))
     assert ours < 0.5 * theirs
 
 
@@ -90,7 +90,7 @@ def test_left_out_stops_fit_worse_and_no_one_complains(known):
     chosen = known.robot_arm.kinematics.result.levels[-1]
     assert chosen.held_out_mm > chosen.rms_mm
     assert chosen.held_out_mm < 0.3 * known.robot_arm.kinematics.result.levels[0].held_out_mm
-    assert "optimism" not in [it.kind for it in known.verdict.findings]
+    assert "optimism" not in [finding.kind for finding in known.verdict.findings]
 
 
 def test_the_arm_of_the_result_has_them(known):
@@ -130,7 +130,7 @@ def test_where_it_carries_over_is_what_is_predicted_there(known):
     assert found.sigma_mm**2 > squares[0]
     assert found.sigma_mm < found.nominal_mm
     assert found.better_share > 0.9
-    assert {it.region for it in found.regions} >= {"box", "beside"}
+    assert {region.region for region in found.regions} >= {"box", "beside"}
     assert found.words in known.verdict.reasons
 
 
@@ -149,7 +149,9 @@ def test_stops_near_one_another_tell_less_elsewhere_and_the_arm_as_stated_is_wor
 
 
 def test_the_words_name_where_it_is_no_better():
-    regions = [CarriedRegion(*it) for it in (("box", 0.2, 1.0, True), ("behind", 0.9, 1.0, False))]
+    regions = [
+        CarriedRegion(*pair) for pair in (("box", 0.2, 1.0, True), ("behind", 0.9, 1.0, False))
+    ]
     words = CarriesOver(
         measured_mm=0.15,
         measured_nominal_mm=0.98,
@@ -165,13 +167,13 @@ def test_the_words_name_where_it_is_no_better():
 
 def test_tables_of_the_functions_are_within_their_sigmas(shop, known):
     found = arm_found(known).functions
-    assert [it.joint for it in found.joints] == list(known.robot.joint_names)
+    assert [joint.joint for joint in found.joints] == list(known.robot.joint_names)
     angles = np.linspace(-np.pi, np.pi, 180, endpoint=False)
     nodes = np.linspace(0.0, 2 * np.pi, len(shop.true_arm.beyond), endpoint=False)
     ratios = []
-    for at, it in enumerate(found.joints):
+    for at, joint in enumerate(found.joints):
         true = 1e3 * np.interp(angles, nodes, shop.true_arm.beyond[:, at], period=2 * np.pi)
-        away, sigma = true - np.array(it.error_mrad), np.array(it.sigma_mrad)
+        away, sigma = true - np.array(joint.error_mrad), np.array(joint.sigma_mrad)
         # What is constant is the joint's offset.
         away -= np.sum(away / sigma**2) / np.sum(1 / sigma**2)
         ratios.append(np.mean(away**2 / sigma**2))
@@ -184,9 +186,9 @@ def test_corrections_send_each_joint_to_where_it_is_wanted(known):
     result = result_of(known)
     written = document(result, "joint-corrections")
     assert "Without it the flange of that arm is off by up to" in written.warnings[0]
-    lines = [it for it in written.text.splitlines() if not it.startswith("#")]
+    lines = [line for line in written.text.splitlines() if not line.startswith("#")]
     assert lines[0] == "joint,angle_deg,correction_deg,sigma_deg"
-    table = np.array([[float(it) for it in line.split(",")[1:]] for line in lines[1:]])
+    table = np.array([[float(part) for part in line.split(",")[1:]] for line in lines[1:]])
     degrees, corrections, sigmas = table.reshape(6, 360, 3).transpose(2, 1, 0)
     chain = result.arm.robot.chain
     stood = chain.effective(np.deg2rad(degrees + corrections))
@@ -202,14 +204,17 @@ def test_targets_by_links_and_their_table_are_those_of_correct(known):
     sent = correct(result, wanted, q).q
     links = document(result, "robot-dh", Selection(with_corrections=True))
     inverse = Inverse(Robot.from_document(tomllib.loads(links.text)))
-    angles = np.array([inverse.solve(*it).positions for it in zip(wanted, q, strict=True)])
+    angles = np.array([inverse.solve(*pair).positions for pair in zip(wanted, q, strict=True)])
     text = document(result, "joint-corrections").text
-    rows = [it.split(",") for it in text.splitlines() if not it.startswith("#")][1:]
+    rows = [line.split(",") for line in text.splitlines() if not line.startswith("#")][1:]
     tables = [
-        np.array([it[1:3] for it in rows if it[0] == joint], dtype=float).T
+        np.array([row[1:3] for row in rows if row[0] == joint], dtype=float).T
         for joint in result.robot.joint_names
     ]
-    added = [np.interp(np.rad2deg(it), *table) for it, table in zip(angles.T, tables, strict=True)]
+    added = [
+        np.interp(np.rad2deg(column), *table)
+        for column, table in zip(angles.T, tables, strict=True)
+    ]
     by_table = angles + np.deg2rad(np.column_stack(added))
     apart = result.standing(sent) - result.standing(by_table)
     # Between whole degrees a function of 0.25 rad departs from a line by 2e-7 rad; what the joints
@@ -226,14 +231,14 @@ def test_a_check_of_an_unchanged_cell_passes_and_a_bump_is_seen(tmp_path):
     prior = CalibrationPrior.of(Calibration.load(tmp_path / "calibration.json"))
     rng = np.random.default_rng(0)
     found = [check(seen_by(known_again(place.cell, rng), prior), prior) for _ in range(4)]
-    assert all(it.passed and not it.named for it in found)
+    assert all(item.passed and not item.named for item in found)
     # Chi-square of thirty directions; views that were left out err by more than the stops of a cell
     # that is well known, so that it comes out small.
-    assert 4.0 < np.mean([it.misfit for it in found]) < 45.0
+    assert 4.0 < np.mean([item.misfit for item in found]) < 45.0
     bump = Change(camera=np.array([0.0, 0.0, 0.0, 0.0, 4e-3, 0.0]))
     bumped = check(seen_by(known_again(place.cell, rng, bump), prior), prior)
     assert not bumped.passed
-    assert [it.name for it in bumped.named] == ["camera"]
+    assert [suspect.name for suspect in bumped.named] == ["camera"]
 
 
 def test_corrected_targets_reach_where_functions_would_have_led_them_astray(shop, known):

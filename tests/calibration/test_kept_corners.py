@@ -45,8 +45,13 @@ def searched(monkeypatch):
 def facts(folder, *, keep: bool):
     found = detect.detect(Session.load(folder), detect.DetectOptions(keeps=keep))
     corners = {
-        view: (it.ids.tolist(), it.px.tolist(), it.blur_px, np.array(it.weights).tolist())
-        for view, it in found.corners.items()
+        view: (
+            view_corners.ids.tolist(),
+            view_corners.px.tolist(),
+            view_corners.blur_px,
+            np.array(view_corners.weights).tolist(),
+        )
+        for view, view_corners in found.corners.items()
     }
     return corners, found.rejections, found.resolution
 
@@ -54,7 +59,7 @@ def facts(folder, *, keep: bool):
 def test_a_second_search_does_not_look_and_finds_the_same_bits(cell, searched):
     first = facts(cell, keep=True)
     assert len(searched) == 6
-    assert [it.view for it in first[1]] == [Session.load(cell).views[3].number]
+    assert [value.view for value in first[1]] == [Session.load(cell).views[3].number]
     searched.clear()
     assert facts(cell, keep=False) == first
     assert searched == []
@@ -66,7 +71,7 @@ def test_what_is_kept_belongs_to_image_board_limits_and_version(cell, searched, 
     assert Session.load(cell).digest() == digest
     searched.clear()
     views = Session.load(cell).views
-    one, two = (cell / views[it].image for it in (0, 1))
+    one, two = (cell / views[name].image for name in (0, 1))
     one.write_bytes(two.read_bytes())
     facts(cell, keep=False)
     # The bytes are those of another view, which has been searched.
@@ -81,7 +86,7 @@ def test_what_is_kept_belongs_to_image_board_limits_and_version(cell, searched, 
     session = Session.load(cell)
     (target,) = session.boards.values()
     larger, kept = replace(target, square_m=2 * target.square_m), KeptCorners.beside(session)
-    keys = {kept.key(it, board, "") for it in (b"1", b"2") for board in (target, larger)}
+    keys = {kept.key(name, board, "") for name in (b"1", b"2") for board in (target, larger)}
     assert len(keys) == 4
     monkeypatch.setattr(kept_corners, "_MADE_BY", {"visioncal": "0.0.1", "opencv": "1"})
     facts(cell, keep=False)
@@ -105,9 +110,9 @@ def test_a_damaged_file_counts_as_none(cell, searched, text):
 
 
 def test_nothing_is_kept_unasked_or_where_it_cannot_be(cell):
-    before = sorted(it.name for it in cell.iterdir())
+    before = sorted(path.name for path in cell.iterdir())
     asked = replace(calibrate(cell), created="")
-    assert sorted(it.name for it in cell.iterdir()) == before
+    assert sorted(path.name for path in cell.iterdir()) == before
     (cell / ".visioncal").write_text("a file in the place of the folder")
     kept = replace(calibrate(cell, keep_corners=True), created="")
     assert to_document(kept) == to_document(asked)

@@ -44,7 +44,7 @@ def test_offsets_alone_are_told_from_wrong_links():
     cell = simulate(replace(GOOD, offset_sigma_rad=1e-3, seed=1))
     known = calibrated(cell)
     assert known.robot_arm.kinematics.level == "offsets"
-    by_name = {it.level: it for it in known.robot_arm.kinematics.result.levels}
+    by_name = {level.level: level for level in known.robot_arm.kinematics.result.levels}
     assert by_name["offsets"].held_out_mm < 0.3 * by_name["nominal"].held_out_mm
     assert by_name["offsets"].held_out_mm < 1.05 * by_name["geometry"].held_out_mm
     # Those of the first and the last joint hide in base and tool; the others are told to 0.1 mrad.
@@ -158,7 +158,7 @@ def test_a_right_arm_stays_nominal():
     known = calibrated(simulate(replace(GOOD, seed=3)))
     assert known.robot_arm.kinematics.level == "nominal"
     assert known.robot_arm.model is None
-    assert [it.level for it in known.robot_arm.kinematics.result.levels] == ["nominal"]
+    assert [level.level for level in known.robot_arm.kinematics.result.levels] == ["nominal"]
 
 
 def test_without_joints_no_level_can_be_asked_for():
@@ -186,11 +186,11 @@ def test_predictions_move_as_their_derivatives_say(mount):
                 invert(middle)
                 @ target_in_camera(
                     mount,
-                    *(edges @ exp(it[:12].reshape(2, 6))),
-                    model.moved(it[12:]).robot.base_from_flange(q),
+                    *(edges @ exp(array[:12].reshape(2, 6))),
+                    model.moved(array[12:]).robot.base_from_flange(q),
                 )
             )
-            for it in (change, -change)
+            for array in (change, -change)
         ]
         # Steps are composed with values of some mrad, whose product is left out.
         assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(jacobian[:, :, at], abs=5e-3)
@@ -225,7 +225,9 @@ def test_the_result_holds_the_calibrated_arm(tmp_path):
     assert result.base_from_flange(q).as_matrix() == pytest.approx(calibrated_poses, abs=1e-14)
     assert found.level == "geometry"
     assert found.levels[0].level == "nominal"
-    changes = {(it.joint, it.name): it.change for it in found.parameters}
+    changes = {
+        (parameter.joint, parameter.name): parameter.change for parameter in found.parameters
+    }
     # A UR's second and third axes are parallel, and so get Hayati's beta.
     assert ("shoulder_lift_joint", "beta_rad") in changes
     assert 1e-5 < max(map(abs, changes.values())) < 0.02
@@ -252,15 +254,17 @@ def test_touches_close_on_the_calibrated_arm():
     assert with_arm.rms_mm < 0.15 * without.rms_mm
     # Controllers' poses are the nominal arm's.
     told = touched_tool(replace(rows, joints_rad=None), result)
-    assert any("without joint angles" in it for it in told.verdict.reasons)
+    assert any("without joint angles" in reason for reason in told.verdict.reasons)
 
 
 def test_a_level_that_explains_too_little_is_told():
     cell = simulate(replace(WRONG_LINKS, seed=1))
     known = calibrated(cell, level="offsets")
     assert known.robot_arm.kinematics.level == "offsets"
-    assert any("speak for more than the arm's offsets" in it for it in known.verdict.reasons)
+    assert any(
+        "speak for more than the arm's offsets" in reason for reason in known.verdict.reasons
+    )
     assert known.verdict.status != "good"
     right = calibrated(simulate(replace(GOOD, seed=3)), level="kinematics")
     assert right.robot_arm.kinematics.level == "nominal"
-    assert any("The arm stays as stated" in it for it in right.verdict.reasons)
+    assert any("The arm stays as stated" in reason for reason in right.verdict.reasons)

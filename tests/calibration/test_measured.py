@@ -44,9 +44,9 @@ def scara(seed: int, prior: dict[str, dict[str, float]], views: int = 12) -> Ses
         numbers = [
             [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()] for pose in (flange, seen)
         ]
-        rows.append([str(view), *(repr(float(it)) for it in np.concatenate(numbers))])
+        rows.append([str(view), *(repr(float(value)) for value in np.concatenate(numbers))])
     document = {"schema": 1, "name": "scara", "mount": "eye-in-hand", "prior": prior}
-    columns = ["view", *POSE, *(f"cft_{it}" for it in POSE)]
+    columns = ["view", *POSE, *(f"cft_{name}" for name in POSE)]
     return Session.assemble(document, columns, rows, MemoryImages({}))
 
 
@@ -79,8 +79,8 @@ def test_an_arm_that_cannot_tilt_is_not_asked_to():
     for at, flange in enumerate(robot.base_from_flange(q)):
         seen = invert(flange @ X) @ Z
         pose = [*seen[:3, 3], *Rotation.from_matrix(seen[:3, :3]).as_quat()]
-        rows.append([str(at), *(repr(float(it)) for it in (*q[at], *pose))])
-    columns = ["view", "q1_rad", "q2_rad", "q3_rad", *(f"cft_{it}" for it in POSE)]
+        rows.append([str(at), *(repr(float(value)) for value in (*q[at], *pose))])
+    columns = ["view", "q1_rad", "q2_rad", "q3_rad", *(f"cft_{name}" for name in POSE)]
     document = {**plain.document, "robot": {"model": "arm.toml"}}
     session = Session.assemble(document, columns, rows, MemoryImages({}), robot_document=model)
     with pytest.raises(DegenerateError) as refused:
@@ -98,7 +98,9 @@ def test_the_one_camera_and_robot_may_have_names(name):
     plain = calibrate(scara(0, {"flange_from_cam": PRIOR}))
     session = scara(0, {name: PRIOR})
     named = {"cameras": {"hand": {}}, "robots": {"a": {}}}
-    rows = [[*(view.cell(it) for it in session.columns), "a", "hand"] for view in session.views]
+    rows = [
+        [*(view.cell(column) for column in session.columns), "a", "hand"] for view in session.views
+    ]
     columns = [*session.columns, "robot", "camera"]
     found = calibrate(Session.assemble(session.document | named, columns, rows, MemoryImages({})))
     edge = next(iter(found.edges))
@@ -116,9 +118,11 @@ def test_four_axes_give_a_result_with_a_measured_height_and_none_without():
         found = calibrate(scara(seed, {"flange_from_cam": prior}))
         assert found.verdict.status == "good"
         assert any(
-            it.startswith(f"The measured z_m of flange_from_cam = {1e3 * prior['z_m']:g} mm was")
-            and it.endswith("the views alone leave it open.")
-            for it in found.verdict.reasons
+            reason.startswith(
+                f"The measured z_m of flange_from_cam = {1e3 * prior['z_m']:g} mm was"
+            )
+            and reason.endswith("the views alone leave it open.")
+            for reason in found.verdict.reasons
         )
         covariance, off = found.covariance("flange_from_cam"), away(found)
         # What was measured is all that is known of the height.
@@ -139,7 +143,7 @@ def test_what_was_measured_of_the_target_helps_as_well(mount):
     sigmas = np.sqrt(np.diag(known.solved.covariance)[:12])
     # Four sigma, for twelve numbers.
     assert np.all(np.abs(error_of(cell, known)) < 4.0 * sigmas)
-    assert sum("was used" in it for it in known.notes) == 3
+    assert sum("was used" in note for note in known.notes) == 3
 
 
 def test_a_rotation_may_be_known_alone():
@@ -168,7 +172,7 @@ def test_a_board_of_several_may_be_known_whole():
     assert np.all(np.abs(error_of(cell, known)) < 4.0 * sigmas)
     # The board is turned no farther than that is known.
     assert sigmas[12:15].max() < 1.001e-5
-    assert sum("was used" in it and name in it for it in known.notes) == 3
+    assert sum("was used" in note and name in note for note in known.notes) == 3
 
 
 def test_a_measurement_that_good_data_contradict_is_told_and_left_out():
@@ -176,16 +180,16 @@ def test_a_measurement_that_good_data_contradict_is_told_and_left_out():
     true = float(cell.transforms["flange_from_cam"][2, 3])
     free = calibrated(cell, level="hand-eye")
     wrong = run(cell, {"flange_from_cam": {"z_m": true + 0.005, "sigma_m": SIGMA_M}})
-    (told,) = (it.words for it in wrong.warnings if it.kind == "prior")
+    (told,) = (warning.words for warning in wrong.warnings if warning.kind == "prior")
     assert "is contradicted by the views" in told
     assert f"{1e3 * true + 5.0:g} mm" in told
     assert told.endswith("it is not used.")
-    assert [it.kind for it in wrong.verdict.causes] == ["prior"]
+    assert [cause.kind for cause in wrong.verdict.causes] == ["prior"]
     # It is said before that the views are few.
     few = simulate(CellOptions(robot="ur5e", views=6, seed=5))
     z_m = float(few.transforms["flange_from_cam"][2, 3]) + 0.02
     ranked = run(few, {"flange_from_cam": {"z_m": z_m, "sigma_m": 1e-3}}).verdict.ranked
-    assert [it.kind for it in ranked[:2]] == ["prior", "few_stops"]
+    assert [finding.kind for finding in ranked[:2]] == ["prior", "few_stops"]
     # The same views once more, from where they were with it.
     sigmas = np.sqrt(np.diag(free.solved.covariance))
     off = log(invert(free.solved.state.edges) @ wrong.solved.state.edges).ravel()
@@ -193,8 +197,8 @@ def test_a_measurement_that_good_data_contradict_is_told_and_left_out():
     assert np.max(np.abs(off) / sigmas[: len(off)]) < 0.2
     assert wrong.used == free.used
     right = run(cell, {"flange_from_cam": {"z_m": true + 2e-4, "sigma_m": SIGMA_M}})
-    assert not any(it.kind == "prior" for it in right.warnings)
-    (note,) = (it for it in right.notes if "was used" in it)
+    assert not any(warning.kind == "prior" for warning in right.warnings)
+    (note,) = (note for note in right.notes if "was used" in note)
     assert "the views alone determine it to" in note
 
 
@@ -205,7 +209,7 @@ def test_only_the_components_that_views_contradict_are_left_out(off_m):
     prior = {"x_m": float(X[0, 3]) + off_m, "y_m": float(X[1, 3]) - off_m, "z_m": height}
     found = calibrate(scara(0, {"flange_from_cam": prior | {"sigma_m": SIGMA_M}}))
     assert found.verdict.status == "check"
-    doubts = [it.words for it in found.verdict.findings if it.kind == "prior"]
+    doubts = [finding.words for finding in found.verdict.findings if finding.kind == "prior"]
     for doubt, axis in zip(doubts, "xy", strict=True):
         stated_mm = 1e3 * prior[f"{axis}_m"]
         assert f"{axis}_m of flange_from_cam = {stated_mm:g} mm, known to 0.5 mm, is" in doubt
@@ -213,7 +217,7 @@ def test_only_the_components_that_views_contradict_are_left_out(off_m):
         # Some ten of their sigmas, and a fifth of the smaller of both offsets.
         assert seen_mm == pytest.approx(1e3 * X["xy".index(axis), 3], abs=1.0)
     kept = f"The measured z_m of flange_from_cam = {1e3 * height:g} mm was used"
-    assert any(it.startswith(kept) for it in found.verdict.reasons)
+    assert any(reason.startswith(kept) for reason in found.verdict.reasons)
     off, covariance = away(found), found.covariance("flange_from_cam")
     # Chi-square of 6 beyond 22 is 0.1 %.
     assert off @ np.linalg.solve(covariance, off) < 22.0
@@ -229,28 +233,30 @@ def test_what_cannot_be_used_is_said():
     other = calibrate(scara_with_tilt({"base_from_cam": prior}))
     assert any(
         "[prior.base_from_cam] was not used: what is unknown of this session is flange_from_cam "
-        "and base_from_target" in it
-        for it in other.verdict.reasons
+        "and base_from_target" in reason
+        for reason in other.verdict.reasons
     )
     closed = calibrate(scara_with_tilt({"flange_from_cam": prior}), solver="park")
-    assert any("was not used: the closed form park cannot" in it for it in closed.verdict.reasons)
+    assert any(
+        "was not used: the closed form park cannot" in reason for reason in closed.verdict.reasons
+    )
 
 
 def scara_with_tilt(prior: dict[str, dict[str, float]]) -> Session:
     """The same session, its first views tilted about other axes."""
     session = scara(5, prior, views=14)
-    rows = [[view.cell(it) for it in session.columns] for view in session.views]
+    rows = [[view.cell(column) for column in session.columns] for view in session.views]
     rng = np.random.default_rng(6)
     for row in rows[:8]:
         flange = compose(
             Rotation.from_rotvec(rng.uniform(-0.5, 0.5, 3)).as_matrix(),
-            np.array([float(it) for it in row[1:4]]),
+            np.array([float(name) for name in row[1:4]]),
         )
         seen = invert(flange @ X) @ Z @ exp(NOISE * rng.standard_normal(6))
         numbers = [
             [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()] for pose in (flange, seen)
         ]
-        row[1:] = [repr(float(it)) for it in np.concatenate(numbers)]
+        row[1:] = [repr(float(value)) for value in np.concatenate(numbers)]
     return Session.assemble(session.document, session.columns, rows, MemoryImages({}))
 
 
@@ -272,7 +278,7 @@ def test_a_plan_counts_what_was_measured():
 def test_measured_distances_of_another_scale_are_named(mount, scale):
     cell = simulate(CellOptions(mount=mount, views=16, board_scale=scale, seed=2))
     verdict = calibrate(cell_session(cell, "measured", seen="poses")).verdict
-    named = [it for it in verdict.findings if it.kind == "board_size"]
+    named = [finding for finding in verdict.findings if finding.kind == "board_size"]
     if scale == 1.0:
         assert verdict.status == "good"
         assert not named
@@ -288,7 +294,7 @@ def test_measured_distances_of_another_scale_are_named(mount, scale):
 def test_an_arm_that_is_off_is_no_board_of_another_size(seed):
     arm = CellOptions(views=10, dh_sigma_m=2e-3, seed=seed)
     verdict = calibrate(cell_session(simulate(arm), "measured", seen="poses")).verdict
-    assert "board_size" not in {it.kind for it in verdict.findings}
+    assert "board_size" not in {finding.kind for finding in verdict.findings}
 
 
 def test_a_size_that_no_arm_explains_is_named_among_poor_poses():
@@ -296,7 +302,7 @@ def test_a_size_that_no_arm_explains_is_named_among_poor_poses():
     noise = {"robot_sigma_m": 2e-3, "robot_sigma_rad": 0.01}
     cell = simulate(CellOptions(views=20, board_scale=0.96, seed=1, **noise))
     verdict = calibrate(cell_session(cell, "measured", seen="poses")).verdict
-    (named,) = (it for it in verdict.findings if it.kind == "board_size")
+    (named,) = (finding for finding in verdict.findings if finding.kind == "board_size")
     # Four of its sigmas.
     assert float(named.do.words.split()[-1].rstrip(".")) == pytest.approx(0.96, abs=0.02)
 
@@ -306,22 +312,22 @@ def test_rotations_that_scatter_with_the_measurement_are_not_blamed_on_the_arm(m
     session = cell_session(
         simulate(CellOptions(mount=mount, views=16, seed=3)), "marker", seen="poses"
     )
-    names = [f"cft_{it}" for it in POSE]
+    names = [f"cft_{name}" for name in POSE]
 
     def turned(view: View) -> View:
         # By how it is seen, as a single marker is by its own errors: its posture shows in them.
-        numbers = [view.numbers[it] for it in names]
+        numbers = [view.numbers[name] for name in names]
         seen = Rotation.from_quat(numbers[3:])
         shift = 5e-4 * np.sin(2.0 * seen.as_rotvec())
         quaternion = (seen * Rotation.from_rotvec(0.02 * np.sin(3.0 * seen.as_rotvec()))).as_quat()
         new = [*np.add(numbers[:3], shift).tolist(), *quaternion.tolist()]
         return replace(view, numbers={**view.numbers, **dict(zip(names, new, strict=True))})
 
-    views = tuple(turned(it) for it in session.views)
+    views = tuple(turned(view) for view in session.views)
     verdict = calibrate(replace(session, views=views)).verdict
     assert verdict.status != "good"
     assert verdict.ranked[0].kind == "measured_turns"
-    assert not any("joint angles" in str(it.do) for it in verdict.findings)
+    assert not any("joint angles" in str(finding.do) for finding in verdict.findings)
 
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
@@ -331,4 +337,4 @@ def test_an_arm_whose_angles_are_off_is_no_bad_measurement_of_rotations(mount):
     session = replace(cell_session(cell, "measured", seen="poses"), robot_document=None)
     verdict = calibrate(session).verdict
     assert verdict.ranked[0].kind == "arm_errors"
-    assert "measured_turns" not in {it.kind for it in verdict.findings}
+    assert "measured_turns" not in {finding.kind for finding in verdict.findings}

@@ -41,7 +41,7 @@ def test_a_six_axis_arm_by_a_laser(real_data):
 def test_a_humanoid_by_contacts(real_data):
     held = list(range(3, 61, 10))
     known = known_of(thirdparty.talos(real_data, held))
-    away = [it.residual_mm for it in known.findings.pairs[0].views if it.view in held]
+    away = [view.residual_mm for view in known.findings.pairs[0].views if view.view in held]
     # Joint offsets alone leave 0.87 mm, in the fit.
     assert np.median(away) < 0.95
     # Its joints hardly moved: the method says that this arm is not known elsewhere.

@@ -36,7 +36,7 @@ OPTIONS = CellOptions(
     dh_sigma_rad=1e-3,
     seed=4,
 )
-CELLS = {it: simulate(replace(OPTIONS, mount=it)) for it in ("eye-in-hand", "eye-to-hand")}
+CELLS = {name: simulate(replace(OPTIONS, mount=name)) for name in ("eye-in-hand", "eye-to-hand")}
 IN_HAND = CELLS["eye-in-hand"]
 TURN = np.array([0.2, -0.1, 0.4, 0.3, 0.1, -0.2])
 
@@ -93,7 +93,7 @@ def test_with_poses_the_hand_eye_goes_on_without_misread_joints():
     assert known.reported.joints_rad is None
     assert known.robot_arm.kinematics is None
     assert known.verdict.status != "good"
-    assert any("pi / 180" in it for it in known.verdict.reasons)
+    assert any("pi / 180" in reason for reason in known.verdict.reasons)
     alone = finished(replace(told, robot=None))
     # What is done with the poses is what would be done if there were no joints.
     assert np.array_equal(known.solved.state.edges[0], alone.solved.state.edges[0])
@@ -108,7 +108,7 @@ def test_an_arm_asked_for_is_refused_where_its_joints_are_misread():
 def test_rows_without_poses_are_not_taken_by_misread_joints():
     session = planted("joints in degrees", with_poses=True).session
     views = list(session.views)
-    joints = {name: it for name, it in views[3].numbers.items() if name.endswith("_rad")}
+    joints = {name: number for name, number in views[3].numbers.items() if name.endswith("_rad")}
     views[3] = replace(views[3], numbers=joints)
     reported = reported_poses(replace(session, views=tuple(views)), load_robot("ur5e"))
     (rejection,) = reported.rejections
@@ -163,10 +163,14 @@ def test_a_lost_encoder_is_found_and_not_thrown_away(with_poses):
     nominal, *others = known.robot_arm.kinematics.result.levels
     assert nominal.held_out_mm > 10.0
     assert others[-1].held_out_mm < 0.5
-    (lost,) = (it for it in known.verdict.findings if it.kind == "misread_joints")
+    (lost,) = (finding for finding in known.verdict.findings if finding.kind == "misread_joints")
     assert lost.do.words.startswith("Home elbow_joint anew")
     assert "visioncal export OUT --to robot-urdf" in lost.do.command
-    theta = {it.joint: it for it in parameters(known) if it.name == "theta_rad"}
+    theta = {
+        parameter.joint: parameter
+        for parameter in parameters(known)
+        if parameter.name == "theta_rad"
+    }
     # Errors of the arm's other parameters are up to a few milliradians.
     assert theta["elbow_joint"].nominal == pytest.approx(0.0, abs=1e-9)
     assert theta["elbow_joint"].change == pytest.approx(np.deg2rad(10.0), abs=5e-3)

@@ -38,7 +38,7 @@ def test_the_chance_is_that_of_drawn_errors(freedom: float, places: int, flat: f
     )
     if np.isfinite(freedom):
         away /= np.sqrt(rng.chisquare(freedom, count) / freedom)[:, None]
-    turned, shifted = (np.linalg.norm(it, axis=1) for it in (away[:, :3], away[:, 3:]))
+    turned, shifted = (np.linalg.norm(value, axis=1) for value in (away[:, :3], away[:, 3:]))
     # 4,096 even points leave 0.007 at most, as 200,000 drawn ones leave three times 0.001.
     for share in (0.3, 0.7, 0.95):
         turn, shift = np.quantile(turned, share), np.quantile(shifted, share)
@@ -86,8 +86,8 @@ def test_picks_err_as_the_chain_does(mount: str) -> None:
     else:
         away = (camera @ off - camera) @ seen
     away = away[:, :3, 0] + sigmas[3:] * rng.standard_normal((count, 3))
-    parts = {name: it for name, it in picks.budget_mm.items() if name != "left out"}
-    total = np.sqrt(sum(it**2 for name, it in parts.items() if name != "total"))
+    parts = {name: value for name, value in picks.budget_mm.items() if name != "left out"}
+    total = np.sqrt(sum(part**2 for name, part in parts.items() if name != "total"))
     assert total == pytest.approx(1e3 * np.sqrt(np.mean(np.sum(away**2, axis=1))), rel=0.05)
     looks = {"look"} if mount == "eye-in-hand" else set()
     assert set(parts) == {"board", "calibration", "pick", "total"} | looks
@@ -96,7 +96,7 @@ def test_picks_err_as_the_chain_does(mount: str) -> None:
 def without_arm_errors(known: RunState) -> RunState:
     """The same with an arm of which nothing but noise is known."""
     answer, solved = known.solved, known.fitted
-    arms = {name: replace(it, errors=None) for name, it in solved.arms.items()}
+    arms = {name: replace(arm, errors=None) for name, arm in solved.arms.items()}
     covariance = answer.covariance - answer.beside["arm"]
     changed = replace(answer, covariance=covariance)
     return replace(known, answer=changed, fit=replace(solved, arms=arms))
@@ -108,8 +108,11 @@ def test_a_focus_that_changes_from_image_to_image_does_so_at_a_pick(mount: str) 
     cell, rng, share = simulate(CellOptions(mount=mount)), np.random.default_rng(3), 2e-3
     centre = cell.options.camera.matrix[2:]
     zoomed = [
-        replace(it, px=centre + (1.0 + share * rng.standard_normal()) * (it.px - centre))
-        for it in cell.corners
+        replace(
+            view_corners,
+            px=centre + (1.0 + share * rng.standard_normal()) * (view_corners.px - centre),
+        )
+        for view_corners in cell.corners
     ]
     (picks,) = calibrated(replace(cell, corners=tuple(zoomed)), joints=False).findings.picks
     # Twenty views know a standard deviation to a sixth; three of that.
@@ -131,7 +134,7 @@ def test_what_an_arm_does_again_moves_no_pick(mount: str) -> None:
         answer=replace(answer, covariance=answer.covariance + off @ off.T),
         fit=replace(solved, arms={robot: replace(arm, errors=errors)}),
     )
-    (before,), (after,) = (findings_of(it).picks for it in (known, erring))
+    (before,), (after,) = (findings_of(run_state).picks for run_state in (known, erring))
     # Both are the same to rounding, of spreads that would be a hundred times as large.
     np.testing.assert_allclose(after.spreads, before.spreads, atol=1e-3 * before.spreads.max())
 
@@ -154,7 +157,7 @@ def test_errors_that_last_are_others_at_a_pick(mount: str) -> None:
         answer=replace(answer, covariance=answer.covariance + off @ off.T),
         fit=replace(solved, arms={robot: replace(arm, errors=errors)}),
     )
-    (before,), (after,) = (findings_of(it).picks for it in (known, erring))
+    (before,), (after,) = (findings_of(run_state).picks for run_state in (known, erring))
     rng, count = np.random.default_rng(0), 20_000
     views = rng.integers(len(known.used), size=count)
     changing = basis - basis.mean(axis=0)
@@ -187,7 +190,7 @@ def test_a_board_of_another_size_misplaces_things_for_a_calibrated_arm(mount: st
     size = 1.0015
     cell = simulate(CellOptions(mount=mount, dh_sigma_m=3e-4, dh_sigma_rad=3e-4, board_scale=size))
     known = calibrated(cell)
-    assert all(it.is_modelled for it in known.fitted.arms.values())
+    assert all(arm.is_modelled for arm in known.fitted.arms.values())
     (picks,) = known.findings.picks
     middle, scaled = np.array([0.135, 0.09, 0.0, 1.0]), np.diag([size, size, size, 1.0])
     went = known.solved.problem.predicted(known.solved.state) @ middle
@@ -215,7 +218,7 @@ def test_only_views_that_are_known_well_show_what_is_not_predicted(views: slice,
     held = replace(answer.held_out, away_rad=away_rad)
     findings = findings_of(replace(known, answer=replace(answer, problem=blurred, held_out=held)))
     (picks,) = findings.picks
-    kinds = [it.kind for it in judge(findings).findings]
+    kinds = [finding.kind for finding in judge(findings).findings]
     assert (("left out" in picks.parts), ("unexplained" in kinds)) == (is_found, is_found)
 
 
@@ -237,7 +240,7 @@ def test_the_verdict_is_about_the_need(sigma_mm: float, status: str) -> None:
     assert "where the views looked lands within 0.5 mm with a probability of" in verdict.reasons[0]
     assert verdict.good_for_mm == pytest.approx(sigma_mm * np.sqrt(7.815), rel=5e-3)
     causes = [] if status == "good" else ["calibration"]
-    assert [it.kind for it in verdict.causes] == causes
+    assert [cause.kind for cause in verdict.causes] == causes
 
 
 @pytest.mark.parametrize(("sigma_mm", "status"), [(0.2, "good"), (0.7, "check")])
@@ -245,7 +248,7 @@ def test_what_a_camera_sees_counts_where_its_frame_is_known_less_well(sigma_mm, 
     place = Place("Where the views look, a point", {"intrinsics": 1.7, "total": 1.7}, 3.0)
     verdict = judge(replace(SOUND, places=(place,), picks=(of_size(sigma_mm),)))
     assert verdict.status == status
-    assert ("place" in {it.kind for it in verdict.findings}) == (status == "check")
+    assert ("place" in {finding.kind for finding in verdict.findings}) == (status == "check")
 
 
 def test_both_have_to_hold() -> None:
@@ -296,8 +299,8 @@ def test_the_worst_pair_counts_and_is_named() -> None:
     verdict = judge(replace(SOUND, need=NEED, picks=picks))
     assert "A pick by robot b of what cam_right sees where" in verdict.reasons[0]
     met = need_met(NEED, picks, whole=True)
-    assert [it.camera for it in met.pairs] == ["left", "right"]
-    assert met.probability == min(it.probability for it in met.pairs)
+    assert [pair.camera for pair in met.pairs] == ["left", "right"]
+    assert met.probability == min(pair.probability for pair in met.pairs)
     assert met.of("left", "a").probability == met.pairs[0].probability
     assert need_met(None, picks) is None
 

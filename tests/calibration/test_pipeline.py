@@ -92,12 +92,12 @@ def test_a_fisheye_camera_goes_the_whole_way(given):
 
 def test_a_closed_form_is_diagnosed_too():
     cell = simulate(replace(FINE, seed=2))
-    joint, park = (calibrated(cell, solver=it).work for it in ("joint", "park"))
+    joint, park = (calibrated(cell, solver=name).work for name in ("joint", "park"))
     assert {"pixels", "robot", "total"} < set(park.budget_mm)
     # The closed form leaves larger residuals, so its budget is wider, but of the same order; what
     # is held pulls at a fit that is at rest only.
     assert "held_values" not in park.budget_mm
-    noise = [np.hypot(it.budget_mm["pixels"], it.budget_mm["robot"]) for it in (joint, park)]
+    noise = [np.hypot(work.budget_mm["pixels"], work.budget_mm["robot"]) for work in (joint, park)]
     assert noise[0] < noise[1] < 10 * noise[0]
 
 
@@ -105,14 +105,14 @@ def test_a_closed_form_is_diagnosed_too():
 def test_views_held_back_may_be_ambiguous(solver):
     cell = simulate(AMBIGUOUS)
     told = session_of(cell)
-    views = tuple(replace(it, holdout=it.number % 4 == 0) for it in told.views)
+    views = tuple(replace(view, holdout=view.number % 4 == 0) for view in told.views)
     plain = known_of(cell, session=replace(told, views=views), solver=solver)
-    for stage in (it for it in STAGES if it.name in ("intrinsics", "pnp")):
+    for stage in (stage for stage in STAGES if stage.name in ("intrinsics", "pnp")):
         plain = stage.run(plain)
     held = range(0, 20, 4)
-    assert any(len(plain.poses[it].cam_from_target) > 1 for it in held)
+    assert any(len(plain.poses[index].cam_from_target) > 1 for index in held)
     known = calibrated(cell, session=replace(told, views=views), solver=solver)
-    assert known.used == tuple(it for it in range(20) if it % 4)
+    assert known.used == tuple(index for index in range(20) if index % 4)
     # Of the order of the used views': half a turn of the board would be metres.
     assert known.findings.pairs[0].holdout.mm < 5 * known.findings.held_out.mm
 
@@ -126,7 +126,7 @@ def test_a_view_left_out_as_ambiguous_is_shown_by_its_best_pose(given):
     )
     known = calibrated(simulate(replace(far, state_intrinsics=given)))
     assert known.reasons[4].startswith("ambiguous")
-    shown = {it.view: it for it in view_evidence(known)}
+    shown = {view.view: view for view in view_evidence(known)}
     np.testing.assert_array_equal(shown[4].cam_from_target, known.poses[4].cam_from_target[0])
     assert shown[4].predicted_px is None
     assert all(shown[view].predicted_px is not None for view in known.used)
@@ -149,7 +149,7 @@ def test_a_lens_stated_for_images_twice_as_large_is_refined(mount):
 def test_a_session_that_holds_all_views_back_is_told_so(given):
     cell = simulate(replace(FINE, views=8, state_intrinsics=given))
     told = session_of(cell)
-    held = replace(told, views=tuple(replace(it, holdout=True) for it in told.views))
+    held = replace(told, views=tuple(replace(view, holdout=True) for view in told.views))
     with pytest.raises(DataError, match="are held back") as caught:
         calibrated(cell, session=held)
     assert "Clear role" in caught.value.next_step

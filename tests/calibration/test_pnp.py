@@ -25,7 +25,7 @@ NOISE_PX = 0.2
 
 
 def corners_of(cell):
-    return {it.view: it for it in cell.corners}
+    return {corner.view: corner for corner in cell.corners}
 
 
 def poses_of(cell, corners=None):
@@ -34,7 +34,7 @@ def poses_of(cell, corners=None):
 
 def chosen_of(result, cell):
     """The views with the one pose that the robot's motion leaves to each."""
-    first = np.array([it.cam_from_target[0] for it in result.views])
+    first = np.array([view.cam_from_target[0] for view in result.views])
     problem = chain("eye-in-hand", cell.base_from_flange, first)
     return init_frames(problem, result.views, {"target": cell.options.target})
 
@@ -91,7 +91,7 @@ def test_a_pose_that_both_starts_run_into_has_no_rival():
     cell = simulate(CellOptions(seed=9, pixel_sigma_px=0.01, tilt_rad=(0.1, 0.3)))
     for view in poses_of(cell).views:
         first, *others = view.cam_from_target
-        assert all(np.linalg.norm(log(invert(first) @ it)[:3]) > 1e-3 for it in others)
+        assert all(np.linalg.norm(log(invert(first) @ other)[:3]) > 1e-3 for other in others)
 
 
 def test_wrong_corners_are_left_out_and_wrong_views_named():
@@ -100,8 +100,8 @@ def test_wrong_corners_are_left_out_and_wrong_views_named():
     corners[1].px[0] += [5.0, -3.0]
     corners[6].px[:] = np.roll(corners[6].px, 3, axis=0)
     result = poses_of(cell, corners)
-    assert [it.view for it in result.rejections] == [6]
-    view = next(it for it in result.views if it.view == 1)
+    assert [rejection.view for rejection in result.rejections] == [6]
+    view = next(view for view in result.views if view.view == 1)
     assert len(view.corners.ids) == len(corners[1].ids) - 1
     assert corners[1].ids[0] not in view.corners.ids
 
@@ -115,11 +115,13 @@ def test_symmetric_boards_are_made_consistent_by_the_motion(size):
     assert len(turns) > 1
     rng = np.random.default_rng(0)
     corners = {}
-    for it in cell.corners:
+    for view_corners in cell.corners:
         # A detector numbers the corners from any end that looks alike.
-        ids = turns[rng.integers(len(turns))][it.ids]
+        ids = turns[rng.integers(len(turns))][view_corners.ids]
         order = np.argsort(ids)
-        corners[it.view] = Corners(it.view, ids[order], it.px[order], it.blur_px)
+        corners[view_corners.view] = Corners(
+            view_corners.view, ids[order], view_corners.px[order], view_corners.blur_px
+        )
     result = poses_of(cell, corners)
     choice = chosen_of(result, cell)
     assert not choice.rejections
@@ -142,7 +144,9 @@ def test_corners_of_a_turned_board_behind_another_stay_among_its_own():
     target = replace(BOARDS["checkerboard"], name="symmetric", columns=9, rows=7)
     cell = simulate(CellOptions(views=8, seed=9, target=target, pixel_sigma_px=0.1))
     before = replace(target, columns=5, rows=4)
-    shifted = {at: replace(it, ids=it.ids + 20) for at, it in corners_of(cell).items()}
+    shifted = {
+        at: replace(corners_, ids=corners_.ids + 20) for at, corners_ in corners_of(cell).items()
+    }
     alone = poses_of(cell).views
     behind = estimate_poses(shifted, [before, target], cell.options.camera).views
     for one, other in zip(alone, behind, strict=True):

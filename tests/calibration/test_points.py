@@ -107,7 +107,7 @@ def test_points_that_are_not_where_the_table_has_them_are_named(tmp_path):
     (folder / "target.csv").write_text("\n".join(lines) + "\n")
     result = calibrate(folder)
     assert result.verdict.status == "check"
-    (sentence,) = (it for it in result.verdict.reasons if "table has it" in it)
+    (sentence,) = (reason for reason in result.verdict.reasons if "table has it" in reason)
     assert sentence.startswith(f"Point {number} of target target lies 0.")
     # The views have it where it was, to within four sigmas of what the table says of it.
     assert result.rig.shape[4][0] == pytest.approx(-5e-4, abs=2e-4)
@@ -133,15 +133,15 @@ def test_wrong_points_of_an_exact_rig_are_named_and_left_out(tmp_path, kind, fau
         first[0], second[0] = second[0], first[0]
     elif fault == "moved":
         first[2] = repr(float(first[2]) + 0.02)
-    (folder / "target.csv").write_text("\n".join(",".join(it) for it in (head, *rows)) + "\n")
+    (folder / "target.csv").write_text("\n".join(",".join(group) for group in (head, *rows)) + "\n")
     result = calibrate(folder)
-    found = [it for it in result.verdict.findings if it.kind == "rig_points"]
+    found = [finding for finding in result.verdict.findings if finding.kind == "rig_points"]
     low, high = sorted((first[0], second[0]), key=int)
     said = {
         "exchanged": f"{low} and {high} are exchanged",
         "moved": f"its table has them: {first[0]} by 20 mm",
     }
-    assert [said[fault] in it.words for it in found] == [True] * bool(fault)
+    assert [said[fault] in finding.words for finding in found] == [True] * bool(fault)
     assert result.verdict.status == ("check" if fault else "good")
     # What is left determines the camera as well as it says: 40 is what chance leaves of six
     # numbers in less than one of a hundred thousand cases, with a noise known to 20 %.
@@ -155,17 +155,17 @@ def test_a_rig_that_is_larger_than_its_table_is_named_with_its_size(tmp_path, mo
     folder = write_rig(tmp_path / "cell", Rig("cube", mount))
     table = folder / "target.csv"
     head, *rows = (line.split(",") for line in table.read_text().splitlines())
-    small = [[number, *(repr(float(it) / 1.01) for it in place)] for number, *place in rows]
-    table.write_text("\n".join(",".join(it) for it in (head, *small)) + "\n")
+    small = [[number, *(repr(float(name) / 1.01) for name in place)] for number, *place in rows]
+    table.write_text("\n".join(",".join(group) for group in (head, *small)) + "\n")
     result = calibrate(folder)
-    (found,) = (it for it in result.verdict.causes if it.kind == "board_size")
+    (found,) = (cause for cause in result.verdict.causes if cause.kind == "board_size")
     (advised,) = re.findall(r"multiply the table's x_m, y_m and z_m by ([0-9.]+)", found.do.words)
     # The sentence has a sigma of 0.1 %, by residuals that are the size's own doing.
     assert float(advised) == pytest.approx(1.01, abs=3e-3)
     by = float(advised)
-    sized = [[number, *(repr(float(it) * by) for it in place)] for number, *place in small]
-    table.write_text("\n".join(",".join(it) for it in (head, *sized)) + "\n")
-    assert not any(it.kind == "board_size" for it in calibrate(folder).verdict.findings)
+    sized = [[number, *(repr(float(name) * by) for name in place)] for number, *place in small]
+    table.write_text("\n".join(",".join(group) for group in (head, *sized)) + "\n")
+    assert not any(finding.kind == "board_size" for finding in calibrate(folder).verdict.findings)
 
 
 def test_sigmas_weigh_the_corners(tmp_path):
@@ -237,7 +237,7 @@ def test_what_was_measured_counts_in_the_digest(cube):
 
 def test_an_image_with_corners_is_not_searched(cube):
     rows = (cube / "views.csv").read_text().splitlines()
-    told = [f"{rows[0]},image", f"{rows[1]},broken.png", *(f"{it}," for it in rows[2:])]
+    told = [f"{rows[0]},image", f"{rows[1]},broken.png", *(f"{row}," for row in rows[2:])]
     (cube / "views.csv").write_text("\n".join(told) + "\n")
     (cube / "broken.png").write_bytes(b"no image")
     result = calibrate(cube)
@@ -247,15 +247,15 @@ def test_an_image_with_corners_is_not_searched(cube):
 
 def test_views_that_do_not_serve_are_left_out_by_name(cube):
     lines = (cube / "corners.csv").read_text().splitlines()
-    of = {view: [it for it in lines if it.startswith(f"{view},")] for view in range(5)}
+    of = {view: [line for line in lines if line.startswith(f"{view},")] for view in range(5)}
     # View 1 has three points, view 2 none, view 3 four of a row, view 4 one far outside.
-    row = [str(it) for it in numbers_of("cube")[:4]]
-    in_row = [it for it in of[3] if it.split(",")[1] in row]
+    row = [str(number) for number in numbers_of("cube")[:4]]
+    in_row = [value for value in of[3] if value.split(",")[1] in row]
     view, point, u_px, _ = of[4][0].split(",")
-    rest = [it for it in lines if it.split(",")[0] not in ("1", "2", "3", "4")]
+    rest = [line for line in lines if line.split(",")[0] not in ("1", "2", "3", "4")]
     kept = [*rest, *of[1][:3], *in_row, f"{view},{point},{u_px},4000.0", *of[4][1:]]
     (cube / "corners.csv").write_text("\n".join(kept) + "\n")
-    reasons = {it.view: it.reason for it in calibrate(cube).views if not it.used}
+    reasons = {view.view: view.reason for view in calibrate(cube).views if not view.used}
     assert reasons.keys() == {1, 2, 3, 4}
     assert "has 3 of 37, needs 4" in reasons[1]
     assert "neither image nor rows in corners.csv" in reasons[2]
@@ -270,8 +270,8 @@ def test_numbers_of_a_board_of_other_columns_are_refused_before_anything_is_fitt
     kind, size, stated, tmp_path
 ):
     folder = write_rig(tmp_path / kind, Rig(kind))
-    (file,) = (it.name for it in folder.glob("*.toml") if it.name != "session.toml")
-    changed(folder, file, *("columns = {}\nrows = {}\n".format(*it) for it in (size, stated)))
+    (file,) = (path.name for path in folder.glob("*.toml") if path.name != "session.toml")
+    changed(folder, file, *("columns = {}\nrows = {}\n".format(*value) for value in (size, stated)))
     with pytest.raises(DataError, match="they do with columns = {}".format(*size[:1])) as caught:
         detect(Session.load(folder))
     assert "Set columns = {} and rows = {} in".format(*size) in caught.value.next_step
@@ -279,27 +279,32 @@ def test_numbers_of_a_board_of_other_columns_are_refused_before_anything_is_fitt
 
 def test_one_view_of_other_numbers_is_left_out_by_name(tmp_path):
     folder = write_rig(tmp_path / "board", Rig("charuco"))
-    rows = [it.split(",") for it in (folder / "corners.csv").read_text().splitlines()]
+    rows = [line.split(",") for line in (folder / "corners.csv").read_text().splitlines()]
     # In view 2 the corners are numbered column by column.
     for row in rows[1:]:
         if row[0] == "2":
             row[1] = str(int(row[1]) % 5 * 8 + int(row[1]) // 5)
     (folder / "corners.csv").write_text("\n".join(map(",".join, rows)) + "\n")
     found = detect(Session.load(folder))
-    assert [(it.view, it.reason) for it in found.rejections] == [(2, OTHER_NUMBERS)]
+    assert [(rejection.view, rejection.reason) for rejection in found.rejections] == [
+        (2, OTHER_NUMBERS)
+    ]
 
 
 def test_a_rig_is_not_looked_for_in_images(cube):
     changed(cube, "views.csv", "view,", "image,view,")
     text = (cube / "views.csv").read_text().splitlines()
-    rows = [text[0], *(f"{'a.png' if at == 1 else ''},{it}" for at, it in enumerate(text[1:]))]
+    rows = [
+        text[0],
+        *(f"{'a.png' if at == 1 else ''},{value}" for at, value in enumerate(text[1:])),
+    ]
     (cube / "views.csv").write_text("\n".join(rows) + "\n")
     image = np.full((960, 1280), 200, dtype=np.uint8)
     cv2.imwrite(str(cube / "a.png"), image)
     lines = (cube / "corners.csv").read_text().splitlines()
-    kept = [it for it in lines if not it.startswith("1,")]
+    kept = [line for line in lines if not line.startswith("1,")]
     (cube / "corners.csv").write_text("\n".join(kept) + "\n")
-    (view,) = (it for it in calibrate(cube).views if not it.used)
+    (view,) = (view for view in calibrate(cube).views if not view.used)
     assert view.view == 1
     assert "rig of points, which no image is searched for" in view.reason
 
@@ -328,10 +333,10 @@ def test_points_that_count_from_another_number_are_named_at_once(tmp_path, kind,
 
     def renumber(name: str, column: int, start: int) -> None:
         header, *rows = ((folder / name).read_text()).splitlines()
-        cells = [it.split(",") for it in rows]
-        numbers = sorted({int(it[column]) for it in cells})
-        for it in cells:
-            it[column] = str(numbers.index(int(it[column])) + start)
+        cells = [row.split(",") for row in rows]
+        numbers = sorted({int(cell[column]) for cell in cells})
+        for cell in cells:
+            cell[column] = str(numbers.index(int(cell[column])) + start)
         (folder / name).write_text("\n".join([header, *map(",".join, cells)]) + "\n")
 
     renumber("corners.csv", 1, first)
@@ -356,7 +361,7 @@ def test_points_that_count_from_another_number_are_named_at_once(tmp_path, kind,
 )
 def test_wrong_columns_are_named(header, cells, said, cube):
     _, *rows = (cube / "corners.csv").read_text().splitlines()
-    (cube / "corners.csv").write_text("\n".join([header, *(f"{it}{cells}" for it in rows)]))
+    (cube / "corners.csv").write_text("\n".join([header, *(f"{row}{cells}" for row in rows)]))
     with pytest.raises(DataError, match=r"corners\.csv") as error:
         Session.load(cube)
     assert said in error.value.message
@@ -408,10 +413,10 @@ def test_one_image_of_two_targets_is_two_views(tmp_path):
     assert len(session.views) == 26
     result = calibrate(session)
     assert all(view.used for view in result.views)
-    places = [result.edges[f"base_from_target_{it}"] for it in ("board", "rig")]
+    places = [result.edges[f"base_from_target_{name}"] for name in ("board", "rig")]
     between = log(invert(places[0].matrix) @ places[1].matrix @ BOARD_FROM_CUBE.inv().as_matrix())
     # Four standard deviations of both places, as if they were independent.
-    sigmas = np.sqrt(sum(np.diag(it.covariance) for it in places))
+    sigmas = np.sqrt(sum(np.diag(place.covariance) for place in places))
     assert np.all(np.abs(between[3:]) < 4.0 * np.linalg.norm(sigmas[3:]))
     session.save(tmp_path / "copy")
     assert Session.load(tmp_path / "copy").digest() == session.digest()
@@ -429,7 +434,7 @@ def test_targets_of_rows_are_those_of_their_views(tmp_path):
         assert said in error.value.message
         changed(folder, "corners.csv", f",{name}\n", ",board\n")
     rows = (folder / "views.csv").read_text().splitlines()
-    told = [f"target,{rows[0]}", *(f"rig,{it}" for it in rows[1:])]
+    told = [f"target,{rows[0]}", *(f"rig,{row}" for row in rows[1:])]
     (folder / "views.csv").write_text("\n".join(told) + "\n")
     with pytest.raises(DataError, match=r"views\.csv says that view 0 shows 'rig'"):
         Session.load(folder)
@@ -491,11 +496,13 @@ def test_corners_of_images_give_what_the_images_give(rendered, tmp_path):
         image.unlink()
     rows = [
         f"{view},{point},{u_px!r},{v_px!r}"
-        for view, it in found.corners.items()
-        for point, (u_px, v_px) in zip(it.ids.tolist(), it.px.tolist(), strict=True)
+        for view, view_corners in found.corners.items()
+        for point, (u_px, v_px) in zip(
+            view_corners.ids.tolist(), view_corners.px.tolist(), strict=True
+        )
     ]
     (tmp_path / "cell" / "corners.csv").write_text("\n".join(["view,point,u_px,v_px", *rows]))
-    ours, theirs = (to_document(calibrate(it)) for it in (tmp_path / "cell", session))
+    ours, theirs = (to_document(calibrate(value)) for value in (tmp_path / "cell", session))
     for name in ("transforms", "noise", "views", "rms", "verdict"):
         assert ours[name] == theirs[name]
 
@@ -530,7 +537,7 @@ def test_a_deleted_row_takes_its_corners_along(cube):
     (cube / "views.csv").write_text("\n".join([*lines[:3], *lines[4:]]) + "\n")
     session = Session.load(cube)
     assert len(session.views) == len(lines) - 2
-    assert set(session.corner_table.views.tolist()) == {it.number for it in session.views}
+    assert set(session.corner_table.views.tolist()) == {view.number for view in session.views}
     # A row without corners instead: views are numbered otherwise.
     moved = [*lines[:3], lines[3].replace("2,", "77,", 1), *lines[4:]]
     (cube / "views.csv").write_text("\n".join(moved) + "\n")
@@ -544,19 +551,19 @@ def test_views_that_repeat_others_are_named_and_count_once(count, tmp_path):
     before = calibrate(folder)
     for name in ("views.csv", "corners.csv"):
         header, *lines = (folder / name).read_text().splitlines()
-        rows = [it.split(",", 1) for it in lines]
+        rows = [line.split(",", 1) for line in lines]
         again = [f"{int(view) + 100},{rest}" for view, rest in rows if int(view) < count]
         (folder / name).write_text("\n".join([header, *lines, *again]) + "\n")
     twice = calibrate(folder)
-    (found,) = (it for it in twice.verdict.findings if it.kind == "repeated_views")
+    (found,) = (finding for finding in twice.verdict.findings if finding.kind == "repeated_views")
     assert found.words.startswith(
         "View 100 repeats 0:" if count == 1 else "Views 100 to 111 repeat 0 to 11:"
     )
     assert twice.next_steps[0] == found.do
-    (last,) = (it for it in twice.views if it.view == 99 + count)
+    (last,) = (view for view in twice.views if view.view == 99 + count)
     assert (last.used, last.reason) == (False, f"repeats view {count - 1}")
     # No copy takes part, and none counts as lost.
-    assert not any(it.kind == "lost_views" for it in twice.verdict.findings)
+    assert not any(finding.kind == "lost_views" for finding in twice.verdict.findings)
     for name, edge in before.edges.items():
         assert np.array_equal(twice.edges[name].covariance, edge.covariance)
 
@@ -566,9 +573,9 @@ def test_a_rig_that_is_seen_mirrored_is_named(lens, tmp_path):
     """Unlike a flat board, it fits no pose then."""
     folder = write_rig(tmp_path / "rig", Rig("cube", lens=lens))
     header, *lines = (folder / "corners.csv").read_text().splitlines()
-    cells = [dict(zip(header.split(","), it.split(","), strict=True)) for it in lines]
-    turned = [{**it, "u_px": str(1279.0 - float(it["u_px"]))} for it in cells]
-    rows = [",".join(it.values()) for it in turned]
+    cells = [dict(zip(header.split(","), line.split(","), strict=True)) for line in lines]
+    turned = [{**cell, "u_px": str(1279.0 - float(cell["u_px"]))} for cell in cells]
+    rows = [",".join(mapping.values()) for mapping in turned]
     (folder / "corners.csv").write_text("\n".join([header, *rows]) + "\n")
     done = visioncal("calibrate", folder, "-o", tmp_path / "out")
     assert done.status == 2
@@ -578,8 +585,10 @@ def test_a_rig_that_is_seen_mirrored_is_named(lens, tmp_path):
 
 def test_tables_that_count_from_other_numbers_are_told_apart(cube):
     lines = (cube / "views.csv").read_text().splitlines()
-    numbers = [int(it.partition(",")[0]) for it in lines[1:]]
-    moved = [f"{at + 1},{it.partition(',')[2]}" for at, it in zip(numbers, lines[1:], strict=True)]
+    numbers = [int(line.partition(",")[0]) for line in lines[1:]]
+    moved = [
+        f"{at + 1},{line.partition(',')[2]}" for at, line in zip(numbers, lines[1:], strict=True)
+    ]
     (cube / "views.csv").write_text("\n".join([lines[0], *moved]) + "\n")
     with pytest.raises(DataError, match="one of them is numbered otherwise") as caught:
         Session.load(cube)
@@ -591,7 +600,7 @@ def drawn(tmp_path: Path) -> Path:
     """A session of corners alone, whose board and lens are stated."""
     cell = simulate(CellOptions(views=12, seed=4))
     session = Session.from_corners(
-        [(it.ids, it.px) for it in cell.corners],
+        [(view_corners.ids, view_corners.px) for view_corners in cell.corners],
         cell.base_from_flange,
         cell.options.target,
         cell.stated_camera.resolution,
@@ -607,7 +616,10 @@ def test_a_view_that_is_far_off_by_its_own_noise_alone_stays():
     cell = simulate(CellOptions(views=15, seed=39, cut_views=0.0))
     rng = np.random.default_rng(39)
     session = Session.from_corners(
-        [(it.ids, it.px + 2.0 * rng.standard_normal(it.px.shape)) for it in cell.exact_corners],
+        [
+            (corners_.ids, corners_.px + 2.0 * rng.standard_normal(corners_.px.shape))
+            for corners_ in cell.exact_corners
+        ],
         cell.base_from_flange,
         cell.options.target,
         cell.stated_camera.resolution,
@@ -615,7 +627,7 @@ def test_a_view_that_is_far_off_by_its_own_noise_alone_stays():
         camera=cell.stated_camera,
     )
     # Without it, view 13 is five degrees off, beyond what is near on the lever of rotations.
-    assert all(it.used for it in calibrate(session).views)
+    assert all(view.used for view in calibrate(session).views)
 
 
 def state(folder: Path, key: str, value: object) -> None:
@@ -635,7 +647,7 @@ def test_a_board_in_another_unit_is_read_as_the_chain_has_it(unit, metres, drawn
     wrong.pop("square_sigma_m")
     state(drawn, "target", '"b.toml"')
     (drawn / "b.toml").write_text(
-        "".join(f"{key} = {json.dumps(it)}\n" for key, it in wrong.items())
+        "".join(f"{key} = {json.dumps(value)}\n" for key, value in wrong.items())
     )
     read = load_in_doubt(drawn).session
     # The unit's own rounding.
@@ -650,7 +662,7 @@ def test_a_lens_that_cannot_be_the_cameras_is_not_used_and_comes_first(drawn):
     """As where fx, cx, fy, cy are copied, in the order of a matrix by rows."""
     sound = calibrate(drawn)
     camera = Session.load(drawn).declaration.camera
-    numbers = [camera.matrix[it] for it in (0, 2, 1, 3)]
+    numbers = [camera.matrix[name] for name in (0, 2, 1, 3)]
     state(drawn, "matrix", numbers)
     found = calibrate(drawn)
     assert found.verdict.causes[0].kind == "other_lens"
@@ -677,7 +689,7 @@ def test_tables_of_spreadsheets_with_decimal_commas_are_read(drawn):
 def test_a_misspelt_key_of_a_board_is_named(drawn):
     document = target_document(Session.load(drawn).target) | {"legacyy": True}
     state(drawn, "target", '"b.toml"')
-    lines = (f"{key} = {json.dumps(it)}\n" for key, it in document.items())
+    lines = (f"{key} = {json.dumps(value)}\n" for key, value in document.items())
     (drawn / "b.toml").write_text("".join(lines))
     words = "b.toml: legacyy is no known name and was not read. Did you mean legacy?"
     assert words in Session.load(drawn).warnings
@@ -694,7 +706,7 @@ def test_a_rigs_size_is_parted_from_errors_of_the_links(tmp_path, mount, size, d
     (tmp_path / "rig.csv").write_text("\n".join(("point,x_m,y_m,z_m", *lines)) + "\n")
     (tmp_path / "rig.toml").write_text('kind = "points"\npoints = "rig.csv"\n')
     session = Session.from_corners(
-        [(it.ids, it.px) for it in cell.corners],
+        [(view_corners.ids, view_corners.px) for view_corners in cell.corners],
         cell.base_from_flange,
         load_target("rig.toml", tmp_path),
         cell.stated_camera.resolution,
@@ -704,10 +716,10 @@ def test_a_rigs_size_is_parted_from_errors_of_the_links(tmp_path, mount, size, d
         q=cell.joints,
     )
     result = calibrate(session)
-    found = [it.words for it in result.verdict.causes if it.kind == "board_size"]
+    found = [cause.words for cause in result.verdict.causes if cause.kind == "board_size"]
     assert bool(found) == (size != 1.0)
-    for it in found:
-        said = re.search(r"is ([0-9.]+) % smaller than the table .* \(sigma ([0-9.]+) %\)", it)
+    for name in found:
+        said = re.search(r"is ([0-9.]+) % smaller than the table .* \(sigma ([0-9.]+) %\)", name)
         percent, sigma = map(float, said.groups())
         assert abs(percent - 0.4) < 4.0 * sigma < 0.1
     assert (result.verdict.status == "good") == (size == 1.0)

@@ -58,7 +58,7 @@ def chi2_chance(square: float) -> float:
 
 
 def ids(verdict: Verdict) -> list[str]:
-    return [it.kind for it in verdict.causes]
+    return [cause.kind for cause in verdict.causes]
 
 
 def test_a_good_result_has_no_causes() -> None:
@@ -74,7 +74,7 @@ def test_exchanged_rows_come_first_with_what_is_left_without_them() -> None:
         "Without these views, the others predict each other to 0.11 mm and 0.011 deg."
     )
     assert first.do == EXCHANGED.do
-    assert verdict.causes == tuple(sorted(verdict.causes, key=lambda it: -it.probability))
+    assert verdict.causes == tuple(sorted(verdict.causes, key=lambda cause: -cause.probability))
 
 
 @pytest.mark.parametrize(
@@ -90,12 +90,12 @@ def test_explanations_of_one_misfit_share_it(warnings, chances) -> None:
     """By the bound of Sellke, Bayarri and Berger on what a chance says, none of them among them."""
     verdict = judge(changed(SOUND, warnings=warnings, away_mm=1.0))
     odds = {text: -1.0 / (np.e * p * np.log(p)) for text, p in zip(warnings, chances, strict=True)}
-    found = {it.words: it.probability for it in verdict.causes}
+    found = {cause.words: cause.probability for cause in verdict.causes}
     for text in warnings:
         assert found[text.words] == pytest.approx(odds[text] / (1.0 + sum(odds.values())))
-    (unexplained,) = (it for it in verdict.causes if it.kind == "unexplained")
+    (unexplained,) = (cause for cause in verdict.causes if cause.kind == "unexplained")
     assert unexplained.probability == pytest.approx(1.0 / (1.0 + sum(odds.values())))
-    assert sum(it.probability for it in verdict.causes) == pytest.approx(1.0)
+    assert sum(cause.probability for cause in verdict.causes) == pytest.approx(1.0)
 
 
 def test_a_size_is_said_as_the_result_has_it() -> None:
@@ -109,7 +109,7 @@ def test_what_moves_picks_little_is_no_cause_of_a_large_misfit() -> None:
     verdict = judge(found)
     assert ids(verdict)[0] == "board_size"
     share = (FIELD.up_to_mm / found.held_out.mm) ** 2
-    assert next(it for it in verdict.causes if it.kind == "lens_field").probability < share
+    assert next(cause for cause in verdict.causes if cause.kind == "lens_field").probability < share
     # Of what is small, or not known, the evidence decides.
     for warnings in ((replace(FIELD, up_to_mm=5.0), SIZE), (replace(FIELD, up_to_mm=np.inf), SIZE)):
         assert ids(judge(replace(found, warnings=warnings)))[0] == "lens_field"
@@ -145,12 +145,12 @@ def test_views_that_are_left_out_are_a_cause(views, cause: str) -> None:
 
 @pytest.mark.parametrize("need", [None, Need(0.5)])
 def test_errors_that_are_too_large_come_from_their_sources(need) -> None:
-    large, small = (np.diag(np.repeat([1e-6, it], 3) ** 2)[None] for it in (4e-4, 3e-4))
+    large, small = (np.diag(np.repeat([1e-6, value], 3) ** 2)[None] for value in (4e-4, 3e-4))
     picks = (Picks("cam", "robot", {"calibration": small, "look": large}, np.inf, 0.5),)
     found = replace(SOUND, need=need, picks=picks, worst=directions(2e-3, 0, 0, 0))
     verdict = judge(found)
     assert ids(verdict) == ["robot_noise", "calibration"]
-    assert [it.probability for it in verdict.causes] == pytest.approx([0.64, 0.36])
+    assert [cause.probability for cause in verdict.causes] == pytest.approx([0.64, 0.36])
     without = f"Without this part 95 % of picks land within {0.3 * np.sqrt(7.815):.2f} mm"
     assert verdict.causes[0].without_it.startswith(without)
     assert ("within what is needed" in verdict.causes[0].without_it) == (need is not None)
@@ -177,7 +177,7 @@ def test_poses_that_are_misread_explain_the_rest() -> None:
         before, Finding("misread_poses", "The quaternions are w, x, y, z.", READ_AGAIN)
     )
     assert ids(after) == ["misread_poses", "moved_slowly"]
-    assert sum(it.probability for it in after.causes) <= 1.0
+    assert sum(cause.probability for cause in after.causes) <= 1.0
     assert after.top[0].startswith("Most likely (98 %): The quaternions are w, x, y, z.")
     assert after.reasons[1:] == before.reasons
 
@@ -241,7 +241,7 @@ def test_verdicts_of_earlier_files_say_the_same() -> None:
     reasons = ["Views disagree.", "It is another. Hold it."]
     old = read(VerdictForm, {"status": "bad", "reasons": reasons, "causes": causes}, "verdict")
     old = old.verdict("verdict")
-    assert [it.kind for it in old.causes] == ["lens", "calibration"]
+    assert [cause.kind for cause in old.causes] == ["lens", "calibration"]
     assert old.top == (
         "Most likely (90 %): It is another. Hold it.",
         "Much comes from it.",
@@ -261,7 +261,7 @@ def test_scatter_without_any_finding_is_unexplained() -> None:
 def session_of(cell: Cell, base_from_flange: np.ndarray) -> Session:
     """A cell's corners with other reported poses."""
     return Session.from_corners(
-        [(it.ids, it.px) for it in cell.corners],
+        [(view_corners.ids, view_corners.px) for view_corners in cell.corners],
         base_from_flange,
         cell.options.target,
         cell.stated_camera.resolution,
@@ -301,16 +301,18 @@ def test_what_was_bumped_on_the_flange_is_named_whatever_the_need(mount, bumped)
     flange = cell.base_from_flange.copy()
     if bumped:
         # Camera, or board, stand elsewhere on the flange from the tenth view on.
-        on_flange = next(it for name, it in cell.transforms.items() if name.startswith("flange"))
+        on_flange = next(
+            transform for name, transform in cell.transforms.items() if name.startswith("flange")
+        )
         knock = on_flange @ exp(np.array([0.006, -0.003, 0.0, 0.0, 0.003, 0.001]))
         flange[9:] = flange[9:] @ on_flange @ invert(knock)
     session = session_of(cell, flange)
     verdict = calibrate(session, need_mm=20.0).verdict
-    causes = [it.kind for it in verdict.findings if it.probability > 0.5]
+    causes = [finding.kind for finding in verdict.findings if finding.probability > 0.5]
     assert ("moved_at_once" in causes) == bumped
     assert (verdict.status == "good") == (not bumped)
     if bumped:
-        (found,) = (it for it in verdict.findings if it.kind == "moved_at_once")
+        (found,) = (finding for finding in verdict.findings if finding.kind == "moved_at_once")
         assert found.words.startswith("The camera" if mount == "eye-in-hand" else "The target")
         assert "from view 9 on" in found.words
         # Processes over posture and time explain the same, and are not the cause.
@@ -340,7 +342,7 @@ def test_a_held_lens_that_is_wrong_is_no_board_of_another_size(mount):
     cell = simulate(CellOptions(mount=mount, views=12, seed=2))
     lens = cell.stated_camera
     session = Session.from_corners(
-        [(it.ids, it.px) for it in cell.corners],
+        [(view_corners.ids, view_corners.px) for view_corners in cell.corners],
         cell.base_from_flange,
         "charuco_9x6_30mm",
         lens.resolution,
@@ -352,7 +354,7 @@ def test_a_held_lens_that_is_wrong_is_no_board_of_another_size(mount):
     held = Session.assemble(
         document,
         session.columns,
-        [[*map(it.cell, session.columns)] for it in session.views],
+        [[*map(view.cell, session.columns)] for view in session.views],
         session.images,
         corners=session.corner_table,
     )
@@ -372,6 +374,6 @@ def test_weak_motion_comes_first_and_its_advice_once(states_lens: bool) -> None:
     verdict = calibrated(simulate(options)).verdict
     assert verdict.status == "check"
     assert verdict.ranked[0].kind == "weak_motion"
-    assert ("weak_lens" in {it.kind for it in verdict.findings}) != states_lens
+    assert ("weak_lens" in {finding.kind for finding in verdict.findings}) != states_lens
     (step,) = verdict.next_steps
     assert step.words.startswith("Add 5 views or more, tilted by 20 to 40 degrees")

@@ -48,8 +48,8 @@ def test_charuco_before_a_fixed_camera(real_data):
     assert result.validation.held_out.deg <= 0.20
     # What is wrong with the cell: a board that is bent and half a per cent larger than stated.
     assert result.verdict.status == "check"
-    assert any("The board is not flat" in it for it in result.verdict.reasons)
-    assert any("larger than stated" in it for it in result.verdict.reasons)
+    assert any("The board is not flat" in reason for reason in result.verdict.reasons)
+    assert any("larger than stated" in reason for reason in result.verdict.reasons)
     # A fifth of its sigma: one more unknown of the board's shape moves it by less.
     assert result.board.shape["scale"] == pytest.approx(0.0047, abs=2e-4)
     # Park's camera, within what 15 views leave open; he takes the board as stated, and half a per
@@ -70,7 +70,7 @@ def test_two_exchanged_rows_among_images_of_other_rows_are_named(real_data, came
     assert result.verdict.status == ("check" if camera == 1 else "bad")
     # An image that shows a tenth of its field, 1.3 m away, fixes a camera to some millimetres; its
     # focal length is open to a few per cent, which are 40 mm.
-    assert all(1.0 < it.sigma_mm < 40.0 for it in result.placed.values())
+    assert all(1.0 < edge.sigma_mm < 40.0 for edge in result.placed.values())
 
 
 @pytest.mark.slow
@@ -96,20 +96,20 @@ def test_two_cameras_of_one_arm_are_one_cell(real_data, tmp_path):
     )
     result = visioncal.align(tmp_path)
     assert "stops 25 and 26 are exchanged" in result.verdict.top[0]
-    assert any(it.frame == "cam_c4" for it in result.moved)
+    assert any(move.frame == "cam_c4" for move in result.moved)
 
 
 def test_eight_views_of_a_poor_set_are_not_called_good(real_data):
     result = visioncal.calibrate(real_data / "sessions/visp_franka_eye_in_hand")
     assert result.verdict.status != "good"
-    assert any("8 views" in it for it in result.verdict.reasons)
-    assert any("disagree with the others by" in it for it in result.verdict.reasons)
+    assert any("8 views" in reason for reason in result.verdict.reasons)
+    assert any("disagree with the others by" in reason for reason in result.verdict.reasons)
     # The stated side of 23.6 mm does not fit the robot's motion, by 14.5 %.
-    (size,) = [it for it in result.verdict.reasons if "By the robot's motion" in it]
+    (size,) = [reason for reason in result.verdict.reasons if "By the robot's motion" in reason]
     assert "larger than stated" in size
     assert abs(result.board.shape["scale"] - 0.145) < 2 * result.board.sigma["scale"]
     assert result.camera.estimated
-    assert any("The given intrinsics do not fit" in it for it in result.verdict.reasons)
+    assert any("The given intrinsics do not fit" in reason for reason in result.verdict.reasons)
     away = result.transforms["flange_from_cam"].translation - [0.0582, -0.0342, -0.0426]
     assert 1e3 * np.linalg.norm(away) < 3 * result.edges["flange_from_cam"].sigma_mm
 

@@ -62,7 +62,7 @@ def of_one_camera(images, *, stops, trembling_m=0.0, bias_px=0.0):
     session = Session.assemble(
         document | {"camera": camera},
         list(rows[0]),
-        [[str(it) for it in row.values()] for row in rows],
+        [[str(value) for value in row.values()] for row in rows],
         MemoryImages({}),
         target_document=target_document(BOARD),
         corners=table(shown, rng),
@@ -77,23 +77,26 @@ def of_a_cell(images, *, stops, seed, bias_px=0.0):
     """
     options = read_cell("two-cameras")
     boards = tuple(
-        replace(it, target=replace(it.target, square_sigma_m=1e-7)) for it in options.boards
+        replace(board, target=replace(board.target, square_sigma_m=1e-7))
+        for board in options.boards
     )
     # Beside such a robot, corners are nearly exact.
-    robots = tuple(replace(it, robot_sigma_m=1e-4) for it in options.robots)
+    robots = tuple(replace(robot, robot_sigma_m=1e-4) for robot in options.robots)
     cell = simulate_network(replace(options, stops=14, boards=boards, robots=robots, seed=seed))
     told = network_session(cell, "repeated", seen="names")
-    columns = [it for it in told.columns if it != "image" and (stops or it != "stop")]
-    exact = {it.view: it.exact for it in cell.sights}
-    for it in cell.sights:
-        if bias_px and it.board == "floor":
-            exact[it.view] = bent(it.exact, bias_px)
+    columns = [
+        column for column in told.columns if column != "image" and (stops or column != "stop")
+    ]
+    exact = {sight.view: sight.exact for sight in cell.sights}
+    for sight in cell.sights:
+        if bias_px and sight.board == "floor":
+            exact[sight.view] = bent(sight.exact, bias_px)
     rows, shown = [], []
-    for view in sorted(told.views, key=lambda it: it.stop):
+    for view in sorted(told.views, key=lambda other: other.stop):
         for _ in range(images):
             if view.number in exact:
                 shown.append((len(rows), exact[view.number]))
-            rows.append([str(len(rows)), *(view.cell(it) for it in columns[1:])])
+            rows.append([str(len(rows)), *(view.cell(column) for column in columns[1:])])
     return cell, Session.assemble(
         told.document,
         columns,
@@ -147,7 +150,7 @@ def test_still_boards_seen_often_outvote_no_robot(seed, images):
     """Most rows are of still cameras and a still board, and agree best of all."""
     cell, session = of_a_cell(images, stops=True, seed=seed)
     found, once = calibrate(session), calibrate(of_a_cell(1, stops=True, seed=seed)[1])
-    assert sum(not it.used for it in found.cell.sights) <= 0.01 * len(found.cell.sights)
+    assert sum(not sight.used for sight in found.cell.sights) <= 0.01 * len(found.cell.sights)
     for name, edge in found.edges.items():
         assert edge.sigma_mm > 0.6 * once.edges[name].sigma_mm, name
         assert off(cell, found, name) < 22.5, name
@@ -156,10 +159,10 @@ def test_still_boards_seen_often_outvote_no_robot(seed, images):
 def test_rows_of_a_cell_in_which_the_robot_stands_still_are_of_one_stop():
     _, session = of_a_cell(3, stops=True, seed=1)
     _, unnamed = of_a_cell(3, stops=False, seed=1)
-    stations = [it.station for it in session.observations]
+    stations = [observation.station for observation in session.observations]
     assert len(set(stations)) == 14
     # Without stops, rows that tell no robot's pose stand alone.
-    told = [it.station for it in unnamed.observations if it.robots]
+    told = [observation.station for observation in unnamed.observations if observation.robots]
     assert len(set(told)) == 14
     named, other = calibrate(session), calibrate(unnamed)
     for name, edge in named.edges.items():
@@ -171,6 +174,6 @@ def test_a_lens_is_not_moved_by_what_repeated_views_have_wrong_alike(seed):
     """The bias is within the noise of one view, and clear in fourteen that count as one."""
     cell, session = of_a_cell(1, stops=True, seed=seed, bias_px=SIGMA_PX)
     found = calibrate(session)
-    assert not any(it.estimated for it in found.cell.cameras.values())
+    assert not any(camera.estimated for camera in found.cell.cameras.values())
     for name in found.edges:
         assert off(cell, found, name) < 22.5, name

@@ -75,7 +75,9 @@ def test_one_row_whose_pose_and_joints_disagree_is_named():
 
 def test_joints_of_another_robot_are_noticed_whatever_single_rows_say():
     stated = session(CELL.base_from_flange, CELL.joints)
-    (sentence,) = (it.reason for it in reported_poses(stated, load_robot("ur5e")).warnings)
+    (sentence,) = (
+        warning.reason for warning in reported_poses(stated, load_robot("ur5e")).warnings
+    )
     assert sentence.startswith("The joint angles were not used: they are misread.")
     assert "With the arm a ur10e and not a ur5e" in sentence
     assert 'In session.toml, write [robot] model = "ur10e".' in sentence
@@ -85,8 +87,10 @@ def test_rows_in_millimetres_beside_others_in_metres_are_named():
     poses = CELL.base_from_flange.copy()
     poses[[2, 5], :3, 3] *= 1e3
     reported = reported_poses(session(poses), None)
-    assert [it.view for it in reported.rejections] == [2, 5]
-    assert all("divide its x_m, y_m, z_m by 1000" in it.reason for it in reported.rejections)
+    assert [rejection.view for rejection in reported.rejections] == [2, 5]
+    assert all(
+        "divide its x_m, y_m, z_m by 1000" in rejection.reason for rejection in reported.rejections
+    )
     # Where all are, it is a reading of the poses.
     poses[:, :3, 3] *= 1e3
     assert not reported_poses(session(poses), None).rejections

@@ -90,7 +90,9 @@ def test_poses_and_joints_of_one_log_change_rows_together(cell, tmp_path):
         found, wanted = by_view(fixed, names), by_view(sound, names)
         # One row at the end has lost its partner; the rest are the numbers that were written.
         assert len(found) == len(wanted) - 1
-        np.testing.assert_allclose(list(found.values()), [wanted[it] for it in found], atol=1e-15)
+        np.testing.assert_allclose(
+            list(found.values()), [wanted[index] for index in found], atol=1e-15
+        )
 
 
 def test_joints_that_were_right_stay_where_they_are(cell, tmp_path):
@@ -127,7 +129,8 @@ def test_a_board_in_millimetres_is_read_so_and_said(cell):
     assert session.target.square_m == pytest.approx(0.030, rel=1e-15)
     assert session.target.marker_m == pytest.approx(0.022, rel=1e-15)
     assert any(
-        "board.toml cannot be in metres: 30 is read as 30 mm" in it for it in session.warnings
+        "board.toml cannot be in metres: 30 is read as 30 mm" in warning
+        for warning in session.warnings
     )
 
 
@@ -136,9 +139,12 @@ def mirrored_cell(folder, *, corners=True):
     cell = simulate(CellOptions(views=18, seed=3))
     flange, width = cell.base_from_flange, cell.stated_camera.resolution[0]
     mirror = np.eye(4) if corners else np.diag([1.0, -1.0, 1.0, 1.0])
-    seen = [it.px * [-1, 1] + [width - 1, 0] if corners else it.px for it in cell.corners]
+    seen = [
+        view_corners.px * [-1, 1] + [width - 1, 0] if corners else view_corners.px
+        for view_corners in cell.corners
+    ]
     Session.from_corners(
-        [(it.ids, px) for it, px in zip(cell.corners, seen, strict=True)],
+        [(view_corners.ids, px) for view_corners, px in zip(cell.corners, seen, strict=True)],
         mirror @ flange @ mirror,
         replace(cell.options.target, square_sigma_m=1e-7),
         cell.stated_camera.resolution,
@@ -150,7 +156,7 @@ def mirrored_cell(folder, *, corners=True):
 def test_mirrored_corners_are_turned_back_by_what_is_typed(tmp_path):
     cell = mirrored_cell(tmp_path / "cell")
     done = typed("calibrate", tmp_path / "cell", "-o", tmp_path / "out")
-    (line,) = (it for it in printed_commands(done.said) if "--guess" in it)
+    (line,) = (command for command in printed_commands(done.said) if "--guess" in command)
     assert list(failures(line)) == []
     found = visioncal.Calibration.load(tmp_path / "out")
     assert found.verdict.status == "good"
@@ -161,7 +167,7 @@ def test_mirrored_corners_are_turned_back_by_what_is_typed(tmp_path):
     changed = "corners.csv is mirrored back: each u_px is 1279 less what it was"
     (said,) = Session.load(tmp_path / "cell-fixed").declaration.corrected
     assert said.startswith(changed)
-    assert any(changed in it.words for it in found.verdict.findings)
+    assert any(changed in finding.words for finding in found.verdict.findings)
     assert by_view(Session.load(tmp_path / "cell-fixed"), POSE) == by_view(
         Session.load(tmp_path / "cell"), POSE
     )
@@ -173,7 +179,7 @@ def test_poses_are_mirrored_only_when_that_is_asked_for(tmp_path):
     # Mirrored images fit as well, and no reading of the poses helps these.
     assert "Look at an image first: where it is mirrored" in done.said
     assert "--mirror-poses" in done.said
-    assert not any("--guess" in it for it in printed_commands(done.said))
+    assert not any("--guess" in command for command in printed_commands(done.said))
     with pytest.raises(DataError, match="mirrored images are the usual cause"):
         guessed(tmp_path / "cell", tmp_path / "fixed", "--yes", strict=True)
     assert not (tmp_path / "fixed").exists()
@@ -212,7 +218,9 @@ def late(tmp_path):
         camera = invert(poses @ NEAR) @ FAR
         keyed = {"joints": one_late(joints), "camera_pose": camera}
         keyed |= {"robot_pose": one_late(poses)} if with_poses else {}
-        rows = [{name: it[at].tolist() for name, it in keyed.items()} for at in range(len(joints))]
+        rows = [
+            {name: value[at].tolist() for name, value in keyed.items()} for at in range(len(joints))
+        ]
         (tmp_path / "log.json").write_text(json.dumps(rows))
         foreign = read_foreign(
             tmp_path / "log.json", ImportOptions(mount="eye-in-hand", robot_model="ur5e")
@@ -233,12 +241,12 @@ def test_a_shift_moves_the_joints(late, with_poses):
         "session": reread_session(session, guess_session(session).best),
     }
     for name, fixed in mended.items():
-        found = [it.joints_rad for it in fixed.views]
+        found = [view.joints_rad for view in fixed.views]
         # The last row's robot was never logged, and the first one's twice.
         np.testing.assert_array_equal(found[:-1], joints[:-1], err_msg=name)
         assert found[-1] is None
         assert fixed.digest() != session.digest()
-        assert any("read otherwise" in it for it in fixed.warnings)
+        assert any("read otherwise" in warning for warning in fixed.warnings)
 
 
 def test_what_joints_cannot_be_is_refused(late):
@@ -265,7 +273,7 @@ def test_the_mount_of_samples_that_do_not_say_it(tmp_path, mount, seed):
     assert done.exit_code == 0, done.stderr
     session = Session.load(tmp_path / "read")
     assert session.mount == mount
-    found = np.array([it.base_from_flange().as_matrix() for it in session.views])
+    found = np.array([view.base_from_flange().as_matrix() for view in session.views])
     # A quaternion and back, and two inversions, in double precision.
     np.testing.assert_allclose(found, robot, atol=1e-13)
 

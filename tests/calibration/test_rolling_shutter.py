@@ -66,7 +66,10 @@ def test_a_target_moves_in_front_of_the_camera_as_finite_motion_has_it(mount):
 def test_corners_move_with_the_readout_as_differences_say():
     moved = swept(0, replace(HURRIED, stops=3))
     camera, target = moved.cell.options.camera, moved.cell.options.target
-    stack = CornerStack.of({it.view: it for it in moved.cell.corners}, numbered_positions([target]))
+    stack = CornerStack.of(
+        {view_corners.view: view_corners for view_corners in moved.cell.corners},
+        numbered_positions([target]),
+    )
     shares = shares_of(EFFECTS, stack, camera)
     # Rows from the first to the last.
     assert -0.5 <= shares.min() < -0.3
@@ -75,8 +78,8 @@ def test_corners_move_with_the_readout_as_differences_say():
     step_s = 1e-6
     _, jacobian = delayed_points(stack, shares, twists, np.array([READOUT_S]))
     ahead, behind = (
-        delayed_points(stack, shares, twists, np.array([READOUT_S + it]))[0]
-        for it in (step_s, -step_s)
+        delayed_points(stack, shares, twists, np.array([READOUT_S + value]))[0]
+        for value in (step_s, -step_s)
     )
     # Places of 0.3 m at rounding over the step.
     np.testing.assert_allclose(jacobian[:, :, 0], (ahead - behind) / (2 * step_s), atol=1e-8)
@@ -135,7 +138,7 @@ def test_a_global_shutter_is_not_mistaken(seed):
     shutter = next(iter(known.clocks.values())).clock.result().shutter
     assert shutter.kind == "global"
     assert abs(shutter.readout_s) < 4.0 * shutter.readout_sigma_s
-    assert not any("rolling" in it for it in known.notes)
+    assert not any("rolling" in note for note in known.notes)
 
 
 def test_it_is_said_and_written(tmp_path):
@@ -145,10 +148,10 @@ def test_it_is_said_and_written(tmp_path):
     assert shutter.kind == "rolling"
     # A line's time is that of the whole over the 799 steps between 800 rows.
     assert shutter.line_s == pytest.approx(shutter.readout_s / 799)
-    (said,) = [it for it in result.verdict.reasons if "rolling shutter" in it]
+    (said,) = [reason for reason in result.verdict.reasons if "rolling shutter" in reason]
     readout_ms = 1e3 * shutter.readout_s
     assert f"the image's last line is taken {readout_ms:.2f} ms after the first" in said
-    (fact,) = [it for it in method_facts(result) if it.label == "rolling shutter"]
+    (fact,) = [fact for fact in method_facts(result) if fact.label == "rolling shutter"]
     # It is rounded by its sigma, to some hundredths of a millisecond.
     assert float(fact.value.split()[0]) == pytest.approx(readout_ms, abs=0.01)
     # A recording has what was seen, not what was set straight.
@@ -174,5 +177,6 @@ def test_a_camera_of_a_whole_cell_has_its_own():
     # Chi-square of 6 beyond 22 is 0.1 %.
     assert distance(away, edge.covariance) < 22.0
     assert any(
-        "cam_side and robot b: The camera has a rolling" in it for it in found.verdict.reasons
+        "cam_side and robot b: The camera has a rolling" in reason
+        for reason in found.verdict.reasons
     )

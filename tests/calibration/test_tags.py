@@ -45,7 +45,7 @@ def test_a_table_is_read_with_its_tags(tmp_path):
     (tmp_path / "rig.toml").write_text('kind = "points"\npoints = "rig.csv"\n')
     rows = [
         "point,x_m,y_m,z_m,tag,corner",
-        *(f"{10 + it},{it % 2},{it // 2},0,7,{it}" for it in range(4)),
+        *(f"{10 + index},{index % 2},{index // 2},0,7,{index}" for index in range(4)),
     ]
     (tmp_path / "rig.csv").write_text("\n".join(rows))
     target = load_target("rig.toml", tmp_path)
@@ -72,7 +72,7 @@ def test_a_wrong_table_is_named(change, words):
         "tag": [7] * 4,
         "corner": [0, 1, 2, 3],
     } | change
-    points = {name: it for name, it in points.items() if it is not None}
+    points = {name: point for name, point in points.items() if point is not None}
     with pytest.raises(DataError, match=words):
         target_from_document({"kind": "points", "points": points}, "rig")
 
@@ -125,7 +125,7 @@ def test_another_page_is_named(seen):
 
 def test_they_are_printed_where_the_table_has_them():
     turned = np.array([[np.cos(0.3), np.sin(0.3)], [-np.sin(0.3), np.cos(0.3)]])
-    points = tuple((*(np.array(it[:2]) @ turned).tolist(), 0.0) for it in TAGS.points_m)
+    points = tuple((*(np.array(point[:2]) @ turned).tolist(), 0.0) for point in TAGS.points_m)
     target = replace(PLATE, points_m=points)
     sheet, page = any_page(target), printed(target, 200)
     seen = find_target(cv2.GaussianBlur(page, (0, 0), 0.7), target)

@@ -125,7 +125,7 @@ def test_an_arm_that_is_off_is_calibrated_beside_its_drift():
     # A file of the arm has no place for the drift, and says so to whoever reads it.
     for form in ("robot-dh", "robot-urdf", "robot-json"):
         written = document(found.calibration, form)
-        assert any("drifts with its temperature" in it for it in written.warnings)
+        assert any("drifts with its temperature" in warning for warning in written.warnings)
         assert "the arm with links at 21 deg C" in written.text
 
 
@@ -176,7 +176,7 @@ def test_jacobian_are_those_of_small_changes(kind):
     for which in range(heating.size // 6):
         change = np.zeros(heating.size)
         change[6 * which : 6 * which + 6] = step
-        ahead, behind = (heating.changed(it).links_c(heat, at_s) for it in (change, -change))
+        ahead, behind = (heating.changed(array).links_c(heat, at_s) for array in (change, -change))
         # Central differences of steps of 1e-5 are good to about 1e-9 of the rise.
         assert jacobian[:, :, which] == pytest.approx((ahead - behind) / (2 * step), abs=1e-6)
 
@@ -301,7 +301,7 @@ def test_a_session_without_temperatures_is_refused_by_the_columns_that_lack(lear
     heat = session.streams["heat"]
     with pytest.raises(DataError, match=r"temp1_c \.\.\. temp6_c or current1_a"):
         calibrate(replace(session, streams={}), level="thermal")
-    five = [at for at, it in enumerate(heat.columns) if it != "temp6_c"]
+    five = [at for at, value in enumerate(heat.columns) if value != "temp6_c"]
     fewer = Stream(tuple(heat.columns[at] for at in five), heat.values[:, five])
     with pytest.raises(DataError, match="temp6_c of temp1_c"):
         calibrate(session.with_streams({"heat": fewer}), level="thermal")
@@ -312,9 +312,9 @@ def test_a_session_without_temperatures_is_refused_by_the_columns_that_lack(lear
         calibrate(session.with_streams({"heat": soon}), level="thermal")
     # Where nobody asks for the drift, residuals that drift say why it was not found.
     (drifts,) = (
-        it
-        for it in calibrate(session.with_streams({"heat": soon})).verdict.findings
-        if it.kind == "moved_slowly"
+        finding
+        for finding in calibrate(session.with_streams({"heat": soon})).verdict.findings
+        if finding.kind == "moved_slowly"
     )
     assert "was not looked for: temperatures were read from 0 to 2990 s, and views" in drifts.words
 
@@ -324,8 +324,8 @@ def test_kelvin_is_no_celsius(learnt, tmp_path):
     session.save(tmp_path / "warm")
     path = tmp_path / "warm" / "streams" / "heat.csv"
     head, *rows = path.read_text(encoding="utf-8").splitlines()
-    kelvin = [",".join([it.split(",")[0], *[repr(float(n) + 273.15) for n in it.split(",")[1:]]])
-              for it in rows]  # fmt: skip
+    kelvin = [",".join([row.split(",")[0], *[repr(float(n) + 273.15) for n in row.split(",")[1:]]])
+              for row in rows]  # fmt: skip
     path.write_text("\n".join([head, *kelvin]) + "\n", encoding="utf-8")
     with pytest.raises(DataError, match=r"heat\.csv, column temp1_c: .*looks like kelvin"):
         Session.load(tmp_path / "warm")
@@ -334,7 +334,7 @@ def test_kelvin_is_no_celsius(learnt, tmp_path):
 def test_a_view_in_kelvin_is_named(learnt):
     session = learnt["temperatures"].session
     columns = (*session.columns, "ambient_c")
-    cells = [[*(it.cell(name) for name in session.columns), "21.5"] for it in session.views]
+    cells = [[*(view.cell(name) for name in session.columns), "21.5"] for view in session.views]
     cells[4][-1] = "294.65"
     with pytest.raises(DataError, match=re.escape("row 5, column ambient_c: 294.65")):
         Session.assemble(session.document, columns, cells, session.images)
@@ -343,7 +343,7 @@ def test_a_view_in_kelvin_is_named(learnt):
 def test_samples_that_are_many_are_averaged():
     stamps = np.arange(0.0, 2000.0, 0.1)
     values = np.column_stack([stamps, np.tile([2.0], (len(stamps), 6))])
-    names = ("stamp_s", *(f"current{it}_a" for it in range(1, 7)))
+    names = ("stamp_s", *(f"current{index}_a" for index in range(1, 7)))
     session = still().with_streams({"fast": Stream(names, values)})
     session = replace(session, streams={"fast": session.streams["fast"]})
     found, _ = inputs_of(session, 6)
@@ -360,24 +360,24 @@ def test_report_and_recording_show_the_drift(learnt, tmp_path):
     assert "seen by the stops" in page.text
     seen = found.calibration.thermal.seen
     # Of the six views that are looked at again every five minutes, one is in the posture drawn.
-    assert [it.stamp_s // 300.0 for it in seen] == list(range(20))
+    assert [value.stamp_s // 300.0 for value in seen] == list(range(20))
     course = found.calibration.thermal.course
     told = np.interp(
-        [it.stamp_s for it in seen],
-        [it.stamp_s for it in course],
-        [it.drift_mm for it in course],
+        [value.stamp_s for value in seen],
+        [value.stamp_s for value in course],
+        [value.drift_mm for value in course],
     )
-    off = np.array([it.drift_mm for it in seen]) - told
+    off = np.array([value.drift_mm for value in seen]) - told
     # Poses that are measured to about 0.05 mm along one direction, of twenty stops.
     assert abs(off.mean()) < 0.04
     assert 0.01 < off.std() < 0.1
     path = tmp_path / "drift.rrd"
     layout = blueprint(found.session, found.calibration)
     write_recording(path, found.session, found.calibration, (), layout)
-    drifts = [it[0] for it in column(path, paths.DRIFT_MM, "Scalars:scalars").values()]
+    drifts = [array[0] for array in column(path, paths.DRIFT_MM, "Scalars:scalars").values()]
     views = found.calibration.thermal.views
     assert len(views) == len(found.session.views)
-    assert sorted(drifts) == pytest.approx(sorted(it.drift_mm for it in views))
+    assert sorted(drifts) == pytest.approx(sorted(view.drift_mm for view in views))
 
 
 def test_correct_goes_by_the_temperatures(learnt, tmp_path):
@@ -387,15 +387,24 @@ def test_correct_goes_by_the_temperatures(learnt, tmp_path):
     warm = known.drift.reference_c + 15.0
     pose = known.base_from_flange(q, temperatures_c=warm)
     numbers = [*pose.translation[0], *pose.rotation.as_quat()[0], *q[0]]
-    names = ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", *(f"q{it}_rad" for it in range(1, 7))]
+    names = [
+        "x_m",
+        "y_m",
+        "z_m",
+        "qx",
+        "qy",
+        "qz",
+        "qw",
+        *(f"q{index}_rad" for index in range(1, 7)),
+    ]
     table = tmp_path / "targets.csv"
     rows = [",".join(names), ",".join(map(repr, map(float, numbers)))]
     table.write_text("\n".join(rows) + "\n", encoding="utf-8")
-    told = ",".join(f"{it:.9f}" for it in warm)
+    told = ",".join(f"{value:.9f}" for value in warm)
     done = run("correct", table, "--against", tmp_path, "--temperatures", told, "--json")
     sent = json.loads(done.out)["targets"][0]
     # The warm arm is at the target with the joints that the target was made of.
-    assert [sent[f"q{it}_rad"] for it in range(1, 7)] == pytest.approx(q[0], abs=1e-6)
+    assert [sent[f"q{index}_rad"] for index in range(1, 7)] == pytest.approx(q[0], abs=1e-6)
     kelvin = ",".join(["300"] * 6)
     refused = run("correct", table, "--against", tmp_path, "--temperatures", kelvin)
     assert refused.status == 2
@@ -406,7 +415,7 @@ def test_a_posture_that_is_come_back_to_is_another_stop(learnt):
     found = learnt["temperatures"]
     # 24 views and then six again, every five minutes; the poses that are told are the same ones.
     assert len(np.unique(found.truth.cell.base_from_flange, axis=0)) == 24
-    stations = {it.station for it in found.session.observations}
+    stations = {observation.station for observation in found.session.observations}
     assert len(stations) == len(found.session.views)
 
 
@@ -417,20 +426,22 @@ def test_an_instrument_that_reads_points_sees_the_drift(learnt, points):
     shop = tracked(Tracked(points=points), truth.cell.joints)
     moved = truth.cell.true_base_from_flange @ invert(truth.cell.base_from_flange)
     base = shop.base_from_instrument
-    read = [(stop, at, invert(base) @ moved[stop] @ base @ it) for stop, at, it in shop.rows]
+    read = [(stop, at, invert(base) @ moved[stop] @ base @ array) for stop, at, array in shop.rows]
     plain = session_of(replace(shop, rows=tuple(read)))
     columns = ("stamp_s", *plain.columns)
     stamps = [truth.stamps_s[stop] for stop, _, _ in read]
     cells = [
-        [repr(float(at)), *(view.cell(it) for it in plain.columns)]
+        [repr(float(at)), *(view.cell(name) for name in plain.columns)]
         for at, view in zip(stamps, plain.views, strict=True)
     ]
     session = Session.assemble(plain.document, columns, cells, plain.images)
     session = session.with_streams({"heat": learnt["temperatures"].session.streams["heat"]})
     found = calibrate(session, level="thermal").thermal
     assert found.residual_mm.with_drift < 0.6 * found.residual_mm.without
-    course = np.array([(it.stamp_s, it.drift_mm) for it in found.course])
-    seen = np.array([(it.stamp_s, it.drift_mm) for it in found.seen])
+    course = np.array([(point.stamp_s, point.drift_mm) for point in found.course])
+    seen = np.array(
+        [(observed_drift.stamp_s, observed_drift.drift_mm) for observed_drift in found.seen]
+    )
     away_mm = seen[:, 1] - np.interp(seen[:, 0], *course.T)
     # What is left of a stop is its noise, along one direction: 0.07 mm, and a tenth of a point's
     # 0.15 m by what the arm's rotation errs.

@@ -35,7 +35,7 @@ def known(cell: Cell) -> RunState:
     """A session with a bad arm, four of whose views are held back."""
     known = known_of(cell)
     views = tuple(
-        replace(it, holdout=True) if it.number in HELD else it for it in known.session.views
+        replace(view, holdout=True) if view.number in HELD else view for view in known.session.views
     )
     known = replace(known, session=replace(known.session, views=views))
     for stage in STAGES:
@@ -45,14 +45,14 @@ def known(cell: Cell) -> RunState:
 
 
 def rms(rows, name):
-    return float(np.sqrt(np.mean([getattr(it, name) ** 2 for it in rows])))
+    return float(np.sqrt(np.mean([getattr(row, name) ** 2 for row in rows])))
 
 
 def test_views_left_out_add_up_to_the_levels_figures(known):
     found = result_of(known).arm
-    by_name = {it.level: it for it in found.levels}
+    by_name = {level.level: level for level in found.levels}
     nominal, chosen = by_name["nominal"], by_name[found.level]
-    assert [it.view for it in found.left_out] == list(known.used)
+    assert [view.view for view in found.left_out] == list(known.used)
     for unit in ("mm", "deg"):
         # The same residuals, written twice.
         before, after = rms(found.left_out, f"nominal_{unit}"), rms(found.left_out, unit)
@@ -62,11 +62,11 @@ def test_views_left_out_add_up_to_the_levels_figures(known):
 
 def test_views_held_back_are_predicted_by_both_arms(known):
     rows = result_of(known).arm.holdout
-    assert tuple(it.view for it in rows) == HELD
-    shown = {it.view: it for it in known.solved.sights}
-    for it in rows:
+    assert tuple(row.view for row in rows) == HELD
+    shown = {sight.view: sight for sight in known.solved.sights}
+    for row in rows:
         # Against the target's estimated place here, against the views' mean there: some 0.01 mm.
-        assert it.mm == pytest.approx(shown[it.view].residual_mm, abs=0.03)
+        assert row.mm == pytest.approx(shown[row.view].residual_mm, abs=0.03)
     # Links off by half a millimetre and a milliradian, against noise of 0.03 mm.
     assert rms(rows, "nominal_mm") > 3 * rms(rows, "mm")
 
@@ -77,12 +77,12 @@ def test_without_a_calibrated_arm_there_is_nothing_to_compare(cell):
         if stage.name not in ("robot", "detect"):
             known = stage.run(known)
     assert result_of(known).arm is None
-    reported = [it.base_from_flange for it in view_evidence(known)]
+    reported = [view.base_from_flange for view in view_evidence(known)]
     assert np.array_equal(reported, cell.base_from_flange)
 
 
 def test_evidence_has_the_calibrated_arm_s_poses(cell, known):
-    ours = np.stack([it.base_from_flange for it in view_evidence(known)])
+    ours = np.stack([view.base_from_flange for view in view_evidence(known)])
     expected = known.robot_arm.model.robot.base_from_flange(cell.joints)
     assert np.array_equal(ours, expected)
     assert not np.allclose(ours, cell.base_from_flange, atol=1e-4)

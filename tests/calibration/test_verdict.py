@@ -130,17 +130,17 @@ def test_a_pair_of_which_all_views_are_left_out_is_told():
     found = left_out(range(20))
     several = (replace(PAIR, name="left of floor"), replace(found.pairs[0], name="right of floor"))
     reasons = judge(replace(found, pairs=several)).reasons
-    assert any(it.startswith("right of floor: views 0, 1, 2") for it in reasons)
-    assert not any("follow each other" in it for it in reasons)
+    assert any(reason.startswith("right of floor: views 0, 1, 2") for reason in reasons)
+    assert not any("follow each other" in reason for reason in reasons)
 
 
 def test_a_reason_is_told_once():
     found = left_out(range(12, 20))
     reasons = judge(found).reasons
-    assert sum("view 12's figures" in it for it in reasons) == 1
+    assert sum("view 12's figures" in reason for reason in reasons) == 1
     assert "8 of 20 views are not used; all of them disagree with the others." in reasons
     more = judge(changed(found, lost=[*found.sensors[0].lost, *LOST[:1]])).reasons
-    assert any("; the first but for these: view 30, blurred: very." in it for it in more)
+    assert any("; the first but for these: view 30, blurred: very." in name for name in more)
 
 
 @pytest.mark.parametrize(
@@ -170,7 +170,7 @@ def test_a_scatter_that_settles_it_is_not_blamed_on_the_motion():
     )
     verdict = judge(wild)
     assert verdict.status == "bad"
-    assert not any("weakly determined" in it for it in verdict.reasons)
+    assert not any("weakly determined" in reason for reason in verdict.reasons)
     assert "units or conventions" in verdict.reasons[0]
 
 
@@ -190,9 +190,9 @@ def test_what_settles_it_comes_first():
 
 
 def test_views_of_a_cell_are_planned_for_the_camera_that_is_known_least():
-    sensors = [Sensor(9, name=f"cam_{it}") for it in ("hand", "left", "top", "fixed")]
+    sensors = [Sensor(9, name=f"cam_{name}") for name in ("hand", "left", "top", "fixed")]
     # No robot looks with the fixed one: of it no stop can be planned.
-    picks = [Picks(it.name, "b", {}, 9.0, 1.0) for it in sensors[:3]]
+    picks = [Picks(sensor.name, "b", {}, 9.0, 1.0) for sensor in sensors[:3]]
     worst = [
         Direction(f"{name}'s offset along the cell's x", sigma, 1e-3, is_rotation=False)
         for name, sigma in (("cam_left", 1e-3), ("cam_top", 3e-3), ("cam_fixed", 5e-3))

@@ -51,7 +51,7 @@ def checked(place, rng, change=None, stops=5, **options):
 
 
 def names(found):
-    return [it.name for it in found.named]
+    return [value.name for value in found.named]
 
 
 def slip(joint, deg):
@@ -68,10 +68,10 @@ def place(request):
 def test_an_unchanged_cell_passes_as_often_as_it_should(place):
     rng = np.random.default_rng(0)
     found = [checked(place, rng) for _ in range(8)]
-    assert all(it.passed and not it.named for it in found)
+    assert all(value.passed and not value.named for value in found)
     # Chi-square of thirty directions; the mean of eight is known to 2.7, and the noise's scale to
     # a tenth, which is three more.
-    assert np.mean([it.misfit for it in found]) == pytest.approx(30.0, abs=12.0)
+    assert np.mean([value.misfit for value in found]) == pytest.approx(30.0, abs=12.0)
 
 
 def test_a_lens_that_departs_from_its_model_is_seen_with_its_field(place):
@@ -81,13 +81,13 @@ def test_a_lens_that_departs_from_its_model_is_seen_with_its_field(place):
     result = with_field(place.calibration)
     lens, known = result.camera, known_again(place.cell, np.random.default_rng(0))
     ((frame, look),) = known.cameras.items()
-    poses = {view: it.cam_from_target[0] for view, it in plain.known.poses.items()}
+    poses = {view: pose.cam_from_target[0] for view, pose in plain.known.poses.items()}
     displaced = {}
-    for view, it in look.corners.items():
-        points = numbered_positions(tuple(plain.known.session.boards.values()))[it.ids]
+    for view, view_corners in look.corners.items():
+        points = numbered_positions(tuple(plain.known.session.boards.values()))[view_corners.ids]
         far_m = float(np.mean(points @ poses[view][2, :3] + poses[view][2, 3]))
-        px = it.px + lens.displacements(it.px, far_m) @ lens.field.coefficients
-        displaced[view] = replace(it, px=px)
+        px = view_corners.px + lens.displacements(view_corners.px, far_m) @ lens.field.coefficients
+        displaced[view] = replace(view_corners, px=px)
     known = known.with_camera(frame, replace(look, corners=displaced))
     expected = plain.away(CalibrationPrior.of(place.calibration))
 
@@ -202,7 +202,7 @@ def test_the_page_shows_what_is_left_with_the_change_undone(place):
     found = checked(
         place, np.random.default_rng(9), Change(camera=knock(np.random.default_rng(9), 2.0, 0.2))
     )
-    before, after = (np.linalg.norm(it[:, 3:], axis=1) for it in (found.away, found.left))
+    before, after = (np.linalg.norm(value[:, 3:], axis=1) for value in (found.away, found.left))
     # Two millimetres and 0.2 deg at half a metre become the noise of stops, some tenths of that.
     assert np.sqrt(np.mean(after**2)) < 0.3 * np.sqrt(np.mean(before**2))
     policy = outcomes(
@@ -212,7 +212,7 @@ def test_the_page_shows_what_is_left_with_the_change_undone(place):
     page = Page(render_check(found, policy, verdict_of(found)))
     assert "does not hold any more" in page.words
     assert "with the likeliest change undone: the camera moved by" in page.words
-    assert [significant(1e3 * it) in page.words for it in (*before, *after)] == [True] * 10
+    assert [significant(1e3 * value) in page.words for value in (*before, *after)] == [True] * 10
     assert "now a collision" in page.words
     passed = checked(place, np.random.default_rng(0))
     assert (passed.left == passed.away).all()
@@ -301,11 +301,11 @@ def test_a_calibration_holds_by_its_own_session_of_which_it_left_views_out(tmp_p
     wrong = replace(cell, base_from_flange=flange)
     session = Session.load(write_session(wrong, tmp_path / "cell", images=False))
     calibration = calibrate(session)
-    assert [it.view for it in calibration.views if not it.used] == [4, 9]
+    assert [view.view for view in calibration.views if not view.used] == [4, 9]
     found = verify(session, calibration)
     assert found.passed
     assert found.seen.stops == 22
-    assert [it["view"] for it in to_document(found, ())["not_used"]] == [4, 9]
+    assert [value["view"] for value in to_document(found, ())["not_used"]] == [4, 9]
     # Of another session nothing is known beforehand.
     assert not verify(
         replace(session, document={**session.document, "name": "b"}), calibration
@@ -320,8 +320,8 @@ def test_boards_are_those_of_the_same_name_or_print_however_many_a_session_has(t
     turned = replace(two, targets=named)
     assert check(predict_stops(turned, prior_calibration), prior_calibration).passed
     for name, board in two.targets.items():
-        shown = tuple(it for it in two.views if it.text["target"] == name)
-        alone = {key: it for key, it in two.document.items() if key != "targets"}
+        shown = tuple(view for view in two.views if view.text["target"] == name)
+        alone = {key: value for key, value in two.document.items() if key != "targets"}
         one = replace(two, document=alone, target=board, targets={}, views=shown)
         found = check(predict_stops(one, prior_calibration), prior_calibration)
         assert found.passed
@@ -372,7 +372,7 @@ def test_triggers_fire_by_their_limits_and_say_what_is_not_known(tmp_path):
         place.calibration, conditions={"ambient_c": 21.0}, created=created.isoformat()
     )
     session = session_of(place.cell.only(range(5)))
-    warm = tuple(replace(it, numbers={"ambient_c": 33.0}) for it in session.views)
+    warm = tuple(replace(view, numbers={"ambient_c": 33.0}) for view in session.views)
     facts = facts_of(
         replace(session, views=warm),
         calibration,
@@ -380,8 +380,8 @@ def test_triggers_fire_by_their_limits_and_say_what_is_not_known(tmp_path):
         collision=True,
         now=created + timedelta(days=200),
     )
-    told = {it.trigger.quantity: it for it in outcomes(load_policy(), facts)}
-    assert {name: it.state for name, it in told.items()} == {
+    told = {outcome.trigger.quantity: outcome for outcome in outcomes(load_policy(), facts)}
+    assert {name: outcome.state for name, outcome in told.items()} == {
         "failed_check": "quiet",
         "collision": "fired",
         "ambient_change_k": "fired",
@@ -408,7 +408,7 @@ def pairs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("pairs")
     whole = write_session(simulate(CellOptions(views=25, seed=5)), folder / "all", images=False)
     session = Session.load(whole)
-    cold = [replace(it, numbers={**it.numbers, "ambient_c": 20.0}) for it in session.views]
+    cold = [replace(view, numbers={**view.numbers, "ambient_c": 20.0}) for view in session.views]
     columns = (*session.columns, "ambient_c")
     for name, views in (("fit", cold[:20]), ("later", cold[20:])):
         replace(session, columns=columns, views=tuple(views)).save(folder / name)
@@ -428,7 +428,9 @@ def test_the_command_says_pass_or_fail_by_its_status(pairs, tmp_path):
     assert not written["recalibrate"]
     page = Page((tmp_path / "check/report.html").read_text(encoding="utf-8"))
     assert "The calibration still holds" in page.words
-    assert not [it for it in page.references if not it.startswith(("#", "data:"))]
+    assert not [
+        reference for reference in page.references if not reference.startswith(("#", "data:"))
+    ]
     # A check has no business with the files of a calibration.
     refused = visioncal("verify", pairs / "later", "--against", out, "-o", out)
     assert refused.status == 2
@@ -436,8 +438,8 @@ def test_the_command_says_pass_or_fail_by_its_status(pairs, tmp_path):
     session = Session.load(pairs / "later")
     # The camera's poses as if it had been knocked by 20 mm along its own x.
     pushed = tuple(
-        replace(it, numbers={**it.numbers, "cft_x_m": it.numbers["cft_x_m"] - 0.02})
-        for it in session.views
+        replace(view, numbers={**view.numbers, "cft_x_m": view.numbers["cft_x_m"] - 0.02})
+        for view in session.views
     )
     replace(session, views=pushed).save(tmp_path / "knocked")
     done = visioncal("verify", tmp_path / "knocked", "--against", out, "--json")

@@ -18,7 +18,7 @@ def bare():
     """A UR10e of which nobody knows what it weighs."""
     document = dict(load_robot("ur10e").document)
     document["joint"] = [
-        {key: it for key, it in row.items() if key not in ("mass_kg", "com_m")}
+        {key: value for key, value in row.items() if key not in ("mass_kg", "com_m")}
         for row in document["joint"]
     ]
     return Robot.from_document(document)
@@ -40,8 +40,8 @@ def test_an_arm_of_unknown_weight_is_calibrated_with_its_sag(bare):
     cell = simulate(replace(SAGGING, views=60, seed=4))
     known = calibrated(cell, robot=bare)
     assert known.robot_arm.kinematics.level == "elastic"
-    assert all(it.stiffness_nm_per_rad is None for it in arm_found(known).springs.springs)
-    assert any("of which its model states nothing" in it for it in known.verdict.reasons)
+    assert all(spring.stiffness_nm_per_rad is None for spring in arm_found(known).springs.springs)
+    assert any("of which its model states nothing" in reason for reason in known.verdict.reasons)
     before = error_m(cell, calibrated(cell, joints=False), bare)
     assert error_m(cell, known, known.robot_arm.model) < 0.06 * before
     q = postures(bare)[:20]

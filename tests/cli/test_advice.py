@@ -39,14 +39,16 @@ def place(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     "name",
-    [it if it in QUICK else slow(it) for it in BROKEN if it not in ALIKE],
+    [name if name in QUICK else slow(name) for name in BROKEN if name not in ALIKE],
 )
 def test_of_broken_sessions(place, name):
     broken_session(place / "session", BROKEN[name])
-    said = [visioncal(*it) for it in (("doctor", "session"), ("calibrate", "session", "-o", "out"))]
-    assert {it.status for it in said} <= {0, 2, 3}
+    said = [
+        visioncal(*pair) for pair in (("doctor", "session"), ("calibrate", "session", "-o", "out"))
+    ]
+    assert {done.status for done in said} <= {0, 2, 3}
     # What both print is run once.
-    assert list(failures("".join(it.said for it in said))) == []
+    assert list(failures("".join(done.said for done in said))) == []
 
 
 @pytest.mark.parametrize("poor", [{"tilt_rad": (0.0, 0.1), "views": 8}, slow({"views": 5})])

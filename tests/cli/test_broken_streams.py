@@ -47,7 +47,7 @@ def status(out, err, *arguments) -> int:
 
 
 def names(folder: Path) -> list[str]:
-    return sorted(it.name for it in folder.iterdir())
+    return sorted(path.name for path in folder.iterdir())
 
 
 def test_a_full_disk_behind_stdout_is_one_message_and_status_2(pairs, tmp_path):

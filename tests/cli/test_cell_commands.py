@@ -24,9 +24,9 @@ MOST, MOST_OF_THREE = 22.5, 16.3
 
 
 def done(*arguments):
-    it = visioncal(*arguments)
-    assert it.status == 0, it.err
-    return it.out
+    result = visioncal(*arguments)
+    assert result.status == 0, result.err
+    return result.out
 
 
 @pytest.fixture(scope="module")
@@ -78,9 +78,9 @@ def test_a_board_is_located_in_the_base_of_any_robot(cell, place, camera, robot)
     found = json.loads(done("locate", place / "later", "-c", place / "out", *names, "--json"))
     at = truth(cell, f"base_{robot}", "target_floor")[:3, 3]
     assert len(found) >= 3
-    for it in found:
-        error = np.array(it["p_base_m"]) - at
-        assert error @ np.linalg.solve(it["covariance"], error) < MOST_OF_THREE
+    for value in found:
+        error = np.array(value["p_base_m"]) - at
+        assert error @ np.linalg.solve(value["covariance"], error) < MOST_OF_THREE
 
 
 def test_a_pixel_is_located_in_the_base_of_any_robot(place):
@@ -151,20 +151,20 @@ def test_a_row_without_the_robots_pose_is_left_out_where_a_tool_is_placed(place)
     open_row = replace(first, numbers={})
     shown = replace(session, views=(open_row, *others))
     frame = seen_frame(shown, whole, "tool", camera="left", robot="b")
-    (left,) = [it for it in frame.observations if not it.used]
+    (left,) = [observation for observation in frame.observations if not observation.used]
     assert "no pose of the robot" in left.reason
 
 
 def test_many_rows_that_are_left_out_for_one_reason_share_a_line(place):
     sight = Calibration.load(place / "out").cell.sights[0]
-    lost = [replace(sight, view=it, used=False, reason="not needed") for it in range(30)]
+    lost = [replace(sight, view=index, used=False, reason="not needed") for index in range(30)]
     of = f"({sight.seer} of {sight.seen})"
     named = ", ".join(map(str, range(12)))
-    assert [it.words for it in left_out([*lost, sight])] == [
+    assert [suspects.words for suspects in left_out([*lost, sight])] == [
         f"30 views, as {named} {of}: not needed"
     ]
     alone = replace(lost[5], reason="blurred")
-    assert f"view 5 {of}: blurred" in [it.words for it in left_out([*lost[:5], alone])]
+    assert f"view 5 {of}: blurred" in [suspects.words for suspects in left_out([*lost[:5], alone])]
 
 
 def test_a_fixture_of_one_robot_is_known_in_the_base_of_the_other(cell, place, tmp_path):
@@ -205,7 +205,7 @@ def test_two_whole_cells_are_compared_by_all_frames_or_by_a_pair(place, tmp_path
     moved = Calibration.whole(replace(whole.cell, edges=edges))
     moved.save(tmp_path / "calibration.json")
     told = json.loads(done("diff", place / "out", tmp_path, "--json"))
-    assert [name for name, it in told["transforms"].items() if it["is_change"]] == [
+    assert [name for name, value in told["transforms"].items() if value["is_change"]] == [
         "cell_from_cam_left"
     ]
     assert "cam_left moved" in told["findings"][1]
@@ -220,8 +220,8 @@ def test_two_whole_cells_are_compared_by_all_frames_or_by_a_pair(place, tmp_path
 def test_transforms_of_one_robot_are_exported(place):
     whole = Calibration.load(place / "out")
     text = done("export", place / "out", "--to", "text", "--camera", "left", "--robot", "b")
-    rows = [it for it in text.splitlines() if it and not it.startswith("#")]
-    written = np.array([it.split() for it in rows], dtype=float)
+    rows = [line for line in text.splitlines() if line and not line.startswith("#")]
+    written = np.array([row.split() for row in rows], dtype=float)
     np.testing.assert_allclose(written, whole.cell.between("base_b", "cam_left").matrix)
     named = ("--edge", "flange_from_target", "--robot", "b", "--camera", "left")
     done("export", place / "out", "--to", "text", *named, "--target", "plate_b")

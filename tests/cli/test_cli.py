@@ -174,7 +174,9 @@ NEEDED = {
 
 def test_errors_as_json_have_one_form(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with_json = [name for name, it in every_command() if "as_json" in {p.name for p in it.params}]
+    with_json = [
+        name for name, value in every_command() if "as_json" in {p.name for p in value.params}
+    ]
     # It looks at its libraries first, which may not be there.
     assert len(with_json) == 19
     for name in with_json:
@@ -229,7 +231,7 @@ def test_simulate_writes_arms_that_warm_up_and_arms_that_bend(tmp_path):
     loads = ("--payload-kg", 0, "--payload-kg", 5)
     bending = ("--stiffness-knm", 10, "--no-images", "--views", 4)
     assert visioncal("simulate", tmp_path / "bent", *bending, *loads).status == 0
-    carried = [it.numbers["payload_kg"] for it in Session.load(tmp_path / "bent").views]
+    carried = [view.numbers["payload_kg"] for view in Session.load(tmp_path / "bent").views]
     assert carried == [0.0, 5.0, 0.0, 5.0]
     truth = read_truth(tmp_path / "bent")
     assert truth.options["compliance_rad_per_nm"] == [1e-4] * 6
@@ -275,9 +277,9 @@ def test_steps_are_said_in_words_and_counted_by_what_they_go_through():
 def test_every_step_has_words():
     sources = Path(visioncal_package.__file__).parent.rglob("*.py")
     called = r"""(?:progress|told)\(\s*"(\w+)","""
-    named = {it for path in sources for it in re.findall(called, path.read_text("utf-8"))}
+    named = {value for path in sources for value in re.findall(called, path.read_text("utf-8"))}
     assert {"detect", "render", "excitation", "path"} <= named
-    assert progress.WORDS.keys() == named | {it.name for it in STAGES}
+    assert progress.WORDS.keys() == named | {stage.name for stage in STAGES}
 
 
 def test_without_a_terminal_the_step_at_work_is_a_line(monkeypatch):
@@ -317,9 +319,9 @@ def test_the_listing_has_the_first_words_of_each_command_s_own_help(path):
         group = group.imported(name)
     assert isinstance(group, LazyGroup)
     # The help of `align` is that of `calibrate`, whose other name it is.
-    listed = {it: words for it, words in group.listed.items() if it != "align"}
-    own = {it: group.imported(it).help.split("\n\n")[0] for it in listed}
-    assert listed == {it: " ".join(words.split()) for it, words in own.items()}
+    listed = {name: words for name, words in group.listed.items() if name != "align"}
+    own = {name: group.imported(name).help.split("\n\n")[0] for name in listed}
+    assert listed == {name: " ".join(words.split()) for name, words in own.items()}
 
 
 @pytest.mark.parametrize("columns", [80, 200])
@@ -328,9 +330,9 @@ def test_help_has_every_word_within_the_terminal(columns):
     for name, command in every_command():
         shown = visioncal(*name.split(), "--help", columns=columns).out
         assert max(map(len, shown.splitlines())) <= columns
-        for it in (command, *command.params):
-            for words in (getattr(it, "help", None) or "", *getattr(it, "opts", ())):
-                assert "".join(words.split()) in "".join(shown.split()), (name, it.name)
+        for value in (command, *command.params):
+            for words in (getattr(value, "help", None) or "", *getattr(value, "opts", ())):
+                assert "".join(words.split()) in "".join(shown.split()), (name, value.name)
 
 
 CHOICES = {
@@ -338,15 +340,21 @@ CHOICES = {
     "plan": {"purpose": PURPOSES, "criterion": get_args(Criterion), "mount": get_args(Mount)},
     "record": {"pose_form": ("ours", *POSE_FORMS), "keep": get_args(Keep)},
     "simulate": {"robot": SIMULATED_ARMS},
-    "export": {"to": [it.name for it in EXPORT_FORMATS], "convention": get_args(Convention)},
-    "convert": {"form": [it.name for it in FOREIGN_FORMATS], "robot_unit": UNITS_M},
+    "export": {
+        "to": [export_format.name for export_format in EXPORT_FORMATS],
+        "convention": get_args(Convention),
+    },
+    "convert": {
+        "form": [foreign_format.name for foreign_format in FOREIGN_FORMATS],
+        "robot_unit": UNITS_M,
+    },
     "fixture": {"cad_unit": UNITS_M},
 }
 
 
 def test_align_is_another_name_for_calibrate():
-    calibrate, align = (get_command(app).imported(it) for it in ("calibrate", "align"))
-    assert [it.opts for it in align.params] == [it.opts for it in calibrate.params]
+    calibrate, align = (get_command(app).imported(name) for name in ("calibrate", "align"))
+    assert [param.opts for param in align.params] == [param.opts for param in calibrate.params]
     assert align.help == calibrate.help
 
 
@@ -354,15 +362,15 @@ def test_align_is_another_name_for_calibrate():
 def test_help_lists_what_can_be_chosen(name):
     command = get_command(app).imported(name)
     context = command.make_context(name, [], resilient_parsing=True)
-    params = {it.name: it for it in command.params}
+    params = {param.name: param for param in command.params}
     for option, choices in CHOICES[name].items():
         words = set(re.split(r"[^\w-]+", " ".join(params[option].get_help_record(context))))
         assert set(choices) <= words, option
 
 
 def test_names_that_help_lists_are_those_of_the_registries():
-    assert tuple(it.name for it in FOREIGN_FORMATS) == FOREIGN_NAMES
-    assert tuple(it.name for it in EXPORT_FORMATS) == EXPORT_NAMES
+    assert tuple(foreign_format.name for foreign_format in FOREIGN_FORMATS) == FOREIGN_NAMES
+    assert tuple(export_format.name for export_format in EXPORT_FORMATS) == EXPORT_NAMES
     assert cell_names() == SIMULATED_CELLS
 
 

@@ -22,7 +22,7 @@ COMMANDS = (
 )
 
 
-@pytest.mark.parametrize("command", COMMANDS, ids=lambda it: it[0])
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda pair: pair[0])
 @pytest.mark.parametrize("name", ["a" * 300, "pipe.rrd", "pipe.json"])
 def test_what_cannot_be_read_is_no_bug_and_is_not_waited_for(
     command: tuple[str, ...], name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -30,7 +30,7 @@ def test_what_cannot_be_read_is_no_bug_and_is_not_waited_for(
     monkeypatch.chdir(tmp_path)
     if name.startswith("pipe"):
         os.mkfifo(name)
-    done = visioncal(*(it.format(tmp_path / name) for it in command))
+    done = visioncal(*(word.format(tmp_path / name) for word in command))
     assert done.status == 2
     assert done.err.startswith("error: ")
     assert not (tmp_path / "out").exists()

@@ -143,8 +143,12 @@ def test_xml_knows_where_its_elements_stand():
     text = b"""<a><b c='1>2'>x</b><d e="f" /><g></g></a>"""
     root = parse_xml(text, "it")
     pieces = {
-        it.tag: (text[it.begin : it.inside], text[it.inside : it.close], text[it.begin : it.end])
-        for it in (root, root.child("b"), root.child("g"))
+        element.tag: (
+            text[element.begin : element.inside],
+            text[element.inside : element.close],
+            text[element.begin : element.end],
+        )
+        for element in (root, root.child("b"), root.child("g"))
     }
     assert pieces == {
         "a": (b"<a>", text[3:-4], text),
@@ -152,7 +156,7 @@ def test_xml_knows_where_its_elements_stand():
         "g": (b"<g>", b"", b"<g></g>"),
     }
     empty = root.child("d")
-    assert [it.is_empty for it in root.children] == [False, True, False]
+    assert [child.is_empty for child in root.children] == [False, True, False]
     assert text[empty.begin : empty.end] == b'<d e="f" />' == text[empty.begin : empty.inside]
 
 
@@ -242,7 +246,7 @@ TABLES = {
 def test_tables(file, text):
     table = read_table(file("a.csv", text))
     assert table.columns == ("a", "b")
-    assert [[float(it) for it in row] for row in table.rows] == [[1, 2], [3, 4]]
+    assert [[float(name) for name in row] for row in table.rows] == [[1, 2], [3, 4]]
 
 
 def test_a_table_without_a_header_has_numbered_columns(file):
@@ -378,7 +382,7 @@ def test_numbers_of_an_xml_are_those_of_a_table(file):
 
 def test_only_line_ends_end_a_row(file):
     cells = ["a\x0bb", "a\x0cb", "a\x1cb", "a\x85b", "a\u2028b"]
-    text = "note,number\n" + "".join(f"{it},{at}\r" for at, it in enumerate(cells))
+    text = "note,number\n" + "".join(f"{cell},{at}\r" for at, cell in enumerate(cells))
     table = read_table(file("a.csv", text))
     assert [row[0] for row in table.rows] == cells
     assert table.place(4) == "a.csv, line 6"

@@ -55,7 +55,7 @@ def test_writers_at_once_leave_the_files_of_one(tmp_path):
     contents = [{name: f"{number} {name}" for name in NAMES} for number in range(4)]
     with ThreadPoolExecutor(len(contents)) as pool:
         for _ in range(5):
-            list(pool.map(lambda it: written(tmp_path, it), contents))
+            list(pool.map(lambda value: written(tmp_path, value), contents))
             assert visible(tmp_path) in contents
     expect_no_leftovers(tmp_path, contents[0])
 
@@ -137,8 +137,10 @@ def test_a_result_outlives_a_drawing_that_fails(tmp_path, monkeypatch, module, n
     done = write_outputs(tmp_path, sample.session, Run(later, sample.evidence))
     assert Calibration.load(tmp_path).created == later.created
     # The earlier drawing does not stand beside the new result as if it were its own.
-    assert sorted(it.name for it in tmp_path.iterdir()) == sorted(it.name for it in done.files)
-    assert {it.name for it in before.files} - {it.name for it in done.files} == {file}
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
+        path.name for path in done.files
+    )
+    assert {item.name for item in before.files} - {item.name for item in done.files} == {file}
     (missing,) = done.undrawn
     assert missing.file == tmp_path / file
     assert "ValueError at test_generations.py" in missing.cause
@@ -151,8 +153,12 @@ def test_what_is_not_wanted_does_not_stay_of_an_earlier_result(tmp_path, file):
     before = write_outputs(tmp_path, sample.session, Run(sample.calibration, sample.evidence))
     run = Run(sample.calibration, sample.evidence)
     done = write_outputs(tmp_path, sample.session, run, without=(file,))
-    assert {it.name for it in before.files} - {it.name for it in tmp_path.iterdir()} == {file}
-    assert sorted(it.name for it in tmp_path.iterdir()) == sorted(it.name for it in done.files)
+    assert {path.name for path in before.files} - {path.name for path in tmp_path.iterdir()} == {
+        file
+    }
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
+        path.name for path in done.files
+    )
 
 
 def test_frames_join_a_result_whose_report_cannot_be_drawn(tmp_path, monkeypatch):
@@ -173,7 +179,7 @@ def test_calibrate_ends_with_1_and_the_result_where_a_drawing_fails(tmp_path, mo
     assert done.status == 1
     assert f"{out / 'report.html'} could not be drawn (ValueError" in done.err
     assert f"The result is safe in {out / 'calibration.json'}" in done.err
-    assert sorted(it.name for it in out.iterdir()) == ["calibration.json", "recording.rrd"]
+    assert sorted(path.name for path in out.iterdir()) == ["calibration.json", "recording.rrd"]
     if as_json:
         assert json.loads(done.out) == json.loads((out / "calibration.json").read_bytes())
     else:
@@ -184,4 +190,4 @@ def test_calibrate_leaves_out_what_is_not_wanted(tmp_path):
     cell = write_session(simulate(CellOptions(views=12, seed=1)), tmp_path / "p", images=False)
     out = tmp_path / "out"
     assert visioncal("calibrate", cell, "-o", out, "--no-report", "--no-recording").status == 0
-    assert [it.name for it in out.iterdir()] == ["calibration.json"]
+    assert [path.name for path in out.iterdir()] == ["calibration.json"]

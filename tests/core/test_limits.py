@@ -9,7 +9,7 @@ PAGE = Path(visioncal.__file__).parent / "calibration" / "README.md"
 
 
 def _row(status: str) -> str:
-    (row,) = (it for it in PAGE.read_text().splitlines() if it.startswith(f"| `{status}` |"))
+    (row,) = (line for line in PAGE.read_text().splitlines() if line.startswith(f"| `{status}` |"))
     return row
 
 

@@ -89,7 +89,9 @@ def test_a_clock_that_jitters_is_named_and_evened():
     found = conditioned(stream)
     assert "steps of its clock differ by" in found.notes[0]
     motion = found.pieces[0].measured.motion
-    ddq = np.stack([np.interp(motion.times_s, done.times_s, it) for it in done.ddq.T], axis=1)
+    ddq = np.stack(
+        [np.interp(motion.times_s, done.times_s, column) for column in done.ddq.T], axis=1
+    )
     # Straight lines between samples 2 ms apart bend by 2e-6 rad at 4 rad/s^2.
     assert np.abs(motion.ddq - ddq).max() < 0.02
 
@@ -157,7 +159,7 @@ def test_joints_that_turn_round_or_rest_are_not_frozen(resolved_rad):
             columns[f"q{joint}_rad"] = np.round(angles / resolved_rad) * resolved_rad
 
     stream = record(built, done, rng, Senses(q_rad=0.0, dq_rad_s=None))
-    assert not any("frozen" in it for it in conditioned(changed(stream, round_off)).notes)
+    assert not any("frozen" in note for note in conditioned(changed(stream, round_off)).notes)
 
 
 def test_saturated_torques_are_named_and_left_out(moved):
@@ -218,7 +220,10 @@ def without(*names):
     [
         (without("tau4_nm"), "lacks tau4_nm: the robot has 6 joints"),
         (without("q6_rad", "tau6_nm"), "lacks q6_rad, tau6_nm"),
-        (lambda it: it.update(q7_rad=it["q1_rad"]), "has q7_rad, but the robot has 6 joints"),
+        (
+            lambda value: value.update(q7_rad=value["q1_rad"]),
+            "has q7_rad, but the robot has 6 joints",
+        ),
     ],
 )
 def test_missing_and_surplus_joints_are_named(moved, change, words):

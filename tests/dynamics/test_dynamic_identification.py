@@ -112,7 +112,7 @@ def test_the_prior_yields_to_the_torques(worlds):
 def test_breaking_loose_is_found():
     rng = np.random.default_rng(1)
     built = real_dynamics("ur5e", rng, stribeck=True)
-    streams = [recorded(built, it(6, rng), rng) for it in (multi_sine, slow_sweep)]
+    streams = [recorded(built, exercise(6, rng), rng) for exercise in (multi_sine, slow_sweep)]
     result = identify(known_arm(), streams, replace(PLAIN, stribeck=True)).identified
     humps, size = result.stribeck, result.base.rank
     assert humps.joints.tolist() == [0, 1, 2, 3, 4, 5]
@@ -136,7 +136,7 @@ def test_planned_sweeps_tell_friction():
     plan = plan_sweeps(allowed_motion(load_robot("ur5e"), Share()), SweepRequest(speeds=4))
     swept = plan.sampled(500.0)
     sweeps = record(built, Exercise(swept.times_s, swept.q, swept.dq, swept.ddq), rng)
-    resting = {f"tau{it}_nm": np.abs(swept.dq[:, it - 1]) < 1e-9 for it in range(1, 7)}
+    resting = {f"tau{index}_nm": np.abs(swept.dq[:, index - 1]) < 1e-9 for index in range(1, 7)}
 
     def hold(columns):
         for joint, (name, rests) in enumerate(resting.items()):
@@ -145,8 +145,8 @@ def test_planned_sweeps_tell_friction():
     held = condition(read_recorded(changed(sweeps, hold), "streams/sweeps.csv", 6))
     streams = [recorded(built, multi_sine(6, rng), rng), held]
     result = identify(known_arm(), streams, replace(PLAIN, stribeck=True)).identified
-    names = [result.base.model.names[it] for it in result.base.independent]
-    friction = result.values[[names.index(f"Fv{it}") for it in range(1, 7)]]
+    names = [result.base.model.names[index] for index in result.base.independent]
+    friction = result.values[[names.index(f"Fv{index}") for index in range(1, 7)]]
     # Four speeds there and back, each held for a second or so, at 3 % of noise.
     assert friction == pytest.approx(built.gears.viscous, rel=0.03)
     assert (result.streams[1].rms_nm < 0.02 * result.streams[1].torque_nm).all()
@@ -155,7 +155,7 @@ def test_planned_sweeps_tell_friction():
 def test_an_arm_without_humps_gets_none(worlds):
     built, _, _, _ = worlds[0]
     rng = np.random.default_rng(7)
-    streams = [recorded(built, it(6, rng), rng) for it in (multi_sine, slow_sweep)]
+    streams = [recorded(built, exercise(6, rng), rng) for exercise in (multi_sine, slow_sweep)]
     result = identify(known_arm(), streams, replace(PLAIN, stribeck=True)).identified
     # Each of six joints is taken for one with a hump once in a thousand cases.
     assert not len(result.stribeck.joints)
@@ -209,7 +209,7 @@ def test_motion_about_one_line_is_named():
         values[:, 1:] = values[:, :1] * np.array([1e-6, 0.0, 0.0, 0.0, 0.0])
     base = BaseModel.reduce(DynamicModel(known_arm(), TERMS))
     stream = recorded(real_dynamics("ur5e", rng), done, rng, Senses(q_rad=0.0))
-    lost = [base.names[it] for it in null_space(base, [block_of(base, stream)])]
+    lost = [base.names[index] for index in null_space(base, [block_of(base, stream)])]
     assert "Fc4" in lost
     assert len(lost) > 20
 
@@ -238,7 +238,7 @@ def test_what_is_predicted_far_worse_than_fitted_is_doubted_where_it_matters(
     range_nm = 10.0 * result.fitted_rms_nm / share
     seen = Validation("fresh", share * range_nm, range_nm, result.streams[0].noise_nm)
     judged = judge(replace(result, validation=seen))
-    assert any("worse than they were fitted" in it for it in judged.reasons) is doubted
+    assert any("worse than they were fitted" in reason for reason in judged.reasons) is doubted
 
 
 def test_what_the_maker_publishes_predicts_worse(worlds):
@@ -255,7 +255,7 @@ def panda():
         pytest.skip("the recording of a Franka Panda is not there")
     load = partial(np.loadtxt, dtype=float)
     q, dq, torques = (
-        load(PANDA / f"{it}.txt").reshape(-1, 7) for it in ("positions", "velocity", "torques")
+        load(PANDA / f"{name}.txt").reshape(-1, 7) for name in ("positions", "velocity", "torques")
     )
     return Recorded("streams/panda.csv", load(PANDA / "time.txt"), q, dq, torques)
 

@@ -160,7 +160,7 @@ def test_a_robot_without_inertias_gets_base_parameters(folder, tmp_path):
 def test_torques_in_thousandths_are_named_though_beyond_all_limits(folder, tmp_path):
     stream = Session.load(folder).streams["excite"]
     values = stream.values.copy()
-    values[:, [stream.columns.index(f"tau{it}_nm") for it in range(1, 7)]] *= 1e3
+    values[:, [stream.columns.index(f"tau{index}_nm") for index in range(1, 7)]] *= 1e3
     done = told_of(tmp_path, "ur5e", type(stream)(stream.columns, values))
     assert done.status == 2
     assert "mN m, or mA for A" in done.err

@@ -152,8 +152,8 @@ def test_names_say_what_base_parameters_are(name):
     base = BaseModel.reduce(DynamicModel(load_robot(name), FrictionTerms(motor_inertia=True)))
     standard = np.random.default_rng(4).uniform(1.0, 2.0, len(base.model.names))
     # Products are parameters of their own: m3*cx3 is a first moment.
-    known = {it.replace("*", "_"): v for it, v in zip(base.model.names, standard, strict=True)}
-    products = sorted((it for it in base.model.names if "*" in it), key=len, reverse=True)
+    known = {word.replace("*", "_"): v for word, v in zip(base.model.names, standard, strict=True)}
+    products = sorted((word for word in base.model.names if "*" in word), key=len, reverse=True)
     for text, value in zip(base.names, base.of(standard), strict=True):
         plain = text
         for product in products:
@@ -181,7 +181,7 @@ def test_base_parameters_are_those_that_are_kept():
 def test_names_keep_only_what_counts():
     names = BaseModel.reduce(DynamicModel(load_robot("ur5e"), FrictionTerms())).names
     assert {"Fc3", "m6*cx6"} <= set(names)
-    assert not any("e-" in it for it in names)
+    assert not any("e-" in word for word in names)
 
 
 def test_the_sense_of_a_motion_is_zero_at_rest():
@@ -294,7 +294,7 @@ def test_what_an_arm_weighs_is_no_fact_of_a_recording():
     told = read_robot_document("panda")
     # The table as it was, in its own words.
     geometry = {"name", "a_m", "alpha_rad", "d_m", "theta_offset_rad", "lower_deg", "upper_deg"}
-    bare = [{key: it for key, it in row.items() if key in geometry} for row in told["joint"]]
+    bare = [{key: value for key, value in row.items() if key in geometry} for row in told["joint"]]
     assert bare != told["joint"]
     session = kept_session()
     digests = [

@@ -55,7 +55,7 @@ class World:
         done = {"exercise": multi_sine(6, rng), "check": multi_sine(6, rng, seconds=8.0)}
         if stribeck:
             done["sweep"] = slow_sweep(6, rng, seconds=20.0)
-        runs = {name: record(self.built, it, rng, senses) for name, it in done.items()}
+        runs = {name: record(self.built, exercise, rng, senses) for name, exercise in done.items()}
         self.done, self.empty = done, exercise_session("ur10e", runs)
         carried = record(self.loaded, done["exercise"], rng, senses)
         self.full = exercise_session("ur10e", {"loaded": carried})
@@ -164,7 +164,7 @@ def test_what_the_drives_gains_are_known_to_counts_in_the_mass(run, world):
     """All drives of one sign, as lists have it: the mass is as wrong as the gains."""
     streams = loaded_streams(run.identified, world.full)
     exact = estimate_payload(run.identified, streams)
-    currents = [replace(it, of_currents=True) for it in streams]
+    currents = [replace(stream, of_currents=True) for stream in streams]
     found = estimate_payload(run.identified, currents, gain_sigma=0.12)
     assert exact.gains_sigma_kg == 0.0
     assert found.mass_kg == exact.mass_kg
@@ -182,9 +182,9 @@ def test_torques_that_do_not_count_are_not_unexplained(run, world):
     moving, standing = (
         estimate_payload(
             run.identified,
-            [replace(stream, pieces=(replace(piece, measured=it, bad=piece.bad | resting),))],
+            [replace(stream, pieces=(replace(piece, measured=value, bad=piece.bad | resting),))],
         )
-        for it in (piece.measured, held)
+        for value in (piece.measured, held)
     )
     # A little of them reaches into the filtered samples beside; counted, they would be 2 N m.
     assert standing.rms_nm == pytest.approx(moving.rms_nm, rel=0.05)
@@ -227,7 +227,7 @@ def test_friction_is_that_of_the_drives(world, run):
 @pytest.fixture(scope="module")
 def written(run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("dynamics")
-    assert [it.name for it in write_dynamics(folder, run).files] == [
+    assert [file.name for file in write_dynamics(folder, run).files] == [
         "dynamics.json",
         "report.html",
         "recording.rrd",
@@ -249,7 +249,7 @@ def test_the_report_says_what_was_found(written, run):
 
 def test_the_recording_has_torques_over_time(written, run):
     path = written / "recording.rrd"
-    samples = sum(len(it.times_s) for it in run.predictions)
+    samples = sum(len(prediction.times_s) for prediction in run.predictions)
     for name in ("measured", "predicted", "known_before"):
         # One more a motion ends its line.
         entity = f"/dynamics/torques_nm/joint_3/{name}"
@@ -306,7 +306,7 @@ def test_the_command_finds_gains(tmp_path):
     known = ("--mass-kg", 8.0, "--com-mm", "80,-30,80", "--inertia", "0.012,0,0.01,0,0,0.008")
     arguments = ("dynamics", "gains", tmp_path / "empty", "--loaded", tmp_path / "loaded", *known)
     rows = json.loads(visioncal(*arguments, "--json").out)
-    assert [it["nm_per_a"] for it in rows] == pytest.approx(gains, rel=0.02)
+    assert [row["nm_per_a"] for row in rows] == pytest.approx(gains, rel=0.02)
     assert visioncal(*arguments).out.startswith("--gains ")
     wrong = visioncal(*arguments, "--inertia", "0.1,0,0.01,0,0,0.01")
     assert (wrong.status, "are those of no body" in wrong.err) == (2, True)
@@ -362,5 +362,5 @@ def test_a_real_load_lies_within_its_sigma_by_either_list_of_gains(real_data, ga
     # The two lists differ by a quarter: truth lies between them, within two sigmas of each.
     assert abs(found.mass_kg - 2.805) < 2.0 * found.mass_sigma_kg < 1.0
     # Dry friction resists at every speed.
-    static = [it["static_nm"] for it in stribeck_rows(run.identified)]
+    static = [row["static_nm"] for row in stribeck_rows(run.identified)]
     assert min(static, default=0.0) >= 0.0

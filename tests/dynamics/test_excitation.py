@@ -73,8 +73,8 @@ def test_the_smooth_condition_tends_to_the_condition_and_knows_its_jacobian():
             step = np.zeros(flat.size)
             step[place] = 1e-6 * max(abs(flat[place]), 0.01)
             ahead, behind = (
-                smooth_condition((flat + it).reshape(rows.shape), sharpness)[0]
-                for it in (step, -step)
+                smooth_condition((flat + array).reshape(rows.shape), sharpness)[0]
+                for array in (step, -step)
             )
             numeric = (ahead - behind) / (2.0 * step[place])
             # Central differences at this step round at 1e-9 of the value over the step.
@@ -144,7 +144,7 @@ def test_torques_have_room_for_wrong_inertias(ur5e, found):
     model, motion = pinocchio_with_bodies(ur5e), found.series.sampled(50.0)
     data = model.createData()
     states = zip(motion.q, motion.dq, motion.ddq, strict=True)
-    torques = np.array([pin.rnea(model, data, *it).copy() for it in states])
+    torques = np.array([pin.rnea(model, data, *state).copy() for state in states])
     assert (1.2 * np.abs(torques).max(axis=0) <= ur5e.torque_nm).all()
     # At a twentieth of the samples the peaks are lower by their curvature.
     assert np.abs(torques).max(axis=0) == pytest.approx(found.kept.torque, rel=0.01)

@@ -84,9 +84,9 @@ def test_sweeps_move_one_joint_at_a_time_within_all_limits(sweeps):
 
 def test_every_joint_sweeps_over_the_same_place_in_both_directions_at_every_speed(sweeps):
     for joint in range(6):
-        own = [it for it in sweeps.strokes if it.sweeps and it.joint == joint]
+        own = [stroke for stroke in sweeps.strokes if stroke.sweeps and stroke.joint == joint]
         there, back = own[::2], own[1::2]
-        speeds = [it.speed for it in there]
+        speeds = [value.speed for value in there]
         assert speeds == sorted(speeds)
         assert len(speeds) == 4
         assert speeds[0] == pytest.approx(0.02)
@@ -103,7 +103,7 @@ def test_joints_without_room_are_left_out_and_named():
     arm = type(small_arm()).from_document(document)
     found = plan_sweeps(allowed_motion(arm, Share()), SweepRequest(speeds=2))
     assert found.left_out == ("joint_2",)
-    assert {it.joint for it in found.strokes} == {0, 2}
+    assert {stroke.joint for stroke in found.strokes} == {0, 2}
     with pytest.raises(DegenerateError, match="no posture was found"):
         plan_sweeps(allowed_motion(arm, Share(floor_m=2.0)), SweepRequest())
     with pytest.raises(DataError, match="1 speeds"):
@@ -134,7 +134,7 @@ def test_the_program_of_sweeps_drives_them(sweeps):
     assert np.abs(np.diff(sent, axis=0)).max() <= 1.001 * np.abs(motion.dq).max() * STEP_S
     assert sent.min(axis=0) == pytest.approx(motion.q.min(axis=0), abs=1e-8)
     assert sent.max(axis=0) == pytest.approx(motion.q.max(axis=0), abs=1e-8)
-    ways = [np.abs(np.diff(it, axis=0)).sum(axis=0) for it in (sent, motion.q)]
+    ways = [np.abs(np.diff(array, axis=0)).sum(axis=0) for array in (sent, motion.q)]
     assert ways[0] == pytest.approx(ways[1], abs=1e-6)
 
 
@@ -168,7 +168,7 @@ def test_a_plan_has_tables_programs_a_preview_and_all_of_it_as_json(tmp_path):
     out = tmp_path / "größer"
     done = plan("ur5e", out, "--rate", 100, "--harmonics", 3, "--duration", 12, "--sweep-speeds", 2)
     assert done.status == 0, done.err
-    assert {it.name for it in out.iterdir()} == TABLES | PROGRAMS
+    assert {path.name for path in out.iterdir()} == TABLES | PROGRAMS
     assert "for 54 base parameters (random motions:" in done.out
     assert "warning" not in done.out
     document = json.loads((out / "plan.json").read_text(encoding="utf-8"))
@@ -210,7 +210,7 @@ def test_a_preview_moves_the_arm_and_draws_its_curves(tmp_path):
     torques = column(file, f"{paths.MOTION}/torque_nm", "Scalars:scalars", paths.MOTION_TIMELINE)
     # Twenty samples a second, and then the sweeps.
     assert len(torques) > 400
-    assert {len(it) for it in torques.values()} == {3}
+    assert {len(torque) for torque in torques.values()} == {3}
     links = column(file, f"{paths.ROBOT}/links", "Capsules3D:translations", paths.MOTION_TIMELINE)
     assert set(links) == set(torques)
     assert column(file, f"{paths.OBSTACLES}/box_1", "Boxes3D:labels")
@@ -224,7 +224,7 @@ def test_other_arms_get_no_program_and_old_ones_are_taken_away(tmp_path):
         (out / name).write_text("old")
     done = plan(small_file(tmp_path), out, "--no-sweeps", "--harmonics", 3, "--json")
     assert done.status == 0, done.err
-    assert {it.name for it in out.iterdir()} == {
+    assert {path.name for path in out.iterdir()} == {
         "excitation.csv",
         "plan.json",
         "plan.rrd",

@@ -69,7 +69,7 @@ def test_torques_in_time_have_none(motion):
 def test_what_no_lag_mends_has_none():
     rng = np.random.default_rng(5)
     stream = late(record(real_dynamics("ur5e", rng), multi_sine(6, rng), rng), 0.08)
-    turned = [it for it in stream.columns if it.startswith("tau")]
+    turned = [column for column in stream.columns if column.startswith("tau")]
 
     def shuffle(columns):
         kept = {name: columns[name] for name in turned}
@@ -87,8 +87,8 @@ def sessions(tmp_path_factory):
         rng = np.random.default_rng(6)
         built = real_dynamics("ur5e", rng)
         streams = {
-            it: late(record(built, multi_sine(6, rng, rate_hz=250.0), rng), lag_s)
-            for it in ("excite", "fresh")
+            name: late(record(built, multi_sine(6, rng, rate_hz=250.0), rng), lag_s)
+            for name in ("excite", "fresh")
         }
         places[lag_s] = tmp_path_factory.mktemp("late") / "session"
         exercise_session("ur5e", streams).save(places[lag_s])

@@ -24,7 +24,7 @@ MOUNTS = ("eye-in-hand", "eye-to-hand")
 def compressed(cell, change=None):
     """The cell's corners under its true lens and a flat board, both changed by a vector."""
     positions = corner_positions(cell.options.target)
-    stack = CornerStack.of({it.view: it for it in cell.corners}, positions)
+    stack = CornerStack.of({corner.view: corner for corner in cell.corners}, positions)
     appearance = Appearance(cell.options.camera, np.zeros(len(BOARD_NAMES)))
     if change is not None:
         appearance = appearance.moved(change)
@@ -64,7 +64,9 @@ def test_the_poses_take_their_share_of_the_information_and_no_more():
     cell = simulate(replace(FINE, views=6, seed=0))
     found = compressed(cell)
     positions = corner_positions(cell.options.target)
-    stack = CornerStack.of({it.view: it for it in cell.corners}, positions)
+    stack = CornerStack.of(
+        {view_corners.view: view_corners for view_corners in cell.corners}, positions
+    )
     now = reproject(stack, cell.options.camera, found.cam_from_target)
     by_board = now.by_pose[:, :, 3:] @ board_basis(positions)[stack.ids]
     by_shared = np.concatenate([now.by_intrinsics, by_board], axis=2)
@@ -119,10 +121,12 @@ def test_a_bent_board_is_noticed_and_costs_nothing(given):
         for seed in range(4):
             options = replace(FINE, state_intrinsics=given, seed=seed, board_bow_m=bow_m)
             known = calibrated(simulate(options))
-            assert any("not flat" in it.reason for it in known.warnings) == (bow_m > 0.0)
+            assert any("not flat" in warning.reason for warning in known.warnings) == (bow_m > 0.0)
             kept.append(error_of(simulate(options), known)[:6])
-    flat, bent = (np.sqrt(np.mean(np.square(it), axis=0)) for it in errors.values())
-    lengths = [np.linalg.norm(it[part]) for it in (flat, bent) for part in (slice(3), slice(3, 6))]
+    flat, bent = (np.sqrt(np.mean(np.square(error), axis=0)) for error in errors.values())
+    lengths = [
+        np.linalg.norm(value[part]) for value in (flat, bent) for part in (slice(3), slice(3, 6))
+    ]
     # The same noise in both: what differs is the price of seven more unknowns.
     assert lengths[2] < 1.2 * lengths[0]
     assert lengths[3] < 1.2 * lengths[1]
@@ -142,12 +146,14 @@ def printed_anew(cell, change):
     """The cell's corners, on a board whose flat corners are where a (3, 3) matrix has them."""
     flat, camera = corner_positions(cell.options.target), cell.options.camera
 
-    def seen(it, pose, places):
-        return project(camera, places[it.ids] @ pose[:3, :3].T + pose[:3, 3])
+    def seen(value, pose, places):
+        return project(camera, places[value.ids] @ pose[:3, :3].T + pose[:3, 3])
 
     corners = tuple(
-        replace(it, px=it.px + seen(it, pose, flat @ change.T) - seen(it, pose, flat))
-        for it, pose in zip(cell.corners, cell.cam_from_target, strict=True)
+        replace(
+            corner, px=corner.px + seen(corner, pose, flat @ change.T) - seen(corner, pose, flat)
+        )
+        for corner, pose in zip(cell.corners, cell.cam_from_target, strict=True)
     )
     return replace(cell, corners=corners)
 
@@ -164,7 +170,7 @@ def printed_anew(cell, change):
 def test_a_board_that_is_printed_askew_is_named_and_costs_nothing(mount, change, words):
     cell = printed_anew(simulate(replace(FINE, mount=mount, seed=4)), np.eye(3) + change)
     known = calibrated(cell)
-    (finding,) = [it for it in known.warnings if it.kind == "board_shape"]
+    (finding,) = [warning for warning in known.warnings if warning.kind == "board_shape"]
     assert words in finding.reason
     assert "not flat" not in finding.reason
     assert mahalanobis_sq(cell, known) < UNLIKELY
@@ -174,7 +180,7 @@ def test_a_board_that_is_printed_askew_is_named_and_costs_nothing(mount, change,
 def test_a_board_within_what_is_stated_is_measured_and_not_accused(mount):
     cell = simulate(replace(FINE, mount=mount, seed=3, board_scale=1.002))
     known = calibrated(cell)
-    (sentence,) = [it for it in known.verdict.reasons if "robot's motion" in it]
+    (sentence,) = [reason for reason in known.verdict.reasons if "robot's motion" in reason]
     assert "% larger than stated" in sentence
     assert "The stated size allows this (to within 0.1 %)" in sentence
     assert known.verdict.status == "good"
@@ -188,7 +194,7 @@ def test_a_size_that_is_contradicted_is_dropped_and_no_arm_is_blamed(mount, scal
     """As after printing with `fit to page`: the robot's measure is all that is left."""
     cell = simulate(replace(FINE, mount=mount, seed=3, board_scale=scale))
     known = calibrated(cell, joints=joints)
-    assert any("The result takes the robot's scale" in it for it in known.verdict.reasons)
+    assert any("The result takes the robot's scale" in reason for reason in known.verdict.reasons)
     assert known.verdict.status == "check"
     assert known.robot_arm.errors is None or not known.robot_arm.errors.is_significant
     assert mahalanobis_sq(cell, known) < UNLIKELY
@@ -230,7 +236,9 @@ def lens_is_free(known):
 def test_intrinsics_that_are_held_against_the_images_are_named_and_counted():
     cell = simulate(replace(FINE, seed=5))
     known = with_lens(cell, np.array([0.0, 0.0, 3.0, 0.0]), intrinsics="hold")
-    (sentence,) = [it for it in known.verdict.reasons if "do not fit these images" in it]
+    (sentence,) = [
+        reason for reason in known.verdict.reasons if "do not fit these images" in reason
+    ]
     assert 'intrinsics = "hold" keeps them' in sentence
     assert known.verdict.status != "good"
     assert not lens_is_free(known)
@@ -250,7 +258,7 @@ def test_intrinsics_within_their_stated_sigma_are_refined_without_a_doubt():
     cell = simulate(replace(FINE, seed=2))
     known = with_lens(cell, np.array([2.0, 2.0, -1.5, 1.0]), matrix_sigma_px=2.0)
     assert known.verdict.status == "good"
-    assert any("refined within what is stated" in it for it in known.verdict.reasons)
+    assert any("refined within what is stated" in reason for reason in known.verdict.reasons)
     assert mahalanobis_sq(cell, known) < UNLIKELY
 
 
@@ -261,7 +269,7 @@ def test_intrinsics_that_are_off_by_less_than_images_show_are_no_doubt(off_px, s
     known = with_lens(cell, off_px * np.array([1.0, -1.0, 1.0, 0.5]))
     assert known.verdict.status == status
     words = "by less than images show" if status == "good" else "do not fit these images"
-    assert any(words in it for it in known.verdict.reasons)
+    assert any(words in reason for reason in known.verdict.reasons)
     assert mahalanobis_sq(cell, known) < UNLIKELY
 
 
@@ -280,7 +288,7 @@ def test_given_intrinsics_that_do_not_fit_are_refined_or_held_as_asked():
     wrong = replace(cell.options.camera, matrix=cell.options.camera.matrix + off)
     told = replace(cell, stated_camera=wrong)
     known = calibrated(told)
-    assert any("given intrinsics do not fit" in it.reason for it in known.warnings)
+    assert any("given intrinsics do not fit" in warning.reason for warning in known.warnings)
     refined = known.fitted.looks.camera("cam")
     lens = known.fitted.columns_of(known.fitted.looks.lens_of("cam"))
     sigma = np.sqrt(np.diag(known.solved.covariance))[lens[:4]]
@@ -303,5 +311,6 @@ def test_too_few_corners_leave_the_lens_alone():
     known = calibrated(cell, session=session)
     assert not lens_is_free(known)
     assert any(
-        '"refine" was not done: 60 corners in 15 views' in it.reason for it in known.warnings
+        '"refine" was not done: 60 corners in 15 views' in warning.reason
+        for warning in known.warnings
     )

@@ -60,8 +60,8 @@ def test_a_wrong_arm_is_noticed_and_counts_in_the_covariance(mount, joints):
             (found,) = known.solved.arms.values()
             sigma = np.deg2rad(known.robot_arm.result(found, ()).arm_errors.sigma_deg)
         assert 1e-4 < sigma < 3e-3
-        told = known.notes if joints else [it.words for it in known.warnings]
-        assert any(("was calibrated" if joints else "arm's posture") in it for it in told)
+        told = known.notes if joints else [warning.words for warning in known.warnings]
+        assert any(("was calibrated" if joints else "arm's posture") in name for name in told)
         error, covariance = error_of(cell, known), known.solved.covariance[:12, :12]
         surprises.append(error @ np.linalg.solve(covariance, error) / 12)
     # Without it, this is about a hundred.
@@ -100,6 +100,6 @@ def test_estimating_the_links_along_makes_the_answer_better():
         cell = simulate(replace(WRONG, seed=seed))
         for joints, kept in errors.items():
             kept.append(error_of(cell, calibrated(cell, joints=joints))[:6])
-    along, not_along = (np.sqrt(np.mean(np.square(it))) for it in errors.values())
+    along, not_along = (np.sqrt(np.mean(np.square(error))) for error in errors.values())
     # Seen 0.6: half of the links' errors look the same in all views.
     assert along < 0.8 * not_along

@@ -109,5 +109,7 @@ def test_misfit_and_evidence_follow_their_distributions():
 def test_a_known_scale_and_one_of_many_degrees_of_freedom_agree():
     data, state = stops_of("eye-in-hand", np.random.default_rng(6))
     off = seen_as(data, data.observations.measured @ exp(np.full(6, 2e-4)))
-    sure, nearly = (explain(off, belief_of(state, freedom=it)).likelihood for it in (np.inf, 1e9))
+    sure, nearly = (
+        explain(off, belief_of(state, freedom=value)).likelihood for value in (np.inf, 1e9)
+    )
     assert nearly == pytest.approx(sure, rel=1e-6)

@@ -130,9 +130,9 @@ def test_touches_that_contradict_each_other_wildly_are_refused():
     # Half of 50 mm at each of the two, and nothing at the others: 25 mm / sqrt(2).
     with pytest.raises(
         DataError, match=r"contradict each other: they are 1[78]\.?\d* mm off"
-    ) as it:
+    ) as caught:
         fit_features(replace(touches, points=points))
-    assert it.value.culprits[0] in {"0", "1"}
+    assert caught.value.culprits[0] in {"0", "1"}
 
 
 def test_a_touch_that_tells_no_direction_does_no_harm():
@@ -148,12 +148,12 @@ def test_a_touch_that_tells_no_direction_does_no_harm():
     guesses = list(FeatureProblem(replace(touches, points=points)).guesses())
     # Of 2 x 2 x 2 sets of three touches two are on one line, and the means make one more start.
     assert len(guesses) == 7
-    assert all(np.allclose(it[:3, :3] @ it[:3, :3].T, np.eye(3)) for it in guesses)
+    assert all(np.allclose(guess[:3, :3] @ guess[:3, :3].T, np.eye(3)) for guess in guesses)
 
 
 @pytest.mark.parametrize("kind", ONE_EACH)
 def test_every_kind_is_needed(kind):
-    _, touches = touched(8, [it for it in ONE_EACH * 2 if it != kind])
+    _, touches = touched(8, [name for name in ONE_EACH * 2 if name != kind])
     with pytest.raises(DataError, match=f"no touch of kind {kind}:"):
         fit_features(touches)
 

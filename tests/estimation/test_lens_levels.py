@@ -171,7 +171,7 @@ def test_a_focus_that_is_fixed_neither_breathes_nor_jitters(monkeypatch):
         session=replace(session, document=session.document | {"camera": camera}),
     )
     assert estimated
-    assert all((it.breathing, it.jitter) == (0.0, 0.0) for it in estimated)
+    assert all((item.breathing, item.jitter) == (0.0, 0.0) for item in estimated)
 
 
 def test_the_size_of_breathing_does_not_hang_on_where_the_fit_before_had_it(monkeypatch):

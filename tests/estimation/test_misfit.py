@@ -67,7 +67,7 @@ def test_a_creeping_base_is_noticed_and_its_way_told(mount):
         found = of_fit(drift, result)
         # A turn of the base by its sigma of some 0.1 mrad moves the place of work by 0.1 mm.
         assert found.moved_m == pytest.approx(3e-4, abs=2.5e-4)
-        assert any("drift with time" in it.reason for it in known.warnings)
+        assert any("drift with time" in warning.reason for warning in known.warnings)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
@@ -77,10 +77,10 @@ def test_a_bump_is_told_from_a_creep(mount):
         lifted = np.where(np.arange(20) < 9, 0.0, 1e-3)[:, None] * np.eye(6)[5]
         moved = replace(cell, base_from_flange=exp(lifted) @ cell.base_from_flange)
         _, known = answered(moved)
-        words = [it.reason for it in known.warnings if "moved at once" in it.reason]
+        words = [warning.reason for warning in known.warnings if "moved at once" in warning.reason]
         assert len(words) == 1
         assert "from view 9 on" in words[0]
-        assert not any("drift with time" in it.reason for it in known.warnings)
+        assert not any("drift with time" in warning.reason for warning in known.warnings)
 
 
 def test_what_a_block_of_stops_alone_determines_is_not_left_out():
@@ -114,14 +114,16 @@ def test_a_bump_is_in_the_covariance(mount):
     squares = []
     for seed in range(4):
         cell = simulate(replace(FINE, mount=mount, seed=seed))
-        on_flange = next(it for name, it in cell.transforms.items() if name.startswith("flange"))
+        on_flange = next(
+            transform for name, transform in cell.transforms.items() if name.startswith("flange")
+        )
         later = on_flange @ exp(np.array([0.001, 0, 0, 0, 1.6e-3, 1.2e-3]))
         flange = cell.base_from_flange.copy()
         flange[10:] = flange[10:] @ on_flange @ invert(later)
         result, known = answered(replace(cell, base_from_flange=flange))
-        assert [it.kind for it in known.verdict.causes][:1] == ["moved_at_once"]
+        assert [cause.kind for cause in known.verdict.causes][:1] == ["moved_at_once"]
         assert not {"weak_motion", "place", "calibration"} & {
-            it.kind for it in known.verdict.findings
+            finding.kind for finding in known.verdict.findings
         }
         edge = result.edges["cam" if mount == "eye-in-hand" else "target"]
         for true in (on_flange, later):
@@ -137,10 +139,10 @@ def test_a_joint_that_slips_between_images_is_named(mount, tmp_path):
     session = cell_session(cell, "slipped", seen="poses")
     views = []
     for at, view in enumerate(session.views):
-        numbers = {name: it for name, it in view.numbers.items() if name not in POSE}
+        numbers = {name: number for name, number in view.numbers.items() if name not in POSE}
         numbers["q3_rad"] += np.deg2rad(0.15 * (at >= 12))
         views.append(replace(view, numbers=numbers))
-    columns = tuple(it for it in session.columns if it not in POSE)
+    columns = tuple(column for column in session.columns if column not in POSE)
     replace(session, columns=columns, views=tuple(views)).save(tmp_path / "slipped")
     verdict = calibrate(tmp_path / "slipped").verdict
     cause = verdict.causes[0]
@@ -194,7 +196,7 @@ def test_stops_that_err_in_groups_are_noticed():
     together = replace(cell, base_from_flange=cell.base_from_flange @ exp(group))
     result, known = answered(together)
     assert of_fit(neighbours, result).is_significant
-    assert any("last from stop to stop" in it.reason for it in known.warnings)
+    assert any("last from stop to stop" in warning.reason for warning in known.warnings)
     # Of three stops that err alike, the mean is as good as that of one.
     white = covariance_of(result.problem, result.fit)
     assert 1.5 < np.trace(result.covariance[3:6, 3:6]) / np.trace(white[3:6, 3:6]) < 6.0
@@ -316,10 +318,12 @@ def through_a_wavy_lens(cell, sigma_px, rng):
 
     def moved(px):
         return px + np.stack(
-            [np.cos(px @ waves[it].T + phases[it]) @ weights[it] for it in (0, 1)], axis=1
+            [np.cos(px @ waves[name].T + phases[name]) @ weights[name] for name in (0, 1)], axis=1
         )
 
-    return replace(cell, corners=tuple(replace(it, px=moved(it.px)) for it in cell.corners))
+    return replace(
+        cell, corners=tuple(replace(corner, px=moved(corner.px)) for corner in cell.corners)
+    )
 
 
 def test_noise_of_corners_is_no_field_of_the_lens():
@@ -327,9 +331,9 @@ def test_noise_of_corners_is_no_field_of_the_lens():
     px = rng.uniform(0, [1280, 800], (800, 2))
     found = [lens_field(px, rng.normal(0, 0.1, (800, 2)), (1280, 800)) for _ in range(300)]
     # One of ten thousand by chance.
-    assert not any(it.is_significant for it in found)
+    assert not any(item.is_significant for item in found)
     # 60 of 72 directions count, so that F lies about 1.2, 0.2 wide, before a fit takes some out.
-    assert np.mean([it.factor for it in found]) == pytest.approx(1.2, abs=0.03)
+    assert np.mean([item.factor for item in found]) == pytest.approx(1.2, abs=0.03)
 
 
 def test_a_field_of_the_lens_is_found_with_its_size():
@@ -356,7 +360,7 @@ def test_a_lens_beyond_its_model_is_counted_and_named(mount, monkeypatch):
         known = calibrated(cell, joints=False)
         squared.append(mahalanobis_sq_of_place(cell, known))
         away.append(error_of(cell, known)[3:6])
-        named += any(it.kind == "lens_field" for it in known.findings.warnings)
+        named += any(warning.kind == "lens_field" for warning in known.findings.warnings)
         with monkeypatch.context() as patched:
             patched.setattr(refine, "estimate_levels", lambda *_: LensLevels())
             without.append(error_of(cell, calibrated(cell, joints=False))[3:6])
@@ -375,7 +379,7 @@ def test_a_focus_that_follows_the_distance_is_counted_and_named(mount):
         cell = simulate(replace(FINE, mount=mount, seed=seed))
         known = calibrated(breathing(cell, 0.01), joints=False)
         squared.append(mahalanobis_sq_of_place(cell, known))
-        named += [it.kind for it in known.findings.warnings] == ["focus"]
+        named += [warning.kind for warning in known.findings.warnings] == ["focus"]
     # 12 components: 2.8 is one in a thousand. Left out of the model, it is above 100.
     assert np.mean(squared) / 3 < 2.8
     assert named == 4
@@ -391,7 +395,7 @@ def test_one_image_that_was_turned_is_named_and_no_lens_that_refocuses(mount):
     corners = list(cell.corners)
     corners[5] = replace(corners[5], px=last - corners[5].px)
     known = calibrated(replace(cell, corners=tuple(corners)), joints=False)
-    assert [it.kind for it in known.findings.warnings] == ["turned_images"]
+    assert [warning.kind for warning in known.findings.warnings] == ["turned_images"]
     (found,) = known.findings.warnings
     assert (found.views, "turned by 180 deg" in found.words) == ((5,), True)
     assert "mogrify -rotate 180 SESSION/images/005.png" in found.do.command
@@ -402,9 +406,9 @@ def test_one_image_that_was_turned_is_named_and_no_lens_that_refocuses(mount):
 
 # What was done to an image (rows, columns), and what undoes it by the words of the finding.
 CHANGES = {
-    "turned by 180 deg": lambda it: np.rot90(it, 2),
+    "turned by 180 deg": lambda value: np.rot90(value, 2),
     "turned by 90 deg counterclockwise": np.rot90,
-    "turned by 90 deg clockwise": lambda it: np.rot90(it, -1),
+    "turned by 90 deg clockwise": lambda value: np.rot90(value, -1),
     "mirrored left to right": np.fliplr,
     "mirrored upside down": np.flipud,
 }
@@ -434,11 +438,11 @@ def mahalanobis_sq_of_place(cell, known):
 
 def breathing(cell, share):
     """Images of a lens whose focal length follows the distance."""
-    far = np.array([it[2, 3] for it in cell.cam_from_target])
+    far = np.array([value[2, 3] for value in cell.cam_from_target])
     zooms = share * (far / far.mean() - 1.0)
     centre = cell.options.camera.matrix[2:]
     corners = [
-        replace(it, px=it.px + zoom * (it.px - centre))
-        for it, zoom in zip(cell.corners, zooms, strict=True)
+        replace(corner, px=corner.px + zoom * (corner.px - centre))
+        for corner, zoom in zip(cell.corners, zooms, strict=True)
     ]
     return replace(cell, corners=tuple(corners))

@@ -110,6 +110,6 @@ def test_triangles_find_what_trying_all_orders_finds(monkeypatch):
             assert find_numbering(points, nominal).assignment.tolist() == tried.assignment.tolist()
         best = min(
             permutations(range(6)),
-            key=lambda it: module.procrustes_residual(points, nominal[list(it)]),
+            key=lambda permutation: module.procrustes_residual(points, nominal[list(permutation)]),
         )
         assert tried.assignment.tolist() == list(best)

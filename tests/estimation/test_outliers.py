@@ -148,12 +148,15 @@ def test_rows_that_are_exchanged_and_an_image_of_another_row_are_named(mount):
     cell = simulate(CellOptions(mount=mount, seed=3))
     poses = cell.base_from_flange.copy()
     poses[[4, 9]] = poses[[9, 4]]
-    corners = [replace(cell.corners[2], view=7) if it.view == 7 else it for it in cell.corners]
+    corners = [
+        replace(cell.corners[2], view=7) if view_corners.view == 7 else view_corners
+        for view_corners in cell.corners
+    ]
     known = calibrated(replace(cell, base_from_flange=poses, corners=tuple(corners)), joints=False)
     verdict = known.verdict
     assert verdict.status == "check"
-    (words,) = [it for it in verdict.reasons if "exchanged" in it]
+    (words,) = [reason for reason in verdict.reasons if "exchanged" in reason]
     assert words.startswith("Views 4 and 9 are exchanged: the image of each fits the pose in the")
-    (words,) = [it for it in verdict.reasons if it.startswith("View 7 was left out")]
+    (words,) = [reason for reason in verdict.reasons if reason.startswith("View 7 was left out")]
     assert "its image is of stop 2; its pose or its image is wrong" in words
     assert set(known.reasons) == {4, 7, 9}

@@ -78,7 +78,7 @@ def test_derivatives_are_those_of_the_residuals(oriented):
     jacobian = problem.linearise(state).jacobian
     for at, step in enumerate(1e-6 * np.eye(jacobian.shape[2])):
         ahead, behind = (
-            problem.linearise(problem.move(state, it)).residuals for it in (step, -step)
+            problem.linearise(problem.move(state, value)).residuals for value in (step, -step)
         )
         # Central differences at 1e-6 err by their square and by rounding over the step.
         assert jacobian[:, :, at] == pytest.approx((ahead - behind) / 2e-6, abs=1e-8)
@@ -95,7 +95,7 @@ def test_the_gradient_is_exact_far_from_closing_too():
 
     groups = problem.linearise(state)
     gradient = np.einsum("mij,mi->j", groups.jacobian, groups.residuals)
-    expected = [(cost(it) - cost(-it)) / 2e-6 for it in 1e-6 * np.eye(12)]
+    expected = [(cost(value) - cost(-value)) / 2e-6 for value in 1e-6 * np.eye(12)]
     # Central differences of a cost of 0.01 are exact to rounding over the step.
     assert gradient == pytest.approx(np.array(expected), abs=1e-10)
 
@@ -119,7 +119,7 @@ def test_the_robots_noise_is_carried_to_the_touched_point():
     "job",
     [
         Job(tips=6, axes=2),
-        *(slow(it) for it in (Job(noise=ROBOT), Job(tips=4, points=3))),
+        *(slow(job) for job in (Job(noise=ROBOT), Job(tips=4, points=3))),
     ],
 )
 def test_error_and_covariance_agree_with_each_other_and_with_the_bound(job):
@@ -147,9 +147,9 @@ def test_error_and_covariance_agree_with_each_other_and_with_the_bound(job):
 @pytest.mark.parametrize(
     "spoil",
     [
-        lambda it: slipped(it, 4, 1e-3 * WAY),
-        lambda it: slipped(it, 4, 5e-3 * WAY),
-        lambda it: turned(it, 4, np.deg2rad(2.0) * WAY),
+        lambda value: slipped(value, 4, 1e-3 * WAY),
+        lambda value: slipped(value, 4, 5e-3 * WAY),
+        lambda value: turned(value, 4, np.deg2rad(2.0) * WAY),
     ],
     ids=["slip of 1 mm", "slip of 5 mm", "turn of 2 deg"],
 )

@@ -108,13 +108,14 @@ def test_the_slope_is_that_of_the_likelihood():
     likelihood = pose_errors._Likelihood.of(problem, fit.state, fit.noise, ROBOT, stops)
     for model in pose_errors._models(problem.poses[ROBOT], fit.noise.robots[0]):
         common = [
-            np.array([block.common(it) for it in model.processes]) for block in likelihood.blocks
+            np.array([block.common(process) for process in model.processes])
+            for block in likelihood.blocks
         ]
         logs = np.log(np.append(0.8 * fit.noise.robots[0], [0.5] * len(model.processes)))
         here = likelihood._step(common, logs)
         for at in range(len(logs)):
             step = 1e-4 * np.eye(len(logs))[at]
-            ends = [likelihood._step(common, logs + it).value for it in (step, -step)]
+            ends = [likelihood._step(common, logs + value).value for value in (step, -step)]
             # The third order of a step of 1e-4, and rounding of a value of some hundreds.
             assert (ends[0] - ends[1]) / 2e-4 == pytest.approx(here.slope[at], abs=1e-4, rel=1e-4)
 

@@ -54,7 +54,7 @@ def sighted(problem, **turned):
 def started(problem):
     tied = init_network(problem.tree, problem.poses, sighted(problem))
     assert not tied.untied
-    return State(np.array([tied.edges[it] for it in problem.unknown]), np.zeros(0))
+    return State(np.array([tied.edges[index] for index in problem.unknown]), np.zeros(0))
 
 
 def with_places_alone(problem, rows):
@@ -66,8 +66,8 @@ def with_places_alone(problem, rows):
 
 def with_values(problem, rng):
     """The problem with two effects of one and two values: on sensors, and on one robot's flange."""
-    known = [Knowledge(np.eye(it), np.zeros(it)) for it in (1, 2)]
-    held = [np.zeros(it, dtype=bool) for it in (1, 2)]
+    known = [Knowledge(np.eye(name), np.zeros(name)) for name in (1, 2)]
+    held = [np.zeros(name, dtype=bool) for name in (1, 2)]
     by_sensor = rng.normal(size=(len(problem), 6, 1)) * 1e-3
     flange_jacobian = {"a": rng.normal(size=(len(problem.poses["a"]), 6, 2)) * 1e-3}
     concerned = np.arange(len(problem)) % 2 == 0
@@ -90,7 +90,7 @@ def test_derivatives_are_those_of_central_differences(kind):
     state = State(state.edges, np.full(problem.size - 6 * len(state.edges), 0.3))
     found, step = problem.linear(state).jacobian, 1e-6
     for at, column in enumerate(np.eye(problem.size) * step):
-        ends = [problem.linear(state.moved(it)).residuals for it in (column, -column)]
+        ends = [problem.linear(state.moved(value)).residuals for value in (column, -column)]
         # Differences of 1e-6 are exact to 1e-9. Of a place alone, a turn of the frame that it is
         # in counts by the place's own error, 0.1 mm, which is left out; and an effect's values move
         # as their last step does, which is its own square, 1e-6, off.
@@ -109,7 +109,7 @@ def test_flanges_move_as_central_differences_have_it():
             for sign in (step, -step):
                 twist = np.zeros(6)
                 twist[at] = sign
-                poses = np.array([moved(it, twist) for it in problem.poses[name]])
+                poses = np.array([moved(value, twist) for value in problem.poses[name]])
                 other = replace(problem, poses={**problem.poses, name: poses})
                 ends.append(other.linear(state).residuals)
             slope = (ends[0] - ends[1]) / (2 * step)
@@ -212,7 +212,9 @@ def test_what_is_left_of_the_observations_is_their_redundancy():
 
 def test_the_level_of_a_sensor_is_found():
     cell, problem = problem_of(6)
-    sensors = np.array([0 if it == "cam_left" else -1 for it in problem.observations.observers])
+    sensors = np.array(
+        [0 if observer == "cam_left" else -1 for observer in problem.observations.observers]
+    )
     # What cam_left says of its own noise is three times too little.
     covariance = problem.observations.covariance / np.where(sensors == 0, 9.0, 1.0)[:, None, None]
     problem = replace(
@@ -250,9 +252,9 @@ def test_a_board_that_slips_and_a_camera_that_is_bumped_are_two_frames_each():
     changed |= pushed(cell, "cam_right", 12, (0, -0.006, 0, 0, 0.005, 0))
     problem = observed(cell, rng, changed)
     found = settle(agree(problem, started(problem), MOVABLE), MOVABLE)
-    assert {(it.frame, it.stop) for it in found.moves} == {("target_b", 9), ("cam_right", 12)}
+    assert {(move.frame, move.stop) for move in found.moves} == {("target_b", 9), ("cam_right", 12)}
     assert found.used.all()
-    plain = [it for it in found.problem.unknown if "@" not in it]
+    plain = [name for name in found.problem.unknown if "@" not in name]
     edges = dict(zip(found.problem.unknown, found.fit.state.edges, strict=True))
     was = np.linalg.inv(cell.truth["base_b"]) @ edges["base_b"]
     assert len(plain) == 6
@@ -268,13 +270,13 @@ def test_a_robot_that_is_pushed_is_no_board_and_no_camera_of_it_that_slipped(twi
         cell = world(rng, 20, 0.9)
         parents = {**cell.parents, "cam_right": "flange_b"}
         truth = {**cell.truth, "cam_right": pose((178, 3, 0), (0.05, 0.0, 0.1))}
-        pairs = [it for it in cell.pairs if it[:2] != ("cam_right", "target_b")]
+        pairs = [pair for pair in cell.pairs if pair[:2] != ("cam_right", "target_b")]
         carrying = replace(cell, parents=parents, truth=truth, pairs=pairs)
         for one, carried in ((cell, {"target_b"}), (carrying, {"target_b", "cam_right"})):
             problem = observed(one, rng, pushed(one, "base_b", 10, twist))
             found = settle(agree(problem, started(problem), MOVABLE), MOVABLE)
             assert not found.moves
-            out = [bool(carried & {*it[:2]}) and it[2] >= 10 for it in one.pairs]
+            out = [bool(carried & {*pair[:2]}) and pair[2] >= 10 for pair in one.pairs]
             assert (~found.used).tolist() == out
 
 
@@ -310,7 +312,7 @@ def test_wrong_images_are_left_out_and_nothing_else(some, others):
 def test_a_camera_on_one_arm_and_a_board_on_the_other_tie_both_bases():
     rng = np.random.default_rng(12)
     cell = world(rng, 25)
-    parents = {it: on for it, on in cell.parents.items() if it[:3] not in ("cam", "tar")}
+    parents = {key: on for key, on in cell.parents.items() if key[:3] not in ("cam", "tar")}
     parents |= {"cam_a": "flange_a", "target_b": "flange_b"}
     truth = {**cell.truth, "cam_a": cell.truth["target_a"]}
     pairs = [("cam_a", "target_b", stop) for stop in range(25)]
@@ -371,7 +373,7 @@ def test_priors_of_frames_have_the_jacobian_of_central_differences():
     ):
         _, jacobian = problem.prior_rows(prior, state)
         for at, column in enumerate(np.eye(problem.size) * step):
-            ends = [problem.prior_rows(prior, state.moved(it))[0] for it in (column, -column)]
+            ends = [problem.prior_rows(prior, state.moved(value))[0] for value in (column, -column)]
             # In units of sigmas of a millimetre: rounding of 1e-16 m over steps of 1e-6.
             np.testing.assert_allclose((ends[0] - ends[1]) / (2 * step), jacobian[:, at], atol=1e-6)
 
@@ -388,7 +390,7 @@ def test_repeated_views_of_a_still_board_count_as_one():
     fixed = replace(
         problem, tree=problem.tree.with_known("cam_left", cell.truth["cam_left"])
     ).subset(still)
-    edges = np.array([cell.truth[it] for it in fixed.tree.unknown])
+    edges = np.array([cell.truth[index] for index in fixed.tree.unknown])
     for count in (1, 5, 40):
         some = fixed.subset(np.arange(40) < count)
         known = covariance_of(some, Solution(State(edges, np.zeros(0)), NOISE))
@@ -397,7 +399,7 @@ def test_repeated_views_of_a_still_board_count_as_one():
     # What the boards on the flanges tell is as without.
     moving = problem.subset(~still & ~problem.observations.involves("target_floor"))
     plain = replace(moving, with_repeats=False)
-    found = [covariance_of(it, Solution(state, NOISE)) for it in (moving, plain)]
+    found = [covariance_of(value, Solution(state, NOISE)) for value in (moving, plain)]
     np.testing.assert_array_equal(*found)
 
 
@@ -410,7 +412,7 @@ def test_observations_of_one_stop_merge_without_loss(count):
     seen = replace(problem.observations.take(rows), sensors=np.full(len(rows), -1))
     known = Knowledge(np.eye(2), np.zeros(2))
     by_sensor = rng.normal(size=(count, len(rows), 6, 2)) * 1e-3
-    effects = [Effect.free(f"effect {at}", known, it) for at, it in enumerate(by_sensor)]
+    effects = [Effect.free(f"effect {at}", known, value) for at, value in enumerate(by_sensor)]
     twice = replace(problem, observations=seen).with_effects(effects)
     merged = twice.merged()
     assert len(merged) == (len(problem) if count == 1 else len(rows))

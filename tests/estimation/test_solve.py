@@ -60,7 +60,7 @@ def doubled(problem):
     return replace(
         problem,
         observations=replace(seen, covariance=2.0 * seen.covariance),
-        effects=tuple(it.take(again) for it in problem.effects),
+        effects=tuple(effect.take(again) for effect in problem.effects),
     )
 
 
@@ -165,7 +165,7 @@ def test_errors_of_an_arm_beside_a_likelihood_are_those_of_a_wider_problem(kind)
         return
     # What the wider problem has left of the arm's columns beside them is rounding.
     levels, fixed = 2.0 * fit.noise.robots, np.zeros(2, dtype=bool)
-    found, values = (it.most_likely(levels, fixed)[1] for it in (beside, expected))
+    found, values = (item.most_likely(levels, fixed)[1] for item in (beside, expected))
     assert found == pytest.approx(values, abs=1e-5)
 
 
@@ -180,7 +180,7 @@ def test_the_likelihood_of_levels_that_grow_together_is_that_of_each(kind):
         problem = replace(problem, observations=seen, is_combined=True)
     found = robot_likelihood(problem, fit.state, fit.noise)
     scales, fixed = np.array([0.02, 0.5, 1.0, 8.0]), np.zeros(2, dtype=bool)
-    values = [found.most_likely(it * fit.noise.robots, fixed)[1] for it in scales]
+    values = [found.most_likely(scale * fit.noise.robots, fixed)[1] for scale in scales]
     scaled = found.scaled(0, fit.noise.robots, scales)
     # The rounding of values of some hundreds, at a fiftieth of the noise some millions.
     np.testing.assert_allclose(np.diff(scaled), np.diff(values), rtol=1e-7, atol=1e-7)
@@ -224,7 +224,7 @@ def test_a_fit_at_its_answer_looks_twice(monkeypatch):
     )
     noise = replace(fit.noise, robots=1.01 * fit.noise.robots)
     solve_problem(problem, fit.state, noise, is_near=True)
-    assert len({id(it) for it in looked}) <= 2
+    assert len({id(value) for value in looked}) <= 2
 
 
 def test_a_fit_that_runs_away_is_an_error_of_the_input(monkeypatch):

@@ -146,16 +146,22 @@ def quiet_opencv():
 @pytest.mark.parametrize("name", ["tsai", "park", "horaud", "daniilidis"])
 def test_pairs_within_groups_tell_as_much_as_all(name, monkeypatch):
     problems = [simulate(replace(PRECISE, views=220), seed) for seed in range(12)]
-    grouped = [turn_error(SOLVERS[name](it.robot, it.camera).x, it.x) for it in problems]
+    grouped = [
+        turn_error(SOLVERS[name](problem.robot, problem.camera).x, problem.x)
+        for problem in problems
+    ]
     monkeypatch.setattr("visioncal.estimation.closed_form.pairs._GROUP", 220)
-    whole = [turn_error(SOLVERS[name](it.robot, it.camera).x, it.x) for it in problems]
+    whole = [
+        turn_error(SOLVERS[name](problem.robot, problem.camera).x, problem.x)
+        for problem in problems
+    ]
     # A hundred partners leave 1 % of the variance; both share all but that of their noise, so 12
     # ratios are known to 3 %, and with neighbours alone as partners all would be far off.
     assert np.sqrt(np.mean(np.square(grouped))) < 1.1 * np.sqrt(np.mean(np.square(whole)))
 
 
 def test_a_view_has_no_more_partners_with_more_views():
-    few, many = (rotation_pairs(*np.tile(np.eye(4), (2, it, 1, 1))) for it in (1000, 3000))
+    few, many = (rotation_pairs(*np.tile(np.eye(4), (2, name, 1, 1))) for name in (1000, 3000))
     assert few.weight.size == 1000 * 100
     assert many.weight.size == 3000 * 100
 

@@ -39,7 +39,7 @@ def test_samples_give_themselves_back() -> None:
 
 
 def test_nothing_is_said_across_gaps_and_beyond_the_ends() -> None:
-    moved = sampled(100, lambda it: (it < 2.0) | (it > 2.5))
+    moved = sampled(100, lambda value: (value < 2.0) | (value > 2.5))
     at_s = np.array([-0.01, 0.0, 1.985, 2.2, 2.505, 9.985, 9.995])
     assert moved.covers(at_s).tolist() == [False, True, True, False, False, True, False]
     assert moved.covers(at_s, 0.02).tolist() == [False] * 7
@@ -49,7 +49,7 @@ def test_nothing_is_said_across_gaps_and_beyond_the_ends() -> None:
 
 
 def test_a_sample_that_is_missing_now_and_then_is_no_gap() -> None:
-    moved = sampled(100, lambda it: np.arange(len(it)) % 7 != 3)
+    moved = sampled(100, lambda value: np.arange(len(value)) % 7 != 3)
     at_s = np.linspace(0.1, 9.9, 300)
     assert moved.covers(at_s).all()
     # Through samples of 50 Hz on one side.
@@ -80,7 +80,7 @@ def test_the_offset_moves_the_chain_as_its_column_says(mount) -> None:
     frames = Frames(mount, at_s, invert(robot @ x) @ z @ exp(1e-3 * rng.normal(size=(40, 6))))
     state, step_s = State(np.stack([x, z]), np.zeros(1)), 1e-4
     residuals = [
-        clock_problem(moved, frames, it).linear(state).residuals for it in (-step_s, step_s)
+        clock_problem(moved, frames, value).linear(state).residuals for value in (-step_s, step_s)
     ]
     column = clock_problem(moved, frames, 0.0).linear(state).jacobian[:, :, 12]
     difference = (residuals[1] - residuals[0]) / (2 * step_s)

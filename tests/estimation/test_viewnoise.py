@@ -52,8 +52,11 @@ def test_sharp_and_blurred_views_have_their_own_covariance():
     cell = simulate(replace(CellOptions(), views=24, state_intrinsics=True, seed=5))
     rng = np.random.default_rng(0)
     corners = [
-        replace(it, px=it.px + (0.0, 0.15)[at % 2] * rng.standard_normal(it.px.shape))
-        for at, it in enumerate(cell.corners)
+        replace(
+            view_corners,
+            px=view_corners.px + (0.0, 0.15)[at % 2] * rng.standard_normal(view_corners.px.shape),
+        )
+        for at, view_corners in enumerate(cell.corners)
     ]
     uneven = replace(cell, corners=tuple(corners))
     known = calibrated(uneven)
@@ -61,7 +64,7 @@ def test_sharp_and_blurred_views_have_their_own_covariance():
     # 72 degrees of freedom tell a mean square to 17 %; one noise for all gives 0.2 and 1.8.
     for first in (0, 1):
         assert 0.6 < nees(cell, known, range(first, 24, 2)) < 1.5
-    weights = [known.poses[it].corners.weights.mean() for it in range(24)]
+    weights = [known.poses[index].corners.weights.mean() for index in range(24)]
     assert min(weights[::2]) > 2.0 * max(weights[1::2])
     even = calibrated(cell)
-    assert all(even.poses[it].corners.weights is None for it in range(24))
+    assert all(even.poses[index].corners.weights is None for index in range(24))

@@ -57,8 +57,8 @@ def tool(sigma=None, verdict=GOOD):
 
 def rows_of(poses, kinds=None, points=None):
     blank = ("",) * len(poses)
-    labels = tuple(str(it) for it in range(1, len(poses) + 1))
-    places = tuple(f"touches.csv, line {it + 1}" for it in range(1, len(poses) + 1))
+    labels = tuple(str(index) for index in range(1, len(poses) + 1))
+    places = tuple(f"touches.csv, line {index + 1}" for index in range(1, len(poses) + 1))
     return TouchRows("touches.csv", labels, places, poses, None, kinds or blank, points or blank)
 
 
@@ -106,7 +106,7 @@ def test_the_tips_error_is_a_pure_offset_where_all_touches_stand_alike(features)
     poses = compose(np.tile(turn, (len(met), 1, 1)), met - turn @ TIP)
     rows = rows_of(poses, KINDS) if features else rows_of(poses, points=NAMES)
     cad = None if features else drawing(local)
-    exact, unsure = (touched_fixture(rows, tool(it), cad) for it in (None, TIP_SIGMA))
+    exact, unsure = (touched_fixture(rows, tool(item), cad) for item in (None, TIP_SIGMA))
     assert np.array_equal(exact.edge.matrix, unsure.edge.matrix)
     more = unsure.edge.covariance - exact.edge.covariance
     turned = unsure.edge.matrix[:3, :3].T @ turn @ made.FLANGE_FROM_TOOL[:3, :3] @ TIP_SIGMA
@@ -154,13 +154,13 @@ def test_touches_that_scatter_by_the_tip_are_not_called_wrong():
         poses = compose(turns.as_matrix(), met - turns.apply(TIP + off))
         rows = rows_of(poses, points=NAMES)
         frame = touched_fixture(rows, tool(2e-4 * np.eye(3)), drawing(1e-3 * CAD_MM))
-        assert all(it.used for it in frame.observations)
+        assert all(observation.used for observation in frame.observations)
 
 
 def test_three_touches_say_what_their_sigma_rests_on():
     poses = touching(ON_FEATURES[[0, 1, 3]], np.random.default_rng(3))
     rows = rows_of(poses, ("origin", "x", "xy"))
-    assumed, stated = (touched_fixture(rows, tool(), touch_noise_m=it) for it in (None, 3e-4))
+    assumed, stated = (touched_fixture(rows, tool(), touch_noise_m=item) for item in (None, 3e-4))
     assert assumed.verdict.status == "check"
     assert "0.1 mm, which is assumed" in assumed.verdict.reasons[0]
     assert "assumed" not in stated.verdict.reasons[0]
@@ -183,7 +183,7 @@ def test_features_that_were_touched_once_are_named():
     ids=["four", "six"],
 )
 def test_few_touches_that_agree_by_chance_are_not_believed(chosen):
-    kinds = tuple(KINDS[it] for it in chosen)
+    kinds = tuple(KINDS[index] for index in chosen)
     squares = []
     for seed in range(100):
         poses = touching(ON_FEATURES[chosen], np.random.default_rng(seed), NOISE_M)
@@ -205,7 +205,7 @@ def test_three_drawn_points_that_agree_by_chance_are_not_believed():
         squares.append(error @ np.linalg.solve(frame.edge.covariance, error))
     assert max(squares) < 41.0  # as above
     exact = drawn(CAD_MM[:3], NAMES[:3], noise_m=0.0)
-    assert any("0.1 mm, which is assumed" in it for it in exact.verdict.reasons)
+    assert any("0.1 mm, which is assumed" in reason for reason in exact.verdict.reasons)
     stated = drawn(CAD_MM[:3], NAMES[:3], noise_m=0.0, touch_noise_m=3e-4)
     assert stated.noise_mm == pytest.approx(0.3)
 
@@ -220,7 +220,9 @@ def test_a_wrong_point_is_left_out_and_named():
     (reason,) = frame.verdict.reasons
     assert reason.startswith("Point P5 (touches.csv, line 6) was left out: 2.")
     assert frame.verdict.status == "check"
-    assert [it.name for it in frame.observations if not it.used] == ["P5"]
+    assert [observation.name for observation in frame.observations if not observation.used] == [
+        "P5"
+    ]
     # Of eight points with a noise of 0.1 mm, the others place it to 0.05 mm.
     assert np.abs(frame.edge.matrix - FRAME).max() < 5e-4
 
@@ -230,7 +232,7 @@ def test_a_wrong_touch_of_a_feature_is_left_out_and_named():
     local[6, 2] += 0.004
     poses = touching(local, np.random.default_rng(6), 5e-5)
     frame = touched_fixture(rows_of(poses, KINDS * 2), tool())
-    assert [it.name for it in frame.observations if not it.used] == ["7"]
+    assert [observation.name for observation in frame.observations if not observation.used] == ["7"]
     assert frame.verdict.reasons[0].startswith("Touch 7 (touches.csv, line 8) was left out: ")
 
 
@@ -240,17 +242,20 @@ def test_two_exchanged_names_are_named():
     words = " ".join(frame.verdict.reasons)
     assert "it is where P3 is drawn: is its name exchanged?" in words
     assert "it is where P7 is drawn: is its name exchanged?" in words
-    assert {it.name for it in frame.observations if not it.used} == {"P3", "P7"}
+    assert {observation.name for observation in frame.observations if not observation.used} == {
+        "P3",
+        "P7",
+    }
     few = (0, 1, 4, 5)
     with pytest.raises(DataError, match="P5 and P6 are exchanged"):
-        drawn(CAD_MM[[0, 1, 5, 4]], [NAMES[it] for it in few])
+        drawn(CAD_MM[[0, 1, 5, 4]], [NAMES[index] for index in few])
 
 
 def test_exchanged_names_are_no_size_of_the_part():
     """The five points that are left fit their drawing through its middle, too."""
     near = [[4, 135, 15], [-107, 135, 23], [-56, -23, 7], [98, -27, 20], [15, -142, 10]]
     points = np.array([*near, [76, 11, 13], [-51, 87, 38]])
-    names = tuple(f"P{it}" for it in range(7))
+    names = tuple(f"P{index}" for index in range(7))
     swapped = ("P0", "P4", "P2", "P3", "P1", "P5", "P6")
     frame = drawn(points, swapped, cad_mm=points, cad_names=names)
     assert "is its name exchanged?" in frame.verdict.reasons[0]
@@ -260,7 +265,7 @@ def test_exchanged_names_are_no_size_of_the_part():
 def test_a_point_that_was_touched_several_times_counts_as_one():
     frame = drawn(np.vstack([CAD_MM, CAD_MM[:4]]), NAMES + NAMES[:4])
     assert frame.method == "best fit of 12 touches of 8 points to cad.csv"
-    assert [it.name for it in frame.observations[-2:]] == ["P3, 11", "P4, 12"]
+    assert [observation.name for observation in frame.observations[-2:]] == ["P3, 11", "P4, 12"]
     assert frame.observations[4].name == "P5"
     assert frame.verdict.status == "good"
     twice = ("P1", "P2", "P6", "P5") * 3
@@ -338,15 +343,15 @@ def test_errors_that_points_share_are_carried_to_the_answer():
     measured = touched_points(rows, tool(), Noise.of_robot(0.0, 1e-6), None)
     # As if the whole set were turned about the base, and shifted.
     sigmas = np.array([1e-4, 2e-4, 3e-4, 1e-4, 1e-4, 5e-5])
-    jacobian = np.concatenate([sigmas * _turning(it) for it in measured.points])
+    jacobian = np.concatenate([sigmas * _turning(point) for point in measured.points])
     shared = replace(measured, common=jacobian @ jacobian.T)
     found = drawn_fixture(shared, drawing(1e-3 * CAD_MM), Setting()).edge
     moves = []
     for step in np.diag(sigmas):
         moved = [placed(exp(sign * step), measured.points) for sign in (1.0, -1.0)]
         ahead, behind = (
-            drawn_fixture(replace(measured, points=it), drawing(1e-3 * CAD_MM), Setting()).edge
-            for it in moved
+            drawn_fixture(replace(measured, points=array), drawing(1e-3 * CAD_MM), Setting()).edge
+            for array in moved
         )
         moves.append(0.5 * away(behind.matrix, ahead.matrix))
     # What is each point's own is a hundredth of it: 1e-4 of the variance.
@@ -546,7 +551,7 @@ def test_a_drawings_own_sigma_counts(tmp_path, tool_file):
     cad.write_text(text)
     done = visioncal("fixture", touches, "--tool", tool_file, "--cad", cad, "--json")
     found = json.loads(done.out)["base_from_fixture"]
-    assert all(it["used"] for it in found["observations"])
+    assert all(value["used"] for value in found["observations"])
     # Seven points of 0.1 mm with a tip of 0.2 mm; the eighth would turn them by 10 mrad.
     assert np.abs(np.array(found["matrix"]) - FRAME).max() < 2e-3
     cad.write_text(text.replace(",50,", ",-50,"))

@@ -227,10 +227,10 @@ def test_the_region_holds_the_true_place(options):
         plane += [pick_by_plane(cell, calibration, rng) for _ in range(10)]
         target += [pick_by_target(cell, calibration, BOARD, rng) for _ in range(10)]
     for picks in (plane, target):
-        held = np.mean([it.located.holds(it.truth) for it in picks])
+        held = np.mean([pick.located.holds(pick.truth) for pick in picks])
         near = [
-            1e3 * np.linalg.norm(it.truth - it.located.p_base) <= it.located.radius95_mm
-            for it in picks
+            1e3 * np.linalg.norm(pick.truth - pick.located.p_base) <= pick.located.radius95_mm
+            for pick in picks
         ]
         # Of 120 picks 95 %, with a standard deviation of 2 %; picks of one cell share its
         # calibration, so that they count for fewer: four times that. A region that was too wide by
@@ -307,7 +307,7 @@ def test_what_cannot_be_located_is_refused_by_name(in_hand):
     at = stand(cell, np.random.default_rng(4))
     middle, flange = np.array([[640.0, 400.0]]), at.base_from_flange
     base_from_cam = flange @ calibration.edges["flange_from_cam"].matrix
-    origin, right, forward = (base_from_cam[:3, it] for it in (3, 0, 2))
+    origin, right, forward = (base_from_cam[:3, name] for name in (3, 0, 2))
     level, behind, beside = (
         Plane.through(forward, origin + forward),
         Plane.through(forward, origin - forward),

@@ -53,7 +53,7 @@ def shown(capsys, **options):
 
 def pose_words(pose):
     turn = Rotation.from_matrix(pose[:3, :3]).as_quat()
-    return ",".join(repr(float(it)) for it in [*pose[:3, 3], *turn])
+    return ",".join(repr(float(value)) for value in [*pose[:3, 3], *turn])
 
 
 def test_every_view_tells_where_the_target_is(cell, capsys):
@@ -62,20 +62,20 @@ def test_every_view_tells_where_the_target_is(cell, capsys):
     point = np.array([0.135, 0.09, 0.0])
     places = shown(capsys, source=session, calibration=calibration, point="135,90,0")
     # A camera that stands still needs no pose of the robot.
-    assert [it["view"] for it in places] == [30, 31, 32, *([33] if to_hand else [])]
-    for it in places:
-        at = it["view"] - 30
+    assert [place["view"] for place in places] == [30, 31, 32, *([33] if to_hand else [])]
+    for place in places:
+        at = place["view"] - 30
         x, z = made.transforms.values()
         base_from_target = x @ made.cam_from_target[at] if to_hand else z
         true = base_from_target[:3, :3] @ point + base_from_target[:3, 3]
-        error = np.array(it["p_base_m"]) - true
+        error = np.array(place["p_base_m"]) - true
         # Half as far again as 95 % of places: rendered corners are not exactly Gaussian.
-        assert 1e3 * np.linalg.norm(error) < 1.5 * it["radius95_mm"]
+        assert 1e3 * np.linalg.norm(error) < 1.5 * place["radius95_mm"]
         np.testing.assert_allclose(
-            it["sigma_mm"], 1e3 * np.sqrt(np.diag(it["covariance"])), rtol=1e-12
+            place["sigma_mm"], 1e3 * np.sqrt(np.diag(place["covariance"])), rtol=1e-12
         )
-        assert it["budget_mm"]["total"] < 2.0
-        assert it["warnings"] == []
+        assert place["budget_mm"]["total"] < 2.0
+        assert place["warnings"] == []
     locate_command(session, calibration, view=31)
     told = capsys.readouterr()
     assert told.out.startswith("view 31: (")
@@ -119,7 +119,7 @@ def test_pixels_are_placed_on_planes(cell, capsys):
         np.testing.assert_allclose(found["p_base_m"], expected.p_base, atol=1e-12)
         np.testing.assert_allclose(found["covariance"], expected.covariance, atol=1e-18)
     both = shown(capsys, pixel=[PIXEL, "600,500"], plane="z=-50", **given)
-    assert [it["pixel"] for it in both] == [[700.0, 350.0], [600.0, 500.0]]
+    assert [value["pixel"] for value in both] == [[700.0, 350.0], [600.0, 500.0]]
     assert "plane" not in both[0]["budget_mm"]
     # The jig's frame is the base's own, and not known exactly.
     for words in ("jig:z=-50", "base_from_jig:z=-50"):

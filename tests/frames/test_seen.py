@@ -80,7 +80,7 @@ def test_what_moves_a_sight_agrees_with_central_differences(mount, parent):
     here = places(eye, sight, see(eye, sight.seen, BOARD, "image", 0.1), parent)[0]
     np.testing.assert_allclose(here.matrix, place, atol=1e-8)
     size = np.concatenate([np.full(6, 1e-3), np.full(4, 1.0), np.full(5, 1e-3)])
-    steps = [1e-2 * it for it in np.diag(size)]
+    steps = [1e-2 * value for value in np.diag(size)]
     differences = []
     for step in steps:
         camera = eye.camera
@@ -139,7 +139,7 @@ def test_more_images_do_not_make_the_common_part_smaller(cell):
     sights = sights_of(made, parent, place, rng, count=12)
     few, many = (place_seen(calibration, sights[:count], BOARD, parent) for count in (3, 12))
     own, common = (
-        [np.sqrt(np.trace(getattr(it, name)[3:, 3:])) for it in (few, many)]
+        [np.sqrt(np.trace(getattr(target_pose, name)[3:, 3:])) for target_pose in (few, many)]
         for name in ("independent", "common")
     )
     # Twelve images average what is their own to half of what three do, more or less as they are
@@ -162,7 +162,7 @@ def test_a_moved_target_and_a_wrong_pose_are_named(cell):
     sights[5] = slipped[5]
     found = place_seen(calibration, sights, BOARD, parent)
     assert list(np.flatnonzero(~found.agrees)) == [2, 5]
-    assert [it.split()[1] for it in found.warnings] == ["2", "5"]
+    assert [warning.split()[1] for warning in found.warnings] == ["2", "5"]
     assert "left out" in found.warnings[0]
     # Two of seven images fewer: the mean stays within what it is known to.
     away = log(invert(clean.matrix) @ found.matrix)
@@ -201,7 +201,7 @@ def test_images_of_one_stop_share_the_robots_error(cell):
     assert "of one stop of the robot" in found.warnings[0]
     # Poses that were read anew differ a little: the stop's number tells that it is one.
     moved = sight.base_from_flange @ exp(np.full(6, 1e-6))
-    numbered = [replace(it, stop=5) for it in same[:3]]
+    numbered = [replace(value, stop=5) for value in same[:3]]
     numbered.append(replace(same[3], base_from_flange=moved, stop=5))
     found = place_seen(calibration, numbered, BOARD, parent, sigma_px=0.1)
     # To the share of a micrometre in a lever of half a metre.
@@ -220,7 +220,7 @@ def test_a_marker_seen_flat_on_may_be_tilted_the_other_way():
         return Sight(label, corners_at(cell, at, place, small, rng))
 
     flat = place_seen(calibration, [sight("flat", (0.15, 0.1))], small, "base")
-    assert any("tilted the other way" in it for it in flat.warnings)
+    assert any("tilted the other way" in warning for warning in flat.warnings)
 
 
 def test_a_symmetric_board_may_be_turned(cell):
@@ -238,7 +238,7 @@ def test_a_symmetric_board_may_be_turned(cell):
     )
     found = place_seen(calibration, sights, board, parent)
     assert found.agrees.all()
-    assert any("the same when it is turned" in it for it in found.warnings)
+    assert any("the same when it is turned" in warning for warning in found.warnings)
     # The first image's numbering is kept.
     assert 1e3 * np.linalg.norm((invert(place) @ found.matrix)[:3, 3]) < 3.0
 

@@ -38,7 +38,7 @@ def rows_of(mount, kind, count=VIEWS):
     """
     rows = shots(calibrated_cell(mount)[0], count)
     moves = (mount == IN_HAND) == (kind == "fixture")
-    return rows if moves else [replace(it, picture=0) for it in rows]
+    return rows if moves else [replace(row, picture=0) for row in rows]
 
 
 @pytest.mark.parametrize("kind", ["tool", "fixture"])
@@ -53,8 +53,14 @@ def test_a_board_in_images_is_where_it_stands(mount, kind):
     assert frame.oriented
     assert frame.verdict.status == "good", frame.verdict.reasons
     assert frame.method == "ChArUco board charuco_9x6_30mm seen in 5 images"
-    assert [it.name for it in frame.observations] == ["30", "31", "32", "33", "34"]
-    assert all(it.used and not it.reason for it in frame.observations)
+    assert [observation.name for observation in frame.observations] == [
+        "30",
+        "31",
+        "32",
+        "33",
+        "34",
+    ]
+    assert all(observation.used and not observation.reason for observation in frame.observations)
     assert frame.source == "the part"
     assert rests_on_camera(frame)
     assert frame.details["camera_calibrated"] == calibration.created
@@ -83,7 +89,7 @@ def test_a_moved_board_is_left_out_and_named():
     assert not wrong.used
     assert "from where the others do" in wrong.reason
     assert wrong.residual_mm > 10.0
-    assert sum(it.used for it in frame.observations) == 5
+    assert sum(observation.used for observation in frame.observations) == 5
     assert frame.verdict.status == "check"
     assert frame.verdict.reasons[0].startswith("view 32 puts the target")
     error = log(invert(true_place(IN_HAND, "fixture")) @ frame.edge.matrix)
@@ -97,14 +103,18 @@ def test_views_that_show_nothing_are_named():
     files = {f"{at}.png": session.images.read(f"{at}.png") for at in (0, 1, 2, 5, 6)}
     session = replace(session, images=MemoryImages(files | {"3.png": empty}))
     frame = seen_frame(session, calibration, "fixture")
-    reasons = {it.name: it.reason for it in frame.observations if not it.used}
+    reasons = {
+        observation.name: observation.reason
+        for observation in frame.observations
+        if not observation.used
+    }
     assert reasons.keys() == {"33", "34", "35", "36"}
     assert "uniform" in reasons["33"]
     assert reasons["34"] == "4.png is missing"
     assert "role = holdout" in reasons["35"]
     assert "no pose of the robot" in reasons["36"]
     # What is held back on purpose is no loss.
-    (told,) = (it for it in frame.verdict.reasons if "views were not used" in it)
+    (told,) = (reason for reason in frame.verdict.reasons if "views were not used" in reason)
     assert told.startswith("3 of 7 views")
 
 
@@ -116,7 +126,9 @@ def test_one_image_or_one_stop_checks_nothing():
     assert alone.noise_mm > 0.0
     same = seen_frame(session_of(cell, [shots(cell, 1)[0]] * 4), calibration, "fixture")
     assert "of one stop of the robot" in same.verdict.reasons[0]
-    moved = [replace(shots(cell, 1)[0], base_from_flange=it) for it in cell.base_from_flange[:4]]
+    moved = [
+        replace(shots(cell, 1)[0], base_from_flange=value) for value in cell.base_from_flange[:4]
+    ]
     numbered = session_of(cell, shots(cell, 4), stop=["1", "1", "2", "2"])
     with pytest.raises(DataError, match="the rows of stop 1"):
         seen_frame(numbered, calibration, "fixture")
@@ -189,7 +201,7 @@ def test_doubts_of_calibration_and_sigma_are_told():
     other["distortion"] = [0.0] * 5
     stated = replace(session, document={**session.document, "camera": other})
     frame = seen_frame(stated, calibration, "fixture")
-    assert any("fx 600" in it and "same camera?" in it for it in frame.verdict.reasons)
+    assert any("fx 600" in reason and "same camera?" in reason for reason in frame.verdict.reasons)
     strict = ImageFrameLimits(sigma_mm=(1e-3, 10.0))
     frame = seen_frame(session, calibration, "fixture", options=strict)
     assert frame.verdict.status == "check"
@@ -214,7 +226,7 @@ def test_markers_place_a_fixture_by_its_drawing(plate):
     error = log(invert(base_from_plate) @ frame.edge.matrix)
     # Six degrees of freedom at 99.9 %: 22.5. The calibration's own error is left out here.
     assert error @ np.linalg.solve(frame.edge.covariance, error) < 22.5
-    assert {it.name for it in frame.observations} == {"0", "7", "21", "30"}
+    assert {observation.name for observation in frame.observations} == {"0", "7", "21", "30"}
     assert frame.details["spare_points"] == ["44"]
     assert frame.details["seen_in"] == {"0": 4, "7": 4, "21": 4, "30": 4}
     assert rests_on_camera(frame)

@@ -30,7 +30,7 @@ NEAR_MM = 0.3
 def file_of(path, touches, **columns):
     more = {"view": range(1, len(touches) + 1), "kind": touches.kinds}
     if len(touches.names) > 1:
-        more["point"] = [touches.names[it] for it in touches.points]
+        more["point"] = [touches.names[index] for index in touches.points]
     return write_poses(path, touches.base_from_flange, more | columns)
 
 
@@ -47,7 +47,7 @@ def _meeting(robot, rng):
 
     point = tip(home)
     starts = home + rng.uniform(-0.4, 0.4, (8, 6))
-    return np.array([least_squares(lambda it: tip(it) - point, start).x for start in starts])
+    return np.array([least_squares(lambda value: tip(value) - point, start).x for start in starts])
 
 
 def found(done):
@@ -87,7 +87,7 @@ def test_the_tip_and_its_rotation(tmp_path):
     assert tool["method"] == (
         "pivot of 10 touches of one point; rotation from 3 along z and 3 in the xz plane"
     )
-    assert {it["kind"] for it in tool["observations"]} == {"point", "z", "xz"}
+    assert {value["kind"] for value in tool["observations"]} == {"point", "z", "xz"}
 
 
 def test_poses_of_a_tool_that_was_active_are_doubted(tmp_path):
@@ -138,7 +138,7 @@ def test_inverse_poses_of_touches_along_axes_are_named(tmp_path, seed):
 def test_joint_angles_go_through_the_robots_model(tmp_path):
     robot, rng = load_robot("ur10e"), np.random.default_rng(4)
     joints = _meeting(robot, rng)
-    names = [f"q{it}_rad" for it in range(1, 7)]
+    names = [f"q{index}_rad" for index in range(1, 7)]
     path = write_table(tmp_path / "touches.csv", names, joints.tolist())
     done = visioncal("tcp", path, "--robot-model", "ur10e", "--json")
     # Exact touches, but for the digits of the joints' angles.
@@ -165,7 +165,9 @@ def test_the_rows_of_a_session_are_touches(tmp_path):
     write_poses(tmp_path / "views.csv", touches.base_from_flange, columns)
     tool = found(visioncal("tcp", tmp_path, "--json"))
     assert off_mm(tool) < NEAR_MM
-    assert [it["name"] for it in tool["observations"]] == [str(it) for it in range(20, 30)]
+    assert [value["name"] for value in tool["observations"]] == [
+        str(index) for index in range(20, 30)
+    ]
     assert tool["source"] == "touches"
 
 
@@ -181,7 +183,7 @@ def test_one_wrong_touch_in_ten_is_named(tmp_path):
     assert reason.startswith("Touch 4 (touches.csv, line 5) was left out: 1.")
     assert "the tip had slipped" in reason
     assert tool["verdict"]["status"] == "check"
-    assert [it["name"] for it in tool["observations"] if not it["used"]] == ["4"]
+    assert [value["name"] for value in tool["observations"] if not value["used"]] == ["4"]
     assert off_mm(tool) < NEAR_MM
 
 
@@ -214,7 +216,7 @@ def test_another_order_of_the_quaternion_is_guessed(tmp_path):
     done = visioncal("tcp", path)
     assert "Read with quaternions as w, x, y, z, the touches close to 0." in done.out
     assert done.out.index("Most likely (98 %): Read with") < done.out.index("is known to")
-    typed = next(it.strip() for it in done.out.splitlines() if "visioncal tcp" in it)
+    typed = next(line.strip() for line in done.out.splitlines() if "visioncal tcp" in line)
     assert visioncal(*shlex.split(typed)[1:]).out.startswith("good")
     right = write_poses(tmp_path / "right.csv", poses)
     done = visioncal("tcp", right, "--robot-form", "quaternion-wxyz")
@@ -226,8 +228,8 @@ def test_another_order_of_the_quaternion_is_guessed(tmp_path):
 
 def refused(done, *words):
     assert done.status == 2
-    for it in words:
-        assert it in done.err
+    for word in words:
+        assert word in done.err
 
 
 def test_too_few_touches_are_refused(tmp_path):
@@ -337,7 +339,7 @@ def test_a_file_of_frames_is_made_extended_and_kept(tmp_path):
 def test_nothing_is_written_unless_it_is_said_where(tmp_path):
     done = tcp(tmp_path, touched(Job(), 1).touches)
     assert "nothing was written" in done.err
-    assert [it.name for it in tmp_path.iterdir()] == ["touches.csv"]
+    assert [path.name for path in tmp_path.iterdir()] == ["touches.csv"]
 
 
 def test_json_is_the_frame_alone(tmp_path):
@@ -369,7 +371,7 @@ def test_a_tool_joins_its_calibration(out, tmp_path):
     touches = touched(Job(axes=3), 1).touches
     done = tcp(tmp_path, touches, "-c", out, "--name", "gripper")
     assert done.status == 0
-    assert all(f"wrote {out / it}" in done.err for it in ("calibration.json", "recording.rrd"))
+    assert all(f"wrote {out / name}" in done.err for name in ("calibration.json", "recording.rrd"))
     after = Calibration.load(out)
     assert list(after.frames) == ["flange_from_gripper"]
     for name, edge in before.edges.items():

@@ -45,13 +45,15 @@ def test_the_tip_comes_as_near_as_predicted(proved):
     folder, look, corners = proved
     points = touch_points(Session.load(look), Calibration.load(folder / "out"))
     assert len(points) == 5
-    away_mm = [1e3 * np.linalg.norm(it.base_m - corners[int(it.name.split()[1])]) for it in points]
+    away_mm = [
+        1e3 * np.linalg.norm(point.base_m - corners[int(point.name.split()[1])]) for point in points
+    ]
     # A ball of 95 % holds five points that share the camera's error, nineteen times of twenty.
-    assert max(away_mm) < max(it.radius95_mm for it in points)
-    for it in points:
+    assert max(away_mm) < max(point.radius95_mm for point in points)
+    for point in points:
         # The flange stands on the point, its z into the board; above it, along that z.
-        np.testing.assert_allclose(it.base_from_flange[:3, 3], it.base_m)
-        step = invert(it.base_from_flange) @ it.above(0.05)
+        np.testing.assert_allclose(point.base_from_flange[:3, 3], point.base_m)
+        step = invert(point.base_from_flange) @ point.above(0.05)
         np.testing.assert_allclose(step[:3, 3], [0.0, 0.0, -0.05], atol=1e-12)
     assert judged(points, away_mm).passed
     assert not judged(points, [5.0] * 5).passed
@@ -69,11 +71,11 @@ def test_a_driven_arm_hovers_above_each_point(proved, monkeypatch):
     # The controller believes in the data sheet, as the calibration's nominal arm does.
     with spawn(ControllerOptions(q=tuple(start), tcp=(0.0,) * 6)) as controller:
         with closing(UrArm(controller.host)) as arm:
-            for it in points[:2]:
-                plane = it.base_m, it.normal
+            for point in points[:2]:
+                plane = point.base_m, point.normal
                 hovering = Hovering(arm, known.robot, np.zeros(3), *plane, 0.05)
-                hovering.bring(it.above(0.05))
-                away = invert(it.above(0.05)) @ arm.state().base_from_flange
+                hovering.bring(point.above(0.05))
+                away = invert(point.above(0.05)) @ arm.state().base_from_flange
                 # A tenth of the least gap that can be read.
                 assert np.linalg.norm(away[:3, 3]) < 1e-5
             # Through the board leads no way.
@@ -108,7 +110,7 @@ def test_targets_are_printed_and_gaps_join_the_result(proved, monkeypatch):
     assert done.status == 0
     known = Calibration.load(out)
     assert known.touch_test.passed
-    assert [it.gap_mm for it in known.touch_test.points] == [0.1, 0.0, 0.1, 0.1, 0.05]
+    assert [point.gap_mm for point in known.touch_test.points] == [0.1, 0.0, 0.1, 0.1, 0.05]
     words = Page((out / "report.html").read_text("utf-8")).words
     assert "Touch test Passed, with flange" in words
 
@@ -123,7 +125,7 @@ def test_targets_are_printed_and_gaps_join_the_result(proved, monkeypatch):
     done = visioncal("touch-test", look, "-c", out)
     assert done.status == 0
     assert done.err.count("gap [mm]:") == 7
-    gaps_mm = [it.gap_mm for it in Calibration.load(out).touch_test.points]
+    gaps_mm = [point.gap_mm for point in Calibration.load(out).touch_test.points]
     assert gaps_mm == [0.1, 0.2, 0.1, 0.1, 0.1]
     ended = visioncal("touch-test", look, "-c", out)
     assert ended.status == 2

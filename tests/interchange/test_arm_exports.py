@@ -87,13 +87,15 @@ def test_a_given_urdf_keeps_all_but_its_origins(tip):
     # A moving joint cannot place the tip behind it, which is then said.
     held = f"{tip}_corrected" if tip == "bend" else tip
     assert off(of_urdf_text(found.text, held), result) < EXACT
-    assert [held in it for it in found.warnings] == [True] * (held != tip)
+    assert [held in warning for warning in found.warnings] == [True] * (held != tip)
     before, after = ET.fromstring(URDF), ET.fromstring(found.text)
     added = 1 if tip == "bend" else 0
     for kind in ("link", "joint", "transmission"):
-        there = [it.get("name") for it in after.findall(kind)]
+        there = [element.get("name") for element in after.findall(kind)]
         extra = added if kind in ("link", "joint") else 0
-        assert there[: len(there) - extra] == [it.get("name") for it in before.findall(kind)]
+        assert there[: len(there) - extra] == [
+            element.get("name") for element in before.findall(kind)
+        ]
 
 
 @pytest.mark.parametrize("convention", [None, *CONVENTIONS])
@@ -103,7 +105,7 @@ def test_a_table_is_the_calibrated_arm(tmp_path, convention):
     assert off(read_back(tmp_path, "arm.toml", found.text), result) < EXACT
     # A UR's parallel axes get Hayati's form where nothing was said.
     assert tomllib.loads(found.text)["convention"] == (convention or "hayati")
-    far = [it for it in found.warnings if "--convention hayati" in it]
+    far = [warning for warning in found.warnings if "--convention hayati" in warning]
     # Some mrad apart, arms of 0.4 m have their common normal a hundred metres away.
     assert bool(far) == (convention in ("standard", "modified"))
 
@@ -124,7 +126,7 @@ def ur_description(content):
     keys = ("x", "y", "z", "roll", "pitch", "yaw")
     assert all(tuple(content[link]) == keys for link in links)
     placed = [[content[link][key] for key in keys] for link in links]
-    return [transform(of_rpy(*it[3:]), it[:3]) for it in placed]
+    return [transform(of_rpy(*group[3:]), group[:3]) for group in placed]
 
 
 def test_urs_kinematics_are_the_calibrated_arm():
@@ -132,8 +134,10 @@ def test_urs_kinematics_are_the_calibrated_arm():
     found = document(result, "ur-kinematics", Selection(calibration_hash="calib_12"))
     content = yaml.safe_load(found.text)["kinematics"]
     assert content["hash"] == "calib_12"
-    said = next(it for it in found.text.splitlines() if it.startswith("# flange in wrist_3: "))
-    xyz, rpy = (it.split() for it in said.partition("xyz ")[2].split(" rpy "))
+    said = next(
+        line for line in found.text.splitlines() if line.startswith("# flange in wrist_3: ")
+    )
+    xyz, rpy = (part.split() for part in said.partition("xyz ")[2].split(" rpy "))
     flange = transform(of_rpy(*map(float, rpy)), np.array(xyz, dtype=float))
     q, expected = poses(result)
     for angles, pose in zip(q, expected, strict=True):
@@ -150,7 +154,7 @@ def test_urs_kinematics_without_a_hash_say_so():
     found = document(calibrated(load_robot("ur5e")), "ur-kinematics")
     # ur_description's macro reads it, so it is never absent.
     assert yaml.safe_load(found.text)["kinematics"]["hash"] == "calib_visioncal"
-    assert any("--hash" in it for it in found.warnings)
+    assert any("--hash" in warning for warning in found.warnings)
 
 
 @pytest.mark.parametrize("name", ["irb120", "panda"])
@@ -212,7 +216,7 @@ def test_links_alone_leave_little_where_the_arm_was_measured_and_say_how_much(
     result = replace(result, arm=replace(result.arm, measured=ranges))
     result = bending(result) if bends else result
     found = document(result, name)
-    (said,) = (it for it in found.warnings if "has no place in it" in it)
+    (said,) = (warning for warning in found.warnings if "has no place in it" in warning)
     assert said.rstrip(".") in found.text.replace("- -", "--")
     assert ("bend under its own weight" in said) == bends
     q = middle + np.random.default_rng(9).uniform(-0.5, 0.5, (1000, 6))
@@ -222,7 +226,7 @@ def test_links_alone_leave_little_where_the_arm_was_measured_and_say_how_much(
     written = read_back(tmp_path, f"arm{suffix}", found.text, nominal.tip)
     real = result.standing(q)
     rms, most = rms_and_most_mm(real - written.base_from_flange(q))
-    figures = [float(it) for it in re.findall(r"([\d.]+) mm", said.partition("of that: ")[2])]
+    figures = [float(value) for value in re.findall(r"([\d.]+) mm", said.partition("of that: ")[2])]
     # Two random draws of hundreds; the worst of each hits the corner more or less well.
     assert figures[0] == pytest.approx(rms, rel=0.15)
     assert figures[1] == pytest.approx(most, rel=0.4)
@@ -238,14 +242,14 @@ def test_links_and_corrections_together_are_the_arm():
     assert "The table of joint-corrections goes with it" in links.warnings[0]
     written = of_urdf_text(links.text, result.robot.tip)
     table = export(result, "joint-corrections").splitlines()
-    rows = [it.split(",") for it in table if not it.startswith("#")][1:]
-    corrections = {(joint, int(angle)): float(it) for joint, angle, it, _ in rows}
+    rows = [name.split(",") for name in table if not name.startswith("#")][1:]
+    corrections = {(joint, int(angle)): float(name) for joint, angle, name, _ in rows}
     # Gears that err turn after turn have their range, of two turns.
     degrees = np.random.default_rng(1).integers(-300, 300, (50, 6))
     names = result.robot.joint_names
     sent = np.array(
         [
-            [it + corrections[joint, it] for joint, it in zip(names, row, strict=True)]
+            [value + corrections[joint, value] for joint, value in zip(names, row, strict=True)]
             for row in degrees.tolist()
         ]
     )

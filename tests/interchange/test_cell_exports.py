@@ -69,14 +69,14 @@ def test_a_fixture_without_rotation_says_whose_it_has_and_unknown_frames_list_it
 
 def test_all_frames_are_one_tree():
     found = list(yaml.safe_load_all(export(CELL, "ros", Selection("all"))))
-    hangs = {it["child_frame_id"]: it["header"]["frame_id"] for it in found}
-    assert hangs == {it: on for it, on in CELL.frames.items() if not it.startswith("flange")}
+    hangs = {value["child_frame_id"]: value["header"]["frame_id"] for value in found}
+    assert hangs == {name: on for name, on in CELL.frames.items() if not name.startswith("flange")}
     robot = ElementTree.fromstring(export(CELL, "urdf", Selection("all")))
-    links = [it.attrib["name"] for it in robot.findall("link")]
+    links = [element.attrib["name"] for element in robot.findall("link")]
     assert sorted(links) == sorted(["cell", *hangs])
     joints = {
-        it.find("child").attrib["link"]: it.find("parent").attrib["link"]
-        for it in robot.findall("joint")
+        element.find("child").attrib["link"]: element.find("parent").attrib["link"]
+        for element in robot.findall("joint")
     }
     assert joints == hangs
     launch = export(CELL, "ros-launch", Selection("all"))

@@ -17,7 +17,7 @@ from visioncal.simulation import BOARDS, CellOptions, simulate
 VIEWS = 12
 NAMES = [f"shot_{at}.png" for at in range(1, VIEWS + 1)]
 CELL = simulate(CellOptions(target=BOARDS["checkerboard"], views=VIEWS, cut_views=0.0, seed=3))
-PX = np.array([it.px for it in CELL.corners])
+PX = np.array([view_corners.px for view_corners in CELL.corners])
 REQUESTED = ImportOptions(
     mount="eye-in-hand", target="checkerboard_9x6_25mm", resolution=(1280, 800)
 )
@@ -35,7 +35,7 @@ def poses(folder: Path, *, named: bool = True) -> Path:
 def mrcal(folder: Path) -> Path:
     lines = ["#!/usr/bin/env mrgingham", "## generated", "# filename x y level"]
     # As a shell sorts them: 1, 10, 11, 12, 2.
-    for at in sorted(range(VIEWS), key=lambda it: NAMES[it]):
+    for at in sorted(range(VIEWS), key=lambda index: NAMES[index]):
         lines += [f"/data/{NAMES[at]} {x!r} {y!r} 0" for x, y in PX[at].tolist()]
     path = folder / "corners.vnl"
     path.write_text("\n".join(lines))
@@ -75,8 +75,8 @@ def records(folder: Path) -> Path:
 
 def by_name(folder: Path) -> Path:
     text = "".join(
-        f"{name}:\n  charuco_ids: {[[it] for it in range(54)]}\n"
-        f"  charuco_corners: {[[it] for it in px.tolist()]}\n"
+        f"{name}:\n  charuco_ids: {[[index] for index in range(54)]}\n"
+        f"  charuco_corners: {[[value] for value in px.tolist()]}\n"
         for name, px in zip(NAMES, PX, strict=True)
     )
     path = folder / "found.yaml"
@@ -99,7 +99,7 @@ def test_corners_are_read_by_image_or_in_order(tmp_path, form, named):
     for view, corners in session.corners.items():
         assert corners.ids.tolist() == [*range(54)]
         np.testing.assert_array_equal(corners.px, PX[view])
-    by_order = any("by their order" in it for it in session.warnings)
+    by_order = any("by their order" in warning for warning in session.warnings)
     assert by_order == (not named or form is opencv)
 
 
@@ -119,20 +119,20 @@ def test_they_are_calibrated_with(tmp_path):
 def test_what_was_not_found_is_not_there(tmp_path):
     path = mrcal(tmp_path)
     lines = path.read_text().splitlines()
-    first = next(at for at, it in enumerate(lines) if "shot_3.png" in it)
+    first = next(at for at, line in enumerate(lines) if "shot_3.png" in line)
     lines[first] = "/data/shot_3.png - - -"
     lines[first + 2] = f"{lines[first + 2].rpartition(' ')[0]} -"
-    lines = [it for it in lines if "shot_5.png" not in it] + ["/data/shot_5.png - - -"]
+    lines = [line for line in lines if "shot_5.png" not in line] + ["/data/shot_5.png - - -"]
     path.write_text("\n".join(lines))
     picture(tmp_path / "shot_3.png", (1280, 800))
     picture(tmp_path / "shot_5.png", (1280, 800))
     requested = replace(REQUESTED, corners=path)
     session = convert(poses(tmp_path), tmp_path / "cell", requested=requested)
     assert session.corners[2].ids.tolist() == [1, *range(3, 54)]
-    assert [it.number for it in session.views] == [0, 1, 2, 3, *range(5, VIEWS)]
+    assert [view.number for view in session.views] == [0, 1, 2, 3, *range(5, VIEWS)]
     # Images beside them are kept where there are corners.
-    assert [it.number for it in session.views if it.image] == [2]
-    assert any("1 of 12 rows are left out" in it for it in session.warnings)
+    assert [view.number for view in session.views if view.image] == [2]
+    assert any("1 of 12 rows are left out" in warning for warning in session.warnings)
 
 
 @pytest.mark.parametrize(

@@ -25,8 +25,8 @@ from visioncal.interchange.exports import EXPORT_FORMATS, Selection, document, e
 from visioncal.results import CameraResult, Edge, Verdict
 from visioncal.vision.camera import matrix_3x3, normalise
 
-NAMES = [it.name for it in EXPORT_FORMATS]
-EDGE_NAMES = [it for it in NAMES if it not in (*readers.ARM_FORMATS, "joint-corrections")]
+NAMES = [export_format.name for export_format in EXPORT_FORMATS]
+EDGE_NAMES = [name for name in NAMES if name not in (*readers.ARM_FORMATS, "joint-corrections")]
 ANGLES = {"urdf", "kuka", "fanuc", "yaskawa", "staubli", "doosan"}
 LENSES = {"camera-info", "kalibr", "oak"}
 RNG = np.random.default_rng(3)
@@ -240,8 +240,8 @@ def test_camera_info_holds_the_lens(model, distortion, ros_model):
     document = yaml.safe_load(export(with_lens(model, distortion), "camera-info"))
 
     def array(key):
-        it = document[key]
-        return np.array(it["data"]).reshape(it["rows"], it["cols"])
+        entry = document[key]
+        return np.array(entry["data"]).reshape(entry["rows"], entry["cols"])
 
     k = np.array([[801.1, 0, 640.3], [0, 802.2, 1 / 3], [0, 0, 1]])
     assert (document["image_width"], document["image_height"]) == (1280, 800)
@@ -284,7 +284,7 @@ def test_kalibr_refuses_what_radtan_cannot_hold(distortion, words):
         export(with_lens("brown", np.array(distortion, float)), "kalibr")
 
 
-@pytest.mark.parametrize(("model", "distortion"), [it[:2] for it in LENS_CASES])
+@pytest.mark.parametrize(("model", "distortion"), [case[:2] for case in LENS_CASES])
 def test_opencv_holds_the_lens_beside_the_transform(model, distortion):
     text = export(with_lens(model, distortion), "opencv")
     storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
@@ -307,7 +307,7 @@ def test_a_field_goes_into_the_coefficients_as_far_as_these_can_say_it():
     # What has no place in the model of others, as Kalibr's, stays without.
     assert coefficients[0, 4] == 0.0
     assert export(result, "kalibr")
-    axes = (np.linspace(20.0, it - 20.0, 15) for it in result.camera.camera.resolution)
+    axes = (np.linspace(20.0, index - 20.0, 15) for index in result.camera.camera.resolution)
     px = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
     rays = normalise(result.camera.camera, result.camera.in_model(px))
 
@@ -320,7 +320,7 @@ def test_a_field_goes_into_the_coefficients_as_far_as_these_can_say_it():
         left_px(matrix_3x3(camera), camera.distortion),
         left_px(matrix, coefficients),
     )
-    figures = [float(it) for it in re.findall(r"([\d.]+) px", said)]
+    figures = [float(value) for value in re.findall(r"([\d.]+) px", said)]
     # The weights are those of what is known, a little larger in the middle.
     assert figures[0] == pytest.approx(after, rel=0.15)
     assert figures[0] < figures[1] < 5 * figures[0]
@@ -333,7 +333,7 @@ def test_a_field_that_nobody_notices_leaves_the_lens_as_it_was_given():
     field = replace(result.camera.field, field_px=1e-3, breathing=0.0)
     count = field.columns(result.camera.camera, np.zeros((1, 2)), None).shape[2]
     names = ("coefficients", "root", "intrinsics_covariance", "edge_covariance")
-    field = replace(field, **{it: getattr(field, it)[:count] for it in names})
+    field = replace(field, **{name: getattr(field, name)[:count] for name in names})
     small = replace(result, camera=replace(result.camera, field=field))
     assert export(small, "camera-info") == export(SAMPLE, "camera-info")
 
@@ -472,9 +472,9 @@ def test_frame_names_of_an_edited_calibration_are_checked_too(tmp_path):
     document = json.loads(path.read_text(encoding="utf-8"))
     name = 'x"\n_from_y'
     placed = document["transforms"]
-    second = next(it for it in placed if it != "flange_from_cam")
+    second = next(value for value in placed if value != "flange_from_cam")
     # In the place of the second, as the covariance is of as many.
-    document["transforms"] = {(name if it == second else it): at for it, at in placed.items()}
+    document["transforms"] = {(name if key == second else key): at for key, at in placed.items()}
     path.write_text(json.dumps(document), encoding="utf-8")
     done = exporting(path, "--to", "ros-launch", "--edge", name)
     assert (done.status, done.out) == (2, "")

@@ -39,7 +39,7 @@ from visioncal.session.columns import POSE
 
 def poses_of(session, name):
     poses = [getattr(view, name)() for view in session.views]
-    return None if poses[0] is None else np.array([it.as_matrix() for it in poses])
+    return None if poses[0] is None else np.array([pose.as_matrix() for pose in poses])
 
 
 @pytest.mark.parametrize("make", RECORDINGS.values(), ids=RECORDINGS.keys())
@@ -64,7 +64,7 @@ def test_what_a_form_says_besides_poses_is_kept(tmp_path):
     assert (session.target.columns, session.target.rows) == (5, 7)
     assert session.target.dictionary == "DICT_6X6_250"
     assert session.resolution == (64, 48)  # from the images, which the source does not describe
-    assert any("no distortion" in it for it in session.warnings)
+    assert any("no distortion" in warning for warning in session.warnings)
     estimated = replace(recording.requested, intrinsics="estimate")
     assert convert(recording.source, tmp_path / "free", requested=estimated).camera is None
 
@@ -122,14 +122,16 @@ def test_other_values_of_a_document_are_kept(tmp_path):
     session = convert(recording.source, tmp_path / "out", requested=recording.requested)
     assert session.views[3].text["lamp.ampere"] == "0.75"
     assert session.views[3].text["lamp.on"] == "True"
-    assert not [it for it in session.columns if "corners" in it or "robot_pose" in it]
+    assert not [
+        column for column in session.columns if "corners" in column or "robot_pose" in column
+    ]
 
 
 def test_columns_that_only_sound_like_ours_get_another_name(tmp_path):
     robot, camera = quaternions(BASE_FROM_FLANGE).tolist(), quaternions(CAM_FROM_TARGET).tolist()
     own = ["a", "b", "c", "d", "e", "f", "g"]
     extra = {"role": "tester", "stop": "emergency", "temp1_c": "warm", "camera": "", "q1_rad": "1"}
-    text = ",".join([*own, *(f"cft_{it}" for it in POSE), *extra, "group"]) + "\n"
+    text = ",".join([*own, *(f"cft_{name}" for name in POSE), *extra, "group"]) + "\n"
     for at, row in enumerate(np.hstack([robot, camera]).tolist()):
         cells = [*map(repr, row), *(extra | {"camera": f"cam {at % 2}"}).values(), "warm-up"]
         text += ",".join(cells) + "\n"
@@ -138,7 +140,7 @@ def test_columns_that_only_sound_like_ours_get_another_name(tmp_path):
         mount="eye-in-hand", robot=PoseImportOptions(tuple(own), unit="m"), joints=("a",)
     )
     session = convert(tmp_path / "log.csv", tmp_path / "out", requested=requested)
-    assert {f"source_{it}" for it in extra} < set(session.columns)
+    assert {f"source_{name}" for name in extra} < set(session.columns)
     assert session.views[0].text["group"] == "warm-up"
     assert session.views[0].text["source_role"] == "tester"
 
@@ -147,7 +149,7 @@ def test_images_are_copied_and_missing_ones_named(tmp_path):
     recording = industrial(tmp_path / "in")
     (recording.source / "images/4.png").unlink()
     session = convert(recording.source, tmp_path / "out", requested=recording.requested)
-    assert any("images/4.png. --images names" in it for it in session.warnings)
+    assert any("images/4.png. --images names" in warning for warning in session.warnings)
     kept = (tmp_path / "out/images/3.png").read_bytes()
     assert kept == (recording.source / "images/3.png").read_bytes()
     assert session.views[4].image == "images/4.png"
@@ -232,7 +234,10 @@ def test_a_row_that_says_nothing_is_left_out_by_name(tmp_path):
     )
     session = convert(recording.source, tmp_path / "out", requested=recording.requested)
     assert [view.number for view in session.views] == [0, 1, 2, 4, 5, 6, 7, 8]
-    assert any("1 of 9 rows are left out" in it and "pose_03.json" in it for it in session.warnings)
+    assert any(
+        "1 of 9 rows are left out" in warning and "pose_03.json" in warning
+        for warning in session.warnings
+    )
 
 
 def test_a_path_that_leaves_the_folder_is_refused(tmp_path):
@@ -259,7 +264,7 @@ def test_what_the_user_says_of_poses_is_applied_in_every_form(make, tmp_path):
             np.testing.assert_array_equal(after.positions, before.positions)
 
 
-@pytest.mark.parametrize("ahead_s", [0.337, *(slow(it) for it in (0.0, -1.25))])
+@pytest.mark.parametrize("ahead_s", [0.337, *(slow(value) for value in (0.0, -1.25))])
 def test_the_offset_of_two_clocks_is_found(tmp_path, ahead_s):
     robot_s, camera_s = np.arange(0, 12, 0.01), np.arange(0.5, 11.5, 1 / 30)
     columns = "t,x,y,z,qx,qy,qz,qw"

@@ -38,7 +38,7 @@ ORDER = [4, 0, 7, 2, 8, 1, 6, 3, 5]
 
 def written(form: PoseForm):
     """The robot's poses as a maker writes them."""
-    return np.array([write_pose(it, form) for it in BASE_FROM_FLANGE])
+    return np.array([write_pose(value, form) for value in BASE_FROM_FLANGE])
 
 
 @pytest.fixture
@@ -74,9 +74,9 @@ def test_a_column_that_names_images_pairs_them(tmp_path, table, header, ending):
     names = () if header else tuple("3456789")
     requested = replace(SEEN, images=tmp_path / "images", robot=PoseImportOptions(names))
     foreign = read_foreign(source, requested)
-    assert [it.name for it in foreign.images] == [f"a{at}b.png" for at in ORDER]
+    assert [image.name for image in foreign.images] == [f"a{at}b.png" for at in ORDER]
     assert foreign.stamps_s is None
-    assert not any("in order" in it for it in foreign.notes)
+    assert not any("in order" in note for note in foreign.notes)
 
 
 def test_pairs_by_order_are_told_and_two_columns_of_images_are_one_too_many(tmp_path, table):
@@ -85,20 +85,22 @@ def test_pairs_by_order_are_told_and_two_columns_of_images_are_one_too_many(tmp_
         picture(tmp_path / f"images/{at:03d}.png")
     requested = replace(SEEN, images=tmp_path / "images")
     foreign = read_foreign(table("x,y,z,qx,qy,qz,qw", poses), requested)
-    assert any("line 2 with 000.png, log.csv, line 10 with 008.png" in it for it in foreign.notes)
+    assert any(
+        "line 2 with 000.png, log.csv, line 10 with 008.png" in note for note in foreign.notes
+    )
     # Why they show nothing is said before any reading is tried.
     with pytest.raises(DataError, match=r"No board can be read in 9 views.*almost uniform"):
         guess_foreign(foreign)
     with pytest.raises(DataError, match="elsewhere does not exist"):
         read_foreign(tmp_path / "log.csv", replace(SEEN, images=tmp_path / "elsewhere"))
-    both = [[f"{at:03d}.png", f"{at:03d}.png", *it] for at, it in enumerate(poses)]
+    both = [[f"{at:03d}.png", f"{at:03d}.png", *pose] for at, pose in enumerate(poses)]
     with pytest.raises(DataError, match=r"left, right name images.*--image-column"):
         read_foreign(table("left,right,x,y,z,qx,qy,qz,qw", both), requested)
 
 
 def test_images_are_looked_for_beside_and_some_must_be_there(tmp_path, table):
     poses = quaternions(BASE_FROM_FLANGE).tolist()
-    rows = [[f"{at}.png", *it] for at, it in enumerate(poses)]
+    rows = [[f"{at}.png", *pose] for at, pose in enumerate(poses)]
     source = table("file,x,y,z,qx,qy,qz,qw", rows)
     with pytest.raises(DataError, match=r"9 of 9 images are missing.*--images"):
         convert(source, tmp_path / "out", requested=SEEN)
@@ -106,7 +108,10 @@ def test_images_are_looked_for_beside_and_some_must_be_there(tmp_path, table):
         picture(tmp_path / f"images/{at}.png")
     session = convert(source, tmp_path / "out", requested=SEEN)
     assert (tmp_path / "out/images/8.png").is_file()
-    assert any("1 of 9 images are missing" in it and "--images" in it for it in session.warnings)
+    assert any(
+        "1 of 9 images are missing" in warning and "--images" in warning
+        for warning in session.warnings
+    )
 
 
 @pytest.mark.parametrize(
@@ -167,7 +172,8 @@ def test_rows_without_a_pose_are_named(logged, cell):
         read_foreign(logged("x,y,z,qx,qy,qz,qw", poses), ImportOptions(mount="eye-in-hand"))
     )
     assert any(
-        "1 of 9 rows have no pose of the robot: log.csv, line 5" in it for it in session.warnings
+        "1 of 9 rows have no pose of the robot: log.csv, line 5" in warning
+        for warning in session.warnings
     )
 
 
@@ -184,7 +190,10 @@ def test_entries_without_a_pose_are_named_and_ragged_ones_refused(tmp_path, thir
     (tmp_path / "log.json").write_text(json.dumps(rows))
     if noted:
         session = assemble(read_foreign(tmp_path / "log.json", ImportOptions(mount="eye-in-hand")))
-        assert any("have no pose of the robot: log.json, entry 3" in it for it in session.warnings)
+        assert any(
+            "have no pose of the robot: log.json, entry 3" in warning
+            for warning in session.warnings
+        )
     else:
         with pytest.raises(DataError, match="entry 3: robot is no regular list"):
             read_foreign(tmp_path / "log.json", ImportOptions(mount="eye-in-hand"))
@@ -206,7 +215,10 @@ def test_numbers_in_quotes_are_told(tmp_path):
 
 
 def test_empty_columns_and_numbers_of_cameras_are_no_poses(table):
-    rows = [["a.png", 0, 1, *it, *[""] * 7] for it in quaternions(BASE_FROM_FLANGE).tolist()]
+    rows = [
+        ["a.png", 0, 1, *quaternion, *[""] * 7]
+        for quaternion in quaternions(BASE_FROM_FLANGE).tolist()
+    ]
     source = table(f"image,camera,robot,x,y,z,qx,qy,qz,qw,{CAMERA}", rows)
     foreign = read_foreign(source, SEEN)
     assert foreign.camera is None
@@ -219,14 +231,14 @@ def test_numbers_of_rows_are_no_times(table, step, timed):
     source = table("", [[1 + step * at, *a, *b] for at, (a, b) in enumerate(pairs)])
     foreign = read_foreign(source, ImportOptions(mount="eye-in-hand"))
     assert (foreign.stamps_s is not None) == timed
-    assert any("Column 1 is taken for times" in it for it in foreign.notes) == timed
+    assert any("Column 1 is taken for times" in note for note in foreign.notes) == timed
 
 
 def test_joints_too_large_for_radians_are_taken_for_degrees(tmp_path):
     degrees = np.array([[168.0, 3.0 * at] for at in range(len(BASE_FROM_FLANGE))])
     rows = [
-        {"joints": them, "robot": it.tolist()}
-        for them, it in zip(degrees.tolist(), BASE_FROM_FLANGE, strict=True)
+        {"joints": them, "robot": value.tolist()}
+        for them, value in zip(degrees.tolist(), BASE_FROM_FLANGE, strict=True)
     ]
     (tmp_path / "log.json").write_text(json.dumps(rows))
     found = read_foreign(tmp_path / "log.json", ImportOptions(mount="eye-in-hand"))
@@ -276,10 +288,10 @@ def test_a_robots_model_is_checked_before_anything_is_written(tmp_path, logged):
 def test_notes_keep_still_where_the_user_has_spoken(tmp_path):
     recording = industrial(tmp_path / "in")
     words = "distortion; it is taken for zero"
-    assert any(words in it for it in read_foreign(recording.source, recording.requested).notes)
+    assert any(words in note for note in read_foreign(recording.source, recording.requested).notes)
     said = replace(recording.requested, intrinsics="estimate")
     foreign = read_foreign(recording.source, said)
-    assert not any(words in it for it in foreign.notes)
+    assert not any(words in note for note in foreign.notes)
     assert not foreign.lens
 
 

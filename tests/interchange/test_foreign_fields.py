@@ -42,9 +42,9 @@ def vector(pose):
 
 # How the robot's stream is written, and what the user then says.
 WRITTEN = {
-    "millimetres": (lambda it: it, 1e3, PoseImportOptions(unit="mm")),
+    "millimetres": (lambda value: value, 1e3, PoseImportOptions(unit="mm")),
     "inverse": (invert, 1.0, PoseImportOptions(inverse=True)),
-    "by name": (lambda it: it, 1.0, PoseImportOptions(form="ros")),
+    "by name": (lambda value: value, 1.0, PoseImportOptions(form="ros")),
 }
 
 
@@ -61,8 +61,11 @@ def test_what_is_said_of_a_stream_holds_once(tmp_path, turned, scale, said):
     common = sorted(set(found.places) & set(wanted.places))
     assert len(common) > 10
     pairs = [
-        [dict(zip(it.places, it.poses(), strict=True))[place] for place in common]
-        for it in (found, wanted)
+        [
+            dict(zip(pose_numbers.places, pose_numbers.poses(), strict=True))[place]
+            for place in common
+        ]
+        for pose_numbers in (found, wanted)
     ]
     # Nine digits are written of the original, twelve here, and the clocks' offset is found anew.
     np.testing.assert_allclose(*pairs, atol=1e-6)
@@ -96,7 +99,7 @@ def test_twelve_numbers_are_read_in_the_order_that_makes_rotations(tmp_path, fir
     upper = BASE_FROM_FLANGE[:, :3].reshape(-1, 12)
     apart = np.hstack([BASE_FROM_FLANGE[:, :3, 3], BASE_FROM_FLANGE[:, :3, :3].reshape(-1, 9)])
     robot = apart if first == "position" else upper
-    header = ",".join([*(f"a{it}" for it in range(12)), *(f"c{it}" for it in range(7))])
+    header = ",".join([*(f"a{index}" for index in range(12)), *(f"c{index}" for index in range(7))])
     source = tmp_path / "log.csv"
     table = np.hstack([robot, quaternions(CAM_FROM_TARGET)])
     np.savetxt(source, table, "%.15g", delimiter=",", header=header, comments="")
@@ -128,11 +131,15 @@ def test_the_robots_fields_are_not_the_cameras_as_well(rows):
 
 
 def test_half_a_pose_is_refused_by_its_row(tmp_path):
-    robot, camera = (quaternions(it).astype(str) for it in (BASE_FROM_FLANGE, CAM_FROM_TARGET))
+    robot, camera = (
+        quaternions(value).astype(str) for value in (BASE_FROM_FLANGE, CAM_FROM_TARGET)
+    )
     robot[4, 6] = ""
     header = "x,y,z,qx,qy,qz,qw,cft_x_m,cft_y_m,cft_z_m,cft_qx,cft_qy,cft_qz,cft_qw"
     source = tmp_path / "log.csv"
-    source.write_text("\n".join([header, *(",".join(it) for it in np.hstack([robot, camera]))]))
+    source.write_text(
+        "\n".join([header, *(",".join(value) for value in np.hstack([robot, camera]))])
+    )
     with pytest.raises(DataError, match=r"log\.csv, line 6: a part of the pose's numbers is"):
         assemble(read_foreign(source, HAND))
 
@@ -159,12 +166,15 @@ def test_joints_in_degrees(rows, tmp_path):
     )
     command = ["convert", str(source), str(tmp_path / "out"), "--mount", "eye-in-hand"]
     assert CliRunner().invoke(app, [*command, "--joint-unit", "deg"]).exit_code == 0
-    joints = [it.joints_rad for it in Session.load(tmp_path / "out").views]
+    joints = [view.joints_rad for view in Session.load(tmp_path / "out").views]
     np.testing.assert_array_equal(joints, np.deg2rad([[10.0 * at, -90.0] for at in range(9)]))
 
 
 def test_no_column_takes_anothers_place(tmp_path):
-    lines = [f"{','.join(map(repr, it))},p,a,b,c" for it in quaternions(BASE_FROM_FLANGE).tolist()]
+    lines = [
+        f"{','.join(map(repr, quaternion))},p,a,b,c"
+        for quaternion in quaternions(BASE_FROM_FLANGE).tolist()
+    ]
     header = "x,y,z,qx,qy,qz,qw,point,source_source_stop,stop,source_stop"
     (tmp_path / "log.csv").write_text("\n".join([header, *lines]))
     session = assemble(read_foreign(tmp_path / "log.csv", HAND))
@@ -191,7 +201,7 @@ def test_no_column_takes_anothers_place(tmp_path):
     ids=["seven numbers", "a matrix", "seven names"],
 )
 def test_an_order_that_nothing_tells_is_said(rows, fields, words):
-    source = rows(lambda at: {name: np.array(it)[at].tolist() for name, it in fields.items()})
+    source = rows(lambda at: {name: np.array(field)[at].tolist() for name, field in fields.items()})
     notes = " ".join(read_foreign(source, HAND).notes)
     assert ("quaternions are taken" in notes) == bool(words)
     assert words in notes

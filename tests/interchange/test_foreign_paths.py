@@ -59,7 +59,7 @@ def test_every_row_keeps_its_own_image(tmp_path, naming):
         grey(tmp_path / name, 10 * level)
     session = naming(*names)
     data = [session.images.read(view.image) for view in session.views]
-    levels = [int(cv2.imdecode(np.frombuffer(it, np.uint8), 0)[0, 0]) for it in data]
+    levels = [int(cv2.imdecode(np.frombuffer(value, np.uint8), 0)[0, 0]) for value in data]
     assert levels == [10, 20, 30, 40, 10]
     assert len({view.image.lower() for view in session.views}) == 4
 
@@ -103,14 +103,14 @@ def test_links_that_lead_out_are_not_followed(tmp_path, naming):
     picture(inside / "own.png")
     linked(inside / "b.png", inside / "own.png")
     linked(tmp_path / "circle.png", tmp_path / "circle.png")
-    assert [it.name for it in listed(inside)] == ["b.png", "own.png"]
+    assert [path.name for path in listed(inside)] == ["b.png", "own.png"]
     linked(tmp_path / "out.png", "/etc/hostname")
     for name in ("out.png", "circle.png"):
         with pytest.raises(DataError, match="or leaves the folder"):
             naming(name)
     # The folder that the user names may be a link itself.
     linked(tmp_path / "alias", inside)
-    assert [it.name for it in listed(tmp_path / "alias")] == ["b.png", "own.png"]
+    assert [path.name for path in listed(tmp_path / "alias")] == ["b.png", "own.png"]
 
 
 def test_poses_are_not_read_through_a_link(tmp_path):
@@ -156,7 +156,7 @@ def test_digits_of_other_scripts_are_letters(tmp_path):
     names = ["10.png", "2.png", "1²2.png", "1٣2.png"]
     for name in names:
         picture(tmp_path / name)
-    assert {it.name for it in listed(tmp_path)} == set(names)
+    assert {path.name for path in listed(tmp_path)} == set(names)
     assert natural(tmp_path / "2.png") < natural(tmp_path / "10.png")
 
 

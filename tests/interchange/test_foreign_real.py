@@ -51,8 +51,8 @@ def calibrated(tmp_path):
 
 def by_opencv(session):
     """Park's flange_from_cam by OpenCV [mm], and the target's scatter: (mm, deg), rms."""
-    robot = np.array([it.base_from_flange().as_matrix() for it in session.views])
-    camera = np.array([it.cam_from_target().as_matrix() for it in session.views])
+    robot = np.array([view.base_from_flange().as_matrix() for view in session.views])
+    camera = np.array([view.cam_from_target().as_matrix() for view in session.views])
     if session.mount == "eye-to-hand":
         robot = invert(robot)
     rotation, translation = cv2.calibrateHandEye(
@@ -63,7 +63,7 @@ def by_opencv(session):
         method=cv2.CALIB_HAND_EYE_PARK,
     )
     targets = robot @ compose(rotation, translation[:, 0]) @ camera
-    apart = [pose_difference(mean_transform(targets), it) for it in targets]
+    apart = [pose_difference(mean_transform(targets), target) for target in targets]
     return 1e3 * translation[:, 0], *np.sqrt(np.mean(np.square(apart), axis=0))
 
 
@@ -81,7 +81,7 @@ def test_industrial_calibration(real_data, calibrated):
     )
     assert result.mount == "eye-to-hand"
     assert result.camera.estimated
-    assert [it.view for it in result.views if not it.used] == [2]
+    assert [view.view for view in result.views if not view.used] == [2]
     assert result.rms.mm <= 1.86
     assert result.rms.deg <= 0.215
     # Park's camera, within what 15 views leave open; he takes the board as stated, and the half per
@@ -180,8 +180,8 @@ def test_moveit_with_a_published_answer(real_data, calibrated, tmp_path):
 def test_two_streams_with_clocks_of_their_own(real_data, calibrated):
     folder = real_data / "pose_pairs_small/ethz_unsynchronised_streams"
     robot, camera = (
-        folder / f"robot_arm_complete_bag_color_and_ir_{it}.csv"
-        for it in ("base_link_sr300_hinge", "target_ir")
+        folder / f"robot_arm_complete_bag_color_and_ir_{name}.csv"
+        for name in ("base_link_sr300_hinge", "target_ir")
     )
     arguments = ["--camera-file", camera, "--camera-inverse", "--mount", "eye-in-hand"]
     result, said = calibrated(robot, *arguments)
@@ -191,19 +191,19 @@ def test_two_streams_with_clocks_of_their_own(real_data, calibrated):
     clock = result.clock
     assert clock.camera_minus_robot_s == pytest.approx(0.0170, abs=1e-3)
     assert 2e-4 < clock.sigma_s < 2e-3
-    used = [it for it in result.views if it.used]
+    used = [view for view in result.views if view.used]
     # 3.2 mm and 0.36 deg in the median over 174 samples that stand close to each other; these lie
     # all over the motion.
-    assert np.median([it.residual_mm for it in used]) < 3.2
-    assert np.median([it.residual_deg for it in used]) < 0.5
+    assert np.median([value.residual_mm for value in used]) < 3.2
+    assert np.median([value.residual_deg for value in used]) < 0.5
 
 
 @pytest.mark.slow
 def test_streams_read_the_wrong_way_round_do_not_close(real_data, calibrated):
     folder = real_data / "pose_pairs_small/ethz_unsynchronised_streams"
     robot, camera = (
-        folder / f"robot_arm_complete_bag_color_and_ir_{it}.csv"
-        for it in ("base_link_sr300_hinge", "target_ir")
+        folder / f"robot_arm_complete_bag_color_and_ir_{name}.csv"
+        for name in ("base_link_sr300_hinge", "target_ir")
     )
     result, _ = calibrated(robot, "--camera-file", camera, "--mount", "eye-in-hand")
     # 190 mm over all samples.
@@ -226,8 +226,8 @@ def test_a_positioner_from_its_joints(real_data, calibrated, tmp_path):
     assert len(result.views) == 205
     # A fit of both axes with 18 parameters leaves a mean of 0.38 mm and 0.046 deg; the nominal
     # geometry with its right angles 20 % more.
-    assert np.mean([it.residual_mm for it in result.views]) < 1.2 * 0.38
-    assert np.mean([it.residual_deg for it in result.views]) < 1.2 * 0.046
+    assert np.mean([view.residual_mm for view in result.views]) < 1.2 * 0.38
+    assert np.mean([view.residual_deg for view in result.views]) < 1.2 * 0.046
 
 
 def test_a_calibrated_positioner_predicts_views_that_no_fit_has_seen(real_data, tmp_path):
@@ -236,14 +236,14 @@ def test_a_calibrated_positioner_predicts_views_that_no_fit_has_seen(real_data, 
     done = convert(source, tmp_path / "s", "--robot-model", tmp_path / "positioner.toml")
     assert done.status == 0, done.err
     session = Session.load(tmp_path / "s")
-    views = tuple(replace(it, holdout=it.number % 10 == 0) for it in session.views)
+    views = tuple(replace(view, holdout=view.number % 10 == 0) for view in session.views)
     result = visioncal.calibrate(replace(session, views=views))
     assert result.arm_is_calibrated
     # Ten folds leave 0.36 mm in the mean over all, and a fit of both axes alone 0.38 mm in sample.
     away = result.arm.holdout
     assert len(away) == 21
-    assert np.mean([it.mm for it in away]) < 1.2 * 0.38
-    assert np.mean([it.deg for it in away]) < 1.2 * 0.046
+    assert np.mean([view.mm for view in away]) < 1.2 * 0.38
+    assert np.mean([view.deg for view in away]) < 1.2 * 0.046
 
 
 def test_a_ur10_from_its_joints(real_data, calibrated):
@@ -262,8 +262,8 @@ def test_a_ur10_from_its_joints(real_data, calibrated):
         "ur10",
     )
     # The nominal geometry leaves a mean of 10.7 mm and 21 at most.
-    assert np.mean([it.residual_mm for it in result.views]) < 11.5
-    assert np.max([it.residual_mm for it in result.views]) < 21
+    assert np.mean([view.residual_mm for view in result.views]) < 11.5
+    assert np.max([view.residual_mm for view in result.views]) < 21
 
 
 def test_touches_alone_are_no_session_of_a_camera(real_data, tmp_path):

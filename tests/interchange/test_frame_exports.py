@@ -24,7 +24,7 @@ CELL = replace(SAMPLE, frames=tool() | fixture(source="points.csv"))
 ALONE = placed.alone(tool(), fixture())
 FRAME_READERS = TOOL_READERS | FIXTURE_READERS
 NUMBERED = {"fanuc-utool", "fanuc-uframe"}
-TAKES = {it.name: it.takes for it in EXPORT_FORMATS}
+TAKES = {export_format.name: export_format.takes for export_format in EXPORT_FORMATS}
 
 
 def wanted(name, **changes):
@@ -142,7 +142,7 @@ P[3]{
 def rounded(text, mark):
     """A document without comments and spaces, its numbers with three decimals alike."""
     plain = re.sub(r"\s", "", readers.code(text, mark))
-    return re.sub(r"-?(\d+\.?\d*|\.\d+)", lambda it: f"{float(it[0]):.3f}", plain)
+    return re.sub(r"-?(\d+\.?\d*|\.\d+)", lambda pair: f"{float(pair[0]):.3f}", plain)
 
 
 def test_abb_gripper_of_the_manual():
@@ -200,7 +200,7 @@ def test_kuka_frames_of_a_controllers_own_file(name, theirs, number):
 
 def test_fanuc_frames_of_a_program_that_a_controller_printed():
     theirs = readers.fanuc_program(SETUP_FRAMES)
-    assert {name: it[:3, 3].tolist() for name, it in theirs.items()} == {
+    assert {name: their[:3, 3].tolist() for name, their in theirs.items()} == {
         "UTOOL[1]": [0, 0, 0],
         "UTOOL[2]": [0, 0, 0.15],
         "UFRAME[1]": [0.9, 0, 0.4],
@@ -211,12 +211,14 @@ def test_fanuc_frames_of_a_program_that_a_controller_printed():
     ):
         text = export(placed.alone(frames), name, Selection(number=number))
         ours = readers.fanuc_program(text)
-        assert all(np.array_equal(theirs[key], it) for key, it in ours.items())
+        assert all(np.array_equal(theirs[key], our) for key, our in ours.items())
         assert text.startswith(f"/PROG  {title}\r\n")
         # Every line but the remarks, the names and the sizes stands in theirs as well.
-        kept = {trimmed(it) for it in SETUP_FRAMES.splitlines()}
-        others = [it for it in text.splitlines() if trimmed(it) not in kept and "!" not in it]
-        assert [it.split()[0] for it in others] == [
+        kept = {trimmed(line) for line in SETUP_FRAMES.splitlines()}
+        others = [
+            line for line in text.splitlines() if trimmed(line) not in kept and "!" not in line
+        ]
+        assert [other.split()[0] for other in others] == [
             "/PROG",
             "COMMENT",
             "PROG_SIZE",
@@ -365,7 +367,7 @@ def test_a_load_that_is_none_is_refused(load):
 def test_a_tool_without_a_load_is_marked_and_warned_of():
     written = document(CELL, "abb-tooldata")
     assert readers.rapid(written.text)[2][2] == [-1, [0, 0, 0], [1, 0, 0, 0], 0, 0, 0]
-    assert ["--mass-kg" in it for it in written.warnings] == [True]
+    assert ["--mass-kg" in warning for warning in written.warnings] == [True]
     loaded = document(CELL, "abb-tooldata", Selection(load=Load(1.25, (0.0, -1.5, 60.0))))
     assert readers.rapid(loaded.text)[2][2][:2] == [1.25, [0, -1.5, 60]]
     assert loaded.warnings == ()
@@ -494,6 +496,6 @@ def test_the_verdict_of_the_frame_is_what_is_warned_of():
     bad = Verdict.of("bad", "Touch 4 is off by 7 mm.")
     frames = tool(verdict=bad) | fixture()
     cell = replace(SAMPLE, frames=frames, verdict=Verdict.of("bad", "The views disagree."))
-    assert any("7 mm" in it for it in document(cell, "ur-tcp").warnings)
+    assert any("7 mm" in warning for warning in document(cell, "ur-tcp").warnings)
     assert document(cell, "ur-feature").warnings == ()
-    assert any("views disagree" in it for it in document(cell, "ros").warnings)
+    assert any("views disagree" in warning for warning in document(cell, "ros").warnings)

@@ -43,14 +43,14 @@ def folder(outputs: Path, tmp_path: Path) -> Path:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    return {it.name: it.read_bytes() for it in folder.iterdir()}
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 def test_all_files_are_as_before_with_the_frames(sample, folder):
     joined = with_frames(sample).calibration
     files = rewrite(folder, joined).files
-    assert [it.name for it in files] == ["calibration.json", "report.html", "recording.rrd"]
-    assert sorted(contents(folder)) == sorted(it.name for it in files)
+    assert [file.name for file in files] == ["calibration.json", "report.html", "recording.rrd"]
+    assert sorted(contents(folder)) == sorted(file.name for file in files)
     expected = to_document(sample.calibration) | {"frames": to_document(joined)["frames"]}
     for calibration in (Calibration.load(folder), read_calibration(folder / "recording.rrd")):
         assert to_document(calibration) == expected
@@ -107,7 +107,7 @@ def test_a_write_that_fails_leaves_the_old_files(sample, folder, monkeypatch, pa
 def test_a_result_without_its_recording_keeps_the_rest(sample, folder):
     (folder / "recording.rrd").unlink()
     files = rewrite(folder, with_frames(sample).calibration).files
-    assert [it.name for it in files] == ["calibration.json", "report.html"]
+    assert [file.name for file in files] == ["calibration.json", "report.html"]
     assert sorted(contents(folder)) == ["calibration.json", "report.html"]
     assert Calibration.load(folder).frames.keys() == with_frames(sample).calibration.frames.keys()
     assert "There is no recording.rrd beside" in (folder / "report.html").read_text("utf-8")

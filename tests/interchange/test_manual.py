@@ -125,7 +125,7 @@ def test_what_is_exported_can_be_pasted_back(form):
         matrix = compose(rotation, SHIFT)
         edges = {**SAMPLE.edges, "flange_from_cam": Edge(matrix, np.eye(6))}
         lines = export(replace(SAMPLE, edges=edges), form).splitlines()
-        pose = " ".join(it for it in lines if not it.startswith(("#", ";", "!")))
+        pose = " ".join(line for line in lines if not line.startswith(("#", ";", "!")))
         found = read_pose(pose, "the line")
         assert found.form.name == form
         # Exports are written to the nanometre and to 1e-8 deg.
@@ -245,7 +245,7 @@ def test_bare_numbers_are_asked_for_once():
     wanted = a_pose(Rotation.from_euler("ZYX", [10, -20, 170], degrees=True))
     assert np.abs(arm.state().base_from_flange - wanted).max() < 1e-12
     assert arm.state().base_from_flange[0, 3] == pytest.approx(0.41)
-    assert sum("Which is it?" in it for it in questions) == 2
+    assert sum("Which is it?" in question for question in questions) == 2
 
 
 def test_lines_of_a_file_are_a_pose_each_and_none_is_passed_over():

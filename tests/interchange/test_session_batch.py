@@ -51,19 +51,19 @@ def facts(found: Calibration):
 
 
 def expect_results_of_calibrate(fleet, out, rows):
-    done = {it.name: it for it in rows if it.state == "done"}
-    assert sorted(done) == [f"robot_{it}/week_{at}" for it in (0, 1) for at in (0, 1)]
+    done = {row.name: row for row in rows if row.state == "done"}
+    assert sorted(done) == [f"robot_{name}/week_{at}" for name in (0, 1) for at in (0, 1)]
     for name, row in done.items():
         alone = run(fleet / name).calibration
         verdict = alone.verdict.with_paths(fleet / name, out.absolute() / name)
         found = Calibration.load(out / name)
         assert facts(found) == facts(replace(alone, verdict=verdict))
         assert (row.residual_mm, row.used) == (found.rms.mm, 10)
-    failed = {it.name: it for it in rows if it.state == "failed"}
+    failed = {row.name: row for row in rows if row.state == "failed"}
     assert sorted(failed) == ["broken", "empty"]
     assert "session.toml does not exist" in failed["empty"].words
     assert "zero." in failed["broken"].words
-    assert {it.error for it in failed.values()} == {"DataError"}
+    assert {value.error for value in failed.values()} == {"DataError"}
 
 
 @pytest.mark.usefixtures("processes")
@@ -71,10 +71,10 @@ def test_results_are_those_of_calibrate_and_errors_are_rows(fleet, tmp_path):
     found = batch(fleet / "*", tmp_path, workers=2, without=BARE)
     expect_results_of_calibrate(fleet, tmp_path, found.rows)
     table = parquet.read_table(found.table).to_pylist()
-    assert [it["name"] for it in table] == [it.name for it in found.rows]
-    assert {it["residual_mm"] for it in table} == {it.residual_mm for it in found.rows}
+    assert [value["name"] for value in table] == [row.name for row in found.rows]
+    assert {value["residual_mm"] for value in table} == {row.residual_mm for row in found.rows}
     page = found.page.read_text()
-    assert all(it.name in page for it in found.rows)
+    assert all(row.name in page for row in found.rows)
 
 
 @pytest.mark.usefixtures("here")
@@ -84,17 +84,17 @@ def test_what_was_done_is_kept(fleet, tmp_path):
     def of(name):
         return (tmp_path / name / "calibration.json").stat().st_mtime_ns
 
-    before = {it.name: of(it.name) for it in found.rows}
+    before = {row.name: of(row.name) for row in found.rows}
     (tmp_path / "robot_1/week_1/calibration.json").unlink()
     again = batch(fleet / "robot_*", tmp_path, without=BARE, against=tmp_path)
-    states = {it.name: it.state for it in again.rows}
+    states = {row.name: row.state for row in again.rows}
     assert states.pop("robot_1/week_1") == "done"
     assert set(states.values()) == {"kept"}
     assert all(of(name) == before[name] for name in states)
     assert again.counts["changed"] == 0
     # Other options are other results.
     asked = batch(fleet / "robot_*", tmp_path, without=BARE, need_mm=1.0)
-    assert [it.state for it in asked.rows] == 4 * ["done"]
+    assert [row.state for row in asked.rows] == 4 * ["done"]
 
 
 @pytest.mark.usefixtures("processes")
@@ -109,7 +109,7 @@ def test_a_worker_that_dies_loses_nothing(fleet, tmp_path, monkeypatch):
 
     monkeypatch.setattr(workers, "_asked", mortal)
     rows = batch([fleet / "robot_0", fleet / "robot_1"], tmp_path, workers=1, without=BARE).rows
-    states = {it.name: it.state for it in rows}
+    states = {row.name: row.state for row in rows}
     assert died == ["robot_0/week_0", *3 * ["robot_1/week_0"]]
     assert states == {
         "robot_0/week_0": "done",
@@ -117,14 +117,14 @@ def test_a_worker_that_dies_loses_nothing(fleet, tmp_path, monkeypatch):
         "robot_1/week_0": "failed",
         "robot_1/week_1": "done",
     }
-    (lost,) = (it for it in rows if it.state == "failed")
+    (lost,) = (row for row in rows if row.state == "failed")
     assert lost.error == "WorkerDied"
     assert "died 3 times" in lost.words
 
 
 def test_sessions_are_found_and_named(fleet, tmp_path):
     jobs = jobs_of([fleet / "robot_0", str(fleet / "robot_1" / "*_1")], tmp_path, Options())
-    assert [it.name for it in jobs] == ["robot_0/week_0", "robot_0/week_1", "robot_1/week_1"]
+    assert [job.name for job in jobs] == ["robot_0/week_0", "robot_0/week_1", "robot_1/week_1"]
     assert jobs[2].folder == tmp_path / "robot_1" / "week_1"
     (only,) = jobs_of([fleet / "robot_0" / "week_0"], tmp_path, Options())
     assert only.name == "week_0"
@@ -221,7 +221,7 @@ def test_a_local_cluster_does_the_same(fleet, tmp_path):
 def test_a_session_whose_facts_changed_is_done_again(fleet, tmp_path):
     name = "robot_0/week_0"
     first = batch(fleet / name, tmp_path / "out", workers=1, without=BARE)
-    assert [it.state for it in first.rows] == ["done"]
+    assert [row.state for row in first.rows] == ["done"]
     table = fleet / name / "views.csv"
     whole = table.read_text()
     try:

@@ -34,7 +34,7 @@ def test_all_combinations_are_calibrated_and_compared_with_the_truth(tmp_path):
     away_mm = 1e3 * np.linalg.norm(edge.matrix[:3, 3] - np.array(true)[:3, 3])
     assert row.error_mm == pytest.approx(away_mm, rel=1e-6)
     few, many = (
-        [it.sigma_mm for it in found.rows if it.group.startswith(f"views_{count}-")]
+        [row.sigma_mm for row in found.rows if row.group.startswith(f"views_{count}-")]
         for count in (8, 20)
     )
     # Two and a half times the stops are known by a factor of 1.6 at the least.
@@ -43,8 +43,8 @@ def test_all_combinations_are_calibrated_and_compared_with_the_truth(tmp_path):
     assert "views_8-robot_sigma_mm_0.1-camera_fine" in page
     assert "Simulated cells" in page
     again = batch_run.batch((), out, cells=file, without=("report.html", "recording.rrd"))
-    assert {it.state for it in again.rows} == {"kept"}
-    assert {it.error_mm for it in again.rows} == {it.error_mm for it in found.rows}
+    assert {row.state for row in again.rows} == {"kept"}
+    assert {row.error_mm for row in again.rows} == {row.error_mm for row in found.rows}
 
 
 @pytest.mark.parametrize(

@@ -52,7 +52,7 @@ def test_the_command_installs_what_the_extra_would():
         with pytest.raises(DriverError) as caught:
             extras.client_library("no_such_module", extra)
         assert [caught.value.next_step] == [
-            f"Install it: pip install '{it}'" for it in declared[extra]
+            f"Install it: pip install '{value}'" for value in declared[extra]
         ]
 
 
@@ -181,10 +181,10 @@ def test_a_stream_whose_decoding_lags_is_stamped_as_if_it_did_not(monkeypatch):
     pictures = [(100.0, 5.0), (100.3, 5.1), (100.6, 5.2), (100.65, 5.9), (101.0, 2.0)]
     found, _ = arrivals_of(monkeypatch, *pictures, is_stream=True)
     # By 0.1 ms a second their clocks may run apart, which counts as a delay.
-    assert [it.stamp_s for it in found] == pytest.approx(
+    assert [value.stamp_s for value in found] == pytest.approx(
         [100.0, 100.1, 100.2, 100.65, 101.0], abs=1e-4
     )
-    assert [it.began_s for it in found[1:]] == [it.stamp_s for it in found[:-1]]
+    assert [item.began_s for item in found[1:]] == [item.stamp_s for item in found[:-1]]
 
 
 class Hanging(Queued):

@@ -39,7 +39,7 @@ def board_plate(cell: PlanCell) -> tuple[FloatArray, FloatArray]:
 def least_clearance(cell: PlanCell, q: FloatArray) -> float:
     """By plain geometry, of arm, camera or board, floor and boxes [m]."""
     pose, size = board_plate(cell)
-    boxes = [(it.base_from_box, it.size_m) for it in cell.boxes]
+    boxes = [(box.base_from_box, box.size_m) for box in cell.boxes]
     flange = forward(ur_arm("ur5e"), q)
     if cell.mount == "eye-in-hand":
         boxes.append((cell.z @ pose, size))
@@ -103,7 +103,7 @@ def test_a_box_in_the_way_is_gone_around():
     )
     stops = np.stack([left, right])
     free = ordered(cell, None, stops)
-    assert [len(it) for it in free.segments] == [0]
+    assert [len(segment) for segment in free.segments] == [0]
     height = compose(np.eye(3), np.array([0.55, 0.12, 0.25]))
     wall = Box("wall", height, np.array([0.3, 0.04, 0.5]))
     walled = ordered(replace(cell, boxes=(wall,)), None, stops)
@@ -202,7 +202,7 @@ def test_the_arm_itself_does_not_hide_the_board():
     behind = compose(rotation, np.array([-0.7, 0.0, 0.75]))
     cell = replace(cell_of(CellOptions(robot="ur5e", mount="eye-to-hand")), x=behind)
     stops = candidates(cell, 100, seed=2)
-    assert any(it.startswith("a line of sight past the arm (link ") for it in stops.lost)
+    assert any(name.startswith("a line of sight past the arm (link ") for name in stops.lost)
     outline = outline_m(Sheet(target=cell.target), 0.0)
     arm = ur_arm("ur5e")
     found = tubes(arm, stops.q)
@@ -276,7 +276,7 @@ def test_guesses_spread_as_they_are_said_to():
     drawn = cell.guesses(2000, seed=0)
     for edge in ("x", "z"):
         guess = getattr(cell, edge)
-        moves = log(invert(guess) @ np.array([getattr(it, edge) for it in drawn]))
+        moves = log(invert(guess) @ np.array([getattr(plan_cell, edge) for plan_cell in drawn]))
         # The spread of 2000 draws is off by 1.6 %.
         np.testing.assert_allclose(moves.std(axis=0), [0.03] * 3 + [0.01] * 3, rtol=0.08)
 

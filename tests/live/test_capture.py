@@ -35,7 +35,7 @@ def test_a_recording_is_a_session_that_calibrates(tmp_path):
     steps = recorded(tmp_path / "live", plan, arm, camera, CaptureOptions(frames=2))
     session = Session.load(tmp_path / "live")
     assert session.warnings == ()
-    assert [it.number for it in session.views] == [it.view for it in plan.stops]
+    assert [view.number for view in session.views] == [stop.view for stop in plan.stops]
     assert session.document["robot"]["model"] == "robot.toml"
     assert session.document["target"] == "charuco_9x6_30mm"
     row = session.views[0]
@@ -44,7 +44,7 @@ def test_a_recording_is_a_session_that_calibrates(tmp_path):
     assert row.text["tcp"] == "0 0 0 0 0 0 1"
     assert row.text["device_exposure_us"] == "10000.0"
     # What was predicted becomes less with every view once something is determined.
-    known = [it.accuracy.mm for it in steps if it.accuracy and not it.accuracy.is_open]
+    known = [step.accuracy.mm for step in steps if step.accuracy and not step.accuracy.is_open]
     assert len(known) > 5
     assert known == sorted(known, reverse=True)
     result = run(session).calibration
@@ -71,7 +71,7 @@ def test_a_moving_arm_gives_no_view(plan, tmp_path, hidden):
     assert len(session.views) == len(plan.stops)
     # It trembles by a millimetre and more at first, and the views waited for its end.
     assert max(errors_m(session, camera)) < REPEATABILITY_M
-    assert all(it.times.settled_s > 0.8 for it in steps)
+    assert all(step.times.settled_s > 0.8 for step in steps)
 
 
 def test_an_arm_that_never_rests_gives_no_view(plan, tmp_path):
@@ -252,7 +252,7 @@ def test_ways_from_elsewhere_are_looked_at(plan):
     assert len(ways.to(first, first.q)) == 1
     assert np.array_equal(ways.to(second, first.q)[-1], second.q)
     # A box where the goal's flange is lets no way lead there.
-    far = next(it for it in plan.stops if np.abs(it.q - first.q).max() > 0.5)
+    far = next(stop for stop in plan.stops if np.abs(stop.q - first.q).max() > 0.5)
     flange = plan.cell.robot.base_from_flange(far.q[None])[0]
     box = Box("post", compose(np.eye(3), flange[:3, 3]), np.full(3, 0.02))
     walled = replace(plan, cell=replace(plan.cell, boxes=(box,)))

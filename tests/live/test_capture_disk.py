@@ -39,8 +39,8 @@ def test_ctrl_c_halts_and_a_resumed_recording_is_complete(plan, tmp_path):
     arm, camera = fake_devices(plan)
     steps = recorded(tmp_path / "live", plan, arm, camera, resume=True)
     assert len(steps) == len(plan.stops) - some
-    numbers = [it.number for it in Session.load(tmp_path / "live").views]
-    assert sorted(numbers) == [it.view for it in plan.stops]
+    numbers = [view.number for view in Session.load(tmp_path / "live").views]
+    assert sorted(numbers) == [stop.view for stop in plan.stops]
 
 
 def test_a_full_disk_is_told_and_leaves_the_session(plan, tmp_path, monkeypatch):
@@ -99,7 +99,7 @@ def test_what_a_killed_process_left_is_removed(plan, tmp_path):
     # An image whose row did not come is written again.
     (folder / "images" / "005.png").write_bytes(b"half")
     recorded(folder, plan, *fake_devices(plan), resume=True)
-    assert not any(it.exists() for it in leftovers)
+    assert not any(leftover.exists() for leftover in leftovers)
     assert len(Session.load(folder).views) == len(plan.stops)
 
 

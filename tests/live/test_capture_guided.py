@@ -60,12 +60,12 @@ def test_a_guided_arm_gives_a_view_wherever_it_rests(plan, tmp_path):
     arm, camera = fake_devices(plan)
     capture = _capture(tmp_path / "live", plan, arm, camera)
     # It begins at the first of them.
-    places = [it.q for it in plan.stops[1:]]
+    places = [stop.q for stop in plan.stops[1:]]
     capture.watchers = (Hand(arm, places),)
     steps = follow(capture, len(plan.stops))
     assert len(steps) == len(plan.stops)
     session = Session.load(tmp_path / "live")
-    assert [it.number for it in session.views] == list(range(1, len(plan.stops) + 1))
+    assert [view.number for view in session.views] == list(range(1, len(plan.stops) + 1))
     assert max(errors_m(session, camera)) < REPEATABILITY_M
 
 
@@ -92,7 +92,7 @@ def test_an_arm_that_is_led_on_before_it_settles_gives_no_view_twice(plan, tmp_p
 
     arm.state = led_on
     follow(capture, 2)
-    poses = [it.base_from_flange().translation for it in Session.load(tmp_path / "live").views]
+    poses = [view.base_from_flange().translation for view in Session.load(tmp_path / "live").views]
     assert np.linalg.norm(poses[1] - poses[0]) > 0.02
 
 
@@ -118,7 +118,7 @@ def test_typed_poses_make_a_session(plan, tmp_path):
         return answer
 
     steps = ask_and_take(capture, arm, 0, ask)
-    assert all(isinstance(it.found, Taken) for it in steps)
+    assert all(isinstance(step.found, Taken) for step in steps)
     assert "View 1 (another place" in asked[0]
     assert len(Session.load(tmp_path / "live").views) == 3
 

@@ -36,7 +36,7 @@ def controller():
 def test_a_way_keeps_speed_and_acceleration_and_takes_the_shortest_time(distance):
     profile = Profile(distance, speed=0.8, acceleration=1.5)
     times = np.linspace(0.0, profile.duration_s, 2001)
-    place, speed = np.array([profile.at(it) for it in times]).T
+    place, speed = np.array([profile.at(value) for value in times]).T
     assert place[0] == speed[0] == speed[-1] == 0.0
     assert place[-1] == distance
     assert speed.max() <= 0.8 + 1e-12

@@ -37,9 +37,10 @@ def errors_px(image, exact):
 def test_at_rest_corners_are_as_good_as_in_a_written_session(mount):
     cell = a_cell(mount=mount)
     scene, live = prepare_scene(cell), LiveView(cell)
-    written = [errors_px(render(scene, it), cell.exact_corners[it]) for it in range(3)]
+    written = [errors_px(render(scene, index), cell.exact_corners[index]) for index in range(3)]
     taken = [
-        errors_px(live.picture(cell.joints[it, None]), cell.exact_corners[it]) for it in (0, 1, 2)
+        errors_px(live.picture(cell.joints[name, None]), cell.exact_corners[name])
+        for name in (0, 1, 2)
     ]
     # Both are the detector's noise on other grain: over 100 corners their rms differ by some 15 %.
     assert np.std(np.vstack(taken)) < 1.3 * np.std(np.vstack(written))

@@ -44,7 +44,7 @@ def test_no_picture_is_from_before_it_was_asked_for():
 def test_pictures_of_unknown_size_are_told_apart_by_what_stands_between(boundary):
     sent = NetworkCamera(lambda: SMALL, boundary=boundary, is_sized=False)
     with served(sent) as url, closing(UvcCamera(url)) as camera:
-        numbers = [number_of(it.image) for it in frames_of(camera, 5)]
+        numbers = [number_of(frame.image) for frame in frames_of(camera, 5)]
         assert (np.diff(numbers) > 0).all()
         assert camera.resolution == (320, 240)
 
@@ -52,8 +52,8 @@ def test_pictures_of_unknown_size_are_told_apart_by_what_stands_between(boundary
 def test_pictures_that_are_cut_short_are_passed_by():
     sent = NetworkCamera(lambda: SMALL, cut=tuple(range(0, 1000, 2)))
     with served(sent) as url, closing(UvcCamera(url)) as camera:
-        numbers = [number_of(it.image) for it in frames_of(camera, 5)]
-    assert all(it % 2 for it in numbers)
+        numbers = [number_of(frame.image) for frame in frames_of(camera, 5)]
+    assert all(number % 2 for number in numbers)
 
 
 def test_a_password_is_given_and_not_shown():
@@ -107,4 +107,4 @@ def test_what_a_url_cannot_do_is_refused():
             UvcCamera(url, DeviceSetup(exposure_us=5000))
     with pytest.raises(DriverError, match=r"cannot be opened: .*refused"):
         UvcCamera(url)
-    assert not [it for it in threading.enumerate() if it.name.startswith("pictures of")]
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("pictures of")]

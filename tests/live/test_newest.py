@@ -22,11 +22,11 @@ class Scripted:
 
     def grab(self):
         """Waits for what comes next."""
-        it = self.coming.get()
-        if isinstance(it, Exception):
-            raise it
-        self.last = it
-        return it
+        coming = self.coming.get()
+        if isinstance(coming, Exception):
+            raise coming
+        self.last = coming
+        return coming
 
     def take(self):
         """Gives the picture, and remembers that it was decoded."""
@@ -110,7 +110,7 @@ def test_for_how_long_nothing_came_is_told(newest):
 
 
 def test_pictures_that_all_come_late_are_told(newest, source):
-    late = [Arrival(it, it - 0.01) for it in np.arange(1.0, 2.0, 0.1)]
+    late = [Arrival(float64, float64 - 0.01) for float64 in np.arange(1.0, 2.0, 0.1)]
     with pytest.raises(DriverError, match=r"no fresh pictures: its last one came \d+\.\d s late"):
         given(newest, source, 1e9, *late, timeout_s=0.2)
 

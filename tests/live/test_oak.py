@@ -314,7 +314,7 @@ def test_a_devices_raw_frames_are_recorded(monkeypatch, tmp_path):
     camera.frame(timeout_s=PATIENT_S)
     frame = camera.frame(timeout_s=PATIENT_S)
     camera.close()
-    stamps = [it.stamp_s for it in replayed(raw)]
+    stamps = [value.stamp_s for value in replayed(raw)]
     # All of them, whether or not anybody took them: one at least while exposure and focus settled.
     assert np.abs(np.array(stamps) - frame.stamp_s).min() < 2e-6
     assert len(stamps) > 2
@@ -399,9 +399,9 @@ def test_the_export_names_the_socket_and_warns_without_the_devices_own():
     source = replace(made_up(5).calibration, camera=lens)
     written = document(source, "oak", Selection(child="CAM_C"))
     assert parsed(written.text).hasCameraCalibration(dai.CameraBoardSocket.CAM_C)
-    assert any("--onto" in it for it in written.warnings)
+    assert any("--onto" in warning for warning in written.warnings)
     onto = document(source, "oak", Selection(onto=written.text))
-    assert not any("--onto" in it for it in onto.warnings)
+    assert not any("--onto" in warning for warning in onto.warnings)
     with pytest.raises(DataError, match="CAM_A to CAM_J"):
         document(source, "oak", Selection(child="cam"))
     with pytest.raises(DataError, match="no calibration of an OAK") as error:

@@ -47,7 +47,7 @@ def strict_rerun():
 def plan(source: object, out: Path, *more: object, **cell: str) -> Done:
     options = CELL | {f"--{name}": value for name, value in cell.items()}
     return visioncal(
-        "plan", source, "-o", out, *more, *(it for two in options.items() for it in two)
+        "plan", source, "-o", out, *more, *(name for two in options.items() for name in two)
     )
 
 
@@ -71,17 +71,17 @@ def one_axis(tmp_path_factory) -> Path:
 
 
 def test_a_plan_has_a_table_a_program_a_preview_and_all_of_it_as_json(planned, document):
-    assert {it.name for it in planned.iterdir()} == FILES
+    assert {path.name for path in planned.iterdir()} == FILES
     assert document["purpose"] == "hand-eye"
     assert len(document["stops"]) == 6
-    assert sorted(it["rank"] for it in document["stops"]) == [1, 2, 3, 4, 5, 6]
+    assert sorted(value["rank"] for value in document["stops"]) == [1, 2, 3, 4, 5, 6]
     assert document["cell"]["limits"]["clearance_m"] == 0.03
     assert document["cell"]["boxes"][0]["name"] == "post"
     assert re.fullmatch("[0-9a-f]{64}", document["inputs_sha256"])
     # Six stops with the board filling the image know the camera's place to well under 1 mm.
     assert 0.0 < document["predicted"]["after"]["sigma_mm"] < 1.0
-    by_rank = sorted(document["stops"], key=lambda it: it["rank"])
-    told = [it["after"]["sigma_mm"] for it in by_rank if "sigma_mm" in it["after"]]
+    by_rank = sorted(document["stops"], key=lambda pair: pair["rank"])
+    told = [value["after"]["sigma_mm"] for value in by_rank if "sigma_mm" in value["after"]]
     assert told == sorted(told, reverse=True)
 
 
@@ -101,25 +101,27 @@ def test_the_table_opens_as_views_with_the_models_poses(planned, document):
 
 def test_the_program_drives_to_each_stop_by_way_of_what_lies_between(planned, document):
     text = (planned / "plan.script").read_text(encoding="ascii")
-    lines = [it for it in text.splitlines() if not it.startswith("#")]
+    lines = [line for line in text.splitlines() if not line.startswith("#")]
     assert lines[0] == "def visioncal_plan():"
     # One function, closed before it is called; inside it nothing but assignments and calls.
-    assert [it for it in lines if it and not it.startswith("  ")] == [
+    assert [line for line in lines if line and not line.startswith("  ")] == [
         "def visioncal_plan():",
         "end",
         "visioncal_plan()",
     ]
-    inside = [it.strip() for it in lines if it.startswith("  ")]
+    inside = [line.strip() for line in lines if line.startswith("  ")]
     call = r'(movej\(\[.*\], a=acceleration, v=speed\)|sleep\(settling\)|popup\(".*", title=".*", '
     call += r"blocking=True\))"
-    assert all(re.match(rf"({call}|[a-z]+ = [0-9.]+)( *#.*)?$", it) for it in inside)
+    assert all(re.match(rf"({call}|[a-z]+ = [0-9.]+)( *#.*)?$", value) for value in inside)
     moves = [
-        json.loads(it.partition("(")[2].partition("]")[0] + "]") for it in inside if "movej" in it
+        json.loads(value.partition("(")[2].partition("]")[0] + "]")
+        for value in inside
+        if "movej" in value
     ]
-    wanted = [q for it in document["stops"] for q in (*it.get("via_q", []), it["q"])]
+    wanted = [q for value in document["stops"] for q in (*value.get("via_q", []), value["q"])]
     # Six decimals.
     np.testing.assert_allclose(moves, wanted, atol=1e-6)
-    assert sum("popup" in it and "take images/" in it for it in inside) == 6
+    assert sum("popup" in value and "take images/" in value for value in inside) == 6
 
 
 def test_the_preview_shows_stops_way_board_and_what_is_in_the_way(planned, document):
@@ -133,7 +135,7 @@ def test_the_preview_shows_stops_way_board_and_what_is_in_the_way(planned, docum
         assert points.shape == (40, 2)
         assert np.all((points > 0) & (points < [1280, 800]))
     labels = column(recording, f"{paths.STOPS}/{paths.USED}", "Points3D:labels")[0]
-    assert list(labels) == [str(it["view"]) for it in document["stops"]]
+    assert list(labels) == [str(value["view"]) for value in document["stops"]]
     notes = column(recording, paths.STOP_NOTE, "TextDocument:text")
     assert document["stops"][2]["why"] in str(notes[2][0])
     for entity, component in (
@@ -165,7 +167,7 @@ def test_a_poor_session_gets_its_missing_stops_and_gives_a_result(one_axis, tmp_
     whole = simulate(replace(ONE_AXIS, motion="free"), both)
     session = write_session(whole, tmp_path / "whole")
     planned = sorted(stop["view"] for stop in document["stops"])
-    assert planned == [it.number for it in Session.load(session).views][-5:]
+    assert planned == [view.number for view in Session.load(session).views][-5:]
     solved = visioncal("calibrate", session, "-o", tmp_path / "out", "--level", "hand-eye")
     assert solved.status == 0, solved.err
     result = Calibration.load(tmp_path / "out")
@@ -192,9 +194,9 @@ def test_a_session_about_one_axis_is_pointed_here_and_gets_its_missing_stops(one
     # The noise of a sound arm, by two stops that turn the camera otherwise.
     assert found["predicted"]["after"]["sigma_mm"] < 0.5
     assert "not determined at all" in found["refusal_before"]
-    numbers = [it.number for it in Session.load(one_axis).views]
-    assert [it["view"] for it in found["stops"]] == [max(numbers) + 1, max(numbers) + 2]
-    first = min(found["stops"], key=lambda it: it["rank"])
+    numbers = [view.number for view in Session.load(one_axis).views]
+    assert [value["view"] for value in found["stops"]] == [max(numbers) + 1, max(numbers) + 2]
+    first = min(found["stops"], key=lambda pair: pair["rank"])
     assert "determines what was open" in first["why"]
 
 
@@ -312,9 +314,9 @@ def test_arms_that_no_ur_program_drives_get_none(tmp_path):
     (out / "plan.script").write_text("of an earlier plan")
     done = plan("panda", out, "--stops", 3, board="450 0 5 180 0 0")
     assert done.status == 0, done.err
-    assert {it.name for it in out.iterdir()} == FILES - {"plan.script"}
+    assert {path.name for path in out.iterdir()} == FILES - {"plan.script"}
     header = (out / "stops.csv").read_text(encoding="utf-8").splitlines()[0].split(",")
-    assert header[:9] == ["view", "image", *(f"q{it}_rad" for it in range(1, 8))]
+    assert header[:9] == ["view", "image", *(f"q{index}_rad" for index in range(1, 8))]
 
 
 def test_advice_to_add_views_names_the_command_once():

@@ -27,7 +27,7 @@ from visioncal.simulation.options import Second
 from visioncal.vision.targets import corner_positions
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
-HAND_EYE, OFFSETS, KINEMATICS = (PURPOSES[it] for it in ("hand-eye", "offsets", "kinematics"))
+HAND_EYE, OFFSETS, KINEMATICS = (PURPOSES[name] for name in ("hand-eye", "offsets", "kinematics"))
 CELL = CellOptions(robot="ur5e")
 
 
@@ -64,7 +64,7 @@ def test_predicted_information_is_that_of_the_recorded_views(mount):
     )
 
 
-@pytest.mark.parametrize("purpose", [HAND_EYE, OFFSETS, KINEMATICS], ids=lambda it: it.name)
+@pytest.mark.parametrize("purpose", [HAND_EYE, OFFSETS, KINEMATICS], ids=lambda value: value.name)
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_more_stops_tell_more_of_everything(mount, purpose):
     options = replace(CELL, mount=mount, views=12, cut_views=0.0)
@@ -91,11 +91,15 @@ def test_each_criterion_beats_chance_in_its_own_measure(views, criterion):
     best = chosen(worlds, 8, criterion=criterion)
     rng = np.random.default_rng(0)
     random = [
-        chosen([replace(it, factors=it.factors[rows]) for it in worlds], 8, criterion=criterion)
+        chosen(
+            [replace(world, factors=world.factors[rows]) for world in worlds],
+            8,
+            criterion=criterion,
+        )
         for rows in (rng.choice(len(views), 8, replace=False) for _ in range(20))
     ]
     assert len(set(best.rows.tolist())) == 8
-    values = [it.value for it in random]
+    values = [design.value for design in random]
     # All but O1, which is to be large, are to be small.
     assert best.value > max(values) if criterion == "O1" else best.value < min(values)
 
@@ -112,7 +116,7 @@ def test_the_choice_is_nearly_the_best_of_all(criterion):
             return float(np.trace(world.counted @ covariance))
         return float(np.linalg.slogdet(covariance)[1])
 
-    values = sorted(value(it) for it in combinations(range(12), 4))
+    values = sorted(value(combination) for combination in combinations(range(12), 4))
     found = value(chosen([world], 4, criterion=criterion).rows)
     # Exchange ends in a local optimum: among the best one per cent.
     assert found <= values[4] + 1e-9 * abs(values[4])
@@ -124,11 +128,13 @@ def test_the_values_are_those_of_a_plain_inversion(views):
     for purpose in (HAND_EYE, KINEMATICS):
         worlds = worlds_of((cell, *cell.guesses(2, 0)), purpose, views)
         design = chosen(worlds, 9)
-        plain = [np.trace(it.place @ it.covariance(design.rows)) for it in worlds]
+        plain = [np.trace(world.place @ world.covariance(design.rows)) for world in worlds]
         assert design.predicted.mm == pytest.approx(1e3 * np.sqrt(np.mean(plain)), rel=1e-6)
-        everything = [np.trace(it.place @ it.covariance(range(len(views)))) for it in worlds]
+        everything = [
+            np.trace(world.place @ world.covariance(range(len(views)))) for world in worlds
+        ]
         assert design.best.mm == pytest.approx(1e3 * np.sqrt(np.mean(everything)), rel=1e-6)
-        history = [it.mm for it in design.history]
+        history = [accuracy.mm for accuracy in design.history]
         assert len(history) == 10
         assert all(after <= before for before, after in pairwise(history))
 
@@ -254,10 +260,10 @@ def test_open_edges_are_those_nearest_to_what_is_known(mount):
     assert np.linalg.norm(guessed.cell.x[:3, 3] - x[:3, 3]) < 1e-3
     # What is open moves both edges together: drawn cells see the recorded views alike.
     drawn = begun.cell.guesses(5, 0)
-    off = np.array([np.linalg.norm(it.x[:3, 3] - begun.cell.x[:3, 3]) for it in drawn])
+    off = np.array([np.linalg.norm(item.x[:3, 3] - begun.cell.x[:3, 3]) for item in drawn])
     assert off.max() > 0.02
     middle = corner_positions(options.target).mean(axis=0)
-    there = [it.cam_from_target(cell.joints)[:, :3] @ [*middle, 1.0] for it in drawn]
+    there = [item.cam_from_target(cell.joints)[:, :3] @ [*middle, 1.0] for item in drawn]
     assert np.ptp(there, axis=0).max() < 2e-3
 
 
@@ -331,7 +337,7 @@ def test_errors_of_the_arm_count_in_the_prediction_as_in_the_result(case):
     design = next_best(begun, HAND_EYE, q, 3).design
     # How well the sizes of the arm's errors and of the noise are known cannot be told beforehand.
     beside = ("size of arm errors", "noise_level")
-    untold = sum((known.solved.beside.get(it, 0.0) for it in beside), 0.0)
+    untold = sum((known.solved.beside.get(name, 0.0) for name in beside), 0.0)
     covariance = known.solved.covariance - untold
     obtained = 1e3 * np.sqrt(np.trace(covariance[3:6, 3:6]))
     world = worlds_of([begun.cell], HAND_EYE, q, recorded=begun.recorded)[0]
@@ -351,7 +357,7 @@ def test_stops_for_the_arm_say_what_of_it_they_tell():
     begun = begin(so_far_of(simulate(options)))
     q = postures_in_view(options, 60)
     added = next_best(begun, KINEMATICS, q, 3, worlds=2)
-    assert all("over the workspace" in it for it in added.helps)
+    assert all("over the workspace" in name for name in added.helps)
     assert any(name in added.helps[0] for name in begun.cell.robot.joint_names)
     assert added.design.predicted.mm < added.design.before.mm
     poses_only = replace(begun, recorded=replace(begun.recorded, q=None))

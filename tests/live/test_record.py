@@ -73,8 +73,8 @@ def test_a_plan_is_read_back_as_it_was_made(planned):
     folder, plan = planned
     for path in (folder, folder / "plan.json"):
         read = read_plan(path)
-        assert [it.view for it in read.stops] == [it.view for it in plan.stops]
-        assert np.array_equal([it.q for it in read.stops], [it.q for it in plan.stops])
+        assert [stop.view for stop in read.stops] == [stop.view for stop in plan.stops]
+        assert np.array_equal([stop.q for stop in read.stops], [stop.q for stop in plan.stops])
         for mine, its in zip(read.stops, plan.stops, strict=True):
             assert np.array_equal(mine.via, its.via)
             assert mine.words == its.words
@@ -109,8 +109,8 @@ def test_a_plan_is_driven_and_told_line_by_line(planned, cell, tmp_path):
     assert done.status == 0, done.err
     assert "4 stops to drive at 0.4 rad/s, about" in done.err
     assert "the way is clear of all that was declared" in done.err
-    lines = [it for it in done.err.splitlines() if it.startswith("[")]
-    assert [it[:5] for it in lines] == ["[1/4]", "[2/4]", "[3/4]", "[4/4]"]
+    lines = [line for line in done.err.splitlines() if line.startswith("[")]
+    assert [line[:5] for line in lines] == ["[1/4]", "[2/4]", "[3/4]", "[4/4]"]
     assert "predicted sigma" in lines[-1]
     assert re.search(r"-> next: view \d, for [0-9.]+ mm$", lines[-2])
     assert "visioncal calibrate" in done.err
@@ -121,7 +121,7 @@ def test_a_plan_is_driven_and_told_line_by_line(planned, cell, tmp_path):
 def test_json_sums_it_up(planned, cell, tmp_path):
     done = record(tmp_path / "live", "--plan", planned[0], "--yes", "--json")
     summary = json.loads(done.out)
-    assert summary["views"] == [it.view for it in planned[1].stops]
+    assert summary["views"] == [stop.view for stop in planned[1].stops]
     assert summary["predicted"]["sigma_mm"] > 0.0
     assert {"view", "moved_s", "settled_s", "worked_s"} == summary["times_s"][0].keys()
     assert cell[0].moves >= 4
@@ -212,7 +212,7 @@ def test_stops_without_a_view_end_in_status_2(planned, cell, tmp_path):
     ],
 )
 def test_what_cannot_be_is_refused_before_a_device_is_asked(planned, tmp_path, more, words):
-    more = [planned[0] if it == "PLAN" else it for it in more]
+    more = [planned[0] if value == "PLAN" else value for value in more]
     done = record(tmp_path / "live", *more)
     assert done.status == 2
     assert words in " ".join(done.err.split())
@@ -292,7 +292,7 @@ def test_typed_poses_and_pictures_in_a_folder_make_a_session(planned, tmp_path):
         cv2.imwrite(str(tmp_path / "pictures" / f"shot{at}.png"), camera.frame().image)
         pose = arm.true_flange(0.0)
         turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
-        numbers = ", ".join(f"{it:.6f}" for it in [*pose[:3, 3], *turn])
+        numbers = ", ".join(f"{value:.6f}" for value in [*pose[:3, 3], *turn])
         lines.append(f"p[{numbers}]")
     answers = io.StringIO("\n".join([*lines, ""]))
     words = ["--arm", "manual", "--camera", f"folder:{tmp_path / 'pictures'}"]
@@ -357,7 +357,7 @@ def test_without_a_display_the_recording_goes_on(planned, cell, tmp_path, monkey
 
 
 @pytest.mark.skipif(
-    any(os.environ.get(it) for it in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")),
+    any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")),
     reason="there is a display, on which a window would open",
 )
 def test_a_viewer_without_a_display_is_told():

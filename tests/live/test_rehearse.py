@@ -25,7 +25,7 @@ from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate
 
 EXTRAS = ("rtde_control", "rtde_receive", "depthai")
-MISSING = [it for it in EXTRAS if importlib.util.find_spec(it) is None]
+MISSING = [extra for extra in EXTRAS if importlib.util.find_spec(extra) is None]
 
 
 @pytest.mark.slow
@@ -49,7 +49,7 @@ def test_a_rehearsal_through_a_protective_stop_is_as_near_to_the_truth_as_it_say
     assert 3 <= told["fault"]["views_kept"] < 6
     assert "protective stop" in told["fault"]["message"].lower().replace("_", " ")
     assert "--resume" in told["fault"]["next_step"]
-    assert [it.number for it in Session.load(out / "session").views] == [1, 2, 3, 4, 5, 6]
+    assert [view.number for view in Session.load(out / "session").views] == [1, 2, 3, 4, 5, 6]
     # What a UR repeats to.
     assert told["most_away_at_exposure_mm"] < 0.05
     for name in ("plan/plan.json", "result/calibration.json", "result/recording.rrd"):
@@ -120,7 +120,7 @@ def test_what_a_recording_adds_is_told_from_motion_driving_and_settling():
     taking = CaptureOptions(speed=1.0, acceleration=1.0)
     ways = [0.0, travel_s(q[0], q[1], 1.0, 1.0) + travel_s(q[1], q[2], 1.0, 1.0)]
     times = [Times(ways[0] + 0.1, 0.5, 0.2), Times(ways[1] + 0.3, 0.7, 0.4)]
-    steps = [Step(1, 1, 2, Missed("none"), "", None, "", it) for it in times]
+    steps = [Step(1, 1, 2, Missed("none"), "", None, "", time) for time in times]
     pace = pace_of(steps, plan, q[0], taking)
     assert pace.views == 2
     assert pace.motion_s == pytest.approx(sum(ways) / 2)

@@ -98,12 +98,12 @@ def test_a_state_is_stamped_with_the_time_at_which_the_arm_was_there(controller)
             states.append(arm.state())
         arm.start_move(start, speed=1.0, acceleration=4.0)
         wait_while(arm.moving)
-    stamps = [it.stamp_s for it in states]
+    stamps = [state.stamp_s for state in states]
     assert np.all(np.diff(stamps) > 0.0)
     truth = controller.truth.state(stamps)
-    fast = [place for place, it in enumerate(states) if abs(it.dq[0]) > 0.3]
+    fast = [place for place, state in enumerate(states) if abs(state.dq[0]) > 0.3]
     assert len(fast) > 5
-    late = [(truth.q[it, 0] - states[it].q[0]) / states[it].dq[0] for it in fast]
+    late = [(truth.q[index, 0] - states[index].q[0]) / states[index].dq[0] for index in fast]
     # States take well under a millisecond.
     assert np.median(np.abs(late)) < 4e-3
 

@@ -41,7 +41,7 @@ FAULTS = [
 ]
 
 
-@pytest.mark.parametrize(("fault", "message"), FAULTS, ids=[it for it, _ in FAULTS])
+@pytest.mark.parametrize(("fault", "message"), FAULTS, ids=[name for name, _ in FAULTS])
 def test_what_keeps_an_arm_from_moving_is_said_with_what_to_press(controller, fault, message):
     controller.truth.inject(fault)
     try:

@@ -126,16 +126,16 @@ def test_views_held_back_stand_apart_from_those_left_out(sample, page):
 def test_the_pictures_have_words_for_those_who_do_not_see_them(html):
     pictures = re.findall(r"<svg[^>]*>", html)
     assert len(pictures) > 8
-    for it in pictures:
-        assert "aria-label=" in it or "aria-hidden" in it
+    for picture in pictures:
+        assert "aria-label=" in picture or "aria-hidden" in picture
 
 
 def test_results_without_what_later_versions_add_are_shown_with_what_they_have(sample):
     document = calibrated()
     for name in ("workspace_map", "not_told", "stops", "left_out", "convention"):
         del document[name]
-    for it in document["parameters"]:
-        del it["sigma"]
+    for value in document["parameters"]:
+        del value["sigma"]
     words = of_arm(page_of(sample, document))
     assert "Over the workspace" not in words
     assert "beyond three sigma" not in words
@@ -176,10 +176,10 @@ def test_a_recording_tells_and_draws_the_arm(sample, tmp_path):
     read = read_calibration(path)
     assert read is not None
     assert to_document(read) == to_document(calibration)
-    entities = {str(it.entity_path) for it in RrdReader(path).stream()}
+    entities = {str(chunk.entity_path) for chunk in RrdReader(path).stream()}
     wanted = (paths.ARM_NOTE, paths.WORKSPACE, paths.NOMINAL_ARM, paths.UNSEEN_MM)
     for entity in wanted:
-        assert any(it.startswith(entity) for it in entities), entity
+        assert any(name.startswith(entity) for name in entities), entity
     assert "Arm" in [tab.name for tab in layout.root_container.contents]
     stated = column(path, f"{paths.UNSEEN_MM}/as_stated", "Scalars:scalars")
     held = column(path, f"{paths.UNSEEN_MM}/as_stated_held_back", "Scalars:scalars")
@@ -193,11 +193,11 @@ def test_places_of_the_workspace_are_coloured_by_their_sigma(sample, tmp_path):
     write_recording(path, sample.session, with_arm(sample, document), sample.evidence, None)
     entity = f"{paths.WORKSPACE}/sigma_of_a_tool_s_place"
     places = column(path, entity, "Points3D:positions")[0]
-    given = [[it["x_m"], it["y_m"], it["z_m"]] for it in document["workspace_map"]]
+    given = [[value["x_m"], value["y_m"], value["z_m"]] for value in document["workspace_map"]]
     # Single precision of places within 2 m.
     np.testing.assert_allclose(places, given, atol=1e-6)
     shades = column(path, entity, "Points3D:colors")[0] >> 16 & 255
-    greens = shades[np.argsort([it["sigma_mm"] for it in document["workspace_map"]])]
+    greens = shades[np.argsort([value["sigma_mm"] for value in document["workspace_map"]])]
     # From violet to yellow: the greens of the worst are the brightest.
     assert greens[-5:].min() > greens[:20].max()
     assert column(path, f"{paths.WORKSPACE}/legend", "Points3D:labels")[0][0].endswith(" mm")
@@ -215,8 +215,8 @@ def test_the_arm_is_drawn_as_calibrated_and_the_stated_one_off_it(sample, tmp_pa
     picture = ArmPicture.of(sample.session, calibration, 1.0)
     assert picture is not None
     assert picture.factor > 1
-    entities = {str(it.entity_path) for it in RrdReader(path).stream()}
-    (entity,) = (it for it in entities if it.startswith(paths.NOMINAL_ARM))
+    entities = {str(chunk.entity_path) for chunk in RrdReader(path).stream()}
+    (entity,) = (entity for entity in entities if entity.startswith(paths.NOMINAL_ARM))
     factor = int(re.findall(r"(\d+)x", entity)[0])
     (strip,) = column(path, entity, "LineStrips3D:strips")[4]
     expected = [np.zeros(3), *(ours + factor * (stated - ours))]

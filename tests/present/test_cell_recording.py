@@ -49,9 +49,9 @@ def true_alignment(cell, session) -> Alignment:
     origin = invert(cell.transforms["base_a"])
     edges = {
         f"{cell.parents[name]}_from_{name}": Edge(
-            origin @ it if cell.parents[name] == "cell" else it, 1e-8 * np.eye(6)
+            origin @ transform if cell.parents[name] == "cell" else transform, 1e-8 * np.eye(6)
         )
-        for name, it in cell.transforms.items()
+        for name, transform in cell.transforms.items()
         if name != "base_a"
     }
     return Alignment(
@@ -66,8 +66,16 @@ def true_alignment(cell, session) -> Alignment:
         cameras={},
         noise={},
         sights=tuple(
-            Sight(it.view.number, it.station, it.seer, it.seen, it.view.number % 5 > 0, "", 0.1)
-            for it in session.observations
+            Sight(
+                observation.view.number,
+                observation.station,
+                observation.seer,
+                observation.seen,
+                observation.view.number % 5 > 0,
+                "",
+                0.1,
+            )
+            for observation in session.observations
         ),
         moved=(),
         untied=(),
@@ -78,10 +86,10 @@ def true_alignment(cell, session) -> Alignment:
 
 def test_frames_are_drawn_where_they_were(cell, session):
     scene = Scene.of(session, Calibration.whole(true_alignment(cell, session)), {})
-    for it in session.observations:
-        seer = scene.in_cell(it.seer, it.view.number)
-        seen = scene.in_cell(it.seen, it.view.number)
-        mm, _ = pose_difference(invert(seer) @ seen, it.view.cam_from_target().as_matrix())
+    for observation in session.observations:
+        seer = scene.in_cell(observation.seer, observation.view.number)
+        seen = scene.in_cell(observation.seen, observation.view.number)
+        mm, _ = pose_difference(invert(seer) @ seen, observation.view.cam_from_target().as_matrix())
         # The pose of a small board as it was measured is off by a few millimetres along the sight.
         assert mm < 6.0
     assert scene.in_cell("cam_nowhere", 0) is None
@@ -90,7 +98,7 @@ def test_frames_are_drawn_where_they_were(cell, session):
 def test_session_and_result_come_back_from_the_recording(cell, session, tmp_path):
     found = true_alignment(cell, session)
     files = write_outputs(tmp_path / "out", session, Run(Calibration.whole(found), ())).files
-    assert [it.name for it in files] == [
+    assert [file.name for file in files] == [
         "calibration.json",
         "alignment.json",
         "report.html",

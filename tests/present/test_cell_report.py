@@ -33,7 +33,7 @@ def test_the_graph_has_every_frame_with_its_sigma():
         edge = CELL.edge_of(frame)
         assert frame in labels
         worth = f"{significant(edge.sigma_mm)} mm, {significant(edge.sigma_deg)}°"
-        assert worth in [it.replace("&#176;", "°") for it in labels]
+        assert worth in [label.replace("&#176;", "°") for label in labels]
     assert "the reference" in labels
     assert {"robot a", "robot b"} <= set(labels)
 
@@ -56,7 +56,7 @@ def test_observations_are_counted_by_who_saw_whom():
 def test_the_table_has_any_frame_in_any_other():
     table = next(known_in_each_other(CELL))
     assert table.titles == ("the cell", "base_a", "base_b", "cam_top")
-    rows = {it.cells[0]: it.cells[1:] for it in table.rows}
+    rows = {row.cells[0]: row.cells[1:] for row in table.rows}
     assert list(rows) == ["base_a", "base_b", "cam_top"]
     edge = CELL.between("cam_top", "base_b")
     assert rows["cam_top"][1].startswith(f"{significant(edge.sigma_mm)} mm")

@@ -23,7 +23,7 @@ def test_a_certificate_says_whose_it_is_and_has_room_to_sign(tmp_path):
     signed = Signed("A. Smith <1>", {"camera": "18443010"})
     write_certificate(page, sample.calibration, sample.session, signed)
     words = Page(page.read_text("utf-8")).words
-    for it in (
+    for name in (
         "bench <1> & 2",
         "CHECK",
         "Serial number, camera 18443010",
@@ -34,7 +34,7 @@ def test_a_certificate_says_whose_it_is_and_has_room_to_sign(tmp_path):
         sample.calibration.session_sha256,
         "Calibrated by, date",
     ):
-        assert it in words
+        assert name in words
     # It is one page, however many views there are: they are counted, not listed.
     many = replace(sample.calibration, views=sample.calibration.views * 50)
     write_certificate(page, many, None, Signed())

@@ -97,8 +97,8 @@ def test_sigmas_are_along_the_axes_of_the_parent(sample):
     frame = sample.calibration.frames["flange_from_tool"]
     turn, covariance = frame.edge.matrix[:3, :3], frame.edge.covariance
     expected_mm = 1e3 * np.sqrt(np.diag(turn @ covariance[3:, 3:] @ turn.T))
-    shown = [it.note for it in edge_facts("flange_from_tool", frame.edge)[:3]]
-    found_mm = [float(re.search(r"[\d.]+", it)[0]) for it in shown]
+    shown = [fact.note for fact in edge_facts("flange_from_tool", frame.edge)[:3]]
+    found_mm = [float(re.search(r"[\d.]+", name)[0]) for name in shown]
     # Two digits are shown.
     np.testing.assert_allclose(found_mm, expected_mm, rtol=0.05)
 
@@ -128,9 +128,9 @@ def test_a_rotation_that_was_not_measured_is_not_given_as_one(page):
 
 
 def test_doubtful_frames_are_among_the_next_steps(sample):
-    steps = [it.words for it in sample.calibration.next_steps]
-    assert [it for it in steps if "flange_from_tool" in it]
-    assert not [it for it in steps if "base_from_fixture" in it]
+    steps = [step.words for step in sample.calibration.next_steps]
+    assert [step for step in steps if "flange_from_tool" in step]
+    assert not [step for step in steps if "base_from_fixture" in step]
     good = replace(sample.calibration, verdict=Verdict("good"))
     assert "what was found of flange_from_tool" in good.next_steps[-1].words
 
@@ -148,7 +148,9 @@ def test_frames_without_observations_or_residuals_still_have_a_report(sample):
     assert "off by" not in words
     seen = replace(
         fixture_frame(),
-        observations=tuple(replace(it, residual_mm=None) for it in tool_frame().observations),
+        observations=tuple(
+            replace(observation, residual_mm=None) for observation in tool_frame().observations
+        ),
     )
     words = of_frames(Page(render(with_frame(sample, seen), None, ())))
     assert "off by [mm]" not in words
@@ -178,7 +180,7 @@ def static(path: Path, entity: str, component: str) -> np.ndarray:
         batch = chunk.to_record_batch()
         if component in batch.schema.names:
             assert chunk.is_static
-            found += [it for it in batch.column(component).to_pylist() if it is not None]
+            found += [value for value in batch.column(component).to_pylist() if value is not None]
     (only,) = found
     return np.array(only)
 
@@ -201,9 +203,13 @@ def test_frames_hang_where_they_belong(recorded, child, parent, expected):
 
 
 def test_ellipsoids_of_frames_are_their_covariances(sample, recorded):
-    entities = {str(it.entity_path) for it in RrdReader(recorded).stream()}
+    entities = {str(chunk.entity_path) for chunk in RrdReader(recorded).stream()}
     for name, frame in sample.calibration.frames.items():
-        (entity,) = (it for it in entities if re.search(rf"{name}_95_percent_magnified_\d+x$", it))
+        (entity,) = (
+            entity
+            for entity in entities
+            if re.search(rf"{name}_95_percent_magnified_\d+x$", entity)
+        )
         factor = int(re.search(r"_(\d+)x$", entity)[1])
         half = static(recorded, entity, "Ellipsoids3D:half_sizes")[0]
         turn = Rotation.from_quat(static(recorded, entity, "Ellipsoids3D:quaternions")[0])
@@ -224,9 +230,9 @@ def test_exact_frames_have_no_ellipsoid(sample, tmp_path):
     exact = replace(frame, edge=replace(frame.edge, covariance=np.zeros((6, 6))))
     calibration = replace(sample.calibration, frames={"base_from_fixture": exact})
     write_recording(tmp_path / "cell.rrd", sample.session, calibration, sample.evidence, None)
-    entities = {str(it.entity_path) for it in RrdReader(tmp_path / "cell.rrd").stream()}
+    entities = {str(chunk.entity_path) for chunk in RrdReader(tmp_path / "cell.rrd").stream()}
     assert f"{paths.FRAMES}/fixture" in entities
-    assert not [it for it in entities if it.startswith(f"{paths.FRAMES}/fixture/")]
+    assert not [entity for entity in entities if entity.startswith(f"{paths.FRAMES}/fixture/")]
 
 
 def test_the_notes_tell_of_frames(sample):

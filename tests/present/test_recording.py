@@ -167,11 +167,13 @@ def test_failed_write_leaves_the_old_file(sample: Sample, tmp_path: Path) -> Non
 
     path = tmp_path / "recording.rrd"
     path.write_bytes(b"old")
-    broken = replace(sample.session, images=Broken({it.image: b"" for it in sample.session.views}))
+    broken = replace(
+        sample.session, images=Broken({view.image: b"" for view in sample.session.views})
+    )
     with pytest.raises(DataError, match=r"000\.png"):
         write_session(path, broken)
     assert path.read_bytes() == b"old"
-    assert [it.name for it in tmp_path.iterdir()] == ["recording.rrd"]
+    assert [path.name for path in tmp_path.iterdir()] == ["recording.rrd"]
     shutil.rmtree(tmp_path)
     with pytest.raises(DataError, match="cannot be written"):
         write_session(path, sample.session)

@@ -99,7 +99,7 @@ def test_the_board_is_as_large_and_as_deep_as_its_corners(sample: Sample) -> Non
 def test_residuals_of_views_left_out_end_at_the_scale_of_the_others(
     sample: Sample, recorded: Path
 ) -> None:
-    used = [it.residual_mm for it in sample.calibration.views if it.used]
+    used = [view.residual_mm for view in sample.calibration.views if view.used]
     beyond = column(recorded, f"{paths.POSITION_MM}/{paths.BEYOND}", "Scalars:scalars")
     # View 6 is off by 14 mm, fifty times as far as the others; view 3 has no residual at all.
     assert set(beyond) == {6}
@@ -111,7 +111,7 @@ def test_residuals_of_views_left_out_end_at_the_scale_of_the_others(
 
 def test_residuals_of_views_left_out_are_drawn_to_scale(sample: Sample, recorded: Path) -> None:
     overlay = Overlay.of(
-        sample.session, sample.calibration, {it.view: it for it in sample.evidence}
+        sample.session, sample.calibration, {view.view: view for view in sample.evidence}
     )
     magnified = column(recorded, paths.magnified_residuals(overlay.factor), "Arrows2D:vectors")
     to_scale = column(recorded, paths.RESIDUALS_TO_SCALE, "Arrows2D:vectors")
@@ -136,8 +136,10 @@ def test_placements_far_out_are_drawn_at_arm_s_length(sample: Sample, tmp_path: 
     evidence[6] = replace(seen, cam_from_target=seen.cam_from_target @ away)
     path = tmp_path / "recording.rrd"
     write_recording(path, sample.session, sample.calibration, evidence, None)
-    entities = {str(it.entity_path) for it in RrdReader(path).stream()}
-    (beyond,) = (it for it in entities if it.endswith(paths.BEYOND) and "placements" in it)
+    entities = {str(chunk.entity_path) for chunk in RrdReader(path).stream()}
+    (beyond,) = (
+        entity for entity in entities if entity.endswith(paths.BEYOND) and "placements" in entity
+    )
     (arrow,) = column(path, beyond, "Arrows3D:vectors")[0]
     points = column(path, beyond.replace(paths.BEYOND, paths.REJECTED), "Points3D:positions")[0]
     # It points where the view puts the target, and is as short as a fifth of the cell.

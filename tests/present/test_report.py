@@ -219,7 +219,7 @@ def test_real_contradictions_are_recognised(tmp_path: Path) -> None:
     cell = simulate(CellOptions(views=15, wrong_views=1))
     write_session(cell, tmp_path / "cell", images=False)
     calibration = run(tmp_path / "cell").calibration
-    assert sum(it.contradict for it in suspects(calibration)) == 1
+    assert sum(suspect.contradict for suspect in suspects(calibration)) == 1
     assert "the largest part" in Page(render(calibration, None, ())).words.lower()
 
 
@@ -248,7 +248,9 @@ def test_views_that_share_a_reason_share_a_row(sample: Sample) -> None:
 def test_joint_angles_get_a_plot_where_there_are_any(sample: Sample, html: str) -> None:
     assert "q6 [deg]" in Page(html).text
     views = tuple(
-        replace(view, numbers={name: it for name, it in view.numbers.items() if name[0] != "q"})
+        replace(
+            view, numbers={name: number for name, number in view.numbers.items() if name[0] != "q"}
+        )
         for view in sample.session.views
     )
     without = render(sample.calibration, replace(sample.session, views=views), sample.evidence)
@@ -261,12 +263,12 @@ def test_an_error_of_one_joint_is_a_slope_in_its_column(sample: Sample) -> None:
     q = np.array([view.joints_rad for view in sample.session.views])
     wrong = load_robot("ur10e").base_from_flange(q + offset_rad * np.eye(6)[3])
     residuals = [
-        log(placement(sample.calibration, replace(it, base_from_flange=pose)))
-        for it, pose in zip(sample.evidence, wrong, strict=True)
-        if it.cam_from_target is not None
+        log(placement(sample.calibration, replace(view, base_from_flange=pose)))
+        for view, pose in zip(sample.evidence, wrong, strict=True)
+        if view.cam_from_target is not None
     ]
     # Without the error, rounding alone is left.
-    exact = [log(placement(sample.calibration, it)) for it in sample.evidence if it.corners]
+    exact = [log(placement(sample.calibration, view)) for view in sample.evidence if view.corners]
     np.testing.assert_allclose(exact, 0.0, atol=1e-9)
     # Every residual turns by the joint's error, whatever the pose.
     turned_rad = np.linalg.norm(np.array(residuals)[:, :3], axis=1)
@@ -331,10 +333,10 @@ def test_views_lead_to_the_recording_and_back(sample: Sample, outputs: Path) -> 
     page = (outputs / "report.html").read_text(encoding="utf-8")
     worst = worst_view(sample.calibration.views, sample.calibration.rms)
     assert f"visioncal review '{outputs}' --view {worst}" in unescape(page)
-    for it in sights(sample.calibration):
-        anchor = f"view-{it.view}"
+    for sight in sights(sample.calibration):
+        anchor = f"view-{sight.view}"
         assert f'id="{anchor}"' in page
-        assert f"(report.html#{anchor})" in view_markdown(it)
+        assert f"(report.html#{anchor})" in view_markdown(sight)
     # Where there is no recording, nothing leads to it.
     assert "visioncal review" not in render(sample.calibration, None, ())
 
@@ -387,7 +389,7 @@ def test_nothing_is_loaded_from_elsewhere(html: str) -> None:
 def test_identifiers_of_figures_stay_apart(html: str) -> None:
     identifiers = re.findall(r'\bid="([^"]+)"', html)
     assert len(identifiers) == len(set(identifiers))
-    assert {it.removeprefix("#") for it in re.findall(r'xlink:href="(#[^"]+)"', html)} <= set(
+    assert {value.removeprefix("#") for value in re.findall(r'xlink:href="(#[^"]+)"', html)} <= set(
         identifiers
     )
 
@@ -401,7 +403,7 @@ def test_plots_are_named_with_units(html: str) -> None:
 def test_pictures_show_the_best_the_worst_and_the_rejected(sample: Sample, html: str) -> None:
     words = Page(html).words
     used = [view for view in sample.calibration.views if view.used and view.rms_px is not None]
-    best, worst = min(used, key=lambda it: it.rms_px), max(used, key=lambda it: it.rms_px)
+    best, worst = min(used, key=lambda item: item.rms_px), max(used, key=lambda item: item.rms_px)
     assert f"Best used view: {best.view}," in words
     assert f"Worst used view: {worst.view}," in words
     assert re.search(r"drawn \d+ times longer", words)
@@ -502,7 +504,7 @@ def test_report_is_whole_or_absent(sample: Sample, tmp_path: Path) -> None:
     path = tmp_path / "report.html"
     write_report(path, sample.calibration, sample.session, sample.evidence)
     assert path.read_text(encoding="utf-8").endswith("</html>")
-    assert [it.name for it in tmp_path.iterdir()] == ["report.html"]
+    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
     with pytest.raises(DataError, match="cannot be written"):
         write_report(tmp_path / "absent" / "report.html", sample.calibration, None, ())
 

@@ -84,13 +84,15 @@ def ask(url: str, path: str, method: str = "GET", **headers: str) -> tuple[int, 
 
 
 def is_open(host: str, port: int) -> bool:
-    with socket.socket() as it:
-        it.settimeout(60)
-        return it.connect_ex((host, port)) == 0
+    with socket.socket() as connection:
+        connection.settimeout(60)
+        return connection.connect_ex((host, port)) == 0
 
 
 def children(process: subprocess.Popen) -> str:
-    return "".join(it.read_text() for it in Path(f"/proc/{process.pid}/task").glob("*/children"))
+    return "".join(
+        path.read_text() for path in Path(f"/proc/{process.pid}/task").glob("*/children")
+    )
 
 
 def test_what_cannot_be_reviewed_is_refused_with_the_next_step(tmp_path):
@@ -117,7 +119,7 @@ def test_it_opens_at_the_worst_view_or_at_the_named_one(out, monkeypatch):
     assert visioncal("review", out).status == 0
     worst = views[opened[0]]
     assert not worst.used
-    assert worst.residual_mm == max(it.residual_mm or 0.0 for it in views)
+    assert worst.residual_mm == max(view.residual_mm or 0.0 for view in views)
     # Views are numbered as the session says, and stand in its order.
     assert visioncal("review", out, "--view", views[3].view).status == 0
     assert opened[1] == 3
@@ -229,14 +231,14 @@ def test_a_browser_draws_it_and_asks_nobody_else(out, tmp_path):
             picture = page.picture_once(drawn, patience_s=90)
             # The viewer goes where the address says.
             page.call("Runtime.evaluate", expression="location.hash = '#when=view@0'")
-            elsewhere = page.picture_once(lambda it: moved(it, picture), patience_s=120)
+            elsewhere = page.picture_once(lambda value: moved(value, picture), patience_s=120)
             requested = page.requested
         process.send_signal(signal.SIGTERM)
         assert process.wait(timeout=60) == 0
     assert drawn(picture)
     server = url.partition("#")[0]
     assert f"{server}recording.rrd" in requested
-    assert [it for it in requested if not it.startswith((server, "data:", "blob:"))] == []
+    assert [name for name in requested if not name.startswith((server, "data:", "blob:"))] == []
     assert moved(elsewhere, picture)
 
 

@@ -24,14 +24,14 @@ def test_columns_in_which_nothing_is_known_are_left_out():
     table = Table.of(("what", "deg", "mm", "note"), rows, (0, 3))
     assert table.titles == ("what", "mm")
     assert table.words == (0,)
-    assert [it.cells for it in table.rows] == [("a", "1"), ("a heading",), ("b", "2")]
+    assert [row.cells for row in table.rows] == [("a", "1"), ("a heading",), ("b", "2")]
 
 
 def test_tables_side_by_side_have_all_rows_in_their_order():
-    table = Table.of(("view",), [(str(it),) for it in range(7)])
+    table = Table.of(("view",), [(str(index),) for index in range(7)])
     found = list(table.parts(3))
-    assert [len(it.rows) for it in found] == [3, 3, 1]
-    assert [row for it in found for row in it.rows] == list(table.rows)
+    assert [len(table.rows) for table in found] == [3, 3, 1]
+    assert [row for table in found for row in table.rows] == list(table.rows)
 
 
 def test_cells_of_a_table_are_text_in_markdown():
@@ -62,7 +62,9 @@ def test_one_camera_has_one_of_each_without_a_name():
     calibration = made_up().calibration
     assert parts.cameras(calibration) == {"": calibration.camera}
     assert parts.arms(calibration) == {"": calibration}
-    assert [it.view for it in parts.sights(calibration)] == [it.view for it in calibration.views]
+    assert [sight.view for sight in parts.sights(calibration)] == [
+        view.view for view in calibration.views
+    ]
     frames = parts.frames(calibration)
     assert frames.parents == {
         "base": "cell", "flange": "base", "cam": "flange", "target": "base"
@@ -90,7 +92,9 @@ def test_frames_of_a_cell_hang_as_they_did_last():
 
 
 def test_views_left_out_of_a_cell_say_who_saw_whom():
-    sights = tuple(Sight(it, it, "cam_top", "target_plate", False, "blurred") for it in (3, 4))
+    sights = tuple(
+        Sight(name, name, "cam_top", "target_plate", False, "blurred") for name in (3, 4)
+    )
     text = verdict_markdown(Calibration.whole(replace(CELL, sights=sights)))
     assert "- views 3 and 4 (cam_top of target_plate): blurred" in text.replace("\\", "")
     assert "0 of 2 views used" in text

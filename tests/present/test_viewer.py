@@ -43,10 +43,12 @@ def strict_rerun() -> Iterator[None]:
 def without_joints(sample: Sample) -> Sample:
     session = sample.session
     views = tuple(
-        replace(it, numbers={key: n for key, n in it.numbers.items() if not key.endswith("_rad")})
-        for it in session.views
+        replace(
+            view, numbers={key: n for key, n in view.numbers.items() if not key.endswith("_rad")}
+        )
+        for view in session.views
     )
-    columns = tuple(it for it in session.columns if not it.endswith("_rad"))
+    columns = tuple(name for name in session.columns if not name.endswith("_rad"))
     return replace(sample, session=replace(session, views=views, columns=columns))
 
 
@@ -54,8 +56,10 @@ def with_explained(sample: Sample) -> Sample:
     """All images but the second were looked at as `calibrate --dense` does."""
     grey = cv2.imencode(".jpg", np.full((4, 6), 128, np.uint8))[1].tobytes()
     evidence = tuple(
-        it if it.view == 1 else replace(it, explained=ExplainedImage(grey, grey, "**Sharp.**"))
-        for it in sample.evidence
+        view
+        if view.view == 1
+        else replace(view, explained=ExplainedImage(grey, grey, "**Sharp.**"))
+        for view in sample.evidence
     )
     dense = DenseResult(kept=True, held_out={}, images=())
     return replace(sample, calibration=replace(sample.calibration, dense=dense), evidence=evidence)
@@ -78,10 +82,10 @@ def recordings(
 ) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("recordings")
     files = {}
-    for name, it in samples.items():
+    for name, sample in samples.items():
         files[name] = folder / f"{name}.rrd"
-        layout = blueprint(it.session, it.calibration)
-        write_recording(files[name], it.session, it.calibration, it.evidence, layout)
+        layout = blueprint(sample.session, sample.calibration)
+        write_recording(files[name], sample.session, sample.calibration, sample.evidence, layout)
     return files
 
 
@@ -89,8 +93,8 @@ def views_of(container: rrb.Container | rrb.View) -> Iterator[rrb.View]:
     if isinstance(container, rrb.View):
         yield container
         return
-    for it in container.contents:
-        yield from views_of(it)
+    for content in container.contents:
+        yield from views_of(content)
 
 
 def tabs(sample: Sample) -> dict[str, list[str]]:
@@ -115,7 +119,7 @@ def column(path: Path, entity: str, component: str) -> dict[int, object]:
 )
 def test_every_panel_shows_something(name, samples, recordings):
     layout = blueprint(samples[name].session, samples[name].calibration)
-    logged = {str(it.entity_path) for it in RrdReader(recordings[name]).stream()}
+    logged = {str(chunk.entity_path) for chunk in RrdReader(recordings[name]).stream()}
     for view in views_of(layout.root_container):
         below = f"{view.origin.rstrip('/')}/"
         assert any(f"{entity}/".startswith(below) for entity in logged), view.name
@@ -144,24 +148,24 @@ def test_an_image_that_was_not_explained_takes_the_last_one_back(recordings):
         shown = column(recordings["images explained"], entity, "EncodedImage:blob")
         cleared = column(recordings["images explained"], entity, "Clear:is_recursive")
         assert {place for place, blob in shown.items() if blob} == {0, *range(2, 9)}
-        assert {place for place, it in cleared.items() if it is not None} == {1}
+        assert {place for place, value in cleared.items() if value is not None} == {1}
         assert entity not in {
-            str(it.entity_path) for it in RrdReader(recordings["images and joints"]).stream()
+            str(chunk.entity_path) for chunk in RrdReader(recordings["images and joints"]).stream()
         }
 
 
 def test_views_that_were_not_used_are_marked_in_the_plots(samples, recordings):
     rejected = {
         place
-        for place, it in enumerate(samples["images and joints"].calibration.views)
-        if not it.used
+        for place, view in enumerate(samples["images and joints"].calibration.views)
+        if not view.used
     }
     for plot in (paths.POSITION_MM, paths.ORIENTATION_DEG, paths.REPROJECTION_PX):
         marks = [
             column(recordings["images and joints"], f"{plot}/{name}", "Scalars:scalars")
             for name in (paths.REJECTED, paths.BEYOND)
         ]
-        assert {place for it in marks for place in it} == rejected
+        assert {place for mark in marks for place in mark} == rejected
 
 
 def test_a_view_without_target_takes_the_marks_of_the_last_off(recordings):
@@ -181,20 +185,20 @@ def test_ellipsoids_are_the_covariance_in_the_frame_of_the_edge(tmp_path):
     sample = made_up(images=False)
     root = np.random.default_rng(1).normal(size=(6, 6)) * 1e-4
     edges = {
-        name: Edge(it.matrix, factor * root @ root.T)
-        for (name, it), factor in zip(sample.calibration.edges.items(), (1.0, 0.3), strict=True)
+        name: Edge(edge.matrix, factor * root @ root.T)
+        for (name, edge), factor in zip(sample.calibration.edges.items(), (1.0, 0.3), strict=True)
     }
     calibration = replace(sample.calibration, edges=edges)
-    evidence = {it.view: it for it in sample.evidence}
+    evidence = {view.view: view for view in sample.evidence}
     uncertainty = Uncertainty.of(calibration, evidence, size_m=1.0)
     file = tmp_path / "cell.rrd"
     write_recording(file, sample.session, calibration, sample.evidence, None)
     found = {
-        str(it.entity_path)
-        for it in RrdReader(file).stream()
-        if re.search(r"95_percent_magnified_\d+x$", str(it.entity_path))
+        str(chunk.entity_path)
+        for chunk in RrdReader(file).stream()
+        if re.search(r"95_percent_magnified_\d+x$", str(chunk.entity_path))
     }
-    assert {it.split("/")[1] for it in found} == {"camera", "target"}
+    assert {name.split("/")[1] for name in found} == {"camera", "target"}
     for entity in found:
         name = re.match(r"/\w+/(\w+)_95_percent", entity)[1]
         drawn_factor = int(re.search(r"_(\d+)x$", entity)[1])
@@ -215,7 +219,7 @@ def test_placements_are_where_the_views_put_the_target(mount):
     base_from_flange = exp(0.7 * rng.normal(size=(5, 6)))
     moved_m = 1e-3 * rng.normal(size=(5, 3))
     hand = base_from_flange if mount == "eye-in-hand" else invert(base_from_flange)
-    shifted = np.array([RigidTransform.from_translation(it).as_matrix() for it in moved_m])
+    shifted = np.array([RigidTransform.from_translation(value).as_matrix() for value in moved_m])
     cam_from_target = invert(hand @ x) @ z @ shifted
     names = {
         "eye-in-hand": ("flange_from_cam", "base_from_target"),
@@ -228,7 +232,7 @@ def test_placements_are_where_the_views_put_the_target(mount):
         edges={
             name: Edge(edge, 1e-8 * np.eye(6)) for name, edge in zip(names, (x, z), strict=True)
         },
-        views=tuple(replace(it, used=True) for it in sample.calibration.views),
+        views=tuple(replace(view, used=True) for view in sample.calibration.views),
     )
     evidence = {
         view: ViewEvidence(view, None, None, base_from_flange[view], cam_from_target[view])
@@ -317,7 +321,7 @@ def test_directions_lie_on_the_side_that_the_camera_is_on():
 def test_axes_of_rotation_and_their_reverse_are_one_point():
     turns_deg = [[0, 0, 0], [20, 0, 0], [0, 0, 0], [0, 0, -50]]
     poses = exp(np.pad(np.deg2rad(turns_deg), ((0, 0), (0, 3))))
-    seen = [ViewEvidence(view, base_from_flange=it) for view, it in enumerate(poses)]
+    seen = [ViewEvidence(view, base_from_flange=pose) for view, pose in enumerate(poses)]
     points = coverage.rotation_axes_chart(seen).points
     np.testing.assert_allclose(np.abs(points[1]), [[90.0, 0.0]], atol=1e-9)
     np.testing.assert_allclose(np.abs(points[2]), [[90.0, 0.0]], atol=1e-9)
@@ -325,9 +329,9 @@ def test_axes_of_rotation_and_their_reverse_are_one_point():
 
 
 def free_port() -> int:
-    with socket.socket() as it:
-        it.bind(("127.0.0.1", 0))
-        return it.getsockname()[1]
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return listener.getsockname()[1]
 
 
 def part(picture: np.ndarray, left: float, top: float, right: float, bottom: float) -> np.ndarray:

@@ -95,10 +95,12 @@ def test_nothing_public_fails_from_inside(bench, tmp_path, monkeypatch):
     refused = 0
     for function in public_functions():
         parameters = inspect.signature(function).parameters
-        needed = [it for it, of in parameters.items() if of.default is of.empty and of.kind != 4]
+        needed = [
+            name for name, of in parameters.items() if of.default is of.empty and of.kind != 4
+        ]
         for wrong in parameters:
             for value in bench.foreign:
-                given = {it: bench.sound.get(it, value) for it in needed} | {wrong: value}
+                given = {name: bench.sound.get(name, value) for name in needed} | {wrong: value}
                 refused += is_refused(function, given)
     # Most of what is tried is wrong; without a check it would not get here.
     assert refused > 500
@@ -156,16 +158,16 @@ def test_a_board_is_taken_by_its_name_and_from_its_file(bench, tmp_path):
         'dictionary = "DICT_5X5_100"\nsquare_sigma_m = 3e-5\n'
     )
     seen = [
-        visioncal.locate_target(bench.calibration, bench.image, it, bench.pose.tolist()).p_base
-        for it in (target, BOARD, file, str(file))
+        visioncal.locate_target(bench.calibration, bench.image, item, bench.pose.tolist()).p_base
+        for item in (target, BOARD, file, str(file))
     ]
     sights = [visioncal.Sight("1", bench.image, bench.pose)]
     placed = [
-        visioncal.place_seen(bench.calibration, sights, it, "base").matrix[:3, 3]
-        for it in (target, BOARD, file)
+        visioncal.place_seen(bench.calibration, sights, item, "base").matrix[:3, 3]
+        for item in (target, BOARD, file)
     ]
-    assert all(np.array_equal(it, seen[0]) for it in seen)
-    assert all(np.array_equal(it, placed[0]) for it in placed)
+    assert all(np.array_equal(array, seen[0]) for array in seen)
+    assert all(np.array_equal(array, placed[0]) for array in placed)
 
 
 def test_a_camera_is_taken_as_a_table_and_poses_as_a_list(bench):
@@ -176,10 +178,10 @@ def test_a_camera_is_taken_as_a_table_and_poses_as_a_list(bench):
         "matrix": camera.matrix,
         "distortion": camera.distortion,
     }
-    poses = [it.base_from_flange() for it in bench.session.views[:1]]
+    poses = [view.base_from_flange() for view in bench.session.views[:1]]
     one, other = (
-        visioncal.Session.from_arrays([bench.image], poses, BOARD, camera=it)
-        for it in (camera, table)
+        visioncal.Session.from_arrays([bench.image], poses, BOARD, camera=value)
+        for value in (camera, table)
     )
     assert one.digest() == other.digest()
     with pytest.raises(DataError, match="matrix"):

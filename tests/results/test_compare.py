@@ -46,12 +46,12 @@ def pair(mount: Mount, seed: int) -> tuple[Calibration, Calibration]:
 def test_noise_is_no_change(mount: Mount) -> None:
     compared = [compare(*pair(mount, seed)) for seed in range(PAIRS)]
     # One in a hundred may be told apart: two of eight come once in four hundred such runs.
-    assert sum(it.is_change for it in compared) <= 1
+    assert sum(comparison.is_change for comparison in compared) <= 1
     p_values = np.array(
         [
             test.p_value
-            for it in compared
-            for edge in it.edges
+            for comparison in compared
+            for edge in comparison.edges
             for test in (edge.rotation, edge.translation)
         ]
     )
@@ -121,7 +121,7 @@ def test_a_change_of_the_lens_is_found(by, words) -> None:
     comparison = compare(first, replace(second, camera=replace(second.camera, camera=longer)))
     assert comparison.lens is not None
     assert comparison.lens.is_change
-    assert sum(it.startswith(words) for it in comparison.findings) == 1
+    assert sum(finding.startswith(words) for finding in comparison.findings) == 1
     same = compare(first, second).lens
     assert same is not None
     assert same.names == ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
@@ -140,7 +140,7 @@ def test_given_lenses_are_compared_as_they_stand() -> None:
     assert not compare(given, given).is_change
     assert compare(given, changed).is_change
     assert compare(given, small).lens is None
-    assert any("model or resolution" in it for it in compare(given, small).findings)
+    assert any("model or resolution" in finding for finding in compare(given, small).findings)
 
 
 def test_covariances_are_added_in_one_tangent_space() -> None:

@@ -56,8 +56,8 @@ def exact(cell, result) -> Calibration:
     arm, nominal = cell.true_arm, result.robot
     numbers = zip(arm.a, arm.alpha, arm.beta, arm.d, arm.offset, strict=True)
     keys = ("a_m", "alpha_rad", "beta_rad", "d_m", "theta_offset_rad")
-    rows = [dict(zip(keys, map(float, it), strict=True)) for it in numbers]
-    named = [{"name": it} | row for it, row in zip(nominal.joint_names, rows, strict=True)]
+    rows = [dict(zip(keys, map(float, number), strict=True)) for number in numbers]
+    named = [{"name": name} | row for name, row in zip(nominal.joint_names, rows, strict=True)]
     robot = Robot.from_document(
         {"schema": 1, "name": "true", "tip": nominal.tip, "convention": "hayati", "joint": named}
     )
@@ -73,7 +73,7 @@ def targets_near(count: int, calibration: Calibration, **draw) -> np.ndarray:
 
 
 def cam_from_target(calibration: Calibration, flange) -> np.ndarray:
-    x, z = (it.matrix for it in calibration.edges.values())
+    x, z = (edge.matrix for edge in calibration.edges.values())
     return invert(flange @ x) @ z
 
 
@@ -98,10 +98,12 @@ def test_the_true_arm_brings_the_camera_to_where_it_is_wanted(cell, result, by_p
     assert sent.reached.all()
     after = rms_mm(wanted, seen(sent.q))
     # Without joint angles: the edges alone, and the nominal controller.
-    nominal_x, nominal_z = (it.matrix for it in by_poses.edges.values())
+    nominal_x, nominal_z = (edge.matrix for edge in by_poses.edges.values())
     told = nominal_z @ invert(wanted) @ invert(nominal_x)
     nominal = Inverse(result.robot)
-    before = rms_mm(wanted, seen(np.array([nominal.solve(it, HOME).positions for it in told])))
+    before = rms_mm(
+        wanted, seen(np.array([nominal.solve(value, HOME).positions for value in told]))
+    )
     assert before > 2.0
     # Forty views leave 4 to 10 % of the nominal arm's error.
     assert after < 0.1 * before
@@ -227,7 +229,7 @@ def test_postures_as_they_were_measured_have_a_map_of_their_own(result):
         result.arm,
         workspace_map=(WorkspacePlace(0.4, 0.0, 0.2, 0.9),),
         measured_map=(WorkspacePlace(0.5, 0.0, 0.2, 0.1),),
-        measured=tuple(JointRange(it, -1.0, 1.0) for it in names),
+        measured=tuple(JointRange(name, -1.0, 1.0) for name in names),
     )
     q = np.zeros((3, len(names)))
     q[1, 2], q[2] = 1.2, -1.0
@@ -249,10 +251,10 @@ def rows_of(text: str) -> list[dict[str, str]]:
 
 
 def numbers(row, names) -> np.ndarray:
-    return np.array([float(row[it]) for it in names])
+    return np.array([float(row[index]) for index in names])
 
 
-JOINTS = tuple(f"q{it}_rad" for it in range(1, 7))
+JOINTS = tuple(f"q{index}_rad" for index in range(1, 7))
 
 
 def test_a_table_is_corrected_and_keeps_its_other_columns(stored, result):
@@ -263,7 +265,7 @@ def test_a_table_is_corrected_and_keeps_its_other_columns(stored, result):
     assert done.status == 0, done.err
     assert "4 of 4 targets corrected" in done.out
     rows = rows_of((stored / "o.csv").read_text())
-    assert [it["view"] for it in rows] == ["7", "8", "9", "10"]
+    assert [row["view"] for row in rows] == ["7", "8", "9", "10"]
     assert rows[1]["note"] == 'say "a, b"'
     sent = visioncal.correct(result, poses, HOME)
     for row, q, mm in zip(rows, sent.q, 1e3 * sent.moved_m, strict=True):
@@ -283,7 +285,7 @@ def test_seeds_in_the_rows_pick_the_branch(stored, result):
     flipped = HOME * [1, 1, 1, 1, -1, 1] + [0, 0, 0, np.pi, 0, np.pi]
     poses = result.robot.base_from_flange(np.array([HOME, HOME, HOME]))
     seeds = np.array([flipped, HOME, flipped])
-    columns = {name: [f"{it:.6f}" for it in seeds[:, at]] for at, name in enumerate(JOINTS)}
+    columns = {name: [f"{seed:.6f}" for seed in seeds[:, at]] for at, name in enumerate(JOINTS)}
     done = run("correct", write_poses(stored / "t.csv", poses, columns), "-c", stored)
     assert done.status == 0, done.err
     # The wrist turns its other side to the same pose.
@@ -344,7 +346,7 @@ def test_json_has_the_same_numbers(stored, result):
     assert document["unreachable"] == document["warnings"] == []
     for target, row in zip(document["targets"], rows, strict=True):
         assert target["view"] == row["view"]
-        assert [target[it] for it in JOINTS] == pytest.approx(numbers(row, JOINTS), abs=1e-9)
+        assert [target[joint] for joint in JOINTS] == pytest.approx(numbers(row, JOINTS), abs=1e-9)
 
 
 def test_another_branch_is_told(stored, result):
@@ -402,7 +404,7 @@ def test_what_is_no_table_of_targets_is_named(stored, result):
 def test_a_payload_is_counted_where_joints_bend(stored, result):
     spring = {"compliance_rad_per_nm": 1e-4, "sigma_rad_per_nm": 1e-6, "determined": True}
     springs = tuple(
-        JointSpring(joint=it, torque_nm=(0.0, 9.0), **spring) for it in result.robot.joint_names
+        JointSpring(joint=name, torque_nm=(0.0, 9.0), **spring) for name in result.robot.joint_names
     )
     sagging = {"not_determined": (), "weight": "unknown", "payload_kg": (0.0, 0.0), "stops": ()}
     elastic = ElasticResult(joints=springs, sag_mm=Sag(0.1, 0.2), **sagging)

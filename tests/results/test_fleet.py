@@ -38,7 +38,12 @@ def fleet(seed: int) -> list[FleetRow]:
 
 def test_of_a_sound_fleet_few_sessions_stand_out():
     """Six figures of 200 sessions; one in a thousand lies beyond 3.5 spreads of 0.2 by chance."""
-    standing = [it for seed in range(5) for it in with_outliers(fleet(seed)) if it.score > 0.0]
+    standing = [
+        outlier
+        for seed in range(5)
+        for outlier in with_outliers(fleet(seed))
+        if outlier.score > 0.0
+    ]
     assert len(standing) <= 3
 
 
@@ -52,25 +57,27 @@ def test_of_a_sound_fleet_few_sessions_stand_out():
     ],
 )
 def test_the_odd_robot_comes_first(changes, words):
-    rows = [replace(it, arm_mm=0.2, drift_mm=0.05) for it in fleet(1)]
-    rows = [replace(it, **changes) if it.group == "robot_7" else it for it in rows]
+    rows = [replace(item, arm_mm=0.2, drift_mm=0.05) for item in fleet(1)]
+    rows = [replace(item, **changes) if item.group == "robot_7" else item for item in rows]
     found = with_outliers(rows)
-    assert {it.group for it in found[:20]} == {"robot_7"}
-    assert all(words in it.stands_out for it in found[:20])
+    assert {item.group for item in found[:20]} == {"robot_7"}
+    assert all(words in item.stands_out for item in found[:20])
     # What is better than usual, or of another camera, is no fault.
-    quiet = [replace(it, noise_mm=0.001) if it.group == "robot_7" else it for it in fleet(1)]
-    assert not any("noise" in it.stands_out for it in with_outliers(quiet))
+    quiet = [
+        replace(item, noise_mm=0.001) if item.group == "robot_7" else item for item in fleet(1)
+    ]
+    assert not any("noise" in outlier.stands_out for outlier in with_outliers(quiet))
     wide = {"camera": "640 x 480", "focal_px": 457.0}
-    other = [replace(it, **wide) if it.group == "robot_7" else it for it in fleet(1)]
-    assert not any("focal" in it.stands_out for it in with_outliers(other))
+    other = [replace(item, **wide) if item.group == "robot_7" else item for item in fleet(1)]
+    assert not any("focal" in outlier.stands_out for outlier in with_outliers(other))
 
 
 def test_another_model_comes_first_and_robots_are_compared_with_their_own():
     other = {"robot": "ur5e", "noise_mm": 0.3}
-    rows = [replace(it, **other) if it.group == "robot_2" else it for it in fleet(3)]
+    rows = [replace(item, **other) if item.group == "robot_2" else item for item in fleet(3)]
     failed = FleetRow(name="robot_4/week_99", session="", state="failed", words="<no> table")
     found = with_outliers([*rows, failed])
-    assert {it.group for it in found[:20]} == {"robot_2"}
+    assert {item.group for item in found[:20]} == {"robot_2"}
     assert found[0].stands_out == "its robot is a ur5e, where 180 of 200 are ur10e"
     page = fleet_page(found)
     assert page.index("robot_2") < page.index("robot_4/week_99") < page.index("All results")

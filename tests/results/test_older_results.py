@@ -52,7 +52,9 @@ def test_sections_have_types_and_none_where_nothing_was_computed():
     assert (arm.clock, arm.thermal, arm.board, arm.dense) == (None,) * 4
     warm = Calibration.from_json(stored("warm"), "warm")
     assert warm.thermal.heated_by == "temperatures"
-    assert warm.drift.growth_per_k == pytest.approx([it.growth_per_k for it in warm.thermal.joints])
+    assert warm.drift.growth_per_k == pytest.approx(
+        [joint.growth_per_k for joint in warm.thermal.joints]
+    )
     cell = Calibration.from_json(stored("pick"), "pick").cell
     part = Calibration.whole(cell).of("left", "a", "plate_a")
     assert part.uncertainty.noise_95.keys() == {"robot_translation_mm", "robot_rotation_deg"}

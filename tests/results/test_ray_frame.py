@@ -55,7 +55,7 @@ def test_two_lenses_of_one_camera_are_no_move():
     shifted = replace(lens.camera, matrix=lens.camera.matrix + np.array([0.0, 0.0, 25.0, -18.0]))
     other = replace(lens, camera=shifted)
     edge = SAMPLE.edges[NAME]
-    turns = [ray_frame(NAME, edge, it).cam_from_ray for it in (lens, other)]
+    turns = [ray_frame(NAME, edge, camera_result).cam_from_ray for camera_result in (lens, other)]
     edges = {**SAMPLE.edges, NAME: Edge(edge.matrix @ turns[0] @ invert(turns[1]), edge.covariance)}
     again = replace(SAMPLE, edges=edges, camera=other, session_sha256="0" * 64)
     assert np.abs(log(invert(edge.matrix) @ edges[NAME].matrix)[:3]).max() > 1e-2

@@ -59,7 +59,7 @@ def test_what_is_wrong_does_not():
     document["thermal"]["joints"][2]["tau_s"] = "x"
     document["transforms"]["flange_from_cam"]["matrix"].pop()
     del document["verdict"]["status"]
-    places = {it.partition(":")[0] for it in faults(document)}
+    places = {fault.partition(":")[0] for fault in faults(document)}
     assert places == {
         "$.thermal.joints[2].tau_s",
         "$.transforms.flange_from_cam.matrix",

@@ -75,8 +75,8 @@ def test_the_file_has_the_sections_of_one_camera_by_name(folder):
     size = 6 * len(written["transforms"])
     assert np.shape(written["joint_covariance"]["matrix"]) == (size, size)
     assert written["tree"]["cam_hand"] == "flange_a"
-    assert all(it["pixel_px"] > 0 for name, it in written["noise"].items() if "cam" in name)
-    view = next(it for it in written["views"] if it["target"] == "plate_b")
+    assert all(value["pixel_px"] > 0 for name, value in written["noise"].items() if "cam" in name)
+    view = next(value for value in written["views"] if value["target"] == "plate_b")
     assert (view["camera"], view["robots"], view["used"]) == ("left", ["b"], True)
     assert view["corners"] == 54
     # A corner is seen to 0.05 px, and the robot's noise moves it by a little more.
@@ -122,20 +122,22 @@ def test_the_file_says_how_well_the_noise_of_each_robot_is_known(folder, found):
 def test_what_was_left_out_is_predicted_as_by_a_fit_without_it(cell, found, folder):
     session = Session.load(folder / "session")
     stop = 7
-    rest = replace(session, views=tuple(it for it in session.views if it.stop != stop))
-    corners = session.corner_table.of_views([it.number for it in rest.views])
+    rest = replace(session, views=tuple(view for view in session.views if view.stop != stop))
+    corners = session.corner_table.of_views([view.number for view in rest.views])
     again = package.calibrate(replace(rest, corner_table=corners)).cell
-    mine = [it for it in found.cell.sights if it.stop == stop and it.left_out_px is not None]
+    mine = [
+        sight for sight in found.cell.sights if sight.stop == stop and sight.left_out_px is not None
+    ]
     away = []
-    for it in mine:
+    for value in mine:
         robots = {name: cell.base_from_flange[name][stop] for name in ("a", "b")}
-        pose = again.between(it.seer, it.seen, robots).matrix
-        seen = session.corners[it.view]
-        positions = corner_positions(session.plates[it.seen.removeprefix("target_")])
-        camera = again.cameras[it.seer].camera
+        pose = again.between(value.seer, value.seen, robots).matrix
+        seen = session.corners[value.view]
+        positions = corner_positions(session.plates[value.seen.removeprefix("target_")])
+        camera = again.cameras[value.seer].camera
         off = project(camera, positions[seen.ids] @ pose[:3, :3].T + pose[:3, 3]) - seen.px
         rms = np.sqrt(np.mean(np.sum(off**2, axis=1)))
-        away.append((it.left_out_px - rms, it.rms_px - rms))
+        away.append((value.left_out_px - rms, value.rms_px - rms))
     # That fit has levels of noise of its own, and its lenses fields of their own: both differ by a
     # stop's share of what they rest on.
     left_out, fitted = np.sum(np.abs(away), axis=0)
@@ -145,7 +147,7 @@ def test_what_was_left_out_is_predicted_as_by_a_fit_without_it(cell, found, fold
 def test_what_was_left_out_is_told_by_camera_and_target(folder, found):
     written = json.loads((folder / "out" / "calibration.json").read_text())["validation"]
     assert written["method"] == "leave-one-out over stops"
-    assert {(it["camera"], it["target"]) for it in written["pairs"]} >= {
+    assert {(value["camera"], value["target"]) for value in written["pairs"]} >= {
         ("left", "plate_a"),
         ("left", "plate_b"),
         ("hand", "floor"),
@@ -153,7 +155,11 @@ def test_what_was_left_out_is_told_by_camera_and_target(folder, found):
     # Unseen views are off by more than those that were fitted, but not by much with 20 stops.
     assert 1.0 < written["held_out"]["px"] / found.rms.px < 1.3
     one = found.of("hand", target="floor").validation
-    pair = next(it for it in written["pairs"] if it["camera"] == "hand" and it["target"] == "floor")
+    pair = next(
+        value
+        for value in written["pairs"]
+        if value["camera"] == "hand" and value["target"] == "floor"
+    )
     assert (one.method, one.held_out.mm) == (written["method"], pair["mm"])
 
 
@@ -196,8 +202,8 @@ def test_one_camera_robot_and_target_are_as_near_as_their_covariance_says(
     assert one.camera.camera is found.cell.cameras[f"cam_{camera}"].camera
     assert one.robot.name == "ur5e"
     ends = (f"cam_{camera}", f"target_{target}")
-    mine = [it.view for it in found.cell.sights if (it.seer, it.seen) == ends]
-    assert [it.view for it in one.views] == mine
+    mine = [sight.view for sight in found.cell.sights if (sight.seer, sight.seen) == ends]
+    assert [view.view for view in one.views] == mine
 
 
 def test_an_only_robot_and_target_without_names_are_called_by_their_kinds(tmp_path):
@@ -205,12 +211,12 @@ def test_an_only_robot_and_target_without_names_are_called_by_their_kinds(tmp_pa
         robots=(RobotAt("a", (-0.6, 0.0, 0.0)),), boards=(BoardAt("plate", "a"),), stops=12
     )
     several = recorded(simulate_network(options))
-    plain = {it: several.document[it] for it in ("schema", "name", "cameras")}
-    columns = [it for it in several.columns if it not in ("robot", "target")]
+    plain = {name: several.document[name] for name in ("schema", "name", "cameras")}
+    columns = [column for column in several.columns if column not in ("robot", "target")]
     session = Session.assemble(
         {**plain, "mount": "eye-to-hand", "robot": {"model": "ur5e"}, "target": FLOOR.name},
         columns,
-        [[view.cell(it) for it in columns] for view in several.views],
+        [[view.cell(column) for column in columns] for view in several.views],
         several.images,
         corners=several.corner_table,
     )
@@ -230,7 +236,7 @@ def test_a_stated_camera_of_measured_poses_is_kept(cell):
     # Of both together: more than the robot's alone.
     assert found.noise["combined_translation_mm"] > found.noise["robot_translation_mm"]
     # Each camera picks with each robot that parts it from what it sees; the worst pair decides.
-    pairs = {(it.camera, it.robot): it.probability for it in whole.need.pairs}
+    pairs = {(pair.camera, pair.robot): pair.probability for pair in whole.need.pairs}
     assert pairs.keys() == {(camera, robot) for camera in ("left", "hand") for robot in "ab"}
     assert whole.need.probability == min(pairs.values()) < max(pairs.values())
     assert found.need.probability == pairs["left", "b"]
@@ -278,13 +284,17 @@ def test_a_session_of_one_pair_has_its_rows_with_the_poses_of_their_stops(cell, 
     assert one.mount == "eye-in-hand"
     assert one.columns[:2] == ("view", "stop")
     assert not {"camera", "robot", "target"} & {*one.columns}
-    seen = [it for it in session.observations if (it.seer, it.seen) == ("cam_hand", "target_floor")]
-    assert [it.number for it in one.views] == [it.view.number for it in seen]
+    seen = [
+        observation
+        for observation in session.observations
+        if (observation.seer, observation.seen) == ("cam_hand", "target_floor")
+    ]
+    assert [view.number for view in one.views] == [observation.view.number for observation in seen]
     for view in one.views:
         pose = view.base_from_flange().as_matrix()
         np.testing.assert_allclose(pose, cell.base_from_flange["a"][view.stop], atol=1e-12)
     assert one.robot_document == session.robot_documents["a"]
-    assert one.corners.keys() == {it.number for it in one.views}
+    assert one.corners.keys() == {view.number for view in one.views}
     assert one.of() is one
 
 
@@ -336,7 +346,7 @@ def test_a_part_holds_by_its_own_session_of_which_rows_were_left_out():
     cell = simulate_network(replace(OPTIONS, stray_images=2, swapped_rows=1, seed=3))
     session = recorded(cell)
     found = package.calibrate(session)
-    assert {it.view for it in found.cell.sights if not it.used} == set(cell.wrong_views)
+    assert {sight.view for sight in found.cell.sights if not sight.used} == set(cell.wrong_views)
     check = verify(session, found, camera="left", robot="b", target="plate_b")
     assert check.passed
     assert set(check.seen.known.reasons) < set(cell.wrong_views)

@@ -52,6 +52,6 @@ def test_an_atlas_leads_to_all_branches():
     positions, reached = inverse.from_starts(
         poses, Atlas(robot, inverse, rng).starts(poses, rng)[1]
     )
-    branches = {tuple(np.sign(np.sin(it[[2, 4]]))) for it in positions[reached]}
+    branches = {tuple(np.sign(np.sin(position[[2, 4]]))) for position in positions[reached]}
     # Six neighbours of one pose lie on several branches.
     assert len(branches) > 1

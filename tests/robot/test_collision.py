@@ -28,7 +28,7 @@ def random_joints(count: int, seed: int = 0) -> np.ndarray:
 
 def test_the_distances_are_those_of_plain_geometry():
     cell, q = ur5e_with_post(), random_joints(60)
-    found = np.array([cell.distances(it).min() for it in q])
+    found = np.array([cell.distances(value).min() for value in q])
     plain = clearances(ur_arm("ur5e"), q, 0.0, [(POST, POST_SIZE)])
     # Where bodies overlap the two count differently how far; golden sections end at 2e-7.
     free = found > 0.0
@@ -40,7 +40,7 @@ def test_the_distances_are_those_of_plain_geometry():
 def test_contacts_are_what_is_nearer_than_the_clearance():
     cell, q = ur5e_with_post(), random_joints(400, 1)
     contact = cell.first_contact(q)
-    lacking = np.array([cell.distances(it) for it in q]) - CLEARANCE
+    lacking = np.array([cell.distances(value) for value in q]) - CLEARANCE
     clear = contact < 0
     assert 20 < clear.sum() < 380
     # Stops keep a few millimetres more, for the ways to and from them.
@@ -57,7 +57,7 @@ def test_a_clear_way_is_clear_between_all_samples():
     joints = (starts + shares * (ends - starts)).reshape(-1, 6)
     apart = clearances(ur_arm("ur5e"), joints, 0.0, [(POST, POST_SIZE)]).reshape(150, -1)
     least = apart.min(axis=0)
-    clear = np.array([cell.on_the_way(*it) < 0 for it in zip(starts, ends, strict=True)])
+    clear = np.array([cell.on_the_way(*pair) < 0 for pair in zip(starts, ends, strict=True)])
     assert 3 < clear.sum() < 23
     assert least[clear].min() > CLEARANCE
     # At worst a way is given up that keeps the clearance by less than half the slack.
@@ -78,11 +78,11 @@ def test_a_thin_wall_between_two_postures_is_not_jumped_over():
 
 def test_what_is_left_out_is_named_with_its_reason():
     cell = ur5e_with_post()
-    left = {(it.first, it.second): it.reason for it in cell.left_out}
+    left = {(left_out.first, left_out.second): left_out.reason for left_out in cell.left_out}
     assert ("floor", "link shoulder_pan_joint") in left
     assert "100 %" in left["link wrist_1_joint", "link wrist_3_joint"]
     joints = load_robot("ur5e").joint_names
-    kept = {frozenset(it) for it in cell.names}
+    kept = {frozenset(name) for name in cell.names}
     for a, b in UR5E_PAIRS:
         assert frozenset({f"link {joints[a]}", f"link {joints[b]}"}) in kept
 
@@ -150,7 +150,7 @@ URDF = """<robot name="r"><link name="base"><collision><origin xyz="0 0 0.05"/>
 def test_the_simple_bodies_of_a_urdf_are_taken_and_links_of_meshes_are_capsules():
     robot = Robot.from_document({"schema": 1, "name": "r", "tip": "tool0", "urdf": URDF})
     bodies = arm_bodies(robot)
-    assert [(it.link, it.shape) for it in bodies] == [
+    assert [(body.link, body.shape) for body in bodies] == [
         (0, "box"),
         (1, "cylinder"),
         (2, "capsule"),
@@ -159,7 +159,7 @@ def test_the_simple_bodies_of_a_urdf_are_taken_and_links_of_meshes_are_capsules(
     np.testing.assert_allclose(bodies[0].size_m, [0.1, 0.2, 0.1])
     np.testing.assert_allclose(bodies[1].size_m, [0.05, 0.4])
     # The sphere as it is given, and a capsule to the tip for the mesh.
-    assert sorted(it.size_m[1] for it in bodies[2:]) == pytest.approx([0.0, 0.3])
+    assert sorted(body.size_m[1] for body in bodies[2:]) == pytest.approx([0.0, 0.3])
 
 
 def test_a_body_is_where_its_link_is():
@@ -170,7 +170,7 @@ def test_a_body_is_where_its_link_is():
     box = Body("box", 6, "box", size, flange @ pose)
     cell = Collisions(robot, [box], 0.0, -2.0)
     heights = corners(robot.base_from_flange(q) @ pose, size)[..., 2].min(axis=1) + 2.0
-    found = np.array([cell.distances(it)[0] for it in q])
+    found = np.array([cell.distances(value)[0] for value in q])
     np.testing.assert_allclose(found, heights, atol=1e-9)
 
 

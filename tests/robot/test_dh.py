@@ -57,12 +57,12 @@ def disturbed(name: str, seed: int) -> Robot:
     return robot.corrected(scale * rng.normal(size=(robot.joint_count + 1, 6)))
 
 
-def robot_of(it: DHTable) -> Robot:
-    return Robot.from_document(json.loads(json.dumps(table_document(it, "a test"))))
+def robot_of(dhtable: DHTable) -> Robot:
+    return Robot.from_document(json.loads(json.dumps(table_document(dhtable, "a test"))))
 
 
-def poses(it: DHTable | Robot, count: int = 20) -> np.ndarray:
-    robot = it if isinstance(it, Robot) else robot_of(it)
+def poses(dhtable: DHTable | Robot, count: int = 20) -> np.ndarray:
+    robot = dhtable if isinstance(dhtable, Robot) else robot_of(dhtable)
     q = np.random.default_rng(7).uniform(-2, 2, (count, robot.joint_count))
     return robot.base_from_flange(q)
 
@@ -133,8 +133,8 @@ def test_nearly_parallel_axes_come_back_too(name: str, other: str) -> None:
         there = convert_table(hayati, other)
         # What Hayati's form is for: the common normal is far away.
         assert np.abs(there.d_m).max() > 5.0 > 2.0 > np.abs(hayati.d_m).max()
-        for it in (hayati, there):
-            np.testing.assert_allclose(poses(it), poses(robot), rtol=0, atol=2e-12)
+        for dhtable in (hayati, there):
+            np.testing.assert_allclose(poses(dhtable), poses(robot), rtol=0, atol=2e-12)
         assert_same_table(convert_table(there, "hayati"), hayati, atol=2e-12)
 
 
@@ -265,8 +265,8 @@ def test_the_other_convention_is_the_arm_of_a_misread_table(name: str) -> None:
     assert motions(found, q) == pytest.approx(seen, abs=1e-9)
 
 
-def _misread(it: DHTable) -> DHTable:
+def _misread(dhtable: DHTable) -> DHTable:
     """The same printed rows under the other convention."""
-    document = table_document(it)
-    other = "standard" if it.convention == "modified" else "modified"
+    document = table_document(dhtable)
+    other = "standard" if dhtable.convention == "modified" else "modified"
     return table_from_document(document | {"convention": other})

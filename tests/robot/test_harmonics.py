@@ -42,8 +42,8 @@ def test_their_jacobian_is_that_of_the_forward_kinematics(wavy: Robot) -> None:
     for _ in range(3):
         change = rng.standard_normal((wavy.joint_count, 7, 2))
         ends = [
-            log(middle @ wavy.corrected(harmonics=it * change).base_from_flange(q))
-            for it in (step, -step)
+            log(middle @ wavy.corrected(harmonics=value * change).base_from_flange(q))
+            for value in (step, -step)
         ]
         # The third order of the step, and rounding over it.
         slope = (ends[0] - ends[1]) / (2 * step)

@@ -135,7 +135,7 @@ def test_five_axes_reach_the_position_and_nearly_the_rotation():
     placements[4] = placements[3] @ placements[4]
     five = with_chain(
         six,
-        joint_names=tuple(six.joint_names[it] for it in keep),
+        joint_names=tuple(six.joint_names[index] for index in keep),
         prismatic=six.chain.prismatic[keep],
         axes=six.chain.axes[keep],
         placements=np.delete(placements, 3, axis=0),

@@ -173,7 +173,7 @@ def test_a_given_urdf_changes_in_its_origins_alone(tip: str) -> None:
 def test_what_a_urdf_cannot_hold_is_said() -> None:
     robot = of_urdf()
     corrected = other(robot)
-    assert [it.partition(":")[0] for it in unwritten(corrected)] == list(robot.joint_names)
+    assert [name.partition(":")[0] for name in unwritten(corrected)] == list(robot.joint_names)
     assert unwritten(robot) == ()
     for text in (corrected_urdf(robot, corrected), small_urdf(corrected)):
         assert "Not in this file" in text
@@ -238,7 +238,9 @@ def test_the_kinematics_of_urs_driver_hold_a_corrected_arm(tmp_path: Path) -> No
         x, y, z, roll, pitch, yaw = (
             content[link][key] for key in ("x", "y", "z", "roll", "pitch", "yaw")
         )
-        about = [exp(np.array(it)) for it in ([0, 0, yaw + 0.0, 0, 0, 0], [0, pitch, 0, 0, 0, 0])]
+        about = [
+            exp(np.array(group)) for group in ([0, 0, yaw + 0.0, 0, 0, 0], [0, pitch, 0, 0, 0, 0])
+        ]
         roll_only = exp(np.array([roll, 0, 0, 0, 0, 0]))
         origin = about[0] @ about[1] @ roll_only
         origin[:3, 3] = x, y, z

@@ -45,7 +45,7 @@ def test_a_torque_is_the_change_of_height_of_what_is_lifted():
     step = 1e-6
     for joint in range(6):
         moved = [robot.base_from_flange(q + sign * step * np.eye(6)[joint]) for sign in (1, -1)]
-        heights = [it[:, 2, :3] @ load.centre_m + it[:, 2, 3] for it in moved]
+        heights = [array[:, 2, :3] @ load.centre_m + array[:, 2, 3] for array in moved]
         work = -load.kg * 9.80665 * (heights[0] - heights[1]) / (2 * step)
         assert torques[:, joint] == pytest.approx(work, abs=1e-6)
 

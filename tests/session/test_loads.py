@@ -61,12 +61,12 @@ def test_a_load_that_changes_while_the_arm_stands_still_is_refused():
 
 def test_views_of_one_stop_share_its_load():
     session = hung(Tracked(robot=NOMINAL.name, payloads=HUNG), postures(6))
-    views = tuple(replace(it, stop=it.stop // 4) for it in session.views)
+    views = tuple(replace(view, stop=view.stop // 4) for view in session.views)
     with pytest.raises(DataError, match="views 0 and 1 are of stop 0 and differ in payload"):
         known_of(replace(session, views=views))
     # Where stops have no numbers, a stop is a pose under a load.
-    bare = replace(session, views=tuple(replace(it, stop=None) for it in session.views))
-    assert len({it.station for it in bare.observations}) > 6
+    bare = replace(session, views=tuple(replace(view, stop=None) for view in session.views))
+    assert len({observation.station for observation in bare.observations}) > 6
 
 
 def test_springs_need_something_that_bends_them():
@@ -74,7 +74,7 @@ def test_springs_need_something_that_bends_them():
     session = hung(options, postures(6)[::4])
     bare = dict(session.robot_document)
     bare["joint"] = [
-        {key: it for key, it in row.items() if key not in ("mass_kg", "com_m")}
+        {key: value for key, value in row.items() if key not in ("mass_kg", "com_m")}
         for row in bare["joint"]
     ]
     with pytest.raises(DataError, match="does not state the masses of its links, and no view has"):

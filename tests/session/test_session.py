@@ -172,7 +172,7 @@ def test_a_saved_session_needs_no_other_file(folder: Path, tmp_path: Path) -> No
     edit(folder, "session.toml", '"board.toml"', '"../shared board.toml"')
     edit(folder, "session.toml", '"ur10e"', '"../arm.toml"')
     session = Session.load(folder)
-    assert [it.partition(" = ")[0] for it in session.warnings] == [
+    assert [warning.partition(" = ")[0] for warning in session.warnings] == [
         "session.toml: target",
         "session.toml: model",
     ]
@@ -560,13 +560,13 @@ def test_the_separators_and_commas_of_spreadsheets_are_read(folder: Path, separa
     digest = Session.load(folder).digest()
     columns, rows = parse_csv((folder / "views.csv").read_text(), "views.csv")
     lines = [
-        separator.join(re.sub(r"^(-?\d+)\.(\d+)$", r"\1,\2", it) for it in cells)
+        separator.join(re.sub(r"^(-?\d+)\.(\d+)$", r"\1,\2", cell) for cell in cells)
         for cells in (columns, *(row.cells for row in rows))
     ]
     (folder / "views.csv").write_text("\n".join(lines))
     assert Session.load(folder).digest() == digest
     # Where cells at the right and below were filled once, empty ones are written.
-    margin = [*(it + 2 * separator for it in lines), separator * (len(columns) + 1)]
+    margin = [*(line + 2 * separator for line in lines), separator * (len(columns) + 1)]
     (folder / "views.csv").write_text("\n".join(margin))
     assert Session.load(folder).digest() == digest
 
@@ -674,7 +674,7 @@ def test_any_text_and_any_number_survive(
 
 
 def test_a_table_of_samples_is_no_table_of_views() -> None:
-    rows = "view,image\n" + "".join(f"{it},a.png\n" for it in range(20_001))
+    rows = "view,image\n" + "".join(f"{index},a.png\n" for index in range(20_001))
     with pytest.raises(DataError, match=r"more than 20,000 rows.*streams/NAME\.csv"):
         parse_csv(rows, "views.csv")
     with pytest.raises(DataError, match="1,000 columns"):
@@ -700,7 +700,8 @@ NUMBERS = np.random.default_rng(3).uniform(0.5, 1.5, (4, 3))
 )
 def test_rotations_of_another_form_are_named(names, rotations, words):
     rows = [
-        ",".join(map(str, (at, 0.5, 0.1, 0.3, *it))) for at, it in enumerate(rotations.tolist())
+        ",".join(map(str, (at, 0.5, 0.1, 0.3, *rotation)))
+        for at, rotation in enumerate(rotations.tolist())
     ]
     text = "\n".join([f"view,x_m,y_m,z_m,{names}", *rows])
     with pytest.raises(DataError) as caught:

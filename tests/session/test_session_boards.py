@@ -50,7 +50,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_rows_say_which_board_they_show(folder):
     session = Session.load(folder)
-    assert {name: it.kind for name, it in session.boards.items()} == {
+    assert {name: board.kind for name, board in session.boards.items()} == {
         "wall": "checkerboard",
         "floor": "charuco",
     }

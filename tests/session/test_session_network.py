@@ -106,7 +106,9 @@ def test_every_frame_hangs_on_another(folder):
 
 
 def test_rows_say_who_saw_what_while_which_robots_stood_how(folder):
-    found = {it.view.number: it for it in Session.load(folder).observations}
+    found = {
+        observation.view.number: observation for observation in Session.load(folder).observations
+    }
     assert list(found) == [0, 1, 2, 4, 5, 6, 7]
     assert (found[1].seer, found[1].seen) == ("cam_left", "target_plate")
     # The pose of robot b is in a row that shows nothing.
@@ -115,22 +117,25 @@ def test_rows_say_who_saw_what_while_which_robots_stood_how(folder):
     assert not found[5].robots
     # Nothing tells where robot b stood at the second stop.
     assert found[6].lacks == ("b",)
-    assert [it for it in found if found[it].view.is_of_lens or found[it].lacks] == [6, 7]
-    stations = [found[it].station for it in found]
+    assert [index for index in found if found[index].view.is_of_lens or found[index].lacks] == [
+        6,
+        7,
+    ]
+    stations = [found[index].station for index in found]
     assert stations == [0, 0, 0, 1, 1, 1, 2]
 
 
 def test_a_row_with_another_pose_than_its_stop_is_of_a_state_of_its_own(folder):
     changed(folder, "views.csv", "1,0,,left,,plate,a.png,,,,,,,", f"1,0,,left,a,plate,a.png,{POSE}")
-    assert not [it for it in Session.load(folder).warnings if "another pose" in it]
+    assert not [warning for warning in Session.load(folder).warnings if "another pose" in warning]
     far = POSE.replace("0.3", "0.35")
     changed(
         folder, "views.csv", "2,0,,right,,plate,b.png,,,,,,,", f"2,0,,right,a,plate,b.png,{far}"
     )
     session = Session.load(folder)
-    (warning,) = [it for it in session.warnings if "another pose" in it]
+    (warning,) = [warning for warning in session.warnings if "another pose" in warning]
     assert "view 2 has another pose of robot a than view 0 of the same stop 0" in warning
-    found = {it.view.number: it.station for it in session.observations}
+    found = {observation.view.number: observation.station for observation in session.observations}
     assert found[0] == found[1] != found[2]
 
 
@@ -247,7 +252,7 @@ def test_of_one_robot_what_its_camera_sees_is_in_the_cell(tmp_path):
     )
     session = Session.load(tmp_path)
     assert session.frames["target_floor"] == session.frames["cam_top"] == "cell"
-    assert [tuple(it.robots) for it in session.observations] == [("",), ("",)]
+    assert [tuple(observation.robots) for observation in session.observations] == [("",), ("",)]
 
 
 def test_what_takes_one_camera_and_robot_says_how_one_is_chosen(folder):
@@ -303,9 +308,9 @@ def test_robots_of_six_and_of_seven_joints_share_columns(tmp_path):
     rows = "0,0,a,,1,2,3,1,2,3,\n1,0,b,a.png,1,2,3,1,2,3,1\n"
     (tmp_path / "views.csv").write_text(f"{header}\n{rows}")
     session = Session.load(tmp_path)
-    assert [len(it.joints_rad) for it in session.views] == [6, 7]
+    assert [len(view.joints_rad) for view in session.views] == [6, 7]
     # A model that is unknown is a warning until something needs it.
-    assert any("robots.b.model" in it for it in session.warnings)
+    assert any("robots.b.model" in warning for warning in session.warnings)
     assert list(session.robot_documents) == ["a"]
     (tmp_path / "views.csv").write_text(f"{header}\n{rows.replace('0,a,,1,2,', '0,a,,1,,')}")
     with pytest.raises(DataError, match="column q2_rad: it is empty while q1_rad is filled"):
@@ -324,7 +329,10 @@ def test_points_are_on_what_moves_while_they_are_read(tmp_path):
     session = Session.load(tmp_path)
     assert session.frames["point_ball"] == "flange_b"
     assert session.frames["point_nest"] == session.frames["instrument_east"] == "cell"
-    found = [(it.seer, it.seen, tuple(it.robots)) for it in session.observations]
+    found = [
+        (observation.seer, observation.seen, tuple(observation.robots))
+        for observation in session.observations
+    ]
     assert found == [
         ("instrument_east", "point_ball", ("b",)),
         ("instrument_east", "point_nest", ()),

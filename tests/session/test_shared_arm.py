@@ -25,7 +25,7 @@ def session_of(cell, name, **changed) -> Session:
     """The session of a simulated cell, with its corners."""
     options = cell.options
     return Session.from_corners(
-        [(it.ids, it.px) for it in cell.corners],
+        [(corner.ids, corner.px) for corner in cell.corners],
         cell.base_from_flange,
         options.target,
         cell.stated_camera.resolution,
@@ -43,19 +43,19 @@ def session_of(cell, name, **changed) -> Session:
 @pytest.fixture(scope="module")
 def cells():
     mounts = ("eye-in-hand", "eye-in-hand", "eye-to-hand")
-    return [simulate(replace(CELL, recording=at, mount=it)) for at, it in enumerate(mounts)]
+    return [simulate(replace(CELL, recording=at, mount=mount)) for at, mount in enumerate(mounts)]
 
 
 @pytest.fixture(scope="module")
 def sessions(cells):
-    return [session_of(it, f"week {at}") for at, it in enumerate(cells)]
+    return [session_of(cell, f"week {at}") for at, cell in enumerate(cells)]
 
 
 def error_mm(cell, calibration) -> float:
     """How far the camera's place seen from the board is off, all over the workspace [mm, rms]."""
     q = postures(calibration.calibrated_robot)
     true = target_in_camera("eye-in-hand", *cell.transforms.values(), cell.flange_at(q))
-    edges = [it.as_matrix() for it in calibration.transforms.values()]
+    edges = [transform.as_matrix() for transform in calibration.transforms.values()]
     ours = target_in_camera("eye-in-hand", *edges, calibration.base_from_flange(q).as_matrix())
     away = (invert(true) - invert(ours))[:, :3, 3]
     return 1e3 * float(np.sqrt(np.mean(np.sum(away**2, axis=1))))
@@ -64,22 +64,24 @@ def error_mm(cell, calibration) -> float:
 def test_an_arm_is_known_better_from_several_sessions_than_from_one(cells, sessions):
     alone = calibrate(sessions[0], level="offsets")
     joined = Calibration.whole(align(join_sessions(sessions), level="offsets"))
-    parts = [joined.of(camera=it, target=it) for it in ("s1", "s2")]
-    sigma, before = (it.arm.workspace_sigma_mm.median for it in (parts[0], alone))
+    parts = [joined.of(camera=name, target=name) for name in ("s1", "s2")]
+    sigma, before = (calibration.arm.workspace_sigma_mm.median for calibration in (parts[0], alone))
     # Three times the stops: 0.6 of the sigma, less what the session's own frames leave.
     assert sigma < 0.85 * before
     for cell, found in zip(cells, parts, strict=False):
         # The p95 over places; one draw of all errors is beyond twice it once in a thousand.
         assert error_mm(cell, found) < 2.0 * found.arm.workspace_sigma_mm.p95
     # The camera of the second session, on the same mount, is estimated apart and agrees.
-    hands = [it.transforms["flange_from_cam"] for it in parts]
+    hands = [part.transforms["flange_from_cam"] for part in parts]
     apart_mm = 1e3 * np.linalg.norm((hands[0].inv() * hands[1]).translation)
-    assert apart_mm < 3.5 * np.hypot(*(it.edges["flange_from_cam"].sigma_mm for it in parts))
+    assert apart_mm < 3.5 * np.hypot(*(part.edges["flange_from_cam"].sigma_mm for part in parts))
 
 
 def timed(session: Session, from_s: float) -> Session:
     """The same with a time of each view."""
-    cells = [[*map(it.cell, session.columns), repr(from_s + it.number)] for it in session.views]
+    cells = [
+        [*map(view.cell, session.columns), repr(from_s + view.number)] for view in session.views
+    ]
     return Session.assemble(
         session.document,
         [*session.columns, "stamp_s"],
@@ -91,13 +93,13 @@ def timed(session: Session, from_s: float) -> Session:
 
 
 def test_views_frames_and_times_of_each_session_stay_apart(sessions):
-    joined = join_sessions([timed(it, 10.0) for it in sessions])
-    assert [it.number for it in joined.views] == list(range(36))
-    assert {it.text["camera"] for it in joined.views[12:24]} == {"s2"}
+    joined = join_sessions([timed(session, 10.0) for session in sessions])
+    assert [view.number for view in joined.views] == list(range(36))
+    assert {view.text["camera"] for view in joined.views[12:24]} == {"s2"}
     assert joined.frames["cam_s2"] == "flange"
     assert joined.frames["cam_s3"] == "base"
-    assert len(joined.corner_table) == sum(len(it.corner_table) for it in sessions)
-    stamps = [it.stamp_s for it in joined.views]
+    assert len(joined.corner_table) == sum(len(session.corner_table) for session in sessions)
+    stamps = [view.stamp_s for view in joined.views]
     assert stamps[:2] == [10.0, 11.0]
     assert stamps[12] > stamps[11]
     assert stamps == sorted(stamps)
@@ -127,12 +129,14 @@ def test_images_are_read_from_their_own_session(tmp_path):
 def test_what_cannot_be_joined_is_refused_by_name(sessions, changed, words):
     document = {**sessions[1].document, "name": "other"}
     for key, value in changed.items():
-        document = {it: known for it, known in document.items() if it != key and it not in key}
+        document = {
+            value: known for value, known in document.items() if value != key and value not in key
+        }
         document |= {} if value is None else {key: {"model": value} if key == "robot" else value}
     other = Session.assemble(
         document,
         sessions[1].columns,
-        [[*map(it.cell, sessions[1].columns)] for it in sessions[1].views],
+        [[*map(view.cell, sessions[1].columns)] for view in sessions[1].views],
         sessions[1].images,
         target_document=sessions[1].target_document,
         corners=sessions[1].corner_table,
@@ -141,9 +145,9 @@ def test_what_cannot_be_joined_is_refused_by_name(sessions, changed, words):
         join_sessions([sessions[0], other])
     with pytest.raises(DataError, match="is there twice"):
         join_sessions([sessions[0], sessions[0]])
-    known = {it: at for it, at in sessions[1].document.items() if it not in ("camera", "target")}
+    known = {key: at for key, at in sessions[1].document.items() if key not in ("camera", "target")}
     columns = [*sessions[1].columns, *MEASURED_CAM_POSE]
-    rows = [[*map(it.cell, sessions[1].columns), *"0001000"] for it in sessions[1].views]
+    rows = [[*map(view.cell, sessions[1].columns), *"0001000"] for view in sessions[1].views]
     poses = Session.assemble(known, columns, rows, sessions[1].images)
     with pytest.raises(DataError, match="has no board"):
         join_sessions([sessions[0], poses])

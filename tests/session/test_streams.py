@@ -52,7 +52,7 @@ def test_rows_without_a_pose_are_no_poses() -> None:
 
 def test_a_file_of_windows_is_read_alike() -> None:
     text = 'stamp_s,"temp1_c"\n0,1.5\n1,\n'
-    one, other = (parse_stream(it, "s.csv") for it in (text, text.replace("\n", "\r\n")))
+    one, other = (parse_stream(name, "s.csv") for name in (text, text.replace("\n", "\r\n")))
     assert one.columns == other.columns
     np.testing.assert_array_equal(one.values, other.values)
 
@@ -83,7 +83,7 @@ def test_what_is_wrong_is_named(lines: list[str], words: str) -> None:
 
 
 def test_a_column_without_numbers_is_one_sentence_with_advice_that_fits() -> None:
-    rows = ["0,1,2", *(f"{it},nan,2" for it in range(1, 31)), "40,1,NaN"]
+    rows = ["0,1,2", *(f"{index},nan,2" for index in range(1, 31)), "40,1,NaN"]
     with pytest.raises(DataError) as error:
         parsed("stamp_s,q1_rad,tau1_nm", *rows)
     words = str(error.value)
@@ -124,9 +124,9 @@ def test_gaps_are_told() -> None:
 def test_folder_recording_and_copies_hold_the_same(tmp_path: Path) -> None:
     # A file of a robot's orders its keys anew.
     session = replace(kept_session(), robot_document=None)
-    cells = [[view.cell(it) for it in session.columns] for view in session.views]
+    cells = [[view.cell(column) for column in session.columns] for view in session.views]
     # The kept one has a time and an angle that no folder of today may hold.
-    cells = [["1e10" if it == "1e+308" else it for it in row] for row in cells]
+    cells = [["1e10" if name == "1e+308" else name for name in row] for row in cells]
     plain = Session.assemble(
         session.document,
         session.columns,
@@ -154,8 +154,8 @@ def test_the_digest_knows_streams_and_is_as_it_was_without() -> None:
     changed[1, 1] = 1e-300
     spelt = np.where(robot.values == 0.0, 0.0, robot.values)
     digests = [
-        session.with_streams(it).digest()
-        for it in (
+        session.with_streams(mapping).digest()
+        for mapping in (
             {},
             {"robot": robot},
             {"robot": replace(robot, values=changed)},
@@ -188,7 +188,7 @@ def test_a_long_stream_is_not_read_row_by_row() -> None:
 def calls_of_reading(rows: int) -> int:
     """Counts Python's calls and returns, which a busy computer does not change."""
     rng = np.random.default_rng(0)
-    names = [f"{it}" for joint in range(1, 7) for it in (
+    names = [f"{name}" for joint in range(1, 7) for name in (
         f"q{joint}_rad", f"dq{joint}_rad_s", f"tau{joint}_nm", f"current{joint}_a", f"temp{joint}_c"
     )]  # fmt: skip
     values = np.hstack([1e-3 * np.arange(rows)[:, None], rng.normal(size=(rows, len(names)))])
@@ -226,7 +226,7 @@ def test_a_number_that_no_cell_has_is_named_by_its_column(
     names = ("stamp_s", *POSE, "q1_rad", "dq1_rad_s", "tau1_nm", "note")
     cells = dict.fromkeys(names, "0") | {"qw": "1"}
     first, second = cells, cells | {"stamp_s": "1"} | {column: value}
-    lines = [",".join(names), *(",".join(it.values()) for it in (first, second))]
+    lines = [",".join(names), *(",".join(mapping.values()) for mapping in (first, second))]
     (tmp_path / "streams").mkdir()
     (tmp_path / "streams" / "robot.csv").write_text("\n".join(lines))
     with pytest.raises(DataError, match=rf"column {column}: .*{words}"):

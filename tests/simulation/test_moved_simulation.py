@@ -80,7 +80,7 @@ def test_recordings_have_the_noise_that_they_are_asked_for():
     built, done = real_dynamics("ur5e", rng), multi_sine(6, rng)
     stream = record(built, done, rng)
     true = drive_torques(built, done.q, done.dq, done.ddq)
-    torques = np.stack([stream[f"tau{it}_nm"] for it in range(1, 7)], axis=1)
+    torques = np.stack([stream[f"tau{index}_nm"] for index in range(1, 7)], axis=1)
     noise = np.std(torques - true, axis=0) / np.sqrt(np.mean(true**2, axis=0))
     # The standard deviation of 10,000 draws is known to 0.7 %.
     assert noise == pytest.approx(np.full(6, 0.03), rel=0.03)

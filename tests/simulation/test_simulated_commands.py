@@ -28,14 +28,14 @@ MOST = 22.5
 
 def done(*arguments):
     """What a command printed to stdout, once it ended well."""
-    it = visioncal(*arguments)
-    assert it.status == 0, it.err
-    return it.out
+    result = visioncal(*arguments)
+    assert result.status == 0, result.err
+    return result.out
 
 
 def truth_of(folder):
     content = json.loads(folder.with_name(f"{folder.name}.truth.json").read_text())
-    edges = {name: np.array(it) for name, it in content.get("transforms", {}).items()}
+    edges = {name: np.array(value) for name, value in content.get("transforms", {}).items()}
     return content, edges
 
 
@@ -78,10 +78,10 @@ def test_another_recording_of_the_cell_is_verified_and_its_board_located(seen):
     assert all(np.array_equal(edges[name], again[name]) for name in again)
     places = json.loads(done("locate", fresh, "-c", out, "--json"))
     assert len(places) == 4
-    for it in places:
-        error = np.array(it["p_base_m"]) - edges["base_from_target"][:3, 3]
+    for value in places:
+        error = np.array(value["p_base_m"]) - edges["base_from_target"][:3, 3]
         # Chi-square of three exceeds this in one case of ten thousand.
-        assert error @ np.linalg.solve(np.array(it["covariance"]), error) < 21.1
+        assert error @ np.linalg.solve(np.array(value["covariance"]), error) < 21.1
 
 
 def test_a_camera_that_was_knocked_fails_the_check(seen, place):
@@ -111,19 +111,21 @@ def test_a_second_board_is_placed_along(place):
 def test_cells_that_come_with_visioncal_are_calibrated(name, place):
     folder, out = place / name, place / f"{name}-out"
     done("simulate", folder, "--cell", name, "--no-images", "--views", 20)
-    assert len({it.stop for it in Session.load(folder).views}) == 20
+    assert len({view.stop for view in Session.load(folder).views}) == 20
     done("calibrate", folder, "-o", out)
     found, (content, edges) = Alignment.load(out), truth_of(folder)
-    bodies = [it for it in edges if it.startswith(("cam_", "target_", "instrument_", "point_"))]
-    assert set(bodies) <= {it.partition("_from_")[2] for it in found.edges}
-    for edge, it in found.edges.items():
+    bodies = [
+        edge for edge in edges if edge.startswith(("cam_", "target_", "instrument_", "point_"))
+    ]
+    assert set(bodies) <= {edge.partition("_from_")[2] for edge in found.edges}
+    for edge, item in found.edges.items():
         parent, _, child = edge.partition("_from_")
         truth = edges[child]
         if parent == "cell":
             assert content["parents"][child] == "cell"
             truth = invert(edges[found.reference]) @ truth
-        among = slice(None) if it.oriented else slice(3, 6)
-        assert misfit(it, truth, among) < MOST, edge
+        among = slice(None) if item.oriented else slice(3, 6)
+        assert misfit(item, truth, among) < MOST, edge
 
 
 @pytest.mark.parametrize("read", ["point", "probe"])
@@ -201,7 +203,10 @@ def test_torques_of_one_robot_of_a_cell_are_identified(cell, place):
     one = ("--robot", "b")
     done("dynamics", "identify", folder, *one, "--validate-on", "b_fresh", "-o", out)
     found, (content, _) = Identified.load(out), truth_of(folder)
-    assert [it.label for it in found.streams] == ["streams/b_excite.csv", "streams/b_sweeps.csv"]
+    assert [stream.label for stream in found.streams] == [
+        "streams/b_excite.csv",
+        "streams/b_sweeps.csv",
+    ]
     assert content["dynamics"]["a"]["bodies"] != content["dynamics"]["b"]["bodies"]
     weighed = json.loads(done("dynamics", "payload", loaded, "--against", out, *one, "--json"))
     assert weighed["mass_kg"] == pytest.approx(2.0, abs=4.0 * weighed["mass_sigma_kg"])
@@ -231,11 +236,13 @@ def test_errors_that_are_asked_for_are_those_of_all_robots_and_cameras_of_a_cell
     content, _ = truth_of(folder)
     for robot in content["options"]["robots"]:
         assert robot["compliance_rad_per_nm"] == [1e-4] * 6
-        assert [it["kg"] for it in robot["payloads"]] == [5.0]
-    assert {it["scale"] for it in content["options"]["boards"]} == {1.01}
+        assert [value["kg"] for value in robot["payloads"]] == [5.0]
+    assert {value["scale"] for value in content["options"]["boards"]} == {1.01}
     session = Session.load(folder)
-    assert all(it.matrix is None for it in session.cameras.values())
-    assert {it.numbers.get("payload_kg") for it in session.views if "robot" in it.text} == {5.0}
+    assert all(camera.matrix is None for camera in session.cameras.values())
+    assert {view.numbers.get("payload_kg") for view in session.views if "robot" in view.text} == {
+        5.0
+    }
 
 
 @pytest.mark.slow
@@ -248,12 +255,12 @@ def test_joints_of_every_robot_of_a_cell_bend_as_was_asked_for(place):
     found = Calibration.load(out)
     for robot in ("a", "b"):
         springs = found.of("left", robot, f"plate_{robot}").elastic.joints
-        determined = [it for it in springs if it.determined]
+        determined = [spring for spring in springs if spring.determined]
         assert len(determined) >= 3
-        for it in determined:
+        for joint_spring in determined:
             # Four sigma: one joint in fifteen thousand.
-            most = 4.0 * it.sigma_rad_per_nm
-            assert it.compliance_rad_per_nm == pytest.approx(1.0 / 12e3, abs=most)
+            most = 4.0 * joint_spring.sigma_rad_per_nm
+            assert joint_spring.compliance_rad_per_nm == pytest.approx(1.0 / 12e3, abs=most)
 
 
 @pytest.mark.parametrize("read", ["points", "probe"])
@@ -284,10 +291,10 @@ def test_currents_stand_for_torques_by_gains_that_the_truth_has(place):
 def test_a_file_of_ones_own_says_what_a_cell_is_made_of(place):
     (place / "own.toml").write_text(OWN + PUSHED)
     cell = simulate_network(read_cell(str(place / "own.toml")))
-    assert [it.robot for it in cell.options.robots] == ["ur10e"]
+    assert [robot.robot for robot in cell.options.robots] == ["ur10e"]
     assert cell.options.cameras[0].camera.resolution == (2448, 2048)
     assert cell.options.boards[0].scale == 1.002
-    assert {it.point for it in cell.readings} == {"ball"}
+    assert {reading.point for reading in cell.readings} == {"ball"}
     assert cell.options.moved[0].from_stop == 4
     assert network_session(cell, "own", seen="poses").cameras.keys() == {"top"}
     done("simulate", place / "own", "--cell", place / "own.toml", "--no-images", "--seed", 3)
@@ -333,8 +340,8 @@ def test_a_sweep_of_a_cell_tells_the_clock_of_its_camera(place):
     done("simulate", folder, "--cell", place / "swept.toml", "--no-images")
     session = Session.load(folder)
     assert "a" in session.streams
-    timed = [it for it in session.views if it.stamp_s is not None]
-    assert all(it.base_from_flange() is None for it in timed)
+    timed = [view for view in session.views if view.stamp_s is not None]
+    assert all(view.base_from_flange() is None for view in timed)
     done("calibrate", folder, "-o", place / "swept-cell-out")
     clocks = Alignment.load(place / "swept-cell-out").details.clocks
     clock = clocks["cam_top and robot a"]
@@ -351,8 +358,8 @@ def test_a_sweep_of_a_cell_with_a_rolling_shutter_has_corners(place):
     assert "--no-images" in refused.err
     done(*some, "--no-images")
     session = Session.load(place / "rolling")
-    assert all(it.has_corners or it.reading_m is not None for it in session.views)
-    assert sum(it.stamp_s is not None for it in session.views) > 10
+    assert all(view.has_corners or view.reading_m is not None for view in session.views)
+    assert sum(view.stamp_s is not None for view in session.views) > 10
 
 
 def test_a_sweep_comes_after_what_was_pushed(place):
@@ -361,12 +368,12 @@ def test_a_sweep_comes_after_what_was_pushed(place):
     (place / "before.toml").write_text(OWN + SWEPT)
     still = simulate_network(read_cell(str(place / "before.toml")))
     pushed, unmoved = (
-        {it.stamp_s: it.cam_from_target for it in its.sights if it.stamp_s is not None}
+        {sight.stamp_s: sight.cam_from_target for sight in its.sights if sight.stamp_s is not None}
         for its in (cell, still)
     )
     away = [
-        1e3 * np.linalg.norm((invert(unmoved[it]) @ pushed[it])[:3, 3])
-        for it in pushed.keys() & unmoved.keys()
+        1e3 * np.linalg.norm((invert(unmoved[value]) @ pushed[value])[:3, 3])
+        for value in pushed.keys() & unmoved.keys()
     ]
     # By default a push is of 5 mm; the robot repeats to some hundredths.
     np.testing.assert_allclose(away, 5.0, atol=0.3)
@@ -375,7 +382,9 @@ def test_a_sweep_comes_after_what_was_pushed(place):
 
 def test_the_page_s_cell_can_be_made(tmp_path):
     page = Path(__file__).parents[2].joinpath("visioncal/simulation/README.md")
-    (shown,) = [it for it in page.read_text("utf-8").split("```toml")[1:] if "[[moved]]" in it]
+    (shown,) = [
+        part for part in page.read_text("utf-8").split("```toml")[1:] if "[[moved]]" in part
+    ]
     (tmp_path / "cell.toml").write_text(shown.partition("```")[0])
     cell = simulate_network(read_cell(str(tmp_path / "cell.toml")))
     assert cell.sights

@@ -65,19 +65,21 @@ def test_rows_tell_all_that_their_observations_need(cell):
     assert session.frames["target_even"] == "cell"
     assert session.frames["cam_hand"] == "flange_a"
     assert session.frames["point_ball"] == "flange_b"
-    pairs = {(it.seer, it.seen) for it in session.observations}
+    pairs = {(observation.seer, observation.seen) for observation in session.observations}
     # The camera on one robot looks at the board on the other.
     assert ("cam_hand", "target_plate_b") in pairs
-    for it in session.observations:
-        assert not it.lacks
-        seer = chained(cell, it.seer, it.robots)
-        seen = chained(cell, it.seen, it.robots)
-        if it.view.reading_m is not None:
-            off_mm = 1e3 * np.linalg.norm((invert(seer) @ seen)[:3, 3] - it.view.reading_m)
+    for observation in session.observations:
+        assert not observation.lacks
+        seer = chained(cell, observation.seer, observation.robots)
+        seen = chained(cell, observation.seen, observation.robots)
+        if observation.view.reading_m is not None:
+            off_mm = 1e3 * np.linalg.norm((invert(seer) @ seen)[:3, 3] - observation.view.reading_m)
             # Four sigma of the tracker (15 um) and of the arm, whose turn acts at 0.1 m.
             assert off_mm < 0.2
             continue
-        mm, deg = pose_difference(invert(seer) @ seen, it.view.cam_from_target().as_matrix())
+        mm, deg = pose_difference(
+            invert(seer) @ seen, observation.view.cam_from_target().as_matrix()
+        )
         # Arms repeat to 0.03 mm and 0.003 deg, but the depth of small boards is seen to 1 mm.
         assert mm < 6.0
         assert deg < 0.5
@@ -99,14 +101,15 @@ def test_faults_are_where_the_truth_says(cell):
         if old.view == new.view and not np.allclose(old.cam_from_target, new.cam_from_target)
     }
     moved = {
-        it.view
-        for it in cell.sights
-        if (it.board == "plate_b" and it.stop >= 4) or (it.camera == "left" and it.stop >= 6)
+        sight.view
+        for sight in cell.sights
+        if (sight.board == "plate_b" and sight.stop >= 4)
+        or (sight.camera == "left" and sight.stop >= 6)
     }
     # A push may take a board out of an image: then rows are numbered otherwise from there on.
-    early = {it.view for it in cell.sights if 0 <= it.stop < 4}
+    early = {sight.view for sight in cell.sights if 0 <= sight.stop < 4}
     assert other & early == set(faulty.wrong_views) & early
-    assert other & moved & {it.view for it in cell.sights if it.stop == 4}
+    assert other & moved & {sight.view for sight in cell.sights if sight.stop == 4}
 
 
 def test_a_board_that_looks_alike_from_both_ends_begins_anywhere(cell):
@@ -134,8 +137,8 @@ def test_it_is_written_whole_with_pictures_and_truth(tmp_path):
     cell = simulate_network(options)
     session = Session.load(write_network(cell, tmp_path / "cell"))
     assert session.digest() == network_session(cell, "cell").digest()
-    assert all(session.images.exists(it.image) for it in session.views if it.image)
-    assert [it.image for it in session.views if it.is_of_lens] == [
+    assert all(session.images.exists(view.image) for view in session.views if view.image)
+    assert [view.image for view in session.views if view.is_of_lens] == [
         f"lens_low/{cell.sights[-1].view:04d}.png"
     ]
     assert session.cameras["low"].matrix is None
@@ -194,8 +197,8 @@ def test_cameras_of_a_whole_cell_are_misstated_and_write_their_own_images(tmp_pa
     low = CameraAt("low", place_m=(0.0, -0.5, 0.7), lens_mismatch_px=0.5, jpeg_quality=80)
     cell = simulate_network(replace(ONE_ARM, cameras=(low,), stops=1))
     session = Session.load(write_network(cell, tmp_path / "cell"))
-    assert {it.image.rpartition(".")[2] for it in session.views} == {"jpg"}
-    assert all(session.images.exists(it.image) for it in session.views)
+    assert {view.image.rpartition(".")[2] for view in session.views} == {"jpg"}
+    assert all(session.images.exists(view.image) for view in session.views)
     off = np.array(session.cameras["low"].matrix) - low.camera.matrix
     assert 0.01 < np.abs(off).max() < 20.0
 
@@ -204,10 +207,10 @@ def test_corners_stand_in_for_images():
     cell = simulate_network(replace(ONE_ARM, lens_views=2))
     session = network_session(cell, "cell", seen="corners")
     assert "image" not in session.columns
-    assert [it.has_corners for it in session.views] == [True] * len(cell.sights)
+    assert [view.has_corners for view in session.views] == [True] * len(cell.sights)
     assert session.corner_table is not None
     np.testing.assert_array_equal(
-        session.corner_table.px, np.concatenate([it.px for it in cell.corners])
+        session.corner_table.px, np.concatenate([view_corners.px for view_corners in cell.corners])
     )
 
 

@@ -101,7 +101,7 @@ def test_worn_joints_turn_beyond_their_encoders_by_waves_of_the_stated_size():
     ]
     assert not np.allclose(waves[0], waves[1], atol=1e-6)
     arms = [simulate(worn_joints(seed)).true_arm for seed in range(60)]
-    sizes = np.std([it.waves for it in arms], axis=(0, 2))
+    sizes = np.std([arm.waves for arm in arms], axis=(0, 2))
     # 360 draws each: a standard deviation is told to 4 %; three of these.
     np.testing.assert_allclose(sizes, [1e-3, 1e-3, 1e-4, 1e-4], rtol=0.12)
     # A whole turn brings the disc's error back, not the encoder's offset.
@@ -204,11 +204,13 @@ def test_given_postures_are_moved_to_in_the_same_cell():
 
 
 def test_another_draw_is_of_the_same_cell():
-    first, again = (simulate(CellOptions(views=4, dh_sigma_m=1e-3, draw=it)) for it in (0, 1))
+    first, again = (simulate(CellOptions(views=4, dh_sigma_m=1e-3, draw=name)) for name in (0, 1))
     assert np.array_equal(first.joints, again.joints)
     assert all(
-        np.array_equal(it, other)
-        for it, other in zip(first.transforms.values(), again.transforms.values(), strict=True)
+        np.array_equal(transform, other)
+        for transform, other in zip(
+            first.transforms.values(), again.transforms.values(), strict=True
+        )
     )
     assert not np.any(first.true_arm.d == again.true_arm.d)
     assert not np.any(first.corners[0].px == again.corners[0].px)

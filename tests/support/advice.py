@@ -16,8 +16,8 @@ _PLACEHOLDER = re.compile(r"\b(SESSION|FIXED|OUT|NEW|AGAIN)\b")
 
 def printed_commands(said: str) -> tuple[str, ...]:
     """The command lines of a message: those on a line of their own."""
-    lines = (it.strip() for it in said.splitlines())
-    return tuple(dict.fromkeys(it for it in lines if it.startswith("visioncal ")))
+    lines = (line.strip() for line in said.splitlines())
+    return tuple(dict.fromkeys(line for line in lines if line.startswith("visioncal ")))
 
 
 def failures(said: str) -> Iterator[str]:

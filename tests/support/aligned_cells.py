@@ -21,7 +21,7 @@ ROBOTS = {"flange_a": "a", "flange_b": "b"}
 def made_up_cell(seed: int) -> Alignment:
     """A cell with edges and a covariance of chance."""
     rng = np.random.default_rng(seed)
-    names = [it for it in FRAMES if it != "base_a" and it not in ROBOTS]
+    names = [frame for frame in FRAMES if frame != "base_a" and frame not in ROBOTS]
     root = 1e-4 * rng.standard_normal((6 * len(names), 6 * len(names)))
     covariance = root @ root.T
     edges = {}

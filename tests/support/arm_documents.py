@@ -27,7 +27,7 @@ def levels() -> list[dict[str, Any]]:
     )
     names = ("level", "unknowns", "rms_mm", "rms_deg")
     names += ("held_out_mm", "held_out_deg", "likelihood_ratio")
-    return [dict(zip(names, it, strict=True)) for it in figures]
+    return [dict(zip(names, figure, strict=True)) for figure in figures]
 
 
 def arm_of(robot: Robot, **changes: Any) -> ArmResult:

@@ -25,7 +25,7 @@ TOOL = exp(np.array([0.1, 0.0, 0.2, 0.01, 0.02, 0.1]))
 
 def erring(robot, blocks=("links",)):
     """An arm with errors of some blocks to be estimated, and a tool on its flange."""
-    sizes = sum(SIZES[it] for it in blocks) * robot.joint_count
+    sizes = sum(SIZES[index] for index in blocks) * robot.joint_count
     return ArmModel(robot, TOOL, dict.fromkeys(blocks, 1.0), np.zeros(sizes))
 
 

@@ -30,7 +30,7 @@ def _jacobian(function: Callable[[FloatArray], FloatArray], size: int) -> FloatA
     if not size:
         return np.zeros((len(function(np.zeros(0))), 0))
     steps = _STEP * np.eye(size)
-    return np.stack([(function(it) - function(-it)) / (2 * _STEP) for it in steps], axis=1)
+    return np.stack([(function(step) - function(-step)) / (2 * _STEP) for step in steps], axis=1)
 
 
 def workspace_bound_m(cell: Cell, q: FloatArray) -> float:
@@ -48,9 +48,9 @@ def workspace_bound_m(cell: Cell, q: FloatArray) -> float:
     covariance = _arm_bound(cell)
     at = np.zeros(3) if cell.options.mount == "eye-in-hand" else centre_m(cell.sheets[0])
     turn = np.concatenate([np.cross(at, np.eye(3)), np.eye(3)], axis=1)
-    stood = [_held(cell, it) for it in q]
-    jacobian = [turn @ _carried(cell, it) @ _pose_jacobian(cell, it) for it in stood]
-    return float(np.sqrt(np.mean([np.trace(it @ covariance @ it.T) for it in jacobian])))
+    stood = [_held(cell, value) for value in q]
+    jacobian = [turn @ _carried(cell, held) @ _pose_jacobian(cell, held) for held in stood]
+    return float(np.sqrt(np.mean([np.trace(value @ covariance @ value.T) for value in jacobian])))
 
 
 def compliance_bound(cell: Cell) -> FloatArray:
@@ -69,8 +69,12 @@ def _arm_bound(cell: Cell) -> FloatArray:
     information = np.diag(np.concatenate([np.zeros(12), arm**-2.0, look**-2.0]))
     for view, pose in enumerate(cell.cam_from_target):
         seen, held = cell.corners[view].ids, _held(cell, cell.joints[view], view)
-        by_pose = _jacobian(lambda it, pose=pose, seen=seen: _seen(cell, pose @ exp(it), seen), 6)
-        by_look = _jacobian(lambda it, pose=pose, seen=seen: _seen(cell, pose, seen, it), len(look))
+        by_pose = _jacobian(
+            lambda value, pose=pose, seen=seen: _seen(cell, pose @ exp(value), seen), 6
+        )
+        by_look = _jacobian(
+            lambda value, pose=pose, seen=seen: _seen(cell, pose, seen, value), len(look)
+        )
         moved, flange_jacobian = np.split(_pose_jacobian(cell, held, slack=True), [size], axis=1)
         jacobian = np.hstack([by_pose @ moved, by_look]) / cell.options.pixel_sigma_px
         by_slack = by_pose @ flange_jacobian / cell.options.pixel_sigma_px
@@ -87,7 +91,7 @@ def _slack(cell: Cell, held: "_Held") -> FloatArray:
     options, arm, q = cell.options, cell.true_arm, held.standing
     covariance = np.diag(np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3) ** 2)
     middle = invert(forward(arm, q[None])[0])
-    turned = _jacobian(lambda it: log(middle @ forward(arm, (q + it)[None])[0]), len(q))
+    turned = _jacobian(lambda array: log(middle @ forward(arm, (q + array)[None])[0]), len(q))
     return np.asarray(covariance + options.ripple_sigma_rad**2 * turned @ turned.T)
 
 
@@ -154,7 +158,7 @@ def _pose_jacobian(cell: Cell, held: _Held, *, slack: bool = False) -> FloatArra
     """How `cam_from_target` (6) moves with x, z and the arm, and with the flange's error."""
     size = 12 + len(_arm_sigmas(cell)) + (6 if slack else 0)
     middle = invert(_pose(cell, held, np.zeros(size)))
-    return _jacobian(lambda it: log(middle @ _pose(cell, held, it)), size)
+    return _jacobian(lambda array: log(middle @ _pose(cell, held, array)), size)
 
 
 def _pose(cell: Cell, held: _Held, change: FloatArray) -> FloatArray:

@@ -58,7 +58,7 @@ def sound_session(folder: Path, mistake: Mistake) -> Path:
     shutil.copytree(Path(_rendered(mistake.options).name) / "session", folder)
     if not mistake.joints:
         edit(folder, lambda text: text.replace('[robot]\nmodel = "ur10e"\ntip = "flange"\n', ""))
-        edit_rows(folder, lambda rows: [_without(it, "q1_rad", 6) for it in rows])
+        edit_rows(folder, lambda rows: [_without(row, "q1_rad", 6) for row in rows])
     return folder
 
 
@@ -89,7 +89,7 @@ def edit_rows(folder: Path, change: Callable[[Rows], Rows]) -> None:
 
 
 def _without(row: dict[str, str], column: str, count: int = 1) -> dict[str, str]:
-    names = [f"q{it}_rad" for it in range(1, count + 1)] if count > 1 else [column]
+    names = [f"q{index}_rad" for index in range(1, count + 1)] if count > 1 else [column]
     return {name: cell for name, cell in row.items() if name not in names}
 
 
@@ -146,14 +146,14 @@ def _rotation_vectors(folder: Path) -> None:
     def changed(rows: Rows) -> Rows:
         vectors = Rotation.from_quat(_numbers(rows, QUATERNION)).as_rotvec()
         _write(rows, ("rx", "ry", "rz"), vectors)
-        return [{k: it for k, it in row.items() if k not in QUATERNION} for row in rows]
+        return [{k: name for k, name in row.items() if k not in QUATERNION} for row in rows]
 
     edit_rows(folder, changed)
 
 
 def _renamed(names: Mapping[str, str]) -> Callable[[Path], None]:
     def changed(rows: Rows) -> Rows:
-        return [{names.get(k, k): it for k, it in row.items()} for row in rows]
+        return [{names.get(k, k): name for k, name in row.items()} for row in rows]
 
     return lambda folder: edit_rows(folder, changed)
 
@@ -163,7 +163,7 @@ def _moved_cells(names: tuple[str, ...], order: Callable[[int], list[int]]) -> C
 
     def changed(rows: Rows) -> Rows:
         cells = [{name: row[name] for name in names} for row in rows]
-        return [row | cells[it] for row, it in zip(rows, order(len(rows)), strict=True)]
+        return [row | cells[index] for row, index in zip(rows, order(len(rows)), strict=True)]
 
     return lambda folder: edit_rows(folder, changed)
 
@@ -174,7 +174,7 @@ def _swapped(count: int) -> list[int]:
 
 def _cell(column: str, at: tuple[int, ...], value: str) -> Callable[[Path], None]:
     def changed(rows: Rows) -> Rows:
-        return [row | {column: value} if it in at else row for it, row in enumerate(rows)]
+        return [row | {column: value} if index in at else row for index, row in enumerate(rows)]
 
     return lambda folder: edit_rows(folder, changed)
 
@@ -237,10 +237,12 @@ def _board(**changes: object) -> Callable[[Path], None]:
     }
     document = declared | changes
     if document["kind"] == "checkerboard":
-        document = {k: it for k, it in document.items() if k not in ("marker_m", "dictionary")}
+        document = {
+            k: value for k, value in document.items() if k not in ("marker_m", "dictionary")
+        }
     lines = (
-        f"{k} = {str(it).lower() if isinstance(it, bool) else repr(it)}\n"
-        for k, it in document.items()
+        f"{k} = {str(value).lower() if isinstance(value, bool) else repr(value)}\n"
+        for k, value in document.items()
     )
 
     def planted(folder: Path) -> None:
@@ -276,21 +278,23 @@ BROKEN: Mapping[str, Mistake] = {
     "positions in millimetres": Mistake(scaled(POSITION, 1e3), "positions in mm"),
     "the other mount": Mistake(_toml("eye-in-hand", "eye-to-hand"), "mount"),
     "quaternion with w first": Mistake(
-        _rotations(lambda it: it.as_quat()[:, [3, 0, 1, 2]]), "w, x, y, z"
+        _rotations(lambda value: value.as_quat()[:, [3, 0, 1, 2]]), "w, x, y, z"
     ),
     "Euler angles in degrees in quaternion columns": Mistake(
-        _rotations(lambda it: it.as_euler("ZYX", degrees=True)), "Euler"
+        _rotations(lambda value: value.as_euler("ZYX", degrees=True)), "Euler"
     ),
     "Euler angles in radians in quaternion columns": Mistake(
-        _rotations(lambda it: it.as_euler("xyz")), "Euler"
+        _rotations(lambda value: value.as_euler("xyz")), "Euler"
     ),
     "rotation vectors in quaternion columns": Mistake(
-        _rotations(lambda it: it.as_rotvec()), "rotation vector"
+        _rotations(lambda value: value.as_rotvec()), "rotation vector"
     ),
     "columns rx, ry, rz": Mistake(_rotation_vectors, "rx,ry,rz"),
     "columns x, y, z": Mistake(_renamed({"x_m": "x", "y_m": "y", "z_m": "z"}), "x,y,z"),
     "inverse poses": Mistake(_poses(np.linalg.inv), "inverse"),
-    "a left-handed frame": Mistake(_poses(lambda it: _MIRROR @ it @ _MIRROR), "handed|mirror"),
+    "a left-handed frame": Mistake(
+        _poses(lambda array: _MIRROR @ array @ _MIRROR), "handed|mirror"
+    ),
     "rows shifted by one": Mistake(
         _moved_cells((*POSITION, *QUATERNION), lambda n: [*range(1, n), 0]), "one row"
     ),
@@ -299,22 +303,28 @@ BROKEN: Mapping[str, Mistake] = {
         _moved_cells((*POSITION, *QUATERNION), lambda n: [0] * n), "one pose"
     ),
     "one pose typed wrong": Mistake(_cell("z_m", (6,), "0.9"), "view 6"),
-    "poses of the tool": Mistake(_poses(lambda it: it @ _tilted(0.4)), "tool|flange", joints=True),
+    "poses of the tool": Mistake(
+        _poses(lambda array: array @ _tilted(0.4)), "tool|flange", joints=True
+    ),
     "poses in base_link": Mistake(
-        _poses(lambda it: np.diag([-1.0, -1.0, 1.0, 1.0]) @ it), "base_link|turned|180", joints=True
+        _poses(lambda array: np.diag([-1.0, -1.0, 1.0, 1.0]) @ array),
+        "base_link|turned|180",
+        joints=True,
     ),
     "joint angles in degrees": Mistake(
-        scaled(tuple(f"q{it}_rad" for it in range(1, 7)), 180 / np.pi),
+        scaled(tuple(f"q{index}_rad" for index in range(1, 7)), 180 / np.pi),
         "degrees",
         joints=True,
     ),
     "another robot": Mistake(_toml('"ur10e"', '"ur5e"'), "ur10e|ur5e|model", joints=True),
     # The table.
-    "semicolons": Mistake(_text(lambda it: it.replace(",", ";")), "-"),
+    "semicolons": Mistake(_text(lambda name: name.replace(",", ";")), "-"),
     "decimal commas": Mistake(_text(_german), "-"),
-    "a byte-order mark": Mistake(_bytes(lambda it: it.encode("utf-8-sig")), "-"),
-    "UTF-16": Mistake(_bytes(lambda it: it.encode("utf-16")), "UTF-16|UTF-8"),
-    "empty rows": Mistake(_text(lambda it: it + "," * it.splitlines()[0].count(",") + "\n"), "-"),
+    "a byte-order mark": Mistake(_bytes(lambda name: name.encode("utf-8-sig")), "-"),
+    "UTF-16": Mistake(_bytes(lambda name: name.encode("utf-16")), "UTF-16|UTF-8"),
+    "empty rows": Mistake(
+        _text(lambda name: name + "," * name.splitlines()[0].count(",") + "\n"), "-"
+    ),
     "no number (NaN)": Mistake(_cell("x_m", (5,), "nan"), "view 5|line 7"),
     "a view's number twice": Mistake(_cell("view", (5,), "4"), "already|twice"),
     "an image twice": Mistake(_cell("image", (5,), "images/004.png"), "share|same image"),
@@ -323,23 +333,26 @@ BROKEN: Mapping[str, Mistake] = {
     "a misspelt board": Mistake(_toml("charuco_9x6_30mm", "charuco_9x6_30"), "charuco_9x6_30mm"),
     "eye_in_hand": Mistake(_toml("eye-in-hand", "eye_in_hand"), "eye-in-hand"),
     "width and height exchanged": Mistake(
-        lambda folder: edit(folder, lambda it: it.replace("1280,\n    800", "800,\n    1280")),
+        lambda folder: edit(folder, lambda name: name.replace("1280,\n    800", "800,\n    1280")),
         "resolution|1280 x 800",
     ),
     "the lens of other images": Mistake(
-        _images(lambda it: cv2.resize(it, (960, 600), interpolation=cv2.INTER_AREA)),
+        _images(lambda array: cv2.resize(array, (960, 600), interpolation=cv2.INTER_AREA)),
         "960 x 600",
     ),
     "images turned clockwise": Mistake(
-        _images(lambda it: cv2.rotate(it, cv2.ROTATE_90_CLOCKWISE)), "turned by 90 degrees clockw"
+        _images(lambda array: cv2.rotate(array, cv2.ROTATE_90_CLOCKWISE)),
+        "turned by 90 degrees clockw",
     ),
     "images turned counterclockwise": Mistake(
-        _images(lambda it: cv2.rotate(it, cv2.ROTATE_90_COUNTERCLOCKWISE)),
+        _images(lambda array: cv2.rotate(array, cv2.ROTATE_90_COUNTERCLOCKWISE)),
         "turned by 90 degrees counterclockw",
     ),
     "the lens of larger images": Mistake(
         lambda folder: (
-            _images(lambda it: cv2.resize(it, (960, 600), interpolation=cv2.INTER_AREA))(folder),
+            _images(lambda array: cv2.resize(array, (960, 600), interpolation=cv2.INTER_AREA))(
+                folder
+            ),
             _toml("1280,\n    800", "960,\n    600")(folder),
         )[0],
         "lens|matrix|intrinsics|focal",
@@ -357,11 +370,11 @@ BROKEN: Mapping[str, Mistake] = {
     "squares in millimetres": Mistake(_board(square_m=30.0, marker_m=22.0), "millimetre|30 m"),
     "squares of another size": Mistake(_board(square_m=0.036, marker_m=0.0264), "board|square"),
     "one image upside down": Mistake(
-        _images(lambda it: cv2.rotate(it, cv2.ROTATE_180), lambda at: at == 7), "view 7"
+        _images(lambda array: cv2.rotate(array, cv2.ROTATE_180), lambda at: at == 7), "view 7"
     ),
-    "mirrored images": Mistake(_images(lambda it: it[:, ::-1]), "mirror"),
+    "mirrored images": Mistake(_images(lambda array: array[:, ::-1]), "mirror"),
     "blurred images": Mistake(
-        _images(lambda it: cv2.GaussianBlur(it, (0, 0), 9.0)),
+        _images(lambda array: cv2.GaussianBlur(array, (0, 0), 9.0)),
         "in 15 views: .*blurred",
         is_mended=False,
     ),

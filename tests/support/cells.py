@@ -20,12 +20,16 @@ from visioncal.simulation.rows import POSE
 def session_of(cell: Cell) -> Session:
     """The session of a cell as it stands in memory, its images not rendered, without joints."""
     session = cell_session(cell, "cell", seen="names")
-    document = {name: it for name, it in session.document.items() if name != "robot"}
-    columns = [it for it in session.columns if it in POSE or (it[0] != "q" and it != "stamp_s")]
+    document = {name: value for name, value in session.document.items() if name != "robot"}
+    columns = [
+        column
+        for column in session.columns
+        if column in POSE or (column[0] != "q" and column != "stamp_s")
+    ]
     return Session.assemble(
         document,
         columns,
-        [[view.cell(it) for it in columns] for view in session.views],
+        [[view.cell(column) for column in columns] for view in session.views],
         session.images,
         target_document=session.target_document,
     )
@@ -43,7 +47,7 @@ def known_of(cell: Cell, *, joints: bool = True, robot: Robot | None = None, **c
     matched = Matched(model, dict(enumerate(cell.joints)) if joints else {}) if known else None
     reported = Reported(dict(enumerate(cell.base_from_flange)), matched=matched)
     known = replace(RunState(session_of(cell)), robots={"": reported}, **changes)
-    return detect_targets(known, {it.view: it for it in cell.corners})
+    return detect_targets(known, {view_corners.view: view_corners for view_corners in cell.corners})
 
 
 def calibrated(cell: Cell, **changes) -> RunState:

@@ -99,7 +99,7 @@ def write_poses(
     """
     turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     rows = [
-        [*(f"{it:.7f}" for it in pose[:3, 3]), *(f"{it:.9f}" for it in turn)]
+        [*(f"{item:.7f}" for item in pose[:3, 3]), *(f"{item:.9f}" for item in turn)]
         for pose, turn in zip(poses, turns, strict=True)
     ]
     return write_table(path, names, rows, columns)
@@ -116,7 +116,7 @@ def write_table(
         writer = csv.writer(file)
         writer.writerow([*more, *names])
         for at, row in enumerate(rows):
-            writer.writerow([*(it[at] for it in more.values()), *row])
+            writer.writerow([*(group[at] for group in more.values()), *row])
     return path
 
 

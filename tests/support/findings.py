@@ -27,7 +27,7 @@ def healthy() -> dict[str, dict[str, Any]]:
                 "robot_translation_mm": [0.041, 0.062],
                 "robot_rotation_deg": [0.0033, 0.0052],
             },
-            "spectrum": [0.001 * it for it in range(1, 13)],
+            "spectrum": [0.001 * index for index in range(1, 13)],
             "inflation": 1.0,
         },
     }

@@ -192,10 +192,10 @@ RARE = (many_cells, zip_bomb)
 def damage(recording: Recording, kind, chance) -> Path:
     """Damages one file of a recording, and says which."""
     source = recording.source
-    files = [source] if source.is_file() else [it for it in source.rglob("*") if it.is_file()]
-    files += [it for it in (recording.requested.camera_file,) if it is not None]
-    files += [Path(it) for it in (recording.requested.intrinsics,) if it is not None]
-    texts = sorted(it for it in files if it.suffix != ".png") or files
+    files = [source] if source.is_file() else [path for path in source.rglob("*") if path.is_file()]
+    files += [path for path in (recording.requested.camera_file,) if path is not None]
+    files += [Path(name) for name in (recording.requested.intrinsics,) if name is not None]
+    texts = sorted(file for file in files if file.suffix != ".png") or files
     path = chance.choice(texts)
     data = kind(path.read_bytes() or b"0", chance)
     path.unlink()

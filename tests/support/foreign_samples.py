@@ -192,7 +192,7 @@ def kuka_csv(folder: Path) -> Recording:
     angles = Rotation.from_matrix(BASE_FROM_FLANGE[:, :3, :3]).as_euler("ZYX", degrees=True)
     rows = np.hstack([1e3 * BASE_FROM_FLANGE[:, :3, 3], angles, quaternions(CAM_FROM_TARGET)])
     names = "X,Y,Z,A,B,C,cam_x,cam_y,cam_z,cam_qx,cam_qy,cam_qz,cam_qw,operator"
-    text = names + "\n" + "".join(f"{','.join(map(repr, it))},Ann\n" for it in rows.tolist())
+    text = names + "\n" + "".join(f"{','.join(map(repr, row))},Ann\n" for row in rows.tolist())
     camera = tuple(names.split(",")[6:13])
     return Recording(
         _write(folder / "log.csv", text),
@@ -215,7 +215,7 @@ def rows_by_turns(folder: Path) -> Recording:
     """The robot's pose in a row and the camera's in the next, each with its name."""
     pairs = zip(quaternions(BASE_FROM_FLANGE), quaternions(CAM_FROM_TARGET), strict=True)
     both = [row for pair in pairs for row in zip(("hand", "eye"), pair, strict=True)]
-    text = "".join(f"{name}, {', '.join(map(repr, it.tolist()))}\n" for name, it in both)
+    text = "".join(f"{name}, {', '.join(map(repr, value.tolist()))}\n" for name, value in both)
     return Recording(_write(folder / "log.csv", text), ImportOptions(mount="eye-in-hand"))
 
 
@@ -348,10 +348,10 @@ def ros_poses(folder: Path) -> Recording:
     lists = {
         name: [
             {
-                first: dict(zip("xyz", it[:3], strict=True)),
-                second: dict(zip("xyzw", it[3:], strict=True)),
+                first: dict(zip("xyz", quaternion[:3], strict=True)),
+                second: dict(zip("xyzw", quaternion[3:], strict=True)),
             }
-            for it in quaternions(poses).tolist()
+            for quaternion in quaternions(poses).tolist()
         ]
         for name, poses, first, second in (
             ("robot_poses", BASE_FROM_FLANGE, "position", "orientation"),
@@ -415,8 +415,11 @@ def stacked_npz(folder: Path) -> Recording:
 
 def keyed_json(folder: Path) -> Recording:
     rows = [
-        {"robot_pose": {"position": dict(zip("xyz", it[:3], strict=True)), "rpy": it[3:]}, "b": b}
-        for it, b in zip(
+        {
+            "robot_pose": {"position": dict(zip("xyz", value[:3], strict=True)), "rpy": value[3:]},
+            "b": b,
+        }
+        for value, b in zip(
             np.hstack(
                 [
                     BASE_FROM_FLANGE[:, :3, 3],
@@ -427,7 +430,7 @@ def keyed_json(folder: Path) -> Recording:
             strict=True,
         )
     ]
-    names = tuple(f"robot_pose.position.{it}" for it in "xyz")
+    names = tuple(f"robot_pose.position.{name}" for name in "xyz")
     return Recording(
         _write(folder / "log.json", json.dumps({"samples": rows})),
         ImportOptions(
@@ -443,7 +446,7 @@ def images_and_table(folder: Path) -> Recording:
     text = "x;y;z;qw;qx;qy;qz;lamp\n"
     for at, (x, y, z, qx, qy, qz, qw) in enumerate(rows):
         cells = (x, y, z, qw, qx, qy, qz)
-        text += ";".join(repr(it).replace(".", ",") for it in cells) + ";on\n"
+        text += ";".join(repr(cell).replace(".", ",") for cell in cells) + ";on\n"
         picture(folder / f"shot{at}.png")
     _write(folder / "robot.csv", text)
     names = ("x", "y", "z", "qw", "qx", "qy", "qz")
@@ -475,8 +478,8 @@ def separate_lens(folder: Path) -> Recording:
 
 
 RECORDINGS: Mapping[str, Callable[[Path], Recording]] = {
-    it.__name__: it
-    for it in (
+    recording.__name__: recording
+    for recording in (
         industrial,
         kinematics,
         visp,
@@ -513,5 +516,5 @@ RECORDINGS: Mapping[str, Callable[[Path], Recording]] = {
 
 # Those whose poses are not the world's, or are in several files.
 MORE_RECORDINGS: Mapping[str, Callable[[Path], Recording]] = {
-    it.__name__: it for it in (streams, separate_lens)
+    recording.__name__: recording for recording in (streams, separate_lens)
 }

@@ -64,7 +64,7 @@ def session_of(cell: Cell, rows: Sequence[Shot], **more: Sequence[str]) -> Sessi
             str(30 + at),
             f"{at}.png",
             *_cells(row.base_from_flange),
-            *(it[at] for it in more.values()),
+            *(group[at] for group in more.values()),
         ]
         for at, row in enumerate(rows)
     ]
@@ -79,4 +79,4 @@ def _cells(pose: FloatArray | None) -> list[str]:
     if pose is None:
         return [""] * len(POSE)
     turn = Rotation.from_matrix(pose[:3, :3]).as_quat()
-    return [repr(float(it)) for it in np.concatenate([pose[:3, 3], turn])]
+    return [repr(float(value)) for value in np.concatenate([pose[:3, 3], turn])]

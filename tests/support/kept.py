@@ -111,9 +111,13 @@ def kept_calibration() -> Calibration:
         "0" * 64,
         "2026-11-20T10:11:12+00:00",
         "eye-to-hand",
-        {name: Edge(it.as_matrix(), covariance) for name, it in transforms.items()},
+        {name: Edge(transform.as_matrix(), covariance) for name, transform in transforms.items()},
         np.kron(np.eye(2), covariance),
-        {"park": SolverResult({name: it.as_matrix() for name, it in transforms.items()}, 0.1, 0.2)},
+        {
+            "park": SolverResult(
+                {name: transform.as_matrix() for name, transform in transforms.items()}, 0.1, 0.2
+            )
+        },
         {"pixel_px": 0.1},
         (ViewResult(7, used=True, residual_mm=0.1, residual_deg=0.2), ViewResult(4, used=False)),
         Rms(0.1, 0.2),

@@ -79,47 +79,47 @@ class Answer:
                 name: {"matrix": edge[:3].round(12).tolist(), "sigma": _sigma(covariance)}
                 for name, (edge, covariance) in self.edges.items()
             },
-            "sigmas": {name: float(f"{it:.6g}") for name, it in self.sigmas.items()},
+            "sigmas": {name: float(f"{sigma:.6g}") for name, sigma in self.sigmas.items()},
         }
 
 
 def _sigma(covariance: np.ndarray) -> list[float]:
-    return [float(f"{it:.6g}") for it in np.sqrt(np.diag(covariance))]
+    return [float(f"{value:.6g}") for value in np.sqrt(np.diag(covariance))]
 
 
 def _flat(noise: Mapping[str, Any], prefix: str = "") -> dict[str, float]:
     found: dict[str, float] = {}
-    for name, it in noise.items():
-        if isinstance(it, Mapping):
-            found |= _flat(it, f"{prefix}{name} ")
-        elif isinstance(it, int | float):
-            found[f"{prefix}{name}"] = float(it)
+    for name, value in noise.items():
+        if isinstance(value, Mapping):
+            found |= _flat(value, f"{prefix}{name} ")
+        elif isinstance(value, int | float):
+            found[f"{prefix}{name}"] = float(value)
     return found
 
 
 def _of_calibration(result) -> Answer:
     words = {
-        "unused": [it.view for it in result.views if not it.used],
+        "unused": [view.view for view in result.views if not view.used],
         "status": result.verdict.status,
-        "findings": sorted(it.kind for it in result.verdict.findings),
+        "findings": sorted(finding.kind for finding in result.verdict.findings),
         "level": "" if result.arm is None else result.arm.level,
         "stages": sorted(write(CalibrationSections, result)),
     }
-    edges = {name: (it.matrix, it.covariance) for name, it in result.edges.items()}
+    edges = {name: (edge.matrix, edge.covariance) for name, edge in result.edges.items()}
     return Answer(words, edges, _flat(result.noise))
 
 
 def _of_alignment(result) -> Answer:
     words = {
-        "unused": [it.view for it in result.sights if not it.used],
-        "moved": [f"{it.frame} {it.last_stop} {it.first_stop}" for it in result.moved],
-        "untied": sorted(it.frame for it in result.untied),
+        "unused": [sight.view for sight in result.sights if not sight.used],
+        "moved": [f"{value.frame} {value.last_stop} {value.first_stop}" for value in result.moved],
+        "untied": sorted(value.frame for value in result.untied),
         "status": result.verdict.status,
         "levels": {
-            name: "" if it.arm is None else it.arm.level for name, it in result.arms.items()
+            name: "" if arm.arm is None else arm.arm.level for name, arm in result.arms.items()
         },
     }
-    edges = {name: (it.matrix, it.covariance) for name, it in result.edges.items()}
+    edges = {name: (edge.matrix, edge.covariance) for name, edge in result.edges.items()}
     return Answer(words, edges, _flat(result.noise))
 
 
@@ -160,7 +160,7 @@ def _network(level: str = "auto", **options) -> Callable[[], Answer]:
     def case() -> Answer:
         cell = simulate_network(NetworkOptions(**options))
         session: Session = network_session(cell, "network", seen="names")
-        corners = {it.view: it for it in cell.corners}
+        corners = {view_corners.view: view_corners for view_corners in cell.corners}
         return _of_alignment(align(session, level=level, corners=corners))
 
     return case
@@ -283,5 +283,5 @@ def sigmas_apart(answer: Answer, before: Mapping[str, Any]) -> float:
 
 def levels_apart(answer: Answer, before: Mapping[str, Any]) -> float:
     """By which share a noise level differs the most."""
-    pairs = [(it, before["sigmas"][name]) for name, it in answer.sigmas.items()]
+    pairs = [(sigma, before["sigmas"][name]) for name, sigma in answer.sigmas.items()]
     return max((abs(now / then - 1.0) for now, then in pairs if then > 0.0), default=0.0)

@@ -59,7 +59,7 @@ def kill_and_resume(
         raise AssertionError("the last recording did not end by itself")
     _check(folder, acknowledged)
     # A view may have been on the disk already when its acknowledgement was cut off.
-    there = sorted(it.number for it in Session.load(folder).views)
+    there = sorted(view.number for view in Session.load(folder).views)
     if there != list(range(1, stops + 1)):
         raise AssertionError(f"views {there} of {stops} are there in the end")
     return ends
@@ -92,7 +92,7 @@ def _check(folder: Path, acknowledged: set[int]) -> None:
         if acknowledged:
             raise AssertionError(f"{acknowledged} were acknowledged: {error}") from error
         return
-    lost = acknowledged - {it.number for it in session.views}
+    lost = acknowledged - {view.number for view in session.views}
     if lost:
         raise AssertionError(f"acknowledged views {sorted(lost)} are lost")
     for view in session.views:

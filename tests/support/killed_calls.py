@@ -47,7 +47,7 @@ def written(folder: Path, content: dict[str, str]) -> None:
 
 def visible(folder: Path) -> dict[str, str]:
     """What a reader finds, of ours and of others."""
-    return {it.name: it.read_text() for it in folder.iterdir() if it.is_file()}
+    return {path.name: path.read_text() for path in folder.iterdir() if path.is_file()}
 
 
 def ended(act: Callable[[], None], call: int) -> bool:
@@ -73,7 +73,10 @@ def killed_everywhere(folder: Path, before: dict[str, str], after: dict[str, str
         whole = ended(lambda: written(folder, after), call)
         seen = visible(folder)
         allowed = [after] if whole else [before, after]
-        expect(seen in [FOREIGN | it for it in allowed], f"{before} to {after}, {call}: {seen}")
+        expect(
+            seen in [FOREIGN | mapping for mapping in allowed],
+            f"{before} to {after}, {call}: {seen}",
+        )
         # The next writer is killed, too, while it puts things in order.
         for again in (12, 30):
             ended(lambda: written(folder, after), again)
@@ -97,7 +100,7 @@ def begin(folder: Path, content: dict[str, str]) -> None:
 
 def expect_no_leftovers(folder: Path, content: dict[str, str]) -> None:
     """The folder holds regular files alone, and none but these."""
-    left = [it.name for it in folder.iterdir() if it.name not in content or it.is_symlink()]
+    left = [path.name for path in folder.iterdir() if path.name not in content or path.is_symlink()]
     expect(not left, f"left: {left}")
 
 

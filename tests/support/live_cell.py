@@ -213,10 +213,10 @@ class FakeCamera:
         self.arm.clock.sleep(PERIOD_S)
         self.exposures[middle] = self.arm.true_flange(middle)
         moments = begun + EXPOSURE_S * np.array([0.1, 0.5, 0.9])
-        poses = [self.arm.true_flange(it) for it in moments]
+        poses = [self.arm.true_flange(moment) for moment in moments]
         if np.allclose(poses[0], poses[2], atol=1e-7):
             poses = poses[1:2]
-        image = np.mean([self._seen(it) for it in poses], axis=0)
+        image = np.mean([self._seen(pose) for pose in poses], axis=0)
         if self.arm.moves in self.hidden_at:
             image = np.full_like(image, 110.0)
         top, left = self._rng.integers(0, 50, 2)
@@ -253,12 +253,14 @@ def fake_plan(stops: int = 5, seed: int = 2, mount: CameraMount = "eye-in-hand")
     cell = replace(true_cell(options), limits=limits, robot=_thin(load_robot("ur5e")))
     q = simulate(options).joints
     none = np.zeros((0, 6))
-    planned = tuple(Stop(at + 1, it, none, f"words of stop {at + 1}") for at, it in enumerate(q))
+    planned = tuple(
+        Stop(at + 1, value, none, f"words of stop {at + 1}") for at, value in enumerate(q)
+    )
     return PlanFile(cell, purpose_of("hand-eye"), planned, q[0] + 0.002, "0" * 64)
 
 
 def _thin(robot: Robot) -> Robot:
-    joints = [{**it, "body_radius_m": 0.01} for it in robot.document["joint"]]
+    joints = [{**value, "body_radius_m": 0.01} for value in robot.document["joint"]]
     return Robot.from_document({**robot.document, "joint": joints})
 
 

@@ -11,10 +11,10 @@ from visioncal.simulation.tracked import Shop, Tracked, above, session_of, track
 
 # Shoulder and elbow yield, the rest does not [N m/rad].
 STIFFNESS = (np.inf, 1.4e6, 9e5, np.inf, np.inf, np.inf)
-COMPLIANCE = tuple(float(it) for it in 1.0 / np.array(STIFFNESS))
+COMPLIANCE = tuple(float(value) for value in 1.0 / np.array(STIFFNESS))
 GRAVITY = 9.80665
 LOADS_N = (0.0, 10.0, 20.0, 50.0)
-HUNG = tuple(Payload(kg=it / GRAVITY) for it in LOADS_N)
+HUNG = tuple(Payload(kg=load / GRAVITY) for load in LOADS_N)
 NOMINAL = arm_named("generic-6r-1800")
 # The arm stretched out, with the longest lever that it has [rad].
 STRETCHED = np.array([[0.0, np.pi / 2, -np.pi / 2 + np.arctan2(0.18, 0.8), 0.0, 0.0, 0.0]])

@@ -47,18 +47,18 @@ class _Schemas:
         more: dict[str, Any] = {}
         for cls in classes:
             words = _words(cls)
-            for it in entries(cls):
-                schema = self.of(it.kind)
-                if INLINE in it.marks:
+            for entry in entries(cls):
+                schema = self.of(entry.kind)
+                if INLINE in entry.marks:
                     inner = self.definitions[schema["$ref"].rpartition("/")[2]]
                     properties |= inner["properties"]
-                    required += inner["required"] if it.required else []
-                elif REST in it.marks:
+                    required += inner["required"] if entry.required else []
+                elif REST in entry.marks:
                     more = {"additionalProperties": schema.get("additionalProperties", {})}
                 else:
-                    note = {"description": words[it.name]} if it.name in words else {}
-                    properties[it.key] = note | schema
-                    required += [it.key] if it.required else []
+                    note = {"description": words[entry.name]} if entry.name in words else {}
+                    properties[entry.key] = note | schema
+                    required += [entry.key] if entry.required else []
         described = {"description": inspect.cleandoc(classes[0].__doc__ or "").partition("\n")[0]}
         table = {"type": "object", "properties": properties, "required": required}
         return described | table | more
@@ -69,7 +69,7 @@ class _Schemas:
         if origin is Annotated:
             return self._marked(args)
         if origin in (Union, UnionType):
-            several = [self.of(it) for it in args if it is not NoneType]
+            several = [self.of(argument) for argument in args if argument is not NoneType]
             return several[0] if len(several) == 1 else {"anyOf": several}
         if origin is Literal:
             return {"enum": list(args)}
@@ -77,7 +77,10 @@ class _Schemas:
             return {"type": "array", "items": self.of(args[0])}
         if origin is tuple:
             sizes = {"minItems": len(args), "maxItems": len(args)}
-            return {"type": "array", "prefixItems": [self.of(it) for it in args]} | sizes
+            return {
+                "type": "array",
+                "prefixItems": [self.of(argument) for argument in args],
+            } | sizes
         if origin is not None and issubclass(origin, Mapping):
             return {"type": "object", "additionalProperties": self.of(args[1])}
         if isinstance(kind, type) and is_dataclass(kind):
@@ -89,12 +92,12 @@ class _Schemas:
 
     def _marked(self, args: tuple[Any, ...]) -> dict[str, Any]:
         inner, *marks = args
-        for it in marks:
-            if isinstance(it, Array):
+        for mark in marks:
+            if isinstance(mark, Array):
                 (kind,) = get_args(get_args(inner)[1])
-                return _array("boolean" if kind is np.bool_ else "number", it.shape)
-            if isinstance(it, Written):
-                return {"type": "object"} if it.form is None else self.of(it.form)
+                return _array("boolean" if kind is np.bool_ else "number", mark.shape)
+            if isinstance(mark, Written):
+                return {"type": "object"} if mark.form is None else self.of(mark.form)
         return self.of(inner)
 
 

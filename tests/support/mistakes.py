@@ -15,7 +15,7 @@ from visioncal.core.types import FloatArray, Mount
 from visioncal.simulation import Cell
 
 OTHER: Mapping[Mount, Mount] = {"eye-in-hand": "eye-to-hand", "eye-to-hand": "eye-in-hand"}
-HALF_TURNS = [np.diag([*it, 1.0]) for it in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))]
+HALF_TURNS = [np.diag([*pair, 1.0]) for pair in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))]
 
 
 @dataclass(frozen=True, eq=False)

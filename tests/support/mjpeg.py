@@ -135,8 +135,8 @@ def served(camera: NetworkCamera) -> Iterator[str]:
         camera.ended.set()
         server.shutdown()
         # A picture that is under way to nobody must not be waited for.
-        for it in connections:
+        for connection in connections:
             with suppress(OSError):
-                it.shutdown(socket.SHUT_RDWR)
+                connection.shutdown(socket.SHUT_RDWR)
         server.server_close()
         thread.join()

@@ -32,7 +32,7 @@ def true_base(base: BaseModel, built: DynamicArm) -> FloatArray:
     gears = built.gears
     own = {"Fc": gears.coulomb, "Fv": gears.viscous, "offset": gears.offset}
     own["Ia"] = gears.motor_inertia
-    friction = np.stack([own[it] for it in base.model.terms.symbols], axis=1)
+    friction = np.stack([own[symbol] for symbol in base.model.terms.symbols], axis=1)
     links = robot_with_bodies(built).inertias.values
     return base.of(np.concatenate([links.ravel(), friction.ravel()]))
 

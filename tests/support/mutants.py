@@ -66,7 +66,7 @@ class Reading:
 
 
 def _each(command: str, words: str, *inputs: str) -> tuple[Reading, ...]:
-    return tuple(Reading(command, it, words) for it in inputs)
+    return tuple(Reading(command, name, words) for name in inputs)
 
 
 # What reads no file of the user's, or only once a robot has answered.
@@ -273,14 +273,14 @@ def run_mutant(
     reading, chance = mutant(number, seed, readings)
     place = folder / f"{os.getpid()}-{number}"
     place.mkdir(parents=True)
-    it, out = place / Path(reading.input).name, place / "earlier"
-    _copy(inputs[reading.input], it)
+    copy, out = place / Path(reading.input).name, place / "earlier"
+    _copy(inputs[reading.input], copy)
     _copy(inputs["out"], out)
     broken = ("none", "sound")
     if number >= 0:
-        broken = mutate(it, chance, [inputs[name] for name in exchanged(readings)])
+        broken = mutate(copy, chance, [inputs[name] for name in exchanged(readings)])
     told(broken)
-    words = [*reading.command.split(), *_words(reading, it, out, place / "new", inputs)]
+    words = [*reading.command.split(), *_words(reading, copy, out, place / "new", inputs)]
     before = digests(place)
     done, seconds, peak = _timed(words, typed() if reading.typed else "")
     faults = [*done.faults]
@@ -297,8 +297,8 @@ def run_mutant(
 
 def exchanged(readings: Sequence[Reading]) -> list[str]:
     """Names what a broken input may be exchanged with, of what is there anyhow."""
-    there = {it.input for it in readings} | {"another.rrd", "old.rrd"}
-    return [it for it in EXCHANGED if it in there]
+    there = {reading.input for reading in readings} | {"another.rrd", "old.rrd"}
+    return [name for name in EXCHANGED if name in there]
 
 
 def _copy(source: Path, dest: Path) -> None:
@@ -308,8 +308,8 @@ def _copy(source: Path, dest: Path) -> None:
         shutil.copyfile(source, dest)
 
 
-def _words(reading: Reading, it: Path, out: Path, new: Path, inputs: Inputs) -> list[str]:
-    places = {"IT": it, "OUT": out, "NEW": new}
+def _words(reading: Reading, file: Path, out: Path, new: Path, inputs: Inputs) -> list[str]:
+    places = {"IT": file, "OUT": out, "NEW": new}
     words = []
     for word in shlex.split(reading.words):
         for name, path in places.items():
@@ -497,7 +497,7 @@ def walk(
         return _Worker(process, here)
 
     with _ended([start() for _ in range(min(processes, len(numbers)))]) as workers:
-        while waiting or any(it.number is not None for it in workers):
+        while waiting or any(worker.number is not None for worker in workers):
             for at, worker in enumerate(workers):
                 ended = _looked_at(worker, seed, readings)
                 if ended is not None:
@@ -516,9 +516,9 @@ def _ended(workers: list[_Worker]) -> Iterator[list[_Worker]]:
     try:
         yield workers
     finally:
-        for it in workers:
-            it.process.kill()
-            it.process.join()
+        for worker in workers:
+            worker.process.kill()
+            worker.process.join()
 
 
 def _looked_at(worker: _Worker, seed: int, readings: Sequence[Reading]) -> Ended | None:
@@ -556,13 +556,13 @@ def _killed(worker: _Worker, seed: int, readings: Sequence[Reading], why: str) -
 
 def missing_commands() -> tuple[str, ...]:
     """Commands that nobody says how to call, and calls of commands that there are not."""
-    said = {it.command for it in READINGS} | set(READS_NOTHING)
+    said = {reading.command for reading in READINGS} | set(READS_NOTHING)
     return tuple(sorted(said.symmetric_difference(dict(every_command()))))
 
 
 def unknown_inputs() -> set[str]:
     """Inputs that nobody makes."""
-    named = {it.input for it in READINGS}.union(
-        *(_NAMED.findall(it.words) for it in READINGS), EXCHANGED
+    named = {reading.input for reading in READINGS}.union(
+        *(_NAMED.findall(reading.words) for reading in READINGS), EXCHANGED
     )
     return named - set(MAKERS)

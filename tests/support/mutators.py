@@ -33,7 +33,7 @@ TEXTS = (
 )  # fmt: skip
 # The same for TOML, where text needs quotes.
 LITERALS = (
-    *(json.dumps(it) for it in TEXTS if "\x00" not in it),
+    *(json.dumps(text) for text in TEXTS if "\x00" not in text),
     "nan", "-inf", "1e308", "-1e308", "-0.0", "0", "-1", "1", "0.5", "9223372036854775808",
     "9" * 400, "true", "[]", "{}", "[1]", "[1, 2, 3, 4, 5, 6, 7, 8, 9]", "[nan, inf, 0, 1]",
     '["a"]', "[[]]", "[[1, 2], [3]]", "{a = 1}", "2026-11-20", "2026-11-20T12:00:00Z", "07:32:00",
@@ -108,7 +108,7 @@ def rows_lost(data: bytes, chance: Chance) -> bytes:
     rows = _rows(data)
     kept = chance.choice([0, 1, 2, 3, 4, len(rows) - 1])
     return _joined(
-        [rows[it] for it in sorted(chance.sample(range(len(rows)), min(kept, len(rows))))]
+        [rows[index] for index in sorted(chance.sample(range(len(rows)), min(kept, len(rows))))]
     )
 
 
@@ -163,9 +163,9 @@ def toml_value(data: bytes, chance: Chance) -> bytes:
     found = list(_KEY.finditer(data))
     if not found:
         return data
-    it = chance.choice(found)
+    match = chance.choice(found)
     literal = chance.choice(LITERALS).encode("utf-8", errors="replace")
-    return data[: it.start(2)] + literal + data[it.end(2) :]
+    return data[: match.start(2)] + literal + data[match.end(2) :]
 
 
 def toml_table(data: bytes, chance: Chance) -> bytes:
@@ -261,8 +261,8 @@ def json_doubled_key(data: bytes, chance: Chance) -> bytes:
     keys = list(re.finditer(rb'"(\w+)":', data))
     if not keys:
         return data
-    it = chance.choice(keys)
-    return data[: it.start()] + b'"%s": 1, ' % it.group(1) + data[it.start() :]
+    match = chance.choice(keys)
+    return data[: match.start()] + b'"%s": 1, ' % match.group(1) + data[match.start() :]
 
 
 # --- Pictures.
@@ -355,8 +355,8 @@ def text_replaced(data: bytes, chance: Chance) -> bytes:
     words = list(re.finditer(rb"[\w.+-]+", data[:200_000]))
     if not words:
         return data
-    it, text = chance.choice(words), chance.choice(TEXTS).encode("utf-8", errors="replace")
-    return data[: it.start()] + text + data[it.end() :]
+    match, text = chance.choice(words), chance.choice(TEXTS).encode("utf-8", errors="replace")
+    return data[: match.start()] + text + data[match.end() :]
 
 
 def number_changed(data: bytes, chance: Chance) -> bytes:
@@ -364,15 +364,15 @@ def number_changed(data: bytes, chance: Chance) -> bytes:
     numbers = list(_NUMBER.finditer(data[:200_000]))
     if not numbers:
         return data
-    it = chance.choice(numbers)
-    if b"." in it[0] or b"e" in it[0]:
+    match = chance.choice(numbers)
+    if b"." in match[0] or b"e" in match[0]:
         factor = chance.choice([-1.0, 0.0, 1e3, 1e-3, 1e12, 1e-12, 1e150, 1e300, 1e-300])
-        number = repr(float(it[0]) * factor)
+        number = repr(float(match[0]) * factor)
     else:
         number = str(
-            int(it[0][:300]) * chance.choice([-1, 0, 2, 1000, 10**9]) + chance.choice([0, 1])
+            int(match[0][:300]) * chance.choice([-1, 0, 2, 1000, 10**9]) + chance.choice([0, 1])
         )
-    return data[: it.start()] + number.encode() + data[it.end() :]
+    return data[: match.start()] + number.encode() + data[match.end() :]
 
 
 ANY: tuple[Bytes, ...] = (
@@ -467,13 +467,17 @@ def mutate(input_: Path, chance: Chance, others: Sequence[Path]) -> tuple[str, s
     Returns:
         The kind of what is broken, a key of `KINDS` or `file system`, and what was done to it.
     """
-    files = sorted(it for it in input_.rglob("*") if it.is_file()) if input_.is_dir() else [input_]
-    kinds = sorted({kind_of(it) for it in files})
+    files = (
+        sorted(path for path in input_.rglob("*") if path.is_file())
+        if input_.is_dir()
+        else [input_]
+    )
+    kinds = sorted({kind_of(file) for file in files})
     if chance.random() < _AS_FILE:
         path = chance.choice([input_, chance.choice(files), chance.choice(files)])
         return "file system", f"{place(path, chance, others)}: {path.relative_to(input_.parent)}"
     kind = chance.choice(kinds)
-    path = chance.choice([it for it in files if kind_of(it) == kind])
+    path = chance.choice([file for file in files if kind_of(file) == kind])
     own, common = KINDS[kind]
     mutator = chance.choice(own if chance.random() < _BY_KIND else common)
     path.write_bytes(mutator(path.read_bytes() or b"0", chance))
@@ -482,16 +486,16 @@ def mutate(input_: Path, chance: Chance, others: Sequence[Path]) -> tuple[str, s
 
 def place(path: Path, chance: Chance, others: Sequence[Path]) -> str:
     """Puts something else where a file or folder is, or nothing."""
-    it = chance.choice(PLACES)
+    mutation = chance.choice(PLACES)
     if path.is_dir() and not path.is_symlink():
         moved = path.rename(path.with_name(path.name + " before"))
     else:
         moved = None
         path.unlink()
-    it(path, chance, others)
+    mutation(path, chance, others)
     if moved is not None:
         shutil.rmtree(moved)
-    return it.__name__
+    return mutation.__name__
 
 
 def missing(path: Path, chance: Chance, others: Sequence[Path]) -> None:

@@ -50,7 +50,7 @@ def network_bound(cell: Network, reference: str = "base_a", *, sizes: bool = Tru
         reference: The base that stands for it.
         sizes: Whether boards' sizes are unknown; else they are as stated.
     """
-    frames = tuple(it for it in cell.transforms if it != reference)
+    frames = tuple(transform for transform in cell.transforms if transform != reference)
     places = {name: slice(6 * at, 6 * at + 6) for at, name in enumerate(frames)}
     size = 6 * len(frames)
     boards = cell.options.boards if sizes else ()
@@ -67,12 +67,12 @@ def network_bound(cell: Network, reference: str = "base_a", *, sizes: bool = Tru
         at = places[f"size {board.name}"].start
         target = board.target
         information[at, at] = (target.square_m / target.square_sigma_m) ** 2
-    robots = [it.name for it in cell.options.robots]
-    sigmas = np.concatenate([it.sigma for it in cell.options.robots])
+    robots = [robot.name for robot in cell.options.robots]
+    sigmas = np.concatenate([robot.sigma for robot in cell.options.robots])
     for stop in range(-1, cell.options.stops):
         between = np.zeros((len(sigmas), size))
         own = np.diag(sigmas**-2.0)
-        for sight in (it for it in cell.sights if it.stop == stop):
+        for sight in (sight for sight in cell.sights if sight.stop == stop):
             jacobian, slack = _jacobian(cell, sight, places, robots, size)
             information += jacobian.T @ jacobian
             between += slack.T @ jacobian
@@ -90,11 +90,11 @@ def _jacobian(
     camera, board = frame_name("camera", sight.camera), frame_name("target", sight.board)
     keys = [camera, board, f"size {sight.board}", f"lens {sight.camera}"]
     carriers = [cell.robot_of(camera), cell.robot_of(board)]
-    keys += [frame_name("base", it) for it in carriers if it is not None]
-    keys = [it for it in keys if it in places]
+    keys += [frame_name("base", carrier) for carrier in carriers if carrier is not None]
+    keys = [key for key in keys if key in places]
     if sight.stop < 0:
         # Of its lens alone: the board was anywhere.
-        keys = [it for it in keys if it.startswith(("size", "lens"))]
+        keys = [key for key in keys if key.startswith(("size", "lens"))]
     jacobian, slack = np.zeros((2 * len(sight.exact.ids), size)), []
     for key in keys:
         width = places[key].stop - places[key].start
@@ -117,8 +117,8 @@ def _differences(cell: Network, sight: Sight, key: str, width: int) -> FloatArra
     steps = _STEP * np.eye(width)
     return np.stack(
         [
-            (_pixels(cell, sight, key, it) - _pixels(cell, sight, key, -it)) / (2 * _STEP)
-            for it in steps
+            (_pixels(cell, sight, key, step) - _pixels(cell, sight, key, -step)) / (2 * _STEP)
+            for step in steps
         ],
         axis=1,
     )

@@ -92,12 +92,12 @@ def some_touches(
 def jacobian(function: Callable[[FloatArray], FloatArray], size: int) -> FloatArray:
     """Derivatives (..., size) of a function of (size,) numbers at zero, by central differences."""
     steps = _STEP * np.eye(size)
-    return np.stack([(function(it) - function(-it)) / (2 * _STEP) for it in steps], axis=-1)
+    return np.stack([(function(step) - function(-step)) / (2 * _STEP) for step in steps], axis=-1)
 
 
 def point_bound(frame: FloatArray, nominal: FloatArray, spreads: FloatArray) -> FloatArray:
     """Least covariance (6, 6) of a frame from points with (n, 3, 3) covariances (Cramer-Rao)."""
-    by_step = jacobian(lambda it: placed(moved(frame, it), nominal), 6)
+    by_step = jacobian(lambda array: placed(moved(frame, array), nominal), 6)
     return np.linalg.inv(np.einsum("nij,nik,nkl->jl", by_step, np.linalg.inv(spreads), by_step))
 
 

@@ -41,4 +41,4 @@ def fixture(matrix=BASE_FROM_FIXTURE, **changes):
 
 def alone(*frames):
     """A file of frames without a calibration."""
-    return FrameFile({name: it for some in frames for name, it in some.items()})
+    return FrameFile({name: value for some in frames for name, value in some.items()})

@@ -70,7 +70,7 @@ def next_best(
     cells = (begun.cell, *begun.cell.guesses(draw.get("worlds", WORLDS) - 1, draw.get("seed", 0)))
     worlds = worlds_of(cells, purpose, q, recorded=begun.recorded)
     design = chosen(worlds, count, criterion="I", wish=wish)
-    names = [f"added stop {it + 1}" for it in range(len(design.rows))]
+    names = [f"added stop {index + 1}" for index in range(len(design.rows))]
     said = helps(begun.cell, purpose, q, worlds[0], design, names, begun=begun)
     return Additions(design, tuple(said))
 

@@ -59,7 +59,8 @@ def plate_session(sights: Sequence[Sight], target: dict | None = None) -> Sessio
         turn = Rotation.from_matrix(pose[:3, :3]).as_quat()
         rows.append([str(at), f"{at}.png", *map(repr, [*pose[:3, 3].tolist(), *turn.tolist()])])
     files = {
-        f"{at}.png": cv2.imencode(".png", it.seen)[1].tobytes() for at, it in enumerate(sights)
+        f"{at}.png": cv2.imencode(".png", sight.seen)[1].tobytes()
+        for at, sight in enumerate(sights)
     }
     document = {
         "schema": 1,

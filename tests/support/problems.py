@@ -101,7 +101,7 @@ def world(rng, stops=40, seen=0.7):
         for _ in range(stops):
             place = pose(rng.uniform(-35, 35, 3), middle + rng.uniform(-0.2, 0.2, 3))
             flanges[robot].append(np.linalg.inv(base) @ place)
-    flanges = {robot: np.array(it) for robot, it in flanges.items()}
+    flanges = {robot: np.array(flange) for robot, flange in flanges.items()}
     pairs = [
         (cam, target, stop)
         for stop in range(stops)
@@ -133,9 +133,9 @@ def observed(world, rng, changed=None, noise=1.0):
         rows.append(moved(true, rng.normal(size=6) * CAMERA_SIGMAS * noise))
     count = len(rows)
     observations = Observations(
-        tuple(it[0] for it in world.pairs),
-        tuple(it[1] for it in world.pairs),
-        np.array([it[2] for it in world.pairs]),
+        tuple(pair[0] for pair in world.pairs),
+        tuple(pair[1] for pair in world.pairs),
+        np.array([pair[2] for pair in world.pairs]),
         np.full(count, -1),
         np.array(rows),
         np.tile(np.diag(CAMERA_SIGMAS**2), (count, 1, 1)),
@@ -146,7 +146,7 @@ def observed(world, rng, changed=None, noise=1.0):
 
 
 def true_state(world, tree):
-    return State(np.array([world.truth[it] for it in tree.unknown]), np.zeros(0))
+    return State(np.array([world.truth[index] for index in tree.unknown]), np.zeros(0))
 
 
 def away(world, problem, state):

@@ -59,12 +59,12 @@ def transform(rotation, position):
 
 def code(text, mark):
     """The lines that are no comments."""
-    return "\n".join(it for it in text.splitlines() if not mark or not it.startswith(mark))
+    return "\n".join(line for line in text.splitlines() if not mark or not line.startswith(mark))
 
 
 def message(fields):
     t, q = fields["translation"], fields["rotation"]
-    assert all(isinstance(it, float) for it in (*t.values(), *q.values()))
+    assert all(isinstance(value, float) for value in (*t.values(), *q.values()))
     return transform(
         of_quaternion(q["x"], q["y"], q["z"], q["w"]), np.array([t["x"], t["y"], t["z"]])
     )
@@ -76,8 +76,8 @@ def ros(text):
 
 def easy_handeye(text):
     found = yaml.safe_load(text)["transformation"]
-    place = {it: found[it] for it in "xyz"}
-    turn = {it: found[f"q{it}"] for it in "xyzw"}
+    place = {name: found[name] for name in "xyz"}
+    turn = {name: found[f"q{name}"] for name in "xyzw"}
     return message({"translation": place, "rotation": turn})
 
 
@@ -86,12 +86,12 @@ def launch_arguments(text):
     compile(text, "calibration.launch.py", "exec")
     tree = ast.parse(text)
     calls = [
-        it
-        for it in ast.walk(tree)
-        if isinstance(it, ast.Call) and isinstance(it.func, ast.Name) and it.func.id == "Node"
+        item
+        for item in ast.walk(tree)
+        if isinstance(item, ast.Call) and isinstance(item.func, ast.Name) and item.func.id == "Node"
     ]
     assert len(calls) == 1
-    fields = {it.arg: ast.literal_eval(it.value) for it in calls[0].keywords}
+    fields = {keyword.arg: ast.literal_eval(keyword.value) for keyword in calls[0].keywords}
     assert fields["package"] == "tf2_ros"
     assert fields["executable"] == "static_transform_publisher"
     words = fields["arguments"]
@@ -100,7 +100,7 @@ def launch_arguments(text):
 
 def launch(text):
     options = launch_arguments(text)
-    x, y, z, *q = (float(options[f"--{it}"]) for it in ("x", "y", "z", "qx", "qy", "qz", "qw"))
+    x, y, z, *q = (float(options[f"--{name}"]) for name in ("x", "y", "z", "qx", "qy", "qz", "qw"))
     return transform(of_quaternion(*q), [x, y, z])
 
 
@@ -108,7 +108,7 @@ def urdf(text):
     origin = ET.fromstring(text).find("joint/origin")
     roll, pitch, yaw = map(float, origin.get("rpy").split())
     return transform(
-        rz(yaw) @ ry(pitch) @ rx(roll), [float(it) for it in origin.get("xyz").split()]
+        rz(yaw) @ ry(pitch) @ rx(roll), [float(part) for part in origin.get("xyz").split()]
     )
 
 
@@ -138,17 +138,17 @@ def _numbers(text, pattern):
     found = re.fullmatch(wanted, text.strip())
     assert found, text
     assert "e" not in "".join(found.groups())
-    return [float(it) for it in found.groups()]
+    return [float(group) for group in found.groups()]
 
 
 def ur(text):
-    it = _numbers(code(text, "#"), "p[#, #, #, #, #, #]")
-    return transform(of_rotation_vector(*it[3:]), it[:3])
+    numbers = _numbers(code(text, "#"), "p[#, #, #, #, #, #]")
+    return transform(of_rotation_vector(*numbers[3:]), numbers[:3])
 
 
 def _angled(text, mark, pattern, rotation):
-    it = _numbers(code(text, mark), pattern)
-    return transform(rotation(*np.radians(it[3:])), np.array(it[:3]) / 1000)
+    numbers = _numbers(code(text, mark), pattern)
+    return transform(rotation(*np.radians(numbers[3:])), np.array(numbers[:3]) / 1000)
 
 
 def kuka(text):
@@ -184,7 +184,7 @@ def urscript_pose(text):
     """A pose of URScript, whose numbers may be without their zero, as .2 and 0. are."""
     found = re.fullmatch(r"\s*p\[([-\d.,\s]*)\]\s*", text)
     assert found, text
-    x, y, z, *rotation = (float(it) for it in found[1].split(","))
+    x, y, z, *rotation = (float(part) for part in found[1].split(","))
     return transform(of_rotation_vector(*rotation), [x, y, z])
 
 
@@ -234,7 +234,7 @@ def abb_wobjdata(text):
 def kuka_named(text):
     """What is set, and the pose it is set to."""
     name, _, value = code(text, ";").strip().partition("=")
-    x, y, z, a, b, c = (float(it[1:]) for it in value.strip().strip("{}").split(","))
+    x, y, z, a, b, c = (float(part[1:]) for part in value.strip().strip("{}").split(","))
     assert re.sub(rf"{NUMBER}", "", value).replace(" ", "") == "{X,Y,Z,A,B,C}"
     angles = np.radians([a, b, c])
     rotation = rz(angles[0]) @ ry(angles[1]) @ rx(angles[2])
@@ -268,7 +268,7 @@ def fanuc_program(text):
     lines = re.findall(r"^ *\d+:  (.*?) *;$", listing, re.M)
     assert len(lines) == len(listing.splitlines()) == int(re.search(r"COUNT\s*= (\d+)", body)[1])
     registers, frames = {}, {}
-    for line in (it for it in lines if not it.startswith(("!", "MESSAGE", "PAUSE"))):
+    for line in (line for line in lines if not line.startswith(("!", "MESSAGE", "PAUSE"))):
         to, _, value = line.partition("=")
         if to.startswith("PR["):
             registers[to] = positions[value]
@@ -281,9 +281,9 @@ def fanuc_program(text):
 def _fanuc_position(fields):
     units = {"X": "mm", "Y": "mm", "Z": "mm", "W": "deg", "P": "deg", "R": "deg"}
     found = re.findall(r"([XYZWPR]) = *([-.\d]+) +(mm|deg)", fields)
-    assert [it[0] for it in found] == list(units)
+    assert [value[0] for value in found] == list(units)
     assert all(units[name] == unit for name, _, unit in found)
-    x, y, z, w, p, r = (float(it[1]) for it in found)
+    x, y, z, w, p, r = (float(value[1]) for value in found)
     w, p, r = np.radians([w, p, r])
     return transform(rz(r) @ ry(p) @ rx(w), np.array([x, y, z]) / 1000)
 

@@ -26,7 +26,7 @@ def main(command: Sequence[str]) -> int:
     """Runs it; `{out}` in an argument is a folder that is new each time."""
     for attempt in range(1, _TIMES + 1):
         with TemporaryDirectory() as out:
-            process = subprocess.Popen([it.replace("{out}", out) for it in command])
+            process = subprocess.Popen([name.replace("{out}", out) for name in command])
             longest_s = _longest_stall_s(process)
         if process.returncode == 0:
             return 0

@@ -24,7 +24,7 @@ class Block:
 
 
 def blocks(page: Path) -> list[Block]:
-    return [Block(*it) for it in BLOCK.findall(page.read_text(encoding="utf-8"))]
+    return [Block(*value) for value in BLOCK.findall(page.read_text(encoding="utf-8"))]
 
 
 def command_lines(text: str) -> Iterator[list[str]]:
@@ -82,7 +82,11 @@ def match(expected: str, said: str, page: str) -> None:
     for part in expected.split("..."):
         wanted = _words(part)
         found = next(
-            (it for it in range(at, len(words) - len(wanted) + 1) if _alike(wanted, words[it:])),
+            (
+                index
+                for index in range(at, len(words) - len(wanted) + 1)
+                if _alike(wanted, words[index:])
+            ),
             None,
         )
         assert found is not None, f"{page}: {' '.join(wanted)!r} is not in what was said:\n{said}"
@@ -91,7 +95,7 @@ def match(expected: str, said: str, page: str) -> None:
 
 def _words(text: str) -> list[str]:
     """What a page may end a quotation before: commas and semicolons."""
-    return [it.rstrip(",;") for it in text.split()]
+    return [part.rstrip(",;") for part in text.split()]
 
 
 def _alike(wanted: list[str], words: list[str]) -> bool:

@@ -61,7 +61,7 @@ def errors_m(session: Session, camera: FakeCamera) -> list[float]:
     found = []
     for view in session.views:
         stamp = view.stamp_s - camera.arm.clock.unix_offset_s()
-        at = min(camera.exposures, key=lambda it: abs(it - stamp))
+        at = min(camera.exposures, key=lambda exposure: abs(exposure - stamp))
         # Stamps are written to the microsecond.
         assert abs(at - stamp) < 2e-6
         away = camera.exposures[at][:3, 3] - view.base_from_flange().as_matrix()[:3, 3]

@@ -119,7 +119,7 @@ def photograph(target: Target, shot: Shot, seed: int = 0) -> tuple[np.ndarray, n
     """Takes a picture: (h, w) grey levels, and the (n, 2) corners in the target's order [px]."""
     rng = np.random.default_rng(seed)
     lines, light = _print(target)
-    low, high = (np.array([it[end] for it in lines]) for end in (0, -1))
+    low, high = (np.array([line[end] for line in lines]) for end in (0, -1))
     axis = np.array([np.cos(roll := rng.uniform(0, 2 * np.pi)), np.sin(roll), 0.0])
     tilt = Rotation.from_rotvec(np.deg2rad(shot.tilt_deg) * axis)
     turn = tilt * Rotation.from_euler("z", rng.uniform(-180, 180), degrees=True)
@@ -173,13 +173,13 @@ class _Lens:
 
 def _covered(x, y, lines, light, ink):
     """Share of each sub-pixel that is light."""
-    near = [_nearest(it, line) for it, line in zip((x, y), lines, strict=True)]
+    near = [_nearest(value, line) for value, line in zip((x, y), lines, strict=True)]
     (at_x, off_x), (at_y, off_y) = near
     (wide_x, reach_x), (wide_y, reach_y) = _extent(x), _extent(y)
     picture = light[at_y + (off_y > 0), at_x + (off_x > 0)]
     # Elsewhere, no edge comes into the sub-pixel.
     cut = (np.abs(off_x) < reach_x + abs(ink)) | (np.abs(off_y) < reach_y + abs(ink))
-    at_x, off_x, at_y, off_y = (it[cut] for it in (at_x, off_x, at_y, off_y))
+    at_x, off_x, at_y, off_y = (value[cut] for value in (at_x, off_x, at_y, off_y))
     wide_x, wide_y = wide_x[:, cut], wide_y[:, cut]
     cells = [[light[at_y + j, at_x + i] for i in (0, 1)] for j in (0, 1)]
     # Dark grows by the ink: an edge from dark to light moves towards the light side.
@@ -213,7 +213,7 @@ def _nearest(places, lines):
 
 def _extent(field):
     """Both even spreads (2, h, w) of a sub-pixel's places, the larger first, and half their sum."""
-    down, right = (np.maximum(np.abs(it), 1e-9) for it in np.gradient(field))
+    down, right = (np.maximum(np.abs(value), 1e-9) for value in np.gradient(field))
     large, small = np.maximum(down, right), np.minimum(down, right)
     small = np.maximum(small, 1e-3 * large)
     return np.stack([large, small]), (large + small) / 2
@@ -224,7 +224,7 @@ def _beyond(wide, off):
     large, small = wide
     outer, inner = (large + small) / 2, (large - small) / 2
     parts = ((off + outer, 1), (off + inner, -1), (off - inner, -1), (off - outer, 1))
-    share = sum(sign * np.maximum(it, 0.0) ** 2 for it, sign in parts) / (2 * large * small)
+    share = sum(sign * np.maximum(value, 0.0) ** 2 for value, sign in parts) / (2 * large * small)
     return np.clip(share, 0.0, 1.0)
 
 

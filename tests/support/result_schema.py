@@ -20,7 +20,9 @@ def _validator() -> Draft202012Validator:
 
 def faults(document: object) -> list[str]:
     """What is wrong with a document, each with its place."""
-    return [f"{it.json_path}: {it.message[:200]}" for it in _validator().iter_errors(document)]
+    return [
+        f"{error.json_path}: {error.message[:200]}" for error in _validator().iter_errors(document)
+    ]
 
 
 def faults_below(folder: Path) -> list[str]:
@@ -36,7 +38,7 @@ def faults_below(folder: Path) -> list[str]:
             if keys not in seen:
                 Calibration.from_json(json.dumps(document), str(path))
                 seen.add(keys)
-                found += [f"{path}: {it}" for it in faults(document)]
+                found += [f"{path}: {fault}" for fault in faults(document)]
         except (VisioncalError, OSError, ValueError, TypeError):
             continue
     return found

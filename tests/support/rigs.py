@@ -71,7 +71,7 @@ def write_target(folder: Path, kind: str, name: str, sigma_m: float = 0.0, seed:
     lines = [",".join([str(number), *map(repr, place)]) for number, place in rows]
     header = "point,x_m,y_m,z_m"
     if sigma_m:
-        header, lines = f"{header},sigma_m", [f"{it},{sigma_m!r}" for it in lines]
+        header, lines = f"{header},sigma_m", [f"{line},{sigma_m!r}" for line in lines]
     (folder / f"{name}.csv").write_text("\n".join([header, *lines, ""]))
     return path.name
 
@@ -216,8 +216,8 @@ def write_rig(folder: Path, rig: Rig) -> Path:
         f"[camera]\nresolution = {list(RESOLUTION)}\n{rig.lens}"
     )
     shots = [
-        Shot(base_from_flange(rig.mount, it), {"": (rig.kind, it)}, uneven=rig.uneven)
-        for it in looks(rig.kind, rig.views, rng)
+        Shot(base_from_flange(rig.mount, look), {"": (rig.kind, look)}, uneven=rig.uneven)
+        for look in looks(rig.kind, rig.views, rng)
     ]
     return write_shots(folder, document, shots, rig.seed + 1000, rig.stated)
 
@@ -230,7 +230,7 @@ def write_two_targets(folder: Path) -> Path:
     """Writes a session whose images show a board and a cube beside it, in one row a stop."""
     folder.mkdir(parents=True, exist_ok=True)
     rng, mount = np.random.default_rng(5), "eye-in-hand"
-    names = [write_target(folder, *it) for it in (("charuco", "board"), ("cube", "rig"))]
+    names = [write_target(folder, *pair) for pair in (("charuco", "board"), ("cube", "rig"))]
     document = (
         f'schema = 1\nname = "two"\nmount = "{mount}"\n[camera]\nresolution = {list(RESOLUTION)}\n'
         f'{LENS}[targets]\nboard = "{names[0]}"\nrig = "{names[1]}"\n'
@@ -248,7 +248,7 @@ def write_two_cameras(folder: Path) -> Path:
     """Writes a robot with a camera and a cube on its flange, a board and a camera in the cell."""
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(6)
-    names = [write_target(folder, *it) for it in (("charuco", "floor"), ("cube", "held"))]
+    names = [write_target(folder, *pair) for pair in (("charuco", "floor"), ("cube", "held"))]
     lens = f"resolution = {list(RESOLUTION)}\n{LENS}"
     document = (
         f'schema = 1\nname = "cell"\n[cameras.left]\n{lens}[cameras.right]\n{lens}[targets]\n'

@@ -25,7 +25,7 @@ def rotation_cases():
             r.rz(a) @ r.ry(m) @ r.rz(b) for a, b in turns for m in (0.0, half)
         ],
         "by 180": [
-            *(2 * np.outer(it, it) - np.eye(3) for it in axes),
+            *(2 * np.outer(axis, axis) - np.eye(3) for axis in axes),
             *(r.rx(half), r.ry(half), r.rz(half)),
         ],
         "tiny": list(Rotation.from_rotvec(1e-7 * axes).as_matrix()),

@@ -102,7 +102,7 @@ def _session(
         numbers = [*_pose(pose), *q[view]]
         numbers += [] if images else _pose(cam_from_target[view])
         note = 'first, "dark"\n' if view == 0 else ""
-        cells.append([str(view), "", image, *(repr(float(it)) for it in numbers), note])
+        cells.append([str(view), "", image, *(repr(float(number)) for number in numbers), note])
         if images:
             files[image] = _picture(target, cam_from_target[view])
     document: dict[str, object] = {"schema": 1, "name": name, "mount": "eye-in-hand"}
@@ -173,13 +173,13 @@ def _calibration(
     }
     solvers = {
         solver: SolverResult(
-            {edge: it.matrix @ exp(rng.normal(0, size, 6)) for edge, it in edges.items()},
+            {edge: item.matrix @ exp(rng.normal(0, size, 6)) for edge, item in edges.items()},
             500 * size,
             20 * size,
         )
         for solver, size in (("joint", 0.0), ("park", 4e-4), ("tsai", 2e-3))
     }
-    views = tuple(_view(it, rng) for it in evidence)
+    views = tuple(_view(view, rng) for view in evidence)
     px = 0.23 if images else None
     return Calibration(
         session.name,

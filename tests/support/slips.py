@@ -54,7 +54,7 @@ class Identifiability:
         """The session, its images not rendered."""
         views = []
         for at, row in enumerate(self.joints):
-            numbers = {f"q{joint + 1}_rad": float(it) for joint, it in enumerate(row)}
+            numbers = {f"q{joint + 1}_rad": float(value) for joint, value in enumerate(row)}
             if self.poses is not None:
                 turn = Rotation.from_matrix(self.poses[at, :3, :3]).as_quat()
                 numbers |= dict(zip(POSE, [*self.poses[at, :3, 3], *turn], strict=True))
@@ -66,7 +66,9 @@ class Identifiability:
         known = RunState(self.session, **changes)
         for stage in STAGES:
             if stage.name == "detect":
-                known = detect_targets(known, {it.view: it for it in self.cell.corners})
+                known = detect_targets(
+                    known, {view_corners.view: view_corners for view_corners in self.cell.corners}
+                )
             else:
                 known = stage.run(known)
             yield known
@@ -74,7 +76,9 @@ class Identifiability:
     def seen(self) -> RunState:
         """What is known once the joints were looked at."""
         return next(
-            it for it, stage in zip(self.known(), STAGES, strict=False) if stage.name == "joints"
+            run_state
+            for run_state, stage in zip(self.known(), STAGES, strict=False)
+            if stage.name == "joints"
         )
 
     def said(self) -> str:
@@ -84,7 +88,7 @@ class Identifiability:
         except VisioncalError as error:
             return f"error: {error}"
         return " ".join(
-            (*(it.reason for it in known.warnings), *known.notes, *known.reasons.values())
+            (*(warning.reason for warning in known.warnings), *known.notes, *known.reasons.values())
         )
 
     def hinted(self) -> str:
@@ -221,4 +225,4 @@ ALARMS = (
 def alarms(told: Identifiability) -> tuple[str, ...]:
     """What is said that accuses somebody's input."""
     said = told.said()
-    return tuple(it for it in ALARMS if it in said)
+    return tuple(alarm for alarm in ALARMS if alarm in said)

@@ -24,7 +24,7 @@ def small_document(**changed: Any) -> dict[str, Any]:
             "inertia_kg_m2": [0.01, 0.001, 0.03, 0.0, 0.002, 0.03],
             **RATES,
         }
-        joints.append({key: it for key, it in (row | changed).items() if it is not None})
+        joints.append({key: value for key, value in (row | changed).items() if value is not None})
     return {"schema": 1, "name": "small", "tip": "tool0", "convention": "standard", "joint": joints}
 
 

@@ -37,7 +37,7 @@ PARTS = {"pairs": PAIR, "sensors": SENSOR, "arms": ARM}
 def changed(findings, **changes):
     """Findings with other values of their only pair, sensor and arm, or of their own."""
     for name, part in PARTS.items():
-        mine = {it: changes.pop(it) for it in list(changes) if hasattr(part, it)}
+        mine = {change: changes.pop(change) for change in list(changes) if hasattr(part, change)}
         if mine:
             (now,) = getattr(findings, name)
             changes[name] = (replace(now, **mine),)
@@ -46,7 +46,7 @@ def changed(findings, **changes):
 
 def left_out(numbers, count=20):
     """Findings of views of which some disagree with the others."""
-    seen = [replace(it, used=it.view not in numbers) for it in views(count)]
+    seen = [replace(view, used=view.view not in numbers) for view in views(count)]
     out = [Rejection(at, f"disagrees with the other views: view {at}'s figures") for at in numbers]
     pair = replace(PAIR, views=seen, disagreeing=out)
     sensor = replace(SENSOR, used=count - len(out), lost=out, disagreeing=[*numbers])

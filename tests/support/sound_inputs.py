@@ -76,7 +76,7 @@ def _command(*words: str) -> Callable[[Inputs, Path], None]:
     """A maker: a command with names of inputs in brackets, and what it writes last."""
 
     def make(inputs: Inputs, path: Path) -> None:
-        _done(*(inputs[it[1:-1]] if it.startswith("[") else it for it in words), path)
+        _done(*(inputs[word[1:-1]] if word.startswith("[") else word for word in words), path)
 
     return make
 
@@ -91,7 +91,7 @@ def typed() -> str:
     lines = []
     for pose in simulate(BOARD).base_from_flange:
         turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
-        lines += ["", f"p[{', '.join(f'{it:.6f}' for it in [*pose[:3, 3], *turn])}]", ""]
+        lines += ["", f"p[{', '.join(f'{value:.6f}' for value in [*pose[:3, 3], *turn])}]", ""]
     return "\n".join([*lines, "q", ""])
 
 
@@ -169,8 +169,8 @@ def _exercised(
     rng = np.random.default_rng(0)
     built = real_dynamics("ur10e", rng)
     built = built if load is None else built.carrying(load)
-    done = {name: multi_sine(6, rng, seconds=it) for name, it in motions.items()}
-    runs = {name: record(built, it, rng, senses) for name, it in done.items()}
+    done = {name: multi_sine(6, rng, seconds=motion) for name, motion in motions.items()}
+    runs = {name: record(built, exercise, rng, senses) for name, exercise in done.items()}
     exercise_session("ur10e", runs).save(path)
 
 
@@ -187,8 +187,11 @@ def _joints(_: Inputs, path: Path) -> None:
         return np.asarray(robot.base_from_flange(joints[None])[0, :3] @ np.append(TIP, 1.0))
 
     starts = HOME_RAD + rng.uniform(-0.4, 0.4, (8, 6))
-    rows = [least_squares(lambda it: tip(it) - tip(HOME_RAD), start).x.tolist() for start in starts]
-    write_table(path, [f"q{it}_rad" for it in range(1, 7)], rows)
+    rows = [
+        least_squares(lambda value: tip(value) - tip(HOME_RAD), start).x.tolist()
+        for start in starts
+    ]
+    write_table(path, [f"q{index}_rad" for index in range(1, 7)], rows)
 
 
 def _features(_: Inputs, path: Path) -> None:
@@ -201,11 +204,11 @@ def _features(_: Inputs, path: Path) -> None:
 def _points(_: Inputs, path: Path) -> None:
     places = 1e-3 * DRAWING_MM + PLACE_M
     poses = turned_poses(np.random.default_rng(3), places, FLANGE_FROM_TOOL[:3, 3], np.eye(3))
-    write_poses(path, poses, {"point": [f"P{it}" for it in range(len(poses))]})
+    write_poses(path, poses, {"point": [f"P{index}" for index in range(len(poses))]})
 
 
 def _drawing(_: Inputs, path: Path) -> None:
-    names = [f"P{it}" for it in range(len(DRAWING_MM))]
+    names = [f"P{index}" for index in range(len(DRAWING_MM))]
     write_table(path, ("x_mm", "y_mm", "z_mm"), DRAWING_MM.tolist(), {"point": names})
 
 
@@ -317,4 +320,7 @@ MAKERS: Mapping[str, Callable[[Inputs, Path], None]] = {
     "old.rrd": _format_of_old,
     "oak.json": _oak,
     "lens.yaml": _lens,
-} | {f"foreign/{it}": _foreign(it) for it in (*foreign.RECORDINGS, *foreign.MORE_RECORDINGS)}
+} | {
+    f"foreign/{recording}": _foreign(recording)
+    for recording in (*foreign.RECORDINGS, *foreign.MORE_RECORDINGS)
+}

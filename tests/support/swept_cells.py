@@ -26,4 +26,6 @@ def cell_of(options: NetworkOptions, how: Swept = HOW) -> Network:
 
 def swept_session(cell: Network) -> tuple[Session, dict[int, Corners]]:
     """The cell's session, and what is detected in its images."""
-    return network_session(cell, "swept", seen="names"), {it.view: it for it in cell.corners}
+    return network_session(cell, "swept", seen="names"), {
+        view_corners.view: view_corners for view_corners in cell.corners
+    }

@@ -43,14 +43,20 @@ def readings_session(
     turned = read.shape[1] == 7
     columns = ["view", "stop", "role", "point", "meas_x_m", "meas_y_m", "meas_z_m"]
     columns += ["meas_qx", "meas_qy", "meas_qz", "meas_qw"] * turned
-    columns += [f"q{it + 1}_rad" for it in range(joints.shape[1])]
+    columns += [f"q{index + 1}_rad" for index in range(joints.shape[1])]
     cells = []
     for view, row in enumerate(read):
         stop, point = divmod(view, len(points))
         role = "holdout" if stop in held else ""
         numbers = (*row, *joints[stop])
         cells.append(
-            [str(view), str(stop), role, points[point], *(repr(float(it)) for it in numbers)]
+            [
+                str(view),
+                str(stop),
+                role,
+                points[point],
+                *(repr(float(number)) for number in numbers),
+            ]
         )
     document = {
         "schema": 1,
@@ -71,7 +77,7 @@ def irb120(data: Path) -> Session:
 def irb120_set(data: Path, joints: str, places: str) -> tuple[FloatArray, FloatArray]:
     """Joint angles [rad] and places [m] of one of its sets."""
     folder = data / "irb120_position"
-    q, read = (loadmat(folder / f"{it}.mat")[it].astype(float) for it in (joints, places))
+    q, read = (loadmat(folder / f"{name}.mat")[name].astype(float) for name in (joints, places))
     return np.deg2rad(q), 1e-3 * read
 
 
@@ -80,9 +86,9 @@ def rokae(data: Path, held: Sequence[int] = ()) -> Session:
     folder = data / "rokae_laser_6d"
     lines = (folder / "joint_angle.csv").read_text().splitlines()
     inside = [re.search(r"j:\{([^}]*)\}", line)[1] for line in lines if "j:{" in line]
-    q = np.array([[float(it) for it in text.split(",")[:6]] for text in inside])
+    q = np.array([[float(part) for part in text.split(",")[:6]] for text in inside])
     rows = [line.split() for line in (folder / "laser_pos.csv").read_text().splitlines() if line]
-    measured = np.array([[float(it) for it in row[7:13]] for row in rows])
+    measured = np.array([[float(name) for name in row[7:13]] for row in rows])
     turns = Rotation.from_euler("xyz", measured[:, 3:], degrees=True).as_quat()
     read = np.column_stack([1e-3 * measured[:, :3], turns])
     table = np.loadtxt(folder / "dh.csv", delimiter=",", skiprows=1)
@@ -115,9 +121,9 @@ def talos(data: Path, held: Sequence[int] = ()) -> Session:
     folder = data / "figaroh_small"
     with (folder / "talos_left_arm_contact.csv").open() as file:
         rows = list(csv.DictReader(file))
-    names = [it for it in rows[0] if it.endswith("_joint")]
-    q = np.array([[float(row[it]) for it in names] for row in rows])
-    read = np.array([[float(row[it]) for it in ("x1", "y1", "z1")] for row in rows])
+    names = [row for row in rows[0] if row.endswith("_joint")]
+    q = np.array([[float(row[name]) for name in names] for row in rows])
+    read = np.array([[float(row[name]) for name in ("x1", "y1", "z1")] for row in rows])
     robot = read_robot_document(str(folder / "talos.urdf"), tip="gripper_left_base_link")
     return readings_session("talos", robot, CONTACT, q, read, held=held)
 
@@ -126,9 +132,9 @@ def figaroh_ur10(data: Path) -> Session:
     """23 poses of a UR10, by a camera that scatters."""
     with (data / "figaroh_small" / "ur10_pose_calibration.csv").open() as file:
         rows = list(csv.DictReader(file))
-    q = np.array([[float(row[it]) for it in row if it.endswith("_joint")] for row in rows])
-    places = np.array([[float(row[it]) for it in ("x1", "y1", "z1")] for row in rows])
-    angles = [[float(row[f"phi{it}1"]) for it in "xyz"] for row in rows]
+    q = np.array([[float(row[name]) for name in row if name.endswith("_joint")] for row in rows])
+    places = np.array([[float(row[name]) for name in ("x1", "y1", "z1")] for row in rows])
+    angles = [[float(row[f"phi{name}1"]) for name in "xyz"] for row in rows]
     turns = Rotation.from_euler("xyz", angles).as_quat()
     robot = read_robot_document("ur10", tip="tool0")
     read = np.column_stack([places, turns])
@@ -142,7 +148,7 @@ def positioner(data: Path) -> Session:
     rows = list(yaml.safe_load(text).values())
     q = np.array([row["target_joints"] for row in rows])
     keys = ("x", "y", "z", "qx", "qy", "qz", "qw")
-    read = np.array([[row["pose"][it] for it in keys] for row in rows])
+    read = np.array([[row["pose"][key] for key in keys] for row in rows])
     joints = [
         {"name": "tilt", "alpha_rad": -0.5 * np.pi, "a_m": 0.0, "d_m": 0.0},
         {"name": "turn", "alpha_rad": 0.0, "a_m": 0.0, "d_m": -0.475},

@@ -110,8 +110,8 @@ def bound(made: Made) -> np.ndarray:
         away = rotation.inv().apply(point - place - made.truly.apply(slack[3:6])) - tip
         return tool.inv().apply(away)
 
-    jacobian = _jacobian(lambda it: seen(it, np.zeros(9)), size)
-    slacks = _jacobian(lambda it: seen(np.zeros(size), it), 9)
+    jacobian = _jacobian(lambda array: seen(array, np.zeros(9)), size)
+    slacks = _jacobian(lambda array: seen(np.zeros(size), array), 9)
     rows = {"point": [0, 1, 2], "z": [0, 1], "xz": [1]}
     information = np.zeros((size, size))
     for at, kind in enumerate(kinds):
@@ -126,7 +126,7 @@ def bound(made: Made) -> np.ndarray:
 def _jacobian(function: Callable[[np.ndarray], np.ndarray], size: int) -> np.ndarray:
     # Small enough for central differences to be exact to 1e-9, large enough for rounding.
     steps = 1e-5 * np.eye(size)
-    return np.stack([(function(it) - function(-it)) / 2e-5 for it in steps], axis=-1)
+    return np.stack([(function(step) - function(-step)) / 2e-5 for step in steps], axis=-1)
 
 
 def _reach(kind: str, rng: np.random.Generator) -> np.ndarray:
@@ -141,4 +141,6 @@ def _touches(read: Rotation, place: np.ndarray, which: np.ndarray, kinds: list[s
     poses = np.zeros((len(kinds), 4, 4))
     poses[:, :3, :3], poses[:, :3, 3], poses[:, 3, 3] = read.as_matrix(), place, 1.0
     names = tuple("ABC"[: which.max() + 1])
-    return Touches(poses, which, tuple(kinds), tuple(str(it) for it in range(len(kinds))), names)
+    return Touches(
+        poses, which, tuple(kinds), tuple(str(index) for index in range(len(kinds))), names
+    )

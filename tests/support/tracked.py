@@ -48,11 +48,14 @@ def information(shop: Shop, arm_columns: bool = False) -> FloatArray:
     options = shop.options
     size = 12 + 3 * (len(options.points) - 1) + 36 * arm_columns
     steps = 1e-5 * np.eye(size)
-    jacobian = np.stack([(reads(shop, it) - reads(shop, -it)) / 2e-5 for it in steps], axis=-1)
+    jacobian = np.stack(
+        [(reads(shop, step) - reads(shop, -step)) / 2e-5 for step in steps], axis=-1
+    )
     slack = 1e-5 * np.eye(6)
     nothing = np.zeros(size)
     flange_jacobian = np.stack(
-        [(reads(shop, nothing, it) - reads(shop, nothing, -it)) / 2e-5 for it in slack], axis=-1
+        [(reads(shop, nothing, value) - reads(shop, nothing, -value)) / 2e-5 for value in slack],
+        axis=-1,
     )
     sigmas = np.full(jacobian.shape[1], options.sigma_m)
     if options.poses:

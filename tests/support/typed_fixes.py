@@ -65,7 +65,7 @@ def _replaced(folder: Path, found: _Found) -> None:
 def _cell_written(folder: Path, found: _Found) -> None:
     value, view, column = found.groups()
     edit_rows(
-        folder, lambda rows: [it | {column: value} if it["view"] == view else it for it in rows]
+        folder, lambda rows: [row | {column: value} if row["view"] == view else row for row in rows]
     )
 
 
@@ -77,12 +77,12 @@ def _line_deleted(folder: Path, found: _Found) -> None:
 
 
 def _rows_deleted(folder: Path, found: _Found) -> None:
-    views = {it.strip() for it in found[1].split(",")}
-    edit_rows(folder, lambda rows: [it for it in rows if it["view"] not in views])
+    views = {part.strip() for part in found[1].split(",")}
+    edit_rows(folder, lambda rows: [row for row in rows if row["view"] not in views])
 
 
 def _in_radians(folder: Path, found: _Found) -> None:
-    scaled(tuple(f"q{it}_rad" for it in range(1, int(found[1]) + 1)), np.pi / 180.0)(folder)
+    scaled(tuple(f"q{index}_rad" for index in range(1, int(found[1]) + 1)), np.pi / 180.0)(folder)
 
 
 def _respelt(folder: Path, found: _Found) -> None:

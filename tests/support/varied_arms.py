@@ -82,7 +82,7 @@ def _row(joint: dict, *, modified: bool) -> tuple[np.ndarray, np.ndarray]:
 
 
 def arm_of_table(table: dict, model: str, text: str = "") -> Arm:
-    rows = [_row(it, modified=table["convention"] == "modified") for it in table["joint"]]
+    rows = [_row(value, modified=table["convention"] == "modified") for value in table["joint"]]
     ends = []
     for name in ("base", "flange"):
         end = table.get(name, {})
@@ -92,10 +92,10 @@ def arm_of_table(table: dict, model: str, text: str = "") -> Arm:
         else:
             turn = Rotation.from_euler("xyz", end.get("rpy_rad", [0.0] * 3))
             ends.append(placed(end.get("xyz_m", [0.0] * 3), turn))
-    behind = [ends[0], *(it[1] for it in rows)]
-    before = [first @ it[0] for first, it in zip(behind, rows, strict=False)]
-    lower = np.deg2rad([it.get("lower_deg", -360.0) for it in table["joint"]])
-    upper = np.deg2rad([it.get("upper_deg", 360.0) for it in table["joint"]])
+    behind = [ends[0], *(row[1] for row in rows)]
+    before = [first @ row[0] for first, row in zip(behind, rows, strict=False)]
+    lower = np.deg2rad([value.get("lower_deg", -360.0) for value in table["joint"]])
+    upper = np.deg2rad([value.get("upper_deg", 360.0) for value in table["joint"]])
     tip = table.get("tip", "flange")
     return Arm(model, text, np.array(before), behind[-1] @ ends[1], lower, upper, tip)
 
@@ -105,7 +105,7 @@ def built_in(name: str) -> Arm:
 
 
 def built_in_names() -> list[str]:
-    return sorted(it.stem for it in BUILT_IN.glob("*.toml"))
+    return sorted(path.stem for path in BUILT_IN.glob("*.toml"))
 
 
 def table_arm(rng: np.random.Generator, file: str, name: str) -> Arm:
@@ -115,9 +115,9 @@ def table_arm(rng: np.random.Generator, file: str, name: str) -> Arm:
     table = {"schema": 1, "name": name, "tip": "hand", "convention": like["convention"]}
     kept = ("alpha_rad", "theta_offset_rad", "lower_deg", "upper_deg")
     table["joint"] = [
-        {"name": f"j{at}", "a_m": size * it["a_m"], "d_m": size * it["d_m"]}
-        | {key: it[key] for key in kept if key in it}
-        for at, it in enumerate(like["joint"], 1)
+        {"name": f"j{at}", "a_m": size * value["a_m"], "d_m": size * value["d_m"]}
+        | {key: value[key] for key in kept if key in value}
+        for at, value in enumerate(like["joint"], 1)
     ]
     if rng.random() < 0.5:
         height_m, yaw_rad = rng.uniform([0.0, -3.0], [0.8, 3.0]).tolist()
@@ -134,8 +134,8 @@ def urdf_arm(rng: np.random.Generator, file: str, name: str) -> Arm:
     before, last = like.before.copy(), like.last.copy()
     before[:, :3, 3] *= size
     last[:3, 3] *= size
-    links = [f"{it}link" for it in range(len(before) + 1)] + ["tcp é"]
-    tags = [f'<link name="{it}"/>' for it in links]
+    links = [f"{index}link" for index in range(len(before) + 1)] + ["tcp é"]
+    tags = [f'<link name="{link}"/>' for link in links]
     turn = np.eye(4)
     for at, place in enumerate(before):
         # The same axis, said in a frame that is turned.
@@ -166,5 +166,5 @@ def _origin(place: np.ndarray) -> str:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         rpy = Rotation.from_matrix(place[:3, :3]).as_euler("xyz").tolist()
-    xyz, turn = (" ".join(map(repr, it)) for it in (place[:3, 3].tolist(), rpy))
+    xyz, turn = (" ".join(map(repr, value)) for value in (place[:3, 3].tolist(), rpy))
     return f'<origin xyz="{xyz}" rpy="{turn}"/>'

@@ -17,7 +17,7 @@ from support.varied_arms import Arm, built_in, built_in_names, placed, table_arm
 from support.varied_images import Lens, Light, Print, background, draw, exposed
 
 SHIPPED = Path(__file__).parents[2] / "targets"
-DICTIONARIES = sorted(it for it in dir(cv2.aruco) if it.startswith("DICT_"))
+DICTIONARIES = sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
 BOARDS = ("floor", "Wall_2", "x")
 POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 LEAST_MODULE_PX = 3.0
@@ -137,7 +137,7 @@ class Cell:
         edge = next(iter(self.truth))
         ways: list[dict[str, np.ndarray]] = [{edge: self.camera_edge}]
         for name, board in zip(list(self.truth)[1:], self.boards.values(), strict=True):
-            ways = [it | {name: self.truth[name] @ turn} for it in ways
+            ways = [way | {name: self.truth[name] @ turn} for way in ways
                     for turn in board.half_turns()]  # fmt: skip
         yield from ways
 
@@ -222,7 +222,9 @@ def _cell(seed: int, rng: np.random.Generator, mount: str, arm_kind: str) -> Cel
         "boards": str(count) + (" in one image" if together else ""),
         "board": board.kind + (" (shipped)" if "file" in board.document else ""),
         "camera": f"{lens.model} {len(lens.distortion)}",
-        "image": next(f"up to {it:g} MP" for it in (0.5, 1, 2, 5, 13, 20) if megapixels <= it),
+        "image": next(
+            f"up to {value:g} MP" for value in (0.5, 1, 2, 5, 13, 20) if megapixels <= value
+        ),
         "upright": "portrait" if lens.resolution[1] > lens.resolution[0] else "landscape",
         "intrinsics": lens_known,
         "robot": f"built-in {arm.model}" if arm is not None and not arm.text else arm_kind,
@@ -400,7 +402,7 @@ def _print(rng: np.random.Generator, lens: Lens, *, together: bool) -> tuple[Pri
             break
     else:
         return None
-    low_m, high_m = (it * square_px / lens.matrix[0] for it in (0.15, 1.8))
+    low_m, high_m = (value * square_px / lens.matrix[0] for value in (0.15, 1.8))
     least, most = (20, 300) if kind == "marker" else (5, 100)
     low_mm, high_mm = max(least, 1e3 * low_m), min(most, 1e3 * high_m)
     if low_mm > high_mm:
@@ -475,7 +477,7 @@ def _is_drawn(path: Path) -> bool:
 
 
 def _shipped(rng: np.random.Generator, lens: Lens) -> tuple[Print, float] | None:
-    path = rng.choice(sorted(it for it in SHIPPED.glob("*.toml") if _is_drawn(it)))
+    path = rng.choice(sorted(path for path in SHIPPED.glob("*.toml") if _is_drawn(path)))
     document = tomllib.loads(path.read_text(encoding="utf-8")) | {"file": path.stem}
     kind = document["kind"]
     size = (1, 1) if kind == "marker" else (document["columns"], document["rows"])
@@ -496,14 +498,14 @@ def _another(
     """Another board of about the same size; in one image, of markers that no other has."""
     if same and chance(rng, 0.5):
         return _printed(rng, board.document)
-    document = {key: it for key, it in board.document.items() if key != "file"}
+    document = {key: value for key, value in board.document.items() if key != "file"}
     if board.kind != "marker":
         document["columns"] = max(3, document["columns"] - int(rng.integers(0, 3)))
     if same:
         return _printed(rng, document)
     if board.kind != "charuco":
         return None
-    taken = {it.document["dictionary"].rsplit("_", 1)[0] for it in others}
+    taken = {other.document["dictionary"].rsplit("_", 1)[0] for other in others}
     bits = board.dictionary.markerSize
     for name in rng.permutation(DICTIONARIES).tolist():
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
@@ -536,9 +538,9 @@ def _anywhere(rng: np.random.Generator, far_m: float) -> np.ndarray:
     return placed(rng.uniform(-far_m, far_m, 3), turn)
 
 
-def _look(rng: np.random.Generator, it: Cell, board: Print) -> np.ndarray | None:
+def _look(rng: np.random.Generator, item: Cell, board: Print) -> np.ndarray | None:
     """cam_from_target of a view that shows enough of a board; None where none is found."""
-    lens = it.lens
+    lens = item.lens
     size = np.array(lens.resolution)
     for attempt in range(60):
         covariance = 0.35 if board.kind != "charuco" else 0.25
@@ -546,11 +548,11 @@ def _look(rng: np.random.Generator, it: Cell, board: Print) -> np.ndarray | None
         ray = np.append(lens.plane_of(px[None])[0], 1.0)
         ray /= np.linalg.norm(ray)
         scale = rng.uniform(0.85, 1.25) * (1 + attempt / 60)
-        depth_m = scale * board.true_m * lens.matrix[0] / it.square_px
+        depth_m = scale * board.true_m * lens.matrix[0] / item.square_px
         along = Rotation.from_rotvec(rng.uniform(-np.pi, np.pi) * np.array([0.0, 0.0, 1.0]))
         tilt = along.apply([np.deg2rad(rng.uniform(8, 42)), 0.0, 0.0])
         roll = Rotation.from_rotvec([0.0, 0.0, rng.normal(0, 0.5)])
-        if it.axis:
+        if item.axis:
             turn = roll
         else:
             turn = Rotation.from_rotvec(0.7 * np.cross([0, 0, 1], ray)) * Rotation.from_rotvec(tilt)
@@ -592,45 +594,45 @@ def _shows(lens: Lens, board: Print, pose: np.ndarray) -> bool:
                 ((px > 2) & (px < np.array(lens.resolution) - 3)).all())  # fmt: skip
 
 
-def _stops(it: Cell, visit: int) -> list[Stop]:
+def _stops(item: Cell, visit: int) -> list[Stop]:
     """The stops of a visit; fewer than wanted where they cannot be found."""
-    rng = np.random.default_rng([it.seed, 7, visit])
-    names, found = list(it.boards), []
-    wanted = it.views if visit == 0 else max(6, 3 * len(names))
+    rng = np.random.default_rng([item.seed, 7, visit])
+    names, found = list(item.boards), []
+    wanted = item.views if visit == 0 else max(6, 3 * len(names))
     for attempt in range(8):
         short = wanted - len(found)
         if short == 0:
             break
         looks = []
-        for at in range(short if it.arm is None else 3 * short):
+        for at in range(short if item.arm is None else 3 * short):
             name = names[(len(found) + at) % len(names)]
-            pose = _look(rng, it, it.boards[name])
+            pose = _look(rng, item, item.boards[name])
             if pose is not None:
                 looks.append((name, pose))
         if not looks:
             return []
-        flanges = np.array([it.flange(name, pose) for name, pose in looks])
-        if it.arm is None:
+        flanges = np.array([item.flange(name, pose) for name, pose in looks])
+        if item.arm is None:
             joints, fits = [None] * len(looks), np.ones(len(looks), bool)
         else:
-            joints, fits = it.arm.reach(flanges, it.start)
-            flanges = it.arm.frames(joints)[1]
+            joints, fits = item.arm.reach(flanges, item.start)
+            flanges = item.arm.frames(joints)[1]
         if attempt == 1 and len(found) + fits.sum() < 0.3 * wanted:
             return []
         for (name, _), flange, q, fit in zip(looks, flanges, joints, fits, strict=True):
             if fit and len(found) < wanted:
-                found.append(_stop(rng, it, name, flange, q))
+                found.append(_stop(rng, item, name, flange, q))
     return found
 
 
-def _stop(rng: np.random.Generator, it: Cell, name: str, reported: np.ndarray,
+def _stop(rng: np.random.Generator, item: Cell, name: str, reported: np.ndarray,
           joints: np.ndarray | None) -> Stop:  # fmt: skip
-    true = shaken(rng, reported, it.sigma)
-    shown = {name: it.seen(name, true)}
-    if it.together:
-        for other, board in it.boards.items():
-            pose = it.seen(other, true)
-            if other != name and _shows(it.lens, board, pose):
+    true = shaken(rng, reported, item.sigma)
+    shown = {name: item.seen(name, true)}
+    if item.together:
+        for other, board in item.boards.items():
+            pose = item.seen(other, true)
+            if other != name and _shows(item.lens, board, pose):
                 shown[other] = pose
     return Stop(reported, joints, shown)
 
@@ -643,31 +645,35 @@ class Written:
     facts: dict[str, str]
 
 
-def write(it: Cell, beside: Path, visit: int = 0) -> Written:
+def write(cell: Cell, beside: Path, visit: int = 0) -> Written:
     """Writes a visit to a cell as a session: the first is to be calibrated, others verify.
 
     Args:
-        it: The cell.
+        cell: The cell.
         beside: The folder in which the session's own is made.
         visit: Each has other stops and other noise.
     """
-    rng = np.random.default_rng([it.seed, 11, visit])
+    rng = np.random.default_rng([cell.seed, 11, visit])
     odd = chance(rng, 0.4)
     folder = beside / (str(rng.choice(FOLDERS)) if odd else "session")
     (folder / "images").mkdir(parents=True)
-    title = str(rng.choice(TITLES)) if odd else f"cell {it.seed}"
+    title = str(rng.choice(TITLES)) if odd else f"cell {cell.seed}"
     image_name = str(rng.choice(NAMES)) if odd else NAMES[0]
     facts = {"names": "odd" if odd else "plain"}
-    document = {"schema": 1, "name": title, "mount": it.mount}
-    if it.camera is not None:
-        document["camera"] = it.camera
-    if it.robot is not None:
-        document["robot"] = it.robot
-        if it.arm is not None and it.arm.text:
-            (folder / it.arm.model).write_text(it.arm.text, encoding="utf-8")
-    if it.seen_sigma is None or len(it.boards) > 1 or (it.camera is not None and chance(rng, 0.5)):
-        document |= _targets(rng, it, folder, odd=odd)
-    columns, rows = _rows(rng, it, visit, facts, folder, image_name)
+    document = {"schema": 1, "name": title, "mount": cell.mount}
+    if cell.camera is not None:
+        document["camera"] = cell.camera
+    if cell.robot is not None:
+        document["robot"] = cell.robot
+        if cell.arm is not None and cell.arm.text:
+            (folder / cell.arm.model).write_text(cell.arm.text, encoding="utf-8")
+    if (
+        cell.seen_sigma is None
+        or len(cell.boards) > 1
+        or (cell.camera is not None and chance(rng, 0.5))
+    ):
+        document |= _targets(rng, cell, folder, odd=odd)
+    columns, rows = _rows(rng, cell, visit, facts, folder, image_name)
     (folder / "session.toml").write_text(tomli_w.dumps(document), encoding="utf-8")
     with (folder / "views.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns, restval="")
@@ -676,10 +682,10 @@ def write(it: Cell, beside: Path, visit: int = 0) -> Written:
     return Written(folder, facts)
 
 
-def _targets(rng: np.random.Generator, it: Cell, folder: Path, *, odd: bool) -> dict:
+def _targets(rng: np.random.Generator, item: Cell, folder: Path, *, odd: bool) -> dict:
     """Writes the boards' files, and gives what session.toml says of them."""
     places = {}
-    for at, (name, board) in enumerate(it.boards.items()):
+    for at, (name, board) in enumerate(item.boards.items()):
         if "file" in board.document:
             places[name] = board.document["file"]
             continue
@@ -696,16 +702,16 @@ def _targets(rng: np.random.Generator, it: Cell, folder: Path, *, odd: bool) -> 
     return {"targets": places}
 
 
-def _rows(rng: np.random.Generator, it: Cell, visit: int, facts: dict[str, str], folder: Path,
+def _rows(rng: np.random.Generator, item: Cell, visit: int, facts: dict[str, str], folder: Path,
           image_name: str) -> tuple[list[str], list[dict]]:  # fmt: skip
     """The rows of views.csv, with their images written."""
-    facts["rows"] = it.rows
-    repeats = it.seen_sigma is None and not it.together and chance(rng, 0.08)
-    stops = _stops(it, visit)
+    facts["rows"] = item.rows
+    repeats = item.seen_sigma is None and not item.together and chance(rng, 0.08)
+    stops = _stops(item, visit)
     held_out = chance(rng, 0.2) and visit == 0 and len(stops) > 10
     shots = [(stop, stops[stop]) for stop in range(len(stops)) for _ in range(1 + repeats)]
-    of_stop = it.together or repeats or chance(rng, 0.1)
-    facts["stops"] = "several rows" if repeats or it.together else "one row"
+    of_stop = item.together or repeats or chance(rng, 0.1)
+    facts["stops"] = "several rows" if repeats or item.together else "one row"
     begin, stride = choice(rng, {(0, 1): 70, (1, 1): 15, (7, 10): 15})
     stamped = chance(rng, 0.3)
     extra = chance(rng, 0.3)
@@ -713,10 +719,10 @@ def _rows(rng: np.random.Generator, it: Cell, visit: int, facts: dict[str, str],
     images: list[str] = []
     for at, (number, stop) in enumerate(shots):
         image = ""
-        if it.seen_sigma is None:
+        if item.seen_sigma is None:
             image = f"images/{image_name.format(at)}"
             images.append(image)
-            _take(rng, it, stop.shown, folder / image)
+            _take(rng, item, stop.shown, folder / image)
         shared: dict[str, object] = {"stop": number} if of_stop else {}
         if stamped:
             shared["stamp_s"] = f"{1.7e9 + 3.25 * at:.6f}"
@@ -724,42 +730,42 @@ def _rows(rng: np.random.Generator, it: Cell, visit: int, facts: dict[str, str],
             shared |= {"Bemerkung ü": f'gut, "{at}"', "📷": "", "operator": "-"}
         for name, pose in stop.shown.items():
             row: dict[str, object] = {"view": begin + stride * len(rows), "image": image}
-            row |= shared | _told(it, stop)
+            row |= shared | _told(item, stop)
             if name:
                 row["target"] = name
-            if it.seen_sigma is not None:
-                row |= _pose_cells(shaken(rng, pose, it.seen_sigma), "cft_")
+            if item.seen_sigma is not None:
+                row |= _pose_cells(shaken(rng, pose, item.seen_sigma), "cft_")
             if held_out:
                 row["role"] = "holdout" if number % 6 == 5 else str(rng.choice(["fit", ""]))
             rows.append(row)
     facts["roles"] = "with holdout" if held_out else "fit"
-    if it.seen_sigma is None and visit == 0:
-        _spoil(rng, it, facts, folder, images, rows, image_name)
+    if item.seen_sigma is None and visit == 0:
+        _spoil(rng, item, facts, folder, images, rows, image_name)
     columns = list(dict.fromkeys(key for row in rows for key in row))
     return columns, rows
 
 
-def _told(it: Cell, stop: Stop) -> dict[str, str]:
+def _told(item: Cell, stop: Stop) -> dict[str, str]:
     """What a row tells of the robot."""
-    cells = {} if it.rows == "joints" else _pose_cells(stop.reported)
-    if stop.joints is not None and it.rows != "poses":
+    cells = {} if item.rows == "joints" else _pose_cells(stop.reported)
+    if stop.joints is not None and item.rows != "poses":
         cells |= {f"q{n}_rad": f"{q:.9f}" for n, q in enumerate(stop.joints, 1)}
     return cells
 
 
-def _spoil(rng: np.random.Generator, it: Cell, facts: dict[str, str], folder: Path,
+def _spoil(rng: np.random.Generator, item: Cell, facts: dict[str, str], folder: Path,
            images: list[str], rows: list[dict], image_name: str) -> None:  # fmt: skip
     """Rows for the lens alone; images that are missing, torn or show nothing."""
-    width, height = it.lens.resolution
+    width, height = item.lens.resolution
     small = width * height < LARGE_PX
     if chance(rng, 0.1) and small:
         facts["roles"] += " and intrinsics"
-        name, board = next(iter(it.boards.items()))
+        name, board = next(iter(item.boards.items()))
         for at in range(int(rng.integers(1, 6))):
-            pose = _look(rng, it, board)
+            pose = _look(rng, item, board)
             if pose is not None:
                 image = f"images/{image_name.format(900 + at)}"
-                _take(rng, it, {name: pose}, folder / image)
+                _take(rng, item, {name: pose}, folder / image)
                 row = {"view": 10_000 + at, "image": image, "role": "intrinsics"}
                 rows.append(row | ({"target": name} if name else {}))
     facts["images"] = "all there"
@@ -775,20 +781,20 @@ def _spoil(rng: np.random.Generator, it: Cell, facts: dict[str, str], folder: Pa
             elif how == "empty":
                 path.write_bytes(b"")
             else:
-                _take(rng, it, {}, path)
+                _take(rng, item, {}, path)
 
 
-def _take(rng: np.random.Generator, it: Cell, shown: dict[str, np.ndarray], path: Path) -> None:
+def _take(rng: np.random.Generator, item: Cell, shown: dict[str, np.ndarray], path: Path) -> None:
     """Takes an image and stores it."""
-    width, height = it.lens.resolution
-    image = background(rng, it.lens, it.light)
+    width, height = item.lens.resolution
+    image = background(rng, item.lens, item.light)
     covered = [
-        draw(image, it.lens, it.boards[name], pose, it.light, it.square_px)
+        draw(image, item.lens, item.boards[name], pose, item.light, item.square_px)
         for name, pose in shown.items()
     ]
     where = None if width * height < LARGE_PX else [part for part in covered if part is not None]
-    grey = exposed(rng, image, it.light, where)
-    if it.seed % 7 == 0:
+    grey = exposed(rng, image, item.light, where)
+    if item.seed % 7 == 0:
         grey = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
     settings: dict[str, list[int]] = {
         ".png": [cv2.IMWRITE_PNG_COMPRESSION, 1],
@@ -803,5 +809,5 @@ def _take(rng: np.random.Generator, it: Cell, shown: dict[str, np.ndarray], path
 
 def _pose_cells(pose: np.ndarray, before: str = "") -> dict[str, str]:
     quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()
-    cells = [*(f"{it:.7f}" for it in pose[:3, 3]), *(f"{it:.9f}" for it in quaternion)]
-    return {before + name: it for name, it in zip(POSE, cells, strict=True)}
+    cells = [*(f"{item:.7f}" for item in pose[:3, 3]), *(f"{item:.9f}" for item in quaternion)]
+    return {before + name: word for name, word in zip(POSE, cells, strict=True)}

@@ -192,7 +192,7 @@ def draw(image: np.ndarray, lens: Lens, board: Print, cam_from_target: np.ndarra
     left, top, right, bottom = box
     printed, n, margin = _texture(board, square_px, light.blur_px)
     # A texel's middle is half a texel from its edge.
-    u, v = (n * (it + margin) - 0.5 for it in _squares(lens, board, cam_from_target, box))
+    u, v = (n * (square + margin) - 0.5 for square in _squares(lens, board, cam_from_target, box))
     grey = cv2.remap(printed, u, v, cv2.INTER_LINEAR, None, cv2.BORDER_CONSTANT, 255)
     high, wide = printed.shape
     on = (u > -0.5) & (u < wide - 0.5) & (v > -0.5) & (v < high - 0.5)
@@ -252,5 +252,5 @@ def _squares(lens: Lens, board: Print, pose: np.ndarray,
         CubicSpline(places, np.eye(len(places)))(np.arange(low, high)).astype(np.float32)
         for places, (low, high) in zip(nodes, spans, strict=True)
     )
-    u, v = (down @ it.reshape(x.shape).astype(np.float32) @ across.T for it in squares.T)
+    u, v = (down @ column.reshape(x.shape).astype(np.float32) @ across.T for column in squares.T)
     return u, v

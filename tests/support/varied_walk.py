@@ -82,25 +82,25 @@ def walk(seed: int, beside: Path, *, whole: bool = True) -> Walk:
     """
     done = Walk(seed)
     begun = time.perf_counter()
-    it = cell(seed)
+    drawn = cell(seed)
     (beside / "first").mkdir()
-    session = write(it, beside / "first")
+    session = write(drawn, beside / "first")
     done.drawn_s = time.perf_counter() - begun
-    done.facts = it.facts | session.facts
+    done.facts = drawn.facts | session.facts
     rng = np.random.default_rng([seed, 3])
     out = beside / "out ü"
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         if _run(done, "calibrate", session.folder, "-o", out, *(["-v"] if seed % 2 else [])):
-            _look_at(done, it, out)
-            _use(done, it, rng, session.folder, out, beside, whole=whole)
+            _look_at(done, drawn, out)
+            _use(done, drawn, rng, session.folder, out, beside, whole=whole)
         if whole or rng.random() < 0.3:
             _convert(done, session.folder, beside)
     done.warned = sorted({f"{Path(w.filename).name}:{w.lineno} {w.message}" for w in caught})
     return done
 
 
-def _use(done: Walk, it: Cell, rng: np.random.Generator, folder: Path, out: Path, beside: Path,
+def _use(done: Walk, item: Cell, rng: np.random.Generator, folder: Path, out: Path, beside: Path,
          *, whole: bool) -> None:  # fmt: skip
     """All that is done with a result."""
     if (whole or rng.random() < 0.2) and _run(done, "report", out, "-o", beside / "again.html"):
@@ -109,18 +109,18 @@ def _use(done: Walk, it: Cell, rng: np.random.Generator, folder: Path, out: Path
         recording = find_recording(out)
         blueprint(Session.load(recording), load_calibration(recording))
     formats = [*rng.choice(POSES, 2, replace=False)]
-    if it.camera is not None and it.seen_sigma is None:
+    if item.camera is not None and item.seen_sigma is None:
         formats.append(rng.choice(LENSES))
-    if it.arm is not None:
+    if item.arm is not None:
         formats.append(rng.choice(ARMS))
-    edge = str(rng.choice(list(it.truth)))
+    edge = str(rng.choice(list(item.truth)))
     for at, name in enumerate(formats):
         chosen = ["--edge", edge] if at == 0 else []
         _run(done, "export", out, "--to", name, *chosen, "-o", beside / f"export {at}")
     if whole or rng.random() < 0.25:
         (beside / "second").mkdir()
         begun = time.perf_counter()
-        fresh = write(it, beside / "second", visit=1)
+        fresh = write(item, beside / "second", visit=1)
         done.drawn_s += time.perf_counter() - begun
         _run(done, "verify", fresh.folder, "--against", out, "-o", beside / "check")
         _run(done, "locate", fresh.folder, "-c", out)
@@ -172,7 +172,7 @@ def _run(done: Walk, command: str, *arguments: object) -> Done | None:
     except Exception:  # noqa: BLE001 - a bug of any kind is what is looked for
         done.steps.append(Step(command, 1, trace=traceback.format_exc()))
         return None
-    words = [type(it).__name__ for it in told] or [""]
+    words = [type(visioncal_error).__name__ for visioncal_error in told] or [""]
     message = told[0].message if told else end.err if end.status == 2 else ""
     culprits = told[0].culprits if told else ()
     if end.status == 2 and not end.err.strip():
@@ -182,7 +182,7 @@ def _run(done: Walk, command: str, *arguments: object) -> Done | None:
     return end if end.status in (0, 3) else None
 
 
-def _look_at(done: Walk, it: Cell, out: Path) -> None:
+def _look_at(done: Walk, item: Cell, out: Path) -> None:
     """The three files, and how far the result is from the truth."""
     done.missing += [
         name for name in (CALIBRATION, REPORT, RECORDING) if not (out / name).is_file()
@@ -195,17 +195,17 @@ def _look_at(done: Walk, it: Cell, out: Path) -> None:
     if _has_null(document):
         done.missing.append("JSON: null")
     done.verdict = document["verdict"]["status"]
-    done.error = error_of(it, document)
+    done.error = error_of(item, document)
 
 
-def error_of(it: Cell, document: dict) -> Error:
+def error_of(item: Cell, document: dict) -> Error:
     """The error of all free transforms together; a checkerboard's frame as it fits best."""
     order = document["joint_covariance"]["order"]
     covariance = np.array(document["joint_covariance"]["matrix"])
     found = {name: np.array(edge["matrix"]) for name, edge in document["transforms"].items()}
     size = 6 * len(order)
     least = np.inf
-    for truth in it.turned():
+    for truth in item.turned():
         away = [np.linalg.inv(truth[name]) @ found[name] for name in order]
         error = RigidTransform.from_matrix(np.array(away)).as_exp_coords().ravel()
         least = min(least, float(error @ np.linalg.solve(covariance, error)))
@@ -214,9 +214,9 @@ def error_of(it: Cell, document: dict) -> Error:
 
 def _has_null(value: object) -> bool:
     if isinstance(value, dict):
-        return any(_has_null(it) for it in value.values())
+        return any(_has_null(number) for number in value.values())
     if isinstance(value, list):
-        return any(_has_null(it) for it in value)
+        return any(_has_null(number) for number in value)
     return value is None
 
 

@@ -88,10 +88,10 @@ def drift_of(found: Warmed) -> Drift:
     arm, heat = truth.cell.true_arm, truth.heat
     really = truth.warming.at(at_s)
     hot, still = (
-        heated_poses(arm, heat, q, it)[:, :3, 3]
-        for it in (really, np.full_like(really, heat.ambient_c))
+        heated_poses(arm, heat, q, array)[:, :3, 3]
+        for array in (really, np.full_like(really, heat.ambient_c))
     )
-    warm, before = (model.base_from_flange(q, it)[:, :3, 3] for it in (links, cold))
+    warm, before = (model.base_from_flange(q, array)[:, :3, 3] for array in (links, cold))
     jacobian = model.heating.jacobian(found.whole, at_s)
     return Drift(
         np.linalg.norm(hot - still, axis=1),

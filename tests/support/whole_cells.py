@@ -46,8 +46,10 @@ def recorded(cell: Network) -> Session:
 
 def part(session: Session, first: int, end: int) -> Session:
     """The rows of some stops, with their corners."""
-    views = tuple(it for it in session.views if it.stop is not None and first <= it.stop < end)
-    numbers = [it.number for it in views]
+    views = tuple(
+        view for view in session.views if view.stop is not None and first <= view.stop < end
+    )
+    numbers = [view.number for view in views]
     return replace(session, views=views, corner_table=session.corner_table.of_views(numbers))
 
 

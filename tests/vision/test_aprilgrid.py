@@ -149,13 +149,13 @@ def test_a_grid_without_squares_is_to_be_described_as_free_tags(tmp_path):
     side, pitch = 0.03, 0.04
     tags = [(5 + 4 * row + column, column, 3 - row) for row in range(4) for column in range(4)]
     around = side * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-    points = np.concatenate([pitch * np.array(it[1:]) + around for it in tags])
+    points = np.concatenate([pitch * np.array(tag[1:]) + around for tag in tags])
     board = replace(
         BOARDS["tags"],
         points_m=tuple((x, y, 0.0) for x, y in points.tolist()),
         point_numbers=tuple(range(len(points))),
         point_sigmas_m=(),
-        point_tags=tuple((it[0], corner) for it in tags for corner in range(4)),
+        point_tags=tuple((tag[0], corner) for tag in tags for corner in range(4)),
     )
     write_session(simulate(CellOptions(target=board, views=4)), tmp_path / "s")
     path = tmp_path / "s" / "target.toml"
@@ -167,9 +167,11 @@ def test_a_grid_without_squares_is_to_be_described_as_free_tags(tmp_path):
     with pytest.raises(DataError, match="lack the small dark squares") as caught:
         run(Session.load(tmp_path / "s"))
     assert "marker" not in caught.value.message
-    assert all(it in caught.value.next_step for it in ('kind = "points"', "0,0,0,0,5,0"))
+    assert all(name in caught.value.next_step for name in ('kind = "points"', "0,0,0,0,5,0"))
     # What is advised is how such a board is described.
-    assert all(it in as_printed for it in ('kind = "points"', f'dictionary = "{board.dictionary}"'))
+    assert all(
+        name in as_printed for name in ('kind = "points"', f'dictionary = "{board.dictionary}"')
+    )
 
 
 def test_kalibrs_files_are_read(tmp_path):

@@ -36,7 +36,7 @@ SHOT = Shot(square_px=24, noise=2)
 
 def numbered(seen, truth):
     """The centres as found, in the numbering of the truth: an even grid may be turned."""
-    away = [np.abs(it - truth).max() for it in (seen.px, seen.px[::-1])]
+    away = [np.abs(value - truth).max() for value in (seen.px, seen.px[::-1])]
     return seen.px if away[0] < away[1] else seen.px[::-1]
 
 
@@ -54,7 +54,7 @@ def test_circles_are_ordered_as_opencvs():
 def test_the_turns_are_those_that_leave_the_page_as_it_is(target, count):
     turns = rotations(target)
     assert len(turns) == count
-    assert all(sorted(it) == list(range(len(it))) for it in turns)
+    assert all(sorted(turn) == list(range(len(turn))) for turn in turns)
 
 
 def test_circles_that_touch_are_refused():
@@ -147,7 +147,7 @@ def test_a_cell_is_calibrated_with_it(tmp_path, mount, target):
     result = run(Session.load(tmp_path / "s")).calibration
     # Of centres to 0.004 px the lens's last digits may be a point to settle.
     assert result.verdict.status in ("good", "check")
-    assert sum(it.used for it in result.views) >= 11
+    assert sum(view.used for view in result.views) >= 11
     # An even grid has two frames.
     errors = []
     for turn in (np.eye(4), TURNED if not target.asymmetric else np.eye(4)):
@@ -155,7 +155,9 @@ def test_a_cell_is_calibrated_with_it(tmp_path, mount, target):
             name: true @ turn if name.endswith("target") else true
             for name, true in cell.transforms.items()
         }
-        error = np.concatenate([log(invert(result.edges[it].matrix) @ edges[it]) for it in edges])
+        error = np.concatenate(
+            [log(invert(result.edges[edge].matrix) @ edges[edge]) for edge in edges]
+        )
         errors.append(error @ np.linalg.solve(result.joint_covariance, error))
     # Twelve values, to one case in a thousand.
     assert min(errors) < 32.9

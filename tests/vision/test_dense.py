@@ -100,7 +100,7 @@ def test_smoothing_helps_where_neighbours_are_not_independent():
     assert rms(smooth.px - truth) < 0.85 * rms(plain.px - truth)
     # It shows without the truth.
     assert smooth.scatter_px < 0.9 * plain.scatter_px
-    sharp, smoothed = (fitted(CHECKERBOARD, SHOT, smooth_px=it)[2] for it in (0.0, 0.7))
+    sharp, smoothed = (fitted(CHECKERBOARD, SHOT, smooth_px=value)[2] for value in (0.0, 0.7))
     # The noise is that before the smoothing.
     assert smoothed.noise == pytest.approx(sharp.noise, rel=0.1)
 
@@ -157,7 +157,7 @@ def test_an_image_is_explained_up_to_its_noise(target, blurred):
 
 @pytest.mark.usefixtures("torch")
 def test_a_board_that_is_elsewhere_is_not_explained():
-    right, wrong = (explained(CHARUCO, SHOT, it)[2] for it in (0.0, 0.3))
+    right, wrong = (explained(CHARUCO, SHOT, value)[2] for value in (0.0, 0.3))
     assert wrong.rest_rms > 3 * right.rest_rms
     assert np.std(wrong.rest.astype(float)) > 2 * np.std(right.rest.astype(float))
     # Predicted far outside of the image, or nowhere at all.
@@ -183,14 +183,14 @@ def test_derivatives_of_the_blur(torch):
     assert float(value.abs().max()) <= 1.0
     step = 1e-5
     for slope, change in zip(jacobian, step * np.eye(4), strict=True):
-        ends = [transfer(Blur.of(start + it), wu, wv)[0] for it in (change, -change)]
+        ends = [transfer(Blur.of(start + value), wu, wv)[0] for value in (change, -change)]
         # torch's Bessel functions are good to 5e-7.
         assert float(((ends[0] - ends[1]) / (2 * step) - slope).abs().max()) < 1e-6
 
 
 def test_a_print_is_drawn_as_its_cells_are(torch):
     printed = Print.of(CHARUCO)
-    x, y = (torch.tensor((it[1:] + it[:-1]) / 2) for it in (printed.x, printed.y))
+    x, y = (torch.tensor((array[1:] + array[:-1]) / 2) for array in (printed.x, printed.y))
     narrow = torch.tensor(1e-3, dtype=torch.float64)
     drawn = printed.drawn(*torch.meshgrid(x, y, indexing="xy"), narrow, narrow)
     np.testing.assert_array_equal(drawn.numpy() > 0.5, printed.light[1:-1, 1:-1])

@@ -131,7 +131,7 @@ def test_every_unusable_view_gets_its_reason(charuco):
     found = detect(session_of(files, BOARDS["charuco"]))
     names = list(files)
     assert [names[view] for view in found.corners] == ["good.png", "good.jpg"]
-    reasons = {names[it.view]: it.reason for it in found.rejections}
+    reasons = {names[rejection.view]: rejection.reason for rejection in found.rejections}
     for name, word in (
         ("missing.png", "missing"),
         ("empty.png", "empty"),
@@ -175,7 +175,7 @@ def test_all_corners_of_the_smallest_boards_suffice():
     for target in (charuco, tag):
         cell, images = images_of(CellOptions(views=2, target=target, cut_views=0.0, seed=6), 2)
         seen = detect(
-            session_of({f"{at}.png": encoded(it) for at, it in enumerate(images)}, target)
+            session_of({f"{at}.png": encoded(image) for at, image in enumerate(images)}, target)
         )
         for view, corners in seen.corners.items():
             assert corners.ids.tolist() == [0, 1, 2, 3]
@@ -262,7 +262,7 @@ def test_a_size_that_no_sensor_has_is_refused_before_it_is_decoded(charuco, monk
     cell, images = charuco
     decoded = []
     plain = cv2.imdecode
-    monkeypatch.setattr(cv2, "imdecode", lambda *it: decoded.append(it) or plain(*it))
+    monkeypatch.setattr(cv2, "imdecode", lambda *args: decoded.append(args) or plain(*args))
     bomb, half = claiming(30000, 30000), claiming(3000, 3000)
     files = {"a.png": encoded(images[0]), "b.png": bomb}
     found = detect(session_of(files, cell.options.target))

@@ -66,8 +66,8 @@ def assert_named(identity, target):
 @pytest.mark.parametrize(
     "target",
     [
-        pytest.param(it, marks=pytest.mark.slow if name == "legacy, tags" else (), id=name)
-        for name, it in (SHIPPED | ODD).items()
+        pytest.param(target, marks=pytest.mark.slow if name == "legacy, tags" else (), id=name)
+        for name, target in (SHIPPED | ODD).items()
     ],
 )
 def test_a_print_is_named(target):
@@ -151,7 +151,7 @@ def test_a_checkerboard_with_little_white_around_is_whole(columns, rows, side_mm
     # Only squares darken that much of a row or a column.
     rows_px, columns_px = (np.flatnonzero((page < 128).mean(axis=axis) > 0.2) for axis in (1, 0))
     white_px = round(8 * 100 / 25.4)
-    top, left = (max(it[0] - white_px, 0) for it in (rows_px, columns_px))
+    top, left = (max(array[0] - white_px, 0) for array in (rows_px, columns_px))
     assert_named(
         identify(page[top : rows_px[-1] + white_px, left : columns_px[-1] + white_px]), target
     )
@@ -248,7 +248,10 @@ LARGE = (
 
 @pytest.mark.parametrize(
     ("pattern", "expected"),
-    [pytest.param(*it, marks=pytest.mark.slow if it[0] in LARGE else ()) for it in REAL.items()],
+    [
+        pytest.param(*pair, marks=pytest.mark.slow if pair[0] in LARGE else ())
+        for pair in REAL.items()
+    ],
     ids=str,
 )
 def test_real_photographs_are_named(real_data, pattern, expected):
@@ -258,18 +261,27 @@ def test_real_photographs_are_named(real_data, pattern, expected):
     # Neighbours in a recording look alike: every second one is named.
     files = files[::2]
     named = [identify(decode_image(file.read_bytes())) for file in files]
-    found = Counter((it.kind, it.columns, it.rows) for it in named)
+    found = Counter((identity.kind, identity.columns, identity.rows) for identity in named)
     assert found == {(kind, columns, rows): len(files)}
-    assert all(not dictionary or dictionary in (it.dictionary, *it.larger) for it in named)
+    assert all(
+        not dictionary or dictionary in (identity.dictionary, *identity.larger)
+        for identity in named
+    )
     # Bright light takes half a pixel off markers on squares of fifty.
-    assert np.median([it.marker_share for it in named]) == pytest.approx(share, abs=0.012)
+    assert np.median([identity.marker_share for identity in named]) == pytest.approx(
+        share, abs=0.012
+    )
     # Two standard deviations: of 22 photographs one may be farther off.
-    far = [it for it in named if abs(it.marker_share - share) > 2 * it.marker_share_sigma]
+    far = [
+        identity
+        for identity in named
+        if abs(identity.marker_share - share) > 2 * identity.marker_share_sigma
+    ]
     assert len(far) <= 0.05 * len(named)
 
 
 def run(*arguments):
-    return CliRunner().invoke(target_app, ["check", *(str(it) for it in arguments)])
+    return CliRunner().invoke(target_app, ["check", *(str(argument) for argument in arguments)])
 
 
 @pytest.fixture(scope="module")

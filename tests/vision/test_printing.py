@@ -89,7 +89,7 @@ def test_an_svg_holds_the_outlines_to_a_micrometre(name):
     points = np.array(re.findall(r"[ML] (\S+) (\S+)", path), dtype=float) * MM_PER_INCH / 72
     loops = [np.vstack([loop, loop[:1]]) for loop in draw_pattern(sheet.target).loops]
     expected = np.array(sheet.origin_mm) + 1e3 * np.concatenate(loops)
-    drawn = {tuple(it) for it in np.round(points, 3)}
+    drawn = {tuple(value) for value in np.round(points, 3)}
     # The file's numbers end at a millionth of a point: a micrometre is rounding, here and there.
     for point in expected:
         near = {tuple(np.round(point + step, 3)) for step in (0, [0.001, 0], [0, 0.001])}
@@ -195,7 +195,7 @@ def test_a_page_of_own_size_stays_as_it_is_given():
 
 
 def run(*arguments):
-    return CliRunner().invoke(target_app, [str(it) for it in arguments])
+    return CliRunner().invoke(target_app, [str(argument) for argument in arguments])
 
 
 def test_make_writes_four_files_and_replaces_none(tmp_path):
@@ -203,7 +203,7 @@ def test_make_writes_four_files_and_replaces_none(tmp_path):
     done = run("make", *options, "-o", tmp_path / "new")
     assert done.exit_code == 0, done.exception
     files = {path.name for path in (tmp_path / "new").iterdir()}
-    assert files == {f"charuco_5x4_30mm.{it}" for it in ("pdf", "svg", "png", "toml")}
+    assert files == {f"charuco_5x4_30mm.{word}" for word in ("pdf", "svg", "png", "toml")}
     target = load_target("charuco_5x4_30mm.toml", tmp_path / "new")
     assert (target.columns, target.rows, target.square_m) == (5, 4, 0.03)
     again = run("make", *options, "-o", tmp_path / "new")

@@ -101,7 +101,7 @@ def test_what_covers_a_corner_leaves_it_to_the_detector(target):
     assert refined.reasons[7]
     np.testing.assert_array_equal(refined.px[7], truth[7] + 0.25)
     assert np.isnan(refined.sigma_px[7])
-    fitted = np.array([not it for it in refined.reasons])
+    fitted = np.array([not reason for reason in refined.reasons])
     # The cover reaches into the patches of three others at most, and bends no map.
     assert fitted.sum() >= len(truth) - 4
     assert np.abs(refined.px - truth)[fitted].max() < 0.1
@@ -116,7 +116,7 @@ def test_a_corner_at_the_edge_of_the_image_is_exact_or_left_to_the_detector():
         refined = refine(
             np.ascontiguousarray(image[:, left:]), CHECKERBOARD, ids, truth - [left, 0]
         )
-        fitted = np.array([not it for it in refined.reasons])
+        fitted = np.array([not reason for reason in refined.reasons])
         assert fitted.sum() >= 29
         assert fitted.all() == (inside > 4)
         assert np.abs(refined.px + np.array([left, 0]) - truth)[fitted].max() < 0.02
@@ -126,7 +126,7 @@ def test_too_few_corners_stay_where_they_are():
     image, truth = photograph(CHECKERBOARD, SMALL, 1)
     for ids in (np.arange(3), np.arange(6)):
         refined = refine(image, CHECKERBOARD, ids, truth[ids])
-        assert all("too few" in it for it in refined.reasons)
+        assert all("too few" in reason for reason in refined.reasons)
         np.testing.assert_array_equal(refined.px, truth[ids])
     nothing = refine(np.full_like(image, 90), CHECKERBOARD, np.arange(30), truth)
     assert all(nothing.reasons)
@@ -185,7 +185,7 @@ def searched(monkeypatch):
     """The sizes of the images that the quick search is given."""
     sizes, plain = [], board.QUICK["charuco"]
     monkeypatch.setitem(
-        board.QUICK, "charuco", lambda im, it: sizes.append(im.shape) or plain(im, it)
+        board.QUICK, "charuco", lambda im, value: sizes.append(im.shape) or plain(im, value)
     )
     return sizes
 
@@ -237,7 +237,7 @@ def test_what_a_quick_search_misses_is_searched_thoroughly(target, monkeypatch):
         asked = []
         monkeypatch.setitem(board.QUICK, target.kind, lambda *_, part=part: part)
         monkeypatch.setitem(
-            board.FINDERS, target.kind, lambda *it, asked=asked: asked.append(1) or plain(*it)
+            board.FINDERS, target.kind, lambda *args, asked=asked: asked.append(1) or plain(*args)
         )
         found = find_target(image, target)
         assert asked == [1]

@@ -87,21 +87,21 @@ def batch_command(
             progress=progress,
         )
     _report(found)
-    if all(it.state == "failed" for it in found.rows):
+    if all(row.state == "failed" for row in found.rows):
         raise typer.Exit(EXIT_NO_RESULT)
 
 
 def _report(found: "Batch") -> None:
     console, counts = answers(), found.counts
     named = ("good", "check", "bad", "failed", "kept", "changed", "standing out")
-    words = ", ".join(f"{counts[it]} {it}" for it in named if counts[it])
+    words = ", ".join(f"{counts[name]} {name}" for name in named if counts[name])
     console.print(f"{len(found.rows)} sessions: {words}")
-    lines = [f"{it.name}: {it.stands_out}" for it in found.rows if it.score > 0.0][:_MOST_NAMED]
-    lines += [f"{it.name}: {it.change}" for it in found.rows if it.changed][:_MOST_NAMED]
+    lines = [f"{row.name}: {row.stands_out}" for row in found.rows if row.score > 0.0][:_MOST_NAMED]
+    lines += [f"{row.name}: {row.change}" for row in found.rows if row.changed][:_MOST_NAMED]
     failed = [
-        f"{it.name}: {it.words} {it.next_step}".rstrip()
-        for it in found.rows
-        if it.state == "failed"
+        f"{row.name}: {row.words} {row.next_step}".rstrip()
+        for row in found.rows
+        if row.state == "failed"
     ]
     for line in [*lines, *failed[:_MOST_NAMED]]:
         console.print(escape(f"  {line}"))

@@ -89,7 +89,7 @@ def calibrate_command(
     # Of several sessions, the recording is the session of them all.
     session = sessions[0] if len(sessions) == 1 else out / RECORDING
     with naming(session, out):
-        loaded = _joined([need.session(it) for it in sessions], shared=robot_shared)
+        loaded = _joined([need.session(session) for session in sessions], shared=robot_shared)
     asked = Asked(
         solver=solver,
         level=level,
@@ -123,6 +123,6 @@ def _joined(sessions: Sequence["Session"], *, shared: bool) -> "Session":
         return join_sessions(sessions)
     raise DataError(
         f"{len(sessions)} sessions are given, and one is calibrated at a time.",
-        culprits=[it.name for it in sessions],
+        culprits=[session.name for session in sessions],
         next_step="visioncal batch calibrates each by itself; --robot-shared one arm from all.",
     )

@@ -86,8 +86,8 @@ def report_error(error: VisioncalError, *, as_json: bool) -> None:
         print_json({"error": document})
     console = messages()
     console.print(f"[bold red]error:[/] {escape(error.message)}")
-    unsaid = [it for it in error.culprits if it not in error.message]
-    if all(len(it) < _SHORT for it in unsaid):
+    unsaid = [culprit for culprit in error.culprits if culprit not in error.message]
+    if all(len(name) < _SHORT for name in unsaid):
         unsaid = [", ".join(unsaid)] if unsaid else []
     for culprit in unsaid[:_LISTED_CULPRITS]:
         console.print(f"  - {escape(culprit)}")
@@ -113,9 +113,9 @@ def report_written(written: "Written", *, quiet: bool = False, status: int = 0) 
 
     for file in () if quiet else written.files:
         say(f"wrote {file}")
-    for it in written.undrawn:
+    for undrawn in written.undrawn:
         messages().print(
-            f"[bold red]bug:[/] {escape(f'{it.file} could not be drawn ({it.cause}).')}\n"
+            f"[bold red]bug:[/] {escape(f'{undrawn.file} could not be drawn ({undrawn.cause}).')}\n"
             f"The result is safe in {escape(str(written.files[0]))}. Please report this, with the "
             "session if it can be given away."
         )

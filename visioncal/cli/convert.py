@@ -223,9 +223,9 @@ def _print_guess(guess: "Guess") -> None:
 
     console = messages()
     table = Table("reading", "chain closes to", "views that agree", box=None, pad_edge=False)
-    for it in guess.candidates:
-        cells = (it.words, it.figures, f"{it.agreeing} of {it.rows}")
-        table.add_row(*map(escape, cells), style="bold green" if it is guess.best else "")
+    for candidate in guess.candidates:
+        cells = (candidate.words, candidate.figures, f"{candidate.agreeing} of {candidate.rows}")
+        table.add_row(*map(escape, cells), style="bold green" if candidate is guess.best else "")
     console.print(table)
     console.print(escape(guess.sentence))
     for note in guess.notes:

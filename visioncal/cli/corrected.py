@@ -92,7 +92,7 @@ def _warm(calibration: Calibration, words: str | None) -> Calibration:
     if words is None:
         return calibration
     count = calibration.drift.joint_count
-    form = ",".join(f"T{it}" for it in range(1, count + 1))
+    form = ",".join(f"T{index}" for index in range(1, count + 1))
     temperatures = np.array(numbers_in(words, "--temperatures", form))
     wrong = no_celsius(temperatures)
     if wrong:
@@ -130,7 +130,7 @@ def _tool(calibration: Calibration, name: str | None) -> FloatArray:
     placed = calibration.placed
     transform = name if name.startswith(_TOOLS) else f"{_TOOLS}{name}"
     if transform not in placed:
-        known = [it.removeprefix(_TOOLS) for it in placed if it.startswith(_TOOLS)]
+        known = [word.removeprefix(_TOOLS) for word in placed if word.startswith(_TOOLS)]
         raise DataError(
             f"--tool {name}: calibration {calibration.session_name!r} has no {transform}; on its "
             f"flange are {', '.join(known) or 'no tools'}.",
@@ -144,7 +144,7 @@ def _seeds(own: FloatArray, words: str | None) -> FloatArray:
     """The rows' seeds (m, n), that of the option in the first where it has none."""
     if words is None:
         return own
-    form = ",".join(f"q{it}" for it in range(1, own.shape[1] + 1))
+    form = ",".join(f"q{index}" for index in range(1, own.shape[1] + 1))
     seed = np.array(numbers_in(words, "--seed-joints", form))
     if np.isnan(own[0, 0]):
         own = own.copy()
@@ -213,7 +213,7 @@ def _singular(arm: CalibratedArm, targets: Targets, q: FloatArray, rows: IntArra
     most = float(turns[worst, joint])
     far = f"{most:.0f}" if most < _MOST_TURN_DEG else f"over {_MOST_TURN_DEG:.0f}"
     yield (
-        f"{some_of([targets.places[rows[it]] for it in near])}: nearly singular; at "
+        f"{some_of([targets.places[rows[index]] for index in near])}: nearly singular; at "
         f"{targets.places[rows[worst]]} a millimetre turns {arm.real.joint_names[joint]} by "
         f"{far} deg. Move slowly there, or keep away from it."
     )
@@ -223,8 +223,8 @@ def _posture(arm: CalibratedArm, q: FloatArray) -> str:
     """Says in which posture targets without a seed begin."""
     turning = ~arm.real.chain.prismatic
     words = [
-        f"{np.rad2deg(it):.0f}" if turns else f"{1e3 * it:.0f} mm"
-        for it, turns in zip(q, turning, strict=True)
+        f"{np.rad2deg(value):.0f}" if turns else f"{1e3 * value:.0f} mm"
+        for value, turns in zip(q, turning, strict=True)
     ]
     return (
         f"the first is reached in the posture nearest to the middle of the joints' limits, "
@@ -255,8 +255,8 @@ def _report(
         console.print(f"[bold yellow]left out:[/] {escape(f'{place}: {why}')}")
     if len(lost) > _SHOWN:
         console.print(f"  and {len(lost) - _SHOWN} more")
-    for it in warnings:
-        warn(it)
+    for warning in warnings:
+        warn(warning)
 
 
 def _document(
@@ -265,8 +265,8 @@ def _document(
     rows: IntArray,
     lost: Sequence[tuple[str, str]],
 ) -> dict[str, Any]:
-    kept = [it for it in targets.table.columns if it not in columns]
-    cells = [dict(zip(targets.table.columns, it, strict=True)) for it in targets.table.rows]
+    kept = [column for column in targets.table.columns if column not in columns]
+    cells = [dict(zip(targets.table.columns, row, strict=True)) for row in targets.table.rows]
     return {
         "targets": [
             {

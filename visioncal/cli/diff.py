@@ -62,8 +62,8 @@ def _print(comparison: "Comparison", paths: tuple[str, str]) -> None:
     if comparison.edges:
         console.print(_edge_table(comparison))
     for name, where in (
-        *((it, "first") for it in comparison.only_in_a),
-        *((it, "second") for it in comparison.only_in_b),
+        *((name, "first") for name in comparison.only_in_a),
+        *((name, "second") for name in comparison.only_in_b),
     ):
         console.print(f"{name} is in the {where} only.")
     lens = comparison.lens
@@ -106,9 +106,11 @@ def _lens_table(lens: "LensChange") -> "Table":
 
 def _noise_table(comparison: "Comparison") -> "Table":
     table = _table("noise, per axis", "first", "second")
-    for it in comparison.noise:
-        values = ("" if value is None else f"{value:.3g}" for value in (it.a, it.b))
-        table.add_row(it.name, *values)
+    for noise_change in comparison.noise:
+        values = (
+            "" if value is None else f"{value:.3g}" for value in (noise_change.a, noise_change.b)
+        )
+        table.add_row(noise_change.name, *values)
     return table
 
 

@@ -45,12 +45,12 @@ def _print(found: "Checkup", session: Path) -> None:
 
     console = answers()
     console.print(escape(f"{found.session}: {'; '.join(found.seen)}"))
-    for at, it in enumerate(found.findings, 1):
-        console.print(f"[bold]{at}.[/] {escape(it.words)}")
-        if it.do is not None:
-            console.print(escape(f"   {it.do.words}"))
-            if it.do.command:
-                console.print(f"   [bold]{escape(it.do.command)}[/]")
+    for at, finding in enumerate(found.findings, 1):
+        console.print(f"[bold]{at}.[/] {escape(finding.words)}")
+        if finding.do is not None:
+            console.print(escape(f"   {finding.do.words}"))
+            if finding.do.command:
+                console.print(f"   [bold]{escape(finding.do.command)}[/]")
     if found.is_sound:
         command = next_command(found, session)
         console.print(f"[bold green]Nothing is wrong.[/] Next: [bold]{escape(command)}[/]")

@@ -81,7 +81,7 @@ class StreamOptions:
         from visioncal.dynamics.run import Request
 
         try:
-            gains = tuple(float(it) for it in self.gains.split(",")) if self.gains else ()
+            gains = tuple(float(part) for part in self.gains.split(",")) if self.gains else ()
         except ValueError as error:
             raise DataError(
                 f"--gains is {self.gains!r}; numbers with commas between are needed.",
@@ -107,14 +107,14 @@ def friction_terms(words: str, known: Sequence[str]) -> "FrictionTerms":
     """
     from visioncal.dynamics.model import FrictionTerms
 
-    wanted = [] if words.strip().lower() == "none" else [it.strip() for it in words.split(",")]
-    wrong = [it for it in wanted if it not in known]
+    wanted = [] if words.strip().lower() == "none" else [part.strip() for part in words.split(",")]
+    wrong = [name for name in wanted if name not in known]
     if wrong:
         raise DataError(
             f"--friction names {some_of(wrong)[:80]}; the terms are {some_of(known)}, or none.",
             culprits=["--friction"],
         )
-    return FrictionTerms(*(it in wanted for it in known))
+    return FrictionTerms(*(name in wanted for name in known))
 
 
 def identified_of(against: Path | None, command: str) -> "Identified":

@@ -21,9 +21,9 @@ def _show_formats(wanted: bool) -> None:
     if wanted:
         from visioncal.interchange.exports import EXPORT_FORMATS
 
-        width = max(len(it.name) for it in EXPORT_FORMATS)
-        for it in EXPORT_FORMATS:
-            typer.echo(f"{it.name:<{width}}  {it.words}")
+        width = max(len(export_format.name) for export_format in EXPORT_FORMATS)
+        for export_format in EXPORT_FORMATS:
+            typer.echo(f"{export_format.name:<{width}}  {export_format.words}")
         raise typer.Exit
 
 
@@ -123,8 +123,8 @@ def export_command(
         with_corrections,
     )
     written = document(load_exportable(source), to, selection)
-    for it in written.warnings:
-        messages().print(f"[bold red]warning:[/] {escape(it)}")
+    for warning in written.warnings:
+        messages().print(f"[bold red]warning:[/] {escape(warning)}")
     if out is None or out == Path("-"):
         typer.echo(written.text, nl=False)
         return

@@ -75,8 +75,8 @@ class TouchOptions(RobotPoseOptions):
 
     def given(self) -> dict[str, object]:
         """By their names; None for those that were not given."""
-        own = [it for it in vars(self) if it not in ("joint_unit", "touch_noise")]
-        named = {f"--{it.replace('_', '-')}": getattr(self, it) for it in own}
+        own = [var for var in vars(self) if var not in ("joint_unit", "touch_noise")]
+        named = {f"--{name.replace('_', '-')}": getattr(self, name) for name in own}
         return {**named, "--touch-noise-mm": self.touch_noise}
 
 
@@ -127,7 +127,7 @@ class Place:
         if result is None and choice:
             raise DataError(
                 "Names of cameras and robots are those of a whole cell, and none is named.",
-                culprits=[f"--{it}" for it in PARTS if choice.of(it)],
+                culprits=[f"--{part}" for part in PARTS if choice.of(part)],
                 next_step="Name its output folder with -c, or leave them out.",
             )
         if result is not None and result.cell is not None:
@@ -218,7 +218,9 @@ def report(place: Place, frame: "Frame", written: Written, *, as_json: bool) -> 
         return
     console = answers()
     print_verdict(frame.verdict, place.name)
-    turn = ", ".join(f"{it:.3f}" for it in frame.edge.transform.rotation.as_rotvec(degrees=True))
+    turn = ", ".join(
+        f"{value:.3f}" for value in frame.edge.transform.rotation.as_rotvec(degrees=True)
+    )
     rotation = (
         f"turned by ({turn}) deg, sigma {figure(frame.edge.sigma_deg)} deg"
         if frame.oriented
@@ -229,7 +231,7 @@ def report(place: Place, frame: "Frame", written: Written, *, as_json: bool) -> 
     fit = f"rms {figure(frame.rms_mm)} mm, noise {figure(frame.noise_mm)} mm per axis"
     console.print(escape(f"{frame.method}: {fit}"))
     _report_before(place, frame)
-    undrawn = [it.file for it in written.undrawn]
+    undrawn = [undrawn.file for undrawn in written.undrawn]
     recording = None if place.folder is None else place.folder / RECORDING
     if recording is not None and recording not in (*written.files, *undrawn):
         why = "it is missing or of another result"

@@ -63,7 +63,7 @@ def print_predictions(
     identified = identified_of(against, "validate")
     predictions = validate_session(Session.load(session), identified, streams.request())
     if as_json:
-        print_json([_figures(it) for it in predictions])
+        print_json([_figures(prediction) for prediction in predictions])
         return
     for prediction in predictions:
         answers().print(escape("\n".join([prediction.label, *prediction.notes])))
@@ -85,7 +85,7 @@ def _report(identified: Identified, proof: Sequence[str]) -> None:
         for note in stream.notes:
             console.print(f"  - {escape(note)}")
     fitted = {note for stream in identified.streams for note in stream.notes}
-    for note in (it for it in proof if it not in fitted):
+    for note in (name for name in proof if name not in fitted):
         console.print(f"  - {escape(note)}")
     counts = [(word, identified.determined.count(word)) for _, word in CLASSES]
     shares = ", ".join(f"{count} to {word}" for word, count in counts[:-1])
@@ -99,7 +99,7 @@ def _report(identified: Identified, proof: Sequence[str]) -> None:
 
 def _joint_table(identified: Identified) -> Table:
     """What each joint's torques and friction came to."""
-    names = [identified.base.model.names[it] for it in identified.base.independent]
+    names = [identified.base.model.names[index] for index in identified.base.independent]
     values = dict(zip(names, identified.values.tolist(), strict=True))
     humps = {row["joint"]: row for row in stribeck_rows(identified)}
     joints = range(1, identified.robot.joint_count + 1)
@@ -111,13 +111,20 @@ def _joint_table(identified: Identified) -> Table:
         if validation.known_rms_nm is not None:
             columns["before"] = [*validation.known_rms_nm]
     for symbol in ("Fc", "Fv", "Ia"):
-        columns[symbol] = [values.get(f"{symbol}{it}") for it in joints]
-    columns["Fs/Fc"] = [humps.get(it, {}).get("static_over_coulomb") for it in joints]
-    columns["vs"] = [humps.get(it, {}).get("speed_rad_s") for it in joints]
-    known = {name: it for name, it in columns.items() if any(value is not None for value in it)}
+        columns[symbol] = [values.get(f"{symbol}{joint}") for joint in joints]
+    columns["Fs/Fc"] = [humps.get(joint, {}).get("static_over_coulomb") for joint in joints]
+    columns["vs"] = [humps.get(joint, {}).get("speed_rad_s") for joint in joints]
+    known = {
+        name: column
+        for name, column in columns.items()
+        if any(value is not None for value in column)
+    }
     table = Table("joint", *known, box=None)
     for at, joint in enumerate(joints):
-        row = [None if it[at] is None else figure(float(it[at] or 0.0)) for it in known.values()]
+        row = [
+            None if group[at] is None else figure(float(group[at] or 0.0))
+            for group in known.values()
+        ]
         table.add_row(str(joint), *row)
     return table
 

@@ -52,9 +52,12 @@ class PlainCommand(TyperCommand):
 
     def _refuse_empty_paths(self, ctx: Any, typed: list[str]) -> None:  # noqa: ANN401 - typer's own
         """Refuses paths of no letter, as of a shell's variable that is not set: none is meant."""
-        paths = (it for it in self.params if isinstance(ctx.params.get(it.name), Path))
-        takers = {opt for it in paths for opt in it.opts}
-        for option, value in (*pairwise(typed), *(it.split("=", 1) for it in typed if "=" in it)):
+        paths = (param for param in self.params if isinstance(ctx.params.get(param.name), Path))
+        takers = {opt for path in paths for opt in path.opts}
+        for option, value in (
+            *pairwise(typed),
+            *(name.split("=", 1) for name in typed if "=" in name),
+        ):
             if option in takers and not value:
                 raise DataError(
                     f"{option} is empty; a path is needed.",
@@ -69,8 +72,8 @@ class PlainCommand(TyperCommand):
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
-            given = [it for it in ctx.params.values() if isinstance(it, Path)]
-            left = sorted(str(it) for path in given for it in _written_since(path, begun))
+            given = [param for param in ctx.params.values() if isinstance(param, Path)]
+            left = sorted(str(file) for path in given for file in _written_since(path, begun))
             words = f"written so far: {some_of(left)}" if left else "nothing was written"
             typer.echo(f"stopped by Ctrl-C; {words}", err=True)
             raise typer.Exit(_EXIT_CTRL_C) from None
@@ -78,10 +81,10 @@ class PlainCommand(TyperCommand):
     def format_options(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401 - typer's own types
         """Writes them."""
         panels: dict[str, list[tuple[str, str]]] = defaultdict(list)
-        for it in self.get_params(ctx):
-            if record := it.get_help_record(ctx):
-                named = getattr(it, "rich_help_panel", None)
-                panels[named or f"{it.param_type_name.capitalize()}s"].append(record)
+        for param in self.get_params(ctx):
+            if record := param.get_help_record(ctx):
+                named = getattr(param, "rich_help_panel", None)
+                panels[named or f"{param.param_type_name.capitalize()}s"].append(record)
         for name, records in panels.items():
             with formatter.section(name):
                 formatter.write_dl(records)
@@ -89,10 +92,10 @@ class PlainCommand(TyperCommand):
 
 def _written_since(path: Path, begun: float) -> Iterator[Path]:
     """The files of a path that were written since some time [s]."""
-    for it in (path, *path.rglob("*")):
+    for file in (path, *path.rglob("*")):
         # File systems keep times as coarse as this.
-        if it.is_file() and it.stat().st_mtime > begun - 0.01:
-            yield it
+        if file.is_file() and file.stat().st_mtime > begun - 0.01:
+            yield file
 
 
 class LazyGroup(TyperGroup):
@@ -139,15 +142,24 @@ def with_fields(command: Callable[..., None]) -> Callable[..., None]:
     """A command whose parameters that are dataclasses are given field by field, at any depth."""
     parameters = inspect.signature(command).parameters.values()
     hints = get_type_hints(command, include_extras=True)
-    flat = [one for it in parameters for one in _each(it.name, hints[it.name], it.default)]
+    flat = [
+        one
+        for parameter in parameters
+        for one in _each(parameter.name, hints[parameter.name], parameter.default)
+    ]
 
     @wraps(command)
     def taking_each(**given: Any) -> None:  # noqa: ANN401 - of any type
-        command(**{it.name: _taken(it.name, hints[it.name], given) for it in parameters})
+        command(
+            **{
+                parameter.name: _taken(parameter.name, hints[parameter.name], given)
+                for parameter in parameters
+            }
+        )
 
     del taking_each.__wrapped__
     taking_each.__signature__ = inspect.Signature(flat)  # type: ignore[attr-defined]
-    taking_each.__annotations__ = {it.name: it.annotation for it in flat}
+    taking_each.__annotations__ = {parameter.name: parameter.annotation for parameter in flat}
     return taking_each
 
 
@@ -158,9 +170,9 @@ def _each(name: str, kind: Any, default: Any) -> Iterator[inspect.Parameter]:  #
         yield inspect.Parameter(name, at, annotation=kind, default=default)
         return
     own = get_type_hints(kind, include_extras=True)
-    for it in fields(kind):
-        given = inspect.Parameter.empty if it.default is MISSING else it.default
-        yield from _each(it.name, own[it.name], given)
+    for field in fields(kind):
+        given = inspect.Parameter.empty if field.default is MISSING else field.default
+        yield from _each(field.name, own[field.name], given)
 
 
 def _taken(name: str, kind: Any, given: Mapping[str, Any]) -> Any:  # noqa: ANN401 - of any type
@@ -168,7 +180,9 @@ def _taken(name: str, kind: Any, given: Mapping[str, Any]) -> Any:  # noqa: ANN4
     if not _has_fields(kind):
         return given[name]
     own = get_type_hints(kind, include_extras=True)
-    return kind(**{it.name: _taken(it.name, own[it.name], given) for it in fields(kind)})
+    return kind(
+        **{field.name: _taken(field.name, own[field.name], given) for field in fields(kind)}
+    )
 
 
 def _has_fields(kind: object) -> TypeGuard[type]:

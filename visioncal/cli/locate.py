@@ -140,7 +140,7 @@ def locate_command(
         wanted = None if target is None else _target(target, result)
         if session is not None:
             shown = _chosen(session, view)
-            if wanted is not None and any(it.has_corners for it in shown):
+            if wanted is not None and any(other.has_corners for other in shown):
                 raise DataError(
                     f"--target: session {session.name!r} has corners of its own target "
                     "(corners.csv), and no image is searched.",
@@ -165,9 +165,9 @@ def _session(source: Path | None) -> "Session | None":
 
 def _chosen(session: "Session", view: int | None) -> "tuple[View, ...]":
     """The views that are meant."""
-    chosen = tuple(it for it in session.views if view in (None, it.number))
+    chosen = tuple(other for other in session.views if view in (None, other.number))
     if not chosen:
-        numbers = some_of([str(it.number) for it in session.views], 20)
+        numbers = some_of([str(other.number) for other in session.views], 20)
         raise DataError(
             f"--view {view}: session {session.name!r} has no such view; it has {numbers}.",
             culprits=["--view"],
@@ -241,16 +241,16 @@ def _by_plane(
             culprits=["--plane"],
             next_step=f"It is {FORMS}.",
         )
-    px = np.array([numbers_in(it, "--pixel", "u,v") for it in pixels])
+    px = np.array([numbers_in(pixel, "--pixel", "u,v") for pixel in pixels])
     declared, note = plane_of(plane, sigma_mm, calibration, boards)
     places = locate(calibration, px, declared, flange, sigma_px=sigma_px)
     return tuple(
         _Found(
             f"pixel ({u:g}, {v:g})",
             {"pixel": [u, v]},
-            replace(it, warnings=(*it.warnings, note)) if note else it,
+            replace(place, warnings=(*place.warnings, note)) if note else place,
         )
-        for (u, v), it in zip(px.tolist(), places, strict=True)
+        for (u, v), place in zip(px.tolist(), places, strict=True)
     )
 
 
@@ -319,18 +319,18 @@ def _target(words: str, result: "Calibration") -> "Target":
 
 def _report(found: Sequence[_Found], *, as_json: bool) -> None:
     if as_json:
-        print_json([_document(it) for it in found])
+        print_json([_document(item) for item in found])
         return
-    for it in found:
-        typer.echo(f"{it.words}: {_line(it.located)}")
-        for warning in it.located.warnings:
-            words = warning if warning.startswith(it.words) else f"{it.words}: {warning}"
+    for item in found:
+        typer.echo(f"{item.words}: {_line(item.located)}")
+        for warning in item.located.warnings:
+            words = warning if warning.startswith(item.words) else f"{item.words}: {warning}"
             warn(words)
 
 
 def _line(located: "Located") -> str:
-    place = ", ".join(f"{it:.2f}" for it in 1e3 * located.p_base)
-    sigmas = ", ".join(figure(float(it)) for it in located.sigma_mm)
+    place = ", ".join(f"{value:.2f}" for value in 1e3 * located.p_base)
+    sigmas = ", ".join(figure(float(value)) for value in located.sigma_mm)
     largest_mm = figure(located.budget_mm[located.largest])
     return (
         f"({place}) mm, sigma ({sigmas}) mm, 95 % within {figure(located.radius95_mm)} mm; "
@@ -338,10 +338,10 @@ def _line(located: "Located") -> str:
     )
 
 
-def _document(it: _Found) -> dict[str, Any]:
-    found = it.located
+def _document(item: _Found) -> dict[str, Any]:
+    found = item.located
     return {
-        **it.document,
+        **item.document,
         "p_base_m": found.p_base.tolist(),
         "covariance": found.covariance.tolist(),
         "sigma_mm": found.sigma_mm.tolist(),

@@ -36,7 +36,7 @@ def numbers_in(words: str, option: str, form: str) -> tuple[float, ...]:
         DataError: It is not as many finite numbers.
     """
     try:
-        values = tuple(float(it) for it in words.split(","))
+        values = tuple(float(part) for part in words.split(","))
     except ValueError:
         values = ()
     if len(values) != len(form.split(",")) or not all(map(math.isfinite, values)):
@@ -80,9 +80,9 @@ def size_in(words: str) -> tuple[int, int]:
 
 def _whole_numbers(words: str) -> list[int]:
     """The whole numbers between commas; none where something else is among them."""
-    cells = [it.strip() for it in words.split(",")]
-    are_whole = all(it.isdecimal() and len(it) <= _MOST_DIGITS for it in cells)
-    return [int(it) for it in cells] if are_whole else []
+    cells = [part.strip() for part in words.split(",")]
+    are_whole = all(cell.isdecimal() and len(cell) <= _MOST_DIGITS for cell in cells)
+    return [int(cell) for cell in cells] if are_whole else []
 
 
 def refuse_given(options: Mapping[str, object], why: str, next_step: str = "Leave it out.") -> None:
@@ -163,9 +163,9 @@ def _of_frame(
     from visioncal.frames.plane import Plane
 
     placed = {**calibration.placed, **boards}
-    planes = [it for it in placed if it.startswith(_LEAD) and it != f"{_LEAD}cam"]
+    planes = [name for name in placed if name.startswith(_LEAD) and name != f"{_LEAD}cam"]
     names = (words, f"{_LEAD}{words}", f"{_LEAD}target_{words}")
-    name = next((it for it in names if it in planes), "")
+    name = next((name for name in names if name in planes), "")
     if not name:
         there = some_of(planes) if planes else "none yet; visioncal fixture places them"
         raise DataError(

@@ -104,7 +104,7 @@ def _report(plan: "Plan") -> None:
     console.print(escape(f"{plan.request.purpose.name}: {summary_of(plan)}"))
     if plan.begun is not None and plan.begun.refusal:
         console.print(escape(f"  so far: {plan.begun.refusal}"))
-    for stop in sorted(plan.stops, key=lambda it: it.rank)[:_SHOWN]:
+    for stop in sorted(plan.stops, key=lambda value: value.rank)[:_SHOWN]:
         console.print(escape(f"  view {stop.view}: {stop.words}"))
     if len(plan.stops) > _SHOWN:
         console.print(f"  and {len(plan.stops) - _SHOWN} more, in plan.json and in the preview")

@@ -23,7 +23,7 @@ _limits = partial(typer.Option, rich_help_panel="What the arm must keep")
 _doubt = partial(typer.Option, rich_help_panel="How well it is known")
 # Of a plan until a need is met.
 _MOST_FOR_NEED = 40
-_USUAL_STOPS = ", ".join(f"{it.stops} for {it.name}" for it in PURPOSES.values())
+_USUAL_STOPS = ", ".join(f"{purpose.stops} for {purpose.name}" for purpose in PURPOSES.values())
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class PlanOptions:
         from visioncal.live.planning.plan import Request
 
         wanted = purpose_of(self.purpose, "--for")
-        form = ",".join(f"q{it + 1}" for it in range(cell.robot.joint_count))
+        form = ",".join(f"q{index + 1}" for index in range(cell.robot.joint_count))
         start = self.start_joints and numbers_in(self.start_joints, "--start-joints", form)
         unwished = self.wish_mm is None and self.wish_deg is None
         needless = self.need_mm is None and self.need_deg is None
@@ -169,7 +169,7 @@ class CellOptions:
 
     def options(self, *names: str) -> dict[str, object]:
         """Some of them by their names; None for those that were not given."""
-        return {f"--{it}": getattr(self, it) for it in names}
+        return {f"--{name}": getattr(self, name) for name in names}
 
 
 @dataclass(frozen=True)
@@ -202,7 +202,7 @@ class ClearanceOptions:
         Raises:
             DataError: A box is written otherwise.
         """
-        return tuple(_box_of(it) for it in self.boxes or ())
+        return tuple(_box_of(box) for box in self.boxes or ())
 
     @property
     def floor_m(self) -> float | None:

@@ -144,7 +144,7 @@ def cell_of(source: Source, words: CellOptions, kept: Kept) -> PlanCell:
         if said is not None:
             pose_of(said, option)
     needed = ("target", "camera", "cam", "board", *(() if numbers is None else ("resolution",)))
-    missing = [f"--{it}" for it in needed if getattr(words, it) is None]
+    missing = [f"--{value}" for value in needed if getattr(words, value) is None]
     if missing or source.robot is None:
         raise DataError(
             f"{source.words}: {some_of(missing)} {'is' if len(missing) == 1 else 'are'} needed to "
@@ -198,7 +198,7 @@ def _with_robot(session: Session, name: str) -> Session:
     return Session.assemble(
         document,
         session.columns,
-        [[view.cell(it) for it in session.columns] for view in session.views],
+        [[view.cell(column) for column in session.columns] for view in session.views],
         session.images,
         target_document=session.target_document,
         robot_document=load_robot(name).document,
@@ -235,7 +235,7 @@ def _calibrated(
 
 
 def _guess(words: CellOptions) -> Guess:
-    missing = [f"--{it}" for it in ("cam", "board") if getattr(words, it) is None]
+    missing = [f"--{name}" for name in ("cam", "board") if getattr(words, name) is None]
     if missing:
         raise DataError(
             f"{missing[0]} is needed too: a guess is one of both, the camera and the board.",

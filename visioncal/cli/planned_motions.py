@@ -102,7 +102,7 @@ def _radians(degrees: float | None) -> float | None:
 def _bodies(arm: Robot, boxes: Sequence[Box], tool: str | None) -> tuple[Body, ...]:
     found = [Body(box.name, 0, "box", box.size_m, box.base_from_box) for box in boxes]
     if tool is not None:
-        length, radius = (1e-3 * it for it in numbers_in(tool, "--tool", "length,radius"))
+        length, radius = (1e-3 * number for number in numbers_in(tool, "--tool", "length,radius"))
         if min(length, radius) <= 0.0:
             raise DataError(
                 f"--tool is {tool!r}; a length and a radius above zero [mm] are needed.",
@@ -121,6 +121,6 @@ def _payload(words: str) -> FloatArray:
         raise DataError(
             f"--payload is {words!r}; a mass of 0 kg or more is needed.", culprits=["--payload"]
         )
-    x, y, z = (1e-3 * it for it in centre_mm)
+    x, y, z = (1e-3 * value for value in centre_mm)
     about = [y * y + z * z, -x * y, x * x + z * z, -x * z, -y * z, x * x + y * y]
     return kg * np.array([1.0, x, y, z, *about])

@@ -88,7 +88,7 @@ def names_in(words: str | None, option: str) -> tuple[str, ...]:
     """
     if words is None:
         return ()
-    names = tuple(it.strip() for it in words.split(","))
+    names = tuple(part.strip() for part in words.split(","))
     if not all(names) or len(set(names)) < len(names):
         raise DataError(
             f"{option} is {words[:80]!r}; names are needed, each once, with commas between.",

@@ -54,7 +54,7 @@ def driven(
     asks: bool,
 ) -> list[Step]:
     """Drives the plan's stops, after a word of the user."""
-    leaving = departure(cell, scene.planned, [it.number for it in journal.views], taking)
+    leaving = departure(cell, scene.planned, [view.number for view in journal.views], taking)
     report_departure(leaving, cell, taking)
     if not leaving.stops:
         return []
@@ -106,11 +106,11 @@ def check_all(journal: Journal, steps: Sequence[Step]) -> None:
     """Ends with status 2 where stops of the plan gave no view."""
     without = dict(missed(steps))
     if without:
-        words = "; ".join(f"view {it}: {reason}" for it, reason in without.items())
+        words = "; ".join(f"view {key}: {reason}" for key, reason in without.items())
         raise DataError(
             f"{len(without)} of {len(steps)} stops gave no view ({words}). {len(journal.views)} "
             f"views are in {journal.folder}.",
-            culprits=[f"view {it}" for it in without],
+            culprits=[f"view {index}" for index in without],
             next_step="--resume tries them again.",
         )
 
@@ -128,13 +128,18 @@ def finish(journal: Journal, steps: Sequence[Step], *, as_json: bool) -> None:
 
 
 def _summary(journal: Journal, steps: Sequence[Step]) -> dict[str, Any]:
-    known = [it.accuracy for it in steps if it.accuracy is not None and not it.accuracy.is_open]
+    known = [
+        step.accuracy for step in steps if step.accuracy is not None and not step.accuracy.is_open
+    ]
     summary: dict[str, Any] = {
         "session": str(journal.folder),
-        "views": [it.number for it in journal.views],
+        "views": [view.number for view in journal.views],
         "times_s": [
-            {"view": it.view, **{name: round(value, 3) for name, value in vars(it.times).items()}}
-            for it in steps
+            {
+                "view": step.view,
+                **{name: round(value, 3) for name, value in vars(step.times).items()},
+            }
+            for step in steps
         ],
     }
     if known:

@@ -128,7 +128,7 @@ class Rehearsal:
             "passed": self.error.passed,
             "chi_square": asdict(self.error),
             "errors": {
-                name: asdict(it) for name, it in edge_errors(self.calibration, truth).items()
+                name: asdict(error) for name, error in edge_errors(self.calibration, truth).items()
             },
             "arm_level": NOMINAL if self.calibration.arm is None else self.calibration.arm.level,
             "noise": dict(self.calibration.noise),
@@ -136,19 +136,19 @@ class Rehearsal:
             "views": len(self.away_mm),
             "most_away_at_exposure_mm": max(self.away_mm),
             "times_s": self.times_s,
-            "truth": {name: it.tolist() for name, it in truth.items()},
+            "truth": {name: array.tolist() for name, array in truth.items()},
         }
         if self.pace is not None:
             document["capture"] = asdict(self.pace)
         if self.touch_test is not None:
             document["touch_test"] = {
                 "passed": self.touch_test.passed,
-                "gaps_mm": [it.gap_mm for it in self.touch_test.points],
-                "radius95_mm": [it.radius95_mm for it in self.touch_test.points],
+                "gaps_mm": [point.gap_mm for point in self.touch_test.points],
+                "radius95_mm": [point.radius95_mm for point in self.touch_test.points],
             }
         if self.taken.fault is not None:
             suffered = asdict(self.taken.fault)
-            document["fault"] = {key: it for key, it in suffered.items() if it is not None}
+            document["fault"] = {key: value for key, value in suffered.items() if value is not None}
         return document
 
     def report(self) -> None:

@@ -52,9 +52,10 @@ def touched(folder: Path, calibration: Calibration, base_from_target: FloatArray
         base_from_target: (4, 4) the truth.
     """
     points = touch_points(Session.load(folder), calibration)
-    true = [base_from_target[:3, :3] @ it.board_m + base_from_target[:3, 3] for it in points]
+    true = [base_from_target[:3, :3] @ point.board_m + base_from_target[:3, 3] for point in points]
     gaps = [
-        1e3 * float(np.linalg.norm(it.base_m - at)) for it, at in zip(points, true, strict=True)
+        1e3 * float(np.linalg.norm(point.base_m - at))
+        for point, at in zip(points, true, strict=True)
     ]
     return judged(points, gaps)
 

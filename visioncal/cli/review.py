@@ -73,7 +73,7 @@ def _row(file: Path, view: int | None) -> int | None:
             view = worst_view(result.views, result.rms)
         if view is None:
             return None
-    numbers = [it.number for it in read_session(file).views]
+    numbers = [other.number for other in read_session(file).views]
     if view not in numbers:
         raise DataError(
             f"{file} has no view {view}; it has {some_of([*map(str, numbers)])}.",

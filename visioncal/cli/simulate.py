@@ -202,7 +202,7 @@ def simulate_command(context: typer.Context, asked: SimulateOptions) -> None:
         wrong_views=asked.wrong_views,
         board_scale=asked.board_scale,
         compliance_rad_per_nm=_compliance(asked.robot, asked.stiffness_knm),
-        payloads=tuple(Payload(it, CENTRE_M) for it in asked.payload_kg or ()),
+        payloads=tuple(Payload(value, CENTRE_M) for value in asked.payload_kg or ()),
         second=Second() if asked.second_board else None,
         recording=asked.recording,
         camera_moved_m=1e-3 * asked.camera_moved_mm,
@@ -270,12 +270,14 @@ def _compliance(robot: str, stiffness_knm: float | None) -> tuple[float, ...]:
 def _given_for(context: typer.Context) -> frozenset[str]:
     """The parameters that the user gave, all of which fit the kind of session asked for."""
     sources = {name: context.get_parameter_source(name) for name in context.params}
-    given = frozenset(name for name, it in sources.items() if it and it.name == "COMMANDLINE")
-    kinds = [it for it in _TAKES if context.params.get(it)]
+    given = frozenset(
+        name for name, source in sources.items() if source and source.name == "COMMANDLINE"
+    )
+    kinds = [take for take in _TAKES if context.params.get(take)]
     if "cell" in kinds:
-        kinds = [it for it in kinds if it not in _ALONG]
+        kinds = [kind for kind in kinds if kind not in _ALONG]
     if len(kinds) > 1:
-        named = [_option(it) for it in kinds]
+        named = [_option(kind) for kind in kinds]
         raise DataError(
             f"{' and '.join(named)}: each makes a session of its own kind.",
             culprits=named,
@@ -288,7 +290,7 @@ def _given_for(context: typer.Context) -> frozenset[str]:
     if kind == "cell" and context.params.get("torques"):
         takes = takes | {"currents"}
     for unfit in sorted(given - takes - {"folder", kind}):
-        fit = [_option(it) for it, taken in _TAKES.items() if unfit in taken]
+        fit = [_option(name) for name, taken in _TAKES.items() if unfit in taken]
         raise DataError(
             f"{_option(unfit)} goes with {' or '.join(fit)}, not with {_option(kind)}.",
             culprits=[_option(unfit)],

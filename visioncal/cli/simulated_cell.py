@@ -60,12 +60,12 @@ def whole_cell(
             next_step="Give it a camera that sees a target, or an instrument and points.",
         )
     exercised = {
-        it.name: exercise(exercise_options(asked, it.robot, seed_of(described.seed, at)))
-        for at, it in enumerate(described.robots if asked.torques else ())
+        robot.name: exercise(exercise_options(asked, robot.robot, seed_of(described.seed, at)))
+        for at, robot in enumerate(described.robots if asked.torques else ())
     }
     touched = touch_network(cell) if asked.touches else {}
     # Rows of an image that are not of one moment have no pose.
-    row_by_row = any(it.readout_s for it in described.sweeps)
+    row_by_row = any(sweep.readout_s for sweep in described.sweeps)
     without_images: Seen = "corners" if row_by_row else "poses"
     with shown_progress(quiet=False) as progress:
         count = len(cell.sights)
@@ -87,15 +87,15 @@ def _described(
     changes = {"views": "stops", "wrong_views": "stray_images", "seed": "seed"}
     changes |= {"recording": "recording"}
     described = replace(
-        described, **{own: getattr(options, it) for it, own in changes.items() if it in given}
+        described, **{own: getattr(options, word) for word, own in changes.items() if word in given}
     )
     described = replace(
         described,
-        robots=tuple(_with_given(it, options, given) for it in described.robots),
-        cameras=tuple(_with_given(it, options, given) for it in described.cameras),
+        robots=tuple(_with_given(robot, options, given) for robot in described.robots),
+        cameras=tuple(_with_given(camera, options, given) for camera in described.cameras),
         boards=tuple(
-            replace(it, scale=options.board_scale) if "board_scale" in given else it
-            for it in described.boards
+            replace(board, scale=options.board_scale) if "board_scale" in given else board
+            for board in described.boards
         ),
     )
     if "camera_moved_mm" in given:
@@ -111,8 +111,8 @@ def _described(
 
 def _with_given(thing: _T, options: CellOptions, given: frozenset[str]) -> _T:
     """A robot or a camera with what the user says of it."""
-    mine = {it.name for it in fields(thing)}
-    changed = {_FIELDS[it] for it in given & _FIELDS.keys()} & mine
+    mine = {field.name for field in fields(thing)}
+    changed = {_FIELDS[name] for name in given & _FIELDS.keys()} & mine
     return replace(thing, **{name: getattr(options, name) for name in changed})
 
 

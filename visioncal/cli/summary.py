@@ -59,14 +59,14 @@ def print_summary(calibration: Calibration, *, verbose: bool) -> None:
         _print_noise(cell)
     else:
         _print_residuals(calibration)
-    for it in left_out(_unsaid(calibration.verdict, sights(calibration))):
-        console.print(escape(f"  {it.words}"))
+    for suspects in left_out(_unsaid(calibration.verdict, sights(calibration))):
+        console.print(escape(f"  {suspects.words}"))
     if cell is not None:
         console.print(escape(cell.weakest))
     solvers = solver_table(calibration)
     if verbose and solvers is not None:
         first, *rest = solvers.titles
-        columns = (Column(first, no_wrap=True), *(Column(it, overflow="fold") for it in rest))
+        columns = (Column(first, no_wrap=True), *(Column(name, overflow="fold") for name in rest))
         table = Table(*columns, box=None, pad_edge=False)
         for row in solvers.rows:
             table.add_row(*row.cells)
@@ -102,10 +102,12 @@ def _print_noise(cell: Alignment) -> None:
 
 def _unsaid(verdict: Verdict, views: Iterable[Sight]) -> Iterator[Sight]:
     """The views about which the verdict does not say already why they were left out."""
-    said = [it for it in verdict.findings if it.without_it]
+    said = [finding for finding in verdict.findings if finding.without_it]
     for view in views:
-        about = [it for it in said if view.view in it.views]
-        if not any(it.kind != "wrong_views" or view.reason in it.words for it in about):
+        about = [finding for finding in said if view.view in finding.views]
+        if not any(
+            finding.kind != "wrong_views" or view.reason in finding.words for finding in about
+        ):
             yield view
 
 
@@ -120,8 +122,11 @@ def truth_table(
         camera: The true lens.
     """
     table = Table("against the truth", "error", "sigma", "error / sigma", box=None)
-    for name, it in edge_errors(calibration, transforms).items():
-        for error, sigma, unit in ((it.mm, it.sigma_mm, "mm"), (it.deg, it.sigma_deg, "deg")):
+    for name, edge_error in edge_errors(calibration, transforms).items():
+        for error, sigma, unit in (
+            (edge_error.mm, edge_error.sigma_mm, "mm"),
+            (edge_error.deg, edge_error.sigma_deg, "deg"),
+        ):
             table.add_row(
                 name, f"{error:.3f} {unit}", f"{sigma:.3f} {unit}", f"{error / sigma:.2f}"
             )

@@ -80,15 +80,21 @@ class BoardOptions:
     @property
     def given(self) -> list[str]:
         """The options by which it is described."""
-        chosen = [it.name for it in fields(self) if getattr(self, it.name) != it.default]
+        chosen = [
+            field.name for field in fields(self) if getattr(self, field.name) != field.default
+        ]
         names = {"marker_id": "id"}
-        return [f"--{names.get(it, it).replace('_', '-')}" for it in chosen if it != "kind"]
+        return [f"--{names.get(name, name).replace('_', '-')}" for name in chosen if name != "kind"]
 
     def request(self, kind: _Described) -> "Request":
         """The same as the printer takes it."""
         from visioncal.vision.printing import Request
 
-        mine = {it.name: getattr(self, it.name) for it in fields(self) if it.name != "size_mm"}
+        mine = {
+            field.name: getattr(self, field.name)
+            for field in fields(self)
+            if field.name != "size_mm"
+        }
         if self.size_mm is not None:
             mine["square_mm"] = self.size_mm
         return Request(**mine | {"kind": kind})
@@ -171,7 +177,7 @@ def _pages(page: str | None, landscape: bool | None, *, larger: bool) -> "tuple[
     if page is not None:
         return pages_named(page, landscape)
     names = _PAGES if larger else _PAGES[:1]
-    return tuple(it for name in names for it in pages_named(name, landscape))
+    return tuple(item for name in names for item in pages_named(name, landscape))
 
 
 @target_app.command("check", cls=PlainCommand)

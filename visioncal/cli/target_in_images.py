@@ -101,15 +101,15 @@ def _image_session(source: Path, for_touches: Mapping[str, object]) -> "Session 
     if not source.is_dir() and source.suffix.lower() != ".rrd":
         return None
     session = Session.load(source)
-    shown = [it.number for it in session.views if it.image or it.has_corners]
+    shown = [view.number for view in session.views if view.image or view.has_corners]
     if not shown:
         return None
-    touched = [it.number for it in session.views if it.text.keys() & {"kind", "point"}]
+    touched = [view.number for view in session.views if view.text.keys() & {"kind", "point"}]
     if touched:
         raise DataError(
             f"session {session.name!r} has images (view {shown[0]}) and touches (kind or point in "
             f"view {touched[0]}): a frame is placed by one of them.",
-            culprits=[f"view {it}" for it in touched],
+            culprits=[f"view {index}" for index in touched],
             next_step="Put the touches into a table or a session of their own, without images.",
         )
     refuse_given(for_touches, f"session {session.name!r} has images, and this is for touches")

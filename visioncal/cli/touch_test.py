@@ -88,7 +88,7 @@ def touch_test_command(
     known = load_result(calibration)
     if known.cell is not None:
         raise DataError("touch-test is for one camera and one robot.", culprits=["-c"])
-    has_tools = any(it.startswith("flange_from_") for it in known.frames)
+    has_tools = any(frame.startswith("flange_from_") for frame in known.frames)
     is_bare = tool == "none" or (tool is None and not has_tools)
     if not (is_bare or has_tools):
         raise DataError(
@@ -100,7 +100,7 @@ def touch_test_command(
     touching = None if is_bare else Tool.among(known.frames, "The calibration", tool)
     with shown_progress(quiet=as_json):
         points = touch_points(loaded, known, touching)
-    targets = [_target(known, it, 1e-3 * height_mm) for it in points]
+    targets = [_target(known, point, 1e-3 * height_mm) for point in points]
     if gaps_mm is not None:
         count = gaps_mm.count(",") + 1
         gaps = [*numbers_in(gaps_mm, "--gaps-mm", ",".join("abcdefghij"[:count]))]
@@ -167,7 +167,7 @@ def _report_point(point: "TouchPoint", target: dict[str, Any], console: Console)
     )
     for name in ("hover", "touch"):
         place, turn = target[name][:3], target[name][3:]
-        numbers = [*(f"{1e3 * it:.2f}" for it in place), *(f"{it:.5f}" for it in turn)]
+        numbers = [*(f"{1e3 * item:.2f}" for item in place), *(f"{item:.5f}" for item in turn)]
         console.print(f"  {name}: {', '.join(numbers)}")
 
 

@@ -106,7 +106,7 @@ def _report(check: "Check", triggers: "Sequence[Outcome]", verdict: "Verdict") -
     for view, reason in sorted(check.seen.known.reasons.items()):
         console.print(f"  view {view} was not used: {escape(reason)}")
     for state, begin in _TRIGGERED.items():
-        words = "; ".join(it.words for it in triggers if it.state == state)
+        words = "; ".join(trigger.words for trigger in triggers if trigger.state == state)
         if words:
             console.print(f"{begin}: {escape(words)}")
 

@@ -42,7 +42,7 @@ def print_payload(asked: PayloadOptions) -> None:
     if asked.as_json:
         print_json(found.document())
         return
-    for note in (note for it in loaded for note in it.notes):
+    for note in (note for conditioned in loaded for note in conditioned.notes):
         say(note)
     typer.echo("\n".join(_lines(found)))
 
@@ -78,11 +78,11 @@ def _lines(found: Payload) -> list[str]:
         f"centre {centre} mm in the flange's frame",
     ]
     if found.consistent:
-        inertia = ", ".join(f"{it:.4g}" for it in found.inertia_kg_m2)
+        inertia = ", ".join(f"{value:.4g}" for value in found.inertia_kg_m2)
         lines.append(f"inertia about it (xx, xy, yy, xz, yz, zz) {inertia} kg m^2")
     else:
         lines.append("its inertia is lost in the noise")
-    left = ", ".join(significant(it) for it in found.rms_nm.tolist())
+    left = ", ".join(significant(rm) for rm in found.rms_nm.tolist())
     lines.append(f"unexplained {left} N m, joint by joint")
     return [*lines, f"on a UR: {_ur_words(found)}"]
 
@@ -96,16 +96,18 @@ def _of_gains(found: Payload) -> str:
 
 def _listed(values: FloatArray, sigmas: FloatArray) -> str:
     pairs = zip(values.tolist(), sigmas.tolist(), strict=True)
-    return ", ".join(f"{matched(it, sigma)} (sigma {significant(sigma)})" for it, sigma in pairs)
+    return ", ".join(
+        f"{matched(value, sigma)} (sigma {significant(sigma)})" for value, sigma in pairs
+    )
 
 
 def _ur_words(found: Payload) -> str:
     """The payload as a UR's program sets it, in kg, m and kg m^2."""
-    centre = ", ".join(f"{it:.5f}" for it in found.centre_m)
+    centre = ", ".join(f"{value:.5f}" for value in found.centre_m)
     if not found.consistent:
         return f"set_target_payload({found.mass_kg:.4f}, [{centre}])"
     xx, xy, yy, xz, yz, zz = found.inertia_kg_m2.tolist()
-    inertia = ", ".join(f"{it:.6f}" for it in (xx, yy, zz, xy, xz, yz))
+    inertia = ", ".join(f"{value:.6f}" for value in (xx, yy, zz, xy, xz, yz))
     return f"set_target_payload({found.mass_kg:.4f}, [{centre}], [{inertia}])"
 
 
@@ -141,7 +143,7 @@ def _report_gains(names: tuple[str, ...], found: Gains) -> None:
             words = f"{matched(gain, sigma)} N m/A (sigma {significant(sigma)})"
         say(f"{name}: {words}")
     if found.determined.all():
-        gains = ",".join(f"{it:.5g}" for it in found.nm_per_a)
+        gains = ",".join(f"{value:.5g}" for value in found.nm_per_a)
         typer.echo(f"--gains {gains}")
     else:
         say(

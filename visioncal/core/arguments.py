@@ -53,8 +53,8 @@ def typed(function: Callable[Given, Answer]) -> Callable[Given, Answer]:
                 fields = typing.get_type_hints(hint[0]) if hint else {}
             else:
                 fields = hints
-            for key, it in values.items():
-                _check(function.__qualname__, key, it, fields.get(key, Any))
+            for key, number in values.items():
+                _check(function.__qualname__, key, number, fields.get(key, Any))
         return function(*args, **kwargs)
 
     return checked
@@ -73,7 +73,11 @@ def check_fields(instance: Any) -> None:  # noqa: ANN401 - any dataclass
 
 @cache
 def _declared(function: Callable[..., Any]) -> tuple[inspect.Signature, dict[str, Any]]:
-    taken = {name: it for name, it in function.__annotations__.items() if name != "return"}
+    taken = {
+        name: annotation
+        for name, annotation in function.__annotations__.items()
+        if name != "return"
+    }
     # What a function gives back may be known to type checkers alone.
     alone = types.SimpleNamespace(__annotations__=taken)
     hints = typing.get_type_hints(alone, getattr(function, "__globals__", None))
@@ -91,8 +95,8 @@ def _check(owner: str, name: str, value: object, hint: object) -> None:
     options = list(_options(hint))
     for option in options:
         if isinstance(value, list | tuple) and _is_list(option):
-            for at, it in enumerate(value):
-                _check(owner, f"{name}[{at}]", it, typing.get_args(option)[0])
+            for at, number in enumerate(value):
+                _check(owner, f"{name}[{at}]", number, typing.get_args(option)[0])
     if isinstance(value, str) and (names := _names(options)):
         raise DataError(
             f"{owner}: {name} {value!r} is not one of {', '.join(names)}.",
@@ -100,11 +104,13 @@ def _check(owner: str, name: str, value: object, hint: object) -> None:
             next_step=did_you_mean(value, names),
         )
     needed = " or ".join(
-        dict.fromkeys(_words(it) for it in options if it is not str or Path not in options)
+        dict.fromkeys(
+            _words(option) for option in options if option is not str or Path not in options
+        )
     )
     step = ""
     if isinstance(value, str | Path):
-        loaders = [f"{it.__name__}.load" for it in options if hasattr(it, "load")]
+        loaders = [f"{option.__name__}.load" for option in options if hasattr(option, "load")]
         loaders += ["load_target"] * (Target in options)
         step = f"Load it first: visioncal.{loaders[0]}({str(value)!r})." if loaders else ""
     raise DataError(
@@ -125,15 +131,17 @@ def _seen(value: object) -> str:
 def _options(hint: Any) -> Iterator[Any]:  # noqa: ANN401
     """The types of which a value may be one."""
     if typing.get_origin(hint) in (Union, types.UnionType):
-        for it in typing.get_args(hint):
-            yield from _options(it)
+        for argument in typing.get_args(hint):
+            yield from _options(argument)
     else:
         yield hint
 
 
 def _names(options: Sequence[Any]) -> list[str]:
-    literals = [typing.get_args(it) for it in options if typing.get_origin(it) is Literal]
-    return [it for names in literals for it in names if isinstance(it, str)]
+    literals = [
+        typing.get_args(option) for option in options if typing.get_origin(option) is Literal
+    ]
+    return [name for names in literals for name in names if isinstance(name, str)]
 
 
 def _is_list(hint: Any) -> bool:  # noqa: ANN401
@@ -164,7 +172,7 @@ def _fits(value: object, hint: Any) -> bool:  # noqa: ANN401 - a type, or a form
     """Whether a value is of a type, as far as that can be seen at once."""
     options = list(_options(hint))
     if len(options) > 1:
-        return hint is npt.ArrayLike or any(_fits(value, it) for it in options)
+        return hint is npt.ArrayLike or any(_fits(value, option) for option in options)
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     if origin is None:
         is_open = hint is Any or not isinstance(hint, type)
@@ -200,12 +208,14 @@ def _is_collection(value: object, origin: type, inner: tuple[Any, ...]) -> bool:
         return False
     else:
         elements = value if isinstance(value, list | tuple) else ()
-    return len(inner) != 1 or all(_fits(it, inner[0]) for it in elements)
+    return len(inner) != 1 or all(_fits(element, inner[0]) for element in elements)
 
 
 _FORMS: dict[Any, Callable[[object, tuple[Any, ...]], bool]] = {
     np.ndarray: _is_array,
-    Literal: lambda value, inner: any(isinstance(value, type(it)) and value == it for it in inner),
+    Literal: lambda value, inner: any(
+        isinstance(value, type(number)) and value == number for number in inner
+    ),
     Callable: lambda value, _: callable(value),
     tuple: lambda value, _: _is_collection(value, Sequence, (Any,)),
 }

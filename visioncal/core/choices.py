@@ -83,8 +83,8 @@ class PoseForm:
 # Staubli VAL 3: Rx, Ry, Rz about moving axes. Doosan: A, B, C about moving Z, Y, Z. URDF
 # specification: roll, pitch, yaw about fixed x, y, z.
 POSE_FORMS: Mapping[str, PoseForm] = {
-    it.name: it
-    for it in (
+    pose_form.name: pose_form
+    for pose_form in (
         PoseForm("ur", "Universal Robots p[...]", "m", "rotation-vector"),
         PoseForm("kuka", "KUKA X, Y, Z, A, B, C", "mm", "euler-ZYX-deg"),
         PoseForm("fanuc", "FANUC X, Y, Z, W, P, R", "mm", "euler-xyz-deg"),

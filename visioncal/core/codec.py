@@ -113,9 +113,9 @@ class Entry:
     def keys(self) -> set[str]:
         """The keys that it has."""
         if INLINE in self.marks:
-            forms = [it.form for it in self.marks if isinstance(it, Written)]
+            forms = [mark.form for mark in self.marks if isinstance(mark, Written)]
             (inner,) = _alternatives(get_args(self.kind)[0])
-            return set().union(*(it.keys for it in entries(forms[0] if forms else inner)))
+            return set().union(*(entry.keys for entry in entries(forms[0] if forms else inner)))
         return set() if REST in self.marks else {self.key}
 
     def is_absent(self, value: object) -> bool:
@@ -130,21 +130,21 @@ def entries(cls: type) -> tuple[Entry, ...]:
     """The fields of a dataclass in their order."""
     hints = get_type_hints(cls, include_extras=True)
     found = []
-    for it in fields(cls):
-        kind = hints[it.name]
+    for entry in fields(cls):
+        kind = hints[entry.name]
         marks = get_args(kind)[1:] if get_origin(kind) is Annotated else ()
         if UNWRITTEN in marks:
             continue
         keys = [mark.name for mark in marks if isinstance(mark, Key)]
-        required = it.default is MISSING and it.default_factory is MISSING
-        found.append(Entry(it.name, keys[0] if keys else it.name, kind, required, marks))
+        required = entry.default is MISSING and entry.default_factory is MISSING
+        found.append(Entry(entry.name, keys[0] if keys else entry.name, kind, required, marks))
     # What is of other things stands first.
-    return tuple(sorted(found, key=lambda it: REST not in it.marks))
+    return tuple(sorted(found, key=lambda value: REST not in value.marks))
 
 
 def names_but(cls: type, others: str) -> tuple[str, ...]:
     """The names of a dataclass' fields, but for some, with blanks between."""
-    return tuple(it.name for it in fields(cls) if it.name not in others.split())
+    return tuple(entry.name for entry in fields(cls) if entry.name not in others.split())
 
 
 def write(cls: type, value: object) -> dict[str, Any]:
@@ -155,12 +155,12 @@ def write(cls: type, value: object) -> dict[str, Any]:
         value: One of it, or of a class that has its fields.
     """
     document: dict[str, Any] = {}
-    for it in entries(cls):
-        mine = getattr(value, it.name)
-        if not it.is_absent(mine):
-            written = _written(it.kind, mine)
-            beside = INLINE in it.marks or REST in it.marks
-            document |= written if beside else {it.key: written}
+    for entry in entries(cls):
+        mine = getattr(value, entry.name)
+        if not entry.is_absent(mine):
+            written = _written(entry.kind, mine)
+            beside = INLINE in entry.marks or REST in entry.marks
+            document |= written if beside else {entry.key: written}
     return document
 
 
@@ -168,18 +168,20 @@ def _written(kind: Any, value: Any) -> Any:  # noqa: ANN401 - what JSON may hold
     kind = _fitting(_alternatives(kind), value)
     if get_origin(kind) is Annotated:
         inner, *marks = get_args(kind)
-        for it in marks:
-            if isinstance(it, Written):
-                return it.write(value) if it.form is None else write(it.form, it.write(value))
+        for mark in marks:
+            if isinstance(mark, Written):
+                return (
+                    mark.write(value) if mark.form is None else write(mark.form, mark.write(value))
+                )
         return _written(inner, value)
     if isinstance(value, np.ndarray):
         return value.tolist()
     if is_dataclass(value):
         return write(type(value), value)
     if kind is not Any and isinstance(value, Mapping):
-        return {name: _written(get_args(kind)[1], it) for name, it in value.items()}
+        return {name: _written(get_args(kind)[1], number) for name, number in value.items()}
     if isinstance(value, tuple):
-        return [_written(get_args(kind)[0], it) for it in value]
+        return [_written(get_args(kind)[0], number) for number in value]
     return value
 
 
@@ -205,20 +207,20 @@ def read(cls: type[_T], document: object, path: str) -> _T:
 def read_fields(cls: type, document: object, path: str) -> dict[str, Any]:
     """Reads the fields of a dataclass by name; its errors are those of `read`."""
     table, known = _table(document, path), entries(cls)
-    ours = set().union(*(it.keys for it in known))
+    ours = set().union(*(entry.keys for entry in known))
     found = {}
-    for it in known:
-        if REST in it.marks:
+    for entry in known:
+        if REST in entry.marks:
             rest = {key: value for key, value in table.items() if key not in ours}
-            found[it.name] = _read(it.kind, rest, path)
-        elif INLINE in it.marks:
-            if it.required or it.keys & table.keys():
-                found[it.name] = _read(it.kind, table, path)
-        elif it.key in table:
-            found[it.name] = _read(it.kind, table[it.key], _joined(path, it.key))
-    for it in known:
-        if it.required and it.name not in found:
-            place = _joined(path, it.key)
+            found[entry.name] = _read(entry.kind, rest, path)
+        elif INLINE in entry.marks:
+            if entry.required or entry.keys & table.keys():
+                found[entry.name] = _read(entry.kind, table, path)
+        elif entry.key in table:
+            found[entry.name] = _read(entry.kind, table[entry.key], _joined(path, entry.key))
+    for entry in known:
+        if entry.required and entry.name not in found:
+            place = _joined(path, entry.key)
             raise DataError(f"{place} is missing.", culprits=[place])
     return found
 
@@ -240,7 +242,7 @@ def _read(kind: Any, value: Any, path: str) -> Any:  # noqa: ANN401 - what JSON 
         return _read_tuple(args, value, path)
     if origin is not None and issubclass(origin, Mapping):
         table = _table(value, path)
-        return {name: _read(args[1], it, _joined(path, name)) for name, it in table.items()}
+        return {name: _read(args[1], number, _joined(path, name)) for name, number in table.items()}
     if is_dataclass(kind):
         return read(kind, value, path)  # type: ignore[arg-type] # no instance, but a class
     return plain(kind, value, path)
@@ -248,13 +250,13 @@ def _read(kind: Any, value: Any, path: str) -> Any:  # noqa: ANN401 - what JSON 
 
 def _read_marked(args: tuple[Any, ...], value: Any, path: str) -> Any:  # noqa: ANN401 - see `_read`
     inner, *marks = args
-    for it in marks:
-        if isinstance(it, Array):
-            return _array(inner, it, value, path)
-        if isinstance(it, Written):
-            known = value if it.form is None else read(it.form, value, path)
+    for mark in marks:
+        if isinstance(mark, Array):
+            return _array(inner, mark, value, path)
+        if isinstance(mark, Written):
+            known = value if mark.form is None else read(mark.form, value, path)
             try:
-                return it.read(known, path)
+                return mark.read(known, path)
             except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
                 why = str(error) or type(error).__name__
                 raise DataError(f"{path}: {why}.", culprits=[path]) from error
@@ -264,7 +266,7 @@ def _read_marked(args: tuple[Any, ...], value: Any, path: str) -> Any:  # noqa: 
 def _alternatives(kind: Any) -> list[Any]:  # noqa: ANN401 - a type
     """What a type that may be None may be beside it."""
     if get_origin(kind) in (Union, UnionType):
-        return [it for it in get_args(kind) if it is not NoneType]
+        return [argument for argument in get_args(kind) if argument is not NoneType]
     return [kind]
 
 
@@ -274,10 +276,10 @@ def _fitting(kinds: list[Any], value: object) -> Any:  # noqa: ANN401 - a type
         return kinds[0]
     if not isinstance(value, Mapping):
         is_row = isinstance(value, list | tuple)
-        return next((it for it in kinds if (get_origin(it) is tuple) == is_row), kinds[0])
+        return next((kind for kind in kinds if (get_origin(kind) is tuple) == is_row), kinds[0])
 
     def fit(kind: type) -> tuple[int, int]:
-        there = sum(it.key in value for it in entries(kind))
+        there = sum(entry.key in value for entry in entries(kind))
         return there, there - len(entries(kind))
 
     return max(kinds, key=fit)
@@ -291,15 +293,15 @@ def _read_tuple(args: tuple[Any, ...], value: object, path: str) -> tuple[Any, .
     if len(value) != len(args):
         raise other(value, f"a list of {len(args)}", path)
     return tuple(
-        _read(kind, it, f"{path}[{at}]")
-        for at, (kind, it) in enumerate(zip(args, value, strict=True))
+        _read(kind, number, f"{path}[{at}]")
+        for at, (kind, number) in enumerate(zip(args, value, strict=True))
     )
 
 
 def _array(kind: Any, form: Array, value: object, path: str) -> Any:  # noqa: ANN401
     """An array of a type, as `npt.NDArray[np.float64]`."""
     (wanted,) = get_args(get_args(kind)[1])
-    sizes = " x ".join("n" if it < 0 else str(it) for it in form.shape)
+    sizes = " x ".join("n" if index < 0 else str(index) for index in form.shape)
     needed = other(value, f"an array of {sizes} numbers", path)
     try:
         found = np.asarray(value)

@@ -69,7 +69,7 @@ def _rotation_vectors(name: str, words: str, unit_rad: float) -> RotationForm:
         name,
         words,
         3,
-        lambda numbers: _finite(numbers, lambda it: Rotation.from_rotvec(it * unit_rad)),
+        lambda numbers: _finite(numbers, lambda array: Rotation.from_rotvec(array * unit_rad)),
         lambda rotations: Rotation.from_matrix(rotations).as_rotvec() / unit_rad,
     )
 
@@ -90,7 +90,7 @@ def _euler(order: str, unit: str) -> RotationForm:
         f"Euler angles {order} about {about} axes in {'degrees' if degrees else 'radians'}",
         3,
         lambda numbers: _finite(
-            numbers, lambda it: Rotation.from_euler(order, it, degrees=degrees)
+            numbers, lambda array: Rotation.from_euler(order, array, degrees=degrees)
         ),
         write,
     )
@@ -128,9 +128,9 @@ def _without(rotations: FloatArray, missing: Mask) -> FloatArray:
 
 def _euler_orders() -> tuple[str, ...]:
     """The twelve orders of three turns, about moving axes and about fixed ones."""
-    straight = ["".join(it) for it in permutations("XYZ")]
+    straight = ["".join(permutation) for permutation in permutations("XYZ")]
     repeated = [f"{a}{b}{a}" for a, b in permutations("XYZ", 2)]
-    return tuple(it for order in straight + repeated for it in (order, order.lower()))
+    return tuple(name for order in straight + repeated for name in (order, order.lower()))
 
 
 def _all_forms() -> tuple[RotationForm, ...]:
@@ -152,7 +152,7 @@ def _all_forms() -> tuple[RotationForm, ...]:
     )
 
 
-ROTATION_FORMS: Mapping[str, RotationForm] = {it.name: it for it in _all_forms()}
+ROTATION_FORMS: Mapping[str, RotationForm] = {form.name: form for form in _all_forms()}
 
 
 @dataclass(frozen=True)
@@ -225,7 +225,7 @@ class PoseNumbers:
             self,
             positions=self.positions[rows],
             rotations=self.rotations[rows],
-            places=tuple(self.places[it] for it in rows),
+            places=tuple(self.places[index] for index in rows),
         )
 
     def read_as(self, reading: Reading) -> "PoseNumbers":
@@ -271,7 +271,7 @@ class PoseNumbers:
         return invert(poses) if self.reading.inverse else poses
 
     def _places_of(self, rows: Mask) -> list[str]:
-        return [self.places[it] for it in np.flatnonzero(rows)]
+        return [self.places[index] for index in np.flatnonzero(rows)]
 
 
 def write_pose(pose: FloatArray, form: PoseForm) -> FloatArray:

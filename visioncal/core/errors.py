@@ -22,7 +22,7 @@ class VisioncalError(Exception):
         message = "\n".join(_shortened(line, most) for line in lines)
         super().__init__(message)
         self.message = message
-        self.culprits = tuple(_shortened(it, _LEAST_LETTERS) for it in culprits)
+        self.culprits = tuple(_shortened(culprit, _LEAST_LETTERS) for culprit in culprits)
         self.next_step = next_step
 
     def with_culprits(self, more: Sequence[str]) -> Self:

@@ -152,7 +152,9 @@ def read_bytes(path: Path | str, most: int = MOST_BYTES) -> bytes:
         step = "Check the path and its spelling."
         if "regular" in why_not:
             step = "Save what it gives as a file first."
-        elif "folder" in why_not and (inside := [it for it in path.glob("*") if it.is_file()]):
+        elif "folder" in why_not and (
+            inside := [file for file in path.glob("*") if file.is_file()]
+        ):
             step = f"Name a file in it, such as {min(inside, key=natural)}."
         raise DataError(f"{path} {why_not}.", culprits=[str(path)], next_step=step)
     try:
@@ -290,9 +292,11 @@ def _check_toml(document: dict[str, Any], label: str) -> None:
         if depth > _DEEPEST:
             raise _too_deep(f"{label}: {path[:80]}")
         if isinstance(value, dict):
-            pending += [(f"{path}.{key}".lstrip("."), it, depth + 1) for key, it in value.items()]
+            pending += [
+                (f"{path}.{key}".lstrip("."), number, depth + 1) for key, number in value.items()
+            ]
         elif isinstance(value, list):
-            pending += [(f"{path}[{at}]", it, depth + 1) for at, it in enumerate(value)]
+            pending += [(f"{path}[{at}]", number, depth + 1) for at, number in enumerate(value)]
         elif isinstance(value, int) and value.bit_length() > 63:
             raise DataError(
                 f"{label}: {path} has more than the 64 bits of a whole number of TOML.",
@@ -308,20 +312,22 @@ def _too_deep(where: str) -> DataError:
 
 def did_you_mean(word: str, known: Iterable[str], least: float = 0.6) -> str:
     """Words a hint at the known names nearest to `word`; empty where none is as near as `least`."""
-    names = {it.lower(): it for it in sorted(known)}
+    names = {name.lower(): name for name in sorted(known)}
     near = difflib.get_close_matches(word.lower(), names, n=3, cutoff=least)
-    return f"Did you mean {' or '.join(names[it] for it in near)}?" if near else ""
+    return f"Did you mean {' or '.join(names[name] for name in near)}?" if near else ""
 
 
 def one_line(text: str) -> str:
     """Replaces by spaces what does not print, such as line ends."""
-    return "".join(it if it.isprintable() else " " for it in text)
+    return "".join(name if name.isprintable() else " " for name in text)
 
 
 def natural(path: Path) -> tuple[object, ...]:
     """Orders names as people do: `view2` before `view10`."""
     parts = re.split(r"([0-9]+)", path.name)
-    return tuple((int(it), "") if it.isascii() and it.isdecimal() else (-1, it) for it in parts)
+    return tuple(
+        (int(part), "") if part.isascii() and part.isdecimal() else (-1, part) for part in parts
+    )
 
 
 def some_of(names: Sequence[str], most: int = 8) -> str:

@@ -17,8 +17,8 @@ def ended_like_ctrl_c(*names: str) -> Iterator[None]:
     Raises:
         KeyboardInterrupt: When one of them comes.
     """
-    there = [it for it in names or ("SIGTERM", "SIGHUP") if hasattr(signal, it)]
-    numbers = [getattr(signal, it) for it in there]
+    there = [name for name in names or ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    numbers = [getattr(signal, name) for name in there]
     previous = {number: signal.signal(number, _interrupt) for number in numbers}
     try:
         yield

@@ -86,7 +86,7 @@ def _named_publicly(new: Path, folder: Path) -> Iterator[None]:
         yield
     except DataError as error:
         message, *culprits = (
-            it.replace(str(new), str(folder)) for it in (error.message, *error.culprits)
+            name.replace(str(new), str(folder)) for name in (error.message, *error.culprits)
         )
         raise DataError(message, culprits=culprits, next_step=error.next_step) from error.__cause__
 
@@ -124,8 +124,8 @@ def _replace_together(folder: Path, switch: Path, names: Sequence[str]) -> None:
         _link_old(folder, switch / _OLD, names)
         for name in names:
             (links / name).symlink_to(_through_switch(name))
-        for it in (switch / _NEW, switch / _OLD, switch):
-            flush_folder(it)
+        for path in (switch / _NEW, switch / _OLD, switch):
+            flush_folder(path)
     except OSError:
         _replace_one_by_one(folder, switch / _NEW, names)
         return

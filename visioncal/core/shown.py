@@ -53,7 +53,7 @@ def html_card(
         f'<td style="text-align:left">{escape(value)}</td></tr>'
         for name, value in facts.items()
     )
-    items = "".join(f"<li>{escape(it)}</li>" for it in says)
+    items = "".join(f"<li>{escape(say)}</li>" for say in says)
     return (
         '<div style="border:1px solid #bbb;border-radius:6px;padding:8px 12px;max-width:46em">'
         f"<div>{badge}<b>{escape(title)}</b></div><table>{rows}</table>"

@@ -128,7 +128,7 @@ def _is_at(descriptor: int, path: Path) -> bool:
 def remove_abandoned(folder: Path) -> None:
     """Removes from a folder what killed processes have left aside, as far as it can be."""
     with suppress(OSError), os.scandir(folder) as entries:
-        found = [it for it in entries if _NAME.fullmatch(it.name)]
+        found = [entry for entry in entries if _NAME.fullmatch(entry.name)]
         for entry in found:
             path, is_folder = Path(entry.path), entry.is_dir(follow_symlinks=False)
             with suppress(OSError), locked(path / LOCK if is_folder else path, wait=False) as held:

@@ -155,8 +155,8 @@ def inverse_right_jacobian(twists: FloatArray) -> FloatArray:
     found[3 + axes, axes] -= 2.0 * along * (across + slope * squared)
     for row, vector in ((0, 0.5 * turn), (3, 0.5 * shift)):
         after, before = [2, 0, 1], [1, 2, 0]
-        found[[row + it for it in after], before] += vector
-        found[[row + it for it in before], after] -= vector
+        found[[row + index for index in after], before] += vector
+        found[[row + index for index in before], after] -= vector
     found[3:, 3:] = found[:3, :3]
     return np.ascontiguousarray(found.transpose(2, 0, 1)).reshape(*twists.shape, 6)
 
@@ -229,7 +229,7 @@ def rigid_fault(matrix: FloatArray, most: float = RIGID) -> tuple[str, str]:
     if not np.allclose(last, LAST_ROW, atol=most):
         if np.allclose(matrix[:, 3], LAST_ROW, atol=most):
             return "it is transposed: its translation is in the last row", "Transpose it."
-        row = ", ".join(f"{it:.4g}" for it in last)
+        row = ", ".join(f"{value:.4g}" for value in last)
         return f"its last row is [{row}]", "The last row is [0, 0, 0, 1]."
     product = rotation.T @ rotation
     scale = float(np.sqrt(np.trace(product) / 3.0))

@@ -132,7 +132,7 @@ class Finding:
 
 def remarks(sentences: Iterable[str], kind: str = "remark") -> tuple[Finding, ...]:
     """Findings that no test is behind."""
-    return tuple(Finding(kind, it) for it in sentences)
+    return tuple(Finding(kind, sentence) for sentence in sentences)
 
 
 @dataclass(frozen=True)
@@ -160,8 +160,8 @@ class Verdict:
         """`bad` with a doubt that settles it, `check` with others, else `good` with its praise."""
         if not doubts:
             return cls("good", (praise,))
-        status: VerdictStatus = "bad" if any(it.is_fatal for it in doubts) else "check"
-        return cls(status, tuple(sorted(doubts, key=lambda it: not it.is_fatal)))
+        status: VerdictStatus = "bad" if any(doubt.is_fatal for doubt in doubts) else "check"
+        return cls(status, tuple(sorted(doubts, key=lambda doubt: not doubt.is_fatal)))
 
     def noting(self, sentences: Iterable[str]) -> Self:
         """The same verdict with notes."""
@@ -171,7 +171,7 @@ class Verdict:
         return "\n  ".join([f"Verdict: {self.status}", *self.top])
 
     def _repr_html_(self) -> str:
-        steps = (f"Next: {it}" for it in self.next_steps)
+        steps = (f"Next: {step}" for step in self.next_steps)
         return html_card(self.headline, {}, self.status, (*self.top, *steps))
 
     @property
@@ -182,28 +182,29 @@ class Verdict:
     @property
     def reasons(self) -> tuple[str, ...]:
         """All findings in sentences, with what to do; what is most likely wrong stands first."""
-        wrong = (it for it in self.causes[:1] if it.kind not in SOURCES)
-        return tuple(it.reason for it in {id(it): it for it in (*wrong, *self.findings)}.values())
+        wrong = (cause for cause in self.causes[:1] if cause.kind not in SOURCES)
+        distinct = {id(finding): finding for finding in (*wrong, *self.findings)}
+        return tuple(finding.reason for finding in distinct.values())
 
     @property
     def causes(self) -> tuple[Finding, ...]:
         """What may be why it is not good, likeliest first."""
-        found = (it for it in self.findings if it.probability)
+        found = (finding for finding in self.findings if finding.probability)
 
-        def order(it: Finding) -> tuple[float, bool, float]:
+        def order(finding: Finding) -> tuple[float, bool, float]:
             # Among what is as good as certain, rows that are exchanged mislead all the rest.
-            return -min(it.probability, _SURE), it.kind != EXCHANGED, -it.probability
+            return -min(finding.probability, _SURE), finding.kind != EXCHANGED, -finding.probability
 
         return tuple(sorted(found, key=order))
 
     @property
     def ranked(self) -> tuple[Finding, ...]:
         """All findings as people read them: the likeliest cause, what it costs, then the rest."""
-        causes = [it for it in self.causes if it.probability >= _LEAST_LIKELY]
-        costs = [it for kind in _SIZES for it in self.findings if it.kind == kind]
-        missing = [it for it in self.findings if it.kind in NOT_USABLE]
+        causes = [cause for cause in self.causes if cause.probability >= _LEAST_LIKELY]
+        costs = [finding for kind in _SIZES for finding in self.findings if finding.kind == kind]
+        missing = [finding for finding in self.findings if finding.kind in NOT_USABLE]
         ordered = [*missing, *causes[:1], *costs[:1], *causes[1:], *self.findings]
-        return tuple({id(it): it for it in ordered}.values())
+        return tuple({id(finding): finding for finding in ordered}.values())
 
     @property
     def top(self) -> tuple[str, ...]:
@@ -225,11 +226,11 @@ class Verdict:
     @property
     def next_steps(self) -> tuple[Step, ...]:
         """What to do about the findings, in their order; each once."""
-        unlikely = [it for it in self.causes[1:] if it.probability < _LIKELY]
+        unlikely = [cause for cause in self.causes[1:] if cause.probability < _LIKELY]
         steps: dict[str, Step] = {}
-        for it in self.ranked:
-            if it.do is not None and it not in unlikely:
-                steps.setdefault(it.do.command or it.do.words, it.do)
+        for finding in self.ranked:
+            if finding.do is not None and finding not in unlikely:
+                steps.setdefault(finding.do.command or finding.do.words, finding.do)
         return tuple(steps.values())[:_SHOWN]
 
     def with_paths(
@@ -243,11 +244,11 @@ class Verdict:
             again: The command line as it was typed, in words.
         """
 
-        def filled(it: Finding) -> Finding:
-            if it.do is None:
-                return it
-            command = with_paths(it.do.command, session, out, again)
-            return replace(it, do=replace(it.do, command=command))
+        def filled(finding: Finding) -> Finding:
+            if finding.do is None:
+                return finding
+            command = with_paths(finding.do.command, session, out, again)
+            return replace(finding, do=replace(finding.do, command=command))
 
         return replace(self, findings=tuple(map(filled, self.findings)))
 
@@ -261,7 +262,7 @@ def with_paths(
     is_file = result.suffix in (".json", ".rrd")
     new = f"{result.parent if is_file else result}-new"
     paths = {"SESSION": str(session), "FIXED": fixed, "OUT": str(out) or "out", "NEW": new}
-    words = {name: shlex.quote(it) for name, it in paths.items()}
+    words = {name: shlex.quote(path) for name, path in paths.items()}
     # Of a sentence, an apostrophe is no quotation.
     if AGAIN in command:
         words[AGAIN] = shlex.join([*_without(again, shlex.split(command))])
@@ -286,5 +287,5 @@ def _without(typed: Sequence[str], added: Sequence[str]) -> Iterator[str]:
 
 def _free(name: str) -> str:
     """A name that no folder has yet: nothing is written over."""
-    names = (name, *(f"{name}-{it}" for it in range(2, 100)))
-    return next((it for it in names if not Path(it).exists()), name)
+    names = (name, *(f"{name}-{index}" for index in range(2, 100)))
+    return next((word for word in names if not Path(word).exists()), name)

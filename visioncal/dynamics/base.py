@@ -100,7 +100,7 @@ class BaseModel:
         shares = across.T @ scaled
         left = np.abs(np.diag(upper)).min(initial=1.0)
         if left <= _RANK or np.abs(scaled - across @ shares).max() > _RANK:
-            kept = ", ".join(model.names[it] for it in independent)
+            kept = ", ".join(model.names[index] for index in independent)
             raise DataError(
                 f"robot {model.robot.name}: {kept} are no base parameters of it.",
                 culprits=[model.robot.name],
@@ -142,7 +142,7 @@ def _columns(model: DynamicModel, rng: np.random.Generator) -> FloatArray:
 def random_motion(model: DynamicModel, rng: np.random.Generator) -> Motion:
     """States all around, at random."""
     shape = (_STATES, model.robot.joint_count)
-    q, dq, ddq = (rng.uniform(-it, it, shape) for it in (np.pi, _FASTEST, _HARDEST))
+    q, dq, ddq = (rng.uniform(-value, value, shape) for value in (np.pi, _FASTEST, _HARDEST))
     return Motion(np.arange(float(_STATES)), q, dq, ddq)
 
 
@@ -186,7 +186,7 @@ def condition_of(base: BaseModel, motion: Motion, weights: FloatArray) -> Condit
     rows = base.regressor(motion)
     flat = rows.reshape(-1, base.rank)
     weighted = (rows * weights[:, None]).reshape(-1, base.rank)
-    figures = [float(np.linalg.cond(it)) for it in (_unit(weighted), _unit(flat), flat)]
+    figures = [float(np.linalg.cond(array)) for array in (_unit(weighted), _unit(flat), flat)]
     return Condition(*figures)
 
 
@@ -226,18 +226,20 @@ def check_turning(base: BaseModel, streams: Sequence[Conditioned]) -> None:
         DegenerateError: One does.
     """
     fastest = np.max(
-        [np.abs(it.measured.motion.dq).max(axis=0) for of in streams for it in of.pieces], axis=0
+        [np.abs(piece.measured.motion.dq).max(axis=0) for of in streams for piece in of.pieces],
+        axis=0,
     )
     still = np.flatnonzero(fastest < _STILL_RAD_S)
     if not len(still):
         return
     names = base.model.robot.joint_names
-    stopped = [f"joint {it + 1} ({names[it]})" for it in still]
+    stopped = [f"joint {index + 1} ({names[index]})" for index in still]
     kept = zip(base.names, base.independent, strict=True)
     lost = [name for name, at in kept if _joint_of(base.model.names[at]) in still + 1]
     raise DegenerateError(
         f"dynamics: {some_of(stopped)} {'stands' if len(stopped) == 1 else 'stand'} still in "
-        f"{some_of([it.label for it in streams])} (at most {fastest[still].max():.2g} rad/s): "
+        f"{some_of([stream.label for stream in streams])} "
+        f"(at most {fastest[still].max():.2g} rad/s): "
         f"{len(lost)} of {base.rank} base parameters, {some_of(lost, 5)}, are not determined.",
         culprits=stopped,
         next_step=_NEXT,
@@ -260,8 +262,8 @@ def check_identifiable(base: BaseModel, blocks: Sequence[Block]) -> None:
         names = base.names
         raise DegenerateError(
             f"dynamics: the motion does not determine {len(lost)} of {base.rank} base parameters: "
-            f"{some_of([names[it] for it in lost], 5)}.",
-            culprits=[names[it] for it in lost],
+            f"{some_of([names[index] for index in lost], 5)}.",
+            culprits=[names[index] for index in lost],
             next_step=_NEXT,
         )
 
@@ -280,7 +282,7 @@ def null_space(base: BaseModel, blocks: Sequence[Block]) -> list[int]:
     values, vectors = np.linalg.eigh(relative)
     null = np.flatnonzero(values < _UNDETERMINED)
     shares = np.sqrt(np.sum(vectors[:, null] ** 2, axis=1))
-    return [int(it) for it in np.flatnonzero(shares > _SHARE)]
+    return [int(index) for index in np.flatnonzero(shares > _SHARE)]
 
 
 def _usual(base: BaseModel) -> FloatArray:

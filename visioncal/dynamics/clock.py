@@ -105,7 +105,7 @@ def clock_notes(recorded: Recorded, clock: Clock, widest_s: float) -> list[str]:
     steps, notes = np.diff(recorded.times_s), []
     gaps = _gaps_of(clock, widest_s)
     if len(gaps):
-        places = [f"{recorded.times_s[it] - recorded.times_s[0]:.2f} s" for it in gaps]
+        places = [f"{recorded.times_s[index] - recorded.times_s[0]:.2f} s" for index in gaps]
         notes.append(
             f"{recorded.label}: samples are missing for up to {steps[gaps].max():.3g} s behind "
             f"{some_of(places, 3)}; nothing is interpolated there."
@@ -144,7 +144,7 @@ def _even(recorded: Recorded, bad: Mask, clock: Clock, rows: slice) -> Even:
     seen = (counts[behind] == 1) | (near < _JITTER * clock.usual_s)
 
     def at(values: FloatArray) -> FloatArray:
-        return np.stack([np.interp(even, times_s, it) for it in values[rows].T], axis=1)
+        return np.stack([np.interp(even, times_s, column) for column in values[rows].T], axis=1)
 
     part = replace(
         recorded,
@@ -181,7 +181,7 @@ def without_frozen(recorded: Recorded, notes: list[str]) -> Recorded:
     begins = np.flatnonzero(rows[:-1] & ~rows[1:])
     ends = np.flatnonzero(~rows & np.append(rows[1:], True))
     lasted = recorded.times_s[ends] - recorded.times_s[begins]
-    places = [f"{recorded.times_s[it] - recorded.times_s[0]:.2f} s" for it in begins]
+    places = [f"{recorded.times_s[begin] - recorded.times_s[0]:.2f} s" for begin in begins]
     notes.append(
         f"{recorded.label}: angles are frozen for up to {figure(float(lasted.max()))} s behind "
         f"{some_of(places, 3)}, though the joints move; these {(~rows).sum()} rows are left out."
@@ -201,7 +201,7 @@ def _frozen(times_s: FloatArray, angles: FloatArray) -> Mask:
         if end - begin < _FROZEN or times_s[end] - times_s[begin] < _FROZEN_S or end == len(steps):
             continue
         before, after = steps[max(begin - _AROUND, 0) : begin], steps[end + 1 : end + 1 + _AROUND]
-        around = max(float(np.median(it)) if len(it) else 0.0 for it in (before, after))
+        around = max(float(np.median(array)) if len(array) else 0.0 for array in (before, after))
         if steps[end] > _JUMP * max(around, resolved):
             frozen[begin + 1 : end + 1] = True
     return frozen

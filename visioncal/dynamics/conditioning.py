@@ -94,7 +94,7 @@ class Piece:
         later = times_s + lag_s
 
         def at(values: FloatArray) -> FloatArray:
-            return np.stack([np.interp(later, times_s, it) for it in values.T], axis=1)
+            return np.stack([np.interp(later, times_s, column) for column in values.T], axis=1)
 
         lost = at((~self.there)[:, None].astype(float))[:, 0] > 0.0
         there = ~lost & (later >= times_s[0]) & (later <= times_s[-1])
@@ -129,22 +129,22 @@ class Conditioned:
     @property
     def count(self) -> int:
         """How many filtered samples there are."""
-        return sum(len(it.times_s) for it in self.pieces)
+        return sum(len(piece.times_s) for piece in self.pieces)
 
     @property
     def times_s(self) -> FloatArray:
         """(k,) when the filtered samples are [s]."""
-        return np.concatenate([it.times_s for it in self.pieces])
+        return np.concatenate([piece.times_s for piece in self.pieces])
 
     @property
     def torques_nm(self) -> FloatArray:
         """(k, n) filtered torques [N m]."""
-        return np.concatenate([it.torques_nm for it in self.pieces])
+        return np.concatenate([piece.torques_nm for piece in self.pieces])
 
     @property
     def used(self) -> Mask:
         """(k, n) which of the filtered torques rest on good samples."""
-        return np.concatenate([it.used for it in self.pieces])
+        return np.concatenate([piece.used for piece in self.pieces])
 
     @property
     def correlation(self) -> FloatArray:
@@ -153,12 +153,12 @@ class Conditioned:
 
     def filtered(self, columns: Callable[[Motion], FloatArray]) -> FloatArray:
         """Filters what is computed of the motion, as the torques are: (k, ...)."""
-        parts = [it.filtered(columns) for it in self.pieces]
+        parts = [piece.filtered(columns) for piece in self.pieces]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def advanced(self, lag_s: float) -> Self:
         """The same with torques of so much later in the place of theirs [s]."""
-        return replace(self, pieces=tuple(it.advanced(lag_s) for it in self.pieces))
+        return replace(self, pieces=tuple(piece.advanced(lag_s) for piece in self.pieces))
 
 
 def condition(
@@ -252,7 +252,7 @@ def _cleaned(
 ) -> tuple[FloatArray, Mask]:
     """Torques with single slips taken out, and which of them are none."""
     torques = recorded.torques_nm.copy()
-    flat = np.stack([_flat_tops(it) for it in torques.T], axis=1)
+    flat = np.stack([_flat_tops(column) for column in torques.T], axis=1)
     if limits_nm is not None:
         beyond = np.abs(torques) >= 0.999 * limits_nm
         # Drives that are at their limits all the time are none: the torques are of another unit.

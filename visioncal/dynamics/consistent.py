@@ -62,7 +62,7 @@ def fit_consistent(
     joints = len(known.values)
     names = base.model.names[10 * joints :]
     held = np.zeros(len(names), dtype=bool)
-    positive = np.array([it.startswith(_POSITIVE) for it in names], dtype=bool)
+    positive = np.array([name.startswith(_POSITIVE) for name in names], dtype=bool)
     problem = _Problem(base, values, _Whitened.of(covariance), LogCholesky.around(known), held)
     for _ in range(len(names) + 1):
         state, _ = levenberg_marquardt(problem.start(), problem.linearised, _SETTLED)

@@ -79,7 +79,7 @@ def check_mistakes(base: BaseModel, streams: Sequence[Conditioned]) -> None:
         if found is not None:
             raise DataError(
                 f"{stream.label}: {found[0].words}: {found[1]}.",
-                culprits=[f"joint {it + 1}" for it in found[0].joints],
+                culprits=[f"joint {joint + 1}" for joint in found[0].joints],
                 next_step="Mend the columns of the stream, or name the robot that was recorded.",
             )
         if robot.inertias is not None:
@@ -88,7 +88,7 @@ def check_mistakes(base: BaseModel, streams: Sequence[Conditioned]) -> None:
 
 def _some(stream: Conditioned) -> Measured:
     """Samples from all over a stream at which all joints move, as they were before the filter."""
-    piece = max(stream.pieces, key=lambda it: len(it.measured))
+    piece = max(stream.pieces, key=lambda value: len(value.measured))
     good = np.flatnonzero(piece.there & ~piece.bad.any(axis=1))
     return piece.measured.chosen(good[:: max(len(good) // _SAMPLES, 1)])
 
@@ -142,10 +142,10 @@ def _explained_better(base: BaseModel, as_it_is: _Guess) -> tuple[_Guess, str] |
         after = _unfitted(base, guess.measured)
         if after.max() < _EXPLAINED:
             tried.append((float(np.sum(np.log(before / after))), guess))
-    gain, best = max(tried, key=lambda it: it[0], default=(0.0, as_it_is))
+    gain, best = max(tried, key=lambda pair: pair[0], default=(0.0, as_it_is))
     if gain < np.log(_SURELY_BETTER):
         return None
-    alike = [it.words for more, it in tried if more > gain - np.log(_FITS_BETTER)]
+    alike = [guess.words for more, guess in tried if more > gain - np.log(_FITS_BETTER)]
     times = float(np.exp(gain / len(as_it_is.joints)))
     why = f"so taken, the best fit leaves {times:.2g} times less of the torques' power a joint"
     return replace(best, words=", or ".join(alike)), why
@@ -230,7 +230,7 @@ def _predicted(robot: Robot, motion: Motion) -> FloatArray:
 
 
 def _reordered(motion: Motion, order: Sequence[int] | IntArray) -> Motion:
-    parts = (it[:, list(order)] for it in (motion.q, motion.dq, motion.ddq))
+    parts = (array[:, list(order)] for array in (motion.q, motion.dq, motion.ddq))
     return Motion(motion.times_s, *parts)
 
 
@@ -240,7 +240,7 @@ def _scaled(motion: Motion, by: FloatArray | float) -> Motion:
 
 def _left(guess: _Guess) -> FloatArray:
     """(n,) share of the power of each joint's torques that nothing explains."""
-    return np.array([_fitted(guess, it)[1] for it in range(guess.predicted.shape[1])])
+    return np.array([_fitted(guess, index)[1] for index in range(guess.predicted.shape[1])])
 
 
 def _fitted(guess: _Guess, joint: int) -> tuple[FloatArray, float]:
@@ -255,7 +255,9 @@ def _fitted(guess: _Guess, joint: int) -> tuple[FloatArray, float]:
 
 
 def _named(joints: tuple[int, ...]) -> str:
-    return ("joint " if len(joints) == 1 else "joints ") + ", ".join(str(it + 1) for it in joints)
+    return ("joint " if len(joints) == 1 else "joints ") + ", ".join(
+        str(joint + 1) for joint in joints
+    )
 
 
 def _check_units(label: str, robot: Robot, guess: _Guess) -> None:
@@ -276,7 +278,7 @@ def _check_units(label: str, robot: Robot, guess: _Guess) -> None:
     raise DataError(
         f"{label}: {whose} are {scale:.3g} times what the inertias of {robot.name} need; "
         f"{_unit(scale)}",
-        culprits=[f"{label}, tau{it + 1}_nm" for it in wrong],
+        culprits=[f"{label}, tau{index + 1}_nm" for index in wrong],
         next_step="Torques are those of the joints, behind the gears, in N m. Currents belong into "
         "current1_a ... [A], and --gains turns them into torques.",
     )

@@ -40,7 +40,7 @@ def to_document(identified: Identified) -> dict[str, Any]:
         ],
         "covariance": identified.covariance.tolist(),
         "stribeck": stribeck_rows(identified),
-        "streams": [write(StreamFacts, it) for it in identified.streams],
+        "streams": [write(StreamFacts, stream) for stream in identified.streams],
     }
     if identified.consistent is not None:
         document["standard"] = _standard_document(identified, identified.consistent)
@@ -56,7 +56,7 @@ def to_document(identified: Identified) -> dict[str, Any]:
 def stribeck_rows(identified: Identified) -> list[dict[str, Any]]:
     """The parameters of each joint whose friction has a hump at low speed."""
     humps, count = identified.stribeck, len(identified.stribeck.joints)
-    names = [identified.base.model.names[it] for it in identified.base.independent]
+    names = [identified.base.model.names[index] for index in identified.base.independent]
     rows = []
     for at, joint in enumerate(humps.joints.tolist()):
         sliding = names.index(f"Fc{joint + 1}")
@@ -145,8 +145,8 @@ class _Figures:
 
 def _of_joints(found: _Figures, joints: int) -> dict[str, Any]:
     """The same by name, if all of it is of so many joints."""
-    for it in (*found.streams, found.validation):
-        for name, value in vars(it).items() if it else ():
+    for stream in (*found.streams, found.validation):
+        for name, value in vars(stream).items() if stream else ():
             if isinstance(value, np.ndarray) and len(value) != joints:
                 raise ValueError(f"{name} has {len(value)} numbers for {joints} joints")
     return vars(found)
@@ -155,7 +155,7 @@ def _of_joints(found: _Figures, joints: int) -> dict[str, Any]:
 def _base(model: DynamicModel, names: Sequence[str]) -> BaseModel:
     """The base parameters that begin as those that were written."""
     # Which ones are kept may hang on rounding, and so on the machine.
-    kept = [model.names.index(it.split()[0]) for it in names]
+    kept = [model.names.index(name.split()[0]) for name in names]
     return BaseModel.keeping(model, np.array(kept, dtype=np.int64))
 
 

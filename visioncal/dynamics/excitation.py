@@ -277,7 +277,9 @@ class _Search:
     def _random(self) -> Condition:
         """The median condition of random motions, which nobody optimised."""
         drawn = [self._figures(self._modest(self._posture())) for _ in range(_COMPARED)]
-        figures = np.median([(it.weighted, it.scaled, it.raw) for it in drawn], axis=0)
+        figures = np.median(
+            [(condition.weighted, condition.scaled, condition.raw) for condition in drawn], axis=0
+        )
         return Condition(*figures.tolist())
 
 

@@ -36,7 +36,7 @@ class Harmonics:
 
     def basis(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Positions, speeds and accelerations (m, 2 count - 1) for a unit of each free number."""
-        q, dq, ddq = (it @ self.resting for it in self._functions(times_s))
+        q, dq, ddq = (function @ self.resting for function in self._functions(times_s))
         return q, dq, ddq
 
     def _functions(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -78,7 +78,7 @@ class Series:
 
     def motion(self, times_s: FloatArray) -> Motion:
         """Where the joints are at (m,) times [s], and how they move."""
-        q, dq, ddq = (it @ self.free.T for it in self.harmonics.basis(times_s))
+        q, dq, ddq = (array @ self.free.T for array in self.harmonics.basis(times_s))
         return Motion(np.asarray(times_s, dtype=float), q, dq, ddq)
 
     def sampled(self, rate_hz: float) -> Motion:

@@ -178,13 +178,15 @@ class Identified:
     @property
     def fitted_rms_nm(self) -> FloatArray:
         """(n,) residuals of what was fitted, of the worst stream, as a root mean square [N m]."""
-        return np.asarray(np.max([it.rms_nm for it in self.streams], axis=0))
+        return np.asarray(np.max([stream.rms_nm for stream in self.streams], axis=0))
 
     @property
     def determined(self) -> tuple[str, ...]:
         """How well each base parameter is determined: to `2 %` of itself, `10 %`, worse, or not."""
         shares = self.sigmas / np.maximum(np.abs(self.values), 1e-300)
-        return tuple(next((word for most, word in CLASSES if it < most), UNKNOWN) for it in shares)
+        return tuple(
+            next((word for most, word in CLASSES if share < most), UNKNOWN) for share in shares
+        )
 
     @cached_property
     def inertias(self) -> Inertias | None:

@@ -72,13 +72,13 @@ def identify(
     check_turning(base, streams)
     if options.checked:
         check_mistakes(base, streams)
-    blocks = [block_of(base, it) for it in streams]
+    blocks = [block_of(base, stream) for stream in streams]
     check_identifiable(base, blocks)
     fit = regress(blocks)
     humps = Stribeck.none()
     if options.stribeck and options.terms.coulomb:
-        names = [base.model.names[it] for it in base.independent]
-        sliding = np.array([names.index(f"Fc{it + 1}") for it in range(robot.joint_count)])
+        names = [base.model.names[index] for index in base.independent]
+        sliding = np.array([names.index(f"Fc{index + 1}") for index in range(robot.joint_count)])
         humps, fit = fit_stribeck(streams, blocks, fit, options.terms.slow_rad_s, sliding)
     consistent = None
     if options.consistent and robot.inertias is not None:

@@ -42,7 +42,7 @@ def judge(identified: Identified) -> Verdict:
     worst: VerdictStatus = (
         "bad" if "bad" in statuses else "check" if "check" in statuses else "good"
     )
-    return Verdict(worst, tuple(it for _, it in found))
+    return Verdict(worst, tuple(finding for _, finding in found))
 
 
 def _of_lag(identified: Identified) -> Iterator[_Judged]:
@@ -72,7 +72,7 @@ def _of_prediction(identified: Identified) -> Iterator[_Judged]:
         return
     shares = validation.shares
     worst = int(np.argmax(shares))
-    percents = ", ".join(figure(100.0 * float(it)) for it in shares)
+    percents = ", ".join(figure(100.0 * float(share)) for share in shares)
     status: VerdictStatus = "good"
     if shares[worst] > _LIMITS.range_share[0]:
         status = "bad" if shares.min() > _LIMITS.range_share[1] else "check"
@@ -161,9 +161,9 @@ def _of_range(identified: Identified) -> Iterator[_Judged]:
 
 
 def _of_parameters(identified: Identified) -> Iterator[_Judged]:
-    lost = np.array([it == UNKNOWN for it in identified.determined])
+    lost = np.array([name == UNKNOWN for name in identified.determined])
     if lost.mean() > _LIMITS.undetermined_share:
-        names = [it for it, is_lost in zip(identified.base.names, lost, strict=True) if is_lost]
+        names = [name for name, is_lost in zip(identified.base.names, lost, strict=True) if is_lost]
         yield _check(
             "undetermined",
             f"{lost.sum()} of {len(lost)} base parameters are not determined by this motion, "
@@ -173,5 +173,5 @@ def _of_parameters(identified: Identified) -> Iterator[_Judged]:
 
 
 def _joints(which: Mask) -> str:
-    places = [str(it + 1) for it in np.flatnonzero(which)]
+    places = [str(index + 1) for index in np.flatnonzero(which)]
     return f"Joint{'s' if len(places) > 1 else ''} {', '.join(places)}"

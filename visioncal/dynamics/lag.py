@@ -44,7 +44,7 @@ def find_lag(robot: Robot, streams: Sequence[Conditioned], terms: FrictionTerms)
     for rotors in (True, terms.motor_inertia):
         model = DynamicModel(robot, replace(terms, motor_inertia=rotors))
         base = BaseModel.reduce(model)
-        blocks = [block_of(base, it) for it in streams]
+        blocks = [block_of(base, stream) for stream in streams]
         if not null_space(base, blocks):
             break
     else:
@@ -60,7 +60,7 @@ def _found(streams: Sequence[Conditioned], blocks: Sequence[Block]) -> Lag | Non
     if lag_s is None:
         return None
     for _ in range(_ROUNDS):
-        lagged = [_lagged(*it, lag_s) for it in zip(streams, blocks, strict=True)]
+        lagged = [_lagged(*pair, lag_s) for pair in zip(streams, blocks, strict=True)]
         fit = regress(lagged)
         change, sigma = float(fit.values[-1]), float(np.sqrt(fit.covariance[-1, -1]))
         lag_s -= change
@@ -68,8 +68,8 @@ def _found(streams: Sequence[Conditioned], blocks: Sequence[Block]) -> Lag | Non
             break
     found = Lag(lag_s, sigma, _share(fit, lag_s))
     left = [
-        rms_of(it, block.used) / spread_of(block.y, block.used)
-        for it, block in zip(fit.residuals, fit.blocks, strict=True)
+        rms_of(residual, block.used) / spread_of(block.y, block.used)
+        for residual, block in zip(fit.residuals, fit.blocks, strict=True)
     ]
     clear = _SIGMAS * sigma < abs(lag_s) <= _LARGEST_S and found.share > _LIMITS.slight_share
     return found if clear and np.median(left) < _LEFT else None
@@ -77,17 +77,17 @@ def _found(streams: Sequence[Conditioned], blocks: Sequence[Block]) -> Lag | Non
 
 def _nearest(streams: Sequence[Conditioned], blocks: Sequence[Block]) -> float | None:
     """The lag on a grid by which the best fit leaves least [s]; None where samples are too few."""
-    step_s = 1.0 / (_PER_PERIOD * max(it.cutoff_hz for it in streams))
+    step_s = 1.0 / (_PER_PERIOD * max(stream.cutoff_hz for stream in streams))
     many = int(_LARGEST_S / step_s)
     lags = step_s * np.arange(-many, many + 1)
     rows, torques, joints = [], [], []
-    total = sum(it.y.size for it in blocks)
+    total = sum(block.y.size for block in blocks)
     for stream, block in zip(streams, blocks, strict=True):
         used = block.used & _inside(stream, _LARGEST_S)[:, None]
         used[np.arange(len(used)) % max(total // _ROWS, 1) > 0] = False
         sizes = np.maximum(spread_of(block.y, used), 1e-12)
         rows.append((block.x / sizes[:, None])[used])
-        torques.append(np.stack([(_torques(stream, it) / sizes)[used] for it in lags], axis=1))
+        torques.append(np.stack([(_torques(stream, lag) / sizes)[used] for lag in lags], axis=1))
         joints.append(np.nonzero(used)[1])
     x, y, joint = np.concatenate(rows), np.concatenate(torques), np.concatenate(joints)
     if len(x) < 2 * x.shape[1]:
@@ -105,7 +105,9 @@ def _nearest(streams: Sequence[Conditioned], blocks: Sequence[Block]) -> float |
 def _lagged(stream: Conditioned, block: Block, lag_s: float) -> Block:
     """The block with its torques taken so much later, and their derivative as one more column."""
     step_s = 1.0 / stream.rate_hz
-    y, before, after = (_torques(stream, it) for it in (lag_s, lag_s - step_s, lag_s + step_s))
+    y, before, after = (
+        _torques(stream, value) for value in (lag_s, lag_s - step_s, lag_s + step_s)
+    )
     slope = (after - before) / (2.0 * step_s)
     used = block.used & _inside(stream, abs(lag_s) + step_s)[:, None]
     return Block(np.concatenate([block.x, slope[:, :, None]], axis=2), y, used, block.correlation)
@@ -116,7 +118,9 @@ def _torques(stream: Conditioned, lag_s: float) -> FloatArray:
     parts = []
     for piece in stream.pieces:
         times_s = piece.measured.motion.times_s
-        later = [np.interp(times_s + lag_s, times_s, it) for it in piece.measured.torques_nm.T]
+        later = [
+            np.interp(times_s + lag_s, times_s, column) for column in piece.measured.torques_nm.T
+        ]
         parts.append(piece.lowpass(np.stack(later, axis=1), piece.there))
     return np.concatenate(parts)
 
@@ -135,7 +139,8 @@ def _inside(stream: Conditioned, lag_s: float) -> Mask:
 def _share(fit: Regression, lag_s: float) -> float:
     """The most that a lag changes of a joint's torques, over their range."""
     shares = [
-        rms_of(lag_s * it.x[:, :, -1], it.used) / np.maximum(spread_of(it.y, it.used), 1e-12)
-        for it in fit.blocks
+        rms_of(lag_s * block.x[:, :, -1], block.used)
+        / np.maximum(spread_of(block.y, block.used), 1e-12)
+        for block in fit.blocks
     ]
     return float(np.max(shares))

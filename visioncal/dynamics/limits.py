@@ -268,7 +268,7 @@ class Kept:
         }
         if self.torque is not None and not allowed.unchecked:
             found["torque"] = self.torque / allowed.torque
-        return {name: [float(it) for it in np.round(used, 6)] for name, used in found.items()}
+        return {name: [float(value) for value in np.round(used, 6)] for name, used in found.items()}
 
     @property
     def breaches(self) -> tuple[str, ...]:
@@ -323,6 +323,6 @@ def _nearest(allowed: Allowed, q: FloatArray) -> tuple[float, tuple[str, ...], i
     collisions = allowed.collisions
     if not collisions.names:
         return np.inf, (), 0
-    left = np.array([collisions.distances(it) for it in q]) - collisions.needed_m()
+    left = np.array([collisions.distances(value) for value in q]) - collisions.needed_m()
     row, pair = np.unravel_index(int(left.argmin()), left.shape)
     return float(left[row, pair]), collisions.names[pair], int(row)

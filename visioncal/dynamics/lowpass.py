@@ -109,7 +109,7 @@ def band_of(q: FloatArray, rate_hz: float) -> float:
     power = np.abs(spectrum[:, moving] * frequencies[:, None] ** 2) ** 2
     octaves = np.log2(frequencies / frequencies[0])
     parts = (_PARTS * octaves).astype(np.int64)
-    return max(_edge(it, parts, frequencies) for it in power.T)
+    return max(_edge(column, parts, frequencies) for column in power.T)
 
 
 def _edge(power: FloatArray, parts: IntArray, frequencies: FloatArray) -> float:

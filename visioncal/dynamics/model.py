@@ -61,7 +61,9 @@ class FrictionTerms:
 
     def names(self, joints: int) -> tuple[str, ...]:
         """The names of all joints' parameters: Fc1, Fv1, offset1, Fc2, ..."""
-        return tuple(f"{it}{joint}" for joint in range(1, joints + 1) for it in self.symbols)
+        return tuple(
+            f"{symbol}{joint}" for joint in range(1, joints + 1) for symbol in self.symbols
+        )
 
     def values(self, motion: Motion) -> FloatArray:
         """Derivatives (m, n, k) of each joint's torque by its own k parameters."""
@@ -71,7 +73,7 @@ class FrictionTerms:
             "offset": np.ones_like(motion.dq),
             "Ia": motion.ddq,
         }
-        columns = [parts[it] for it in self.symbols]
+        columns = [parts[symbol] for symbol in self.symbols]
         return np.stack(columns, axis=-1) if columns else np.empty((*motion.dq.shape, 0))
 
     def columns(self, motion: Motion) -> FloatArray:

@@ -83,7 +83,7 @@ class Objective:
         self, numbers: FloatArray, sharpness: float, price: float
     ) -> tuple[float, list[FloatArray]]:
         """Condition and torques, with derivatives (m, n) by positions, speeds, accelerations."""
-        states = [it @ numbers.T for it in self._basis]
+        states = [array @ numbers.T for array in self._basis]
         rows, jacobian = self._regressors(states)
         weighted = (rows * self._weights[:, None]).reshape(-1, rows.shape[2])
         value, by_weighted = smooth_condition(weighted, sharpness)
@@ -100,19 +100,19 @@ class Objective:
         """Rows (m, n, b), and their derivatives (3 n, m, n, b) by the numbers of the states."""
         # Forward differences; the rows are linear in the accelerations and quadratic in the speeds.
         count, joints = states[0].shape
-        stepped = [np.repeat(it[None], 3 * joints + 1, axis=0) for it in states]
+        stepped = [np.repeat(state[None], 3 * joints + 1, axis=0) for state in states]
         for kind, values in enumerate(stepped):
             for joint in range(joints):
                 values[1 + kind * joints + joint, :, joint] += _STEP
         times = np.tile(self._times, 3 * joints + 1)
-        motion = Motion(times, *(it.reshape(-1, joints) for it in stepped))
+        motion = Motion(times, *(array.reshape(-1, joints) for array in stepped))
         rows = self._base.regressor(motion).reshape(3 * joints + 1, count, joints, -1)
         return rows[0], (rows[1:] - rows[0]) / _STEP
 
     def _beyond(self, numbers: FloatArray) -> tuple[float, list[FloatArray]]:
         """What is beyond limits and distances, with derivatives (m, n)."""
         allowed, less = self._allowed, 1.0 - _EARLIER
-        q, dq, ddq = (it @ numbers.T for it in self._looks)
+        q, dq, ddq = (look @ numbers.T for look in self._looks)
         position, by_q = _hinge(q - allowed.middle, less * allowed.half)
         speed, by_dq = _hinge(dq, less * allowed.speed)
         hard, by_ddq = _hinge(ddq, less * allowed.acceleration)
@@ -148,5 +148,5 @@ def _hinge(values: FloatArray, limits: FloatArray) -> tuple[float, FloatArray]:
 
 def _back(basis: tuple[FloatArray, ...], jacobian: list[FloatArray]) -> FloatArray:
     """(n, k) derivatives by the free numbers, of those (m, n) by the states."""
-    found = sum(values.T @ it for values, it in zip(basis, jacobian, strict=True))
+    found = sum(values.T @ array for values, array in zip(basis, jacobian, strict=True))
     return np.asarray(found).T

@@ -59,8 +59,8 @@ class MomentumObserver:
         Raises:
             DataError: Time does not go on, or a shape is wrong.
         """
-        rows = (np.asarray(it, dtype=float)[None] for it in (q, dq))
-        momentum, rate = (it[0] for it in self._arm.momentum(*rows))
+        rows = (np.asarray(array, dtype=float)[None] for array in (q, dq))
+        momentum, rate = (array[0] for array in self._arm.momentum(*rows))
         return self._step(time_s, momentum, rate + torques_nm)
 
     def _step(self, time_s: float, momentum: FloatArray, push: FloatArray) -> FloatArray:
@@ -104,4 +104,4 @@ def external_torques(
     motion = measured.motion
     momentum, rate = arm.momentum(motion.q, motion.dq)
     samples = zip(motion.times_s.tolist(), momentum, rate + measured.torques_nm, strict=True)
-    return np.array([observer._step(*it) for it in samples])
+    return np.array([observer._step(*sample) for sample in samples])

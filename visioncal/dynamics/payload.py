@@ -144,7 +144,7 @@ def estimate_payload(
         slow_rad_s=identified.base.model.terms.slow_rad_s,
     )
     try:
-        fit = regress([_block(identified, terms, it) for it in loaded])
+        fit = regress([_block(identified, terms, conditioned) for conditioned in loaded])
     except np.linalg.LinAlgError as error:
         raise DegenerateError(
             "payload: the motion does not determine all of its inertia.", next_step=_HOW
@@ -153,7 +153,7 @@ def estimate_payload(
     found = Payload(
         fit.values[:10],
         (fit.covariance + _of_arm(identified, loaded, fit) + of_gains)[:10, :10],
-        rms_of(np.concatenate(fit.residuals), np.concatenate([it.used for it in fit.blocks])),
+        rms_of(np.concatenate(fit.residuals), np.concatenate([block.used for block in fit.blocks])),
         float(np.sqrt(of_gains[0, 0])),
     )
     if not found.mass_sigma_kg < _WORST * found.mass_kg:
@@ -255,12 +255,13 @@ def drive_gains(
         return np.asarray(body_regressor(robot, motion.q, motion.dq, motion.ddq) @ body)
 
     streams = (*empty, *loaded)
-    own = np.concatenate([it.filtered(base.regressor) for it in streams])
+    own = np.concatenate([stream.filtered(base.regressor) for stream in streams])
     pulls = np.concatenate(
-        [np.zeros_like(it.torques_nm) for it in empty] + [it.filtered(load) for it in loaded]
+        [np.zeros_like(item.torques_nm) for item in empty]
+        + [item.filtered(load) for item in loaded]
     )
-    currents = np.concatenate([it.torques_nm for it in streams])
-    used = np.concatenate([it.used for it in streams])
+    currents = np.concatenate([stream.torques_nm for stream in streams])
+    used = np.concatenate([stream.used for stream in streams])
     found = np.array(
         [
             _gain(own[rows, joint], pulls[rows, joint], currents[rows, joint])

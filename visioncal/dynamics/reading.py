@@ -75,8 +75,8 @@ def read_recorded(
         DataError: Columns of a joint are missing or there are those of more joints than the robot
             has, currents have no gains, too few samples are filled, or stamps are not in seconds.
     """
-    names = {it: _names(it, count) for it in ("q", "tau", "current", "dq")}
-    there = {it: [name in stream for name in names[it]] for it in names}
+    names = {name: _names(name, count) for name in ("q", "tau", "current", "dq")}
+    there = {word: [name in stream for name in names[word]] for word in names}
     _check_joints(stream, label, count)
     of_currents = not any(there["tau"]) and any(there["current"])
     drive = "current" if of_currents else "tau"
@@ -89,7 +89,7 @@ def read_recorded(
     if missing:
         raise DataError(
             f"{label} lacks {', '.join(missing)}: the robot has {count} joints.",
-            culprits=[f"{label}, {it}" for it in missing],
+            culprits=[f"{label}, {name}" for name in missing],
             next_step=_HOW,
         )
     gains = _gains(label, count, gains_nm_a) if of_currents else np.ones(count)
@@ -118,11 +118,13 @@ def _names(kind: str, count: int) -> list[str]:
 def _check_joints(stream: Stream, label: str, count: int) -> None:
     """Refuses columns of joints that the robot does not have."""
     known = {name for kind in ("q", "dq", "tau", "current") for name in _names(kind, count)}
-    beyond = [it for it in stream.columns if _NUMBERED.fullmatch(it) and it not in known]
+    beyond = [
+        column for column in stream.columns if _NUMBERED.fullmatch(column) and column not in known
+    ]
     if beyond:
         raise DataError(
             f"{label} has {', '.join(beyond)}, but the robot has {count} joints.",
-            culprits=[f"{label}, {it}" for it in beyond],
+            culprits=[f"{label}, {name}" for name in beyond],
             next_step="Name the robot that was recorded under [robot] in session.toml, or leave "
             "the columns of other axes out.",
         )

@@ -81,7 +81,7 @@ class Regression:
     @property
     def residuals(self) -> tuple[FloatArray, ...]:
         """(k, n) torques less the fit, a block."""
-        return tuple(it.y - it.predicted(self.values) for it in self.blocks)
+        return tuple(block.y - block.predicted(self.values) for block in self.blocks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +114,9 @@ def regress(blocks: Sequence[Block]) -> Regression:
     with one_blas_thread():
         for _ in range(_CUTS):
             values, sigmas, root = _weighted(blocks)
-            cut = tuple(it.within(values, sigma) for it, sigma in zip(blocks, sigmas, strict=True))
+            cut = tuple(
+                block.within(values, sigma) for block, sigma in zip(blocks, sigmas, strict=True)
+            )
             pairs = zip(cut, blocks, strict=True)
             if all(new.used.sum() == old.used.sum() for new, old in pairs):
                 break
@@ -142,12 +144,14 @@ def _weighted(
     # Each joint's rows are decomposed once; changing weights costs triangles alone.
     joints = [_decomposed(block) for block in blocks]
     size = blocks[0].x.shape[2]
-    sigmas = [np.ones(len(it)) for it in joints]
+    sigmas = [np.ones(len(joint)) for joint in joints]
     for turn in range(_ROUNDS):
         values, root = _solved(joints, sigmas, size)
         before = sigmas
         sigmas = [
-            np.array([_sigma(it, values, root, old) for it, old in zip(of, olds, strict=True)])
+            np.array(
+                [_sigma(joint, values, root, old) for joint, old in zip(of, olds, strict=True)]
+            )
             for of, olds in zip(joints, before, strict=True)
         ]
         pairs = zip(before, sigmas, strict=True)

@@ -101,7 +101,11 @@ def identify_session(session: Session, request: Request | None = None) -> Run:
     request = Request() if request is None else request
     session = of_one_arm(session, request.robot)
     robot = robot_of(session)
-    names = [it for it in _torque_streams(session, request.streams) if it != request.validate_on]
+    names = [
+        stream
+        for stream in _torque_streams(session, request.streams)
+        if stream != request.validate_on
+    ]
     if not names:
         raise DataError(
             f"session {session.name!r}: {request.validate_on} is its only stream of torques, and "
@@ -109,8 +113,10 @@ def identify_session(session: Session, request: Request | None = None) -> Run:
             culprits=[request.validate_on],
             next_step="Leave --validate-on out: then the end of the motion is predicted.",
         )
-    recorded = [_read(session, robot, it, request) for it in names]
-    streams, lag = _lagging(robot, [_conditioned(robot, it, request) for it in recorded], request)
+    recorded = [_read(session, robot, name, request) for name in names]
+    streams, lag = _lagging(
+        robot, [_conditioned(robot, item, request) for item in recorded], request
+    )
     request = replace(request, lag_s=request.lag_s if lag is None else lag.seconds)
     split = _split(robot, recorded, streams, request)
     options = _with_rotors(robot, split, request)
@@ -136,7 +142,7 @@ def identify_session(session: Session, request: Request | None = None) -> Run:
         },
     )
     friction = friction_of_known(whole)
-    fitted = tuple(predict(identified, it, friction) for it in streams)
+    fitted = tuple(predict(identified, stream, friction) for stream in streams)
     return Run(session, identified, whole, proof, fitted)
 
 
@@ -148,7 +154,9 @@ def validate_session(
     Raises:
         DataError: The robot is another one, there is no such stream, or a stream is wrong.
     """
-    return [predict(identified, it) for it in conditioned_streams(session, identified, request)]
+    return [
+        predict(identified, stream) for stream in conditioned_streams(session, identified, request)
+    ]
 
 
 @on_one_blas_thread
@@ -162,14 +170,16 @@ def conditioned_streams(
     """
     robot, session = identified.robot, of_one_arm(session, request.robot)
     names = _torque_streams(session, request.streams)
-    recorded = [_read(session, robot, it, request) for it in names]
+    recorded = [_read(session, robot, name, request) for name in names]
     cutoff_hz = request.cutoff_hz or identified.streams[0].cutoff_hz
     filtered = replace(request, cutoff_hz=cutoff_hz)
-    streams = [_conditioned(robot, it, filtered) for it in recorded]
+    streams = [_conditioned(robot, item, filtered) for item in recorded]
     streams, lag = _lagging(robot, streams, request)
     if lag is None:
         return streams
-    return [replace(it, notes=(*it.notes, f"{it.label}: {lag.words}")) for it in streams]
+    return [
+        replace(stream, notes=(*stream.notes, f"{stream.label}: {lag.words}")) for stream in streams
+    ]
 
 
 @on_one_blas_thread
@@ -190,15 +200,15 @@ def current_streams(
         DataError: There is no stream of currents, or one is wrong.
     """
     request = Request(cutoff_hz=cutoff_hz, gains_nm_a=(1.0,) * robot.joint_count)
-    recorded = [_read(session, robot, it, request) for it in _torque_streams(session)]
-    recorded = [it for it in recorded if it.of_currents]
+    recorded = [_read(session, robot, stream, request) for stream in _torque_streams(session)]
+    recorded = [item for item in recorded if item.of_currents]
     if not recorded:
         raise DataError(
             f"session {session.name!r} has torques and no currents.",
-            culprits=[f"{STREAMS}/{it}.csv" for it in session.streams],
+            culprits=[f"{STREAMS}/{stream}.csv" for stream in session.streams],
             next_step="Drives that report torques need no gains: visioncal dynamics identify.",
         )
-    return [condition(it, cutoff_hz) for it in recorded]
+    return [condition(item, cutoff_hz) for item in recorded]
 
 
 def of_one_arm(session: Session, robot: str | None = None) -> Session:
@@ -241,12 +251,14 @@ def _torque_streams(session: Session, wanted: Sequence[str] = ()) -> list[str]:
     if wanted:
         return list(dict.fromkeys(wanted))
     drives = ("tau1_nm", "current1_a")
-    found = [name for name, it in session.streams.items() if any(one in it for one in drives)]
+    found = [
+        name for name, stream in session.streams.items() if any(one in stream for one in drives)
+    ]
     if not found:
         raise DataError(
             f"session {session.name!r} has no stream with torques or currents: "
             f"{', '.join(session.streams) or 'it has no streams'}.",
-            culprits=[f"{STREAMS}/{it}.csv" for it in session.streams],
+            culprits=[f"{STREAMS}/{stream}.csv" for stream in session.streams],
             next_step=f"Put them into {STREAMS}/NAME.csv: stamp_s, q1_rad ..., and tau1_nm ... or "
             "current1_a ....",
         )
@@ -271,7 +283,7 @@ def _lagging(
     lag = None
     if request.lag_s is None:
         lag = find_lag(robot, streams, request.options.terms)
-    return streams if lag is None else [it.advanced(lag.seconds) for it in streams], lag
+    return streams if lag is None else [stream.advanced(lag.seconds) for stream in streams], lag
 
 
 def _split(
@@ -279,7 +291,7 @@ def _split(
 ) -> _Split | None:
     """Leaves the end of the fastest motion out; None where the rest determines too little."""
     # Sweeps move one joint after the other: no part of them stands for the others.
-    fastest = int(np.argmax([_speed(it) for it in streams]))
+    fastest = int(np.argmax([_speed(stream) for stream in streams]))
     filtered = replace(request, cutoff_hz=streams[fastest].cutoff_hz)
     begin = recorded[fastest].part(0.0, 1.0 - HELD_OUT)
     end = recorded[fastest].part(1.0 - HELD_OUT, 1.0)
@@ -314,7 +326,7 @@ def _quick(options: Options, rotors: bool) -> Options:
 
 def _speed(stream: Conditioned) -> FloatArray:
     """How fast the slowest joint is [rad/s]."""
-    speeds = np.concatenate([it.measured.motion.dq for it in stream.pieces])
+    speeds = np.concatenate([piece.measured.motion.dq for piece in stream.pieces])
     return np.asarray(np.sqrt(np.mean(speeds**2, axis=0)).min())
 
 

@@ -90,9 +90,9 @@ def fit_stribeck(
     whole = _Weighted.of(streams, blocks, plain.sigmas)
     while len(joints):
         ones = np.ones(len(joints))
-        starts = [Stribeck(joints, ones, it * ones, slow_rad_s) for it in _STARTS]
-        tried = [_descended(whole, it) for it in starts]
-        found, fit = _polished(streams, blocks, min(tried, key=lambda it: it.cost).humps)
+        starts = [Stribeck(joints, ones, start * ones, slow_rad_s) for start in _STARTS]
+        tried = [_descended(whole, start) for start in starts]
+        found, fit = _polished(streams, blocks, min(tried, key=lambda value: value.cost).humps)
         shown = _shown(found, fit, fit.values[sliding[joints]])
         if shown.all():
             return found, fit
@@ -183,18 +183,18 @@ class _Weighted:
         cls, streams: Sequence[Conditioned], blocks: Sequence[Block], sigmas: Sequence[FloatArray]
     ) -> Self:
         """Weighs blocks by the noise of their joints."""
-        weights = tuple(it.used / sigma for it, sigma in zip(blocks, sigmas, strict=True))
+        weights = tuple(block.used / sigma for block, sigma in zip(blocks, sigmas, strict=True))
         weighted = tuple(
-            replace(it, x=it.x * weight[:, :, None], y=it.y * weight)
-            for it, weight in zip(blocks, weights, strict=True)
+            replace(block, x=block.x * weight[:, :, None], y=block.y * weight)
+            for block, weight in zip(blocks, weights, strict=True)
         )
         return cls(
             streams,
             weighted,
             weights,
-            np.asarray(sum(gram(it.x, it.x) for it in weighted)),
-            np.asarray(sum(gram(it.x, it.y) for it in weighted)),
-            float(sum(np.sum(it.y**2) for it in weighted)),
+            np.asarray(sum(gram(block.x, block.x) for block in weighted)),
+            np.asarray(sum(gram(block.x, block.y) for block in weighted)),
+            float(sum(np.sum(block.y**2) for block in weighted)),
         )
 
     def look(self, at: Stribeck) -> _Look:

@@ -147,7 +147,7 @@ def plan_sweeps(allowed: Allowed, request: SweepRequest) -> Sweeps:
     turn = np.minimum(np.pi, allowed.half)
     drawn = allowed.middle + rng.uniform(-turn, turn, (_POSTURES, len(turn)))
     clear = drawn[allowed.collisions.first_contact(drawn) < 0]
-    rooms = np.array([_room(allowed, it) for it in clear]).reshape(-1, len(turn), 2)
+    rooms = np.array([_room(allowed, value) for value in clear]).reshape(-1, len(turn), 2)
     order = np.argsort(-np.sort(rooms[:, :, 1] - rooms[:, :, 0], axis=1)[:, 0], kind="stable")
     breaches: tuple[str, ...] = ("everywhere something is too near",)
     for row in order[:_CLOSELY].tolist():
@@ -218,7 +218,7 @@ def _way(allowed: Allowed, joint: int, begin: float, end: float) -> Iterator[Str
 def _room(allowed: Allowed, home: FloatArray) -> FloatArray:
     """(n, 2) how far each joint can turn from a clear posture, as lowest and highest [rad]."""
     joints = range(len(home))
-    return np.array([[_feel(allowed, home, it, sense) for sense in (-1, 1)] for it in joints])
+    return np.array([[_feel(allowed, home, joint, sense) for sense in (-1, 1)] for joint in joints])
 
 
 def _feel(allowed: Allowed, home: FloatArray, joint: int, sense: int) -> float:
@@ -249,7 +249,7 @@ def _surely(
 
 
 def _begins(strokes: tuple[Stroke, ...]) -> FloatArray:
-    lengths = [it.duration_s + REST_S for it in strokes]
+    lengths = [stroke.duration_s + REST_S for stroke in strokes]
     return np.concatenate([[0.0], np.cumsum(lengths)])
 
 

@@ -91,7 +91,7 @@ def validate(identified: Identified, prediction: Prediction) -> Validation:
         prediction.label,
         prediction.rms_nm(prediction.predicted_nm),
         prediction.torque_nm,
-        np.max([it.noise_nm for it in identified.streams], axis=0),
+        np.max([stream.noise_nm for stream in identified.streams], axis=0),
         None if consistent is None else prediction.rms_nm(consistent),
         None if known is None else prediction.rms_nm(known),
     )

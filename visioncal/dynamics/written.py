@@ -62,9 +62,9 @@ def _motion_table(motion: Motion) -> str:
     joints = range(1, motion.q.shape[1] + 1)
     columns = [
         "stamp_s",
-        *(f"q{it}_rad" for it in joints),
-        *(f"dq{it}_rad_s" for it in joints),
-        *(f"ddq{it}_rad_s2" for it in joints),
+        *(f"q{joint}_rad" for joint in joints),
+        *(f"dq{joint}_rad_s" for joint in joints),
+        *(f"ddq{joint}_rad_s2" for joint in joints),
     ]
     text = io.StringIO()
     rows = np.column_stack([motion.times_s, motion.q, motion.dq, motion.ddq])
@@ -128,16 +128,16 @@ def _sweeps(found: Sweeps) -> dict[str, Any]:
         "kept": _kept(found.kept),
         "strokes": [
             {
-                "joint": it.joint + 1,
+                "joint": stroke.joint + 1,
                 "begin_s": begin,
-                "from_rad": it.begin,
-                "to_rad": it.end,
-                "speed_rad_s": it.speed,
-                "ramp_s": it.ramp_s,
-                "duration_s": it.duration_s,
+                "from_rad": stroke.begin,
+                "to_rad": stroke.end,
+                "speed_rad_s": stroke.speed,
+                "ramp_s": stroke.ramp_s,
+                "duration_s": stroke.duration_s,
             }
-            for it, begin in zip(found.strokes, begins[:-1], strict=True)
-            if it.sweeps
+            for stroke, begin in zip(found.strokes, begins[:-1], strict=True)
+            if stroke.sweeps
         ],
     }
     if found.left_out:
@@ -178,7 +178,7 @@ def _limits(allowed: Allowed) -> dict[str, Any]:
         "speed_share": share.speed,
         "acceleration_share": share.acceleration,
         "torque_margin": share.torque,
-        "bodies": [it.name for it in allowed.bodies if not it.of_arm],
+        "bodies": [body.name for body in allowed.bodies if not body.of_arm],
     }
     if not allowed.unchecked:
         document["torque_nm"] = allowed.torque.tolist()
@@ -201,8 +201,8 @@ def excitation_program(robot: Robot, series: Series) -> str:
         # Sums of steps round: the last one must not be driven twice.
         "  while t < period - 0.5 * step:",
         "    w = 6.283185307179586 * t / period",
-        *(f"    s{it} = sin({it}.0 * w)" for it in orders),
-        *(f"    c{it} = cos({it}.0 * w)" for it in orders),
+        *(f"    s{order} = sin({order}.0 * w)" for order in orders),
+        *(f"    c{order} = cos({order}.0 * w)" for order in orders),
         *(
             f"    q{joint + 1} = {_sum(mean[joint], sines[joint], cosines[joint])}"
             for joint in range(len(mean))
@@ -291,12 +291,12 @@ def _end() -> Iterator[str]:
 
 def _strokes(strokes: Sequence[Stroke]) -> Iterator[str]:
     joint = -1
-    for it in strokes:
-        if it.joint != joint:
-            joint = it.joint
+    for stroke in strokes:
+        if stroke.joint != joint:
+            joint = stroke.joint
             yield f"  # joint {joint + 1}"
-        numbers = (it.begin, it.end, it.speed, it.ramp_s)
-        yield f"  stroke({it.joint}, {', '.join(_number(value) for value in numbers)})"
+        numbers = (stroke.begin, stroke.end, stroke.speed, stroke.ramp_s)
+        yield f"  stroke({stroke.joint}, {', '.join(_number(value) for value in numbers)})"
 
 
 def _servo(q: str) -> str:
@@ -313,7 +313,7 @@ def _sum(mean: float, sines: FloatArray, cosines: FloatArray) -> str:
 
 
 def _joints(q: FloatArray) -> str:
-    return f"[{', '.join(_number(it) for it in np.asarray(q).tolist())}]"
+    return f"[{', '.join(_number(value) for value in np.asarray(q).tolist())}]"
 
 
 def _number(value: float) -> str:

@@ -39,7 +39,7 @@ _BENDS = slice(2, 9)
 BOARD_NAMES = (
     "scale",
     "aspect",
-    *(f"bow_{it}" for it in (["xx", "xy", "yy", "xxx", "xxy", "xyy", "yyy"])),
+    *(f"bow_{name}" for name in (["xx", "xy", "yy", "xxx", "xxy", "xyy", "yyy"])),
     "shear",
 )
 # Exponents of the polynomial's terms.
@@ -89,15 +89,15 @@ def shape_basis(target: Target) -> FloatArray:
 
 def boards_basis(targets: Sequence[Target]) -> FloatArray:
     """Derivatives of several targets' corners by all of their shapes, (c, 3, s)."""
-    parts = [shape_basis(it) for it in targets]
-    flat = block_diag(*(it.reshape(3 * len(it), it.shape[2]) for it in parts))
+    parts = [shape_basis(target) for target in targets]
+    flat = block_diag(*(part.reshape(3 * len(part), part.shape[2]) for part in parts))
     return np.asarray(flat.reshape(len(flat) // 3, 3, flat.shape[1]))
 
 
 def shape_slices(targets: Sequence[Target], first: int = 0) -> tuple[slice, ...]:
     """Where each target's shape stands among all of them, the first one's at `first`."""
-    ends = first + np.cumsum([0, *(len(board_prior(it)) for it in targets)])
-    return tuple(slice(*it) for it in pairwise(ends.tolist()))
+    ends = first + np.cumsum([0, *(len(board_prior(target)) for target in targets)])
+    return tuple(slice(*pair) for pair in pairwise(ends.tolist()))
 
 
 def board_prior(target: Target) -> FloatArray:

@@ -78,9 +78,9 @@ class ArmModel:
 
     def erring(self, errors: Mapping[str, ArmErrors]) -> "ArmModel":
         """Returns the arm with the errors of some blocks to be estimated."""
-        sizes = sum(it.basis.shape[2] for it in errors.values())
+        sizes = sum(error.basis.shape[2] for error in errors.values())
         first = next(iter(errors.values())).sigma
-        weights = {name: it.sigma / first for name, it in errors.items()}
+        weights = {name: error.sigma / first for name, error in errors.items()}
         springs = errors.get(COMPLIANCE)
         yielding = None if springs is None else np.any(springs.basis, axis=(0, 1)) > 0
         return replace(self, weights=weights, values=np.zeros(sizes), yielding=yielding)
@@ -243,7 +243,7 @@ class ArmModel:
             return np.asarray(moved @ self.harmonic_directions)
         count = self.nominal.joint_count
         functions = self.robot.function_jacobian(bent).reshape(len(q), 6, count, 4)
-        return np.concatenate([functions[..., it] for it in _FUNCTIONS[name]], axis=2)
+        return np.concatenate([functions[..., function] for function in _FUNCTIONS[name]], axis=2)
 
     def basis(self, q: FloatArray, loads: Loads | None = None) -> FloatArray:
         """How the reported frame (m, 6, p) moves with all values, under the loads of each stop."""
@@ -253,8 +253,10 @@ class ArmModel:
 
     def kept_basis(self, q: FloatArray) -> FloatArray:
         """The columns of `basis` that are of no harmonics."""
-        rest = {it: weight for it, weight in self.weights.items() if it != HARMONICS}
-        return np.concatenate([it * self.columns(name, q) for name, it in rest.items()], axis=2)
+        rest = {name: weight for name, weight in self.weights.items() if name != HARMONICS}
+        return np.concatenate(
+            [value * self.columns(name, q) for name, value in rest.items()], axis=2
+        )
 
 
 def blocks_of(robot: Robot, loads: Loads) -> tuple[str, ...]:

@@ -36,12 +36,14 @@ class ArmPair:
 
         def rank(at: int) -> tuple[bool, int]:
             group = problem.groups[at]
-            robots = [it.robot for it in group.path if it.robot]
+            robots = [step.robot for step in group.path if step.robot]
             turned = int(problem.observations.has_rotation[group.rows].sum())
             return robots == [robot], turned
 
         mine = [
-            at for at, it in enumerate(problem.groups) if robot in {step.robot for step in it.path}
+            at
+            for at, group in enumerate(problem.groups)
+            if robot in {step.robot for step in group.path}
         ]
         row = int(problem.groups[max(mine, key=rank)].rows[0])
         seen = problem.observations
@@ -53,13 +55,13 @@ class ArmPair:
         seen = self.problem.observations
         pairs = zip(seen.observers, seen.observed, strict=True)
         mine = (self.observer, self.observed)
-        return np.flatnonzero(np.array([it == mine for it in pairs], dtype=bool))
+        return np.flatnonzero(np.array([pair == mine for pair in pairs], dtype=bool))
 
     @property
     def is_observer_carried(self) -> bool:
         """Whether the arm carries the observer; else what it observes."""
         path = self.problem.tree.path(self.observer, self.observed)
-        return next(it.is_up for it in path if it.robot == self.robot)
+        return next(step.is_up for step in path if step.robot == self.robot)
 
     def at(self, base_from_flange: FloatArray) -> tuple[Linear, FloatArray]:
         """The pair with its flange at (k, 4, 4), all other robots as at its first stop.
@@ -70,8 +72,8 @@ class ArmPair:
         """
         count, stop = len(base_from_flange), self.problem.observations.stops[self.rows[0]]
         poses = {
-            name: np.repeat(it[stop][None], count, axis=0)
-            for name, it in self.problem.poses.items()
+            name: np.repeat(pose[stop][None], count, axis=0)
+            for name, pose in self.problem.poses.items()
         }
         seen = Observations(
             (self.observer,) * count,
@@ -249,7 +251,7 @@ class ArmData:
         waves = np.stack([np.sin(phases), np.cos(phases)], axis=2)
         first = model.weights["eccentricity"] * waves[:, 0]
         higher = model.weights[HARMONICS] * waves[:, 1:].reshape(len(angles), -1)
-        eccentric, harmonic = (model.place_of(it) for it in ("eccentricity", HARMONICS))
+        eccentric, harmonic = (model.place_of(name) for name in ("eccentricity", HARMONICS))
         variances = np.zeros((count, len(angles)))
         for joint in range(count):
             rows = slice(2 * orders * joint, 2 * orders * (joint + 1))

@@ -53,8 +53,8 @@ def bends_seen(arm: ArmData, torques: FloatArray) -> FloatArray:
     residuals, jacobian = whitened(problem, arm.state, arm.noise, ideal=False)
     springs = jacobian[:, :, arm.columns[model.place_of(COMPLIANCE)]]
     of = [problem.observations.stops == stop for stop in arm.stops.tolist()]
-    pulled = np.array([np.einsum("mij,mi->j", springs[it], residuals[it]) for it in of])
-    square = np.array([np.einsum("mij,mij->j", springs[it], springs[it]) for it in of])
+    pulled = np.array([np.einsum("mij,mi->j", springs[index], residuals[index]) for index in of])
+    square = np.array([np.einsum("mij,mij->j", springs[index], springs[index]) for index in of])
     least = np.maximum(_LEAST_NM, _LEAST_SHARE * np.abs(torques).max(axis=0))
     determined = (np.abs(torques) > least) & (square > 0.0)
     more = np.full(torques.shape, np.nan)

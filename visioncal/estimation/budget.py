@@ -58,7 +58,7 @@ def covariance_by_source(
     gain = _weighted_jacobian(problem, linear, own, noise) @ fitted[:, : 6 * len(problem.unknown)]
     found: dict[str, FloatArray] = defaultdict(lambda: np.zeros((gain.shape[2],) * 2))
     for frame in dict.fromkeys(problem.observations.observers):
-        mine = np.array([it == frame for it in problem.observations.observers])
+        mine = np.array([observer == frame for observer in problem.observations.observers])
         # Where nothing is known of the observations' own noise, that and the robot's are one.
         if own[mine].any():
             found[sources.sensors[frame]] += gram(gain[mine], own[mine] @ gain[mine])

@@ -46,15 +46,17 @@ def scatter(problem: Problem, others: Problem, state: State) -> tuple[FloatArray
         (n,) distances [m], and (n,) [rad].
     """
     placed, among = _placed(others, state), np.array(others.observations.observed)
-    mean = {it: mean_transform(placed[among == it]) for it in dict.fromkeys(among.tolist())}
+    mean = {
+        value: mean_transform(placed[among == value]) for value in dict.fromkeys(among.tolist())
+    }
     return distances(
-        _placed(problem, state), np.array([mean[it] for it in problem.observations.observed])
+        _placed(problem, state), np.array([mean[name] for name in problem.observations.observed])
     )
 
 
 def _placed(problem: Problem, state: State) -> FloatArray:
     """(n, 4, 4) where each observation places its target, in the frame that this hangs on."""
-    edges = state.edges[[problem.unknown[it] for it in problem.observations.observed]]
+    edges = state.edges[[problem.unknown[name] for name in problem.observations.observed]]
     return np.asarray(edges @ invert(problem.predicted(state)) @ problem.measured(state))
 
 
@@ -82,10 +84,10 @@ def chain(
         effects: What moves views together.
     """
     count = len(cam_from_target)
-    (camera, observer), (target, only) = (it.split("_from_") for it in edge_names(mount))
+    (camera, observer), (target, only) = (name.split("_from_") for name in edge_names(mount))
     observed = tuple(targets) or (only,) * count
     targets = order or observed or (only,)
-    unknown = {observer: Branch(camera), **{it: Branch(target) for it in targets}}
+    unknown = {observer: Branch(camera), **{name: Branch(target) for name in targets}}
     return Problem(
         Tree(BASE, {FLANGE: Branch(BASE, robot=ROBOT), **unknown}),
         {ROBOT: base_from_flange},
@@ -99,6 +101,6 @@ def chain(
             np.ones(count, dtype=bool),
             np.full(count, covariance is None),
         ),
-        tuple(it for it in effects if len(it)),
+        tuple(effect for effect in effects if len(effect)),
         is_combined=covariance is None,
     )

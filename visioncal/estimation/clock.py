@@ -133,7 +133,7 @@ class _Late:
         seen = compress_delayed(stack, self.camera, shares, moved, self.times_s, poses)
         unknowns = 6 * len(frames) + len(self.times_s)
         weight = floored_sigma_px(stack.sigma_px(seen.residuals, unknowns)) ** -2.0
-        prior = np.array([it.sigma_s for it in self.delays]) ** -2.0
+        prior = np.array([delay.sigma_s for delay in self.delays]) ** -2.0
         known = Knowledge(
             weight * seen.shared_information + np.diag(prior),
             weight * seen.shared_gradient + prior * self.times_s,
@@ -167,13 +167,13 @@ def fit_offset(robot: Trajectory, frames: Frames, starts: Sequence[float]) -> tu
         on_time = _Late(None, (), np.zeros(0))
         fits = [
             fit.clock
-            for it in starts
-            if (fit := _fitted(robot, some, it, None, on_time)) is not None
-            and abs(fit.clock.offset_s - it) <= near_s
+            for start in starts
+            if (fit := _fitted(robot, some, start, None, on_time)) is not None
+            and abs(fit.clock.offset_s - start) <= near_s
         ]
     # Few frames agree with anything.
-    most = max((it.frames for it in fits), default=0)
-    whole = (it for it in fits if 2 * it.frames > most)
+    most = max((fit.frames for fit in fits), default=0)
+    whole = (fit for fit in fits if 2 * fit.frames > most)
     return tuple(sorted(whole, key=left_by))
 
 
@@ -227,10 +227,10 @@ def clock_change(robot: Trajectory, frames: Frames, fit: ClockFit) -> ClockChang
         return None
     means = (np.bincount(of, weights * asked_s)[kept]) / sums[kept]
     middles = (np.bincount(of, weights * times_s)[kept]) / sums[kept]
-    columns = [(middles >= it).astype(float) for it in middles[2:-1]]
-    tried = [_slope(it, means, sums[kept]) for it in (middles - middles[0], *columns)]
+    columns = [(middles >= middle).astype(float) for middle in middles[2:-1]]
+    tried = [_slope(value, means, sums[kept]) for value in (middles - middles[0], *columns)]
     freedom = len(means) - 2
-    best = int(np.argmax([it[2] for it in tried]))
+    best = int(np.argmax([pair[2] for pair in tried]))
     step_s, sigma_s, square = tried[best]
     if square < f_limit(_FALSE_ALARM / len(tried), 1, freedom):
         return None
@@ -238,7 +238,9 @@ def clock_change(robot: Trajectory, frames: Frames, fit: ClockFit) -> ClockChang
         return ClockChange(float(times_s[0]), step_s, sigma_s, is_drift=True)
     # Within the stretches about it, the frame that parts best.
     near = np.flatnonzero((times_s >= middles[best]) & (times_s <= middles[best + 2]))
-    parts = [_slope((times_s >= times_s[it]).astype(float), asked_s, weights)[2] for it in near]
+    parts = [
+        _slope((times_s >= times_s[index]).astype(float), asked_s, weights)[2] for index in near
+    ]
     from_s = float(times_s[near[int(np.argmax(parts))]])
     return ClockChange(from_s, step_s, sigma_s, is_drift=False)
 
@@ -311,10 +313,14 @@ def clear_fit(fits: Sequence[ClockFit], stated_s: float | None) -> ClockFit | No
     """
     if not fits:
         return None
-    alike = [it for it in fits if left_by(it) <= _ALIKE * left_by(fits[0])]
-    if all(abs(it.offset_s - fits[0].offset_s) <= NEAR_S for it in alike):
+    alike = [fit for fit in fits if left_by(fit) <= _ALIKE * left_by(fits[0])]
+    if all(abs(clock_fit.offset_s - fits[0].offset_s) <= NEAR_S for clock_fit in alike):
         return fits[0]
-    near = [it for it in alike if stated_s is not None and abs(it.offset_s - stated_s) <= NEAR_S]
+    near = [
+        clock_fit
+        for clock_fit in alike
+        if stated_s is not None and abs(clock_fit.offset_s - stated_s) <= NEAR_S
+    ]
     return near[0] if near else None
 
 

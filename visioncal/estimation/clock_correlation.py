@@ -113,7 +113,7 @@ def turning_matches(robot: Trajectory, frames: Frames, about_s: float = 0.0) -> 
         if inside.sum() > max(0.5 * len(first), 2):
             scores[at] = _correlation(turned, turning.by_camera[inside])
     found = _peaks(turning, lags, scores)
-    return tuple(replace(it, offset_s=it.offset_s + about_s) for it in found)
+    return tuple(replace(match, offset_s=match.offset_s + about_s) for match in found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,9 +172,9 @@ class _Turning:
     def sigma_s(self, lag: int) -> float:
         """Standard deviation of an offset [s]: angles are off by noise, and change with it."""
         inside, turned = self.by_robot(lag)
-        sides = [self.by_robot(lag + it) for it in (-1, 1)]
+        sides = [self.by_robot(lag + name) for name in (-1, 1)]
         both = sides[0][0] & sides[1][0] & inside
-        early, late = (it[both[there]] for there, it in sides)
+        early, late = (array[both[there]] for there, array in sides)
         slope = (late - early) / (2.0 * _STEP_S)
         off = self.by_camera[both] - turned[both[inside]]
         information = float(np.sum((slope - slope.mean()) ** 2)) if len(slope) else 0.0
@@ -193,7 +193,7 @@ def _steps(stamps_s: FloatArray) -> IntArray:
     A clock that was set during a recording leaves samples that are years apart.
     """
     places, near = (stamps_s - stamps_s[0]) / _STEP_S, np.diff(stamps_s) < LONGEST_GAP_S
-    low, high = (np.floor(it[near]).astype(np.int64) for it in (places[:-1], places[1:]))
+    low, high = (np.floor(value[near]).astype(np.int64) for value in (places[:-1], places[1:]))
     counts = high - low + 1
     starts = np.cumsum(counts) - counts
     steps = np.unique(np.repeat(low - starts, counts) + np.arange(counts.sum()))

@@ -64,18 +64,20 @@ class CornerStack:
     def of(cls, corners: Mapping[int, Corners], positions: FloatArray) -> Self:
         """Stacks the corners by view; `positions` are the target's (c, 3) corners [m]."""
         views = tuple(corners.values())
-        counts = [len(it.ids) for it in views]
-        weights = [np.ones(len(it.ids)) if it.weights is None else it.weights for it in views]
-        stated = {it.stated_px for it in views}
+        counts = [len(view.ids) for view in views]
+        weights = [
+            np.ones(len(view.ids)) if view.weights is None else view.weights for view in views
+        ]
+        stated = {view.stated_px for view in views}
         return cls(
             tuple(corners),
-            tuple(it.blur_px for it in corners.values()),
+            tuple(view_corners.blur_px for view_corners in corners.values()),
             np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64),
             np.repeat(np.arange(len(counts)), counts),
-            np.concatenate([it.ids for it in corners.values()]),
-            np.concatenate([positions[it.ids] for it in corners.values()]),
-            np.concatenate([it.px for it in corners.values()]),
-            None if all(it.weights is None for it in views) else np.concatenate(weights),
+            np.concatenate([view_corners.ids for view_corners in corners.values()]),
+            np.concatenate([positions[view_corners.ids] for view_corners in corners.values()]),
+            np.concatenate([view_corners.px for view_corners in corners.values()]),
+            None if all(view.weights is None for view in views) else np.concatenate(weights),
             stated.pop() if len(stated) == 1 else None,
         )
 
@@ -120,7 +122,7 @@ class CornerStack:
 
         Noise of a corner is its own, by its weight, and what a random change of focus makes of it.
         """
-        kept = [it for it in rows if it.size]
+        kept = [row for row in rows if row.size]
         if self.weights is not None:
             for array in kept:
                 np.multiply(array, self.weights.reshape(-1, *[1] * (array.ndim - 1)), out=array)
@@ -201,8 +203,8 @@ class CornerStack:
         size, ends = left.shape[2], np.append(self.starts, len(left))
         flat = left.reshape(len(left), -1)
         found = np.empty((len(self.starts), 2 * size, modes.shape[1]))
-        for (start, end), it in zip(pairwise(ends.tolist()), found, strict=True):
-            np.matmul(flat[start:end].T, modes[start:end], out=it)
+        for (start, end), value in zip(pairwise(ends.tolist()), found, strict=True):
+            np.matmul(flat[start:end].T, modes[start:end], out=value)
         both = found.reshape(len(found), 2, size, -1)
         return np.concatenate([both[:, 0], both[:, 1]], axis=2)
 
@@ -210,8 +212,8 @@ class CornerStack:
         """Products `left right` of each view's corners (n, 2, j) and its (v, j, k): (n, 2, k)."""
         found = np.empty((2 * len(left), right.shape[2]))
         rows, ends = left.reshape(len(found), -1), 2 * np.append(self.starts, len(left))
-        for (start, end), it in zip(pairwise(ends.tolist()), right, strict=True):
-            np.matmul(rows[start:end], it, out=found[start:end])
+        for (start, end), value in zip(pairwise(ends.tolist()), right, strict=True):
+            np.matmul(rows[start:end], value, out=found[start:end])
         return found.reshape(*left.shape[:2], -1)
 
 
@@ -369,7 +371,7 @@ def reproject(
         for at in range(3)
     )
     # A turn by w moves point p by w x p: a row b of derivatives becomes p x b.
-    px, py, pz = (it[:, None] for it in (px, py, pz))
+    px, py, pz = (value[:, None] for value in (px, py, pz))
     by_pose = np.empty((*bx.shape, 6))
     for at, column in enumerate(
         (py * bz - pz * by, pz * bx - px * bz, px * by - py * bx, bx, by, bz)

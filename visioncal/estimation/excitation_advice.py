@@ -51,7 +51,9 @@ def joints_to_move(
     while now < wanted:
         tried = _tried(robot, q, count, wanted)
         # Of equal joints, the one that has to move least, and then that moved least.
-        best = max(tried, key=lambda it: (tried[it], -it.wanted, -it.moved), default=None)
+        best = max(
+            tried, key=lambda value: (tried[value], -value.wanted, -value.moved), default=None
+        )
         if best is None or tried[best] <= now:
             break
         found.append(best)

@@ -66,7 +66,7 @@ class FeatureTouches:
 
     def rows(self, kind: FeatureKind) -> IntArray:
         """Numbers of the touches of a kind."""
-        return np.array([at for at, it in enumerate(self.kinds) if it == kind], dtype=np.int64)
+        return np.array([at for at, name in enumerate(self.kinds) if name == kind], dtype=np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +124,7 @@ class FeatureProblem:
             sets = np.random.default_rng(0).choice(sets, _SETS, replace=False)
         frames = (_frame_from(*points[rows]) for rows in sets)
         # Three touches on one line make no frame, and nothing would contradict what is none.
-        yield from (it for it in frames if np.linalg.det(it[:3, :3]) > _IS_FRAME)
+        yield from (frame for frame in frames if np.linalg.det(frame[:3, :3]) > _IS_FRAME)
 
     def linearise(self, state: FloatArray) -> Groups:
         """Residuals (n, 3) in the fixture's frame, and their derivatives by its perturbation.
@@ -179,7 +179,7 @@ def fit_features(touches: FeatureTouches, expected_noise_m: float | None = None)
     fit = agreement.fit
     noise_m = _noise_of(touches, fit, expected_noise_m)
     worst = worst_directions(fit, fit.state, np.zeros(3), noise_m)
-    if fit.sigma > SIGMA_LIMIT_M and any(it.sigma > it.limit for it in worst):
+    if fit.sigma > SIGMA_LIMIT_M and any(direction.sigma > direction.limit for direction in worst):
         raise _contradiction(touches, fit)
     refuse_poor(
         worst,
@@ -250,7 +250,7 @@ def _check_one_side(
             next_step=f"Touch a point far from the {start}.",
         )
     shares = away @ away[farthest] / distances[farthest] ** 2
-    behind = [name for name, it in zip(names, shares, strict=True) if it < -_BEHIND]
+    behind = [name for name, share in zip(names, shares, strict=True) if share < -_BEHIND]
     if behind:
         raise DataError(
             f"fixture: the touches of kind {kind} lie on both sides of the {start}: "

@@ -178,11 +178,11 @@ def _stepped(fitted: Fitted) -> LinearisedCorners:
     """Linearises where the fit came to rest, or on the way there as far as the corners follow."""
     # Far from the answer, as where a lens was stated for images of another size, the whole step
     # leads to lenses that see nothing.
-    limits = [_FOLLOWS * floored_sigma_px(it) for it in fitted.seen.sigmas_px]
+    limits = [_FOLLOWS * floored_sigma_px(sigma) for sigma in fitted.seen.sigmas_px]
     looks, free, change = fitted.seen.looks, fitted.seen.free, fitted.change
     for _ in range(_HALVINGS):
         seen = looks.with_values(free, looks.values[free] + change).seen(fitted.moving)
-        if all(it <= limit for it, limit in zip(seen.sigmas_px, limits, strict=True)):
+        if all(sigma <= limit for sigma, limit in zip(seen.sigmas_px, limits, strict=True)):
             return seen
         change = change / 2
     return fitted.seen
@@ -305,7 +305,7 @@ def target_sizes(problem: Problem, frames: Sequence[str], sigma: float = np.inf)
         sigma: What each size is known to, as a share of itself.
     """
     # A target that was moved has a frame for each place where it was.
-    observed = np.array([it.partition("@")[0] for it in problem.observations.observed])
+    observed = np.array([name.partition("@")[0] for name in problem.observations.observed])
     poses = problem.observations.measured
     by_size = np.zeros((len(observed), 6, len(frames)))
     by_size[:, 3:] = np.swapaxes(poses[:, :3, :3], 1, 2) @ poses[:, :3, 3:]

@@ -235,7 +235,7 @@ class _Arm:
         mine = (nominal.members == robot).any(axis=1)
         own, others = likelihood.jacobian[mine], nominal.jacobian[~mine]
         names = (*bases, "second", *([HARMONICS] if waves.length_rad else []))
-        groups = np.repeat(np.arange(len(bases)), [it.shape[2] for it in bases.values()])
+        groups = np.repeat(np.arange(len(bases)), [base.shape[2] for base in bases.values()])
         shares = np.zeros((size, len(names)))
         shares[np.arange(len(groups)), groups] = 1.0
         second = slice(len(groups), len(groups) + waves.seconds)
@@ -255,10 +255,10 @@ class _Arm:
     def springs_of(self, step: "_Step") -> FloatArray:
         """(n,) the compliances at some step; none without any."""
         at = 0
-        for name, it in self.bases.items():
+        for name, base in self.bases.items():
             if name == COMPLIANCE:
-                return step.effects[at : at + it.shape[2]]
-            at += it.shape[2]
+                return step.effects[at : at + base.shape[2]]
+            at += base.shape[2]
         return np.zeros(0)
 
     def start(self) -> FloatArray:
@@ -271,11 +271,11 @@ class _Arm:
     def _typical(self) -> FloatArray:
         """(g,) logarithms of typical sizes of the groups."""
         factor = {COMPLIANCE: self.torque_nm / _TORQUE_NM}
-        return np.log([_TYPICAL[it] * factor.get(it, 1.0) for it in self.names])
+        return np.log([_TYPICAL[name] * factor.get(name, 1.0) for name in self.names])
 
     def most_likely(self, start: FloatArray, enough: float = np.inf) -> "_Step | None":
         """Finds the most likely levels and sizes; None where there are none to start from."""
-        low, high = (np.full(len(start), np.log(it)) for it in (LEAST_SIGMA, MOST_SIGMA))
+        low, high = (np.full(len(start), np.log(value)) for value in (LEAST_SIGMA, MOST_SIGMA))
         try:
             return most_likely(self._likelihood, start, low, high, 0.0, enough, little=_LITTLE)[1]
         except LinAlgError:
@@ -312,9 +312,9 @@ class _Arm:
         )
         growth = 2.0 * sigmas[:, None, None] ** 2 * components.parts
         taken = np.array([
-            np.sum(inverse * weighted_gram(weighted, it[mine]))
-            + np.sum(inverse[inner] * weighted_gram(rest, it[~mine]))
-            for it in growth
+            np.sum(inverse * weighted_gram(weighted, value[mine]))
+            + np.sum(inverse[inner] * weighted_gram(rest, value[~mine]))
+            for value in growth
         ])  # fmt: skip
         own = np.diagonal(weights, axis1=1, axis2=2)
         by_levels = 0.5 * (np.einsum("kui,ui->k", growth, own - pulled**2) - taken)

@@ -78,7 +78,7 @@ class LevelFit:
     @property
     def size(self) -> int:
         """How many columns are carried."""
-        return sum(it.basis.shape[2] for it in self.errors.values())
+        return sum(error.basis.shape[2] for error in self.errors.values())
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +104,7 @@ class ArmTrials:
 
     def erring(self, errors: Mapping[str, ArmErrors]) -> Problem:
         """The observations with errors of the arm among the unknowns."""
-        effects = [it.effect(self.robot, name) for name, it in errors.items()]
+        effects = [error.effect(self.robot, name) for name, error in errors.items()]
         return self.problem.with_effects([*self.problem.effects, *effects])
 
     def fitted(self, errors: Mapping[str, ArmErrors]) -> Solution:
@@ -167,7 +167,7 @@ def fit_level(arm: ArmTrials, blocks: Blocks = _RIGID) -> LevelFit | None:
     # What large errors of another block hid shows once these are free.
     while len(errors) > count:
         count = len(errors)
-        for name in (it for it in blocks.names if it in arm.bases and it not in errors):
+        for name in (name for name in blocks.names if name in arm.bases and name not in errors):
             found = arm.found(errors, arm.bases[name])
             if found is not None and found.is_significant:
                 gain += found.gain
@@ -185,9 +185,9 @@ def resized(arm: ArmTrials, fit: LevelFit) -> LevelFit:
     if len(fit.errors) < 2:
         return fit
     errors = dict(fit.errors)
-    for name, it in fit.errors.items():
+    for name, error in fit.errors.items():
         others = {other: errors[other] for other in errors if other != name}
-        errors[name] = arm.found(others, it.basis) or it
+        errors[name] = arm.found(others, error.basis) or error
     return arm.level(errors, fit.gain)
 
 

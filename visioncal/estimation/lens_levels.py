@@ -252,8 +252,8 @@ class _Likelihood:
         """
         t, levels, variances = len(self.known), np.flatnonzero(self.counts), np.exp(2.0 * logs)
         singles, modes = self._members
-        among_rows = [taken[self.kinds == it] for it in levels.tolist()]
-        turned = np.array([covariance @ (it.T @ it) for it in among_rows])
+        among_rows = [taken[self.kinds == level] for level in levels.tolist()]
+        turned = np.array([covariance @ (row.T @ row) for row in among_rows])
         of_one_view = (inverse * (inverse + 2.0 * in_common)) @ singles
         both = np.tensordot(singles, of_one_view, axes=([0, 1], [0, 1]))
         both += np.tensordot(turned, turned, axes=([1, 2], [2, 1]))
@@ -369,7 +369,9 @@ def estimate_levels(
     sizes = np.exp(logs[: _JITTER + 1])
     low = np.exp(likelihood.limits(closed)[0][: _JITTER + 1])
     field, breathing, jitter = np.where(sizes > 2.0 * low, sizes, 0.0)[1:] / sizes[_NOISE]
-    gains = [likelihood.gain(logs, best[0], closed, it) for it in (_FIELD, _BREATHING, _JITTER)]
+    gains = [
+        likelihood.gain(logs, best[0], closed, index) for index in (_FIELD, _BREATHING, _JITTER)
+    ]
     return LensLevels(
         float(field), _LENGTHS[at], float(breathing), float(jitter), (gains[0], gains[1], gains[2])
     )
@@ -414,7 +416,7 @@ def _rows(
     by_board = now.by_point @ shape
     stack.weigh(focus, breath, by_board)
     columns = [now.by_intrinsics, by_board, *(
-        it[:, :, None] for it in (breath, focus, now.residuals)
+        array[:, :, None] for array in (breath, focus, now.residuals)
     )]  # fmt: skip
     every = np.concatenate(columns, axis=2)
     here = np.flatnonzero((rows >= of_camera.start) & (rows < of_camera.stop))

@@ -112,8 +112,8 @@ def _eigen(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
         if not np.isfinite(matrices).all():
             raise
     size = matrices.shape[-1]
-    pairs = [eigh(it, driver="evr") for it in matrices.reshape(-1, size, size)]
-    values, vectors = (np.array(it) for it in zip(*pairs, strict=True))
+    pairs = [eigh(array, driver="evr") for array in matrices.reshape(-1, size, size)]
+    values, vectors = (np.array(pair) for pair in zip(*pairs, strict=True))
     return values.reshape(matrices.shape[:-1]), vectors.reshape(matrices.shape)
 
 

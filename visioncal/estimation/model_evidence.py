@@ -20,7 +20,7 @@ from visioncal.estimation.problem import Linear, Problem
 from visioncal.estimation.variance import Knowledge
 
 # Changes come in all sizes: from a tenth of a millimetre to a tenth of a metre, by half decades.
-SIZES_M = tuple(float(it) for it in 10.0 ** np.arange(-4.0, -0.9, 0.5))
+SIZES_M = tuple(float(value) for value in 10.0 ** np.arange(-4.0, -0.9, 0.5))
 # A knock that shifts by a millimetre turns by 4 mrad.
 TURN_PER_M = 4.0
 # Steps of a cause settle after two or three; far beyond any arm's repeatability is far enough.
@@ -70,8 +70,8 @@ class Cause:
     def trials(self) -> tuple[tuple[float, float], ...]:
         """Sizes [m] and factors of the noise to be tried, all as likely beforehand."""
         if self.noise_factors:
-            return tuple((0.0, it) for it in self.noise_factors)
-        return tuple((it, 1.0) for it in SIZES_M)
+            return tuple((0.0, factor) for factor in self.noise_factors)
+        return tuple((size, 1.0) for size in SIZES_M)
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,7 +215,7 @@ def undone(problem: Problem, cause: Cause, values: FloatArray) -> Problem:
             measured=seen.measured @ by_sensor.moved,
             covariance=carried @ seen.covariance @ np.swapaxes(carried, 1, 2),
         ),
-    ).with_effects([*(it.carried(carried) for it in problem.effects), changed])
+    ).with_effects([*(effect.carried(carried) for effect in problem.effects), changed])
 
 
 def with_change(state: State, cause: Cause) -> State:

@@ -127,7 +127,7 @@ def better_stop(problem: Problem, fit: Solution, move: Move) -> int:
         explained.append(explained_by_noise(there, fit, len(problem)))
     stops = part.observations.stops
     choices = np.unique(stops)
-    counts = [np.sum(np.where(stops < it, *explained)) for it in choices]
+    counts = [np.sum(np.where(stops < choice, *explained)) for choice in choices]
     best = max(counts)
     if counts[int(np.searchsorted(choices, move.stop))] == best:
         return move.stop
@@ -143,7 +143,7 @@ def moved_earlier_or_later(
     sightings = mine.renamed(move.frame, move.twin, after).renamed(move.twin, move.frame, ~after)
     return (
         replace(problem, observations=sightings),
-        [replace(it, stop=stop) if it is move else it for it in moves],
+        [replace(item, stop=stop) if item is move else item for item in moves],
     )
 
 
@@ -160,14 +160,14 @@ def needless_move(problem: Problem, fit: Solution, moves: Sequence[Move]) -> Mov
     known = fitted_covariance(problem, fit.state, fit.noise)
     found = []
     for move in moves:
-        first, second = (problem.unknown[it] for it in (move.frame, move.twin))
+        first, second = (problem.unknown[name] for name in (move.frame, move.twin))
         between = invert(fit.state.edges[first]) @ fit.state.edges[second]
         slope = np.zeros((6, len(known)))
         slope[:, 6 * first : 6 * first + 6] = -adjoint(invert(between))
         slope[:, 6 * second : 6 * second + 6] = np.eye(6)
         away = log(between)
         found.append((float(away @ np.linalg.solve(slope @ known @ slope.T, away)), move))
-    squared, move = min(found, key=lambda it: it[0])
+    squared, move = min(found, key=lambda pair: pair[0])
     stops = len(np.unique(problem.observations.stops))
     return move if squared < _move_limit(problem, len(problem.unknown) * stops) else None
 
@@ -185,9 +185,9 @@ def unmoved(
     )
     state = State(np.delete(fit.state.edges, at, axis=0), fit.state.values)
     rest = [
-        replace(it, frame=move.frame if it.frame == move.twin else it.frame)
-        for it in moves
-        if it is not move
+        replace(item, frame=move.frame if item.frame == move.twin else item.frame)
+        for item in moves
+        if item is not move
     ]
     return joined, replace(fit, state=state), rest
 
@@ -219,19 +219,19 @@ def gross_move(
     steps = _steps(problem, fit, agrees, movable)
     if not steps or _pushed_gain(problem, fit, agrees) > steps[0].gain:
         return None
-    rivals = [it for it in steps if it.gain >= _RIVAL_GAIN * steps[0].gain][:_MOST_TRIED]
-    moves = [_move(problem, it) for it in rivals]
+    rivals = [step for step in steps if step.gain >= _RIVAL_GAIN * steps[0].gain][:_MOST_TRIED]
+    moves = [_move(problem, rival) for rival in rivals]
     if len(rivals) == 1:
         return moves[0]
-    followed = [_followed(problem, fit, agrees, movable, it) for it in moves]
-    totals = [it.gain + gain for it, (gain, _) in zip(rivals, followed, strict=True)]
+    followed = [_followed(problem, fit, agrees, movable, move) for move in moves]
+    totals = [rival.gain + gain for rival, (gain, _) in zip(rivals, followed, strict=True)]
     best = int(np.argmax(totals))
     # What goes next is no rival: it moved as well.
     own = {moves[best].frame, followed[best][1]}
     others = [
-        it.frame
-        for it, total in zip(rivals, totals, strict=True)
-        if total >= _RIVAL_SHARE * totals[best] and it.frame not in own
+        rival.frame
+        for rival, total in zip(rivals, totals, strict=True)
+        if total >= _RIVAL_SHARE * totals[best] and rival.frame not in own
     ]
     return replace(moves[best], rivals=tuple(dict.fromkeys(others)))
 
@@ -253,7 +253,7 @@ def _steps(problem: Problem, fit: Solution, agrees: Mask, movable: Sequence[str]
         rows = np.flatnonzero(problem.observations.involves(frame))
         if np.sum(~agrees[rows]) >= _FEWEST:
             found += _best_steps(problem, fit, agrees, frame, rows)
-    return sorted(found, key=lambda it: -it.gain)
+    return sorted(found, key=lambda value: -value.gain)
 
 
 def _pushed_gain(problem: Problem, fit: Solution, agrees: Mask) -> int:
@@ -264,7 +264,7 @@ def _pushed_gain(problem: Problem, fit: Solution, agrees: Mask) -> int:
             continue
         rows = np.flatnonzero(np.isfinite(problem.change_of(base, fit.state)[:, 0, 0]))
         if np.sum(~agrees[rows]) >= _FEWEST:
-            gains += [it.gain for it in _best_steps(problem, fit, agrees, base, rows)]
+            gains += [step.gain for step in _best_steps(problem, fit, agrees, base, rows)]
     return max(gains)
 
 
@@ -346,21 +346,26 @@ def slight_move(problem: Problem, fit: Solution, movable: Sequence[str]) -> Move
         fit: The unknowns and the noise.
         movable: Frames that may have moved.
     """
-    columns = np.array([np.r_[problem.edge_columns(it)] for it in movable]).reshape(-1, 6)
+    columns = np.array([np.r_[problem.edge_columns(name)] for name in movable]).reshape(-1, 6)
     tried = int(problem.observations.stops.max()) + 1
-    spread = np.array([_spread_of_means(problem, it) for it in movable])
-    between = [_between(problem, problem.observations.involves(it)) for it in movable]
+    spread = np.array([_spread_of_means(problem, name) for name in movable])
+    between = [_between(problem, problem.observations.involves(name)) for name in movable]
     freedom = _residual_freedom(problem, fit)
     best, limit = None, _move_limit(problem, len(movable) * tried)
-    for it in _scored(problem, fit, columns, between):
-        values = scaled_values(it.alone)
+    for scored in _scored(problem, fit, columns, between):
+        values = scaled_values(scored.alone)
         clear = (values[:, 0] >= _TAKEN * values[:, -1]) & (values[:, -1] > 0.0)
-        clear &= scaled_values(it.own)[:, 0] >= _TAKEN
-        squares = np.where(clear, it.squares, 0.0) / spread[it.seen, it.stop]
+        clear &= scaled_values(scored.own)[:, 0] >= _TAKEN
+        squares = np.where(clear, scored.squares, 0.0) / spread[scored.seen, scored.stop]
         tested = _beside_itself(squares, freedom, 6)
         place = int(tested.argmax())
         if tested[place] > limit:
-            best = movable[it.seen[place]], it.stop, it.steps[place], float(squares[place])
+            best = (
+                movable[scored.seen[place]],
+                scored.stop,
+                scored.steps[place],
+                float(squares[place]),
+            )
             limit = tested[place]
     if best is None:
         return None
@@ -380,7 +385,7 @@ def slipped_joint(
         offsets: (s, 6, n) by robot, how its flange moves at each stop with the offset of each of
             its n joints.
     """
-    joints = [(robot, at) for robot, it in offsets.items() for at in range(it.shape[2])]
+    joints = [(robot, at) for robot, offset in offsets.items() for at in range(offset.shape[2])]
     if not joints:
         return None
     columns = problem.size + np.arange(len(joints))[:, None]
@@ -388,15 +393,15 @@ def slipped_joint(
     tried = len(joints) * (int(problem.observations.stops.max()) + 1)
     freedom = _residual_freedom(problem, fit)
     best, limit = None, float(f_limit(_FALSE_MOVE / tried, 1, freedom))
-    for it in _scored(problem, fit, columns, between, offsets):
-        alone, own = it.alone[:, 0, 0], it.own[:, 0, 0]
-        squares = np.where(own > _TAKEN * alone, it.squares, 0.0)
+    for scored in _scored(problem, fit, columns, between, offsets):
+        alone, own = scored.alone[:, 0, 0], scored.own[:, 0, 0]
+        squares = np.where(own > _TAKEN * alone, scored.squares, 0.0)
         tested = _beside_itself(squares, freedom, 1)
         place = int(tested.argmax())
         if tested[place] > limit:
-            limit, (robot, joint) = tested[place], joints[it.seen[place]]
-            step_rad, sigma_rad = float(it.steps[place, 0]), float(own[place] ** -0.5)
-            best = Slip(robot, joint, it.stop, step_rad, sigma_rad, float(squares[place]))
+            limit, (robot, joint) = tested[place], joints[scored.seen[place]]
+            step_rad, sigma_rad = float(scored.steps[place, 0]), float(own[place] ** -0.5)
+            best = Slip(robot, joint, scored.stop, step_rad, sigma_rad, float(squares[place]))
     return best
 
 
@@ -492,10 +497,10 @@ def _scored(
     free = [
         Effect.free(
             f"offsets of {robot}",
-            Knowledge(np.zeros((it.shape[2],) * 2), np.zeros(it.shape[2])),
-            flange_jacobian={robot: it},
+            Knowledge(np.zeros((offset.shape[2],) * 2), np.zeros(offset.shape[2])),
+            flange_jacobian={robot: offset},
         )
-        for robot, it in offsets.items()
+        for robot, offset in offsets.items()
     ]
     wider = problem.with_effects([*problem.effects, *free])
     values = np.append(fit.state.values, np.zeros(wider.size - size))

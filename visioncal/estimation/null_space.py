@@ -102,17 +102,17 @@ def _connected(directions: FloatArray) -> Iterator[list[int]]:
     groups: list[tuple[list[int], set[int]]] = []
     for row, numbers in enumerate(directions):
         rows, columns = [row], set(np.flatnonzero(numbers).tolist())
-        for group in [it for it in groups if it[1] & columns]:
+        for group in [group for group in groups if group[1] & columns]:
             rows, columns = [*group[0], *rows], group[1] | columns
             groups.remove(group)
         groups.append((rows, columns))
-    for rows, _ in sorted(groups, key=lambda it: min(it[1])):
+    for rows, _ in sorted(groups, key=lambda pair: min(pair[1])):
         yield rows
 
 
 def _is_sum(directions: FloatArray, named: Sequence[Parameter]) -> bool:
     """Whether all that is lost keeps the sum of numbers of one kind."""
-    alike = len({it.kind for it in named}) == 1
+    alike = len({parameter.kind for parameter in named}) == 1
     return alike and bool(np.abs(directions.sum(axis=1)).max() < _NOTHING)
 
 
@@ -123,8 +123,8 @@ def _frame(frames: FloatArray) -> str:
 
 
 def _summed(named: Sequence[Parameter], robot: Robot) -> str:
-    joints = [it.joint for it in named]
-    numbers = ", ".join(str(it + 1) for it in joints)
+    joints = [parameter.joint for parameter in named]
+    numbers = ", ".join(str(joint + 1) for joint in joints)
     between = parallel_axes(robot)[joints[0] : joints[-1]]
     why = " (parallel axes)" if between.all() else ""
     return f"the {_plural(named[0])} of joints {numbers}{why}"
@@ -151,7 +151,7 @@ def listed(words: Sequence[str]) -> str:
 
 
 def _listed(named: Sequence[Parameter], robot: Robot) -> str:
-    return listed([_thing(it, robot) for it in named])
+    return listed([_thing(parameter, robot) for parameter in named])
 
 
 def dominant_words(changes: FloatArray, parameters: Sequence[Parameter], robot: Robot) -> str:

@@ -153,9 +153,9 @@ def _orders(measured: FloatArray, nominal: FloatArray) -> IntArray:
         triples = _similar_triples(measured[triangle], nominal)
         placed = apply(align(measured[triangle][None], nominal[triples]), nominal[None])
         # No order is better than every point's nearest one.
-        lower = [float(_squares(measured, it).min(axis=1).sum()) for it in placed]
+        lower = [float(_squares(measured, value).min(axis=1).sum()) for value in placed]
         nearest = np.argsort(lower, kind="stable")[:_PLACES]
-        found += [_nearest(measured, nominal, it) for it in placed[nearest]]
+        found += [_nearest(measured, nominal, value) for value in placed[nearest]]
     return np.array(found)
 
 

@@ -162,13 +162,15 @@ def _at_typical_noise(
     """The same observations at a noise that is typical, where these data show a larger one."""
     shares = {name: min(1.0, TYPICAL_PX / px) for name, px in pixel_px.items()}
     seen, least = problem.observations, min(shares.values(), default=1.0)
-    by_row = np.array([shares.get(it, 1.0) for it in seen.observers])[:, None, None]
+    by_row = np.array([shares.get(observer, 1.0) for observer in seen.observers])[:, None, None]
     typical = replace(
         problem,
         observations=replace(seen, covariance=by_row**2 * seen.covariance),
         effects=tuple(
-            replace(it, known=replace(it.known, information=it.known.information / least**2))
-            for it in problem.effects
+            replace(
+                effect, known=replace(effect.known, information=effect.known.information / least**2)
+            )
+            for effect in problem.effects
         ),
     )
     robots = np.minimum(noise.robots, TYPICAL_NOISE.robots)
@@ -196,10 +198,10 @@ def _refuse_vague(problem: Problem, state: State, noise: Noise, scene: Scene) ->
     """Refuses frames whose predicted sigmas are over the limit."""
     covariance = covariance_among(fisher_information(problem, state, noise), problem.counted)
     beyond = [
-        (frame, it)
+        (frame, direction)
         for frame in problem.unknown
-        for it in _frame_directions(problem, state, covariance, frame, scene.names[frame])
-        if it.sigma > it.limit
+        for direction in _frame_directions(problem, state, covariance, frame, scene.names[frame])
+        if direction.sigma > direction.limit
     ]
     if beyond:
         frame, worst = beyond[0]
@@ -207,7 +209,7 @@ def _refuse_vague(problem: Problem, state: State, noise: Noise, scene: Scene) ->
             f"{scene.title}: {worst.words} has a predicted sigma of {worst.figure} at a typical "
             f"noise: "
             f"{scene.motion(frame)}.",
-            culprits=[it.words for _, it in beyond],
+            culprits=[direction.words for _, direction in beyond],
             next_step=scene.advice(frame, ""),
         )
 
@@ -254,9 +256,9 @@ def directions(
         mount: Where the camera is.
     """
     return tuple(
-        it
+        direction
         for frame, names in _names(problem, mount).items()
-        for it in _frame_directions(problem, state, covariance, frame, names)
+        for direction in _frame_directions(problem, state, covariance, frame, names)
     )
 
 
@@ -320,7 +322,7 @@ def _null_direction(
     """The first frame that (p, k) null directions leave open, and what of it."""
     for frame, at in problem.unknown.items():
         turn, start = state.edges[at][:3, :3], problem.edge_columns(frame).start
-        rotation, translation = (turn @ null[start + it : start + it + 3] for it in (0, 3))
+        rotation, translation = (turn @ null[start + name : start + name + 3] for name in (0, 3))
         parts = [
             _open_part(scene.names[frame], directions, is_rotation)
             for directions, is_rotation in ((translation, False), (rotation, True))
@@ -355,7 +357,7 @@ def _names(problem: Problem, mount: Mount) -> dict[str, tuple[str, str]]:
     hangs = "the base" if mount == "eye-in-hand" else "the tool"
     return {
         camera: (f"the {_sensor(mount)}", f"the {_frame(mount)}"),
-        **{it: (f"the {it.replace('_', ' ', 1)}", hangs) for it in targets},
+        **{target: (f"the {target.replace('_', ' ', 1)}", hangs) for target in targets},
     }
 
 

@@ -253,19 +253,19 @@ def closed_form(problem: Problem, rows: IntArray) -> State | None:
         problem: The observations.
         rows: (m,) those to solve from.
     """
-    paths = [it.path for it in problem.groups]
+    paths = [group.path for group in problem.groups]
     if len(paths) != 1 or not problem.observations.has_rotation.all() or problem.points:
         return None
     steps = paths[0]
     ends, between = (steps[0], steps[-1]), steps[1:-1]
-    are_all = problem.unknown.keys() == {it.frame for it in ends}
-    if not are_all or sum(bool(it.robot) for it in between) != 1:
+    are_all = problem.unknown.keys() == {end.frame for end in ends}
+    if not are_all or sum(bool(step.robot) for step in between) != 1:
         return None
     nowhere = State(np.zeros((0, 4, 4)), problem.start_values)
     robot = invert(problem.product(between, nowhere, rows))
     found = SOLVERS["park"](robot, problem.observations.measured[rows])
     edges = {ends[0].frame: found.x, ends[1].frame: found.z}
-    return State(np.array([edges[it] for it in problem.unknown]), problem.start_values)
+    return State(np.array([edges[name] for name in problem.unknown]), problem.start_values)
 
 
 def _core(problem: Problem, state: State | None, among: Mask) -> tuple[Mask, Solution]:
@@ -281,7 +281,7 @@ def _core(problem: Problem, state: State | None, among: Mask) -> tuple[Mask, Sol
         return solve_problem(part.subset(_of_pairs(part, mask, state)), state, noise)[0]
 
     starts = _starts(part, state)
-    mask, start = trimmed_start(starts, lambda it: _away(part, it), solve, half_of(len(rows)))
+    mask, start = trimmed_start(starts, lambda item: _away(part, item), solve, half_of(len(rows)))
     search, mask = _Search(part), _of_pairs(part, mask, start)
     every = np.ones(len(rows), dtype=bool)
     mask, fit = widened(search, mask, search.fit_from(mask, start), every)

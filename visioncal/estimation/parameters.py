@@ -102,14 +102,14 @@ def parameter_moves(model: ArmModel, table: DHTable, parameters: Sequence[Parame
         takes its place.
     """
     steps = [model.changes(row) for row in np.eye(len(model.values))]
-    placements, functions = (np.array(it) for it in zip(*steps, strict=True))
+    placements, functions = (np.array(pair) for pair in zip(*steps, strict=True))
     rows = table_moves(model.bare, table, placements, functions)
     moves = np.zeros((len(parameters), len(steps)))
-    for at, it in enumerate(parameters):
-        if it.place >= _ROW:
-            moves[at] = functions[:, it.joint, it.place - _ROW]
-        elif it.link:
-            moves[at] = rows[:, it.link - 1, it.place]
+    for at, parameter in enumerate(parameters):
+        if parameter.place >= _ROW:
+            moves[at] = functions[:, parameter.joint, parameter.place - _ROW]
+        elif parameter.link:
+            moves[at] = rows[:, parameter.link - 1, parameter.place]
     return moves
 
 
@@ -129,9 +129,9 @@ def parameter_jacobian(
     """
     rows, functions = number_jacobian(table, q)
     columns = [
-        rows[:, :, it.link, it.place]
-        if it.place < _ROW
-        else functions[:, :, it.joint, it.place - _ROW]
-        for it in parameters
+        rows[:, :, parameter.link, parameter.place]
+        if parameter.place < _ROW
+        else functions[:, :, parameter.joint, parameter.place - _ROW]
+        for parameter in parameters
     ]
     return np.asarray(adjoint(invert(mounted)) @ np.stack(columns, axis=2))

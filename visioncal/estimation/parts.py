@@ -59,8 +59,8 @@ class Observations:
     def take(self, rows: IntArray) -> "Observations":
         """Returns those of (m,) rows."""
         return Observations(
-            tuple(self.observers[it] for it in rows.tolist()),
-            tuple(self.observed[it] for it in rows.tolist()),
+            tuple(self.observers[index] for index in rows.tolist()),
+            tuple(self.observed[index] for index in rows.tolist()),
             self.stops[rows],
             self.sensors[rows],
             self.measured[rows],
@@ -156,7 +156,7 @@ class Effect:
 
     def of_stops(self, chosen: Mask) -> "Effect":
         """Returns it for the stops of an (s,) mask."""
-        flange_jacobian = {name: it[chosen] for name, it in self.flange_jacobian.items()}
+        flange_jacobian = {name: array[chosen] for name, array in self.flange_jacobian.items()}
         return replace(self, flange_jacobian=flange_jacobian)
 
     def jacobian_of_flange(self, robot: str, stops: IntArray) -> FloatArray:
@@ -206,10 +206,12 @@ class FramePrior:
     def without(self, axis: int) -> "FramePrior":
         """Returns the prior without one of its measured components."""
         kept = [
-            (it, value) for it, value in zip(self.axes, self.values_m, strict=True) if it != axis
+            (index, value)
+            for index, value in zip(self.axes, self.values_m, strict=True)
+            if index != axis
         ]
         return replace(
-            self, axes=tuple(it for it, _ in kept), values_m=tuple(value for _, value in kept)
+            self, axes=tuple(index for index, _ in kept), values_m=tuple(value for _, value in kept)
         )
 
     def whitened(self, found: FloatArray) -> tuple[FloatArray, FloatArray]:

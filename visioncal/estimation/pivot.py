@@ -132,12 +132,12 @@ def _check_doubt(problem: TouchProblem, found: GroupInliers[Placed]) -> None:
     if not found.doubtful.any() or found.fit.sigma < CARELESS_M:
         return
     touches, rows = problem.touches, np.flatnonzero(found.doubtful)
-    labels = [touches.labels[it] for it in rows]
+    labels = [touches.labels[row] for row in rows]
     belongs = _belonging(problem, found)
     fitting = [
-        f"touch {touches.labels[it]} fits point {touches.names[at]!r}"
-        for it, at in enumerate(belongs)
-        if found.doubtful[it] and at is not None
+        f"touch {touches.labels[index]} fits point {touches.names[at]!r}"
+        for index, at in enumerate(belongs)
+        if found.doubtful[index] and at is not None
     ]
     matches = f" ({', '.join(fitting)})" if fitting else ""
     raise DataError(
@@ -151,9 +151,9 @@ def _check_doubt(problem: TouchProblem, found: GroupInliers[Placed]) -> None:
 def _check_sides(touches: Touches, found: GroupInliers[Placed]) -> None:
     seen = in_tool(touches, found.fit.state)
     for kind, along in (("z", seen[:, 2]), ("xz", seen[:, 0])):
-        these = found.agrees & np.array([it == kind for it in touches.kinds])
-        behind = [touches.labels[it] for it in np.flatnonzero(these & (along < 0.0))]
-        before = [touches.labels[it] for it in np.flatnonzero(these & (along > 0.0))]
+        these = found.agrees & np.array([name == kind for name in touches.kinds])
+        behind = [touches.labels[index] for index in np.flatnonzero(these & (along < 0.0))]
+        before = [touches.labels[index] for index in np.flatnonzero(these & (along > 0.0))]
         if behind:
             axis = kind[0]
             raise DataError(
@@ -187,7 +187,8 @@ def _belonging(problem: TouchProblem, found: GroupInliers[Placed]) -> tuple[int 
     belongs: list[int | None] = [None] * len(suspects)
     for at in np.flatnonzero(suspects):
         ratios = [
-            _mahalanobis_sq_at(problem, fit, int(at), it) for it in range(len(fit.state.points))
+            _mahalanobis_sq_at(problem, fit, int(at), index)
+            for index in range(len(fit.state.points))
         ]
         ratios[problem.touches.points[at]] = np.inf
         best = int(np.argmin(ratios))

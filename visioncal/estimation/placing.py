@@ -128,10 +128,10 @@ def refuse_poor(
     Raises:
         DegenerateError: Naming the first that is.
     """
-    beyond = [it for it in worst if it.sigma > it.limit]
+    beyond = [direction for direction in worst if direction.sigma > direction.limit]
     if beyond:
         raise DegenerateError(
             f"fixture: {beyond[0].words} has a predicted sigma of {beyond[0].figure}: {cause}.",
-            culprits=[*(it.words for it in beyond), *culprits],
+            culprits=[*(direction.words for direction in beyond), *culprits],
             next_step=next_step,
         )

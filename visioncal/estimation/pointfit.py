@@ -170,12 +170,12 @@ def fit_points(pairs: PointPairs, expected_noise_m: float | None = None) -> Poin
     check_hand(points, numbering, noise)
     agreement, scale = _agreeing(pairs, expected_noise_m)
     _check_numbering(
-        points, numbering, {pairs.labels[it] for it in np.flatnonzero(agreement.agrees)}
+        points, numbering, {pairs.labels[index] for index in np.flatnonzero(agreement.agrees)}
     )
     fit, agrees = agreement.fit, agreement.agrees
     centre = pairs.nominal[agrees].mean(axis=0)
     worst = worst_directions(fit, fit.state.base_from_fixture, centre, fit.sigma)
-    if fit.sigma > SIGMA_LIMIT_M and any(it.sigma > it.limit for it in worst):
+    if fit.sigma > SIGMA_LIMIT_M and any(direction.sigma > direction.limit for direction in worst):
         raise _no_fit(pairs, fit, scale)
     refuse_poor(
         worst,
@@ -222,7 +222,7 @@ def _scale_of(fit: GroupFit[Placed]) -> Scale:
 def _check_numbering(pairs: PointPairs, numbering: Numbering, agree: Collection[str]) -> None:
     """Refuses a wrong order, unless just the points that are out of order were left out."""
     moved = [pairs.labels[at] for at in numbering.moved]
-    if not numbering.is_wrong or not any(it in agree for it in moved):
+    if not numbering.is_wrong or not any(value in agree for value in moved):
         return
     more = ""
     if not numbering.is_unique:

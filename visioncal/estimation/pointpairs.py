@@ -67,13 +67,13 @@ class PointPairs:
         if len(names) == len(self.labels):
             return self
         labels = np.array(self.labels)
-        rows = [np.flatnonzero(labels == it) for it in names]
-        first = np.array([it[0] for it in rows])
+        rows = [np.flatnonzero(labels == name) for name in names]
+        first = np.array([row[0] for row in rows])
         return replace(
             self,
             labels=names,
-            measured=np.array([np.median(self.measured[it], axis=0) for it in rows]),
-            covariances=np.array([self.covariances[it].mean(axis=0) for it in rows]),
+            measured=np.array([np.median(self.measured[row], axis=0) for row in rows]),
+            covariances=np.array([self.covariances[row].mean(axis=0) for row in rows]),
             nominal=self.nominal[first],
             nominal_sigma_m=self.nominal_sigma_m[first],
         )

@@ -126,25 +126,29 @@ def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -
     independent = [white]
     if problem.is_combined:
         scatter = likelihood.maximised(_scatter(len(stood), white.white))
-        independent = [replace(it, prior=_PRIOR["white"] / 2) for it in (white, scatter)]
+        independent = [replace(model, prior=_PRIOR["white"] / 2) for model in (white, scatter)]
     models = [*independent, *map(likelihood.maximised, _models(poses[stood], white.white))]
     likeliest = [
-        max((it for it in models if it.kind == kind), key=lambda it: it.evidence)
+        max((model for model in models if model.kind == kind), key=lambda model: model.evidence)
         for kind in ("posture", "time")
     ]
-    both = tuple(it for model in likeliest for it in model.processes)
+    both = tuple(process for model in likeliest for process in model.processes)
     models.append(likelihood.maximised(_Model("both", _PRIOR["both"], both, white.white)))
-    logs = np.array([it.evidence for it in models])
+    logs = np.array([model.evidence for model in models])
     shares = np.exp(logs - logs.max())
-    unlikely = min(it.value + len(it.processes) for it in independent)
+    unlikely = min(model.value + len(model.processes) for model in independent)
     gain = 2.0 * float(logs.max() + np.log(shares.sum()) + unlikely)
     weights = np.where(shares / shares.sum() > _NO_WEIGHT, shares, 0.0)
     weights /= weights.sum()
     pairs = [pair for pair in zip(models, weights.tolist(), strict=True) if pair[1]]
     processes = [
-        replace(it, size=weight**0.5 * it.size) for model, weight in pairs for it in model.processes
+        replace(process, size=weight**0.5 * process.size)
+        for model, weight in pairs
+        for process in model.processes
     ]
-    kinds = [[it for it in processes if it.lasts is lasts] for lasts in (False, True)]
+    kinds = [
+        [process for process in processes if process.lasts is lasts] for lasts in (False, True)
+    ]
     most = _MOST_COLUMNS // 6 // max(sum(map(bool, kinds)), 1)
     by_posture, in_time = (
         _columns(some, len(stood), np.searchsorted(stood, observed), most) for some in kinds
@@ -262,8 +266,8 @@ def _columns(
     """
     every, columns = np.arange(count), np.zeros((count, 6, 0))
     left = np.zeros((count, 6, 6))
-    for it in processes:
-        left += it.size**2 * it.at @ np.swapaxes(it.at, 1, 2)
+    for process in processes:
+        left += process.size**2 * process.at @ np.swapaxes(process.at, 1, 2)
     whole = np.diagonal(left[observed].mean(axis=0)).reshape(2, 3).mean(axis=1)
     scale = np.repeat(np.sqrt(np.maximum(whole, LEAST_SIGMA**2)), 3)
     for _ in range(min(len(observed), most) if processes else 0):
@@ -274,8 +278,8 @@ def _columns(
             break
         kept = values > _FACTORED
         cross = -columns @ columns[at].T
-        for it in processes:
-            cross += it.between(every, np.array([at]))[:, 0]
+        for process in processes:
+            cross += process.between(every, np.array([at]))[:, 0]
         found = cross / scale @ (vectors[:, kept] / np.sqrt(values[kept]))
         columns = np.concatenate([columns, found], axis=2)
         left -= found @ np.swapaxes(found, 1, 2)
@@ -303,9 +307,9 @@ class _Block:
     white: FloatArray
     by_flange: FloatArray
 
-    def common(self, it: _Process) -> FloatArray:
+    def common(self, process: _Process) -> FloatArray:
         """(n, n) what a process of unit size adds to the covariance."""
-        among = replace(it, size=1.0).between(self.stops, self.stops)
+        among = replace(process, size=1.0).between(self.stops, self.stops)
         turned = self.by_flange[:, None] @ among @ np.swapaxes(self.by_flange, 1, 2)
         return np.asarray(np.swapaxes(turned, 1, 2).reshape(self.known.shape))
 
@@ -381,8 +385,11 @@ class _Likelihood:
 
     def maximised(self, model: _Model) -> _Model:
         """The model with its likeliest sizes, by Newton's steps from those that it has."""
-        common = [np.array([block.common(it) for it in model.processes]) for block in self.blocks]
-        sizes = np.array([it.size for it in model.processes])
+        common = [
+            np.array([block.common(process) for process in model.processes])
+            for block in self.blocks
+        ]
+        sizes = np.array([process.size for process in model.processes])
         least = np.append([LEAST_SIGMA] * 2, np.full(len(sizes), _NOTHING))
         damping, now = 1e-3, self._step(common, np.log(np.append(model.white, sizes)))
         for _ in range(_ITERATIONS):
@@ -401,7 +408,7 @@ class _Likelihood:
             return model
         found = np.exp(now.logs)
         pairs = zip(model.processes, found[2:].tolist(), strict=True)
-        processes = tuple(replace(it, size=size) for it, size in pairs)
+        processes = tuple(replace(process, size=size) for process, size in pairs)
         return replace(model, processes=processes, white=found[:2], value=now.value)
 
     def _step(self, common: Sequence[FloatArray], logs: FloatArray) -> _Step | None:
@@ -436,7 +443,7 @@ class _Likelihood:
             left = inverse - by_root @ by_root.T
             of_white = block.white * left_over
             grown = np.concatenate([of_white, parts @ left_over]) if len(parts) else of_white
-            traces = [*(block.white @ np.diag(left)), *(np.sum(left * it) for it in parts)]
+            traces = [*(block.white @ np.diag(left)), *(np.sum(left * part) for part in parts)]
             slope += squares * (np.array(traces) - grown @ left_over)
             grown = 2.0 * squares[:, None] * grown
             average += grown @ inverse @ grown.T

@@ -74,7 +74,7 @@ def find_mounting(places: Places) -> tuple[Mounting, FloatArray]:
         The mounting, and the (m,) distances [m] between read and predicted places.
     """
     count, points = int(places.stops.max()) + 1, int(places.points.max()) + 1
-    starts = (fit_mounting(places.subset(it), None, points) for it in _starts(places, count))
+    starts = (fit_mounting(places.subset(start), None, points) for start in _starts(places, count))
 
     def solve(stops: Mask, start: Mounting) -> Mounting:
         return fit_mounting(places.subset(stops[places.stops]), start, points)

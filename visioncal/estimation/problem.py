@@ -87,18 +87,18 @@ class Linear:
         places = np.full(len(self.residuals), -1)
         places[rows] = np.arange(len(rows))
         found = np.zeros((len(rows), 6, self.size))
-        for it in self.blocks:
-            mine = places[it.rows]
+        for block in self.blocks:
+            mine = places[block.rows]
             chosen = mine >= 0
-            found[np.ix_(mine[chosen], np.arange(6), it.columns)] = it.jacobian[chosen]
+            found[np.ix_(mine[chosen], np.arange(6), block.columns)] = block.jacobian[chosen]
         return found
 
     def covariance(self, covariance: FloatArray) -> FloatArray:
         """Covariances (n, 6, 6) of what a (p, p) one of the unknowns predicts."""
         found = np.zeros((len(self.residuals), 6, 6))
-        for it in self.blocks:
-            among = covariance[np.ix_(it.columns, it.columns)]
-            found[it.rows] = it.jacobian @ among @ np.swapaxes(it.jacobian, 1, 2)
+        for block in self.blocks:
+            among = covariance[np.ix_(block.columns, block.columns)]
+            found[block.rows] = block.jacobian @ among @ np.swapaxes(block.jacobian, 1, 2)
         return found
 
 
@@ -145,7 +145,7 @@ class Problem:
         return replace(
             self,
             observations=self.observations.take(rows),
-            effects=tuple(it.take(rows) for it in self.effects),
+            effects=tuple(effect.take(rows) for effect in self.effects),
         )
 
     @cached_property
@@ -155,10 +155,14 @@ class Problem:
         What several effects on sensors move stays apart: merged, it would mix them.
         """
         seen, keys = self.observations, dict[tuple[int, str, str, int], int]()
-        moved = [it.by_sensor.any(axis=(1, 2)) for it in self.effects if it.by_sensor is not None]
+        moved = [
+            effect.by_sensor.any(axis=(1, 2))
+            for effect in self.effects
+            if effect.by_sensor is not None
+        ]
         apart = np.where(np.sum(moved, axis=0) > 1, np.arange(len(seen)), -1).tolist()
         every = zip(seen.stops.tolist(), seen.observers, seen.observed, apart, strict=True)
-        return np.array([keys.setdefault(it, len(keys)) for it in every], dtype=np.int64)
+        return np.array([keys.setdefault(pair, len(keys)) for pair in every], dtype=np.int64)
 
     def merged(self) -> "Problem":
         """Makes one observation of all of one stop (`of_one_stop`).
@@ -192,14 +196,15 @@ class Problem:
                 information += np.sum(weighted @ jacobian, axis=0)
                 gradient += np.einsum("mij,mj->i", weighted, away - shift)
         effects, at = [], 0
-        for it in self.effects:
-            mine = slice(at, at + len(it))
-            at += len(it)
+        for effect in self.effects:
+            mine = slice(at, at + len(effect))
+            at += len(effect)
             known = Knowledge(
-                it.known.information + information[mine, mine], it.known.gradient + gradient[mine]
+                effect.known.information + information[mine, mine],
+                effect.known.gradient + gradient[mine],
             )
-            moved = None if it.by_sensor is None else by_sensor[:, :, mine]
-            effects.append(replace(it.take(first), known=known, by_sensor=moved))
+            moved = None if effect.by_sensor is None else by_sensor[:, :, mine]
+            effects.append(replace(effect.take(first), known=known, by_sensor=moved))
         return replace(
             self,
             observations=replace(seen, measured=measured, covariance=covariance),
@@ -208,7 +213,7 @@ class Problem:
 
     def with_effects(self, effects: Sequence[Effect]) -> "Problem":
         """Returns the problem with other effects."""
-        return replace(self, effects=tuple(it for it in effects if len(it)))
+        return replace(self, effects=tuple(effect for effect in effects if len(effect)))
 
     @cached_property
     def unknown(self) -> Mapping[str, int]:
@@ -224,9 +229,9 @@ class Problem:
     def effect_columns(self) -> Mapping[str, slice]:
         """The columns of each effect, by its name."""
         found, at = {}, 6 * len(self.unknown)
-        for it in self.effects:
-            found[it.name] = slice(at, at + len(it))
-            at += len(it)
+        for effect in self.effects:
+            found[effect.name] = slice(at, at + len(effect))
+            at += len(effect)
         return found
 
     def values_of(self, name: str, state: State) -> FloatArray:
@@ -241,12 +246,12 @@ class Problem:
 
     def start(self, frames: Mapping[str, FloatArray]) -> State:
         """The unknowns where frames are, and where effects were linearised."""
-        return State(np.stack([frames[it] for it in self.unknown]), self.start_values)
+        return State(np.stack([frames[name] for name in self.unknown]), self.start_values)
 
     @cached_property
     def start_values(self) -> FloatArray:
         """(k,) the effects' values where the observations were linearised."""
-        return np.concatenate([np.zeros(0), *(it.values for it in self.effects)])
+        return np.concatenate([np.zeros(0), *(effect.values for effect in self.effects)])
 
     @cached_property
     def counted(self) -> Mask:
@@ -262,7 +267,7 @@ class Problem:
         """(p,) which columns a fit moves: all but what is fixed or held."""
         found = self.counted.copy()
         found[6 * len(self.unknown) :] &= ~np.concatenate(
-            [np.zeros(0, dtype=bool), *(it.held for it in self.effects)]
+            [np.zeros(0, dtype=bool), *(effect.held for effect in self.effects)]
         )
         return found
 
@@ -325,7 +330,7 @@ class Problem:
         """The rows of each pair of frames that no robot parts, where they repeat each other."""
         if not self.with_repeats:
             return ()
-        still = [it.rows for it in self.groups if not any(step.robot for step in it.path)]
+        still = [group.rows for group in self.groups if not any(step.robot for step in group.path)]
         return tuple(rows for rows in still if len(rows) > 1)
 
     @cached_property
@@ -335,11 +340,11 @@ class Problem:
         count, joined = len(self.robots), []
         first = np.full(len(self), -1, dtype=np.int64)
         for group in self.groups:
-            mine = [self.robots.index(it.robot) for it in group.path if it.robot]
+            mine = [self.robots.index(step.robot) for step in group.path if step.robot]
             keys = self.observations.stops[group.rows] * count
             if mine:
                 first[group.rows] = keys + mine[0]
-                joined += [np.stack([keys + mine[0], keys + it], axis=1) for it in mine]
+                joined += [np.stack([keys + mine[0], keys + index], axis=1) for index in mine]
         if not joined:
             return first, np.zeros((0, 0), dtype=np.int64)
         used, pairs = np.unique(np.concatenate(joined), return_inverse=True)
@@ -357,8 +362,8 @@ class Problem:
     def by_sensor(self) -> FloatArray:
         """(n, 6, k) how the measured poses move with all effects."""
         parts = [
-            np.zeros((len(self), 6, len(it))) if it.by_sensor is None else it.by_sensor
-            for it in self.effects
+            np.zeros((len(self), 6, len(effect))) if effect.by_sensor is None else effect.by_sensor
+            for effect in self.effects
         ]
         found = np.concatenate([np.zeros((len(self), 6, 0)), *parts], axis=2)
         # Repeats move alike: slopes that differ by the noise of each would explain that noise.
@@ -369,11 +374,11 @@ class Problem:
     @cached_property
     def flange_jacobian(self) -> Mapping[str, FloatArray]:
         """By robot, (n, 6, k) how its flange moves with all effects; of unmoved robots, nothing."""
-        robots = dict.fromkeys(robot for it in self.effects for robot in it.flange_jacobian)
+        robots = dict.fromkeys(robot for effect in self.effects for robot in effect.flange_jacobian)
         stops = self.observations.stops
         return {
             robot: np.concatenate(
-                [it.jacobian_of_flange(robot, stops) for it in self.effects], axis=2
+                [effect.jacobian_of_flange(robot, stops) for effect in self.effects], axis=2
             )
             for robot in robots
         }
@@ -381,13 +386,14 @@ class Problem:
     def knowledge(self, state: State) -> Knowledge:
         """What is known of all p unknowns beside the observations, and half its gradient there."""
         information = block_diag(
-            np.zeros((6 * len(self.unknown),) * 2), *(it.known.information for it in self.effects)
+            np.zeros((6 * len(self.unknown),) * 2),
+            *(effect.known.information for effect in self.effects),
         )
         gradient = np.zeros(self.size)
-        for it in self.effects:
-            columns = self.effect_columns[it.name]
-            change = self.values_of(it.name, state) - it.values
-            gradient[columns] = it.known.gradient + it.known.information @ change
+        for effect in self.effects:
+            columns = self.effect_columns[effect.name]
+            change = self.values_of(effect.name, state) - effect.values
+            gradient[columns] = effect.known.gradient + effect.known.information @ change
         for prior in self.priors:
             away, jacobian = self.prior_rows(prior, state)
             information += jacobian.T @ jacobian
@@ -411,9 +417,11 @@ class Problem:
     def cost_of_knowledge(self, state: State) -> float:
         """The squared error of what is known, in units of its sigmas, up to a constant."""
         cost = 0.0
-        for it in self.effects:
-            change = self.values_of(it.name, state) - it.values
-            cost += float(change @ (2.0 * it.known.gradient + it.known.information @ change))
+        for effect in self.effects:
+            change = self.values_of(effect.name, state) - effect.values
+            cost += float(
+                change @ (2.0 * effect.known.gradient + effect.known.information @ change)
+            )
         for prior in self.priors:
             away, _ = self.prior_rows(prior, state)
             cost += float(away @ away)
@@ -475,19 +483,19 @@ class Problem:
         alike: dict[tuple[tuple[bool, ...], ...], list[int]] = {}
         for at, group in enumerate(self.groups):
             kind = [
-                (it.is_up, it.frame in self.unknown, it.robot in self.flange_jacobian)
-                for it in group.path
+                (step.is_up, step.frame in self.unknown, step.robot in self.flange_jacobian)
+                for step in group.path
             ]
             alike.setdefault(tuple(kind), []).append(at)
         return tuple(self._ways_of(mine) for mine in alike.values())
 
     def _ways_of(self, mine: list[int]) -> Ways:
         """The ways of some groups whose steps are of the same kinds."""
-        groups, (of, members) = [self.groups[it] for it in mine], self.units
-        ends = np.cumsum([0, *(len(it.rows) for it in groups)]).tolist()
-        rows = np.concatenate([it.rows for it in groups])
+        groups, (of, members) = [self.groups[index] for index in mine], self.units
+        ends = np.cumsum([0, *(len(group.rows) for group in groups)]).tolist()
+        rows = np.concatenate([group.rows for group in groups])
         strides = []
-        for steps in zip(*(it.path for it in groups), strict=True):
+        for steps in zip(*(group.path for group in groups), strict=True):
             edges, poses, moves, slots = [], [], [], []
             for step, group in zip(steps, groups, strict=True):
                 count = len(group.rows)
@@ -513,7 +521,7 @@ class Problem:
                     np.concatenate(slots),
                 )
             )
-        places = tuple((at, slice(*it)) for at, it in zip(mine, pairwise(ends), strict=True))
+        places = tuple((at, slice(*pair)) for at, pair in zip(mine, pairwise(ends), strict=True))
         return Ways(rows, places, tuple(strides))
 
     @cached_property
@@ -523,13 +531,13 @@ class Problem:
         for group in self.groups:
             by_sensor = self.by_sensor[group.rows]
             flanges = [self.flange_jacobian.get(step.robot) for step in group.path]
-            by_steps = [None if it is None else it[group.rows] for it in flanges]
+            by_steps = [None if flange is None else flange[group.rows] for flange in flanges]
             moved = by_sensor.any(axis=(0, 1))
-            for it in by_steps:
-                if it is not None:
-                    moved |= it.any(axis=(0, 1))
+            for item in by_steps:
+                if item is not None:
+                    moved |= item.any(axis=(0, 1))
             values = np.flatnonzero(moved)
-            steps = tuple(None if it is None else it[:, :, values] for it in by_steps)
+            steps = tuple(None if step is None else step[:, :, values] for step in by_steps)
             found.append((values, by_sensor[:, :, values], steps))
         return tuple(found)
 
@@ -548,27 +556,29 @@ class Problem:
         for ways in self._ways:
             inverse, moved = ways.moved(state.edges, change)
             back[ways.rows] = inverse
-            for it, step in zip(ways.strides, moved, strict=True):
-                erring = np.flatnonzero(it.slots >= 0)
+            for stride, step in zip(ways.strides, moved, strict=True):
+                erring = np.flatnonzero(stride.slots >= 0)
                 if len(erring):
-                    errors[ways.rows[erring], :, it.slots[erring]] += step[erring]
-            unknown = [at for at, it in enumerate(ways.strides) if len(it.edges)]
+                    errors[ways.rows[erring], :, stride.slots[erring]] += step[erring]
+            unknown = [at for at, stride in enumerate(ways.strides) if len(stride.edges)]
             for at, place in ways.groups:
                 values, _, by_steps = self._moved_groups[at]
                 effects = np.zeros((place.stop - place.start, 6, len(values)))
                 for step, by_flange in zip(moved, by_steps, strict=True):
                     if by_flange is not None:
                         effects += step[place] @ by_flange
-                edges = [6 * ways.strides[it].edges[place.start] + np.arange(6) for it in unknown]
+                edges = [
+                    6 * ways.strides[index].edges[place.start] + np.arange(6) for index in unknown
+                ]
                 blocks[at] = Block(
                     ways.rows[place],
                     np.concatenate([*edges, 6 * len(self.unknown) + values]),
-                    np.concatenate([*(moved[it][place] for it in unknown), effects], axis=2),
+                    np.concatenate([*(moved[index][place] for index in unknown), effects], axis=2),
                 )
         for rows in self.repeats:
             errors[rows, :, 0] = np.eye(6)
         by_flanges = errors.reshape(len(self), 6, 6 * width)
-        found = back, by_flanges, tuple(blocks[it] for it in range(len(self.groups)))
+        found = back, by_flanges, tuple(blocks[index] for index in range(len(self.groups)))
         self._last_moved[:] = [(state, found)]
         return found
 

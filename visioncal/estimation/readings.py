@@ -54,7 +54,7 @@ def readings_that_close(touches: Touches) -> tuple[Reading, ...]:
     }
     options = {first: "--robot-columns x_m,y_m,z_m,qy,qz,qw,qx"}
     if len(np.unique(there.points)) > 1:
-        others |= {f"{words} and {inverse}": invert(it) for words, it in others.items()}
+        others |= {f"{words} and {inverse}": invert(other) for words, other in others.items()}
         others[inverse] = invert(poses)
         options |= {inverse: "--robot-inverse"}
         options |= {f"{first} and {inverse}": f"{options[first]} --robot-inverse"}
@@ -71,8 +71,12 @@ def readings_that_close(touches: Touches) -> tuple[Reading, ...]:
         back = replace(touches, base_from_flange=invert(touches.base_from_flange))
         sizes = (_axes_rms(back), _axes_rms(touches))
         found.append(Reading(inverse, *sizes, "--robot-inverse"))
-    closing = [it for it in found if it.rms_m < min(it.as_read_m / _MUCH_BETTER, _CLOSED_M)]
-    return tuple(sorted(closing, key=lambda it: it.rms_m))
+    closing = [
+        reading
+        for reading in found
+        if reading.rms_m < min(reading.as_read_m / _MUCH_BETTER, _CLOSED_M)
+    ]
+    return tuple(sorted(closing, key=lambda value: value.rms_m))
 
 
 def _reordered(poses: FloatArray, shift: int) -> FloatArray:
@@ -85,8 +89,8 @@ def _linear_rms(touches: Touches) -> float:
     poses = touches.base_from_flange
     met = poses[:, :3, :3] @ linear_tip(poses, touches.points) + poses[:, :3, 3]
     away = [
-        met[touches.points == it] - met[touches.points == it].mean(axis=0)
-        for it in np.unique(touches.points)
+        met[touches.points == value] - met[touches.points == value].mean(axis=0)
+        for value in np.unique(touches.points)
     ]
     return float(np.sqrt(np.sum(np.concatenate(away) ** 2) / len(touches)))
 

@@ -112,7 +112,10 @@ def common_errors(
     if between < 1:
         return LensField(1.0, 0.0, 0.0, is_significant=False)
     sums = np.stack(
-        [np.bincount(cell[rows], (shares * residuals[:, it])[rows], len(counts)) for it in (0, 1)],
+        [
+            np.bincount(cell[rows], (shares * residuals[:, name])[rows], len(counts))
+            for name in (0, 1)
+        ],
         axis=1,
     )
     among = float(np.sum(sums[counts >= _FEWEST_CORNERS] ** 2 / many[:, None]))

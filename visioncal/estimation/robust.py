@@ -104,10 +104,10 @@ def trimmed_start(
     Returns:
         (m,) mask of these units, and the state that they agree on.
     """
-    found = [(it, away(it)) for it in starts]
-    found.sort(key=lambda it: trimmed_sum(it[1], count))
-    refined = [_concentrated(*it, away, solve, count) for it in found[:followed]]
-    return min(refined, key=lambda it: it[0])[1:]
+    found = [(start, away(start)) for start in starts]
+    found.sort(key=lambda pair: trimmed_sum(pair[1], count))
+    refined = [_concentrated(*pair, away, solve, count) for pair in found[:followed]]
+    return min(refined, key=lambda pair: pair[0])[1:]
 
 
 def _concentrated(
@@ -146,12 +146,12 @@ def widened(
     """
     fewest = int(used.sum()) if among is not None else 1
     for _ in range(_ROUNDS):
-        it = search.distances(used, fit)
-        directions = np.maximum(it.directions, 1)
-        shares = it.squares / chi2_limit(0.5, directions)
+        distances = search.distances(used, fit)
+        directions = np.maximum(distances.directions, 1)
+        shares = distances.squares / chi2_limit(0.5, directions)
         scale = max(float(np.median(shares[used if among is None else among])), 1.0)
-        limit = it.limit if among is None else chi2_limit(_MISSED, directions)
-        reached = (it.squares < scale * limit) | (it.directions < 1)
+        limit = distances.limit if among is None else chi2_limit(_MISSED, directions)
+        reached = (distances.squares < scale * limit) | (distances.directions < 1)
         if among is not None:
             reached &= among
         if np.array_equal(reached, used) or reached.sum() < fewest:

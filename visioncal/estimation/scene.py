@@ -59,7 +59,7 @@ def repeat_shares(shown: Mapping[int, Hashable]) -> dict[int, float]:
         shown: What each view shows from where, by its number; alike where that is the same.
     """
     counts = Counter(shown.values())
-    return {view: 1.0 / counts[it] for view, it in shown.items()}
+    return {view: 1.0 / counts[hashable] for view, hashable in shown.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,14 +101,14 @@ class CornerProblem:
         stack = CornerStack.of(corners, positions)
         if stack.stated_px is None:
             stack = replace(stack, weights=None)
-        priors = [board_prior(it) for it in scene.targets]
+        priors = [board_prior(target) for target in scene.targets]
         return cls(
             scene,
             stack,
             positions,
             boards_basis(scene.targets),
             np.concatenate([lens_prior(scene), *priors]),
-            np.array([shares.get(it, 1.0) for it in corners]),
+            np.array([shares.get(corner, 1.0) for corner in corners]),
         )
 
     def with_levels(self, levels: LensLevels) -> "CornerProblem":
@@ -140,7 +140,7 @@ class CornerProblem:
     @property
     def printed(self) -> list[int]:
         """Which targets are printed: those that have a scale, and may be bent."""
-        return [at for at, it in enumerate(self.scene.targets) if it.kind != "points"]
+        return [at for at, target in enumerate(self.scene.targets) if target.kind != "points"]
 
     @property
     def scale(self) -> IntArray:

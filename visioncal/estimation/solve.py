@@ -594,7 +594,7 @@ class RobotLikelihood:
     @property
     def _ratios(self) -> RatioPrior:
         seen = np.flatnonzero(self.seen).tolist()
-        return replace(RATIO_PRIOR, places=tuple((2 * it, 2 * it + 1) for it in seen))
+        return replace(RATIO_PRIOR, places=tuple((2 * index, 2 * index + 1) for index in seen))
 
 
 def robot_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLikelihood:
@@ -712,7 +712,7 @@ def left_out_residuals(problem: Problem, state: State, noise: Noise) -> FloatArr
     )
     for unit, rows in problem.shared_units:
         by_errors, own_jacobian = (
-            it[rows].reshape(6 * len(rows), -1) for it in (linear.by_errors, jacobian)
+            array[rows].reshape(6 * len(rows), -1) for array in (linear.by_errors, jacobian)
         )
         among = block_diag(*own[rows]) + by_errors @ errors[unit] @ by_errors.T
         without = covariance_from(among - own_jacobian @ fitted @ own_jacobian.T)

@@ -55,7 +55,7 @@ class Touches:
 
     def are(self, kind: TouchKind) -> Mask:
         """Mask (n,) of the touches of one kind."""
-        return np.array([it == kind for it in self.kinds])
+        return np.array([name == kind for name in self.kinds])
 
     def subset(self, chosen: Mask) -> "Touches":
         """Returns the touches of an (n,) mask; the points keep their numbers."""
@@ -64,8 +64,8 @@ class Touches:
             self,
             base_from_flange=self.base_from_flange[rows],
             points=self.points[rows],
-            kinds=tuple(self.kinds[it] for it in rows),
-            labels=tuple(self.labels[it] for it in rows),
+            kinds=tuple(self.kinds[row] for row in rows),
+            labels=tuple(self.labels[row] for row in rows),
         )
 
 
@@ -109,8 +109,8 @@ class TouchProblem:
         there = touches.are("point")
         points = np.array(
             [
-                np.median(seen[there & (touches.points == it)], axis=0)
-                for it in range(len(touches.names))
+                np.median(seen[there & (touches.points == index)], axis=0)
+                for index in range(len(touches.names))
             ]
         )
         state = Placed(compose(np.eye(3), tip), points)
@@ -136,7 +136,7 @@ class TouchProblem:
         touches, count = self.touches, len(self.touches)
         rotation = state.flange_from_tool[:3, :3]
         seen = in_tool(touches, state)
-        observed = np.array([_OBSERVED[it] for it in touches.kinds])
+        observed = np.array([_OBSERVED[kind] for kind in touches.kinds])
         jacobian = np.zeros((count, 3, 6 + state.points.size))
         jacobian[:, :, :3] = skew(np.where(observed, 0.0, seen))
         jacobian[:, :, 3:6] = -np.eye(3)
@@ -209,7 +209,7 @@ def _main_direction(vectors: FloatArray) -> FloatArray:
 def _small_sets(touches: Touches, there: IntArray) -> Iterator[IntArray]:
     """Gives small sets of touches by chance: three of one point, or two each of two points."""
     rng = np.random.default_rng(0)
-    by_point = [there[touches.points[there] == it] for it in range(len(touches.names))]
+    by_point = [there[touches.points[there] == index] for index in range(len(touches.names))]
     several = [rows for rows in by_point if len(rows) > 1]
     drawn = set()
     for _ in range(_SETS):

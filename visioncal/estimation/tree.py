@@ -65,7 +65,7 @@ class Tree:
     @property
     def unknown(self) -> tuple[str, ...]:
         """The frames whose edges are unknown, in the tree's order."""
-        return tuple(name for name, it in self.branches.items() if it.is_unknown)
+        return tuple(name for name, branch in self.branches.items() if branch.is_unknown)
 
     @property
     def robots(self) -> tuple[str, ...]:
@@ -75,12 +75,12 @@ class Tree:
     @property
     def flanges(self) -> dict[str, str]:
         """The frame of each robot's flange."""
-        return {it.robot: name for name, it in self.branches.items() if it.robot}
+        return {branch.robot: name for name, branch in self.branches.items() if branch.robot}
 
     @property
     def bases(self) -> dict[str, str]:
         """The frame of each robot's base."""
-        return {it.robot: it.parent for it in self.branches.values() if it.robot}
+        return {branch.robot: branch.parent for branch in self.branches.values() if branch.robot}
 
     def with_known(self, frame: str, matrix: FloatArray) -> "Tree":
         """Returns the tree with one edge that is no longer asked for."""
@@ -92,7 +92,7 @@ class Tree:
         kept = {
             name: branch
             for name, branch in self.branches.items()
-            if not any(it in frames for it in self.above(name))
+            if not any(word in frames for word in self.above(name))
         }
         return replace(self, branches=kept)
 
@@ -110,7 +110,9 @@ class Tree:
 
     def body(self, frame: str) -> str:
         """The frame that a frame's body is named by: the root, or a flange."""
-        return next(it for it in self.above(frame) if it == self.root or self.branches[it].robot)
+        return next(
+            name for name in self.above(frame) if name == self.root or self.branches[name].robot
+        )
 
     def path(self, start: str, end: str) -> tuple[Step, ...]:
         """The edges whose product is `start_from_end`, first to last."""
@@ -119,8 +121,8 @@ class Tree:
             up.pop()
             down.pop()
         return (
-            *(Step(it, self.branches[it].robot, True) for it in up),
-            *(Step(it, self.branches[it].robot, False) for it in reversed(down)),
+            *(Step(name, self.branches[name].robot, True) for name in up),
+            *(Step(name, self.branches[name].robot, False) for name in reversed(down)),
         )
 
 
@@ -171,8 +173,8 @@ class Ways:
     def backward(self, edges: FloatArray, change: FloatArray) -> FloatArray:
         """(m, 4, 4) `observed_from_observer`."""
         found = np.broadcast_to(np.eye(4), (len(self.rows), 4, 4))
-        for it in reversed(self.strides):
-            found = found @ it.backward(edges, change)
+        for stride in reversed(self.strides):
+            found = found @ stride.backward(edges, change)
         return found
 
     def moved(self, edges: FloatArray, change: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
@@ -181,9 +183,9 @@ class Ways:
         An edge moves on its right: at its end, or at its start where it is gone up.
         """
         back, found = np.broadcast_to(np.eye(4), (len(self.rows), 4, 4)), []
-        for it in reversed(self.strides):
-            behind, back = back, back @ it.backward(edges, change)
-            counts = len(it.edges) or it.moves is not None or (it.slots >= 0).any()
+        for stride in reversed(self.strides):
+            behind, back = back, back @ stride.backward(edges, change)
+            counts = len(stride.edges) or stride.moves is not None or (stride.slots >= 0).any()
             none = np.zeros((len(self.rows), 6, 0))
-            found.append((-adjoint(back) if it.is_up else adjoint(behind)) if counts else none)
+            found.append((-adjoint(back) if stride.is_up else adjoint(behind)) if counts else none)
         return back, found[::-1]

@@ -42,7 +42,7 @@ def check_counts(touches: Touches) -> None:
     counts = np.bincount(tips, minlength=len(touches.names))
     if np.maximum(counts - 1, 0).sum() < FEWEST_TOUCHES - 1:
         counted = ", ".join(
-            f"{n} of {it or 'one point'}" for it, n in zip(touches.names, counts, strict=True)
+            f"{n} of {name or 'one point'}" for name, n in zip(touches.names, counts, strict=True)
         )
         raise DataError(
             f"tcp: {len(tips)} touches of kind point ({counted}): at least {FEWEST_TOUCHES} of one "
@@ -91,15 +91,15 @@ def check_turning(problem: TouchProblem, fit: GroupFit[Placed]) -> tuple[Directi
     level = min(max(fit.sigma, LEAST_NOISE_M), SIGMA_LIMIT_M)
     worst = _worst(problem, fit, level)
     null = spectrum(fit.groups.subset(fit.used).information(level)).ratio < _NULL_RATIO
-    beyond = [it for it in worst if it.sigma > it.limit]
+    beyond = [direction for direction in worst if direction.sigma > direction.limit]
     if not beyond and not null:
         return _worst(problem, fit, max(fit.sigma, LEAST_NOISE_M))
-    culprit = beyond[0] if beyond else max(worst, key=lambda it: it.sigma / it.limit)
+    culprit = beyond[0] if beyond else max(worst, key=lambda value: value.sigma / value.limit)
     cause, next_step = _cause(problem, fit, culprit)
     fault = "is not determined at all" if null else f"has a predicted sigma of {culprit.figure}"
     raise DegenerateError(
         f"tcp: {culprit.words} {fault}: {cause}.",
-        culprits=[it.words for it in beyond] or [culprit.words],
+        culprits=[direction.words for direction in beyond] or [culprit.words],
         next_step=next_step,
     )
 
@@ -127,8 +127,12 @@ def _direction(words: str, variance: float, limit: float, *, is_rotation: bool) 
 def _cause(problem: TouchProblem, fit: GroupFit[Placed], culprit: Direction) -> tuple[str, str]:
     """Why a direction is undetermined, and what to do about it."""
     used = problem.touches.subset(fit.used)
-    careful = [it for it in _worst(problem, fit, CARELESS_M) if it.words == culprit.words]
-    if fit.sigma > CARELESS_M and all(it.sigma < it.limit for it in careful):
+    careful = [
+        direction
+        for direction in _worst(problem, fit, CARELESS_M)
+        if direction.words == culprit.words
+    ]
+    if fit.sigma > CARELESS_M and all(direction.sigma < direction.limit for direction in careful):
         readings = readings_that_close(problem.touches)
         cause = f"the touches scatter by {1e3 * fit.sigma:.3g} mm"
         if readings:

@@ -375,7 +375,7 @@ def likelihood(
     asked = growth * pulled
     slope = 0.5 * np.einsum("kmi,mi->k", growth, left_over - pulled**2)
     # Traces of P G_k P G_l, where P is the weight less what the parameters have taken of it.
-    shrunk = np.array([weighted_gram(y, it) for it in growth])
+    shrunk = np.array([weighted_gram(y, value) for value in growth])
     crossed = growth[:, :, None, :] @ ((weights - 2.0 * removed) * weights)
     flat = shrunk.reshape(len(shrunk), -1)
     expected = 0.5 * (np.tensordot(crossed[:, :, 0], growth, axes=([1, 2], [1, 2])) + flat @ flat.T)

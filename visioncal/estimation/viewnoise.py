@@ -41,7 +41,7 @@ def weights_by_view(squares: FloatArray, freedom: FloatArray) -> FloatArray | No
     from scipy.optimize import brentq
 
     between = float(np.clip(np.var(logs, ddof=1) - np.mean(covariance), *_BETWEEN))
-    half = float(np.exp(brentq(lambda it: polygamma(1, np.exp(it)) - between, *_LOGS)))
+    half = float(np.exp(brentq(lambda value: polygamma(1, np.exp(value)) - between, *_LOGS)))
     scale = np.exp(np.mean(logs) + digamma(half))
     variances = (scale + squares / 2.0) / (half + freedom / 2.0)
     return np.asarray(np.exp(np.mean(np.log(variances)) / 2.0) / np.sqrt(variances), dtype=float)

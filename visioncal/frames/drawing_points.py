@@ -43,27 +43,27 @@ class NominalPoints:
             DataError: The drawing has no point of that name; near ones are named.
         """
         places = {name: at for at, name in enumerate(self.names)}
-        folded = [it.casefold() for it in self.names]
+        folded = [name.casefold() for name in self.names]
         places |= {
             name: folded.index(name.casefold())
             for name in names
             if name not in places and folded.count(name.casefold()) == 1
         }
-        unknown = [it for it in dict.fromkeys(names) if it not in places]
+        unknown = [name for name in dict.fromkeys(names) if name not in places]
         if unknown:
             raise DataError(
                 f"{self.source} has no point {some_of(unknown)}; it has {some_of(self.names, 20)}.",
                 culprits=unknown,
                 next_step=did_you_mean(unknown[0], self.names) or "Correct the points' names.",
             )
-        rows = np.array([places[it] for it in names], dtype=np.int64)
+        rows = np.array([places[name] for name in names], dtype=np.int64)
         spare = np.setdiff1d(np.arange(len(self.names)), rows)
         return PointPairs(
-            tuple(self.names[it] for it in rows),
+            tuple(self.names[index] for index in rows),
             measured,
             covariances,
             self.positions[rows],
             self.sigma_m[rows],
-            tuple(self.names[it] for it in spare),
+            tuple(self.names[index] for index in spare),
             self.positions[spare],
         )

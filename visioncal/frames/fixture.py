@@ -82,7 +82,9 @@ def touched_fixture(
 
 
 def _check_named(rows: TouchRows) -> None:
-    unnamed = [place for place, it in zip(rows.places, rows.points, strict=True) if not it.strip()]
+    unnamed = [
+        place for place, point in zip(rows.places, rows.points, strict=True) if not point.strip()
+    ]
     if unnamed:
         where = rows.source if len(unnamed) == len(rows) else some_of(unnamed)
         raise DataError(
@@ -124,7 +126,7 @@ def _featured_fixture(measured: MeasuredPoints, kinds: Sequence[str], setting: S
         # One of each kind leaves no residual to estimate the noise from.
         expected = TOUCH_NOISE_M
     fitted = _fitted(fit_features(touches, expected), measured, setting)
-    counts = ", ".join(f"{kinds.count(it)} {it}" for it in FEATURE_KINDS)
+    counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in FEATURE_KINDS)
     return fixture_frame(
         fitted, kinds, f"{counts} touches", tuple(_unchecked(fitted, kinds, setting)), {}, setting
     )
@@ -136,7 +138,7 @@ def _fitted(fit: FeatureFit, measured: MeasuredPoints, setting: Setting) -> Fitt
     return Fitted(
         measured,
         measured.labels,
-        tuple(f"Touch {it}" for it in measured.labels),
+        tuple(f"Touch {label}" for label in measured.labels),
         matrix,
         measured.carried(fit.by_points, np.full(len(measured), noise_m)),
         np.asarray((amid - matrix[:3, 3]) @ matrix[:3, :3]),
@@ -168,4 +170,4 @@ def _unchecked(
 
 
 def _count(kinds: Sequence[str], kind: str, agrees: Mask) -> int:
-    return sum(it == kind and used for it, used in zip(kinds, agrees.tolist(), strict=True))
+    return sum(name == kind and used for name, used in zip(kinds, agrees.tolist(), strict=True))

@@ -150,7 +150,7 @@ def fixture_frame(
     doubts = [*_doubts(fitted, setting), *more, *setting.doubts]
     offset, rotation = fitted.worst
     used = fitted.agreement.off_m[fitted.agrees]
-    noise_95 = [1e3 * it for it in fitted.agreement.fit.sigma_95]
+    noise_95 = [1e3 * value for value in fitted.agreement.fit.sigma_95]
     return Frame(
         Edge(fitted.matrix, fitted.covariance),
         True,

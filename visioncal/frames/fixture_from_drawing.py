@@ -63,7 +63,7 @@ def _fitted(
     return Fitted(
         measured,
         _labels(measured, pairs),
-        tuple(f"Point {it}" for it in pairs.labels),
+        tuple(f"Point {label}" for label in pairs.labels),
         fit.base_from_fixture,
         measured.carried(fit.by_points, noise),
         np.asarray(pairs.nominal[fit.agreement.agrees].mean(axis=0)),
@@ -75,7 +75,7 @@ def _fitted(
 
 def _labels(measured: MeasuredPoints, pairs: PointPairs) -> tuple[str, ...]:
     """The points' names; where one was measured several times, with which time it was."""
-    several = {it for it in pairs.labels if pairs.labels.count(it) > 1}
+    several = {label for label in pairs.labels if pairs.labels.count(label) > 1}
     return tuple(
         f"{name}, {label}" if name in several else name
         for name, label in zip(pairs.labels, measured.labels, strict=True)
@@ -90,7 +90,7 @@ def _causes(fit: PointFit, pairs: PointPairs) -> list[str]:
         for at in fit.numbering.moved.tolist():
             other = points.drawn_labels[fit.numbering.assignment[at]]
             causes[points.labels[at]] = f"it is where {other} is drawn: is its name exchanged?"
-    return [causes[it] for it in pairs.labels]
+    return [causes[label] for label in pairs.labels]
 
 
 def _doubts(

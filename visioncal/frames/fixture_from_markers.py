@@ -62,7 +62,7 @@ def marked_fixture(
         DataError: Fewer than three drawn markers are seen, or they do not fit the drawing.
         DegenerateError: They leave a direction open.
     """
-    ids = {_id(it, drawing): it for it in drawing.names}
+    ids = {_id(name, drawing): name for name in drawing.names}
     shown = pictured(session, calibration, among=for_fits(session))
     if shown.target.kind != "marker":
         raise DataError(
@@ -83,8 +83,8 @@ def marked_fixture(
     measured = MeasuredPoints(
         session.name,
         found.names,
-        tuple(_count(it, "image") for it in found.seen_in),
-        tuple(ids[it] for it in seen),
+        tuple(_count(index, "image") for index in found.seen_in),
+        tuple(ids[index] for index in seen),
         found.points,
         found.independent,
         found.common,
@@ -92,7 +92,7 @@ def marked_fixture(
     )
     trusted = Eye.of(calibration).warnings
     doubts = (
-        *(replace(it, is_fatal=it.words in trusted) for it in remarks(found.warnings)),
+        *(replace(remark, is_fatal=remark.words in trusted) for remark in remarks(found.warnings)),
         *view_doubts(session, shown.lost),
         *remarks(shown.warnings),
     )
@@ -119,9 +119,9 @@ def _id(name: str, drawing: NominalPoints) -> int:
 
 def _seen(shown: Sighting, ids: Sequence[int]) -> tuple[int, ...]:
     """The drawn markers that an image shows."""
-    pictures = [it.seen for it in shown.sights if not isinstance(it.seen, Corners)]
-    there = {it for image in pictures for it in marker_ids(image, shown.target.dictionary)}
-    seen = tuple(it for it in ids if it in there)
+    pictures = [sight.seen for sight in shown.sights if not isinstance(sight.seen, Corners)]
+    there = {id_ for image in pictures for id_ in marker_ids(image, shown.target.dictionary)}
+    seen = tuple(number for number in ids if number in there)
     if len(seen) >= FEWEST_POINTS:
         return seen
     others = sorted(there - set(ids))
@@ -130,14 +130,14 @@ def _seen(shown: Sighting, ids: Sequence[int]) -> tuple[int, ...]:
         f"{_count(len(seen), 'drawn marker')} of {shown.target.dictionary}"
         f"{_listed(seen)}, at least {FEWEST_POINTS} are needed"
         f"{'; markers that are not drawn' if others else ''}{_listed(others)}.",
-        culprits=[f"marker {it}" for it in ids if it not in there],
+        culprits=[f"marker {number}" for number in ids if number not in there],
         next_step="Take images that show them whole, with their white margins; or correct the ids "
         "in the drawing.",
     )
 
 
 def _listed(ids: Sequence[int]) -> str:
-    return f" ({some_of([str(it) for it in ids])})" if ids else ""
+    return f" ({some_of([str(number) for number in ids])})" if ids else ""
 
 
 def _count(count: int, thing: str) -> str:
@@ -147,7 +147,7 @@ def _count(count: int, thing: str) -> str:
 def _outward(calibration: Calibration, sights: Sequence[Sight], found: SeenPoints) -> FloatArray:
     """(n, 3) directions from the markers to the camera, on the mean over the images."""
     eye = Eye.of(calibration)
-    eyes = np.array([eye.at(it.base_from_flange).base_from_cam[:3, 3] for it in sights])
+    eyes = np.array([eye.at(sight.base_from_flange).base_from_cam[:3, 3] for sight in sights])
     away = eyes.mean(axis=0) - found.points
     return np.asarray(away / np.linalg.norm(away, axis=1)[:, None])
 

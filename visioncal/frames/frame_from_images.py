@@ -115,13 +115,16 @@ def seen_frame(
     shown = session_looks(session, calibration, parent, among=for_fits(session), progress=progress)
     views, looks, lost = _looks(eye, shown)
     lost |= held_back(session)
-    sights = [it for it, view in zip(shown.sights, shown.views, strict=True) if view in views]
+    sights = [sight for sight, view in zip(shown.sights, shown.views, strict=True) if view in views]
     seen = place_looks(eye, sights, looks, parent).at(point)
     worst = worst_of(seen.matrix, seen.covariance, kind, parent)
     placed = _Placed(kind, shown, seen, worst, views, lost)
     _check_still(eye, placed, sights, looks)
     doubts = [
-        *(replace(it, is_fatal=it.words in eye.warnings) for it in remarks(seen.warnings)),
+        *(
+            replace(remark, is_fatal=remark.words in eye.warnings)
+            for remark in remarks(seen.warnings)
+        ),
         *weak_directions(worst, options.sigma_mm, options.sigma_deg, _advice(seen)),
         *view_doubts(session, lost),
         *remarks(shown.warnings),
@@ -160,7 +163,7 @@ def _check_still(
     """Refuses a target that moves where it should stand still, and stands still elsewhere."""
     other: FrameKind = "fixture" if placed.kind == "tool" else "tool"
     parent, seen = PARENTS[other], placed.seen
-    has_poses = all(it.base_from_flange is not None for it in sights)
+    has_poses = all(sight.base_from_flange is not None for sight in sights)
     if seen.scatter < _WILD or (needs_robot(eye, parent) and not has_poses):
         return
     found = place_looks(eye, sights, looks, parent)
@@ -176,7 +179,7 @@ def _check_still(
 
 
 def _advice(seen: TargetPose) -> str:
-    own, common = (float(np.trace(it[3:, 3:])) for it in (seen.independent, seen.common))
+    own, common = (float(np.trace(array[3:, 3:])) for array in (seen.independent, seen.common))
     if own > common:
         return "Take more images, from nearer and from other sides."
     return (
@@ -214,7 +217,7 @@ def _method(placed: _Placed, point: FloatArray) -> str:
     note = f"{words.get(target.kind, target.kind)} {target.name} seen in {images}"
     if not point.any():
         return note
-    return f"{note}; its point ({', '.join(f'{it:.6g}' for it in 1e3 * point)}) mm"
+    return f"{note}; its point ({', '.join(f'{value:.6g}' for value in 1e3 * point)}) mm"
 
 
 def _noise_mm(seen: TargetPose) -> float:
@@ -227,7 +230,7 @@ def _noise_mm(seen: TargetPose) -> float:
 
 def _observations(session: Session, placed: _Placed) -> Iterator[Observation]:
     places = {view.number: at for at, view in enumerate(placed.views)}
-    for number in (it.number for it in session.views):
+    for number in (view.number for view in session.views):
         if number not in places:
             yield Observation(str(number), used=False, reason=placed.lost[number])
             continue

@@ -151,22 +151,24 @@ def _nearest(sights: CandidateViews, seed: Place) -> tuple[FloatArray, IntArray]
     """Squared distance (m,) of each image's nearest pose from a place, and which one it is."""
     own, found = sights.own(seed), []
     for view in sights.views:
-        away = [log(invert(seed.matrix) @ it.matrix) for it in view]
+        away = [log(invert(seed.matrix) @ place.matrix) for place in view]
         squared = [
-            float(d @ np.linalg.solve(own + sights.own(it), d))
-            for d, it in zip(away, view, strict=True)
+            float(d @ np.linalg.solve(own + sights.own(place), d))
+            for d, place in zip(away, view, strict=True)
         ]
         found.append((min(squared), int(np.argmin(squared))))
-    return np.array([it[0] for it in found]), np.array([it[1] for it in found], dtype=np.int64)
+    return np.array([item[0] for item in found]), np.array(
+        [item[1] for item in found], dtype=np.int64
+    )
 
 
 def _judged(sights: CandidateViews, picks: IntArray, agrees: Mask) -> ImageInliers:
     """The mean of some images, and how far all of them are from it."""
     chosen = [view[at] for view, at in zip(sights.views, picks, strict=True)]
     mean = _mean(sights, chosen, agrees)
-    away = log(invert(mean.matrix) @ np.array([it.matrix for it in chosen]))
-    own = np.array([sights.own(it) for it in chosen])
-    apart = np.array([it.by_common for it in chosen]) - mean.by_common
+    away = log(invert(mean.matrix) @ np.array([value.matrix for value in chosen]))
+    own = np.array([sights.own(value) for value in chosen])
+    apart = np.array([value.by_common for value in chosen]) - mean.by_common
     shared = apart @ sights.common @ np.swapaxes(apart, 1, 2)
     inside, others = agrees[:, None, None], int(agrees.sum()) - 1
     squared = np.einsum("mi,mi->m", away, np.linalg.solve(own + shared, away[..., None])[..., 0])
@@ -193,20 +195,20 @@ def _mean(sights: CandidateViews, chosen: Sequence[Place], agrees: Mask) -> Mean
     """Weighs images by what is their own; what they share cannot be averaged by weights."""
     weights = np.array(
         [
-            np.linalg.inv(sights.own(it)) if ok else np.zeros((6, 6))
-            for it, ok in zip(chosen, agrees, strict=True)
+            np.linalg.inv(sights.own(place)) if ok else np.zeros((6, 6))
+            for place, ok in zip(chosen, agrees, strict=True)
         ]
     )
     own = covariance_from(weights.sum(axis=0))
     gains = own @ weights
-    matrices = np.array([it.matrix for it in chosen])
+    matrices = np.array([place.matrix for place in chosen])
     matrix = matrices[int(np.flatnonzero(agrees)[0])]
     for _ in range(_STEPS):
         step = np.einsum("mij,mj->i", gains, log(invert(matrix) @ matrices))
         matrix = matrix @ exp(step)
         if np.abs(step).max() < _SETTLED:
             break
-    by_common = np.einsum("mij,mjk->ik", gains, np.array([it.by_common for it in chosen]))
+    by_common = np.einsum("mij,mjk->ik", gains, np.array([place.by_common for place in chosen]))
     return Mean(matrix, own, gains, by_common)
 
 

@@ -162,7 +162,7 @@ def _located(
     eye: Eye, place: FloatArray, parts: dict[str, FloatArray], warnings: Sequence[str]
 ) -> Located:
     """Puts the place together; sources that add nothing are left out."""
-    kept = {name: it for name, it in parts.items() if np.trace(it) > 0.0}
+    kept = {name: part for name, part in parts.items() if np.trace(part) > 0.0}
     kept = kept or {"pixels": np.zeros((3, 3))}
     found = Located(place, kept, _freedom(eye, kept), (*eye.warnings, *warnings))
     worst_m = float(np.sqrt(max(np.linalg.eigvalsh(found.covariance)[-1], 0.0)))
@@ -180,8 +180,8 @@ def _freedom(eye: Eye, parts: Mapping[str, FloatArray]) -> float:
 
     The pixels' noise comes from thousands of corners; plane and target are declared.
     """
-    total = sum(float(np.trace(it)) for it in parts.values())
-    estimated = sum(float(np.trace(parts[it])) for it in _ESTIMATED & parts.keys())
+    total = sum(float(np.trace(part)) for part in parts.values())
+    estimated = sum(float(np.trace(parts[name])) for name in _ESTIMATED & parts.keys())
     return eye.freedom * (total / estimated) ** 2 if estimated > 0.0 else np.inf
 
 

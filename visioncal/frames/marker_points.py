@@ -94,20 +94,21 @@ def seen_markers(
     """
     check_labels(sights)
     eye = Eye.of(calibration)
-    targets = [_target(it, dictionary, size_m, size_sigma_m) for it in ids]
+    targets = [_target(number, dictionary, size_m, size_sigma_m) for number in ids]
     if not targets:
         raise DataError("no markers to look for: give their ids.")
-    markers = [_look(eye, sights, it, sigma_px) for it in targets]
-    unseen = [it.name for it in markers if not it.images]
+    markers = [_look(eye, sights, target, sigma_px) for target in targets]
+    unseen = [marker.name for marker in markers if not marker.images]
     if unseen:
         raise DataError(
             f"marker {some_of(unseen)} of {dictionary} is in none of the {len(sights)} images.",
-            culprits=[f"marker {it}" for it in unseen],
+            culprits=[f"marker {name}" for name in unseen],
             next_step="Take an image that shows it whole, with its white margin; or leave it out.",
         )
     common = common_covariance(eye, markers[0].looks[0].scale_sigma)
     found = [
-        agreeing(CandidateViews(it.views, eye.flange_noise, common, eye.freedom)) for it in markers
+        agreeing(CandidateViews(marker.views, eye.flange_noise, common, eye.freedom))
+        for marker in markers
     ]
     warnings = [
         warning
@@ -115,11 +116,11 @@ def seen_markers(
         for warning in _warnings(eye, marker, agreement, sights)
     ]
     return SeenPoints(
-        tuple(it.name for it in markers),
-        np.array([it.mean.matrix[:3, 3] for it in found]),
-        np.array([_own(*it) for it in zip(markers, found, strict=True)]),
+        tuple(marker.name for marker in markers),
+        np.array([inliers.mean.matrix[:3, 3] for inliers in found]),
+        np.array([_own(*pair) for pair in zip(markers, found, strict=True)]),
         _shared(eye, markers, found, common, len(sights)),
-        tuple(int(it.agrees.sum()) for it in found),
+        tuple(int(inliers.agrees.sum()) for inliers in found),
         (*eye.warnings, *warnings),
     )
 
@@ -168,8 +169,8 @@ def _warnings(
         yield from look.warnings
     if len(marker.images) > 1:
         own = [sights[at] for at in marker.images]
-        stops = len({it.stop_key for it in own}) if needs_robot(eye, "base") else None
-        labels = [it.label for it in own]
+        stops = len({sight.stop_key for sight in own}) if needs_robot(eye, "base") else None
+        labels = [sight.label for sight in own]
         yield from doubts(found, labels, marker.looks, stops, f"marker {marker.name}")
 
 
@@ -187,7 +188,7 @@ def _shares(
 def _own(marker: _Marker, found: ImageInliers) -> FloatArray:
     """(3, 3) covariance of a centre by the pixels of its images."""
     covariance = np.sum(
-        [slope @ it.pixels @ slope.T for it, slope in _shares(found, marker.views)], axis=0
+        [slope @ place.pixels @ slope.T for place, slope in _shares(found, marker.views)], axis=0
     )
     return np.asarray(found.variance * covariance)
 

@@ -49,7 +49,7 @@ class Tool:
         Raises:
             DataError: There is none of that name, or which one is meant is not said.
         """
-        tools = {it: frame for it, frame in frames.items() if it.startswith("flange_from_")}
+        tools = {word: frame for word, frame in frames.items() if word.startswith("flange_from_")}
         if name is None and len(tools) == 1:
             name = next(iter(tools))
         if name is None or not tools:
@@ -163,7 +163,7 @@ def touched_points(
         rows.source,
         rows.labels,
         rows.places,
-        tuple(it.strip() for it in rows.points),
+        tuple(point.strip() for point in rows.points),
         there @ away + poses[:, :3, 3],
         there @ lever @ np.swapaxes(there, 1, 2),
         flat @ covariance @ flat.T,
@@ -174,8 +174,8 @@ def touched_points(
 def _tip_poses(rows: TouchRows) -> FloatArray:
     """The poses (n, 4, 4) of the tip itself, of which positions are enough."""
     missing = [
-        rows.places[it]
-        for it in np.flatnonzero(~np.isfinite(rows.base_from_flange[:, :3, 3]).all(axis=1))
+        rows.places[index]
+        for index in np.flatnonzero(~np.isfinite(rows.base_from_flange[:, :3, 3]).all(axis=1))
     ]
     if missing:
         raise DataError(

@@ -47,9 +47,9 @@ class Plane:
             DataError: The normal has no direction, or a number is not finite or no length in
                 metres.
         """
-        for name, it in (("normal", normal), ("point", point)):
-            if np.shape(it) != (3,):
-                raise DataError(f"plane: the {name} is {it!r}; three numbers are needed.")
+        for name, array in (("normal", normal), ("point", point)):
+            if np.shape(array) != (3,):
+                raise DataError(f"plane: the {name} is {array!r}; three numbers are needed.")
         length = float(np.linalg.norm(normal))
         if not np.isfinite(length) or length < 1e-9:
             raise DataError(

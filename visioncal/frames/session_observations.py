@@ -75,11 +75,12 @@ def session_looks(
     poses, lost = _poses(session, calibration, parent, asked)
     views = _usable(session, asked, target, lost)
     seen = detect(session, progress=progress, among=views)
-    lost |= {it.view: it.reason for it in seen.rejections}
+    lost |= {rejection.view: rejection.reason for rejection in seen.rejections}
     views = _usable(session, asked, target, lost)
     check_resolution(session, calibration, seen.resolution)
     sights = [
-        Sight(_label(it), seen.corners[it.number], poses.get(it.number), it.stop) for it in views
+        Sight(_label(view), seen.corners[view.number], poses.get(view.number), view.stop)
+        for view in views
     ]
     return Sighting(
         session.name, target, tuple(sights), views, lost, _warnings(session, calibration)
@@ -106,7 +107,7 @@ def pictured(
     asked = session.views if among is None else tuple(among)
     poses, lost = _poses(session, calibration, "base", asked)
     sights = []
-    lost |= {it.number: _NO_IMAGE for it in asked if not it.image}
+    lost |= {view.number: _NO_IMAGE for view in asked if not view.image}
     for view in _usable(session, asked, target, lost):
         image = image_of(session, view)
         if isinstance(image, Rejection):
@@ -122,12 +123,12 @@ def pictured(
 
 def for_fits(session: Session) -> tuple[View, ...]:
     """The views that a fit may use."""
-    return tuple(it for it in session.views if not it.holdout)
+    return tuple(view for view in session.views if not view.holdout)
 
 
 def held_back(session: Session) -> dict[int, str]:
     """The views that none may use, by their numbers, with the reason."""
-    return {it.number: HELD_BACK for it in session.views if it.holdout}
+    return {view.number: HELD_BACK for view in session.views if view.holdout}
 
 
 def pose_of(session: Session, view: View, calibration: Calibration) -> FloatArray | None:
@@ -143,7 +144,7 @@ def _warnings(session: Session, calibration: Calibration) -> tuple[str, ...]:
     """What is odd about the session itself, or beside the calibration."""
     known, stated = calibration.camera, session.camera
     words = session.warnings
-    if calibration.arm_is_calibrated and any(it.joints_rad is None for it in session.views):
+    if calibration.arm_is_calibrated and any(view.joints_rad is None for view in session.views):
         words = (
             *words,
             "The calibration is of a calibrated arm, but views come without joint angles: their "
@@ -154,7 +155,7 @@ def _warnings(session: Session, calibration: Calibration) -> tuple[str, ...]:
     off = stated.matrix - known.camera.matrix
     if np.abs(off).max() <= _OTHER_LENS * known.camera.matrix[0]:
         return words
-    fx, cx, of_fx, of_cx = (it.matrix[at] for it in (stated, known.camera) for at in (0, 2))
+    fx, cx, of_fx, of_cx = (camera.matrix[at] for camera in (stated, known.camera) for at in (0, 2))
     return (
         *words,
         f"The session states a lens of fx {fx:.0f} and cx {cx:.0f} px, and the camera was "
@@ -209,13 +210,13 @@ def _poses(
     session: Session, calibration: Calibration, parent: Parent, asked: tuple[View, ...]
 ) -> tuple[Mapping[int, FloatArray], dict[int, str]]:
     """The robot's poses by view, and why views without one or without an image are of no use."""
-    lost = {it.number: _NO_IMAGE for it in asked if not (it.image or it.has_corners)}
+    lost = {view.number: _NO_IMAGE for view in asked if not (view.image or view.has_corners)}
     if needs_robot(Eye.of(calibration), parent):
         reported = _flange(session, calibration, asked)
-        lost = {it.view: it.reason for it in reported.rejections} | lost
+        lost = {rejection.view: rejection.reason for rejection in reported.rejections} | lost
         return reported.base_from_flange, lost
-    there = {it.number: pose for it in asked if (pose := it.base_from_flange()) is not None}
-    return {view: np.asarray(it.as_matrix()) for view, it in there.items()}, lost
+    there = {view.number: pose for view in asked if (pose := view.base_from_flange()) is not None}
+    return {view: np.asarray(value.as_matrix()) for view, value in there.items()}, lost
 
 
 def _flange(session: Session, calibration: Calibration, asked: tuple[View, ...]) -> Reported:
@@ -242,7 +243,7 @@ def _usable(
     session: Session, asked: Sequence[View], target: Target, lost: Mapping[int, str]
 ) -> tuple[View, ...]:
     """The views that nothing speaks against so far."""
-    views = tuple(it for it in asked if it.number not in lost)
+    views = tuple(view for view in asked if view.number not in lost)
     if views:
         return views
     culprits = by_reason(lost) or (f"all views: {HELD_BACK}",)

@@ -89,7 +89,7 @@ def all_places(
     eye: Eye, sights: Sequence[Sight], looks: Sequence[SeenTarget], parent: Parent
 ) -> list[tuple[Place, ...]]:
     """Carries what images of one target allow to the parent's frame; see `places`."""
-    stops = [it.stop_key for it in sights]
+    stops = [sight.stop_key for sight in sights]
     return [
         places(eye, sight, look, parent, stops.count(stop))
         for sight, look, stop in zip(sights, looks, stops, strict=True)
@@ -168,7 +168,7 @@ def check_labels(sights: Sequence[Sight]) -> None:
     """
     if not sights:
         raise DataError("no image shows the target: at least one is needed.")
-    labels = [it.label for it in sights]
-    twice = sorted({it for it in labels if labels.count(it) > 1})
+    labels = [sight.label for sight in sights]
+    twice = sorted({label for label in labels if labels.count(label) > 1})
     if twice:
         raise DataError(f"two images are called {twice[0]!r}.", culprits=twice)

@@ -97,10 +97,14 @@ def see(
     # Exact corners show no noise; a millionth of a pixel keeps their covariance a covariance.
     variance, lens = max(noise_px, 1e-6) ** 2, 4 + len(eye.camera.distortion)
     return SeenTarget(
-        np.array([it.cam_from_target[0] for it, _ in looks]),
-        np.array([variance * covariance_from(it.information[0]) for it, _ in looks]),
-        np.array([np.hstack([it.by_shared[0, :, :lens], beyond]) for it, beyond in looks]),
-        np.array([_by_scale(it.by_shared[0, :, lens:], target) for it, _ in looks]),
+        np.array([compressed.cam_from_target[0] for compressed, _ in looks]),
+        np.array(
+            [variance * covariance_from(compressed.information[0]) for compressed, _ in looks]
+        ),
+        np.array(
+            [np.hstack([compressed.by_shared[0, :, :lens], beyond]) for compressed, beyond in looks]
+        ),
+        np.array([_by_scale(compressed.by_shared[0, :, lens:], target) for compressed, _ in looks]),
         target.square_sigma_m / target.square_m,
         poses.turns,
         warnings,

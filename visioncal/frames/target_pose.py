@@ -123,7 +123,7 @@ def place_seen(
     check_labels(sights)
     eye = Eye.of(calibration)
     board = target if isinstance(target, Target) else load_target(target)
-    looks = [see(eye, it.seen, board, it.label, sigma_px) for it in sights]
+    looks = [see(eye, sight.seen, board, sight.label, sigma_px) for sight in sights]
     return place_looks(eye, sights, looks, parent)
 
 
@@ -133,9 +133,9 @@ def place_looks(
     """Places a target by what was seen of it in each of the images; see `place_seen`."""
     views = all_places(eye, sights, looks, parent)
     common = common_covariance(eye, looks[0].scale_sigma)
-    stops = len({it.stop_key for it in sights}) if needs_robot(eye, parent) else None
+    stops = len({sight.stop_key for sight in sights}) if needs_robot(eye, parent) else None
     found = agreeing(CandidateViews(views, eye.flange_noise, common, eye.freedom))
-    labels = tuple(it.label for it in sights)
+    labels = tuple(sight.label for sight in sights)
     return TargetPose(
         found.mean.matrix,
         found.variance * found.mean.own,

@@ -92,7 +92,7 @@ def _touches(rows: TouchRows, poses: FloatArray) -> Touches:
     numbers = numbered(rows.points)
     return Touches(
         poses,
-        np.array([numbers[it] for it in rows.points], dtype=np.int64),
+        np.array([numbers[point] for point in rows.points], dtype=np.int64),
         cast("tuple[TouchKind, ...]", rows.kinds),
         rows.labels,
         tuple(numbers),
@@ -126,7 +126,9 @@ def _closing_words(best: Reading) -> str:
 
 def _method(rows: TouchRows) -> str:
     counts = {kind: rows.kinds.count(kind) for kind in TOUCH_KINDS}
-    points = len({it for it, kind in zip(rows.points, rows.kinds, strict=True) if kind == "point"})
+    points = len(
+        {point for point, kind in zip(rows.points, rows.kinds, strict=True) if kind == "point"}
+    )
     tip = f"pivot of {counts['point']} touches of {_counted(points, 'point')}"
     if not counts["z"]:
         return tip
@@ -171,8 +173,8 @@ def _doubts(
         yield Finding("misread_poses", words, step, probability=_MISREAD, is_fatal=True)
     rows = range(len(touches))
     yield from disputed(
-        [placed_name(f"Touch {touches.labels[it]}", places[it]) for it in rows],
-        [_wrong(fit, touches, it) for it in rows],
+        [placed_name(f"Touch {touches.labels[row]}", places[row]) for row in rows],
+        [_wrong(fit, touches, row) for row in rows],
         fit.agreement,
         "Touch what is named once more, and write the new poses in its rows.",
     )
@@ -227,7 +229,7 @@ def _praise(fit: PivotFit, touches: Touches) -> str:
 def _details(fit: PivotFit, touches: Touches) -> dict[str, Any]:
     turns = invert(touches.base_from_flange)[:, None] @ touches.base_from_flange[None]
     return {
-        "noise_95_mm": [1e3 * it for it in fit.agreement.fit.sigma_95],
+        "noise_95_mm": [1e3 * value for value in fit.agreement.fit.sigma_95],
         "turn_deg": float(np.rad2deg(rotation_angle(turns).max())),
         "points_m": {
             _point_name(name): point.tolist()

@@ -107,18 +107,20 @@ def judged(
     Raises:
         DataError: There are as many gaps as points in no way, or one is no length.
     """
-    if len(gaps_mm) != len(points) or not all(0.0 <= it < np.inf for it in gaps_mm):
+    if len(gaps_mm) != len(points) or not all(0.0 <= gap < np.inf for gap in gaps_mm):
         raise DataError(
-            f"touch-test: the gaps are {', '.join(f'{it:g}' for it in gaps_mm)} mm; "
+            f"touch-test: the gaps are {', '.join(f'{gap:g}' for gap in gaps_mm)} mm; "
             f"{len(points)} of 0 mm and more are needed, one a point.",
             culprits=["--gaps-mm"],
             next_step="Give them in the order of the points, as --gaps-mm 0.2,0.1,0.3,0.2,0.2.",
         )
     touched = tuple(
-        TouchedPoint(name=it.name, base_m=it.base_m, radius95_mm=it.radius95_mm, gap_mm=float(gap))
-        for it, gap in zip(points, gaps_mm, strict=True)
+        TouchedPoint(
+            name=point.name, base_m=point.base_m, radius95_mm=point.radius95_mm, gap_mm=float(gap)
+        )
+        for point, gap in zip(points, gaps_mm, strict=True)
     )
-    beyond = sum(it.gap_mm > it.radius95_mm for it in touched)
+    beyond = sum(touched_point.gap_mm > touched_point.radius95_mm for touched_point in touched)
     created = datetime.now(UTC).isoformat(timespec="seconds")
     return TouchTest(
         created=created,
@@ -130,8 +132,8 @@ def judged(
 
 def finding_of(test: TouchTest) -> Finding:
     """What a touch test says, and what to do about it."""
-    gaps = [it.gap_mm for it in test.points]
-    radius = max(it.radius95_mm for it in test.points)
+    gaps = [point.gap_mm for point in test.points]
+    radius = max(point.radius95_mm for point in test.points)
     words = (
         f"Touched with {test.tool}, {len(gaps)} points have gaps of {figure(min(gaps))} to "
         f"{figure(max(gaps))} mm; 95 % were predicted within {figure(radius)} mm."
@@ -147,6 +149,6 @@ def _five(board: Target) -> dict[str, FloatArray]:
     places = corner_positions(board)
     middle = (places.min(axis=0) + places.max(axis=0)) / 2.0
     signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    chosen = [int(np.argmax((places - middle)[:, :2] @ it)) for it in signs]
+    chosen = [int(np.argmax((places - middle)[:, :2] @ sign)) for sign in signs]
     chosen.append(int(np.argmin(np.linalg.norm(places - middle, axis=1))))
-    return {f"corner {it}": places[it] for it in dict.fromkeys(chosen)}
+    return {f"corner {index}": places[index] for index in dict.fromkeys(chosen)}

@@ -63,8 +63,8 @@ class TouchRows:
         Raises:
             DataError: A row is of another kind.
         """
-        kinds = tuple(it.strip().lower() or default for it in self.kinds)
-        wrong = [at for at, it in enumerate(kinds) if it not in allowed]
+        kinds = tuple(kind.strip().lower() or default for kind in self.kinds)
+        wrong = [at for at, kind in enumerate(kinds) if kind not in allowed]
         if wrong:
             seen = kinds[wrong[0]]
             needed = f"{some_of(allowed)} or nothing, for {default}," if default else "one of "
@@ -97,16 +97,16 @@ def touches_of(session: Session, robot: str | None = None) -> TouchRows:
         pose = view.base_from_flange()
         poses.append(nowhere if pose is None else np.asarray(pose.as_matrix()))
         joints.append(view.joints_rad)
-    size = max((len(it) for it in joints if it is not None), default=0)
+    size = max((len(joint) for joint in joints if joint is not None), default=0)
     missing = np.full(size, np.nan)
     return TouchRows(
         session.name,
-        tuple(str(it.number) for it in session.views),
-        tuple(f"views.csv, view {it.number}" for it in session.views),
+        tuple(str(view.number) for view in session.views),
+        tuple(f"views.csv, view {view.number}" for view in session.views),
         np.array(poses),
-        np.array([missing if it is None else it for it in joints]) if size else None,
-        tuple(it.text.get("kind", "") for it in session.views),
-        tuple(it.text.get("point", "") for it in session.views),
+        np.array([missing if joint is None else joint for joint in joints]) if size else None,
+        tuple(view.text.get("kind", "") for view in session.views),
+        tuple(view.text.get("point", "") for view in session.views),
     )
 
 
@@ -138,7 +138,7 @@ def flange_poses(
     modelled, poses = _modelled(rows, robot, needed=not reported.all())
     without = np.flatnonzero(~reported & ~modelled)
     if len(without):
-        places = [rows.places[it] for it in without]
+        places = [rows.places[index] for index in without]
         raise DataError(
             f"{some_of(places)}: no pose of the robot.",
             culprits=places,
@@ -177,7 +177,7 @@ def check_lengths(rows: TouchRows) -> None:
         raise DataError(
             f"{rows.places[far[0]]}: its position is {away[far[0]]:.4g} m from the base, and no "
             f"arm reaches {_FAR_M:g} m: these look like millimetres.",
-            culprits=[rows.places[it] for it in far],
+            culprits=[rows.places[index] for index in far],
             next_step="Say --robot-unit mm, or write metres.",
         )
     farthest = float(np.max(away, initial=0.0, where=np.isfinite(away)))
@@ -253,7 +253,7 @@ def _check_angles(rows: TouchRows, there: Mask) -> None:
         raise DataError(
             f"{rows.places[wide[0]]}: a joint stands at {largest[wide[0]]:.4g} rad, more than two "
             "turns: these look like degrees.",
-            culprits=[rows.places[it] for it in wide],
+            culprits=[rows.places[index] for index in wide],
             next_step="Say --joint-unit deg, or write radians.",
         )
 
@@ -271,7 +271,7 @@ def _check_same_arm(rows: TouchRows, poses: FloatArray, there: Mask, robot: Robo
             f"{rows.places[both[at]]}: the joints lead through {robot.name} to a flange "
             f"{1e3 * apart_m[at]:.0f} mm and {np.rad2deg(apart_rad[at]):.1f} deg away from the "
             "pose that is reported.",
-            culprits=[rows.places[it] for it in both[odd]],
+            culprits=[rows.places[index] for index in both[odd]],
             next_step="Check the robot's model and its base, and whether the controller reports "
             "the flange without a tool.",
         )

@@ -26,16 +26,16 @@ def weak_directions(
         sigma_deg: The same of a rotation's [deg].
         advice: What to do about it, as a sentence.
     """
-    for it in worst:
-        scale, unit = (np.rad2deg(1.0), "deg") if it.is_rotation else (1e3, "mm")
-        check, bad = sigma_deg if it.is_rotation else sigma_mm
-        if it.sigma * scale > check:
+    for direction in worst:
+        scale, unit = (np.rad2deg(1.0), "deg") if direction.is_rotation else (1e3, "mm")
+        check, bad = sigma_deg if direction.is_rotation else sigma_mm
+        if direction.sigma * scale > check:
             yield Finding(
                 "weak_motion",
-                f"{it.words[0].upper()}{it.words[1:]} is known to {figure(it.sigma * scale)} "
-                f"{unit} only (doubt begins at {check:g}).",
+                f"{direction.words[0].upper()}{direction.words[1:]} is known to "
+                f"{figure(direction.sigma * scale)} {unit} only (doubt begins at {check:g}).",
                 Step(advice),
-                is_fatal=it.sigma * scale > bad,
+                is_fatal=direction.sigma * scale > bad,
             )
 
 

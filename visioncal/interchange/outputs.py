@@ -293,7 +293,7 @@ def _write(
 
     # The result last: it is what the others are beside.
     mine = [*results, *drawings]
-    names = [*(it for it in (*others, *without) if it not in mine), *reversed(mine)]
+    names = [*(other for other in (*others, *without) if other not in mine), *reversed(mine)]
     return Written(write_generation(folder, names, write), tuple(undrawn))
 
 

@@ -54,8 +54,8 @@ def suspects(calibration: Calibration) -> tuple[Suspects, ...]:
     doubt.
     """
     found, by_pair = sights(calibration), dict[str, list[Sight]]()
-    for it in found if calibration.verdict.status != "good" else ():
-        by_pair.setdefault(_of(it), []).append(it)
+    for sight in found if calibration.verdict.status != "good" else ():
+        by_pair.setdefault(_of(sight), []).append(sight)
     outlying = (
         Suspects((view,), used=True, why=why, of=of)
         for of, mine in by_pair.items()
@@ -67,9 +67,9 @@ def suspects(calibration: Calibration) -> tuple[Suspects, ...]:
 def left_out(found: Iterable[Sight]) -> Iterator[Suspects]:
     """Those of some views that were not used, by their reasons."""
     by_reason: dict[tuple[str, str], list[int]] = {}
-    for it in found:
-        if not it.used:
-            by_reason.setdefault((_of(it), it.reason), []).append(it.view)
+    for sight in found:
+        if not sight.used:
+            by_reason.setdefault((_of(sight), sight.reason), []).append(sight.view)
     for (of, why), views in by_reason.items():
         yield Suspects(tuple(views), used=False, why=why, of=of)
 
@@ -80,7 +80,7 @@ def _of(sight: Sight) -> str:
 
 def outlying_views(found: Sequence[Suspects]) -> tuple[int, ...]:
     """Numbers of the used views among suspects, ascending."""
-    return tuple(sorted(view for it in found if it.used for view in it.views))
+    return tuple(sorted(view for item in found if item.used for view in item.views))
 
 
 def contradicts(view: Sight) -> bool:
@@ -120,7 +120,7 @@ def _outlying(views: Sequence[Sight]) -> dict[int, str]:
                 words.setdefault(view, []).append(
                     f"{significant(value)} {unit} (median {significant(median)})"
                 )
-    return {view: f"off by {' and '.join(it)}" for view, it in words.items()}
+    return {view: f"off by {' and '.join(word)}" for view, word in words.items()}
 
 
 def listed(views: Sequence[int]) -> str:

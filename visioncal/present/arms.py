@@ -138,7 +138,9 @@ def level_table(found: ArmResult) -> Table | None:
         return None
     titles = ("what is free", "values", "fit, mm", "fit, deg", "left out, mm", "left out, deg",
               "likelihood ratio")  # fmt: skip
-    return Table.of(titles, [_level(it, taken=it.level == found.level) for it in found.levels])
+    return Table.of(
+        titles, [_level(level, taken=level.level == found.level) for level in found.levels]
+    )
 
 
 def level_note(observed: str) -> str:
@@ -151,50 +153,55 @@ def level_note(observed: str) -> str:
     )
 
 
-def _level(it: ArmLevel, *, taken: bool) -> Row:
-    words = level_words(it.level) + (" (taken)" if taken else "")
-    residuals = map(significant, (it.rms_mm, it.rms_deg, it.held_out_mm, it.held_out_deg))
-    ratio = significant(None) if it.level == NOMINAL else f"{it.likelihood_ratio:.0f}"
-    return Row((words, str(it.unknowns), *residuals, ratio), "taken" if taken else "")
+def _level(arm_level: ArmLevel, *, taken: bool) -> Row:
+    words = level_words(arm_level.level) + (" (taken)" if taken else "")
+    residuals = map(
+        significant,
+        (arm_level.rms_mm, arm_level.rms_deg, arm_level.held_out_mm, arm_level.held_out_deg),
+    )
+    ratio = significant(None) if arm_level.level == NOMINAL else f"{arm_level.likelihood_ratio:.0f}"
+    return Row((words, str(arm_level.unknowns), *residuals, ratio), "taken" if taken else "")
 
 
 def parameter_tables(found: ArmResult, count: int = 1) -> list[Table]:
     """The numbers of the arm's model, joint by joint, in so many tables."""
     joints: dict[str, list[Row]] = {}
-    for it in found.parameters:
-        joints.setdefault(it.joint, [Row((joint_words(it.joint),))]).append(_parameter(it))
+    for parameter in found.parameters:
+        joints.setdefault(parameter.joint, [Row((joint_words(parameter.joint),))]).append(
+            _parameter(parameter)
+        )
     titles, rows = ("parameter", "nominal", "identified", "change", "sigma", "unit"), [*joints]
     size = max(-(-len(rows) // count), 1)
     parts = [rows[at : at + size] for at in range(0, len(rows), size)]
-    return [Table(titles, tuple(it for name in part for it in joints[name]), (0, 4, 5))
+    return [Table(titles, tuple(joint for name in part for joint in joints[name]), (0, 4, 5))
             for part in parts]  # fmt: skip
 
 
-def _parameter(it: ArmParameter) -> Row:
+def _parameter(arm_parameter: ArmParameter) -> Row:
     """Writes a number of the arm's model with as many digits as its change is known to."""
-    suffix = next((end for end in _UNITS if it.name.endswith(end)), "")
+    suffix = next((end for end in _UNITS if arm_parameter.name.endswith(end)), "")
     unit, scale = _UNITS.get(suffix, ("", 1.0))
-    stem = it.name.removesuffix(suffix)
-    sigma = None if it.sigma is None else scale * it.sigma
+    stem = arm_parameter.name.removesuffix(suffix)
+    sigma = None if arm_parameter.sigma is None else scale * arm_parameter.sigma
     decimals = decimals_for(sigma) if sigma else _DECIMALS.get(unit, 5)
     cells = (
         _SYMBOLS.get(stem, stem.replace("_", " ")),
         # As stated, whatever is known of it now.
-        f"{scale * it.nominal + 0.0:.7g}",
-        fixed(scale * it.identified, decimals),
-        signed(scale * it.change, decimals),
+        f"{scale * arm_parameter.nominal + 0.0:.7g}",
+        fixed(scale * arm_parameter.identified, decimals),
+        signed(scale * arm_parameter.change, decimals),
         f"{PLUS_MINUS} {significant(sigma)}" if sigma else "",
         unit,
     )
-    return Row(cells, "sure" if it.is_sure else "")
+    return Row(cells, "sure" if arm_parameter.is_sure else "")
 
 
 def parameter_note(found: ArmResult) -> str:
     """In which form the parameters are, and how many changes are beyond chance."""
     form = _CONVENTIONS.get(found.convention or "", "")
     words = f"In {form}. " if form else ""
-    if any(it.sigma is not None for it in found.parameters):
-        sure = sum(it.is_sure for it in found.parameters)
+    if any(parameter.sigma is not None for parameter in found.parameters):
+        sure = sum(parameter.is_sure for parameter in found.parameters)
         words += (
             f"{sure} of {len(found.parameters)} changes are beyond three sigma, in bold; "
             f"{PLUS_MINUS} is one standard deviation."
@@ -229,22 +236,25 @@ def spring_facts(elastic: ElasticResult) -> Iterator[Fact]:
 def spring_table(elastic: ElasticResult) -> Table:
     """The joints' stiffness, and the torques on them."""
     rows = []
-    for it in elastic.joints:
-        stiffness, sigma = it.stiffness_nm_per_rad, it.stiffness_sigma_nm_per_rad
-        low, high = (f"{round(end, 1) + 0.0:g}" for end in it.torque_nm)
+    for joint in elastic.joints:
+        stiffness, sigma = joint.stiffness_nm_per_rad, joint.stiffness_sigma_nm_per_rad
+        low, high = (f"{round(end, 1) + 0.0:g}" for end in joint.torque_nm)
         words = "taken for rigid" if stiffness is None else f"{1e-3 * stiffness:.4g}"
         known = "" if sigma is None else f"{PLUS_MINUS} {significant(1e-3 * sigma)}"
-        rows.append((joint_words(it.joint), words, known, f"{low} to {high}"))
+        rows.append((joint_words(joint.joint), words, known, f"{low} to {high}"))
     return Table.of(("joint", "stiffness [kN m/rad]", "sigma", "torque [N m]"), rows, (0, 2))
 
 
 def stop_table(found: ArmResult) -> Table | None:
     """By how much the variance would grow without the most influential stops, and the least."""
     first, rest = found.stops[:_MOST_INFLUENTIAL], found.stops[_MOST_INFLUENTIAL:][-1:]
-    named = [*((it, "") for it in first), *((it, ", the least") for it in rest)]
+    named = [*((item, "") for item in first), *((item, ", the least") for item in rest)]
     rows = [
-        (f"view {it.view}{words}", f"{significant(100.0 * max(it.influence, 0.0))} %")
-        for it, words in named
+        (
+            f"view {stop_influence.view}{words}",
+            f"{significant(100.0 * max(stop_influence.influence, 0.0))} %",
+        )
+        for stop_influence, words in named
     ]
     return Table.of(("without", "grows by"), rows) if rows else None
 
@@ -288,14 +298,15 @@ def drift_table(found: ThermalResult) -> Table:
         "",
     )
     rows = []
-    for it in found.joints:
-        known = f"growth of {it.joint}" in found.not_determined
+    for joint in found.joints:
+        known = f"growth of {joint.joint}" in found.not_determined
         rows.append(
             (
-                it.joint,
-                f"{1e6 * it.growth_per_k:.1f} {PLUS_MINUS} {1e6 * it.growth_sigma_per_k:.1f}",
-                f"{1e6 * it.drift_rad_per_k:.1f} {PLUS_MINUS} {1e6 * it.drift_sigma_rad_per_k:.1f}",
-                significant(it.tau_s / 60.0),
+                joint.joint,
+                f"{1e6 * joint.growth_per_k:.1f} {PLUS_MINUS} {1e6 * joint.growth_sigma_per_k:.1f}",
+                f"{1e6 * joint.drift_rad_per_k:.1f} {PLUS_MINUS} "
+                f"{1e6 * joint.drift_sigma_rad_per_k:.1f}",
+                significant(joint.tau_s / 60.0),
                 "growth as known before" if known else "",
             )
         )

@@ -39,12 +39,12 @@ class Pair:
 def pairs(found: Alignment) -> tuple[Pair, ...]:
     """Lists who saw whom, and how well that fits."""
     rows: dict[tuple[str, str], list[Sight]] = {}
-    for it in found.sights:
-        rows.setdefault((it.seer, it.seen), []).append(it)
+    for sight in found.sights:
+        rows.setdefault((sight.seer, sight.seen), []).append(sight)
     listed = []
     for (seer, seen), mine in rows.items():
-        used = sum(it.used for it in mine)
-        unseen = any(it.used and it.left_out_mm is not None for it in mine)
+        used = sum(sight.used for sight in mine)
+        unseen = any(sight.used and sight.left_out_mm is not None for sight in mine)
         rms = (rms_of(mine) if used else None, left_out_rms(mine) if unseen else None)
         listed.append(Pair(seer, seen, used, len(mine) - used, *rms))
     return tuple(listed)
@@ -75,8 +75,8 @@ class Body:
 
 def weakest_frame(found: Alignment) -> str:
     """The frame whose place on its parent is known worst, of those as they hang last."""
-    edges = {it: found.edge_of(it) for it in _edged(found)}
-    return max(edges, key=lambda it: edges[it].sigma_mm, default="")
+    edges = {name: found.edge_of(name) for name in _edged(found)}
+    return max(edges, key=lambda index: edges[index].sigma_mm, default="")
 
 
 def sigma_words(found: Alignment, frame: str) -> str:
@@ -90,7 +90,7 @@ def sigma_words(found: Alignment, frame: str) -> str:
 
 def _edged(found: Alignment) -> list[str]:
     former = former_frames(found)
-    return [it for it in found.frames if it not in found.robots and it not in former]
+    return [frame for frame in found.frames if frame not in found.robots and frame not in former]
 
 
 def bodies(found: Alignment) -> list[Body]:
@@ -99,10 +99,10 @@ def bodies(found: Alignment) -> list[Body]:
     half = (len(flanges) + 1) // 2
     found_bodies = []
     for name in [*flanges[:half], "cell", *flanges[half:]]:
-        mine = [it for it in _edged(found) if found.frames[it] == name]
-        top = tuple(it for it in mine if it.startswith(_SEERS))
-        bottom = tuple(it for it in mine if it.startswith("base"))
-        middle = tuple(it for it in mine if it not in top and it not in bottom)
+        mine = [word for word in _edged(found) if found.frames[word] == name]
+        top = tuple(name for name in mine if name.startswith(_SEERS))
+        bottom = tuple(name for name in mine if name.startswith("base"))
+        middle = tuple(name for name in mine if name not in top and name not in bottom)
         found_bodies.append(Body(name, top, middle, bottom))
     return found_bodies
 

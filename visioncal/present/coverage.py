@@ -40,7 +40,9 @@ def image_chart(
     calibration: Calibration, evidence: Mapping[int, ViewEvidence]
 ) -> PointChart | None:
     """All corners of all views in one image; None where there are none."""
-    points = {view: it.corners.px for view, it in evidence.items() if it.corners is not None}
+    points = {
+        view: other.corners.px for view, other in evidence.items() if other.corners is not None
+    }
     if not points or calibration.camera is None:
         return None
     return corners_chart(calibration.camera.camera.resolution, points)
@@ -52,8 +54,8 @@ def corners_chart(resolution: tuple[int, int], points: Mapping[int, FloatArray])
     # Pixel centres are at integers, so the image begins half a pixel before the first one.
     x = np.linspace(0, width, _CELLS[0] + 1) - 0.5
     y = np.linspace(0, height, _CELLS[1] + 1) - 0.5
-    lines = [np.array([[it, y[0]], [it, y[-1]]]) for it in x]
-    lines += [np.array([[x[0], it], [x[-1], it]]) for it in y]
+    lines = [np.array([[value, y[0]], [value, y[-1]]]) for value in x]
+    lines += [np.array([[x[0], value], [x[-1], value]]) for value in y]
     return PointChart("image", points, lines, [])
 
 
@@ -61,9 +63,9 @@ def directions_chart(evidence: Mapping[int, ViewEvidence]) -> PointChart | None:
     """Where the camera looked from: how far from the target's normal [deg], and to which side."""
     points = {
         # The target's z axis points into the board, away from who looks at it.
-        view: _disc(it.cam_from_target[2:3, :3] * [-1.0, -1.0, 1.0])
-        for view, it in evidence.items()
-        if it.cam_from_target is not None
+        view: _disc(other.cam_from_target[2:3, :3] * [-1.0, -1.0, 1.0])
+        for view, other in evidence.items()
+        if other.cam_from_target is not None
     }
     if not points:
         return None
@@ -75,7 +77,9 @@ def rotation_axes_chart(evidence: Sequence[ViewEvidence]) -> PointChart | None:
 
     The middle is the flange's z axis, the rim its x, y plane; an axis and its reverse are one.
     """
-    poses = {it.view: it.base_from_flange for it in evidence if it.base_from_flange is not None}
+    poses = {
+        view.view: view.base_from_flange for view in evidence if view.base_from_flange is not None
+    }
     if len(poses) < 2:
         return None
     rotations = np.array(list(poses.values()))[:, :3, :3]

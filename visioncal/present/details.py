@@ -43,7 +43,7 @@ _RATIOS = {"scale.value"}
 
 def frame_facts(frame: Frame) -> tuple[Fact, ...]:
     """How a tool or a fixture was found, and how well."""
-    used = sum(it.used for it in frame.observations)
+    used = sum(observation.used for observation in frame.observations)
     return (
         Fact("method", frame.method),
         Fact("source", frame.source),
@@ -58,10 +58,15 @@ def frame_facts(frame: Frame) -> tuple[Fact, ...]:
 def observation_table(frame: Frame) -> Table:
     """How far each observation is off, and what became of it."""
     rows = []
-    for it in frame.observations:
-        mark = "left-out" if not it.used else "look" if it.reason else "used"
+    for observation in frame.observations:
+        mark = "left-out" if not observation.used else "look" if observation.reason else "used"
         words = {"left-out": "left out", "look": "look", "used": "yes"}[mark]
-        rows.append(Row((it.name, it.kind, significant(it.residual_mm), words), mark))
+        rows.append(
+            Row(
+                (observation.name, observation.kind, significant(observation.residual_mm), words),
+                mark,
+            )
+        )
     return Table.of(("observation", "kind", "mm", "used"), rows, (0, 1, 3))
 
 
@@ -87,7 +92,7 @@ def _details(document: Mapping[str, Any], parent: str) -> Iterator[tuple[str, st
 
 
 def _suffix(key: str) -> str:
-    return next((it for it in _UNITS if key.endswith(it)), "")
+    return next((unit for unit in _UNITS if key.endswith(unit)), "")
 
 
 def _label(parent: str, name: str) -> str:
@@ -113,6 +118,8 @@ def _text(value: object, digits: int, between: str) -> str:
         return f"{value:.{digits}g}"
     if isinstance(value, str):
         return value
-    if isinstance(value, Sequence) and all(isinstance(it, int | float | str) for it in value):
-        return between.join(_text(it, digits, between) for it in value)
+    if isinstance(value, Sequence) and all(
+        isinstance(number, int | float | str) for number in value
+    ):
+        return between.join(_text(number, digits, between) for number in value)
     return ""

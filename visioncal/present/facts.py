@@ -77,8 +77,8 @@ def answering_solver(calibration: Calibration) -> str | None:
     """The solver whose transforms are the result; None where none's are."""
     for name, result in calibration.solvers.items():
         if all(
-            edge in result.matrices and np.array_equal(result.matrices[edge], it.matrix)
-            for edge, it in calibration.edges.items()
+            edge in result.matrices and np.array_equal(result.matrices[edge], item.matrix)
+            for edge, item in calibration.edges.items()
         ):
             return name
     return None
@@ -103,15 +103,15 @@ def solver_table(calibration: Calibration) -> Table | None:
     """What each solver left, and how far its edges are from the result's; None without solvers."""
     if not calibration.solvers:
         return None
-    titles = ("solver", "rms, mm", "rms, deg", *(f"{it} off by" for it in calibration.edges))
+    titles = ("solver", "rms, mm", "rms, deg", *(f"{edge} off by" for edge in calibration.edges))
     answer, rows = answering_solver(calibration), []
     for name, result in calibration.solvers.items():
         away = [
             f"{significant(mm)} mm, {significant(deg)}{DEGREE}"
-            if name != answer and it in result.matrices
+            if name != answer and word in result.matrices
             else significant(None)
-            for it, edge in calibration.edges.items()
-            for mm, deg in [pose_difference(edge.matrix, result.matrices.get(it, edge.matrix))]
+            for word, edge in calibration.edges.items()
+            for mm, deg in [pose_difference(edge.matrix, result.matrices.get(word, edge.matrix))]
         ]
         label = f"{name} (result)" if name == answer else name
         rows.append((label, significant(result.rms_mm), significant(result.rms_deg), *away))
@@ -121,15 +121,15 @@ def solver_table(calibration: Calibration) -> Table | None:
 def moved_table(cell: Alignment) -> Table:
     """What moved while the session was taken, and what nothing ties to the rest."""
     rows = []
-    for it in cell.moved:
-        how_far = f"{significant(it.shift_mm)} mm, {significant(it.turn_deg)}{DEGREE}"
-        rivals = f" It may have been {', '.join(it.rivals)} instead." if it.rivals else ""
+    for move in cell.moved:
+        how_far = f"{significant(move.shift_mm)} mm, {significant(move.turn_deg)}{DEGREE}"
+        rivals = f" It may have been {', '.join(move.rivals)} instead." if move.rivals else ""
         words = (
-            f"Between stops {it.last_stop} and {it.first_stop}. {it.frame} is where it stood last, "
-            f"{it.before} where it stood before.{rivals}"
+            f"Between stops {move.last_stop} and {move.first_stop}. {move.frame} is where it stood "
+            f"last, {move.before} where it stood before.{rivals}"
         )
-        rows.append(Row((it.frame, how_far, words), "look"))
-    rows += [Row((it.frame, "not tied", it.remedy), "left-out") for it in cell.untied]
+        rows.append(Row((move.frame, how_far, words), "look"))
+    rows += [Row((untied.frame, "not tied", untied.remedy), "left-out") for untied in cell.untied]
     return Table(("", "", ""), tuple(rows), (0, 1, 2))
 
 
@@ -161,11 +161,11 @@ def pair_table(calibration: Calibration) -> Table | None:
     if cell.left_out:
         titles += ["unseen, mm", "unseen, deg", "unseen, px"]
     rows = []
-    for it in pairs(cell):
-        figures = [*_rms_cells(it.rms)] if it.rms else [significant(None)] * 3
+    for pair in pairs(cell):
+        figures = [*_rms_cells(pair.rms)] if pair.rms else [significant(None)] * 3
         if cell.left_out:
-            figures += [*_rms_cells(it.unseen)] if it.unseen else [significant(None)] * 3
-        rows.append((it.seer, it.seen, str(it.used), str(it.left_out), *figures))
+            figures += [*_rms_cells(pair.unseen)] if pair.unseen else [significant(None)] * 3
+        rows.append((pair.seer, pair.seen, str(pair.used), str(pair.left_out), *figures))
     return Table.of(titles, rows, (0, 1))
 
 
@@ -188,14 +188,19 @@ def source_table(calibration: Calibration) -> Table | None:
     if cell is None or cell.uncertainty is None or not cell.uncertainty.budget_mm:
         return None
     budgets = cell.uncertainty.budget_mm
-    names = dict.fromkeys(name for it in budgets.values() for name in it)
+    names = dict.fromkeys(name for budget in budgets.values() for name in budget)
     shown = [
         name
         for name in names
-        if any(it.get(name, 0.0) > _LEAST_SHARE * it["total"] for it in budgets.values())
+        if any(
+            budget.get(name, 0.0) > _LEAST_SHARE * budget["total"] for budget in budgets.values()
+        )
     ]
-    rows = [(edge, *(significant(it.get(name)) for name in shown)) for edge, it in budgets.items()]
-    return Table.of(("", *(SOURCES.get(it, it) for it in shown)), rows)
+    rows = [
+        (edge, *(significant(budget.get(name)) for name in shown))
+        for edge, budget in budgets.items()
+    ]
+    return Table.of(("", *(SOURCES.get(name, name) for name in shown)), rows)
 
 
 def summary(calibration: Calibration, found: UncertaintyResult) -> tuple[str, ...]:
@@ -228,7 +233,7 @@ def noise_facts(calibration: Calibration) -> tuple[Fact, ...]:
 
 
 def _noise_fact(of: str, name: str, value: float, interval: tuple[float, float] | None) -> Fact:
-    suffix = next((it for it in _UNITS if name.endswith(it)), "")
+    suffix = next((unit for unit in _UNITS if name.endswith(unit)), "")
     label = f"{of} {name.removesuffix(suffix).replace('_', ' ')}".strip()
     note = ""
     if interval is not None:
@@ -270,7 +275,7 @@ def _size_facts(board: BoardResult, target: Target) -> tuple[Fact, ...]:
         return (stated, Fact("squares, found", "as stated", "nothing speaks against it"))
     known_mm = 1e3 * target.square_m * board.sigma.get("scale", target.square_sigma_m)
     decimals = decimals_for(known_mm)
-    x_mm, y_mm = (f"{1e3 * it:.{decimals}f}" for it in board.squares_m(target))
+    x_mm, y_mm = (f"{1e3 * square:.{decimals}f}" for square in board.squares_m(target))
     note = f"{PLUS_MINUS} {significant(known_mm)}"
     if "scale" in moved:
         note += ", between what is stated and what the robot's motion measures"

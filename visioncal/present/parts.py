@@ -50,7 +50,7 @@ def cameras(calibration: Calibration) -> Mapping[str, CameraResult]:
 
 def image_width(calibration: Calibration) -> int | None:
     """Width of the images, of several cameras that of the widest [px]; None without a camera."""
-    widths = [it.camera.resolution[0] for it in cameras(calibration).values()]
+    widths = [camera.camera.resolution[0] for camera in cameras(calibration).values()]
     return max(widths, default=None)
 
 
@@ -64,14 +64,18 @@ def robots(calibration: Calibration) -> dict[str, Robot]:
     cell = calibration.cell
     models = {"": calibration.robot}
     if cell is not None:
-        models = {name: it.model for name, it in cell.arms.items()}
-    return {name: it for name, it in models.items() if it is not None}
+        models = {name: arm.model for name, arm in cell.arms.items()}
+    return {name: model for name, model in models.items() if model is not None}
 
 
 def calibrated_robots(calibration: Calibration) -> dict[str, Robot]:
     """The robots as they were calibrated, or else their nominal models."""
-    found = ((name, it.arm) for name, it in arms(calibration).items())
-    calibrated = {name: it.robot for name, it in found if it is not None and it.robot is not None}
+    found = ((name, arm.arm) for name, arm in arms(calibration).items())
+    calibrated = {
+        name: arm_result.robot
+        for name, arm_result in found
+        if arm_result is not None and arm_result.robot is not None
+    }
     return {**robots(calibration), **calibrated}
 
 
@@ -113,7 +117,9 @@ def sights(calibration: Calibration) -> tuple[Sight, ...]:
     """What became of each observation; of one camera, without names of who saw whom."""
     if calibration.cell is not None:
         return calibration.cell.sights
-    return tuple(Sight(stop=it.view, seer="", seen="", **vars(it)) for it in calibration.views)
+    return tuple(
+        Sight(stop=view.view, seer="", seen="", **vars(view)) for view in calibration.views
+    )
 
 
 def frames(calibration: Calibration | None) -> Frames:
@@ -138,4 +144,4 @@ def frames(calibration: Calibration | None) -> Frames:
 
 def former_frames(cell: Alignment) -> frozenset[str]:
     """Frames as they hung before they moved."""
-    return frozenset(it.before for it in cell.moved)
+    return frozenset(move.before for move in cell.moved)

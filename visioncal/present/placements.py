@@ -41,7 +41,7 @@ def placement(
         return None
     # The edge of the camera, or of the instrument, is the first; targets' follow.
     x, *targets = calibration.edges
-    z = next((it for it in targets if it.endswith(f"_from_{frame}")), targets[0])
+    z = next((target for target in targets if target.endswith(f"_from_{frame}")), targets[0])
     is_in_hand, edges = calibration.mount == "eye-in-hand", calibration.edges
     robot = seen.base_from_flange if is_in_hand else invert(seen.base_from_flange)
     return np.asarray(invert(edges[z].matrix) @ robot @ edges[x].matrix @ seen.cam_from_target)

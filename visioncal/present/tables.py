@@ -55,16 +55,16 @@ class Table:
         words: tuple[int, ...] = (0,),
     ) -> "Table":
         """A table without the columns in which nothing is known."""
-        marked = [it if isinstance(it, Row) else Row(tuple(it)) for it in rows]
-        filled = [it.cells for it in marked if len(it.cells) > 1]
+        marked = [row if isinstance(row, Row) else Row(tuple(row)) for row in rows]
+        filled = [group.cells for group in marked if len(group.cells) > 1]
         kept = [
             at
             for at in range(len(titles))
-            if not filled or any(it[at] not in ("", _UNKNOWN) for it in filled)
+            if not filled or any(value[at] not in ("", _UNKNOWN) for value in filled)
         ]
         return cls(
             tuple(titles[at] for at in kept),
-            tuple(replace(it, cells=_some(it.cells, kept)) for it in marked),
+            tuple(replace(group, cells=_some(group.cells, kept)) for group in marked),
             tuple(place for place, at in enumerate(kept) if at in words),
         )
 

@@ -40,9 +40,9 @@ def torque_table(identified: "Identified") -> Table:
         }
     columns = [
         [significant(None)] * identified.robot.joint_count
-        if it is None
-        else list(map(significant, it.tolist()))
-        for it in figures.values()
+        if figure is None
+        else list(map(significant, figure.tolist()))
+        for figure in figures.values()
     ]
     rows = zip(identified.robot.joint_names, *columns, strict=True)
     return Table.of(("joint", *figures), list(rows))
@@ -91,7 +91,7 @@ def link_table(identified: "Identified") -> Table | None:
     found, known = identified.inertias.masses, identified.robot.masses
     rows = []
     for at, joint in enumerate(identified.robot.joint_names):
-        centre = ", ".join(f"{it:.1f}" for it in 1e3 * np.asarray(found.centres_m[at]))
+        centre = ", ".join(f"{value:.1f}" for value in 1e3 * np.asarray(found.centres_m[at]))
         before = significant(None if known is None else float(known.kg[at]), 3)
         rows.append((joint, significant(float(found.kg[at]), 3), before, centre))
     titles = ("link behind joint", "mass [kg]", "known before [kg]",

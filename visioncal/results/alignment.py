@@ -195,7 +195,7 @@ class Alignment(CellSections):
             matrix = invert(near[1].edge.matrix) @ matrix
             carry = adjoint(invert(matrix))
             covariance = covariance + carry @ near[1].edge.covariance @ carry.T
-        if not all(it[1].oriented for it in (near, far) if it):
+        if not all(pair[1].oriented for pair in (near, far) if pair):
             covariance[:3], covariance[:, :3] = 0.0, 0.0
         return Edge(matrix, covariance)
 
@@ -214,14 +214,14 @@ class Alignment(CellSections):
         tree, poses = self._tree, poses or {}
         for frame in (first, second):
             if frame != tree.root and frame not in tree.branches:
-                placed = (it.partition("_from_")[2] for it in self.placed)
+                placed = (name.partition("_from_")[2] for name in self.placed)
                 known = [tree.root, *tree.branches, *placed]
                 raise DataError(
                     f"no frame {frame!r}: this alignment has {', '.join(known)}.",
                     culprits=[frame],
                     next_step=did_you_mean(frame, known),
                 )
-        way, places = tree.path(first, second), {it: at for at, it in enumerate(self.edges)}
+        way, places = tree.path(first, second), {edge: at for at, edge in enumerate(self.edges)}
         rest, slope = np.eye(4), np.zeros((6, 6 * len(places)))
         for step in reversed(way):
             edge = self._matrix(step, poses)

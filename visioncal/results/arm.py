@@ -22,7 +22,7 @@ NOMINAL = "nominal"
 _SURE = 3.0
 
 StoredRobot = Annotated[
-    Robot, Written(lambda it: dict(it.document), lambda it, _: Robot.from_document(it))
+    Robot, Written(lambda item: dict(item.document), lambda item, _: Robot.from_document(item))
 ]
 
 
@@ -197,7 +197,7 @@ class CarriesOver:
     @property
     def words(self) -> str:
         """All this in a sentence or two."""
-        worse = [_WHERE[it.region] for it in self.regions if not it.better]
+        worse = [_WHERE[region.region] for region in self.regions if not region.better]
         where = f"; {listed(worse)} it is no better than as stated" if worse else ""
         return (
             f"Where it was measured, the calibrated arm errs by {figure(self.measured_mm)} mm (the "
@@ -328,7 +328,7 @@ class ArmResult(Section):
         Raises:
             ValueError: It is not.
         """
-        if self.is_calibrated and self.level not in [it.level for it in self.levels]:
+        if self.is_calibrated and self.level not in [level.level for level in self.levels]:
             raise ValueError(f"level {self.level!r} is not among the levels")
 
     @property
@@ -344,17 +344,19 @@ class ArmResult(Section):
     @property
     def chosen(self) -> ArmLevel:
         """The level that was taken."""
-        return next(it for it in self.levels if it.level == self.level)
+        return next(level for level in self.levels if level.level == self.level)
 
     @cached_property
     def map_places_m(self) -> FloatArray:
         """(k, 3) places of `workspace_map` in the base [m]."""
-        return np.array([(it.x_m, it.y_m, it.z_m) for it in self.workspace_map]).reshape(-1, 3)
+        return np.array(
+            [(place.x_m, place.y_m, place.z_m) for place in self.workspace_map]
+        ).reshape(-1, 3)
 
     @cached_property
     def map_sigmas_mm(self) -> FloatArray:
         """(k,) predicted standard deviations there [mm]."""
-        return np.array([it.sigma_mm for it in self.workspace_map])
+        return np.array([place.sigma_mm for place in self.workspace_map])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -466,13 +468,15 @@ class ElasticResult(Section):
     @cached_property
     def compliance(self) -> FloatArray:
         """(n,) compliance of the joints [rad/(N m)]."""
-        return np.array([it.compliance_rad_per_nm for it in self.joints])
+        return np.array([joint.compliance_rad_per_nm for joint in self.joints])
 
     def bends(self, joint: int) -> list[tuple[float, float]]:
         """The torque [N m] on a joint and its bend [mrad], at the stops that show it."""
         name = self.joints[joint].joint
         return [
-            (it.torque_nm[joint], it.bend_mrad[name]) for it in self.stops if name in it.bend_mrad
+            (stop.torque_nm[joint], stop.bend_mrad[name])
+            for stop in self.stops
+            if name in stop.bend_mrad
         ]
 
 
@@ -588,13 +592,13 @@ class ThermalResult(Section):
             robot: The arm at its reference temperatures.
         """
         rows = self.joints
-        gains = [1.0 if it.gain_k_per_a2 is None else it.gain_k_per_a2 for it in rows]
+        gains = [1.0 if row.gain_k_per_a2 is None else row.gain_k_per_a2 for row in rows]
         return ThermalModel(
             robot,
-            Heating(self.heated_by, np.array([it.tau_s for it in rows]), np.array(gains)),
-            np.array([it.reference_c for it in rows]),
-            np.array([it.growth_per_k for it in rows]),
-            np.array([it.drift_rad_per_k for it in rows]),
+            Heating(self.heated_by, np.array([row.tau_s for row in rows]), np.array(gains)),
+            np.array([row.reference_c for row in rows]),
+            np.array([row.growth_per_k for row in rows]),
+            np.array([row.drift_rad_per_k for row in rows]),
             self.covariance,
             self.lengths_m,
         )

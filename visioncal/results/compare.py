@@ -192,12 +192,15 @@ def compare(
     if choice or a.cell is None or b.cell is None:
         # The names are of what is of a whole cell; where neither is, they are refused.
         neither = a.cell is None and b.cell is None
-        a, b = (it.chosen(choice if neither or it.cell is not None else ANY) for it in (a, b))
+        a, b = (
+            calibration.chosen(choice if neither or calibration.cell is not None else ANY)
+            for calibration in (a, b)
+        )
     names = [name for name in a.edges if name in b.edges]
     # Two tests a transform, and one of the lens.
     limit = FALSE_ALARMS / (2 * len(names) + 1)
     freedom = (_freedom(a), _freedom(b))
-    edges = tuple(_edge_change(it, *_comparable(a, b, it), freedom, limit) for it in names)
+    edges = tuple(_edge_change(name, *_comparable(a, b, name), freedom, limit) for name in names)
     levels = (_levels(a), _levels(b))
     lens = _lens_change(a.camera, b.camera, limit)
     return Comparison(
@@ -236,9 +239,9 @@ def _levels(calibration: Calibration) -> Mapping[str, float]:
     if calibration.cell is None:
         return calibration.noise
     return {
-        f"{of} {name}": it
+        f"{of} {name}": level
         for of, levels in calibration.cell.noise.items()
-        for name, it in levels.items()
+        for name, level in levels.items()
     }
 
 
@@ -257,7 +260,7 @@ def _edge_change(name: str, a: Edge, b: Edge, freedom: tuple[int, int], limit: f
     spreads = (of_a @ a.covariance @ of_a.T, of_b @ b.covariance @ of_b.T)
     moved_mm, moved_deg = pose_difference(first, second)
     rotation, translation = (
-        _hotelling(twist[part], [it[part, part] for it in spreads], freedom, limit)
+        _hotelling(twist[part], [spread[part, part] for spread in spreads], freedom, limit)
         for part in (slice(0, 3), slice(3, 6))
     )
     return EdgeChange(
@@ -272,7 +275,7 @@ def _hotelling(
     limit: float,
 ) -> Significance:
     """Tests a difference whose covariance is the sum of two, each of an estimated scale."""
-    sizes = np.array([np.trace(it) for it in spreads]) + _LEAST_SIGMA**2
+    sizes = np.array([np.trace(spread) for spread in spreads]) + _LEAST_SIGMA**2
     together = sizes.sum() ** 2 / np.sum(sizes**2 / np.array(freedom))
     squared, count = _squared_distance(difference, spreads[0] + spreads[1]), len(difference)
     return Significance(float(fdtrc(count, together, squared / count)), limit)
@@ -319,7 +322,7 @@ def _findings(
             "Both come from the same session and share its noise: their sigmas say nothing about "
             "the difference."
         )
-    changed = [it.name for it in edges if it.is_change]
+    changed = [edge.name for edge in edges if edge.is_change]
     longer = 1.0 if lens is None else float(lens.b[0] / lens.a[0])
     is_other = abs(longer - 1.0) > _OTHER_LENS
     if is_other:
@@ -366,8 +369,8 @@ _BOARD_MOVED = {
 def _edge_finding(mount: Mount, changed: Sequence[str]) -> str:
     """Says which of the two bodies moved; an edge is named by the body at its end."""
     ends = [name.rpartition("_from_")[2] for name in changed]
-    camera = any(it.startswith(("cam", "instrument")) for it in ends)
-    board = any(it.startswith(("target", "probe")) for it in ends)
+    camera = any(end.startswith(("cam", "instrument")) for end in ends)
+    board = any(end.startswith(("target", "probe")) for end in ends)
     sensor, seen = ("instrument", "probe") if mount == "instrument" else ("camera", "board")
     if camera and board:
         both = f"{sensor.capitalize()} and {seen} both moved."
@@ -383,7 +386,7 @@ def _whole_finding(changed: Sequence[str]) -> str:
     """Says which frames of a whole cell moved."""
     if not changed:
         return "No transform changed: noise explains what differs."
-    frames = [it.partition("_from_")[2] for it in changed]
+    frames = [name.partition("_from_")[2] for name in changed]
     return f"{some_of(frames)} moved, or what they hang on was redefined; the others did not."
 
 
@@ -398,7 +401,10 @@ def to_document(comparison: Comparison) -> dict[str, Any]:
         "transforms": {edge.name: _edge_document(edge) for edge in comparison.edges},
         "only_in_first": list(comparison.only_in_a),
         "only_in_second": list(comparison.only_in_b),
-        "noise": {it.name: _present({"first": it.a, "second": it.b}) for it in comparison.noise},
+        "noise": {
+            noise_change.name: _present({"first": noise_change.a, "second": noise_change.b})
+            for noise_change in comparison.noise
+        },
     }
     if comparison.lens is not None:
         document["camera"] = _lens_document(comparison.lens)
@@ -432,8 +438,12 @@ def _lens_document(lens: LensChange) -> dict[str, Any]:
     return document
 
 
-def _significance_document(it: Significance) -> dict[str, Any]:
-    return {"is_change": it.is_change, "p_value": it.p_value, "limit": it.limit}
+def _significance_document(significance: Significance) -> dict[str, Any]:
+    return {
+        "is_change": significance.is_change,
+        "p_value": significance.p_value,
+        "limit": significance.limit,
+    }
 
 
 def _present(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -113,8 +113,8 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
     """
     check_schema(document)
     form = read(CalibrationForm, document, "")
-    own = {it.name for it in fields(CalibrationForm)}
-    rest = {key: it for key, it in document.items() if key not in own}
+    own = {entry.name for entry in fields(CalibrationForm)}
+    rest = {key: value for key, value in document.items() if key not in own}
     return {
         "session_name": form.session.name,
         "session_sha256": form.session.sha256,

@@ -59,7 +59,7 @@ class Edge:
 
     def place_words(self, decimals: int = 2) -> str:
         """Where it is, in millimetres with so many decimals."""
-        x, y, z = (f"{1e3 * it:.{decimals}f}" for it in self.transform.translation)
+        x, y, z = (f"{1e3 * value:.{decimals}f}" for value in self.transform.translation)
         return f"({x}, {y}, {z}) mm"
 
 
@@ -157,7 +157,7 @@ def _edge_form(edge: Edge) -> EdgeForm:
 
 StoredPose = Annotated[FloatArray, Written(PoseForm.of, PoseForm.pose, PoseForm)]
 StoredEdge = Annotated[
-    Edge, Written(_edge_form, lambda it, path: Edge(it.pose(path), it.covariance), EdgeForm)
+    Edge, Written(_edge_form, lambda item, path: Edge(item.pose(path), item.covariance), EdgeForm)
 ]
 
 

@@ -62,9 +62,9 @@ def magnification(evidence: Iterable[ViewEvidence], image_width: int) -> int:
         image's width long.
     """
     errors = [
-        it.predicted_px - it.corners.px
-        for it in evidence
-        if it.corners is not None and it.predicted_px is not None
+        view.predicted_px - view.corners.px
+        for view in evidence
+        if view.corners is not None and view.predicted_px is not None
     ]
     if not errors or image_width <= 0:
         return 1

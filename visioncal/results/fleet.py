@@ -132,7 +132,7 @@ def row_of(name: str, session: str, found: Calibration, version: str) -> FleetRo
         mount=found.mount,
         camera="" if size is None else f"{size[0]} x {size[1]}",
         views=len(found.views),
-        used=sum(it.used for it in found.views),
+        used=sum(view.used for view in found.views),
         residual_mm=found.rms.mm,
         residual_deg=found.rms.deg,
         residual_px=found.rms.px,
@@ -143,14 +143,16 @@ def row_of(name: str, session: str, found: Calibration, version: str) -> FleetRo
         sigma_deg=edge.sigma_deg if edge.oriented else None,
         radius95_mm=None if known is None else known.radius95_mm,
         arm_mm=None if arm is None else arm.sigma_mm,
-        drift_mm=None if drift is None else max((it.drift_mm for it in drift.course), default=0.0),
+        drift_mm=None
+        if drift is None
+        else max((point.drift_mm for point in drift.course), default=0.0),
         focal_px=None if matrix is None else float(np.mean(matrix[:2])),
     )
 
 
 def camera_edge(found: Calibration) -> str:
     """The name of the transform that places the camera, or what is observed in its place."""
-    placed = (it for it in found.edges if it.rpartition("_from_")[2].startswith("cam"))
+    placed = (edge for edge in found.edges if edge.rpartition("_from_")[2].startswith("cam"))
     return next(placed, next(iter(found.edges)))
 
 
@@ -180,19 +182,19 @@ class CellFigures:
 def cell_figures(rows: Sequence[FleetRow]) -> list[CellFigures]:
     """The figures of simulated cells by what they have in common."""
     groups: dict[str, list[FleetRow]] = defaultdict(list)
-    for it in sorted(rows, key=lambda it: it.name):
-        groups[it.group].append(it)
+    for item in sorted(rows, key=lambda row: row.name):
+        groups[item.group].append(item)
 
     def share(some: Sequence[FleetRow], field: str, percent: float) -> float | None:
-        values = [value for it in some if (value := getattr(it, field)) is not None]
+        values = [value for row in some if (value := getattr(row, field)) is not None]
         return float(np.percentile(values, percent)) if values else None
 
     return [
         CellFigures(
             name,
             len(some),
-            sum(it.state != "failed" for it in some),
-            sum(it.verdict == "good" for it in some),
+            sum(row.state != "failed" for row in some),
+            sum(row.verdict == "good" for row in some),
             share(some, "radius95_mm", 50.0),
             share(some, "sigma_mm", 50.0),
             share(some, "error_mm", 95.0),
@@ -240,14 +242,14 @@ def with_outliers(rows: Sequence[FleetRow]) -> list[FleetRow]:
     for name, score, sentence in [*_odd_models(rows), *_odd_figures(rows)]:
         scores[name] = max(scores[name], score)
         words[name].append(sentence)
-    found = [replace(it, score=scores[it.name], stands_out="; ".join(words[it.name]))
-             for it in rows]  # fmt: skip
+    found = [replace(row, score=scores[row.name], stands_out="; ".join(words[row.name]))
+             for row in rows]  # fmt: skip
     order = {"": 0, "bad": 1, "check": 2, "good": 3}
-    return sorted(found, key=lambda it: (-it.score, order.get(it.verdict, 0), it.name))
+    return sorted(found, key=lambda value: (-value.score, order.get(value.verdict, 0), value.name))
 
 
 def _odd_models(rows: Sequence[FleetRow]) -> list[tuple[str, float, str]]:
-    counts = Counter(it.robot for it in rows if it.robot)
+    counts = Counter(row.robot for row in rows if row.robot)
     if not counts:
         return []
     usual, most = counts.most_common(1)[0]
@@ -255,9 +257,9 @@ def _odd_models(rows: Sequence[FleetRow]) -> list[tuple[str, float, str]]:
     if total < _FEWEST or most < _MOST * total:
         return []
     return [
-        (it.name, _ODD_MODEL, f"its robot is a {it.robot}, where {most} of {total} are {usual}")
-        for it in rows
-        if it.robot and it.robot != usual and counts[it.robot] <= _FEW * total
+        (row.name, _ODD_MODEL, f"its robot is a {row.robot}, where {most} of {total} are {usual}")
+        for row in rows
+        if row.robot and row.robot != usual and counts[row.robot] <= _FEW * total
     ]
 
 
@@ -265,11 +267,11 @@ def _odd_figures(rows: Sequence[FleetRow]) -> list[tuple[str, float, str]]:
     found = []
     for field, measure in _MEASURES.items():
         groups: dict[tuple[str, str], list[tuple[str, float]]] = defaultdict(list)
-        for it in rows:
-            value = getattr(it, field)
+        for row in rows:
+            value = getattr(row, field)
             if value is not None and value > 0.0:
-                camera = it.camera if field == "focal_px" else ""
-                groups[it.robot, camera].append((it.name, value))
+                camera = row.camera if field == "focal_px" else ""
+                groups[row.robot, camera].append((row.name, value))
         for members in groups.values():
             if len(members) >= _FEWEST:
                 found += _beyond(members, measure)
@@ -330,7 +332,7 @@ def _change(old: Calibration | None, new: Calibration | None) -> str:
     words = []
     if old.verdict.status != new.verdict.status:
         words.append(f"verdict {new.verdict.status}, was {old.verdict.status}")
-    gone = [it for it in old.edges if it not in new.edges]
+    gone = [edge for edge in old.edges if edge not in new.edges]
     words += [f"{name} is gone" for name in gone]
     for name, edge in old.edges.items():
         if name in gone:

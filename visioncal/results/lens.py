@@ -91,8 +91,8 @@ _StoredCamera = Annotated[
     Camera,
     INLINE,
     Written(
-        lambda it: it,
-        lambda it, _: Camera(it.model, it.resolution, it.matrix, it.distortion),
+        lambda item: item,
+        lambda item, _: Camera(item.model, item.resolution, item.matrix, item.distortion),
         CameraForm,
     ),
 ]
@@ -124,9 +124,9 @@ class CameraResult:
             ValueError: They are not.
         """
         size = 4 + len(self.camera.distortion)
-        for it in (self.covariance, self.edge_covariance):
-            if it is not None and len(it) != size:
-                raise ValueError(f"a covariance has {len(it)} rows; {size} are needed")
+        for array in (self.covariance, self.edge_covariance):
+            if array is not None and len(array) != size:
+                raise ValueError(f"a covariance has {len(array)} rows; {size} are needed")
         if self.field is not None:
             count = self.displacements(np.zeros((1, 2))).shape[2]
             for name in ("coefficients", "root", "intrinsics_covariance", "edge_covariance"):

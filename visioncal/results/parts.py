@@ -22,7 +22,7 @@ HELD_BACK = "held out of the fit by the session (role = holdout)"
 
 
 _OF_ROBOT = Written(
-    lambda it: dict(it.document), lambda it, _: Robot.from_document(it) if it else None
+    lambda item: dict(item.document), lambda item, _: Robot.from_document(item) if item else None
 )
 
 
@@ -68,7 +68,7 @@ class SolverResult:
     @property
     def transforms(self) -> dict[str, RigidTransform]:
         """Both edges by name."""
-        return {name: RigidTransform.from_matrix(it) for name, it in self.matrices.items()}
+        return {name: RigidTransform.from_matrix(matrix) for name, matrix in self.matrices.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +183,7 @@ class NeedMet:
 
     def of(self, camera: str, robot: str) -> "NeedMet":
         """What is said of one camera and robot; of those that are no pair, of all."""
-        mine = [it for it in self.pairs if (it.camera, it.robot) == (camera, robot)]
+        mine = [pair for pair in self.pairs if (pair.camera, pair.robot) == (camera, robot)]
         return NeedMet(self.need, mine[0].probability) if mine else self
 
 
@@ -261,14 +261,14 @@ class VerdictForm:
 
     def _earlier(self) -> Iterator[Finding]:
         """Findings of reasons and causes, of which a reason may begin with a cause's sentence."""
-        causes = {it.sentence: it for it in self.causes}
+        causes = {cause.sentence: cause for cause in self.causes}
         for reason in self.reasons:
-            begun = next((it for it in causes if reason.startswith(it)), None)
+            begun = next((cause for cause in causes if reason.startswith(cause)), None)
             if begun is None:
                 yield Finding("remark", reason)
             else:
                 yield causes.pop(begun).finding(reason)
-        yield from (it.finding(sentence) for sentence, it in causes.items())
+        yield from (cause.finding(sentence) for sentence, cause in causes.items())
 
 
 StoredVerdict = Annotated[Verdict, Written(VerdictForm.of, VerdictForm.verdict, VerdictForm)]

@@ -66,7 +66,7 @@ def check_resolution(
     camera = calibration.camera
     if camera is None or resolution == camera.camera.resolution:
         return
-    shown, needed = (f"{it[0]} x {it[1]}" for it in (resolution, camera.camera.resolution))
+    shown, needed = (f"{pair[0]} x {pair[1]}" for pair in (resolution, camera.camera.resolution))
     raise DataError(
         f"session {session.name!r}: its images have {shown} pixels, and the calibrated camera has "
         f"{needed}.",

@@ -116,7 +116,7 @@ class Calibration(CalibrationSections):
     @property
     def next_steps(self) -> tuple[Step, ...]:
         """What to do about what was found, of tools and fixtures, too; the most pressing first."""
-        doubtful = (name for name, it in self.frames.items() if it.verdict.status != "good")
+        doubtful = (name for name, frame in self.frames.items() if frame.verdict.status != "good")
         frames = (Step(f"Read what was found of {name} before it is used.") for name in doubtful)
         return (*self.verdict.next_steps, *frames)
 
@@ -160,7 +160,7 @@ class Calibration(CalibrationSections):
             raise DataError(
                 f"calibration {self.session_name!r} is of one camera and one robot, which have no "
                 "names.",
-                culprits=[f"--{it}" for it in PARTS if choice.of(it)],
+                culprits=[f"--{part}" for part in PARTS if choice.of(part)],
                 next_step="Leave their names out.",
             )
         return self
@@ -173,21 +173,21 @@ class Calibration(CalibrationSections):
     @property
     def placed(self) -> ByName[Edge]:
         """The estimated transforms by name with their covariances, frames among them."""
-        return ByName({**self.edges, **{name: it.edge for name, it in self.frames.items()}})
+        return ByName({**self.edges, **{name: frame.edge for name, frame in self.frames.items()}})
 
     def __repr__(self) -> str:
         title = f"Calibration of {self.session_name!r}: {self.verdict.status}"
         return text_card(title, self._facts)
 
     def _repr_html_(self) -> str:
-        steps = (f"Next: {it}" for it in self.verdict.next_steps[:1])
+        steps = (f"Next: {step}" for step in self.verdict.next_steps[:1])
         says = (*self.verdict.top, *steps)
         title = f"Calibration of {self.session_name}"
         return html_card(title, self._facts, self.verdict.status, says)
 
     @property
     def _facts(self) -> dict[str, str]:
-        used = sum(it.used for it in self.views)
+        used = sum(view.used for view in self.views)
         left_out = self.validation.held_out
         turned = "" if left_out.deg is None else f", {figure(left_out.deg)} deg"
         return {
@@ -204,7 +204,7 @@ class Calibration(CalibrationSections):
 
         Columns are the attributes of `ViewResult`; what was not computed is None (NaN in a frame).
         """
-        records = [asdict(it) for it in self.views]
+        records = [asdict(view) for view in self.views]
         if find_spec("pandas") is None:
             return records
         return import_module("pandas").DataFrame.from_records(records, index="view")

@@ -106,7 +106,7 @@ class BoardResult(Section):
     @property
     def values(self) -> FloatArray:
         """(10,) the shape in the order of `BOARD_NAMES`."""
-        return np.array([self.shape.get(it, 0.0) for it in BOARD_NAMES])
+        return np.array([self.shape.get(name, 0.0) for name in BOARD_NAMES])
 
     @property
     def is_bent(self) -> bool:
@@ -180,8 +180,8 @@ class UncertaintyResult(Section):
     @property
     def parts_mm(self) -> dict[str, float]:
         """Standard deviation by source, the largest first [mm]; their squares add up."""
-        parts = [(name, it) for name, it in self.budget_mm.items() if name != "total"]
-        return dict(sorted(parts, key=lambda it: -it[1]))
+        parts = [(name, value) for name, value in self.budget_mm.items() if name != "total"]
+        return dict(sorted(parts, key=lambda pair: -pair[1]))
 
     @property
     def total_mm(self) -> float:

@@ -27,7 +27,7 @@ def whole_fields(cell: Alignment) -> dict[str, Any]:
     """The fields of a calibration that stands for a whole cell."""
     rms = rms_of(cell.sights)
     cameras = frames_of_kind(cell.frames, "camera")
-    carried = [bool(robots_between(cell.frames, it, CELL)) for it in cameras]
+    carried = [bool(robots_between(cell.frames, camera, CELL)) for camera in cameras]
     return {
         "session_name": cell.session_name,
         "session_sha256": cell.session_sha256,
@@ -56,13 +56,13 @@ def selected_fields(cell: Alignment, choice: Choice, needs: Collection[Part]) ->
     chosen = _chosen(cell, choice, needs)
     chain = _chain(cell, chosen)
     nothing = np.zeros((0, len(cell.joint_covariance)))
-    jacobian = np.concatenate([nothing, *(it[1] for it in chain.values())])
+    jacobian = np.concatenate([nothing, *(pair[1] for pair in chain.values())])
     covariance = jacobian @ cell.joint_covariance @ jacobian.T
     arm = cell.arms.get(chosen.robot or "robot", RobotResult())
     sights = [
-        it
-        for it in cell.sights
-        if chosen.camera in ("", it.seer) and chosen.target in ("", it.seen)
+        sight
+        for sight in cell.sights
+        if chosen.camera in ("", sight.seer) and chosen.target in ("", sight.seen)
     ]
     rms, target = rms_of(sights), thing_name(chosen.target, "target")
     camera = cell.cameras.get(chosen.camera)
@@ -81,7 +81,7 @@ def selected_fields(cell: Alignment, choice: Choice, needs: Collection[Part]) ->
         "camera": None if camera is None else camera.carried(jacobian),
         "robot": arm.model,
         "frames": _placed(cell, chosen),
-        **{it.name: getattr(arm, it.name) for it in entries(ArmSections)},
+        **{entry.name: getattr(arm, entry.name) for entry in entries(ArmSections)},
         "clock": _clock(cell, chosen),
         "uncertainty": _intervals(cell, chosen),
         "board": cell.boards.get(target),
@@ -111,15 +111,15 @@ def boards_before(cell: Alignment, choice: Choice, needs: Collection[Part]) -> d
     """The targets that stand still before a robot's base, as `base_from_target_floor`."""
     base = _chosen(cell, choice, needs).base
     return {
-        f"base_from_{it}": cell.between(base, it)
-        for it in frames_of_kind(cell.frames, "target")
-        if not robots_between(cell.frames, base, it)
+        f"base_from_{name}": cell.between(base, name)
+        for name in frames_of_kind(cell.frames, "target")
+        if not robots_between(cell.frames, base, name)
     }
 
 
 def _chosen(cell: Alignment, choice: Choice, needs: Collection[Part]) -> Chosen:
     """What is meant, where all stood last; of what is neither needed nor named, nothing."""
-    before = {it.before for it in cell.moved}
+    before = {move.before for move in cell.moved}
     frames = {name: on for name, on in cell.frames.items() if name not in before}
     chosen = choose(frames, choice, needs, label=f"the cell {cell.session_name!r}")
     kept = {*needs, *(part for part in PARTS if choice.of(part))}
@@ -151,14 +151,15 @@ def _noise(cell: Alignment, chosen: Chosen, rms: Rms) -> dict[str, float]:
     """The noise of corners and of the robot."""
     # Of poses that were measured without corners, that of camera and robot together is as this pair
     # scatters: the camera's own level is a mean over all that it sees, near and far.
-    robot, camera = (cell.noise.get(it, {}) for it in (chosen.robot or "robot", chosen.camera))
+    robot, camera = (cell.noise.get(name, {}) for name in (chosen.robot or "robot", chosen.camera))
     found = {"pixel_px": camera["pixel_px"]} if "pixel_px" in camera else {}
     names = ("translation_mm", "rotation_deg")
     found |= {f"robot_{name}": robot[name] for name in names if name in robot}
     if chosen.camera and chosen.target and "pixel_px" not in camera:
         each = (rms.mm, rms.deg or 0.0)
         found |= {
-            f"combined_{name}": it / np.sqrt(3.0) for name, it in zip(names, each, strict=True)
+            f"combined_{name}": value / np.sqrt(3.0)
+            for name, value in zip(names, each, strict=True)
         }
     return found
 
@@ -198,7 +199,7 @@ def _intervals(cell: Alignment, chosen: Chosen) -> NoiseIntervals | None:
     """How well the robot's noise is known."""
     known = {} if cell.uncertainty is None else cell.uncertainty.noise_95
     found = known.get(chosen.robot or "robot", {})
-    named = {f"robot_{name}": it for name, it in found.items()}
+    named = {f"robot_{name}": pair for name, pair in found.items()}
     return NoiseIntervals(noise_95=named) if named else None
 
 
@@ -216,8 +217,8 @@ def _joint_fit(cell: Alignment, chosen: Chosen, jacobian: FloatArray) -> JointFi
     columns: list[int] = []
     at = jacobian.shape[1]
     for part, name, first in ((fit.cameras, camera, 0), (fit.targets, target, lens_count)):
-        for it, places in part.items():
-            if it == name:
+        for word, places in part.items():
+            if word == name:
                 looks += [first + place for place in places]
                 columns += range(at, at + len(places))
             at += len(places)

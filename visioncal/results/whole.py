@@ -86,19 +86,19 @@ class CellView:
         """Writes an observation."""
         both = {sight.seer, sight.seen} <= cell.frames.keys()
         robots = robots_between(cell.frames, sight.seer, sight.seen) if both else ()
-        figures = {name: it for name, it in vars(sight).items() if name not in ("seer", "seen")}
-        between = tuple(it or "robot" for it in robots)
+        figures = {name: var for name, var in vars(sight).items() if name not in ("seer", "seen")}
+        between = tuple(robot or "robot" for robot in robots)
         return cls(robots=between, **_seer_and_seen(sight), **figures)
 
     def sight(self, tree: Mapping[str, str]) -> Sight:
         """Reads it."""
         names = ("camera", "instrument", "target", "point")
-        there = {it: name for it in names if (name := getattr(self, it)) is not None}
+        there = {word: name for word in names if (name := getattr(self, word)) is not None}
         seer, seen = (
             next(_frame(tree, kind, there[kind]) for kind in kinds if kind in there)
             for kinds in (names[:2], names[2:])
         )
-        figures = {name: it for name, it in vars(self).items() if name not in (*names, "robots")}
+        figures = {name: var for name, var in vars(self).items() if name not in (*names, "robots")}
         return Sight(seer=seer, seen=seen, **figures)
 
 
@@ -205,9 +205,9 @@ def whole_document(cell: Alignment) -> dict[str, Any]:
         tree=cell.frames,
         transforms=cell.edges,
         joint_covariance=JointCovariance.of(cell.edges, cell.joint_covariance),
-        cameras={thing_name(frame, "camera"): it for frame, it in cell.cameras.items()},
+        cameras={thing_name(frame, "camera"): camera for frame, camera in cell.cameras.items()},
         robots=cell.arms,
-        views=tuple(CellView.of(cell, it) for it in cell.sights),
+        views=tuple(CellView.of(cell, sight) for sight in cell.sights),
         rms=rms_of(cell.sights),
         validation=_validation(cell) if cell.left_out else None,
         frames=cell.placed,
@@ -224,18 +224,18 @@ def read_whole(document: Mapping[str, Any]) -> Alignment:
     """
     check_schema(document)
     form = read(CellForm, document, "")
-    own = {it.name for it in fields(CellForm)}
-    rest = {key: it for key, it in document.items() if key not in own}
+    own = {entry.name for entry in fields(CellForm)}
+    rest = {key: value for key, value in document.items() if key not in own}
     tree = form.tree
     return Alignment(
         session_name=form.session.name,
         session_sha256=form.session.sha256,
         frames=tree,
-        robots={it: thing_name(it, "robot") for it in frames_of_kind(tree, "flange")},
+        robots={name: thing_name(name, "robot") for name in frames_of_kind(tree, "flange")},
         edges=form.transforms,
         joint_covariance=form.joint_covariance.matrix,
-        cameras={_frame(tree, "camera", name): it for name, it in form.cameras.items()},
-        sights=tuple(it.sight(tree) for it in form.views),
+        cameras={_frame(tree, "camera", name): camera for name, camera in form.cameras.items()},
+        sights=tuple(view.sight(tree) for view in form.views),
         arms=form.robots,
         placed=form.frames,
         left_out="" if form.validation is None else form.validation.method,
@@ -247,9 +247,9 @@ def read_whole(document: Mapping[str, Any]) -> Alignment:
 def _validation(cell: Alignment) -> CellValidation:
     """Residuals of what was left out of fits in turn: of all, and by camera and target."""
     pairs: dict[tuple[str, str], list[Sight]] = {}
-    for it in cell.sights:
-        if it.left_out_mm is not None:
-            pairs.setdefault((it.seer, it.seen), []).append(it)
+    for sight in cell.sights:
+        if sight.left_out_mm is not None:
+            pairs.setdefault((sight.seer, sight.seen), []).append(sight)
     return CellValidation(
         method=cell.left_out,
         held_out=left_out_rms(cell.sights),
@@ -271,8 +271,13 @@ def _seer_and_seen(sight: Sight) -> dict[str, Any]:
 def left_out_rms(sights: Iterable[Sight]) -> Rms:
     """Root mean square residuals of observations by fits that were made without them."""
     unseen = (
-        replace(it, residual_mm=it.left_out_mm, residual_deg=it.left_out_deg, rms_px=it.left_out_px)
-        for it in sights
+        replace(
+            sight,
+            residual_mm=sight.left_out_mm,
+            residual_deg=sight.left_out_deg,
+            rms_px=sight.left_out_px,
+        )
+        for sight in sights
     )
     return rms_of(unseen)
 
@@ -280,25 +285,25 @@ def left_out_rms(sights: Iterable[Sight]) -> Rms:
 def holdout_rms(sights: Iterable[Sight]) -> Rms | None:
     """Root mean square residuals of what the session holds back; None where that is nothing."""
     held = [
-        replace(it, used=True)
-        for it in sights
-        if it.reason == HELD_BACK and it.residual_mm is not None
+        replace(sight, used=True)
+        for sight in sights
+        if sight.reason == HELD_BACK and sight.residual_mm is not None
     ]
     return rms_of(held) if held else None
 
 
 def rms_of(sights: Iterable[Sight]) -> Rms:
     """Root mean square residuals over the used ones of some observations; zero of none."""
-    used = [it for it in sights if it.used]
+    used = [sight for sight in sights if sight.used]
 
     def rms(values: list[float | None]) -> float | None:
-        known = [it for it in values if it is not None]
+        known = [value for value in values if value is not None]
         return float(np.sqrt(np.mean(np.square(known)))) if known else None
 
     return Rms(
-        rms([it.residual_mm for it in used]) or 0.0,
-        rms([it.residual_deg for it in used]),
-        rms([it.rms_px for it in used]),
+        rms([sight.residual_mm for sight in used]) or 0.0,
+        rms([sight.residual_deg for sight in used]),
+        rms([sight.rms_px for sight in used]),
     )
 
 
@@ -306,9 +311,15 @@ def view_results(sights: Iterable[Sight]) -> tuple[ViewResult, ...]:
     """Observations as one camera's views."""
     return tuple(
         ViewResult(
-            it.view, it.used, it.reason, it.corners, it.rms_px, it.residual_mm, it.residual_deg
+            sight.view,
+            sight.used,
+            sight.reason,
+            sight.corners,
+            sight.rms_px,
+            sight.residual_mm,
+            sight.residual_deg,
         )
-        for it in sights
+        for sight in sights
     )
 
 

@@ -148,7 +148,7 @@ def chain_document(name: str, tip: str, chain: Chain) -> dict[str, Any]:
             "placement": chain.placements[place].tolist(),
         }
         limits = {"lower": chain.lower[place], "upper": chain.upper[place]}
-        row |= {key: float(it) for key, it in limits.items() if np.isfinite(it)}
+        row |= {key: float(limit) for key, limit in limits.items() if np.isfinite(limit)}
         row |= dict(zip(FUNCTION_NAMES, chain.functions[place].tolist(), strict=True))
         if chain.harmonics is not None:
             row["harmonics"] = chain.harmonics[place].tolist()
@@ -203,7 +203,7 @@ def _harmonics(rows: Sequence[Table]) -> FloatArray | None:
             raise row.refuse("harmonics", pairs, needed)
     return np.array(
         [
-            [number_list(Table({"harmonics": it}, row.label), "harmonics", 2) for it in pairs]
+            [number_list(Table({"harmonics": pair}, row.label), "harmonics", 2) for pair in pairs]
             for row, pairs in zip(rows, given, strict=True)
         ]
     )
@@ -276,7 +276,7 @@ def _placement(row: Table) -> FloatArray:
     if not isinstance(rows, Sequence) or isinstance(rows, str) or len(rows) != 4:
         raise row.refuse("placement", rows, needed)
     matrix = np.array(
-        [number_list(Table({"placement": it}, row.label), "placement", 4) for it in rows]
+        [number_list(Table({"placement": value}, row.label), "placement", 4) for value in rows]
     )
     _check_rigid(matrix, row.label)
     return matrix

@@ -156,7 +156,9 @@ class Collisions:
         import pinocchio as pin
 
         pin.computeDistances(self._model, self._data, self._geometry, self._memory, positions)
-        return np.array([it.min_distance for it in self._memory.distanceResults])
+        return np.array(
+            [distanceresult.min_distance for distanceresult in self._memory.distanceResults]
+        )
 
     def _watch(self, pairs: _Pairs) -> None:
         """Makes these the pairs that are looked at."""
@@ -178,11 +180,11 @@ class Collisions:
         most = np.where(chain.prismatic, _TRAVEL_M, _TURN_RAD)
         lower, upper = np.maximum(chain.lower, -most), np.minimum(chain.upper, most)
         postures = chain.effective(rng.uniform(lower, upper, (_SAMPLES, len(chain))))
-        margin_m = np.array([self._distances(it) for it in postures]) - pairs.needed_m
+        margin_m = np.array([self._distances(posture) for posture in postures]) - pairs.needed_m
         often = (margin_m < SLACK_M).mean(axis=0)
-        parts = np.array([*(it.of_arm for it in bodies), False])[pairs.bodies].all(axis=1)
-        carried = np.array([*(it.link > 0 for it in bodies), False])[pairs.bodies].all(axis=1)
-        stands = np.array([*(it.link == 1 for it in bodies), False])[pairs.bodies].any(axis=1)
+        parts = np.array([*(body.of_arm for body in bodies), False])[pairs.bodies].all(axis=1)
+        carried = np.array([*(body.link > 0 for body in bodies), False])[pairs.bodies].all(axis=1)
+        stands = np.array([*(body.link == 1 for body in bodies), False])[pairs.bodies].any(axis=1)
         # What a later link touches in every posture is an error of the cell, which must show.
         never = (often == 1.0) & (parts | carried | stands)
         out = never | (parts & (often > _OFTEN))
@@ -271,7 +273,9 @@ def urdf_bodies(robot: Robot) -> tuple[tuple[Body, ...], frozenset[int]]:
     for link in root.findall("link"):
         for collision in link.findall("collision"):
             shape = collision.find("geometry")
-            if shape is None or all(shape.find(it) is None for it in ("box", "cylinder", "sphere")):
+            if shape is None or all(
+                shape.find(name) is None for name in ("box", "cylinder", "sphere")
+            ):
                 link.remove(collision)
                 elsewhere.add(link.get("name"))
     text = ElementTree.tostring(root, encoding="unicode")
@@ -281,8 +285,8 @@ def urdf_bodies(robot: Robot) -> tuple[tuple[Body, ...], frozenset[int]]:
     others = [joint for joint in range(1, model.njoints) if model.names[joint] not in places]
     model, reduced = pin.buildReducedModel(model, [geometry], others, pin.neutral(model))
     bodies = [
-        _body(it, places.get(model.names[it.parentJoint], 0), robot)
-        for it in reduced[0].geometryObjects
+        _body(geometryobject, places.get(model.names[geometryobject.parentJoint], 0), robot)
+        for geometryobject in reduced[0].geometryObjects
     ]
     undrawn = {
         places.get(model.names[frame.parentJoint], 0)
@@ -292,8 +296,8 @@ def urdf_bodies(robot: Robot) -> tuple[tuple[Body, ...], frozenset[int]]:
     return tuple(bodies), frozenset(undrawn)
 
 
-def _body(it: "pin.GeometryObject", link: int, robot: Robot) -> Body:
-    name, pose, form = body_name(robot, link), it.placement.homogeneous, it.geometry
+def _body(item: "pin.GeometryObject", link: int, robot: Robot) -> Body:
+    name, pose, form = body_name(robot, link), item.placement.homogeneous, item.geometry
     if type(form).__name__ == "Box":
         return Body(name, link, "box", 2.0 * np.asarray(form.halfSide), pose, of_arm=True)
     if type(form).__name__ == "Cylinder":

@@ -49,7 +49,7 @@ class _Row:
 
     @property
     def across(self) -> FloatArray:
-        return about_x(*(np.asarray(it) for it in (self.a, self.alpha, self.beta)))
+        return about_x(*(np.asarray(value) for value in (self.a, self.alpha, self.beta)))
 
     @property
     def transform(self) -> FloatArray:
@@ -196,7 +196,7 @@ def _of_table(
     document = table_document(table, source)
     for row, known in zip(document["joint"], robot.document["joint"], strict=True):
         row |= {key: known[key] for key in LINK_KEYS if key in known}
-    kept = {it: robot.document[it] for it in ("gravity_m_s2",) if it in robot.document}
+    kept = {name: robot.document[name] for name in ("gravity_m_s2",) if name in robot.document}
     return Robot.from_document(document | kept | dict(gravity))
 
 

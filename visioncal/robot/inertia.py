@@ -55,7 +55,7 @@ class Inertias:
     @classmethod
     def of_bodies(cls, kg: FloatArray, centres_m: FloatArray, about: FloatArray) -> "Inertias":
         """Of masses (n,) [kg], centres (n, 3) [m] and inertias about these (n, 3, 3) [kg m^2]."""
-        turned = np.array([skew(it) for it in centres_m])
+        turned = np.array([skew(centre) for centre in centres_m])
         about_origin = about - kg[:, None, None] * turned @ turned
         moments = kg[:, None] * centres_m
         return cls(np.column_stack([kg, moments, entries(about_origin)]))
@@ -71,7 +71,7 @@ class Inertias:
     def about_centres(self) -> FloatArray:
         """(n, 3, 3) inertias about the centres of mass, along the frames' axes [kg m^2]."""
         masses = self.masses
-        turned = np.array([skew(it) for it in masses.centres_m])
+        turned = np.array([skew(centre) for centre in masses.centres_m])
         found = matrices(self.values[:, 4:]) + masses.kg[:, None, None] * turned @ turned
         return np.asarray(found)
 
@@ -85,7 +85,7 @@ class Inertias:
         """The joints' entries in a description whose rows are the joints' frames."""
         about = entries(self.about_centres).tolist()
         rows = zip(self.masses.rows(), about, strict=True)
-        return [mass | {INERTIA_KEY: it} for mass, it in rows]
+        return [mass | {INERTIA_KEY: value} for mass, value in rows]
 
 
 def entries(full: FloatArray) -> FloatArray:
@@ -190,7 +190,7 @@ class LogCholesky:
             raise DataError(
                 f"robot: the inertia stated for link {wrong[0] + 1} is that of no body: its "
                 "second moments of mass are negative.",
-                culprits=[f"joint {it + 1}" for it in wrong],
+                culprits=[f"joint {index + 1}" for index in wrong],
                 next_step="Check mass_kg, com_m and inertia_kg_m2 (about the centre of mass).",
             )
         raised = np.maximum(values, _THIN * values[:, -1:])
@@ -203,12 +203,17 @@ class LogCholesky:
         """(n, 10) inertial parameters of (n, 10) coordinates."""
         import pinocchio as pin
 
-        own = [pin.LogCholeskyParameters(it).toDynamicParameters() for it in coordinates]
+        own = [
+            pin.LogCholeskyParameters(coordinate).toDynamicParameters()
+            for coordinate in coordinates
+        ]
         return np.asarray((self.maps @ np.array(own)[:, :, None])[:, :, 0])
 
     def jacobians(self, coordinates: FloatArray) -> FloatArray:
         """(n, 10, 10) derivatives of the parameters by the coordinates."""
         import pinocchio as pin
 
-        own = [pin.LogCholeskyParameters(it).calculateJacobian() for it in coordinates]
+        own = [
+            pin.LogCholeskyParameters(coordinate).calculateJacobian() for coordinate in coordinates
+        ]
         return np.asarray(self.maps @ np.array(own))

@@ -97,7 +97,7 @@ class _Bounds:
     def middle_and_half(self, around: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Middle (n,) and half (n,) of the range; about the given positions if unlimited."""
         known = np.isfinite(self.lower) & np.isfinite(self.upper)
-        lower, upper = (np.where(known, it, 0.0) for it in (self.lower, self.upper))
+        lower, upper = (np.where(known, array, 0.0) for array in (self.lower, self.upper))
         half = np.where(known, 0.5 * (upper - lower), _SPREAD)
         half = np.where(self.turning, np.minimum(half, _SPREAD), half)
         return np.where(known, 0.5 * (lower + upper), around), half
@@ -150,10 +150,10 @@ class Inverse:
         if first.reached and _widest(first.positions - wanted, bounds) <= widest_rad:
             return first
         tries = [first, *self._from_everywhere(goal, bounds, wanted)]
-        reached = [it for it in tries if it.reached]
+        reached = [posture for posture in tries if posture.reached]
         if reached:
-            return min(reached, key=lambda it: bounds.apart(it.positions - wanted))
-        nearest = min(tries, key=lambda it: it.off_m**2 + it.off_rad**2)
+            return min(reached, key=lambda value: bounds.apart(value.positions - wanted))
+        nearest = min(tries, key=lambda value: value.off_m**2 + value.off_rad**2)
         nearest = self._descend(goal, nearest.positions, bounds, wanted, settle=_POLISH)
         return replace(nearest, beyond=self._in_the_way(goal, wanted))
 
@@ -199,13 +199,15 @@ class Inverse:
             upper=np.full_like(self._bounds.upper, np.inf),
         )
         middle, _ = self._bounds.middle_and_half(wanted)
-        tries = [it for it in self._from_everywhere(goal, free, middle) if it.reached]
+        tries = [
+            posture for posture in self._from_everywhere(goal, free, middle) if posture.reached
+        ]
         if not tries:
             return ()
-        excess = [self._bounds.beyond(it.positions) for it in tries]
-        least = min(excess, key=lambda it: float(np.sum(it)))
+        excess = [self._bounds.beyond(posture.positions) for posture in tries]
+        least = min(excess, key=lambda value: float(np.sum(value)))
         names = zip(self._names, least, strict=True)
-        return tuple(name for name, it in names if it > 0.0)
+        return tuple(name for name, value in names if value > 0.0)
 
     def _descend(
         self,

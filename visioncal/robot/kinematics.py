@@ -119,7 +119,7 @@ def gravity_torques(model: "pin.Model", positions: FloatArray, gravity: FloatArr
 
     model.gravity.linear = gravity
     data = model.createData()
-    held = [pin.computeGeneralizedGravity(model, data, it).copy() for it in positions]
+    held = [pin.computeGeneralizedGravity(model, data, position).copy() for position in positions]
     return np.array(held).reshape(positions.shape)
 
 
@@ -231,18 +231,20 @@ def arm_of_urdf(table: Table) -> UrdfArm:
     others = [joint for joint in range(1, model.njoints) if joint not in on_way]
     arm = pin.buildReducedModel(model, others, pin.neutral(model))
     bodies = list(arm.inertias)[1:]
-    kg = np.array([it.mass for it in bodies])
+    kg = np.array([body.mass for body in bodies])
     rates = _rates_of_model(arm)
     if not kg.any():
         return UrdfArm(_chain_of_model(arm, tip), tip, None, None, rates)
-    inertias = Inertias(np.array([it.toDynamicParameters() for it in bodies]))
+    inertias = Inertias(np.array([body.toDynamicParameters() for body in bodies]))
     return UrdfArm(_chain_of_model(arm, tip), tip, inertias.masses, inertias, rates)
 
 
 def _rates_of_model(model: "pin.Model") -> Rates:
     """The limits of the joints' drives; a URDF that does not know one writes zero."""
-    known = [np.where(it > 0.0, it, np.inf) for it in (model.velocityLimit, model.effortLimit)]
-    speed, torque = (np.where(it < np.finfo(float).max, it, np.inf) for it in known)
+    known = [
+        np.where(value > 0.0, value, np.inf) for value in (model.velocityLimit, model.effortLimit)
+    ]
+    speed, torque = (np.where(array < np.finfo(float).max, array, np.inf) for array in known)
     return Rates(speed, np.full(len(speed), np.inf), torque)
 
 

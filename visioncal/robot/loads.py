@@ -42,7 +42,7 @@ class Masses:
     def rows(self) -> list[dict[str, Any]]:
         """The joints' entries in a description whose rows are the joints' frames."""
         columns = zip(self.kg.tolist(), self.centres_m.tolist(), strict=True)
-        return [dict(zip(MASS_KEYS, it, strict=True)) for it in columns]
+        return [dict(zip(MASS_KEYS, column, strict=True)) for column in columns]
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +110,7 @@ class Loads:
     def chosen(self, rows: IntArray | Mask) -> "Loads":
         """The loads of some of the stops, by their places or a mask."""
         parts = (self.payload_kg, self.payload_m, self.force_n, self.side)
-        return Loads(*(it[rows] for it in parts))
+        return Loads(*(part[rows] for part in parts))
 
     @property
     def rows(self) -> FloatArray:

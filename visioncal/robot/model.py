@@ -357,8 +357,8 @@ class Robot:
             if known is not None:
                 orders = max(known.shape[1], harmonics.shape[1])
                 known, harmonics = (
-                    np.pad(it, ((0, 0), (0, orders - it.shape[1]), (0, 0)))
-                    for it in (known, harmonics)
+                    np.pad(array, ((0, 0), (0, orders - array.shape[1]), (0, 0)))
+                    for array in (known, harmonics)
                 )
             chain = replace(chain, harmonics=harmonics if known is None else known + harmonics)
         document = chain_document(self.name, self.tip, chain)

@@ -46,6 +46,10 @@ class Rates:
         """The joints' entries in a description."""
         columns = np.stack([self.velocity, self.acceleration, self.torque], axis=1)
         return [
-            {key: float(it) for key, it in zip(RATE_KEYS, row, strict=True) if np.isfinite(it)}
+            {
+                key: float(value)
+                for key, value in zip(RATE_KEYS, row, strict=True)
+                if np.isfinite(value)
+            }
             for row in columns
         ]

@@ -75,7 +75,7 @@ def joint_torques(
     states = effective_states(robot, q, dq, ddq)
     parameters = inertias.values.ravel()
     found = regressors(robot.pinocchio_model, robot.gravity, states)
-    return np.array([parameters @ it for it in found]).reshape(np.shape(q))
+    return np.array([parameters @ array for array in found]).reshape(np.shape(q))
 
 
 def body_regressor(robot: Robot, q: FloatArray, dq: FloatArray, ddq: FloatArray) -> FloatArray:
@@ -106,7 +106,7 @@ def effective_states(
     Raises:
         DataError: A shape is wrong.
     """
-    q, dq, ddq = (np.asarray(it, dtype=float) for it in (q, dq, ddq))
+    q, dq, ddq = (np.asarray(array, dtype=float) for array in (q, dq, ddq))
     wanted = (len(q), robot.joint_count)
     if not q.shape == dq.shape == ddq.shape == wanted:
         raise DataError(
@@ -166,7 +166,7 @@ def weighed_model(robot: Robot, inertias: Inertias) -> "pin.Model":
     masses = inertias.masses
     lost = (masses.kg == 0.0) & inertias.values[:, 1:4].any(axis=1)
     if lost.any():
-        names = [name for name, it in zip(robot.joint_names, lost, strict=True) if it]
+        names = [name for name, value in zip(robot.joint_names, lost, strict=True) if value]
         raise DataError(
             f"robot {robot.name}: {', '.join(names)} have first moments and no mass.",
             culprits=names,

@@ -36,7 +36,7 @@ def weighed_urdf(robot: Robot, inertias: Inertias, notes: Sequence[str] = ()) ->
         )
     data = text.encode("utf-8")
     root, joints = joints_of(data)
-    links = {it.attributes["name"]: it for it in root.children if it.tag == "link"}
+    links = {child.attributes["name"]: child for child in root.children if child.tag == "link"}
     masses = inertias.masses
     bodies = zip(masses.kg.tolist(), masses.centres_m, inertias.about_centres, strict=True)
     edits = []
@@ -56,9 +56,9 @@ def _moving_with(link: str, joints: Mapping[str, Element], arm: Sequence[str]) -
     found = [link]
     for name in found:
         found += [
-            end_of(it, "child")
-            for joint, it in joints.items()
-            if end_of(it, "parent") == name and joint not in arm
+            end_of(element, "child")
+            for joint, element in joints.items()
+            if end_of(element, "parent") == name and joint not in arm
         ]
     return found
 

@@ -71,7 +71,9 @@ def corrected_tip(nominal: Robot, corrected: Robot) -> str:
 def joints_of(data: bytes) -> tuple[Element, dict[str, Element]]:
     """The root of a URDF, and its joints by name; those of transmissions are deeper down."""
     root = parse_xml(data, "the URDF")
-    return root, {it.attributes["name"]: it for it in root.children if it.tag == "joint"}
+    return root, {
+        child.attributes["name"]: child for child in root.children if child.tag == "joint"
+    }
 
 
 def end_of(joint: Element, end: str) -> str:
@@ -97,8 +99,10 @@ def _placement(joint: Element) -> FloatArray:
 
 def _of_tip(joints: Mapping[str, Element], robot: Robot) -> Element | None:
     """The fixed joint that places the tip; None where a moving joint does."""
-    fixed = {name: it for name, it in joints.items() if name not in robot.joint_names}
-    named = (it for name, it in fixed.items() if robot.tip in (name, end_of(it, "child")))
+    fixed = {name: joint for name, joint in joints.items() if name not in robot.joint_names}
+    named = (
+        element for name, element in fixed.items() if robot.tip in (name, end_of(element, "child"))
+    )
     return next(named, None)
 
 

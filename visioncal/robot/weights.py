@@ -32,12 +32,12 @@ class WeightFunctions:
         """Finds the functions of an arm, by postures all around."""
         q = np.random.default_rng(0).uniform(-np.pi, np.pi, (_POSTURES, robot.joint_count))
         jacobian = np.moveaxis(robot.weight_jacobian(q), 1, 0)
-        return cls(tuple(_independent(it) for it in jacobian))
+        return cls(tuple(_independent(value) for value in jacobian))
 
     @property
     def size(self) -> int:
         """How many functions there are in all."""
-        return sum(it.shape[1] for it in self.parts)
+        return sum(part.shape[1] for part in self.parts)
 
     def bends(self, robot: Robot, q: FloatArray) -> FloatArray:
         """The functions' values at (m, n) joint angles: (m, n, size), each for its joint alone."""

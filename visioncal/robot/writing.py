@@ -33,14 +33,14 @@ def table_toml(table: DHTable, source: str, notes: Sequence[str] = ()) -> str:
         source: Where its values come from.
         notes: Lines for a comment at its head.
     """
-    head = "".join(f"# {one_line(it)}\n" for it in notes)
+    head = "".join(f"# {one_line(note)}\n" for note in notes)
     return head + tomli_w.dumps(table_document(table, source))
 
 
 def numbers_text(pose: FloatArray) -> tuple[list[str], list[str]]:
     """Writes a (4, 4) pose [m] as xyz and rpy, each number so that it reads back the same."""
     # A negative zero would only raise questions.
-    numbers = [repr(it) for it in (write_pose(pose, POSE_FORMS["rpy"]) + 0.0).tolist()]
+    numbers = [repr(value) for value in (write_pose(pose, POSE_FORMS["rpy"]) + 0.0).tolist()]
     return numbers[:3], numbers[3:]
 
 
@@ -89,7 +89,7 @@ def small_urdf(robot: Robot, notes: Sequence[str] = ()) -> str:
         kind = "prismatic" if chain.prismatic[place] else turning
         lines.append(f'  <joint name={quoteattr(joint)} type="{kind}">')
         lines += _joint_lines(links[place], links[place + 1], chain.placements[place])
-        axis = " ".join(repr(it) for it in chain.axes[place].tolist())
+        axis = " ".join(repr(axis) for axis in chain.axes[place].tolist())
         lines.append(f'    <axis xyz="{axis}"/>')
         if bounded:
             lower, upper = map(float, limits)
@@ -106,10 +106,10 @@ def small_urdf(robot: Robot, notes: Sequence[str] = ()) -> str:
 
 def inertial_lines(kg: float, centre_m: FloatArray, about: FloatArray) -> list[str]:
     """Writes a body in its link's frame: mass, centre (3,), and inertia (3, 3) about the centre."""
-    xyz = " ".join(repr(it) for it in (centre_m + 0.0).tolist())
+    xyz = " ".join(repr(value) for value in (centre_m + 0.0).tolist())
     names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
     numbers = about[np.triu_indices(3)].tolist()
-    values = " ".join(f'{name}="{it!r}"' for name, it in zip(names, numbers, strict=True))
+    values = " ".join(f'{name}="{number!r}"' for name, number in zip(names, numbers, strict=True))
     return [
         "    <inertial>",
         f'      <origin xyz="{xyz}" rpy="0.0 0.0 0.0"/>',
@@ -125,7 +125,7 @@ def _inertials(robot: Robot) -> list[list[str]]:
         return [[] for _ in robot.joint_names]
     masses = robot.inertias.masses
     bodies = zip(masses.kg.tolist(), masses.centres_m, robot.inertias.about_centres, strict=True)
-    return [inertial_lines(*it) for it in bodies]
+    return [inertial_lines(*body) for body in bodies]
 
 
 def comment_lines(robot: Robot, notes: Sequence[str] = ()) -> list[str]:
@@ -133,8 +133,10 @@ def comment_lines(robot: Robot, notes: Sequence[str] = ()) -> list[str]:
     missing = unwritten(robot)
     said = f"Not in this file, for URDF cannot say it: {'; '.join(missing)}"
     # XML ends a comment at two hyphens.
-    texts = [re.sub("-(?=-)", "- ", one_line(it)) for it in (*notes, *([said] if missing else []))]
-    return [f"  <!-- {it} -->" for it in texts]
+    texts = [
+        re.sub("-(?=-)", "- ", one_line(note)) for note in (*notes, *([said] if missing else []))
+    ]
+    return [f"  <!-- {text} -->" for text in texts]
 
 
 def _joint_lines(parent: str, child: str, placement: FloatArray) -> list[str]:
@@ -177,7 +179,7 @@ def ur_kinematics_yaml(
     placements[0] = table.base @ placements[0]
     missing = unwritten(robot)
     said = [f"Not in this file, which has no field for it: {'; '.join(missing)}"] if missing else []
-    lines = [f"# {one_line(it)}" for it in (*notes, *said)]
+    lines = [f"# {one_line(note)}" for note in (*notes, *said)]
     rest = table.along_x[-1] @ table.flange
     if np.abs(rest - np.eye(4)).max() > 0.0:
         xyz, rpy = numbers_text(rest)
@@ -186,7 +188,7 @@ def ur_kinematics_yaml(
     for link, placement in zip(_UR_LINKS, placements, strict=True):
         xyz, rpy = numbers_text(placement)
         lines.append(f"  {link}:")
-        lines += [f"    {key}: {it}" for key, it in zip(_UR_FIELDS, [*xyz, *rpy], strict=True)]
+        lines += [f"    {key}: {name}" for key, name in zip(_UR_FIELDS, [*xyz, *rpy], strict=True)]
     return "\n".join([*lines, f"  hash: {calibration_hash}", ""])
 
 

@@ -64,8 +64,8 @@ def of_images(
     matrices = _matrices(poses, "images", len(images))
     paths = [f"images/{at:03d}.png" for at in range(len(images))]
     files = {
-        path: it if isinstance(it, bytes) else encode_png(it)
-        for path, it in zip(paths, images, strict=True)
+        path: image if isinstance(image, bytes) else encode_png(image)
+        for path, image in zip(paths, images, strict=True)
     }
     return _facts(matrices, board, cell, {"image": paths}, MemoryImages(files))
 
@@ -79,7 +79,7 @@ def of_corners(
 ) -> Facts:
     """The facts of a session of corners; see `Session.from_corners`."""
     matrices = _matrices(poses, "corners", len(corners))
-    read = [_corners(at, *it) for at, it in enumerate(corners)]
+    read = [_corners(at, *corner) for at, corner in enumerate(corners)]
     counts = [len(ids) for ids, _ in read]
     table = CornerTable(
         np.repeat(np.arange(len(read)), counts),
@@ -124,7 +124,8 @@ def _matrices(poses: Poses, what: str, count: int) -> FloatArray:
     """The (n, 4, 4) poses of as many views, checked."""
     given = poses.as_matrix() if isinstance(poses, RigidTransform) else poses
     matrices = [
-        np.array(it.as_matrix() if isinstance(it, RigidTransform) else it, float) for it in given
+        np.array(value.as_matrix() if isinstance(value, RigidTransform) else value, float)
+        for value in given
     ]
     for at, matrix in enumerate(matrices):
         if matrix.shape != (4, 4):
@@ -140,14 +141,14 @@ def _matrices(poses: Poses, what: str, count: int) -> FloatArray:
             culprits=[what, "base_from_flange"],
             next_step=_KEPT_PLACE if what == "corners" else "",
         )
-    faulty = enumerate(rigid_fault(it, _ROUGH) for it in matrices)
-    faults = {at: it for at, it in faulty if it[0]}
+    faulty = enumerate(rigid_fault(matrix, _ROUGH) for matrix in matrices)
+    faults = {at: pair for at, pair in faulty if pair[0]}
     if faults:
         at, (fault, step) = next(iter(faults.items()))
         more = f" So are {len(faults) - 1} more of {count}." if len(faults) > 1 else ""
         raise DataError(
             f"base_from_flange[{at}] is no rigid transform: {fault}.{more}",
-            culprits=[f"base_from_flange[{it}]" for it in faults],
+            culprits=[f"base_from_flange[{fault}]" for fault in faults],
             next_step=step,
         )
     stacked = np.array(matrices).reshape(-1, 4, 4)
@@ -197,7 +198,7 @@ def _facts(
     if "robot" in cell:
         document["robot"] = {"model": cell["robot"]}
     rows = [
-        [str(at), *(it[at] for it in columns.values()), *map(repr, [*pose, *joints])]
+        [str(at), *(column[at] for column in columns.values()), *map(repr, [*pose, *joints])]
         for at, (pose, joints) in enumerate(zip(numbers.tolist(), q.tolist(), strict=True))
     ]
     content = target_document(board) if isinstance(board, Target) else None
@@ -217,7 +218,7 @@ def _camera(
     if camera is None:
         return {} if resolution is None else {"resolution": list(resolution)}
     if isinstance(camera, Mapping):
-        return {k: np.asarray(it).tolist() for k, it in camera.items()}
+        return {k: np.asarray(value).tolist() for k, value in camera.items()}
     return {
         "resolution": list(camera.resolution),
         "model": camera.model,

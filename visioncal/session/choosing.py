@@ -29,7 +29,7 @@ class Choice:
     target: str | None = None
 
     def __bool__(self) -> bool:
-        return any(it is not None for it in (self.camera, self.robot, self.target))
+        return any(name is not None for name in (self.camera, self.robot, self.target))
 
     def of(self, part: Part) -> str | None:
         """The name that was given of a part."""
@@ -92,15 +92,23 @@ def choose(
         DataError: There is no such thing, several are meant, or this robot does not part these.
     """
     known = {part: frames_of_kind(frames, _KINDS[part]) for part in PARTS}
-    named = {it: _named(known[it], it, name, label) for it in PARTS if (name := choice.of(it))}
-    options = [it for it in _options(frames, known, parted=parted) if all(map(it.frame_of, needs))]
-    fitting = [it for it in options if all(it.frame_of(p) == at for p, at in named.items())]
+    named = {
+        part: _named(known[part], part, name, label) for part in PARTS if (name := choice.of(part))
+    }
+    options = [
+        option
+        for option in _options(frames, known, parted=parted)
+        if all(map(option.frame_of, needs))
+    ]
+    fitting = [
+        option for option in options if all(option.frame_of(p) == at for p, at in named.items())
+    ]
     if not fitting:
         raise _none_fits(frames, known, named, needs, label)
     for part in PARTS:
-        meant = list(dict.fromkeys(it.frame_of(part) for it in fitting))
+        meant = list(dict.fromkeys(chosen.frame_of(part) for chosen in fitting))
         if part in needs and len(meant) > 1:
-            names = [thing_name(it, part) for it in meant]
+            names = [thing_name(name, part) for name in meant]
             raise DataError(
                 f"{label} has several {part}s ({some_of(names)}), and which is meant is not said.",
                 culprits=[f"--{part}"],
@@ -118,7 +126,7 @@ def _named(known: Collection[str], part: Part, name: str, label: str) -> str:
     for frame in known:
         if name in (frame, thing_name(frame, part)):
             return frame
-    names = [thing_name(it, part) for it in known]
+    names = [thing_name(word, part) for word in known]
     raise DataError(
         f"{label} has no {part} {name!r}: its {part}s are {some_of(names) or 'none'}.",
         culprits=[f"--{part}"],
@@ -151,16 +159,18 @@ def _none_fits(
     label: str,
 ) -> DataError:
     """Says why nothing goes with what is named."""
-    culprits = [f"--{it}" for it in named]
+    culprits = [f"--{name}" for name in named]
     for part in needs:
         if not known[part]:
             return DataError(f"{label} has no {part}.", culprits=[f"--{part}"])
-    only = {part: next(iter(it)) for part, it in known.items() if len(it) == 1} | dict(named)
-    camera, target, flange = (only.get(it) for it in ("camera", "target", "robot"))
+    only = {
+        part: next(iter(collection)) for part, collection in known.items() if len(collection) == 1
+    } | dict(named)
+    camera, target, flange = (only.get(name) for name in ("camera", "target", "robot"))
     robot = None if flange is None else thing_name(flange, "robot")
     if camera and target and "target" in needs:
         robots = robots_between(frames, camera, target)
-        names = " and ".join(it or "robot" for it in robots)
+        names = " and ".join(robot or "robot" for robot in robots)
         on = f"{camera} is on {frames[camera]} and {target} on {frames[target]}"
         if not robots:
             words = f"{on}, and no robot moves them before each other"
@@ -181,10 +191,10 @@ def _none_fits(
             next_step="Name another robot, or another camera.",
         )
     pairs = [
-        f"{thing_name(it.camera, 'camera')} and {thing_name(it.target, 'target')} by robot "
-        f"{thing_name(it.flange, 'robot')}"
-        for it in _options(frames, known, parted=True)
-        if it.camera and it.target
+        f"{thing_name(option.camera, 'camera')} and {thing_name(option.target, 'target')} by robot "
+        f"{thing_name(option.flange, 'robot')}"
+        for option in _options(frames, known, parted=True)
+        if option.camera and option.target
     ]
     return DataError(
         f"{label}: no robot parts a camera from a target as they are named.",

@@ -128,9 +128,9 @@ def check_header(columns: Sequence[str], where: str) -> None:
         return
     spelt = {name.lower(): name for name in columns}
     places = position_columns(columns)
-    turned = next((it for it in ROTATIONS if spelt.keys() >= set(it)), None)
+    turned = next((rotation for rotation in ROTATIONS if spelt.keys() >= set(rotation)), None)
     if turned is not None and not set(QUATERNION) & set(columns):
-        names = ",".join(spelt[it] for it in turned)
+        names = ",".join(spelt[word] for word in turned)
         raise DataError(
             f"{where}: the rotations are in {names}, and quaternions qx, qy, qz, qw are needed.",
             culprits=[where],
@@ -150,9 +150,11 @@ def check_header(columns: Sequence[str], where: str) -> None:
 def position_columns(columns: Sequence[str]) -> tuple[str, ...] | None:
     """The columns of positions by the names that others give them; None where there are none."""
     spelt = {name.lower(): name for name in columns}
-    found = next((it for it in _POSITIONS if spelt.keys() >= set(it)), None)
+    found = next((position for position in _POSITIONS if spelt.keys() >= set(position)), None)
     return (
-        None if found is None or set(POSITION) & set(columns) else tuple(spelt[it] for it in found)
+        None
+        if found is None or set(POSITION) & set(columns)
+        else tuple(spelt[word] for word in found)
     )
 
 
@@ -182,7 +184,7 @@ def _header_problems(columns: Sequence[str]) -> Iterator[str]:
 def _spelt_otherwise(columns: Sequence[str], missing: Sequence[str]) -> str:
     """Names the columns that are missing ones in capitals or with a unit behind them."""
     plain = {re.sub(r"[ _]*[\[(].*", "", name).lower(): name for name in columns}
-    found = [plain[it] for it in missing if it in plain]
+    found = [plain[word] for word in missing if word in plain]
     return f"; {', '.join(found)} may be meant: names are plain and small" if found else ""
 
 

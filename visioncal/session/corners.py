@@ -102,14 +102,14 @@ def parse_corners(text: str) -> CornerTable:
     columns = [name.strip() for name in next(rows, (1, []))[1]]
     known = (*_NEEDED, COLUMN, _SIGMA)
     missing = [name for name in _NEEDED if name not in columns]
-    other = [it for it in columns if it not in known or columns.count(it) > 1]
+    other = [column for column in columns if column not in known or columns.count(column) > 1]
     if missing or other:
-        hints = [it for it in (did_you_mean(name, known) for name in other) if it]
+        hints = [word for word in (did_you_mean(name, known) for name in other) if word]
         there = f"its columns are {', '.join(columns)}" if any(columns) else "it is empty"
         raise DataError(
             f"{FILE}, header: {there}; {', '.join(_NEEDED)} are "
             f"needed, {COLUMN} and {_SIGMA} may be there, and others are not read.",
-            culprits=[f"{FILE}: {it}" for it in (*missing, *other)],
+            culprits=[f"{FILE}: {name}" for name in (*missing, *other)],
             next_step=hints[0] if hints else f"Begin {FILE} with the line {','.join(_NEEDED)}.",
         )
     problems: list[Problem] = []
@@ -122,18 +122,18 @@ def parse_corners(text: str) -> CornerTable:
                 next_step="Take fewer views, or fewer points of each.",
             )
         lines.append(_line(columns, cells, f"{FILE}, line {number}", problems))
-    stated = [it.sigma_px is not None for it in lines]
+    stated = [line.sigma_px is not None for line in lines]
     if any(stated) and not all(stated) and not problems:
         place = f"{lines[stated.index(False)].place}, column {_SIGMA}"
         problems.append(Problem(place, "it is empty; all rows state it, or none"))
     if problems:
         raise problems_error(problems)
-    sigmas = [it.sigma_px for it in lines if it.sigma_px is not None]
+    sigmas = [line.sigma_px for line in lines if line.sigma_px is not None]
     return CornerTable(
-        np.array([it.view for it in lines], dtype=np.int64),
-        np.array([it.point for it in lines], dtype=np.int64),
-        np.array([it.px for it in lines], dtype=float).reshape(-1, 2),
-        tuple(it.target for it in lines),
+        np.array([line.view for line in lines], dtype=np.int64),
+        np.array([line.point for line in lines], dtype=np.int64),
+        np.array([line.px for line in lines], dtype=float).reshape(-1, 2),
+        tuple(line.target for line in lines),
         np.array(sigmas, dtype=float) if sigmas else None,
     )
 
@@ -216,17 +216,21 @@ def with_corners(
     """
     rows = {view.number: view for view in views}
     table = _of_rows(table, rows)
-    own = [rows[it].text.get(COLUMN, "").strip() if it in rows else "" for it in table.views]
+    own = [rows[view].text.get(COLUMN, "").strip() if view in rows else "" for view in table.views]
     problems = list(_target_problems(table, rows, own, names))
     if problems:
         raise problems_error(problems)
     if not names:
         has = set(table.views.tolist())
-        return columns, tuple(replace(it, has_corners=it.number in has) for it in views), table
+        return (
+            columns,
+            tuple(replace(view, has_corners=view.number in has) for view in views),
+            table,
+        )
     shown = [said or of_view for said, of_view in zip(table.targets, own, strict=True)]
     numbers = table.views.copy()
     made: list[View] = []
-    new, stop = (1 + max([0, *it]) for it in (rows, (view.stop or 0 for view in views)))
+    new, stop = (1 + max([0, *mapping]) for mapping in (rows, (view.stop or 0 for view in views)))
     for number in list(rows):
         mine = np.flatnonzero(table.views == number)
         boards = list(dict.fromkeys(shown[at] for at in mine))
@@ -239,10 +243,10 @@ def with_corners(
             made.append(replace(_showing(rows[number], board), number=new))
             numbers[[at for at in mine if shown[at] == board]] = new
             new += 1
-    more = [it for it in ("stop", COLUMN) if it not in columns]
-    wanted = {"stop": any(it.stop is not None for it in rows.values()), COLUMN: True}
+    more = [name for name in ("stop", COLUMN) if name not in columns]
+    wanted = {"stop": any(row.stop is not None for row in rows.values()), COLUMN: True}
     return (
-        (*columns, *(it for it in more if wanted[it])),
+        (*columns, *(name for name in more if wanted[name])),
         (*rows.values(), *made),
         replace(table, views=numbers, targets=tuple(shown)),
     )
@@ -257,9 +261,9 @@ def _of_rows(table: CornerTable, rows: Mapping[int, View]) -> CornerTable:
     # Where a row has neither corners nor an image, views are numbered otherwise, not deleted; and a
     # number with fewer corners than show a pose is a mistyped one.
     there, counts = np.unique(table.views, return_counts=True)
-    others = {it for it in there.tolist() if it not in rows}
+    others = {value for value in there.tolist() if value not in rows}
     few = {*there[counts < _FEWEST].tolist()}
-    if not others or others & few or any(it not in there and not rows[it].image for it in rows):
+    if not others or others & few or any(row not in there and not rows[row].image for row in rows):
         return table
     return table.of_views(list(rows))
 
@@ -268,7 +272,7 @@ def _target_problems(
     table: CornerTable, rows: Mapping[int, View], own: Sequence[str], names: Sequence[str]
 ) -> Iterator[Problem]:
     """What is wrong with the rows' views and targets."""
-    first = next((it for it in table.targets if it), "")
+    first = next((target for target in table.targets if target), "")
     there = sorted(set(table.views.tolist()))
     if len(there) == len(rows) and there != sorted(rows):
         (by, *others) = {b - a for a, b in zip(there, sorted(rows), strict=True)}
@@ -280,7 +284,7 @@ def _target_problems(
                 step=f"Add {by} to the views of {FILE}, if both tables have the same order.",
             )
             return
-    for view in dict.fromkeys(it for it in table.views.tolist() if it not in rows):
+    for view in dict.fromkeys(view for view in table.views.tolist() if view not in rows):
         mine = np.flatnonzero(table.views == view)
         more = f" and {len(mine) - 1} more" if len(mine) > 1 else ""
         place = f"{table.place(int(mine[0]))}{more}, column view"
@@ -321,15 +325,17 @@ def check_points(table: CornerTable, names: Sequence[str], targets: Mapping[str,
     Raises:
         DataError: They are not; it names them.
     """
-    boards, file = [targets[it] for it in names], FILE if table.is_file else "corners"
-    numbers = {it: frozenset(point_numbers(it)) for it in dict.fromkeys(boards)}
+    boards, file = [targets[name] for name in names], FILE if table.is_file else "corners"
+    numbers = {board: frozenset(point_numbers(board)) for board in dict.fromkeys(boards)}
     for target, known in numbers.items():
-        mine = {it for it, of in zip(table.points.tolist(), boards, strict=True) if of is target}
+        mine = {
+            point for point, of in zip(table.points.tolist(), boards, strict=True) if of is target
+        }
         _check_first_number(mine, known, target, file)
     by_name: dict[str, set[int]] = {}
     for name, point in zip(names, table.points.tolist(), strict=True):
         by_name.setdefault(name, set()).add(point)
-    _check_exchanged(by_name, {it: numbers[targets[it]] for it in by_name}, file)
+    _check_exchanged(by_name, {name: numbers[targets[name]] for name in by_name}, file)
     problems: list[Problem] = []
     seen: dict[tuple[int, int], int] = {}
     for at, key in enumerate(zip(table.views.tolist(), table.points.tolist(), strict=True)):
@@ -349,7 +355,7 @@ def check_points(table: CornerTable, names: Sequence[str], targets: Mapping[str,
 def _check_first_number(seen: Set[int], known: Set[int], target: Target, file: str) -> None:
     """Refuses corners that all count from one number higher or lower than the target's points."""
     for more, sign in ((-1, "-"), (1, "+")):
-        if not seen <= known and {it + more for it in seen} <= known:
+        if not seen <= known and {index + more for index in seen} <= known:
             first = min(known) - more
             rig = f", or in the table of {target.name} count its points from {first}"
             raise DataError(
@@ -404,7 +410,7 @@ def corners_by_view(
     """
     order = np.argsort(table.views, kind="stable")
     cuts = np.flatnonzero(np.diff(table.views[order])) + 1
-    rows_of = {int(table.views[it[0]]): it for it in np.split(order, cuts) if len(it)}
+    rows_of = {int(table.views[part[0]]): part for part in np.split(order, cuts) if len(part)}
     camera_of = {view.number: name_of(declaration, "camera", view) for view in views}
     typical = _typical_px(table, rows_of, camera_of)
     index = {
@@ -412,9 +418,11 @@ def corners_by_view(
         for target in dict.fromkeys(board_of.values())
     }
     found = {}
-    for view in (it.number for it in views if it.number in rows_of):
+    for view in (view.number for view in views if view.number in rows_of):
         rows = rows_of[view]
-        ids = np.array([index[board_of[view]][int(it)] for it in table.points[rows]], np.int64)
+        ids = np.array(
+            [index[board_of[view]][int(point)] for point in table.points[rows]], np.int64
+        )
         order = np.argsort(ids)
         rows, stated_px = rows[order], typical.get(camera_of[view])
         sigmas = table.sigmas_px
@@ -433,4 +441,4 @@ def _typical_px(
     for view, camera in camera_of.items():
         if view in rows_of:
             mine.setdefault(camera, []).append(table.sigmas_px[rows_of[view]])
-    return {camera: float(np.median(np.concatenate(it))) for camera, it in mine.items()}
+    return {camera: float(np.median(np.concatenate(group))) for camera, group in mine.items()}

@@ -29,7 +29,7 @@ def digest_facts(
     and heavy the robot's links are, how strong its drives, and what the task needs, is no fact of
     what was recorded.
     """
-    digests = {path: images.sha256(path) for path in sorted({it.image for it in views} - {""})}
+    digests = {path: images.sha256(path) for path in sorted({view.image for view in views} - {""})}
     facts: dict[str, object] = {
         "document": _without_paths(document),
         "target": target_document,
@@ -37,10 +37,13 @@ def digest_facts(
         "columns": columns,
         # A cell's value is free of its spelling.
         "rows": [
-            [view.numbers[it] if it in view.numbers else view.cell(it) for it in columns]
+            [
+                view.numbers[column] if column in view.numbers else view.cell(column)
+                for column in columns
+            ]
             for view in views
         ],
-        "images": {path: it for path, it in digests.items() if it},
+        "images": {path: digest for path, digest in digests.items() if digest},
     }
     if streams:
         facts["streams"] = {name: stream.fact() for name, stream in streams.items()}
@@ -57,7 +60,7 @@ def is_file(name: object) -> bool:
 def _without_paths(document: Mapping[str, object]) -> dict[str, object]:
     """Leaves out where the target's and the robot's files lie; what they hold counts instead."""
     # So it does with the need, which is of the task.
-    kept = {name: it for name, it in document.items() if name != "need"}
+    kept = {name: value for name, value in document.items() if name != "need"}
     if is_file(kept.get("target")):
         del kept["target"]
     targets = kept.get("targets")
@@ -80,7 +83,7 @@ def _robots(
     if not isinstance(several, Mapping) or len(several) < 2:
         return _without_bodies(robot_document)
     models = robot_document.items()
-    return {name: _without_bodies(it) for name, it in models if isinstance(it, Mapping)}
+    return {name: _without_bodies(value) for name, value in models if isinstance(value, Mapping)}
 
 
 def _without_bodies(document: Mapping[str, object]) -> dict[str, object]:

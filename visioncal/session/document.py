@@ -83,7 +83,7 @@ class Declaration(TableModel):
     def is_network(self) -> bool:
         """Whether frames need names: several cameras, robots or instruments, or said."""
         several = (self.cameras, self.robots, self.instruments)
-        return bool(self.frames) or any(len(it) > 1 for it in several)
+        return bool(self.frames) or any(len(mapping) > 1 for mapping in several)
 
     @property
     def has_names(self) -> bool:
@@ -131,7 +131,7 @@ def read_declaration(
         problems = list(_misfits(error.errors(), document))
     else:
         problems = list(_contradictions(declaration, observed))
-        hints = [it for it in _unknown_keys(declaration, "", label) if "Did you mean" in it]
+        hints = [key for key in _unknown_keys(declaration, "", label) if "Did you mean" in key]
     if problems:
         raise DataError(
             f"{label}: {'; '.join(f'{field} {words}' for field, words in problems)}.",
@@ -156,7 +156,7 @@ def _misfits(
     lists: dict[str, str] = {}
     for entry in errors:
         place = tuple(entry["loc"])
-        at = next((at for at, it in enumerate(place) if it in ("matrix", "distortion")), None)
+        at = next((at for at, value in enumerate(place) if value in ("matrix", "distortion")), None)
         field = () if at is None else place[: at + 1]
         value = reduce(lambda table, key: table[key], field, document) if field else None
         words = _of_list(str(field[-1]), value) if isinstance(value, list) else ""
@@ -168,15 +168,15 @@ def _misfits(
 
 def _of_list(name: str, value: list[Any]) -> str:
     """What is wrong with a lens's matrix of 3 x 3, or a list in a list; empty for neither."""
-    flat = [it for part in value for it in (part if isinstance(part, list) else [part])]
-    if not all(type(it) in (int, float) for it in flat):
+    flat = [number for part in value for number in (part if isinstance(part, list) else [part])]
+    if not all(type(number) in (int, float) for number in flat):
         return ""
     if name == "matrix" and len(flat) == _ENTRIES:
-        for fx, skew, cx, low, fy, cy, *last in (flat, [flat[it] for it in _TRANSPOSED]):
+        for fx, skew, cx, low, fy, cy, *last in (flat, [flat[index] for index in _TRANSPOSED]):
             if [skew, low, *last] == [0, 0, 0, 0, 1]:
                 return f"is the 3 x 3 {value!r}, but must be fx, fy, cx, cy: {[fx, fy, cx, cy]}"
         return f"is {value!r}, but must be fx, fy, cx, cy"
-    is_nested = any(isinstance(it, list) for it in value)
+    is_nested = any(isinstance(number, list) for number in value)
     return f"is {value!r}, but must be one list: {flat}" if is_nested else ""
 
 
@@ -245,7 +245,7 @@ def _prior_contradictions(declaration: Declaration) -> Iterator[tuple[str, str]]
             yield f"clocks.{name}", "is of no camera: [clocks.NAME] is for [cameras.NAME]"
     for edge, prior in declaration.prior.items():
         turn, places = prior.quaternion_xyzw, (prior.x_m, prior.y_m, prior.z_m)
-        if not any(it is not None for it in places):
+        if not any(place is not None for place in places):
             if turn is None:
                 needed = "x_m, y_m or z_m, or quaternion_xyzw"
                 yield f"prior.{edge}", f"names no component, but must give {needed}"
@@ -254,13 +254,13 @@ def _prior_contradictions(declaration: Declaration) -> Iterator[tuple[str, str]]
             yield f"prior.{edge}.sigma_m", words
         if (turn is None) != (prior.sigma_rad is None):
             yield f"prior.{edge}", "needs quaternion_xyzw and sigma_rad together, or neither"
-        if turn is not None and not 0.9 < sum(it * it for it in turn) < 1.1:
+        if turn is not None and not 0.9 < sum(value * value for value in turn) < 1.1:
             yield f"prior.{edge}.quaternion_xyzw", f"is {turn}, but its length must be 1"
         yield from _far_components(edge, prior)
 
 
 def _far_components(edge: str, prior: PriorTable) -> Iterator[tuple[str, str]]:
-    on_flange = any(it.partition("_")[0] == "flange" for it in edge.split("_from_"))
+    on_flange = any(part.partition("_")[0] == "flange" for part in edge.split("_from_"))
     most, where = (_MOST_ON_FLANGE_M, "on a flange") if on_flange else (_MOST_M, "in a cell")
     for name in ("x_m", "y_m", "z_m"):
         value = getattr(prior, name)
@@ -310,7 +310,7 @@ def _camera_contradictions(camera: CameraTable, path: str) -> Iterator[tuple[str
 def declaration_warnings(declaration: Declaration, label: str) -> Iterator[str]:
     """Words what is allowed but suspicious: unknown keys, a principal point off the image."""
     yield from _unknown_keys(declaration, "", label)
-    edges = [*_EDGES, *(f"{it}_{name}" for it in _EDGES for name in declaration.targets)]
+    edges = [*_EDGES, *(f"{edge}_{name}" for edge in _EDGES for name in declaration.targets)]
     for edge in declaration.prior:
         if not declaration.has_names and edge not in edges:
             hint = did_you_mean(edge, edges)
@@ -342,6 +342,6 @@ def _unknown_keys(table: BaseModel, path: str, label: str) -> Iterator[str]:
         value = getattr(table, name)
         if isinstance(value, BaseModel):
             yield from _unknown_keys(value, f"{path}{name}.", label)
-        elif name in ("prior", "clocks", *(f"{it}s" for it in KINDS)):
+        elif name in ("prior", "clocks", *(f"{kind}s" for kind in KINDS)):
             for key, entry in cast(Mapping[str, BaseModel], value).items():
                 yield from _unknown_keys(entry, f"{path}{name}.{key}.", label)

@@ -44,7 +44,7 @@ def robots_of(
     found = declaration.named("robot")
     if not found and (in_streams or any(has_robot_state(view) for view in views)):
         return {"": RobotTable()}
-    return {name: it for name, it in found.items() if isinstance(it, RobotTable)}
+    return {name: table for name, table in found.items() if isinstance(table, RobotTable)}
 
 
 def _point_name(view: View) -> str:
@@ -83,7 +83,7 @@ def check_frames(declaration: Declaration, views: Sequence[View]) -> None:
 def frames_of_kind(frames: Iterable[str], kind: str) -> tuple[str, ...]:
     """The frames of a kind among some: `cam` and `cam_left` of cameras."""
     bare = frame_name(kind, "")
-    return tuple(it for it in frames if it == bare or it.startswith(f"{bare}_"))
+    return tuple(frame for frame in frames if frame == bare or frame.startswith(f"{bare}_"))
 
 
 def thing_name(frame: str, kind: str) -> str:
@@ -95,8 +95,8 @@ def robots_between(frames: Mapping[str, str], first: str, second: str) -> tuple[
     """Names the robots by whose motion two frames move before each other."""
     chains = [set(_upwards(frames, frame)) for frame in (first, second)]
     apart = chains[0] ^ chains[1]
-    flanges = sorted(it for it in apart if _is_flange(it))
-    return tuple(it.removeprefix("flange").removeprefix("_") for it in flanges)
+    flanges = sorted(name for name in apart if _is_flange(name))
+    return tuple(flange.removeprefix("flange").removeprefix("_") for flange in flanges)
 
 
 def _upwards(frames: Mapping[str, str], frame: str) -> Iterator[str]:
@@ -120,10 +120,12 @@ class _Tree:
     @cached_property
     def frames(self) -> dict[str, tuple[str, str]]:
         """All frames but the cell, with their kinds and names."""
-        listed = [("base", it) for it in self.robots] + [("flange", it) for it in self.robots]
+        listed = [("base", robot) for robot in self.robots] + [
+            ("flange", robot) for robot in self.robots
+        ]
         for kind in ("camera", "target", "instrument"):
             listed += [(kind, name) for name in self._names(kind)]
-        points = dict.fromkeys(_point_name(it) for it in self.views if is_read(it))
+        points = dict.fromkeys(_point_name(view) for view in self.views if is_read(view))
         listed += [("point", name) for name in points]
         return {frame_name(kind, name): (kind, name) for kind, name in listed}
 
@@ -138,7 +140,9 @@ class _Tree:
         """Places that `[frames]` names itself."""
         words = [*self.declaration.frames, *map(str, self.declaration.frames.values())]
         return tuple(
-            dict.fromkeys(it for it in words if it == _FIXTURE or it.startswith(f"{_FIXTURE}_"))
+            dict.fromkeys(
+                word for word in words if word == _FIXTURE or word.startswith(f"{_FIXTURE}_")
+            )
         )
 
     @cached_property
@@ -191,17 +195,17 @@ class _Tree:
     def resolved(self) -> dict[str, str]:
         """The parent of each frame; see `resolve_frames`."""
         parents = dict(self.said)
-        unsaid = [it for it in self.frames if it not in parents]
+        unsaid = [frame for frame in self.frames if frame not in parents]
         # Where a thing is may follow from where that is which it sees, or is seen by.
         for _ in range(2):
-            for frame in [it for it in unsaid if it not in parents]:
+            for frame in [name for name in unsaid if name not in parents]:
                 parent = self._follows(frame, parents)
                 if parent is not None:
                     parents[frame] = parent
-        missing = [it for it in unsaid if it not in parents]
+        missing = [name for name in unsaid if name not in parents]
         if missing:
             raise self._unclear(missing)
-        return {it: _carrier(parents, it, self) or CELL for it in self.frames}
+        return {frame: _carrier(parents, frame, self) or CELL for frame in self.frames}
 
     def _follows(self, frame: str, parents: Mapping[str, str]) -> str | None:
         """What a frame hangs on though it is not said; None where that is not clear."""
@@ -215,7 +219,7 @@ class _Tree:
             return self._flange_of(frame) if kind == moves else CELL
         if len(self.robots) == 1:
             flange, others = frame_name("flange", self.robots[0]), self._across(frame)
-            carriers = {_carrier(parents, it, self) for it in others if it in parents}
+            carriers = {_carrier(parents, other, self) for other in others if other in parents}
             # A board on the flange of the camera that looks at it would never move before it.
             return CELL if flange in carriers else None
         return None
@@ -223,8 +227,8 @@ class _Tree:
     def _of_point(self, frame: str) -> str | None:
         """A point moves with the robot that its rows name; where they have no pose, it is fixed."""
         _, name = self.frames[frame]
-        rows = [it for it in self.views if is_read(it) and _point_name(it) == name]
-        moved = [it for it in rows if has_robot_state(it)]
+        rows = [view for view in self.views if is_read(view) and _point_name(view) == name]
+        moved = [row for row in rows if has_robot_state(row)]
         if not moved and len(self.robots) < 2:
             return CELL if self.declaration.is_network else self._flange_of(frame)
         if not moved:
@@ -245,7 +249,9 @@ class _Tree:
     def _across(self, frame: str) -> set[str]:
         """What a camera sees, or which cameras see a target."""
         pairs = [
-            observed(self.declaration, it) for it in self.views if is_seen(it) and not it.is_of_lens
+            observed(self.declaration, view)
+            for view in self.views
+            if is_seen(view) and not view.is_of_lens
         ]
         return {other for pair in pairs if frame in pair for other in pair if other != frame}
 
@@ -258,13 +264,13 @@ class _Tree:
                 next_step="Give each row the flange's pose, as x_m, y_m, z_m, qx, qy, qz, qw, or "
                 "the joints' angles, as q1_rad, q2_rad and so on with [robot] in session.toml.",
             )
-        places = [*(frame_name("flange", it) for it in self.robots), CELL]
-        example = "\n".join(f'{it} = "{places[0]}"' for it in missing)
-        among = ", ".join(f'"{it}"' for it in places)
+        places = [*(frame_name("flange", robot) for robot in self.robots), CELL]
+        example = "\n".join(f'{name} = "{places[0]}"' for name in missing)
+        among = ", ".join(f'"{place}"' for place in places)
         return DataError(
             f"session.toml: it is not said what {some_of(missing)} "
             f"{'hangs' if len(missing) == 1 else 'hang'} on, and it does not follow from the rest.",
-            culprits=[f"{_WHERE}.{it}" for it in missing],
+            culprits=[f"{_WHERE}.{name}" for name in missing],
             next_step=f"Say it, each by one of {among}:\n[frames]\n{example}",
         )
 

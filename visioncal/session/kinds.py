@@ -70,7 +70,7 @@ def _check(declaration: Declaration, kind: Kind, views: Sequence[View]) -> None:
     named = {view.number: view.text.get(kind, "").strip() for view in views}
     declared = list(declaration.named(kind))
     if declared in ([], [""]):
-        _check_one(kind, bool(declared), sorted({it for it in named.values() if it}))
+        _check_one(kind, bool(declared), sorted({name for name in named.values() if name}))
         return
     known = ", ".join(declared)
     unknown = {view: name for view, name in named.items() if name and name not in declared}
@@ -80,7 +80,7 @@ def _check(declaration: Declaration, kind: Kind, views: Sequence[View]) -> None:
         raise DataError(
             f"views.csv, view {view}, column {kind}: {name!r} is not declared; session.toml "
             f"declares {known}{f' ({others} more such rows)' if others else ''}.",
-            culprits=[f"views.csv: view {it}" for it in unknown],
+            culprits=[f"views.csv: view {index}" for index in unknown],
             next_step=did_you_mean(name, declared) or f"Add [{plural}.{name}], or correct the row.",
         )
     if len(declared) < 2:
@@ -91,7 +91,7 @@ def _check(declaration: Declaration, kind: Kind, views: Sequence[View]) -> None:
         raise DataError(
             f"views.csv: of several {plural} ({known}), the column {kind} must name {whose}; it "
             f"is empty in view {some_of(without)}.",
-            culprits=[f"views.csv: view {it}" for it in without],
+            culprits=[f"views.csv: view {name}" for name in without],
             next_step=f"Name the {kind} in each of these rows{hint}.",
         )
 

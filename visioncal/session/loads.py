@@ -22,7 +22,7 @@ def loads_of(rows: Sequence[Mapping[str, float]], approaches: Sequence[str] | No
         rows: The views' numbers.
         approaches: Their cells of the column approach; None where that does not matter.
     """
-    sides = [SIDES.get(it.strip(), 0.0) for it in approaches or [""] * len(rows)]
+    sides = [SIDES.get(approach.strip(), 0.0) for approach in approaches or [""] * len(rows)]
 
     def read(*names: str) -> FloatArray:
         return np.array([[row.get(name, 0.0) for name in names] for row in rows])

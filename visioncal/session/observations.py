@@ -72,26 +72,26 @@ def observations_of(
         states: dict[tuple[int, ...], int] = {}
         for view in stop.rows:
             own = {name_of(declaration, "robot", view): view} if has_robot_state(view) else {}
-            strays = {it: row for it, row in own.items() if _differ(row, stop.robot_rows[it])}
+            strays = {name: row for name, row in own.items() if _differ(row, stop.robot_rows[name])}
             by_robot = {**stop.robot_rows, **strays}
-            key = tuple(by_robot[it].number for it in sorted(by_robot))
+            key = tuple(by_robot[name].number for name in sorted(by_robot))
             seer, seen = observed(declaration, view)
             if not seer:
                 continue
             if key not in states:
                 states[key], station = station, station + 1
             needed = () if view.is_of_lens else robots_between(frames, seer, seen)
-            robots = {it: by_robot[it] for it in needed if it in by_robot}
-            lacks = tuple(it for it in needed if it not in by_robot)
+            robots = {name: by_robot[name] for name in needed if name in by_robot}
+            lacks = tuple(name for name in needed if name not in by_robot)
             found.append(Observation(view, states[key], seer, seen, robots, lacks))
-    return tuple(sorted(found, key=lambda it: place_of[it.view.number]))
+    return tuple(sorted(found, key=lambda value: place_of[value.view.number]))
 
 
 def standing(declaration: Declaration, views: Sequence[View]) -> dict[int, Mapping[str, View]]:
     """Of each row, by its view: the rows with the robots' poses at its stop, by robot."""
     found: dict[int, Mapping[str, View]] = {}
     for stop in _stops(declaration, views):
-        found |= dict.fromkeys((it.number for it in stop.rows), stop.robot_rows)
+        found |= dict.fromkeys((row.number for row in stop.rows), stop.robot_rows)
     return found
 
 
@@ -108,13 +108,15 @@ def _still_since(views: Iterable[View]) -> dict[int, int]:
 
 def _moved(first: View, second: View) -> bool:
     """Whether two rows have poses that differ by more than readings of one pose do, or loads."""
-    if any(first.numbers.get(it) != second.numbers.get(it) for it in LOAD):
+    if any(first.numbers.get(name) != second.numbers.get(name) for name in LOAD):
         return True
-    before, after = ([it.numbers.get(name, math.nan) for name in POSE] for it in (first, second))
+    before, after = (
+        [view.numbers.get(name, math.nan) for name in POSE] for view in (first, second)
+    )
     if not math.isnan(before[0] + after[0]):
-        units = [[it / math.hypot(*pose[3:]) for it in pose[3:]] for pose in (before, after)]
+        units = [[value / math.hypot(*pose[3:]) for value in pose[3:]] for pose in (before, after)]
         # A quaternion and its negative are the same rotation, by twice the angle between them.
-        chord = min(math.dist(units[0], [sign * it for it in units[1]]) for sign in (1.0, -1.0))
+        chord = min(math.dist(units[0], [sign * unit for unit in units[1]]) for sign in (1.0, -1.0))
         return math.dist(before[:3], after[:3]) > _STILL_M or 2.0 * chord > _STILL_RAD
     joints = first.joints_rad, second.joints_rad
     if joints[0] is None or joints[1] is None or joints[0].shape != joints[1].shape:
@@ -166,7 +168,10 @@ def _robot_rows(declaration: Declaration, rows: Sequence[View]) -> dict[str, Vie
             rows_of.setdefault(name_of(declaration, "robot", view), []).append(view)
     agreed = {}
     for robot, mine in rows_of.items():
-        counts, first = Counter(map(_pose_cells, mine)), {_pose_cells(it): it for it in mine[::-1]}
+        counts, first = (
+            Counter(map(_pose_cells, mine)),
+            {_pose_cells(view): view for view in mine[::-1]},
+        )
         agreeing = Counter(
             {a: sum(counts[b] for b in counts if not _differ(first[a], first[b])) for a in counts}
         )
@@ -177,7 +182,7 @@ def _robot_rows(declaration: Declaration, rows: Sequence[View]) -> dict[str, Vie
 def _pose_cells(view: View) -> tuple[float | None, ...]:
     """What a row says of where its robot stood: most rows of a stop repeat it to the digit."""
     names = (*POSE, *joint_columns(tuple(view.numbers)))
-    return tuple(view.numbers.get(it) for it in names)
+    return tuple(view.numbers.get(name) for name in names)
 
 
 def _differ(first: View, second: View) -> bool:

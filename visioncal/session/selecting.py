@@ -56,8 +56,10 @@ def select(
     if "camera" not in needs:
         chosen = replace(chosen, camera="", target="")
     rows = dict(_rows(session, chosen))
-    columns = tuple(it for it in session.columns if it not in (*SELECTORS, TARGET))
-    cells = [[_cell(row, robot_row, it) for it in columns] for row, robot_row in rows.values()]
+    columns = tuple(column for column in session.columns if column not in (*SELECTORS, TARGET))
+    cells = [
+        [_cell(row, robot_row, column) for column in columns] for row, robot_row in rows.values()
+    ]
     table, target = session.corner_table, chosen.target.partition("_")[2]
     models, boards = session.robot_documents, session.target_document
     found = session.assemble(
@@ -75,13 +77,15 @@ def select(
 def streams_of(session: "Session", robot: str) -> dict[str, Stream]:
     """The streams of one robot, and those of none, by name."""
     mine = {None, robot or "robot"}
-    return {name: it for name, it in session.streams.items() if _robot_of(session, name) in mine}
+    return {
+        name: stream for name, stream in session.streams.items() if _robot_of(session, name) in mine
+    }
 
 
 def _robot_of(session: "Session", stream: str) -> str | None:
     """The robot whose name a stream has or begins with, as `a` and `a_excite`; None for none."""
-    names = (it or "robot" for it in session.robots)
-    fitting = [it for it in names if stream == it or stream.startswith(f"{it}_")]
+    names = (robot or "robot" for robot in session.robots)
+    fitting = [name for name in names if stream == name or stream.startswith(f"{name}_")]
     return max(fitting, key=len, default=None)
 
 
@@ -90,7 +94,10 @@ def _rows(
 ) -> Iterator[tuple[int, tuple[View, Mapping[str, float]]]]:
     """The rows that are meant, by view, with the robot's numbers at their stop."""
     declaration, stood = session.declaration, standing(session.declaration, session.views)
-    seen = {it.view.number: (it.seer, it.seen) for it in session.observations}
+    seen = {
+        observation.view.number: (observation.seer, observation.seen)
+        for observation in session.observations
+    }
     for view in session.views:
         if chosen.camera:
             mine = is_seen(view) and seen.get(view.number) == (chosen.camera, chosen.target)
@@ -111,7 +118,7 @@ def _cell(view: View, robot_row: Mapping[str, float], column: str) -> str:
 def _document(session: "Session", chosen: Chosen) -> dict[str, Any]:
     """The content of session.toml, of what is meant alone."""
     given, declaration = dict(session.document), session.declaration
-    for name in ("frames", "clocks", "prior", "mount", *KINDS, *(f"{it}s" for it in KINDS)):
+    for name in ("frames", "clocks", "prior", "mount", *KINDS, *(f"{kind}s" for kind in KINDS)):
         given.pop(name, None)
     given["mount"] = "eye-in-hand" if chosen.mount == "instrument" else chosen.mount
     for kind, name in (
@@ -150,7 +157,7 @@ def _priors(session: "Session", chosen: Chosen) -> Iterator[tuple[str, Any]]:
         chosen.target: "target",
     }
     for edge, prior in session.document.get("prior", {}).items():
-        ends = [short.get(it) for it in edge.split("_from_")]
+        ends = [short.get(part) for part in edge.split("_from_")]
         if len(ends) == 2 and all(ends):
             yield f"{ends[0]}_from_{ends[1]}", prior
 
@@ -187,15 +194,21 @@ def check_one_of_each(session: "Session") -> None:
 
 def _several(session: "Session") -> str:
     """What makes a session that of a whole cell; empty where it is none."""
-    several = {it: list(session.declaration.named(it)) for it in KINDS if it != "target"}
+    several = {kind: list(session.declaration.named(kind)) for kind in KINDS if kind != "target"}
     words = [f"{kind}s ({some_of(names)})" for kind, names in several.items() if len(names) > 1]
     if words:
         return f"has several {' and several '.join(words)}; this takes one"
     if not session.declaration.frames or session.mount == "instrument":
         return ""
     boards = [frame_name("target", name) for name in session.declaration.named("target")]
-    moves = {it: session.frames[it].startswith("flange") for it in boards if it in session.frames}
-    amiss = [it for it, is_moved in moves.items() if is_moved == (session.mount == "eye-in-hand")]
+    moves = {
+        board: session.frames[board].startswith("flange")
+        for board in boards
+        if board in session.frames
+    }
+    amiss = [
+        name for name, is_moved in moves.items() if is_moved == (session.mount == "eye-in-hand")
+    ]
     if not amiss:
         return ""
     return (

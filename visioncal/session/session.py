@@ -263,12 +263,14 @@ class Session:
 
     @property
     def _facts(self) -> dict[str, str]:
-        images = sum(bool(it.image) for it in self.views)
+        images = sum(bool(view.image) for view in self.views)
         return {
             "mount": self.mount,
             "views": f"{len(self.views)}, {images} with images",
-            "boards": ", ".join(it.name for it in self.boards.values()) or "none",
-            "robots": ", ".join(it or (self.robot_name or "poses alone") for it in self.robots),
+            "boards": ", ".join(board.name for board in self.boards.values()) or "none",
+            "robots": ", ".join(
+                robot or (self.robot_name or "poses alone") for robot in self.robots
+            ),
             **({"streams": ", ".join(self.streams)} if self.streams else {}),
         }
 
@@ -313,7 +315,7 @@ class Session:
             DataError: One is no number above 0.
         """
         both = (("mm", mm), ("deg", deg))
-        asked = {name: float(it) for name, it in both if it is not None}
+        asked = {name: float(value) for name, value in both if value is not None}
         for name, value in asked.items():
             if not 0.0 < value < np.inf:
                 raise DataError(
@@ -358,7 +360,9 @@ class Session:
             texts["views.csv"] = write_csv(self.columns, self.views)
         if self.corner_table is not None:
             texts[FILE] = write_corners(self.corner_table)
-        texts |= {f"{FOLDER}/{name}.csv": write_stream(it) for name, it in self.streams.items()}
+        texts |= {
+            f"{FOLDER}/{name}.csv": write_stream(stream) for name, stream in self.streams.items()
+        }
         paths = dict.fromkeys(view.image for view in self.views if view.image)
         write_folder(Path(folder), texts, self.images, tuple(paths))
 
@@ -409,8 +413,8 @@ class Session:
             return "instrument"
         if declared is not None:
             return declared
-        on = [self.frames[frame_name("camera", it)] for it in self.cameras]
-        return "eye-in-hand" if all(it.startswith("flange") for it in on) else "eye-to-hand"
+        on = [self.frames[frame_name("camera", camera)] for camera in self.cameras]
+        return "eye-in-hand" if all(name.startswith("flange") for name in on) else "eye-to-hand"
 
     @property
     def is_network(self) -> bool:
@@ -421,19 +425,19 @@ class Session:
     def cameras(self) -> Mapping[str, CameraTable]:
         """The cameras by the names that rows give them; that of `[camera]` is empty."""
         found = self.declaration.named("camera").items()
-        return {name: it for name, it in found if isinstance(it, CameraTable)}
+        return {name: table for name, table in found if isinstance(table, CameraTable)}
 
     @cached_property
     def robots(self) -> Mapping[str, RobotTable]:
         """The robots by name; that of `[robot]`, and of poses without a robot, is empty."""
-        in_streams = any(it.has_robot_state for it in self.streams.values())
+        in_streams = any(stream.has_robot_state for stream in self.streams.values())
         return robots_of(self.declaration, self.views, in_streams=in_streams)
 
     @cached_property
     def instruments(self) -> Mapping[str, InstrumentTable]:
         """The instruments by name; that of `[instrument]` is empty."""
         found = self.declaration.named("instrument").items()
-        return {name: it for name, it in found if isinstance(it, InstrumentTable)}
+        return {name: table for name, table in found if isinstance(table, InstrumentTable)}
 
     @cached_property
     def plates(self) -> Mapping[str, Target]:
@@ -557,5 +561,5 @@ def _build(
     if corners is not None:
         seen = (view for view in views if view.has_corners)
         shown = {view.number: session.board_of(view) for view in seen}
-        check_points(corners, [shown[it] for it in corners.views.tolist()], session.boards)
+        check_points(corners, [shown[index] for index in corners.views.tolist()], session.boards)
     return session

@@ -72,7 +72,7 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
         return sessions[0]
     for at, session in enumerate(sessions):
         _check(session, sessions[0])
-        if any(session.digest() == it.digest() for it in sessions[:at]):
+        if any(session.digest() == item.digest() for item in sessions[:at]):
             raise DataError(
                 f"session {session.name!r} is there twice, and would count as twice the data.",
                 culprits=[session.name],
@@ -80,21 +80,23 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
             )
     names = [f"s{at}" for at in range(1, len(sessions) + 1)]
     by_name = dict(zip(names, sessions, strict=True))
-    document = {it: value for it, value in sessions[0].document.items() if it not in _NAMED}
+    document = {name: value for name, value in sessions[0].document.items() if name not in _NAMED}
     document |= {
-        "name": " + ".join(it.name for it in sessions),
-        "cameras": {name: it.document.get("camera", {}) for name, it in by_name.items()},
-        "targets": {name: it.document["target"] for name, it in by_name.items()},
+        "name": " + ".join(session.name for session in sessions),
+        "cameras": {name: session.document.get("camera", {}) for name, session in by_name.items()},
+        "targets": {name: session.document["target"] for name, session in by_name.items()},
         "frames": dict(_frames(by_name)),
     }
     if clocks := {
-        name: it.document["clock"] for name, it in by_name.items() if "clock" in it.document
+        name: session.document["clock"]
+        for name, session in by_name.items()
+        if "clock" in session.document
     }:
         document["clocks"] = clocks
     if priors := dict(_priors(by_name)):
         document["prior"] = priors
-    columns = list(dict.fromkeys(name for it in sessions for name in it.columns))
-    columns += [it for it in ("stop", "camera", TARGET) if it not in columns]
+    columns = list(dict.fromkeys(name for session in sessions for name in session.columns))
+    columns += [name for name in ("stop", "camera", TARGET) if name not in columns]
     rows: list[list[str]] = []
     tables: list[CornerTable] = []
     views, stops, until_s = 0, 0, -np.inf
@@ -110,18 +112,18 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
             }
             if view.stamp_s is not None:
                 own["stamp_s"] = repr(view.stamp_s + later_s)
-            rows.append([own.get(it, view.cell(it)) for it in columns])
+            rows.append([own.get(column, view.cell(column)) for column in columns])
         if session.corner_table is not None:
             tables.append(_moved(session.corner_table, views, name))
-        views += 1 + max((it.number for it in session.views), default=0)
-        stops += 1 + max((it.stop or 0 for it in session.views), default=0)
-        until_s = max([until_s, *(it + later_s for it in _stamps(session.views))])
+        views += 1 + max((view.number for view in session.views), default=0)
+        stops += 1 + max((view.stop or 0 for view in session.views), default=0)
+        until_s = max([until_s, *(stamp + later_s for stamp in _stamps(session.views))])
     return Session.assemble(
         document,
         columns,
         rows,
-        JoinedImages({name: it.images for name, it in by_name.items()}),
-        target_document={name: it.target_document for name, it in by_name.items()},
+        JoinedImages({name: session.images for name, session in by_name.items()}),
+        target_document={name: session.target_document for name, session in by_name.items()},
         robot_document=sessions[0].robot_document,
         corners=_stacked(tables) if tables else None,
     )
@@ -174,13 +176,14 @@ def _priors(by_name: Mapping[str, Session]) -> Iterator[tuple[str, Any]]:
     for name, session in by_name.items():
         for edge, prior in session.document.get("prior", {}).items():
             ends = [
-                f"{it}_{name}" if it in ("cam", "target") else it for it in edge.split("_from_")
+                f"{part}_{name}" if part in ("cam", "target") else part
+                for part in edge.split("_from_")
             ]
             yield "_from_".join(ends), prior
 
 
 def _stamps(views: Sequence[View]) -> list[float]:
-    return [it.stamp_s for it in views if it.stamp_s is not None]
+    return [view.stamp_s for view in views if view.stamp_s is not None]
 
 
 def _later(session: Session, until_s: float) -> float:
@@ -195,11 +198,11 @@ def _moved(table: CornerTable, views: int, target: str) -> CornerTable:
 
 def _stacked(tables: Sequence[CornerTable]) -> CornerTable:
     """All corners in one table; a sigma is stated of all or of none."""
-    sigmas = [it.sigmas_px for it in tables if it.sigmas_px is not None]
+    sigmas = [table.sigmas_px for table in tables if table.sigmas_px is not None]
     return CornerTable(
-        np.concatenate([it.views for it in tables]),
-        np.concatenate([it.points for it in tables]),
-        np.concatenate([it.px for it in tables]),
-        tuple(name for it in tables for name in it.targets),
+        np.concatenate([table.views for table in tables]),
+        np.concatenate([table.points for table in tables]),
+        np.concatenate([table.px for table in tables]),
+        tuple(name for table in tables for name in table.targets),
         np.concatenate(sigmas) if len(sigmas) == len(tables) else None,
     )

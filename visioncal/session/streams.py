@@ -188,7 +188,7 @@ def _numbers(
         missing = all(cell.lower() in _NONE for of in wrong.values() for _, cell in of)
         raise DataError(
             ".\n".join(shown) + ".",
-            culprits=[it.partition(": ")[0] for it in shown],
+            culprits=[name.partition(": ")[0] for name in shown],
             next_step="Leave a cell empty where there is no number; its row then does not count."
             if wrong and missing
             else "A stream holds numbers alone; leave other columns out.",
@@ -227,7 +227,10 @@ def _number(cell: str) -> float:
 
 def write_stream(stream: Stream) -> str:
     """Writes a stream so that reading it gives the same numbers again."""
-    rows = (",".join("" if it != it else repr(it) for it in row) for row in stream.values.tolist())
+    rows = (
+        ",".join("" if value != value else repr(value) for value in row)
+        for row in stream.values.tolist()
+    )
     return "\n".join([",".join(stream.columns), *rows]) + "\n"
 
 
@@ -268,7 +271,9 @@ def check_stream(name: str, stream: Stream) -> None:
     _check_times(stream, label)
     for group in (*known.WHOLE_GROUPS, known.joint_columns(stream.columns)):
         _check_whole(stream, group, label)
-    for column in (it for it in stream.columns if it.endswith("_c") and known.is_number(it)):
+    for column in (
+        column for column in stream.columns if column.endswith("_c") and known.is_number(column)
+    ):
         wrong = known.no_celsius(stream[column])
         if wrong:
             raise DataError(f"{label}, column {column}: {wrong}.", culprits=[f"{label}, {column}"])
@@ -316,10 +321,10 @@ def _wrong_rows(
     stream: Stream, label: str, rows: IntArray, words: str, next_step: str = ""
 ) -> DataError:
     lines = rows + 2 if stream.lines is None else stream.lines[rows]
-    named = [f"line {it}" for it in lines.tolist()]
+    named = [f"line {line}" for line in lines.tolist()]
     return DataError(
         f"{label}: {words} in {some_of(named, 3)}.",
-        culprits=[f"{label}, {it}" for it in named[:_SHOWN_PROBLEMS]],
+        culprits=[f"{label}, {name}" for name in named[:_SHOWN_PROBLEMS]],
         next_step=next_step,
     )
 
@@ -333,7 +338,7 @@ def too_far_apart(label: str, usual_s: float, slowest_s: float) -> DataError:
         slowest_s: How far apart they may be [s].
     """
     # The largest unit that leaves steps of a controller.
-    unit = next((it for it, per_s in _UNITS.items() if usual_s <= slowest_s * per_s), "")
+    unit = next((name for name, per_s in _UNITS.items() if usual_s <= slowest_s * per_s), "")
     like = "no time in seconds"
     if unit:
         like = f"{unit} ({_UNITS[unit] / usual_s:.3g} samples a second)"

@@ -86,7 +86,9 @@ class View:
     def reading_m(self) -> FloatArray | None:
         """(3,) the place that an instrument read (meas_*), in its frame [m], if there is one."""
         names = known.INSTRUMENT_POSITION
-        return np.array([self.numbers[it] for it in names]) if names[0] in self.numbers else None
+        return (
+            np.array([self.numbers[name] for name in names]) if names[0] in self.numbers else None
+        )
 
     def instrument_from_probe(self) -> RigidTransform | None:
         """The pose of a probe that an instrument read (meas_*), if its rotation was read too."""
@@ -121,12 +123,12 @@ def reported_matrices(views: Sequence[View]) -> dict[int, FloatArray]:
 
     All at once: one pose alone takes as long as a hundred together.
     """
-    reported = [it for it in views if known.POSE[0] in it.numbers]
+    reported = [view for view in views if known.POSE[0] in view.numbers]
     if not reported:
         return {}
-    values = np.array([[it.numbers[name] for name in known.POSE] for it in reported])
+    values = np.array([[view.numbers[name] for name in known.POSE] for view in reported])
     poses = RigidTransform.from_components(values[:, :3], Rotation.from_quat(values[:, 3:]))
-    return dict(zip((it.number for it in reported), poses.as_matrix(), strict=True))
+    return dict(zip((view.number for view in reported), poses.as_matrix(), strict=True))
 
 
 @dataclass(frozen=True)
@@ -233,7 +235,7 @@ def read_views(
     views: list[View] = []
     problems: list[Problem] = []
     first_seen: dict[int, str] = {}
-    if rows and not any(it.isdigit() for cell in rows[0].cells for it in cell):
+    if rows and not any(name.isdigit() for cell in rows[0].cells for name in cell):
         raise DataError(
             f"{rows[0].where} has no number, but {', '.join(rows[0].cells)[:80]!r}: units or names "
             "below the header?",
@@ -256,7 +258,7 @@ def read_views(
 
 def problems_error(problems: Sequence[Problem]) -> DataError:
     """Words the first ten problems of a table."""
-    norms = [it.norm for it in problems if it.norm is not None]
+    norms = [problem.norm for problem in problems if problem.norm is not None]
     if len(norms) == len(problems) >= _FEWEST_ALIKE and max(norms) > _FAR_FROM_UNIT:
         degrees = max(norms) > _ANGLES_RAD
         return DataError(
@@ -269,11 +271,11 @@ def problems_error(problems: Sequence[Problem]) -> DataError:
     where = ", ".join(problems[0].place.split(", ")[:2])
     step = f"Correct it, or delete {where}."
     if len(problems) > 1:
-        columns = dict.fromkeys(it.place.partition(", column ")[2] for it in problems)
+        columns = dict.fromkeys(problem.place.partition(", column ")[2] for problem in problems)
         step = ""
         if len(columns) == 1 and "" not in columns:
             step = f"Correct column {', '.join(columns)} of {where.partition(',')[0]}."
-    own = {it.step for it in problems}
+    own = {problem.step for problem in problems}
     if len(own) == 1:
         step = own.pop() or step
     shown = problems[:_SHOWN_PROBLEMS]
@@ -370,7 +372,7 @@ class _RowReader:
             self.report(column, words)
 
     def _check_lens_alone(self, image: str, numbers: Mapping[str, float]) -> None:
-        poses = [it for it in ("x_m", "q1_rad", "cft_x_m", "meas_x_m") if it in numbers]
+        poses = [name for name in ("x_m", "q1_rad", "cft_x_m", "meas_x_m") if name in numbers]
         if not (image or self.with_corners) or poses:
             self.report(
                 "role",

@@ -104,11 +104,11 @@ class NeedTable(TableModel):
         if self.at == VIEWS:
             return ""
         numbers = self.at if isinstance(self.at, list) else []
-        if len(numbers) != 3 or not all(type(it) in (int, float) for it in numbers):
+        if len(numbers) != 3 or not all(type(number) in (int, float) for number in numbers):
             return f'is {self.at!r}, but must be "{VIEWS}" or [x, y, z] in the base [m]'
-        if not all(abs(it) < np.inf for it in numbers):
+        if not all(abs(number) < np.inf for number in numbers):
             return f"is {self.at!r}, but must be finite numbers: [x, y, z] in the base [m]"
-        if not all(abs(it) <= _FAR_M for it in numbers):
+        if not all(abs(number) <= _FAR_M for number in numbers):
             return (
                 f"is {self.at!r}, farther than any arm reaches: it is in the base, in metres "
                 f"(under {_FAR_M:g})"

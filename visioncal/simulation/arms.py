@@ -289,7 +289,7 @@ def _linearise(
     jacobian = np.swapaxes(np.concatenate([axes, levers], axis=2), 1, 2)
     # Half the sum of the cross products of the axes: zero only where the rotations agree, or
     # where they differ by half a turn, which the caller's check of the error does not see.
-    here, there = (np.swapaxes(it[:, :3, :3], 1, 2) for it in (tip, goal))
+    here, there = (np.swapaxes(array[:, :3, :3], 1, 2) for array in (tip, goal))
     turn = 0.5 * cross(here, there).sum(axis=1)
     opposed = np.einsum("mij,mij->m", tip[:, :3, :3], goal[:, :3, :3]) < 0.0
     turn[opposed] *= 2.0 / np.maximum(np.linalg.norm(turn[opposed], axis=1), 1e-3)[:, None]

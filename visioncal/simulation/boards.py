@@ -56,7 +56,7 @@ def corners_m(sheet: Sheet) -> FloatArray:
     elif target.kind == "points":
         flat = np.array(target.points_m)[:, :2]
     elif target.kind == "aprilgrid":
-        flat = np.concatenate([_around(it, target.square_m) for _, it in tags_m(target)])
+        flat = np.concatenate([_around(array, target.square_m) for _, array in tags_m(target)])
     else:
         first, less = (1, 1) if target.kind == "charuco" else (0, 0)
         columns = np.arange(target.columns - less) + first

@@ -90,7 +90,7 @@ class Cell:
             cam_from_target=self.cam_from_target[kept],
             exact_corners=exact,
             corners=found,
-            wrong_views=tuple(at for at, it in enumerate(kept) if it in self.wrong_views),
+            wrong_views=tuple(at for at, index in enumerate(kept) if index in self.wrong_views),
             shown=Shown(self.shown.stops[kept], self.shown.boards[kept]),
             payloads=tuple(self.payloads[at] for at in kept if self.payloads),
             approach=None if self.approach is None else self.approach[kept],
@@ -99,7 +99,7 @@ class Cell:
     def standing_at(self, true_base_from_flange: FloatArray) -> "Cell":
         """The cell as its views look where the flange really stands at (m, 4, 4)."""
         boards = self.shown.boards
-        poses = [before_camera(it, true_base_from_flange) for it in chains(self.transforms)]
+        poses = [before_camera(chain, true_base_from_flange) for chain in chains(self.transforms)]
         seen = np.array(poses)[boards, np.arange(len(boards))]
         exact = tuple(
             seen_in(self.options, self.sheets[board], pose, view)
@@ -114,7 +114,7 @@ class Cell:
     def showing(self, exact_corners: Sequence[Corners]) -> "Cell":
         """The cell with corners elsewhere in the images of its views, and found anew."""
         noise, sigma_px = self.options.stream(Stream.PIXELS), self.options.pixel_sigma_px
-        found = tuple(detected(it, sigma_px, noise) for it in exact_corners)
+        found = tuple(detected(corners_, sigma_px, noise) for corners_ in exact_corners)
         return replace(self, exact_corners=tuple(exact_corners), corners=found)
 
 
@@ -206,7 +206,10 @@ def _bumped(options: CellOptions, transforms: Mapping[str, FloatArray]) -> dict[
     away = options.stream(Stream.BUMP).standard_normal(3)
     away *= options.camera_moved_m / np.linalg.norm(away)
     push = compose(np.eye(3), away)
-    return {name: it @ push if name.endswith("cam") else it for name, it in transforms.items()}
+    return {
+        name: transform @ push if name.endswith("cam") else transform
+        for name, transform in transforms.items()
+    }
 
 
 def looking_at(point: FloatArray, away: FloatArray, view: FloatArray) -> FloatArray:

@@ -134,7 +134,7 @@ class _Reader:
         label = f"{self.file}, {path}" if path else self.file
         if not isinstance(row, dict):
             raise Table({path: row}, self.file).refuse(path, row, "a table")
-        types = {it: kind for it, kind in get_type_hints(kind).items() if it not in given}
+        types = {name: kind for name, kind in get_type_hints(kind).items() if name not in given}
         unknown = sorted(row.keys() - types.keys())
         if unknown:
             known = [*types, *([] if path else _TABLES)]
@@ -143,7 +143,7 @@ class _Reader:
                 culprits=[f"{label}: {unknown[0]}"],
                 next_step=did_you_mean(unknown[0], known),
             )
-        needed = {it.name for it in fields(kind) if _has_no_default(it)}
+        needed = {field.name for field in fields(kind) if _has_no_default(field)}
         table = Table(row, label)
         values: dict[str, Any] = {
             key: self._value(table, key, hint, kind, path)
@@ -196,5 +196,5 @@ def _number(table: Table, key: str) -> float:
     return value
 
 
-def _has_no_default(it: Field[Any]) -> bool:
-    return it.default is MISSING and it.default_factory is MISSING
+def _has_no_default(field: Field[Any]) -> bool:
+    return field.default is MISSING and field.default_factory is MISSING

@@ -157,7 +157,7 @@ def real_dynamics(name: str, rng: np.random.Generator, *, stribeck: bool = False
         around(_MOTOR_INERTIA),
     )
     return replace(
-        nominal, bodies=tuple(_off(it, _OFF_SHARE, rng) for it in nominal.bodies), gears=gears
+        nominal, bodies=tuple(_off(body, _OFF_SHARE, rng) for body in nominal.bodies), gears=gears
     )
 
 

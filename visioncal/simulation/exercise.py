@@ -114,7 +114,7 @@ def record(
     else:
         groups["tau{}_nm"] = torques
     numbers = range(1, done.q.shape[1] + 1)
-    columns = ("stamp_s", *(name.format(it) for name in groups for it in numbers))
+    columns = ("stamp_s", *(name.format(number) for name in groups for number in numbers))
     return Stream(columns, np.column_stack([done.times_s, *groups.values()]))
 
 
@@ -169,7 +169,7 @@ def exercise(options: ExerciseOptions) -> Exercised:
         "sweeps": slow_sweep(count, rng, seconds=30.0, rate_hz=rate),
         "fresh": multi_sine(count, rng, rate_hz=rate),
     }
-    streams = {name: record(built, it, rng, options.senses) for name, it in motions.items()}
+    streams = {name: record(built, motion, rng, options.senses) for name, motion in motions.items()}
     return Exercised(streams, empty)
 
 

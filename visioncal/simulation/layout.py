@@ -189,7 +189,7 @@ class NetworkOptions(DrawOptions):
     def __post_init__(self) -> None:
         if self.stops < 1:
             raise DataError(f"simulation: stops is {self.stops}, at least 1 is needed.")
-        if any(it.warms_up for it in self.robots) and self.pace_s <= 0.0:
+        if any(robot.warms_up for robot in self.robots) and self.pace_s <= 0.0:
             raise DataError("simulation: a robot that warms up needs pace_s, from stop to stop.")
         for robot in self.robots:
             if robot.wrong_stops > self.stops:
@@ -203,12 +203,14 @@ class NetworkOptions(DrawOptions):
                     f"simulation: {moved.frame} is pushed before stop {moved.from_stop}; of "
                     f"{self.stops} stops the last is {self.stops - 1}."
                 )
-        swept = [it.robot for it in self.sweeps]
+        swept = [sweep.robot for sweep in self.sweeps]
         if len(set(swept)) < len(swept):
             raise DataError("simulation: a robot moves in one sweep; in two its streams are one.")
-        known = {CELL, *(it.name for it in self.robots)}
-        on = [(it.name, it.on) for it in self.cameras]
-        on += [(it.name, it.on) for it in self.boards] + [(it.name, it.on) for it in self.points]
+        known = {CELL, *(robot.name for robot in self.robots)}
+        on = [(camera.name, camera.on) for camera in self.cameras]
+        on += [(board.name, board.on) for board in self.boards] + [
+            (point.name, point.on) for point in self.points
+        ]
         for name, carrier in on:
             if carrier not in known:
                 raise DataError(

@@ -84,10 +84,10 @@ class LiveView:
         parts = int(np.clip(np.ceil(smear_px), 3, _MOST_PARTS))
         at = (np.arange(parts) + 0.5) / parts * (len(joints) - 1)
         steps = np.arange(len(joints))
-        between_them = np.stack([np.interp(at, steps, it) for it in joints.T], axis=1)
+        between_them = np.stack([np.interp(at, steps, column) for column in joints.T], axis=1)
         poses = self.cam_from_target(between_them)
         if smear_px < _SHORT_PX:
-            lights = (self._light(*it) for it in zip(poses, between_them, strict=True))
+            lights = (self._light(*pair) for pair in zip(poses, between_them, strict=True))
         else:
             middle = self.cam_from_target(joints[len(joints) // 2, None])[0]
             whole = self._light(middle, joints[len(joints) // 2], samples=1)
@@ -135,7 +135,9 @@ def _faces(cell: Cell, cam_from_target: FloatArray) -> bool:
     points_cam = points @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]
     cosines = points_cam[:, 2] / np.linalg.norm(points_cam, axis=1)
     camera = cell.options.camera
-    ends = np.array(np.meshgrid(*((0.0, it - 1.0) for it in camera.resolution))).reshape(2, 4).T
+    ends = (
+        np.array(np.meshgrid(*((0.0, index - 1.0) for index in camera.resolution))).reshape(2, 4).T
+    )
     # The target's z points into the board.
     in_front = invert(cam_from_target)[2, 3] < 0.0
     return bool(in_front and cosines.max() > rays(camera, ends)[:, 2].min())

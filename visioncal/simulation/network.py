@@ -42,7 +42,7 @@ def simulate_network(options: NetworkOptions) -> Network:
     """
     parents, transforms = parents_of(options), mounted(options)
     moved = postures(options, transforms)
-    arms = {it.name: arm_named(it.robot) for it in options.robots}
+    arms = {robot.name: arm_named(robot.robot) for robot in options.robots}
     true_arms, flanges, joints, heat = {}, {}, {}, {}
     wrong_stops: dict[str, tuple[int, ...]] = {}
     stamps_s = np.arange(options.stops, dtype=np.float64) * options.pace_s
@@ -67,8 +67,8 @@ def simulate_network(options: NetworkOptions) -> Network:
         arms=arms,
         true_arms=true_arms,
         stated={
-            it.name: it.stated(options.stream(Stream.LENS, at))
-            for at, it in enumerate(options.cameras)
+            camera.name: camera.stated(options.stream(Stream.LENS, at))
+            for at, camera in enumerate(options.cameras)
         },
         joints=joints,
         base_from_flange={name: forward(arm, joints[name]) for name, arm in arms.items()},
@@ -79,19 +79,21 @@ def simulate_network(options: NetworkOptions) -> Network:
         wrong_views=(),
         wrong_stops=wrong_stops,
         stamps_s=stamps_s if options.pace_s else None,
-        loads={it.name: it.loads(options.stops) for it in options.robots if it.payloads},
+        loads={
+            robot.name: robot.loads(options.stops) for robot in options.robots if robot.payloads
+        },
         approach={
-            it.name: sides
-            for it in options.robots
-            if (sides := it.approach(options.stops)) is not None
+            robot.name: sides
+            for robot in options.robots
+            if (sides := robot.approach(options.stops)) is not None
         },
         streams=heat,
     )
     cell = with_faults(_observed(cell))
-    last = {name: it[-1] for name, it in _hanging(cell).items()}
+    last = {name: array[-1] for name, array in _hanging(cell).items()}
     for swept in options.sweeps:
-        taken = [it.view for it in cell.sights] + [it.view for it in cell.readings]
-        first = 1 + max([*taken, *(it[0] for it in cell.pose_rows)], default=-1)
+        taken = [sight.view for sight in cell.sights] + [reading.view for reading in cell.readings]
+        first = 1 + max([*taken, *(row[0] for row in cell.pose_rows)], default=-1)
         sights, recorded = sweep_network(cell, swept, last, first)
         streams = {**cell.streams, swept.robot: recorded}
         cell = replace(cell, sights=(*cell.sights, *sights), streams=streams)
@@ -124,7 +126,7 @@ def _observed(cell: Network) -> Network:
             readings.append(reading)
             _need(cell, needed, frame_name("point", reading.point), "")
             view += 1
-        for robot in [it for it, is_given in needed.items() if not is_given]:
+        for robot in [name for name, is_given in needed.items() if not is_given]:
             pose_rows.append((view, stop, robot))
             view += 1
     sights += _of_lenses(cell, view)
@@ -133,7 +135,9 @@ def _observed(cell: Network) -> Network:
 
 def _need(cell: Network, needed: dict[str, bool], first: str, second: str) -> None:
     """Notes the robots between two frames, and that the row has the pose of the first of them."""
-    robots = [it for frame in (first, second) if frame and (it := cell.robot_of(frame)) is not None]
+    robots = [
+        arm for frame in (first, second) if frame and (arm := cell.robot_of(frame)) is not None
+    ]
     if len(set(robots)) < len(robots):
         return
     for place, robot in enumerate(robots):
@@ -143,7 +147,7 @@ def _need(cell: Network, needed: dict[str, bool], first: str, second: str) -> No
 def _hanging(cell: Network) -> dict[str, FloatArray]:
     """(s, 4, 4) where each frame hangs in its parent, stop by stop."""
     stops = cell.options.stops
-    hangs = {name: np.tile(it, (stops, 1, 1)) for name, it in cell.transforms.items()}
+    hangs = {name: np.tile(transform, (stops, 1, 1)) for name, transform in cell.transforms.items()}
     for at, moved in enumerate(cell.options.moved):
         if moved.frame not in hangs:
             raise DataError(
@@ -176,8 +180,8 @@ def _shown(cell: Network, camera: str, board: str, pose: FloatArray) -> FloatArr
     options = cell.options
     seen = looks_at(camera_named(options, camera).camera, board_named(options, board), pose)
     places = (
-        [it.name for it in options.cameras].index(camera),
-        [it.name for it in options.boards].index(board),
+        [camera_at.name for camera_at in options.cameras].index(camera),
+        [board_at.name for board_at in options.boards].index(board),
     )
     kept = options.stream(Stream.SHARE, *places).random(options.stops) < options.share_seen
     return np.asarray(seen & kept)

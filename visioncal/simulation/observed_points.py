@@ -118,7 +118,7 @@ class Network:
     @property
     def corners(self) -> tuple[Corners, ...]:
         """What was detected in all images, by ascending view."""
-        return tuple(it.corners for it in self.sights)
+        return tuple(sight.corners for sight in self.sights)
 
     def between(self, first: str, second: str) -> FloatArray:
         """(4, 4) `first_from_second` of two frames of the cell, none of which a robot moves."""
@@ -135,13 +135,15 @@ class Network:
     def robot_of(self, frame: str) -> str | None:
         """The robot whose pose the rows of a camera, board or point have; None for none."""
         on = self.parents[frame]
-        return next((it for it in self.arms if frame_name("flange", it) == on), None)
+        return next((arm for arm in self.arms if frame_name("flange", arm) == on), None)
 
     @property
     def is_named(self) -> bool:
         """Whether its things have names: else there is one of each kind."""
         options = self.options
-        return any([*(it.name for it in options.robots), *(it.name for it in options.boards)])
+        return any(
+            [*(robot.name for robot in options.robots), *(board.name for board in options.boards)]
+        )
 
 
 def whole(
@@ -158,16 +160,16 @@ def whole(
     options, shown = cell.options, cell.shown
     names = NAMES if len(cell.sheets) > 1 else ("",)
     camera_on, board_on = ("", CELL) if options.mount == "eye-in-hand" else (CELL, "")
-    optics = {it.name: getattr(options, it.name) for it in fields(CameraOptions)}
+    optics = {entry.name: getattr(options, entry.name) for entry in fields(CameraOptions)}
     described = NetworkOptions(
         robots=(RobotAt("", (0.0, 0.0, 0.0), **options.of_arm),),
         cameras=(CameraAt("", camera_on, **optics),),
         boards=tuple(
-            BoardAt(name, board_on, target=it.target, scale=it.scale, bow_m=it.bow_m)
-            for name, it in zip(names, cell.sheets, strict=True)
+            BoardAt(name, board_on, target=sheet.target, scale=sheet.scale, bow_m=sheet.bow_m)
+            for name, sheet in zip(names, cell.sheets, strict=True)
         ),
         stops=int(shown.stops.max()) + 1,
-        **{it.name: getattr(options, it.name) for it in fields(DrawOptions)},
+        **{entry.name: getattr(options, entry.name) for entry in fields(DrawOptions)},
     )
     # The first view of each stop has what is the same for all of them.
     stops, first = np.unique(shown.stops, return_index=True)
@@ -209,19 +211,21 @@ def whole(
         wrong_views=cell.wrong_views,
         wrong_stops={},
         stamps_s=_PACE_S * np.arange(float(described.stops)) if stamps_s is None else stamps_s,
-        loads={"": [loads.get(it, Payload()) for it in range(described.stops)]} if loads else {},
+        loads={"": [loads.get(index, Payload()) for index in range(described.stops)]}
+        if loads
+        else {},
         approach={} if cell.approach is None else by_stop(cell.approach),
     )
 
 
 def camera_named(options: NetworkOptions, name: str) -> CameraAt:
     """The camera of that name."""
-    return next(it for it in options.cameras if it.name == name)
+    return next(camera for camera in options.cameras if camera.name == name)
 
 
 def board_named(options: NetworkOptions, name: str) -> BoardAt:
     """The board of that name."""
-    return next(it for it in options.boards if it.name == name)
+    return next(board for board in options.boards if board.name == name)
 
 
 def with_faults(cell: Network) -> Network:
@@ -232,7 +236,7 @@ def with_faults(cell: Network) -> Network:
     for at, sight in enumerate(sights):
         if sight.stop >= 0 and _moves(cell, sight):
             groups.setdefault((sight.camera, sight.board), []).append(at)
-    pools = [rng.permutation(it).tolist() for it in groups.values() if len(it) > 1]
+    pools = [rng.permutation(group).tolist() for group in groups.values() if len(group) > 1]
     wrong: list[int] = []
     for _ in range(options.swapped_rows):
         pool = _pool(pools, 2)
@@ -248,7 +252,7 @@ def with_faults(cell: Network) -> Network:
         row = pool.pop()
         sights[row] = _showing(cell.sights[row], cell.sights[pool[0]])
         wrong.append(row)
-    views = sorted(cell.sights[it].view for it in wrong)
+    views = sorted(cell.sights[index].view for index in wrong)
     return replace(cell, sights=tuple(sights), wrong_views=tuple(views))
 
 

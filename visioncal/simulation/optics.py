@@ -59,7 +59,7 @@ def mistaken(camera: Camera, rms_px: float, rng: np.random.Generator) -> Camera:
     draws = rng.standard_normal(4 + count)
     matrix, bent = draws[:4], draws[4:] * (2.0 / focal)
     middles = (np.arange(24) + 0.5) / 24
-    grid = np.meshgrid(*(middles * it - 0.5 for it in camera.resolution))
+    grid = np.meshgrid(*(middles * index - 0.5 for index in camera.resolution))
     looks = rays(camera, np.stack(grid, axis=-1))
 
     def off(share: float) -> Camera:

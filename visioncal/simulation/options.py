@@ -40,7 +40,7 @@ def _tags() -> Target:
         dictionary=_APRILTAGS,
         points_m=tuple(points),
         point_numbers=tuple(range(len(points))),
-        point_tags=tuple((it[0], corner) for it in tags for corner in range(4)),
+        point_tags=tuple((tag[0], corner) for tag in tags for corner in range(4)),
     )
 
 
@@ -75,7 +75,7 @@ BOARDS: Mapping[str, Target] = {
     "symmetric-circles": _SYMMETRIC,
     "tags": _tags(),
 }
-TARGETS: Mapping[str, Target] = {it.name: it for it in BOARDS.values()}
+TARGETS: Mapping[str, Target] = {board.name: board for board in BOARDS.values()}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -106,7 +106,7 @@ def columns_of(raster: Raster, values: FloatArray) -> Columns:
     mean = values.mean()
     across = raster.across
     found = raster.down.coefficients @ (values - mean) @ across.coefficients.T
-    taps = [found.astype(np.float32)[:, across.first + it] for it in range(_TAPS)]
+    taps = [found.astype(np.float32)[:, across.first + index] for index in range(_TAPS)]
     return Columns(np.float32(mean), np.einsum("tac,ct->ac", taps, across.weights))
 
 

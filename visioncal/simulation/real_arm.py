@@ -38,7 +38,7 @@ class ArmOptions(ArmErrors):
     @property
     def of_arm(self) -> dict[str, Any]:
         """The fields of an arm by their names, for options that have an arm likewise."""
-        return {it.name: getattr(self, it.name) for it in fields(ArmOptions)}
+        return {field.name: getattr(self, field.name) for field in fields(ArmOptions)}
 
     @property
     def sigma(self) -> FloatArray:

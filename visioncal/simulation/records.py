@@ -121,14 +121,14 @@ def write_network(
     """
     folder = Path(folder)
     streams = {
-        f"{robot}_{motion}": it
+        f"{robot}_{motion}": stream
         for robot, done in (exercised or {}).items()
-        for motion, it in done.streams.items()
+        for motion, stream in done.streams.items()
     }
     session = network_session(cell, folder.name, progress, seen=seen)
     truth = _truth_of_network(cell)
     if exercised:
-        truth["dynamics"] = {robot: asdict(it.arm) for robot, it in exercised.items()}
+        truth["dynamics"] = {robot: asdict(item.arm) for robot, item in exercised.items()}
     every = session.with_streams({**session.streams, **streams})
     return _write(every, folder, truth, touched or {})
 
@@ -140,8 +140,8 @@ def _write(
     session.save(folder)
     if touched:
         write_touches(touched, folder)
-    for robot, it in touched.items():
-        truth["transforms"] |= it.transforms(robot)
+    for robot, touching in touched.items():
+        truth["transforms"] |= touching.transforms(robot)
     write_truth(folder, truth)
     return folder
 
@@ -170,21 +170,28 @@ def network_session(
 
     With `seen="names"`, `Network.corners` is what was detected in the images that are not there.
     """
-    if seen in ("images", "poses") and any(it.readout_s for it in cell.options.sweeps):
+    if seen in ("images", "poses") and any(sweep.readout_s for sweep in cell.options.sweeps):
         raise DataError(
             "simulation: images and poses are those of a moment, and a sweep has readout_s.",
             next_step="Leave readout_s out, or write corners: visioncal simulate --no-images.",
         )
-    sights = [it for it in cell.sights if not it.is_of_lens or seen != "poses"]
+    sights = [sight for sight in cell.sights if not sight.is_of_lens or seen != "poses"]
     rows = _rows(cell, sights, seen)
     numbers = dict.fromkeys(key for row in rows for key in row.numbers)
     texts = dict.fromkeys(key for row in rows for key in row.text)
-    last = [it for it in texts if it == "approach"]
+    last = [text for text in texts if text == "approach"]
     stops = ("stop",) if cell.is_named else ()
     images = ("image",) if any(row.image for row in rows) else ()
-    columns = ("view", *stops, *(it for it in texts if it not in last), *images, *numbers, *last)
-    boards = [it for it in cell.options.boards if it.name or seen != "poses"]
-    documents = {it.name: target_document(it.target) for it in boards}
+    columns = (
+        "view",
+        *stops,
+        *(text for text in texts if text not in last),
+        *images,
+        *numbers,
+        *last,
+    )
+    boards = [board for board in cell.options.boards if board.name or seen != "poses"]
+    documents = {board.name: target_document(board.target) for board in boards}
     single = next(iter(documents.values()), None)
     return Session.assemble(
         _document(cell, name, seen),
@@ -198,8 +205,8 @@ def network_session(
 
 def _rows(cell: Network, sights: Sequence[Sight], seen: Seen) -> list[View]:
     """The rows of what cameras saw, of what instruments read, and of poses alone."""
-    views = {it.view: _row(cell, it, seen) for it in sights}
-    turned = {it.name for it in cell.options.instruments if it.sigma_rad}
+    views = {sight.view: _row(cell, sight, seen) for sight in sights}
+    turned = {instrument.name for instrument in cell.options.instruments if instrument.sigma_rad}
     for reading in cell.readings:
         robot = cell.robot_of(frame_name("point", reading.point))
         keys = POSE if reading.instrument in turned else POSE[:3]
@@ -216,12 +223,14 @@ def _document(cell: Network, name: str, seen: Seen) -> dict[str, Any]:
     """What session.toml says."""
     options = cell.options
     document: dict[str, Any] = {"schema": 1, "name": name}
-    if any(not it.name for it in options.cameras):
+    if any(not camera.name for camera in options.cameras):
         in_hand = cell.parents[frame_name("camera", "")] != CELL
         document["mount"] = "eye-in-hand" if in_hand else "eye-to-hand"
-    robots = {it.name: {"model": it.robot, "tip": "flange"} for it in options.robots}
-    cameras = {it.name: _camera_table(it, cell.stated[it.name]) for it in options.cameras}
-    boards = {it.name: {"target": _target_place(it)} for it in options.boards}
+    robots = {robot.name: {"model": robot.robot, "tip": "flange"} for robot in options.robots}
+    cameras = {
+        camera.name: _camera_table(camera, cell.stated[camera.name]) for camera in options.cameras
+    }
+    boards = {board.name: {"target": _target_place(board)} for board in options.boards}
     if seen == "poses":
         # Of the only camera and the only board, measured poses say all.
         cameras.pop("", None)
@@ -229,13 +238,14 @@ def _document(cell: Network, name: str, seen: Seen) -> dict[str, Any]:
     document |= _tables("robot", robots)
     document |= boards[""] if "" in boards else _tables("target", boards)
     document |= _tables("camera", cameras)
-    if any(it.name for it in options.robots):
+    if any(robot.name for robot in options.robots):
         document["frames"] = {
-            it: on for it, on in cell.parents.items() if not it.startswith("base")
+            word: on for word, on in cell.parents.items() if not word.startswith("base")
         }
     instruments = {
-        it.name: {"sigma_m": it.sigma_m} | ({"sigma_rad": it.sigma_rad} if it.sigma_rad else {})
-        for it in options.instruments
+        instrument.name: {"sigma_m": instrument.sigma_m}
+        | ({"sigma_rad": instrument.sigma_rad} if instrument.sigma_rad else {})
+        for instrument in options.instruments
     }
     return document | _tables("instrument", instruments)
 
@@ -274,7 +284,7 @@ def _row(cell: Network, sight: Sight, seen: Seen) -> View:
     if sight.is_of_lens:
         return View(sight.view, image, text=_named(text | {"role": "intrinsics"}))
     frames = frame_name("camera", sight.camera), frame_name("target", sight.board)
-    robots = [it for frame in frames if (it := cell.robot_of(frame)) is not None]
+    robots = [arm for frame in frames if (arm := cell.robot_of(frame)) is not None]
     robot = robots[0] if len(set(robots)) == len(robots) > 0 else None
     return _view(cell, sight.view, sight.stop, robot, numbers, text, image)
 
@@ -305,16 +315,16 @@ def _view(
 
 def _named(text: Mapping[str, str]) -> dict[str, str]:
     """A row's words but for those of the only one of its kind, which has no name."""
-    return {column: it for column, it in text.items() if it}
+    return {column: name for column, name in text.items() if name}
 
 
 def _corners(sights: Sequence[Sight]) -> CornerTable:
     """The table of the corners that a detector found."""
-    counts = [len(it.corners.ids) for it in sights]
+    counts = [len(sight.corners.ids) for sight in sights]
     return CornerTable(
-        np.repeat([it.view for it in sights], counts),
-        np.concatenate([it.corners.ids for it in sights]),
-        np.concatenate([it.corners.px for it in sights]),
+        np.repeat([sight.view for sight in sights], counts),
+        np.concatenate([sight.corners.ids for sight in sights]),
+        np.concatenate([sight.corners.px for sight in sights]),
         ("",) * sum(counts),
     )
 
@@ -326,7 +336,7 @@ def measured_poses(cell: Cell) -> FloatArray:
         DataError: A view shows too few corners for a pose.
     """
     single = whole(cell)
-    return np.array([measured_pose(single, it) for it in single.sights])
+    return np.array([measured_pose(single, sight) for sight in single.sights])
 
 
 def measured_pose(cell: Network, sight: Sight) -> FloatArray:
@@ -375,7 +385,7 @@ def _rendered(cell: Network, progress: Progress | None) -> dict[str, bytes]:
     scenes: dict[tuple[str, str], Scene] = {}
     files: dict[str, bytes] = {}
     for camera in cell.options.cameras:
-        for at, sight in enumerate(it for it in cell.sights if it.camera == camera.name):
+        for at, sight in enumerate(sight for sight in cell.sights if sight.camera == camera.name):
             seen = sight.camera, sight.board
             scene = scenes.get(seen) or scenes.setdefault(seen, network_scene(cell, *seen))
             files[_image(cell, sight)] = encode(render(scene, at), camera.jpeg_quality)
@@ -392,8 +402,8 @@ def _truth_of_network(cell: Network) -> dict[str, Any]:
         "wrong_views": cell.wrong_views,
         "wrong_stops": cell.wrong_stops,
         "moved": [
-            {"frame": it.frame, "from_stop": cell.options.first_pushed(it)}
-            for it in cell.options.moved
+            {"frame": move.frame, "from_stop": cell.options.first_pushed(move)}
+            for move in cell.options.moved
         ],
         "options": asdict(cell.options),
         "arms": {name: asdict(arm) for name, arm in cell.true_arms.items()},

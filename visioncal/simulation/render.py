@@ -120,9 +120,9 @@ def prepare_scene(cell: Cell, board: int = 0) -> Scene:
 def network_scene(cell: Network, camera: str, board: str) -> Scene:
     """Draws the textures of what one camera sees of one board; see `prepare_scene`."""
     options, optics = cell.options, camera_named(cell.options, camera)
-    sights = [it for it in cell.sights if it.camera == camera]
+    sights = [sight for sight in cell.sights if sight.camera == camera]
     sheet = board_named(options, board)
-    place = [it.name for it in options.cameras].index(camera)
+    place = [camera_at.name for camera_at in options.cameras].index(camera)
     # The first draws as the only one does.
     rng = options.stream(Stream.BACKDROP, *((place,) if place else ()))
     seer, holder = frame_name("camera", camera), cell.robot_of(frame_name("target", board))
@@ -134,7 +134,9 @@ def network_scene(cell: Network, camera: str, board: str) -> Scene:
     return Scene(
         camera=optics,
         board=sheet,
-        sheet=_textured(optics.camera, sheet, np.array([it.cam_from_target for it in sights])),
+        sheet=_textured(
+            optics.camera, sheet, np.array([sight.cam_from_target for sight in sights])
+        ),
         backdrop=_table(rng) if arm is None else _wall(rng),
         sights=sights,
         arm=arm,
@@ -307,7 +309,7 @@ def _cover(light: Float32Array, scene: Scene, cam_from_target: FloatArray, sampl
     level = int(np.argmin(np.abs(np.log(np.array(sheet.texel_m) / spacing))))
     # Texel centres are half a texel from the texture's outer corner.
     texels = (flat - sheet.origin_m) / sheet.texel_m[level] - 0.5
-    at_x, at_y = (columns_of(raster, texels[..., it]) for it in range(2))
+    at_x, at_y = (columns_of(raster, texels[..., index]) for index in range(2))
     width, height = patch.size
     for top in range(0, height, _BAND_PX):
         rows = min(_BAND_PX, height - top)

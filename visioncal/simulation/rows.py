@@ -10,8 +10,8 @@ POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 
 def load_row(load: Payload) -> dict[str, float]:
     """The columns of what the flange carries and is pushed by."""
-    centre = {f"payload_{it}_m": at for it, at in zip("xyz", load.centre_m, strict=True)}
-    force = {f"force_{it}_n": at for it, at in zip("xyz", load.force_n, strict=True)}
+    centre = {f"payload_{name}_m": at for name, at in zip("xyz", load.centre_m, strict=True)}
+    force = {f"force_{name}_n": at for name, at in zip("xyz", load.force_n, strict=True)}
     return {"payload_kg": load.kg} | centre | force
 
 

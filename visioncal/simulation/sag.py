@@ -138,17 +138,17 @@ def load_torques(
 ) -> FloatArray:
     """(m, n) by which weight and force turn the joints [N m]: their moments about the axes."""
     frames = link_frames(arm, joints)
-    kg, centres = (np.array(it) for it in zip(*_BODIES[arm.name], strict=True))
+    kg, centres = (np.array(pair) for pair in zip(*_BODIES[arm.name], strict=True))
     weights = giving.mass_share * kg[:, None] * _GRAVITY
     at = frames[:, 1:, :3, :3] @ centres[:, :, None]
     places = at[..., 0] + frames[:, 1:, :3, 3]
     forces = np.broadcast_to(weights, places.shape)
     if payloads:
         tip = frames[:, -1]
-        hung = np.array([it.centre_m for it in payloads])
+        hung = np.array([payload.centre_m for payload in payloads])
         held = np.einsum("mij,mj->mi", tip[:, :3, :3], hung) + tip[:, :3, 3]
-        load = np.array([it.kg for it in payloads])[:, None] * _GRAVITY
-        pushed = np.array([it.force_n for it in payloads])
+        load = np.array([payload.kg for payload in payloads])[:, None] * _GRAVITY
+        pushed = np.array([payload.force_n for payload in payloads])
         places = np.concatenate([places, held[:, None], tip[:, None, :3, 3]], axis=1)
         forces = np.concatenate([forces, load[:, None], pushed[:, None]], axis=1)
     torques = np.empty(joints.shape)

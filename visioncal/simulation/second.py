@@ -45,7 +45,7 @@ def with_second(
 ) -> dict[str, FloatArray]:
     """Adds the second board to the two edges of a cell, and names both boards' edges."""
     (x_name, x), (z_name, z) = transforms.items()
-    first, further = (centre_m(it) for it in sheets)
+    first, further = (centre_m(sheet) for sheet in sheets)
     middle = z[:3, :3] @ first + z[:3, 3]
     around = Rotation.from_euler("z", second.turn_rad).as_matrix()
     if x_name == "flange_from_cam":
@@ -84,7 +84,7 @@ def shown_at(options: CellOptions, sheets: Sequence[Sheet], poses: Sequence[Floa
     count = len(poses[0])
     if len(sheets) == 1:
         return Shown(np.arange(count), np.zeros(count, dtype=np.int64))
-    seen = [looks_at(options.camera, *it) for it in zip(sheets, poses, strict=True)]
+    seen = [looks_at(options.camera, *pair) for pair in zip(sheets, poses, strict=True)]
     # What a stop was made for is in view.
     aimed = np.arange(count) % len(sheets)
     visible = np.array(seen).T

@@ -31,7 +31,7 @@ _DEPTH_M = 0.15
 
 def parents_of(options: NetworkOptions) -> dict[str, str]:
     """What each frame but the flanges hangs on, by its name in a session."""
-    parents = {frame_name("base", it.name): CELL for it in options.robots}
+    parents = {frame_name("base", robot.name): CELL for robot in options.robots}
     for kind, things in (
         ("camera", options.cameras),
         ("target", options.boards),
@@ -40,20 +40,26 @@ def parents_of(options: NetworkOptions) -> dict[str, str]:
         for thing in things:
             on = CELL if thing.on == CELL else frame_name("flange", thing.on)
             parents[frame_name(kind, thing.name)] = on
-    return parents | {frame_name("instrument", it.name): CELL for it in options.instruments}
+    return parents | {
+        frame_name("instrument", instrument.name): CELL for instrument in options.instruments
+    }
 
 
 def mounted(options: NetworkOptions) -> dict[str, FloatArray]:
     """(4, 4) where each frame hangs in its parent, before anything is pushed."""
     rng = options.stream(Stream.MOUNTINGS)
-    placed = {frame_name("base", it.name): _base(it, rng) for it in options.robots}
-    placed |= {frame_name("camera", it.name): _camera(it, rng) for it in options.cameras}
-    placed |= {frame_name("target", it.name): _board(it, rng) for it in options.boards}
+    placed = {frame_name("base", robot.name): _base(robot, rng) for robot in options.robots}
+    placed |= {
+        frame_name("camera", camera.name): _camera(camera, rng) for camera in options.cameras
+    }
+    placed |= {frame_name("target", board.name): _board(board, rng) for board in options.boards}
     for point in options.points:
         placed[frame_name("point", point.name)] = compose(np.eye(3), np.array(point.place_m))
-    for it in options.instruments:
-        turn = Rotation.from_euler("z", it.turn_rad).as_matrix()
-        placed[frame_name("instrument", it.name)] = compose(turn, np.array(it.place_m))
+    for instrument in options.instruments:
+        turn = Rotation.from_euler("z", instrument.turn_rad).as_matrix()
+        placed[frame_name("instrument", instrument.name)] = compose(
+            turn, np.array(instrument.place_m)
+        )
     return placed
 
 

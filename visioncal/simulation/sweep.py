@@ -78,7 +78,11 @@ def sweep(options: CellOptions, how: SweepOptions | None = None) -> Sweep:
     frames = simulate(options, passage.way(taken_s))
     if how.readout_s:
         frames = _by_rows(frames, passage)
-    seen = [at for at, it in enumerate(frames.exact_corners) if len(it.ids) >= _FEWEST_CORNERS]
+    seen = [
+        at
+        for at, corners_ in enumerate(frames.exact_corners)
+        if len(corners_.ids) >= _FEWEST_CORNERS
+    ]
     if len(seen) < 2:
         raise DataError(f"simulation: {len(seen)} frames of the sweep show the board.")
     taken_s = taken_s[seen]
@@ -208,7 +212,7 @@ def sweep_network(
     """
     options = cell.options
     seen_from = _chain(cell, swept, transforms)
-    at = [it.name for it in options.robots].index(swept.robot)
+    at = [robot.name for robot in options.robots].index(swept.robot)
     robot, rng = options.robots[at], options.stream(Stream.SWEEPS, at)
     ticks = options.stream(Stream.SWEEPS, at, 1)
     passage = Passage.through(cell.joints[swept.robot][: swept.stops], swept)
@@ -240,9 +244,9 @@ def _chain(
 ) -> Callable[[FloatArray], FloatArray]:
     """Where the target (k, 4, 4) is before the camera, by (k, 4, 4) `base_from_flange`."""
     there = {
-        "robot": [it.name for it in cell.options.robots],
-        "camera": [it.name for it in cell.options.cameras],
-        "target": [it.name for it in cell.options.boards],
+        "robot": [robot.name for robot in cell.options.robots],
+        "camera": [camera.name for camera in cell.options.cameras],
+        "target": [board.name for board in cell.options.boards],
     }
     for kind, name in (("robot", swept.robot), ("camera", swept.camera), ("target", swept.target)):
         if name not in there[kind]:
@@ -251,7 +255,7 @@ def _chain(
             )
     flange = frame_name("flange", swept.robot)
     ends = frame_name("camera", swept.camera), frame_name("target", swept.target)
-    on = [cell.parents[it] for it in ends]
+    on = [cell.parents[end] for end in ends]
     if sorted(on) != sorted((CELL, flange)):
         raise DataError(
             f"simulation: of camera {swept.camera} and target {swept.target} of a sweep, one has "

@@ -137,7 +137,7 @@ def _print(target: Target, shape: tuple[int, int], texels: int) -> Image:
         return _inked(_tags(target, shape, texels))
     if target.kind == "circles":
         return _inked(_circles(target, shape, texels))
-    rows, columns = (it // texels for it in shape)
+    rows, columns = (index // texels for index in shape)
     row, column = np.mgrid[:rows, :columns]
     # Boards from before OpenCV 4.6 start with a white square where the number of rows is even.
     shift = int(target.kind == "charuco" and target.legacy and rows % 2 == 0)
@@ -180,7 +180,7 @@ def _tags(target: Target, shape: tuple[int, int], texels: int) -> FloatArray:
     scale = texels / unit_m(target)
     low = np.array(pattern_box(target)[:2])
     for at in range(0, len(target.points_m), 4):
-        corner, beside = (np.array(target.points_m[at + it])[:2] for it in (0, 1))
+        corner, beside = (np.array(target.points_m[at + name])[:2] for name in (0, 1))
         cells = _modules(target, target.point_tags[at][0]) == 0
         _stamp(dark, cells, scale * (corner - low), scale * (beside - corner)[0] / len(cells))
     return dark
@@ -191,7 +191,7 @@ def _circles(target: Target, shape: tuple[int, int], texels: int) -> FloatArray:
     dark = np.zeros(shape)
     radius = 0.5 * target.diameter_m / target.square_m * texels
     for middle in radius + circles_m(target) / target.square_m * texels:
-        low, high = (np.clip(middle + it, 0, shape[::-1]) for it in (-radius - 1, radius + 2))
+        low, high = (np.clip(middle + value, 0, shape[::-1]) for value in (-radius - 1, radius + 2))
         (left, top), (right, bottom) = low.astype(int), high.astype(int)
         x, y = np.arange(left, right) + 0.5 - middle[0], np.arange(top, bottom) + 0.5 - middle[1]
         inside = np.clip(radius - np.hypot(x[None], y[:, None]) + 0.5, 0.0, 1.0)
@@ -206,7 +206,7 @@ def _stamp(dark: FloatArray, cells: Mask, corner: FloatArray, cell: float) -> No
         _overlaps(start, cell, cells.shape[axis], dark.shape[axis])
         for axis, start in enumerate(corner[::-1].tolist())
     )
-    rows, columns = (slice(it[0], it[0] + it[1].shape[1]) for it in (down, across))
+    rows, columns = (slice(pair[0], pair[0] + pair[1].shape[1]) for pair in (down, across))
     dark[rows, columns] += down[1].T @ cells @ across[1]
 
 
@@ -303,7 +303,8 @@ def _around(layer: _Canvas, margin: int) -> tuple[slice, slice]:
     """The rows and columns in which something is drawn, and so many beside them [texels]."""
     rows, columns = (np.flatnonzero(layer.any(axis=axis)) for axis in (1, 0))
     down, across = (
-        slice(max(int(it[0]) - margin, 0), int(it[-1]) + margin + 1) for it in (rows, columns)
+        slice(max(int(array[0]) - margin, 0), int(array[-1]) + margin + 1)
+        for array in (rows, columns)
     )
     return down, across
 

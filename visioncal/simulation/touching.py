@@ -131,11 +131,11 @@ def touch_network(cell: Network) -> dict[str, Touching]:
         DataError: An arm does not reach enough postures.
     """
     found = {}
-    for at, it in enumerate(cell.options.robots):
-        toucher = _Toucher(it, cell.arms[it.name], cell.true_arms[it.name])
+    for at, robot in enumerate(cell.options.robots):
+        toucher = _Toucher(robot, cell.arms[robot.name], cell.true_arms[robot.name])
         # The first draws as the only one does.
         rng = cell.options.stream(Stream.TOUCHES, *((at,) if at else ()))
-        found[it.name] = _touching(toucher, rng)
+        found[robot.name] = _touching(toucher, rng)
     return found
 
 
@@ -147,7 +147,7 @@ def _touching(toucher: _Toucher, rng: np.random.Generator) -> Touching:
     base_from_fixture = compose(lies, np.array([0.45 * reach, -0.1 * reach, 0.12 * reach]))
 
     far, aside = rng.uniform(0.08, 0.12, 4), rng.uniform(-0.02, 0.02, 2)
-    along = [[0.0, 0.0, it] for it in far[:2]]
+    along = [[0.0, 0.0, value] for value in far[:2]]
     across = [[x, 0.0, z] for x, z in zip(far[2:], aside, strict=True)]
     in_tool = np.concatenate([np.zeros((10, 3)), along, across])
     corner = np.tile(base_from_fixture[:3, 3] + [0.0, 0.0, 0.05], (len(in_tool), 1))
@@ -242,8 +242,8 @@ def write_touches(touched: Mapping[str, Touching], folder: Path) -> None:
     for name, part in {"touches": "tip", "features": "features", "points": "points"}.items():
         rows = [
             ({"robot": robot} if robot else {}) | row
-            for robot, it in touched.items()
-            for row in _rows(getattr(it, part))
+            for robot, touching in touched.items()
+            for row in _rows(getattr(touching, part))
         ]
         numbered: list[dict[str, object]] = [{"view": at} | row for at, row in enumerate(rows)]
         write_atomically(folder / f"{name}.csv", _csv(numbered))
@@ -252,8 +252,8 @@ def write_touches(touched: Mapping[str, Touching], folder: Path) -> None:
 
 def _rows(table: Touched) -> Iterator[dict[str, object]]:
     for at, (pose, q) in enumerate(zip(table.base_from_flange, table.joints, strict=True)):
-        joints = {f"q{joint}_rad": it for joint, it in enumerate(q.tolist(), start=1)}
-        yield {name: it[at] for name, it in table.columns.items()} | pose_row(pose) | joints
+        joints = {f"q{joint}_rad": value for joint, value in enumerate(q.tolist(), start=1)}
+        yield {name: column[at] for name, column in table.columns.items()} | pose_row(pose) | joints
 
 
 def _csv(rows: Sequence[Mapping[str, object]]) -> str:

@@ -113,11 +113,13 @@ def session_of(
     rows = []
     for view, (stop, point, read) in enumerate(shop.rows):
         keys = POSE if options.poses else POSE[:3]
-        numbers = {f"meas_{key}": it for key, it in pose_row(read).items() if key in keys}
+        numbers = {f"meas_{key}": value for key, value in pose_row(read).items() if key in keys}
         if poses:
             numbers |= pose_row(nominal[stop])
         if joints:
-            numbers |= {f"q{at}_rad": it for at, it in enumerate(shop.joints[stop].tolist(), 1)}
+            numbers |= {
+                f"q{at}_rad": joint for at, joint in enumerate(shop.joints[stop].tolist(), 1)
+            }
         if payloads:
             numbers |= load_row(payloads[stop])
         name = "abc"[point] if len(options.points) > 1 else ""
@@ -127,7 +129,7 @@ def session_of(
         noise["sigma_rad"] = options.sigma_rad
     facts = {"schema": 1, "name": "tracked", "instrument": noise}
     facts |= {"robot": {"model": options.robot}} if joints else {}
-    cells = [[str(it) for it in row.values()] for row in rows]
+    cells = [[str(value) for value in row.values()] for row in rows]
     return Session.assemble(facts | document, list(rows[0]), cells, MemoryImages({}))
 
 

@@ -92,7 +92,7 @@ class Warming:
 
     def at(self, stamps_s: FloatArray) -> FloatArray:
         """(m, n) temperatures of the links at some times."""
-        columns = [np.interp(stamps_s, self.stamps_s, it) for it in self.links_c.T]
+        columns = [np.interp(stamps_s, self.stamps_s, column) for column in self.links_c.T]
         return np.stack(columns, axis=1)
 
     def recorded(self, *, temperatures: bool, until_s: float = np.inf) -> Recorded:

@@ -57,7 +57,7 @@ def dark_cells(target: Target) -> tuple[Cells, ...]:
 def _tags(target: Target) -> tuple[Cells, ...]:
     """The tags of a rig, as they lie by their corners."""
     known, places = tag_corners(target), corner_positions(target)
-    if not known or np.ptp(places[:, 2]) > 0.0 or min(it.min() for it in known.values()) < 0:
+    if not known or np.ptp(places[:, 2]) > 0.0 or min(array.min() for array in known.values()) < 0:
         raise DataError(
             f"target {target.name} is a rig of points; a board can be printed, or a rig in one "
             "plane z = 0 whose points are all four corners of tags.",
@@ -109,4 +109,4 @@ def _aprilgrid(target: Target) -> tuple[Cells, ...]:
         grids.append(Cells(corner_m, side / len(cells), cells))
     x, y = np.meshgrid(np.arange(target.columns + 1), np.arange(target.rows + 1))
     squares = (side + gap) * np.stack([x, y], axis=-1).reshape(-1, 2) - gap
-    return (*grids, *(Cells(it, gap, np.ones((1, 1), bool)) for it in squares))
+    return (*grids, *(Cells(square, gap, np.ones((1, 1), bool)) for square in squares))

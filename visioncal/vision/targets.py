@@ -120,13 +120,13 @@ def _read_rig(folder: Path, name: str) -> dict[str, list[Any]]:
             next_step="Copy the table of points beside the target's file.",
         )
     table = read_table(path)
-    unknown = [it for it in table.columns if it not in RIG_COLUMNS]
-    missing = [it for it in RIG_COLUMNS[:4] if it not in table.columns]
+    unknown = [column for column in table.columns if column not in RIG_COLUMNS]
+    missing = [column for column in RIG_COLUMNS[:4] if column not in table.columns]
     if unknown or missing:
         raise DataError(
             f"{path}: its columns are {', '.join(table.columns)}; point, x_m, y_m, z_m and, where "
             "it is known, sigma_m are needed; tag and corner where they are corners of tags.",
-            culprits=[f"{path.name}: {it}" for it in (*missing, *unknown)],
+            culprits=[f"{path.name}: {word}" for word in (*missing, *unknown)],
         )
     return {name: _column(table, at) for at, name in enumerate(table.columns)}
 
@@ -148,8 +148,8 @@ def _column(table: TextTable, at: int) -> list[Any]:
 
 def rig_csv(points: Mapping[str, Sequence[float]]) -> str:
     """Writes a rig's points, column by column, as the text of its table."""
-    columns = [it for it in RIG_COLUMNS if it in points]
-    rows = zip(*(points[it] for it in columns), strict=True)
+    columns = [column for column in RIG_COLUMNS if column in points]
+    rows = zip(*(points[column] for column in columns), strict=True)
     return "\n".join([",".join(columns), *(",".join(map(repr, row)) for row in rows), ""])
 
 
@@ -232,7 +232,7 @@ def _size(table: Table, key: str) -> float:
 
 def _check_one_unit(table: Table) -> None:
     """Refuses sides of squares and markers of which one is in another unit, as their ratio says."""
-    square, marker = (table.number(it, positive=True) for it in ("square_m", "marker_m"))
+    square, marker = (table.number(name, positive=True) for name in ("square_m", "marker_m"))
     if _UNREADABLE * square < marker < square:
         return
     low, high = _MARKERS
@@ -325,10 +325,10 @@ def _circles(table: Table, name: str) -> Target:
 
 def _rig(table: Table, name: str) -> Target:
     columns = table.content.get("points")
-    if not isinstance(columns, Mapping) or not all(it in columns for it in RIG_COLUMNS[:4]):
+    if not isinstance(columns, Mapping) or not all(column in columns for column in RIG_COLUMNS[:4]):
         raise table.refuse("points", columns, 'the path of a table (points = "rig.csv")')
-    names = [it for it in RIG_COLUMNS if it in columns]
-    lists = [columns[it] for it in names]
+    names = [column for column in RIG_COLUMNS if column in columns]
+    lists = [columns[word] for word in names]
     try:
         values = np.array(lists, dtype=float)
     except (TypeError, ValueError):
@@ -339,7 +339,7 @@ def _rig(table: Table, name: str) -> Target:
     sigmas_m = values[names.index("sigma_m")] if "sigma_m" in names else np.zeros(0)
     if len(numbers) < _FEWEST_POINTS:
         raise table.refuse("points", f"a table of {len(numbers)}", "four points or more")
-    repeated = sorted({int(it) for it in numbers if np.sum(numbers == it) > 1})
+    repeated = sorted({int(number) for number in numbers if np.sum(numbers == number) > 1})
     if repeated or (numbers != np.round(numbers)).any():
         given = f"a table with point {repeated[0]} twice" if repeated else "a table"
         raise table.refuse("points", given, "a whole number of its own for each point")
@@ -365,7 +365,7 @@ def _rig(table: Table, name: str) -> Target:
 
 def _tags_of_rig(table: Table, columns: Mapping[str, Any]) -> dict[str, Any]:
     """Which corners of which tags a rig's points are, and the tags' dictionary."""
-    given = [it for it in ("tag", "corner") if it in columns]
+    given = [name for name in ("tag", "corner") if name in columns]
     if not given:
         return {}
     if len(given) == 1:
@@ -430,7 +430,10 @@ def target_document(target: Target) -> dict[str, Any]:
         tags = np.reshape(target.point_tags, (-1, 2)).T.astype(int).tolist()
         columns = (list(target.point_numbers), x_m, y_m, z_m, list(target.point_sigmas_m), *tags)
         rig = dict(zip(RIG_COLUMNS, columns, strict=True))
-        document = {"kind": "points", "points": {name: it for name, it in rig.items() if it}}
+        document = {
+            "kind": "points",
+            "points": {name: value for name, value in rig.items() if value},
+        }
         return document | ({"dictionary": target.dictionary} if target.point_tags else {})
     fields = {key: getattr(target, _NAMES.get(key, key)) for key in _FORMS[target.kind].split()}
     return {"kind": target.kind, **fields}
@@ -519,7 +522,7 @@ def tag_corners(target: Target) -> dict[int, IntArray]:
 
 def first_corners(targets: Sequence[Target]) -> IntArray:
     """Numbers (b,) that the first corners of several targets get where all are numbered through."""
-    counts = [len(corner_positions(it)) for it in targets]
+    counts = [len(corner_positions(target)) for target in targets]
     return np.cumsum([0, *counts], dtype=np.int64)[:-1]
 
 

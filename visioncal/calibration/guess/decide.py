@@ -93,10 +93,10 @@ def guess_reading(
         DegenerateError: Too few rows have both poses.
     """
     mounts = MOUNTS if mount is None else (mount,)
-    recordings = [Recording(robot, camera, it, is_measured) for it in mounts]
+    recordings = [Recording(robot, camera, name, is_measured) for name in mounts]
     _check(recordings[0])
     with one_blas_thread():
-        found = [_found(it, chain) for it in recordings]
+        found = [_found(recording, chain) for recording in recordings]
         if mount is not None:
             return _guess(found[0], chain)
         chosen = _of_likelier_mount(found[0], found[1], chain)
@@ -106,7 +106,7 @@ def guess_reading(
 def _found(recording: Recording, chain: FloatArray | None) -> _Found:
     declared, *others = search(recording)
     if chain is not None:
-        others = [_by_chain(it, recording, chain) for it in others]
+        others = [_by_chain(other, recording, chain) for other in others]
     scored = [declared, *others]
     best = _decided(recording, scored)
     swapped = exchanged(recording, best, is_poor=_is_poor(recording, best))
@@ -125,24 +125,27 @@ def _of_likelier_mount(first: _Found, second: _Found, chain: FloatArray | None) 
     """Chooses the mount: by residuals, by the joints, by what cells look like, by the changes."""
     # An inverse of the poses closes the chain under the wrong mount as poses as they are do under
     # the right one, so that the number of changes alone says nothing.
-    better, worse = sorted((first, second), key=lambda it: it.best.score)
+    better, worse = sorted((first, second), key=lambda value: value.best.score)
     if better.best.score > CLOSING_SCORE or worse.best.score > STANDS_OUT * better.best.score:
         return better
-    both = {it.best.hypothesis: it for it in (first, second)}
+    both = {found.best.hypothesis: found for found in (first, second)}
     by_joints = None if chain is None else _by_joints(tuple(both), first.recording.robot, chain)
     if by_joints is not None:
         return both[by_joints]
     other, likelier = sorted(
         (first, second),
-        key=lambda it: (likeness(it.recording, it.best), -it.recording.cost(it.best.hypothesis)),
+        key=lambda value: (
+            likeness(value.recording, value.best),
+            -value.recording.cost(value.best.hypothesis),
+        ),
     )
     is_same = other.best.hypothesis.mount == likelier.best.hypothesis.mount
     is_clear = is_far_likelier(likelier.recording, likelier.best, other.best)
     if is_same or (is_clear and not _is_poor(likelier.recording, likelier.best)):
         return likelier
     readings = " and ".join(
-        f"{it.best.hypothesis.mount} ({_candidate(it.recording, it.best).words})"
-        for it in (first, second)
+        f"{found.best.hypothesis.mount} ({_candidate(found.recording, found.best).words})"
+        for found in (first, second)
     )
     raise DataError(
         f"The mount is not given, and the poses fit both ways of mounting: {readings}.",
@@ -200,9 +203,9 @@ def _decided(recording: Recording, scored: Sequence[Scored]) -> Scored:
     declared, *others = scored
     if not others:
         return declared
-    least = min(it.score for it in others)
-    alike = [it for it in others if it.score <= _ALIKE * least]
-    alike.sort(key=lambda it: (it.cost, it.score))
+    least = min(other.score for other in others)
+    alike = [other for other in others if other.score <= _ALIKE * least]
+    alike.sort(key=lambda item: (item.cost, item.score))
     best, rivals = alike[0], alike[1:]
     if best.score > (_ROUGHLY if _is_turned_about(recording, best) else CLOSING_SCORE):
         return declared
@@ -211,10 +214,10 @@ def _decided(recording: Recording, scored: Sequence[Scored]) -> Scored:
     if is_likely and declared.score <= STANDS_OUT * best.score:
         return declared
     is_open = any(
-        it.cost == best.cost
-        and it.score < _RIVALS * best.score
-        and not _are_same(recording, it, best)
-        for it in rivals
+        rival.cost == best.cost
+        and rival.score < _RIVALS * best.score
+        and not _are_same(recording, rival, best)
+        for rival in rivals
     )
     return declared if is_open or _is_poor(recording, best) else best
 
@@ -232,7 +235,7 @@ def _are_same(recording: Recording, one: Scored, other: Scored) -> bool:
     """Whether two readings have the same poses, so that it does not matter which is meant."""
     rows = np.intersect1d(one.rows, other.rows)
     (first, _), (second, _) = (
-        it.hypothesis.chain(recording.robot, recording.camera) for it in (one, other)
+        scored.hypothesis.chain(recording.robot, recording.camera) for scored in (one, other)
     )
     away = invert(first[rows]) @ second[rows]
     shift, angle = one.fit.rms
@@ -244,9 +247,11 @@ def _are_same(recording: Recording, one: Scored, other: Scored) -> bool:
 
 def _guess(found: _Found, chain: FloatArray | None, mount_note: str = "") -> Guess:
     recording, best = found.recording, found.best
-    candidates = {id(it): _candidate(recording, it) for it in found.scored}
+    candidates = {id(scored): _candidate(recording, scored) for scored in found.scored}
     declared, chosen = candidates[id(found.scored[0])], candidates[id(best)]
-    ranked = sorted(candidates.values(), key=lambda it: (it is not chosen, it.score))[:_LISTED]
+    ranked = sorted(
+        candidates.values(), key=lambda candidate: (candidate is not chosen, candidate.score)
+    )[:_LISTED]
     if declared not in ranked:
         ranked[-1] = declared
     is_poor = _is_poor(recording, best)

@@ -105,7 +105,7 @@ def robust_fit(robot: FloatArray, camera: FloatArray, starts: int = 0) -> Fit:
         sets += [rng.choice(count, _SUBSET, replace=False) for _ in range(starts)]
     return trimmed_start(
         (_fit(robot, camera, lever, rows) for rows in sets),
-        lambda it: it.away**2,
+        lambda fit: fit.away**2,
         lambda mask, _: _fit(robot, camera, lever, np.flatnonzero(mask)),
         kept_count(count),
         len(sets),

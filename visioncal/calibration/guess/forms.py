@@ -66,8 +66,8 @@ def _direct(declared: str) -> Iterator[Turns]:
     if size != 9:
         yield from (
             Turns(name)
-            for name, it in ROTATION_FORMS.items()
-            if it.size == size and name != declared
+            for name, form in ROTATION_FORMS.items()
+            if form.size == size and name != declared
         )
 
 
@@ -99,18 +99,18 @@ def _all_small(rotations: FloatArray) -> bool:
 
 def _read(numbers: PoseNumbers, turns: Sequence[Turns]) -> Forms:
     """Reads every way, each written form's numbers computed once; unreadable ways are dropped."""
-    one_of_each = {it.written: it for it in turns}
-    written = {name: it.numbers(numbers) for name, it in one_of_each.items()}
-    pairs = [(it, ROTATION_FORMS[it.form].read(written[it.written]).copy()) for it in turns]
+    one_of_each = {turn.written: turn for turn in turns}
+    written = {name: item.numbers(numbers) for name, item in one_of_each.items()}
+    pairs = [(turn, ROTATION_FORMS[turn.form].read(written[turn.written]).copy()) for turn in turns]
     for _, rotations in pairs:
         rotations[~numbers.there] = np.nan
     # The declared way stays first even where it is unreadable; nothing of it will fit.
     whole = [
-        (it, rotations)
-        for at, (it, rotations) in enumerate(pairs)
+        (item, rotations)
+        for at, (item, rotations) in enumerate(pairs)
         if at == 0 or np.isfinite(rotations[numbers.there]).all()
     ]
-    return Forms(tuple(it for it, _ in whole), np.array([rotations for _, rotations in whole]))
+    return Forms(tuple(item for item, _ in whole), np.array([rotations for _, rotations in whole]))
 
 
 def screen(robot: Forms, camera: Forms, rows: IntArray) -> tuple[Pairing, ...]:

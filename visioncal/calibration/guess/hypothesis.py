@@ -23,9 +23,9 @@ _MIRROR = np.array([1.0, -1.0, 1.0])
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 # The orders of turns that makers of robots and libraries use, about moving and about fixed axes.
 _ORDERS = {
-    it.rotation.split("-")[1].upper()
-    for it in POSE_FORMS.values()
-    if it.rotation.startswith("euler-")
+    form.rotation.split("-")[1].upper()
+    for form in POSE_FORMS.values()
+    if form.rotation.startswith("euler-")
 }
 
 
@@ -237,7 +237,7 @@ def _of_side(whose: str, tried: Taken, declared: Taken) -> Iterator[str]:
 
 def strangeness(turns: Turns) -> float:
     """What makes a form less likely than another: angles once misread, orders that nobody uses."""
-    names = [it.split("-") for it in (turns.form, turns.written) if it.startswith("euler-")]
+    names = [name.split("-") for name in (turns.form, turns.written) if name.startswith("euler-")]
     orders = [order for _, order, _ in names]
     unused = any(order.upper() not in _ORDERS for order in orders)
     # Degrees taken for radians are one slip; in another order besides they are two.

@@ -65,7 +65,7 @@ def joint_readings(robot: Robot) -> Iterator[JointReading]:
     yield from _couplings(declared)
     yield from _models(declared)
     for unit in units:
-        yield from (_both(unit, it) for it in columns)
+        yield from (_both(unit, column) for column in columns)
     for first, second in combinations(_signs(declared), 2):
         yield _both(first, second)
 

@@ -24,7 +24,7 @@ def sentence(
             "As declared, the rotations of the robot or of the camera are none, and no other "
             "reading of the numbers stands out."
         )
-    rivals = [it for it in ranked if it is not declared]
+    rivals = [candidate for candidate in ranked if candidate is not declared]
     others = f"the next, {rivals[0].words}, to {_figures(rivals[0])}" if rivals else ""
     if is_poor:
         return (
@@ -32,7 +32,7 @@ def sentence(
             f"declared, the chain closes to {_figures(declared)}{others and f'; {others}'}. Add "
             "views tilted about different axes."
         )
-    if not declared.closes or any(_is_far_better(it, declared) for it in rivals):
+    if not declared.closes or any(_is_far_better(rival, declared) for rival in rivals):
         return (
             "No reading that was tried stands out: as declared, the chain closes to "
             f"{_figures(declared)}{others and f'; {others}'}."
@@ -43,8 +43,8 @@ def sentence(
     )
 
 
-def _is_far_better(it: Candidate, declared: Candidate) -> bool:
-    return STANDS_OUT * it.score < declared.score
+def _is_far_better(candidate: Candidate, declared: Candidate) -> bool:
+    return STANDS_OUT * candidate.score < declared.score
 
 
 def _found(declared: Candidate, best: Candidate) -> str:
@@ -62,14 +62,20 @@ def _found(declared: Candidate, best: Candidate) -> str:
 
 
 def _other_mount(best: Candidate) -> str:
-    other = "; ".join(it for it in best.other_mount if it not in best.differences)
-    own = "; ".join(it for it in best.differences if it not in best.other_mount)
+    other = "; ".join(name for name in best.other_mount if name not in best.differences)
+    own = "; ".join(
+        difference for difference in best.differences if difference not in best.other_mount
+    )
     return f"; {other} in place of {own} fits as well" if other else ""
 
 
-def _figures(it: Candidate) -> str:
-    views = "" if it.agreeing == it.rows else f" in {it.agreeing} of {it.rows} views"
-    return f"{it.figures}{views}"
+def _figures(candidate: Candidate) -> str:
+    views = (
+        ""
+        if candidate.agreeing == candidate.rows
+        else f" in {candidate.agreeing} of {candidate.rows} views"
+    )
+    return f"{candidate.figures}{views}"
 
 
 def notes(
@@ -87,9 +93,11 @@ def notes(
     # Other units for both make the cell as much larger.
     own = best.hypothesis.robot.unit, best.hypothesis.camera.unit
     others = [
-        it for it in best.labels if it != best.hypothesis and (it.robot.unit, it.camera.unit) == own
+        label
+        for label in best.labels
+        if label != best.hypothesis and (label.robot.unit, label.camera.unit) == own
     ]
-    also = " or with ".join("; ".join(recording.changes(it)) for it in others)
+    also = " or with ".join("; ".join(recording.changes(other)) for other in others)
     if also and not is_declared:
         yield (
             f"The views close the chain in the same way with {also}. It was chosen by what lies "

@@ -102,13 +102,13 @@ class JointGuess:
 
         Of joints with parallel axes it is the likelier: whose zero it is takes a fit of all.
         """
-        lost = all(it.is_zero for it in (self.best.reading, *self.rivals))
+        lost = all(joint_reading.is_zero for joint_reading in (self.best.reading, *self.rivals))
         return self.best.reading if lost else None
 
     def sentence(self, what: str) -> str:
         """Says what was found: `what` is what the joints are compared with."""
         readings = [self.best.reading, *self.rivals]
-        words = " or with ".join(it.words for it in readings)
+        words = " or with ".join(reading.words for reading in readings)
         fit = self.best.fit
         agreeing = len(fit.away) - len(self.best.out)
         rows = "" if agreeing == len(fit.away) else f" in {agreeing} of {len(fit.away)} views"
@@ -120,7 +120,9 @@ class JointGuess:
     @property
     def fix(self) -> str:
         """What the user can do about it."""
-        return " Or: ".join(it.fix for it in (self.best.reading, *self.rivals))
+        return " Or: ".join(
+            joint_reading.fix for joint_reading in (self.best.reading, *self.rivals)
+        )
 
 
 def guess_joints(robot: Robot, q: FloatArray, poses: FloatArray, fits: float = _FITS) -> JointGuess:
@@ -143,31 +145,31 @@ def guess_joints(robot: Robot, q: FloatArray, poses: FloatArray, fits: float = _
             return JointGuess(declared_fit, declared_fit)
         few = thinned(np.arange(len(q)), _SCREENED)
         screened = _screened(declared_fit, q[few], poses[few])
-        best = [_fitted(it, q, poses, _STARTS) for it in screened]
+        best = [_fitted(joint_reading, q, poses, _STARTS) for joint_reading in screened]
     return _decided(declared_fit, best) if best else JointGuess(declared_fit, declared_fit)
 
 
 def _screened(start: FittedJoints, q: FloatArray, poses: FloatArray) -> list[JointReading]:
     """The readings that may explain a few rows far better than the declared one."""
     declared = start.reading
-    tried = [_fitted(it, q, poses, 0) for it in joint_readings(declared.robot)]
-    tried.sort(key=lambda it: it.score * (1.0 + it.reading.cost))
+    tried = [_fitted(reading, q, poses, 0) for reading in joint_readings(declared.robot)]
+    tried.sort(key=lambda fit: fit.score * (1.0 + fit.reading.cost))
     best = [*tried[:_REFINED], *_with_zeros(start, q, poses)]
     limit = _SHARE * _fitted(declared, q, poses, 0).score
-    return [it.reading for it in best if it.score < limit]
+    return [fit.reading for fit in best if fit.score < limit]
 
 
 def _decided(start: FittedJoints, tried: Sequence[FittedJoints]) -> JointGuess:
-    least = min(it.score for it in tried)
-    alike = [it for it in tried if it.score <= _ALIKE * least]
-    alike.sort(key=lambda it: (it.reading.cost, it.score))
+    least = min(fit.score for fit in tried)
+    alike = [fit for fit in tried if fit.score <= _ALIKE * least]
+    alike.sort(key=lambda fit: (fit.reading.cost, fit.score))
     best, others = alike[0], alike[1:]
     if best.score > _CLOSES or start.score <= STANDS_OUT * best.score:
         return JointGuess(start, start)
     rivals = tuple(
-        it.reading
-        for it in others
-        if it.reading.cost == best.reading.cost and it.score < _RIVALS * best.score
+        other.reading
+        for other in others
+        if other.reading.cost == best.reading.cost and other.score < _RIVALS * best.score
     )
     return JointGuess(start, best, rivals)
 

@@ -22,7 +22,7 @@ from visioncal.estimation.closed_form import SOLVERS
 # Poses are written in these; micrometres are for instruments. Nobody has a robot in inches and a
 # camera in centimetres, but a target of another size than stated looks like it.
 _UNITS = ("m", "mm", "cm", "inch")
-UNIT_PAIRS = tuple(it for it in product(_UNITS, _UNITS) if {*it} != {"cm", "inch"})
+UNIT_PAIRS = tuple(pair for pair in product(_UNITS, _UNITS) if {*pair} != {"cm", "inch"})
 
 # Sizes of targets that are looked for, as logarithms of their share of the stated size: a half more
 # or less is fitted elsewhere. Fewer views could be of any.
@@ -77,7 +77,8 @@ def solve_turn(
 ) -> Turned:
     """Solves for X's rotation by the views that agree best."""
     robot, camera = (
-        np.swapaxes(it, 1, 2) if flip else it for it, flip in zip(sides, transposed, strict=True)
+        np.swapaxes(side, 1, 2) if flip else side
+        for side, flip in zip(sides, transposed, strict=True)
     )
     nowhere, count = np.zeros(3), kept_count(len(rows))
     kept = np.arange(len(rows))
@@ -119,8 +120,10 @@ def _of_another_size(
     # stated one are found by whoever fits them; here, units would be taken for them.
     declared = _ratio(recording.declared.robot.unit, recording.declared.camera.unit)
     kept = turned.kept
-    for it in (it for it in variants if it.ratio == declared and not it.signs):
-        steps, lever = _steps(recording, turned, (it, replace(it, ratio=0.0)))
+    for item in (
+        variant for variant in variants if variant.ratio == declared and not variant.signs
+    ):
+        steps, lever = _steps(recording, turned, (item, replace(item, ratio=0.0)))
         steps = (steps - steps[kept].mean(axis=0)) / lever
         # Without the robot's positions the camera's are left.
         towards = steps[..., 1]
@@ -131,11 +134,11 @@ def _of_another_size(
             continue
         away = np.sort(np.linalg.norm(towards + left @ found, axis=1))[: len(kept)]
         score = float(np.hypot(np.sqrt(np.mean(away**2)), turned.score))
-        yield score, replace(it, changes=it.changes + 1, scale=float(scale))
+        yield score, replace(item, changes=item.changes + 1, scale=float(scale))
 
 
 def _variants(recording: Recording) -> Iterator[Variant]:
-    ratios = sorted({_ratio(*it) for it in UNIT_PAIRS})
+    ratios = sorted({_ratio(*pair) for pair in UNIT_PAIRS})
     declared = recording.declared
     inverse = declared.robot.inverse != (recording.mount == "eye-to-hand")
     given = (inverse != declared.camera.inverse, _ratio(declared.robot.unit, declared.camera.unit))
@@ -160,7 +163,9 @@ def _steps(
         given = p * _sign(signs)
         moved[signs, False] = given
         moved[signs, True] = -(turned.robot @ given[..., None])[..., 0]
-    steps = [it.ratio * moved[it.signs, it.carried] + towards for it in variants]
+    steps = [
+        variant.ratio * moved[variant.signs, variant.carried] + towards for variant in variants
+    ]
     lever = max(float(np.median(np.linalg.norm(c, axis=1))), 1e-12)
     return np.stack(steps, axis=2), lever
 

@@ -51,7 +51,7 @@ def exchanged(recording: Recording, scored: Scored, *, is_poor: bool) -> Scored 
         before, after = fit.away[list(pair)], again.fit.away[list(pair)]
         if after.max() < _OUT * typical and (after < before / _NEARER).all():
             found.append((float(after.max()), again))
-    found.sort(key=lambda it: it[0])
+    found.sort(key=lambda value: value[0])
     if not found or (len(found) > 1 and found[1][0] < _CLEARLY * found[0][0]):
         return None
     return found[0][1]
@@ -75,7 +75,7 @@ def _exchanged_among_few(recording: Recording, scored: Scored) -> Scored | None:
         robot, camera = changed.chain(recording.robot, recording.camera)
         fit = robust_fit(robot[scored.rows], camera[scored.rows])
         found.append(Scored(changed, fit, scored.rows))
-    found.sort(key=lambda it: it.score)
+    found.sort(key=lambda item: item.score)
     best, second = found[:2]
     is_clear = best.score < CLOSING_SCORE and second.score > _CLEARLY * best.score
     return best if is_clear and scored.score > _NEARER * best.score else None

@@ -74,8 +74,8 @@ def search(recording: Recording) -> list[Scored]:
     own, classes = _closing(part, robot, camera, turned)
     declared = _with_likelier(part, fitted(part, part.declared, rows, _STARTS), own, rows)
     others = [_best_label(part, labels, rows) for labels in classes]
-    others.sort(key=lambda it: it.score)
-    return [replace(it, rows=looked_at[it.rows]) for it in (declared, *others)]
+    others.sort(key=lambda other: other.score)
+    return [replace(scored, rows=looked_at[scored.rows]) for scored in (declared, *others)]
 
 
 def _with_neighbours(rows: IntArray, count: int) -> IntArray:
@@ -94,8 +94,8 @@ def _closing(
         for score, variant in score_variants(recording, turn)
     ]
     best = min((score for score, *_ in scored), default=0.0)
-    close = [it for it in scored if it[0] <= _REACH * best + _SLACK_RAD]
-    close.sort(key=lambda it: _priced(it[0], _cheap_cost(robot, camera, it[1], it[2])))
+    close = [pair for pair in scored if pair[0] <= _REACH * best + _SLACK_RAD]
+    close.sort(key=lambda pair: _priced(pair[0], _cheap_cost(robot, camera, pair[1], pair[2])))
     own: list[Hypothesis] = []
     classes = []
     for score, turn, variant in close[:_LABELLED]:
@@ -103,11 +103,11 @@ def _closing(
         if recording.declared in labels:
             own = labels
             continue
-        costs = [recording.cost(it) for it in labels]
+        costs = [recording.cost(label) for label in labels]
         least = min(costs)
-        simplest = [it for it, cost in zip(labels, costs, strict=True) if cost == least]
+        simplest = [label for label, cost in zip(labels, costs, strict=True) if cost == least]
         classes.append((_priced(score, least), simplest))
-    classes.sort(key=lambda it: it[0])
+    classes.sort(key=lambda pair: pair[0])
     return own, [labels for _, labels in classes[:_FITTED]]
 
 
@@ -122,11 +122,11 @@ def _cheap_cost(robot: Forms, camera: Forms, turned: Turned, variant: Variant) -
     return _pairing_cost(robot, camera, turned.pairing) + variant.changes + transposed
 
 
-def _pairing_cost(robot: Forms, camera: Forms, it: Pairing) -> float:
+def _pairing_cost(robot: Forms, camera: Forms, pairing: Pairing) -> float:
     """About `Recording.cost` of a pairing alone."""
-    of_robot = 1.0 + strangeness(robot.turns[it.robot]) if it.robot else 0.0
-    of_camera = 1.0 + strangeness(camera.turns[it.camera]) if it.camera else 0.0
-    return of_robot + of_camera + (it.shift != 0)
+    of_robot = 1.0 + strangeness(robot.turns[pairing.robot]) if pairing.robot else 0.0
+    of_camera = 1.0 + strangeness(camera.turns[pairing.camera]) if pairing.camera else 0.0
+    return of_robot + of_camera + (pairing.shift != 0)
 
 
 def _labels(
@@ -144,7 +144,7 @@ def _labels(
     ]
     if variant.scale != 1.0:
         pairs = [(recording.declared.robot.unit, recording.declared.camera.unit)]
-    likely = [it for it in pairs if is_likely_unit(recording, it[1])]
+    likely = [pair for pair in pairs if is_likely_unit(recording, pair[1])]
     inverses = (False,) if recording.is_measured else (False, True)
     for mount, inverse, (unit, camera_unit) in product(MOUNTS, inverses, likely or pairs):
         yield Hypothesis(
@@ -170,16 +170,16 @@ def _labels(
 def _best_label(recording: Recording, labels: Sequence[Hypothesis], rows: IntArray) -> Scored:
     """Chooses among readings of one class by what cells look like."""
     # The target is before the camera, and what sits on the flange is near it.
-    scored = [fitted(recording, it, rows, _STARTS) for it in labels]
+    scored = [fitted(recording, label, rows, _STARTS) for label in labels]
     chosen = max(
         scored,
-        key=lambda it: (likeness(recording, it), it.hypothesis.mount == recording.mount),
+        key=lambda value: (likeness(recording, value), value.hypothesis.mount == recording.mount),
     )
     as_likely = (
-        it.hypothesis
-        for it in scored
-        if it.hypothesis.mount != chosen.hypothesis.mount
-        and likeness(recording, it) == likeness(recording, chosen)
+        item.hypothesis
+        for item in scored
+        if item.hypothesis.mount != chosen.hypothesis.mount
+        and likeness(recording, item) == likeness(recording, chosen)
     )
     cost = recording.cost(chosen.hypothesis)
     return replace(chosen, labels=tuple(labels), cost=cost, other_mount=next(as_likely, None))
@@ -190,18 +190,27 @@ def _with_likelier(
 ) -> Scored:
     """Tells of the simplest readings of the declared one's class that make a likelier cell."""
     unit = declared.hypothesis.robot.unit
-    scored = [fitted(recording, it, rows, _STARTS) for it in own if it.robot.unit == unit]
-    likelier = [it.hypothesis for it in scored if is_far_likelier(recording, it, declared)]
-    least = min((recording.cost(it) for it in likelier), default=0.0)
-    return replace(declared, labels=tuple(it for it in likelier if recording.cost(it) == least))
+    scored = [
+        fitted(recording, hypothesis, rows, _STARTS)
+        for hypothesis in own
+        if hypothesis.robot.unit == unit
+    ]
+    likelier = [item.hypothesis for item in scored if is_far_likelier(recording, item, declared)]
+    least = min((recording.cost(hypothesis) for hypothesis in likelier), default=0.0)
+    return replace(
+        declared,
+        labels=tuple(hypothesis for hypothesis in likelier if recording.cost(hypothesis) == least),
+    )
 
 
 def _plausible(robot: Forms, camera: Forms, pairings: Sequence[Pairing]) -> list[Pairing]:
     """The pairings with the best mismatch, simple ones first, and the declared one."""
-    best = min(it.mismatch_rad for it in pairings)
+    best = min(pairing.mismatch_rad for pairing in pairings)
     bound = _REACH * best + _SLACK_RAD
-    near = [it for it in pairings[1:] if it.mismatch_rad <= bound]
-    near.sort(key=lambda it: _priced(it.mismatch_rad, _pairing_cost(robot, camera, it)))
+    near = [pairing for pairing in pairings[1:] if pairing.mismatch_rad <= bound]
+    near.sort(
+        key=lambda pairing: _priced(pairing.mismatch_rad, _pairing_cost(robot, camera, pairing))
+    )
     return [pairings[0], *near[: _PAIRINGS - 1]]
 
 
@@ -223,8 +232,12 @@ def _turned(
         if len(inside) < 3:
             continue
         sides = turns[0][inside + pairing.shift], turns[1][inside]
-        solved += [solve_turn(pairing, it, inside, sides) for it in product((False, True), cameras)]
-    best = min((it.score for it in solved), default=0.0)
-    near = [it for it in solved if it.score <= _REACH * best + _SLACK_RAD]
-    near.sort(key=lambda it: _priced(it.score, _pairing_cost(robot, camera, it.pairing)))
+        solved += [
+            solve_turn(pairing, pair, inside, sides) for pair in product((False, True), cameras)
+        ]
+    best = min((turned.score for turned in solved), default=0.0)
+    near = [turned for turned in solved if turned.score <= _REACH * best + _SLACK_RAD]
+    near.sort(
+        key=lambda turned: _priced(turned.score, _pairing_cost(robot, camera, turned.pairing))
+    )
     return near[:_TURNED]

@@ -108,11 +108,17 @@ class Answer:
     def last_edges(self) -> dict[str, Edge]:
         """The edges of frames at their last places."""
         named = self.versions.values()
-        return {it.frame: self.edges[it.frame] for it in named if it.name == it.frame}
+        return {
+            version.frame: self.edges[version.frame]
+            for version in named
+            if version.name == version.frame
+        }
 
     def clocks(self, looked: Observed) -> dict[Pair, Clock]:
         """The clocks as the fit has them, where it estimates them."""
-        return {pair: self._fitted_clock(pair, it.clock) for pair, it in looked.clocks.items()}
+        return {
+            pair: self._fitted_clock(pair, clock.clock) for pair, clock in looked.clocks.items()
+        }
 
     def _fitted_clock(self, pair: Pair, clock: Clock) -> Clock:
         found = self._fitted_time(pair.effect)
@@ -123,7 +129,7 @@ class Answer:
             clock,
             camera_minus_robot_s=clock.camera_minus_robot_s + late_s,
             sigma_s=sigma_s,
-            delays=tuple(self._fitted_delay(pair, it) for it in clock.delays),
+            delays=tuple(self._fitted_delay(pair, delay) for delay in clock.delays),
         )
 
     def _fitted_delay(self, pair: Pair, delay: FoundDelay) -> FoundDelay:
@@ -145,7 +151,7 @@ class Answer:
     def budget_mm(self) -> dict[str, dict[str, float]]:
         """Sigmas of each frame's place in its parent, by the frame and by source [mm]."""
         found = budget_mm(self.solved, self.beside)
-        return {self.versions[key].name: it for key, it in found.items()}
+        return {self.versions[key].name: mapping for key, mapping in found.items()}
 
     @cached_property
     def intervals(self) -> FloatArray:
@@ -167,7 +173,9 @@ def answer_of(
     part, fit = solved.part, solved.agreed.fit
     # A closed form is not at rest, and that would pass for a misfit.
     at_rest = fit if solved.solver == "joint" else fit_problem(part, fit.state)
-    arms = {name: it.errors for name, it in solved.arms.items() if not it.is_modelled and it.errors}
+    arms = {
+        name: arm.errors for name, arm in solved.arms.items() if not arm.is_modelled and arm.errors
+    }
     offsets = joint_offsets(solved.arms)
     found = misfits(part, at_rest, arms, offsets)
     is_fit = solved.solver == "joint"
@@ -217,7 +225,7 @@ def _sigmas(solved: Solved) -> dict[str, dict[str, float]]:
         pairs = zip(solved.seen.looks.problems, solved.seen.sigmas_px, strict=True)
         found |= {frame: {"pixel_px": sigma} for frame, sigma in pairs}
     sensors = dict.fromkeys(
-        (*sensors_of(solved.cell, solved.poses), *(it.seer for it in solved.cell.rows))
+        (*sensors_of(solved.cell, solved.poses), *(row.seer for row in solved.cell.rows))
     )
     for frame, level in zip(sensors, fit.noise.sensors.tolist(), strict=False):
         found[frame] = {**found.get(frame, {}), "level": level}
@@ -254,17 +262,23 @@ def _sights(
         )
     found |= held_sights(solved, looked)
     lost = solved.cell.reasons
-    for it in cell.session.observations:
-        number = it.view.number
-        if number not in found and not it.view.is_of_lens:
-            stop = cell.stops[it.station] if it.station < len(cell.stops) else number
-            found[number] = Sight(number, stop, it.seer, it.seen, False, lost.get(number, ""))
-    return tuple(found[it] for it in (view.number for view in cell.session.views) if it in found)
+    for observation in cell.session.observations:
+        number = observation.view.number
+        if number not in found and not observation.view.is_of_lens:
+            stop = (
+                cell.stops[observation.station] if observation.station < len(cell.stops) else number
+            )
+            found[number] = Sight(
+                number, stop, observation.seer, observation.seen, False, lost.get(number, "")
+            )
+    return tuple(
+        found[index] for index in (view.number for view in cell.session.views) if index in found
+    )
 
 
 def _known(figures: FloatArray) -> list[float | None]:
     """Figures, None in the place of those that are not known."""
-    return [it if np.isfinite(it) else None for it in figures.tolist()]
+    return [figure if np.isfinite(figure) else None for figure in figures.tolist()]
 
 
 def _away(solved: Solved) -> FloatArray:

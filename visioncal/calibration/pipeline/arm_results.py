@@ -38,20 +38,24 @@ STEP = "what moved at once"
 def arms_of(cell: Cell, robots: Mapping[str, Reported]) -> dict[str, RobotArm]:
     """Reads the arms of a cell, as they are stated."""
     found, session = {}, cell.session
-    for name, it in robots.items():
+    for name, robot in robots.items():
         key = robot_key(name)
         if key in cell.poses:
-            rows = {it.station: it.robots[name] for it in session.observations if name in it.robots}
+            rows = {
+                observation.station: observation.robots[name]
+                for observation in session.observations
+                if name in observation.robots
+            }
             stood = np.flatnonzero(np.isfinite(cell.poses[key][:, 0, 0])).tolist()
-            views = [rows[it] for it in stood]
-            found[key] = RobotArm.of(key, cell.poses[key], views, it.matched, (session, name))
+            views = [rows[index] for index in stood]
+            found[key] = RobotArm.of(key, cell.poses[key], views, robot.matched, (session, name))
     return found
 
 
 def joint_offsets(arms: Mapping[str, RobotArm]) -> dict[str, FloatArray]:
     """(s, 6, n) how flanges move with the offsets of their joints, of arms that are modelled."""
-    found = {name: it.joint_offsets for name, it in arms.items()}
-    return {name: it for name, it in found.items() if it is not None}
+    found = {name: arm.joint_offsets for name, arm in arms.items()}
+    return {name: array for name, array in found.items() if array is not None}
 
 
 def covariance_beside_noise(
@@ -108,12 +112,12 @@ def _beyond_noise(
 ) -> dict[str, FloatArray]:
     """Covariances (p, p) by what residuals show: stops that err alike, and what moved at once."""
     parts: dict[str, FloatArray] = {}
-    for robot, it in found.items():
-        if it.alike is not None and it.alike.is_significant:
-            more = inflation(problem, fit.state, fit.noise, robot, it.alike.factor)
+    for robot, test in found.items():
+        if test.alike is not None and test.alike.is_significant:
+            more = inflation(problem, fit.state, fit.noise, robot, test.alike.factor)
             parts[f"misfit{_of(arms, robot)}"] = more
-        if it.step is not None:
-            parts[STEP] = step_covariance(problem, fit, it.step, offsets)
+        if test.step is not None:
+            parts[STEP] = step_covariance(problem, fit, test.step, offsets)
     return parts
 
 
@@ -140,8 +144,8 @@ def doubts_of_arms(
 
     for robot, arm in arms.items():
         mine = _doubts(arm, found.get(robot), asked, from_when, joint)
-        for it in (*mine, *results[robot].doubts()):
-            yield it if it.kind in MOVED_AT_ONCE else it.of(_called(arms, robot))
+        for finding in (*mine, *results[robot].doubts()):
+            yield finding if finding.kind in MOVED_AT_ONCE else finding.of(_called(arms, robot))
 
 
 def notes_on_arms(arms: Mapping[str, RobotArm], results: Mapping[str, ArmFound]) -> Iterator[str]:
@@ -149,8 +153,8 @@ def notes_on_arms(arms: Mapping[str, RobotArm], results: Mapping[str, ArmFound])
     for robot, arm in arms.items():
         drifts = () if arm.thermal is None else thermal.findings(arm.thermal)
         chosen = () if arm.kinematics is None else findings(arm.kinematics)
-        for it in remarks((*drifts, *chosen, *results[robot].notes()), NOTE):
-            yield it.of(_called(arms, robot)).words
+        for remark in remarks((*drifts, *chosen, *results[robot].notes()), NOTE):
+            yield remark.of(_called(arms, robot)).words
 
 
 def _doubts(
@@ -173,14 +177,12 @@ def _doubts(
     if found is not None:
         calibrated = arm.model is not None
         aside = "" if arm.heat is None else arm.heat.set_aside
-        for it in diagnose.doubts(found, arm.errors, from_when, joint, calibrated=calibrated):
-            if it.kind == "moved_slowly" and aside:
-                words = (
-                    f"{it.words} Whether the arm drifts with its temperature was not looked for: "
-                )
-                yield replace(it, words=f"{words}{aside}.")
+        for doubt in diagnose.doubts(found, arm.errors, from_when, joint, calibrated=calibrated):
+            if doubt.kind == "moved_slowly" and aside:
+                words = f"Whether the arm drifts with its temperature was not looked for: {aside}."
+                yield replace(doubt, words=f"{doubt.words} {words}")
             else:
-                yield it
+                yield doubt
 
 
 def _called(arms: Mapping[str, RobotArm], robot: str) -> str:
@@ -226,10 +228,10 @@ def with_pose_errors(
 ) -> dict[str, RobotArm]:
     """Weighs what arms do wrong of which the joints are not known."""
     return {
-        name: it
-        if it.is_modelled
-        else replace(it, errors=find_pose_errors(problem, fit.state, fit.noise, name))
-        for name, it in arms.items()
+        name: arm
+        if arm.is_modelled
+        else replace(arm, errors=find_pose_errors(problem, fit.state, fit.noise, name))
+        for name, arm in arms.items()
     }
 
 
@@ -243,8 +245,8 @@ def beside_steps(
 
     Processes over time and postures would explain a step, too.
     """
-    step = next((it.step for it in found.values() if it.step), None)
-    if not isinstance(step, Move) or all(it.is_modelled for it in arms.values()):
+    step = next((test.step for test in found.values() if test.step), None)
+    if not isinstance(step, Move) or all(arm.is_modelled for arm in arms.values()):
         return arms
     apart, start = moved(problem, fit, step)
     return with_pose_errors(arms, apart, fit_problem(apart, start.state, start.noise))

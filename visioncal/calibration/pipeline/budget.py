@@ -49,7 +49,7 @@ def _covariances_of_edges(
     fit, part = solved.agreed.fit, solved.part
     parts = covariance_by_source(part, fit.state, fit.noise, _sources(solved))
     size = 6 * len(part.unknown)
-    parts |= {name: it[:size, :size] for name, it in beside.items()}
+    parts |= {name: array[:size, :size] for name, array in beside.items()}
     parts["total"] = sum(parts.values(), np.zeros((size, size)))
     return parts
 
@@ -61,7 +61,7 @@ def budget_mm(solved: Solved, beside: Mapping[str, FloatArray]) -> dict[str, dic
     for key in part.unknown:
         at = part.edge_columns(key).start
         place = slice(at + 3, at + 6)
-        found[key] = {name: 1e3 * _root_trace(it[place, place]) for name, it in parts.items()}
+        found[key] = {name: 1e3 * _root_trace(part[place, place]) for name, part in parts.items()}
     return found
 
 
@@ -98,19 +98,19 @@ def work_of(solved: Solved, beside: Mapping[str, FloatArray], covariance: FloatA
     """
     part, state = solved.part, solved.agreed.fit.state
     middles = middles_of(solved.cell)
-    middle = np.array([middles.get(it, np.zeros(3)) for it in part.observations.observed])
+    middle = np.array([middles.get(name, np.zeros(3)) for name in part.observations.observed])
     camera = part.measured(state)
     seen = (camera[:, :3, :3] @ middle[:, :, None])[:, :, 0] + camera[:, :3, 3]
     point = seen.mean(axis=0)
     at_work = {
-        name: point_covariance(state.edges[0], it[:6, :6], point)
-        for name, it in _covariances_of_edges(solved, beside).items()
+        name: point_covariance(state.edges[0], edge[:6, :6], point)
+        for name, edge in _covariances_of_edges(solved, beside).items()
     }
     limit = np.tile(np.repeat([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M], 3), 2)
     values = np.linalg.eigvalsh(covariance[:12, :12] / np.outer(limit, limit))
     return Work(
         point,
-        {name: 1e3 * _root_trace(it) for name, it in at_work.items()},
+        {name: 1e3 * _root_trace(array) for name, array in at_work.items()},
         1e3 * radius95(at_work["total"]),
         np.sqrt(np.maximum(values, 0.0)),
     )
@@ -119,8 +119,8 @@ def work_of(solved: Solved, beside: Mapping[str, FloatArray], covariance: FloatA
 def middles_of(cell: Cell) -> dict[str, FloatArray]:
     """(3,) the middle of each printed target by its frame, in that [m]."""
     return {
-        frame_name("target", name): corner_positions(it).mean(axis=0)
-        for name, it in cell.session.plates.items()
+        frame_name("target", name): corner_positions(plate).mean(axis=0)
+        for name, plate in cell.session.plates.items()
     }
 
 
@@ -129,11 +129,11 @@ def _sources(solved: Solved) -> Sources:
     problem, is_pair = solved.agreed.problem, solved.cell.mount is not None
     of_corners = () if solved.looks is None else tuple(solved.looks.problems)
     columns: dict[str, IntArray] = {}
-    for name, it in problem.effect_columns.items():
+    for name, column in problem.effect_columns.items():
         if name != LENSES:
             called = _of_effect(name) if is_pair else name
             columns[called] = np.append(
-                columns.get(called, np.zeros(0, np.int64)), np.arange(it.start, it.stop)
+                columns.get(called, np.zeros(0, np.int64)), np.arange(column.start, column.stop)
             )
     if len(solved.field_columns):
         columns["lens_field"] = solved.field_columns
@@ -143,7 +143,7 @@ def _sources(solved: Solved) -> Sources:
         sensors = dict.fromkeys(problem.observations.observers, kind)
         return Sources(sensors, dict.fromkeys(problem.robots, robot), columns | _looks(solved))
     # One that moved is one sensor all the same.
-    seers = {it: it.partition("@")[0] for it in problem.observations.observers}
+    seers = {observer: observer.partition("@")[0] for observer in problem.observations.observers}
     return Sources(
         {
             key: f"pixels of {frame}" if frame in of_corners else f"readings of {frame}"
@@ -162,7 +162,7 @@ def _of_effect(name: str) -> str:
 
 def columns_of_boards(solved: Solved) -> IntArray:
     """The problem's columns of boards' shapes, as far as they are free."""
-    found = (it for name, it in _looks(solved).items() if name.startswith("board"))
+    found = (look for name, look in _looks(solved).items() if name.startswith("board"))
     return np.concatenate([np.zeros(0, dtype=np.int64), *found])
 
 
@@ -190,16 +190,17 @@ def _looks(solved: Solved) -> dict[str, IntArray]:
         return {}
     boards, alone = solved.cell.session.boards, solved.cell.mount is not None
     places = {
-        "intrinsics" if alone else f"intrinsics of {name}": it for name, it in looks.lenses.items()
+        "intrinsics" if alone else f"intrinsics of {name}": lens
+        for name, lens in looks.lenses.items()
     }
     if alone:
         places["board"] = looks.boards
         boards = {}
     slices = shape_slices(tuple(boards.values()), looks.boards.start)
-    for name, it in zip(boards, slices, strict=True):
-        places[f"board {name}".strip()] = it
+    for name, item in zip(boards, slices, strict=True):
+        places[f"board {name}".strip()] = item
     free = {
-        name: seen.free[(seen.free >= it.start) & (seen.free < it.stop)]
-        for name, it in places.items()
+        name: seen.free[(seen.free >= place.start) & (seen.free < place.stop)]
+        for name, place in places.items()
     }
-    return {name: solved.columns_of(it) for name, it in free.items() if len(it)}
+    return {name: solved.columns_of(array) for name, array in free.items() if len(array)}

@@ -63,13 +63,13 @@ class Checkup:
         return not self.findings
 
     def _repr_html_(self) -> str:
-        says = [it.reason for it in self.findings] or ["Nothing is wrong."]
+        says = [finding.reason for finding in self.findings] or ["Nothing is wrong."]
         seen = {"seen": "; ".join(self.seen)}
         return html_card(self.session, seen, "good" if self.is_sound else "check", says)
 
     def __repr__(self) -> str:
         lines = [f"{self.session}: {'; '.join(self.seen)}."]
-        lines += [f"- {it.reason}" for it in self.findings] or ["Nothing is wrong."]
+        lines += [f"- {finding.reason}" for finding in self.findings] or ["Nothing is wrong."]
         return "\n".join(lines)
 
 
@@ -93,16 +93,21 @@ def doctor(session: Session | Path | str, *, progress: Progress | None = None) -
         known, error = _looked(known)
         found = [*_findings(known, error)]
     if not isinstance(session, Session):
-        found = [_of(it, session) for it in found]
+        found = [_of(finding, session) for finding in found]
     return Checkup(known.session.name, tuple(_seen(known)), tuple(found))
 
 
 def to_document(checkup: Checkup) -> dict[str, object]:
     """Writes what was found as the content of a JSON document."""
     findings = []
-    for it in checkup.findings:
-        step = {"do": it.do.words, "command": it.do.command} if it.do else {}
-        entry = {"kind": it.kind, "sentence": it.words, "views": list(it.views), **step}
+    for finding in checkup.findings:
+        step = {"do": finding.do.words, "command": finding.do.command} if finding.do else {}
+        entry = {
+            "kind": finding.kind,
+            "sentence": finding.words,
+            "views": list(finding.views),
+            **step,
+        }
         findings.append({name: value for name, value in entry.items() if value})
     return {"session": checkup.session, "seen": list(checkup.seen), "findings": findings}
 
@@ -110,7 +115,7 @@ def to_document(checkup: Checkup) -> dict[str, object]:
 def _of(found: Finding, session: Path | str) -> Finding:
     if found.do is None:
         return found
-    words, command = (with_paths(it, session) for it in (found.do.words, found.do.command))
+    words, command = (with_paths(name, session) for name in (found.do.words, found.do.command))
     return replace(found, do=Step(words, command))
 
 
@@ -142,16 +147,16 @@ def _findings(known: RunState, error: VisioncalError | None) -> Iterator[Finding
     if error is not None and cause is None:
         yield _refused("refused", error)
     said = () if cause is None else (cause.kind,)
-    warned = [it for it in known.warnings if it.kind not in (*_NO_FAULT, *said)]
-    is_said = "other_lens" in {it.kind for it in warned}
+    warned = [warning for warning in known.warnings if warning.kind not in (*_NO_FAULT, *said)]
+    is_said = "other_lens" in {finding.kind for finding in warned}
     lens = [] if error is not None or is_said else list(_lenses(known))
-    yield from sorted([*lens, *warned], key=lambda it: it.do is None)
+    yield from sorted([*lens, *warned], key=lambda value: value.do is None)
     if error is None:
         if hint is None and known.mount is not None and not lens:
             yield from _motion(known, known.mount)
         yield from _lost(known)
         yield from _coverage(known)
-    if not {MISSING, "shared_image"} & {it.kind for it in (*warned, cause) if it}:
+    if not {MISSING, "shared_image"} & {finding.kind for finding in (*warned, cause) if finding}:
         yield from unnamed_images(known.session)
 
 
@@ -199,7 +204,7 @@ def _resized(known: RunState, look: CameraLook, stated: Camera) -> tuple[str, St
 
 def _measured_px(look: CameraLook) -> float:
     """Noise of a corner's coordinate [px]; zero where it is not measured, but stated."""
-    stated = {it.stated_px for it in look.corners.values()}
+    stated = {view_corners.stated_px for view_corners in look.corners.values()}
     return 0.0 if look.pixel_px is None or look.pixel_px in stated else look.pixel_px
 
 
@@ -250,7 +255,7 @@ def _motion(known: RunState, mount: Mount) -> Iterator[Finding]:
 
 def _lost(known: RunState) -> Iterator[Finding]:
     """Views that cannot be used, but for those whose images are missing: that was said."""
-    absent = {it for found in known.warnings for it in found.views}
+    absent = {view for found in known.warnings for view in found.views}
     reasons: Mapping[int, str] = {
         view: why for view, why in known.reasons.items() if view not in absent
     }
@@ -271,7 +276,7 @@ def _coverage(known: RunState) -> Iterator[Finding]:
     for frame, look in known.cameras.items():
         if look.resolution is None or look.table.stated is not None or not look.corners:
             continue
-        px = np.concatenate([it.px for it in look.corners.values()])
+        px = np.concatenate([view_corners.px for view_corners in look.corners.values()])
         part = np.floor(_PARTS * px / np.array(look.resolution)).clip(0, _PARTS - 1)
         filled = len(np.unique(part @ [_PARTS, 1]))
         if filled < _LEAST_PARTS:
@@ -287,12 +292,16 @@ def _coverage(known: RunState) -> Iterator[Finding]:
 def _seen(known: RunState) -> Iterator[str]:
     session = known.session
     yield f"{len(session.views)} views"
-    images = [it.image for it in session.views if it.image]
+    images = [view.image for view in session.views if view.image]
     if images:
-        there = sum(session.images.exists(it) for it in images)
+        there = sum(session.images.exists(image) for image in images)
         yield f"{there} of {len(images)} images"
     for look in known.cameras.values():
-        blur = [it.blur_px for it in look.corners.values() if it.blur_px > 0.0]
+        blur = [
+            view_corners.blur_px
+            for view_corners in look.corners.values()
+            if view_corners.blur_px > 0.0
+        ]
         size = "" if look.resolution is None else " of {} x {} px".format(*look.resolution)
         edges = f", edges {np.median(blur):.1f} px wide" if blur else ""
         yield f"the board in {len(look.corners)} {'images' if images else 'views'}{size}{edges}"
@@ -310,11 +319,20 @@ def _unseen_rows(session: Session, look: CameraLook) -> Iterator[str]:
     if target is None or session.targets or target.kind != "charuco" or look.resolution is None:
         return
     across, rows = target.columns - 1, target.rows - 1
-    seen = max((int(it.ids.max()) // across + 1 for it in look.corners.values()), default=rows)
+    seen = max(
+        (int(view_corners.ids.max()) // across + 1 for view_corners in look.corners.values()),
+        default=rows,
+    )
     last, shape = np.arange(seen * across, rows * across), look.resolution[::-1]
     # The board's place is known well by most of the corners that there may be.
-    clear = [it for it in look.corners.values() if 2 * len(it.ids) > seen * across]
-    without = [it for it in clear if np.isin(last, hidden_corners(it, shape, target)).all()]
+    clear = [
+        view_corners
+        for view_corners in look.corners.values()
+        if 2 * len(view_corners.ids) > seen * across
+    ]
+    without = [
+        corners for corners in clear if np.isin(last, hidden_corners(corners, shape, target)).all()
+    ]
     if len(last) and len(without) >= _LEAST_WITHOUT:
         yield (
             f"{seen + 1} rows of squares, where {target.rows} are declared and {len(without)} "

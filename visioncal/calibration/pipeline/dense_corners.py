@@ -25,7 +25,7 @@ def _is_worse(before: Run, after: Run) -> bool:
     # That is so where their squared errors grow in the mean, by more than chance explains.
     views = sorted(before.left_out.keys() & after.left_out.keys())
     growth = np.array(
-        [np.square(after.left_out[it]) - np.square(before.left_out[it]) for it in views]
+        [np.square(after.left_out[view]) - np.square(before.left_out[view]) for view in views]
     )
     growth = growth[np.isfinite(growth).all(axis=1)]
     if len(growth) < 2:
@@ -69,7 +69,7 @@ def run_dense(session: Session, *, device: str = "auto", **asked: Unpack[Asked])
             next_step="Leave it out, or calibrate one camera and robot of it (Session.of).",
         )
     on = chosen_device(device)
-    if not any(it.kind in ("charuco", "checkerboard") for it in session.boards.values()):
+    if not any(board.kind in ("charuco", "checkerboard") for board in session.boards.values()):
         raise DataError(
             "--dense needs images of a checkerboard or a ChArUco board; this session has none.",
             culprits=["--dense"],
@@ -83,13 +83,13 @@ def run_dense(session: Session, *, device: str = "auto", **asked: Unpack[Asked])
         return _noting(plain, None, [f"Dense corners are not kept: {error.message}"])
     if found.dense is None or not found.dense.fits:
         return _noting(plain, None, ["Dense corners are not kept: no image could be fitted."])
-    both = [it.calibration.validation.held_out for it in (plain, found)]
+    both = [item.calibration.validation.held_out for item in (plain, found)]
     kept = not _is_worse(plain, found)
     result = DenseResult(
         kept=kept,
         held_out={
-            name: CornerResiduals(mm=it.mm, px=it.px)
-            for name, it in zip(("template", "dense"), both, strict=True)
+            name: CornerResiduals(mm=rms.mm, px=rms.px)
+            for name, rms in zip(("template", "dense"), both, strict=True)
         },
         images=tuple(_images(found.dense)),
     )
@@ -103,15 +103,15 @@ def run_dense(session: Session, *, device: str = "auto", **asked: Unpack[Asked])
 
 
 def _images(dense: Dense) -> Iterator[ImageBlur]:
-    for view, it in dense.fits.items():
+    for view, fit in dense.fits.items():
         yield ImageBlur(
             view=view,
-            sigma_px=it.blur.sigma_px,
-            disc_px=it.blur.disc_px,
-            motion_px=it.blur.length_px,
-            motion_deg=it.blur.direction_deg,
-            tone=it.tone,
-            pixel_noise=it.noise,
+            sigma_px=fit.blur.sigma_px,
+            disc_px=fit.blur.disc_px,
+            motion_px=fit.blur.length_px,
+            motion_deg=fit.blur.direction_deg,
+            tone=fit.tone,
+            pixel_noise=fit.noise,
         )
 
 

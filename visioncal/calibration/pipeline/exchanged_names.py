@@ -36,7 +36,11 @@ def exchanged_names(known: RunState) -> Finding | None:
         return None
     seen = known.corners.keys() | session.corners.keys() | given_poses(session).keys()
     there = seen - known.held_back
-    rows = [it for it in session.observations if it.view.number in there and not it.view.is_of_lens]
+    rows = [
+        observation
+        for observation in session.observations
+        if observation.view.number in there and not observation.view.is_of_lens
+    ]
     before = _agreeing(known)
     kinds: tuple[tuple[Kind, list[str]], ...] = (
         ("camera", [*session.cameras]),
@@ -44,12 +48,12 @@ def exchanged_names(known: RunState) -> Finding | None:
     )
     for kind, names in kinds:
         for pair in combinations(names, 2):
-            frames = {frame_name(kind, it) for it in pair}
+            frames = {frame_name(kind, name) for name in pair}
             # Of robots, what was seen by way of them.
             mine = {
-                it.view.number
-                for it in rows
-                if (it.seer in frames if kind == "camera" else {*pair} & {*it.robots, *it.lacks})
+                row.view.number
+                for row in rows
+                if (row.seer in frames if kind == "camera" else {*pair} & {*row.robots, *row.lacks})
             }
             if len(mine) < _FEWEST or len(mine & before) > _HARDLY_ANY * len(mine):
                 continue
@@ -81,7 +85,7 @@ def _looked(known: RunState, kind: Kind, pair: tuple[str, str]) -> RunState | No
     session = _renamed(known.session, kind, pair)
     looks = dict(known.cameras)
     # Corners of a table are taken up anew: those outside of the other camera's image were left out.
-    is_kept = any(it.image for it in session.views)
+    is_kept = any(view.image for view in session.views)
     if kind == "camera" and is_kept:
         for name, other in (pair, pair[::-1]):
             look = known.cameras.get(frame_name(kind, other))
@@ -92,7 +96,7 @@ def _looked(known: RunState, kind: Kind, pair: tuple[str, str]) -> RunState | No
             )
     state = RunState(session, None, known.threads, level=known.level)
     try:
-        for stage in STAGES[: [it.name for it in STAGES].index("joints")]:
+        for stage in STAGES[: [stage.name for stage in STAGES].index("joints")]:
             is_known = stage.name == "detect" and is_kept
             state = replace(state, cameras=looks) if is_known else stage.run(state)
     except VisioncalError:

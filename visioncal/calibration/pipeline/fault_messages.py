@@ -65,7 +65,7 @@ class Version:
 
 def versions(solved: Solved) -> dict[str, Version]:
     """All unknown frames over time, by their names in the problem."""
-    moves = {it.twin: it for it in solved.agreed.moves}
+    moves = {move.twin: move for move in solved.agreed.moves}
     parts: dict[str, list[tuple[int, str]]] = defaultdict(list)
     for key in solved.agreed.problem.unknown:
         start = moves[key].stop if key in moves else -1
@@ -87,21 +87,23 @@ def _stops_of(solved: Solved, key: str) -> list[int]:
     rows = problem.observations.involves(key)
     some = rows & solved.agreed.used
     stations = problem.observations.stops[some if some.any() else rows]
-    return [solved.cell.stops[it] for it in np.unique(stations).tolist()]
+    return [solved.cell.stops[index] for index in np.unique(stations).tolist()]
 
 
 def movements(solved: Solved) -> tuple[Moved, ...]:
     """What moved, in the order of time."""
     found, names = [], versions(solved)
     edges = dict(zip(solved.agreed.problem.unknown, solved.agreed.fit.state.edges, strict=True))
-    for move in sorted(solved.agreed.moves, key=lambda it: it.stop):
+    for move in sorted(solved.agreed.moves, key=lambda value: value.stop):
         after = names[move.twin]
         earlier = [
-            it for it in names.values() if it.frame == after.frame and it.start < after.start
+            name
+            for name in names.values()
+            if name.frame == after.frame and name.start < after.start
         ]
-        before = max(earlier, key=lambda it: it.start)
+        before = max(earlier, key=lambda value: value.start)
         mm, deg = pose_difference(edges[before.key], edges[after.key])
-        rivals = tuple(dict.fromkeys(it.partition("@")[0] for it in move.rivals))
+        rivals = tuple(dict.fromkeys(rival.partition("@")[0] for rival in move.rivals))
         found.append(
             Moved(
                 after.frame,
@@ -110,7 +112,7 @@ def movements(solved: Solved) -> tuple[Moved, ...]:
                 _stops_of(solved, move.twin)[0],
                 mm,
                 deg,
-                tuple(it for it in rivals if it != after.frame),
+                tuple(rival for rival in rivals if rival != after.frame),
             )
         )
     return tuple(found)
@@ -137,18 +139,18 @@ def pose_faults(solved: Solved) -> tuple[PoseFault, ...]:
     if not len(out):
         return ()
     turned = _turned_images(solved)
-    explained = {row for it in turned for row in it.rows}
+    explained = {row for fault in turned for row in fault.rows}
     mutual = exchanged(solved.agreed.problem, _fitting(solved, out))
     if solved.cell.mount is not None:
         swapped = tuple(_exchanged_views(solved, mutual))
         return (*turned, *swapped, *(() if turned or swapped else _moved_runs(solved)))
     found = _pushed_bases(solved)
     found += _exchanged(solved, mutual)
-    explained |= {row for it in found for row in it.rows}
+    explained |= {row for fault in found for row in fault.rows}
     found += _exchanged_views(
-        solved, {it: by for it, by in mutual.items() if not {it, by} & explained}
+        solved, {key: by for key, by in mutual.items() if not {key, by} & explained}
     )
-    explained |= {row for it in found for row in it.rows}
+    explained |= {row for fault in found for row in fault.rows}
     return (*turned, *found, *_wrong_poses(solved, explained))
 
 
@@ -159,7 +161,7 @@ def _turned_images(solved: Solved) -> list[PoseFault]:
     for at, row in enumerate(rows):
         if row.view in solved.turned and not solved.agreed.used[at]:
             alike[solved.turned[row.view]].append(at)
-    images = {it.number: it.image for it in solved.cell.session.views}
+    images = {view.number: view.image for view in solved.cell.session.views}
     for how, mine in alike.items():
         views = _numbers(solved, mine)
         named = some_of([*map(str, views)], _LISTED)
@@ -168,8 +170,8 @@ def _turned_images(solved: Solved) -> list[PoseFault]:
         left_out = "It was" if len(views) == 1 else "They were"
         words = f"{subject} {how.words}: turned back, {them} with the others. {left_out} left out."
         step = Step("Turn these corners back in corners.csv, and calibrate again.", CALIBRATE)
-        if all(images[it] for it in views):
-            files = " ".join(f"SESSION/{shlex.quote(images[it])}" for it in views)
+        if all(images[view] for view in views):
+            files = " ".join(f"SESSION/{shlex.quote(images[view])}" for view in views)
             turn = f"mogrify {how.option} {files}"
             step = Step("Turn the file back, and calibrate again.", f"{turn} && {CALIBRATE}")
         fault = Finding("turned_images", words, step, views)
@@ -188,11 +190,11 @@ def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
     is_run = len(out) >= _FEWEST_STOPS and np.sum(used[1:] != used[:-1]) == 1
     if not is_run or not problem.observations.has_rotation[out].all():
         return
-    asked = {it: problem.change_of(it, agreed.fit.state)[out] for it in problem.unknown}
-    asked = {it: change for it, change in asked.items() if np.isfinite(change).all()}
+    asked = {name: problem.change_of(name, agreed.fit.state)[out] for name in problem.unknown}
+    asked = {name: change for name, change in asked.items() if np.isfinite(change).all()}
     scatter_m = {
-        it: float(np.median(distances(change, mean_transform(change))[0]))
-        for it, change in asked.items()
+        name: float(np.median(distances(change, mean_transform(change))[0]))
+        for name, change in asked.items()
     }
     if not scatter_m:
         return
@@ -201,7 +203,7 @@ def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
     shift_mm, turn_deg = pose_difference(np.eye(4), change)
     if 1e3 * scatter_m[frame] > _SURELY_ALIKE * shift_mm:
         return
-    ordered = [rows[it].view for it in order.tolist()]
+    ordered = [rows[index].view for index in order.tolist()]
     first = int(np.argmax(used[1:] != used[:-1])) + 1
     when = f"from view {ordered[first]} on" if used[0] else f"before view {ordered[first]}"
     views = _numbers(solved, out.tolist())
@@ -246,7 +248,7 @@ def _exchanged_views(solved: Solved, mutual: Mapping[int, int]) -> Iterator[Pose
 
 
 def _numbers(solved: Solved, rows: Sequence[int]) -> tuple[int, ...]:
-    return tuple(solved.cell.rows[it].view for it in rows)
+    return tuple(solved.cell.rows[row].view for row in rows)
 
 
 def _views(solved: Solved, rows: Sequence[int]) -> str:
@@ -325,11 +327,11 @@ def reasons(solved: Solved, faults: Sequence[PoseFault]) -> dict[int, str]:
     away = residuals(solved)[out]
     counted = np.maximum(agreed.distances.directions, 1)
     times, limit = (
-        np.sqrt(it / counted) for it in (agreed.distances.squares, agreed.distances.limit)
+        np.sqrt(array / counted) for array in (agreed.distances.squares, agreed.distances.limit)
     )
     fitting = _fitting(solved, out)
     mutual = exchanged(problem, fitting)
-    robots = {row: it.short for it in faults if it.short for row in it.rows}
+    robots = {row: fault.short for fault in faults if fault.short for row in fault.rows}
     rest = "the rest of the cell" if solved.cell.mount is None else "the other views"
     found = {}
     for at, (mm, deg) in zip(out.tolist(), away.tolist(), strict=True):
@@ -344,7 +346,7 @@ def reasons(solved: Solved, faults: Sequence[PoseFault]) -> dict[int, str]:
                 f"{_stop(solved, at)}: these two rows are exchanged"
             )
         elif at in fitting:
-            stops = [str(solved.cell.stops[it]) for it in fitting[at][:_NAMED]]
+            stops = [str(solved.cell.stops[index]) for index in fitting[at][:_NAMED]]
             one = "stop" if len(stops) == 1 else "another stop, as"
             cause = f"its image is of {one} {', '.join(stops)}; {cause}"
         # Little may be known of where it should be: what is far away is wrong all the same.
@@ -417,7 +419,7 @@ def _exchanged(solved: Solved, mutual: Mapping[int, int]) -> list[PoseFault]:
         for stations, members in pairs.items():
             at_both = [at for at in mine if rows[at].station in stations]
             if len(members) >= 2 * _FEWEST and not used[at_both].any():
-                first, second = (solved.cell.stops[it] for it in stations)
+                first, second = (solved.cell.stops[station] for station in stations)
                 short = f"the poses of robot {robot} at stops {first} and {second} are exchanged"
                 words = (
                     f"{short[0].upper()}{short[1:]}: {_views(solved, at_both)} were left out. Each "

@@ -152,7 +152,7 @@ def seen_by_camera(known: RunState) -> RunState:
 def seen_ways(seen: RunState, robot: PoseNumbers) -> Iterator[PoseNumbers]:
     """The camera's poses as the declared robot would have them, and then by the images alone."""
     # They differ where an image allows several poses: the wrong robot would choose wrong ones.
-    if any(len(it.cam_from_target) > 1 for it in seen.poses.values()):
+    if any(len(pose.cam_from_target) > 1 for pose in seen.poses.values()):
         # Where the declared robot cannot choose, the images alone are left.
         with suppress(VisioncalError):
             yield camera_numbers(_chosen(seen, robot))
@@ -162,18 +162,18 @@ def seen_ways(seen: RunState, robot: PoseNumbers) -> Iterator[PoseNumbers]:
 def _chosen(seen: RunState, robot: PoseNumbers) -> RunState:
     """Chooses among the poses that an image allows by the declared robot."""
     base_from_flange = dict(
-        zip((it.number for it in seen.session.views), robot.poses(), strict=True)
+        zip((view.number for view in seen.session.views), robot.poses(), strict=True)
     )
-    both = [it for it in seen.poses.values() if np.isfinite(base_from_flange[it.view]).all()]
+    both = [pose for pose in seen.poses.values() if np.isfinite(base_from_flange[pose.view]).all()]
     problem = chain(
         seen.session.mount,
-        np.array([base_from_flange[it.view] for it in both]).reshape(-1, 4, 4),
-        np.array([it.cam_from_target[0] for it in both]).reshape(-1, 4, 4),
+        np.array([base_from_flange[view.view] for view in both]).reshape(-1, 4, 4),
+        np.array([view.cam_from_target[0] for view in both]).reshape(-1, 4, 4),
     )
     boards = [*seen.session.boards.values()]
-    targets = {it: boards[both[0].board] for it in problem.observations.observed if boards}
+    targets = {name: boards[both[0].board] for name in problem.observations.observed if boards}
     found = init_frames(problem, both, targets)
-    return replace(seen, poses={it.view: it for it in found.views})
+    return replace(seen, poses={view.view: view for view in found.views})
 
 
 def camera_numbers(seen: RunState) -> PoseNumbers:

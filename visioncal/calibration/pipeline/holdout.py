@@ -41,19 +41,19 @@ class Held:
 def held_back(solved: Solved, looked: Observed) -> Held | None:
     """What is held back and can be compared with the fit; None for nothing."""
     cell, state, placed = solved.cell, solved.agreed.fit.state, solved.cell.tree.branches.keys()
-    rows = [it for it in cell.held if it.view in looked.poses and {it.seer, it.seen} <= placed]
+    rows = [row for row in cell.held if row.view in looked.poses and {row.seer, row.seen} <= placed]
     if not rows:
         return None
     solved = replace(solved, cell=replace(cell, rows=tuple(rows)))
-    views = [looked.poses[it.view] for it in rows]
-    predicted = _problem(solved, looked, [chosen(it, 0, None) for it in views]).predicted(state)
+    views = [looked.poses[row.view] for row in rows]
+    predicted = _problem(solved, looked, [chosen(view, 0, None) for view in views]).predicted(state)
     targets = targets_of(cell)
     views = [
         choose_by(view, pose, targets.get(row.seen))
         for view, pose, row in zip(views, predicted, rows, strict=True)
     ]
     looks = solved.looks
-    lenses = {} if looks is None else {it: looks.camera(it) for it in looks.problems}
+    lenses = {} if looks is None else {problem: looks.camera(problem) for problem in looks.problems}
     positions = np.zeros((0, 3)) if looks is None else np.concatenate(looks.corners)
     for at, (view, row) in enumerate(zip(views, rows, strict=True)):
         camera = lenses.get(row.seer)
@@ -70,22 +70,22 @@ def held_sights(solved: Solved, looked: Observed) -> dict[int, Sight]:
     if held is None:
         return {}
     state, looks, problem = solved.agreed.fit.state, solved.looks, held.problem
-    lenses = {} if looks is None else {it: looks.camera(it) for it in looks.problems}
+    lenses = {} if looks is None else {problem: looks.camera(problem) for problem in looks.problems}
     positions = np.zeros((0, 3)) if looks is None else np.concatenate(looks.corners)
     away_m, away_rad = apart(problem, state)
     if solved.cell.mount is not None:
         among = set(solved.part.observations.observed)
-        known = np.array([it in among for it in problem.observations.observed])
+        known = np.array([name in among for name in problem.observations.observed])
         from_mean = scatter(problem.subset(known), solved.part, state)
         away_m[known] = from_mean[0]
         away_rad[known] = np.where(np.isnan(away_rad[known]), np.nan, from_mean[1])
-    cameras = [lenses.get(it.seer) for it in held.rows]
-    corners = [it.corners for it in held.views]
+    cameras = [lenses.get(row.seer) for row in held.rows]
+    corners = [view.corners for view in held.views]
     rms_px = chain_rms_px(corners, problem.predicted(state), cameras, positions)
     figures = np.stack([1e3 * away_m, np.rad2deg(away_rad), rms_px], axis=1)
     found = {}
     for row, seen, each in zip(held.rows, corners, figures.tolist(), strict=True):
-        mm, deg, px = (it if np.isfinite(it) else None for it in each)
+        mm, deg, px = (value if np.isfinite(value) else None for value in each)
         stop, count = solved.cell.stops[row.station], None if seen is None else len(seen.ids)
         found[row.view] = Sight(
             row.view, stop, row.seer, row.seen, False, HELD_BACK, mm, deg, count, px
@@ -107,7 +107,7 @@ def held_by_both_arms(solved: Solved, looked: Observed, robot: str) -> tuple[Uns
             (held.problem, solved.agreed.fit.state),
         )
     )
-    views = [it.view for it in held.rows]
+    views = [row.view for row in held.rows]
     return unseen_views(views, was, now, np.isfinite(now[:, 0]))
 
 
@@ -128,10 +128,10 @@ def _problem(solved: Solved, looked: Observed, views: Sequence[ViewPoses]) -> Pr
     seen, none = problem.observations, np.zeros(len(problem), dtype=bool)
     for move in solved.agreed.moves:
         seen = seen.renamed(move.frame, move.twin, seen.stops >= move.stop)
-    late = {it.name: it for it in clock_effects(solved.cell, looked.clocks)}
+    late = {effect.name: effect for effect in clock_effects(solved.cell, looked.clocks)}
     effects = [
-        late.get(it.name)
-        or replace(it, by_sensor=None, concerned=None if it.concerned is None else none)
-        for it in fitted.effects
+        late.get(effect.name)
+        or replace(effect, by_sensor=None, concerned=None if effect.concerned is None else none)
+        for effect in fitted.effects
     ]
     return replace(problem, observations=seen, points=fitted.points).with_effects(effects)

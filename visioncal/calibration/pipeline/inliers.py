@@ -85,12 +85,12 @@ def levelled(cell: Cell, poses: Sequence[ViewPoses], agreed: Agreed) -> Agreed:
     if is_alone or agreed.problem.is_combined:
         return agreed
     sensors = sensors_of(cell, poses)
-    frames = tuple(dict.fromkeys((*sensors, *(it.seer for it in cell.rows))))
-    places = {it: at for at, it in enumerate(frames)}
+    frames = tuple(dict.fromkeys((*sensors, *(row.seer for row in cell.rows))))
+    places = {frame: at for at, frame in enumerate(frames)}
     problem = agreed.problem
     observations = replace(
         problem.observations,
-        sensors=np.array([places[it.seer] for it in cell.rows], dtype=np.int64),
+        sensors=np.array([places[row.seer] for row in cell.rows], dtype=np.int64),
     )
     more = np.ones(len(frames) - len(sensors))
     least_levels = np.concatenate([np.zeros(len(sensors)), more])
@@ -133,4 +133,4 @@ def _movable(cell: Cell, problem: Problem) -> tuple[str, ...]:
     if cell.mount is not None:
         return ()
     bases = problem.tree.bases.values()
-    return tuple(it for it in problem.tree.unknown if it not in bases)
+    return tuple(name for name in problem.tree.unknown if name not in bases)

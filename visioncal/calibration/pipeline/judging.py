@@ -48,17 +48,17 @@ def findings_of(known: RunState) -> Findings:
     """Puts together what a session is judged by."""
     answer, solved = known.solved, known.fitted
     tree = solved.cell.tree
-    tied = [it for it in answer.sights if {it.seer, it.seen} <= tree.branches.keys()]
-    explained = {solved.cell.rows[row].view for it in answer.faults for row in it.rows}
+    tied = [sight for sight in answer.sights if {sight.seer, sight.seen} <= tree.branches.keys()]
+    explained = {solved.cell.rows[row].view for fault in answer.faults for row in fault.rows}
     worst, places, warnings = _of_pair(known) if known.mount else _of_cell(known)
     of_arms = [
         *doubts_of_arms(
             solved.arms, answer.misfits, answer.arms, solved.asked, solved.cell.from_when
         )
     ]
-    if any(it.kind == "measured_turns" for it in warnings):
+    if any(warning.kind == "measured_turns" for warning in warnings):
         # They follow what the camera sees, and so the arm's posture, and joint angles do not help.
-        of_arms = [it for it in of_arms if it.do is not NO_JOINTS]
+        of_arms = [arm for arm in of_arms if arm.do is not NO_JOINTS]
     of_rest = [
         *prior_words(answer.problem, answer.state, answer.covariance, solved.cell.priors),
         *solved.found_of_looks(answer.covariance),
@@ -70,11 +70,11 @@ def findings_of(known: RunState) -> Findings:
         worst,
         places,
         (
-            *(it.found for it in answer.faults),
+            *(fault.found for fault in answer.faults),
             *of_arms,
             *errors_found(answer.lenses),
             *known.warnings,
-            *(it for it in of_rest if it.kind != NOTE),
+            *(finding for finding in of_rest if finding.kind != NOTE),
             *warnings,
             *_untied(known),
         ),
@@ -82,7 +82,7 @@ def findings_of(known: RunState) -> Findings:
             *known.notes,
             *_clock_words(known),
             *notes_on_arms(solved.arms, answer.arms),
-            *(it.reason for it in of_rest if it.kind == NOTE),
+            *(finding.reason for finding in of_rest if finding.kind == NOTE),
         ),
         known.mount or _mount(tied),
         known.session.need,
@@ -93,7 +93,7 @@ def findings_of(known: RunState) -> Findings:
 def _pickable(known: RunState) -> Fitted:
     """What picks are predicted from."""
     answer, solved = known.solved, known.fitted
-    freedom = [freedom_of(it.tolist()) for it in answer.intervals]
+    freedom = [freedom_of(interval.tolist()) for interval in answer.intervals]
     return Fitted(
         answer.problem,
         answer.state,
@@ -106,7 +106,7 @@ def _pickable(known: RunState) -> Fitted:
         columns_of_boards(solved),
         middles_moved(solved),
         answer.problem,
-        {name: it.noise_px * it.levels.jitter for name, it in answer.lenses.items()},
+        {name: lens.noise_px * lens.levels.jitter for name, lens in answer.lenses.items()},
     )
 
 
@@ -135,14 +135,18 @@ def _of_pair(known: RunState) -> _Parts:
 
 def _of_measured(known: RunState) -> Iterator[Finding]:
     """Whether poses that another program measured have the robot's scale, and turn as it does."""
-    views = [it for it in known.base_from_flange if it in known.poses and it not in known.reasons]
+    views = [
+        index
+        for index in known.base_from_flange
+        if index in known.poses and index not in known.reasons
+    ]
     if known.cameras or known.mount == "instrument" or not views:
         return
-    poses = np.array([known.base_from_flange[it] for it in views])
-    seen = np.array([known.poses[it].cam_from_target[0] for it in views])
+    poses = np.array([known.base_from_flange[view] for view in views])
+    seen = np.array([known.poses[view].cam_from_target[0] for view in views])
     parent = poses if known.mount == "eye-in-hand" else invert(poses)
     # The one camera may have a name.
-    (edge,) = (it for name, it in known.solved.last_edges.items() if name.startswith("cam"))
+    (edge,) = (edge for name, edge in known.solved.last_edges.items() if name.startswith("cam"))
     if (found := distance_scale(parent, seen, edge.matrix)) is not None:
         yield found
     from_seer = edge.matrix @ seen
@@ -158,19 +162,23 @@ def _of_cell(known: RunState) -> _Parts:
     """The worst directions and the frames of a whole cell, and what moved in it."""
     answer, solved = known.solved, known.fitted
     edges, budget = answer.last_edges, answer.budget_mm
-    worst = [it for frame, edge in edges.items() for it in _directions(solved.cell, frame, edge)]
+    worst = [
+        direction
+        for frame, edge in edges.items()
+        for direction in _directions(solved.cell, frame, edge)
+    ]
     return (
-        sorted(worst, key=lambda it: (it.is_rotation, -it.sigma)),
+        sorted(worst, key=lambda value: (value.is_rotation, -value.sigma)),
         [
             Place(frame, budget[frame], 1e3 * radius95(edge.covariance[3:, 3:]))
             for frame, edge in edges.items()
         ],
-        [moved_found(it) for it in answer.moved],
+        [moved_found(move) for move in answer.moved],
     )
 
 
 def _mount(sights: Sequence[Sight]) -> Mount:
-    is_read = all(it.seer.startswith("instrument") for it in sights)
+    is_read = all(sight.seer.startswith("instrument") for sight in sights)
     return "instrument" if is_read else "eye-to-hand"
 
 
@@ -190,8 +198,8 @@ def _pairs(
 ) -> list[Pair]:
     """What each camera saw of each target; of one camera and one robot, all that there is."""
     rows: dict[tuple[str, str], list[Sight]] = {}
-    for it in sights:
-        rows.setdefault(("", "") if alone else (it.seer, it.seen), []).append(it)
+    for sight in sights:
+        rows.setdefault(("", "") if alone else (sight.seer, sight.seen), []).append(sight)
     return [
         Pair(
             view_results(mine),
@@ -199,9 +207,9 @@ def _pairs(
             left_out_rms(mine),
             holdout_rms(mine),
             [
-                Rejection(it.view, it.reason)
-                for it in mine
-                if _disagrees(it) and it.view not in explained
+                Rejection(sight.view, sight.reason)
+                for sight in mine
+                if _disagrees(sight) and sight.view not in explained
             ],
             f"{seer} of {seen}" if len(rows) > 1 else "",
             *_weighed(answer, mine),
@@ -216,8 +224,8 @@ def _weighed(answer: Answer, sights: Sequence[Sight]) -> tuple[Rms, Rms]:
     # expected of each where doubt begins: one whose own pose is known badly says nothing of the
     # others.
     used, held, limits = answer.problem.observations, answer.held_out, CalibrationLimits()
-    seen = {(it.seer, it.seen) for it in sights}
-    mine = np.array([it in seen for it in zip(used.observers, used.observed, strict=True)])
+    seen = {(sight.seer, sight.seen) for sight in sights}
+    mine = np.array([pair in seen for pair in zip(used.observers, used.observed, strict=True)])
 
     def rms(block: slice, away: FloatArray, doubt: float) -> FloatArray | None:
         known = mine & np.isfinite(away)
@@ -251,23 +259,25 @@ def _sensors(
     shown_px: Mapping[str, float],
     known: RunState,
 ) -> list[Sensor]:
-    seers = dict.fromkeys(it.seer for it in sights)
+    seers = dict.fromkeys(sight.seer for sight in sights)
     set_aside = known.spared.keys() | known.held_back
     found = []
     for seer in seers:
-        mine = [it for it in sights if it.seer == seer]
+        mine = [sight for sight in sights if sight.seer == seer]
         lost = [
-            Rejection(it.view, it.reason) for it in mine if not it.used and it.view not in set_aside
+            Rejection(sight.view, sight.reason)
+            for sight in mine
+            if not sight.used and sight.view not in set_aside
         ]
         levels = noise.get(seer, {})
         found.append(
             Sensor(
-                sum(it.used for it in mine),
+                sum(sight.used for sight in mine),
                 lost,
-                [it.view for it in mine if _disagrees(it)],
+                [sight.view for sight in mine if _disagrees(sight)],
                 shown_px.get(seer, levels.get("pixel_px")),
                 levels.get("level", 1.0),
-                sum(it.view in known.spared for it in mine),
+                sum(sight.view in known.spared for sight in mine),
                 seer if len(seers) > 1 else "",
             )
         )
@@ -325,12 +335,12 @@ def check_answer(known: RunState) -> None:
     agreed, cell = known.fitted.agreed, known.fitted.cell
     part, fit = known.fitted.part, agreed.fit
     seen = known.fitted.seen
-    looks = seen is not None and any(it.estimated for it in known.scenes.values())
+    looks = seen is not None and any(scene.estimated for scene in known.scenes.values())
     pixel_px = {} if seen is None else dict(zip(seen.looks.problems, seen.sigmas_px, strict=True))
     if known.mount is not None:
         check_observability(part, fit.state, fit.noise, known.mount, pixel_px, looks=looks)
         return
-    names = {it: _names(part.tree, it) for it in part.unknown}
+    names = {name: _names(part.tree, name) for name in part.unknown}
     lost = agreed.problem.subset(~agreed.used)
 
     def motion(frame: str) -> str:
@@ -368,20 +378,20 @@ def _motion(cell: Cell, part: Problem, frame: str) -> str:
 def _worst_direction(cell: Cell, frame: str, edge: Edge) -> Direction:
     """The direction of a frame that is known worst, in the axes of the frame that it hangs on."""
     found = _directions(cell, frame, edge)
-    return max(found, key=lambda it: it.sigma / it.limit)
+    return max(found, key=lambda value: value.sigma / value.limit)
 
 
 def _directions(cell: Cell, frame: str, edge: Edge) -> list[Direction]:
     """The worst directions of a frame: of its offset and, where it has one, of its rotation."""
     found = edge_directions(edge.matrix, edge.covariance, *_names(cell.tree, frame))
-    return [it for it in found if edge.oriented or not it.is_rotation]
+    return [direction for direction in found if edge.oriented or not direction.is_rotation]
 
 
 def _more(cell: Cell, frame: str) -> str:
     """What would determine a frame better."""
     frame = frame.partition("@")[0]
-    rows = [it for it in cell.rows if frame in (it.seer, it.seen)]
-    others = sorted({it.seen if it.seer == frame else it.seer for it in rows})
+    rows = [row for row in cell.rows if frame in (row.seer, row.seen)]
+    others = sorted({row.seen if row.seer == frame else row.seer for row in rows})
     if not others:
         return "Add stops at which its robot turns about two axes or more."
     if frame.startswith("target") and len(others) == 1 and frame not in _carried(cell):
@@ -397,14 +407,14 @@ def _more(cell: Cell, frame: str) -> str:
 
 def _carried(cell: Cell) -> set[str]:
     """The frames that robots carry."""
-    return {it for it in cell.tree.branches if cell.tree.body(it) != cell.tree.root}
+    return {branch for branch in cell.tree.branches if cell.tree.body(branch) != cell.tree.root}
 
 
 def weakest_link(cell: Cell, edges: Mapping[str, Edge]) -> str:
     """Names the link of the cell that is known worst, and what it rests on."""
     if not edges:
         return ""
-    name, edge = max(edges.items(), key=lambda it: it[1].sigma_mm)
+    name, edge = max(edges.items(), key=lambda pair: pair[1].sigma_mm)
     worst = _worst_direction(cell, name, edge)
     return (
         f"The weakest link is {name}: sigma {figure(edge.sigma_mm)} mm and "
@@ -413,11 +423,11 @@ def weakest_link(cell: Cell, edges: Mapping[str, Edge]) -> str:
 
 
 def _resting(cell: Cell, frame: str) -> str:
-    rows = [it for it in cell.rows if frame in cell.tree.above(it.seer)]
-    rows += [it for it in cell.rows if frame in cell.tree.above(it.seen)]
+    rows = [row for row in cell.rows if frame in cell.tree.above(row.seer)]
+    rows += [row for row in cell.rows if frame in cell.tree.above(row.seen)]
     pairs: dict[str, int] = {}
-    for it in rows:
-        key = f"{it.seer} of {it.seen}"
+    for row in rows:
+        key = f"{row.seer} of {row.seen}"
         pairs[key] = pairs.get(key, 0) + 1
-    least = sorted(pairs.items(), key=lambda it: it[1])
+    least = sorted(pairs.items(), key=lambda pair: pair[1])
     return f"It rests on {some_of([f'{count} views by {key}' for key, count in least], 4)}."

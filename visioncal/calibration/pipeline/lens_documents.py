@@ -57,9 +57,9 @@ def fit_section(known: RunState) -> CellJointFit:
     columns = [*range(edges), *solved.columns_of(seen.free).tolist()]
     return CellJointFit(
         cameras={
-            thing_name(it, "camera"): _among(seen.free, at) for it, at in looks.lenses.items()
+            thing_name(name, "camera"): _among(seen.free, at) for name, at in looks.lenses.items()
         },
-        targets={name: _among(seen.free, it) for name, it in _shapes(known).items()},
+        targets={name: _among(seen.free, shape) for name, shape in _shapes(known).items()},
         covariance=covariance[np.ix_(columns, columns)],
     )
 
@@ -67,23 +67,23 @@ def fit_section(known: RunState) -> CellJointFit:
 def boards_of(known: RunState) -> dict[str, BoardResult]:
     """The boards as they were found to be, by name."""
     return {
-        it.name: BoardResult(
-            shape=dict(zip(BOARD_NAMES, it.values.tolist(), strict=True)),
-            sigma={BOARD_NAMES[at]: float(it.sigmas[at]) for at in it.free},
-            estimated=tuple(BOARD_NAMES[at] for at in it.moving),
-            bend_mm=1e3 * float(np.ptp(it.corners[:, 2])),
+        shape.name: BoardResult(
+            shape=dict(zip(BOARD_NAMES, shape.values.tolist(), strict=True)),
+            sigma={BOARD_NAMES[at]: float(shape.sigmas[at]) for at in shape.free},
+            estimated=tuple(BOARD_NAMES[at] for at in shape.moving),
+            bend_mm=1e3 * float(np.ptp(shape.corners[:, 2])),
         )
-        for it in _found_shapes(known)
-        if it.kind != "points"
+        for shape in _found_shapes(known)
+        if shape.kind != "points"
     }
 
 
 def rigs_of(known: RunState) -> dict[str, RigResult]:
     """The rigs as they were found to be, by name; those that are exact are left out."""
     return {
-        it.name: RigResult(shape=it.values.reshape(-1, 3), sigma=it.sigmas.reshape(-1, 3))
-        for it in _found_shapes(known)
-        if it.kind == "points" and it.free
+        shape.name: RigResult(shape=shape.values.reshape(-1, 3), sigma=shape.sigmas.reshape(-1, 3))
+        for shape in _found_shapes(known)
+        if shape.kind == "points" and shape.free
     }
 
 
@@ -135,4 +135,4 @@ def _shapes(known: RunState) -> dict[str, slice]:
 def _among(places: IntArray, mine: slice) -> tuple[int, ...]:
     """Which values of a lens or a target are among some, from its own first on."""
     free = places[(places >= mine.start) & (places < mine.stop)]
-    return tuple(int(it) for it in free - mine.start)
+    return tuple(int(value) for value in free - mine.start)

@@ -131,7 +131,7 @@ def lens_field_of(
 def _columns_beyond(solved: Solved, which: int) -> IntArray:
     """The problem's columns of what one lens does beyond its model."""
     seen = solved.seen
-    sizes = [] if seen is None else [it.by_field.shape[2] for it in seen.compressed]
+    sizes = [] if seen is None else [compressed.by_field.shape[2] for compressed in seen.compressed]
     first = sum(sizes[:which])
     return solved.field_columns[first : first + sizes[which]]
 
@@ -144,7 +144,7 @@ def _distance_m(seen: LinearisedCorners, which: int) -> float:
 
 def _root(covariance: FloatArray, camera: Camera, levels: LensLevels) -> FloatArray:
     """(m, r) root of a covariance of coefficients, without what displaces no pixel visibly."""
-    wide, high = (np.linspace(0.0, it - 1.0, _GRID) for it in camera.resolution)
+    wide, high = (np.linspace(0.0, index - 1.0, _GRID) for index in camera.resolution)
     px = np.stack(np.meshgrid(wide, high), axis=-1).reshape(-1, 2)
     # Breathing by as much as the distance changes.
     size = np.sqrt(np.mean(np.sum(displacements(px, camera, 1.0, levels) ** 2, axis=1), axis=0))
@@ -155,26 +155,26 @@ def _root(covariance: FloatArray, camera: Camera, levels: LensLevels) -> FloatAr
 
 def errors_found(lenses: Mapping[str, LensErrors]) -> Iterator[Finding]:
     """What chance does not explain."""
-    for name, it in lenses.items():
+    for name, lens in lenses.items():
         of = "The lens" if len(lenses) == 1 else f"The lens of {name}"
-        field, breathing, jitter = it.levels.gains
-        if it.is_of_lens:
+        field, breathing, jitter = lens.levels.gains
+        if lens.is_of_lens:
             yield Finding(
                 "lens_field",
                 f"{of} departs from its model: corners of one part of the image are off alike, by "
-                f"{figure(it.field_px)} px. The result counts it, and belongs to this lens.",
+                f"{figure(lens.field_px)} px. The result counts it, and belongs to this lens.",
                 Step(
                     "Give matrix and distortion of a model that fits the lens, or keep the work in "
                     "the middle of the image."
                 ),
                 mahalanobis_sq=field,
-                up_to_mm=1e3 * it.field_px / it.focal_px * it.distance_m,
+                up_to_mm=1e3 * lens.field_px / lens.focal_px * lens.distance_m,
             )
         if max(breathing, jitter) > SIGNIFICANT:
-            share = 100.0 * it.noise_px
-            how = [f"by {figure(share * it.levels.breathing)} % where the distance doubles"] * (
+            share = 100.0 * lens.noise_px
+            how = [f"by {figure(share * lens.levels.breathing)} % where the distance doubles"] * (
                 breathing > SIGNIFICANT
-            ) + [f"by {figure(share * it.levels.jitter)} % from view to view"] * (
+            ) + [f"by {figure(share * lens.levels.jitter)} % from view to view"] * (
                 jitter > SIGNIFICANT
             )
             yield Finding(
@@ -182,5 +182,8 @@ def errors_found(lenses: Mapping[str, LensErrors]) -> Iterator[Finding]:
                 f"{of} changes its focal length {' and '.join(how)}. The result counts it.",
                 Step("Fix the focus (no autofocus), or work at one distance."),
                 mahalanobis_sq=max(breathing, jitter),
-                up_to_mm=10.0 * share * max(it.levels.breathing, it.levels.jitter) * it.distance_m,
+                up_to_mm=10.0
+                * share
+                * max(lens.levels.breathing, lens.levels.jitter)
+                * lens.distance_m,
             )

@@ -25,31 +25,35 @@ def untied_robots(cell: Cell, lost: Collection[str], *, seen: bool = False) -> N
     """
     branches = cell.tree.branches
     # Where no row is left, the robot whose base stands for the cell is tied to nothing, too.
-    none_left = seen and all(it.seer in lost or it.seen in lost for it in cell.rows)
+    none_left = seen and all(row.seer in lost or row.seen in lost for row in cell.rows)
     flanges = [
-        it for it in branches if branches[it].robot and (branches[it].parent in lost or none_left)
+        branch
+        for branch in branches
+        if branches[branch].robot and (branches[branch].parent in lost or none_left)
     ]
     if not flanges:
         return
-    bases = [branches[it].parent for it in flanges]
-    untied = [it for it in bases if it in lost] or [it for it in lost if not branches[it].robot]
-    words = [untied_words(cell, it) for it in bases]
+    bases = [branches[flange].parent for flange in flanges]
+    untied = [base for base in bases if base in lost] or [
+        item for item in lost if not branches[item].robot
+    ]
+    words = [untied_words(cell, base) for base in bases]
     robots = "this robot" if len(bases) == 1 else "these robots"
     why = f"no observation links {robots} to the rest of the cell"
     parts = []
     if seen:
-        moves = [robot_motion(cell, it, _stations(cell, it)) for it in bases]
+        moves = [robot_motion(cell, base, _stations(cell, base)) for base in bases]
         why = (
             f"the observations that link {robots} to the rest of the cell are too few, too much "
             f"alike, or wrong (it takes 3 stops or more, turned about two axes): {'; '.join(moves)}"
         )
-        parts = [part for it in bases if it in lost and (part := _open_part(cell, it))]
+        parts = [part for base in bases if base in lost and (part := _open_part(cell, base))]
         if parts:
             why += f", which does not determine {' and '.join(parts)}"
             words = [
-                f"Add 3 or more stops in which {it} is tilted by 20 to 40 degrees about different "
-                "axes, not only about one."
-                for it in flanges
+                f"Add 3 or more stops in which {flange} is tilted by 20 to 40 degrees about "
+                "different axes, not only about one."
+                for flange in flanges
             ]
     raise DegenerateError(
         f"cell: nothing ties {some_of(untied)} to {cell.reference}: {why}.",
@@ -67,7 +71,7 @@ def _open_part(cell: Cell, base: str) -> str:
 
 
 def _robot_on(cell: Cell, base: str) -> str:
-    return next(robot for robot, it in cell.tree.bases.items() if it == base)
+    return next(robot for robot, name in cell.tree.bases.items() if name == base)
 
 
 def robot_motion(cell: Cell, base: str, stations: IntArray) -> str:
@@ -95,17 +99,19 @@ def _stations(cell: Cell, base: str) -> IntArray:
 def untied_words(cell: Cell, frame: str) -> str:
     """What would tie a frame to the rest, in a sentence."""
     tree, carried = cell.tree, [*_carried(cell, frame)]
-    cameras = [it for it in carried if it.startswith("cam")]
-    boards = [it for it in carried if it.startswith("target")]
-    others = [it for it in cell.tied() if it not in carried]
-    seeing = [it for it in others if it.startswith("cam")]
-    lying = [it for it in others if it.startswith("target")]
+    cameras = [name for name in carried if name.startswith("cam")]
+    boards = [name for name in carried if name.startswith("target")]
+    others = [name for name in cell.tied() if name not in carried]
+    seeing = [other for other in others if other.startswith("cam")]
+    lying = [other for other in others if other.startswith("target")]
     ways = []
     if boards and seeing:
         ways.append(f"let {some_of(seeing)} see {some_of(boards)} at 5 stops or more")
     if cameras and lying:
         ways.append(f"let {some_of(cameras)} see {some_of(lying)} at 5 stops or more")
-    flange = next((it for it in tree.flanges.values() if tree.branches[it].parent == frame), "")
+    flange = next(
+        (flange for flange in tree.flanges.values() if tree.branches[flange].parent == frame), ""
+    )
     if not ways and flange and seeing:
         ways.append(f"put a board on {flange} and let {some_of(seeing)} see it at 5 stops or more")
     if not ways and flange and lying:
@@ -129,7 +135,7 @@ def _carried(cell: Cell, frame: str) -> Iterator[str]:
 
 def ambiguous_error(cell: Cell, frames: Sequence[str]) -> DegenerateError:
     """Words that frames are tied by boards alone that look the same when turned."""
-    boards = sorted({it.seen for it in cell.rows if it.seer in frames or it.seen in frames})
+    boards = sorted({row.seen for row in cell.rows if row.seer in frames or row.seen in frames})
     return DegenerateError(
         f"cell: {some_of(frames)} may be in two places: {some_of(boards)} looks the same after "
         "half a turn, and no other observation shows which way round it was seen.",

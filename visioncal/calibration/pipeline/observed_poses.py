@@ -40,18 +40,18 @@ class ObservedPoses(Observed):
     @classmethod
     def of(cls, seen: Observed) -> Self:
         """What was observed, not seen with anything yet."""
-        return cls(**{it.name: getattr(seen, it.name) for it in fields(Observed)})
+        return cls(**{entry.name: getattr(seen, entry.name) for entry in fields(Observed)})
 
     def posed(self, poses: Iterable[ViewPoses]) -> Self:
         """Takes over poses, made anew by lens and board where their view has just one."""
-        given = {it.view: it for it in poses}
+        given = {pose.view: pose for pose in poses}
         if self.free is not None and self.pixel_px is not None:
             single = [
-                it
-                for it in given.values()
-                if it.corners is not None and len(it.cam_from_target) == 1
+                view
+                for view in given.values()
+                if view.corners is not None and len(view.cam_from_target) == 1
             ]
-            given |= {it.view: it for it in remade(single, self.free, self.pixel_px)}
+            given |= {view.view: view for view in remade(single, self.free, self.pixel_px)}
         return replace(self, poses={**self.poses, **given})
 
     @cached_property
@@ -59,18 +59,18 @@ class ObservedPoses(Observed):
         """The robot's arm; its stops are all views with a pose, in their order."""
         if self.calibrated is not None:
             return self.calibrated
-        rows = {it.number: it for it in self.session.views}
+        rows = {view.number: view for view in self.session.views}
         return RobotArm.of(
             ROBOT,
             np.array([*self.base_from_flange.values()]).reshape(-1, 4, 4),
-            [rows[it] for it in self.base_from_flange],
+            [rows[index] for index in self.base_from_flange],
             self.reported.matched,
             (self.session, next(iter(self.robots), "")),
         )
 
     def arm_at(self, views: Sequence[int]) -> RobotArm:
         """The robot's arm at some views."""
-        return self.robot_arm.at(np.array([self._places[it] for it in views], dtype=np.int64))
+        return self.robot_arm.at(np.array([self._places[view] for view in views], dtype=np.int64))
 
     @property
     def arm_at_stops(self) -> RobotArm:
@@ -85,26 +85,26 @@ class ObservedPoses(Observed):
         """What some views measured, each with its first or chosen pose."""
         poses, first = [self.poses[view] for view in views], self.first_of_stops(views)
         covariance, effects = None, []
-        from_corners = all(it.corners is not None for it in poses)
+        from_corners = all(pose.corners is not None for pose in poses)
         if self.free is not None:
             # Poses that others have measured do not move with lens and board.
             shift = np.zeros((len(poses), 6, len(self.free.columns)))
             if from_corners:
-                shift = np.array([it.by_shared[0] for it in poses]).reshape(shift.shape)
+                shift = np.array([pose.by_shared[0] for pose in poses]).reshape(shift.shape)
             effects = [self.free.effect(shift)]
         if from_corners:
-            covariance = np.array([it.covariance[0] for it in poses]).reshape(-1, 6, 6)
+            covariance = np.array([pose.covariance[0] for pose in poses]).reshape(-1, 6, 6)
         effects += self.arm_at(first).effects()
         return chain(
             self.session.mount,
             self.arm_at(first).poses,
-            np.array([it.cam_from_target[0] for it in poses]).reshape(-1, 4, 4),
+            np.array([pose.cam_from_target[0] for pose in poses]).reshape(-1, 4, 4),
             covariance,
             stops=self.stops_of(views),
             targets=self.targets(views),
-            order=[self.frame_of(it) for it in self.boards],
+            order=[self.frame_of(board) for board in self.boards],
             # What is shared counts from where it is.
-            effects=[replace(it, values=np.zeros(len(it))) for it in effects],
+            effects=[replace(effect, values=np.zeros(len(effect))) for effect in effects],
         )
 
     def targets(self, views: Sequence[int]) -> tuple[str, ...]:
@@ -130,7 +130,7 @@ class ObservedPoses(Observed):
     def first_of_stops(self, views: Sequence[int]) -> list[int]:
         """(s,) the first view of each stop."""
         first = np.unique(self.stops_of(views), return_index=True)[1]
-        return [views[it] for it in first.tolist()]
+        return [views[index] for index in first.tolist()]
 
     @property
     def stops(self) -> IntArray:
@@ -147,11 +147,13 @@ class ObservedPoses(Observed):
         keys: dict[tuple[int, int], int] = {}
         boards = (self.poses[view].board if own else 0 for view in views)
         both = zip((self._stations[view] for view in views), boards, strict=True)
-        return np.array([keys.setdefault(it, len(keys)) for it in both], dtype=np.int64)
+        return np.array([keys.setdefault(pair, len(keys)) for pair in both], dtype=np.int64)
 
     @cached_property
     def _stations(self) -> Mapping[int, int]:
-        return {it.view.number: it.station for it in self.timed.observations}
+        return {
+            observation.view.number: observation.station for observation in self.timed.observations
+        }
 
     def seen(self, views: Sequence[int]) -> list[Corners | None]:
         """The corners of some views that their poses were made from."""

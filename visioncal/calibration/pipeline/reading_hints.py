@@ -111,9 +111,9 @@ def _corners_are_mirrored(seen: RunState) -> bool:
     # A left-handed frame of the robot does not do that, nor do images that were mirrored before
     # another program numbered their corners.
     session = seen.session
-    if any(it.image for it in session.views) or not session.corners:
+    if any(view.image for view in session.views) or not session.corners:
         return False
-    if any(it.kind == "points" for it in session.boards.values()):
+    if any(board.kind == "points" for board in session.boards.values()):
         # Its z may point either way.
         return False
     poses = camera_numbers(replace(seen, poses=seen.poses_of_one_board)).poses()
@@ -138,7 +138,7 @@ def _unrecorded(seen: RunState) -> Finding | None:
     both = robot.there & camera.there
     if both.sum() < FEWEST_ROWS:
         return None
-    moved = [invert(it[:1]) @ it for it in (way.poses()[both] for way in (robot, camera))]
+    moved = [invert(array[:1]) @ array for array in (way.poses()[both] for way in (robot, camera))]
     by_robot, by_camera = map(rotation_angle, moved)
     most, half = np.rad2deg([by_robot.max(), np.median(by_camera)]).tolist()
     if most > _STILL_DEG or half < _TURNED_DEG:
@@ -254,7 +254,7 @@ def readings_in_cell(known: RunState) -> Iterator[Finding]:
             looked.add(pair.camera)
             try:
                 part = RunState(session.of(pair.camera, robot, pair.target), None, known.threads)
-                for stage in STAGES[: [it.name for it in STAGES].index("joints") + 1]:
+                for stage in STAGES[: [stage.name for stage in STAGES].index("joints") + 1]:
                     part = stage.run(part)
             except VisioncalError:
                 # There is too little to see.
@@ -287,10 +287,10 @@ def readings_in_cell(known: RunState) -> Iterator[Finding]:
 def _closes(known: RunState, robot: str, pair: Pair) -> bool:
     """Whether the chain of a pair closes as declared."""
     reported = known.robots[robot].base_from_flange
-    views = [it for it in pair.poses if it in reported]
-    places = tuple(f"view {it}" for it in views)
-    robot_poses = np.array([reported[it] for it in views]).reshape(-1, 4, 4)
-    seen = np.array([pair.poses[it].cam_from_target[0] for it in views]).reshape(-1, 4, 4)
+    views = [pose for pose in pair.poses if pose in reported]
+    places = tuple(f"view {view}" for view in views)
+    robot_poses = np.array([reported[view] for view in views]).reshape(-1, 4, 4)
+    seen = np.array([pair.poses[view].cam_from_target[0] for view in views]).reshape(-1, 4, 4)
     recording = Recording(
         PoseNumbers.of_poses(robot_poses, places),
         PoseNumbers.of_poses(seen, places),

@@ -84,8 +84,8 @@ def _edge_names(known: RunState) -> dict[str, str]:
     """The names of the edges by the frames that they place, the camera's first."""
     # Of points that an instrument read, the first is the probe.
     frames, first = known.solved.problem.unknown, edge_names(known.session.mount)
-    parents = [it.partition("_from_")[0] for it in first]
-    names = {it: f"{parents[min(at, 1)]}_from_{it}" for at, it in enumerate(frames)}
+    parents = [name.partition("_from_")[0] for name in first]
+    names = {frame: f"{parents[min(at, 1)]}_from_{frame}" for at, frame in enumerate(frames)}
     if known.mount == "instrument":
         names = dict(zip(frames, first, strict=False))
     return names
@@ -96,20 +96,20 @@ def _solvers(known: RunState, names: Mapping[str, str]) -> dict[str, SolverResul
     found = compare_solvers(answer.problem, answer.state, mount, known.solver)
     return {
         name: SolverResult(
-            dict(zip(names.values(), it.edges, strict=False)),
-            1e3 * it.rms_m,
-            None if it.rms_rad is None else float(np.rad2deg(it.rms_rad)),
+            dict(zip(names.values(), answer.edges, strict=False)),
+            1e3 * answer.rms_m,
+            None if answer.rms_rad is None else float(np.rad2deg(answer.rms_rad)),
         )
-        for name, it in found.items()
+        for name, answer in found.items()
     }
 
 
 def _views(known: RunState) -> tuple[ViewResult, ...]:
     """What became of each view of the session, in its order."""
-    seen = {it.view: it for it in view_results(known.solved.sights)}
+    seen = {result.view: result for result in view_results(known.solved.sights)}
     return tuple(
-        seen.get(it.number) or ViewResult(it.number, used=False, reason=_reason(known, it))
-        for it in known.session.views
+        seen.get(view.number) or ViewResult(view.number, used=False, reason=_reason(known, view))
+        for view in known.session.views
     )
 
 
@@ -127,7 +127,7 @@ def _sections(known: RunState) -> CalibrationSections:
     alone = not known.session.targets
     return CalibrationSections(
         **vars(_arm(known)),
-        clock=next((it.clock.result() for it in known.clocks.values()), None),
+        clock=next((clock.clock.result() for clock in known.clocks.values()), None),
         instrument=None if known.readings is None else _instrument(known.readings),
         points=tuple(_points(known)),
         board=next(iter(boards.values()), None) if alone else None,
@@ -176,8 +176,8 @@ def _uncertainty(known: RunState) -> UncertaintyResult:
     work, answer = known.work, known.solved
     of = "combined" if answer.problem.is_combined else "robot"
     (turn_rad, shift_m) = answer.intervals[0]
-    tests = (it.alike for it in answer.misfits.values())
-    alike = [it.factor for it in tests if it is not None and it.is_significant]
+    tests = (misfit.alike for misfit in answer.misfits.values())
+    alike = [test.factor for test in tests if test is not None and test.is_significant]
     return UncertaintyResult(
         point_cam_m=work.point_cam,
         budget_mm=work.budget_mm,
@@ -196,9 +196,9 @@ def _noise(known: RunState) -> dict[str, float]:
     sigma_rad, sigma_m = known.solved.noise.robots[0].tolist()
     of = "combined" if known.solved.problem.is_combined else "robot"
     found = {
-        name: it
+        name: value
         for of_frame in known.solved.sigmas.values()
-        for name, it in of_frame.items()
+        for name, value in of_frame.items()
         if name == "pixel_px"
     }
     if not found and known.pixel_px is not None:
@@ -219,9 +219,9 @@ def _joint_fit_of(known: RunState) -> JointFit | None:
         return None
     boards, seen = known.session.boards, known.fitted.seen
     placed = known.solved.problem.unknown
-    names = [it for it in boards if len(boards) < 2 or frame_name("target", it) in placed]
+    names = [board for board in boards if len(boards) < 2 or frame_name("target", board) in placed]
     return JointFit(
-        targets={name: target_document(it) for name, it in boards.items()},
+        targets={name: target_document(board) for name, board in boards.items()},
         boards=tuple(names) or ("",),
         looks=() if seen is None else tuple(seen.free.tolist()),
         arm=_fitted_arm(known),
@@ -231,11 +231,11 @@ def _joint_fit_of(known: RunState) -> JointFit | None:
 
 def _conditions_of(known: RunState) -> dict[str, float]:
     """The mean conditions of the used views; those that a used view does not say are left out."""
-    views = [it for it in known.session.views if it.number in known.used]
+    views = [view for view in known.session.views if view.number in known.used]
     return {
-        name: float(np.mean([it.numbers[name] for it in views]))
+        name: float(np.mean([view.numbers[name] for view in views]))
         for name in CONDITIONS
-        if views and all(name in it.numbers for it in views)
+        if views and all(name in view.numbers for view in views)
     }
 
 
@@ -248,7 +248,7 @@ def _fitted_arm(known: RunState) -> FittedArm | None:
     count = errors.basis.shape[2]
     # Errors that only count are where they were stated; those of a model are in its arm already.
     problem, name = known.solved.problem, f"arm of {arm.robot}"
-    linearised = problem.start({it: np.eye(4) for it in problem.unknown})
+    linearised = problem.start({name: np.eye(4) for name in problem.unknown})
     values = problem.values_of(name, known.solved.state) - problem.values_of(name, linearised)
     values = values if errors.is_estimated else np.zeros(count)
     if model is None:
@@ -261,7 +261,7 @@ def _fitted_arm(known: RunState) -> FittedArm | None:
     return FittedArm(
         of="model",
         values=values[kept],
-        weights={it: size for it, size in model.weights.items() if it != HARMONICS},
+        weights={name: size for name, size in model.weights.items() if name != HARMONICS},
         flange_from_reported=model.flange_from_reported,
         by_stop=model.values_by_stop[kept] if loaded else None,
         torque_nm=model.torque_nm if loaded else None,

@@ -123,7 +123,7 @@ def run_steps(known: RunState) -> RunState:
                 known = stage.run(known)
             except VisioncalError as error:
                 # Views that are out of the game are often why the rest does not suffice.
-                more = [it for it in known.lost_views if it not in error.culprits]
+                more = [view for view in known.lost_views if view not in error.culprits]
                 cause = unseen_cause(known) or (
                     poor_motion(known) if stage.name == "intrinsics" else None
                 )
@@ -170,7 +170,7 @@ def _with_hint(
 def _with_other_board(known: RunState) -> RunState:
     """Adds to a verdict on views without a board which board they show."""
     verdict = known.verdict
-    if verdict is None or all(it.kind != "lost_views" for it in verdict.findings):
+    if verdict is None or all(finding.kind != "lost_views" for finding in verdict.findings):
         return known
     cause = unseen_cause(known)
     if cause is None or cause.kind != "other_board":

@@ -58,7 +58,7 @@ class Solved:
     @property
     def side(self) -> FramesSide:
         """The frames' side of the joint fit."""
-        problem, views = self.agreed.problem, [it.view for it in self.cell.rows]
+        problem, views = self.agreed.problem, [row.view for row in self.cell.rows]
         used, noise = self.agreed.used, self.agreed.fit.noise
         return FramesSide(problem, used, views, self.arms, self.late, noise)
 
@@ -69,7 +69,7 @@ class Solved:
 
     def posed(self) -> Self:
         """The same with the robots' poses by their arms."""
-        poses = {name: it.poses for name, it in self.arms.items()}
+        poses = {name: arm.poses for name, arm in self.arms.items()}
         problem = self.agreed.problem
         problem = replace(problem, poses={**problem.poses, **poses})
         return replace(self, agreed=replace(self.agreed, problem=problem))
@@ -84,7 +84,7 @@ class Solved:
         if self.seen is not None:
             fitted = Fitted(self.seen, self.part, self.agreed.fit)
             arms, stated = self.arms.values(), None
-            if any(it.model is not None for it in arms):
+            if any(arm.model is not None for arm in arms):
                 stated = self.part
                 for arm in arms:
                     stated = arm.without_errors(stated)
@@ -96,10 +96,12 @@ class Solved:
         if self.seen is None:
             return {}
         looks, found = self.seen.looks, {}
-        for (camera, it), corners in zip(looks.problems.items(), self.seen.compressed, strict=True):
+        for (camera, corner_problem), corners in zip(
+            looks.problems.items(), self.seen.compressed, strict=True
+        ):
             moving = np.flatnonzero(np.isin(looks.places(camera), self.seen.moving))
-            unknowns = it.unknowns(corners, moving)
-            found[camera] = it.stack.shown_px(corners.residuals, unknowns)
+            unknowns = corner_problem.unknowns(corners, moving)
+            found[camera] = corner_problem.stack.shown_px(corners.residuals, unknowns)
         return found
 
     @property
@@ -126,9 +128,9 @@ class Solved:
         if looks is None:
             return np.full(len(rows), np.nan)
         poses = self.agreed.problem.subset(chosen).predicted(state)
-        lenses = {it: looks.camera(it) for it in looks.problems}
-        seen = [self.poses[it].corners for it in rows]
-        cameras = [lenses.get(self.cell.rows[it].seer) for it in rows]
+        lenses = {problem: looks.camera(problem) for problem in looks.problems}
+        seen = [self.poses[index].corners for index in rows]
+        cameras = [lenses.get(self.cell.rows[index].seer) for index in rows]
         return chain_rms_px(seen, poses, cameras, np.concatenate(looks.corners))
 
     @property

@@ -63,7 +63,7 @@ def solve(
     arms: Mapping[str, RobotArm] = arms_of(cell, looked.robots)
     check_arms(arms, asked)
     if cell.mount is not None:
-        can = solver == "joint" and all(it.is_modelled for it in arms.values())
+        can = solver == "joint" and all(arm.is_modelled for arm in arms.values())
         check_asked(asked, can=can)
     if solver != "joint":
         cell, asked = replace(cell, priors=()), "hand-eye"
@@ -82,7 +82,7 @@ def solve(
         looked = replace(looked, turned=turned)
         found = _agreeing_looks(replace(start, turned=turned), looked, sizes)
     found = replace(found, arms=with_drifts(found.arms, found.part, found.agreed.fit, asked))
-    if any(it.drift is not None for it in found.arms.values()):
+    if any(arm.drift is not None for arm in found.arms.values()):
         found = _agreeing_looks(found, looked, sizes)
     found = replace(found, agreed=levelled(cell, poses, found.agreed))
     # Poses that are misread say nothing of the arm, nor which views are outliers.
@@ -113,7 +113,7 @@ def _alternating(found: Solved, looked: Observed) -> Solved:
     for turn in range(_ROUNDS + 1):
         if found.asked != "hand-eye":
             arms = _levels(found)
-            erring = [name for name, it in arms.items() if it.frees_errors()]
+            erring = [name for name, arm in arms.items() if arm.frees_errors()]
             late = clock_effects(found.cell, looked.clocks, erring)
             found = _at_rest(replace(found, arms=arms, late=late))
         before = found.agreed
@@ -185,7 +185,9 @@ def _with_looks(
     found: Solved, looked: Observed, levels: Mapping[str, LensLevels], sizes: Mapping[str, float]
 ) -> Solved:
     """Fits lenses, boards and frames, with errors of the arms sought anew beside their drift."""
-    found = replace(found, arms={name: it.erring(None) for name, it in found.arms.items()}).posed()
+    found = replace(
+        found, arms={name: arm.erring(None) for name, arm in found.arms.items()}
+    ).posed()
     if looked.scenes and not found.agreed.problem.is_combined:
         side, frames = found.side, found.frames
         views = _views_by_camera(looked, found.poses)
@@ -196,8 +198,8 @@ def _with_looks(
             fitted, side = refined(side, looks, frames)
         except ConvergenceError:
             names = next(iter(looked.scenes.values())).names
-            targets = [frame_name("target", it) for it in names]
-            other = {it: sizes.get(targets[it], 0.0) for it in looks.printed}
+            targets = [frame_name("target", name) for name in names]
+            other = {index: sizes.get(targets[index], 0.0) for index in looks.printed}
             far = {board: size for board, size in other.items() if abs(size) > _FAR_SIZE}
             if not far:
                 raise
@@ -214,7 +216,7 @@ def _with_looks(
 def _levels(found: Solved) -> dict[str, RobotArm]:
     """Chooses how far each arm is calibrated, beside the errors of the others."""
     problem, chosen, fit = found.part, dict(found.arms), found.agreed.fit
-    views = [found.cell.rows[it].view for it in np.flatnonzero(found.agreed.used)]
+    views = [found.cell.rows[index].view for index in np.flatnonzero(found.agreed.used)]
     for name, arm in found.arms.items():
         stated = arm.without_errors(problem)
         start = State(fit.state.edges, stated.start_values)
@@ -247,7 +249,7 @@ def _with_functions(found: Solved) -> Solved:
 
 def _at_rest(found: Solved) -> Solved:
     """Fits with calibrated arms that are linearised anew until they stay."""
-    is_modelled = any(it.model is not None for it in found.arms.values())
+    is_modelled = any(arm.model is not None for arm in found.arms.values())
     for turn in range(_ROUNDS if is_modelled else 0):
         found = found.posed()
         if found.seen is None:
@@ -261,7 +263,7 @@ def _at_rest(found: Solved) -> Solved:
                 fitted = settle_looks(looks, side, fitted.moving, fitted.frames, fitted.others)
             found = found.settled(side, fitted)
         problem, state = found.agreed.problem, found.agreed.fit.state
-        moved = {name: it.moved(problem, state) for name, it in found.arms.items()}
+        moved = {name: arm.moved(problem, state) for name, arm in found.arms.items()}
         found = replace(found, arms={name: arm for name, (arm, _) in moved.items()})
         if max(step for _, step in moved.values()) < _AT_REST_RAD:
             break
@@ -270,11 +272,11 @@ def _at_rest(found: Solved) -> Solved:
 
 def _views_by_camera(looked: Observed, views: Sequence[ViewPoses]) -> dict[str, list[ViewPoses]]:
     """The views of each camera's images that some fit may use, each with its one pose."""
-    known = {**looked.poses, **{it.view: it for it in views}}
+    known = {**looked.poses, **{view.view: view for view in views}}
     # Frames of a sweep that are not needed were taken on the move: rows of theirs are not at rest.
     out = looked.held_back | looked.spared.keys() | looked.turned.keys()
     return {
-        frame: [known[it] for it in look.corners if it in known and it not in out]
+        frame: [known[corner] for corner in look.corners if corner in known and corner not in out]
         for frame, look in looked.cameras.items()
     }
 

@@ -49,9 +49,9 @@ def with_poses(cell: Cell, looked: Observed) -> Cell:
         DataError: None is left.
     """
     missing = {
-        it.view: cell.reasons.get(it.view, "nothing was found in its image")
-        for it in cell.rows
-        if it.view not in looked.poses
+        row.view: cell.reasons.get(row.view, "nothing was found in its image")
+        for row in cell.rows
+        if row.view not in looked.poses
     }
     cell = cell.without(missing)
     if not cell.rows:
@@ -70,20 +70,22 @@ def started(cell: Cell, looked: Observed) -> Start:
         DegenerateError: A robot is tied to nothing, or a frame may be in two places.
     """
     cell, lost = _tied_part(cell)
-    views = [looked.poses[it.view] for it in cell.rows]
+    views = [looked.poses[row.view] for row in cell.rows]
     problem = problem_of(cell, views)
     if cell.mount is not None:
         refuse_too_few(problem, cell.mount, len(cell.rows))
         _refuse_few_of_each(cell)
     placed = init_frames(problem, views, targets_of(cell))
-    tied, clear = placed.tied, {it.view: it for it in placed.views}
+    tied, clear = placed.tied, {view.view: view for view in placed.views}
     if tied.untied:
         untied_robots(cell, tied.untied, seen=True)
         cell = _without_frames(cell, tied.untied)
     if tied.ambiguous:
         raise ambiguous_error(cell, tied.ambiguous)
-    cell, more = _tied_part(cell.without({it.view: it.reason for it in placed.rejections}))
-    poses = tuple(clear[it.view] for it in cell.rows)
+    cell, more = _tied_part(
+        cell.without({rejection.view: rejection.reason for rejection in placed.rejections})
+    )
+    poses = tuple(clear[row.view] for row in cell.rows)
     problem = problem_of(cell, poses)
     return Start(cell, poses, problem, problem.start(tied.edges), (*lost, *tied.untied, *more))
 
@@ -99,26 +101,28 @@ def agreeing_views(cell: Cell, looked: Observed) -> frozenset[int]:
     between = invert(start.problem.predicted(start.state)) @ start.problem.observations.measured
     away = np.linalg.norm(between[:, :3, 3], axis=1) + LEVER_M * rotation_angle(between)
     near = (away < AGREE_M).tolist()
-    return frozenset(it.view for it, is_near in zip(start.poses, near, strict=True) if is_near)
+    return frozenset(pose.view for pose, is_near in zip(start.poses, near, strict=True) if is_near)
 
 
 def targets_of(cell: Cell) -> dict[str, Target]:
     """The printed targets by their frames."""
-    return {f"target_{name}" if name else "target": it for name, it in cell.session.plates.items()}
+    return {
+        f"target_{name}" if name else "target": plate for name, plate in cell.session.plates.items()
+    }
 
 
 def problem_of(cell: Cell, views: Sequence[ViewPoses]) -> Problem:
     """The problem of views with one pose each, lenses and boards as they are taken to be."""
-    given = np.array([not it.covariance.any() for it in views])
-    levels = {it: at for at, it in enumerate(sensors_of(cell, views))}
+    given = np.array([not view.covariance.any() for view in views])
+    levels = {sensor: at for at, sensor in enumerate(sensors_of(cell, views))}
     sensors = [
         levels.get(row.seer, -1) if _is_sensed(row.seer, view) else -1
         for row, view in zip(cell.rows, views, strict=True)
     ]
-    covariance = np.array([it.covariance[0] for it in views])
-    places = np.array([it.is_place for it in cell.rows], dtype=bool)
+    covariance = np.array([view.covariance[0] for view in views])
+    places = np.array([row.is_place for row in cell.rows], dtype=bool)
     covariance[given] = _NOMINAL
-    turned = {it.seen for it in cell.rows if not it.is_place}
+    turned = {row.seen for row in cell.rows if not row.is_place}
     # What one camera measured with one robot, without a word of its noise, has that of both as one.
     is_combined = cell.mount is not None and cell.mount != "instrument" and bool(given.any())
     is_uneven = given & [not row.seer.startswith("instrument") for row in cell.rows]
@@ -129,17 +133,17 @@ def problem_of(cell: Cell, views: Sequence[ViewPoses]) -> Problem:
         cell.tree,
         cell.poses,
         Observations(
-            tuple(it.seer for it in cell.rows),
-            tuple(it.seen for it in cell.rows),
-            np.array([it.station for it in cell.rows]),
+            tuple(row.seer for row in cell.rows),
+            tuple(row.seen for row in cell.rows),
+            np.array([row.station for row in cell.rows]),
             np.array(sensors, dtype=np.int64),
-            np.array([it.cam_from_target[0] for it in views]),
+            np.array([view.cam_from_target[0] for view in views]),
             covariance,
             ~places,
             is_uneven,
         ),
         priors=cell.priors,
-        points=frozenset(it.seen for it in cell.rows) - turned,
+        points=frozenset(row.seen for row in cell.rows) - turned,
         is_combined=is_combined,
     )
 
@@ -163,9 +167,9 @@ def _is_sensed(seer: str, view: ViewPoses) -> bool:
 def _tied_part(cell: Cell) -> tuple[Cell, tuple[str, ...]]:
     """The part of a cell that observations tie together, and the frames outside."""
     tied = cell.tied()
-    lost = tuple(it for it in cell.tree.branches if it not in tied)
+    lost = tuple(branch for branch in cell.tree.branches if branch not in tied)
     untied_robots(cell, lost)
-    return _without_frames(cell, lost), tuple(it for it in lost if not _is_flange(cell, it))
+    return _without_frames(cell, lost), tuple(name for name in lost if not _is_flange(cell, name))
 
 
 def _is_flange(cell: Cell, frame: str) -> bool:
@@ -175,27 +179,30 @@ def _is_flange(cell: Cell, frame: str) -> bool:
 def _without_frames(cell: Cell, frames: Sequence[str]) -> Cell:
     tree = cell.tree.without(frames)
     reasons = {
-        it.view: f"nothing ties {it.seer if it.seer in frames else it.seen} to the rest of the cell"
-        for it in cell.rows
-        if it.seer not in tree.branches or it.seen not in tree.branches
+        row.view: f"nothing ties {row.seer if row.seer in frames else row.seen} "
+        "to the rest of the cell"
+        for row in cell.rows
+        if row.seer not in tree.branches or row.seen not in tree.branches
     }
     robots = set(tree.robots)
-    poses = {name: it for name, it in cell.poses.items() if name in robots}
+    poses = {name: pose for name, pose in cell.poses.items() if name in robots}
     priors = tuple(
-        it for it in cell.priors if it.first in tree.branches and it.second in tree.branches
+        prior
+        for prior in cell.priors
+        if prior.first in tree.branches and prior.second in tree.branches
     )
     return replace(cell.without(reasons), tree=tree, poses=poses, priors=priors)
 
 
 def _refuse_few_of_each(cell: Cell) -> None:
     """Refuses several targets of which none is seen often enough to begin with."""
-    shown = [it.seen for it in cell.rows]
-    counts = {it: shown.count(it) for it in dict.fromkeys(shown)}
+    shown = [row.seen for row in cell.rows]
+    counts = {name: shown.count(name) for name in dict.fromkeys(shown)}
     if len(counts) > 1 and max(counts.values()) < FEWEST_VIEWS and cell.mount != "instrument":
-        shares = ", ".join(f"{it.partition('_')[2]} in {count}" for it, count in counts.items())
+        shares = ", ".join(f"{name.partition('_')[2]} in {count}" for name, count in counts.items())
         raise DegenerateError(
             f"hand-eye: of several targets, at least one must be seen in {FEWEST_VIEWS} views, to "
             f"begin with; here {shares}.",
-            culprits=[it.replace("_", " ", 1) for it in counts],
+            culprits=[count.replace("_", " ", 1) for count in counts],
             next_step="Add views of one of them, tilted about different axes.",
         )

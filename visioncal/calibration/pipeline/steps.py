@@ -50,7 +50,7 @@ def _read_robot(known: RunState) -> RunState:
         what = "streams and no views" if session.streams else "no views"
         raise DataError(
             " ".join([f"session {session.name!r} has {what}.", *session.warnings]),
-            culprits=[f"{STREAMS}/{it}.csv" for it in session.streams] or [session.name],
+            culprits=[f"{STREAMS}/{stream}.csv" for stream in session.streams] or [session.name],
             next_step="Calibration needs views.csv; streams of torques alone are for visioncal "
             "dynamics identify.",
         )
@@ -97,7 +97,7 @@ def _suspicious(warning: str) -> Finding:
 def _without_times(session: Session) -> str:
     """Asks for the times of views whose poses are in a stream; empty where that is not it."""
     stream = stream_of(session, "")
-    if not stream or any(it.stamp_s is not None for it in session.views):
+    if not stream or any(view.stamp_s is not None for view in session.views):
         return ""
     return (
         f"Fill in stamp_s, when each image was taken, and {STREAMS}/{stream}.csv gives the poses; "
@@ -122,8 +122,8 @@ def _reported(known: RunState) -> RunState:
             or "Fill in x_m to qw, or joint angles and [robot] model.",
         )
     views = tuple(known.base_from_flange)
-    declared = {it.number: it.stop for it in known.session.views}
-    check_stops(known.loads(views), views, [declared[it] for it in views])
+    declared = {view.number: view.stop for view in known.session.views}
+    check_stops(known.loads(views), views, [declared[view] for view in views])
     return known
 
 
@@ -141,8 +141,8 @@ def _readings(known: RunState) -> RunState:
                 )
             known = known.noting(exchanged_points(known, readings))
     poses = {
-        view: it
-        for view, it in read_instruments(known.session).items()
+        view: instrument
+        for view, instrument in read_instruments(known.session).items()
         if view not in known.reasons
     }
     return replace(known, poses={**known.poses, **poses})
@@ -171,9 +171,9 @@ def _solve(known: RunState) -> RunState:
 def _examine(known: RunState) -> RunState:
     check_answer(known)
     answer = answer_of(known.cell, known, known.fitted, known.convention)
-    out = (it for it in answer.sights if not it.used and it.view not in known.held_back)
+    out = (sight for sight in answer.sights if not sight.used and sight.view not in known.held_back)
     known = replace(known, fit=answer.solved, answer=answer)
-    return known.noting(Rejection(it.view, it.reason) for it in out)
+    return known.noting(Rejection(sight.view, sight.reason) for sight in out)
 
 
 def _judge(known: RunState) -> RunState:

@@ -28,10 +28,10 @@ def view_evidence(known: RunState) -> tuple[ViewEvidence, ...]:
             if view.corners is not None:
                 px = _predicted(known, row.seer, predicted, view.corners)
             found[row.view] = ViewEvidence(row.view, view.corners, px, None, measured)
-    stood = {it.view.number: it for it in known.timed.observations}
+    stood = {observation.view.number: observation for observation in known.timed.observations}
     return tuple(
-        _evidence(known, it.number, found.get(it.number), stood.get(it.number))
-        for it in known.session.views
+        _evidence(known, view.number, found.get(view.number), stood.get(view.number))
+        for view in known.session.views
     )
 
 

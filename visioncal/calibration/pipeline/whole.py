@@ -34,10 +34,10 @@ def alignment_of(known: RunState) -> Alignment:
     if known.verdict is None or known.findings is None:
         raise RuntimeError("a step is missing")
     branches, edges = answer.problem.tree.branches, answer.edges
-    parents = {it.name: branches[it.key].parent for it in answer.versions.values()}
+    parents = {version.name: branches[version.key].parent for version in answer.versions.values()}
     kept = {
-        name: it.parent
-        for name, it in cell.tree.branches.items()
+        name: branch.parent
+        for name, branch in cell.tree.branches.items()
         if name in solved.cell.tree.branches
     }
     size = 6 * len(edges)
@@ -55,17 +55,19 @@ def alignment_of(known: RunState) -> Alignment:
         sights=answer.sights,
         left_out=answer.held_out.method if np.isfinite(answer.held_out.away_m).any() else "",
         moved=answer.moved,
-        untied=tuple(Untied(it, untied_words(cell, it)) for it in solved.untied),
+        untied=tuple(Untied(name, untied_words(cell, name)) for name in solved.untied),
         weakest=weakest_link(solved.cell, answer.last_edges),
         verdict=known.verdict,
         details=_details(known),
         arms=_arms(known),
-        targets={name or "target": target_document(it) for name, it in session.plates.items()},
+        targets={
+            name or "target": target_document(plate) for name, plate in session.plates.items()
+        },
         boards=boards_of(known),
         rigs=rigs_of(known),
         joint_fit=fit_section(known),
         uncertainty=CellUncertainty(
-            budget_mm={f"{parents[it]}_from_{it}": mm for it, mm in answer.budget_mm.items()},
+            budget_mm={f"{parents[name]}_from_{name}": mm for name, mm in answer.budget_mm.items()},
             noise_95=_intervals(known),
         ),
         need=need_met(known.findings.need, known.findings.picks, whole=True),
@@ -91,12 +93,12 @@ def arm_sections(known: RunState, robot: str) -> ArmSections:
         first.setdefault(row.station, row.view)
     stops = stops_of(answer.problem, robot)
     found = answer.arms[robot]
-    return solved.arms[robot].at(stops).result(found, [first[it] for it in stops.tolist()])
+    return solved.arms[robot].at(stops).result(found, [first[index] for index in stops.tolist()])
 
 
 def _details(known: RunState) -> CellDetails:
     """What was found of clocks."""
-    return CellDetails({it.words: at.result() for it, at in known.solved.clocks(known).items()})
+    return CellDetails({key.words: at.result() for key, at in known.solved.clocks(known).items()})
 
 
 def _intervals(known: RunState) -> dict[str, Intervals]:

@@ -118,11 +118,13 @@ class ArmIdentifiability:
             views: (m,) by which views the stops go.
             lost: A joint whose zero was found far from where it was stated.
         """
-        ordered = sorted(zip(self.influence.tolist(), views, strict=True), key=lambda it: -it[0])
+        ordered = sorted(
+            zip(self.influence.tolist(), views, strict=True), key=lambda pair: -pair[0]
+        )
         return replace(
             result,
             convention=self.convention,
-            parameters=tuple(_number(it, robot, lost) for it in self.estimates),
+            parameters=tuple(_number(estimate, robot, lost) for estimate in self.estimates),
             workspace_sigma_mm=WorkspaceSigma(
                 1e3 * float(np.median(self.sigmas_m)),
                 1e3 * float(np.quantile(self.sigmas_m, 0.95)),
@@ -187,7 +189,7 @@ def identify_arm(arm: ArmData, convention: Convention | None = None) -> ArmIdent
                 imitated(by_numbers, by_arm, counts.missing), _moves(arm, counts, weight)
             )
         place = arm.place_jacobian(anywhere)[0]
-        sigmas_m, near_sigmas_m = (arm.place_sigmas_m(it) for it in (anywhere, near))
+        sigmas_m, near_sigmas_m = (arm.place_sigmas_m(array) for array in (anywhere, near))
         fitted = (arm.problem, arm.state, arm.noise)
         influence = stop_influence(*fitted, arm.stops, place, arm.chain)
     nominal = arm.model.nominal
@@ -261,7 +263,7 @@ def _by_numbers(arm: ArmData, numbers: _Numbers, q: FloatArray, weight: FloatArr
     model, parameters = arm.model, numbers.parameters
     moved = parameter_jacobian(numbers.before, parameters, q, model.flange_from_reported)
     flange = model.nominal.base_from_flange(q) @ model.flange_from_reported
-    return _through(arm.pair, flange, moved * [it.unit for it in parameters], weight)
+    return _through(arm.pair, flange, moved * [parameter.unit for parameter in parameters], weight)
 
 
 def _through(pair: ArmPair, flange: FloatArray, moved: FloatArray, weight: FloatArray) -> Jacobians:
@@ -299,9 +301,12 @@ def _missing_words(missing: _Missing, parameters: Sequence[Parameter], robot: Ro
     if not missing.moves:
         return f"these stops do not determine {named}"
     first, *others = (
-        (joint_words(it.joint, robot), _length(it.moved, it.joint, robot)) for it in missing.moves
+        (joint_words(move.joint, robot), _length(move.moved, move.joint, robot))
+        for move in missing.moves
     )
-    moved = listed([f"{first[0]} moved by {first[1]}", *(f"{it} by {way}" for it, way in others)])
+    moved = listed(
+        [f"{first[0]} moved by {first[1]}", *(f"{name} by {way}" for name, way in others)]
+    )
     return f"{moved} only, too little to determine {named}"
 
 
@@ -311,7 +316,8 @@ def _advice(
     further = "Add stops in which the arm stands otherwise, all over the workspace."
     if missing.moves:
         joints = [
-            f"joint {it.joint + 1} by {_length(it.wanted, it.joint, robot)}" for it in missing.moves
+            f"joint {move.joint + 1} by {_length(move.wanted, move.joint, robot)}"
+            for move in missing.moves
         ]
         further = f"Add stops that move {listed(joints)} or more."
     return (

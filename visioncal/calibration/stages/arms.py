@@ -147,19 +147,21 @@ class RobotArm:
             matched: Its model, beside poses and joints; None where none is known.
             recorded: The session, and the robot's name there.
         """
-        joints = [] if matched is None else [matched.joints_rad.get(it.number) for it in views]
-        q = [it for it in joints if it is not None]
+        joints = [] if matched is None else [matched.joints_rad.get(view.number) for view in views]
+        q = [joint for joint in joints if joint is not None]
         known, heat = 0 < len(q) == len(views), None
         if known:
-            stamps_s = np.array([it.stamp_s for it in views], dtype=float)
-            numbers = np.array([it.number for it in views])
+            stamps_s = np.array([view.stamp_s for view in views], dtype=float)
+            numbers = np.array([view.number for view in views])
             heat = Heat(*recorded, len(q[0]), numbers, stamps_s)
         return cls(
             robot,
             reported,
             np.isfinite(reported[:, 0, 0]),
             np.array(q) if known else None,
-            loads_of([it.numbers for it in views], [it.text.get("approach", "") for it in views]),
+            loads_of(
+                [view.numbers for view in views], [view.text.get("approach", "") for view in views]
+            ),
             matched,
             heat,
         )
@@ -184,7 +186,7 @@ class RobotArm:
         """Twice what functions of its joints gain of the log-likelihood; zero without any."""
         if self.kinematics is None or self.kinematics.functions is None:
             return 0.0
-        *others, functions = (it.gain for it in self.kinematics.fits.values())
+        *others, functions = (fit.gain for fit in self.kinematics.fits.values())
         return functions - max(others)
 
     def at(self, stops: IntArray) -> Self:
@@ -247,8 +249,8 @@ class RobotArm:
 
     def put_into(self, problem: Problem) -> Problem:
         """A problem with this arm in the place of what it has of it."""
-        mine = {f"{it} of {self.robot}" for it in ("arm", "temperature")}
-        rest = [it for it in problem.effects if it.name not in mine]
+        mine = {f"{name} of {self.robot}" for name in ("arm", "temperature")}
+        rest = [effect for effect in problem.effects if effect.name not in mine]
         moved = replace(problem, poses={**problem.poses, self.robot: self.poses})
         return moved.with_effects([*rest, *self.effects()])
 
@@ -314,7 +316,9 @@ class RobotArm:
         tools, sound = invert(nominal) @ self.reported[self.stood], agrees[self.stood]
         away = distances(tools, mean_transform(tools[sound]))
         found = agrees.copy()
-        found[self.stood] = np.all([it <= 2.0 * it[sound].max() + _ROUNDED for it in away], axis=0)
+        found[self.stood] = np.all(
+            [array <= 2.0 * array[sound].max() + _ROUNDED for array in away], axis=0
+        )
         return found
 
     def data(
@@ -390,8 +394,8 @@ class RobotArm:
             carries_over(data, self.kinematics) if erring else None,
             functions_of(data, self.kinematics),
             tuple(
-                JointRange(name, float(it.min()), float(it.max()))
-                for name, it in zip(data.model.nominal.joint_names, data.q.T, strict=True)
+                JointRange(name, float(column.min()), float(column.max()))
+                for name, column in zip(data.model.nominal.joint_names, data.q.T, strict=True)
             ),
         )
 
@@ -475,7 +479,7 @@ class RobotArm:
             problem, start, self.robot, bases, asked, self.stated(problem), noise=noise
         )
         mine = np.flatnonzero(rows_of(problem, self.robot)).tolist()
-        arm = replace(self, kinematics=replace(found, views=tuple(views[it] for it in mine)))
+        arm = replace(self, kinematics=replace(found, views=tuple(views[index] for index in mine)))
         if found.errors:
             return arm._bending(model.erring(found.errors))
         if self.model is None:
@@ -528,7 +532,7 @@ class RobotArm:
         if self.model is None:
             return self, 0.0
         name = f"arm of {self.robot}"
-        start = [it.values for it in problem.effects if it.name == name]
+        start = [effect.values for effect in problem.effects if effect.name == name]
         if not start:
             return self, 0.0
         step = problem.values_of(name, state) - start[0]
@@ -539,7 +543,7 @@ class RobotArm:
         if self.kinematics is None:
             return self
         found = self.kinematics.errors.values()
-        arm, gain = replace(self, model=model), sum(it.gain for it in found)
+        arm, gain = replace(self, model=model), sum(arm_errors.gain for arm_errors in found)
         return replace(arm, errors=ArmErrors(arm.basis, next(iter(found)).sigma, gain, True))
 
     def _by_stop(self, columns: FloatArray) -> FloatArray:

@@ -71,7 +71,7 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
                 corners, seen = looked[0], replace(seen, dense=looked[1])
         mine = _numbered_through(session, views, corners)
         again = _repeated(views, mine)
-        mine = {view: it for view, it in mine.items() if view not in again}
+        mine = {view: corners for view, corners in mine.items() if view not in again}
         repeats = {view: f"repeats view {earlier}" for view, earlier in again.items()}
         look = CameraLook(table, mine, resolution, repeats=repeats)
         seen = seen.noting((), _said_of(again)).with_camera(frame, look)
@@ -88,7 +88,11 @@ def estimate_lenses(seen: T) -> T:
     """
     session, targets = seen.session, tuple(seen.session.boards.values())
     for frame, look in seen.cameras.items():
-        fitted = {view: it for view, it in look.corners.items() if view not in seen.held_back}
+        fitted = {
+            view: view_corners
+            for view, view_corners in look.corners.items()
+            if view not in seen.held_back
+        }
         if not fitted or look.resolution is None:
             continue
         stated = look.table.stated
@@ -103,7 +107,7 @@ def estimate_lenses(seen: T) -> T:
                     raise
             lens = CameraResult(found.camera, estimated=True, covariance=found.covariance)
             of = frame if len(session.cameras) > 1 else ""
-            seen = seen.noting(found.rejections, (it.of(of) for it in found.warnings))
+            seen = seen.noting(found.rejections, (warning.of(of) for warning in found.warnings))
         seen = seen.with_camera(frame, replace(look, lens=lens))
     return seen
 
@@ -122,8 +126,16 @@ def locate_targets(seen: T) -> T:
     poses = {**seen.poses, **given_poses(session)}
     for frame in seen.cameras:
         look = seen.cameras[frame]
-        corners = {view: it for view, it in look.corners.items() if view not in seen.reasons}
-        fitted = {view: it for view, it in corners.items() if view not in seen.held_back}
+        corners = {
+            view: view_corners
+            for view, view_corners in look.corners.items()
+            if view not in seen.reasons
+        }
+        fitted = {
+            view: view_corners
+            for view, view_corners in corners.items()
+            if view not in seen.held_back
+        }
         lens = look.lens
         if lens is None or not fitted:
             continue
@@ -138,9 +150,11 @@ def locate_targets(seen: T) -> T:
                 seen = seen.noting((), (said,))
             elif found.sigma_px > _WRONG_LENS_PX:
                 _refuse_mirrored(seen, frame, fitted, found.sigma_px)
-        rest = {view: it for view, it in corners.items() if view in seen.held_back}
+        rest = {
+            view: view_corners for view, view_corners in corners.items() if view in seen.held_back
+        }
         held = measure_poses(rest, targets, lens.camera, found.sigma_px)
-        poses |= {it.view: it for it in (*found.views, *held)}
+        poses |= {view.view: view for view in (*found.views, *held)}
         seen = seen.with_camera(frame, replace(look, lens=lens, pixel_px=found.sigma_px))
         seen = seen.noting(found.rejections)
     if not poses:
@@ -168,7 +182,7 @@ def _other_lens(
         f"The stated matrix and distortion are not this camera's: by them corners deviate by "
         f"{figure(stated_px)} px from any pose of the target, by a lens estimated of these images "
         f"by {figure(poses.sigma_px)} px. The estimated one was taken: fx, fy, cx, cy = "
-        f"{', '.join(f'{it:.1f}' for it in lens.camera.matrix)} px."
+        f"{', '.join(f'{value:.1f}' for value in lens.camera.matrix)} px."
     )
     step = Step(
         "In session.toml, delete matrix and distortion, or give those of this camera: matrix is "
@@ -204,8 +218,11 @@ def _refuse_mirrored(
         return
     width = look.resolution[0]
     turned = {
-        view: replace(it, px=np.stack([width - 1.0 - it.px[:, 0], it.px[:, 1]], axis=1))
-        for view, it in corners.items()
+        view: replace(
+            view_corners,
+            px=np.stack([width - 1.0 - view_corners.px[:, 0], view_corners.px[:, 1]], axis=1),
+        )
+        for view, view_corners in corners.items()
     }
     try:
         found = estimate_intrinsics(turned, targets, look.resolution, look.table.model)
@@ -213,7 +230,7 @@ def _refuse_mirrored(
         return
     if found.sigma_px > min(_MUCH_BETTER * sigma_px, _WRONG_LENS_PX):
         return
-    has_images = any(it.image for it in seen.session.views if it.number in corners)
+    has_images = any(view.image for view in seen.session.views if view.number in corners)
     raise DataError(
         "The target is seen mirrored: its corners fit no pose as they are, and to "
         f"{figure(found.sigma_px)} px with left and right exchanged.",
@@ -241,9 +258,11 @@ def _numbered_through(
     starts = dict(
         zip(session.boards, first_corners(tuple(session.boards.values())).tolist(), strict=True)
     )
-    mine = [it for it in views if it.number in corners]
-    first = {it.number: starts[session.board_of(it)] for it in mine}
-    return {it: replace(corners[it], ids=corners[it].ids + first[it]) for it in first}
+    mine = [view for view in views if view.number in corners]
+    first = {view.number: starts[session.board_of(view)] for view in mine}
+    return {
+        index: replace(corners[index], ids=corners[index].ids + first[index]) for index in first
+    }
 
 
 def _repeated(views: Sequence[View], corners: Mapping[int, Corners]) -> dict[int, int]:
@@ -251,10 +270,10 @@ def _repeated(views: Sequence[View], corners: Mapping[int, Corners]) -> dict[int
     first: dict[Hashable, int] = {}
     again: dict[int, int] = {}
     for view in views:
-        numbers = tuple(it for it in view.numbers.items() if it[0] != "stamp_s")
+        numbers = tuple(number for number in view.numbers.items() if number[0] != "stamp_s")
         if numbers and view.number in corners:
-            it = corners[view.number]
-            key = (numbers, it.ids.tobytes(), it.px.tobytes())
+            seen = corners[view.number]
+            key = (numbers, seen.ids.tobytes(), seen.px.tobytes())
             earlier = first.setdefault(key, view.number)
             if earlier != view.number:
                 again[view.number] = earlier
@@ -266,7 +285,7 @@ def _of_other_size(session: Session, found: Detections) -> Iterator[Finding]:
     if not found.other_sizes:
         return
     views, (wide, high) = tuple(found.other_sizes), found.resolution
-    names = {it.number: it.image for it in session.views}
+    names = {view.number: view.image for view in session.views}
     shown = [f"{names[at]} ({w} x {h} px)" for at, (w, h) in found.other_sizes.items()]
     one = len(views) == 1
     is_turned = {*found.other_sizes.values()} == {(high, wide)}
@@ -303,7 +322,7 @@ def _listed(views: Sequence[int]) -> str:
     """Views by their numbers, those in a row by the first and the last."""
     if len(views) > 2 and list(views) == list(range(views[0], views[-1] + 1)):
         return f"{views[0]} to {views[-1]}"
-    return some_of([str(it) for it in views])
+    return some_of([str(view) for view in views])
 
 
 @contextmanager

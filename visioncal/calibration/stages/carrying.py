@@ -59,7 +59,7 @@ def carries_over(arm: ArmData, kinematics: Kinematics) -> CarriesOver:
     regions = _regions(found.places, stops)
     boxed = regions["box"]
     away = ~boxed if (~boxed).any() else boxed
-    sigma_mm, nominal_mm = (1e3 * _rms(it[away]) for it in (found.sigmas_m, found.nominal_m))
+    sigma_mm, nominal_mm = (1e3 * _rms(array[away]) for array in (found.sigmas_m, found.nominal_m))
     return CarriesOver(
         measured_mm=kinematics.result.chosen.held_out_mm,
         measured_nominal_mm=kinematics.result.nominal.held_out_mm,
@@ -67,7 +67,9 @@ def carries_over(arm: ArmData, kinematics: Kinematics) -> CarriesOver:
         nominal_mm=nominal_mm,
         session_mm=1e3 * found.session_m,
         better_share=float(np.mean(found.sigmas_m < _BETTER * found.nominal_m)),
-        regions=tuple(_region(name, found, it) for name, it in regions.items() if it.any()),
+        regions=tuple(
+            _region(name, found, region) for name, region in regions.items() if region.any()
+        ),
     )
 
 
@@ -129,7 +131,9 @@ def _regions(places: FloatArray, stops: FloatArray) -> dict[Region, Mask]:
 
 
 def _region(name: Region, found: Predicted, chosen: Mask) -> CarriedRegion:
-    sigma_mm, nominal_mm = (1e3 * _rms(it[chosen]) for it in (found.sigmas_m, found.nominal_m))
+    sigma_mm, nominal_mm = (
+        1e3 * _rms(array[chosen]) for array in (found.sigmas_m, found.nominal_m)
+    )
     return CarriedRegion(name, sigma_mm, nominal_mm, sigma_mm < _BETTER * nominal_mm)
 
 

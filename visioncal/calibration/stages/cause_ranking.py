@@ -148,13 +148,15 @@ def with_misread(verdict: Verdict, found: Finding) -> Verdict:
         # The same, found by the views themselves; the command exchanges the rows.
         words = "Write a copy of the session with these rows exchanged, and calibrate it."
         step = found.do and replace(found.do, words=words)
-        said = (replace(it, do=step) if it.do else it for it in verdict.findings)
+        said = (
+            replace(finding, do=step) if finding.do else finding for finding in verdict.findings
+        )
         return replace(verdict, findings=tuple(said))
     odds = _odds(EVIDENCE[found.kind].chance)
     rest = (
-        replace(it, probability=it.probability / (1.0 + odds), do=None)
-        for it in verdict.findings
-        if it.kind not in (GOOD_FOR, *SOURCES, *_BY_THE_CHAIN)
+        replace(finding, probability=finding.probability / (1.0 + odds), do=None)
+        for finding in verdict.findings
+        if finding.kind not in (GOOD_FOR, *SOURCES, *_BY_THE_CHAIN)
     )
     return replace(verdict, findings=(replace(found, probability=odds / (1.0 + odds)), *rest))
 
@@ -168,7 +170,7 @@ def with_other_board(verdict: Verdict, found: Finding) -> Verdict:
     """
     odds = _odds(EVIDENCE[found.kind].chance)
     named = replace(found, probability=odds / (1.0 + odds))
-    rest = (it for it in verdict.findings if it.kind != "lost_views")
+    rest = (finding for finding in verdict.findings if finding.kind != "lost_views")
     return replace(verdict, findings=(named, *rest))
 
 
@@ -191,49 +193,66 @@ def ranked(
     """
     found = _tested(doubts, left_out_mm)
     unmet = met is not None and met.probability < NeedLimits.probability[0]
-    too_large = met is None and any(it.good_for_mm > CalibrationLimits.sigma_mm[0] for it in picks)
-    if picks and (unmet or (too_large and any(it.until_mm == 0.0 for it in doubts))):
-        known = {it.kind for it in found if it.probability}
+    too_large = met is None and any(
+        pick.good_for_mm > CalibrationLimits.sigma_mm[0] for pick in picks
+    )
+    if picks and (unmet or (too_large and any(doubt.until_mm == 0.0 for doubt in doubts))):
+        known = {finding.kind for finding in found if finding.probability}
         # What moved is in the arm's errors by posture and time, too, which are no cause then.
         known |= {"arm_errors"} if known & {*_MOVED} else set()
         # ... and in the calibration's uncertainty.
         known |= {"calibration"} if known & {*MOVED_AT_ONCE} else set()
         # What was measured badly is in all that the robot seems to err by.
         known |= {*_OF_ROBOT} if "measured_turns" in known else set()
-        found += [it for it in _sources(picks, met, more) if it.kind not in known]
+        found += [source for source in _sources(picks, met, more) if source.kind not in known]
     return tuple(_with_weak_motion(_with_joints_at_hand(found), more))
 
 
 def _with_weak_motion(found: Sequence[Finding], more: Step | None) -> Sequence[Finding]:
     """The same where the motion is why the calibration is uncertain: one cause, and one advice."""
-    weak = next((it for it in found if it.kind == "weak_motion"), None)
-    source = next((it for it in found if it.kind == "calibration"), None)
+    weak = next((finding for finding in found if finding.kind == "weak_motion"), None)
+    source = next((finding for finding in found if finding.kind == "calibration"), None)
     if weak is None or source is None or source.probability < 0.5 or more in (None, MEASURE_BOARD):
         return found
     first = replace(weak, probability=source.probability)
-    rest = (it for it in found if it is not weak)
-    return [first, *(replace(it, do=weak.do) if it.do in (more, TILTED) else it for it in rest)]
+    rest = (finding for finding in found if finding is not weak)
+    return [
+        first,
+        *(
+            replace(finding, do=weak.do) if finding.do in (more, TILTED) else finding
+            for finding in rest
+        ),
+    ]
 
 
 def _with_joints_at_hand(found: Sequence[Finding]) -> Sequence[Finding]:
     """The same where joint angles that would explain an arm's errors are there, but misread."""
-    unused = next((it for it in found if it.kind in _UNUSED_JOINTS and it.do is not None), None)
-    errors = [it for it in found if it.do is NO_JOINTS]
+    unused = next(
+        (finding for finding in found if finding.kind in _UNUSED_JOINTS and finding.do is not None),
+        None,
+    )
+    errors = [finding for finding in found if finding.do is NO_JOINTS]
     if unused is None or not errors:
         return found
-    first = replace(unused, probability=max(it.probability for it in errors))
-    rest = [it for it in found if it is not unused]
-    return [first, *(replace(it, do=first.do) if it.do is NO_JOINTS else it for it in rest)]
+    first = replace(unused, probability=max(error.probability for error in errors))
+    rest = [finding for finding in found if finding is not unused]
+    return [
+        first,
+        *(
+            replace(finding, do=first.do) if finding.do is NO_JOINTS else finding
+            for finding in rest
+        ),
+    ]
 
 
 def _tested(doubts: Sequence[Finding], left_out_mm: float) -> list[Finding]:
     """Doubts, each weighed against what explains the same; of one kind, the first is the cause."""
     first: dict[str, Finding] = {}
-    for it in doubts:
-        if it.kind in EVIDENCE:
-            first.setdefault(it.kind, it)
+    for finding in doubts:
+        if finding.kind in EVIDENCE:
+            first.setdefault(finding.kind, finding)
     misfit_mm = left_out_mm if "unexplained" in first else 0.0
-    odds = {name: _explaining(it, misfit_mm) for name, it in first.items()}
+    odds = {name: _explaining(finding, misfit_mm) for name, finding in first.items()}
     odds |= dict.fromkeys(_feigned(first) & odds.keys(), 1.0)
     weighed = []
     for doubt in doubts:
@@ -242,9 +261,11 @@ def _tested(doubts: Sequence[Finding], left_out_mm: float) -> list[Finding]:
             weighed.append(doubt)
             continue
         rivals = sum(
-            odds[it]
-            for it in first
-            if it != name and EVIDENCE[it].misfit and EVIDENCE[it].misfit == EVIDENCE[name].misfit
+            odds[word]
+            for word in first
+            if word != name
+            and EVIDENCE[word].misfit
+            and EVIDENCE[word].misfit == EVIDENCE[name].misfit
         )
         # None of these is what is unexplained: a cause of its own where it shows, of odds one.
         none = float(name != "unexplained" and not (rivals and "unexplained" in first))
@@ -262,7 +283,7 @@ def _feigned(first: Mapping[str, Finding]) -> set[str]:
     # size, and the lens is tested beside all three. What is left of a clock's jump passes for
     # motion.
     feigned: set[str] = set()
-    if moved := [first[it].mahalanobis_sq for it in _MOVED if it in first]:
+    if moved := [first[name].mahalanobis_sq for name in _MOVED if name in first]:
         feigned.add("focus")
         if "arm_errors" in first and max(moved) > first["arm_errors"].mahalanobis_sq:
             feigned.add("arm_errors")
@@ -339,9 +360,9 @@ _SOURCES: Mapping[str, tuple[str, str, Step | None]] = {
 def _sources(picks: Sequence[Picks], met: NeedMet | None, more: Step | None) -> list[Finding]:
     """What makes errors as large as they are, by the worst camera and robot."""
     if met is None:
-        worst = max(picks, key=lambda it: it.good_for_mm)
+        worst = max(picks, key=lambda pick: pick.good_for_mm)
     else:
-        worst = min(picks, key=lambda it: it.probability(met.need))
+        worst = min(picks, key=lambda pick: pick.probability(met.need))
     need = None if met is None else met.need
     in_mm, causes = need is None or need.mm is not None, []
     budget, unit = (worst.budget_mm, "mm") if in_mm else (worst.budget_deg, "deg")

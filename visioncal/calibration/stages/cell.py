@@ -74,7 +74,7 @@ class Cell:
 
     def without(self, reasons: Mapping[int, str]) -> "Cell":
         """Returns the cell without some views."""
-        rows = tuple(it for it in self.rows if it.view not in reasons)
+        rows = tuple(row for row in self.rows if row.view not in reasons)
         return replace(self, rows=rows, reasons={**self.reasons, **reasons})
 
     def tied(self) -> tuple[str, ...]:
@@ -87,20 +87,22 @@ class Cell:
             if branch.known is not None
         ]
         pairs += [
-            (place[it.first], place[it.second]) for it in self.priors if it.matrix is not None
+            (place[prior.first], place[prior.second])
+            for prior in self.priors
+            if prior.matrix is not None
         ]
-        for seer, seen in {(it.seer, it.seen) for it in self.rows}:
+        for seer, seen in {(row.seer, row.seen) for row in self.rows}:
             ends = [seer, seen]
             for step in self.tree.path(seer, seen):
                 if step.robot:
                     ends += [step.frame, self.tree.branches[step.frame].parent]
-            pairs += [(place[seer], place[it]) for it in ends]
+            pairs += [(place[seer], place[end]) for end in ends]
         links = coo_array(
             (np.ones(len(pairs)), np.array(pairs, dtype=np.int64).reshape(-1, 2).T),
             shape=(len(names), len(names)),
         )
         part = connected_components(links, directed=False)[1]
-        return tuple(it for it in self.tree.branches if part[place[it]] == part[0])
+        return tuple(branch for branch in self.tree.branches if part[place[branch]] == part[0])
 
     def held_to(self, reference: str) -> "Cell":
         """Returns the cell in which one frame stands for it."""
@@ -119,7 +121,9 @@ def read_cell(seen: Observed) -> Cell:
     branches = {
         name: Branch(parent, robot=_robot_of(session, name)) for name, parent in frames.items()
     }
-    observations = [it for it in session.observations if not it.view.is_of_lens]
+    observations = [
+        observation for observation in session.observations if not observation.view.is_of_lens
+    ]
     if not observations:
         raise DataError(
             f"session {session.name!r}: no row has an observation of a camera or an instrument.",
@@ -127,27 +131,27 @@ def read_cell(seen: Observed) -> Cell:
         )
     rows = [
         Row(
-            it.view.number,
-            it.station,
-            it.seer,
-            it.seen,
-            not is_seen(it.view) and it.view.instrument_from_probe() is None,
+            observation.view.number,
+            observation.station,
+            observation.seer,
+            observation.seen,
+            not is_seen(observation.view) and observation.view.instrument_from_probe() is None,
         )
-        for it in observations
-        if _is_known(it, seen.robots)
+        for observation in observations
+        if _is_known(observation, seen.robots)
     ]
-    held = tuple(it for it in rows if it.view in seen.held_back)
-    rows = [it for it in rows if it.view not in seen.held_back]
+    held = tuple(row for row in rows if row.view in seen.held_back)
+    rows = [row for row in rows if row.view not in seen.held_back]
     reasons = {**dict.fromkeys(seen.held_back, HELD_BACK), **seen.reasons, **seen.spared}
     stations: dict[int, int] = {}
-    for it in observations:
-        number = it.view.number if it.view.stop is None else it.view.stop
-        stations.setdefault(it.station, number)
+    for observation in observations:
+        number = observation.view.number if observation.view.stop is None else observation.view.stop
+        stations.setdefault(observation.station, number)
     tree = Tree(_CELL, branches)
     priors = priors_of(_tables_of_priors(session, tree), tree)
     poses = _poses(seen, observations)
     cell = Cell(session, tree, "", poses, tuple(rows), reasons, priors=priors, held=held)
-    cell = replace(cell, stops=tuple(stations[it] for it in sorted(stations)))
+    cell = replace(cell, stops=tuple(stations[station] for station in sorted(stations)))
     return cell.held_to(_reference(cell))
 
 
@@ -157,18 +161,18 @@ def _tables_of_priors(session: Session, tree: Tree) -> dict[str, PriorTable]:
     # they have names, flange and cam mean the only ones.
     tables = session.declaration.prior
     if not session.declaration.has_names:
-        kept = {name: it for name, it in tables.items() if name in pair_edges(session)}
+        kept = {name: table for name, table in tables.items() if name in pair_edges(session)}
         of_probe = edge_names("instrument")[1]
-        probe = next((it for it in tree.branches if it.startswith("point")), "")
+        probe = next((branch for branch in tree.branches if branch.startswith("point")), "")
         if probe and of_probe in kept:
             kept[f"flange_from_{probe}"] = kept.pop(of_probe)
         return kept
 
     def full(frame: str) -> str:
-        alike = [it for it in tree.branches if it.startswith(f"{frame}_")]
+        alike = [branch for branch in tree.branches if branch.startswith(f"{frame}_")]
         return alike[0] if frame not in tree.branches and len(alike) == 1 else frame
 
-    return {"_from_".join(map(full, name.split("_from_"))): it for name, it in tables.items()}
+    return {"_from_".join(map(full, name.split("_from_"))): table for name, table in tables.items()}
 
 
 def pair_edges(session: Session) -> tuple[str, ...]:
@@ -178,7 +182,7 @@ def pair_edges(session: Session) -> tuple[str, ...]:
         return camera, target
     boards = tuple(session.targets) or ("",)
     parent = target.partition("_from_")[0]
-    return (camera, *(f"{parent}_from_{frame_name('target', it)}" for it in boards))
+    return (camera, *(f"{parent}_from_{frame_name('target', board)}" for board in boards))
 
 
 def _robot_of(session: Session, frame: str) -> str:
@@ -194,35 +198,39 @@ def robot_key(name: str) -> str:
     return name or "robot"
 
 
-def _is_known(it: Observation, robots: Mapping[str, Reported]) -> bool:
+def _is_known(observation: Observation, robots: Mapping[str, Reported]) -> bool:
     """Whether it is known where all robots stood by way of which something was observed."""
-    view = it.view.number
-    return not it.lacks and all(view in robots[name].base_from_flange for name in it.robots)
+    view = observation.view.number
+    return not observation.lacks and all(
+        view in robots[name].base_from_flange for name in observation.robots
+    )
 
 
 def _poses(seen: Observed, observations: Sequence[Observation]) -> dict[str, FloatArray]:
     """(s, 4, 4) where every robot stood at every station."""
-    count = 1 + max(it.station for it in observations)
+    count = 1 + max(observation.station for observation in observations)
     poses = {robot_key(name): np.full((count, 4, 4), np.nan) for name in seen.robots}
-    for it in observations:
-        for name, row in it.robots.items():
+    for observation in observations:
+        for name, row in observation.robots.items():
             known = seen.robots[name].base_from_flange
             # What most rows of a stop say comes before what each says itself.
-            at = row.number if row.number in known else it.view.number
+            at = row.number if row.number in known else observation.view.number
             if at in known:
-                poses[robot_key(name)][it.station] = known[at]
+                poses[robot_key(name)][observation.station] = known[at]
     return poses
 
 
 def _reference(cell: Cell) -> str:
     """The frame that stands for the cell: the first base of most observations, or the like."""
     tree = cell.tree
-    bases = [tree.branches[it].parent for it in tree.branches if tree.branches[it].robot]
-    still = [it for it, branch in tree.branches.items() if branch.parent == _CELL]
-    choices = [it for it in bases if it in still] or still
+    bases = [
+        tree.branches[branch].parent for branch in tree.branches if tree.branches[branch].robot
+    ]
+    still = [name for name, branch in tree.branches.items() if branch.parent == _CELL]
+    choices = [base for base in bases if base in still] or still
 
     def rows(name: str) -> int:
         tied = cell.held_to(name).tied()
-        return sum(it.seer in tied for it in cell.rows)
+        return sum(row.seer in tied for row in cell.rows)
 
     return max(choices, key=rows)

@@ -131,15 +131,17 @@ class Sweep:
 
     def frames(self, seen: Sequence[tuple[View, ViewPoses]]) -> Frames:
         """What the camera saw over time, each view by its best pose."""
-        known = [it.corners for _, it in seen]
-        corners = {view.number: it for (view, _), it in zip(seen, known, strict=True) if it}
+        known = [view.corners for _, view in seen]
+        corners = {
+            view.number: corners for (view, _), corners in zip(seen, known, strict=True) if corners
+        }
         measured = bool(seen) and len(corners) == len(seen)
         stacked = measured and self.camera is not None
         return Frames(
             "eye-in-hand" if self.mount == "eye-in-hand" else "eye-to-hand",
             np.array([view.stamp_s for view, _ in seen], dtype=float),
-            np.array([it.cam_from_target[0] for _, it in seen]).reshape(-1, 4, 4),
-            np.array([it.covariance[0] for _, it in seen]) if measured else None,
+            np.array([view.cam_from_target[0] for _, view in seen]).reshape(-1, 4, 4),
+            np.array([view.covariance[0] for _, view in seen]) if measured else None,
             CornerStack.of(corners, self.positions) if stacked else None,
         )
 
@@ -161,7 +163,7 @@ def set_clock(sweep: Sweep, poses: Mapping[int, ViewPoses]) -> Clocked:
     if change is None:
         return _placed_by(sweep, found, poses)
     doubt = change_doubt(change, found.views)
-    sweep = replace(sweep, views=tuple(_corrected(it, change) for it in sweep.views))
+    sweep = replace(sweep, views=tuple(_corrected(view, change) for view in sweep.views))
     placed = _placed_by(sweep, _match(sweep, poses), poses)
     return replace(placed, warnings=(*placed.warnings, doubt))
 
@@ -193,8 +195,12 @@ def _match(sweep: Sweep, poses: Mapping[int, ViewPoses]) -> _Matched:
     views.sort(key=lambda view: view.stamp_s or 0.0)
     frames = _frames(sweep, [view for view in views if not view.holdout], poses)
     matches = turning_matches(flange, frames, stated_s or 0.0)
-    sound = [it for it in matches if it.correlation >= LEAST_CORRELATION and not it.at_end]
-    starts = [it.offset_s for it in sound] + [it for it in (stated_s,) if it is not None]
+    sound = [
+        match for match in matches if match.correlation >= LEAST_CORRELATION and not match.at_end
+    ]
+    starts = [match.offset_s for match in sound] + [
+        value for value in (stated_s,) if value is not None
+    ]
     fits = fit_offset(flange, frames, starts) if sound else ()
     return _Matched(views, frames, matches, sound, fits, clear_fit(fits, stated_s))
 
@@ -204,7 +210,7 @@ def _placed_by(sweep: Sweep, found: _Matched, poses: Mapping[int, ViewPoses]) ->
     fit, sound = found.fit, found.sound
     if fit is not None and fit.sigma_s <= LARGEST_SIGMA_S:
         nearest_s = fit.offset_s
-        match = min(sound, key=lambda it: abs(it.offset_s - nearest_s))
+        match = min(sound, key=lambda value: abs(value.offset_s - nearest_s))
         return _by_motion(sweep, found.views, (fit, match), found.frames, poses)
     if len(sound) == 1 and found.frames.are_dense and sound[0].sigma_s <= LARGEST_SIGMA_S:
         return _by_turning(sweep, found.views, sound[0])
@@ -245,10 +251,10 @@ def _corrected(view: View, change: ClockChange) -> View:
 def _frames(sweep: Sweep, views: Sequence[View], poses: Mapping[int, ViewPoses]) -> Frames:
     """What the camera saw over time: of several boards one, and where it can be of clear poses."""
     seen = [(view, poses[view.number]) for view in views]
-    boards = [it.board for _, it in seen]
+    boards = [view.board for _, view in seen]
     most = max(sorted(set(boards)), key=boards.count, default=0)
-    seen = [it for it in seen if it[1].board == most]
-    clear = [it for it in seen if len(it[1].cam_from_target) == 1]
+    seen = [pair for pair in seen if pair[1].board == most]
+    clear = [pair for pair in seen if len(pair[1].cam_from_target) == 1]
     return sweep.frames(clear if 2 * len(clear) > len(seen) else seen)
 
 
@@ -271,7 +277,7 @@ def misread_joints(sweep: Sweep, poses: Mapping[int, ViewPoses], robot: Robot) -
     def alike(reading: JointReading) -> float:
         flange = Trajectory(samples.stamps_s, reading.poses(q))
         matches = turning_matches(flange, frames, sweep.stated_s or 0.0)
-        return max((it.correlation for it in matches), default=0.0)
+        return max((match.correlation for match in matches), default=0.0)
 
     declared, file = declared_reading(robot), f"streams/{sweep.motion.name}.csv"
     recorded = alike(declared)
@@ -308,7 +314,7 @@ def _by_motion(
         delays=delays,
     )
     words, warnings = clock_words(fit, match, sweep.motion.name), list(stated_doubts(clock, views))
-    notes = [words, *(it.words for it in delays if it.is_clear)]
+    notes = [words, *(delay.words for delay in delays if delay.is_clear)]
     placed = _placed(sweep, views, clock, warnings, notes)
     return placed if late is None else _straightened(sweep, placed, views, poses, late)
 
@@ -325,23 +331,23 @@ def _straightened(
     seen = [(view, poses[view.number]) for view in views if poses[view.number].corners is not None]
     at_s = np.array([view.stamp_s for view, _ in seen], dtype=float) - clock.camera_minus_robot_s
     covered = flange.covers(at_s)
-    seen, at_s = [it for it, ok in zip(seen, covered, strict=True) if ok], at_s[covered]
+    seen, at_s = [pair for pair, ok in zip(seen, covered, strict=True) if ok], at_s[covered]
     if sweep.camera is None:
         return placed
     found = straighten(
         sweep.frames(seen),
         (flange.at(at_s), flange.speeds(at_s)),
-        [it for _, it in seen],
+        [view for _, view in seen],
         sweep.camera,
         late,
     )
-    jacobian = {view: it for view, it in found.jacobian.items() if view in clock.speeds}
-    places = {it: at for at, it in enumerate(late.delays)}
+    jacobian = {view: array for view, array in found.jacobian.items() if view in clock.speeds}
+    places = {delay: at for at, delay in enumerate(late.delays)}
     delays = tuple(
-        replace(it, jacobian={view: by[:, places[it.of]] for view, by in jacobian.items()})
-        if it.of in places
-        else it
-        for it in clock.delays
+        replace(delay, jacobian={view: by[:, places[delay.of]] for view, by in jacobian.items()})
+        if delay.of in places
+        else delay
+        for delay in clock.delays
     )
     return replace(placed, clock=replace(clock, delays=delays), poses=found.poses)
 
@@ -364,7 +370,7 @@ def _undetermined(
     why, stated_s = why_undetermined(*tried), sweep.stated_s
     likeliest = not_ascending(views) or why
     offset_s = stated_s or 0.0
-    correlation = max((it.correlation for it in tried[1]), default=None)
+    correlation = max((match.correlation for match in tried[1]), default=None)
     stamps_s = np.array([view.stamp_s for view in views], dtype=float)
     resting = at_rest(sweep.motion.flange, stamps_s - offset_s)
     clock = Clock(offset_s, 0.0, "rest", stated_s, 0, correlation, speeds={})
@@ -390,12 +396,12 @@ def _undetermined(
         f"{int((~resting).sum())} views that were taken in motion are left out, as the offset "
         f"between the clocks is not known: {likeliest}.",
     )
-    kept = [view for view, it in zip(views, resting, strict=True) if it]
+    kept = [view for view, value in zip(views, resting, strict=True) if value]
     placed = _placed(sweep, kept, clock, [warning], [])
-    rejected = {it.view: it for it in placed.rejections} | {
+    rejected = {rejection.view: rejection for rejection in placed.rejections} | {
         view.number: Rejection(view.number, _IN_MOTION)
-        for view, it in zip(views, resting, strict=True)
-        if not it
+        for view, value in zip(views, resting, strict=True)
+        if not value
     }
     return replace(placed, rejections=tuple(rejected.values()))
 
@@ -410,7 +416,7 @@ def _placed(
     """Gives views their poses at an offset, and chooses among very many."""
     at_s = np.array([view.stamp_s for view in views], dtype=float) - clock.camera_minus_robot_s
     covered = sweep.motion.flange.covers(at_s)
-    inside = [view for view, it in zip(views, covered, strict=True) if it]
+    inside = [view for view, value in zip(views, covered, strict=True) if value]
     poses, speeds = sweep.motion.flange.at(at_s[covered]), sweep.motion.flange.speeds(at_s[covered])
     chosen = _chosen(inside, poses, speeds)
     taken = [inside[at].number for at in chosen]
@@ -420,15 +426,15 @@ def _placed(
         notes = [*notes, speed_words(clock, speeds[chosen], len(inside))]
     lost = dict(_uncovered(sweep.motion, views, at_s, covered))
     # A sweep may be longer than the stream beside it.
-    beyond = {it for it, why in lost.items() if why == _BEYOND and len(views) > _MANY_VIEWS}
-    spared = {it.number: _SPARED for it in inside if it.number not in rows}
-    lost |= {it.number: _NO_TIME for it in sweep.views if _knows_nothing(it)}
+    beyond = {key for key, why in lost.items() if why == _BEYOND and len(views) > _MANY_VIEWS}
+    spared = {view.number: _SPARED for view in inside if view.number not in rows}
+    lost |= {view.number: _NO_TIME for view in sweep.views if _knows_nothing(view)}
     return Clocked(
         clock,
         tuple(
-            replace(it, numbers={**it.numbers, **rows.get(it.number, {})})
-            for it in sweep.views
-            if it.number in rows or not (is_open(it) or _knows_nothing(it))
+            replace(view, numbers={**view.numbers, **rows.get(view.number, {})})
+            for view in sweep.views
+            if view.number in rows or not (is_open(view) or _knows_nothing(view))
         ),
         tuple(Rejection(view, why) for view, why in lost.items() if view not in beyond),
         spared | dict.fromkeys(beyond, _BEYOND),

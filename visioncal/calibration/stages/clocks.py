@@ -54,9 +54,15 @@ def _waiting(session: Session) -> dict[Pair, list[View]]:
     if not session.streams or not any(is_open(view) for view in session.views):
         return {}
     found: dict[Pair, list[View]] = {}
-    for it in session.observations:
-        if len(it.lacks) == 1 and is_seen(it.view) and stream_of(session, it.lacks[0]):
-            found.setdefault(Pair(it.seer, it.lacks[0]), []).append(it.view)
+    for observation in session.observations:
+        if (
+            len(observation.lacks) == 1
+            and is_seen(observation.view)
+            and stream_of(session, observation.lacks[0])
+        ):
+            found.setdefault(Pair(observation.seer, observation.lacks[0]), []).append(
+                observation.view
+            )
     return {pair: rows for pair, rows in found.items() if any(map(is_open, rows))}
 
 
@@ -82,18 +88,18 @@ def _with_pair(seen: T, pair: Pair, rows: list[View]) -> T:
     except VisioncalError as error:
         if is_only:
             raise
-        lost = [Rejection(it.number, f"no pose: {error.message}") for it in rows]
+        lost = [Rejection(row.number, f"no pose: {error.message}") for row in rows]
         found = Finding("clock", error.message, Step(error.next_step) if error.next_step else None)
         return seen.noting(lost, (found.of(of),))
     named = {"robot": pair.robot} if pair.robot else {}
-    views = tuple(replace(it, text={**it.text, **named}) for it in clocked.views)
+    views = tuple(replace(view, text={**view.text, **named}) for view in clocked.views)
     seen = replace(
         seen,
         clocks={**seen.clocks, pair: replace(clocked, views=views)},
         poses={**seen.poses, **clocked.poses},
-        notes=(*seen.notes, *(f"{of}: {it}" if of else it for it in clocked.notes)),
+        notes=(*seen.notes, *(f"{of}: {note}" if of else note for note in clocked.notes)),
     )
-    return seen.noting(clocked.rejections, (it.of(of) for it in clocked.warnings))
+    return seen.noting(clocked.rejections, (warning.of(of) for warning in clocked.warnings))
 
 
 def _set(sweep: Sweep, poses: Mapping[int, ViewPoses], model: Robot | None) -> Clocked:
@@ -110,7 +116,7 @@ def _stated_s(session: Session, camera: str) -> float | None:
     """What the session states of a camera's clock, or of all of them."""
     declared = session.declaration
     tables: dict[str, ClockTable] = {
-        frame_name("camera", name): it for name, it in declared.clocks.items()
+        frame_name("camera", name): clock for name, clock in declared.clocks.items()
     }
     clock = tables.get(camera, declared.clock)
     return clock.camera_minus_robot_s if clock.model_fields_set else None
@@ -126,21 +132,23 @@ def clock_effects(
         clocks: What was found of clocks.
         erring: The robots, as the problem has them, whose arms' errors are unknowns of the fit.
     """
-    views = [it.view for it in cell.rows]
+    views = [row.view for row in cell.rows]
     found: list[Effect] = []
     for pair, clocked in clocks.items():
         if clocked.clock.speeds and robot_key(pair.robot) in cell.poses:
             errs = robot_key(pair.robot) in erring
             found.append(_effect(cell, pair, clocked.clock, clocked.clock.known_s(erring=errs)))
             found += [
-                it.effect(views, pair.delay(it.of)) for it in clocked.clock.delays if it.is_clear
+                delay.effect(views, pair.delay(delay.of))
+                for delay in clocked.clock.delays
+                if delay.is_clear
             ]
     return tuple(found)
 
 
 def _effect(cell: Cell, pair: Pair, clock: Clock, sigma_s: float) -> Effect:
     speeds = clock.speeds
-    concerned = np.array([it.view in speeds for it in cell.rows], dtype=bool)
+    concerned = np.array([row.view in speeds for row in cell.rows], dtype=bool)
     robot = robot_key(pair.robot)
     moving = np.zeros((len(cell.poses[robot]), 6))
     for row in cell.rows:

@@ -50,15 +50,15 @@ def check_numbers(views: Sequence[Corners], target: Target, name: str = "") -> l
     Raises:
         DataError: So do those of most views; another number of columns is named where it fits.
     """
-    wrong = [it for it in views if _is_misnumbered(it, target)]
+    wrong = [view for view in views if _is_misnumbered(view, target)]
     if 2 * len(wrong) <= len(views):
-        return [it.view for it in wrong]
+        return [corners.view for corners in wrong]
     size = "" if not target.columns else f", {target.columns} columns and {target.rows} rows,"
     seen = (
         f"target {name or target.name!r}: in {len(wrong)} of {len(views)} views the corners of "
         f"corners.csv do not lie as its drawing{size} numbers them"
     )
-    culprits = [f"view {it.view}" for it in wrong]
+    culprits = [f"view {corners.view}" for corners in wrong]
     width = _fitting_width(wrong) if target.kind in _BEYOND else None
     if width is None:
         raise DataError(
@@ -66,8 +66,8 @@ def check_numbers(views: Sequence[Corners], target: Target, name: str = "") -> l
             culprits=culprits,
             next_step="Compare columns, rows and the order of the points with the detector's.",
         )
-    most = max(int(it.ids.max()) for it in wrong)
-    columns, rows = (it + _BEYOND[target.kind] for it in (width, most // width + 1))
+    most = max(int(corners.ids.max()) for corners in wrong)
+    columns, rows = (index + _BEYOND[target.kind] for index in (width, most // width + 1))
     raise DataError(
         f"{seen}; they do with columns = {columns}.",
         culprits=culprits,
@@ -78,11 +78,11 @@ def check_numbers(views: Sequence[Corners], target: Target, name: str = "") -> l
 def _fitting_width(views: Iterable[Corners]) -> int | None:
     """The number of corners a row with which all views are of a grid; None where there is none."""
     views = list(views)
-    for width in range(2, min(max(int(it.ids.max()) for it in views), _MOST_A_ROW) + 1):
-        grids = [np.stack([it.ids % width, it.ids // width], axis=1) for it in views]
+    for width in range(2, min(max(int(view.ids.max()) for view in views), _MOST_A_ROW) + 1):
+        grids = [np.stack([view.ids % width, view.ids // width], axis=1) for view in views]
         if all(
-            _left(grid.astype(float), it.px) < _MOST_LEFT
-            for grid, it in zip(grids, views, strict=True)
+            _left(grid.astype(float), view.px) < _MOST_LEFT
+            for grid, view in zip(grids, views, strict=True)
         ):
             return width
     return None

@@ -48,24 +48,24 @@ class Dense:
     @property
     def blurs(self) -> dict[int, Blur]:
         """The point-spread function of each view's image."""
-        return {view: it.blur for view, it in self.fits.items()}
+        return {view: fit.blur for view, fit in self.fits.items()}
 
     def notes(self) -> tuple[str, ...]:
         """What blurs the images, in sentences."""
         words = []
         moved, focus = (
-            {view: it for view, it in self.blurs.items() if it.cause == cause}
+            {view: blur for view, blur in self.blurs.items() if blur.cause == cause}
             for cause in ("motion", "focus")
         )
         if moved:
-            view, worst = max(moved.items(), key=lambda it: it[1].length_px)
+            view, worst = max(moved.items(), key=lambda pair: pair[1].length_px)
             words.append(
                 f"Motion smears {len(moved)} of {len(self.fits)} images, by up to "
                 f"{worst.length_px:.1f} px (view {view}, at {worst.direction_deg:.0f} deg from the "
                 "image's rows): stand still for longer before an image, or expose for less."
             )
         if focus:
-            view, worst = max(focus.items(), key=lambda it: it[1].width_px)
+            view, worst = max(focus.items(), key=lambda pair: pair[1].width_px)
             words.append(
                 f"{len(focus)} of {len(self.fits)} images are out of focus, with edges up to "
                 f"{worst.width_px:.1f} px wide as a sigma (view {view}): set the focus to the "
@@ -96,12 +96,12 @@ def fit_densely(
     """
     boards, board_of = session.boards, session.board_of
     mine = [
-        it
-        for it in views
-        if it.number in corners
-        and it.image
-        and not it.has_corners
-        and boards[board_of(it)].kind in _KINDS
+        view
+        for view in views
+        if view.number in corners
+        and view.image
+        and not view.has_corners
+        and boards[board_of(view)].kind in _KINDS
     ]
 
     def fit(view: View, smooth_px: float) -> _Look | None:
@@ -130,19 +130,19 @@ def fit_densely(
             list(pool.map(lambda view, px=px: fit(view, px), sample)) for px in (0.0, _SMOOTH_PX)
         ]
         smooths = _smoothing_helps(*both)
-        ready = dict(zip((it.number for it in sample), both[smooths], strict=True))
-        rest = [it for it in mine if it.number not in ready]
+        ready = dict(zip((view.number for view in sample), both[smooths], strict=True))
+        rest = [view for view in mine if view.number not in ready]
         looks = pool.map(lambda view: fit(view, smooths * _SMOOTH_PX), rest)
-        looked = chain(ready.items(), zip((it.number for it in rest), looks, strict=True))
-        for view, it in looked:
-            if it is not None:
-                found[view] = it
+        looked = chain(ready.items(), zip((view.number for view in rest), looks, strict=True))
+        for view, pair in looked:
+            if pair is not None:
+                found[view] = pair
             if progress is not None:
                 progress("dense", len(found), len(mine))
     fits = {
-        view: it
-        for view, (_, it) in found.items()
-        if it is not None and it.fitted.mean() >= _LEAST_FITTED
+        view: fitted
+        for view, (_, fitted) in found.items()
+        if fitted is not None and fitted.fitted.mean() >= _LEAST_FITTED
     }
     sigmas = {view: fits[view].sigma_px if view in fits else start.sigma_px
               for view, (start, _) in found.items()}  # fmt: skip
@@ -206,7 +206,7 @@ def explained(
         found = explain(image, target, seen.corners.ids, px, camera, fit.blur, fit.tone)
         if found is None:
             return seen
-        drawn, rest = (_as_jpeg(it) for it in (found.drawn, found.rest))
+        drawn, rest = (_as_jpeg(array) for array in (found.drawn, found.rest))
         return replace(seen, explained=ExplainedImage(drawn, rest, _words(fit, found)))
 
     with ONE_TORCH_THREAD.held(), ThreadPoolExecutor(dense.threads or os.cpu_count() or 1) as pool:

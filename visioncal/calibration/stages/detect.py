@@ -139,7 +139,7 @@ def detect(
     views = [view for view in among if view.image and not view.has_corners]
     stated = _stated_resolution(session, among)
     looks: list[_Look] = []
-    others = {it for it in session.boards if _shows_another(session, it, views)}
+    others = {board for board in session.boards if _shows_another(session, board, views)}
     quick = replace(options, quick=True, keeps=False)
     room = _Room()
     kept = KeptCorners.beside(session, options.min_corners, options.max_blur_px)
@@ -160,8 +160,8 @@ def detect(
         kept.save()
     given = [view for view in among if view.has_corners]
     resolution = _common_resolution(session, views, looks, given, stated)
-    sizes = {view.number: it.resolution for view, it in zip(views, looks, strict=True)}
-    looks = [_of_size(it, view, resolution) for it, view in zip(looks, views, strict=True)]
+    sizes = {view.number: look.resolution for view, look in zip(views, looks, strict=True)}
+    looks = [_of_size(look, view, resolution) for look, view in zip(looks, views, strict=True)]
     for name in session.boards:
         _check_layout(session, name, views, looks)
     own = {view.number: look.found for view, look in zip(views, looks, strict=True)}
@@ -169,15 +169,17 @@ def detect(
     for name, target in session.boards.items():
         mine = [elsewhere[view.number] for view in given if session.board_of(view) == name]
         several = name if len(session.boards) > 1 else ""
-        wrong = check_numbers([it for it in mine if isinstance(it, Corners)], target, several)
-        elsewhere |= {it: Rejection(it, OTHER_NUMBERS) for it in wrong}
+        wrong = check_numbers(
+            [corners for corners in mine if isinstance(corners, Corners)], target, several
+        )
+        elsewhere |= {index: Rejection(index, OTHER_NUMBERS) for index in wrong}
     own |= elsewhere
     found = [own[view.number] for view in among if view.number in own]
     return Detections(
-        {it.view: it for it in found if isinstance(it, Corners)},
-        tuple(it for it in found if isinstance(it, Rejection)),
+        {corners.view: corners for corners in found if isinstance(corners, Corners)},
+        tuple(corners for corners in found if isinstance(corners, Rejection)),
         resolution,
-        {view: it for view, it in sizes.items() if it not in (None, resolution)},
+        {view: size for view, size in sizes.items() if size not in (None, resolution)},
     )
 
 
@@ -188,7 +190,7 @@ def _shows_another(session: Session, name: str, views: Sequence[View]) -> bool:
     target = session.boards[name]
     if target.kind != "checkerboard":
         return False
-    mine = [it for it in views if session.board_of(it) == name]
+    mine = [view for view in views if session.board_of(view) == name]
     sample = mine[:: max(len(mine) // _LAYOUT_SAMPLE, 1)][:_LAYOUT_SAMPLE]
     for view in sample:
         image = image_of(session, view)
@@ -357,7 +359,7 @@ def _common_resolution(
             )
         return stated
     if not sizes:
-        reasons = [f"view {it.view}: {it.reason}" for it in _rejections(looks)]
+        reasons = [f"view {rejection.view}: {rejection.reason}" for rejection in _rejections(looks)]
         raise DataError(
             f"session {session.name!r}: none of its {len(views)} images can be read.",
             culprits=reasons,
@@ -404,7 +406,7 @@ def _other_size(
     mine = name_of(session.declaration, "camera", views[0])
     camera = session.cameras[mine]
     words, step = "", f"In session.toml, write resolution = [{size[0]}, {size[1]}]"
-    other = next((it for it, at in session.cameras.items() if at.size == size), None)
+    other = next((name for name, at in session.cameras.items() if at.size == size), None)
     if other is not None:
         words = f"that is the size of camera {other}'s"
         step = (
@@ -427,7 +429,7 @@ def _other_size(
 def _sample(session: Session, views: Sequence[View], name: str) -> dict[int, Corners]:
     """The corners of a few views that show a board."""
     found: dict[int, Corners] = {}
-    for view in [it for it in views if session.board_of(it) == name][:_MOST_LOOKED_AT]:
+    for view in [view for view in views if session.board_of(view) == name][:_MOST_LOOKED_AT]:
         image = image_of(session, view)
         if isinstance(image, Rejection):
             continue
@@ -455,14 +457,16 @@ def _check_layout(
 ) -> None:
     """Refuses a board whose markers lie otherwise than declared in most views that show it."""
     target, board_of = session.boards[name], session.board_of
-    mine = [it for it in zip(views, looks, strict=True) if board_of(it[0]) == name]
+    mine = [pair for pair in zip(views, looks, strict=True) if board_of(pair[0]) == name]
     misfits = [view for view, look in mine if look.misfit]
     shown = sum(isinstance(look.found, Corners) for _, look in mine)
     if not misfits or len(misfits) <= shown:
         return
-    culprits = [f"view {it.number}" for it in misfits]
+    culprits = [f"view {misfit.number}" for misfit in misfits]
     if target.kind != "charuco":
-        reasons = [it.reason for it in _rejections([look for _, look in mine if look.misfit])]
+        reasons = [
+            rejection.reason for rejection in _rejections([look for _, look in mine if look.misfit])
+        ]
         usual = max(set(reasons), key=reasons.count)
         raise DataError(
             f"target {target.name!r}: in {len(misfits)} of {len(misfits) + shown} views another "
@@ -473,9 +477,11 @@ def _check_layout(
             else "Mend the target's .toml, or name another: visioncal target check IMAGE says what "
             "is printed.",
         )
-    images = [decode_image(session.images.read(it.image)) for it in misfits[:_LAYOUT_SAMPLE]]
-    fitting = [fitting_layouts(it, target) for it in images if not isinstance(it, str)]
-    common = [it for it in fitting[0] if all(it in others for others in fitting)]
+    images = [
+        decode_image(session.images.read(misfit.image)) for misfit in misfits[:_LAYOUT_SAMPLE]
+    ]
+    fitting = [fitting_layouts(image, target) for image in images if not isinstance(image, str)]
+    common = [target for target in fitting[0] if all(target in others for others in fitting)]
     seen = (
         f"target {target.name!r}: in {len(misfits)} of {len(misfits) + shown} views the markers do "
         f"not lie as on a ChArUco board of {target.columns} x {target.rows} squares with "

@@ -56,10 +56,12 @@ def misfits(
         errors: Those of arms whose joints are not known, by the robot.
         offsets: (s, 6, n) of the others, how their flanges move with the offsets of their joints.
     """
-    robots = [it for it in problem.robots if len(stops_of(problem, it)) >= _FEWEST_STOPS]
+    robots = [robot for robot in problem.robots if len(stops_of(problem, robot)) >= _FEWEST_STOPS]
     # Frames are those of all robots: what moved is sought once, and said once.
     slight = slight_move(problem, fit, tuple(problem.unknown)) if robots else None
-    slipped = slipped_joint(problem, fit, {it: offsets[it] for it in robots if it in offsets})
+    slipped = slipped_joint(
+        problem, fit, {robot: offsets[robot] for robot in robots if robot in offsets}
+    )
     found: dict[str, ResidualTest] = {}
     for robot in robots:
         fitted = (problem, fit.state, fit.noise, robot)
@@ -68,12 +70,12 @@ def misfits(
         steps = _steps(problem, fit, (slight, slipped), crept)
         # What a process over postures or time explains as well is no motion.
         if arm:
-            steps = [it for it in steps if it.mahalanobis_sq >= arm.gain]
+            steps = [step for step in steps if step.mahalanobis_sq >= arm.gain]
         if arm and crept and crept.mahalanobis_sq < arm.gain:
             crept = None
         if steps:
             # Before and after it, neighbours err alike because of it.
-            known = any(it.step for it in found.values())
+            known = any(test.step for test in found.values())
             first, second = (*steps, None)[:2]
             found[robot] = ResidualTest(None, None, *(() if known else (first, second)))
         else:
@@ -95,14 +97,14 @@ def _steps(
     each = float(np.log(problem.observations.directions.sum()))
     likely: list[tuple[float, Move | Slip]] = []
     least = log_gain(problem, fit, crept.mahalanobis_sq) if crept else 0.0
-    for it in found:
-        gain = log_gain(problem, fit, it.mahalanobis_sq) - price if it else -np.inf
-        if it is None or gain < least:
+    for move in found:
+        gain = log_gain(problem, fit, move.mahalanobis_sq) - price if move else -np.inf
+        if move is None or gain < least:
             continue
-        numbers = 6 if isinstance(it, Move) else 1
-        likely.append((gain - numbers * each, replace(it, mahalanobis_sq=gain)))
-    likely.sort(key=lambda it: -it[0])
-    return [it for gain, it in likely if gain > likely[0][0] - _CLEARLY]
+        numbers = 6 if isinstance(move, Move) else 1
+        likely.append((gain - numbers * each, replace(move, mahalanobis_sq=gain)))
+    likely.sort(key=lambda pair: -pair[0])
+    return [move for gain, move in likely if gain > likely[0][0] - _CLEARLY]
 
 
 def doubts(
@@ -193,7 +195,9 @@ def _step_words(
 ) -> str:
     if isinstance(step, Slip):
         # What is to be added to a reading so that it is the joint's angle, the other way round.
-        reads_deg, sigma_deg = (float(np.rad2deg(it)) for it in (-step.step_rad, step.sigma_rad))
+        reads_deg, sigma_deg = (
+            float(np.rad2deg(value)) for value in (-step.step_rad, step.sigma_rad)
+        )
         sign = "+" if reads_deg > 0.0 else "-"
         return (
             f"The offset of {joint(step)} steps: {from_when(step.stop)}, it reads "

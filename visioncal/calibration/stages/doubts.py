@@ -50,16 +50,24 @@ def doubts_of(findings: Findings) -> list[Finding]:
     pairs, sensors = findings.pairs, findings.sensors
     return [
         *scatter,
-        *(doubt for it in pairs for doubt in _disagreement_doubts(it)),
+        *(doubt for pair in pairs for doubt in _disagreement_doubts(pair)),
         *_outlier_doubts(findings, limits),
-        *(doubt for it in pairs for doubt in _holdout_doubts(it, findings.mount, limits)),
+        *(doubt for pair in pairs for doubt in _holdout_doubts(pair, findings.mount, limits)),
         # Sigmas of views that disagree wildly say nothing about the motion.
-        *([] if any(it.is_fatal for it in scatter) else _accuracy_doubts(findings, limits)),
+        *(
+            []
+            if any(finding.is_fatal for finding in scatter)
+            else _accuracy_doubts(findings, limits)
+        ),
         *_stop_doubts(findings, limits),
-        *(doubt for it in sensors for doubt in _lost_doubts(it, limits)),
-        *(doubt for it in sensors for doubt in _noise_doubts(it, limits)),
+        *(doubt for sensor in sensors for doubt in _lost_doubts(sensor, limits)),
+        *(doubt for sensor in sensors for doubt in _noise_doubts(sensor, limits)),
         *([] if scatter else _robot_doubts(findings, limits)),
-        *(_warned(it, findings) for it in findings.warnings if it.kind not in NOT_USABLE),
+        *(
+            _warned(warning, findings)
+            for warning in findings.warnings
+            if warning.kind not in NOT_USABLE
+        ),
     ]
 
 
@@ -96,7 +104,7 @@ def _scatter_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[F
         if outside > _ROUNDING and within > 0.0
     ]
     ratio = max(ratios, default=0.0)
-    followed = any(it.by_functions for it in findings.arms)
+    followed = any(arm.by_functions for arm in findings.arms)
     if ratio > limits.optimism[0] and not followed:
         yield Finding(
             "optimism",
@@ -110,14 +118,14 @@ def _scatter_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[F
 
 def _is_of_arm(findings: Findings) -> bool:
     """Whether what is uncertain is mostly what an arm does wrong whose joints are not known."""
-    has_no_joints = any(it.do is NO_JOINTS for it in findings.warnings)
+    has_no_joints = any(warning.do is NO_JOINTS for warning in findings.warnings)
     return has_no_joints and _is_mostly_of(findings, "arm", "robot", "poses")
 
 
 def _is_of_board(findings: Findings) -> bool:
     """Whether it is mostly how well boards are known, which no view tells."""
     # A lens that is held has a part in what held values cost.
-    names = {name.partition(" of ")[0] for it in findings.places for name in it.budget_mm}
+    names = {name.partition(" of ")[0] for place in findings.places for name in place.budget_mm}
     held = () if "lens" in names else ("held values",)
     return _is_mostly_of(findings, "board", *held)
 
@@ -135,7 +143,7 @@ def helping(findings: Findings) -> Step | None:
     """What makes a result less uncertain; None where that is said of the arm already."""
     if _is_of_board(findings):
         return MEASURE_BOARD
-    if any(it.do is NO_JOINTS for it in findings.warnings):
+    if any(warning.do is NO_JOINTS for warning in findings.warnings):
         return None
     words = "Add views from other poses of the robot."
     return adding(words, modelled=findings.plannable, purpose=findings.of_camera)
@@ -143,7 +151,7 @@ def helping(findings: Findings) -> Step | None:
 
 def _tilted(findings: Findings) -> Step:
     words = "Add 5 views or more, tilted by 20 to 40 degrees about different axes."
-    if not all(it.can_tilt for it in findings.arms):
+    if not all(arm.can_tilt for arm in findings.arms):
         words = "Add 5 views or more, all over the workspace and turned as far as the arm turns."
     return adding(words, modelled=findings.plannable, purpose=findings.of_camera)
 
@@ -164,10 +172,10 @@ def _pair_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Find
             if value is not None and value > max(check, _OF_NOISE * noise)
         ]
         if beyond:
-            away = " and ".join(it for it, _ in beyond)
+            away = " and ".join(name for name, _ in beyond)
             words.append(f"{away} ({pair.name})" if pair.name else away)
             views += pair.views
-            is_fatal |= any(it for _, it in beyond)
+            is_fatal |= any(flag for _, flag in beyond)
     if words:
         worst = _worst_views(views)
         named = ", ".join(f"view {view.view} ({_residual(view)})" for view in worst)
@@ -180,7 +188,7 @@ def _pair_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Find
                 "arm with large model errors.",
                 REVIEW,
             ),
-            tuple(it.view for it in worst),
+            tuple(view.view for view in worst),
             is_fatal=is_fatal,
             until_mm=0.0,
         )
@@ -196,7 +204,7 @@ def _disagreement_doubts(pair: Pair) -> Iterator[Finding]:
     out = pair.disagreeing
     if not out:
         return
-    views, run = tuple(it.view for it in out), _run(pair)
+    views, run = tuple(rejection.view for rejection in out), _run(pair)
     if len(out) == 1:
         named, them, rows = f"view {views[0]}", "it", f"the row of view {views[0]}"
         words = f"View {views[0]} was left out. It {out[0].reason}."
@@ -218,8 +226,8 @@ def _disagreement_doubts(pair: Pair) -> Iterator[Finding]:
 
 def _run(pair: Pair) -> str:
     """Says so where the views that were left out follow each other, with no other between them."""
-    out = [it.view for it in pair.disagreeing]
-    compared = [it.view for it in pair.views if it.used or it.view in out]
+    out = [rejection.view for rejection in pair.disagreeing]
+    compared = [view.view for view in pair.views if view.used or view.view in out]
     first = compared.index(out[0])
     end = first + len(out)
     if len(out) < _LEAST_RUN or compared[first:end] != out or compared == out:
@@ -234,7 +242,7 @@ def _outlier_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[F
     """Names single views whose residual stands out from the others'."""
     # Where the corners show how well each view sees the board, the consensus has judged them
     # better.
-    if any(it.away_mm is not None for it in findings.arms):
+    if any(arm.away_mm is not None for arm in findings.arms):
         return
     for pair in findings.pairs:
         for view, ratio in _outlying_views(pair.views, limits.outlier):
@@ -261,9 +269,9 @@ def _outlying_views(
     ratios = (away / np.maximum(np.median(away, axis=0), _ROUNDING)).max(axis=1)
     pairs = zip(used, ratios.tolist(), strict=True)
     return tuple(
-        (view, it)
-        for view, it in pairs
-        if it > (limit if view.rms_px is not None else _UNEVEN * limit)
+        (view, value)
+        for view, value in pairs
+        if value > (limit if view.rms_px is not None else _UNEVEN * limit)
     )
 
 
@@ -294,13 +302,13 @@ def _accuracy_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[
     # Edges are known in the arm's own frames. Those of a calibrated arm are as open as the errors
     # of the first and the last link, which its poses make up for.
     # What moved at once is in all that is known, and more views do not help.
-    if any(it.kind in MOVED_AT_ONCE for it in findings.warnings):
+    if any(warning.kind in MOVED_AT_ONCE for warning in findings.warnings):
         return
-    if any(it.workspace_mm is None for it in findings.arms):
+    if any(arm.workspace_mm is None for arm in findings.arms):
         yield from _sigma_doubts(findings, limits)
         yield from _budget_doubts(findings, limits)
-    for it in findings.arms:
-        if it.workspace_mm is not None and it.workspace_mm > limits.sigma_mm[0]:
+    for arm in findings.arms:
+        if arm.workspace_mm is not None and arm.workspace_mm > limits.sigma_mm[0]:
             seen = any(sensor.pixel_px is not None for sensor in findings.sensors)
             board = (
                 " The board's size counts in it, as no view shows when an arm and a board are "
@@ -308,7 +316,7 @@ def _accuracy_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[
             )
             words = (
                 "All over the workspace the calibrated arm places its tool to "
-                f"{figure(it.workspace_mm)} mm (sigma, in the median; doubt begins at "
+                f"{figure(arm.workspace_mm)} mm (sigma, in the median; doubt begins at "
                 f"{limits.sigma_mm[0]:g}).{board if seen else ''}"
             )
             step = adding(
@@ -316,9 +324,9 @@ def _accuracy_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[
                 modelled=findings.plannable,
                 purpose=f" --for kinematics{findings.of_camera}",
             )
-            is_fatal = it.workspace_mm > limits.sigma_mm[1]
+            is_fatal = arm.workspace_mm > limits.sigma_mm[1]
             found = Finding("workspace", words, step, is_fatal=is_fatal, until_mm=0.0)
-            yield found.of(_robot(it))
+            yield found.of(_robot(arm))
 
 
 def _sigma_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
@@ -356,7 +364,7 @@ def _sigma_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Fin
 
 def _budget_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
     """Says what makes the result uncertain where it is to be used."""
-    beyond = [it for it in findings.places if it.budget_mm["total"] > limits.sigma_mm[0]]
+    beyond = [place for place in findings.places if place.budget_mm["total"] > limits.sigma_mm[0]]
     # Where a lens and its mount make up for each other, what a camera sees is known better than
     # what is stated in its frame.
     if len(findings.places) == len(findings.picks) == 1:
@@ -364,11 +372,13 @@ def _budget_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Fi
         beyond = beyond if picks.budget_mm["total"] > limits.sigma_mm[0] else []
     if not beyond:
         return
-    worst = max(beyond, key=lambda it: it.budget_mm["total"])
+    worst = max(beyond, key=lambda value: value.budget_mm["total"])
     budget = worst.budget_mm
     parts = sorted((at for at in budget.items() if at[0] != "total"), key=lambda at: -at[1])
     others = [
-        f"{it.words} ({figure(it.budget_mm['total'])} mm)" for it in beyond if it is not worst
+        f"{place.words} ({figure(place.budget_mm['total'])} mm)"
+        for place in beyond
+        if place is not worst
     ]
     yield Finding(
         "place",
@@ -384,16 +394,16 @@ def _budget_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Fi
 
 
 def _stop_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
-    used = sum(view.used for it in findings.pairs for view in it.views)
+    used = sum(view.used for pair in findings.pairs for view in pair.views)
     check, bad = limits.stops
-    for it in findings.arms:
-        if it.stops < check:
-            counted = f"{used} views" if it.stops == used else f"{it.stops} stops"
+    for arm in findings.arms:
+        if arm.stops < check:
+            counted = f"{used} views" if arm.stops == used else f"{arm.stops} stops"
             words = f"Only {counted} are used; {check} or more are needed to check the result."
-            step, is_fatal = _tilted(findings), it.stops < bad
+            step, is_fatal = _tilted(findings), arm.stops < bad
             kind = "too_few_stops" if is_fatal else "few_stops"
             found = Finding(kind, words, step, is_fatal=is_fatal, until_mm=0.0)
-            yield found.of(_robot(it))
+            yield found.of(_robot(arm))
 
 
 def _lost_doubts(sensor: Sensor, limits: CalibrationLimits) -> Iterator[Finding]:
@@ -402,7 +412,7 @@ def _lost_doubts(sensor: Sensor, limits: CalibrationLimits) -> Iterator[Finding]
     share = len(lost) / max(count_all, 1)
     if share > limits.lost_share[0]:
         details, disagree = "", {*sensor.disagreeing}
-        others = [it for it in lost if it.view not in disagree]
+        others = [rejection for rejection in lost if rejection.view not in disagree]
         if disagree:
             count = len(disagree) if others else "all"
             details = f"; {count} of them disagree with the others"
@@ -412,7 +422,7 @@ def _lost_doubts(sensor: Sensor, limits: CalibrationLimits) -> Iterator[Finding]
         words = f"{len(lost)} of {count_all} views are not used{details}."
         words_do = "Look at the first of them, and repeat what is missing."
         step = Step(words_do, look_at(others[0].view)) if others else None
-        views, is_fatal = tuple(it.view for it in lost), share > limits.lost_share[1]
+        views, is_fatal = tuple(rejection.view for rejection in lost), share > limits.lost_share[1]
         # Those that disagree have a finding of their own.
         kind = "lost_views" if others else "left_out"
         yield Finding(kind, words, step, views, is_fatal=is_fatal).of(sensor.name)
@@ -448,11 +458,11 @@ def _robot_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Fin
     """An arm is a good instrument: what looks like its error is often something else's."""
     # What chance makes of a good arm's noise, where poses are coarse, is no error. A task that
     # needs ten times as much has an arm that is as good as it has to be.
-    for it in findings.arms:
-        if it.away_mm is None or it.away_deg is None or it.errs:
+    for arm in findings.arms:
+        if arm.away_mm is None or arm.away_deg is None or arm.errs:
             continue
-        found_mm, found_deg = it.surely or (it.away_mm, it.away_deg)
-        beyond = max(it.away_mm / limits.robot_mm, it.away_deg / limits.robot_deg)
+        found_mm, found_deg = arm.surely or (arm.away_mm, arm.away_deg)
+        beyond = max(arm.away_mm / limits.robot_mm, arm.away_deg / limits.robot_deg)
         if max(found_mm / limits.robot_mm, found_deg / limits.robot_deg) > 1.0:
             cause, step = (
                 (
@@ -473,9 +483,9 @@ def _robot_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Fin
                 )
             )
             words = (
-                f"The residuals would take a flange that is off by {figure(it.away_mm)} mm and "
-                f"{figure(it.away_deg)} deg from stop to stop; arms repeat to 0.1 mm. More likely "
+                f"The residuals would take a flange that is off by {figure(arm.away_mm)} mm and "
+                f"{figure(arm.away_deg)} deg from stop to stop; arms repeat to 0.1 mm. More likely "
                 f"{cause}"
             )
             until_mm = 10.0 * beyond * limits.robot_mm
-            yield Finding("unexplained", words, step, until_mm=until_mm).of(_robot(it))
+            yield Finding("unexplained", words, step, until_mm=until_mm).of(_robot(arm))

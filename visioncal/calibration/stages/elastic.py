@@ -60,7 +60,7 @@ class Elastic:
     @property
     def rigid(self) -> tuple[str, ...]:
         """The joints whose compliance the loads do not determine."""
-        return tuple(it.joint for it in self.springs if not it.determined)
+        return tuple(spring.joint for spring in self.springs if not spring.determined)
 
     def result(self, views: Sequence[int]) -> ElasticResult:
         """The springs as a section of a calibration.
@@ -81,7 +81,7 @@ class Elastic:
 
     def _stop(self, at: int, view: int) -> LoadedStop:
         """Torques and bends of a stop; a bend that is not determined is left out."""
-        joints = (it.joint for it in self.springs)
+        joints = (spring.joint for spring in self.springs)
         bends = zip(joints, self.bends_rad[at].tolist(), strict=True)
         return LoadedStop(
             view=view,
@@ -213,12 +213,13 @@ def plays_of(model: ArmModel, covariance: FloatArray) -> tuple[JointBacklash, ..
 
 def play_remarks(plays: Sequence[JointBacklash]) -> Iterator[str]:
     """Says which joints have play, for the verdict."""
-    sure = [it for it in plays if it.is_sure]
+    sure = [play for play in plays if play.is_sure]
     if not sure:
         return
     words = ", ".join(
-        f"{it.joint} {figure(1e3 * abs(it.deadband_rad))} +- {figure(1e3 * it.sigma_rad)} mrad"
-        for it in sure
+        f"{backlash.joint} {figure(1e3 * abs(backlash.deadband_rad))} +- "
+        f"{figure(1e3 * backlash.sigma_rad)} mrad"
+        for backlash in sure
     )
     yield (
         f"Joints have play: {words}. The calibrated arm stands in the middle of it: approach every "

@@ -32,9 +32,10 @@ def other_stops(
     """
     seen = problem.observations
     # Between the last stop before a move and the first one after it, either may be true.
-    late = {it.twin: it.stop for it in moves}
+    late = {move.twin: move.stop for move in moves}
     early = {
-        it.twin: int(seen.stops[seen.involves(it.frame) & used].max(initial=-1)) + 1 for it in moves
+        move.twin: int(seen.stops[seen.involves(move.frame) & used].max(initial=-1)) + 1
+        for move in moves
     }
     found = {}
     for at in out.tolist():
@@ -58,7 +59,7 @@ def _squares_by_stop(
     seen = problem.observations
     stops = np.arange(max(map(len, problem.poses.values()), default=0))
     repeated = np.full(len(stops), at)
-    observer, observed = (it[at].partition("@")[0] for it in (seen.observers, seen.observed))
+    observer, observed = (pair[at].partition("@")[0] for pair in (seen.observers, seen.observed))
     here = replace(
         seen.take(repeated),
         observers=(observer,) * len(stops),
@@ -67,10 +68,10 @@ def _squares_by_stop(
     )
     for move in moves:
         here = here.renamed(move.frame, move.twin, stops >= starts[move.twin])
-    effects = tuple(it.take(repeated) for it in problem.effects)
+    effects = tuple(effect.take(repeated) for effect in problem.effects)
     there = replace(problem, observations=here, effects=effects)
     known, squares = _known(there), np.full(len(stops), np.inf)
-    if known.any() and any(it.robot for group in there.groups for it in group.path):
+    if known.any() and any(step.robot for group in there.groups for step in group.path):
         squares[known] = by_noise_alone(there.subset(known), fit)
     return squares
 
@@ -94,8 +95,8 @@ def exchanged(problem: Problem, fitting: Mapping[int, Sequence[int]]) -> dict[in
         fitting: The other stops that some of them fit; see `other_stops`.
     """
     seen, found = problem.observations, {}
-    first = [it.partition("@")[0] for it in seen.observers]
-    second = [it.partition("@")[0] for it in seen.observed]
+    first = [observer.partition("@")[0] for observer in seen.observers]
+    second = [name.partition("@")[0] for name in seen.observed]
     for a, b in combinations(sorted(fitting), 2):
         alike = (first[a], second[a]) == (first[b], second[b])
         if alike and seen.stops[b] in fitting[a] and seen.stops[a] in fitting[b]:

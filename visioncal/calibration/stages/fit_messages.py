@@ -57,11 +57,13 @@ def found_of_looks(
     """
     looks = fitted.looks
     cameras = zip(looks.problems.items(), fitted.seen.compressed, strict=True)
-    for (camera, problem), it in cameras:
+    for (camera, problem), compressed in cameras:
         moving = np.flatnonzero(np.isin(looks.places(camera), fitted.moving))
-        scattered = _noise_found(problem.stack, it.residuals, problem.unknowns(it, moving))
+        scattered = _noise_found(
+            problem.stack, compressed.residuals, problem.unknowns(compressed, moving)
+        )
         of = "" if camera == ONLY_CAMERA else camera
-        yield from (it.of(of) for it in (*scattered, *_lens_found(fitted, camera)))
+        yield from (finding.of(of) for finding in (*scattered, *_lens_found(fitted, camera)))
     scene = next(iter(looks.problems.values())).scene
     for board, target in enumerate(scene.targets):
         if board not in looks.printed:
@@ -311,4 +313,4 @@ def _moved(fitted: Fitted, places: IntArray) -> bool:
 
 
 def _px(values: FloatArray) -> str:
-    return ", ".join(f"{'-' if it < 0 else '+'}{figure(abs(it))}" for it in values)
+    return ", ".join(f"{'-' if value < 0 else '+'}{figure(abs(value))}" for value in values)

@@ -42,8 +42,8 @@ def compare_solvers(problem: Problem, state: State, mount: Mount, solver: str) -
     """
     found = {"joint": state} if solver == "joint" else {}
     if not problem.points:
-        found |= {it: closed_form_state(problem, it, state, mount) for it in SOLVERS}
-    return {name: _answer(problem, it) for name, it in found.items()}
+        found |= {name: closed_form_state(problem, name, state, mount) for name in SOLVERS}
+    return {name: _answer(problem, item) for name, item in found.items()}
 
 
 def closed_form_state(problem: Problem, solver: str, start: State, mount: Mount) -> State:
@@ -56,7 +56,7 @@ def closed_form_state(problem: Problem, solver: str, start: State, mount: Mount)
         mount: Where the camera is.
     """
     seen, from_first = problem.observations, invert(start.edges[1:]) @ start.edges[1]
-    shown = [problem.unknown[it] - 1 for it in seen.observed]
+    shown = [problem.unknown[name] - 1 for name in seen.observed]
     robot = robot_part(problem.poses[problem.robots[0]][seen.stops], mount)
     found = SOLVERS[solver](robot, seen.measured @ from_first[shown])
     return State(np.stack([found.x, *(found.z @ invert(from_first))]), start.values)

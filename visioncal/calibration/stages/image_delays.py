@@ -53,7 +53,7 @@ class FoundDelay:
     def effect(self, views: Sequence[int], name: str = "") -> Effect:
         """Its error as an unknown of some views; see `Clock.effects`."""
         still = np.zeros(6)
-        jacobian = np.array([self.jacobian.get(it, still) for it in views]).reshape(-1, 6, 1)
+        jacobian = np.array([self.jacobian.get(view, still) for view in views]).reshape(-1, 6, 1)
         known = Knowledge(np.array([[self.sigma_s**-2.0]]), np.zeros(1))
         return Effect.free(name or self.of.name, known, jacobian)
 
@@ -94,7 +94,7 @@ def find_delays(
             strict=True,
         )
     )
-    clear = [it.of for it in found if it.is_clear]
+    clear = [delay.of for delay in found if delay.is_clear]
     if len(clear) in (0, len(found)):
         return (whole if clear else None), found
     return fit_delays(flange, frames, camera, whole.clock, clear), found
@@ -145,10 +145,10 @@ def straighten(
         px = stack.px + _projected(plain, camera, found.cam_from_target) - late_px
     covariance = sigma_px**2 * covariance_from(found.information)
     poses = {
-        it.view: _with_corners(
-            it, px[stack.view_of == at], found.cam_from_target[at], covariance[at]
+        view.view: _with_corners(
+            view, px[stack.view_of == at], found.cam_from_target[at], covariance[at]
         )
-        for at, it in enumerate(seen)
+        for at, view in enumerate(seen)
     }
     return Straight(poses, dict(zip(poses, found.by_shared, strict=True)))
 

@@ -53,7 +53,7 @@ def other_size_step(
 
 
 def _written(key: str, values: FloatArray, form: str) -> str:
-    return f"{key} = [{', '.join(format(it, form) for it in values.tolist())}]"
+    return f"{key} = [{', '.join(format(value, form) for value in values.tolist())}]"
 
 
 def scaled_matrix(matrix: FloatArray, scale: float) -> FloatArray:

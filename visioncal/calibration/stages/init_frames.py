@@ -52,7 +52,9 @@ def init_frames(
     """
     seen, candidates = problem.observations, Candidates.of(views)
     turned = {
-        frame: turns for frame, it in targets.items() if len(turns := rotation_transforms(it)) > 1
+        frame: turns
+        for frame, target in targets.items()
+        if len(turns := rotation_transforms(target)) > 1
     }
     sighted = Sighted(
         seen.observers,
@@ -70,18 +72,22 @@ def init_frames(
         raise DegenerateError(
             f"pnp: {unclear.sum()} of {len(views)} views allow two poses of the target that the "
             "robot's motion cannot distinguish.",
-            culprits=[f"view {view.view}" for view, it in zip(views, unclear, strict=True) if it],
+            culprits=[
+                f"view {view.view}" for view, value in zip(views, unclear, strict=True) if value
+            ],
             next_step="Add views tilted about different axes, or use a board without symmetry "
             "(ChArUco, or an odd sum of columns and rows).",
         )
     rows = list(zip(views, picks.tolist(), unclear.tolist(), seen.observed, strict=True))
     return Placed(
         tied,
-        tuple(chosen(view, pick, targets.get(frame)) for view, pick, it, frame in rows if not it),
+        tuple(
+            chosen(view, pick, targets.get(frame)) for view, pick, value, frame in rows if not value
+        ),
         tuple(
             Rejection(view.view, "ambiguous: two poses of the target fit image and motion alike")
-            for view, _, it, _ in rows
-            if it
+            for view, _, value, _ in rows
+            if value
         ),
     )
 
@@ -89,10 +95,10 @@ def init_frames(
 def _distances(problem: Problem, candidates: Candidates, tied: Tied) -> FloatArray:
     """(n, k) how far the views' candidates are from what the start predicts [m]."""
     # Of views of frames that are not tied, they say nothing.
-    frames = {it: tied.edges.get(it, np.eye(4)) for it in problem.unknown}
+    frames = {name: tied.edges.get(name, np.eye(4)) for name in problem.unknown}
     away = candidates.distances(problem.predicted(problem.start(frames)))
     for group in problem.groups:
-        rows, robots = group.rows, [it for it in group.path if it.robot]
+        rows, robots = group.rows, [step for step in group.path if step.robot]
         if not candidates.valid[rows, 1:].any():
             continue
         if len(robots) == 1 and max(FEWEST, len(away) / 2) <= len(rows):
@@ -135,4 +141,4 @@ def _numbered_as_first(
 
 
 def _measured(problem: Problem) -> set[str]:
-    return {it for prior in problem.priors for it in (prior.first, prior.second)}
+    return {name for prior in problem.priors for name in (prior.first, prior.second)}

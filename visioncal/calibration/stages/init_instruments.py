@@ -32,11 +32,11 @@ def mounted_points(growth: Growth) -> Iterator[Relation]:
             groups.setdefault((pair.seer, pair.robots[0].frame), []).append(pair)
     for (seer, flange), pairs in groups.items():
         robot = growth.tree.branches[flange].robot
-        rows = np.concatenate([it.rows for it in pairs])
+        rows = np.concatenate([pair.rows for pair in pairs])
         stops = growth.sighted.stops[rows]
         if len(np.unique(stops)) < _FEWEST_STOPS:
             continue
-        points = np.repeat(np.arange(len(pairs)), [len(it.rows) for it in pairs])
+        points = np.repeat(np.arange(len(pairs)), [len(pair.rows) for pair in pairs])
         places = Places(
             growth.poses[robot][stops],
             growth.sighted.candidates.poses[rows, 0, :3, 3],
@@ -60,7 +60,7 @@ def placed_by_points(
     open_seers: dict[str, list[tuple[FloatArray, FloatArray]]] = {}
     for pair in growth.pointed:
         inner = factors_of(growth, pair, pair.rows)[1:-1]
-        if not all(it.frame in placed for it in inner if it.frame):
+        if not all(factor.frame in placed for factor in inner if factor.frame):
             continue
         read = growth.sighted.candidates.poses[pair.rows, 0, :3, 3]
         body = product_of(inner, placed)
@@ -71,6 +71,6 @@ def placed_by_points(
             there = apply(body, np.broadcast_to(placed[pair.seen][:3, 3], (len(read), 1, 3)))
             open_seers.setdefault(pair.seer, []).append((there[:, 0], read))
     for seer, parts in open_seers.items():
-        there, read = (np.concatenate(it) for it in zip(*parts, strict=True))
+        there, read = (np.concatenate(pair) for pair in zip(*parts, strict=True))
         if len(read) >= _FEWEST_POINTS and spreads(there)[0][1] > _SPREAD_M:
             yield seer, align(there, read)[None], _ROUGH_M

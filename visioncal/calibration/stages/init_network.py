@@ -76,7 +76,7 @@ def init_network(
         for name in tree.unknown
         if name in placed and tree.branches[name].parent in placed
     }
-    return Tied(edges, tuple(it for it in tree.unknown if it not in edges), ambiguous)
+    return Tied(edges, tuple(name for name in tree.unknown if name not in edges), ambiguous)
 
 
 def _pairs(tree: Tree, sighted: Sighted) -> tuple[Pair, ...]:
@@ -114,9 +114,9 @@ def _solved(
 
 def _loose(growth: Growth) -> Iterator[Relation]:
     """What the pair with the most views says, however little that is."""
-    pairs = [it for it in growth.oriented if len(it.robots) == 1 and len(it.rows) >= FEWEST]
+    pairs = [pair for pair in growth.oriented if len(pair.robots) == 1 and len(pair.rows) >= FEWEST]
     if pairs:
-        pair = max(pairs, key=lambda it: len(it.rows))
+        pair = max(pairs, key=lambda value: len(value.rows))
         found = trimmed(*_parted(growth.poses, growth.sighted, pair, pair.rows))[1]
         yield from _both(growth.tree, growth.sighted, pair, (found.x, found.z), (np.inf, np.inf))
 

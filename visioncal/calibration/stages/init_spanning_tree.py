@@ -61,23 +61,23 @@ def spanning_tree(growth: Growth) -> tuple[dict[str, FloatArray], tuple[str, ...
     for chosen in _choices(first.counts):
         grown = _grown(growth, chosen)
         found.append((_score(growth, grown.placed), chosen, grown))
-    found.sort(key=lambda it: it[0])
+    found.sort(key=lambda pair: pair[0])
     score, chosen, best = found[0]
-    rivals = [it for value, it, _ in found[1:] if value < CLEAR_RATIO * score]
+    rivals = [pair for value, pair, _ in found[1:] if value < CLEAR_RATIO * score]
     ambiguous = {
         name
         for rival in rivals
         for name, mine, other in zip(best.by_turn, chosen, rival, strict=False)
         if mine != other
     }
-    return best.placed, tuple(it for it in best.placed if it in ambiguous)
+    return best.placed, tuple(name for name in best.placed if name in ambiguous)
 
 
 def _choices(counts: Sequence[int]) -> Iterator[tuple[int, ...]]:
     tried = list(counts)
     while np.prod(tried, dtype=float) > _MOST_TRIED:
         tried[tried.index(max(tried))] = 1
-    yield from product(*(range(it) for it in tried))
+    yield from product(*(range(index) for index in tried))
 
 
 def _grown(growth: Growth, chosen: Sequence[int]) -> _Grown:
@@ -93,7 +93,7 @@ def _grown(growth: Growth, chosen: Sequence[int]) -> _Grown:
         or [*_parted(growth, placed)]
     ):
         # What a turned board places comes last: others may come by a way that is certain.
-        name, matrices, _ = min(options, key=lambda it: (len(it[1]), it[2]))
+        name, matrices, _ = min(options, key=lambda pair: (len(pair[1]), pair[2]))
         at = 0
         if len(matrices) > 1:
             at = chosen[len(by_turn)] if len(by_turn) < len(chosen) else 0
@@ -107,11 +107,19 @@ def _related(
     growth: Growth, placed: Mapping[str, FloatArray]
 ) -> Iterator[tuple[str, FloatArray, float]]:
     """Frames that a relation places: each with (t, 4, 4) where it may be, and how well [m]."""
-    for it in growth.relations:
-        if it.first in placed and it.second not in placed:
-            yield it.second, (placed[it.first] @ it.matrix)[None], it.sigma_m
-        elif it.second in placed and it.first not in placed:
-            yield it.first, placed[it.second] @ invert(it.matrix @ it.turns), it.sigma_m
+    for relation in growth.relations:
+        if relation.first in placed and relation.second not in placed:
+            yield (
+                relation.second,
+                (placed[relation.first] @ relation.matrix)[None],
+                relation.sigma_m,
+            )
+        elif relation.second in placed and relation.first not in placed:
+            yield (
+                relation.first,
+                placed[relation.second] @ invert(relation.matrix @ relation.turns),
+                relation.sigma_m,
+            )
 
 
 def _implied(
@@ -121,19 +129,19 @@ def _implied(
     for pair in growth.oriented:
         rows = growth.sighted.early(pair.rows)
         factors = factors_of(growth, pair, rows)
-        missing = [it for it in factors if it.frame and it.frame not in placed]
+        missing = [factor for factor in factors if factor.frame and factor.frame not in placed]
         if len(missing) != 1:
             continue
-        (it,) = missing
-        at = factors.index(it)
+        (factor,) = missing
+        at = factors.index(factor)
         before, after = (product_of(part, placed) for part in (factors[:at], factors[at + 1 :]))
         there = growth.sighted.candidates.take(rows).carried(invert(before), invert(after))
-        if it.is_inverse:
+        if factor.is_inverse:
             there = replace(there, poses=invert(there.poses))
         # A board's own frame may be either way round: that of its first view is taken.
-        ways = range(1 if it.frame == pair.seen else len(growth.sighted.turns_of(pair.seen)))
+        ways = range(1 if factor.frame == pair.seen else len(growth.sighted.turns_of(pair.seen)))
         found = [common_transform(there, way) for way in ways]
-        yield it.frame, np.array([matrix for matrix, *_ in found]), found[0][2]
+        yield factor.frame, np.array([matrix for matrix, *_ in found]), found[0][2]
 
 
 def _parted(
@@ -145,12 +153,14 @@ def _parted(
     for pair in growth.oriented:
         rows = growth.sighted.early(pair.rows)
         factors = factors_of(growth, pair, rows)
-        open_ones = [at for at, it in enumerate(factors) if it.frame and it.frame not in placed]
+        open_ones = [
+            at for at, factor in enumerate(factors) if factor.frame and factor.frame not in placed
+        ]
         if len(rows) < FEWEST or len(open_ones) not in (2, 3):
             continue
         # What no robot separates cannot be distinguished.
         inner = [factors[begin + 1 : end] for begin, end in pairwise(open_ones)]
-        if not all(any(not it.frame for it in part) for part in inner):
+        if not all(any(not factor.frame for factor in part) for part in inner):
             continue
         parts = [
             product_of(factors[begin + 1 : end], placed)
@@ -178,7 +188,7 @@ def _score(growth: Growth, placed: Mapping[str, FloatArray]) -> float:
     for pair in growth.oriented:
         rows = growth.sighted.early(pair.rows)
         factors = factors_of(growth, pair, rows)
-        if all(it.frame in placed for it in factors if it.frame):
+        if all(factor.frame in placed for factor in factors if factor.frame):
             distances = growth.sighted.candidates.take(rows).distances(product_of(factors, placed))
             away.append(np.minimum(distances.min(axis=1), _FAR_M))
     return float(np.concatenate(away).mean()) if away else 0.0
@@ -196,9 +206,9 @@ def _between_arms(
     for turn in starts:
         middle, away = _alternated(first, second, seen, compose(turn, np.zeros(3)), _ROUNDS)
         found.append((away, middle))
-    found.sort(key=lambda it: it[0])
-    followed = [_alternated(first, second, seen, it, _LONG) for _, it in found[:_FOLLOWED]]
-    middle, away = min(followed, key=lambda it: it[1])
+    found.sort(key=lambda pair: pair[0])
+    followed = [_alternated(first, second, seen, array, _LONG) for _, array in found[:_FOLLOWED]]
+    middle, away = min(followed, key=lambda pair: pair[1])
     return (middle, away) if away < _NEAR_M else None
 
 

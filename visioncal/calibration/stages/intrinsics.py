@@ -219,7 +219,7 @@ def _warnings(stack: CornerStack, fit: BundleFit) -> Iterator[Finding]:
     sigma = np.sqrt(np.diag(fit.covariance))
     focal, centre = (sigma[:2] / fit.camera.matrix[:2]).max(), sigma[2:4].max()
     causes = list(_causes(fit)) if _is_flat(stack) else []
-    why = "".join(f" {it.words}" for it in causes)
+    why = "".join(f" {cause.words}" for cause in causes)
     step = causes[0].do if causes else Step("Add views, tilted and near the image's edges.")
     weak = [f"the focal length to {100 * focal:.1f} %"] * bool(focal > _FOCAL_LIMIT)
     weak += [f"the image centre to {centre:.1f} px"] * bool(centre > _CENTRE_LIMIT_PX)

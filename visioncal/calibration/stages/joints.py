@@ -129,9 +129,9 @@ def match_joints(rows: Sequence[View], robot: Robot) -> Matched:
     Returns:
         The angles that belong to it, and what does not.
     """
-    joints = {it.number: q for it in rows if (q := it.joints_rad) is not None}
-    poses = reported_matrices([it for it in rows if it.number in joints])
-    counts = {len(it) for it in joints.values()} - {robot.joint_count}
+    joints = {row.number: q for row in rows if (q := row.joints_rad) is not None}
+    poses = reported_matrices([row for row in rows if row.number in joints])
+    counts = {len(joint) for joint in joints.values()} - {robot.joint_count}
     if counts:
         words = (
             f"Joint angles were not used: there are {min(counts)} a row, and {robot.name} has "
@@ -200,10 +200,10 @@ def _constants(model: FloatArray, poses: FloatArray, guess: JointGuess | None) -
     # Rows of one stop give the same.
     first = np.unique(flange_from_reported, axis=0, return_index=True)[1]
     around = [
-        distances(of_poses, model, lever, (np.eye(4), invert(flange_from_reported[it])))
-        for it in np.sort(first)
+        distances(of_poses, model, lever, (np.eye(4), invert(flange_from_reported[index])))
+        for index in np.sort(first)
     ]
-    same = _Constants(min(around, key=lambda it: float(np.median(it.away))))
+    same = _Constants(min(around, key=lambda value: float(np.median(value.away))))
     if guess is None:
         return same
     other = _Constants(guess.best.fit)
@@ -249,12 +249,13 @@ def _rows_out(
     if rest:
         shift, angle = found.fit.shift[rest].max(), found.fit.angle[rest].max()
         words = (
-            f"Pose and joint angles disagree in {', '.join(f'view {views[it]}' for it in rest)}, "
+            f"Pose and joint angles disagree in "
+            f"{', '.join(f'view {views[index]}' for index in rest)}, "
             f"by up to {figure(1e3 * shift)} mm and {_deg(angle)} deg; in the other views they "
             "agree. The hand-eye result uses the poses."
         )
         step = Step("Correct what is wrong there in views.csv.")
-        named = tuple(views[it] for it in rest)
+        named = tuple(views[index] for index in rest)
         warnings.append(Finding("contradicting_joints", words, step, named))
     return replace(matched, contradicting=reasons, warnings=tuple(warnings))
 
@@ -304,7 +305,7 @@ def _described(matched: Matched, found: _Constants) -> Matched:
     """Says of which frame the poses are, and how well the model predicts them."""
     robot, tool = matched.robot, matched.flange_from_reported
     warnings, notes = list(matched.warnings), list(matched.notes)
-    shift, angle = (it[~found.out].max() for it in (found.fit.shift, found.fit.angle))
+    shift, angle = (array[~found.out].max() for array in (found.fit.shift, found.fit.angle))
     if shift > _AGREE_M or angle > _AGREE_RAD:
         away = f"{figure(1e3 * shift)} mm and {_deg(angle)} deg"
         typical_m, typical_rad = found.typical

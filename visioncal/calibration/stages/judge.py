@@ -45,8 +45,8 @@ def judge(findings: Findings) -> Verdict:
     elif met.probability >= NeedLimits.probability[0]:
         enough = met.need.mm or 0.0
         # Where nothing was seen, later picks may be all the same.
-        hints = [replace(it, kind=NOTE) for it in doubts if it.kind == EMPTY_IMAGE]
-        doubts = [it for it in doubts if it.until_mm > enough]
+        hints = [replace(doubt, kind=NOTE) for doubt in doubts if doubt.kind == EMPTY_IMAGE]
+        doubts = [doubt for doubt in doubts if doubt.until_mm > enough]
         status = "check" if doubts else "good"
     else:
         status = "check" if met.probability >= NeedLimits.probability[1] else "bad"
@@ -68,16 +68,16 @@ def judge(findings: Findings) -> Verdict:
             Finding(NEED, _met_words(findings, met)),
         )
     said += [] if doubts else [_praise(findings, is_enough=status == "good")]
-    said += [*hints, *(it for it in findings.warnings if it.kind in NOT_USABLE)]
+    said += [*hints, *(warning for warning in findings.warnings if warning.kind in NOT_USABLE)]
     return Verdict(status, (*said, *remarks(findings.notes, NOTE)), good_for_mm)
 
 
 def _good_for_mm(picks: Sequence[Picks], doubts: Sequence[Finding]) -> float | None:
     """The least need that would be met by all pairs; None where none would, or none is known."""
-    least = max((it.until_mm for it in doubts), default=0.0)
+    least = max((doubt.until_mm for doubt in doubts), default=0.0)
     if not picks or np.isinf(least):
         return None
-    return max(least, *(it.good_for_mm for it in picks))
+    return max(least, *(pick.good_for_mm for pick in picks))
 
 
 def _good_for(
@@ -86,7 +86,7 @@ def _good_for(
     if good_for_mm is None:
         return ()
     verb = "would be" if status == "bad" else "is"
-    worst = max(findings.picks, key=lambda it: it.good_for_mm)
+    worst = max(findings.picks, key=lambda pick: pick.good_for_mm)
     sensor = "instrument" if worst.camera.startswith("instrument") else "camera"
     words = (
         f"It {verb} good for tasks of {figure(good_for_mm)} mm and more at "
@@ -97,7 +97,7 @@ def _good_for(
 
 def _met_words(findings: Findings, met: NeedMet) -> str:
     """How likely picks land within what is needed."""
-    need, worst = met.need, min(findings.picks, key=lambda it: it.probability(met.need))
+    need, worst = met.need, min(findings.picks, key=lambda pick: pick.probability(met.need))
     within = [f"{value:g} {unit}" for value, unit in ((need.mm, "mm"), (need.deg, "deg")) if value]
     where = "where the views looked" if need.at == "views" else f"at {list(need.at)} m in the base"
     who = f" by robot {worst.robot} of what {worst.camera} sees" if len(findings.picks) > 1 else ""
@@ -112,7 +112,7 @@ def _praise(findings: Findings, *, is_enough: bool) -> Finding:
         "Use the result with its covariance, and keep it: visioncal verify and visioncal diff "
         "compare later stops with it."
     )
-    used = sum(view.used for it in findings.pairs for view in it.views)
+    used = sum(view.used for pair in findings.pairs for view in pair.views)
     worst = findings.worst[0]
     return Finding(
         AGREEMENT,

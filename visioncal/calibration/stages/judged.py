@@ -137,17 +137,20 @@ class Findings:
     @property
     def plannable(self) -> bool:
         """Whether views can be proposed: of cameras, by arms whose models are known."""
-        has_images = any(it.pixel_px is not None for it in self.sensors)
-        return has_images and all(it.modelled for it in self.arms)
+        has_images = any(sensor.pixel_px is not None for sensor in self.sensors)
+        return has_images and all(arm.modelled for arm in self.arms)
 
     @property
     def of_camera(self) -> str:
         """The option that names, of several cameras that a robot looks with, the least known."""
-        cameras = dict.fromkeys(it.camera for it in self.picks)
-        if len({it.name for it in self.sensors}) < 2 or not cameras:
+        cameras = dict.fromkeys(pick.camera for pick in self.picks)
+        if len({sensor.name for sensor in self.sensors}) < 2 or not cameras:
             return ""
         weak_m = {
-            camera: max((it.sigma for it in self.worst if _is_offset_of(it, camera)), default=0.0)
+            camera: max(
+                (direction.sigma for direction in self.worst if _is_offset_of(direction, camera)),
+                default=0.0,
+            )
             for camera in cameras
         }
         return f" --camera {thing_name(max(cameras, key=weak_m.__getitem__), 'camera')}"
@@ -155,29 +158,31 @@ class Findings:
     @property
     def rms(self) -> Rms:
         """Residuals of all used views."""
-        return self._pooled(lambda it: it.rms)
+        return self._pooled(lambda pair: pair.rms)
 
     @property
     def held_out(self) -> Rms:
         """Residuals of all of them, left out in turn."""
-        return self._pooled(lambda it: it.held_out)
+        return self._pooled(lambda pair: pair.held_out)
 
     def _pooled(self, of: Callable[[Pair], Rms]) -> Rms:
         if len(self.pairs) == 1:
             return of(self.pairs[0])
-        counts = np.array([sum(view.used for view in it.views) for it in self.pairs])
+        counts = np.array([sum(view.used for view in pair.views) for pair in self.pairs])
 
         def pooled(values: Sequence[float | None]) -> float | None:
             known = [
-                (it, count) for it, count in zip(values, counts, strict=True) if it is not None
+                (value, count)
+                for value, count in zip(values, counts, strict=True)
+                if value is not None
             ]
             if not any(count for _, count in known):
                 return None
             squares, weights = np.array(known).T
             return float(np.sqrt(np.average(squares**2, weights=weights)))
 
-        each = [of(it) for it in self.pairs]
-        return Rms(pooled([it.mm for it in each]) or 0.0, pooled([it.deg for it in each]))
+        each = [of(pair) for pair in self.pairs]
+        return Rms(pooled([item.mm for item in each]) or 0.0, pooled([item.deg for item in each]))
 
 
 def _is_offset_of(direction: Direction, frame: str) -> bool:

@@ -113,7 +113,7 @@ def _document(searched: Searched) -> dict[str, Any]:
 
 
 def _searched(entry: Any, view: int) -> Searched:  # noqa: ANN401 - as it was read
-    width, height = (int(it) for it in entry["size"])
+    width, height = (int(value) for value in entry["size"])
     if "reason" in entry:
         return Searched(
             Rejection(view, str(entry["reason"])), bool(entry["misfit"]), (width, height)

@@ -81,8 +81,8 @@ class Kinematics:
     def left_out(self) -> tuple[UnseenView, ...]:
         """How far stops that are left out in turn are off by both arms, by view."""
         before, after = (
-            np.linalg.norm(it.left_out.reshape(-1, 2, 3), axis=2)
-            for it in (self.nominal, self.fits[self.level])
+            np.linalg.norm(level_fit.left_out.reshape(-1, 2, 3), axis=2)
+            for level_fit in (self.nominal, self.fits[self.level])
         )
         return unseen_views(self.views, before, after, self.nominal.has_rotation)
 
@@ -149,7 +149,9 @@ def choose_level(
             fits = _with_lost_zero(fits, problem, stated, nominal, bases)
     found = {name: fit for name, fit in fits.items() if fit is not None}
     least = (NOMINAL,) if stated is None else (NOMINAL, "offsets")
-    best = _best({name: it for name, it in found.items() if name in (*least, *ASKED[asked])})
+    best = _best(
+        {name: level_fit for name, level_fit in found.items() if name in (*least, *ASKED[asked])}
+    )
     with one_blas_thread():
         found[best] = resized(arm, found[best])
     return Kinematics(best, found, asked not in _ALL)
@@ -181,9 +183,9 @@ def with_functions(
     names = [*dict.fromkeys(["links", "eccentricity", *found.errors])]
     names += [COMPLIANCE if model.functions is None else WEIGHT]
     bases = {
-        it: np.tensordot(placed, model.columns(it, q, loads), axes=1)
-        for it in dict.fromkeys(names)
-        if it != "offsets"
+        name: np.tensordot(placed, model.columns(name, q, loads), axes=1)
+        for name in dict.fromkeys(names)
+        if name != "offsets"
     }
     harmonics = model.robot.harmonic_jacobian(q, most_orders()).reshape(len(q), -1)
     harmonics = (placed @ harmonics).reshape(len(placed), 6, count, -1, 2)
@@ -236,7 +238,7 @@ def _best(fits: Mapping[str, LevelFit]) -> str:
     # levels with as many sizes, such as offsets or links, neither is the simpler one: to prefer
     # offsets would leave links that are off by as little out of the covariance.
     best, *others = fits
-    off_mm = {name: _rms(it.left_out, it.has_rotation).mm for name, it in fits.items()}
+    off_mm = {name: _rms(fit.left_out, fit.has_rotation).mm for name, fit in fits.items()}
     nominal_mm = off_mm[best]
     for name in others:
         more_sizes = len(fits[name].errors) > len(fits[best].errors)
@@ -248,7 +250,7 @@ def _best(fits: Mapping[str, LevelFit]) -> str:
 
 def _level(name: str, fit: LevelFit) -> ArmLevel:
     """Writes a fit as figures."""
-    inside, left_out = (_rms(it, fit.has_rotation) for it in (fit.inside, fit.left_out))
+    inside, left_out = (_rms(array, fit.has_rotation) for array in (fit.inside, fit.left_out))
     return ArmLevel(
         level=name,
         unknowns=fit.size,
@@ -261,7 +263,9 @@ def _level(name: str, fit: LevelFit) -> ArmLevel:
 
 
 def _rms(residuals: FloatArray, turned: Mask) -> Rms:
-    turns, shifts = (np.sum(it**2, axis=1) for it in (residuals[turned, :3], residuals[:, 3:]))
+    turns, shifts = (
+        np.sum(array**2, axis=1) for array in (residuals[turned, :3], residuals[:, 3:])
+    )
     deg = float(np.rad2deg(np.sqrt(np.mean(turns)))) if turned.any() else None
     return Rms(mm=1e3 * float(np.sqrt(np.mean(shifts))), deg=deg)
 

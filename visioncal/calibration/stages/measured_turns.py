@@ -34,7 +34,7 @@ def measured_turns(
     turned = (flange_from_target[:, :3, :3] @ off[:, :3, None])[..., 0]
     moved = cross(turned, flange_from_target[:, :3, 3])
     rad, would_m, is_m = (
-        float(np.median(np.linalg.norm(it, axis=1))) for it in (turned, moved, off[:, 3:])
+        float(np.median(np.linalg.norm(array, axis=1))) for array in (turned, moved, off[:, 3:])
     )
     deg = float(np.rad2deg(rad))
     if deg < CalibrationLimits.scatter_deg[0] or would_m < _BEYOND_ARM * is_m:

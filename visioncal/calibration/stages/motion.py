@@ -68,11 +68,11 @@ def stream_of(session: Session, robot: str) -> str:
     It is the one of the robot's name; of an only robot also `robot`, or the only one with poses or
     joints.
     """
-    moving = [name for name, it in session.streams.items() if it.has_robot_state]
+    moving = [name for name, stream in session.streams.items() if stream.has_robot_state]
     names = [robot or ROBOT_STREAM]
     if len(session.robots) < 2:
         names += [ROBOT_STREAM, *(moving if len(moving) == 1 else ())]
-    return next((it for it in names if it in moving), "")
+    return next((name for name in names if name in moving), "")
 
 
 def motion_of(session: Session, robot: Robot | None, name: str) -> Motion:

@@ -75,7 +75,7 @@ class Picks:
 
     def without(self, source: str) -> "Picks":
         """Picks that do not err by one of the sources."""
-        parts = {name: it for name, it in self.parts.items() if name != source}
+        parts = {name: part for name, part in self.parts.items() if name != source}
         return replace(self, parts=parts or {"none": np.zeros_like(self.parts[source])})
 
     @cached_property
@@ -92,18 +92,20 @@ class Picks:
     @property
     def budget_mm(self) -> dict[str, float]:
         """Standard deviation of the place by source, and as a `total` [mm]."""
-        return {name: 1e3 * it for name, it in self._budget(slice(3, 6)).items()}
+        return {name: 1e3 * value for name, value in self._budget(slice(3, 6)).items()}
 
     @property
     def budget_deg(self) -> dict[str, float]:
         """Standard deviation of the direction by source, and as a `total` [deg]."""
-        return {name: float(np.rad2deg(it)) for name, it in self._budget(slice(3)).items()}
+        return {name: float(np.rad2deg(value)) for name, value in self._budget(slice(3)).items()}
 
     def _budget(self, of: slice) -> dict[str, float]:
         every = {**self.parts, "total": self.spreads}
-        squares = {name: np.trace(it[:, of, of], axis1=1, axis2=2) for name, it in every.items()}
+        squares = {
+            name: np.trace(array[:, of, of], axis1=1, axis2=2) for name, array in every.items()
+        }
         # Of two sources that make up for each other, one may be under zero.
-        return {name: float(max(it.mean(), 0.0) ** 0.5) for name, it in squares.items()}
+        return {name: float(max(square.mean(), 0.0) ** 0.5) for name, square in squares.items()}
 
     def stays_within(self, need: Need | None) -> str:
         """Within what 95 % of picks land, in the units of a need."""
@@ -124,9 +126,10 @@ def need_met(need: Need | None, picks: Sequence[Picks], *, whole: bool = False) 
     if need is None or not picks:
         return None
     pairs = [
-        Picker(thing_name(it.camera, "camera"), it.robot, it.probability(need)) for it in picks
+        Picker(thing_name(pick.camera, "camera"), pick.robot, pick.probability(need))
+        for pick in picks
     ]
-    return NeedMet(need, min(it.probability for it in pairs), tuple(pairs) if whole else ())
+    return NeedMet(need, min(pair.probability for pair in pairs), tuple(pairs) if whole else ())
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,9 +201,9 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
     seen, base, arm = problem.observations, problem.tree.bases[robot], fitted.arms.get(robot)
     in_base = _in_base(problem, state, base)
     middles = np.array(
-        [fitted.middles.get(it.partition("@")[0], np.zeros(3)) for it in seen.observed]
+        [fitted.middles.get(name.partition("@")[0], np.zeros(3)) for name in seen.observed]
     )
-    carries = np.array([_is_between(problem, it, base, robot) for it in seen.observers])
+    carries = np.array([_is_between(problem, observer, base, robot) for observer in seen.observers])
     calibrated = arm is not None and arm.model is not None
     errors = None if arm is None or calibrated else arm.errors
     unfitted = None if errors is None or errors.is_estimated else errors
@@ -221,7 +224,7 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
         covariance = covariance - fitted.inflation * off @ off.T
         by_posture, in_time = _left_by_arm(fitted, robot, unfitted, off)
         if not whole:
-            by_posture, in_time = (turned @ it @ turned.mT for it in (by_posture, in_time))
+            by_posture, in_time = (turned @ array @ turned.mT for array in (by_posture, in_time))
         parts["arm"] = by_posture + in_time
         if unfitted.white is not None:
             white, levels = unfitted.white, noise.robots.copy()
@@ -240,7 +243,7 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
     else:
         look = looking.total_covariance(linear, noise) - looking.covariance(noise)
     parts["look"] = look
-    placed = {name: _at_points(it, at_m) for name, it in parts.items()}
+    placed = {name: _at_points(part, at_m) for name, part in parts.items()}
     at_camera = problem.measured(state)
     in_camera = _carried(at_camera, middles)
     axes = np.swapaxes(at_camera[:, :3, :3], 1, 2)[:, :, 2]
@@ -260,7 +263,7 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
     return Picks(
         camera,
         robot,
-        {name: it for name, it in placed.items() if it.any()},
+        {name: array for name, array in placed.items() if array.any()},
         fitted.freedom.get(robot, np.inf),
         float(np.linalg.norm(in_camera, axis=1).mean()),
     )
@@ -286,7 +289,7 @@ def _of_flange(problem: Problem, robot: str, in_base: FloatArray, noise: FloatAr
 
 
 def _is_between(problem: Problem, observer: str, base: str, robot: str) -> bool:
-    return any(it.robot == robot for it in problem.tree.path(observer, base))
+    return any(step.robot == robot for step in problem.tree.path(observer, base))
 
 
 def _in_base(problem: Problem, state: State, base: str) -> FloatArray:
@@ -303,11 +306,11 @@ def _to_base(fitted: Fitted, base: str, in_base: FloatArray) -> Problem:
     # What a lens does to the measured poses of targets then moves the base instead.
     problem = fitted.problem
     carry, effects = adjoint(in_base), []
-    for it in problem.effects:
-        at = problem.effect_columns[it.name]
+    for effect in problem.effects:
+        at = problem.effect_columns[effect.name]
         of_thing = ~np.isin(np.arange(at.start, at.stop), fitted.of_boards)
-        seen = None if it.by_sensor is None else carry @ it.by_sensor * of_thing
-        effects.append(replace(it, by_sensor=seen))
+        seen = None if effect.by_sensor is None else carry @ effect.by_sensor * of_thing
+        effects.append(replace(effect, by_sensor=seen))
     return replace(
         problem,
         observations=replace(
@@ -328,14 +331,14 @@ def _of_things(fitted: Fitted) -> Problem:
     # board's shape then moves is its middle.
     problem, effects = fitted.problem, []
     still, frames = np.zeros((3, len(fitted.of_boards))), problem.observations.observed
-    moved = np.array([fitted.moved.get(it.partition("@")[0], still) for it in frames])
-    for it in problem.effects:
-        at, seen = problem.effect_columns[it.name], it.by_sensor
+    moved = np.array([fitted.moved.get(frame.partition("@")[0], still) for frame in frames])
+    for effect in problem.effects:
+        at, seen = problem.effect_columns[effect.name], effect.by_sensor
         of_boards = np.isin(np.arange(at.start, at.stop), fitted.of_boards)
         if seen is not None and of_boards.any():
             seen = seen.copy()
             seen[:, :3, of_boards], seen[:, 3:, of_boards] = 0.0, -moved
-        effects.append(replace(it, by_sensor=seen))
+        effects.append(replace(effect, by_sensor=seen))
     return replace(problem, effects=tuple(effects))
 
 

@@ -88,7 +88,9 @@ class Observed:
 
     def noting(self, rejections: Iterable[Rejection], warnings: Iterable[Finding] = ()) -> Self:
         """Adds rejected views, of which the first reason counts, and warnings."""
-        reasons = {it.view: it.reason for it in rejections} | dict(self.reasons)
+        reasons = {rejection.view: rejection.reason for rejection in rejections} | dict(
+            self.reasons
+        )
         return replace(self, reasons=reasons, warnings=(*self.warnings, *warnings))
 
     def with_camera(self, frame: str, look: CameraLook) -> Self:
@@ -102,23 +104,27 @@ class Observed:
     @cached_property
     def corners(self) -> Mapping[int, Corners]:
         """What was found in the images of all cameras, by view."""
-        return {view: it for look in self.cameras.values() for view, it in look.corners.items()}
+        return {
+            view: view_corners
+            for look in self.cameras.values()
+            for view, view_corners in look.corners.items()
+        }
 
     @cached_property
     def timed(self) -> Session:
         """The session with what robots' streams have at the times of rows that wait for them."""
         if not self.clocks:
             return self.session
-        found = {view.number: view for it in self.clocks.values() for view in it.views}
-        views = tuple(found.get(it.number, it) for it in self.session.views)
+        found = {view.number: view for clock in self.clocks.values() for view in clock.views}
+        views = tuple(found.get(view.number, view) for view in self.session.views)
         return replace(self.session, views=views)
 
     @cached_property
     def spared(self) -> Mapping[int, str]:
         """Why views of sweeps, and those that repeat others, are not needed, by view."""
-        of_sweeps = (it.spared for it in self.clocks.values())
-        of_cameras = (it.repeats for it in self.cameras.values())
-        return {view: why for it in (*of_sweeps, *of_cameras) for view, why in it.items()}
+        of_sweeps = (clock.spared for clock in self.clocks.values())
+        of_cameras = (camera.repeats for camera in self.cameras.values())
+        return {view: why for sweep in (*of_sweeps, *of_cameras) for view, why in sweep.items()}
 
     @property
     def lenses(self) -> Mapping[str, CameraResult]:
@@ -128,7 +134,7 @@ class Observed:
     @property
     def scenes(self) -> Mapping[str, Scene]:
         """What each camera whose corners have poses looks at, and with what, by its frame."""
-        boards, tables = self.session.boards, {it: at.table for it, at in self.cameras.items()}
+        boards, tables = self.session.boards, {name: at.table for name, at in self.cameras.items()}
         return {
             frame: Scene(
                 tuple(boards.values()),
@@ -167,19 +173,19 @@ class Observed:
     @property
     def pixel_px(self) -> float | None:
         """Noise of a coordinate of the only camera's corners [px]."""
-        return next((it.pixel_px for it in self.cameras.values()), None)
+        return next((camera.pixel_px for camera in self.cameras.values()), None)
 
     def with_noise(self, pixel_px: float) -> Self:
         """Takes over the noise of the corners."""
-        cameras = {it: replace(look, pixel_px=pixel_px) for it, look in self.cameras.items()}
+        cameras = {name: replace(look, pixel_px=pixel_px) for name, look in self.cameras.items()}
         return replace(self, cameras=cameras)
 
     @property
     def poses_of_one_board(self) -> Mapping[int, ViewPoses]:
         """The poses of the board that most views show: those of different ones do not compare."""
-        shown = [it.board for it in self.poses.values()]
+        shown = [pose.board for pose in self.poses.values()]
         most = max(sorted(set(shown)), key=shown.count, default=0)
-        return {view: it for view, it in self.poses.items() if it.board == most}
+        return {view: pose for view, pose in self.poses.items() if pose.board == most}
 
     @cached_property
     def held_back(self) -> frozenset[int]:
@@ -200,8 +206,8 @@ def by_reason(reasons: Mapping[int, str]) -> tuple[str, ...]:
         views[reason].append(view)
     grouped = sorted(views.items(), key=lambda item: -len(item[1]))
     return tuple(
-        f"view{'s' if len(it) > 1 else ''} {some_of([*map(str, it)], _LISTED)}: {reason}"
-        for reason, it in grouped
+        f"view{'s' if len(group) > 1 else ''} {some_of([*map(str, group)], _LISTED)}: {reason}"
+        for reason, group in grouped
     )
 
 
@@ -223,14 +229,14 @@ def nothing_seen(seen: Observed) -> DataError:
             f"session {seen.session.name!r}: there are neither images nor measured poses.",
             next_step="Give the views images, rows in corners.csv, or cft_ or meas_ columns.",
         )
-    few = [it for it in seen.lost_views if "too few corners" in it]
+    few = [view for view in seen.lost_views if "too few corners" in view]
     if few:
         return DataError(
             f"session {seen.session.name!r}: no view shows enough of the target.",
             next_step="Bring more of the board into the images; one of 4 x 4 squares or more has "
             "corners enough.",
         )
-    outside = [it for it in seen.lost_views if "lies far outside the image" in it]
+    outside = [view for view in seen.lost_views if "lies far outside the image" in view]
     if 2 * len(outside) > len(seen.lost_views):
         return DataError(
             f"session {seen.session.name!r}: the corners lie outside the image: resolution in "
@@ -248,6 +254,6 @@ def nothing_seen(seen: Observed) -> DataError:
 
 def _named_by(seen: Observed) -> str:
     """The command that names the board in an image, where images are files."""
-    image = next((it.image for it in seen.session.views if it.image), "")
+    image = next((view.image for view in seen.session.views if view.image), "")
     has_files = image and isinstance(seen.session.images, FolderImages)
     return f" Run: visioncal target check SESSION/{shlex.quote(image)}" if has_files else ""

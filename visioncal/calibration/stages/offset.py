@@ -84,7 +84,7 @@ class Clock:
             stated_s=self.stated_s,
             frames=self.frames or None,
             correlation=self.correlation,
-            **{name: it for delay in self.delays for name, it in delay.result().items()},
+            **{name: value for delay in self.delays for name, value in delay.result().items()},
         )
 
 
@@ -123,7 +123,7 @@ def change_doubt(change: ClockChange, views: Sequence[View]) -> Finding:
             f"{figure(1e6 * change.sigma_s)})"
         )
     else:
-        later = [it.number for it in views if (it.stamp_s or 0.0) >= change.from_s]
+        later = [view.number for view in views if (view.stamp_s or 0.0) >= change.from_s]
         how = (
             f"jumps against the robot's: from view {(*later, 0)[0]} on it is "
             f"{1e3 * change.step_s:+.1f} ms (sigma {figure(1e3 * change.sigma_s)} ms) farther "
@@ -158,7 +158,7 @@ def stated_doubts(clock: Clock, views: Sequence[View]) -> Iterator[Finding]:
 
 def why_undetermined(fits: Sequence[ClockFit], matches: Sequence[Match]) -> str:
     """Says why the motion does not determine the offset."""
-    best = max(matches, key=lambda it: it.correlation, default=None)
+    best = max(matches, key=lambda match: match.correlation, default=None)
     if best is None:
         return "camera and robot are not seen to turn together for long enough"
     if best.correlation < LEAST_CORRELATION:
@@ -179,7 +179,7 @@ def why_undetermined(fits: Sequence[ClockFit], matches: Sequence[Match]) -> str:
             f"the motion determines the offset to {figure(1e3 * fits[0].sigma_s)} ms only "
             f"({1e3 * LARGEST_SIGMA_S:g} ms are needed)"
         )
-    several = " and ".join(f"{1e3 * it.offset_s:+.0f}" for it in fits)
+    several = " and ".join(f"{1e3 * fit.offset_s:+.0f}" for fit in fits)
     return f"the motion repeats itself: offsets of {several} ms explain it alike"
 
 
@@ -196,14 +196,14 @@ def shared_times(views: Sequence[View], poses: Mapping[int, ViewPoses]) -> DataE
     same: dict[tuple[float | None, int], list[View]] = {}
     for view in views:
         same.setdefault((view.stamp_s, poses[view.number].board), []).append(view)
-    shared = [it for it in same.values() if _elsewhere(it, poses)]
+    shared = [group for group in same.values() if _elsewhere(group, poses)]
     if 2 * sum(map(len, shared)) <= len(views):
         return None
     largest = max(shared, key=len)
     return DataError(
         f"{sum(map(len, shared))} of {len(views)} views have the same stamp_s as others that show "
         f"the target elsewhere: it is {largest[0].stamp_s:.6f} s in views "
-        f"{some_of([str(it.number) for it in largest])}.",
+        f"{some_of([str(view.number) for view in largest])}.",
         culprits=["views.csv: stamp_s"],
         next_step="Write the time at which each image was taken into stamp_s, in seconds with all "
         "the digits that the camera gives.",
@@ -212,17 +212,17 @@ def shared_times(views: Sequence[View], poses: Mapping[int, ViewPoses]) -> DataE
 
 def _elsewhere(views: Sequence[View], poses: Mapping[int, ViewPoses]) -> bool:
     """Whether views show the target in several places."""
-    first_m, *others = (poses[it.number].cam_from_target[:, :3, 3] for it in views)
+    first_m, *others = (poses[view.number].cam_from_target[:, :3, 3] for view in views)
     at_m = first_m[0]
     # A board that looks the same upside down may be taken for either.
-    away_m = [np.linalg.norm(it - at_m, axis=1).min() for it in others]
+    away_m = [np.linalg.norm(other - at_m, axis=1).min() for other in others]
     return max(away_m, default=0.0) > _ELSEWHERE * float(np.linalg.norm(at_m))
 
 
 def not_ascending(views: Sequence[View]) -> str:
     """Says so where the times do not go along with the views' numbers; empty where they do."""
-    ordered = sorted(views, key=lambda it: it.number)
-    stamps_s = np.array([it.stamp_s for it in ordered], dtype=float)
+    ordered = sorted(views, key=lambda view: view.number)
+    stamps_s = np.array([view.stamp_s for view in ordered], dtype=float)
     falls = np.flatnonzero(np.diff(stamps_s) < 0.0)
     if len(falls) <= _SHUFFLED * max(len(ordered) - 1, 0):
         return ""

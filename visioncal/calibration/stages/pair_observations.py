@@ -83,7 +83,7 @@ class Pair:
     @property
     def robots(self) -> tuple[Step, ...]:
         """The robots in the way."""
-        return tuple(it for it in self.way if it.robot)
+        return tuple(step for step in self.way if step.robot)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,12 +107,12 @@ class Growth:
     @property
     def oriented(self) -> tuple[Pair, ...]:
         """The pairs of which rotations were measured, too."""
-        return tuple(it for it in self.pairs if not self.sighted.places[it.rows[0]])
+        return tuple(pair for pair in self.pairs if not self.sighted.places[pair.rows[0]])
 
     @property
     def pointed(self) -> tuple[Pair, ...]:
         """The pairs of which places alone were read."""
-        return tuple(it for it in self.pairs if self.sighted.places[it.rows[0]])
+        return tuple(pair for pair in self.pairs if self.sighted.places[pair.rows[0]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +140,7 @@ def factors_of(growth: Growth, pair: Pair, rows: IntArray) -> list[Factor]:
 def product_of(factors: Sequence[Factor], placed: Mapping[str, FloatArray]) -> FloatArray:
     """Their product (m, 4, 4) with the frames where they are placed; (1, 4, 4) of no robot."""
     product = np.eye(4)[None]
-    for it in factors:
-        matrix = it.robot @ placed[it.frame] if it.frame else it.robot
-        product = product @ (invert(matrix) if it.is_inverse else matrix)
+    for factor in factors:
+        matrix = factor.robot @ placed[factor.frame] if factor.frame else factor.robot
+        product = product @ (invert(matrix) if factor.is_inverse else matrix)
     return product

@@ -52,13 +52,13 @@ class Candidates:
     @staticmethod
     def of(views: Sequence[ViewPoses]) -> "Candidates":
         """Puts those of views into one array."""
-        most = max(len(it.cam_from_target) for it in views)
-        every = [np.minimum(np.arange(most), len(it.cam_from_target) - 1) for it in views]
+        most = max(len(view.cam_from_target) for view in views)
+        every = [np.minimum(np.arange(most), len(view.cam_from_target) - 1) for view in views]
         pairs = list(zip(views, every, strict=True))
         return Candidates(
-            np.array([it.cam_from_target[rows] for it, rows in pairs]),
-            np.array([np.array(it.turns)[rows] for it, rows in pairs]),
-            np.array([np.arange(most) < len(it.cam_from_target) for it in views]),
+            np.array([view.cam_from_target[rows] for view, rows in pairs]),
+            np.array([np.array(view.turns)[rows] for view, rows in pairs]),
+            np.array([np.arange(most) < len(view.cam_from_target) for view in views]),
         )
 
     def take(self, rows: IntArray) -> "Candidates":
@@ -119,8 +119,8 @@ def trimmed(robot: FloatArray, candidates: Candidates) -> tuple[Mask, Parted]:
         return parted(robot, candidates, rows, at.picks[rows])
 
     return trimmed_start(
-        (parted(robot, candidates, *it) for it in _starts(candidates)),
-        lambda it: np.asarray(it.away.min(axis=1)),
+        (parted(robot, candidates, *start) for start in _starts(candidates)),
+        lambda item: np.asarray(item.away.min(axis=1)),
         solve,
         max(len(robot) // 2 + 1, FEWEST),
     )

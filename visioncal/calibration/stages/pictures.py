@@ -56,11 +56,11 @@ def unnamed_images(session: Session) -> Iterator[Finding]:
 
 
 def _missing(session: Session) -> Iterator[Finding]:
-    with_image = [it for it in session.views if it.image and not it.has_corners]
-    missing = [it for it in with_image if session.images.absence(it.image) == "is missing"]
+    with_image = [view for view in session.views if view.image and not view.has_corners]
+    missing = [view for view in with_image if session.images.absence(view.image) == "is missing"]
     if not missing:
         return
-    names = [it.image for it in missing]
+    names = [view.image for view in missing]
     are = "image is" if len(with_image) == 1 else "images are"
     words = f"{len(missing)} of {len(with_image)} {are} missing: {some_of(names, _LISTED)}"
     old, new = _renamed(session, names)
@@ -69,12 +69,12 @@ def _missing(session: Session) -> Iterator[Finding]:
         step = Step(f"In views.csv, replace {old} by {new}.")
     else:
         words = f"{words}."
-        rows = ", ".join(str(it.number) for it in missing)
+        rows = ", ".join(str(view.number) for view in missing)
         step = Step(
             f"Copy the image{'s' if len(names) > 1 else ''} there; or in views.csv, delete the "
             f"row{'s' if len(names) > 1 else ''} of view {rows}."
         )
-    views = tuple(it.number for it in missing)
+    views = tuple(view.number for view in missing)
     yield Finding(MISSING, words, step, views, until_mm=0.0)
 
 
@@ -84,14 +84,14 @@ def _renamed(session: Session, names: Sequence[str]) -> tuple[str, str]:
     if not isinstance(store, FolderImages):
         return "", ""
     first = Path(names[0])
-    pairs = [(first.suffix, it) for it in (*_ENDINGS, *(it.upper() for it in _ENDINGS))]
+    pairs = [(first.suffix, item) for item in (*_ENDINGS, *(ending.upper() for ending in _ENDINGS))]
     if first.parent != Path():
         folder = f"{first.parent.as_posix()}/"
-        others = sorted(f"{it.name}/" for it in store.folder.iterdir() if it.is_dir())
-        pairs += [(folder, it) for it in (*others, "")]
+        others = sorted(f"{path.name}/" for path in store.folder.iterdir() if path.is_dir())
+        pairs += [(folder, other) for other in (*others, "")]
     for old, new in pairs:
-        changed = [it.replace(old, new) for it in names]
-        if old != new and all(store.exists(it) for it in changed):
+        changed = [name.replace(old, new) for name in names]
+        if old != new and all(store.exists(name) for name in changed):
             return old, new
     return "", ""
 
@@ -123,10 +123,10 @@ def _unnamed(session: Session) -> list[str]:
     store = session.images
     if not isinstance(store, FolderImages):
         return []
-    named = {it.image for it in session.views if it.image}
-    folders = {Path(it).parent for it in named} - {Path()}
-    found = (file for it in folders for file in (store.folder / it).glob("*"))
-    paths = (it.relative_to(store.folder).as_posix() for it in found if it.suffix in _ENDINGS)
+    named = {view.image for view in session.views if view.image}
+    folders = {Path(name).parent for name in named} - {Path()}
+    found = (file for folder in folders for file in (store.folder / folder).glob("*"))
+    paths = (path.relative_to(store.folder).as_posix() for path in found if path.suffix in _ENDINGS)
     return sorted(set(paths) - named)
 
 
@@ -137,12 +137,12 @@ def unseen_cause(seen: Observed) -> Finding | None:
         It; None where the target is in most of the images, or nothing else is seen.
     """
     session = seen.session
-    with_image = [it for it in session.views if it.image and not it.has_corners]
+    with_image = [view for view in session.views if view.image and not view.has_corners]
     there = seen.poses.keys() | seen.corners.keys()
-    unseen = [it for it in with_image if it.number not in there]
+    unseen = [view for view in with_image if view.number not in there]
     if not with_image or 3 * len(unseen) < len(with_image):
         return None
-    missing = next((it for it in pairing(session) if it.kind == MISSING), None)
+    missing = next((finding for finding in pairing(session) if finding.kind == MISSING), None)
     if missing is not None and 2 * len(missing.views) > len(unseen):
         return missing
     return other_board(session, unseen)
@@ -167,7 +167,7 @@ def other_board(session: Session, unseen: Sequence[View]) -> Finding | None:
     declared = session.target
     if declared is None or session.targets:
         return None
-    there = [it for it in unseen if it.image and session.images.exists(it.image)]
+    there = [view for view in unseen if view.image and session.images.exists(view.image)]
     shown: tuple[View, Identity] | None = None
     hard: Finding | None = None
     for view in _some(there):
@@ -245,7 +245,7 @@ def _lacks_markers(image: Image, found: Identity, declared: Target) -> bool:
 
 def _is_larger(found: Identity, declared: Target) -> bool:
     """Whether a checkerboard has more squares along a side than a ChArUco board."""
-    seen, inner = (sorted((it.columns, it.rows)) for it in (found, declared))
+    seen, inner = (sorted((identity.columns, identity.rows)) for identity in (found, declared))
     return any(one > other - 1 for one, other in zip(seen, inner, strict=True))
 
 
@@ -256,13 +256,13 @@ def _is_better(found: Identity, before: Identity) -> bool:
 def _is(found: Identity, target: Target) -> bool:
     """Whether a board that was seen is a target, but for its size."""
     seen = found.target(target.name, target.square_m)
-    same = all(getattr(seen, it) == getattr(target, it) for it in _SEEN)
+    same = all(getattr(seen, name) == getattr(target, name) for name in _SEEN)
     return same and target.dictionary in ("", found.dictionary, *found.larger)
 
 
 def _another(view: View, found: Identity, declared: Target) -> Finding:
     shipped = (load_target(name) for name in target_names())
-    mine = [it.name for it in shipped if _is(found, it) and _as_large(it, declared)]
+    mine = [target.name for target in shipped if _is(found, target) and _as_large(target, declared)]
     if mine:
         step = Step(f'In session.toml, write target = "{mine[0]}".')
     else:
@@ -287,7 +287,7 @@ def _miscounted(found: Identity, declared: Target) -> str:
     """What was counted in the place of inner corners, in words; empty where that is not it."""
     if found.kind != "checkerboard" or declared.kind != "checkerboard":
         return ""
-    one, other = (sorted((it.columns, it.rows)) for it in (declared, found))
+    one, other = (sorted((target.columns, target.rows)) for target in (declared, found))
     more = {a - b for a, b in zip(one, other, strict=True)}
     if more == {1}:
         return " The squares were counted: columns and rows are of inner corners, one less each."
@@ -370,7 +370,7 @@ def _blurred(view: View, why: str, views: Sequence[View]) -> Finding:
         "blurred_images",
         f"No board can be read{of_all}: in view {view.number}, {why}.",
         Step("Focus the lens, expose for a shorter time with more light, and record again."),
-        tuple(it.number for it in views),
+        tuple(other.number for other in views),
     )
 
 

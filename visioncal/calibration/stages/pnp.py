@@ -156,13 +156,14 @@ def _with_rivals(
 ) -> tuple[ViewPoses, ...]:
     """Gives each view its candidates: the planar solutions that rival, in all of its turns."""
     best, other = _sorted(stack, fit, _mirrored(stack, camera, fit, mirrored))
-    mean_squares = [mean_square_by_view(stack, it.residuals) for it in (best, other)]
-    turns_of = [rotation_transforms(it) for it in targets]
-    turned_of = [adjoint(invert(it)) for it in turns_of]
+    mean_squares = [mean_square_by_view(stack, pose_fit.residuals) for pose_fit in (best, other)]
+    turns_of = [rotation_transforms(target) for target in targets]
+    turned_of = [adjoint(invert(turn)) for turn in turns_of]
     firsts = first_corners(targets)
     boards = np.searchsorted(firsts, stack.ids[stack.starts], side="right") - 1
     spreads = [
-        floored_sigma_px(sigma_px) ** 2 * covariance_from(it.information) for it in (best, other)
+        floored_sigma_px(sigma_px) ** 2 * covariance_from(pose_fit.information)
+        for pose_fit in (best, other)
     ]
     turned_by = np.abs(best.cam_from_target - other.cam_from_target)[:, :3, :3].max(axis=(1, 2))
     views = []
@@ -172,12 +173,14 @@ def _with_rivals(
             mean_squares[0][at], mean_squares[1][at], stack.counts[at], sigma_px
         )
         fits = (best, other) if rival else (best,)
-        covariance = [turned @ it[at] @ np.swapaxes(turned, 1, 2) for it in spreads[: len(fits)]]
+        covariance = [
+            turned @ spread[at] @ np.swapaxes(turned, 1, 2) for spread in spreads[: len(fits)]
+        ]
         views.append(
             ViewPoses(
                 view,
                 _surviving(stack, at),
-                np.concatenate([it.cam_from_target[at] @ turns for it in fits]),
+                np.concatenate([pose_fit.cam_from_target[at] @ turns for pose_fit in fits]),
                 tuple(range(len(turns))) * len(fits),
                 np.concatenate(covariance),
                 np.zeros((len(turns) * len(fits), 6, 0)),

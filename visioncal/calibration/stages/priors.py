@@ -27,7 +27,7 @@ _LOOSE_M = 1.0
 def _prior_of(name: str, table: PriorTable) -> FramePrior:
     """Reads `[prior.A_from_B]`: the components that it states, and the rotation where it does."""
     first, _, second = name.partition("_from_")
-    values = [getattr(table, it) for it in _COMPONENTS]
+    values = [getattr(table, component) for component in _COMPONENTS]
     axes = tuple(axis for axis, value in enumerate(values) if value is not None)
     places = tuple(float(values[axis]) for axis in axes)
     found = FramePrior(first, second, axes, places, table.sigma_m or 1.0)
@@ -100,14 +100,18 @@ def components(
         covariance: (p, p) covariance of the unknowns.
         priors: Priors, in the problem or left out of it.
     """
-    return tuple(it for prior in priors for it in _components(prior, problem, state, covariance))
+    return tuple(
+        component
+        for prior in priors
+        for component in _components(prior, problem, state, covariance)
+    )
 
 
 def _components(
     prior: FramePrior, problem: Problem, state: State, covariance: FloatArray
 ) -> Iterator[Component]:
     away, jacobian = problem.prior_rows(prior, state)
-    used = {(it.name, axis) for it in problem.priors for axis in it.axes}
+    used = {(frame_prior.name, axis) for frame_prior in problem.priors for axis in frame_prior.axes}
     sigmas = np.sqrt(np.einsum("dp,pq,dq->d", jacobian, covariance, jacobian)) * prior.sigma_m
     # Behind those of the rotation, which no word is said of.
     places = slice(len(away) - len(prior.axes), len(away))
@@ -151,14 +155,14 @@ def _prior(name: str, table: PriorTable, tree: Tree) -> FramePrior:
     label = f"session.toml: prior.{name}"
     for frame in (first, second):
         if frame not in tree.branches:
-            known = [it for it in tree.branches if it != frame]
+            known = [branch for branch in tree.branches if branch != frame]
             raise DataError(
                 f"{label}: {frame!r} is no frame of this cell; those are {', '.join(known)}.",
                 culprits=[label],
                 next_step=did_you_mean(frame, known)
                 or "Name a prior A_from_B, as [prior.flange_a_from_cam_left].",
             )
-    moved_by = [it.robot for it in tree.path(first, second) if it.robot]
+    moved_by = [step.robot for step in tree.path(first, second) if step.robot]
     if moved_by or first == second:
         why = f"robot {moved_by[0]} moves one before the other" if moved_by else "they are one"
         raise DataError(
@@ -171,7 +175,7 @@ def _prior(name: str, table: PriorTable, tree: Tree) -> FramePrior:
 
 def loosened(priors: Iterable[FramePrior]) -> tuple[FramePrior, ...]:
     """The priors with places so uncertain that the observations overrule them."""
-    return tuple(replace(it, sigma_m=max(it.sigma_m, _LOOSE_M)) for it in priors)
+    return tuple(replace(prior, sigma_m=max(prior.sigma_m, _LOOSE_M)) for prior in priors)
 
 
 def without_most_contradicted(
@@ -188,16 +192,20 @@ def without_most_contradicted(
         The others; None where the observations contradict none.
     """
     found = [
-        (it.contradiction, at, it.axis)
+        (component.contradiction, at, component.axis)
         for at, prior in enumerate(problem.priors)
-        for it in components(problem, state, covariance, [prior])
-        if it.is_contradicted
+        for component in components(problem, state, covariance, [prior])
+        if component.is_contradicted
     ]
     if not found:
         return None
     _, worst, axis = max(found)
-    kept = [it.without(axis) if at == worst else it for at, it in enumerate(problem.priors)]
-    return tuple(it for it in kept if it.axes or it.rotation is not None)
+    kept = [
+        prior.without(axis) if at == worst else prior for at, prior in enumerate(problem.priors)
+    ]
+    return tuple(
+        frame_prior for frame_prior in kept if frame_prior.axes or frame_prior.rotation is not None
+    )
 
 
 def prior_words(
@@ -211,9 +219,9 @@ def prior_words(
         covariance: (p, p) covariance of the unknowns.
         stated: All priors, whole.
     """
-    for it in components(problem, state, covariance, tuple(stated)):
-        if it.is_used:
-            yield from remarks([it.remark], NOTE)
+    for component in components(problem, state, covariance, tuple(stated)):
+        if component.is_used:
+            yield from remarks([component.remark], NOTE)
         else:
             step = Step("Measure it again, or delete it from session.toml.", CALIBRATE)
-            yield Finding("prior", it.doubt, step, mahalanobis_sq=it.contradiction**2)
+            yield Finding("prior", component.doubt, step, mahalanobis_sq=component.contradiction**2)

@@ -91,7 +91,9 @@ def read_instrument(session: Session) -> Readings:
     _check_unit(rows)
     are_poses, instrument = _are_poses(rows), _instrument(session, rows)
     names, rejections = _names(rows, are_poses=are_poses)
-    kept = [view for view in rows if view.number not in {it.view for it in rejections}]
+    kept = [
+        view for view in rows if view.number not in {rejection.view for rejection in rejections}
+    ]
     missing = [
         Rejection(view.number, "no reading of the instrument: meas_x_m ... are empty")
         for view in session.views
@@ -115,20 +117,20 @@ def probe_poses(session: Session, readings: Readings) -> dict[int, FloatArray]:
     """
     if readings.probes is not None:
         return dict(readings.probes)
-    station = {it.view.number: it.station for it in session.observations}
+    station = {observation.view.number: observation.station for observation in session.observations}
     stops: dict[Hashable, dict[int, int]] = defaultdict(dict)
     for view, point in readings.points.items():
         stops[station[view]][point] = view
     numbers = range(len(readings.names))
-    views = [[it[at] for at in numbers] for it in stops.values() if len(it) == len(numbers)]
-    places = np.array([[readings.read_m[view] for view in it] for it in views])
+    views = [[stop[at] for at in numbers] for stop in stops.values() if len(stop) == len(numbers)]
+    places = np.array([[readings.read_m[view] for view in group] for group in views])
     if len(numbers) < 3 or not views:
         return {}
     away = places[0] - places[0].mean(axis=0)
     sizes = np.linalg.svd(away, compute_uv=False)
     if sizes[1] < _LINE * sizes[0]:
         return {}
-    return {it[0]: align(at, places[0]) for it, at in zip(views, places, strict=True)}
+    return {view[0]: align(at, places[0]) for view, at in zip(views, places, strict=True)}
 
 
 def read_instruments(session: Session) -> dict[int, ViewPoses]:
@@ -138,9 +140,9 @@ def read_instruments(session: Session) -> dict[int, ViewPoses]:
         DataError: An instrument's noise is not known, or its readings are in millimetres.
     """
     rows: dict[str, list[View]] = {}
-    for it in session.observations:
-        if is_read(it.view) and not is_seen(it.view):
-            rows.setdefault(it.seer, []).append(it.view)
+    for observation in session.observations:
+        if is_read(observation.view) and not is_seen(observation.view):
+            rows.setdefault(observation.seer, []).append(observation.view)
     found = {}
     for mine in rows.values():
         _check_unit(mine)
@@ -169,12 +171,14 @@ def exchanged_points(seen: Observed, readings: Readings) -> tuple[Rejection, ...
         DataError: No view can be used.
         DegenerateError: There are too few stops.
     """
-    station = {it.view.number: it.station for it in seen.session.observations}
+    station = {
+        observation.view.number: observation.station for observation in seen.session.observations
+    }
     poses = seen.base_from_flange
-    views = [it for it in readings.read_m if it in poses and it not in seen.held_back]
+    views = [index for index in readings.read_m if index in poses and index not in seen.held_back]
     if not views:
         raise nothing_seen(seen)
-    stops = np.unique([station[it] for it in views], return_inverse=True)[1]
+    stops = np.unique([station[view] for view in views], return_inverse=True)[1]
     _check_stops(readings, stops)
     places = readings.places(views, poses, stops)
     with one_blas_thread():
@@ -212,7 +216,7 @@ def _instrument(session: Session, rows: Sequence[View]) -> Instrument:
             f"its name: {', '.join(instrument_names())}.",
         )
     found = stated_instrument(table.name, table.sigma_m, table.sigma_per_m, table.sigma_rad)
-    if found.sigma_rad is None and any(it.instrument_from_probe() is not None for it in rows):
+    if found.sigma_rad is None and any(row.instrument_from_probe() is not None for row in rows):
         raise DataError(
             f"session.toml: rows have rotations of a probe (meas_qx ...), but how good they are "
             f"is not known of the instrument {table.name!r}.",
@@ -237,11 +241,11 @@ def _check_unit(rows: Sequence[View]) -> None:
 def _are_poses(rows: Sequence[View]) -> bool:
     turned = [view.instrument_from_probe() is not None for view in rows]
     if any(turned) and not all(turned):
-        without = [str(it.number) for it, there in zip(rows, turned, strict=True) if not there]
+        without = [str(row.number) for row, there in zip(rows, turned, strict=True) if not there]
         raise DataError(
             f"views.csv: {sum(turned)} of {len(rows)} readings have the probe's rotation "
             f"(meas_qx ...); view{'s' if len(without) > 1 else ''} {some_of(without)} have none.",
-            culprits=[f"views.csv: view {it}" for it in without],
+            culprits=[f"views.csv: view {name}" for name in without],
             next_step="Fill it in everywhere, or leave its columns out.",
         )
     return all(turned)
@@ -258,7 +262,7 @@ def _names(rows: Sequence[View], *, are_poses: bool) -> tuple[tuple[str, ...], l
             f"views.csv: readings name their point ({some_of(others)}), but those of "
             f"view{'s' if len(by_name['']) > 1 else ''} {some_of(list(map(str, by_name[''])))} "
             "do not.",
-            culprits=[f"views.csv: view {it}, point" for it in by_name[""]],
+            culprits=[f"views.csv: view {index}, point" for index in by_name[""]],
             next_step="Fill the column point in everywhere.",
         )
     if are_poses and len(by_name) > 1:
@@ -277,7 +281,7 @@ def _names(rows: Sequence[View], *, are_poses: bool) -> tuple[tuple[str, ...], l
 
 
 def _alone(name: str, view: int, others: Mapping[str, Sequence[int]]) -> Rejection:
-    known = [it for it, views in others.items() if len(views) > 1]
+    known = [word for word, views in others.items() if len(views) > 1]
     hint = did_you_mean(name, known)
     if hint:
         raise DataError(
@@ -324,13 +328,13 @@ def _exchanged(
         for one, other in combinations(rows.tolist(), 2):
             back = off[rows] - _change(places, mounting, rows, one, other)
             if _apart(back) < _USUAL * usual:
-                names = [readings.names[places.points[it]] for it in (one, other)]
+                names = [readings.names[places.points[index]] for index in (one, other)]
                 words = (
                     f"the points {names[0]} and {names[1]} are exchanged at this stop: changed "
                     f"back, its points agree to {figure(1e3 * _apart(back))} mm, not "
                     f"{figure(1e3 * _apart(off[rows]))} mm"
                 )
-                yield from (Rejection(views[it], words) for it in (one, other))
+                yield from (Rejection(views[index], words) for index in (one, other))
                 break
 
 

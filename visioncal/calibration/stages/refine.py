@@ -84,7 +84,7 @@ def refined(
         fitted, found = _refined(side, looks, frames, is_plain=False)
         levels = fitted.looks.levels
         sizes = zip(fitted.looks.problems, fitted.seen.sigmas_px, strict=True)
-        if not any(name in levels and are_beyond(levels[name], it) for name, it in sizes):
+        if not any(name in levels and are_beyond(levels[name], value) for name, value in sizes):
             return _doubted(found, fitted), found
     except ConvergenceError:
         pass
@@ -104,7 +104,8 @@ def _refined(
     answer, side = _equally_weighed(side, looks, frames)
     looks = answer.looks.weighed(answer.seen)
     if any(
-        it.stack is not answer.looks.problems[name].stack for name, it in looks.problems.items()
+        problem.stack is not answer.looks.problems[name].stack
+        for name, problem in looks.problems.items()
     ):
         answer = again(answer, side, answer.moving, looks)
     elif np.array_equal(answer.moving, looks.first) and not (levels or side.errors):
@@ -129,18 +130,20 @@ def _equally_weighed(
         stated = again(stated, side, stated.moving, stated.looks.with_levels(levels))
     answer = chosen(side, stated)
     found = side.with_errors(answer)
-    if not any(it.is_significant for it in found.errors):
+    if not any(error.is_significant for error in found.errors):
         return answer, found
     under_stated = side.with_errors(stated)
     erring = (under_stated if under_stated.errors else found).freed(freely=True)
     answer = chosen(erring, _still_asked_for(erring, stated, answer))
     estimating = erring.freed(freely=False)
-    if all(it.is_estimated for it in erring.errors):
+    if all(error.is_estimated for error in erring.errors):
         return answer, estimating
     fitted = settle(answer.looks, estimating, answer.moving, answer.frames)
     found = estimating.with_errors(fitted)
     # Errors that were less than significant under the stated lenses may be it under these.
-    if [it.is_estimated for it in found.errors] != [it.is_estimated for it in estimating.errors]:
+    if [error.is_estimated for error in found.errors] != [
+        error.is_estimated for error in estimating.errors
+    ]:
         fitted = settle(fitted.looks, found, fitted.moving, fitted.frames)
     return fitted, found
 
@@ -148,10 +151,10 @@ def _equally_weighed(
 def _sized(side: Side, fitted: Fitted) -> Fitted:
     """The fit with boards as large as the motion says, where that is far from what is stated."""
     looks = fitted.looks
-    away = np.array([_measured(side, fitted, it).scale for it in looks.printed])
+    away = np.array([_measured(side, fitted, index).scale for index in looks.printed])
     if not np.any(np.abs(away) > _FAR):
         return fitted
-    sizes = np.concatenate([looks.scale_of(it) for it in looks.printed])
+    sizes = np.concatenate([looks.scale_of(index) for index in looks.printed])
     looks = looks.without_prior(sizes.tolist()).with_values(sizes, away)
     return again(fitted, side, np.union1d(fitted.moving, sizes), looks)
 
@@ -162,21 +165,21 @@ def lens_levels(side: Side, fitted: Fitted) -> dict[str, LensLevels]:
     Lenses and boards are free for that, so that what they have wrong is not taken for it.
     """
     levels = fitted.looks.levels
-    if any(it.breathing for it in levels.values()):
+    if any(level.breathing for level in levels.values()):
         # Linearised far from where there is none, that would be underrated.
-        still = {name: replace(it, breathing=0.0) for name, it in levels.items()}
+        still = {name: replace(level, breathing=0.0) for name, level in levels.items()}
         fitted = again(fitted, side, fitted.moving, fitted.looks.with_levels(still))
     looks = fitted.seen.looks
     # A size of the board is left to the motion: a wrong one would pass for breathing. So would a
     # focal length.
     looks = looks.doubting(
         {
-            name: (lens_prior(it.scene), it.doubted[:0])
-            for name, it in looks.problems.items()
-            if len(it.doubted)
+            name: (lens_prior(problem.scene), problem.doubted[:0])
+            for name, problem in looks.problems.items()
+            if len(problem.doubted)
         }
     )
-    sizes = [looks.scale_of(it) for it in looks.printed]
+    sizes = [looks.scale_of(index) for index in looks.printed]
     unsized = looks.without_prior(np.concatenate([np.zeros(0), *sizes]).tolist())
     seen = fitted.seen.freed(np.arange(len(looks.values)), unsized)
     # What was measured by hand may be wrong, which is looked at later; all may hang on it.
@@ -200,7 +203,9 @@ def _doubted(side: Side, fitted: Fitted) -> Fitted:
     """
     looks, moving = fitted.looks, [fitted.moving]
     # A board that is larger by less than it is known to looks like another focal length.
-    scales = np.array([it for board in looks.printed for it in looks.scale_of(board)], dtype=int)
+    scales = np.array(
+        [value for board in looks.printed for value in looks.scale_of(board)], dtype=int
+    )
     doubts = {}
     for name, problem in looks.problems.items():
         scene, lens = problem.scene, looks.lens_of(name)
@@ -238,15 +243,15 @@ def _still_asked_for(erring: Side, stated: Fitted, answer: Fitted) -> Fitted:
     # what really is another is clear now.
     wide = settle(answer.looks, erring, answer.moving, answer.frames)
     looks = answer.looks
-    freed = [looks.shape_of(it) for it in looks.printed] + [
-        looks.lens_of(it) for it in looks.problems
+    freed = [looks.shape_of(index) for index in looks.printed] + [
+        looks.lens_of(problem) for problem in looks.problems
     ]
     kept = [
-        it
-        for it in freed
-        if np.isin(it, answer.moving).all()
-        and not np.isin(it, stated.moving).any()
-        and moved_mahalanobis_sq(wide, it) > chance_limit(len(it))
+        array
+        for array in freed
+        if np.isin(array, answer.moving).all()
+        and not np.isin(array, stated.moving).any()
+        and moved_mahalanobis_sq(wide, array) > chance_limit(len(array))
     ]
     sizes, wide = _still_other_sizes(erring, wide)
     places = np.concatenate([stated.moving, *kept, *sizes])
@@ -261,17 +266,17 @@ def _still_other_sizes(erring: Side, wide: Fitted) -> tuple[list[IntArray], Fitt
     # What all boards have in common, links of arms may have, too, and free together none is clear:
     # the least clear one is as stated, and the rest are measured anew beside it.
     looks = wide.looks
-    free = [it for it in looks.printed if np.isin(looks.scale_of(it), wide.moving).all()]
+    free = [index for index in looks.printed if np.isin(looks.scale_of(index), wide.moving).all()]
     while free:
         measured = [measured_scale(erring, wide, board) for board in free]
-        least = min(measured, key=lambda it: abs(it.scale) / it.sigma)
+        least = min(measured, key=lambda value: abs(value.scale) / value.sigma)
         if least.is_another:
             break
         free.remove(least.board)
         place = looks.scale_of(least.board)
         held = wide.looks.with_values(place, looks.stated[place])
         wide = again(wide, erring, np.setdiff1d(wide.moving, place), held)
-    return [looks.scale_of(it) for it in free], wide
+    return [looks.scale_of(index) for index in free], wide
 
 
 def _measured(side: Side, fitted: Fitted, board: int) -> MeasuredScale:
@@ -281,7 +286,7 @@ def _measured(side: Side, fitted: Fitted, board: int) -> MeasuredScale:
     # linear about the views' poses is held by that. The costs of fits with other sizes say more.
     found, looks = measured_scale(side, fitted, board), fitted.looks
     noise, place = fitted.fit.noise, looks.scale_of(board)
-    if found.is_another or not any(it[1] > _ROUGH_M for it in noise.robots):
+    if found.is_another or not any(robot[1] > _ROUGH_M for robot in noise.robots):
         return found
 
     def held(scale: float) -> Fitted:
@@ -289,8 +294,8 @@ def _measured(side: Side, fitted: Fitted, board: int) -> MeasuredScale:
         return again(fitted, side, fitted.moving, looks.with_values(place, value))
 
     below, here, above = (
-        equations_and_cost(it.problem, it.fit.state, noise)[2]
-        for it in (held(-_TRIED), fitted, held(_TRIED))
+        equations_and_cost(item.problem, item.fit.state, noise)[2]
+        for item in (held(-_TRIED), fitted, held(_TRIED))
     )
     bend = below + above - 2.0 * here
     if bend <= 0.0:
@@ -329,7 +334,7 @@ def chosen(side: Side, fitted: Fitted) -> Fitted:
 def _contesting(side: Side, answer: Fitted) -> Fitted:
     """The fit with the uncertainty of intrinsics that are held although corners contradict them."""
     contested = _contested(side, answer)
-    if contested == [name for name, it in answer.looks.problems.items() if it.contested]:
+    if contested == [name for name, problem in answer.looks.problems.items() if problem.contested]:
         return answer
     return again(answer, side, answer.moving, answer.looks.contesting(contested))
 
@@ -339,9 +344,9 @@ def _freed(side: Side, moving: IntArray, fitted: Fitted) -> Fitted:
     wider = again(fitted, side, moving)
     looks = wider.looks
     wrong = [
-        looks.lens_of(it)
-        for it in looks.problems
-        if np.isin(looks.lens_of(it), moving).all() and contradicted_lens(wider, it)
+        looks.lens_of(problem)
+        for problem in looks.problems
+        if np.isin(looks.lens_of(problem), moving).all() and contradicted_lens(wider, problem)
     ]
     if not wrong:
         return wider
@@ -369,11 +374,13 @@ def _resized(side: Side, answer: Fitted) -> Fitted:
 def _wrongly_sized(side: Side, answer: Fitted) -> MeasuredScale | None:
     """The board whose size is held and farthest from what the robot measures, if any is beyond."""
     looks = answer.looks
-    held = [it for it in looks.printed if looks.scale_of(it)[0] not in answer.moving]
+    held = [index for index in looks.printed if looks.scale_of(index)[0] not in answer.moving]
     measured = [_measured(side, answer, board) for board in held]
     # An arm whose links may all be too long is hard to distinguish from a board that is too large.
-    other = [it for it in measured if (it.contradicts if side.has_errors else it.is_another)]
-    return max(other, key=lambda it: abs(it.scale) / it.sigma, default=None)
+    other = [
+        scale for scale in measured if (scale.contradicts if side.has_errors else scale.is_another)
+    ]
+    return max(other, key=lambda value: abs(value.scale) / value.sigma, default=None)
 
 
 def _is_determined(wider: Fitted, fitted: Fitted) -> bool:
@@ -386,22 +393,24 @@ def _is_determined(wider: Fitted, fitted: Fitted) -> bool:
 
 def _worst(fitted: Fitted) -> FloatArray:
     """(2 e,) the largest sigma of each unknown frame's rotation [rad] and place [m]."""
-    looks, fit = [it.determined for it in fitted.problem.effects[:1]], fitted.fit
+    looks, fit = [effect.determined for effect in fitted.problem.effects[:1]], fitted.fit
     problem = fitted.problem.with_effects(looks)
     values = fit.state.values[: sum(map(len, looks))]
     covariance = covariance_of(problem, replace(fit, state=State(fit.state.edges, values)))
     places = np.arange(6 * len(problem.unknown)).reshape(-1, 3)
-    return np.sqrt([np.linalg.eigvalsh(covariance[np.ix_(it, it)])[-1] for it in places])
+    return np.sqrt([np.linalg.eigvalsh(covariance[np.ix_(place, place)])[-1] for place in places])
 
 
 def _contested(side: Side, answer: Fitted) -> list[str]:
     """Cameras whose intrinsics are held, and explain the corners worse than chance does."""
     looks, moving = answer.looks, answer.moving
-    held = [it for it in looks.problems if not np.isin(looks.lens_of(it), moving).all()]
+    held = [
+        problem for problem in looks.problems if not np.isin(looks.lens_of(problem), moving).all()
+    ]
     if not held or not looks.has_spare_corners:
         return []
     bent = np.union1d(moving, looks.shape)
-    lenses = {it: looks.lens_of(it) for it in held}
+    lenses = {name: looks.lens_of(name) for name in held}
     scores = Scores.of(side, answer, np.concatenate([bent, *lenses.values()]))
     least = scores.gain(bent)
     return [
@@ -440,8 +449,8 @@ def _shapes(side: Side, fitted: Fitted) -> Iterator[IntArray]:
     bent = np.union1d(now, looks.shape)
     stated = {
         name: np.setdiff1d(looks.lens_of(name), bent)
-        for name, it in looks.problems.items()
-        if it.scene.mode != "hold"
+        for name, problem in looks.problems.items()
+        if problem.scene.mode != "hold"
     }
     scores = Scores.of(side, fitted, np.concatenate([bent, *stated.values()]))
     gain_bent = scores.gain(bent)
@@ -451,9 +460,11 @@ def _shapes(side: Side, fitted: Fitted) -> Iterator[IntArray]:
         if len(lens)
     }
     # The one that is asked for least is done without first.
-    asked = sorted((name for name, it in gains.items() if it > 0.0), key=lambda it: -gains[it])
+    asked = sorted(
+        (name for name, gain in gains.items() if gain > 0.0), key=lambda index: -gains[index]
+    )
     while asked:
-        yield np.unique(np.concatenate([bent, *(stated[it] for it in asked)]))
+        yield np.unique(np.concatenate([bent, *(stated[name] for name in asked)]))
         asked.pop()
     if len(bent) > len(now) and gain_bent > chance_limit(len(bent) - len(now)):
         yield bent
@@ -464,22 +475,22 @@ def _predicts_worse(wider: Fitted, fitted: Fitted) -> bool:
     # Intrinsics whose sigma is stated are free to move within that, whatever they predict.
     looks = wider.looks
     freed = [
-        it.scene
-        for name, it in looks.problems.items()
+        problem.scene
+        for name, problem in looks.problems.items()
         if np.isin(looks.lens_of(name), np.setdiff1d(wider.moving, fitted.moving)).all()
     ]
-    if freed and all(it.matrix_sigma_px is not None for it in freed):
+    if freed and all(scene.matrix_sigma_px is not None for scene in freed):
         return False
     errors = [
-        left_out_residuals(it.problem, it.fit.state, it.fit.noise).reshape(-1, 2, 3)
-        for it in (wider, fitted)
+        left_out_residuals(item.problem, item.fit.state, item.fit.noise).reshape(-1, 2, 3)
+        for item in (wider, fitted)
     ]
-    more, less = (np.mean(it**2, axis=(0, 2)) for it in errors)
+    more, less = (np.mean(error**2, axis=(0, 2)) for error in errors)
     return bool(np.all(more > less))
 
 
 def _corners(views: Sequence[ViewPoses]) -> dict[int, Corners]:
-    return {it.view: it.corners for it in views if it.corners is not None}
+    return {view.view: view.corners for view in views if view.corners is not None}
 
 
 def _remade(

@@ -60,7 +60,7 @@ class Reported:
 
     def without(self, views: Collection[int]) -> Self:
         """Leaves out some views."""
-        kept = {it: pose for it, pose in self.base_from_flange.items() if it not in views}
+        kept = {key: pose for key, pose in self.base_from_flange.items() if key not in views}
         return replace(self, base_from_flange=kept)
 
     def with_zero(self, zero: JointReading) -> Self:
@@ -70,8 +70,8 @@ class Reported:
             return self
         after = replace(before, zero=zero)
         views = list(self.base_from_flange)
-        q = np.array([joints[it] for it in views])
-        poses = np.array([self.base_from_flange[it] for it in views])
+        q = np.array([joints[view] for view in views])
+        poses = np.array([self.base_from_flange[view] for view in views])
         moved = moved_arm(poses, q, before.arm, after.arm)
         return replace(self, base_from_flange=dict(zip(views, moved, strict=True)), matched=after)
 
@@ -122,13 +122,15 @@ def reported_poses(session: Session, robot: Robot | None) -> Reported:
 
 def _in_millimetres(poses: Mapping[int, FloatArray]) -> set[int]:
     """The views whose position is a thousand times as far as those of others."""
-    away_m = {view: float(np.linalg.norm(it[:3, 3])) for view, it in poses.items()}
-    near = [it for it in away_m.values() if it < _OUT_OF_REACH_M]
+    away_m = {view: float(np.linalg.norm(pose[:3, 3])) for view, pose in poses.items()}
+    near = [value for value in away_m.values() if value < _OUT_OF_REACH_M]
     if not near:
         return set()
     low, high = min(near) / _ALIKE, max(near) * _ALIKE
     return {
-        view for view, it in away_m.items() if it >= _OUT_OF_REACH_M and low <= 1e-3 * it <= high
+        view
+        for view, value in away_m.items()
+        if value >= _OUT_OF_REACH_M and low <= 1e-3 * value <= high
     }
 
 

@@ -69,9 +69,12 @@ def leave_out_wrong_points(seen: T) -> T:
             continue
         called = name if len(targets) > 1 else target.name
         seen = seen.noting((), (_said(target, places, called),))
-        gone = np.array([first + it for it in places])
+        gone = np.array([first + place for place in places])
         for frame, look in seen.cameras.items():
-            kept = {view: it.take(~np.isin(it.ids, gone)) for view, it in look.corners.items()}
+            kept = {
+                view: view_corners.take(~np.isin(view_corners.ids, gone))
+                for view, view_corners in look.corners.items()
+            }
             seen = seen.with_camera(frame, replace(look, corners=kept))
     return seen
 
@@ -101,7 +104,7 @@ def _agreed(
             by_point[point].append((look, row))
     places = {}
     for point, rows in sorted(by_point.items()):
-        off = [not it.agrees[row] for it, row in rows]
+        off = [not look.agrees[row] for look, row in rows]
         if len(rows) < _VIEWS or np.mean(off) < _SHARE:
             continue
         place, left_px = _triangulated(rows)
@@ -164,7 +167,7 @@ def _triangulated(rows: Sequence[tuple[_Look, int]]) -> tuple[FloatArray, float]
 
 def _said(target: Target, places: Mapping[int, FloatArray], name: str) -> Finding:
     """Says which points are elsewhere, and what would mend it."""
-    table, labels = np.array(target.points_m), [str(it) for it in target.point_numbers]
+    table, labels = np.array(target.points_m), [str(number) for number in target.point_numbers]
     measured = table.copy()
     for point, place in places.items():
         measured[point] = place
@@ -175,12 +178,13 @@ def _said(target: Target, places: Mapping[int, FloatArray], name: str) -> Findin
     if reordered:
         parts.append(f"the numbers of points are not those of its table: {numbering.words(labels)}")
         steps.append("correct the numbers of these points in corners.csv or in the rig's table")
-    others = [it for it in places if it not in reordered]
+    others = [place for place in places if place not in reordered]
     if others:
         listing = ", ".join(
-            f"{labels[it]} by {figure(1e3 * float(np.linalg.norm(places[it] - table[it])))} mm, at "
-            f"({', '.join(f'{1e3 * x:.1f}' for x in places[it])}) mm"
-            for it in others
+            f"{labels[other]} by "
+            f"{figure(1e3 * float(np.linalg.norm(places[other] - table[other])))} mm, at "
+            f"({', '.join(f'{1e3 * x:.1f}' for x in places[other])}) mm"
+            for other in others
         )
         parts.append(f"points are elsewhere than its table has them: {listing}")
         steps.append("measure these points again, and correct the rig's table")

@@ -41,18 +41,24 @@ def read_robots(seen: T) -> T:
     for name in session.robots:
         document = session.robot_documents.get(name)
         mine = tuple(
-            it
-            for it in session.views
-            if name_of(session.declaration, "robot", it) == name
-            and not (seen.clocks and is_open(it))
+            view
+            for view in session.views
+            if name_of(session.declaration, "robot", view) == name
+            and not (seen.clocks and is_open(view))
         )
         model = None if document is None else Robot.from_document(document)
         reported = reported_poses(replace(session, views=mine), model)
         found[name] = _with_stops(session, name, reported)
-        seen = seen.noting((), (it.of(_called(session, name)) for it in reported.warnings))
-        notes = (it.of(_called(session, name)).words for it in remarks(reported.notes))
+        seen = seen.noting(
+            (), (warning.of(_called(session, name)) for warning in reported.warnings)
+        )
+        notes = (remark.of(_called(session, name)).words for remark in remarks(reported.notes))
         seen = replace(seen, notes=(*seen.notes, *notes))
-    rows = [it for it in session.observations if it.view.number not in seen.spared]
+    rows = [
+        observation
+        for observation in session.observations
+        if observation.view.number not in seen.spared
+    ]
     return replace(seen, robots=found).noting(_lost(session, rows, found))
 
 
@@ -60,8 +66,11 @@ def _with_stops(session: Session, name: str, reported: Reported) -> Reported:
     """Fills in, where a row has no pose of its robot, that of another row of its stop."""
     poses, matched = dict(reported.base_from_flange), reported.matched
     joints = {} if matched is None else dict(matched.joints_rad)
-    for it in session.observations:
-        view, row = it.view.number, it.robots[name].number if name in it.robots else None
+    for observation in session.observations:
+        view, row = (
+            observation.view.number,
+            observation.robots[name].number if name in observation.robots else None,
+        )
         if row in poses and view not in poses:
             poses[view] = poses[row]
             joints |= {view: joints[row]} if row in joints else {}
@@ -74,7 +83,10 @@ def _lost(
     session: Session, rows: Sequence[Observation], found: Mapping[str, Reported]
 ) -> Iterator[Rejection]:
     """Why where a robot stood is not known for an observation."""
-    reasons = {name: {it.view: it.reason for it in at.rejections} for name, at in found.items()}
+    reasons = {
+        name: {rejection.view: rejection.reason for rejection in at.rejections}
+        for name, at in found.items()
+    }
     for row in rows:
         for name in (*row.lacks, *row.robots):
             if row.view.number in found[name].base_from_flange:
@@ -113,26 +125,30 @@ def _checked(seen: T, name: str, reported: Reported, matched: Matched, how: tupl
     session, joints, (drops, takes) = seen.session, reported.joints_rad or {}, how
     pair = next(iter(pairs_of(seen, name)), _NO_PAIR)
     mount, poses = pair.mount, pair.poses
-    views = [it for it in poses if it in joints]
+    views = [pose for pose in poses if pose in joints]
     if not views:
         return seen
     doubted = matched.contradicting
-    sound = [it for it in views if it not in doubted and it not in seen.held_back]
+    sound = [view for view in views if view not in doubted and view not in seen.held_back]
     looks = {view: poses[view].cam_from_target[0] for view in views}
     rows = np.array([looks[view] for view in sound])
     q = np.array([joints[view] for view in sound]).reshape(len(sound), matched.robot.joint_count)
     guess = _guess_seen_joints(matched.arm, q, rows, mount)
     if drops:
-        both = {it: (reported.base_from_flange[it], looks[it]) for it in views if it in doubted}
+        both = {
+            view: (reported.base_from_flange[view], looks[view])
+            for view in views
+            if view in doubted
+        }
         lost = tuple(_contradicted_joints(matched, guess, both, mount))
-        reported = reported.without({it.view for it in lost})
+        reported = reported.without({rejection.view for rejection in lost})
         seen = seen.noting(lost).with_robot(name, reported)
     if guess is None or not guess.stands_out:
         return seen
     zero = guess.zero
     if zero is None:
-        mine = [it for it in session.views if it.number in reported.base_from_flange]
-        has_poses = any(it.base_from_flange() is not None for it in mine)
+        mine = [view for view in session.views if view.number in reported.base_from_flange]
+        has_poses = any(view.base_from_flange() is not None for view in mine)
         error = misread_joints(guess, matched.robot, has_poses=has_poses)
         raise error.within(f"robot {name}") if len(session.robots) > 1 else error
     taken = takes and matched.zero is None
@@ -154,15 +170,15 @@ def check_read_joints(seen: Observed, probes: Mapping[int, FloatArray]) -> None:
     """
     for reported in seen.robots.values():
         matched, joints = reported.matched, reported.joints_rad or {}
-        views = [it for it in probes if it in joints and it not in seen.held_back]
+        views = [probe for probe in probes if probe in joints and probe not in seen.held_back]
         if matched is None or not views:
             continue
-        q, looks = (np.array([by_view[it] for it in views]) for by_view in (joints, probes))
+        q, looks = (np.array([by_view[view] for view in views]) for by_view in (joints, probes))
         # The instrument stands still beside the robot, as a camera does.
         guess = _guess_seen_joints(matched.arm, q, looks, "eye-to-hand")
         if guess is not None and guess.stands_out and guess.zero is None:
-            mine = (it for it in seen.session.views if it.number in joints)
-            has_poses = any(it.base_from_flange() is not None for it in mine)
+            mine = (view for view in seen.session.views if view.number in joints)
+            has_poses = any(view.base_from_flange() is not None for view in mine)
             by = "what the instrument reads"
             raise misread_joints(guess, matched.robot, has_poses=has_poses, seen=by)
 
@@ -193,12 +209,16 @@ def pairs_of(seen: Observed, robot: str) -> list[Pair]:
     Poses of different ones do not compare.
     """
     pairs: dict[tuple[str, str], dict[int, ViewPoses]] = {}
-    for it in seen.timed.observations:
-        view = it.view.number
-        if view in seen.poses and is_seen(it.view) and [*it.robots, *it.lacks] == [robot]:
-            pairs.setdefault((it.seer, it.seen), {})[view] = seen.poses[view]
+    for observation in seen.timed.observations:
+        view = observation.view.number
+        if (
+            view in seen.poses
+            and is_seen(observation.view)
+            and [*observation.robots, *observation.lacks] == [robot]
+        ):
+            pairs.setdefault((observation.seer, observation.seen), {})[view] = seen.poses[view]
     flange, found = frame_name("flange", robot), []
-    for camera, target in sorted(pairs, key=lambda it: (-len(pairs[it]), it)):
+    for camera, target in sorted(pairs, key=lambda pair: (-len(pairs[pair]), pair)):
         on_flange = seen.session.frames[camera] == flange
         mount: Mount = "eye-in-hand" if on_flange else "eye-to-hand"
         found.append(Pair(camera, target, mount, pairs[camera, target]))

@@ -43,17 +43,17 @@ class FramesSide:
     @property
     def errors(self) -> tuple[ArmErrors, ...]:
         """The errors of arms that were found."""
-        return tuple(it.errors for it in self.arms.values() if it.errors is not None)
+        return tuple(arm.errors for arm in self.arms.values() if arm.errors is not None)
 
     @property
     def has_errors(self) -> bool:
         """Whether errors of an arm are free."""
-        return any(it.frees_errors(freely=self.freely) for it in self.arms.values())
+        return any(arm.frees_errors(freely=self.freely) for arm in self.arms.values())
 
     @property
     def has_links(self) -> bool:
         """Whether those of an arm's own links are."""
-        return self.has_errors and any(it.of_links for it in self.errors)
+        return self.has_errors and any(error.of_links for error in self.errors)
 
     def problem(self, seen: LinearisedCorners) -> Problem:
         """The problem of the observations that agree, repeated ones sharing an error."""
@@ -65,7 +65,7 @@ class FramesSide:
 
     def _all_rows(self, seen: LinearisedCorners) -> IntArray:
         places = {view: at for at, view in enumerate(seen.views)}
-        return np.array([places.get(it, -1) for it in self.views], dtype=np.int64)
+        return np.array([places.get(view, -1) for view in self.views], dtype=np.int64)
 
     def whole(self, seen: LinearisedCorners) -> Problem:
         """The problem of all observations, with poses as lenses and boards make them."""
@@ -83,10 +83,10 @@ class FramesSide:
         problem, fit = fitted.problem, fitted.fit
         likelihood = robot_likelihood(problem, fit.state, fit.noise)
         arms = {
-            name: it
-            if it.frees_errors(freely=self.freely)
-            else it.with_errors(likelihood, problem.robots.index(name))
-            for name, it in self.arms.items()
+            name: arm
+            if arm.frees_errors(freely=self.freely)
+            else arm.with_errors(likelihood, problem.robots.index(name))
+            for name, arm in self.arms.items()
         }
         return replace(self, arms=arms)
 
@@ -106,11 +106,11 @@ class FramesSide:
         shares, problems, poses = self._shares, {}, {}
         for frame, scene in scenes.items():
             corners: dict[int, Corners] = {
-                it.view: it.corners for it in views[frame] if it.corners is not None
+                view.view: view.corners for view in views[frame] if view.corners is not None
             }
             problems[frame] = CornerProblem.of(scene, corners, shares)
             poses[frame] = np.array(
-                [it.cam_from_target[0] for it in views[frame] if it.view in corners]
+                [view.cam_from_target[0] for view in views[frame] if view.view in corners]
             )
         return CameraParameters.of(problems, poses)
 
@@ -119,8 +119,8 @@ class FramesSide:
         """As how much of a view each counts for lenses and boards: those of one stop as one."""
         seen, tree = self.observed.observations, self.observed.tree
         pairs = list(zip(seen.observers, seen.observed, strict=True))
-        parted = {it: any(step.robot for step in tree.path(*it)) for it in set(pairs)}
+        parted = {pair: any(step.robot for step in tree.path(*pair)) for pair in set(pairs)}
         rows = zip(self.views, pairs, seen.stops.tolist(), strict=True)
         return repeat_shares(
-            {it: (pair, stop if parted[pair] else None) for it, pair, stop in rows}
+            {index: (pair, stop if parted[pair] else None) for index, pair, stop in rows}
         )

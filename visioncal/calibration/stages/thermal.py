@@ -194,7 +194,7 @@ def findings(fit: ThermalFit) -> Iterator[str]:
     # Currents determine a gain and a growth by their product alone.
     measured = fit.model.heating.kind == "temperatures"
     counted = ("growth", "drift") if measured else ("drift",)
-    names = [it for it in fit.not_determined if it.startswith(counted)]
+    names = [name for name in fit.not_determined if name.startswith(counted)]
     if names:
         yield (
             f"The views do not determine {some_of(names, 6)}: what is known of arms, steel and "
@@ -246,7 +246,7 @@ def _joints(model: ThermalModel) -> tuple[JointDrift, ...]:
         names.append("gain_sigma")
     columns |= dict(zip(names, sigmas, strict=True))
     return tuple(
-        JointDrift(joint=joint, **{name: float(it[at]) for name, it in columns.items()})
+        JointDrift(joint=joint, **{name: float(column[at]) for name, column in columns.items()})
         for at, joint in enumerate(model.robot.joint_names)
     )
 
@@ -307,7 +307,7 @@ def _seen(
 
 def _typical(q: FloatArray) -> FloatArray:
     """(n,) the posture that most of (s, n) stops are in; of several, the one that most are near."""
-    alike = [int((np.abs(q - it).max(axis=1) < _SAME_RAD).sum()) for it in q]
+    alike = [int((np.abs(q - value).max(axis=1) < _SAME_RAD).sum()) for value in q]
     away = np.abs(q - np.median(q, axis=0)).sum(axis=1)
     return np.asarray(q[np.lexsort((away, -np.array(alike)))[0]])
 
@@ -362,8 +362,8 @@ def _bunched(inputs: Inputs) -> Inputs:
 
 def _of_views(session: Session, robot: str) -> Stream:
     """A robot's views that have a time, as a stream of their numbers."""
-    mine = [it for it in session.views if name_of(session.declaration, "robot", it) == robot]
-    rows = sorted({it.stamp_s: it.numbers for it in mine if it.stamp_s is not None}.items())
+    mine = [view for view in session.views if name_of(session.declaration, "robot", view) == robot]
+    rows = sorted({view.stamp_s: view.numbers for view in mine if view.stamp_s is not None}.items())
     names = sorted({name for _, row in rows for name in row} - {STAMP})
     values = [[stamp_s, *(row.get(name, np.nan) for name in names)] for stamp_s, row in rows]
     return Stream((STAMP, *names), np.array(values).reshape(len(rows), len(names) + 1))

@@ -95,7 +95,9 @@ class ThermalFit:
     def not_determined(self) -> tuple[str, ...]:
         """The parameters that stay at what was known before, by joint."""
         names = _parameter_names(self.model)
-        return tuple(it for it, share in zip(names, self.shares, strict=True) if share > _LITTLE)
+        return tuple(
+            name for name, share in zip(names, self.shares, strict=True) if share > _LITTLE
+        )
 
     def links_c(self, stops: Stops) -> FloatArray:
         """(m, n) temperatures of the links at some stops [deg C]."""

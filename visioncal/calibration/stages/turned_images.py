@@ -71,7 +71,7 @@ def turned_how(
     if not len(known) or _away_px(px, known) < limit_px:
         return None
     undone = {**_UNDONE, **(_QUARTERS if size[0] == size[1] else {})}
-    how = min(undone, key=lambda it: _away_px(undone[it](px, *size), known))
+    how = min(undone, key=lambda index: _away_px(undone[index](px, *size), known))
     return how if _away_px(undone[how](px, *size), known) < limit_px else None
 
 

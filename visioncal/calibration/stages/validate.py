@@ -79,7 +79,9 @@ def _needs(problem: Problem) -> Mask:
     """(n, u) the unknown frames on the way of each observation."""
     needs = np.zeros((len(problem), len(problem.unknown)), dtype=bool)
     for group in problem.groups:
-        frames = [problem.unknown[it.frame] for it in group.path if it.frame in problem.unknown]
+        frames = [
+            problem.unknown[step.frame] for step in group.path if step.frame in problem.unknown
+        ]
         needs[group.rows[:, None], frames] = True
     return needs
 
@@ -114,11 +116,11 @@ def chain_rms_px(
             alike[id(camera)].append((at, camera, corners))
     for views in alike.values():
         camera, rows = views[0][1], [at for at, _, _ in views]
-        counts = [len(it.ids) for _, _, it in views]
+        counts = [len(corners.ids) for _, _, corners in views]
         of = np.repeat(rows, counts)
-        points = positions[np.concatenate([it.ids for _, _, it in views])]
+        points = positions[np.concatenate([corners.ids for _, _, corners in views])]
         points = (poses[of, :3, :3] @ points[:, :, None])[:, :, 0] + poses[of, :3, 3]
-        away = project(camera, points) - np.concatenate([it.px for _, _, it in views])
+        away = project(camera, points) - np.concatenate([corners.px for _, _, corners in views])
         # A corner behind the camera counts as a whole image away.
         away = np.nan_to_num(away, nan=float(max(camera.resolution)))
         squares = np.bincount(of, np.sum(away**2, axis=1), minlength=len(poses))

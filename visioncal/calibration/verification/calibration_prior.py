@@ -148,8 +148,10 @@ class CalibrationPrior:
 def _read(calibration: Calibration, fit: JointFit) -> CalibrationPrior:
     names = fit.boards
     x_name, z_name = edge_names(calibration.mount)
-    placed = [calibration.edges[f"{z_name}_{it}" if it else z_name].matrix for it in names]
-    targets = {name: target_from_document(it, name or "target") for name, it in fit.targets.items()}
+    placed = [calibration.edges[f"{z_name}_{name}" if name else z_name].matrix for name in names]
+    targets = {
+        name: target_from_document(target, name or "target") for name, target in fit.targets.items()
+    }
     values = np.zeros(0) if fit.arm is None else fit.arm.values
     jacobian = _jacobian(np.array(placed), len(fit.looks), len(values))
     if fit.covariance.shape != (jacobian.shape[1],) * 2:
@@ -157,7 +159,7 @@ def _read(calibration: Calibration, fit: JointFit) -> CalibrationPrior:
     return CalibrationPrior(
         calibration,
         targets,
-        tuple(list(targets).index(it) for it in names) if targets else (0,),
+        tuple(list(targets).index(name) for name in names) if targets else (0,),
         State(
             np.stack([calibration.edges[x_name].matrix, *placed]),
             np.concatenate([np.zeros(len(fit.looks)), values]),
@@ -177,12 +179,17 @@ def _looks(
     # follows them lies one place farther for each board.
     only, camera = calibration.board, calibration.camera
     boards = [*calibration.boards.values(), *([] if only is None else [only])]
-    if camera is None or all("shear" in it.shape for it in boards):
+    if camera is None or all("shear" in board.shape for board in boards):
         return fit.looks
-    sizes = [len(intrinsics(camera.camera)), *(len(board_prior(it)) for it in targets.values())]
+    sizes = [
+        len(intrinsics(camera.camera)),
+        *(len(board_prior(target)) for target in targets.values()),
+    ]
     is_new = [
         at == size - 1 and kind != "points"
-        for size, kind in zip(sizes, ("points", *(it.kind for it in targets.values())), strict=True)
+        for size, kind in zip(
+            sizes, ("points", *(target.kind for target in targets.values())), strict=True
+        )
         for at in range(size)
     ]
     return tuple(np.flatnonzero(~np.array(is_new))[list(fit.looks)].tolist())
@@ -229,7 +236,7 @@ def _model(arm: Robot | None, fitted: FittedArm | None) -> ArmModel | None:
         np.zeros(len(fitted.values)) if fitted.by_stop is None else fitted.by_stop,
         1.0 if fitted.torque_nm is None else fitted.torque_nm,
         fitted.yielding,
-        None if parts is None else WeightFunctions(tuple(it.reshape(shape) for it in parts)),
+        None if parts is None else WeightFunctions(tuple(part.reshape(shape) for part in parts)),
     )
 
 
@@ -239,7 +246,7 @@ def _shape(calibration: Calibration, targets: Mapping[str, Target]) -> FloatArra
     only = calibration.board or calibration.rig
     if only is not None:
         found[""] = only
-    stated = {name: np.zeros(len(board_prior(it))) for name, it in targets.items()}
+    stated = {name: np.zeros(len(board_prior(target))) for name, target in targets.items()}
     return np.concatenate(
-        [it + found[name].values if name in found else it for name, it in stated.items()]
+        [array + found[name].values if name in found else array for name, array in stated.items()]
     )

@@ -53,7 +53,11 @@ def causes_of(
             _jointly(REPLACED, moved, replace(size, units=np.array([_OTHER_SIZE_PER_M])))
             for moved, size in zip(boards, sizes, strict=False)
         ),
-        *(_jointly(BOTH, camera, it) for it in boards if _both_possible(seen, prior_calibration)),
+        *(
+            _jointly(BOTH, camera, board)
+            for board in boards
+            if _both_possible(seen, prior_calibration)
+        ),
         *_joints(seen, prior_calibration),
         *_noise(seen),
         *_views(seen, prior_calibration),

@@ -141,7 +141,7 @@ def verify(
     is_its_own = session.digest() == calibration.session_sha256
     session, calibration = picked(session, calibration, Choice(camera, robot, target))
     # What the calibration has left out contradicts it now as it did then.
-    without = {it.view: it.reason for it in calibration.views if is_its_own and not it.used}
+    without = {view.view: view.reason for view in calibration.views if is_its_own and not view.used}
     prior_calibration = CalibrationPrior.of(calibration)
     seen = predict_stops(session, prior_calibration, progress, without)
     return check(seen, prior_calibration, board_placed_anew=board_placed_anew)
@@ -172,15 +172,17 @@ def check(
     causes = causes_of(seen, prior_calibration, board_placed_anew=board_placed_anew)
     with one_blas_thread():
         nothing = explain(seen.problem, belief)
-        found = [explain(seen.problem, belief, it) for it in causes]
-    scores = np.array([it.likelihood for it in found]) + np.log(_shares(causes))
+        found = [explain(seen.problem, belief, cause) for cause in causes]
+    scores = np.array([explained.likelihood for explained in found]) + np.log(_shares(causes))
     evidence = float(np.logaddexp.reduce(scores))
     order = np.argsort(-scores, kind="stable")
     shares = np.exp(scores - evidence)
-    suspects = tuple(Suspect(causes[it].name, float(shares[it]), found[it]) for it in order)
+    suspects = tuple(
+        Suspect(causes[index].name, float(shares[index]), found[index]) for index in order
+    )
     log_evidence = evidence - nothing.likelihood
     named = () if log_evidence < np.log(_LIMITS.likelihood_ratio) else _not_separated(suspects)
-    camera = next(it for it in suspects if it.name == CAMERA)
+    camera = next(suspect for suspect in suspects if suspect.name == CAMERA)
     away = log(seen.away(prior_calibration))
     left = _left(seen, belief, causes[order[0]], suspects[0].explained) if named else away
     return Check(
@@ -208,8 +210,8 @@ def _left(seen: PredictedStops, belief: Belief, cause: Cause, explained: Explain
 
 def _shares(causes: Sequence[Cause]) -> FloatArray:
     """How likely each cause is beforehand: each kind alike, and each of a kind alike."""
-    kinds = [kind_of(it.name) for it in causes]
-    return np.array([1.0 / (len(set(kinds)) * kinds.count(it)) for it in kinds])
+    kinds = [kind_of(cause.name) for cause in causes]
+    return np.array([1.0 / (len(set(kinds)) * kinds.count(kind)) for kind in kinds])
 
 
 def _not_separated(suspects: Sequence[Suspect]) -> tuple[Suspect, ...]:
@@ -222,17 +224,17 @@ def _not_separated(suspects: Sequence[Suspect]) -> tuple[Suspect, ...]:
         return (best,)
     margin = 2.0 * np.log(_LIMITS.ruled_out)
 
-    def price(it: Suspect) -> float:
-        return it.explained.misfit + len(it.explained.values)
+    def price(suspect: Suspect) -> float:
+        return suspect.explained.misfit + len(suspect.explained.values)
 
     rivals = [
-        it
-        for it in others
+        other
+        for other in others
         # Two changes at once imitate either: that says nothing against it.
-        if kind_of(it.name) not in _PAIRS
+        if kind_of(other.name) not in _PAIRS
         and (
-            it.probability * _LIMITS.ruled_out > best.probability
-            or (it.name != NOISE and price(it) < price(best) + margin)
+            other.probability * _LIMITS.ruled_out > best.probability
+            or (other.name != NOISE and price(other) < price(best) + margin)
         )
     ]
     return (best, *rivals)

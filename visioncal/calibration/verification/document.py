@@ -36,9 +36,13 @@ def to_document(
         },
         "session": {"name": known.session.name, "sha256": known.session.digest()},
         "sentences": list(verdict.reasons),
-        "next": [vars(it) for it in verdict.next_steps],
-        "changes": [_change(check, it) for it in check.named],
-        "others": [_change(check, it) for it in listed_suspects(check) if it not in check.named],
+        "next": [vars(step) for step in verdict.next_steps],
+        "changes": [_change(check, suspect) for suspect in check.named],
+        "others": [
+            _change(check, suspect)
+            for suspect in listed_suspects(check)
+            if suspect not in check.named
+        ],
         "explained": check.explained,
         "log10_evidence": check.log_evidence / float(np.log(10.0)),
         "misfit": check.misfit,
@@ -62,15 +66,15 @@ def to_document(
             {"view": view, "reason": reason} for view, reason in sorted(known.reasons.items())
         ],
         "warnings": list(check.seen.warnings),
-        "recalibrate": any(it.state == "fired" for it in triggers),
-        "triggers": [_trigger(it) for it in triggers],
+        "recalibrate": any(trigger.state == "fired" for trigger in triggers),
+        "triggers": [_trigger(trigger) for trigger in triggers],
     }
 
 
 def listed_suspects(check: Check) -> tuple[Suspect, ...]:
     """The changes that are listed: those that are named, and others that are not unlikely."""
-    others = (it for it in check.suspects if it not in check.named)
-    return (*check.named, *(it for it in others if it.probability > _LISTED_SHARE))
+    others = (suspect for suspect in check.suspects if suspect not in check.named)
+    return (*check.named, *(other for other in others if other.probability > _LISTED_SHARE))
 
 
 def _change(check: Check, suspect: Suspect) -> dict[str, Any]:
@@ -87,6 +91,6 @@ def _trigger(outcome: Outcome) -> dict[str, Any]:
     return {
         "quantity": trigger.quantity,
         "state": outcome.state,
-        **{name: it for name, it in figures.items() if it is not None},
+        **{name: figure for name, figure in figures.items() if figure is not None},
         "words": outcome.words,
     }

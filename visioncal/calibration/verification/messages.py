@@ -139,7 +139,7 @@ def verdict_of(check: Check) -> Verdict:
 def _runnable(check: Check, step: Step) -> Step:
     """Advice without its command where these stops do not allow it."""
     session = check.seen.known.session
-    of_images = any(it.image for it in session.views)
+    of_images = any(view.image for view in session.views)
     is_lens_known = not of_images or session.camera is not None
     allowed = {
         CALIBRATE_ANEW: check.seen.stops >= CheckLimits.stops and is_lens_known,
@@ -153,7 +153,7 @@ def _runnable(check: Check, step: Step) -> Step:
 
 def _rivals(check: Check, best: Suspect, others: Sequence[Suspect]) -> Finding:
     """What the likeliest change cannot be distinguished from."""
-    named = listed([thing(check, it) for it in others])
+    named = listed([thing(check, other) for other in others])
     robot = check.calibration.calibrated_robot
     if robot is not None and best.name in (f"{JOINT} 1", f"{JOINT} {robot.joint_count}"):
         # A base that turns about the first axis, or a tool about the last, looks the same anywhere.
@@ -175,7 +175,7 @@ def described(check: Check, suspect: Suspect) -> dict[str, Any]:
     if kind == JOINT:
         value, sigma, unit = _joint_figures(check, suspect)
         return {f"offset_{unit}": value, f"sigma_{unit}": sigma}
-    documents = {name: _motion_document(it) for name, it in motions(check, suspect).items()}
+    documents = {name: _motion_document(motion) for name, motion in motions(check, suspect).items()}
     if kind == REPLACED:
         return {**documents[suspect.name], "share": float(values[6]), "sigma": float(sigmas[6])}
     return documents if kind == BOTH else documents[suspect.name]
@@ -199,8 +199,8 @@ def motions(check: Check, suspect: Suspect) -> dict[str, MeasuredMove]:
     parts = [slice(6 * at, 6 * at + 6) for at in range(len(names))]
     grown = float(values[6]) if kind_of(suspect.name) == REPLACED else 0.0
     return {
-        name: _motion(check, name, values[it], covariance[it, it], grown)
-        for name, it in zip(names, parts, strict=True)
+        name: _motion(check, name, values[part], covariance[part, part], grown)
+        for name, part in zip(names, parts, strict=True)
     }
 
 
@@ -240,7 +240,7 @@ def _board(check: Check, name: str) -> int:
     if kind in (BOARD, REPLACED):
         names = list(prior_calibration.targets)
         return prior_calibration.boards.index(names.index(which)) if which in names else 0
-    return int(seen.boards[[int(which) in it for it in seen.views]][0])
+    return int(seen.boards[[int(which) in view for view in seen.views]][0])
 
 
 def _middle(check: Check, place: int) -> FloatArray:
@@ -274,7 +274,7 @@ def _changed(check: Check, suspect: Suspect) -> str:
         return f"{_capital(thing(check, suspect))}."
     moved = motions(check, suspect)
     if kind in (CAMERA, BOARD, BOTH):
-        return f"{_capital('; '.join(f'the {name} {it.words}' for name, it in moved.items()))}."
+        return f"{_capital('; '.join(f'the {name} {move.words}' for name, move in moved.items()))}."
     return (
         f"{_capital(suspect.name)} alone contradicts the calibration, by "
         f"{_short(moved[suspect.name])}; the other stops agree with it."
@@ -296,7 +296,7 @@ def thing(check: Check, suspect: Suspect) -> str:
         )
     if kind == LENGTH:
         share, sigma = float(explained.values[0]), float(np.sqrt(explained.covariance[0, 0]))
-        kelvins = [f"{abs(share) / it:.0f} K" for it in (_ALUMINIUM, _STEEL)]
+        kelvins = [f"{abs(share) / value:.0f} K" for value in (_ALUMINIUM, _STEEL)]
         grown = "longer" if share > 0.0 else "shorter"
         return (
             f"all lengths of the arm {grown} by {figure(1e2 * abs(share))} % (sigma "
@@ -308,7 +308,7 @@ def thing(check: Check, suspect: Suspect) -> str:
         return f"the robot scatters about {explained.noise_factor:.0f} times as much as it did"
     if kind in (CAMERA, BOARD, BOTH):
         moved = motions(check, suspect)
-        return listed([f"the {name} moved by {_short(it)}" for name, it in moved.items()])
+        return listed([f"the {name} moved by {_short(move)}" for name, move in moved.items()])
     return f"{suspect.name} alone being wrong"
 
 

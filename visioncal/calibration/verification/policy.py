@@ -86,13 +86,13 @@ def load_policy(path: Path | None = None) -> tuple[Trigger, ...]:
     """
     file = _FILE if path is None else path
     rows = read_toml(file, str(file)).get("trigger")
-    if not isinstance(rows, list) or not all(isinstance(it, dict) for it in rows):
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         raise DataError(
             f"{file}: it holds no [[trigger]].",
             culprits=[str(file)],
             next_step='Write [[trigger]], quantity = "age_days", limit = 365.0, and so on.',
         )
-    return tuple(_trigger(it, f"{file}, trigger {at}") for at, it in enumerate(rows, start=1))
+    return tuple(_trigger(row, f"{file}, trigger {at}") for at, row in enumerate(rows, start=1))
 
 
 def _trigger(row: Mapping[str, Any], label: str) -> Trigger:
@@ -127,7 +127,7 @@ def facts_of(
     values, unknown = {}, {}
     before = calibration.conditions
     for quantity, column in _COLUMNS.items():
-        here = [it.numbers[column] for it in session.views if column in it.numbers]
+        here = [view.numbers[column] for view in session.views if column in view.numbers]
         if column not in before:
             unknown[quantity] = f"the views that were calibrated with do not all have {column}"
         elif not here:
@@ -153,7 +153,7 @@ def _age_days(created: str, now: datetime) -> float | None:
 
 def outcomes(policy: Sequence[Trigger], facts: Facts) -> tuple[Outcome, ...]:
     """Says of each trigger whether it fires."""
-    return tuple(_outcome(it, facts) for it in policy)
+    return tuple(_outcome(trigger, facts) for trigger in policy)
 
 
 def _outcome(trigger: Trigger, facts: Facts) -> Outcome:

@@ -32,7 +32,7 @@ from visioncal.vision.targets import numbered_positions, target_document
 # Models that place the flange alike to this are of one robot; tables are written with six digits.
 _ONE_ROBOT_MM, _ONE_ROBOT_DEG = 0.01, 0.001
 _POSTURES = 5
-_STAGES = {it.name: it.run for it in STAGES}
+_STAGES = {stage.name: stage.run for stage in STAGES}
 # Corners that scatter by so many times as much as when they were calibrated with are mentioned.
 _MENTIONED = 2.0
 
@@ -66,7 +66,9 @@ class PredictedStops:
     @property
     def boards(self) -> IntArray:
         """(m,) which of the calibration's boards each sight is of."""
-        return np.array([self.problem.unknown[it] - 1 for it in self.problem.observations.observed])
+        return np.array(
+            [self.problem.unknown[name] - 1 for name in self.problem.observations.observed]
+        )
 
     def away(self, prior_calibration: CalibrationPrior) -> FloatArray:
         """(m, 4, 4) by how much its board has moved, on its right, as each sight places it."""
@@ -98,8 +100,8 @@ def predict_stops(
     """
     known = _STAGES["robot"](known_before(session, prior_calibration, progress))
     known = _STAGES["detect"](known)
-    rejected = {it: why for it, why in (without or {}).items() if it not in known.held_back}
-    return seen_by(known.noting(Rejection(*it) for it in rejected.items()), prior_calibration)
+    rejected = {key: why for key, why in (without or {}).items() if key not in known.held_back}
+    return seen_by(known.noting(Rejection(*pair) for pair in rejected.items()), prior_calibration)
 
 
 def known_before(
@@ -163,7 +165,9 @@ def _breathed(
     targets = tuple(known.session.boards.values())
     placed = _STAGES["pnp"](known).poses
     for frame, look in detected.items():
-        shown = {view: it for view, it in look.corners.items() if view in placed}
+        shown = {
+            view: view_corners for view, view_corners in look.corners.items() if view in placed
+        }
         if not shown:
             continue
         stack = CornerStack.of(shown, numbered_positions(targets))
@@ -179,7 +183,8 @@ def _straightened(
 ) -> dict[int, Corners]:
     """Corners by view where the lens would show them, were it what its model says."""
     return {
-        view: replace(it, px=lens.in_model(it.px, depths.get(view))) for view, it in corners.items()
+        view: replace(view_corners, px=lens.in_model(view_corners.px, depths.get(view)))
+        for view, view_corners in corners.items()
     }
 
 
@@ -198,11 +203,11 @@ def _with_arm(known: ObservedPoses, prior_calibration: CalibrationPrior) -> Obse
     if prior_calibration.arm in ("none", "poses"):
         return known
     if known.robot_arm.joints_rad is None:
-        missing = [it.number for it in known.session.views if it.joints_rad is None]
+        missing = [view.number for view in known.session.views if view.joints_rad is None]
         raise DataError(
             f"session {known.session.name!r}: the calibration is of an arm by its joints, and "
             + (f"{len(missing)} views have no joint angles." if missing else "its joints differ."),
-            culprits=[f"views.csv: view {it}" for it in missing],
+            culprits=[f"views.csv: view {index}" for index in missing],
             next_step="Record q1_rad ... with every view.",
         )
     return known
@@ -214,7 +219,7 @@ def _posed(known: ObservedPoses, prior_calibration: CalibrationPrior) -> Observe
     x, *placed = prior_calibration.state.edges
     order = {board: at for at, board in enumerate(prior_calibration.boards)}
     views, chosen = [], []
-    for view in (it.number for it in known.session.views):
+    for view in (view.number for view in known.session.views):
         poses = known.poses.get(view)
         if poses is None or view not in known.base_from_flange or view in known.reasons:
             continue
@@ -234,7 +239,7 @@ def _posed(known: ObservedPoses, prior_calibration: CalibrationPrior) -> Observe
         known, used=tuple(views), boards=prior_calibration.boards, free=prior_calibration.free
     )
     known = replace(known, frames=known.framed(prior_calibration.state.edges)).posed(chosen)
-    if known.free is not None and all(it.corners is not None for it in chosen):
+    if known.free is not None and all(view.corners is not None for view in chosen):
         known = known.with_noise(_noise_px(known)).posed(chosen)
     return _with_errors(known, prior_calibration)
 
@@ -252,7 +257,11 @@ def _with_errors(known: ObservedPoses, prior_calibration: CalibrationPrior) -> O
 
 def _noise_px(known: ObservedPoses) -> float:
     """Noise of a corner's coordinate around the poses, by lens and boards as calibrated [px]."""
-    corners = {view: it for view, it in zip(known.used, known.seen(known.used), strict=True) if it}
+    corners = {
+        view: corners
+        for view, corners in zip(known.used, known.seen(known.used), strict=True)
+        if corners
+    }
     free = known.free
     if free is None or not corners:
         return known.pixel_px or 0.0
@@ -274,7 +283,7 @@ def _with_its_targets(session: Session, prior_calibration: CalibrationPrior) -> 
         return session
     name = ""
     if "" in shown:
-        alike = [it for it, target in known.items() if not _differing(target, shown[""])]
+        alike = [name for name, target in known.items() if not _differing(target, shown[""])]
         name = alike[0] if len(alike) == 1 else ""
     if not name:
         _check_targets(session, prior_calibration)
@@ -288,15 +297,15 @@ def _with_its_targets(session: Session, prior_calibration: CalibrationPrior) -> 
         )
     views = session.views
     if name:
-        views = tuple(replace(it, text={**it.text, COLUMN: name}) for it in views)
+        views = tuple(replace(view, text={**view.text, COLUMN: name}) for view in views)
     return replace(session, target=None, targets=known, views=views)
 
 
 def _differing(ours: Target, theirs: Target) -> list[str]:
     """The fields in which two targets are printed differently."""
     one, other = target_document(ours), target_document(theirs)
-    differing = [it for it in {**one, **other} if one.get(it) != other.get(it)]
-    return [it for it in differing if it != "square_sigma_m"]
+    differing = [name for name in {**one, **other} if one.get(name) != other.get(name)]
+    return [name for name in differing if name != "square_sigma_m"]
 
 
 def _check_targets(session: Session, prior_calibration: CalibrationPrior) -> None:
@@ -311,7 +320,9 @@ def _check_targets(session: Session, prior_calibration: CalibrationPrior) -> Non
     for name, target in session.boards.items():
         known = prior_calibration.targets.get(name)
         if known is None:
-            there = ", ".join(it or "one without a name" for it in prior_calibration.targets)
+            there = ", ".join(
+                target or "one without a name" for target in prior_calibration.targets
+            )
             raise DataError(
                 f"session {session.name!r}: target {name or target.name!r} is none of those that "
                 f"were calibrated with ({there}).",
@@ -348,8 +359,8 @@ def check_robot(session: Session, stated: Robot, known: Robot) -> None:
         )
     q = np.random.default_rng(0).uniform(-1.0, 1.0, (_POSTURES, known.joint_count))
     # The calibrated one's base may have been placed by the poses: motions are compared.
-    ours, theirs = (it.base_from_flange(q) for it in (known, stated))
-    between = [invert(it[0]) @ it for it in (ours, theirs)]
+    ours, theirs = (robot.base_from_flange(q) for robot in (known, stated))
+    between = [invert(array[0]) @ array for array in (ours, theirs)]
     off = np.max([pose_difference(a, b) for a, b in zip(*between, strict=True)], axis=0)
     if off[0] > _ONE_ROBOT_MM or off[1] > _ONE_ROBOT_DEG:
         raise DataError(
@@ -363,7 +374,7 @@ def check_robot(session: Session, stated: Robot, known: Robot) -> None:
 
 def _warnings(known: ObservedPoses, prior_calibration: CalibrationPrior) -> Iterator[str]:
     """What is odd about the session."""
-    yield from dict.fromkeys(it.reason for it in known.warnings)
+    yield from dict.fromkeys(warning.reason for warning in known.warnings)
     if prior_calibration.calibration.thermal is not None:
         cold_c = float(prior_calibration.calibration.drift.reference_c.mean())
         yield (

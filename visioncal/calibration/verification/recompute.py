@@ -50,7 +50,7 @@ def recompute(
     """
     again = calibrate(session, progress=progress)
     before, after = to_document(calibration), to_document(again)
-    differing = [it for it in _NUMBERS if before.get(it) != after.get(it)]
+    differing = [number for number in _NUMBERS if before.get(number) != after.get(number)]
     if not differing:
         return Recomputed(True, "Recomputed from the recording: the same numbers, bit for bit.")
     moved = [

@@ -106,11 +106,11 @@ def _parse_npy(data: bytes, where: str) -> Array:
             culprits=[where],
             next_step="Arrays of Python objects are not read: they run code when they are loaded.",
         )
-    sizes = [it.strip() for it in header["shape"].split(",") if it.strip()]
-    plain = len(sizes) <= _MOST_AXES and all(len(it) <= 12 and it.isdecimal() for it in sizes)
-    shape = tuple(int(it) for it in sizes) if plain else ()
+    sizes = [part.strip() for part in header["shape"].split(",") if part.strip()]
+    plain = len(sizes) <= _MOST_AXES and all(len(size) <= 12 and size.isdecimal() for size in sizes)
+    shape = tuple(int(size) for size in sizes) if plain else ()
     # An axis of none hides the others from the count of bytes.
-    if not plain or math.prod(max(it, 1) for it in shape) > MOST_BYTES:
+    if not plain or math.prod(max(index, 1) for index in shape) > MOST_BYTES:
         raise DataError(
             f"{where} has the shape ({header['shape'][:60]}); up to {_MOST_AXES} axes and "
             f"{MOST_BYTES:,} entries are read.",

@@ -129,14 +129,14 @@ def _checked(value: Any, path: str, key: str) -> Any:  # noqa: ANN401 - what JSO
     if isinstance(value, dict):
         return StoredTable(
             {
-                name: _checked(it, f"{path}{name}.", "" if key in _NAMED else name)
-                for name, it in value.items()
+                name: _checked(number, f"{path}{name}.", "" if key in _NAMED else name)
+                for name, number in value.items()
             },
             path,
         )
     if isinstance(value, list):
         stem = path.rstrip(".")
-        return [_checked(it, f"{stem}[{at}].", key) for at, it in enumerate(value)]
+        return [_checked(number, f"{stem}[{at}].", key) for at, number in enumerate(value)]
     return value
 
 

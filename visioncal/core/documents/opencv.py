@@ -43,7 +43,7 @@ def _with_matrices(value: object, where: str) -> object:
     if isinstance(value, Mapping):
         if value.get("type_id") in _MATRICES:
             return matrix_from(value, where)
-        return {key: _with_matrices(it, f"{where}: {key}") for key, it in value.items()}
+        return {key: _with_matrices(number, f"{where}: {key}") for key, number in value.items()}
     return value
 
 
@@ -51,14 +51,14 @@ def _from_xml(element: Element, where: str) -> object:
     place = f"{where}, line {element.line}"
     if element.attributes.get("type_id") in _MATRICES:
         content = {
-            tag: it.text.strip('"') if tag == "dt" else _numbers(it.text, place)
-            for tag, it in _by_tag(element, where).items()
+            tag: item.text.strip('"') if tag == "dt" else _numbers(item.text, place)
+            for tag, item in _by_tag(element, where).items()
         }
         return matrix_from(content, place)
-    if element.children and all(it.tag == "_" for it in element.children):
-        return [_from_xml(it, where) for it in element.children]
+    if element.children and all(child.tag == "_" for child in element.children):
+        return [_from_xml(child, where) for child in element.children]
     if element.children:
-        return {tag: _from_xml(it, where) for tag, it in _by_tag(element, where).items()}
+        return {tag: _from_xml(item, where) for tag, item in _by_tag(element, where).items()}
     try:
         numbers = _numbers(element.text, place)
     except DataError:
@@ -68,11 +68,11 @@ def _from_xml(element: Element, where: str) -> object:
 
 def _by_tag(element: Element, where: str) -> dict[str, Element]:
     by_tag: dict[str, Element] = {}
-    for it in element.children:
-        if by_tag.setdefault(it.tag, it) is not it:
-            place = f"{where}, line {it.line}"
+    for child in element.children:
+        if by_tag.setdefault(child.tag, child) is not child:
+            place = f"{where}, line {child.line}"
             raise DataError(
-                f"{place}: <{it.tag[:60]}> is there twice; once is needed.", culprits=[place]
+                f"{place}: <{child.tag[:60]}> is there twice; once is needed.", culprits=[place]
             )
     return by_tag
 
@@ -80,6 +80,6 @@ def _by_tag(element: Element, where: str) -> dict[str, Element]:
 def _numbers(text: str, where: str) -> list[float]:
     """Reads numbers between blanks; OpenCV writes `.Nan` and `-.Inf`."""
     words = text.replace(".N", "N").replace(".I", "I").split()
-    if not all(is_number(it) for it in words):
+    if not all(is_number(word) for word in words):
         raise DataError(f"{where}: {text[:60]!r}; numbers are needed.", culprits=[where])
-    return [float(it) for it in words]
+    return [float(word) for word in words]

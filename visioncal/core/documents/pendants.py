@@ -130,13 +130,13 @@ def _marked(line: str) -> _Written | None:
         # Of two poses in a line it is not known which is meant.
         if len(found) == 1:
             words = re.split(r"[\s,\[\]]+", found[0].strip())
-            if all(re.fullmatch(_NUMBER, it) for it in words):
+            if all(re.fullmatch(_NUMBER, word) for word in words):
                 return _Written(tuple(map(float, words)), (form,))
     return None
 
 
 def _named(line: str) -> _Written | None:
-    found = [(it[1].lower(), it[2], it[3]) for it in _NAMED.finditer(line)]
+    found = [(match[1].lower(), match[2], match[3]) for match in _NAMED.finditer(line)]
     values = {name: float(number) for name, number, _ in found}
     units = {name: unit for name, _, unit in found if unit}
     for names, forms in _NAMED_ROTATIONS.items():
@@ -144,9 +144,9 @@ def _named(line: str) -> _Written | None:
         if needed <= values.keys():
             if sum(name in needed for name, _, _ in found) > len(needed):
                 return None  # two poses in a line
-            numbers = tuple(values[it] for it in ("x", "y", "z", *names))
-            lengths = {units[it] for it in "xyz" if it in units}
-            angles = {units[it] for it in names if it in units}
+            numbers = tuple(values[name] for name in ("x", "y", "z", *names))
+            lengths = {units[name] for name in "xyz" if name in units}
+            angles = {units[name] for name in names if name in units}
             # One unit for each, and of the right kind.
             if len(lengths) > 1 or len(angles) > 1 or lengths - {"m", "mm"} or angles & {"m", "mm"}:
                 return None
@@ -157,8 +157,8 @@ def _named(line: str) -> _Written | None:
 
 
 def _bare(line: str) -> _Written | None:
-    words = [it for it in _BETWEEN.split(line) if it]
-    if len(words) not in _BARE_FORMS or not all(re.fullmatch(_NUMBER, it) for it in words):
+    words = [part for part in _BETWEEN.split(line) if part]
+    if len(words) not in _BARE_FORMS or not all(re.fullmatch(_NUMBER, word) for word in words):
         return None
     return _Written(tuple(map(float, words)), _BARE_FORMS[len(words)])
 

@@ -84,13 +84,13 @@ def read_table(path: Path) -> TextTable:
     )
     if not lines:
         raise DataError(f"{where} has no rows.", culprits=[where])
-    separator = said[1] if said else next((it for it in ";\t," if it in lines[0][1]), " ")
+    separator = said[1] if said else next((name for name in ";\t," if name in lines[0][1]), " ")
     if sum(line.count(separator) + 1 for _, line in lines) > MAX_VALUES:
         raise too_many(where)
     numbers = [at for at, _ in lines]
     cells = [_cells(line, separator, f"{where}, line {at}") for at, line in lines]
     rows = without_margin(cells)
-    columns = rows[0] if not any(is_number(it) for it in rows[0]) else None
+    columns = rows[0] if not any(is_number(row) for row in rows[0]) else None
     if columns is not None:
         rows, numbers = rows[1:], numbers[1:]
     else:
@@ -112,7 +112,7 @@ def read_table(path: Path) -> TextTable:
 def _without_brackets(lines: list[tuple[int, str]]) -> list[tuple[int, str]]:
     """Takes what stands in the brackets of lines that are all lists of one kind."""
     listed = [_LISTED.fullmatch(line.strip()) for _, line in lines]
-    inside = [next(filter(None, it.groups()), "") for it in listed if it]
+    inside = [next(filter(None, match.groups()), "") for match in listed if match]
     return list(zip((at for at, _ in lines), inside, strict=True)) if all(listed) else lines
 
 
@@ -123,7 +123,7 @@ def _cells(line: str, separator: str, where: str) -> tuple[str, ...]:
         (cells,) = csv.reader(io.StringIO(line), delimiter=separator, skipinitialspace=True)
     except (csv.Error, ValueError) as error:
         raise DataError(f"{where}: {error}.", culprits=[where]) from error
-    stripped = tuple(it.strip() for it in cells)
+    stripped = tuple(cell.strip() for cell in cells)
     return with_points(stripped) if separator in ";\t" else stripped
 
 
@@ -133,14 +133,16 @@ def without_margin(rows: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
     Spreadsheets write them where cells were filled once. A single row's cells beyond are kept.
     """
     filled = max(
-        (at for row in rows for at, it in enumerate(row, start=1) if it.strip()), default=0
+        (at for row in rows for at, name in enumerate(row, start=1) if name.strip()), default=0
     )
     return [row[:filled] + row[max(filled, len(rows[0])) :] for row in rows]
 
 
 def with_points(cells: Sequence[str]) -> tuple[str, ...]:
     """Cells that commas do not separate, with decimal commas as points."""
-    return tuple(it.replace(",", ".") if _DECIMAL_COMMA.fullmatch(it) else it for it in cells)
+    return tuple(
+        cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in cells
+    )
 
 
 def separator_of(header: str) -> str:
@@ -148,18 +150,18 @@ def separator_of(header: str) -> str:
 
     Spreadsheets in languages with a decimal comma write semicolons.
     """
-    return next((it for it in ";\t" if it in header and "," not in header), ",")
+    return next((name for name in ";\t" if name in header and "," not in header), ",")
 
 
 def _header_in_comments(
     before: Sequence[str], separator: str, width: int
 ) -> tuple[str, ...] | None:
-    comment = next((it.strip() for it in reversed(before) if it.strip()), "")
+    comment = next((name.strip() for name in reversed(before) if name.strip()), "")
     if not comment.startswith(_COMMENTS):
         return None
     said = comment.lstrip("#%/ ").rpartition(":")[2]
     words = said.replace(separator, " ").replace(",", " ").split()
-    fits = len(words) == width and not any(is_number(it) for it in words)
+    fits = len(words) == width and not any(is_number(word) for word in words)
     return tuple(words) if fits else None
 
 

@@ -41,7 +41,7 @@ def read_plain_text(path: Path) -> str:
             culprits=[str(path)],
             next_step=save_as_utf8("UTF-16"),
         )
-    readable = _COMMENT_LINE.sub(lambda it: it[0].decode("utf-8", "replace").encode(), data)
+    readable = _COMMENT_LINE.sub(lambda pair: pair[0].decode("utf-8", "replace").encode(), data)
     return decode_text(readable, str(path))
 
 
@@ -78,9 +78,9 @@ def check_bounds(value: object, where: str) -> None:
         if depth > MAX_DEPTH:
             raise too_deep(where)
         if isinstance(item, Mapping):
-            pending += [(it, depth + 1) for it in item.values()]
+            pending += [(value, depth + 1) for value in item.values()]
         elif isinstance(item, list):
-            pending += [(it, depth + 1) for it in item]
+            pending += [(value, depth + 1) for value in item]
 
 
 def shown(value: object) -> str:
@@ -155,7 +155,7 @@ def matrix_from(value: object, where: str) -> FloatArray:
     if "sizes" in content:
         sides = as_numbers(content["sizes"], f"{where}: sizes").reshape(-1).tolist()
     else:
-        sides = [number(content.get(it), f"{where}: {it}") for it in ("rows", "cols")]
+        sides = [number(content.get(name), f"{where}: {name}") for name in ("rows", "cols")]
     kind = re.fullmatch(r"([0-9]*)[ucwsifdh]", str(content.get("dt", "d")))
     if kind is None:
         raise DataError(
@@ -164,11 +164,13 @@ def matrix_from(value: object, where: str) -> FloatArray:
         )
     if kind[1] and int(kind[1][:3]) > 1:
         sides.append(float(kind[1][:3]))
-    whole = len(sides) <= _MOST_AXES and all(0 <= it <= MAX_VALUES and it % 1 == 0 for it in sides)
-    shape = [int(it) for it in sides] if whole else []
+    whole = len(sides) <= _MOST_AXES and all(
+        0 <= side <= MAX_VALUES and side % 1 == 0 for side in sides
+    )
+    shape = [int(side) for side in sides] if whole else []
     # A side of none hides the others from the count.
-    if not whole or math.prod(max(it, 1) for it in shape) > MAX_VALUES:
-        words = " x ".join(f"{it:g}" for it in sides[:_MOST_AXES])
+    if not whole or math.prod(max(index, 1) for index in shape) > MAX_VALUES:
+        words = " x ".join(f"{side:g}" for side in sides[:_MOST_AXES])
         raise DataError(f"{where}: a matrix of {words} is none that is read.", culprits=[where])
     if math.prod(shape) != len(data):
         words = " x ".join(map(str, shape))

@@ -45,7 +45,7 @@ class Element:
 
     def child(self, tag: str) -> "Element | None":
         """Finds the first child of a name; None where there is none."""
-        return next((it for it in self.children if it.tag == tag), None)
+        return next((child for child in self.children if child.tag == tag), None)
 
 
 def read_xml(path: Path) -> Element:

@@ -19,7 +19,9 @@ from visioncal.core.documents.values import (
 from visioncal.core.errors import DataError
 
 _STANDARD = "tag:yaml.org,2002:"
-_PLAIN_TAGS = {f"{_STANDARD}{it}" for it in ("map", "seq", "str", "int", "float", "bool", "null")}
+_PLAIN_TAGS = {
+    f"{_STANDARD}{name}" for name in ("map", "seq", "str", "int", "float", "bool", "null")
+}
 _MATRIX_TAGS = {f"{_STANDARD}opencv-matrix", f"{_STANDARD}opencv-nd-matrix"}
 
 _INTEGER = re.compile(r"[+-]?[0-9]{1,18}")

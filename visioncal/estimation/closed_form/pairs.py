@@ -63,7 +63,7 @@ def pair_products(left: FloatArray, right: FloatArray) -> FloatArray:
     """Products `left[j] * right[i]` of (m, 4) quaternions for all pairs of views, as (4, n)."""
     if len(left) <= _GROUP:
         return quaternions.all_products(left, right)
-    parts = [quaternions.all_products(left[it], right[it]) for it in _groups(len(left))]
+    parts = [quaternions.all_products(left[group], right[group]) for group in _groups(len(left))]
     return np.concatenate(parts, axis=1)
 
 

@@ -81,7 +81,7 @@ def delayed_points(
 
 def shares_of(delays: Sequence[Delay], stack: CornerStack, camera: Camera) -> FloatArray:
     """The (n, k) shares of all corners."""
-    return np.stack([it.shares(stack.px, camera.resolution) for it in delays], axis=1)
+    return np.stack([delay.shares(stack.px, camera.resolution) for delay in delays], axis=1)
 
 
 def compress_delayed(

@@ -51,7 +51,7 @@ class CameraParameters:
             problems: Each camera's corners, of the same boards.
             poses: (v, 4, 4) the poses of each camera's views, in the order of its corners.
         """
-        lenses = [intrinsics(it.scene.camera) for it in problems.values()]
+        lenses = [intrinsics(problem.scene.camera) for problem in problems.values()]
         boards = next(iter(problems.values())).basis.shape[2]
         return cls(
             problems,
@@ -71,7 +71,7 @@ class CameraParameters:
     @property
     def boards(self) -> slice:
         """Places of the boards' shapes."""
-        return slice(sum(len(it.lens) for it in self.problems.values()), len(self.values))
+        return slice(sum(len(problem.lens) for problem in self.problems.values()), len(self.values))
 
     @property
     def printed(self) -> list[int]:
@@ -95,7 +95,7 @@ class CameraParameters:
         """The corners (c, 3) of every board, as it is taken to be, in its frame [m]."""
         one = self._one
         places = one.positions + one.basis @ self.values[self.boards]
-        return tuple(places[one.corners_of(it)] for it in range(len(one.scene.targets)))
+        return tuple(places[one.corners_of(index)] for index in range(len(one.scene.targets)))
 
     @property
     def _one(self) -> CornerProblem:
@@ -109,7 +109,7 @@ class CameraParameters:
     @cached_property
     def prior_sigma(self) -> FloatArray:
         """(k,) what the values are known to beforehand; inf where nothing is."""
-        lenses = [it.prior_sigma[it.lens] for it in self.problems.values()]
+        lenses = [problem.prior_sigma[problem.lens] for problem in self.problems.values()]
         return np.concatenate([*lenses, self._one.prior_sigma[len(self._one.lens) :]])
 
     @cached_property
@@ -122,13 +122,13 @@ class CameraParameters:
     @property
     def first(self) -> IntArray:
         """What is free from the start."""
-        found = [self.places(name)[it.first] for name, it in self.problems.items()]
+        found = [self.places(name)[problem.first] for name, problem in self.problems.items()]
         return np.unique(np.concatenate([*found, *map(self.scale_of, self.resized)]))
 
     @property
     def counted(self) -> IntArray:
         """What is uncertain and counts in the covariance, whether it is free or not."""
-        found = (self.places(name)[it.counted] for name, it in self.problems.items())
+        found = (self.places(name)[problem.counted] for name, problem in self.problems.items())
         return np.unique(np.concatenate([*found]))
 
     @property
@@ -148,14 +148,14 @@ class CameraParameters:
     @property
     def has_spare_corners(self) -> bool:
         """Whether all cameras show more corners than it takes to free lens and board."""
-        return all(it.has_spare_corners for it in self.problems.values())
+        return all(problem.has_spare_corners for problem in self.problems.values())
 
     def without_prior(self, places: Iterable[int]) -> "CameraParameters":
         """The same, some values of which nobody has stated."""
         gone = np.array([*places])
         problems = {
-            name: it.without_prior(np.flatnonzero(np.isin(self.places(name), gone)))
-            for name, it in self.problems.items()
+            name: problem.without_prior(np.flatnonzero(np.isin(self.places(name), gone)))
+            for name, problem in self.problems.items()
         }
         return replace(self, problems=problems)
 
@@ -166,44 +166,51 @@ class CameraParameters:
             lenses: Both by camera, places being those among its own intrinsics.
         """
         problems = {
-            name: it.with_lens_sigma(*lenses[name]) if name in lenses else it
-            for name, it in self.problems.items()
+            name: problem.with_lens_sigma(*lenses[name]) if name in lenses else problem
+            for name, problem in self.problems.items()
         }
         return replace(self, problems=problems)
 
     def with_sizes(self, scales: Mapping[int, float]) -> "CameraParameters":
         """The same, printed boards being larger than stated by some shares, free from the start."""
-        places = [int(self.scale_of(it)[0]) for it in scales]
+        places = [int(self.scale_of(scale)[0]) for scale in scales]
         unstated = replace(self.without_prior(places), resized=tuple(scales))
         return unstated.with_values(np.array(places), np.array([*scales.values()]))
 
     def contesting(self, names: Collection[str]) -> "CameraParameters":
         """The same, the intrinsics of some cameras being held although corners contradict them."""
         problems = {
-            name: replace(it, contested=name in names) for name, it in self.problems.items()
+            name: replace(problem, contested=name in names)
+            for name, problem in self.problems.items()
         }
         return replace(self, problems=problems)
 
     def weighed(self, seen: "LinearisedCorners") -> "CameraParameters":
         """The same, views weighing as the residuals of all corners ask for."""
         problems = {
-            name: replace(it, stack=it.stack.weighed(own.residuals))
-            for (name, it), own in zip(self.problems.items(), seen.compressed, strict=True)
+            name: replace(corner_problem, stack=corner_problem.stack.weighed(own.residuals))
+            for (name, corner_problem), own in zip(
+                self.problems.items(), seen.compressed, strict=True
+            )
         }
         return replace(self, problems=problems)
 
     def with_levels(self, levels: Mapping[str, LensLevels]) -> "CameraParameters":
         """The same, lenses erring beyond their models by these sizes."""
         problems = {
-            name: it.with_levels(levels[name]) if name in levels else it
-            for name, it in self.problems.items()
+            name: problem.with_levels(levels[name]) if name in levels else problem
+            for name, problem in self.problems.items()
         }
         return replace(self, problems=problems)
 
     @property
     def levels(self) -> dict[str, LensLevels]:
         """The sizes of what lenses do beyond their models, as far as they were estimated."""
-        return {name: it.levels for name, it in self.problems.items() if it.levels is not None}
+        return {
+            name: problem.levels
+            for name, problem in self.problems.items()
+            if problem.levels is not None
+        }
 
     def camera(self, name: str) -> Camera:
         """A camera with its lens as it is taken to be."""
@@ -228,7 +235,7 @@ class CameraParameters:
             gradient[places] += weight * compressed.shared_gradient
             found.append(compressed)
             sigmas.append(sigma)
-        poses = np.concatenate([it.cam_from_target for it in found])
+        poses = np.concatenate([compressed.cam_from_target for compressed in found])
         corners = Knowledge(information, gradient)
         looks = replace(self, poses=poses)
         return LinearisedCorners(looks, np.sort(moving), tuple(found), tuple(sigmas), corners)
@@ -248,7 +255,10 @@ class CameraParameters:
 
     def rows(self, name: str) -> slice:
         """The rows of one camera's views among all."""
-        names, counts = list(self.problems), [len(it.stack.views) for it in self.problems.values()]
+        names, counts = (
+            list(self.problems),
+            [len(problem.stack.views) for problem in self.problems.values()],
+        )
         first = sum(counts[: names.index(name)])
         return slice(first, first + counts[names.index(name)])
 
@@ -307,8 +317,8 @@ class LinearisedCorners:
         """Covariances (v, 6, 6) of all views' poses."""
         return np.concatenate(
             [
-                floored_sigma_px(sigma) ** 2 * covariance_from(it.information)
-                for it, sigma in zip(self.compressed, self.sigmas_px, strict=True)
+                floored_sigma_px(sigma) ** 2 * covariance_from(compressed.information)
+                for compressed, sigma in zip(self.compressed, self.sigmas_px, strict=True)
             ]
         )
 
@@ -316,21 +326,21 @@ class LinearisedCorners:
     def by_free(self) -> FloatArray:
         """How all views' poses (v, 6, f) move with the free values."""
         parts = []
-        for name, it in zip(self.looks.problems, self.compressed, strict=True):
-            every = np.zeros((len(it.by_shared), 6, len(self.looks.values)))
-            every[:, :, self.looks.places(name)] = it.by_shared
+        for name, compressed in zip(self.looks.problems, self.compressed, strict=True):
+            every = np.zeros((len(compressed.by_shared), 6, len(self.looks.values)))
+            every[:, :, self.looks.places(name)] = compressed.by_shared
             parts.append(every[:, :, self.free])
         return np.concatenate(parts)
 
     @cached_property
     def by_field(self) -> FloatArray:
         """How all views' poses (v, 6, m) move with the lenses beyond their models."""
-        sizes = [it.by_field.shape[2] for it in self.compressed]
+        sizes = [compressed.by_field.shape[2] for compressed in self.compressed]
         found = np.zeros((len(self.views), 6, sum(sizes)))
         view = at = 0
-        for it, size in zip(self.compressed, sizes, strict=True):
-            found[view : view + len(it.by_field), :, at : at + size] = it.by_field
-            view, at = view + len(it.by_field), at + size
+        for compressed, size in zip(self.compressed, sizes, strict=True):
+            found[view : view + len(compressed.by_field), :, at : at + size] = compressed.by_field
+            view, at = view + len(compressed.by_field), at + size
         return found
 
     def effect(self, rows: IntArray) -> Effect:
@@ -342,8 +352,8 @@ class LinearisedCorners:
         mine, fields = rows >= 0, self.by_field.shape[2]
         by_sensor = np.zeros((len(rows), 6, len(self.free) + fields))
         by_sensor[mine] = np.concatenate([self.by_free, self.by_field], axis=2)[rows[mine]]
-        sizes = [it.by_field.shape[2] for it in self.compressed]
-        variances = np.repeat([floored_sigma_px(it) ** 2 for it in self.sigmas_px], sizes)
+        sizes = [compressed.by_field.shape[2] for compressed in self.compressed]
+        variances = np.repeat([floored_sigma_px(sigma) ** 2 for sigma in self.sigmas_px], sizes)
         # Coefficients follow the free values: neither says anything of the other.
         known = Knowledge(
             np.asarray(block_diag(self.known.information, np.diag(1.0 / variances))),
@@ -356,4 +366,6 @@ class LinearisedCorners:
     @property
     def views(self) -> tuple[int, ...]:
         """The views, camera by camera."""
-        return tuple(view for it in self.looks.problems.values() for view in it.stack.views)
+        return tuple(
+            view for problem in self.looks.problems.values() for view in problem.stack.views
+        )

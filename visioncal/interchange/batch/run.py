@@ -44,8 +44,8 @@ _NUMBERS: Mapping[str, tuple[str, float]] = {
 }
 # That of the names that a key takes, and what they stand for.
 _NAMES: Mapping[str, tuple[str, Mapping[str, Any]]] = {
-    "robot": ("robot", {it: it for it in SIMULATED_ARMS}),
-    "mount": ("mount", {it: it for it in ("eye-in-hand", "eye-to-hand")}),
+    "robot": ("robot", {arm: arm for arm in SIMULATED_ARMS}),
+    "mount": ("mount", {name: name for name in ("eye-in-hand", "eye-to-hand")}),
     "camera": ("camera", CAMERAS),
     "board": ("target", TARGETS),
 }
@@ -69,10 +69,10 @@ class Batch:
     @property
     def counts(self) -> Counter[str]:
         """How many sessions came to each verdict, failed, or were kept; and how many changed."""
-        found = Counter(it.verdict or it.state for it in self.rows)
-        found["kept"] = sum(it.state == "kept" for it in self.rows)
-        found["changed"] = sum(it.changed is True for it in self.rows)
-        found["standing out"] = sum(it.score > 0.0 for it in self.rows)
+        found = Counter(row.verdict or row.state for row in self.rows)
+        found["kept"] = sum(row.state == "kept" for row in self.rows)
+        found["changed"] = sum(row.changed is True for row in self.rows)
+        found["standing out"] = sum(row.score > 0.0 for row in self.rows)
         return found
 
 
@@ -139,14 +139,14 @@ def batch(
         if progress is not None:
             progress("batch", len(rows), len(jobs))
     if against is not None:
-        old, failed = Path(against), {it.name for it in rows if it.state == "failed"}
+        old, failed = Path(against), {row.name for row in rows if row.state == "failed"}
         rows = with_changes(
             rows,
             lambda name: _result(old / name),
             lambda name: None if name in failed else _result(folder / name),
         )
     if cells is not None:
-        rows = [_beside_truth(it, folder) for it in rows]
+        rows = [_beside_truth(row, folder) for row in rows]
     found = Batch(tuple(with_outliers(rows)), folder / TABLE, folder / PAGE)
     write_atomically(found.table, _table(found.rows))
     from visioncal.present.report.fleet import fleet_page
@@ -190,7 +190,7 @@ def _table(rows: Iterable[FleetRow]) -> bytes:
     names = {name: _kind(kind) for name, kind in FleetRow.__annotations__.items()}
     schema = pa.schema([(name, kinds[kind]) for name, kind in names.items()])
     buffer = io.BytesIO()
-    parquet.write_table(pa.Table.from_pylist([asdict(it) for it in rows], schema=schema), buffer)
+    parquet.write_table(pa.Table.from_pylist([asdict(row) for row in rows], schema=schema), buffer)
     return buffer.getvalue()
 
 
@@ -222,9 +222,9 @@ def write_cells(file: Path, folder: Path, progress: Progress | None = None) -> l
             f"{file}: seeds is {seeds!r}; 1 to {_MOST_SEEDS} is needed.", culprits=[str(file)]
         )
     varied = {key: value if isinstance(value, list) else [value] for key, value in document.items()}
-    fields = {key: [_field(file, key, it) for it in values] for key, values in varied.items()}
+    fields = {key: [_field(file, key, value) for value in values] for key, values in varied.items()}
     wanted = []
-    for places in product(*(range(len(it)) for it in varied.values())):
+    for places in product(*(range(len(group)) for group in varied.values())):
         chosen = dict(zip(varied, places, strict=True))
         words = "-".join(f"{key}_{varied[key][at]}" for key, at in chosen.items()) or "cell"
         options = replace(CellOptions(), **dict(fields[key][at] for key, at in chosen.items()))

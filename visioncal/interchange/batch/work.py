@@ -74,19 +74,19 @@ def jobs_of(sessions: Iterable[Path | str], out: Path, options: Options) -> list
     Raises:
         DataError: There are no sessions, a glob finds none, or two would have one name.
     """
-    given = {str(it): [*_named(str(it))] for it in sessions}
+    given = {str(session): [*_named(str(session))] for session in sessions}
     empty = [name for name, found in given.items() if not found]
     paths = sorted(
-        {it.absolute() for found in given.values() for it in found},
-        key=lambda it: [natural(Path(part)) for part in it.parts],
+        {path.absolute() for found in given.values() for path in found},
+        key=lambda value: [natural(Path(part)) for part in value.parts],
     )
     if empty or not paths:
         raise DataError(
             f"{', '.join(empty) or 'nothing'}: there is no session.",
             next_step="Name folders of sessions, .rrd recordings, or a glob in quotes.",
         )
-    shared = Path(os.path.commonpath([it.parent for it in paths]))
-    names = [it.relative_to(shared).with_suffix("").as_posix() for it in paths]
+    shared = Path(os.path.commonpath([path.parent for path in paths]))
+    names = [path.relative_to(shared).with_suffix("").as_posix() for path in paths]
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
         raise DataError(
@@ -95,12 +95,12 @@ def jobs_of(sessions: Iterable[Path | str], out: Path, options: Options) -> list
             next_step="Leave one of them out.",
         )
     whole = out.absolute()
-    return [Job(name, it, whole / name, options) for name, it in zip(names, paths, strict=True)]
+    return [Job(name, path, whole / name, options) for name, path in zip(names, paths, strict=True)]
 
 
 def _named(given: str) -> Iterator[Path]:
     """The sessions that are meant; what is none is kept, so that its row can say so."""
-    magic = next((at for at, it in enumerate(Path(given).parts) if set(it) & set("*?[")), None)
+    magic = next((at for at, part in enumerate(Path(given).parts) if set(part) & set("*?[")), None)
     if magic is None or Path(given).exists():
         yield from _within(Path(given))
     else:
@@ -114,7 +114,7 @@ def _named(given: str) -> Iterator[Path]:
 def _within(path: Path) -> Iterator[Path]:
     below = []
     if path.is_dir() and not (path / _SESSION).exists():
-        below = [it.parent for it in path.rglob(_SESSION)]
+        below = [file.parent for file in path.rglob(_SESSION)]
     yield from below or [path]
 
 
@@ -178,7 +178,7 @@ def _kept(job: Job, made_by: Mapping[str, object]) -> FleetRow | None:
         document = json.loads(read_text(job.folder / ROW))
     except (DataError, ValueError):
         return None
-    names = {it.name for it in fields(FleetRow)}
+    names = {field.name for field in fields(FleetRow)}
     if (
         not isinstance(document, dict)
         or {key: document.get(key) for key in made_by} != made_by
@@ -202,7 +202,7 @@ def _draw(folder: Path, session: Session, found: Calibration) -> bool:
     """Writes a small picture of the first view that was used; returns whether there is one."""
     from visioncal.present.report.thumbnails import small_picture
 
-    used = {it.view for it in found.views if it.used}
+    used = {view.view for view in found.views if view.used}
     for view in session.views:
         if view.number in used and view.image and session.images.exists(view.image):
             picture = small_picture(session.images.read(view.image))

@@ -95,8 +95,8 @@ def _by_processes(jobs: Sequence[Job], count: int) -> Iterator[FleetRow]:
     for job in jobs:
         waiting.put(job)
     threads = [Thread(target=_feed, args=(waiting, rows, stopped)) for _ in range(count)]
-    for it in threads:
-        it.start()
+    for thread in threads:
+        thread.start()
     try:
         for _ in jobs:
             row = rows.get()
@@ -105,8 +105,8 @@ def _by_processes(jobs: Sequence[Job], count: int) -> Iterator[FleetRow]:
             yield row
     finally:
         stopped.set()
-        for it in threads:
-            it.join()
+        for thread in threads:
+            thread.join()
 
 
 def _feed(

@@ -118,7 +118,7 @@ class ArmContent:
     @property
     def omitted(self) -> tuple[str, ...]:
         """What no file holds of the arm, and what that costs."""
-        return tuple(it for it in (self.sagging, self.drifting) if it)
+        return tuple(name for name in (self.sagging, self.drifting) if name)
 
     @property
     def sagging(self) -> str:
@@ -136,7 +136,7 @@ class ArmContent:
         """What no file holds of an arm that drifts with its temperature; else empty."""
         if self.cold_c is None:
             return ""
-        low, high = (f"{it:.0f}" for it in self.cold_c)
+        low, high = (f"{value:.0f}" for value in self.cold_c)
         links = f"links at {low} deg C" if low == high else f"links at {low} to {high} deg C"
         return (
             "it drifts with its temperature, which has no place in it: this is the arm with "
@@ -261,16 +261,20 @@ def _fitted(calibration: Calibration, robot: Robot, measured: Sequence[JointRang
     """Fits links to where the calibrated arm stands, where it was measured and all over."""
     drawn = [(postures(robot, 2 * _FITTED), _ELSEWHERE)]
     if measured:
-        lower, upper = np.array([(it.lower, it.upper) for it in measured]).T
+        lower, upper = np.array([(joint.lower, joint.upper) for joint in measured]).T
         rng = np.random.default_rng(0)
         drawn = [(rng.uniform(lower, upper, (2 * _FITTED, len(lower))), 1.0), *drawn]
     # One half is fitted, the other one shows what that leaves.
-    q = np.concatenate([it[::2] for it, _ in drawn])
-    weights = np.concatenate([np.full(len(it[::2]), share / len(it)) for it, share in drawn])
+    q = np.concatenate([array[::2] for array, _ in drawn])
+    weights = np.concatenate(
+        [np.full(len(array[::2]), share / len(array)) for array, share in drawn]
+    )
     found = fit_links(robot, q, calibration.standing(q), weights)
     left = [
-        LeftBehind.of((calibration.standing(it[1::2]) - found.base_from_flange(it[1::2]))[:, :3, 3])
-        for it, _ in drawn
+        LeftBehind.of(
+            (calibration.standing(array[1::2]) - found.base_from_flange(array[1::2]))[:, :3, 3]
+        )
+        for array, _ in drawn
     ]
     return FittedLinks(found, left[0] if measured else None, left[-1])
 
@@ -291,7 +295,7 @@ def _drift(calibration: Calibration) -> tuple[tuple[float, float] | None, float]
         return None, 0.0
     model = calibration.drift
     cold_c = float(model.reference_c.min()), float(model.reference_c.max())
-    return cold_c, max(it.drift_mm for it in calibration.thermal.course)
+    return cold_c, max(point.drift_mm for point in calibration.thermal.course)
 
 
 def omission_mm(robot: Robot) -> float:

@@ -114,7 +114,7 @@ def _write_chain(content: ArmContent) -> str:
 def _write_corrections(content: ArmContent) -> str:
     """A table of corrections: a line for each joint and degree."""
     robot = content.written
-    lines = [f"# {it}" for it in content.notes]
+    lines = [f"# {note}" for note in content.notes]
     lines.append("joint,angle_deg,correction_deg,sigma_deg")
     for at, joint in enumerate(robot.joint_names):
         if robot.chain.prismatic[at]:
@@ -145,7 +145,7 @@ def _sigmas_deg(content: ArmContent, joint: int, degrees: IntArray) -> list[str]
         return [""] * len(degrees)
     known = np.rad2deg(1e-3 * np.array(content.functions.joints[joint].sigma_mrad))
     nodes = np.linspace(-180.0, 180.0, len(known), endpoint=False)
-    return [f"{it:.6f}" for it in np.interp(degrees, nodes, known, period=360.0).tolist()]
+    return [f"{value:.6f}" for value in np.interp(degrees, nodes, known, period=360.0).tolist()]
 
 
 def _warn_corrections(content: ArmContent) -> tuple[str, ...]:
@@ -154,7 +154,7 @@ def _warn_corrections(content: ArmContent) -> tuple[str, ...]:
         "that --to robot-urdf, robot-dh or ur-kinematics writes --with-corrections: send each "
         "joint to its angle and the correction there. Without it the flange of that arm is off by "
         f"up to {omission_mm(content.written):.2g} mm{content.still_bent}.",
-        *(f"{it}." for it in content.omitted),
+        *(f"{name}." for name in content.omitted),
     )
 
 
@@ -233,7 +233,7 @@ def write_dynamics(identified: Identified, to: str, selection: Selection) -> str
 
 
 def _of_inertias(name: str) -> ArmFormat:
-    known = {it.name: it for it in (ROBOT_URDF, ROBOT_JSON)}
+    known = {arm_format.name: arm_format for arm_format in (ROBOT_URDF, ROBOT_JSON)}
     if name in known:
         return known[name]
     raise DataError(

@@ -90,7 +90,7 @@ class Selection:
             "onto": self.onto,
             "with-corrections": self.with_corrections,
         }
-        return tuple(name for name, it in options.items() if it not in (None, False))
+        return tuple(name for name, option in options.items() if option not in (None, False))
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +166,7 @@ class Content:
     @property
     def notes(self) -> list[str]:
         """Lines for a comment: where it comes from, its quality, and what it does."""
-        is_of_lens = self.lens is not None and any(it.startswith("cam") for it in self.frames)
+        is_of_lens = self.lens is not None and any(frame.startswith("cam") for frame in self.frames)
         return [self.origin, self.quality, self.direction, *([_OF_LENS] if is_of_lens else [])]
 
 
@@ -198,12 +198,12 @@ class Format(Generic[_T]):
         Raises:
             DataError: Something of the kind was said.
         """
-        unused = [it for it in selection.said if it not in (*self.takes, *also)]
+        unused = [name for name in selection.said if name not in (*self.takes, *also)]
         if unused:
             raise DataError(
                 f"{self.name} has no place for "
-                f"{', '.join(_OPTIONS.get(it, f'--{it}') for it in unused)}.",
-                culprits=[f"--{it}" for it in unused],
+                f"{', '.join(_OPTIONS.get(name, f'--{name}') for name in unused)}.",
+                culprits=[f"--{name}" for name in unused],
                 next_step="Leave it out.",
             )
 
@@ -228,7 +228,7 @@ class ExportFormat(Format[Content]):
 def numbers(values: FloatArray) -> list[float]:
     """Turns an array into plain floats, whose text reads back as the same doubles."""
     # A negative zero would only raise questions.
-    return [float(it) + 0.0 for it in values.ravel()]
+    return [float(value) + 0.0 for value in values.ravel()]
 
 
 def rows(matrix: FloatArray) -> list[list[float]]:
@@ -244,7 +244,7 @@ def fixed(value: float, decimals: int) -> str:
 
 def comments(mark: str, lines: Iterable[str]) -> str:
     """Writes lines as comments, each behind `mark`; no text can end its comment early."""
-    return "".join(f"{mark} {one_line(it)}\n" for it in lines)
+    return "".join(f"{mark} {one_line(line)}\n" for line in lines)
 
 
 def yaml_text(document: dict[str, Any], *, short_lists: bool = False) -> str:

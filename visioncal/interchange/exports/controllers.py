@@ -112,7 +112,7 @@ def _write_abb_tool(content: Content) -> str:
     pose = abb_pose(pose_texts(content.matrix, POSE_FORMS["abb"]))
     load = _NO_LOAD
     if content.load is not None:
-        centre = ",".join(fixed(it, 6) for it in content.load.centre_mm)
+        centre = ",".join(fixed(value, 6) for value in content.load.centre_mm)
         load = f"[{fixed(content.load.mass_kg, 6)},[{centre}],[1,0,0,0],0,0,0]"
     notes = comments("!", content.notes)
     return f"{notes}PERS tooldata {name}:=[TRUE,{pose},{load}];\n"

@@ -128,12 +128,12 @@ def _write_kalibr(content: Content) -> str:
 
 def _radtan(coefficients: list[float]) -> list[float]:
     """Takes k1, k2, p1, p2 of coefficients whose others are all zero."""
-    beyond = [it for it in coefficients[4:] if it != 0.0]
+    beyond = [coefficient for coefficient in coefficients[4:] if coefficient != 0.0]
     if not beyond:
         return coefficients[:4]
     raise DataError(
         f"Kalibr's radtan has the coefficients k1, k2, p1 and p2, but this lens has {len(beyond)} "
-        f"more that are not zero: {', '.join(f'{it:.3g}' for it in beyond)}.",
+        f"more that are not zero: {', '.join(f'{value:.3g}' for value in beyond)}.",
         culprits=["camera.distortion"],
         next_step="Leaving them out would bend the image: export with --to camera-info or opencv.",
     )

@@ -57,9 +57,9 @@ def _write(what: Literal["UTOOL", "UFRAME"], content: Content) -> str:
     lines = [
         f"/PROG  {_program_name(what, content.number)}",
         "/ATTR",
-        *(it.format(count=len(instructions)) for it in _ATTRIBUTES),
+        *(attribute.format(count=len(instructions)) for attribute in _ATTRIBUTES),
         "/MN",
-        *(f"{number:>4}:  {it} ;" for number, it in enumerate(instructions, 1)),
+        *(f"{number:>4}:  {instruction} ;" for number, instruction in enumerate(instructions, 1)),
         "/POS",
         *_position(content),
         "/END",
@@ -80,12 +80,12 @@ def _remarks(content: Content) -> list[str]:
         f"sigma {edge.sigma_mm:.2g} mm" + (f" and {edge.sigma_deg:.2g} deg" if measured else ""),
         *([] if measured else ["rotation not measured"]),
     ]
-    return [f"!{it[: _REMARK_SIZE - 1]}" for it in parts]
+    return [f"!{part[: _REMARK_SIZE - 1]}" for part in parts]
 
 
 def _position(content: Content) -> list[str]:
-    pose = [fixed(it, _DECIMALS) for it in write_pose(content.matrix, POSE_FORMS["fanuc"])]
-    x, y, z, w, p, r = (f"{it:>13}" for it in pose)
+    pose = [fixed(value, _DECIMALS) for value in write_pose(content.matrix, POSE_FORMS["fanuc"])]
+    x, y, z, w, p, r = (f"{name:>13}" for name in pose)
     return [
         "P[1]{",
         "   GP1:",

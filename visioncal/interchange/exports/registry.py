@@ -114,7 +114,7 @@ def document(source: Source | Identified, to: str, selection: Selection = _EVERY
     source, selection = _of_whole(source, selection, form)
     if isinstance(form, ArmFormat):
         arm = select_arm(source, selection, form)
-        omitted = tuple(f"{it}." for it in arm.omitted)
+        omitted = tuple(f"{name}." for name in arm.omitted)
         return Document(form.write(arm), (*_of_verdict(arm.verdict), *form.warn(arm), *omitted))
     if selection.edge == _ALL:
         contents = _select_all(source, selection, form)
@@ -154,7 +154,7 @@ def _of_verdict(verdict: Verdict) -> tuple[str, ...]:
 
 
 def _find(name: str) -> ExportFormat | ArmFormat:
-    by_name = {it.name: it for it in EXPORT_FORMATS}
+    by_name = {export_format.name: export_format for export_format in EXPORT_FORMATS}
     if name in by_name:
         return by_name[name]
     hint = did_you_mean(name, by_name)
@@ -246,7 +246,7 @@ def _named(form: ExportFormat, selection: Selection, there: Placements) -> str:
     if selection.edge is not None:
         return selection.edge
     if form.holds == "lens" and there.cell is not None:
-        frame = next(it for it, lens in there.lenses.items() if lens is there.lens)
+        frame = next(name for name, lens in there.lenses.items() if lens is there.lens)
         return f"{there.cell.frames[frame]}_from_{frame}"
     return there.default()
 

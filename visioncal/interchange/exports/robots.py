@@ -16,24 +16,24 @@ _ROTATION_DECIMALS = {"rotation-vector": 10, "quaternion-wxyz": 10}
 _DEGREE_DECIMALS = 8
 
 
-def ur_pose(it: list[str]) -> str:
+def ur_pose(group: list[str]) -> str:
     """Writes URScript's pose (Universal Robots, script manual)."""
-    return f"p[{', '.join(it)}]"
+    return f"p[{', '.join(group)}]"
 
 
-def kuka_frame(it: list[str]) -> str:
+def kuka_frame(group: list[str]) -> str:
     """Writes KRL's FRAME (KUKA, system variables)."""
-    return "{" + ",".join(f"{a} {b}" for a, b in zip("XYZABC", it, strict=True)) + "}"
+    return "{" + ",".join(f"{a} {b}" for a, b in zip("XYZABC", group, strict=True)) + "}"
 
 
-def abb_pose(it: list[str]) -> str:
+def abb_pose(group: list[str]) -> str:
     """Writes RAPID's `pose`: trans of type pos, rot of type orient (RAPID reference manual)."""
-    return f"[[{','.join(it[:3])}],[{','.join(it[3:])}]]"
+    return f"[[{','.join(group[:3])}],[{','.join(group[3:])}]]"
 
 
-def _fanuc(it: list[str]) -> str:
+def _fanuc(group: list[str]) -> str:
     """Writes a position's numbers as an ASCII program (.LS) has them."""
-    x, y, z, w, p, r = it
+    x, y, z, w, p, r = group
     return f"X = {x} mm, Y = {y} mm, Z = {z} mm,\nW = {w} deg, P = {p} deg, R = {r} deg"
 
 
@@ -41,8 +41,8 @@ def pose_texts(matrix: FloatArray, form: PoseForm) -> list[str]:
     """Writes the numbers of a (4, 4) pose [m] as a controller reads them."""
     decimals = _ROTATION_DECIMALS.get(form.rotation, _DEGREE_DECIMALS)
     pose = write_pose(matrix, form)
-    texts = [fixed(it, _DECIMALS[form.unit]) for it in pose[:3]]
-    return texts + [fixed(it, decimals) for it in pose[3:]]
+    texts = [fixed(value, _DECIMALS[form.unit]) for value in pose[:3]]
+    return texts + [fixed(value, decimals) for value in pose[3:]]
 
 
 def _write(form: PoseForm, mark: str, shape: Callable[[list[str]], str], content: Content) -> str:
@@ -75,14 +75,14 @@ STAUBLI = _robot(
     "staubli",
     "Staubli VAL 3 trsf: {x, y, z, rx, ry, rz} [mm, deg]",
     "//",
-    lambda it: f"{{{', '.join(it)}}}",
+    lambda group: f"{{{', '.join(group)}}}",
 )
 YASKAWA = _robot("yaskawa", "Yaskawa: X,Y,Z,Rx,Ry,Rz as in a job [mm, deg]", "", ",".join)
 DOOSAN = _robot(
     "doosan",
     "Doosan DRL: posx(x, y, z, a, b, c) [mm, deg about z, y, z]",
     "#",
-    lambda it: f"posx({', '.join(it)})",
+    lambda group: f"posx({', '.join(group)})",
 )
 
 ROBOTS = (UR, KUKA, FANUC, ABB, STAUBLI, YASKAWA, DOOSAN)

@@ -49,8 +49,8 @@ def _write_urdf_all(contents: Sequence[Content]) -> str:
     Ry(pitch) Rx(roll) (ROS wiki, urdf/XML/joint; urdfdom, Rotation::setFromRPY).
     """
     # A cell's root is a parent alone, and no robot's description has a link for it.
-    roots = {it.parent for it in contents if it.frames[0] == "cell"}
-    links = "".join(f'  <link name="{it}"/>\n' for it in sorted(roots))
+    roots = {content.parent for content in contents if content.frames[0] == "cell"}
+    links = "".join(f'  <link name="{root}"/>\n' for root in sorted(roots))
     joints = "".join(map(_urdf_joint, contents))
     return f'<?xml version="1.0"?>\n<robot name="visioncal">\n{links}{joints}</robot>\n'
 
@@ -58,9 +58,9 @@ def _write_urdf_all(contents: Sequence[Content]) -> str:
 def _urdf_joint(content: Content) -> str:
     # XML ends a comment at two hyphens.
     notes = "".join(
-        f"  <!-- {re.sub('-(?=-)', '- ', one_line(it))} -->\n" for it in _ros_notes(content)
+        f"  <!-- {re.sub('-(?=-)', '- ', one_line(note))} -->\n" for note in _ros_notes(content)
     )
-    pose = [repr(it) for it in numbers(write_pose(content.matrix, POSE_FORMS["rpy"]))]
+    pose = [repr(number) for number in numbers(write_pose(content.matrix, POSE_FORMS["rpy"]))]
     joint = f"{content.parent}-{content.child}".replace("/", "_")
     return (
         f"{notes}"
@@ -122,7 +122,7 @@ def _write_launch(content: Content) -> str:
 
 def _write_launches(contents: Sequence[Content]) -> str:
     first = '"""Publishes where all frames of a cell are."""\n\n'
-    notes = [note for it in contents for note in it.notes[1:]]
+    notes = [note for content in contents for note in content.notes[1:]]
     return first + comments("#", [contents[0].origin, *notes]) + _program(contents)
 
 

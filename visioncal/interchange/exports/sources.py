@@ -129,7 +129,7 @@ class Placements:
         Raises:
             DataError: There is none, or there are several.
         """
-        known = [it for it in self.frames if is_kind(it, kind)]
+        known = [frame for frame in self.frames if is_kind(frame, kind)]
         if len(known) == 1:
             return known[0]
         if known:
@@ -138,7 +138,7 @@ class Placements:
                 culprits=known,
                 next_step="Name one with --edge.",
             )
-        others = [it for it in self.by_name if is_kind(it, kind)]
+        others = [name for name in self.by_name if is_kind(name, kind)]
         choose = f", or name another transform: --edge {others[0]}" if others else ""
         raise DataError(
             f"{self.words.capitalize()} has no {kind}; it has {', '.join(self.by_name)}.",
@@ -175,13 +175,13 @@ def placements(source: Source, camera: str | None = None) -> Placements:
             culprits=["--camera"],
             next_step="Leave it out.",
         )
-    frames = {name: _of_frame(it) for name, it in source.frames.items()}
+    frames = {name: _of_frame(frame) for name, frame in source.frames.items()}
     if isinstance(source, FrameFile):
         return Placements(frames, tuple(frames), "this file of frames", None, None)
     origin = f"calibrated by visioncal from {source.session_name!r}, {source.created}"
     edges = {
-        name: Placement(it, origin, source.verdict, it.oriented)
-        for name, it in source.edges.items()
+        name: Placement(edge, origin, source.verdict, edge.oriented)
+        for name, edge in source.edges.items()
     }
     return Placements(
         {**edges, **frames}, tuple(frames), "this calibration", source.mount, source.camera
@@ -191,15 +191,15 @@ def placements(source: Source, camera: str | None = None) -> Placements:
 def _of_alignment(cell: Alignment, camera: str | None) -> Placements:
     # The reference and the cell are one frame: without it, the tree would be in two.
     placed = {
-        f"{on}_from_{it}": cell.edge_of(it)
-        for it, on in cell.frames.items()
-        if it not in cell.robots
+        f"{on}_from_{name}": cell.edge_of(name)
+        for name, on in cell.frames.items()
+        if name not in cell.robots
     }
     edges = {name: _of_cell(cell, edge) for name, edge in placed.items()}
     lens = None
     if camera is not None or len(cell.cameras) == 1:
         lens = cell.cameras[_camera(cell, camera)]
-    frames = {name: _of_frame(it) for name, it in cell.placed.items()}
+    frames = {name: _of_frame(frame) for name, frame in cell.placed.items()}
     by_name, lenses = {**edges, **frames}, cell.cameras
     return Placements(by_name, tuple(frames), "this alignment", None, lens, cell, lenses)
 

@@ -66,7 +66,7 @@ def wished(foreign: Foreign, requested: ImportOptions) -> Foreign:
 def _with_lens(foreign: Foreign, requested: ImportOptions) -> Foreign:
     lens, notes = dict(foreign.lens or {}), foreign.notes
     if requested.intrinsics == "estimate":
-        lens = {it: lens[it] for it in ("name", "model", "resolution") if it in lens}
+        lens = {name: lens[name] for name in ("name", "model", "resolution") if name in lens}
     elif requested.intrinsics is not None:
         lens, more = read_intrinsics(Path(requested.intrinsics))
         notes = (*notes, *more)
@@ -123,7 +123,7 @@ def assemble(foreign: Foreign, *, mount: Mount | None = None) -> Session:
     if foreign.sweep is not None:
         session = session.with_streams({"robot": _stream(foreign.sweep)})
     elif foreign.joints_rad is None and not foreign.robot.there.all():
-        absent = [foreign.robot.places[it] for it in np.flatnonzero(~foreign.robot.there)]
+        absent = [foreign.robot.places[index] for index in np.flatnonzero(~foreign.robot.there)]
         notes.append(
             f"{len(absent)} of {len(rows)} rows have no pose of the robot: {some_of(absent)}."
         )
@@ -151,7 +151,7 @@ def _stream(sweep: Sweep) -> Stream:
 
 
 def _check_images(name: str, files: Sequence[Path], notes: list[str]) -> None:
-    missing = [it for it in files if not it.is_file()]
+    missing = [file for file in files if not file.is_file()]
     if not missing:
         return
     words = f"{len(missing)} of {len(files)} images are missing: {some_of([*map(str, missing)], 3)}"
@@ -183,10 +183,10 @@ def spoken(foreign: Foreign) -> Foreign:
     points = foreign.columns.get("point", ())
     saw = np.zeros(len(foreign.robot), dtype=bool)
     for cells in (foreign.images, foreign.corners, points):
-        saw |= np.array([bool(it) for it in cells] or [False])
+        saw |= np.array([bool(cell) for cell in cells] or [False])
     if foreign.camera is not None:
         saw |= foreign.camera.there
-    silent = [foreign.robot.places[it] for it in np.flatnonzero(~saw)]
+    silent = [foreign.robot.places[index] for index in np.flatnonzero(~saw)]
     if len(silent) == len(saw):
         raise DataError(
             f"{foreign.name} has {len(saw)} poses of the robot, but neither images nor poses of "
@@ -247,12 +247,12 @@ def _written(foreign: Foreign) -> list[_Row]:
 def _corner_table(foreign: Foreign) -> CornerTable:
     views = foreign.views or range(len(foreign.robot))
     both = zip(views, foreign.corners, strict=True)
-    shown = [(view, it) for view, it in both if it is not None]
-    counts = [len(it.ids) for _, it in shown]
+    shown = [(view, corners) for view, corners in both if corners is not None]
+    counts = [len(corners.ids) for _, corners in shown]
     return CornerTable(
         np.repeat([view for view, _ in shown], counts),
-        np.concatenate([it.ids for _, it in shown]),
-        np.concatenate([it.px for _, it in shown]),
+        np.concatenate([corners.ids for _, corners in shown]),
+        np.concatenate([corners.px for _, corners in shown]),
         ("",) * sum(counts),
         is_file=False,
     )
@@ -265,7 +265,9 @@ def _scalars(foreign: Foreign, at: int) -> dict[str, str]:
     if foreign.joints_rad is not None:
         angles = foreign.joints_rad[at].tolist()
         names = [f"q{number}_rad" for number in range(1, len(angles) + 1)]
-        cells |= {it: "" if np.isnan(a) else repr(a) for it, a in zip(names, angles, strict=True)}
+        cells |= {
+            name: "" if np.isnan(a) else repr(a) for name, a in zip(names, angles, strict=True)
+        }
     return cells
 
 
@@ -300,14 +302,14 @@ def _extra_columns(foreign: Foreign) -> dict[str, tuple[str, ...]]:
 
 def _is_meant(name: str, cells: Sequence[str]) -> bool:
     """Tells whether a column with a name that sessions know holds what they mean by it."""
-    filled = {it for it in cells if it}
+    filled = {cell for cell in cells if cell}
     if name == "role":
         return filled <= {"fit", "holdout"}
     if name == "stop":
-        return all(it.isascii() and it.isdecimal() and len(it) < 10 for it in filled)
+        return all(word.isascii() and word.isdecimal() and len(word) < 10 for word in filled)
     if name in known.SELECTORS:
         return len(filled) < 2
-    finite = (is_number(it) and np.isfinite(float(it)) for it in filled)
+    finite = (is_number(word) and np.isfinite(float(word)) for word in filled)
     return not known.is_number(name) or all(finite)
 
 
@@ -322,15 +324,17 @@ def _image_paths(foreign: Foreign) -> list[tuple[str, Path] | None]:
             continue
         names = chain([file.name], (f"{number}_{file.name}" for number in count(at)))
         # Not every file system distinguishes capitals from small letters.
-        paths[file] = next(it for it in names if it.casefold() not in taken)
+        paths[file] = next(name for name in names if name.casefold() not in taken)
         taken.add(paths[file].casefold())
-    return [None if it is None else (f"images/{paths[it]}", it) for it in foreign.images]
+    return [
+        None if image is None else (f"images/{paths[image]}", image) for image in foreign.images
+    ]
 
 
 def _camera(foreign: Foreign, files: Sequence[Path]) -> dict[str, Any]:
-    lens = {it: value for it, value in (foreign.lens or {}).items() if value is not None}
+    lens = {name: value for name, value in (foreign.lens or {}).items() if value is not None}
     if "resolution" not in lens:
-        size = next((it for file in files if (it := _image_size(file)) is not None), None)
+        size = next((pair for file in files if (pair := _image_size(file)) is not None), None)
         if size is not None:
             lens["resolution"] = list(size)
         elif "matrix" in lens or foreign.corners:
@@ -366,7 +370,7 @@ def _robot(foreign: Foreign, document: dict[str, Any]) -> dict[str, Any] | None:
     """Names the robot's model in the document, reads it, and checks that it is one."""
     if foreign.arm is None:
         return None
-    arm = {it: str(value) for it, value in foreign.arm.items()}
+    arm = {name: str(value) for name, value in foreign.arm.items()}
     robot = read_robot_document(arm["model"], tip=arm.get("tip"))
     Robot.from_document(robot)
     suffix = Path(arm["model"]).suffix.lower()

@@ -67,7 +67,7 @@ def _of_kalibr(path: Path) -> dict[str, Any]:
         document: dict[str, Any] = {"kind": "aprilgrid"}
     else:
         names = {"columns": "targetCols", "rows": "targetRows", "square_m": "rowSpacingMeters"}
-        across, down = (table.number(f"{it}SpacingMeters") for it in ("col", "row"))
+        across, down = (table.number(f"{name}SpacingMeters") for name in ("col", "row"))
         if across != down:
             raise table.refuse("colSpacingMeters", across, f"rowSpacingMeters, {down!r},")
         document = {"kind": "checkerboard"}
@@ -116,5 +116,5 @@ def _in_one_word(words: str) -> dict[str, Any] | None:
 
 def target_name(document: Mapping[str, Any]) -> str | None:
     """Finds the shipped target with this content; None where there is none."""
-    shipped = ((it, read_target(it, None)[1]) for it in target_names())
+    shipped = ((name, read_target(name, None)[1]) for name in target_names())
     return next((name for name, content in shipped if content == document), None)

@@ -93,15 +93,19 @@ def _fields_of_document(document: object, path: Path) -> Fields:
     if isinstance(document, Mapping):
         numbered = _numbered(document)
         if len(numbered) > 1:
-            places = [f"{path.name}, {it}" for it in numbered]
-            rows = [flattened(it) for it in numbered.values()]
+            places = [f"{path.name}, {index}" for index in numbered]
+            rows = [flattened(mapping) for mapping in numbered.values()]
             return fields_of_records(rows, places, path.stem, path.parent, tuple(numbered))
-        lists = [it for it in document.values() if isinstance(it, list) and it]
-        tables = [it for it in lists if isinstance(it[0], Mapping)]
-        if not tables and document and all(isinstance(it, Mapping) for it in document.values()):
+        lists = [value for value in document.values() if isinstance(value, list) and value]
+        tables = [value for value in lists if isinstance(value[0], Mapping)]
+        if (
+            not tables
+            and document
+            and all(isinstance(value, Mapping) for value in document.values())
+        ):
             document = list(document.values())
         elif lists:
-            count = max(len(it) for it in tables or lists)
+            count = max(len(table) for table in tables or lists)
             columns = {k: v for k, v in document.items() if isinstance(v, list) and len(v) == count}
             rows = [{k: v[at] for k, v in columns.items()} for at in range(count)]
             document = next(iter(columns.values())) if tables and len(columns) == 1 else rows
@@ -110,7 +114,7 @@ def _fields_of_document(document: object, path: Path) -> Fields:
             f"{path} holds no rows; a list with one entry a pose is needed.", culprits=[str(path)]
         )
     places = [f"{path.name}, entry {at}" for at in range(len(document))]
-    records = [flattened(it) for it in document]
+    records = [flattened(value) for value in document]
     return fields_of_records(records, places, path.stem, path.parent)
 
 
@@ -118,9 +122,11 @@ def _numbered(document: Mapping[str, object]) -> dict[int, dict[str, object]]:
     """Groups matrices by the numbers that their names end with, or that are their names."""
     rows: dict[int, dict[str, object]] = defaultdict(dict)
     for name, value in document.items():
-        if isinstance(value, Mapping) and all(re.fullmatch("[0-9]{1,9}", str(it)) for it in value):
-            for at, it in value.items():
-                rows[int(at)][name] = it
+        if isinstance(value, Mapping) and all(
+            re.fullmatch("[0-9]{1,9}", str(number)) for number in value
+        ):
+            for at, number in value.items():
+                rows[int(at)][name] = number
         match = re.fullmatch(r"(.*?)[_-]?([0-9]{1,9})", name)
         # Columns of numbers may have names such as q1; a matrix is a list of lists.
         nested = isinstance(value, list) and bool(value) and isinstance(value[0], list)
@@ -145,10 +151,10 @@ def _read_file(path: Path, requested: ImportOptions) -> Foreign:
 def _pose_file(path: Path) -> Path | None:
     if path.is_file():
         return path if path.suffix.lower() in ENDINGS else None
-    files = [it for it in listed(path) if it.suffix.lower() in ENDINGS]
+    files = [file for file in listed(path) if file.suffix.lower() in ENDINGS]
     # Beside a file of intrinsics or notes, the name decides.
-    named = [it for it in files if re.search("pose|robot", it.stem.lower())]
-    return next((it[0] for it in (files, named) if len(it) == 1), None)
+    named = [file for file in files if re.search("pose|robot", file.stem.lower())]
+    return next((group[0] for group in (files, named) if len(group) == 1), None)
 
 
 def foreign_from(
@@ -166,7 +172,7 @@ def foreign_from(
     """
     unnamed = unnamed_columns(fields)
     given = (*requested.robot.names, *requested.camera.names, *requested.joints)
-    used = {fields.find(it) for it in given}
+    used = {fields.find(name) for name in given}
     robot_names = pose_names(fields, requested.robot.names, unnamed["robot"], "robot", used)
     used.update(robot_names)
     camera_names = pose_names(fields, requested.camera.names, unnamed["camera"], "camera", used)
@@ -192,7 +198,7 @@ def foreign_from(
         joints, more = joints_from(fields, of_joints, degrees=requested.joints_deg)
         notes = (*notes, *more)
     # The coordinates of a field that is taken.
-    used |= {it for it in fields.texts if it.rpartition(".")[0] in used}
+    used |= {text for text in fields.texts if text.rpartition(".")[0] in used}
     stamps = stamp_name(fields, used)
     if stamps and stamps in unnamed["time"]:
         notes = (*notes, f"Column {stamps} is taken for times, as the source does not say.")
@@ -208,7 +214,9 @@ def foreign_from(
         joints_rad=joints,
         stamps_s=in_seconds(fields.column(stamps)[:, 0]) if stamps else None,
         views=fields.views or view_numbers(fields),
-        columns={it: cells for it, cells in fields.texts.items() if it not in used | {image_name}},
+        columns={
+            name: cells for name, cells in fields.texts.items() if name not in used | {image_name}
+        },
         notes=(*notes, *more),
     )
 
@@ -217,8 +225,8 @@ def _check_no_more_poses(fields: Fields, used: Collection[str]) -> None:
     """Raises DataError where fields may be poses of the target, of which nobody says so."""
     rest = [
         name
-        for name, it in fields.numbers.items()
-        if it.ndim > 1 and it[0].size in _WHOLE_POSES and name not in used
+        for name, number in fields.numbers.items()
+        if number.ndim > 1 and number[0].size in _WHOLE_POSES and name not in used
     ]
     if rest:
         raise DataError(
@@ -233,8 +241,8 @@ def _check_no_more_poses(fields: Fields, used: Collection[str]) -> None:
 def view_numbers(fields: Fields) -> tuple[int, ...]:
     """The numbers in a column `view`, where they are whole and each is there once."""
     cells = fields.texts.get("view", ())
-    whole = all(it.isascii() and it.isdecimal() and len(it) < 10 for it in cells)
-    return tuple(int(it) for it in cells) if whole and len(set(cells)) == len(cells) else ()
+    whole = all(cell.isascii() and cell.isdecimal() and len(cell) < 10 for cell in cells)
+    return tuple(int(cell) for cell in cells) if whole and len(set(cells)) == len(cells) else ()
 
 
 def _images(
@@ -255,15 +263,15 @@ def _images(
 def _image_name(fields: Fields, folder: Path | None, taken: Collection[str]) -> str:
     """Finds the field that names images, by its name or its cells; empty where none does."""
     free = {name: cells for name, cells in fields.texts.items() if name not in taken}
-    usual = (it for it in _IMAGE_NAMES if any(map(is_image_name, free.get(it, ()))))
+    usual = (name for name in _IMAGE_NAMES if any(map(is_image_name, free.get(name, ()))))
     if name := next(usual, ""):
         return name
     files = [] if folder is None else listed(folder)
-    there = {name for it in files if is_image_name(it.name) for name in (it.name, it.stem)}
+    there = {name for file in files if is_image_name(file.name) for name in (file.name, file.stem)}
     naming = [
         name
         for name, cells in free.items()
-        if any(cells) and all(not it or is_image_name(it) or it in there for it in cells)
+        if any(cells) and all(not cell or is_image_name(cell) or cell in there for cell in cells)
     ]
     if len(naming) > 1:
         raise DataError(

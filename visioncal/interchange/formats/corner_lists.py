@@ -23,7 +23,7 @@ from visioncal.interchange.formats.foreign import Foreign, FoundCorners
 
 # What others call the image, a corner's number and its place; of one corner, and of all.
 _IMAGE = ("image", "img", "filename", "file", "image_name", "image_file", "image_path", "frame")
-_IMAGES = tuple(f"{it}s" for it in _IMAGE)
+_IMAGES = tuple(f"{name}s" for name in _IMAGE)
 _POINT = ("point", "point_id", "corner", "corner_id", "charuco_id", "id")
 _POINTS = ("ids", "charuco_ids", "corner_ids", "point_ids", "all_ids", "allids")
 _U, _V = ("u_px", "x_px", "u", "x", "img_loc_x"), ("v_px", "y_px", "v", "y", "img_loc_y")
@@ -53,15 +53,18 @@ def with_corners(foreign: Foreign, path: Path) -> Foreign:
     """
     is_document = path.suffix.lower() in (*DOCUMENTS, ".npz")
     images = list(_of_document(path) if is_document else _of_table(path))
-    if not any(it.found.ids.size for it in images):
+    if not any(image.found.ids.size for image in images):
         raise DataError(f"{path} holds no corners.", culprits=[str(path)])
-    count, names = len(foreign.robot), [Path(it.name.replace("\\", "/")).name for it in images]
-    rows = [None if it is None else it.name for it in foreign.images]
+    count, names = (
+        len(foreign.robot),
+        [Path(image.name.replace("\\", "/")).name for image in images],
+    )
+    rows = [None if image is None else image.name for image in foreign.images]
     notes = foreign.notes
     if all(names) and any(rows):
         found = dict(zip(names, images, strict=True))
         if len(found) < len(names):
-            twice = next(it for it in names if names.count(it) > 1)
+            twice = next(name for name in names if names.count(name) > 1)
             raise DataError(
                 f"{path.name} has corners of {twice} twice; each image is needed once.",
                 culprits=[twice],
@@ -70,13 +73,15 @@ def with_corners(foreign: Foreign, path: Path) -> Foreign:
         if not found.keys() & set(rows):
             raise DataError(
                 f"{path.name} has corners of {some_of(names, 3)}; the recording's images are "
-                f"{some_of([it for it in rows if it], 3)}.",
+                f"{some_of([row for row in rows if row], 3)}.",
                 culprits=[str(path)],
                 next_step="Name the column of the images that it is about with --image-column.",
             )
-        paired = [found.get(it or "") for it in rows]
+        paired = [found.get(row or "") for row in rows]
     elif len(images) == count:
-        order = sorted(images, key=lambda it: natural(Path(it.name))) if all(names) else images
+        order = (
+            sorted(images, key=lambda image: natural(Path(image.name))) if all(names) else images
+        )
         paired = [*order]
         notes = (*notes, f"The images of {path.name} are paired with the poses by their order.")
     else:
@@ -86,11 +91,13 @@ def with_corners(foreign: Foreign, path: Path) -> Foreign:
             culprits=[str(path)],
             next_step="Give as many of both, or a column with each pose's image (--image-column).",
         )
-    corners = tuple(it.found if it is not None and it.found.ids.size else None for it in paired)
+    corners = tuple(
+        image.found if image is not None and image.found.ids.size else None for image in paired
+    )
     # What the other program did not find is not searched, and what is missing not missed.
     pictures = tuple(
-        it if it is not None and of is not None and it.is_file() else None
-        for it, of in zip(foreign.images, corners, strict=bool(foreign.images))
+        image if image is not None and of is not None and image.is_file() else None
+        for image, of in zip(foreign.images, corners, strict=bool(foreign.images))
     )
     return replace(foreign, corners=corners, images=pictures if any(pictures) else (), notes=notes)
 
@@ -98,12 +105,12 @@ def with_corners(foreign: Foreign, path: Path) -> Foreign:
 def _of_table(path: Path) -> Iterator[_Image]:
     """Takes the images of a table in the order of their first rows."""
     columns, rows, places = _table(path)
-    lower = [it.lower() for it in columns]
+    lower = [column.lower() for column in columns]
 
     def column(names: Sequence[str]) -> int:
-        return next((lower.index(it) for it in names if it in lower), -1)
+        return next((lower.index(name) for name in names if name in lower), -1)
 
-    image, point, u, v, level = (column(it) for it in (_IMAGE, _POINT, _U, _V, (_LEVEL,)))
+    image, point, u, v, level = (column(pair) for pair in (_IMAGE, _POINT, _U, _V, (_LEVEL,)))
     if min(image, u, v) < 0:
         raise DataError(
             f"{path.name} has the columns {', '.join(columns)}; the image, x and y of each corner "
@@ -119,7 +126,7 @@ def _of_table(path: Path) -> Iterator[_Image]:
         if {"-", "nan"} & {row[u], row[v], row[level] if level >= 0 else ""} or not row[u]:
             continue
         cells = (str(number) if point < 0 else row[point], row[u], row[v])
-        if not all(is_number(it) for it in cells):
+        if not all(is_number(cell) for cell in cells):
             raise DataError(
                 f"{place}: {' '.join(cells)[:60]!r}; numbers are needed.", culprits=[place]
             )
@@ -134,11 +141,17 @@ def _table(path: Path) -> tuple[Sequence[str], Sequence[Sequence[str]], Sequence
     if path.suffix.lower() != ".vnl":
         table = read_table(path)
         return table.columns, table.rows, [table.place(at) for at in range(len(table.rows))]
-    lines = [(at, it.strip()) for at, it in enumerate(read_plain_text(path).splitlines(), start=1)]
+    lines = [
+        (at, line.strip()) for at, line in enumerate(read_plain_text(path).splitlines(), start=1)
+    ]
     # Comments have two signs, or one and an exclamation mark; the header has one.
-    headers = [it[1:].split() for _, it in lines if it[:1] == "#" and it[1:2] not in ("#", "!")]
+    headers = [
+        name[1:].split() for _, name in lines if name[:1] == "#" and name[1:2] not in ("#", "!")
+    ]
     columns = headers[0] if headers else []
-    rows = [(f"{path.name}, line {at}", it.split()) for at, it in lines if it and it[0] != "#"]
+    rows = [
+        (f"{path.name}, line {at}", name.split()) for at, name in lines if name and name[0] != "#"
+    ]
     short = next((place for place, cells in rows if len(cells) != len(columns)), "")
     if short:
         raise DataError(
@@ -166,7 +179,10 @@ def _of_document(path: Path) -> Iterator[_Image]:
         places, ids = _named(record, _PLACES), _named(record, (*_POINTS, *_POINT))
         try:
             if isinstance(places, list):
-                places = [[it["x"], it["y"]] if isinstance(it, Mapping) else it for it in places]
+                places = [
+                    [place["x"], place["y"]] if isinstance(place, Mapping) else place
+                    for place in places
+                ]
             px = np.array([] if places is None else places, dtype=float)
             numbers = None if ids is None else np.array(ids, dtype=float)
         except (KeyError, ValueError, TypeError, OverflowError):
@@ -183,7 +199,9 @@ def _of_document(path: Path) -> Iterator[_Image]:
 def _records(document: object) -> Iterator[Mapping[str, object]]:
     """Finds the records of images in a document: each has a list of corners."""
     if isinstance(document, list):
-        yield from (it for it in document if isinstance(it, Mapping) and _has_corners(it))
+        yield from (
+            value for value in document if isinstance(value, Mapping) and _has_corners(value)
+        )
     if not isinstance(document, Mapping):
         return
     places = _named(document, _PLACES)
@@ -197,30 +215,30 @@ def _records(document: object) -> Iterator[Mapping[str, object]]:
         yield document
     else:
         ids, names = _named(document, _POINTS), _named(document, _IMAGES)
-        for at, it in enumerate(places):
+        for at, place in enumerate(places):
             beside = {"ids": ids, "image": names}
             own = {
                 key: them[at]
                 for key, them in beside.items()
                 if isinstance(them, list | np.ndarray) and len(them) == len(places)
             }
-            yield {"corners": it, **own}
+            yield {"corners": place, **own}
 
 
 def _is_of_images(places: Sequence[object] | Array) -> bool:
     """Whether a list has a list of corners for each image, and is not itself one of corners."""
-    some = (it for it in places if isinstance(it, list | np.ndarray) and len(it) > 1)
-    return any(isinstance(it[0], list | np.ndarray) for it in some)
+    some = (place for place in places if isinstance(place, list | np.ndarray) and len(place) > 1)
+    return any(isinstance(value[0], list | np.ndarray) for value in some)
 
 
 def _has_corners(record: Mapping[str, object]) -> bool:
-    return any(it.lower() in _PLACES for it in map(str, record))
+    return any(name.lower() in _PLACES for name in map(str, record))
 
 
 def _named(record: Mapping[str, object], names: Sequence[str]) -> object:
     """The value of the first of some names, in whatever case; None where there is none."""
     lower = {str(name).lower(): value for name, value in record.items()}
-    return next((lower[it] for it in names if it in lower), None)
+    return next((lower[name] for name in names if name in lower), None)
 
 
 def _checked(ids: FloatArray, px: FloatArray, where: str) -> FoundCorners:

@@ -32,7 +32,9 @@ def exchange_views(session: Session, first: int, second: int) -> Session:
     Raises:
         DataError: There are no two such views.
     """
-    cells = {it.number: {name: it.cell(name) for name in session.columns} for it in session.views}
+    cells = {
+        view.number: {name: view.cell(name) for name in session.columns} for view in session.views
+    }
     for view in (first, second):
         if view not in cells:
             raise DataError(
@@ -41,7 +43,7 @@ def exchange_views(session: Session, first: int, second: int) -> Session:
                 culprits=["--exchange"],
             )
     one, other = cells[first], cells[second]
-    apart = [it for it in _BY_WHOM if one.get(it, "") != other.get(it, "")]
+    apart = [name for name in _BY_WHOM if one.get(name, "") != other.get(name, "")]
     if first == second or apart:
         what = f"are of another {' and '.join(apart)}" if apart else "are the same view"
         raise DataError(

@@ -65,10 +65,10 @@ class Fields:
         """The same of some rows alone."""
         return replace(
             self,
-            places=tuple(self.places[it] for it in chosen),
-            numbers={name: it[list(chosen)] for name, it in self.numbers.items()},
-            texts={name: tuple(it[at] for at in chosen) for name, it in self.texts.items()},
-            views=tuple(self.views[it] for it in chosen) if self.views else (),
+            places=tuple(self.places[index] for index in chosen),
+            numbers={name: number[list(chosen)] for name, number in self.numbers.items()},
+            texts={name: tuple(text[at] for at in chosen) for name, text in self.texts.items()},
+            views=tuple(self.views[index] for index in chosen) if self.views else (),
         )
 
     def find(self, name: str) -> str:
@@ -80,7 +80,7 @@ class Fields:
         known = list(dict.fromkeys([*self.numbers, *self.texts, *self.ragged]))
         if name in known:
             return name
-        ends = [it for it in known if it.endswith(f".{name}")]
+        ends = [word for word in known if word.endswith(f".{name}")]
         if len(ends) == 1:
             return ends[0]
         if ends:
@@ -105,7 +105,7 @@ class Fields:
             raise DataError(self.ragged[full], culprits=[full])
         if full not in self.numbers:
             cells = zip(self.places, self.texts[full], strict=True)
-            odd = ((place, it) for place, it in cells if it and not is_number(it))
+            odd = ((place, word) for place, word in cells if word and not is_number(word))
             # JSON has numbers in quotes as well.
             place, text = next(odd, (self.places[0], self.texts[full][0]))
             raise DataError(
@@ -119,10 +119,10 @@ class Fields:
         """Words the fields with the numbers that each has a row."""
         names = list(dict.fromkeys([*self.numbers, *self.texts]))
         words = [
-            f"{it} ({int(np.prod(self.numbers[it].shape[1:]))})"
-            if it in self.numbers and self.numbers[it].ndim > 1
-            else it
-            for it in names
+            f"{name} ({int(np.prod(self.numbers[name].shape[1:]))})"
+            if name in self.numbers and self.numbers[name].ndim > 1
+            else name
+            for name in names
         ]
         return some_of(words, _LISTED)
 
@@ -133,16 +133,16 @@ def fields_of_table(table: TextTable) -> Fields:
     Matrices below or beside each other are a row each; so are two rows, of the robot and of the
     camera, that come by turns.
     """
-    if it := _stacked_matrices(table) or _rows_by_turns(table):
-        return it
+    if matrices := _stacked_matrices(table) or _rows_by_turns(table):
+        return matrices
     columns = list(zip(*table.rows, strict=True))
     texts = dict(zip(table.columns, columns, strict=True))
     numbers = {
-        name: np.array([float(it) if it else np.nan for it in cells])
+        name: np.array([float(cell) if cell else np.nan for cell in cells])
         for name, cells in texts.items()
-        if any(cells) and all(not it or is_number(it) for it in cells)
+        if any(cells) and all(not cell or is_number(cell) for cell in cells)
     }
-    places = tuple(table.place(it) for it in range(len(table.rows)))
+    places = tuple(table.place(index) for index in range(len(table.rows)))
     return Fields(table.path.stem, table.path.parent, places, numbers, texts)
 
 
@@ -152,7 +152,7 @@ def _stacked_matrices(table: TextTable) -> Fields | None:
     count = height * width // 16
     if table.has_header or count < 2 or 4 not in (height, width) or (height + width) % 4:
         return None
-    if not all(is_number(it) for row in table.rows for it in row):
+    if not all(is_number(name) for row in table.rows for name in row):
         return None
     numbers = np.array(table.rows, dtype=float)
     matrices = (
@@ -172,7 +172,7 @@ def _rows_by_turns(table: TextTable) -> Fields | None:
     both = labels[:2]
     if len(set(both)) < 2 or len(labels) < 4 or labels != both * (len(labels) // 2):
         return None
-    if is_number(both[0]) or not all(is_number(it) for row in numbers for it in row):
+    if is_number(both[0]) or not all(is_number(name) for row in numbers for name in row):
         return None
     arrays = np.array(numbers, dtype=float)
     found = {
@@ -195,30 +195,30 @@ def fields_of_records(
     numbers: dict[str, FloatArray] = {}
     texts: dict[str, tuple[str, ...]] = {}
     ragged: dict[str, str] = {}
-    for key in dict.fromkeys(name for it in records for name in it):
-        values = [it.get(key) for it in records]
-        if any(isinstance(it, str) for it in values):
-            texts[key] = tuple("" if it is None else str(it) for it in values)
+    for key in dict.fromkeys(name for record in records for name in record):
+        values = [record.get(key) for record in records]
+        if any(isinstance(value, str) for value in values):
+            texts[key] = tuple("" if value is None else str(value) for value in values)
             continue
-        if bad := [at for at, it in enumerate(values) if isinstance(it, list)]:
+        if bad := [at for at, value in enumerate(values) if isinstance(value, list)]:
             ragged[key] = (
                 f"{places[bad[0]]}: {key} is no regular list or matrix of numbers: its lists "
                 "differ in length, or hold something else."
             )
             continue
-        arrays = [it if isinstance(it, np.ndarray) else None for it in values]
-        shapes = Counter(it.shape for it in arrays if it is not None)
+        arrays = [value if isinstance(value, np.ndarray) else None for value in values]
+        shapes = Counter(array.shape for array in arrays if array is not None)
         if not shapes:
             continue
         shape = shapes.most_common(1)[0][0]
-        odd = [at for at, it in enumerate(arrays) if it is not None and it.shape != shape]
+        odd = [at for at, array in enumerate(arrays) if array is not None and array.shape != shape]
         if odd:
             ragged[key] = (
                 f"{places[odd[0]]}: {key} has the shape {shapes.most_common()[-1][0]}; most rows "
                 f"have {shape}."
             )
             continue
-        rows = [np.full(shape, np.nan) if it is None else it for it in arrays]
+        rows = [np.full(shape, np.nan) if array is None else array for array in arrays]
         numbers[key] = np.array(rows).reshape(len(rows), *shape)
         if not shape:
             texts[key] = _cells(numbers[key])
@@ -237,7 +237,7 @@ def flattened(record: object, prefix: str = "") -> dict[str, object]:
     if isinstance(record, Mapping):
         flat: dict[str, object] = {}
         if prefix and [*record] in (["x", "y", "z"], ["x", "y", "z", "w"], ["w", "x", "y", "z"]):
-            flat |= flattened([record[it] for it in "xyzw"[: len(record)]], prefix)
+            flat |= flattened([record[name] for name in "xyzw"[: len(record)]], prefix)
         for name, value in record.items():
             flat |= flattened(value, f"{prefix}{name}.")
         return flat
@@ -257,23 +257,27 @@ def fields_of_arrays(arrays: Mapping[str, Array], path: Path) -> Fields:
     Raises:
         DataError: There is no array with rows.
     """
-    lengths = Counter(len(it) for it in arrays.values() if it.ndim > 1)
-    lengths = lengths or Counter(len(it) for it in arrays.values() if it.ndim == 1)
+    lengths = Counter(len(array) for array in arrays.values() if array.ndim > 1)
+    lengths = lengths or Counter(len(array) for array in arrays.values() if array.ndim == 1)
     if not lengths:
-        shapes = ", ".join(f"{name} {it.shape}" for name, it in arrays.items()) or "nothing"
+        shapes = ", ".join(f"{name} {array.shape}" for name, array in arrays.items()) or "nothing"
         raise DataError(
             f"{path} holds {shapes}; arrays with one row a pose are needed.", culprits=[str(path)]
         )
     rows = lengths.most_common(1)[0][0]
     fitting = {
-        name: it
-        for name, it in arrays.items()
-        if it.ndim and len(it) == rows and it.size <= _MOST_NUMBERS * max(rows, 1)
+        name: array
+        for name, array in arrays.items()
+        if array.ndim and len(array) == rows and array.size <= _MOST_NUMBERS * max(rows, 1)
     }
-    numbers = {name: it.astype(float) for name, it in fitting.items() if it.dtype.kind in "fiub"}
-    texts = {name: _cells(it) for name, it in numbers.items() if it.ndim == 1}
+    numbers = {
+        name: array.astype(float) for name, array in fitting.items() if array.dtype.kind in "fiub"
+    }
+    texts = {name: _cells(number) for name, number in numbers.items() if number.ndim == 1}
     texts |= {
-        name: tuple(it.decode("latin-1") if isinstance(it, bytes) else str(it) for it in array)
+        name: tuple(
+            value.decode("latin-1") if isinstance(value, bytes) else str(value) for value in array
+        )
         for name, array in fitting.items()
         if array.dtype.kind in "US" and array.ndim == 1
     }
@@ -284,7 +288,8 @@ def fields_of_arrays(arrays: Mapping[str, Array], path: Path) -> Fields:
 def _cells(numbers: FloatArray) -> tuple[str, ...]:
     """Writes (n,) numbers as the cells of a table, whole ones as counts are written."""
     return tuple(
-        "" if np.isnan(it) else str(int(it)) if it % 1 == 0 else repr(it) for it in numbers.tolist()
+        "" if np.isnan(number) else str(int(number)) if number % 1 == 0 else repr(number)
+        for number in numbers.tolist()
     )
 
 
@@ -301,7 +306,7 @@ def unnamed_columns(fields: Fields) -> Mapping[str, tuple[str, ...]]:
     if _are_matrices(fields, names):
         robot = 12
     if len(names) == 7 and set(names) == set(fields.numbers):
-        last = np.stack([fields.numbers[it] for it in names[3:]])
+        last = np.stack([fields.numbers[name] for name in names[3:]])
         if (np.abs(np.linalg.norm(last, axis=0) - 1.0) > _NO_QUATERNION).all():
             # A number or a time, and a position with three angles.
             time, robot = 1, 6
@@ -319,7 +324,7 @@ def _are_rotations_first(fields: Fields, names: Sequence[str]) -> bool:
     """Whether the last three of six numbers are no angles, even in degrees; the first may be."""
     if not set(names) <= set(fields.numbers):
         return False
-    first, last = np.abs([fields.numbers[it] for it in names]).reshape(2, -1)
+    first, last = np.abs([fields.numbers[name] for name in names]).reshape(2, -1)
     return bool(np.nanmax(first) <= _MOST_DEG < np.nanmax(last))
 
 
@@ -327,7 +332,7 @@ def _are_matrices(fields: Fields, names: Sequence[str]) -> bool:
     """Whether twelve numbers are the upper three rows of matrices, and not two poses."""
     if len(names) != 12 or set(names) != set(fields.numbers):
         return False
-    numbers = np.stack([fields.numbers[it] for it in names], axis=1)
+    numbers = np.stack([fields.numbers[name] for name in names], axis=1)
     rows = numbers.reshape(-1, 3, 4)[..., :3]
     return bool((np.abs(np.linalg.norm(rows, axis=2) - 1.0) < _NO_QUATERNION).all())
 
@@ -347,7 +352,7 @@ def _unnamed_times(fields: Fields, taken: Collection[str]) -> tuple[str, ...]:
     unnamed = unnamed_columns(fields)
     if not set(unnamed["robot"]) <= set(taken):
         return ()
-    return tuple(it for it in unnamed["time"] if not _are_counts(fields.column(it)[:, 0]))
+    return tuple(name for name in unnamed["time"] if not _are_counts(fields.column(name)[:, 0]))
 
 
 def _are_counts(numbers: FloatArray) -> bool:

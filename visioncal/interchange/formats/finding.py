@@ -30,16 +30,16 @@ def listed(folder: Path) -> tuple[Path, ...]:
     Links that lead out of it are left out.
     """
     try:
-        files = [it for it in folder.iterdir() if it.is_file()]
+        files = [path for path in folder.iterdir() if path.is_file()]
     except OSError:
         return ()
-    own = (it for it in files if not it.is_symlink() or is_inside(it, folder))
+    own = (file for file in files if not file.is_symlink() or is_inside(file, folder))
     return tuple(sorted(own, key=natural))
 
 
 def _images_in(folder: Path) -> tuple[Path, ...]:
     """Lists the images of a folder in natural order."""
-    found = tuple(it for it in listed(folder) if is_image_name(it.name))
+    found = tuple(path for path in listed(folder) if is_image_name(path.name))
     if not found:
         is_there = folder.is_dir()
         raise DataError(
@@ -97,9 +97,9 @@ def images_named(
 
 def _found(names: Sequence[str | None], folder: Path) -> list[Path | None]:
     there = _images_in(folder)
-    by_name = {it.stem: it for it in there} | {it.name: it for it in there}
+    by_name = {item.stem: item for item in there} | {item.name: item for item in there}
     by_number = _unique_numbers(there)
-    wanted = [number_in(it) for it in names if it]
+    wanted = [number_in(name) for name in names if name]
     is_unique = len(set(wanted)) == len(wanted) and None not in wanted
     found: list[Path | None] = []
     for name in names:
@@ -147,9 +147,9 @@ def _images_of(
     """
     there = _images_in(folder)
     by_number = _unique_numbers(there)
-    kinds = Counter(kind_of(it) for it in there if number_in(it.name) in set(views))
+    kinds = Counter(kind_of(path) for path in there if number_in(path.name) in set(views))
     if numbered and kinds and len(by_number) < len(there):
-        usual = [it for it, count in kinds.items() if count == max(kinds.values())]
+        usual = [name for name, count in kinds.items() if count == max(kinds.values())]
         if len(usual) > 1:
             raise DataError(
                 f"{folder} has several images a pose ({some_of(usual)}, with numbers); one is "
@@ -157,10 +157,10 @@ def _images_of(
                 culprits=usual,
                 next_step="Put those of one kind into a folder, and name it with --images.",
             )
-        there = tuple(it for it in there if kind_of(it) in usual)
+        there = tuple(path for path in there if kind_of(path) in usual)
         by_number = _unique_numbers(there)
     if numbered and len(by_number) == len(there) and by_number.keys() & set(views):
-        return tuple(by_number.get(it) for it in views), ()
+        return tuple(by_number.get(view) for view in views), ()
     if len(there) != len(views):
         first, last = there[0].name, there[-1].name
         raise DataError(
@@ -191,14 +191,14 @@ def images_beside(
     Raises:
         DataError: `chosen` has no images, or they are not as many as the rows.
     """
-    beside = any(is_image_name(it.name) for it in listed(folder))
+    beside = any(is_image_name(path.name) for path in listed(folder))
     if chosen is None and not beside:
         return (), ()
     return _images_of(chosen or folder, views, labels, numbered=numbered)
 
 
 def _unique_numbers(paths: Sequence[Path]) -> dict[int, Path]:
-    numbers = [(number_in(it.name), it) for it in paths]
+    numbers = [(number_in(path.name), path) for path in paths]
     counts = Counter(number for number, _ in numbers)
     return {number: path for number, path in numbers if number is not None and counts[number] == 1}
 

@@ -89,12 +89,14 @@ def rows_of(foreign: Foreign, rows: IntArray) -> Foreign:
         foreign,
         robot=foreign.robot.rows(rows),
         camera=None if foreign.camera is None else foreign.camera.rows(rows),
-        images=tuple(foreign.images[it] for it in rows) if foreign.images else (),
-        corners=tuple(foreign.corners[it] for it in rows) if foreign.corners else (),
+        images=tuple(foreign.images[index] for index in rows) if foreign.images else (),
+        corners=tuple(foreign.corners[index] for index in rows) if foreign.corners else (),
         joints_rad=None if foreign.joints_rad is None else foreign.joints_rad[rows],
         stamps_s=None if foreign.stamps_s is None else foreign.stamps_s[rows],
-        views=tuple((foreign.views or tuple(range(count)))[it] for it in rows),
-        columns={name: tuple(cells[it] for it in rows) for name, cells in foreign.columns.items()},
+        views=tuple((foreign.views or tuple(range(count)))[index] for index in rows),
+        columns={
+            name: tuple(cells[index] for index in rows) for name, cells in foreign.columns.items()
+        },
     )
 
 

@@ -34,7 +34,7 @@ def _hand_eye_file(path: Path) -> Path | None:
 
 def _kinematic_file(path: Path) -> Path | None:
     files = listed(path) if path.is_dir() else (path,)
-    return next((it for it in files if "target_joints:" in head(it)), None)
+    return next((file for file in files if "target_joints:" in head(file)), None)
 
 
 def _read_hand_eye(path: Path, requested: ImportOptions) -> Foreign:
@@ -65,8 +65,8 @@ def _read_hand_eye(path: Path, requested: ImportOptions) -> Foreign:
     # What the user says stands in place of what the source does.
     lens = None if requested.intrinsics else _lens(document, str(file), notes)
     target = None if requested.target else _target(document, notes)
-    numbered = [number_in(it) for it in places]
-    views = tuple(it for it in numbered if it is not None)
+    numbered = [number_in(place) for place in places]
+    views = tuple(index for index in numbered if index is not None)
     return Foreign(
         name=file.parent.name,
         robot=requested.robot.applied_to(
@@ -84,7 +84,7 @@ def _read_hand_eye(path: Path, requested: ImportOptions) -> Foreign:
 def _pose_numbers_of(value: object, where: str) -> list[float]:
     """Reads x, y, z, qx, qy, qz, qw [m]."""
     content = mapping(value, where)
-    return [number(content.get(it), f"{where}: {it}") for it in _POSE]
+    return [number(content.get(name), f"{where}: {name}") for name in _POSE]
 
 
 def _lens(document: Mapping[str, Any], where: str, notes: list[str]) -> dict[str, Any] | None:
@@ -122,8 +122,8 @@ def _dictionary(value: object, where: str) -> str:
     if isinstance(value, str):
         return value
     wanted = _integer(value, where)
-    names = [it for it in dir(cv2.aruco) if it.startswith("DICT_")]
-    found = [it for it in names if getattr(cv2.aruco, it) == wanted]
+    names = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
+    found = [name for name in names if getattr(cv2.aruco, name) == wanted]
     if not found:
         raise DataError(f"{where} is {wanted}, which OpenCV does not have.", culprits=[where])
     return found[0]
@@ -147,8 +147,8 @@ def _read_kinematics(path: Path, requested: ImportOptions) -> Foreign:
         poses.append(_pose_numbers_of(entry.get("pose"), f"{file}: {name}: pose"))
         for chain, values in joints.items():
             values.append(as_numbers(entry.get(chain, []), f"{file}: {name}: {chain}").reshape(-1))
-    moving = [it for it, values in joints.items() if any(len(row) for row in values)]
-    counts = {len(row) for it in moving for row in joints[it]}
+    moving = [name for name, values in joints.items() if any(len(row) for row in values)]
+    counts = {len(row) for name in moving for row in joints[name]}
     if len(moving) != 1 or len(counts) != 1:
         raise DataError(
             f"{file}: {' and '.join(moving) or 'no chain'} with {sorted(counts)} joints; one chain "
@@ -156,7 +156,7 @@ def _read_kinematics(path: Path, requested: ImportOptions) -> Foreign:
             culprits=[str(file)],
         )
     numbers = np.array(poses)
-    places = tuple(f"{file.name}: {it}" for it in document)
+    places = tuple(f"{file.name}: {name}" for name in document)
     camera = PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), places)
     return Foreign(
         name=file.stem,
@@ -164,7 +164,7 @@ def _read_kinematics(path: Path, requested: ImportOptions) -> Foreign:
         camera=requested.camera.applied_to(camera),
         joints_rad=np.array(joints[moving[0]]),
         mount="eye-to-hand" if moving == ["target_joints"] else "eye-in-hand",
-        columns={"source_row": tuple(str(it) for it in document)},
+        columns={"source_row": tuple(str(name) for name in document)},
     )
 
 

@@ -84,9 +84,9 @@ def intrinsics_from(
     if isinstance(inner, Mapping):
         return intrinsics_from(inner, f"{where}: intrinsics")
     if {"fx", "fy", "cx", "cy"} <= content.keys():
-        values = [number(content[it], f"{where}: {it}") for it in ("fx", "fy", "cx", "cy")]
+        values = [number(content[name], f"{where}: {name}") for name in ("fx", "fy", "cx", "cy")]
         return _lens("brown", values, [], content, where), ()
-    key = next((it for it in _MATRIX_KEYS if it in content), None)
+    key = next((key for key in _MATRIX_KEYS if key in content), None)
     if key is None:
         raise DataError(
             f"{where} has no camera matrix; it has {', '.join(map(str, list(content)[:20]))}.",
@@ -94,7 +94,7 @@ def intrinsics_from(
             next_step=f"The usual names are {', '.join(_MATRIX_KEYS[:5])}, or fx, fy, cx, cy.",
         )
     k = _camera_matrix(_array(content[key], f"{where}: {key}"), f"{where}: {key}")
-    coefficients: object = next((content[it] for it in _DISTORTION_KEYS if it in content), [])
+    coefficients: object = next((content[key] for key in _DISTORTION_KEYS if key in content), [])
     flat = _array(coefficients, f"{where}: distortion").reshape(-1)
     notes: tuple[str, ...] = ()
     if len(flat) == 4 and "distortion_model" not in content:
@@ -167,9 +167,11 @@ def _visp(root: Element, where: str) -> dict[str, Any]:
     """ViSP's camera XML (ViSP, vpCameraParameters)."""
     # Its k_ud carries undistorted to distorted points with 1 + k_ud r^2, which is OpenCV's k1.
     camera = root.child("camera") or root
-    models = [it for it in camera.children if it.tag == "model"]
-    kinds = [(it.child("type") or it).text for it in models]
-    chosen = [it for it, kind in zip(models, kinds, strict=True) if kind.endswith("WithDistortion")]
+    models = [child for child in camera.children if child.tag == "model"]
+    kinds = [(model.child("type") or model).text for model in models]
+    chosen = [
+        model for model, kind in zip(models, kinds, strict=True) if kind.endswith("WithDistortion")
+    ]
     if not models:
         raise DataError(f"{where}: the camera has no <model>.", culprits=[where])
     model = (chosen or models)[0]
@@ -181,7 +183,7 @@ def _visp(root: Element, where: str) -> dict[str, Any]:
         place, text = f"{where}: <{tag}>", child.text if child else ""
         return number(float(text) if is_number(text) else text, place)
 
-    values = [read(model, it) for it in ("px", "py", "u0", "v0")]
+    values = [read(model, name) for name in ("px", "py", "u0", "v0")]
     size = {"width": read(camera, "image_width", 0.0), "height": read(camera, "image_height", 0.0)}
     return _lens("brown", values, [read(model, "kud", 0.0)], size if size["width"] else {}, where)
 
@@ -200,7 +202,7 @@ def _lens(
             culprits=[where],
         )
     count = 4 if model == "fisheye" else 5 if len(coefficients) <= 5 else 8
-    beyond = [it for it in coefficients[count:] if it]
+    beyond = [coefficient for coefficient in coefficients[count:] if coefficient]
     values = np.array([*matrix, *coefficients])
     if not np.isfinite(values).all() or beyond:
         what = f"{len(coefficients)} coefficients" if beyond else "a number that is not finite"
@@ -211,8 +213,8 @@ def _lens(
     padded = (coefficients + [0.0] * count)[:count]
     lens: dict[str, Any] = {
         "model": model,
-        "matrix": [float(it) for it in matrix],
-        "distortion": [float(it) for it in padded],
+        "matrix": [float(value) for value in matrix],
+        "distortion": [float(value) for value in padded],
     }
     size = _size(content, where)
     return lens | ({"resolution": list(size)} if size else {})
@@ -221,12 +223,12 @@ def _lens(
 def _size(content: Mapping[str, Any], where: str) -> tuple[int, int] | None:
     for names in _SIZE_KEYS:
         if set(names) <= content.keys():
-            sides = [number(content[it], f"{where}: {it}") for it in names]
+            sides = [number(content[name], f"{where}: {name}") for name in names]
             break
     else:
         if "resolution" not in content:
             return None
         sides = list(as_numbers(content["resolution"], f"{where}: resolution").reshape(-1))
-    if len(sides) != 2 or not all(it % 1 == 0 and 0 < it < 1e6 for it in sides):
+    if len(sides) != 2 or not all(side % 1 == 0 and 0 < side < 1e6 for side in sides):
         raise DataError(f"{where}: the size of the image is {sides}.", culprits=[where])
     return int(sides[0]), int(sides[1])

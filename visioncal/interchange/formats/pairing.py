@@ -42,7 +42,7 @@ def _poses(
     """Takes the poses of one file: (poses, the fields that hold them, what was assumed)."""
     unnamed = unnamed_columns(fields)["robot"]
     # A file of the camera's poses alone calls them what a robot's file calls its own.
-    ways = (pose_names(fields, requested.names, unnamed, it, ()) for it in (whose, "robot"))
+    ways = (pose_names(fields, requested.names, unnamed, name, ()) for name in (whose, "robot"))
     names = next(filter(None, ways), ())
     if not names:
         raise DataError(

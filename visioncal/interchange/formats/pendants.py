@@ -53,11 +53,11 @@ def program_fields(path: Path) -> Fields:
     text = read_plain_text(path)
     # FANUC writes a position in several lines, between braces.
     lines = [
-        (text.count("\n", 0, it.start()) + 1, it[0].replace("\n", " "))
-        for it in _STATEMENT.finditer(text)
-        if not it[0].lstrip().startswith(_REMARKS) and _NO_STOP.search(it[0]) is None
+        (text.count("\n", 0, match.start()) + 1, match[0].replace("\n", " "))
+        for match in _STATEMENT.finditer(text)
+        if not match[0].lstrip().startswith(_REMARKS) and _NO_STOP.search(match[0]) is None
     ]
-    poses = [it for it in lines if is_marked_pose(it[1])]
+    poses = [line for line in lines if is_marked_pose(line[1])]
     if not poses:
         raise DataError(f"{path} has no taught poses that are known.", culprits=[str(path)])
     return _fields_of_lines(path, poses)
@@ -66,13 +66,13 @@ def program_fields(path: Path) -> Fields:
 def _fields_of_lines(path: Path, lines: Sequence[tuple[int, str]]) -> Fields:
     places = tuple(f"{path.name}, line {at}" for at, _ in lines)
     texts = [line for _, line in lines]
-    images = tuple(found[0] if (found := _IMAGE.search(it)) else "" for it in texts)
+    images = tuple(found[0] if (found := _IMAGE.search(text)) else "" for text in texts)
     poses = [
         read_pose(_IMAGE.sub(" ", text), place) for text, place in zip(texts, places, strict=True)
     ]
     form = poses[0].form
     _check_one_form(poses, places)
-    numbers = np.array([write_pose(it.pose, form) for it in poses])
+    numbers = np.array([write_pose(pose.pose, form) for pose in poses])
     columns = dict(zip(_NAMES[numbers.shape[1]], numbers.T, strict=True))
     named = {"image": images} if any(images) else {}
     return Fields(path.stem, path.parent, places, columns, named, form=form.name)
@@ -80,7 +80,7 @@ def _fields_of_lines(path: Path, lines: Sequence[tuple[int, str]]) -> Fields:
 
 def _check_one_form(poses: list[PendantPose], places: tuple[str, ...]) -> None:
     form = poses[0].form
-    others = [place for place, it in zip(places, poses, strict=True) if it.form != form]
+    others = [place for place, pose in zip(places, poses, strict=True) if pose.form != form]
     if others:
         raise DataError(
             f"{some_of(others)}: another maker's form than {form.words}, as {places[0]} has.",

@@ -86,29 +86,31 @@ def known_names(
         The fields' full names; empty where no set is whole.
     """
     # One number in a field called `robot` or `camera` says which of several it is.
-    numbers = (it for it, them in fields.numbers.items() if them.ndim > 1 or it not in SELECTORS)
+    numbers = (
+        name for name, them in fields.numbers.items() if them.ndim > 1 or name not in SELECTORS
+    )
     holding = [*numbers, *fields.ragged]
-    worded = (it for it, cells in fields.texts.items() if any(cells) and it not in SELECTORS)
+    worded = (name for name, cells in fields.texts.items() if any(cells) and name not in SELECTORS)
     names = list(dict.fromkeys([*holding, *worded]))
     whole = _sets_of_names(names, candidates, taken)
-    return next((it for it in whole if len(it) > 1 or it[0] in holding), ())
+    return next((pair for pair in whole if len(pair) > 1 or pair[0] in holding), ())
 
 
 def _sets_of_names(
     names: Sequence[str], candidates: Sequence[tuple[str, ...]], taken: Collection[str]
 ) -> Iterator[tuple[str, ...]]:
     """Yields the full names of every candidate that is whole."""
-    free = [it for it in names if it not in taken]
-    endings = Counter(it.rsplit(".", 1)[-1] for it in free)
-    full = {end: it for it in free if endings[end := it.rsplit(".", 1)[-1]] == 1}
-    full |= {it: it for it in free}
+    free = [name for name in names if name not in taken]
+    endings = Counter(name.rsplit(".", 1)[-1] for name in free)
+    full = {end: name for name in free if endings[end := name.rsplit(".", 1)[-1]] == 1}
+    full |= {name: name for name in free}
     # A name in the very letters of a candidate goes before one in other letters or with a unit.
-    plain = {it: without_unit(it)[0].lower() for it in full}
+    plain = {name: without_unit(name)[0].lower() for name in full}
     counts = Counter(plain.values())
-    bare = {plain[it]: name for it, name in full.items() if counts[plain[it]] == 1}
-    full = bare | {it.lower(): name for it, name in full.items()} | full
+    bare = {plain[word]: name for word, name in full.items() if counts[plain[word]] == 1}
+    full = bare | {word.lower(): name for word, name in full.items()} | full
     for them in candidates:
-        found = tuple(full.get(it, full.get(it.lower(), "")) for it in them)
+        found = tuple(full.get(name, full.get(name.lower(), "")) for name in them)
         if all(found):
             yield found
 
@@ -136,7 +138,7 @@ def pose_names(
         DataError: The user names what is not there.
     """
     if given:
-        return tuple(fields.find(it) for it in given)
+        return tuple(fields.find(name) for name in given)
     if unnamed:
         return () if set(unnamed) & set(taken) else unnamed
     keys = ROBOT_KEYS if whose == "robot" else CAMERA_KEYS
@@ -166,8 +168,8 @@ def poses_from(
     """
     if whose == "robot" and fields.form:
         requested = _with_own_form(fields, requested)
-    blocks = [fields.column(it) for it in names]
-    sizes = [it.shape[1] for it in blocks]
+    blocks = [fields.column(name) for name in names]
+    sizes = [block.shape[1] for block in blocks]
     places = fields.places
     if sum(sizes) in (12, 16) and 9 not in sizes:
         numbers = PoseNumbers(*_matrices(np.hstack(blocks)), Reading("matrix"), places)
@@ -180,7 +182,7 @@ def poses_from(
             culprits=list(names),
             next_step=f"Name the fields of the {whose}'s poses with --{whose}-columns.",
         )
-    units = {without_unit(it)[1] for it in names}
+    units = {without_unit(name)[1] for name in names}
     rotation, notes = _likely_rotation(
         rotations.shape[1], turned, requested, whose, degrees=bool(units & {"deg", "degrees"})
     )
@@ -207,7 +209,7 @@ def joint_names(fields: Fields, taken: Collection[str]) -> tuple[str, ...]:
     """Finds the fields of joint angles: a list of them, or one a joint that counts from one."""
     if whole := joint_columns(tuple(fields.numbers)):
         return whole
-    if listed := known_names(fields, [(it,) for it in JOINT_KEYS], taken):
+    if listed := known_names(fields, [(key,) for key in JOINT_KEYS], taken):
         return listed
     counted: dict[tuple[str, ...], dict[int, str]] = defaultdict(dict)
     for name, numbers in fields.numbers.items():
@@ -233,17 +235,17 @@ def joints_from(
     Raises:
         DataError: There are no such fields, a row lacks some, or they are no radians as named.
     """
-    joints = np.hstack([fields.column(it) for it in names])
+    joints = np.hstack([fields.column(name) for name in names])
     bad = ~np.isfinite(joints).all(axis=1)
     if bad.any():
         place = fields.places[int(np.argmax(bad))]
         raise DataError(f"{place}: a joint angle is missing or infinite.", culprits=[place])
-    ends = [it.rsplit(".", 1)[-1].lower() for it in names]
-    if degrees or all("deg" in it for it in ends):
+    ends = [name.rsplit(".", 1)[-1].lower() for name in names]
+    if degrees or all("deg" in end for end in ends):
         return np.deg2rad(joints), ()
     if (largest := np.abs(joints).max(initial=0.0)) > _MOST_TURNS_RAD:
         words = f"Joint angles up to {largest:.0f} are no radians"
-        if any("rad" in it for it in ends):
+        if any("rad" in end for end in ends):
             raise DataError(
                 f"{fields.name}: {words.lower()}.",
                 culprits=list(names),
@@ -353,9 +355,13 @@ def _likely_rotation(
     if size == 9:
         return "matrix", ()
     if size == 4:
-        ends = names[0][-4:].lower() if len(names) == 1 else "".join(it[-1].lower() for it in names)
+        ends = (
+            names[0][-4:].lower()
+            if len(names) == 1
+            else "".join(name[-1].lower() for name in names)
+        )
         # ABB counts q1 to q4 from the scalar on.
-        counted = [it[-2:].lower() for it in names] == ["q1", "q2", "q3", "q4"]
+        counted = [name[-2:].lower() for name in names] == ["q1", "q2", "q3", "q4"]
         rotation = f"quaternion-{'wxyz' if counted or ends == 'wxyz' else 'xyzw'}"
         if requested.form is not None or counted or ends in ("xyzw", "wxyz"):
             return rotation, ()

@@ -36,10 +36,10 @@ def printed_fields(path: Path) -> Fields | None:
     heading, begins = "", 0
     rows: list[list[float]] = []
     for at, line in enumerate(read_plain_text(path).splitlines(), start=1):
-        words = [it for it in _BETWEEN.split(line) if it]
+        words = [part for part in _BETWEEN.split(line) if part]
         if len(words) == 4 and all(map(is_number, words)):
             begins = begins if rows else at
-            rows.append([float(it) for it in words])
+            rows.append([float(word) for word in words])
         elif words:
             heading, rows = _plain(line), []
         if len(rows) == 4:
@@ -59,7 +59,7 @@ def printed_fields(path: Path) -> Fields | None:
     first = next(iter(found.values()))
     places = tuple(f"{path.name}, line {at}" for at, _ in first)
     numbers = {
-        name or "matrix": np.array([it for _, it in them]).reshape(-1, 16)
+        name or "matrix": np.array([group for _, group in them]).reshape(-1, 16)
         for name, them in found.items()
     }
     return Fields(path.stem, path.parent, places, numbers)
@@ -82,10 +82,10 @@ def echoed_fields(path: Path) -> Fields | None:
     """
     text = read_plain_text(path)
     places, rows = list[str](), list[list[float]]()
-    for it in _POSE.finditer(text):
-        at = text.count("\n", 0, it.start()) + 1
+    for match in _POSE.finditer(text):
+        at = text.count("\n", 0, match.start()) + 1
         places.append(f"{path.name}, line {at}")
-        numbers = re.findall(r"[^\s,]+", f"{it[1]},{it[2]}")
+        numbers = re.findall(r"[^\s,]+", f"{match[1]},{match[2]}")
         if len(numbers) != len(_NAMES) or not all(map(is_number, numbers)):
             raise DataError(
                 f"{places[-1]}: a translation of 3 numbers and a quaternion of 4 are needed.",

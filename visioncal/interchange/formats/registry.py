@@ -188,7 +188,7 @@ def _check_dest(source: Path, dest: Path, *, force: bool) -> None:
 
 def _foreign_format(source: Path, form: str | None) -> ForeignFormat:
     _check_source(source)
-    names = [it.name for it in FOREIGN_FORMATS]
+    names = [foreign_format.name for foreign_format in FOREIGN_FORMATS]
     if form is not None and form not in names:
         raise DataError(
             f"There is no format named {form!r}; the names are {', '.join(names)}.",
@@ -199,8 +199,8 @@ def _foreign_format(source: Path, form: str | None) -> ForeignFormat:
         if known.name == form or (form is None and known.recognises(source)):
             return known
     own = ("a session's folder", "an .rrd recording")
-    words = "; ".join([*own, *(it.words for it in FOREIGN_FORMATS)])
-    inside = ", ".join(it.name for it in listed(source)[:8]) if source.is_dir() else ""
+    words = "; ".join([*own, *(foreign_format.words for foreign_format in FOREIGN_FORMATS)])
+    inside = ", ".join(path.name for path in listed(source)[:8]) if source.is_dir() else ""
     raise DataError(
         f"{source} is no session and in no format that is known: {words}."
         + (f" It holds {inside}." if inside else ""),

@@ -110,7 +110,7 @@ def reread(foreign: Foreign, candidate: Candidate, *, mirrors_poses: bool = Fals
         joints_rad=joints,
         mount=taken.mount,
         target=None if target is None else _scaled(target, candidate.board_scale),
-        notes=(*(it for it in foreign.notes if not _is_overruled(it, candidate)), *notes),
+        notes=(*(note for note in foreign.notes if not _is_overruled(note, candidate)), *notes),
     )
 
 
@@ -119,7 +119,9 @@ def _is_overruled(note: str, candidate: Candidate) -> bool:
     if " taken for " not in note:
         return False
     start = note.replace("quaternions", "rotations").lower()
-    return any(start.startswith(" ".join(it.split()[:3])) for it in candidate.differences)
+    return any(
+        start.startswith(" ".join(difference.split()[:3])) for difference in candidate.differences
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,9 +153,9 @@ def load_in_doubt(path: Path) -> InDoubt:
     stated = {}
     if isinstance(name, str) and name.endswith(".toml"):
         stated = read_toml(path / name, name)
-    sides = (stated.get(it) for it in ("square_m", "size_m"))
-    numbers = (it for it in sides if isinstance(it, int | float))
-    side = next((it for it in numbers if LARGEST_M < it < _LARGEST_MM), None)
+    sides = (stated.get(name) for name in ("square_m", "size_m"))
+    numbers = (side for side in sides if isinstance(side, int | float))
+    side = next((number for number in numbers if LARGEST_M < number < _LARGEST_MM), None)
     if side is None:
         return InDoubt(Session.load(path, table=plain), robot)
     ways = {}
@@ -161,8 +163,8 @@ def load_in_doubt(path: Path) -> InDoubt:
         if UNITS_M[unit] * side <= LARGEST_M:
             target = _scaled(stated, UNITS_M[unit])
             ways[unit] = Session.load(path, target_document=target, table=plain)
-    scores = {unit: _closing_score(it, robot) for unit, it in ways.items()}
-    unit = min(scores, key=lambda it: scores[it])
+    scores = {unit: _closing_score(way, robot) for unit, way in ways.items()}
+    unit = min(scores, key=lambda index: scores[index])
     note = f"{name} cannot be in metres: {side:g} is read as {side:g} {unit}."
     return InDoubt(replace(ways[unit], warnings=(note, *ways[unit].warnings)), robot)
 
@@ -197,7 +199,9 @@ def _otherwise_written(folder: Path) -> _Table | None:
     columns, rows = parse_csv(read_text_inside(folder, "views.csv"), "views.csv")
     places = position_columns(columns) or POSITION
     spelt = {name.lower(): name for name in columns}
-    others = (tuple(spelt[it] for it in names) for names in ROTATIONS if spelt.keys() >= set(names))
+    others = (
+        tuple(spelt[name] for name in names) for names in ROTATIONS if spelt.keys() >= set(names)
+    )
     turns = QUATERNION if set(QUATERNION) <= set(columns) else next(others, ())
     if not turns or not {*places} <= {*columns}:
         return None
@@ -220,7 +224,7 @@ def _otherwise_written(folder: Path) -> _Table | None:
         is_there = np.isfinite(position).all()
         pose = [*map(repr, position.tolist()), *_NO_TURN] if is_there else [""] * len(POSE)
         plain.append(replace(row, cells=(*(mine.get(name, "") for name in kept), *pose)))
-    robot = PoseNumbers(positions, rotations, Reading(form), tuple(it.where for it in rows))
+    robot = PoseNumbers(positions, rotations, Reading(form), tuple(row.where for row in rows))
     return _Table(((*kept, *POSE), tuple(plain)), robot)
 
 
@@ -283,7 +287,9 @@ def reread_session(
         target_document=target,
         robot_document=session.robot_document,
         corners=corners,
-    ).with_streams({name: _reread_stream(it, taken) for name, it in session.streams.items()})
+    ).with_streams(
+        {name: _reread_stream(stream, taken) for name, stream in session.streams.items()}
+    )
     said = dict.fromkeys((*changed, *session.warnings, *reread.warnings))
     return replace(reread, warnings=tuple(said))
 
@@ -331,7 +337,7 @@ def _turned_back(
     )
     tried = candidate.hypothesis
     tried = replace(tried, robot=replace(tried.robot, signs=""))
-    others = tuple(it for it in candidate.differences if it != MIRROR_WORDS)
+    others = tuple(difference for difference in candidate.differences if difference != MIRROR_WORDS)
     return (
         replace(corners, px=px),
         (words,),
@@ -363,7 +369,8 @@ def _go_together(chain: FloatArray | None, robot: PoseNumbers) -> bool:
         return True
     # Other units or frames move all rows alike: what differs from row to row shows it.
     steps = [
-        np.linalg.norm(np.diff(it, axis=0), axis=1) for it in (chain[:, :3, 3], robot.positions)
+        np.linalg.norm(np.diff(array, axis=0), axis=1)
+        for array in (chain[:, :3, 3], robot.positions)
     ]
     both = np.isfinite(steps).all(axis=0)
     if both.sum() < _FEWEST_STEPS:
@@ -388,6 +395,6 @@ def _scaled(target: Mapping[str, Any], factor: float) -> Mapping[str, Any]:
     if factor == 1.0:
         return target
     return {
-        it: factor * value if it in _LENGTHS and isinstance(value, int | float) else value
-        for it, value in target.items()
+        name: factor * value if name in _LENGTHS and isinstance(value, int | float) else value
+        for name, value in target.items()
     }

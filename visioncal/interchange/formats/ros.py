@@ -55,8 +55,8 @@ def _transform(value: object, where: str) -> list[float]:
     position = mapping(content.get("translation"), f"{where}: translation")
     rotation = mapping(content.get("rotation"), f"{where}: rotation")
     return [
-        *(number(position.get(it), f"{where}: translation: {it}") for it in "xyz"),
-        *(number(rotation.get(it), f"{where}: rotation: {it}") for it in "xyzw"),
+        *(number(position.get(name), f"{where}: translation: {name}") for name in "xyz"),
+        *(number(rotation.get(name), f"{where}: rotation: {name}") for name in "xyzw"),
     ]
 
 

@@ -57,7 +57,7 @@ def in_seconds(stamps: FloatArray) -> FloatArray:
     """Reads stamps as seconds; an epoch's size shows milli-, micro- or nanoseconds."""
     known = np.abs(stamps[np.isfinite(stamps)])
     largest = float(known.max()) if len(known) else 0.0
-    return stamps * next((it for limit, it in _EPOCHS if largest > limit), 1.0)
+    return stamps * next((value for limit, value in _EPOCHS if largest > limit), 1.0)
 
 
 def pair_streams(

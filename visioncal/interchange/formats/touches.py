@@ -76,7 +76,7 @@ def _of_robot(fields: Fields, robot: str | None) -> Fields:
             culprits=["--robot"],
             next_step=did_you_mean(robot, known),
         )
-    return fields.rows([at for at, it in enumerate(named) if it == robot])
+    return fields.rows([at for at, name in enumerate(named) if name == robot])
 
 
 def _rows_of(
@@ -127,7 +127,7 @@ def read_nominal(path: Path, unit: str | None = None) -> NominalPoints:
             next_step="Name the touches first, and the drawing's table with --cad.",
         )
     names = _names(fields)
-    twice = [it for it in dict.fromkeys(names) if names.count(it) > 1]
+    twice = [name for name in dict.fromkeys(names) if names.count(name) > 1]
     if twice:
         raise DataError(
             f"{path.name}: point {some_of(twice)} stands there more than once.", culprits=twice
@@ -138,20 +138,20 @@ def read_nominal(path: Path, unit: str | None = None) -> NominalPoints:
     if len(bad):
         raise DataError(
             f"{fields.places[bad[0]]}: a coordinate is missing.",
-            culprits=[fields.places[it] for it in bad],
+            culprits=[fields.places[index] for index in bad],
         )
     return NominalPoints(path.name, names, positions, _sigmas(fields, length_m))
 
 
 def _names(fields: Fields) -> tuple[str, ...]:
-    column = next((it for it in _NAMES if it in fields.texts), None)
+    column = next((name for name in _NAMES if name in fields.texts), None)
     if column is None:
         raise DataError(
             f"{fields.name}: a column {some_of(_NAMES)} is needed, with the name of each point; "
             f"there are {fields.listing()}.",
             culprits=[fields.name],
         )
-    names = tuple(it.strip() for it in fields.texts[column])
+    names = tuple(text.strip() for text in fields.texts[column])
     if not all(names):
         place = fields.places[names.index("")]
         raise DataError(f"{place}: the point has no name.", culprits=[place])
@@ -161,7 +161,7 @@ def _names(fields: Fields) -> tuple[str, ...]:
 def _sigmas(fields: Fields, length_m: float) -> FloatArray:
     """How well each point is known (n,) [m]; zero where the table does not say."""
     units = {f"sigma_{name}": length for name, length in UNITS_M.items()} | {"sigma": length_m}
-    column = next((it for it in units if it in fields.numbers), None)
+    column = next((unit for unit in units if unit in fields.numbers), None)
     if column is None:
         return np.zeros(len(fields))
     sigmas = units[column] * np.nan_to_num(fields.column(column)[:, 0])
@@ -180,12 +180,12 @@ def _axes(
             f"There is no unit of length named {unit!r}; the names are {some_of(list(UNITS_M))}.",
             culprits=[unit],
         )
-    known = {it.lower(): it for it in (*fields.texts, *fields.numbers)}
+    known = {text.lower(): text for text in (*fields.texts, *fields.numbers)}
     for name, length in UNITS_M.items():
         wanted = named or [f"{axis}_{name}" for axis in "xyz"]
-        if all(it.lower() in known and it.endswith(f"_{name}") for it in wanted):
+        if all(word.lower() in known and word.endswith(f"_{name}") for word in wanted):
             # Who names a unit has seen that the columns' names are wrong.
-            return tuple(known[it.lower()] for it in wanted), UNITS_M[unit] if unit else length
+            return tuple(known[name.lower()] for name in wanted), UNITS_M[unit] if unit else length
     plain = tuple(named) or tuple(known.get(axis, "") for axis in "xyz")
     if not all(plain):
         raise DataError(
@@ -203,11 +203,11 @@ def _axes(
 
 
 def _has_axes(fields: Fields) -> bool:
-    known = {it.lower() for it in fields.numbers}
-    suffixes = ("", *(f"_{it}" for it in UNITS_M))
-    return any(all(f"{axis}{it}" in known for axis in "xyz") for it in suffixes)
+    known = {number.lower() for number in fields.numbers}
+    suffixes = ("", *(f"_{unit}" for unit in UNITS_M))
+    return any(all(f"{axis}{suffix}" in known for axis in "xyz") for suffix in suffixes)
 
 
 def _coordinates(fields: Fields, columns: Sequence[str], length_m: float) -> FloatArray:
     """Takes three columns in a unit of some length: (n, 3) [m]; NaN where a cell is empty."""
-    return length_m * np.column_stack([fields.column(it)[:, 0] for it in columns])
+    return length_m * np.column_stack([fields.column(column)[:, 0] for column in columns])

@@ -47,7 +47,10 @@ def _families(folder: Path) -> tuple[_Family, ...]:
             groups[kind_of(file)].setdefault(number, file)
     families = [_Family(name.rsplit(".", 1)[0], files) for name, files in groups.items()]
     return tuple(
-        sorted((it for it in families if len(it.files) > 1), key=lambda it: -len(it.files))
+        sorted(
+            (family for family in families if len(family.files) > 1),
+            key=lambda family: -len(family.files),
+        )
     )
 
 
@@ -57,7 +60,7 @@ def _view_folder(path: Path) -> Path | None:
         return None
     inner = path / "poses"
     folders = (path, inner) if is_inside(inner, path) else (path,)
-    return next((it for it in folders if _families(it)), None)
+    return next((folder for folder in folders if _families(folder)), None)
 
 
 def _read_views(path: Path, requested: ImportOptions) -> Foreign:
@@ -66,7 +69,7 @@ def _read_views(path: Path, requested: ImportOptions) -> Foreign:
     if folder is None:
         raise DataError(f"{path} has no files like pose_01.json.", culprits=[str(path)])
     families = _families(folder)
-    views = sorted({number for it in families for number in it.files})
+    views = sorted({number for family in families for number in family.files})
     records: list[dict[str, object]] = [{} for _ in views]
     for family in families:
         prefix = f"{family.name}." if len(families) > 1 else ""
@@ -76,12 +79,15 @@ def _read_views(path: Path, requested: ImportOptions) -> Foreign:
                     own = family.name if key == "matrix" else f"{prefix}{key}"
                     records[at][own or "matrix"] = value
     places = [
-        " and ".join(it.files[view].name for it in families if view in it.files) for view in views
+        " and ".join(family.files[view].name for family in families if view in family.files)
+        for view in views
     ]
     name = (path if folder == path else folder.parent).resolve().name
     fields = fields_of_records(records, places, name, folder, tuple(views))
-    around = (it for it in (folder, path, path / "images") if is_inside(it, path))
-    images = next((it for it in around if any(is_image_name(at.name) for at in listed(it))), None)
+    around = (file for file in (folder, path, path / "images") if is_inside(file, path))
+    images = next(
+        (file for file in around if any(is_image_name(at.name) for at in listed(file))), None
+    )
     return foreign_from(fields, requested, images=images)
 
 
@@ -104,8 +110,8 @@ def _record(path: Path) -> dict[str, object]:
 def _table_record(path: Path) -> object:
     table = read_table(path)
     if table.has_header and len(table.rows) == 1:
-        return dict(zip(table.columns, (_cell(it) for it in table.rows[0]), strict=True))
-    rows = [[_cell(it) for it in row] for row in table.rows]
+        return dict(zip(table.columns, (_cell(row) for row in table.rows[0]), strict=True))
+    rows = [[_cell(name) for name in row] for row in table.rows]
     return rows[0] if len(rows) == 1 else rows
 
 
@@ -123,15 +129,15 @@ VIEWS = ForeignFormat(
 
 def _halcon_pose(path: Path) -> FloatArray | None:
     """Reads the (4, 4) pose of one file."""
-    lines = {it[1]: it[2].split() for it in _LINE.finditer(read_plain_text(path))}
+    lines = {match[1]: match[2].split() for match in _LINE.finditer(read_plain_text(path))}
     if lines.keys() != {"f", "r", "t"}:
         return None
     counts = {name: len(words) for name, words in lines.items()}
     if counts != {"f": 1, "r": 3, "t": 3} or not all(
-        is_number(it) for them in lines.values() for it in them
+        is_number(name) for them in lines.values() for name in them
     ):
         raise DataError(f"{path}: f, r and t hold 1, 3 and 3 numbers.", culprits=[str(path)])
-    (code,), turns, position = (np.array(lines[it], dtype=float) for it in "frt")
+    (code,), turns, position = (np.array(lines[name], dtype=float) for name in "frt")
     if code == _RODRIGUEZ:
         half = np.arctan(np.linalg.norm(turns))
         rotation = Rotation.from_rotvec(2.0 * half * turns / max(float(np.tan(half)), 1e-300))

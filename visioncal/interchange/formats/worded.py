@@ -67,18 +67,18 @@ def _in_two(sizes: dict[str, int], whose: str) -> Iterator[tuple[str, ...]]:
     for name, size in sizes.items():
         words = _words(name)
         if size in (3, 4, 9) and _ROTATIONS & {*words}:
-            rotations[tuple(it for it in words if it not in _ROTATIONS)].append(name)
+            rotations[tuple(word for word in words if word not in _ROTATIONS)].append(name)
         elif size == 3 and _POSITIONS & {*words}:
-            positions[tuple(it for it in words if it not in _POSITIONS)] = name
+            positions[tuple(word for word in words if word not in _POSITIONS)] = name
     for left, position in positions.items():
         is_plain = not {*left} - _WHOLE and whose == "robot"
         if rotations[left] and (is_plain or _is_of(left, whose)):
             # Of several, what leaves the least open: a matrix, then a quaternion.
-            yield position, max(rotations[left], key=lambda it: sizes[it])
+            yield position, max(rotations[left], key=lambda index: sizes[index])
 
 
 def _words(name: str) -> list[str]:
-    return [it for it in re.split(r"[\W_]+|(2)", without_unit(name)[0].lower()) if it]
+    return [part for part in re.split(r"[\W_]+|(2)", without_unit(name)[0].lower()) if part]
 
 
 def _is_of(words: Sequence[str], whose: str) -> bool:
@@ -86,7 +86,7 @@ def _is_of(words: Sequence[str], whose: str) -> bool:
     stays, placed = _FRAMES[whose]
     if _sides(words) != [whose]:
         return False
-    frames = [it for it in words if it in stays | placed]
+    frames = [word for word in words if word in stays | placed]
     if {*frames} & stays and {*frames} & placed:
         return (frames[0] in placed) == bool({*words} & _PLACED_FIRST)
     return True
@@ -94,4 +94,8 @@ def _is_of(words: Sequence[str], whose: str) -> bool:
 
 def _sides(words: Sequence[str]) -> list[str]:
     """Whose frames words name."""
-    return [it for it in _FRAMES if {*words} & (_FRAMES[it][0] | _FRAMES[it][1] | _MEANT[it])]
+    return [
+        frame
+        for frame in _FRAMES
+        if {*words} & (_FRAMES[frame][0] | _FRAMES[frame][1] | _MEANT[frame])
+    ]

@@ -28,7 +28,7 @@ _ZIVID_NAME = re.compile(r"(pos|pose|robot_pose)_?[0-9]+\.ya?ml", re.IGNORECASE)
 def _zivid_files(path: Path) -> tuple[Path, ...]:
     if not path.is_dir():
         return ()
-    named = tuple(it for it in listed(path) if _ZIVID_NAME.fullmatch(it.name))
+    named = tuple(file for file in listed(path) if _ZIVID_NAME.fullmatch(file.name))
     return named if named and re.search("FloatMatrix|PoseState", head(named[0])) else ()
 
 
@@ -37,10 +37,10 @@ def _read_zivid(path: Path, requested: ImportOptions) -> Foreign:
     files = _zivid_files(path)
     if not files:
         raise DataError(f"{path} has no files like pos01.yaml.", culprits=[str(path)])
-    matrices = np.array([_matrix(it) for it in files])
-    numbers = [number_in(it.name) for it in files]
-    views = tuple(it for it in numbers if it is not None)
-    places = tuple(it.name for it in files)
+    matrices = np.array([_matrix(file) for file in files])
+    numbers = [number_in(file.name) for file in files]
+    views = tuple(number for number in numbers if number is not None)
+    places = tuple(file.name for file in files)
     images, notes = images_beside(path, requested.images, views, places, numbered=True)
     return Foreign(
         name=path.resolve().name,
@@ -70,7 +70,7 @@ ZIVID = ForeignFormat(
 def _pose_files(path: Path, name: re.Pattern[str] = _POSE_NAME) -> tuple[Path, ...]:
     if not path.is_dir():
         return ()
-    return tuple(it for it in listed(path) if name.fullmatch(it.name))
+    return tuple(file for file in listed(path) if name.fullmatch(file.name))
 
 
 def _read(path: Path, requested: ImportOptions) -> Foreign:
@@ -79,12 +79,16 @@ def _read(path: Path, requested: ImportOptions) -> Foreign:
     files = _pose_files(path)
     if not files:
         raise DataError(f"{path} has no files like franka_pose_rPe_1.yaml.", culprits=[str(path)])
-    views = tuple(number_in(it.name) or 0 for it in files)
-    places = tuple(it.name for it in files)
+    views = tuple(number_in(file.name) or 0 for file in files)
+    places = tuple(file.name for file in files)
     notes: list[str] = []
     images, paired = images_beside(path, requested.images, views, places, numbered=True)
-    seen = {} if any(images) else {number_in(it.name): it for it in _pose_files(path, _SEEN_NAME)}
-    camera = requested.camera.applied_to(_poses([seen.get(it) for it in views], places))
+    seen = (
+        {}
+        if any(images)
+        else {number_in(file.name): file for file in _pose_files(path, _SEEN_NAME)}
+    )
+    camera = requested.camera.applied_to(_poses([seen.get(view) for view in views], places))
     return Foreign(
         name=path.resolve().name,
         robot=requested.robot.applied_to(_poses(files, places)),
@@ -99,7 +103,7 @@ def _read(path: Path, requested: ImportOptions) -> Foreign:
 
 
 def _poses(files: Sequence[Path | None], places: tuple[str, ...]) -> PoseNumbers:
-    numbers = np.array([[np.nan] * 6 if it is None else _pose(it) for it in files])
+    numbers = np.array([[np.nan] * 6 if file is None else _pose(file) for file in files])
     return PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading("rotation-vector"), places)
 
 
@@ -111,19 +115,19 @@ def _pose(path: Path) -> list[float]:
             f"{path}: data holds {len(flat)} numbers; tx, ty, tz and theta-u are needed.",
             culprits=[str(path)],
         )
-    return [float(it) for it in flat]
+    return [float(float64) for float64 in flat]
 
 
 def _mount(path: Path, notes: list[str]) -> Mount | None:
     name = path.resolve().name
-    found = next((it for it in MOUNTS if it in name), None)
+    found = next((mount for mount in MOUNTS if mount in name), None)
     if found is not None:
         notes.append(f"The mount is taken from the folder's name: {found}.")
     return found
 
 
 def _lens(path: Path, notes: list[str]) -> dict[str, Any] | None:
-    cameras = [it for it in listed(path) if it.suffix.lower() == ".xml"]
+    cameras = [file for file in listed(path) if file.suffix.lower() == ".xml"]
     if not cameras:
         return None
     lens, more = read_intrinsics(cameras[0])

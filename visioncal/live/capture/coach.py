@@ -90,7 +90,9 @@ class Coach:
 
     def _tilts(self) -> list[float]:
         """The angles between the optical axis and the board's normal [deg]."""
-        return [float(np.rad2deg(np.arccos(np.clip(-it[2], -1.0, 1.0)))) for it in self._normals]
+        return [
+            float(np.rad2deg(np.arccos(np.clip(-normal[2], -1.0, 1.0)))) for normal in self._normals
+        ]
 
     def _missing_side(self, tilts: FloatArray) -> Iterator[str]:
         """Names the axis of the camera about which no view leans yet."""
@@ -119,4 +121,4 @@ class Coach:
             found = measure_poses(seen, (self.target,), self.camera, _PIXEL_PX)
         except VisioncalError:
             return ()
-        return [it.cam_from_target[0] for it in found]
+        return [view.cam_from_target[0] for view in found]

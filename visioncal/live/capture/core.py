@@ -146,7 +146,7 @@ class Capture:
             return ""
         if self.prediction is None:
             return f"view {view}"
-        then = self.prediction.after([*(it.number for it in self.journal.views), view])
+        then = self.prediction.after([*(other.number for other in self.journal.views), view])
         if then is None or then.is_open:
             return f"view {view}"
         return f"view {view}, for {figure(then.mm)} mm"
@@ -165,19 +165,20 @@ class Capture:
     def _accuracy(self) -> Accuracy | None:
         if self.prediction is None:
             return None
-        return self.prediction.after([it.number for it in self.journal.views])
+        return self.prediction.after([view.number for view in self.journal.views])
 
     def _check_lost(self) -> None:
         if not self.options.lost:
             return
         last = self.steps[-self.options.lost :]
-        reasons = [it.found.reason for it in last if isinstance(it.found, Missed)]
+        reasons = [step.found.reason for step in last if isinstance(step.found, Missed)]
         if len(reasons) < self.options.lost:
             return
         raise DataError(
-            f"no view at {len(last)} stops in a row ({', '.join(f'{it.view}' for it in last)}): "
+            f"no view at {len(last)} stops in a row "
+            f"({', '.join(f'{step.view}' for step in last)}): "
             f"{reasons[-1]}.",
-            culprits=[f"view {it.view}" for it in last],
+            culprits=[f"view {step.view}" for step in last],
             next_step="Look at the board: does it lie where the plan has it, in the light and "
             f"unhidden? Is it a {self.target.name}, and the lens in focus? Then go on with "
             "--resume.",

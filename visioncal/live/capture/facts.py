@@ -104,13 +104,13 @@ def view_of(number: int, image: str, taken: Taken, facts: Facts, unix_offset_s: 
         ("temp{}_c", state.temperatures_c),
     ):
         if values is not None:
-            numbers |= {form.format(at): float(it) for at, it in enumerate(values, start=1)}
+            numbers |= {form.format(at): float(value) for at, value in enumerate(values, start=1)}
     if state.payload_kg is not None:
         numbers["payload_kg"] = float(state.payload_kg)
     if state.payload_m is not None:
         numbers |= {
-            f"payload_{it}_m": float(value)
-            for it, value in zip("xyz", state.payload_m, strict=True)
+            f"payload_{name}_m": float(value)
+            for name, value in zip("xyz", state.payload_m, strict=True)
         }
     return View(number, image=image, numbers=numbers, text=_texts(taken, state, facts))
 
@@ -131,7 +131,7 @@ def _texts(taken: Taken, state: ArmState, facts: Facts) -> dict[str, str]:
         "motion_px": f"{taken.motion_px:.3f}",
     }
     if state.flange_from_tool is not None:
-        texts["tcp"] = " ".join(f"{it:.9g}" for it in _pose(state.flange_from_tool).values())
+        texts["tcp"] = " ".join(f"{value:.9g}" for value in _pose(state.flange_from_tool).values())
     if taken.frame.exposure_s is not None:
         texts["exposure_ms"] = f"{1e3 * taken.frame.exposure_s:.3f}"
     return texts | {f"device_{name}": str(value) for name, value in facts.settings.items()}

@@ -148,9 +148,9 @@ def _is_new(state: ArmState, been: Sequence[FloatArray]) -> bool:
 
 
 def _places(capture: Capture) -> list[FloatArray]:
-    poses = [it.base_from_flange() for it in capture.journal.views]
-    return [np.asarray(it.as_matrix()) for it in poses if it is not None]
+    poses = [view.base_from_flange() for view in capture.journal.views]
+    return [np.asarray(pose.as_matrix()) for pose in poses if pose is not None]
 
 
 def _next(capture: Capture) -> int:
-    return 1 + max((it.number for it in capture.journal.views), default=0)
+    return 1 + max((view.number for view in capture.journal.views), default=0)

@@ -59,11 +59,11 @@ class JointPoseCheck:
         # With a tool of whatever kind on the flange, `invert(model) @ pose` is the same for all;
         # with another base, `pose @ invert(model)` is.
         states = [*self._states, state]
-        model = robot.base_from_flange(np.array([it.q for it in states]))
-        pose = np.array([it.base_from_flange for it in states])
+        model = robot.base_from_flange(np.array([arm_state.q for arm_state in states]))
+        pose = np.array([arm_state.base_from_flange for arm_state in states])
         return min(
-            (_nearest(it) for it in (invert(model) @ pose, pose @ invert(model))),
-            key=lambda it: it[0] / _SAME_M + it[1] / _SAME_RAD,
+            (_nearest(value) for value in (invert(model) @ pose, pose @ invert(model))),
+            key=lambda pair: pair[0] / _SAME_M + pair[1] / _SAME_RAD,
         )
 
     def _cause(self, state: ArmState) -> str:

@@ -194,11 +194,11 @@ def _check_same(before: dict[str, Any], facts: Facts, folder: Path) -> None:
     if not differ:
         return
     words = "; ".join(
-        f"{it} was {_short(before.get(it))} and is {_short(now[it])}" for it in differ
+        f"{name} was {_short(before.get(name))} and is {_short(now[name])}" for name in differ
     )
     raise DataError(
         f"{folder} was recorded of something else: {words}.",
-        culprits=[f"{folder / PROVENANCE}: {it}" for it in differ],
+        culprits=[f"{folder / PROVENANCE}: {name}" for name in differ],
         next_step="Go on with the same, or record into a new folder.",
     )
 

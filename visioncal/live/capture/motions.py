@@ -55,7 +55,9 @@ def record_motion(
         if _moves(sample):
             moved_s = sample.stamp_s
     report(f"it has come to rest after {moved_s - kept[0].stamp_s:.1f} s")
-    return _stream([it for it in kept if it.stamp_s <= moved_s + _LEAD_S])
+    return _stream(
+        [joint_sample for joint_sample in kept if joint_sample.stamp_s <= moved_s + _LEAD_S]
+    )
 
 
 def _moves(sample: JointSample) -> bool:
@@ -64,10 +66,13 @@ def _moves(sample: JointSample) -> bool:
 
 def _stream(samples: list[JointSample]) -> Stream:
     """Samples as a stream; those that did not ascend in time were sent twice."""
-    stamps_s = np.array([it.stamp_s for it in samples])
+    stamps_s = np.array([sample.stamp_s for sample in samples])
     new = np.concatenate([[True], np.diff(stamps_s) > 0.0])
     count = len(samples[0].q)
-    parts = [np.array([getattr(it, name) for it in samples]) for name in ("q", "dq", "currents_a")]
+    parts = [
+        np.array([getattr(sample, name) for sample in samples])
+        for name in ("q", "dq", "currents_a")
+    ]
     columns = [
         name.format(joint)
         for name in ("q{}_rad", "dq{}_rad_s", "current{}_a")

@@ -39,9 +39,9 @@ class PlannedAccuracy:
     @classmethod
     def of(cls, plan: PlanFile) -> "PlannedAccuracy":
         """Prepares the predictions of a plan's stops."""
-        q = np.array([it.q for it in plan.stops])
+        q = np.array([stop.q for stop in plan.stops])
         (world,) = worlds_of((plan.cell,), plan.purpose, q)
-        return cls(tuple(it.view for it in plan.stops), world)
+        return cls(tuple(stop.view for stop in plan.stops), world)
 
     def after(self, views: Sequence[int]) -> Accuracy | None:
         """What is predicted of some of the plan's views; None without any."""
@@ -49,7 +49,9 @@ class PlannedAccuracy:
         if not rows:
             return None
         covariance = self.world.covariance(rows)
-        place, turn = (np.trace(it @ covariance) for it in (self.world.place, self.world.turn))
+        place, turn = (
+            np.trace(array @ covariance) for array in (self.world.place, self.world.turn)
+        )
         return Accuracy(1e3 * float(np.sqrt(place)), float(np.rad2deg(np.sqrt(turn))))
 
     def close(self) -> None:

@@ -69,12 +69,12 @@ def departure(
     """
     here = joints_of(cell)
     _check_model(cell, plan, here)
-    stops = tuple(it for it in plan.stops if it.view not in done)
+    stops = tuple(stop for stop in plan.stops if stop.view not in done)
     if not stops:
         return Departure((), here, (), 0.0, 0.0)
     first = Ways(plan).to(stops[0], here)
     pace = (options.speed, options.acceleration)
-    way = [here, *first, *(q for it in stops[1:] for q in (*it.via, it.q))]
+    way = [here, *first, *(q for stop in stops[1:] for q in (*stop.via, stop.q))]
     legs = [travel_s(a, b, *pace) for a, b in pairwise(way)]
     turns = np.abs(np.diff(np.array([here, *first]), axis=0)).sum(axis=0)
     return Departure(stops, here, first, float(turns.max()), sum(legs) + _STOP_S * len(stops))
@@ -128,8 +128,8 @@ def record(
         watchers,
     )
     capture.catch_up()
-    done = {it.number for it in journal.views}
-    left = [it for it in plan.stops if it.view not in done]
+    done = {view.number for view in journal.views}
+    left = [stop for stop in plan.stops if stop.view not in done]
     ways = Ways(plan)
     with closed_cleanly(cell, journal, options):
         for at, stop in enumerate(left):
@@ -267,4 +267,4 @@ def _there(here: FloatArray, posture: FloatArray) -> bool:
 
 
 def _deg(q: FloatArray) -> str:
-    return ", ".join(f"{it:.0f}" for it in np.rad2deg(q)) + " deg"
+    return ", ".join(f"{value:.0f}" for value in np.rad2deg(q)) + " deg"

@@ -36,7 +36,7 @@ class Look:
         """The state that is nearer to the middle of the exposure."""
         middle = self.frame.stamp_s
         ends = (self.before, self.after)
-        return min(ends, key=lambda it: abs(it.stamp_s - middle))
+        return min(ends, key=lambda end: abs(end.stamp_s - middle))
 
 
 def grey(image: Image) -> Image:

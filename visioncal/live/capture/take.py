@@ -153,7 +153,7 @@ def _chosen(
         return first
     # The board stands still: the corners of one frame are those of all.
     found = first.corners
-    blurs = [blur_of(grey(it.frame.image), target, found.ids, found.px) for it in looks]
+    blurs = [blur_of(grey(look.frame.image), target, found.ids, found.px) for look in looks]
     sharpest = int(np.argmin(blurs))
     return first if sharpest == 0 else _taken(looks[sharpest], target, view, moved)
 
@@ -168,7 +168,7 @@ def _taken(kept: Look, target: Target, view: int, moved: float) -> Taken | Misse
 def _mean(looks: Sequence[Look]) -> Look:
     """The mean of all frames, with the arm as it was at the middle one."""
     middle = looks[len(looks) // 2]
-    images = np.stack([it.frame.image for it in looks]).astype(np.float32)
+    images = np.stack([look.frame.image for look in looks]).astype(np.float32)
     image: Image = np.asarray(np.rint(images.mean(axis=0)), dtype=np.uint8)
-    stamp = float(np.mean([it.frame.stamp_s for it in looks]))
+    stamp = float(np.mean([look.frame.stamp_s for look in looks]))
     return replace(middle, frame=replace(middle.frame, image=image, stamp_s=stamp))

@@ -30,8 +30,8 @@ def refuse_without(needed: str, extras: Mapping[str, str]) -> None:
     """
     missing = [extra for extra, module in extras.items() if find_spec(module) is None]
     if needed in missing:
-        modules = [extras[it] for it in missing]
-        packages = " ".join(f"'{_PACKAGES[it]}'" for it in missing)
+        modules = [extras[name] for name in missing]
+        packages = " ".join(f"'{_PACKAGES[name]}'" for name in missing)
         raise DriverError(
             f"{' and '.join(modules)} {'are' if len(missing) > 1 else 'is'} not installed.",
             culprits=modules,

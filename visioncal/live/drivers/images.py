@@ -36,7 +36,7 @@ class FolderCamera:
         if not folder.is_dir():
             raise DataError(f"There is no folder {folder}.", culprits=[str(folder)])
         self._files = sorted(
-            (it for it in folder.iterdir() if it.suffix.lower() in _ENDINGS), key=natural
+            (path for path in folder.iterdir() if path.suffix.lower() in _ENDINGS), key=natural
         )
         if not self._files:
             raise DataError(

@@ -194,7 +194,10 @@ def _opened(dai: ModuleType, device: str | None) -> Handle:
 
 def _sensor(device: Handle, socket: str) -> Handle:
     """What the device says of the sensor on a socket."""
-    sensors = {it.socket.name: it for it in device.getConnectedCameraFeatures()}
+    sensors = {
+        getconnectedcamerafeature.socket.name: getconnectedcamerafeature
+        for getconnectedcamerafeature in device.getConnectedCameraFeatures()
+    }
     if socket not in sensors:
         raise DriverError(
             f"The OAK has no camera on {socket}; it has {', '.join(sensors) or 'none'}.",

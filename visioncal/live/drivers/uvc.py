@@ -188,7 +188,7 @@ def _set(capture: cv2.VideoCapture, requested: DeviceSetup) -> dict[str, str | f
         "rate_hz": capture.get(cv2.CAP_PROP_FPS),
     }
     # OpenCV says 0 or -1 of what the camera does not have.
-    return {name: it for name, it in values.items() if math.isfinite(it) and it > 0.0}
+    return {name: value for name, value in values.items() if math.isfinite(value) and value > 0.0}
 
 
 class GrabbedPictures:

@@ -118,7 +118,7 @@ def candidates(
     if len(search.kept) < (least or max(_LEAST_SHARE * count, min(_LEAST, count))):
         search.ask_again()
         raise search.losses.error(len(search.kept), count)
-    q = _unwound(cell, search.collisions, np.array([it for it, _ in search.kept]))
+    q = _unwound(cell, search.collisions, np.array([array for array, _ in search.kept]))
     shares = np.array([share for _, share in search.kept])
     return Candidates(q, cell.cam_from_target(q), shares, search.losses.counts())
 
@@ -169,8 +169,10 @@ class _Search:
     def ask_again(self) -> None:
         """Finds the joints whose limits alone kept the arm from views that it did not reach."""
         still = np.zeros(self._cell.robot.joint_count)
-        found = [self._inverse.solve(it, still) for it in self._unreached]
-        self.losses.blame(REACH, [f"limits of {name}" for it in found for name in it.beyond])
+        found = [self._inverse.solve(array, still) for array in self._unreached]
+        self.losses.blame(
+            REACH, [f"limits of {name}" for posture in found for name in posture.beyond]
+        )
 
     def _reaching(self) -> tuple[FloatArray, FloatArray]:
         """Postures (k, n) that reach drawn views, and their shares (k,)."""
@@ -227,11 +229,13 @@ class _Search:
         robot, margin = self._cell.robot, self._cell.limits.joint_margin_rad
         over = np.maximum(robot.lower_rad + margin - q, q - robot.upper_rad + margin)
         within = self.losses.passed(LIMITS, np.asarray(np.all(over <= 0.0, axis=1)))
-        self.losses.blame(LIMITS, [robot.joint_names[it] for it in over[~within].argmax(axis=1)])
+        self.losses.blame(
+            LIMITS, [robot.joint_names[index] for index in over[~within].argmax(axis=1)]
+        )
         q, share = q[within], share[within]
         behind = self._shade.behind_arm(q)
         free = self.losses.passed(BEHIND_ARM, behind < 0)
-        self.losses.blame(BEHIND_ARM, [self._shade.parts[it].name for it in behind[~free]])
+        self.losses.blame(BEHIND_ARM, [self._shade.parts[index].name for index in behind[~free]])
         q, share = q[free], share[free]
         contact = self.collisions.first_contact(q)
         clear = self.losses.passed(CLEARANCE, contact < 0)
@@ -305,19 +309,23 @@ class Losses:
         """How many were lost to what, the most first."""
         counts = Counter(self.named)
         for limit, times in self.lost.items():
-            known = sum(it for name, it in self.named.items() if name.startswith(f"{limit} ("))
+            known = sum(
+                index for name, index in self.named.items() if name.startswith(f"{limit} (")
+            )
             counts[limit] += times - known
         return {limit: times for limit, times in counts.most_common() if times > 0}
 
     def worst(self) -> str:
         """The limit that lets the smallest share through."""
-        left = {it: 1.0 - self.lost[it] / tried for it, tried in self.tried.items() if tried}
+        left = {name: 1.0 - self.lost[name] / tried for name, tried in self.tried.items() if tried}
         return min(left, key=lambda limit: left[limit])
 
     def error(self, found: int, wished: int) -> DataError:
         """The error of a search that found too few."""
         worst = self.worst()
-        own = {name: it for name, it in self.counts().items() if name.startswith(f"{worst} (")}
+        own = {
+            name: count for name, count in self.counts().items() if name.startswith(f"{worst} (")
+        }
         culprit = max(own, key=lambda name: own[name], default=worst)
         tried = max(self.tried.values())
         lost = some_of([f"{times} to {what}" for what, times in self.counts().items()], _NAMED)

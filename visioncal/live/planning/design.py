@@ -78,7 +78,7 @@ def chosen(
     _check(worlds, count, criterion)
     with one_blas_thread():
         # A wish that is met already needs no stop.
-        state = Selection.of(tuple(reduced(it, criterion) for it in worlds), criterion)
+        state = Selection.of(tuple(reduced(world, criterion) for world in worlds), criterion)
         while len(state.rows) < count and not _enough(state, wish):
             state = state.with_one(state.best_to_add())
         state = _exchanged(state)
@@ -86,8 +86,8 @@ def chosen(
             state = _thinned(state, wish)
         rows = _ranked(state)
         history, best = _history(worlds, rows)
-        sure = _all_of([it.with_known_looks() for it in worlds]).accuracy
-        exact = _all_of([it.without_misfit() for it in worlds]).accuracy
+        sure = _all_of([world.with_known_looks() for world in worlds]).accuracy
+        exact = _all_of([world.without_misfit() for world in worlds]).accuracy
     met = None if wish is None else history[-1].meets(wish)
     return Design(rows, criterion, state.figure, history, best, sure, exact, met)
 
@@ -197,7 +197,8 @@ def _ranked(state: Selection) -> IntArray:
     """The chosen rows, the most informative first."""
     rows = np.array(state.rows, dtype=np.int64)
     few = tuple(
-        replace(it, factors=it.factors[rows], misfit=it.misfit[rows]) for it in state.problem
+        replace(item, factors=item.factors[rows], misfit=item.misfit[rows])
+        for item in state.problem
     )
     now = Selection.of(few, state.criterion)
     for _ in rows:
@@ -207,7 +208,7 @@ def _ranked(state: Selection) -> IntArray:
 
 def _history(worlds: Sequence[World], rows: IntArray) -> tuple[tuple[Accuracy, ...], Accuracy]:
     """What is predicted after each of some candidates in order, and after all that there are."""
-    now = Selection.of(tuple(reduced(it, "I") for it in worlds), "I")
+    now = Selection.of(tuple(reduced(world, "I") for world in worlds), "I")
     history = [now.accuracy]
     for row in rows.tolist():
         now = now.with_one(row)
@@ -216,4 +217,4 @@ def _history(worlds: Sequence[World], rows: IntArray) -> tuple[tuple[Accuracy, .
 
 
 def _all_of(worlds: Sequence[World]) -> Selection:
-    return Selection.of(tuple(reduced(it, "I") for it in worlds), "I").with_all()
+    return Selection.of(tuple(reduced(world, "I") for world in worlds), "I").with_all()

@@ -52,7 +52,7 @@ def helps(
     there, known = np.zeros((0, 4, 4)), []
     if begun is not None:
         there = next(iter(begun.recorded.problem.poses.values()))
-        known = [f"view {it}" for it in begun.views]
+        known = [f"view {view}" for view in begun.views]
     poses = cell.robot.base_from_flange(q[design.rows])
     before = world.covariance([])
     for place in range(len(design.rows)):
@@ -96,7 +96,7 @@ def _effect(
     """What a stop helps: `history` is the accuracy without it and with it."""
     if purpose.judged == "sight":
         return _edge_effect(before, after)
-    then, now = (1e-3 * it.mm for it in history)
+    then, now = (1e-3 * accuracy.mm for accuracy in history)
     joint = _joint_determined(cell.robot, purpose, np.diag(before - after))
     change = _change("the error over the workspace", then, now, is_rotation=False)
     return f"{change}; most information on {joint}"
@@ -120,7 +120,7 @@ def _edge_effect(before: FloatArray, after: FloatArray) -> str:
     at = int(np.argmax(drops))
     axis = ("the image's x", "the image's y", "the optical axis")[at % 3]
     words = f"the error {'about' if at < 3 else 'along'} {axis}"
-    then, now = (float(np.sqrt(it[at, at])) for it in (before, after))
+    then, now = (float(np.sqrt(array[at, at])) for array in (before, after))
     return _change(words, then, now, is_rotation=at < 3)
 
 

@@ -305,7 +305,7 @@ def _world(
         judged = _of_sight(cell, arm, q)
     else:
         judged = _of_workspace(cell, purpose, workspace)
-    counted, place, turn = (_widened(it, looks) for it in judged)
+    counted, place, turn = (_widened(array, looks) for array in judged)
     misfit, gradient, held = factors[:, :, size:], known[:size, size:], 0
     if recorded is not None and not purpose.blocks:
         beside, held = recorded.beside, recorded.held.shape[1]
@@ -369,7 +369,7 @@ def _erring(
 
 def _of_effects(problem: Problem) -> FloatArray:
     """(k, k) what is known of a problem's effects beforehand."""
-    known = (it.known.information for it in problem.effects)
+    known = (effect.known.information for effect in problem.effects)
     return np.asarray(block_diag(np.zeros((0, 0)), *known))
 
 
@@ -380,7 +380,7 @@ def _effect(known: FloatArray, moved: list[FloatArray]) -> Effect:
 
 def _model(robot: Robot, purpose: Purpose) -> ArmModel:
     sigma = _sigma(purpose)
-    weights = {name: it / sigma for name, it in purpose.blocks.items()}
+    weights = {name: block / sigma for name, block in purpose.blocks.items()}
     model = ArmModel(robot, np.eye(4), weights, np.zeros(_arm_size(robot, purpose)))
     if COMPLIANCE not in weights:
         return model

@@ -71,7 +71,7 @@ def plan_words(plan: MotionPlan) -> tuple[str, ...]:
 
 def plan_warnings(plan: MotionPlan) -> tuple[str, ...]:
     """What the reader must know before the plan is driven."""
-    found = [f"not checked: {it}" for it in plan.allowed.unchecked]
+    found = [f"not checked: {name}" for name in plan.allowed.unchecked]
     if plan.sweeps is not None and plan.sweeps.left_out:
         found.append(f"too little room to sweep {some_of(plan.sweeps.left_out)}")
     return tuple(found)
@@ -87,8 +87,8 @@ def _used(kept: Kept) -> str:
 
 
 def _sweeps(sweeps: Sweeps) -> str:
-    speeds = [it.speed for it in sweeps.strokes if it.sweeps]
-    joints = len({it.joint for it in sweeps.strokes})
+    speeds = [stroke.speed for stroke in sweeps.strokes if stroke.sweeps]
+    joints = len({stroke.joint for stroke in sweeps.strokes})
     return (
         f"sweeps of {joints} joints, one at a time, there and back at "
         f"{len(speeds) // (2 * joints)} speeds from {figure(min(speeds))} to "

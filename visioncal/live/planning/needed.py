@@ -207,8 +207,8 @@ _WAYS_OUT = {
 
 def _in_the_way(picking: Picking, every: IntArray) -> str:
     """What would help most, and whether that would be enough."""
-    without = {it: picking.chance(every, without=it) for it in _WAYS_OUT}
-    most = max(without, key=lambda it: without[it])
+    without = {name: picking.chance(every, without=name) for name in _WAYS_OUT}
+    most = max(without, key=lambda index: without[index])
     cause, advice = _WAYS_OUT[most]
     words = f"is {cause} ({percent(without[most])} without it): {advice}."
     if without[most] >= NeedLimits.probability[0]:

@@ -97,7 +97,9 @@ class Detours:
         kept, at = [0], 0
         while at < len(way) - 1:
             ahead = range(len(way) - 1, at + 1, -1)
-            clear = (it for it in ahead if self._collisions.on_the_way(way[at], way[it]) < 0)
+            clear = (
+                index for index in ahead if self._collisions.on_the_way(way[at], way[index]) < 0
+            )
             at = next(clear, at + 1)
             kept.append(at)
         return np.asarray(way[kept])
@@ -125,7 +127,7 @@ class _Tree:
         way = [place]
         while way[-1]:
             way.append(self._parents[way[-1]])
-        return np.array([self.postures[it] for it in way])
+        return np.array([self.postures[index] for index in way])
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +215,7 @@ class _Tour:
         """Goes to all stops in an order, and comes back to those that were not reached at first."""
         aside = [row for row in order if not self._insert(row, len(self.order))]
         for row in aside:
-            away = [float(np.linalg.norm(self._q[it] - self._q[row])) for it in self.order]
+            away = [float(np.linalg.norm(self._q[index] - self._q[row])) for index in self.order]
             # Behind its nearest neighbours, or before them.
             places = [place + after for place in np.argsort(away)[:_PLACES] for after in (1, 0)]
             any(self._insert(row, int(place)) for place in dict.fromkeys(places))

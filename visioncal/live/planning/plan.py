@@ -191,7 +191,7 @@ def make_plan(
         len(found),
         found.lost,
         chosen_stops.in_the_way,
-        " ".join(it for it in missing if it),
+        " ".join(name for name in missing if name),
         map_m,
         map_sigma_m,
         needed,
@@ -219,7 +219,10 @@ def _with_a_way(
     left = np.arange(len(q))
     given_up: list[str] = []
     for turn in range(_ROUNDS):
-        few = tuple(replace(it, factors=it.factors[left], misfit=it.misfit[left]) for it in worlds)
+        few = tuple(
+            replace(world, factors=world.factors[left], misfit=world.misfit[left])
+            for world in worlds
+        )
         design = _enough(cells, request, q[left], few, begun)
         design = replace(design, rows=left[design.rows])
         progress("path", turn, _ROUNDS)
@@ -293,7 +296,7 @@ def _stops(
 ) -> tuple[PlannedStop, ...]:
     """The stops in driving order; `numbers` are their views' in the order of the design."""
     design, route = taken.design, taken.route
-    names = [f"view {it}" for it in numbers]
+    names = [f"view {number}" for number in numbers]
     said = tuple(helps(cell, request.purpose, found.q, world, design, names, begun=begun))
     q = found.q[design.rows]
     flange = cell.robot.base_from_flange(q)

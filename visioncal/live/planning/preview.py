@@ -17,7 +17,7 @@ _EXCITATION_HZ, _SWEEPS_HZ = 20.0, 5.0
 def preview_of(plan: Plan, name: str) -> Preview:
     """What is drawn of a plan, under a name."""
     cell = plan.cell
-    history = [np.nan if it.is_open else it.mm for it in plan.design.history]
+    history = [np.nan if accuracy.is_open else accuracy.mm for accuracy in plan.design.history]
     return Preview(
         name,
         cell.mount,
@@ -26,9 +26,9 @@ def preview_of(plan: Plan, name: str) -> Preview:
         cell.target,
         cell.x,
         cell.z,
-        tuple(PreviewStop(it.view, it.q, it.via, _note(it)) for it in plan.stops),
+        tuple(PreviewStop(stop.view, stop.q, stop.via, _note(stop)) for stop in plan.stops),
         np.array(history),
-        tuple(Obstacle(it.name, it.base_from_box, it.size_m) for it in cell.boxes),
+        tuple(Obstacle(box.name, box.base_from_box, box.size_m) for box in cell.boxes),
         cell.limits.floor_m,
         plan.map_m,
         1e3 * plan.map_sigma_m,
@@ -37,7 +37,7 @@ def preview_of(plan: Plan, name: str) -> Preview:
 
 
 def _note(stop: PlannedStop) -> str:
-    degrees = ", ".join(f"{it:.1f}" for it in np.rad2deg(stop.q))
+    degrees = ", ".join(f"{value:.1f}" for value in np.rad2deg(stop.q))
     x, y, z = 1e3 * stop.base_from_flange[:3, 3]
     distance = 1e3 * float(np.linalg.norm(stop.cam_from_target[:3, 3]))
     return "\n\n".join(
@@ -65,8 +65,10 @@ def _plan_note(plan: Plan, name: str) -> str:
         "numbered as the arm drives to them.",
         "",
     ]
-    ranked = sorted(plan.stops, key=lambda it: it.rank)
-    lines += [f"- **view {it.view}** ({accuracy_words(it.after)}): {it.words}" for it in ranked]
+    ranked = sorted(plan.stops, key=lambda stop: stop.rank)
+    lines += [
+        f"- **view {stop.view}** ({accuracy_words(stop.after)}): {stop.words}" for stop in ranked
+    ]
     return "\n".join(lines)
 
 
@@ -77,12 +79,12 @@ def motion_preview(plan: MotionPlan) -> MotionPreview:
     if plan.sweeps is not None:
         parts.append(_part(plan, "sweeps", plan.sweeps.sampled(_SWEEPS_HZ)))
     boxes = [
-        Obstacle(it.name, it.link_from_body, it.size_m)
-        for it in allowed.bodies
-        if it.link == 0 and it.shape == "box" and not it.of_arm
+        Obstacle(body.name, body.link_from_body, body.size_m)
+        for body in allowed.bodies
+        if body.link == 0 and body.shape == "box" and not body.of_arm
     ]
     name = f"motions for {allowed.robot.name}"
-    note = "\n\n".join([f"# {name}", *(f"- {it}" for it in plan_words(plan))])
+    note = "\n\n".join([f"# {name}", *(f"- {word}" for word in plan_words(plan))])
     return MotionPreview(name, allowed.robot, parts, boxes, allowed.share.floor_m, note)
 
 

@@ -64,7 +64,7 @@ _ELASTIC = Purpose(
     {"links": 1e-3, "compliance": 1e-2},
 )
 PURPOSES: Mapping[str, Purpose] = MappingProxyType(
-    {it.name: it for it in (_HAND_EYE, _OFFSETS, _KINEMATICS, _ELASTIC)}
+    {purpose.name: purpose for purpose in (_HAND_EYE, _OFFSETS, _KINEMATICS, _ELASTIC)}
 )
 
 

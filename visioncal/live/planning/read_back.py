@@ -103,12 +103,12 @@ def _plan(document: Mapping[str, Any]) -> PlanFile:
         purpose_of(document["purpose"]),
         tuple(
             Stop(
-                int(it["view"]),
-                _array(it["q"], (joints,)),
-                _array(it.get("via_q") or np.zeros((0, joints)), (-1, joints)),
-                str(it.get("why", "")),
+                int(value["view"]),
+                _array(value["q"], (joints,)),
+                _array(value.get("via_q") or np.zeros((0, joints)), (-1, joints)),
+                str(value.get("why", "")),
             )
-            for it in document["stops"]
+            for value in document["stops"]
         ),
         None if start is None else _array(start, (joints,)),
         str(document["inputs_sha256"]),
@@ -141,8 +141,10 @@ def _cell(content: Mapping[str, Any]) -> PlanCell:
         float(noise["pixel_px"]),
         Limits(**limits),
         tuple(
-            Box(it["name"], _array(it["base_from_box"], (4, 4)), _array(it["size_m"], (3,)))
-            for it in content["boxes"]
+            Box(
+                value["name"], _array(value["base_from_box"], (4, 4)), _array(value["size_m"], (3,))
+            )
+            for value in content["boxes"]
         ),
         None if covariance is None else _array(covariance, (12, 12)),
     )

@@ -151,7 +151,9 @@ def begin(
         boxes,
         covariance,
     )
-    alike = () if known.answer is None else (it.alike for it in known.answer.misfits.values())
+    alike = (
+        () if known.answer is None else (misfit.alike for misfit in known.answer.misfits.values())
+    )
     recorded = Recorded(
         begun.problem,
         edges,
@@ -161,7 +163,14 @@ def begin(
         int(first_corners(targets)[begun.board]),
         # Of few stops, sizes of errors that noise alone explains are mostly chance.
         arm.errors if arm.is_modelled and arm.errors and arm.errors.is_likely else None,
-        max((it.factor for it in alike if it is not None and it.is_significant), default=1.0),
+        max(
+            (
+                neighbours.factor
+                for neighbours in alike
+                if neighbours is not None and neighbours.is_significant
+            ),
+            default=1.0,
+        ),
         _beside_noise(known, begun),
         _held_pull(known, begun.problem),
     )
@@ -201,17 +210,19 @@ def _fitted(known: RunState, solved: Solved) -> _Start:
     stops, first, of = np.unique(part.observations.stops, return_index=True, return_inverse=True)
     frames = dict(zip(part.unknown, solved.agreed.fit.state.edges, strict=True))
     # The arm's own errors are the purpose's business: they are put in again with its priors.
-    bare = part.with_effects([it for it in part.effects if it.name != f"arm of {arm.robot}"])
+    bare = part.with_effects(
+        [effect for effect in part.effects if effect.name != f"arm of {arm.robot}"]
+    )
     seen_at = np.isin(np.arange(len(arm.stood)), stops)
     camera, *boards = part.unknown
-    order = [it for it in part.tree.branches if it not in part.unknown]
-    order += [camera, most, *(it for it in boards if it != most)]
+    order = [branch for branch in part.tree.branches if branch not in part.unknown]
+    order += [camera, most, *(board for board in boards if board != most)]
     problem = replace(
         bare,
-        tree=replace(part.tree, branches={it: part.tree.branches[it] for it in order}),
-        poses={name: it[stops] for name, it in part.poses.items()},
+        tree=replace(part.tree, branches={name: part.tree.branches[name] for name in order}),
+        poses={name: pose[stops] for name, pose in part.poses.items()},
         observations=replace(part.observations, stops=of),
-        effects=tuple(it.of_stops(seen_at) for it in bare.effects),
+        effects=tuple(effect.of_stops(seen_at) for effect in bare.effects),
     ).merged()
     noise = solved.agreed.fit.noise
     return _Start(
@@ -220,27 +231,31 @@ def _fitted(known: RunState, solved: Solved) -> _Start:
         replace(noise, robots=np.maximum(noise.robots, _LEAST_NOISE.robots)),
         free_of(solved.seen),
         arm.at(stops),
-        tuple(frame_name("target", it) for it in known.session.boards).index(most),
-        tuple(known.used[it] for it in first.tolist()),
+        tuple(frame_name("target", board) for board in known.session.boards).index(most),
+        tuple(known.used[index] for index in first.tolist()),
     )
 
 
 def _guessed(known: RunState, guess: Guess | None) -> _Start:
     """What stops too few for a fit determine, beside a guess."""
     looked = ObservedPoses.of(known)
-    views = [it for it in known.poses if it in known.base_from_flange and it not in known.held_back]
+    views = [
+        pose
+        for pose in known.poses
+        if pose in known.base_from_flange and pose not in known.held_back
+    ]
     if guess is None or not views:
         raise _too_vague(known, len(views))
-    shown = [known.poses[it].board for it in views]
+    shown = [known.poses[view].board for view in views]
     board = max(dict.fromkeys(shown), key=shown.count)
-    mine = [it for it in sorted(views) if known.poses[it].board == board]
+    mine = [view for view in sorted(views) if known.poses[view].board == board]
     looked = replace(looked, boards=(board,), used=tuple(mine))
     looked = replace(looked, frames=looked.framed(np.stack([guess.x, guess.z])))
     robot = robot_part(looked.arm_at(mine).poses, known.session.mount)
     target = tuple(known.session.boards.values())[board]
     poses = [
-        choose_by(known.poses[it], pose, target)
-        for it, pose in zip(mine, invert(robot @ guess.x) @ guess.z, strict=True)
+        choose_by(known.poses[index], pose, target)
+        for index, pose in zip(mine, invert(robot @ guess.x) @ guess.z, strict=True)
     ]
     ((frame, scene),) = known.scenes.items()
     problem, alone = looked.posed(poses).problem(mine), np.ones(len(mine), dtype=bool)
@@ -264,8 +279,10 @@ def _held_pull(known: RunState, problem: Problem) -> FloatArray:
         return np.zeros((0, 0))
     fitted, state, noise = known.answer.problem, known.answer.state, known.answer.noise
     pull = normal_equations(fitted, state, noise)[1] * (fitted.counted & ~fitted.moving)
-    columns = [fitted.effect_columns[it.name] for it in problem.effects]
-    return np.concatenate([np.zeros(0), *(pull[it.start : it.stop] for it in columns)])[:, None]
+    columns = [fitted.effect_columns[effect.name] for effect in problem.effects]
+    return np.concatenate([np.zeros(0), *(pull[column.start : column.stop] for column in columns)])[
+        :, None
+    ]
 
 
 def _beside_noise(known: RunState, begun: "_Start") -> FloatArray:
@@ -273,7 +290,9 @@ def _beside_noise(known: RunState, begun: "_Start") -> FloatArray:
     if known.answer is None or begun.arm.is_modelled or "arm" not in known.answer.beside:
         return np.zeros((12, 0))
     names = tuple(begun.problem.unknown)[:2]
-    columns = [np.arange(it.start, it.stop) for it in map(known.solved.problem.edge_columns, names)]
+    columns = [
+        np.arange(item.start, item.stop) for item in map(known.solved.problem.edge_columns, names)
+    ]
     at = np.concatenate(columns)
     values, vectors = np.linalg.eigh(known.answer.beside["arm"][np.ix_(at, at)])
     return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0)))[:, values > 0.0])
@@ -321,7 +340,7 @@ def _away(edges: FloatArray, guess: Guess | None) -> FloatArray:
     """(12,) steps from what is known beforehand to the edges (2, 4, 4)."""
     if guess is not None:
         return np.asarray(log(invert(np.stack([guess.x, guess.z])) @ edges).ravel())
-    local = [it[:3, :3].T @ it[:3, 3] for it in edges]
+    local = [edge[:3, :3].T @ edge[:3, 3] for edge in edges]
     return np.concatenate([np.zeros(3), local[0], np.zeros(3), local[1]])
 
 

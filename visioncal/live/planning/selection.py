@@ -150,13 +150,13 @@ class Selection:
     @classmethod
     def of(cls, problem: tuple[Reduced, ...], criterion: Criterion) -> "Selection":
         """No candidates, but what is recorded."""
-        starts, pulls = ((it.start for it in problem), (it.gradient for it in problem))
+        starts, pulls = ((item.start for item in problem), (item.gradient for item in problem))
         return cls(problem, criterion, (), tuple(starts), tuple(pulls))
 
     @cached_property
     def spreads(self) -> tuple[FloatArray, ...]:
         """(r, r) covariance by world, of noise alone."""
-        return tuple(np.asarray(np.linalg.inv(it), dtype=float) for it in self.information)
+        return tuple(np.asarray(np.linalg.inv(array), dtype=float) for array in self.information)
 
     def with_one(self, row: int) -> "Selection":
         """Takes one more candidate."""
@@ -164,7 +164,7 @@ class Selection:
 
     def without(self, row: int) -> "Selection":
         """Leaves one out."""
-        return self._changed(tuple(it for it in self.rows if it != row), [row], -1.0)
+        return self._changed(tuple(index for index in self.rows if index != row), [row], -1.0)
 
     def with_all(self) -> "Selection":
         """Takes all candidates."""
@@ -175,10 +175,10 @@ class Selection:
     def left(self) -> list[int]:
         """The candidates that are not taken."""
         taken = set(self.rows)
-        return [it for it in range(len(self.problem[0].factors)) if it not in taken]
+        return [index for index in range(len(self.problem[0].factors)) if index not in taken]
 
     def _changed(self, rows: tuple[int, ...], by: list[int], sign: float) -> "Selection":
-        added = [(it.factors[by], it.misfit[by]) for it in self.problem]
+        added = [(item.factors[by], item.misfit[by]) for item in self.problem]
         information = tuple(
             before + sign * gram(factors, factors)
             for before, (factors, _) in zip(self.information, added, strict=True)
@@ -192,7 +192,7 @@ class Selection:
     @cached_property
     def value(self) -> float:
         """What is minimised: a mean variance over the worlds, above zero."""
-        return float(np.mean([self._value(*it) for it in self._worlds()]))
+        return float(np.mean([self._value(*world) for world in self._worlds()]))
 
     def _value(self, world: Reduced, covariance: FloatArray) -> float:
         if self.criterion in ("I", "A"):
@@ -202,8 +202,10 @@ class Selection:
         return float(np.exp(np.linalg.slogdet(covariance)[1] / max(len(covariance), 1)))
 
     def _worlds(self) -> Iterator[tuple[Reduced, FloatArray]]:
-        answers = (it @ gradient for it, gradient in zip(self.spreads, self.pulls, strict=True))
-        totals = (it + off @ off.T for it, off in zip(self.spreads, answers, strict=True))
+        answers = (
+            spread @ gradient for spread, gradient in zip(self.spreads, self.pulls, strict=True)
+        )
+        totals = (spread + off @ off.T for spread, off in zip(self.spreads, answers, strict=True))
         return zip(self.problem, totals, strict=True)
 
     @property
@@ -215,12 +217,12 @@ class Selection:
             return float(np.sqrt(self.value))
         # What little is known beforehand is no part of the Jacobian.
         volumes = [
-            np.linalg.slogdet(world.determined.T @ (it - np.eye(len(it))) @ world.determined)
-            for world, it in zip(self.problem, self.information, strict=True)
+            np.linalg.slogdet(world.determined.T @ (array - np.eye(len(array))) @ world.determined)
+            for world, array in zip(self.problem, self.information, strict=True)
         ]
         mean = [
-            np.exp(it / (2 * max(world.determined.shape[1], 1))) if sign > 0 else 0.0
-            for world, (sign, it) in zip(self.problem, volumes, strict=True)
+            np.exp(value / (2 * max(world.determined.shape[1], 1))) if sign > 0 else 0.0
+            for world, (sign, value) in zip(self.problem, volumes, strict=True)
         ]
         return float(np.mean(mean)) / float(np.sqrt(max(len(self.rows), 1)))
 
@@ -241,14 +243,17 @@ class Selection:
 
     def _best(self, rows: list[int], sign: float) -> int:
         gains: FloatArray = np.mean(
-            [self._gains(*it, rows, sign) for it in zip(self.problem, self.spreads, strict=True)],
+            [
+                self._gains(*pair, rows, sign)
+                for pair in zip(self.problem, self.spreads, strict=True)
+            ],
             axis=0,
         )
         if self.criterion != "E":
             return rows[int(np.argmax(gains))]
-        promising: list[int] = [rows[it] for it in np.argsort(-gains)[:_TRIED].tolist()]
-        then = [self.with_one(it) if sign > 0 else self.without(it) for it in promising]
-        values = [it.value for it in then]
+        promising: list[int] = [rows[index] for index in np.argsort(-gains)[:_TRIED].tolist()]
+        then = [self.with_one(index) if sign > 0 else self.without(index) for index in promising]
+        values = [selection.value for selection in then]
         return promising[int(np.argmin(values))]
 
     def _gains(

@@ -31,7 +31,7 @@ class Shade:
     @classmethod
     def of(cls, cell: PlanCell, points: FloatArray) -> "Shade":
         """Prepares the bodies of a cell."""
-        parts = (it for it in arm_bodies(cell.robot) if it.link < cell.robot.joint_count)
+        parts = (body for body in arm_bodies(cell.robot) if body.link < cell.robot.joint_count)
         return cls(cell, points, tuple(parts))
 
     def behind_boxes(self, base_from_flange: FloatArray) -> IntArray:

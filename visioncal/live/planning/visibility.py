@@ -257,8 +257,8 @@ def sight_of(cell: PlanCell, seed: int) -> Sight:
         _outline(cell.target),
         np.append(0.5 * (low + high), 0.0),
         Window(cell.camera, cell.limits.edge_px),
-        np.array([it.x for it in drawn]),
-        np.array([it.z for it in drawn]),
+        np.array([plan_cell.x for plan_cell in drawn]),
+        np.array([plan_cell.z for plan_cell in drawn]),
     )
 
 

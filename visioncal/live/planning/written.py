@@ -34,13 +34,13 @@ def stops_table(plan: Plan) -> str:
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    joints = [f"q{it + 1}_rad" for it in range(plan.cell.robot.joint_count)]
+    joints = [f"q{index + 1}_rad" for index in range(plan.cell.robot.joint_count)]
     writer.writerow(["view", "image", *joints, *POSE, "why"])
     for stop in plan.stops:
         pose = stop.base_from_flange
         turn = Rotation.from_matrix(pose[:3, :3]).as_quat()
         numbers = [*stop.q.tolist(), *pose[:3, 3].tolist(), *turn.tolist()]
-        cells = [f"{it:.9f}" for it in numbers]
+        cells = [f"{number:.9f}" for number in numbers]
         writer.writerow([stop.view, image_of(stop), *cells, stop.words])
     return text.getvalue()
 
@@ -93,7 +93,7 @@ def plan_document(plan: Plan, source: Mapping[str, str]) -> dict[str, Any]:
     if plan.shortfall:
         document["shortfall"] = plan.shortfall
     document |= {
-        "stops": [_stop_document(it) for it in plan.stops],
+        "stops": [_stop_document(stop) for stop in plan.stops],
         "joints": list(plan.cell.robot.joint_names),
         "path_rad": plan.length_rad,
         "candidates": {"found": plan.found, "lost_to": dict(plan.lost)},
@@ -114,12 +114,12 @@ def program_of(plan: Plan) -> str:
     if not has_ur_axes(robot):
         return ""
     lines = [
-        *(f"# {it}" for it in _heading(plan)),
+        *(f"# {name}" for name in _heading(plan)),
         "def visioncal_plan():",
         f"  speed = {PLAN_SPEED}          # rad/s",
         f"  acceleration = {PLAN_ACCELERATION}   # rad/s^2",
         f"  settling = {_SETTLING_S}       # s",
-        *(f"  {it}" for stop in plan.stops for it in _stop_lines(stop)),
+        *(f"  {line}" for stop in plan.stops for line in _stop_lines(stop)),
         '  popup("All stops are done.", title="visioncal", blocking=True)',
         "end",
         "",
@@ -154,7 +154,7 @@ def _stop_lines(stop: PlannedStop) -> Iterator[str]:
 
 
 def _move(q: FloatArray, words: str) -> str:
-    joints = ", ".join(f"{it:.6f}" for it in q)
+    joints = ", ".join(f"{value:.6f}" for value in q)
     return f"movej([{joints}], a=acceleration, v=speed)  # {words}"
 
 
@@ -212,7 +212,7 @@ def _cell_document(cell: PlanCell) -> dict[str, Any]:
             for name, value in vars(cell.limits).items()
             if value is not None
         },
-        "boxes": [_box_document(it) for it in cell.boxes],
+        "boxes": [_box_document(box) for box in cell.boxes],
     }
     if cell.covariance is not None:
         document["guesses"]["covariance"] = cell.covariance.tolist()
@@ -228,7 +228,9 @@ def _box_document(box: Box) -> dict[str, Any]:
 
 
 def _given(asked: Wish | Need) -> dict[str, float]:
-    return {it: getattr(asked, it) for it in ("mm", "deg") if getattr(asked, it) is not None}
+    return {
+        name: getattr(asked, name) for name in ("mm", "deg") if getattr(asked, name) is not None
+    }
 
 
 def _request_document(request: Request) -> dict[str, Any]:

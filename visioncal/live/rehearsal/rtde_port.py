@@ -90,7 +90,7 @@ class RtdePort:
             if link.writer.transport.get_write_buffer_size() > _FULL_BYTES:
                 continue
             link.due_s = max(link.due_s + link.every_s, moment.now_s)
-            values = [VARIABLES[it][1](moment) for it in link.outputs.names]
+            values = [VARIABLES[name][1](moment) for name in link.outputs.names]
             link.writer.write(link.outputs.pack(values))
 
     def _answer(self, link: _Link, kind: int, payload: bytes) -> bytes:
@@ -122,7 +122,7 @@ class RtdePort:
     def _set_outputs(self, link: _Link, payload: bytes) -> bytes:
         (rate,) = struct.unpack_from(">d", payload)
         names = split_names(payload[8:])
-        types = tuple(VARIABLES[it][0] if it in VARIABLES else NOT_FOUND for it in names)
+        types = tuple(VARIABLES[name][0] if name in VARIABLES else NOT_FOUND for name in names)
         link.every_s = 1.0 / rate if rate > 0.0 else 0.0
         link.outputs = None if NOT_FOUND in types else Recipe(1, names, types)
         return frame(Kind.OUTPUTS, _YES + join_types(types))
@@ -131,7 +131,7 @@ class RtdePort:
 def _set_inputs(link: _Link, payload: bytes) -> bytes:
     """Recipes are numbered from 1 for each client, which counts them itself."""
     names = split_names(payload)
-    types = tuple(input_type(it) or NOT_FOUND for it in names)
+    types = tuple(input_type(name) or NOT_FOUND for name in names)
     number = len(link.inputs) + 1
     link.inputs[number] = Recipe(number, names, types)
     return frame(Kind.INPUTS, bytes([number]) + join_types(types))

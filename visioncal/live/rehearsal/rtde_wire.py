@@ -61,7 +61,7 @@ class Recipe:
 
     @cached_property
     def _struct(self) -> struct.Struct:
-        return struct.Struct(">B" + "".join(_FORMATS[it] for it in self.types))
+        return struct.Struct(">B" + "".join(_FORMATS[name] for name in self.types))
 
     def pack(self, values: Sequence[Value]) -> bytes:
         """Packs one value for each variable as a frame."""
@@ -95,7 +95,7 @@ def read_header(header: bytes) -> tuple[int, int]:
 
 def split_names(text: bytes) -> tuple[str, ...]:
     """Reads a list of names; the last may be followed by a comma."""
-    return tuple(it for it in text.decode("ascii").split(",") if it)
+    return tuple(part for part in text.decode("ascii").split(",") if part)
 
 
 def join_types(types: Sequence[str]) -> bytes:

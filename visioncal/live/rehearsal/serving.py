@@ -83,7 +83,7 @@ def _state_message(machine: Machine, now_s: float) -> bytes:
     cartesian = struct.pack(">12d", *pose, *machine.tcp.tolist())
     arm = machine.believed
     columns = (arm.offset, arm.a, arm.d, arm.alpha)
-    numbers = [float(it) for column in columns for it in column]
+    numbers = [float(value) for column in columns for value in column]
     kinematics = struct.pack(f">6I{len(numbers)}dI", *range(1, 7), *numbers, _LINEARISED)
     body = _package(_CARTESIAN, cartesian) + _package(_KINEMATICS, kinematics)
     return _package(_ROBOT_STATE, body)
@@ -143,7 +143,7 @@ class ControllerServer:
             SCRIPT_PORT: lambda r, w: self._script(script, r, w),
             TRUTH_PORT: lambda r, w: _truth(TruthChannel(machine, self._silence.set), r, w),
         }
-        handlers |= {it: lambda r, w: self._primary(machine, r, w) for it in PRIMARY_PORTS}
+        handlers |= {port: lambda r, w: self._primary(machine, r, w) for port in PRIMARY_PORTS}
         with ExitStack() as servers:
             for port, handler in handlers.items():
                 server = await asyncio.start_server(_quietly(handler), self._host, port)

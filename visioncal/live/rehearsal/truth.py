@@ -126,7 +126,7 @@ class TruthClient:
             DriverError: The controller is gone.
         """
         reply = self._ask({"at": list(at_s)})
-        return TrueState(*(np.array(reply[it]) for it in ("q", "dq", "base_from_flange")))
+        return TrueState(*(np.array(reply[name]) for name in ("q", "dq", "base_from_flange")))
 
     def inject(self, fault: Fault) -> None:
         """Lets the controller suffer a fault; returns as it has happened.

@@ -103,16 +103,16 @@ def _table() -> dict[str, tuple[str, _Reader]]:
     """The variables by name: type, and how the value is had."""
     six, three = "VECTOR6D", "VECTOR3D"
     table: dict[str, tuple[str, _Reader]] = {
-        "timestamp": ("DOUBLE", lambda it: it.up_s),
-        "joint_temperatures": (six, lambda it: it.temperatures),
+        "timestamp": ("DOUBLE", lambda moment: moment.up_s),
+        "joint_temperatures": (six, lambda moment: moment.temperatures),
         "joint_mode": ("VECTOR6INT32", _constant((253,) * 6)),
-        "robot_mode": ("INT32", lambda it: _MODES.get(it.machine.mode, -1)),
-        "safety_mode": ("INT32", lambda it: _SAFETY_MODES[it.machine.safety]),
-        "runtime_state": ("UINT32", lambda it: _RUNTIME[it.machine.program]),
-        "robot_status_bits": ("UINT32", lambda it: it.status_bits),
-        "safety_status_bits": ("UINT32", lambda it: _SAFETY_BITS[it.machine.safety]),
-        "payload": ("DOUBLE", lambda it: it.machine.payload_kg),
-        "payload_cog": (three, lambda it: tuple(it.machine.payload_m.tolist())),
+        "robot_mode": ("INT32", lambda moment: _MODES.get(moment.machine.mode, -1)),
+        "safety_mode": ("INT32", lambda moment: _SAFETY_MODES[moment.machine.safety]),
+        "runtime_state": ("UINT32", lambda moment: _RUNTIME[moment.machine.program]),
+        "robot_status_bits": ("UINT32", lambda moment: moment.status_bits),
+        "safety_status_bits": ("UINT32", lambda moment: _SAFETY_BITS[moment.machine.safety]),
+        "payload": ("DOUBLE", lambda moment: moment.machine.payload_kg),
+        "payload_cog": (three, lambda moment: tuple(moment.machine.payload_m.tolist())),
         "actual_tool_accelerometer": (three, _constant((0.0, 0.0, _GRAVITY))),
         "actual_main_voltage": ("DOUBLE", _constant(48.0)),
         "actual_robot_voltage": ("DOUBLE", _constant(48.0)),
@@ -122,10 +122,10 @@ def _table() -> dict[str, tuple[str, _Reader]]:
     }
     # What is aimed at is reached at once.
     for kind in ("actual", "target"):
-        table[f"{kind}_q"] = (six, lambda it: tuple(it.joints[0].tolist()))
-        table[f"{kind}_qd"] = (six, lambda it: tuple(it.joints[1].tolist()))
-        table[f"{kind}_current"] = (six, lambda it: it.currents)
-        table[f"{kind}_TCP_pose"] = (six, lambda it: it.tcp_pose)
+        table[f"{kind}_q"] = (six, lambda moment: tuple(moment.joints[0].tolist()))
+        table[f"{kind}_qd"] = (six, lambda moment: tuple(moment.joints[1].tolist()))
+        table[f"{kind}_current"] = (six, lambda moment: moment.currents)
+        table[f"{kind}_TCP_pose"] = (six, lambda moment: moment.tcp_pose)
     table |= dict.fromkeys(("speed_scaling", "target_speed_fraction"), ("DOUBLE", _constant(1.0)))
     numbers = ("actual_execution_time", "actual_momentum", "actual_robot_current")
     analog = [f"standard_analog_{way}{place}" for way in ("input", "output") for place in (0, 1)]

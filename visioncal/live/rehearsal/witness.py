@@ -88,13 +88,13 @@ def pace_of(
         pace = (options.speed, options.acceleration)
         motions.append(sum(travel_s(a, b, *pace) for a, b in pairwise(way)))
         here = stop.q
-    times = [it.times for it in steps]
-    motion_s, added = float(np.mean(motions)), [it.worked_s for it in times]
+    times = [step.times for step in steps]
+    motion_s, added = float(np.mean(motions)), [time.worked_s for time in times]
     return Pace(
         len(steps),
         motion_s,
-        float(np.mean([it.moved_s for it in times])) - motion_s,
-        float(np.mean([it.settled_s for it in times])),
+        float(np.mean([time.moved_s for time in times])) - motion_s,
+        float(np.mean([time.settled_s for time in times])),
         float(np.mean(added)),
         max(added),
     )
@@ -128,7 +128,7 @@ def explained(calibration: Calibration, transforms: Mapping[str, FloatArray]) ->
         transforms: (4, 4) true edges by name.
     """
     away = np.concatenate(
-        [log(invert(transforms[it]) @ edge.matrix) for it, edge in calibration.edges.items()]
+        [log(invert(transforms[name]) @ edge.matrix) for name, edge in calibration.edges.items()]
     )
     squared = float(away @ np.linalg.solve(calibration.joint_covariance, away))
     return Explained(squared, away.size, _LARGER**2 * float(chi2_limit(_CHANCE, away.size)))

@@ -24,19 +24,19 @@ def log_arm(stream: rr.RecordingStream, link_frames: FloatArray, entity: str = p
         link_frames: (n, 4, 4) the frames of its joints and its flange in the base [m].
         entity: Under which entity.
     """
-    it = _Shapes.of(link_frames[None])
+    shapes = _Shapes.of(link_frames[None])
     capsules = rr.Capsules3D(
-        lengths=it.lengths_m,
-        radii=it.radii_m,
-        translations=it.begins_m,
-        quaternions=it.quaternions,
+        lengths=shapes.lengths_m,
+        radii=shapes.radii_m,
+        translations=shapes.begins_m,
+        quaternions=shapes.quaternions,
         colors=colours.LINK,
         fill_mode="solid",
     )
     stream.log(f"{entity}/links", capsules)
     balls = rr.Ellipsoids3D(
-        centers=it.joints_m,
-        half_sizes=it.half_sizes_m,
+        centers=shapes.joints_m,
+        half_sizes=shapes.half_sizes_m,
         colors=colours.JOINT,
         fill_mode="solid",
     )
@@ -82,23 +82,23 @@ def log_arms(
             that of the view before off the screen.
         entity: Under which entity.
     """
-    known = [it for it in views if it is not None]
+    known = [view for view in views if view is not None]
     link_frames, rows = np.array(known or [np.zeros((0, 4, 4))]), range(len(views))
-    drawn = [it is not None for it in views]
-    it, links, joints = _Shapes.of(link_frames), f"{entity}/links", f"{entity}/joints"
+    drawn = [view is not None for view in views]
+    shapes, links, joints = _Shapes.of(link_frames), f"{entity}/links", f"{entity}/joints"
     capsules = rr.Capsules3D.from_fields(colors=colours.LINK, fill_mode="solid")
     stream.log(links, capsules, static=True)
     columns = rr.Capsules3D.columns(
-        lengths=it.lengths_m,
-        radii=it.radii_m,
-        translations=it.begins_m,
-        quaternions=it.quaternions,
+        lengths=shapes.lengths_m,
+        radii=shapes.radii_m,
+        translations=shapes.begins_m,
+        quaternions=shapes.quaternions,
     )
     counts = link_frames.shape[1] * np.array(drawn)
     send_rows(stream, links, rows, columns.partition(counts))
     balls = rr.Ellipsoids3D.from_fields(colors=colours.JOINT, fill_mode="solid")
     stream.log(joints, balls, static=True)
-    columns = rr.Ellipsoids3D.columns(centers=it.joints_m, half_sizes=it.half_sizes_m)
+    columns = rr.Ellipsoids3D.columns(centers=shapes.joints_m, half_sizes=shapes.half_sizes_m)
     send_rows(stream, joints, rows, columns.partition(np.maximum(counts - 1, 0)))
 
 

@@ -27,7 +27,7 @@ def outline(target: Target) -> FloatArray:
     Those of a rig are of the middle of the box around its points.
     """
     low, high = extent_m(target)
-    middle = float(np.mean([it[:, 2] for it in _ends(target)]))
+    middle = float(np.mean([end[:, 2] for end in _ends(target)]))
     corners = [[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]]
     return np.pad(corners, ((0, 0), (0, 1)), constant_values=middle)
 
@@ -76,7 +76,7 @@ def picture(target: Target) -> Image:
     page = np.full((height, width), 255, dtype=np.uint8)
     for grid in dark_cells(target):
         left, top = np.rint(scale * (grid.corner_m - low)).astype(int).tolist()
-        rows, columns = (max(round(scale * grid.cell_m * it), 1) for it in grid.dark.shape)
+        rows, columns = (max(round(scale * grid.cell_m * value), 1) for value in grid.dark.shape)
         # Where there are more cells than pixels, they mix to grey.
         how = cv2.INTER_NEAREST if rows >= len(grid.dark) else cv2.INTER_AREA
         light = np.where(grid.dark, 0, 255).astype(np.uint8)

@@ -70,7 +70,10 @@ class JointChart:
             stream,
             f"{paths.over_joint(self.joint)}/{paths.THIS_VIEW}",
             rows.values(),
-            [rr.ComponentColumn(it, rr.AnyBatchValue(it, found)) for it, found in columns.items()],
+            [
+                rr.ComponentColumn(key, rr.AnyBatchValue(key, found))
+                for key, found in columns.items()
+            ],
         )
 
     @property
@@ -105,7 +108,7 @@ class Charts:
         found = (
             coverage.image_chart(calibration, evidence),
             None if calibration.mount == "instrument" else coverage.directions_chart(evidence),
-            coverage.rotation_axes_chart([it for it in evidence.values() if it.view in used]),
+            coverage.rotation_axes_chart([view for view in evidence.values() if view.view in used]),
         )
         points = tuple(chart for chart in found if chart is not None)
         return cls(points, _joint_charts(session, calibration), used)
@@ -125,7 +128,9 @@ class Charts:
                 (paths.USED, colours.USED, True),
                 (paths.REJECTED, colours.REJECTED, False),
             ):
-                some = [it for view, it in chart.points.items() if (view in self.used) is wanted]
+                some = [
+                    point for view, point in chart.points.items() if (view in self.used) is wanted
+                ]
                 if some:
                     points = rr.Points2D(np.vstack(some), colors=colour, radii=_POINT)
                     stream.log(f"{paths.COVERAGE}/{chart.name}/{name}", points, static=True)
@@ -147,7 +152,7 @@ class Charts:
             marked = [chart.points.get(view, np.zeros((0, 2))) for view in rows]
             points = rr.Points2D.columns(positions=np.vstack(marked))
             entity = f"{paths.COVERAGE}/{chart.name}/{paths.THIS_VIEW}"
-            parts = points.partition([len(it) for it in marked])
+            parts = points.partition([len(array) for array in marked])
             send_rows(stream, entity, rows.values(), parts)
         for joint in self.joints:
             joint.log_marks(stream, rows)
@@ -164,8 +169,8 @@ def _single_tensors(values: Sequence[float | None]) -> pa.Array:
     """Tensors of one number each, or of none; rerun itself makes no batches of them."""
     kind = rr.components.TensorDataBatch(np.zeros(1)).as_arrow_array().type
     union, count = kind.field("buffer").type, len(values)
-    sizes = np.array([it is not None for it in values], dtype=np.int64)
-    numbers = pa.array([it for it in values if it is not None], pa.float64())
+    sizes = np.array([value is not None for value in values], dtype=np.int64)
+    numbers = pa.array([value for value in values if value is not None], pa.float64())
     children = [pa.nulls(0, field.type) for field in union]
     place = [field.name for field in union].index("F64")
     # By their buffers: what arrow makes itself may hold nulls, which is another type.
@@ -193,9 +198,9 @@ def _from_buffers(
 def _joint_charts(session: Session, calibration: Calibration) -> tuple[JointChart, ...]:
     """Charts of the used views that have joint angles."""
     residual_mm = {
-        it.view: it.residual_mm
-        for it in calibration.views
-        if it.used and it.residual_mm is not None
+        view.view: view.residual_mm
+        for view in calibration.views
+        if view.used and view.residual_mm is not None
     }
     q_deg: dict[int, FloatArray] = {}
     for view in session.views:

@@ -266,9 +266,11 @@ def read_rows(batch: pa.RecordBatch) -> dict[int, Row]:
     """Reads those rows whose seal holds, by their place in the session."""
     rows = {}
     for place, index in enumerate(places(batch)):
-        it = values_of(batch, _ROW, place)
-        row = Row(tuple(it.get("numbers") or ()), tuple(it["texts"]), it["image_sha256"][0])
-        if row.seal() == it["seal"][0]:
+        stored = values_of(batch, _ROW, place)
+        row = Row(
+            tuple(stored.get("numbers") or ()), tuple(stored["texts"]), stored["image_sha256"][0]
+        )
+        if row.seal() == stored["seal"][0]:
             rows[index] = row
     return rows
 
@@ -278,7 +280,7 @@ def read_samples(batch: pa.RecordBatch) -> dict[str, Stream]:
     streams = {}
     for place in range(batch.num_rows):
         name, columns = (
-            batch.column(f"{_STREAM}:{it}")[place].as_py() for it in ("name", "columns")
+            batch.column(f"{_STREAM}:{name}")[place].as_py() for name in ("name", "columns")
         )
         cells = batch.column(f"{_STREAM}:values")[place].values.to_numpy(zero_copy_only=False)
         values = np.array(cells, dtype=float).reshape(-1, len(columns))
@@ -291,7 +293,7 @@ def read_corners(batch: pa.RecordBatch) -> CornerTable:
     """Reads the corners that another detector found."""
     found = values_of(batch, _CORNERS)
     names = ("views", "points", "px", "targets", "sigmas_px")
-    views, points, px, targets, sigmas_px = (found.get(it) or () for it in names)
+    views, points, px, targets, sigmas_px = (found.get(name) or () for name in names)
     return CornerTable(
         np.array(views, dtype=np.int64),
         np.array(points, dtype=np.int64),

@@ -59,10 +59,10 @@ def _log(run: Run, recorder: Recorder) -> None:
     recorder.stream.reset_time()
     _log_static(recorder.stream, run.identified, run.predictions)
     begin_s = 0.0
-    for it in run.predictions:
-        times_s = begin_s + it.times_s - it.times_s[0]
-        _log_series(recorder.stream, it, times_s)
-        _log_motion(recorder, run.identified, it, times_s)
+    for prediction in run.predictions:
+        times_s = begin_s + prediction.times_s - prediction.times_s[0]
+        _log_series(recorder.stream, prediction, times_s)
+        _log_motion(recorder, run.identified, prediction, times_s)
         begin_s = float(times_s[-1]) + _PAUSE_S
 
 
@@ -70,7 +70,7 @@ def _log_static(
     stream: rr.RecordingStream, identified: Identified, found: Sequence[Prediction]
 ) -> None:
     log_frames(stream, _AXIS_M)
-    with_known = any(it.known_nm is not None for it in found)
+    with_known = any(prediction.known_nm is not None for prediction in found)
     for joint in range(identified.robot.joint_count):
         torque = paths.of_joint(paths.TORQUES, joint)
         for name, colour, width in _LINES:

@@ -121,7 +121,7 @@ class LiveDrawing:
         self._places.append(flange)
         in_base = rr.CoordinateFrame(paths.BASE_FRAME)
         points = rr.Points3D(
-            [it[:3, 3] for it in self._places], colors=colours.USED, radii=_POINT_M
+            [place[:3, 3] for place in self._places], colors=colours.USED, radii=_POINT_M
         )
         stream.log(f"{paths.STOPS}/{paths.USED}", in_base, points)
         if cell.x is None or cell.z is None:
@@ -130,7 +130,7 @@ class LiveDrawing:
         placed = (flange @ cell.x, cell.z) if in_hand else (cell.x, flange @ cell.z)
         log_pose(stream, paths.CAMERA, paths.CAM_FRAME, placed[0])
         log_pose(stream, paths.TARGET, paths.TARGET_FRAME, placed[1])
-        strips = [it for pose in self._places for it in self._carried(pose)]
+        strips = [array for pose in self._places for array in self._carried(pose)]
         if strips:
             lines = rr.LineStrips3D(strips, colors=colours.USED, radii=_LINE_M)
             stream.log(f"{paths.STOPS}/{paths.USED}/carried", in_base, lines)
@@ -143,4 +143,4 @@ class LiveDrawing:
             pose = flange @ np.asarray(cell.x)
         else:
             shapes, pose = [board.closed_outline(cell.target)], flange @ np.asarray(cell.z)
-        return [it @ pose[:3, :3].T + pose[:3, 3] for it in shapes]
+        return [shape @ pose[:3, :3].T + pose[:3, 3] for shape in shapes]

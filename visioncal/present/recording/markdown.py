@@ -23,9 +23,9 @@ def markdown(text: str) -> rr.TextDocument:
 
 def fact_lines(facts: Iterable[Fact]) -> Iterator[str]:
     """Facts as a list."""
-    for it in facts:
-        note = f" ({plain(it.note)})" if it.note else ""
-        yield f"- {plain(it.label)}: {plain(it.value)}{note}"
+    for fact in facts:
+        note = f" ({plain(fact.note)})" if fact.note else ""
+        yield f"- {plain(fact.label)}: {plain(fact.value)}{note}"
 
 
 def table_lines(table: Table | None) -> Iterator[str]:

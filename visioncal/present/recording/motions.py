@@ -62,7 +62,7 @@ class MotionPreview:
     @property
     def places_m(self) -> FloatArray:
         """(k, 3) where the flange comes by, and the base [m]."""
-        ways = [self.robot.base_from_flange(it.motion.q)[:, :3, 3] for it in self.parts]
+        ways = [self.robot.base_from_flange(part.motion.q)[:, :3, 3] for part in self.parts]
         return np.vstack([np.zeros(3), *ways])
 
 
@@ -116,7 +116,7 @@ def _log_static(stream: rr.RecordingStream, preview: MotionPreview) -> None:
 def _log_curves(stream: rr.RecordingStream, part: MotionPart, begin_s: float) -> None:
     """Draws the joints' curves."""
     motion = part.motion
-    curves = [np.rad2deg(it) for it in (motion.q, motion.dq, motion.ddq)]
+    curves = [np.rad2deg(array) for array in (motion.q, motion.dq, motion.ddq)]
     if part.torques_nm is not None:
         curves.append(part.torques_nm)
     times = rr.TimeColumn(paths.MOTION_TIMELINE, duration=_durations(begin_s + motion.times_s))

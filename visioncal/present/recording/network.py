@@ -18,17 +18,17 @@ def log_network(stream: rr.RecordingStream, found: Alignment) -> None:
     nodes |= places(found)
     words = {flange: f"robot {robot}" for flange, robot in found.robots.items()}
     words[paths.CELL_FRAME] = f"the frame of {found.reference}"
-    labels = [f"{it}\n{words.get(it) or sigma_words(found, it)}" for it in nodes]
+    labels = [f"{node}\n{words.get(node) or sigma_words(found, node)}" for node in nodes]
     bodies = {paths.CELL_FRAME, *found.robots}
-    seen = [(it.seer, it.seen) for it in pairs(found) if it.used]
-    hangs = [(found.frames[it], it) for it in nodes if it != paths.CELL_FRAME]
+    seen = [(pair.seer, pair.seen) for pair in pairs(found) if pair.used]
+    hangs = [(found.frames[node], node) for node in nodes if node != paths.CELL_FRAME]
     stream.log(
         paths.NETWORK,
         rr.GraphNodes(
             list(nodes),
             positions=[(_ACROSS_PX * x, -_DOWN_PX * y) for x, y in nodes.values()],
             labels=labels,
-            colors=[colours.LINK if it in bodies else colours.USED for it in nodes],
+            colors=[colours.LINK if node in bodies else colours.USED for node in nodes],
         ),
         rr.GraphEdges([*hangs, *seen], graph_type="undirected"),
         static=True,

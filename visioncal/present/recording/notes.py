@@ -53,7 +53,7 @@ def log_static(
     ):
         if text:
             stream.log(entity, markdown(text), static=True)
-    for seer in dict.fromkeys(it.seer for it in parts.sights(calibration)):
+    for seer in dict.fromkeys(sight.seer for sight in parts.sights(calibration)):
         for plot in _PLOTS:
             for name, label, colour, marker, size in _MARKS:
                 points = rr.SeriesPoints(
@@ -84,16 +84,16 @@ def log_views(
         unposed: The robots whose pose is not known at a view, by its place.
     """
     by_seer: dict[str, dict[int, Sight]] = defaultdict(dict)
-    for row, it in sights.items():
-        by_seer[it.seer][row] = it
+    for row, sight in sights.items():
+        by_seer[sight.seer][row] = sight
     for seer, mine in by_seer.items():
         for plot, attribute in _PLOTS.items():
             _log_residuals(stream, paths.part_of(plot, seer), mine, attribute)
     texts = [
-        view_markdown(sights[row], () if it.is_of_lens else unposed.get(row, ()))
+        view_markdown(sights[row], () if view.is_of_lens else unposed.get(row, ()))
         if row in sights
-        else _unseen_markdown(it)
-        for row, it in rows.items()
+        else _unseen_markdown(view)
+        for row, view in rows.items()
     ]
     columns = rr.TextDocument.columns(text=texts, media_type=["text/markdown"] * len(texts))
     send_rows(stream, paths.VIEW_NOTE, rows, columns)
@@ -103,8 +103,8 @@ def _log_residuals(
     stream: rr.RecordingStream, plot: str, sights: Mapping[int, Sight], attribute: str
 ) -> None:
     """Logs a residual of the views, by their places in the session."""
-    values = {row: getattr(it, attribute) for row, it in sights.items()}
-    used = [it for row, it in values.items() if it is not None and sights[row].used]
+    values = {row: getattr(sight, attribute) for row, sight in sights.items()}
+    used = [value for row, value in values.items() if value is not None and sights[row].used]
     # Views that were not used must not flatten the others.
     end, marks = _ROOM * max(used, default=math.inf), defaultdict[str, dict[int, float]](dict)
     for row, value in values.items():
@@ -136,8 +136,8 @@ def _verdict_lines(calibration: Calibration) -> Iterator[str]:
     yield from (f"# {verdict.headline}", "", *_list(verdict.top))
     if calibration.next_steps:
         yield from ("", "## What to do next", "")
-    for at, it in enumerate(calibration.next_steps, 1):
-        yield f"{at}. {plain(it.words)}" + (f"  \n   `{it.command}`" if it.command else "")
+    for at, step in enumerate(calibration.next_steps, 1):
+        yield f"{at}. {plain(step.words)}" + (f"  \n   `{step.command}`" if step.command else "")
     for name, frame in calibration.frames.items():
         if frame.verdict.status != "good":
             yield f"- {plain(name)}: {frame.verdict.headline}, see Tools and fixtures."
@@ -145,18 +145,18 @@ def _verdict_lines(calibration: Calibration) -> Iterator[str]:
         yield from ("", "## What else was found", "", *_list(verdict.rest))
     if cell is not None:
         yield from ("", plain(cell.weakest), "")
-        yield from _list(": ".join(it.cells) for it in facts.moved_table(cell).rows)
+        yield from _list(": ".join(row.cells) for row in facts.moved_table(cell).rows)
         yield f"The frame of the cell is that of {plain(cell.reference)}."
     yield from table_lines(facts.edge_table(calibration.placed))
     if known is not None:
         yield from ("", plain(" ".join(facts.summary(calibration, known))))
-    used = sum(it.used for it in calibration.views)
+    used = sum(view.used for view in calibration.views)
     yield from ("", f"{used} of {len(calibration.views)} views used.")
-    yield from _list(it.words for it in advice.left_out(parts.sights(calibration)))
+    yield from _list(suspects.words for suspects in advice.left_out(parts.sights(calibration)))
 
 
 def _list(sentences: Iterable[str]) -> Iterator[str]:
-    return (f"- {plain(it)}" for it in sentences)
+    return (f"- {plain(sentence)}" for sentence in sentences)
 
 
 def figures_markdown(
@@ -216,7 +216,9 @@ def view_markdown(sight: Sight, unposed: Sequence[str] = ()) -> str:
     )
     known = [] if sight.corners is None else [f"corners {sight.corners}"]
     known += [
-        f"{label} {significant(it, 3)} {unit}" for label, it, unit in figures if it is not None
+        f"{label} {significant(value, 3)} {unit}"
+        for label, value, unit in figures
+        if value is not None
     ]
     of = f"Stop {sight.stop}, {plain(sight.seer)} of {plain(sight.seen)}: " if sight.seer else ""
     lines.append(of + ", ".join(known))
@@ -234,17 +236,17 @@ def _unseen_markdown(view: View) -> str:
 
 def tools_markdown(calibration: Calibration) -> str:
     """All tools and fixtures, each with its verdict, its pose, its observations and its figures."""
-    return "\n".join(chain.from_iterable(_tool(*it) for it in calibration.frames.items()))
+    return "\n".join(chain.from_iterable(_tool(*frame) for frame in calibration.frames.items()))
 
 
 def _tool(name: str, frame: Frame) -> Iterator[str]:
     yield from (f"# {plain(name)}: {frame.verdict.headline}", "", *_list(frame.verdict.reasons))
     yield from (*table_lines(facts.edge_table({name: frame.edge})), "")
-    for it in frame.observations:
-        if it.reason or not it.used:
-            reason = f": {plain(it.reason)}" if it.reason else ""
-            state = "used" if it.used else "not used"
-            yield f"- **{plain(f'{it.kind} {it.name}'.strip())} {state}**{reason}"
+    for observation in frame.observations:
+        if observation.reason or not observation.used:
+            reason = f": {plain(observation.reason)}" if observation.reason else ""
+            state = "used" if observation.used else "not used"
+            yield f"- **{plain(f'{observation.kind} {observation.name}'.strip())} {state}**{reason}"
     if frame.observations:
         yield from table_lines(observation_table(frame))
     yield from ("", *fact_lines(frame_facts(frame)), "")
@@ -254,7 +256,7 @@ def arms_markdown(calibration: Calibration) -> str:
     """What is known of each arm of which levels were tried, and of its drift."""
     return "\n".join(
         chain.from_iterable(
-            _arm(facts.of(name), it) for name, it in parts.arms(calibration).items()
+            _arm(facts.of(name), arm) for name, arm in parts.arms(calibration).items()
         )
     )
 
@@ -273,7 +275,7 @@ def _arm(of: str, found: ArmSections) -> Iterator[str]:
 
 def _levels(found: ArmResult) -> Iterator[str]:
     """Which level was taken and why, and what is known of the arm then."""
-    yield from (f"{plain(it)}\n" for it in arms.arm_sentences(found))
+    yield from (f"{plain(sentence)}\n" for sentence in arms.arm_sentences(found))
     yield from table_lines(arms.level_table(found))
     yield from ("", "Ratio: twice the gain in log-likelihood over the arm as stated.")
     if found.left_out:
@@ -286,8 +288,8 @@ def _levels(found: ArmResult) -> Iterator[str]:
         )
     if found.parameters:
         yield from ("", "## Parameters", "", plain(arms.parameter_note(found)))
-        for it in arms.parameter_tables(found):
-            yield from table_lines(it)
+        for table in arms.parameter_tables(found):
+            yield from table_lines(table)
     if found.observability is not None:
         yield from ("", "## What the stops determine", "")
         yield from fact_lines(arms.identifiability_facts(found))

@@ -51,9 +51,9 @@ class Overlay:
         width = None if calibration is None else parts.image_width(calibration)
         if width is None:
             width = 1280 if session.resolution is None else session.resolution[0]
-        used = frozenset(it.view for it in sights if it.used)
-        shown = [it for view, it in evidence.items() if view in used]
-        active = any(it.corners is not None for it in evidence.values())
+        used = frozenset(sight.view for sight in sights if sight.used)
+        shown = [other for view, other in evidence.items() if view in used]
+        active = any(view.corners is not None for view in evidence.values())
         return cls(
             magnification(shown, width),
             used,
@@ -67,8 +67,10 @@ class Overlay:
         if not self.active:
             return
         nothing = np.zeros((0, 2))
-        px = [nothing if it.corners is None else it.corners.px for it in seen]
-        predicted_px = [nothing if it.predicted_px is None else it.predicted_px for it in seen]
+        px = [nothing if view.corners is None else view.corners.px for view in seen]
+        predicted_px = [
+            nothing if view.predicted_px is None else view.predicted_px for view in seen
+        ]
         for entity, points_px, colour, size in (
             (paths.DETECTED, px, colours.DETECTED, _DOT),
             (paths.PREDICTED, predicted_px, colours.PREDICTED, 0.5 * _DOT),
@@ -81,11 +83,13 @@ class Overlay:
             (paths.RESIDUALS_TO_SCALE, 1, False),
         ):
             paired = [
-                len(ends) == len(begins) and (it.view in self.used) is wanted
-                for it, begins, ends in zip(seen, px, predicted_px, strict=True)
+                len(ends) == len(begins) and (view.view in self.used) is wanted
+                for view, begins, ends in zip(seen, px, predicted_px, strict=True)
             ]
-            begins_px = [it if own else nothing for it, own in zip(px, paired, strict=True)]
-            ends_px = [it if own else nothing for it, own in zip(predicted_px, paired, strict=True)]
+            begins_px = [array if own else nothing for array, own in zip(px, paired, strict=True)]
+            ends_px = [
+                array if own else nothing for array, own in zip(predicted_px, paired, strict=True)
+            ]
             origins = np.vstack(begins_px)
             vectors = factor * (np.vstack(ends_px) - origins)
             arrows = rr.Arrows2D.columns(vectors=vectors, origins=origins + _CENTRE)
@@ -103,7 +107,9 @@ class Overlay:
         """Sends what is drawn in the image; empty parts take back what the view before has left."""
         stream.log(entity, look, static=True)
         log_image_frames(stream, entity, self.frames)
-        send_rows(stream, entity, range(len(parts)), columns.partition([len(it) for it in parts]))
+        send_rows(
+            stream, entity, range(len(parts)), columns.partition([len(part) for part in parts])
+        )
 
 
 def image_frames(session: Session, calibration: Calibration | None) -> dict[int, str]:
@@ -111,9 +117,9 @@ def image_frames(session: Session, calibration: Calibration | None) -> dict[int,
     cell = None if calibration is None else calibration.cell
     if cell is None:
         return dict.fromkeys(range(len(session.views)), paths.IMAGE_FRAME)
-    seers = {it.view.number: it.seer for it in session.observations}
+    seers = {observation.view.number: observation.seer for observation in session.observations}
     seen_by = {row: seers.get(view.number, "") for row, view in enumerate(session.views)}
-    return {row: paths.image_frame(it) for row, it in seen_by.items() if it in cell.cameras}
+    return {row: paths.image_frame(name) for row, name in seen_by.items() if name in cell.cameras}
 
 
 def log_image_frames(stream: rr.RecordingStream, entity: str, frames: Mapping[int, str]) -> None:

@@ -87,7 +87,7 @@ class Preview:
     @property
     def base_from_flange(self) -> FloatArray:
         """(k, 4, 4) the flange at the stops [m]."""
-        return self.robot.base_from_flange(np.array([it.q for it in self.stops]))
+        return self.robot.base_from_flange(np.array([stop.q for stop in self.stops]))
 
     @property
     def size_m(self) -> float:
@@ -137,7 +137,11 @@ def _charts(preview: Preview) -> Charts:
         directions_chart(evidence),
         rotation_axes_chart(list(evidence.values())),
     )
-    return Charts(tuple(it for it in found if it is not None), (), frozenset(evidence))
+    return Charts(
+        tuple(point_chart for point_chart in found if point_chart is not None),
+        (),
+        frozenset(evidence),
+    )
 
 
 def _corners_px(preview: Preview, cam_from_target: FloatArray) -> FloatArray:
@@ -188,14 +192,14 @@ def _log_carried(stream: rr.RecordingStream, preview: Preview, size_m: float) ->
             base_from_carried = base_from_target
             shapes = [board.closed_outline(preview.target)]
         centres.append(base_from_carried[:3, 3])
-        strips += [it @ base_from_carried[:3, :3].T + centres[-1] for it in shapes]
+        strips += [shape @ base_from_carried[:3, :3].T + centres[-1] for shape in shapes]
     lines = rr.LineStrips3D(strips, colors=colours.USED, radii=0.5 * _LINE * size_m)
     stream.log(f"{paths.STOPS}/{paths.USED}/carried", frame, lines, static=True)
     points = rr.Points3D(
         centres,
         colors=colours.USED,
         radii=_POINT * size_m,
-        labels=[str(it.view) for it in preview.stops],
+        labels=[str(stop.view) for stop in preview.stops],
         show_labels=True,
     )
     stream.log(f"{paths.STOPS}/{paths.USED}", frame, points, static=True)

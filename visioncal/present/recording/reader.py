@@ -61,9 +61,11 @@ def _images_of(path: Path, records: "_Records", complete: Sequence[int]) -> Imag
     kept = _ELSEWHERE.get(records.header.images)
     if kept is None:
         return images
-    digests = {records.image_name(it): records.rows[it].image_sha256 for it in complete}
+    digests = {records.image_name(index): records.rows[index].image_sha256 for index in complete}
     pictures = {name: partial(images.read, name) for name in images.places}
-    return ImagesElsewhere(path, kept, {k: it for k, it in digests.items() if it}, pictures)
+    return ImagesElsewhere(
+        path, kept, {k: digest for k, digest in digests.items() if digest}, pictures
+    )
 
 
 @dataclass(frozen=True)
@@ -147,7 +149,7 @@ class _Records:
         """Whether the last view lacks its row or its image."""
         if self.header.images:
             return False
-        with_image = {it for it, row in self.rows.items() if row.image_sha256}
+        with_image = {key for key, row in self.rows.items() if row.image_sha256}
         return with_image != set(self.images)
 
     def image_name(self, row: int) -> str:

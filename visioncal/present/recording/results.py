@@ -45,7 +45,7 @@ def log_results(
             beside the edges cannot be read.
         OSError: The file cannot be written.
     """
-    seen_of = {it.view: it for it in evidence}
+    seen_of = {view.view: view for view in evidence}
     rows = {view.number: row for row, view in enumerate(session.views)}
     unknown = [f"view {number}" for number in sorted(seen_of.keys() - rows.keys())]
     if unknown:
@@ -108,13 +108,13 @@ def _draw(
     scene.log_static(stream)
     if calibration is not None:
         notes.log_static(stream, calibration, parts.stated_boards(session))
-    seen = [evidence.get(it.number, ViewEvidence(it.number)) for it in session.views]
+    seen = [evidence.get(view.number, ViewEvidence(view.number)) for view in session.views]
     scene.log_views(stream, seen)
     overlay.log_views(stream, seen)
-    if any(it.explained is not None for it in seen):
-        for row, it in enumerate(seen):
+    if any(view.explained is not None for view in seen):
+        for row, view in enumerate(seen):
             recorder.at(row)
-            _log_explained(stream, it)
+            _log_explained(stream, view)
     if calibration is not None:
         _log_views(stream, session, calibration, scene)
     recorder.keep()
@@ -126,14 +126,14 @@ def _log_views(
     """Logs what became of each view, and how the arms had drifted."""
     views = dict(enumerate(session.views))
     rows = {view.number: row for row, view in views.items()}
-    sights = {rows[it.view]: it for it in parts.sights(calibration) if it.view in rows}
+    sights = {rows[sight.view]: sight for sight in parts.sights(calibration) if sight.view in rows}
     unposed = {row: scene.unposed(view.number) for row, view in views.items()}
     notes.log_views(stream, sights, views, unposed)
     for name, arm in parts.arms(calibration).items():
         drifts = () if arm.thermal is None else arm.thermal.views
         for plot, attribute in ((paths.DRIFT_MM, "drift_mm"), (paths.RISE_K, "rise_k")):
-            values = {rows[it.view]: float(getattr(it, attribute)) for it in drifts
-                      if it.view in rows}  # fmt: skip
+            values = {rows[drift.view]: float(getattr(drift, attribute)) for drift in drifts
+                      if drift.view in rows}  # fmt: skip
             notes.log_scalars(stream, paths.part_of(plot, name), values)
 
 

@@ -45,17 +45,17 @@ def robot_states(
     # Of several robots, each pose is in a base of its own, which nothing places.
     views = () if session.is_network else session.views
     poses = reported_matrices(views)
-    seen = {it.view: it.base_from_flange for it in evidence.values()}
+    seen = {view.view: view.base_from_flange for view in evidence.values()}
     poses |= {view: pose for view, pose in seen.items() if pose is not None}
     (flange,) = parts.frames(calibration).robots
     robot = None if calibration is None else calibration.calibrated_robot
     states = {
-        it.number: RobotState(poses[it.number], it.joints_rad)
-        if it.number in poses
-        else _state(it, robot)
-        for it in views
+        view.number: RobotState(poses[view.number], view.joints_rad)
+        if view.number in poses
+        else _state(view, robot)
+        for view in views
     }
-    return {flange: {view: it for view, it in states.items() if it is not None}}
+    return {flange: {view: state for view, state in states.items() if state is not None}}
 
 
 def _of_cell(session: Session, calibration: Calibration) -> Mapping[str, Mapping[int, RobotState]]:
@@ -69,7 +69,7 @@ def _of_cell(session: Session, calibration: Calibration) -> Mapping[str, Mapping
     for flange, name in parts.frames(calibration).robots.items():
         by_view = {view: mine[name] for view, mine in rows.items() if name in mine}
         own = {view: _state(row, models.get(name)) for view, row in by_view.items()}
-        last = next((it for it in own.values() if it is not None), None)
+        last = next((robot_state for robot_state in own.values() if robot_state is not None), None)
         shown: dict[int, RobotState] = {}
         for view in session.views:
             last = own.get(view.number) or (last and replace(last, is_past=True))

@@ -123,15 +123,15 @@ class Scene:
             seen: What was seen in each, in the order of the session.
         """
         for flange in self.frames.robots:
-            states = [self.states[flange].get(it.view) for it in seen]
-            poses = [None if it is None else it.pose for it in states]
+            states = [self.states[flange].get(view.view) for view in seen]
+            poses = [None if state is None else state.pose for state in states]
             _log_poses(stream, self.frames.parents[flange], flange, poses)
             self._log_arm(stream, flange, states)
         if self.calibration is None:
             return
         self._log_seen_targets(stream, seen)
         self._log_sights(stream)
-        rows = {it.view: row for row, it in enumerate(seen)}
+        rows = {view.view: row for row, view in enumerate(seen)}
         if self.uncertainty is not None:
             self.uncertainty.log_views(stream, list(rows))
         if self.charts is not None:
@@ -157,15 +157,19 @@ class Scene:
         """The robots of a whole cell without a pose at the stop of a view."""
         if self.calibration is None or self.calibration.cell is None:
             return []
-        found = {robot: self.states[it].get(view) for it, robot in self.frames.robots.items()}
-        return [robot for robot, it in found.items() if it is None or it.is_past]
+        found = {robot: self.states[name].get(view) for name, robot in self.frames.robots.items()}
+        return [
+            robot
+            for robot, robot_state in found.items()
+            if robot_state is None or robot_state.is_past
+        ]
 
     @cached_property
     def _boards(self) -> Mapping[str, Target]:
         """The targets by their frames, as far as the calibration places them."""
         boards = parts.stated_boards(self.session).items()
-        frames = {frame_name("target", name): it for name, it in boards}
-        return {frame: it for frame, it in frames.items() if frame in self.frames.parents}
+        frames = {frame_name("target", name): target for name, target in boards}
+        return {frame: target for frame, target in frames.items() if frame in self.frames.parents}
 
     @cached_property
     def _rejected(self) -> frozenset[int]:
@@ -178,13 +182,13 @@ class Scene:
     def _log_axes(self, stream: rr.RecordingStream, entity: str, frame: str) -> None:
         """Draws a frame's axes with its name."""
         tools = () if self.calibration is None else self.calibration.frames
-        is_tool = any(it.endswith(f"_from_{frame}") for it in tools)
+        is_tool = any(tool.endswith(f"_from_{frame}") for tool in tools)
         share = _TOOL_AXES if is_tool else _AXES.get(frame.partition("_")[0], _OTHER_AXES)
         axes = rr.TransformAxes3D(share * _AXIS * self.size_m, show_frame=True)
         stream.log(entity, rr.CoordinateFrame(frame), axes, static=True)
 
     def _carried_by(self, flange: str) -> list[str]:
-        return [it for it, on in self.frames.parents.items() if on == flange]
+        return [name for name, on in self.frames.parents.items() if on == flange]
 
     def _log_mount(self, stream: rr.RecordingStream, flange: str) -> None:
         """Draws the edges that hang on a flange, as lines."""
@@ -201,10 +205,12 @@ class Scene:
         """All places of a flange; those of views that were not used in another colour."""
         stops = paths.part_of(paths.STOPS, self.frames.robots[flange])
         frame = rr.CoordinateFrame(self.frames.parents[flange])
-        own = {view: it.pose for view, it in self.states[flange].items() if not it.is_past}
+        own = {view: state.pose for view, state in self.states[flange].items() if not state.is_past}
         for name, colour in ((paths.USED, colours.USED), (paths.REJECTED, colours.REJECTED)):
             is_rejected = name == paths.REJECTED
-            poses = [it for view, it in own.items() if (view in self._rejected) is is_rejected]
+            poses = [
+                array for view, array in own.items() if (view in self._rejected) is is_rejected
+            ]
             if not poses:
                 continue
             points = rr.Points3D(
@@ -212,7 +218,7 @@ class Scene:
             )
             stream.log(f"{stops}/{name}", frame, points, static=True)
             shapes = self._shapes_on(flange)
-            strips = [it @ pose[:3, :3].T + pose[:3, 3] for pose in poses for it in shapes]
+            strips = [shape @ pose[:3, :3].T + pose[:3, 3] for pose in poses for shape in shapes]
             if strips:
                 lines = rr.LineStrips3D(strips, colors=colour, radii=self._radius(0.3 * _LINE))
                 stream.log(f"{stops}/{name}/carried", frame, lines, static=True)
@@ -224,10 +230,10 @@ class Scene:
             return []
         cameras = parts.cameras(self.calibration)
         shapes = {
-            frame or paths.CAM_FRAME: frustum(it.camera, SMALL_FRUSTUM * self.size_m)
-            for frame, it in cameras.items()
+            frame or paths.CAM_FRAME: frustum(camera.camera, SMALL_FRUSTUM * self.size_m)
+            for frame, camera in cameras.items()
         }
-        shapes |= {frame: [board.closed_outline(it)] for frame, it in self._boards.items()}
+        shapes |= {frame: [board.closed_outline(target)] for frame, target in self._boards.items()}
         return [
             shape @ matrix[:3, :3].T + matrix[:3, 3]
             for child in self._carried_by(flange)
@@ -244,10 +250,10 @@ class Scene:
         robot, entity = known.get(name), paths.named(paths.ROBOT, name)
         arms: list[FloatArray | None] = []
         strips: list[list[FloatArray]] = []
-        for it in states:
-            arms.append(None if it is None else it.link_frames(robot))
-            is_line = it is not None and arms[-1] is None
-            strips.append([np.array([np.zeros(3), it.pose[:3, 3]])] if it and is_line else [])
+        for state in states:
+            arms.append(None if state is None else state.link_frames(robot))
+            is_line = state is not None and arms[-1] is None
+            strips.append([np.array([np.zeros(3), state.pose[:3, 3]])] if state and is_line else [])
         log_arms(stream, arms, entity)
         style = rr.LineStrips3D.from_fields(colors=colours.JOINT, radii=self._radius(2 * _LINE))
         stream.log(f"{entity}/reach", style, static=True)
@@ -257,20 +263,22 @@ class Scene:
         """Draws the target's outline where each view alone sees it."""
         # A part without strips takes those of the view before off the screen.
         strips: dict[int, list[FloatArray]] = {}
-        boards = self.session.boards if any(it.cam_from_target is not None for it in seen) else {}
-        outlines = {name: board.closed_outline(it) for name, it in boards.items()}
+        boards = (
+            self.session.boards if any(view.cam_from_target is not None for view in seen) else {}
+        )
+        outlines = {name: board.closed_outline(target) for name, target in boards.items()}
         sights = () if self.calibration is None else parts.sights(self.calibration)
-        seers = {it.view: it.seer or paths.CAM_FRAME for it in sights}
+        seers = {sight.view: sight.seer or paths.CAM_FRAME for sight in sights}
         cameras = frames_of_kind(seers.values(), "camera")
-        for row, (view, it) in enumerate(zip(self.session.views, seen, strict=True)):
+        for row, (view, other) in enumerate(zip(self.session.views, seen, strict=True)):
             if (name := self.session.board_of(view)) not in boards:
                 continue
             strips[row] = []
-            if it.cam_from_target is None or seers.get(it.view) not in cameras:
+            if other.cam_from_target is None or seers.get(other.view) not in cameras:
                 continue
-            cell_from_cam = self.in_cell(seers[it.view], it.view)
+            cell_from_cam = self.in_cell(seers[other.view], other.view)
             if cell_from_cam is not None:
-                pose = cell_from_cam @ it.cam_from_target
+                pose = cell_from_cam @ other.cam_from_target
                 strips[row] = [outlines[name] @ pose[:3, :3].T + pose[:3, 3]]
         rejected = {row: seen[row].view in self._rejected for row in strips}
         self._send_lines(stream, paths.SEEN_TARGET, strips, rejected, _LINE)
@@ -280,7 +288,7 @@ class Scene:
         cell = None if self.calibration is None else self.calibration.cell
         if cell is None:
             return
-        sights = {it.view: it for it in cell.sights}
+        sights = {sight.view: sight for sight in cell.sights}
         strips: dict[int, list[FloatArray]] = {}
         rejected: dict[int, bool] = {}
         for row, view in enumerate(self.session.views):
@@ -288,7 +296,7 @@ class Scene:
             rejected[row] = sight is None or not sight.used
             if sight is None:
                 continue
-            ends = [self.in_cell(it, view.number) for it in (sight.seer, sight.seen)]
+            ends = [self.in_cell(name, view.number) for name in (sight.seer, sight.seen)]
             if ends[0] is not None and ends[1] is not None:
                 strips[row] = [np.array([ends[0][:3, 3], self._middle(sight.seen, ends[1])])]
         self._send_lines(stream, paths.SIGHT_LINE, strips, rejected, 2.0 * _LINE)
@@ -314,16 +322,18 @@ class Scene:
         frame = rr.CoordinateFrame(paths.CELL_FRAME)
         style = rr.LineStrips3D.from_fields(radii=self._radius(width))
         stream.log(entity, frame, style, static=True)
-        colour = [colours.REJECTED if rejected[it] else colours.DETECTED for it in strips]
+        colour = [colours.REJECTED if rejected[strip] else colours.DETECTED for strip in strips]
         _send_strips(stream, entity, strips, rr.LineStrips3D.columns(colors=colour))
 
 
 def _size_m(frames: parts.Frames, states: Mapping[str, Mapping[int, RobotState]]) -> float:
     """How far flanges are from their bases, or half of how far apart things stand in the cell."""
-    poses = [it.pose for mine in states.values() for it in mine.values()]
-    distances = [float(np.linalg.norm(it[:3, 3])) for it in poses]
+    poses = [robot_state.pose for mine in states.values() for robot_state in mine.values()]
+    distances = [float(np.linalg.norm(pose[:3, 3])) for pose in poses]
     fixed = (paths.CELL_FRAME, paths.BASE_FRAME)
-    places = [it[:3, 3] for frame, it in frames.matrices.items() if frames.parents[frame] in fixed]
+    places = [
+        matrix[:3, 3] for frame, matrix in frames.matrices.items() if frames.parents[frame] in fixed
+    ]
     extent_m = float(np.linalg.norm(np.ptp([np.zeros(3), *places], axis=0)))
     return max(float(np.median(distances)) if distances else 1.0, 0.5 * extent_m)
 
@@ -374,7 +384,7 @@ def _log_poses(
     """Places a frame on its parent in each view of a session, as `log_pose` in one."""
     entity = paths.entity_of(frame)
     known = {row: pose for row, pose in enumerate(poses) if pose is not None}
-    for row in (it for it in range(len(poses)) if it not in known):
+    for row in (index for index in range(len(poses)) if index not in known):
         stream.set_time(paths.TIMELINE, sequence=row)
         stream.log(entity, rr.Clear(recursive=False))
     if known:
@@ -395,6 +405,6 @@ def _send_strips(
     more: Iterable[rr.ComponentColumn] = (),
 ) -> None:
     """Draws lines in views, by their places; no line takes those of the view before off."""
-    lines = rr.LineStrips3D.columns(strips=[it for some in strips.values() for it in some])
-    parts = lines.partition([len(it) for it in strips.values()])
+    lines = rr.LineStrips3D.columns(strips=[array for some in strips.values() for array in some])
+    parts = lines.partition([len(strip) for strip in strips.values()])
     send_rows(stream, entity, strips, [*parts, *more])

@@ -70,14 +70,15 @@ class Uncertainty:
             frames = dict.fromkeys(evidence, list(calibration.edges)[1].rpartition("_from_")[2])
         scatter_m = {
             view: placed[:3, 3]
-            for view, it in evidence.items()
-            if view in frames and (placed := placement(calibration, it, frames[view])) is not None
+            for view, other in evidence.items()
+            if view in frames
+            and (placed := placement(calibration, other, frames[view])) is not None
         }
         last = parts.frames(calibration).matrices
         edges = {
-            name: it
-            for name, it in calibration.placed.items()
-            if it.covariance.any() and name.rpartition("_from_")[2] in last
+            name: edge
+            for name, edge in calibration.placed.items()
+            if edge.covariance.any() and name.rpartition("_from_")[2] in last
         }
         sizes_m = [SIGMAS_95 * _axes(edge)[0].max() for edge in edges.values()]
         sizes_m += [float(np.linalg.norm(scatter_m[view])) for view in scatter_m.keys() & used]
@@ -138,19 +139,19 @@ class Uncertainty:
         """
         for frame in self._frames_of(self.scatter_m):
             # Of the other targets, nothing takes the mark of the view before off the screen.
-            marked = [self._positions_m([it] * (it in self.scatter_m), frame) for it in views]
+            marked = [self._positions_m([view] * (view in self.scatter_m), frame) for view in views]
             entity = f"{self._placements(frame)}/{paths.THIS_VIEW}"
             radius = 1.5 * _POINT * self.size_m
             style = rr.Points3D.from_fields(colors=colours.THIS_VIEW, radii=radius)
             stream.log(entity, rr.CoordinateFrame(frame), style, static=True)
             points = rr.Points3D.columns(positions=np.vstack(marked))
-            parts = points.partition([len(it) for it in marked])
+            parts = points.partition([len(array) for array in marked])
             send_rows(stream, entity, range(len(views)), parts)
 
     def _positions_m(self, views: Iterable[int], frame: str) -> FloatArray:
         """(k, 3) where the placements of a target by some views are drawn, in its frame."""
-        shown = [it for it in views if self.frames[it] == frame]
-        places_m = [self._within_reach(self.factor * self.scatter_m[it]) for it in shown]
+        shown = [view for view in views if self.frames[view] == frame]
+        places_m = [self._within_reach(self.factor * self.scatter_m[index]) for index in shown]
         return np.reshape(places_m, (-1, 3))
 
     def _placements(self, frame: str) -> str:
@@ -158,12 +159,12 @@ class Uncertainty:
 
     def _log_beyond(self, stream: rr.RecordingStream, frame: str) -> None:
         """Arrows towards the placements that lie too far out to be drawn."""
-        mine = [it for view, it in self.scatter_m.items() if self.frames[view] == frame]
-        drawn_m = [self.factor * it for it in mine]
-        far = [it for it in drawn_m if np.linalg.norm(it) > _REACH * self.size_m]
+        mine = [array for view, array in self.scatter_m.items() if self.frames[view] == frame]
+        drawn_m = [self.factor * array for array in mine]
+        far = [array for array in drawn_m if np.linalg.norm(array) > _REACH * self.size_m]
         if far:
             arrows = rr.Arrows3D(
-                vectors=[self._within_reach(it) for it in far],
+                vectors=[self._within_reach(array) for array in far],
                 origins=np.zeros((len(far), 3)),
                 colors=colours.REJECTED,
                 radii=_LINE * self.size_m,

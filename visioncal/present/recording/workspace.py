@@ -66,7 +66,7 @@ class ArmPicture:
             and view.joints_rad is not None
             and len(view.joints_rad) == robot.joint_count == nominal.joint_count
         }
-        farthest_m = max((float(np.abs(it[1]).max()) for it in off_m.values()), default=0.0)
+        farthest_m = max((float(np.abs(pair[1]).max()) for pair in off_m.values()), default=0.0)
         return cls(found, robot, off_m, round_factor(_SHARE * size_m, farthest_m), size_m)
 
     def log_static(self, stream: rr.RecordingStream) -> None:
@@ -106,7 +106,9 @@ class ArmPicture:
             stream, entity, rows.values(), lines.partition([view in self.off_m for view in rows])
         )
         for held, views in ((False, self.found.left_out), (True, self.found.holdout)):
-            _log_unseen(stream, {rows[it.view]: it for it in views if it.view in rows}, held=held)
+            _log_unseen(
+                stream, {rows[view.view]: view for view in views if view.view in rows}, held=held
+            )
 
 
 def log_map(
@@ -119,7 +121,7 @@ def log_map(
         places_m,
         colors=_colours(sigma_mm, low, high),
         radii=_PLACE * size_m,
-        labels=[f"{significant(it)} mm" for it in sigma_mm],
+        labels=[f"{significant(value)} mm" for value in sigma_mm],
         show_labels=False,
     )
     stream.log(f"{paths.WORKSPACE}/sigma_of_a_tool_s_place", frame, places, static=True)
@@ -129,7 +131,7 @@ def log_map(
     column = np.zeros((_LEGEND_STEPS, 3))
     column[:, :2] = places_m[:, :2].min(axis=0)
     column[:, 2] = np.linspace(bottom, top, _LEGEND_STEPS)
-    words = [f"{significant(it)} mm" for it in steps_mm]
+    words = [f"{significant(step)} mm" for step in steps_mm]
     words[-1] += " sigma of a tool's place"
     legend = rr.Points3D(
         column,
@@ -146,11 +148,11 @@ def _log_unseen(stream: rr.RecordingStream, seen: Mapping[int, UnseenView], *, h
         (paths.UNSEEN_MM, "nominal_mm", "mm"),
         (paths.UNSEEN_DEG, "nominal_deg", "deg"),
     ):
-        pairs = {row: (getattr(it, before), getattr(it, after)) for row, it in seen.items()}
-        known = {row: it for row, it in pairs.items() if None not in it}
+        pairs = {row: (getattr(view, before), getattr(view, after)) for row, view in seen.items()}
+        known = {row: pair for row, pair in pairs.items() if None not in pair}
         for at, name in enumerate((_STATED, _CALIBRATED)):
             entity = _series(plot, name, held=held)
-            log_scalars(stream, entity, {row: it[at] for row, it in known.items()})
+            log_scalars(stream, entity, {row: pair[at] for row, pair in known.items()})
 
 
 def _series(plot: str, name: str, *, held: bool) -> str:

@@ -48,16 +48,18 @@ def before_and_after(found: ArmResult) -> Markup:
     views = [*found.left_out, *found.holdout]
     places = np.arange(float(len(views)))
     places[len(found.left_out) :] += _GAP
-    panels: list[tuple[str, _Pair]] = [("position [mm]", lambda it: (it.nominal_mm, it.mm))]
-    if all(it.deg is not None for it in views):
-        panels.append(("orientation [deg]", lambda it: (it.nominal_deg, it.deg)))
+    panels: list[tuple[str, _Pair]] = [("position [mm]", lambda view: (view.nominal_mm, view.mm))]
+    if all(view.deg is not None for view in views):
+        panels.append(("orientation [deg]", lambda view: (view.nominal_deg, view.deg)))
     step = max(1, -(-len(views) // _MOST_LABELS))
-    ticks = [(float(it), str(view.view)) for it, view in zip(places, views, strict=True)][::step]
+    ticks = [(float(place), str(view.view)) for place, view in zip(places, views, strict=True)][
+        ::step
+    ]
     figure = Figure(_WIDE_IN, 1.7 * len(panels) + 0.2)
     rows = boxes(figure, len(panels), 1, Margins(0.75, 0.75, top=0.45), (0.0, 0.2))
     for (box,), (label, pair) in zip(rows, panels, strict=True):
         last = box is rows[-1][0]
-        pairs = np.maximum(np.array([pair(it) for it in views], dtype=float), _LEAST)
+        pairs = np.maximum(np.array([pair(view) for view in views], dtype=float), _LEAST)
         heights = Scale(float(pairs.min()) / _SPARE, float(pairs.max()) * _SPARE, decades=True)
         panel = Panel(figure, box, Scale(places[0] - 0.8, places[-1] + 0.8), heights)
         panel.x_axis("view" if last else "", ticks, grid=False, words=last)
@@ -167,11 +169,14 @@ def _map(
 
 def course(found: ThermalResult) -> Markup:
     """The drift over time, with the band in which it is predicted to lie."""
-    times_h = [hours(found, it.stamp_s) for it in found.course]
-    drift_mm = np.array([it.drift_mm for it in found.course])
-    band_mm = _BAND * np.array([it.sigma_mm for it in found.course])
+    times_h = [hours(found, point.stamp_s) for point in found.course]
+    drift_mm = np.array([point.drift_mm for point in found.course])
+    band_mm = _BAND * np.array([point.sigma_mm for point in found.course])
     low, high = drift_mm - band_mm, drift_mm + band_mm
-    seen = [(hours(found, it.stamp_s), it.drift_mm) for it in found.seen or ()]
+    seen = [
+        (hours(found, observed_drift.stamp_s), observed_drift.drift_mm)
+        for observed_drift in found.seen or ()
+    ]
     values_mm = np.concatenate([low, high, [mm for _, mm in seen]])
     least, most = 1.1 * min(0.0, float(values_mm.min())), float(values_mm.max())
     figure = Figure(_WIDE_IN, _DRIFT_IN)

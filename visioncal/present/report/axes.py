@@ -50,13 +50,13 @@ class Scale:
         if not high > low:
             return [low]
         exponent = math.floor(math.log10((high - low) / most))
-        for step in (it * 10.0**power for power in (exponent, exponent + 1) for it in _STEPS):
+        for step in (step * 10.0**power for power in (exponent, exponent + 1) for step in _STEPS):
             if whole and step != round(step):
                 continue
             first, last = math.ceil(low / step - 1e-6), math.floor(high / step + 1e-6)
             if (high - low) / step <= most + 1e-6:
                 # Rounded, as many steps of 0.1 add up to 0.30000000000000004.
-                return [round(it * step, 12) for it in range(first, last + 1)]
+                return [round(index * step, 12) for index in range(first, last + 1)]
         return [low, high]
 
 
@@ -73,8 +73,8 @@ def _decades(low: float, high: float, most: int) -> list[float]:
     step = max(1, -(-(last - first) // most))
     # Where few powers of ten lie within, others beside them.
     for digits in ((1.0,), (1.0, 3.0), (1.0, 2.0, 5.0)):
-        found = [it * 10.0**power for power in range(first, last + 1, step) for it in digits]
-        inside = [it for it in found if low <= it <= high]
+        found = [digit * 10.0**power for power in range(first, last + 1, step) for digit in digits]
+        inside = [value for value in found if low <= value <= high]
         if len(inside) > 1:
             break
     return inside
@@ -83,12 +83,12 @@ def _decades(low: float, high: float, most: int) -> list[float]:
 def tick_words(values: Sequence[float]) -> list[str]:
     """Writes the values of ticks with the decimals that they need."""
     for decimals in range(_MOST_DECIMALS + 1):
-        if all(math.isclose(round(it, decimals), it, abs_tol=1e-12) for it in values):
-            texts = [f"{it:.{decimals}f}" for it in values]
+        if all(math.isclose(round(value, decimals), value, abs_tol=1e-12) for value in values):
+            texts = [f"{value:.{decimals}f}" for value in values]
             break
     else:
-        texts = [f"{it:g}" for it in values]
-    return [it.replace("-", "\N{MINUS SIGN}") for it in texts]
+        texts = [f"{value:g}" for value in values]
+    return [text.replace("-", "\N{MINUS SIGN}") for text in texts]
 
 
 @dataclass(frozen=True)
@@ -186,11 +186,11 @@ class Panel:
             turned: Whether the words stand upright.
         """
         box, marked = self.box, self._ticks(self.x, ticks, whole)
-        places = self.x_at([it for it, _ in marked]).tolist()
+        places = self.x_at([value for value, _ in marked]).tolist()
         if grid:
-            lines = "".join(f"M{it:.1f} {box.bottom:.1f}V{box.top:.1f}" for it in places)
+            lines = "".join(f"M{place:.1f} {box.bottom:.1f}V{box.top:.1f}" for place in places)
             self.figure.path(lines, stroke=svg.LINE, width=_THIN)
-        data = "".join(f"M{it:.1f} {box.bottom:.1f}v{_TICK_PT}" for it in places)
+        data = "".join(f"M{place:.1f} {box.bottom:.1f}v{_TICK_PT}" for place in places)
         data += f"M{box.left:.1f} {box.bottom:.1f}H{box.right:.1f}"
         self.figure.path(data, stroke=svg.LINE, width=0.8)
         below = box.bottom + _TICK_PT + _GAP_PT
@@ -214,11 +214,11 @@ class Panel:
     ) -> None:
         """Draws the axis at the left; see `x_axis`."""
         box, marked = self.box, self._ticks(self.y, ticks, whole=False)
-        places = self.y_at([it for it, _ in marked]).tolist()
+        places = self.y_at([value for value, _ in marked]).tolist()
         if grid:
-            lines = "".join(f"M{box.left:.1f} {it:.1f}H{box.right:.1f}" for it in places)
+            lines = "".join(f"M{box.left:.1f} {place:.1f}H{box.right:.1f}" for place in places)
             self.figure.path(lines, stroke=svg.LINE, width=_THIN)
-        data = "".join(f"M{box.left:.1f} {it:.1f}h-{_TICK_PT}" for it in places)
+        data = "".join(f"M{box.left:.1f} {place:.1f}h-{_TICK_PT}" for place in places)
         data += f"M{box.left:.1f} {box.bottom:.1f}V{box.top:.1f}"
         self.figure.path(data, stroke=svg.LINE, width=0.8)
         beside = box.left - _TICK_PT - _GAP_PT
@@ -239,7 +239,7 @@ class Panel:
         if not isinstance(ticks, int):
             return ticks
         values = scale.ticks(ticks, whole)
-        words = [f"{it:g}" for it in values] if scale.decades else tick_words(values)
+        words = [f"{value:g}" for value in values] if scale.decades else tick_words(values)
         return list(zip(values, words, strict=True))
 
     def frame(self) -> None:

@@ -63,7 +63,9 @@ def draw(
     panel.y_axis(titles[1])
     for colour in dict.fromkeys(bar.colour for _, bar, _ in known):
         shown = [(place, value) for place, bar, value in known if bar.colour == colour]
-        panel.bars([it for it, _ in shown], [min(it, top) for _, it in shown], _WIDTH, colour)
+        panel.bars(
+            [index for index, _ in shown], [min(value, top) for _, value in shown], _WIDTH, colour
+        )
     for place, bar, value in known:
         if not bar.used:
             _mark(panel, place, bar, value, top)

@@ -69,16 +69,18 @@ def _cell(
     if calibration.robot is not None:
         yield "Robot", calibration.robot.name
     if session is not None:
-        robots = {name: it.model for name, it in session.robots.items() if name and it.model}
+        robots = {
+            name: robot.model for name, robot in session.robots.items() if name and robot.model
+        }
         if robots:
             yield "Robots", "; ".join(f"{name} ({model})" for name, model in robots.items())
-        cameras = [it for it in session.cameras if it] or [session.camera_name]
+        cameras = [camera for camera in session.cameras if camera] or [session.camera_name]
         yield "Cameras" if len(cameras) > 1 else "Camera", "; ".join(cameras)
         boards = {
-            f"{it.name}, {it.columns} x {it.rows}, {1e3 * it.square_m:g} mm"
-            if it.columns
-            else it.name
-            for it in session.boards.values()
+            f"{board.name}, {board.columns} x {board.rows}, {1e3 * board.square_m:g} mm"
+            if board.columns
+            else board.name
+            for board in session.boards.values()
         }
         if boards:
             yield "Boards" if len(boards) > 1 else "Board", "; ".join(sorted(boards))
@@ -88,18 +90,20 @@ def _cell(
 
 
 def _result(calibration: Calibration) -> Iterator[tuple[str, str]]:
-    for it in need_facts(calibration.need, calibration.verdict):
-        yield it.label[0].upper() + it.label[1:], f"{it.value} {it.note}".strip()
+    for fact in need_facts(calibration.need, calibration.verdict):
+        yield fact.label[0].upper() + fact.label[1:], f"{fact.value} {fact.note}".strip()
     for name, edge in [*calibration.placed.items()][:_MOST_EDGES]:
-        turn = ", ".join(f"{it:.4f}" for it in edge.transform.rotation.as_rotvec(degrees=True))
+        turn = ", ".join(
+            f"{value:.4f}" for value in edge.transform.rotation.as_rotvec(degrees=True)
+        )
         yield name, f"{edge.place_words(3)}; rotation vector ({turn}) deg; {edge.sigma_words}"
     if (test := calibration.touch_test) is not None:
-        largest = max(it.gap_mm for it in test.points)
+        largest = max(point.gap_mm for point in test.points)
         words = "passed" if test.passed else "not passed"
         yield "Touch test", f"{words}, largest gap {figure(largest)} mm, with {test.tool}"
     left_out = calibration.validation.held_out
     turned = "" if left_out.deg is None else f" and {figure(left_out.deg)} deg"
-    used = sum(it.used for it in calibration.views)
+    used = sum(view.used for view in calibration.views)
     yield "Views used", f"{used} of {len(calibration.views)}"
     yield "Left out, views are predicted to", f"{figure(left_out.mm)} mm{turned} (rms)"
 

@@ -58,7 +58,7 @@ def _residual_table(stops: Sequence[str], before: FloatArray, after: FloatArray 
         for at, unit in enumerate(("mm", "deg"))
         for name, values in sides.items()
     }
-    rms = [np.sqrt(np.mean(np.square(it))) for it in columns.values()]
+    rms = [np.sqrt(np.mean(np.square(column))) for column in columns.values()]
     rows = [*zip(stops, *columns.values(), strict=True), ("rms", *rms)]
     return Table.of(
         ("stop (views)", *columns), [(name, *map(significant, row)) for name, *row in rows]
@@ -72,7 +72,7 @@ def _residuals(stops: Sequence[str], before: FloatArray, after: FloatArray | Non
         sides = [("as calibrated", svg.BAD, before),
                  ("with the change undone", svg.ACCENT, after)]  # fmt: skip
     step = -(-count // _MOST_LABELS)
-    ticks = [(float(it), stops[it]) for it in range(0, count, step)]
+    ticks = [(float(index), stops[index]) for index in range(0, count, step)]
     figure = Figure(_WIDE_IN, _HIGH_IN)
     rows = boxes(figure, 2, 1, Margins(0.75, top=0.3), (0.0, 0.2))
     # Side by side where there are two.
@@ -84,7 +84,7 @@ def _residuals(stops: Sequence[str], before: FloatArray, after: FloatArray | Non
         panel.x_axis("stop, by its views" if last else "", ticks, grid=False, words=last)
         panel.y_axis(label)
         for shift, (_, colour, values) in zip(shifts, sides, strict=True):
-            panel.bars([it + shift for it in range(count)], values[:, column], width, colour)
+            panel.bars([index + shift for index in range(count)], values[:, column], width, colour)
     if after is not None:
         entries = [("\N{BLACK SQUARE}", colour, words) for words, colour, _ in sides]
         figure.legend(rows[0][0].right, 12.0, entries)
@@ -100,12 +100,12 @@ def _undone(check: Check) -> str:
 def _change_table(check: Check) -> Table:
     """The changes that were compared, with their shares, and which the check takes for true."""
     rows = []
-    for it in [] if check.passed else listed_suspects(check):
-        share, named = 100.0 * it.probability, it in check.named
+    for suspect in [] if check.passed else listed_suspects(check):
+        share, named = 100.0 * suspect.probability, suspect in check.named
         cells = (
             f"{share:.0f} %" if share >= 1.0 else f"{share:.1g} %",
             "found" if named else "ruled out",
-            thing(check, it),
+            thing(check, suspect),
         )
         rows.append(Row(cells, "left-out" if named else "rejected"))
     return _reasons(rows, ("share", "", "change"))
@@ -116,8 +116,11 @@ def _trigger_table(triggers: Sequence[Outcome]) -> Table:
     words = {"fired": "now", "unknown": "not known", "quiet": "not yet"}
     states = [*words]
     return _reasons(
-        Row((words[it.state], "", it.words), "look" if it.state == "fired" else "rejected")
-        for it in sorted(triggers, key=lambda it: states.index(it.state))
+        Row(
+            (words[outcome.state], "", outcome.words),
+            "look" if outcome.state == "fired" else "rejected",
+        )
+        for outcome in sorted(triggers, key=lambda trigger: states.index(trigger.state))
     )
 
 

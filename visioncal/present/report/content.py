@@ -76,9 +76,9 @@ def key_figures(calibration: Calibration) -> tuple[Fact, ...]:
     validation, cell = calibration.validation, calibration.cell
     facts = [*need_facts(calibration.need, calibration.verdict)]
     facts += _camera_sigmas(calibration) if cell is None else _cell_sigmas(cell)
-    for name, it in parts.arms(calibration).items():
-        if it.arm is not None and it.arm.workspace_sigma_mm is not None:
-            sigma = f"{significant(it.arm.workspace_sigma_mm.median)} mm"
+    for name, arm in parts.arms(calibration).items():
+        if arm.arm is not None and arm.arm.workspace_sigma_mm is not None:
+            sigma = f"{significant(arm.arm.workspace_sigma_mm.median)} mm"
             facts.append(Fact(f"all over the workspace{of(name)}, sigma", sigma))
     if cell is None or cell.left_out:
         turned = validation.held_out.deg
@@ -91,7 +91,7 @@ def key_figures(calibration: Calibration) -> tuple[Fact, ...]:
 
 def views_used(calibration: Calibration) -> Fact:
     """How many views the fit used."""
-    used = sum(it.used for it in calibration.views)
+    used = sum(view.used for view in calibration.views)
     return Fact("views used", f"{used} of {len(calibration.views)}")
 
 
@@ -106,7 +106,7 @@ def _camera_sigmas(calibration: Calibration) -> list[Fact]:
 
 def _cell_sigmas(cell: Alignment) -> list[Fact]:
     """How well the robots' bases are known in the first one's, and what is known worst."""
-    bases = [it for it in frames_of_kind(cell.frames, "base") if cell.frames[it] == CELL]
+    bases = [name for name in frames_of_kind(cell.frames, "base") if cell.frames[name] == CELL]
     facts = []
     for base in bases[1:]:
         edge = cell.between(bases[0], base)
@@ -120,9 +120,9 @@ def _cell_sigmas(cell: Alignment) -> list[Fact]:
 
 def stops_m(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> FloatArray:
     """(m, 3) where the flange was in the used views [m]."""
-    used = {it.view for it in calibration.views if it.used}
-    poses = [it.base_from_flange for it in evidence if it.view in used]
-    return np.reshape([it[:3, 3] for it in poses if it is not None], (-1, 3))
+    used = {view.view for view in calibration.views if view.used}
+    poses = [view.base_from_flange for view in evidence if view.view in used]
+    return np.reshape([pose[:3, 3] for pose in poses if pose is not None], (-1, 3))
 
 
 def need_facts(met: NeedMet | None, verdict: Verdict) -> tuple[Fact, ...]:
@@ -155,14 +155,14 @@ def method_facts(calibration: Calibration) -> tuple[Fact, ...]:
     for name, robot in parts.robots(calibration).items():
         model = str(robot.document.get("name", "given"))
         facts.append(Fact(f"robot model{of(name)}", model))
-    for name, it in parts.cameras(calibration).items():
-        width, height = it.camera.resolution
-        size = f"{it.camera.model}, {width} \N{MULTIPLICATION SIGN} {height} px"
+    for name, camera in parts.cameras(calibration).items():
+        width, height = camera.camera.resolution
+        size = f"{camera.camera.model}, {width} \N{MULTIPLICATION SIGN} {height} px"
         facts.append(Fact(name or "camera", size))
     if calibration.instrument is not None:
         read = f"it read {calibration.instrument.reads}"
         facts.append(Fact("instrument", calibration.instrument.words, read))
-        facts += [_point_fact(it) for it in calibration.points]
+        facts += [_point_fact(point) for point in calibration.points]
     for name, clock in parts.clocks(calibration).items():
         facts += _clock_facts(clock, f"clock{of(name)}" if name else "camera's clock")
     return tuple(facts)
@@ -172,10 +172,10 @@ def touch_table(test: TouchTest) -> Table:
     """The gaps at the points of a touch test, and those that were predicted."""
     rows = [
         Row(
-            (it.name, significant(it.gap_mm), significant(it.radius95_mm)),
-            "left-out" if it.gap_mm > it.radius95_mm else "",
+            (point.name, significant(point.gap_mm), significant(point.radius95_mm)),
+            "left-out" if point.gap_mm > point.radius95_mm else "",
         )
-        for it in test.points
+        for point in test.points
     ]
     return Table.of(("point", "gap [mm]", "predicted, 95 % [mm]"), rows)
 
@@ -199,7 +199,7 @@ def _clock_facts(clock: ClockResult, label: str) -> Iterator[Fact]:
 
 def _point_fact(point: PointResult) -> Fact:
     axis_mm = point.sigma_mm / np.sqrt(3.0)
-    place = ", ".join(matched(1e3 * it, axis_mm) for it in (point.x_m, point.y_m, point.z_m))
+    place = ", ".join(matched(1e3 * value, axis_mm) for value in (point.x_m, point.y_m, point.z_m))
     note = f"{PLUS_MINUS} {significant(point.sigma_mm)}, on the flange"
     return Fact(f"point {point.point}", f"[{place}] mm", note)
 
@@ -226,13 +226,13 @@ def lens_facts(result: CameraResult) -> tuple[Fact, ...]:
 def view_table(calibration: Calibration, outlying: Collection[int]) -> Table:
     """What became of each view; rows have the names to which the recording's notes lead."""
     rows, words = [], {"used": "yes", "look": "look", "left-out": "left out", "rejected": "no"}
-    for it in parts.sights(calibration):
-        figures = (it.rms_px, it.residual_mm, it.residual_deg)
-        corners = significant(None) if it.corners is None else str(it.corners)
-        mark = "look" if it.used and it.view in outlying else mark_of(it)
-        cells = (str(it.view), corners, *map(significant, figures), words[mark])
-        names = (it.seer, it.seen) if it.seer else ()
-        rows.append(Row((cells[0], *names, *cells[1:]), mark, f"view-{it.view}"))
+    for sight in parts.sights(calibration):
+        figures = (sight.rms_px, sight.residual_mm, sight.residual_deg)
+        corners = significant(None) if sight.corners is None else str(sight.corners)
+        mark = "look" if sight.used and sight.view in outlying else mark_of(sight)
+        cells = (str(sight.view), corners, *map(significant, figures), words[mark])
+        names = (sight.seer, sight.seen) if sight.seer else ()
+        rows.append(Row((cells[0], *names, *cells[1:]), mark, f"view-{sight.view}"))
     titles = ("view", "corners", "px", "mm", "deg", "used")
     if calibration.cell is None:
         return Table.of(titles, rows, (5,))

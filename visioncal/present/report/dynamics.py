@@ -42,19 +42,19 @@ def render_dynamics(run: Run) -> str:
     identified = run.identified
     source = identified.facts.get("session", {})
     shown = [] if run.predicted is None else [(run.predicted, "not fitted")]
-    shown += [(it, "fitted") for it in run.fitted[:_MOST_FITTED]]
+    shown += [(prediction, "fitted") for prediction in run.fitted[:_MOST_FITTED]]
     origin = {"session": source.get("name", ""), "sha256": source.get("sha256", "")}
     created = facts.readable_time(str(identified.facts.get("created", "")))
     judged = judge(identified)
     return template("dynamics.html.j2").render(
         kind="Dynamic identification",
         name=identified.robot.name,
-        subtitle=" \N{MIDDLE DOT} ".join(it for it in (origin["session"], created) if it),
-        notes=tuple(note for it in identified.streams for note in it.notes),
+        subtitle=" \N{MIDDLE DOT} ".join(value for value in (origin["session"], created) if value),
+        notes=tuple(note for stream in identified.streams for note in stream.notes),
         judged=judged,
         steps=judged.next_steps,
         key_figures=tuple(_key_figures(identified)),
-        provenance={name: it for name, it in origin.items() if it},
+        provenance={name: value for name, value in origin.items() if value},
         identified=identified,
         counts=_counts(identified),
         humps=tuple(_hump_facts(identified)),
@@ -79,14 +79,14 @@ def _key_figures(identified: Identified) -> Iterator[Fact]:
         median = significant(100.0 * float(np.median(found.shares)))
         high = significant(100.0 * float(found.shares[worst]))
         yield Fact("error on unseen motion", f"{median} %", f"up to {high} % (joint {worst + 1})")
-    samples = sum(it.samples for it in identified.streams)
+    samples = sum(stream.samples for stream in identified.streams)
     yield Fact("samples", str(samples), f"{identified.robot.joint_count} torques each")
 
 
 def _counts(identified: Identified) -> str:
     shares = identified.determined
     kinds = dict.fromkeys(("2 %", "10 %", *shares))
-    return "; ".join(f"{it}: {shares.count(it)}" for it in kinds)
+    return "; ".join(f"{kind}: {shares.count(kind)}" for kind in kinds)
 
 
 def _hump_facts(identified: Identified) -> Iterator[Fact]:
@@ -116,9 +116,9 @@ def torques(found: Prediction) -> Markup:
         heights = spanning(np.concatenate([measured[:, joint], predicted[:, joint]]))
         panel = Panel(figure, pair[0], span, heights)
         beside = Panel(figure, pair[1], span, spanning(off[:, joint]))
-        for it, title in ((panel, f"joint {joint + 1}\n[N m]"), (beside, "")):
-            it.x_axis("time [s]" if last else "", _TICKS, words=last)
-            it.y_axis(title, 3)
+        for item, title in ((panel, f"joint {joint + 1}\n[N m]"), (beside, "")):
+            item.x_axis("time [s]" if last else "", _TICKS, words=last)
+            item.y_axis(title, 3)
         panel.line(times, measured[:, joint], svg.MUTED, 2.0)
         panel.line(times, predicted[:, joint], svg.ACCENT, 0.9)
         beside.line(times, off[:, joint], svg.BAD, 0.7)
@@ -155,7 +155,7 @@ def _friction_panel(
     found: Sequence[Prediction],
     joint: int,
 ) -> Panel:
-    samples = np.concatenate([_samples(identified, it, joint) for it in found])
+    samples = np.concatenate([_samples(identified, prediction, joint) for prediction in found])
     speeds, left = samples[:: max(len(samples) // _MOST_MARKS, 1)].T
     reach = max(float(np.abs(speeds).max(initial=0.0)), 1e-3)
     # Close to rest, where dry friction turns over, in small steps.

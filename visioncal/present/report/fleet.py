@@ -38,7 +38,7 @@ def fleet_page(rows: Sequence[FleetRow], cells: Sequence[CellFigures] = ()) -> s
         rows: Those first that stand out the most.
         cells: What simulated ones came to, by what they have in common.
     """
-    states = Counter(it.verdict or it.state for it in rows)
+    states = Counter(row.verdict or row.state for row in rows)
     return template("fleet.html.j2").render(
         kind="Batch",
         name=f"{len(rows)} sessions",
@@ -48,14 +48,19 @@ def fleet_page(rows: Sequence[FleetRow], cells: Sequence[CellFigures] = ()) -> s
         cells=_cell_table(cells),
         odd=list(_odd(rows)),
         states=[(name, states[name]) for name in ("good", "check", "bad", "failed")],
-        changes=_reasons((it.name, "", it.change, "look") for it in rows if it.changed),
-        is_compared=any(it.changed is not None for it in rows),
+        changes=_reasons((row.name, "", row.change, "look") for row in rows if row.changed),
+        is_compared=any(row.changed is not None for row in rows),
         failures=_reasons(
-            (it.name, _ERRORS.get(it.error, it.error), f"{it.words} {it.next_step}", "rejected")
-            for it in rows
-            if it.state == "failed"
+            (
+                row.name,
+                _ERRORS.get(row.error, row.error),
+                f"{row.words} {row.next_step}",
+                "rejected",
+            )
+            for row in rows
+            if row.state == "failed"
         ),
-        icon_of=lambda it: _ICONS.get(it.verdict, "bad"),
+        icon_of=lambda value: _ICONS.get(value.verdict, "bad"),
         figure=_figure,
     )
 
@@ -71,9 +76,9 @@ def _cell_table(cells: Sequence[CellFigures]) -> Table:
         "95 % of cameras off by [mm]",
     )
     rows = (
-        (it.name, f"{it.results} of {it.count}", str(it.good),
-         *map(_figure, (it.radius95_mm, it.sigma_mm, it.error_mm)))
-        for it in cells
+        (cell.name, f"{cell.results} of {cell.count}", str(cell.good),
+         *map(_figure, (cell.radius95_mm, cell.sigma_mm, cell.error_mm)))
+        for cell in cells
     )  # fmt: skip
     return Table.of(titles, rows)
 
@@ -90,11 +95,11 @@ def _figure(value: float | None) -> str:
 
 def _odd(rows: Sequence[FleetRow]) -> Iterator[_Odd]:
     """By folder, in the order of the worst that stands out in each."""
-    standing = [it for it in rows if it.score > 0.0]
-    order = list(dict.fromkeys(it.group or it.name for it in standing))
-    sizes = Counter(it.group or it.name for it in rows)
-    by_place = sorted(standing, key=lambda it: order.index(it.group or it.name))
-    for name, members in groupby(by_place, key=lambda it: it.group or it.name):
+    standing = [row for row in rows if row.score > 0.0]
+    order = list(dict.fromkeys(row.group or row.name for row in standing))
+    sizes = Counter(row.group or row.name for row in rows)
+    by_place = sorted(standing, key=lambda value: order.index(value.group or value.name))
+    for name, members in groupby(by_place, key=lambda value: value.group or value.name):
         mine = tuple(members)
         reasons = tuple(mine[0].stands_out.split("; "))
         count = f"{len(mine)} of {sizes[name]} sessions" if sizes[name] > 1 else ""

@@ -44,7 +44,7 @@ def kinds(found: Alignment) -> str:
     """How many robots, cameras, boards and the like there are, in words."""
     former, words = former_frames(found), []
     for kind, start in _KINDS.items():
-        count = sum(it.startswith(start) and it not in former for it in found.frames)
+        count = sum(frame.startswith(start) and frame not in former for frame in found.frames)
         if count:
             words.append(f"{count} {kind}{'' if count == 1 else 's'}")
     return ", ".join(words)
@@ -54,11 +54,11 @@ def known_in_each_other(found: Alignment) -> Iterator[Table]:
     """How well frames of one body, the cell or a flange, are known in each other [mm, deg]."""
     left = {*found.robots, *former_frames(found)}
     for body in (CELL, *found.robots):
-        carried = [it for it, on in found.frames.items() if on == body and it not in left]
+        carried = [name for name, on in found.frames.items() if on == body and name not in left]
         frames = carried if body == CELL else [body, *carried]
         if len(frames) > 1:
             # In the frame of a point alone nothing has a place: its axes are chosen.
-            turned = [it for it in frames if _is_turned(found, it)]
+            turned = [frame for frame in frames if _is_turned(found, frame)]
             rows = [(a, *(_between(found, a, b) for b in frames)) for a in turned]
             yield Table.of(("the cell" if body == CELL else body, *frames), rows)
 
@@ -91,7 +91,7 @@ def graph(found: Alignment) -> Markup:
     panel = Panel(figure, box, Scale(-0.15 - spare, right + 0.15 + spare), Scale(-0.6, 3.5))
     for name, span in bodies.items():
         _draw_body(panel, found, name, span)
-    seen = [it for it in pairs(found) if it.seer in frames and it.seen in frames]
+    seen = [pair for pair in pairs(found) if pair.seer in frames and pair.seen in frames]
     for pair in seen:
         _draw_pair(panel, pair, frames)
     for flange, robot in found.robots.items():

@@ -90,7 +90,7 @@ def render(
 def _pictures(
     calibration: Calibration, session: Session | None, evidence: Sequence[ViewEvidence]
 ) -> dict[str, object]:
-    seen = {it.view: it for it in evidence}
+    seen = {view.view: view for view in evidence}
     sights = parts.sights(calibration)
     extremes = _extremes(sights, seen)
     magnify = _magnification(calibration, [seen[view.view] for _, view in extremes])
@@ -117,7 +117,7 @@ def _extremes(sights: Sequence[Sight], seen: Mapping[int, ViewEvidence]) -> list
         and view.view in seen
         and seen[view.view].corners is not None
     ]
-    ranked = sorted(drawn, key=lambda it: it[0])
+    ranked = sorted(drawn, key=lambda pair: pair[0])
     picked = [ranked[0], ranked[-1]] if len(ranked) > 1 else ranked
     return [
         (f"{which} used view: {named(view)}, {significant(rms_px)} px rms", view)
@@ -138,7 +138,7 @@ class _Pictures:
             self._of(view, caption, self.seen.get(view.view), magnify)
             for caption, view in captioned
         ]
-        return [it for it in found if it is not None]
+        return [item for item in found if item is not None]
 
     def of_rejected(self, views: Sequence[Sight]) -> list[Thumbnail]:
         """The first few of the views that were not used, with their reasons."""
@@ -152,14 +152,14 @@ class _Pictures:
             for view in views
             if not view.used
         )
-        return list(islice((it for it in found if it is not None), _MAX_REJECTED_PICTURES))
+        return list(islice((item for item in found if item is not None), _MAX_REJECTED_PICTURES))
 
     def _of(
         self, view: Sight, caption: str, evidence: ViewEvidence | None, magnify: int
     ) -> Thumbnail | None:
         """A view's picture; None where it has no image, which the table of views says anyway."""
         # Corners that another detector found are drawn on nothing where there is no image of them.
-        shown = next((it for it in self.session.views if it.number == view.view), None)
+        shown = next((other for other in self.session.views if other.number == view.view), None)
         if shown is None:
             return None
         if not shown.image or not self.session.images.exists(shown.image):

@@ -80,13 +80,13 @@ def residuals(calibration: Calibration, outlying: Collection[int] = ()) -> Marku
     if calibration.cell is not None:
         measures = (replace(_MEASURES[0], limit=None),)
     by_seer: dict[str, list[Sight]] = {}
-    for it in sights(calibration):
-        by_seer.setdefault(it.seer, []).append(it)
+    for sight in sights(calibration):
+        by_seer.setdefault(sight.seer, []).append(sight)
     shown = [
         (seer, mine, measure)
         for seer, mine in by_seer.items()
         for measure in measures
-        if any(measure.value_of(it) is not None for it in mine)
+        if any(measure.value_of(sight) is not None for sight in mine)
     ]
     if not shown:
         return Markup("")
@@ -96,8 +96,10 @@ def residuals(calibration: Calibration, outlying: Collection[int] = ()) -> Marku
     for (box,), (seer, mine, measure) in zip(rows, shown, strict=True):
         last = box is rows[-1][0]
         rms = calibration.rms if calibration.cell is None else rms_of(mine)
-        marked = [Bar(str(it.view), measure.value_of(it), it.used, _colour(it, outlying))
-                  for it in mine]  # fmt: skip
+        marked = [
+            Bar(str(sight.view), measure.value_of(sight), sight.used, _colour(sight, outlying))
+            for sight in mine
+        ]
         # Views of several cameras are other ones in each panel.
         labelled = last or calibration.cell is not None
         bars.draw(figure, box, marked, measure.rms_of(rms), limit=measure.limit,
@@ -115,11 +117,11 @@ def _colour(view: Sight, outlying: Collection[int]) -> str:
 def image_coverage(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> Markup:
     """All corners of the used views over the image frame, coloured by reprojection error."""
     used = {view.view for view in calibration.views if view.used}
-    seen = [it for it in evidence if it.corners is not None and it.view in used]
+    seen = [view for view in evidence if view.corners is not None and view.view in used]
     if not seen or calibration.camera is None:
         return Markup("")
-    px = np.concatenate([it.corners.px for it in seen if it.corners is not None])
-    errors = np.concatenate([_corner_errors(it) for it in seen])
+    px = np.concatenate([view.corners.px for view in seen if view.corners is not None])
+    errors = np.concatenate([_corner_errors(view) for view in seen])
     known = np.isfinite(errors)
     width, height = calibration.camera.camera.resolution
     errors_known = bool(known.any())
@@ -134,8 +136,8 @@ def image_coverage(calibration: Calibration, evidence: Sequence[ViewEvidence]) -
     panel.frame()
     top = float(np.percentile(errors[known], 98)) if errors_known else 1.0
     steps, colours = svg.shades(errors[known], 0.0, top, svg.PLASMA, _SHADES)
-    layers = [(px[~known], svg.ACCENT), *((px[known][steps == it], colours[it])
-                                          for it in range(_SHADES))]  # fmt: skip
+    layers = [(px[~known], svg.ACCENT), *((px[known][steps == index], colours[index])
+                                          for index in range(_SHADES))]  # fmt: skip
     if len(px) > _MANY_MARKS and errors_known:
         _draw_bitmap(panel, px[known], steps, colours)
     else:
@@ -151,7 +153,7 @@ def _draw_bitmap(panel: Panel, px: FloatArray, steps: IntArray, colours: Sequenc
     box: Box = panel.box
     size = np.array([box.right - box.left, box.bottom - box.top]) * _DOTS_A_POINT
     image = np.zeros((int(size[1]) + 1, int(size[0]) + 1, 4), np.uint8)
-    shades = np.array([[int(it[k : k + 2], 16) for k in (5, 3, 1)] for it in colours])
+    shades = np.array([[int(colour[k : k + 2], 16) for k in (5, 3, 1)] for colour in colours])
     shares = np.stack([panel.x.shares(px[:, 0]), 1.0 - panel.y.shares(px[:, 1])], axis=1)
     middle = np.round(shares * size - 0.5).astype(int)
     reach = range(-_DOT_REACH, _DOT_REACH + 1)
@@ -174,7 +176,7 @@ def _corner_errors(evidence: ViewEvidence) -> FloatArray:
 
 def viewing_directions(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> Markup:
     """Where the camera looked at the target from: tilt against its normal, and azimuth."""
-    chart = directions_chart({it.view: it for it in evidence})
+    chart = directions_chart({view.view: view for view in evidence})
     if chart is None or calibration.mount == "instrument":
         return Markup("")
     used = {view.view for view in calibration.views if view.used}
@@ -192,7 +194,7 @@ def viewing_directions(calibration: Calibration, evidence: Sequence[ViewEvidence
     middle, radius = 0.5 * figure.width, 0.5 * figure.height - 24.0
     box = Box(middle - radius, 24.0, middle + radius, 24.0 + 2.0 * radius)
     panel = Panel(figure, box, Scale(-top, top), Scale(top, -top))
-    _draw_rings(panel, [it for it in Scale(0.0, top).ticks(4, whole=True) if it > 0.0], top)
+    _draw_rings(panel, [tick for tick in Scale(0.0, top).ticks(4, whole=True) if tick > 0.0], top)
     for mark, colour, _, places in seen:
         panel.marks(places[:, 0], places[:, 1], mark, colour)
     if len(seen) > 1:
@@ -231,9 +233,9 @@ def flange_rotations(calibration: Calibration, evidence: Sequence[ViewEvidence])
     """How far the flange turned from its mean orientation, about each of its own axes."""
     used = {view.view for view in calibration.views if view.used}
     poses = [
-        it.base_from_flange
-        for it in evidence
-        if it.base_from_flange is not None and it.view in used
+        view.base_from_flange
+        for view in evidence
+        if view.base_from_flange is not None and view.view in used
     ]
     if len(poses) < 2:
         return Markup("")
@@ -271,14 +273,14 @@ def residuals_over_joints(
     if session is None or not evidence:
         return Markup("")
     joints_rad = {view.number: view.joints_rad for view in session.views}
-    shown = {it.view for it in calibration.views if it.used and it.view not in outlying}
+    shown = {view.view for view in calibration.views if view.used and view.view not in outlying}
     frames = target_frames(calibration, session)
     pairs = [
         (joints, log(placed))
-        for it in evidence
-        if it.view in shown
-        and (joints := joints_rad.get(it.view)) is not None
-        and (placed := placement(calibration, it, frames.get(it.view))) is not None
+        for view in evidence
+        if view.view in shown
+        and (joints := joints_rad.get(view.view)) is not None
+        and (placed := placement(calibration, view, frames.get(view.view))) is not None
     ]
     if len(pairs) < 3:
         return Markup("")

@@ -33,14 +33,14 @@ def budget(found: UncertaintyResult) -> Markup:
     ]
     labels.append(significant(found.total_mm))
     top = max(values) or 1.0
-    words = [SOURCES.get(it, it) for it in names]
+    words = [SOURCES.get(name, name) for name in names]
     figure = Figure(_WIDTH_IN, 0.32 * len(names) + 0.6)
     margins = Margins(0.2 + _LETTER_IN * max(map(len, words)))
     ((box,),) = boxes(figure, 1, 1, margins)
     # Room for the labels beside the longest bar.
     panel = Panel(figure, box, Scale(0.0, 1.55 * top), Scale(len(names) - 0.5, -0.5))
     panel.x_axis("sigma of the point's place [mm]", 4)
-    panel.y_axis("", [(float(row), it) for row, it in enumerate(words)], grid=False)
+    panel.y_axis("", [(float(row), word) for row, word in enumerate(words)], grid=False)
     for row, (value, label) in enumerate(zip(values, labels, strict=True)):
         end, high = float(panel.x_at(value)), panel.y_at([row + 0.3, row - 0.3]).tolist()
         bar = f"M{box.left:.1f} {high[0]:.1f}V{high[1]:.1f}H{end:.1f}V{high[0]:.1f}z"
@@ -73,7 +73,7 @@ def board_shape(board: BoardResult, target: Target, name: str = "") -> Markup:
     reach = float(np.abs(depth_mm).max())
     if not board.is_bent or reach < _LEAST_DEPTH_MM:
         return Markup("")
-    (left, right), (above, below) = ((it.min(), it.max()) for it in (x_mm, y_mm))
+    (left, right), (above, below) = ((value.min(), value.max()) for value in (x_mm, y_mm))
     share = (below - above) / (right - left)
     figure = Figure(_WIDTH_IN, 0.7 + 0.75 * _WIDTH_IN * min(share, _TALLEST))
     ((box,),) = boxes(figure, 1, 1, Margins(right=0.85))
@@ -117,7 +117,7 @@ def _draw_map(panel: Panel, steps: IntArray, colours: Sequence[str]) -> None:
     """Fills cells, those side by side of one colour as one."""
     box, (rows, columns) = panel.box, steps.shape
     wide, high = (box.right - box.left) / columns, (box.bottom - box.top) / rows
-    data: dict[str, list[str]] = {it: [] for it in colours}
+    data: dict[str, list[str]] = {colour: [] for colour in colours}
     for row in range(rows):
         ends = [*np.flatnonzero(np.diff(steps[row])) + 1, columns]
         for first, last in zip([0, *ends], ends, strict=False):

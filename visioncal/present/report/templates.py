@@ -43,10 +43,10 @@ def _environment() -> Environment:
     )
     found.filters["significant"] = significant
     named = {
-        name: it
+        name: var
         for module in _CALLED
-        for name, it in vars(module).items()
-        if getattr(it, "__module__", "") == module.__name__
+        for name, var in vars(module).items()
+        if getattr(var, "__module__", "") == module.__name__
     }
     found.globals |= named | {"software": _software, "version": __version__}
     return found

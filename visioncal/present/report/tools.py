@@ -18,13 +18,13 @@ _LETTER_IN = 0.068
 
 def frame_plot(name: str, frame: Frame) -> Markup:
     """Bars of what each observation is off; the wrong ones in red."""
-    if all(it.residual_mm is None for it in frame.observations):
+    if all(observation.residual_mm is None for observation in frame.observations):
         return Markup("")
-    labels = [_short(it.name) for it in frame.observations]
+    labels = [_short(observation.name) for observation in frame.observations]
     upright = sum(map(len, labels)) > _MOST_CHARACTERS
     shown = [
-        Bar(label, it.residual_mm, it.used, _colour(it))
-        for label, it in zip(labels, frame.observations, strict=True)
+        Bar(label, observation.residual_mm, observation.used, _colour(observation))
+        for label, observation in zip(labels, frame.observations, strict=True)
     ]
     below_in = 0.25 + _LETTER_IN * max(map(len, labels)) if upright else 0.3
     figure = Figure(_WIDTH_IN, _HEIGHT_IN + (0.4 if upright else 0.0))

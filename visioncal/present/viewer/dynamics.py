@@ -21,8 +21,10 @@ def dynamics_blueprint(run: Run) -> rrb.Blueprint:
 def _overview(run: Run) -> rrb.Container:
     robot = run.identified.robot
     joints, names = range(robot.joint_count), robot.joint_names
-    torques = [series(f"{names[it]} [N m]", paths.of_joint(paths.TORQUES, it)) for it in joints]
-    q = np.concatenate([it.q for it in run.predictions])
+    torques = [
+        series(f"{names[joint]} [N m]", paths.of_joint(paths.TORQUES, joint)) for joint in joints
+    ]
+    q = np.concatenate([prediction.q for prediction in run.predictions])
     flange = robot.base_from_flange(q)[:, :3, 3]
     contents = [f"+ {paths.BASE}/**", f"+ {paths.ROBOT}/**"]
     arm = space_view("The arm as it moved", contents, eye_on(np.array([np.zeros(3), *flange])))

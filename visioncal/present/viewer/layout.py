@@ -45,11 +45,11 @@ class _Contents:
         return cls(
             any(view.image or view.has_corners for view in session.views),
             min(joints, default=0) if cell is None else 0,
-            not all(it.used for it in sights),
+            not all(sight.used for sight in sights),
             calibration is not None and bool(calibration.frames),
-            not sights or any(it.residual_deg is not None for it in sights),
+            not sights or any(sight.residual_deg is not None for sight in sights),
             session.mount != "instrument",
-            tuple(dict.fromkeys(it.seer for it in sights)) or ("",),
+            tuple(dict.fromkeys(sight.seer for sight in sights)) or ("",),
             cell,
         )
 
@@ -159,10 +159,10 @@ def _overview(
 def _bounds(contents: _Contents) -> rrb.VisualBounds2D | None:
     """What holds the largest image of several cameras; None of one, whose image is alone."""
     cameras = {} if contents.cell is None else contents.cell.cameras
-    sizes = [it.camera.resolution for it in cameras.values()]
+    sizes = [camera.camera.resolution for camera in cameras.values()]
     if not sizes:
         return None
-    width, height = (float(max(it)) for it in zip(*sizes, strict=True))
+    width, height = (float(max(pair)) for pair in zip(*sizes, strict=True))
     return rrb.VisualBounds2D(x_range=(0.0, width), y_range=(0.0, height))
 
 
@@ -185,14 +185,14 @@ def _explained() -> rrb.Container:
 def _arms(calibration: Calibration, eye: rrb.EyeControls3D | None) -> list[rrb.Container]:
     """The calibrated arms: one with its workspace, several in words; and their drift."""
     arms = parts.arms(calibration).values()
-    found = [it.arm for it in arms if it.arm is not None and it.arm.is_calibrated]
+    found = [arm.arm for arm in arms if arm.arm is not None and arm.arm.is_calibrated]
     tabs: list[rrb.Container] = []
     if found and calibration.cell is None:
         tabs.append(_arm(found[0], eye))
     elif found:
         note = rrb.TextDocumentView(name="The arms", origin=paths.ARM_NOTE)
         tabs.append(rrb.Horizontal(note, name="Arm"))
-    if any(it.thermal is not None for it in arms):
+    if any(arm.thermal is not None for arm in arms):
         tabs.append(_warming())
     return tabs
 
@@ -211,7 +211,7 @@ def _arm(found: ArmResult, eye: rrb.EyeControls3D | None) -> rrb.Container:
     # The places are all around the base, farther out than the views.
     wider = eye_on(found.map_places_m, MAP_DISTANCE) if found.workspace_map else eye
     places = (paths.BASE, paths.ROBOT, paths.WORKSPACE, paths.NOMINAL_ARM)
-    contents = [*(f"+ {it}/**" for it in places), f"+ {paths.STOPS}/{paths.USED}"]
+    contents = [*(f"+ {place}/**" for place in places), f"+ {paths.STOPS}/{paths.USED}"]
     cell = space_view("Sigma of a tool's place over the workspace", contents, wider)
     note = rrb.TextDocumentView(name="The arm", origin=paths.ARM_NOTE)
     if not found.left_out:
@@ -246,7 +246,7 @@ def _verdict(contents: _Contents, found: Verdict | None) -> rrb.Container | rrb.
 
 
 def _residuals(contents: _Contents) -> rrb.Container:
-    over_views = [rrb.Horizontal(*_plots(contents, it)) for it in contents.seers]
+    over_views = [rrb.Horizontal(*_plots(contents, seer)) for seer in contents.seers]
     if contents.joints == 0:
         return rrb.Vertical(*over_views, name="Residuals")
     over_joints = rrb.Grid(
@@ -301,10 +301,12 @@ def _eye(session: Session, calibration: Calibration | None) -> rrb.EyeControls3D
     """Looks at the cell from the side, from where all of it fills the view."""
     frames = parts.frames(calibration)
     bases = {paths.CELL_FRAME, paths.BASE_FRAME}
-    fixed = [it[:3, 3] for frame, it in frames.matrices.items() if frames.parents[frame] in bases]
+    fixed = [
+        matrix[:3, 3] for frame, matrix in frames.matrices.items() if frames.parents[frame] in bases
+    ]
     # Of several robots, each pose is in a base of its own.
     poses = {} if session.is_network else reported_matrices(session.views)
-    places = np.array([np.zeros(3), *(it[:3, 3] for it in poses.values()), *fixed])
+    places = np.array([np.zeros(3), *(pose[:3, 3] for pose in poses.values()), *fixed])
     return eye_on(places) if len(places) > 2 else None
 
 
@@ -321,7 +323,7 @@ def eye_on(places: FloatArray, distance: float = EYE_DISTANCE) -> rrb.EyeControl
 def _cell_contents(contents: _Contents) -> list[str]:
     several = (paths.BASE, paths.ROBOT, paths.FLANGE, paths.CAMERA, paths.TARGET)
     entities = [
-        *(it for entity in several for it in (entity, f"{entity}s")),
+        *(name for entity in several for name in (entity, f"{entity}s")),
         paths.STOPS,
         paths.FRAMES,
         paths.SEEN_TARGET,
@@ -345,4 +347,4 @@ def _plots(contents: _Contents, seer: str) -> list[rrb.TimeSeriesView]:
     # title would be cut beside a plot's buttons.
     legend = "; red: not used" if contents.unused else ""
     of = f"{seer}: " if seer else ""
-    return [series(f"{of}{name}{legend}", paths.part_of(it, seer)) for name, it in wanted]
+    return [series(f"{of}{name}{legend}", paths.part_of(word, seer)) for name, word in wanted]

@@ -60,7 +60,7 @@ def live_viewer(name: str) -> Iterator[rr.RecordingStream]:
 def live_blueprint() -> rrb.Blueprint:
     """The layout of a recording at work: image and cell, coverage and predicted sigma."""
     entities = (paths.BASE, paths.ROBOT, paths.FLANGE, paths.CAMERA, paths.TARGET, paths.STOPS)
-    shown = [*(f"+ {it}/**" for it in entities), f"- {paths.DETECTED}/**"]
+    shown = [*(f"+ {entity}/**" for entity in entities), f"- {paths.DETECTED}/**"]
     cell = space_view("Cell: views so far in blue", shown)
     image = image_view("This view", paths.IMAGE)
     covered = image_view("What corners have reached", paths.IMAGE_COVERAGE)

@@ -32,8 +32,8 @@ def plan_blueprint(preview: Preview) -> rrb.Blueprint:
         The layout, to be written into the recording.
     """
     flange = preview.base_from_flange
-    placed = [pose for it in flange for pose in preview.placed(it)]
-    places = np.array([np.zeros(3), *flange[:, :3, 3], *(it[:3, 3] for it in placed)])
+    placed = [pose for value in flange for pose in preview.placed(value)]
+    places = np.array([np.zeros(3), *flange[:, :3, 3], *(array[:3, 3] for array in placed)])
     tabs = [_overview(places), _coverage()]
     if len(preview.places_m):
         tabs.insert(1, _workspace(preview))
@@ -53,7 +53,11 @@ def _cell(
         *more,
     )
     # The predicted corners would float as a crowd of points in the frustum.
-    contents = [*(f"+ {it}/**" for it in entities), f"- {paths.IMAGE}/**", f"+ {paths.IMAGE}"]
+    contents = [
+        *(f"+ {entity}/**" for entity in entities),
+        f"- {paths.IMAGE}/**",
+        f"+ {paths.IMAGE}",
+    ]
     return space_view(name, contents, eye_on(places, distance))
 
 
@@ -100,21 +104,21 @@ def motion_blueprint(preview: MotionPreview) -> rrb.Blueprint:
     entities = (paths.BASE, paths.ROBOT, paths.FLANGE, paths.OBSTACLES, paths.WAY)
     cell = space_view(
         "The flange's way: exciting motion in orange, sweeps in blue",
-        [f"+ {it}/**" for it in entities],
+        [f"+ {entity}/**" for entity in entities],
         eye_on(preview.places_m),
     )
     note = rrb.TextDocumentView(name="The plan", origin=paths.PLAN_NOTE)
     kinds: tuple[str, ...] = paths.MOTION_KINDS
-    if any(it.torques_nm is None for it in preview.parts):
+    if any(part.torques_nm is None for part in preview.parts):
         kinds = kinds[:-1]
     # One legend is enough: a joint has the same colour in all curves.
     curves = [
         rrb.TimeSeriesView(
-            name=_TITLES[it],
-            origin=f"{paths.MOTION}/{it}",
-            plot_legend=rrb.PlotLegend(visible=it == kinds[0]),
+            name=_TITLES[kind],
+            origin=f"{paths.MOTION}/{kind}",
+            plot_legend=rrb.PlotLegend(visible=kind == kinds[0]),
         )
-        for it in kinds
+        for kind in kinds
     ]
     both = rrb.Horizontal(
         rrb.Vertical(cell, note, row_shares=[2, 1]),

@@ -60,7 +60,7 @@ def _quiet(environment: Mapping[str, str]) -> dict[str, str]:
     """The environment in which the viewer sends no statistics and asks for no newer version."""
     # It sends none where it believes itself under continuous integration, and it asks through the
     # proxy; both leave the user's own settings of rerun as they are.
-    quiet = {key: it for key, it in environment.items() if key != "FORCE_RERUN_ANALYTICS"}
+    quiet = {key: name for key, name in environment.items() if key != "FORCE_RERUN_ANALYTICS"}
     proxies = dict.fromkeys(("HTTPS_PROXY", "https_proxy", "ALL_PROXY", "all_proxy"), _NOWHERE)
     return quiet | proxies | {"CI": "1", "NO_COLOR": "1"}
 

@@ -131,7 +131,7 @@ def predicted_sigma_mm(
     found = _around(p_base, arm.workspace_map)
     if q is None or not arm.measured_map:
         return found
-    lower, upper = np.array([(it.lower, it.upper) for it in arm.measured]).T
+    lower, upper = np.array([(joint.lower, joint.upper) for joint in arm.measured]).T
     margin = _MARGIN * (upper - lower)
     measured = np.all((lower - margin <= q) & (q <= upper + margin), axis=1)
     return np.where(measured, _around(p_base, arm.measured_map), found)
@@ -139,10 +139,10 @@ def predicted_sigma_mm(
 
 def _around(p_base: FloatArray, rows: Sequence[WorkspacePlace]) -> FloatArray:
     """(m,) sigmas [mm] of a map at (m, 3) places [m], by the places of the map around each."""
-    places = np.array([(it.x_m, it.y_m, it.z_m) for it in rows])
+    places = np.array([(row.x_m, row.y_m, row.z_m) for row in rows])
     away = np.linalg.norm(p_base[:, None] - places, axis=2)
     near = np.argsort(away, axis=1)[:, :_AROUND]
     # A place of the map itself would have all the weight there is.
     weights = 1.0 / np.maximum(np.take_along_axis(away, near, axis=1), 1e-6) ** 2
-    sigmas = np.array([it.sigma_mm for it in rows])[near]
+    sigmas = np.array([row.sigma_mm for row in rows])[near]
     return np.asarray((weights * sigmas).sum(axis=1) / weights.sum(axis=1))

@@ -130,24 +130,24 @@ def correct(
             found.append(inverse.solve(target, start, widest_rad=widest_rad))
             starts[at] = start
         last = found[-1].positions if found[-1].reached else start
-    positions = np.array([it.positions for it in found]).reshape(seeds.shape)
+    positions = np.array([posture.positions for posture in found]).reshape(seeds.shape)
     q = arm.unbent(chain.encoded(positions), loads)
     return Corrected(
         wanted=wanted,
         q=q,
         base_from_flange=arm.nominal.base_from_flange(q),
-        reached=np.array([it.reached for it in found], dtype=bool),
-        off_m=np.array([it.off_m for it in found]),
-        off_rad=np.array([it.off_rad for it in found]),
+        reached=np.array([posture.reached for posture in found], dtype=bool),
+        off_m=np.array([posture.off_m for posture in found]),
+        off_rad=np.array([posture.off_rad for posture in found]),
         turned_rad=np.where(chain.prismatic, 0.0, np.abs(positions - starts)),
-        beyond=tuple(it.beyond for it in found),
+        beyond=tuple(posture.beyond for posture in found),
     )
 
 
 def _middle(robot: Robot) -> FloatArray:
     """(n,) effective positions in the middle of the limits, zero without limits [rad or m]."""
     known = np.isfinite(robot.lower_rad) & np.isfinite(robot.upper_rad)
-    ends = [np.where(known, it, 0.0) for it in (robot.lower_rad, robot.upper_rad)]
+    ends = [np.where(known, array, 0.0) for array in (robot.lower_rad, robot.upper_rad)]
     return np.asarray(robot.chain.effective((0.5 * (ends[0] + ends[1]))[None])[0])
 
 

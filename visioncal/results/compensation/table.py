@@ -59,7 +59,7 @@ def read_targets(path: Path, robot: Robot) -> Targets:
     """
     table = read_table(path)
     _check_columns(table)
-    places = tuple(table.place(it) for it in range(len(table.rows)))
+    places = tuple(table.place(index) for index in range(len(table.rows)))
     poses = _numbers(table, POSE, needed=True)
     _check_poses(poses, places)
     turns = Rotation.from_quat(poses[:, 3:]).as_matrix()
@@ -68,7 +68,7 @@ def read_targets(path: Path, robot: Robot) -> Targets:
 
 def _check_columns(table: TextTable) -> None:
     name, columns = table.path.name, table.columns
-    done = [it for it in ADDED if it in columns]
+    done = [name for name in ADDED if name in columns]
     if done:
         raise DataError(
             f"{name} has the column {some_of(done)}, which visioncal correct writes: these targets "
@@ -76,9 +76,9 @@ def _check_columns(table: TextTable) -> None:
             culprits=done,
             next_step="Correct the targets that they came from, or rename the column.",
         )
-    missing = [it for it in POSE if it not in columns]
+    missing = [name for name in POSE if name not in columns]
     if missing:
-        other = [it for it in columns if it.lower() in ("x_mm", "y_mm", "z_mm")]
+        other = [column for column in columns if column.lower() in ("x_mm", "y_mm", "z_mm")]
         hint = did_you_mean(missing[0], columns)
         raise DataError(
             f"{name}: the columns {', '.join(missing)} are missing; there are {some_of(columns)}.",
@@ -91,11 +91,11 @@ def _check_columns(table: TextTable) -> None:
 
 def _numbers(table: TextTable, names: Sequence[str], *, needed: bool) -> FloatArray:
     """Columns of numbers (m, k); a row leaves all of them empty or none, and none where needed."""
-    at = [table.columns.index(it) for it in names]
+    at = [table.columns.index(name) for name in names]
     values = np.full((len(table.rows), len(names)), np.nan)
     problems: list[tuple[str, str]] = []
     for row, cells in enumerate(table.rows):
-        chosen = [cells[it] for it in at]
+        chosen = [cells[index] for index in at]
         if not needed and not any(chosen):
             continue
         for column, cell in enumerate(chosen):
@@ -106,17 +106,17 @@ def _numbers(table: TextTable, names: Sequence[str], *, needed: bool) -> FloatAr
                 problems.append((table.place(row), words))
     if problems:
         more = len(problems) - _SHOWN
-        shown = [it for _, it in problems[:_SHOWN]] + ([f"and {more} more"] if more > 0 else [])
+        shown = [name for _, name in problems[:_SHOWN]] + ([f"and {more} more"] if more > 0 else [])
         raise DataError(
             f"{'; '.join(shown)}: finite numbers are needed"
             f"{'' if needed else ', or none at all in that row'}.",
-            culprits=[it for it, _ in problems],
+            culprits=[name for name, _ in problems],
         )
     return values
 
 
 def _rows_where(mask: Mask) -> list[int]:
-    return [int(it) for it in np.flatnonzero(mask)]
+    return [int(index) for index in np.flatnonzero(mask)]
 
 
 def _check_poses(poses: FloatArray, places: Sequence[str]) -> None:
@@ -126,7 +126,7 @@ def _check_poses(poses: FloatArray, places: Sequence[str]) -> None:
         raise DataError(
             f"{places[far[0]]}: its position is {away[far[0]]:.4g} m from the base, and no arm "
             f"reaches {FAR_M:g} m: these look like millimetres.",
-            culprits=[places[it] for it in far],
+            culprits=[places[index] for index in far],
             next_step="Write metres.",
         )
     norms = np.linalg.norm(poses[:, 3:], axis=1)
@@ -135,7 +135,7 @@ def _check_poses(poses: FloatArray, places: Sequence[str]) -> None:
         raise DataError(
             f"{places[off[0]]}: the quaternion's norm is {norms[off[0]]:.6g}, but must be 1 to "
             f"within {_NORM_TOLERANCE:g}.",
-            culprits=[places[it] for it in off],
+            culprits=[places[index] for index in off],
             next_step="qx, qy, qz, qw are a unit quaternion, w last.",
         )
 
@@ -159,7 +159,7 @@ def _seeds(table: TextTable, places: Sequence[str], robot: Robot) -> FloatArray:
         raise DataError(
             f"{places[wide[0]]}: a joint stands at {turns[wide[0]]:.4g} rad, more than two turns: "
             "these look like degrees.",
-            culprits=[places[it] for it in wide],
+            culprits=[places[index] for index in wide],
             next_step="Write radians.",
         )
     return seeds
@@ -167,7 +167,7 @@ def _seeds(table: TextTable, places: Sequence[str], robot: Robot) -> FloatArray:
 
 def joint_names(robot: Robot) -> tuple[str, ...]:
     """The columns of a robot's joints."""
-    return tuple(f"q{it}_rad" for it in range(1, robot.joint_count + 1))
+    return tuple(f"q{index}_rad" for index in range(1, robot.joint_count + 1))
 
 
 def columns_to_send(
@@ -184,7 +184,7 @@ def columns_to_send(
         base_from_tool: (m, 4, 4) Cartesian targets to send, of the flange or the tool [m].
         sigma_mm: (m,) predicted sigma of each [mm]; NaN where there is none.
     """
-    names = tuple(f"q{it}_rad" for it in range(1, corrected.q.shape[1] + 1))
+    names = tuple(f"q{index}_rad" for index in range(1, corrected.q.shape[1] + 1))
     turns = Rotation.from_matrix(base_from_tool[:, :3, :3]).as_quat(canonical=True)
     between = invert(targets.base_from_tool) @ base_from_tool
     columns: dict[str, FloatArray] = {
@@ -209,14 +209,14 @@ def table_to_send(targets: Targets, columns: Mapping[str, FloatArray], rows: Int
         rows: Which rows.
     """
     own = targets.table.columns
-    names = [*own, *(it for it in columns if it not in own)]
+    names = [*own, *(column for column in columns if column not in own)]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(names)
     for row in rows:
         cells = dict(zip(own, targets.table.rows[row], strict=True))
         cells |= {name: written(name, float(numbers[row])) for name, numbers in columns.items()}
-        writer.writerow([cells[it] for it in names])
+        writer.writerow([cells[name] for name in names])
     return text.getvalue()
 
 

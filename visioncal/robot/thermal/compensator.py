@@ -208,7 +208,7 @@ class OnlineCompensator:
         if not len(stamps) or stamps[-1] - stamps[0] < 2.0 * _SPAN_S:
             return None
         then = stamps[-1] - _SPAN_S * np.arange(3)
-        links = [np.interp(then, stamps, it) for it in np.array(self._links).T]
+        links = [np.interp(then, stamps, column) for column in np.array(self._links).T]
         late, early = -np.diff(np.stack(links, axis=1), axis=0) / _SPAN_S
         # One share for all joints: those of single ones would follow the work from piece to piece.
         slowed = float(late @ early) / max(float(early @ early), 1e-12)

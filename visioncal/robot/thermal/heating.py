@@ -122,7 +122,7 @@ class Heating:
             # The states are linear in the rest, and the air has no part in this.
             alone = replace(inputs, ambient_c=np.zeros_like(inputs.ambient_c))
             parts.append(self._course(alone)[0])
-        return np.stack([self._at(inputs, at_s, it) for it in parts], axis=2)
+        return np.stack([self._at(inputs, at_s, part) for part in parts], axis=2)
 
     def _course(self, inputs: Inputs) -> tuple[FloatArray, FloatArray, FloatArray]:
         """States (t, n) at the samples; rests and what is kept (t - 1, n) between them."""
@@ -133,7 +133,7 @@ class Heating:
         return _scanned(first, kept, (1.0 - kept) * rests), rests, kept
 
     def _at(self, inputs: Inputs, at_s: FloatArray, states: FloatArray) -> FloatArray:
-        return np.stack([np.interp(at_s, inputs.stamps_s, it) for it in states.T], axis=1)
+        return np.stack([np.interp(at_s, inputs.stamps_s, column) for column in states.T], axis=1)
 
 
 def _scanned(first: FloatArray, kept: FloatArray, added: FloatArray) -> FloatArray:

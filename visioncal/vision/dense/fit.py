@@ -129,7 +129,7 @@ def fit_corners(
         scatter more than before.
     """
     board = board_places(target, ids)
-    flat = all(np.linalg.matrix_rank(it - it.mean(axis=0)) == 2 for it in (board, px))
+    flat = all(np.linalg.matrix_rank(array - array.mean(axis=0)) == 2 for array in (board, px))
     if len(ids) < _FEWEST or not flat:
         return None
     torch = library("torch")
@@ -250,14 +250,16 @@ class _Patches:
         covariance, corners = tensor(covariance), tensor(scene.board[chosen])
         x, y = (covariance @ tensor(values[..., axis]) @ covariance.T for axis in (0, 1))
         widths = tensor(DRAWN_PX * np.linalg.norm(normals, axis=2))[:, :, None, None]
-        board_x, board_y = (it + corners[:, axis, None, None] for axis, it in enumerate((x, y)))
+        board_x, board_y = (
+            value + corners[:, axis, None, None] for axis, value in enumerate((x, y))
+        )
         drawn = scene.printed.drawn(board_x, board_y, widths[:, 0], widths[:, 1])
         # What ends at the edge of a patch would ring all over it.
         fade = np.clip((size / 2 - np.abs(places)) / _TAPER_PX, 0.0, 1.0)
         fade = tensor(np.sin(np.pi / 2 * fade) ** 2)
         spectrum = torch.fft.rfft2((drawn - 0.5) * fade * fade[:, None])
         window = slice(size - 2 * reach, size + 2 * reach + 1, 2)
-        x, y = (it[:, window, window] for it in (x, y))
+        x, y = (value[:, window, window] for value in (x, y))
         steps = np.arange(-reach, reach + 1)
         height, width = scene.pixels.shape
         rows, columns = centre[:, 1, None] + steps, centre[:, 0, None] + steps
@@ -293,8 +295,8 @@ class _Patches:
 
     def at(self, chosen: IntArray) -> Self:
         """The patches of some corners."""
-        parts = (it for it in fields(self) if it.name != "scene")
-        return replace(self, **{it.name: getattr(self, it.name)[chosen] for it in parts})
+        parts = (field for field in fields(self) if field.name != "scene")
+        return replace(self, **{part.name: getattr(self, part.name)[chosen] for part in parts})
 
     def images(self, values: FloatArray, shift: FloatArray, *, blurs: bool) -> "Tensor":
         """The blurred print, and its derivatives by the shift and, if asked for, by the blur.
@@ -318,8 +320,8 @@ class _Patches:
         wu, wv = wu.to(torch.float32), wv.to(torch.float32)
         parts = [blurred, -1j * wu * blurred, -1j * wv[:, None] * blurred]
         if blurs:
-            parts += [base * it for it in otf[1:]]
-        folded = torch.stack([_folded(it) for it in parts], dim=1)
+            parts += [base * value for value in otf[1:]]
+        folded = torch.stack([_folded(part) for part in parts], dim=1)
         found = torch.fft.irfft2(folded, s=(size, size))
         window = slice(size // 2 - reach, size // 2 + reach + 1)
         found = found[..., window, window]
@@ -337,7 +339,7 @@ class _Patches:
         found[:, 1:] *= (1.0 + q * (1.0 - 2.0 * light))[:, None]
         jacobian = torch.as_tensor(self.jacobian, dtype=torch.float32, device=self.grey.device)
         plane = torch.einsum("nlk,nkw->nlkw", jacobian, self.off)
-        offset, gain = (plane[:, it, 0, None, :] + plane[:, it, 1, :, None] for it in (0, 1))
+        offset, gain = (plane[:, name, 0, None, :] + plane[:, name, 1, :, None] for name in (0, 1))
         parts = [torch.ones_like(light), toned, found[:, 1], found[:, 2]]
         if blurs:
             parts += [*found[:, 3:].unbind(dim=1), light * (1.0 - light)]
@@ -349,7 +351,9 @@ def _kept(smooth_px: float, w: "Tensor") -> "Tensor":
     """What smoothing leaves of angular frequencies w [rad/px]."""
     kernel = library("kornia").filters.get_gaussian_kernel1d
     taps = kernel(_TAPS, smooth_px, device=w.device, dtype=w.dtype)[0]
-    return sum(taps[it] * library("torch").cos((it - _TAPS // 2) * w) for it in range(_TAPS))
+    return sum(
+        taps[index] * library("torch").cos((index - _TAPS // 2) * w) for index in range(_TAPS)
+    )
 
 
 def _folded(spectrum: "Tensor") -> "Tensor":
@@ -487,8 +491,8 @@ def _started(scene: _Scene, px: FloatArray, widths_px: FloatArray) -> FloatArray
     starts = [*_starts(normals, wide)]
     if np.linalg.norm(normals, axis=1).max() * wide.max() > _WIDE:
         starts += _starts(normals, np.maximum(wide / 2, _SHARP_PX))
-    found = [_searched(patches, np.append(it, 0.0), _START_TURNS) for it in starts]
-    return min(found, key=lambda it: it[1])[0]
+    found = [_searched(patches, np.append(start, 0.0), _START_TURNS) for start in starts]
+    return min(found, key=lambda pair: pair[1])[0]
 
 
 def _starts(normals: FloatArray, wide: FloatArray) -> Iterator[FloatArray]:

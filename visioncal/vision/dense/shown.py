@@ -117,13 +117,13 @@ def _over(
     """A smooth map (h, w) of all places u, v, by polynomials through some of its values."""
     nodes = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
     inverse = np.linalg.inv(chebvander(nodes, _NODES - 1))
-    ends = [(it[0], it[-1]) for it in (u, v)]
+    ends = [(array[0], array[-1]) for array in (u, v)]
     at_u, at_v = ((a + b + nodes * (b - a)) / 2 for a, b in ends)
     values = mapped(np.stack(np.meshgrid(at_u, at_v), axis=-1).reshape(-1, 2))
     values = values.reshape(_NODES, _NODES, 2)
     along_u, along_v = (
-        chebvander((2 * it - a - b) / (b - a), _NODES - 1) @ inverse
-        for it, (a, b) in zip((u, v), ends, strict=True)
+        chebvander((2 * array - a - b) / (b - a), _NODES - 1) @ inverse
+        for array, (a, b) in zip((u, v), ends, strict=True)
     )
     x, y = (along_v @ values[..., axis] @ along_u.T for axis in (0, 1))
     return x, y
@@ -137,7 +137,9 @@ def _blurred(printed: Print, x: FloatArray, y: FloatArray, blur: Blur, fine: int
     def tensor(array: FloatArray) -> "Tensor":
         return torch.as_tensor(array, dtype=torch.float32)
 
-    widths = (tensor(DRAWN_PX * fine * np.hypot(*np.gradient(it)).clip(1e-6)) for it in (x, y))
+    widths = (
+        tensor(DRAWN_PX * fine * np.hypot(*np.gradient(array)).clip(1e-6)) for array in (x, y)
+    )
     drawn = printed.drawn(tensor(x), tensor(y), *widths)
     height, width = drawn.shape
     wu = 2 * np.pi * torch.fft.rfftfreq(width, step, dtype=torch.float64)

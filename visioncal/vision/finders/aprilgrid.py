@@ -120,15 +120,17 @@ def grid_tags(
         parameters.adaptiveThreshConstant = work.darker
         detector = cv2.aruco.ArucoDetector(aruco_dictionary(dictionary), parameters)
         px, ids, _ = detector.detectMarkers(work.image)
-        found = [] if ids is None else [int(it) for it in ids.ravel()]
+        found = [] if ids is None else [int(number) for number in ids.ravel()]
         # Where a pixel of the copy has its centre in the image.
         quads = (np.reshape(px, (-1, 4, 2)) + 0.5) / work.scale - 0.5
-        once = {it: quad for it, quad in zip(found, quads, strict=True) if found.count(it) == 1}
+        once = {
+            index: quad for index, quad in zip(found, quads, strict=True) if found.count(index) == 1
+        }
         corners = once | corners
         if len(corners) >= enough:
             break
     numbers = sorted(corners)
-    found_px = np.reshape([corners[it] for it in numbers], (-1, 4, 2))
+    found_px = np.reshape([corners[number] for number in numbers], (-1, 4, 2))
     return np.array(numbers, dtype=np.int64), found_px
 
 
@@ -166,7 +168,7 @@ def laid(target: Target, numbers: IntArray, px: FloatArray, own: Mask) -> tuple[
     if own.sum() < _LEAST_TAGS:
         return turned[0], 0.0
     places = _places(target, numbers[own])
-    misfits = [layout_misfit(places, it[own]) for it in turned]
+    misfits = [layout_misfit(places, array[own]) for array in turned]
     return turned[int(np.argmin(misfits))], min(misfits)
 
 
@@ -184,11 +186,11 @@ def _has_squares(image: Image, px: FloatArray, spacing: float) -> bool:
     inside, outside = 0.9, 1.0 + spacing
     places = [
         centre + inside * (px - centre),
-        *(centre + outside * (it - centre) for it in (px, sides)),
+        *(centre + outside * (array - centre) for array in (px, sides)),
     ]
     top = np.array(image.shape[::-1]) - 1
-    at = (np.clip(np.rint(it), 0, top).astype(int) for it in places)
-    dark, squares, white = (float(np.median(image[it[..., 1], it[..., 0]])) for it in at)
+    at = (np.clip(np.rint(place), 0, top).astype(int) for place in places)
+    dark, squares, white = (float(np.median(image[value[..., 1], value[..., 0]])) for value in at)
     return squares < (dark + white) / 2
 
 
@@ -226,7 +228,7 @@ def seen_spacing(target: Target, numbers: IntArray, px: FloatArray) -> float:
             (number + target.columns, [[3, 0], [2, 1]]),
         ):
             if beside in index:
-                lines += [np.concatenate([px[at][it], px[index[beside]][it]]) for it in sides]
+                lines += [np.concatenate([px[at][side], px[index[beside]][side]]) for side in sides]
     if len(lines) < _LEAST_SPACINGS:
         return target.spacing
     a, b, c, d = np.moveaxis(np.array(lines), 1, 0)
@@ -248,12 +250,12 @@ def lacks_a_line(image: Image, target: Target, numbers: IntArray, px: FloatArray
     # Rows count from below. Of a missing tag the side is looked at that is nearest to the others.
     near, far = _INSIDE, 1.0 - _INSIDE
     lines = (
-        (rows, 0, [(it, near) for it in _ALONG]),
-        (rows, target.rows - 1, [(it, far) for it in _ALONG]),
-        (columns, 0, [(far, it) for it in _ALONG]),
-        (columns, target.columns - 1, [(near, it) for it in _ALONG]),
+        (rows, 0, [(value, near) for value in _ALONG]),
+        (rows, target.rows - 1, [(value, far) for value in _ALONG]),
+        (columns, 0, [(far, value) for value in _ALONG]),
+        (columns, target.columns - 1, [(near, value) for value in _ALONG]),
     )
-    return any(_lacks(image, target, numbers, px, *it) for it in lines)
+    return any(_lacks(image, target, numbers, px, *line) for line in lines)
 
 
 def _lacks(
@@ -278,8 +280,8 @@ def _lacks(
         return False
     white = 0.5 + (0.5 + target.spacing / 2) * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
     dark, light = (
-        float(np.nanmedian(_levels(image, flat[:, 0], it, homography)))
-        for it in (np.array(rim), white)
+        float(np.nanmedian(_levels(image, flat[:, 0], array, homography)))
+        for array in (np.array(rim), white)
     )
     missing = _levels(image, _places(target, line)[:, 0], np.array(rim), homography)
     # Nothing is said of what is outside the image.

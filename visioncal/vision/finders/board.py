@@ -86,7 +86,7 @@ def _quick_searches(image: Image, kind: TargetKind) -> Iterator[tuple[_Finder, i
 
 def _refined(image: Image, target: Target, seen: DetectedCorners) -> DetectedCorners:
     refined = refine(image, target, seen.ids, seen.px)
-    fitted = np.array([not it for it in refined.reasons])
+    fitted = np.array([not reason for reason in refined.reasons])
     if fitted.sum() < max(min(_FEWEST_FITTED, len(fitted)), _LEAST_FITTED * len(fitted)):
         return replace(seen, weights=np.full(len(fitted), DETECTED_WEIGHT))
     return DetectedCorners(

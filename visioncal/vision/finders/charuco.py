@@ -108,8 +108,10 @@ def fitting_layouts(image: Image, target: Target) -> tuple[Target, ...]:
     if not marker_px:
         return ()
     markers = _by_id(marker_px, marker_ids)
-    enough = [it for it in variants if len(_matches(markers, it)[0]) >= 4 * _LAYOUT_MARKERS]
-    return tuple(it for it in enough if _misfit(markers, it) <= LAYOUT_MISFIT)
+    enough = [
+        variant for variant in variants if len(_matches(markers, variant)[0]) >= 4 * _LAYOUT_MARKERS
+    ]
+    return tuple(item for item in enough if _misfit(markers, item) <= LAYOUT_MISFIT)
 
 
 def _by_id(marker_px: Sequence[Any], marker_ids: Any) -> _Markers:  # noqa: ANN401 - OpenCV's
@@ -133,5 +135,5 @@ def _matches(markers: _Markers, target: Target) -> tuple[FloatArray, FloatArray]
 
 def _misfit(markers: _Markers, target: Target) -> float:
     """How far the markers are from their places; see `layout_misfit`."""
-    on_board, in_image = (it.reshape(-1, 4, 2) for it in _matches(markers, target))
+    on_board, in_image = (match.reshape(-1, 4, 2) for match in _matches(markers, target))
     return layout_misfit(on_board, in_image) if len(on_board) >= _LAYOUT_MARKERS else 0.0

@@ -60,7 +60,7 @@ def _dark_corner_first(image: Image, grid: FloatArray) -> FloatArray:
     # Where no turn changes the colour, the board is symmetric and the grid stays as it is.
     turns = (0, 2, 1, 3) if grid.shape[0] == grid.shape[1] else (0, 2)
     turned = (np.rot90(grid, quarter) for quarter in turns)
-    return next((it for it in turned if _starts_dark(image, it)), grid)
+    return next((array for array in turned if _starts_dark(image, array)), grid)
 
 
 def _starts_dark(image: Image, grid: FloatArray) -> bool:

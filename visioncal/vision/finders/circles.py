@@ -31,7 +31,11 @@ _LEAST = 9
 _DIAMETER, _SPREAD_PX = 0.2, 3.0
 # Bases of a lattice: by which matrices one leads to another.
 _BASES = np.array(
-    [it for it in product(range(-2, 3), repeat=4) if it[0] * it[3] - it[1] * it[2] in (1, -1)]
+    [
+        pair
+        for pair in product(range(-2, 3), repeat=4)
+        if pair[0] * pair[3] - pair[1] * pair[2] in (1, -1)
+    ]
 ).reshape(-1, 2, 2)
 # From a basis of a staggered grid, whose circles lie where column and row are both even or odd.
 _STAGGER = np.array([[1, 1], [1, -1]])
@@ -71,20 +75,20 @@ def find_circles(image: Image, target: Target) -> DetectedCorners | NotFound:
         The centres, or why there are none.
     """
     seen = seen_grids(image)
-    for it in seen:
-        if (it.columns, it.rows, it.asymmetric) == (
+    for circles in seen:
+        if (circles.columns, circles.rows, circles.asymmetric) == (
             target.columns,
             target.rows,
             target.asymmetric,
         ):
             share = target.diameter_m / target.square_m
-            if abs(it.share / share - 1.0) > _DIAMETER + _SPREAD_PX / it.diameter_px:
+            if abs(circles.share / share - 1.0) > _DIAMETER + _SPREAD_PX / circles.diameter_px:
                 return NotFound(
-                    f"the circles' diameter is {it.share:.2f} of square_m, and the target says "
-                    f"{share:.2f}",
+                    f"the circles' diameter is {circles.share:.2f} of square_m, and the target "
+                    f"says {share:.2f}",
                     misfit=True,
                 )
-            return DetectedCorners(np.arange(len(it.px)), it.px)
+            return DetectedCorners(np.arange(len(circles.px)), circles.px)
     wanted = f"{_layout(target.asymmetric)} grid of {target.columns} x {target.rows} circles"
     if not seen:
         return NotFound(f"no board: no {wanted} is seen")
@@ -130,7 +134,7 @@ def seen_grids(image: Image) -> tuple[Circles, ...]:
             width = float(np.median(diameters))
             if share > 0.0:
                 grids.append(Circles(columns, rows, asymmetric, px[order], share, width))
-    return tuple(sorted(grids, key=lambda it: abs(_turn(it))))
+    return tuple(sorted(grids, key=lambda value: abs(_turn(value))))
 
 
 def _turn(grid: Circles) -> float:
@@ -193,7 +197,7 @@ def _blobs(image: Image) -> _Blobs:
     found = found.at(np.argsort(-found.diameters, kind="stable"))
     pairs = cKDTree(found.px).query_pairs(2.0) if len(found.px) else set()
     wide = found.diameters
-    inner = [max(it) for it in pairs if wide[max(it)] > _INNER * wide[min(it)]]
+    inner = [max(pair) for pair in pairs if wide[max(pair)] > _INNER * wide[min(pair)]]
     return found.at(np.setdiff1d(np.arange(len(found.px)), inner))
 
 
@@ -218,8 +222,8 @@ def _first_steps(px: FloatArray, tree: cKDTree, seed: int) -> FloatArray | None:
         length = float(np.linalg.norm(step))
         if tree.query(px[seed] - step)[0] > _OFF * length:
             continue
-        slant = [abs(float(step[0] * it[1] - step[1] * it[0])) for it in steps]
-        if all(it > _OFF * length * float(np.linalg.norm(steps[0])) for it in slant):
+        slant = [abs(float(step[0] * array[1] - step[1] * array[0])) for array in steps]
+        if all(value > _OFF * length * float(np.linalg.norm(steps[0])) for value in slant):
             steps.append(step)
         if len(steps) == 2:
             return np.array(steps)

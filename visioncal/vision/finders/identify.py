@@ -158,42 +158,44 @@ def _identity(image: Image) -> Identity | None:
     """The target whose corners are the most; None where there is none."""
     markers = decode_markers(image)
     boards = _charucos(image, markers)
-    singles = _singles(tuple(it for it in genuine(markers) if it.family not in boards))
+    singles = _singles(tuple(marker for marker in genuine(markers) if marker.family not in boards))
     grids = _aprilgrids(image)
     found = [*boards.values(), *grids]
     if not found:
         squares = _checkerboards(image)
         # Circles in staggered rows pass for a checkerboard, and the dark squares of a blurred board
         # for circles; what lies in the light squares tells that there are squares.
-        circles = [] if any(it.is_filled for it in squares) else _circles(image)
-        if squares and any(it.asymmetric and it.diameter_share > _WIDE for it in circles):
+        circles = [] if any(square.is_filled for square in squares) else _circles(image)
+        if squares and any(
+            circle.asymmetric and circle.diameter_share > _WIDE for circle in circles
+        ):
             circles = []
         found = circles or [*squares, *singles]
     if not found:
         return None
-    best = max(found, key=lambda it: it.corners_seen)
+    best = max(found, key=lambda value: value.corners_seen)
     # A grid's tags are no single ones.
     around = () if best.kind == "aprilgrid" else singles
-    beside = (it for it in (*found, *around) if it is not best)
+    beside = (value for value in (*found, *around) if value is not best)
     return replace(best, notes=(*best.notes, *dict.fromkeys(_notes_beside(beside))))
 
 
 def _notes_beside(others: Iterable[Identity]) -> Iterator[str]:
-    for it in others:
-        if it.kind == "marker":
-            yield f"Beside it, marker {it.marker_ids[0]} of {it.dictionary} is seen."
-        elif it.is_filled:
+    for other in others:
+        if other.kind == "marker":
+            yield f"Beside it, marker {other.marker_ids[0]} of {other.dictionary} is seen."
+        elif other.is_filled:
             yield f"Squares are seen around it. {_MAYBE_CHARUCO}"
 
 
 def _charucos(image: Image, markers: tuple[Marker, ...]) -> dict[str, Identity]:
     """The best board by its family."""
     found = {}
-    for family in sorted({it.family for it in markers}):
-        members = [it for it in markers if it.family == family]
+    for family in sorted({marker.family for marker in markers}):
+        members = [marker for marker in markers if marker.family == family]
         lattices = find_lattices(image, members) if len(members) >= LEAST_MARKERS else ()
-        named = [_charuco(image, family, it) for it in lattices]
-        boards = [it for it in named if it is not None]
+        named = [_charuco(image, family, lattice) for lattice in lattices]
+        boards = [identity for identity in named if identity is not None]
         if boards:
             found[family] = _decided(boards)
     return found
@@ -201,12 +203,15 @@ def _charucos(image: Image, markers: tuple[Marker, ...]) -> dict[str, Identity]:
 
 def _decided(boards: list[Identity]) -> Identity:
     """Of boards that the same markers may be of, the one with the most corners."""
-    best = max(boards, key=lambda it: it.corners_seen)
-    rivals = [it for it in boards if it is not best and it.corners_seen == best.corners_seen]
+    best = max(boards, key=lambda board: board.corners_seen)
+    rivals = [
+        board for board in boards if board is not best and board.corners_seen == best.corners_seen
+    ]
     if not rivals:
         return best
     layouts = ", ".join(
-        f"{it.columns} x {it.rows}{' in the legacy layout' if it.legacy else ''}" for it in rivals
+        f"{rival.columns} x {rival.rows}{' in the legacy layout' if rival.legacy else ''}"
+        for rival in rivals
     )
     note = f"What is seen of it fits {layouts} as well: show more of the board."
     return replace(best, whole=False, notes=(note, *best.notes))
@@ -214,7 +219,7 @@ def _decided(boards: list[Identity]) -> Identity:
 
 def _charuco(image: Image, family: str, lattice: Lattice) -> Identity | None:
     """Names a board, and confirms it by the finder that calibrations use."""
-    ids = tuple(sorted({it.number for it in lattice.markers}))
+    ids = tuple(sorted({marker.number for marker in lattice.markers}))
     names = holding(family, max(lattice.columns * lattice.rows // 2, ids[-1] + 1))
     if not names:
         return None
@@ -319,7 +324,9 @@ def _aprilgrids(image: Image) -> list[Identity]:
 
 def _circles(image: Image) -> list[Identity]:
     # Of the ways to number them, one as wide as it is high or wider, as people count.
-    grids = sorted(seen_grids(image), key=lambda it: not it.asymmetric and it.columns < it.rows)
+    grids = sorted(
+        seen_grids(image), key=lambda value: not value.asymmetric and value.columns < value.rows
+    )
     if not grids:
         return []
     grid = grids[0]
@@ -351,11 +358,11 @@ def _singles(markers: tuple[Marker, ...]) -> list[Identity]:
         return []
     members: list[Marker] = []
     # The likest marker comes first; of two families with as many, its own is taken.
-    for family in dict.fromkeys(it.family for it in markers):
-        its = [it for it in markers if it.family == family]
+    for family in dict.fromkeys(marker.family for marker in markers):
+        its = [marker for marker in markers if marker.family == family]
         members = its if len(its) > len(members) else members
-    largest = max(members, key=lambda it: it.side_px)
-    others = tuple(sorted(it.number for it in members if it is not largest))
+    largest = max(members, key=lambda member: member.side_px)
+    others = tuple(sorted(member.number for member in members if member is not largest))
     ids = (largest.number, *others)
     names = holding(largest.family, max(ids) + 1)
     notes = []

@@ -47,7 +47,7 @@ def find_grid(image: Image) -> Grid | None:
     """Infers an AprilGrid of Kalibr's family, with borders of one or two modules; None without."""
     read = {border: grid_tags(image, APRILGRID_DICTIONARY, border, np.inf) for border in (2, 1)}
     # With a wrong border a few tags are read, and misplaced.
-    border = max(read, key=lambda it: len(read[it][0]))
+    border = max(read, key=lambda index: len(read[index][0]))
     ids, px = read[border]
     if len(ids) < _LEAST_TAGS:
         return None
@@ -73,13 +73,16 @@ def _columns(ids: IntArray, px: FloatArray, border: int) -> tuple[int, int]:
     every = np.ones(len(ids), bool)
     tried = range(1, _MOST_COLUMNS + 1)
     # Ids begin with 0 unless the tags say otherwise.
-    for starts in ([(it, 0) for it in tried], [(it, at) for it in tried for at in range(1, it)]):
+    for starts in (
+        [(item, 0) for item in tried],
+        [(item, at) for item in tried for at in range(1, item)],
+    ):
         misfits = {}
         for columns, first in starts:
             numbers = ids - first + columns * (first > 0)
             target = _target(columns, int(numbers.max()) // columns + 1, 0, border)
             misfits[columns, first] = laid(target, numbers, px, every)[1]
-        best = min(misfits, key=lambda it: misfits[it], default=(0, 0))
+        best = min(misfits, key=lambda index: misfits[index], default=(0, 0))
         if misfits.get(best, np.inf) <= LAYOUT_MISFIT:
             return best
     return 0, 0

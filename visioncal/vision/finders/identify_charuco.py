@@ -114,26 +114,28 @@ def find_lattices(image: Image, markers: Sequence[Marker]) -> tuple[Lattice, ...
                 fit = _fit(lens, columns, legacy, markers)
                 if fit is not None:
                     fits.append(fit)
-        if any(it.fits.mean() > _NEARLY_ALL for it in fits):
+        if any(fit.fits.mean() > _NEARLY_ALL for fit in fits):
             break
     # Half of the markers may be look-alikes, not more.
     least = max(LEAST_MARKERS, len(markers) / 2)
-    best = max(fits, key=lambda it: it.score, default=None)
+    best = max(fits, key=lambda value: value.score, default=None)
     if best is None or best.score[0] < least:
         return ()
     # With the same markers in the same places the misfit is the same but for noise.
     tied = [
-        it for it in fits if it.score[0] == best.score[0] and it.misfit < _SAME_MISFIT * best.misfit
+        fit
+        for fit in fits
+        if fit.score[0] == best.score[0] and fit.misfit < _SAME_MISFIT * best.misfit
     ]
-    first = {(it.columns, it.legacy): it for it in sorted(tied, key=lambda it: it.misfit)}
-    return tuple(_lattice(image, markers, it) for it in list(first.values())[:_MOST_TIED])
+    first = {(fit.columns, fit.legacy): fit for fit in sorted(tied, key=lambda value: value.misfit)}
+    return tuple(_lattice(image, markers, fit) for fit in list(first.values())[:_MOST_TIED])
 
 
 def _lattice(image: Image, markers: Sequence[Marker], fit: _Fit) -> Lattice:
     held = tuple(marker for marker, fits in zip(markers, fit.fits, strict=True) if fits)
-    squares = _places(np.array([it.number for it in held]), fit.columns, fit.legacy)
+    squares = _places(np.array([marker.number for marker in held]), fit.columns, fit.legacy)
     on_board = (squares + 0.5)[:, None] + fit.share * _AROUND
-    in_image = np.concatenate([it.px for it in held])
+    in_image = np.concatenate([marker.px for marker in held])
     fit = replace(fit, plane=bent_plane(fit.plane, on_board.reshape(-1, 2), in_image))
     rows, certain = _rows(image, fit, int(squares[:, 1].max()) + 1)
     modules = modules_along(held[0].family)
@@ -155,18 +157,18 @@ def _places(ids: IntArray, columns: int, legacy: bool) -> FloatArray:
 
 def _fit(lens: Lens, columns: int, legacy: bool, markers: Sequence[Marker]) -> _Fit | None:
     """Tries one hypothesis; None where the markers cannot be on such a board."""
-    places = _places(np.array([it.number for it in markers]), columns, legacy)
+    places = _places(np.array([marker.number for marker in markers]), columns, legacy)
     if np.ptp(places, axis=0).min() < 1:
         return None
-    centres = np.array([it.centre for it in markers])
+    centres = np.array([marker.centre for marker in markers])
     # Half a side of a marker away is another square, or a look-alike.
-    tolerance_px = 0.5 * float(np.median([it.side_px for it in markers]))
+    tolerance_px = 0.5 * float(np.median([marker.side_px for marker in markers]))
     found = robust_plane(lens, places + 0.5, centres, tolerance_px)
     if found is None or found[1].sum() < LEAST_MARKERS:
         return None
     plane, near = found
     plane = bent_plane(plane, places[near] + 0.5, centres[near]) if lens.bend else plane
-    corners = np.array([it.px for it in markers])
+    corners = np.array([marker.px for marker in markers])
     offsets = plane.to_board(corners.reshape(-1, 2)).reshape(-1, 4, 2) - (places + 0.5)[:, None]
     # Projections onto an ideal marker's corners, whose own squared length is two.
     shares = (offsets * _AROUND).sum(axis=(1, 2)) / 2
@@ -232,7 +234,7 @@ def marker_share(
         tenth of it where fewer than two markers show their outline.
     """
     shares = [_share(image, plane, square + 0.5, modules, guess) for square in squares]
-    known = np.array([it for it in shares if it > 0.0])
+    known = np.array([share for share in shares if share > 0.0])
     if len(known) < _LEAST_MARKERS:
         return guess, 0.1 * guess
     middle = float(np.median(known))

@@ -151,17 +151,17 @@ def _plane(image: Image, corners: FloatArray, px: FloatArray) -> Plane | None:
     """Fits the view of the board that the most corners agree with."""
     tolerance_px = _OFF * float(np.median(np.linalg.norm(np.diff(px, axis=0), axis=1)))
     planes = [robust_plane(lens_of(image, bend), corners, px, tolerance_px) for bend in BENDS]
-    found = [it for it in planes if it is not None]
+    found = [plane for plane in planes if plane is not None]
     if not found:
         return None
-    plane, right = max(found, key=lambda it: int(it[1].sum()))
+    plane, right = max(found, key=lambda pair: int(pair[1].sum()))
     return bent_plane(plane, corners[right], px[right])
 
 
 def _side_px(plane: Plane, extent: _Extent) -> float:
     """The median side of a board's squares [px]."""
     px = plane.to_px(extent.corners()).reshape(*extent.size[::-1], 2)
-    sides = [np.linalg.norm(np.diff(px, axis=it), axis=2).ravel() for it in (0, 1)]
+    sides = [np.linalg.norm(np.diff(px, axis=name), axis=2).ravel() for name in (0, 1)]
     return float(np.median(np.concatenate(sides)))
 
 

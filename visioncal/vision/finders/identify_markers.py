@@ -95,7 +95,7 @@ def decode_markers(image: Image) -> tuple[Marker, ...]:
 def genuine(markers: tuple[Marker, ...]) -> tuple[Marker, ...]:
     """Keeps the markers that look as they should; of several at one place, the likest."""
     kept: list[Marker] = []
-    for marker in sorted(markers, key=lambda it: -it.likeness):
+    for marker in sorted(markers, key=lambda value: -value.likeness):
         apart = all(
             np.linalg.norm(marker.centre - other.centre) > max(marker.side_px, other.side_px) / 2
             for other in kept
@@ -109,7 +109,7 @@ def genuine(markers: tuple[Marker, ...]) -> tuple[Marker, ...]:
 def holding(family: str, count: int) -> tuple[str, ...]:
     """Lists the dictionaries of a family that have at least so many markers, smallest first."""
     names = FAMILIES[family]
-    return tuple(it for it in names if len(aruco_dictionary(it).bytesList) >= count)
+    return tuple(name for name in names if len(aruco_dictionary(name).bytesList) >= count)
 
 
 def modules_along(family: str) -> int:

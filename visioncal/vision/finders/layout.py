@@ -32,8 +32,8 @@ def layout_misfit(on_board: FloatArray, in_image: FloatArray) -> float:
     distances = np.linalg.norm(centres[:, None] - centres, axis=2)
     near = np.argsort(distances, axis=1)[:, :_NEIGHBOURS]
     squares, most = 0.0, len(near) * LAYOUT_MISFIT**2
-    for it in near:
-        squares += _off_plane(on_board[it], in_image[it]) ** 2
+    for index in near:
+        squares += _off_plane(on_board[index], in_image[index]) ** 2
         if squares > most:
             break
     return float(np.sqrt(squares / len(near)))

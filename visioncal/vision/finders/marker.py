@@ -56,5 +56,5 @@ def _markers(image: Image, dictionary: str) -> tuple[Sequence[FloatArray], list[
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     detector = cv2.aruco.ArucoDetector(aruco_dictionary(dictionary), parameters)
     px, ids, _ = detector.detectMarkers(image)
-    found = [] if ids is None else [int(it) for it in ids.ravel()]
-    return [np.asarray(it, dtype=np.float64) for it in px], found
+    found = [] if ids is None else [int(number) for number in ids.ravel()]
+    return [np.asarray(mat, dtype=np.float64) for mat in px], found

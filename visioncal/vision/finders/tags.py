@@ -29,7 +29,7 @@ def find_tags(image: Image, target: Target) -> DetectedCorners | NotFound:
         return NotFound("the image is a line")
     dictionary = aruco_dictionary(target.dictionary)
     found, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(image)
-    numbers = [] if ids is None else [int(it) for it in ids.ravel()]
+    numbers = [] if ids is None else [int(number) for number in ids.ravel()]
     known = tag_corners(target)
     quads = {
         number: np.asarray(px, dtype=float).reshape(4, 2)
@@ -48,23 +48,23 @@ def find_tags(image: Image, target: Target) -> DetectedCorners | NotFound:
             return NotFound("the tags do not lie as the target describes them", misfit=True)
     modules = int(dictionary.markerSize) + 2
     if places is None:
-        parts = [refine_tags(image, modules, it[None]) for it in quads.values()]
+        parts = [refine_tags(image, modules, quad[None]) for quad in quads.values()]
     else:
         parts = [refine_tags(image, modules, np.array(list(quads.values())), places)]
-    points = np.concatenate([known[it] for it in quads])
-    fitted = np.array([not it for part in parts for it in part.reasons]) & (points >= 0)
+    points = np.concatenate([known[quad] for quad in quads])
+    fitted = np.array([not reason for part in parts for reason in part.reasons]) & (points >= 0)
     if not fitted.any():
         return NotFound("no corner of the tags seen is like the print")
-    px = np.concatenate([it.px for it in parts])[fitted]
+    px = np.concatenate([part.px for part in parts])[fitted]
     order = np.argsort(points[fitted])
-    blur_px = float(np.nanmedian([it.blur_px.max() for it in parts]))
+    blur_px = float(np.nanmedian([part.blur_px.max() for part in parts]))
     return DetectedCorners(points[fitted][order], px[order], blur_px=blur_px)
 
 
 def _in_plane(target: Target, quads: Mapping[int, FloatArray]) -> FloatArray | None:
     """The (t, 4, 2) places of tags [m] where all are whole, two or more, in the plane z = 0."""
     known = tag_corners(target)
-    numbers = np.array([known[it] for it in quads])
+    numbers = np.array([known[quad] for quad in quads])
     places = corner_positions(target)
     if len(quads) < _LEAST_TAGS or (numbers < 0).any() or np.ptp(places[:, 2]) > 0.0:
         return None

@@ -180,7 +180,7 @@ class _Pattern:
 
     def at(self, chosen: IntArray) -> Self:
         """The pattern around some corners."""
-        lone, axes = (None if it is None else it[chosen] for it in (self.lone, self.axes))
+        lone, axes = (None if array is None else array[chosen] for array in (self.lone, self.axes))
         return replace(self, signs=self.signs[chosen], lone=lone, axes=axes)
 
 
@@ -279,7 +279,9 @@ class _Windows:
 
     def at(self, chosen: IntArray) -> Self:
         """The windows of some corners."""
-        return replace(self, **{it.name: getattr(self, it.name)[chosen] for it in fields(self)})
+        return replace(
+            self, **{field.name: getattr(self, field.name)[chosen] for field in fields(self)}
+        )
 
     def length_px(self, shift: FloatArray) -> FloatArray:
         """(n,) lengths of shifts (n, 2) [squares] in the image [px]."""
@@ -343,12 +345,14 @@ class _Step:
 
     def at(self, chosen: IntArray) -> Self:
         """The steps of some corners."""
-        return replace(self, **{it.name: getattr(self, it.name)[chosen] for it in fields(self)})
+        return replace(
+            self, **{field.name: getattr(self, field.name)[chosen] for field in fields(self)}
+        )
 
     def replace(self, chosen: IntArray, others: Self) -> None:
         """Takes the steps of some corners from elsewhere."""
-        for it in fields(self):
-            getattr(self, it.name)[chosen] = getattr(others, it.name)
+        for field in fields(self):
+            getattr(self, field.name)[chosen] = getattr(others, field.name)
 
 
 def refine(image: Image, target: Target, ids: IntArray, px: FloatArray) -> Refined:
@@ -425,7 +429,7 @@ def _placed(image: Image, pattern: _Pattern, board: FloatArray, px: FloatArray) 
     high = np.ceil(px.max(axis=0)).astype(int) + _RIM_PX + 1
     axis = OpticalAxis.of(image.shape, low)
     part = np.ascontiguousarray(image[low[1] : high[1], low[0] : high[0]])
-    flat = all(np.linalg.matrix_rank(it - it.mean(axis=0)) == 2 for it in (board, px))
+    flat = all(np.linalg.matrix_rank(array - array.mean(axis=0)) == 2 for array in (board, px))
     # Corners that cannot be fitted may lead to anything; they are sorted out afterwards.
     with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
         if len(px) >= _FEWEST and flat and part.size:
@@ -475,7 +479,7 @@ def _refined(
         first = _step(windows, pattern, none, blur_px)
         shift, step = _fitted(windows, pattern, blur_px, None, first, still_px[0])
         better = windows.moved(shift)
-        good = np.array([not it for it in _reasons(windows, step, better - px, last_px[0])])
+        good = np.array([not reason for reason in _reasons(windows, step, better - px, last_px[0])])
         better = np.where(good[:, None], better, px)
         moved_px = np.abs(better - windows.px).max()
         windows = _Windows.cut(smooth, board, better, good, every, pattern, axis)
@@ -490,7 +494,7 @@ def _refined(
     shift, step = _fitted(windows, pattern, blur_px, slopes, first, still_px[1])
     better = windows.moved(shift)
     reasons = _reasons(windows, step, better - px, last_px[1])
-    good = np.array([not it for it in reasons])
+    good = np.array([not reason for reason in reasons])
     spread = windows.by_board @ step.covariance @ windows.by_board.transpose(0, 2, 1)
     sigma_px = np.sqrt(np.trace(spread, axis1=1, axis2=2) / 2)
     return Refined(
@@ -510,7 +514,7 @@ def _measured_blur(windows: _Windows, pattern: _Pattern) -> tuple[FloatArray, fl
     for _ in range(_BLUR_TURNS):
         step = _step(windows, pattern, shift, blur_px, blurs=True)
         shift = shift + _bounded(step.shift)
-        medians = np.array([_median(it) for it in step.blur.T])
+        medians = np.array([_median(column) for column in step.blur.T])
         changes = np.clip(np.nan_to_num(medians), -0.5, 0.5)
         change, grown = changes[:2], float(changes[2]) if pattern.radius else 0.0
         radius = np.clip(pattern.radius + grown, 0.5 * pattern.radius, 1.5 * pattern.radius)
@@ -578,14 +582,14 @@ def _steps(
     """One Gauss-Newton step by each of some slopes, None of even light."""
     count = len(shift)
     sx, sy, dx, dy, signs = (
-        np.asarray(it, np.float32)[:, None, None]
-        for it in (*(blur_px * windows.widths).T, *shift.T, pattern.signs)
+        np.asarray(column, np.float32)[:, None, None]
+        for column in (*(blur_px * windows.widths).T, *shift.T, pattern.signs)
     )
     x, y = windows.x - dx, windows.y - dy
     used = windows.within & windows.inside
     if np.isfinite(pattern.inset):
         clear_x, clear_y = (
-            np.float32(pattern.inset) - np.float32(pattern.clear) * it for it in (sx, sy)
+            np.float32(pattern.inset) - np.float32(pattern.clear) * array for array in (sx, sy)
         )
         # Light squares are where the signs of x and y agree, or do not.
         light = np.logical_xor(np.logical_xor(x > 0, y > 0), signs > 0)
@@ -595,7 +599,7 @@ def _steps(
     if pattern.lone is not None:
         lone_x, lone_y = np.asarray(pattern.lone.T, np.float32)[:, :, None, None]
         far_x, far_y = (
-            np.float32(pattern.clear) * it - np.float32(pattern.outside) for it in (sx, sy)
+            np.float32(pattern.clear) * array - np.float32(pattern.outside) for array in (sx, sy)
         )
         used &= (lone_x * x > far_x) & (lone_y * y > far_y)
         # Where a view slants the corner, its blur is not the product of two.
@@ -609,7 +613,7 @@ def _steps(
     columns: list[npt.NDArray[np.floating]] = [product, *slopes_of]
     if pattern.lone is not None:
         # Light slopes where it is white, and there the product is 0; in the dark it is 4.
-        columns += [(1 - product / 4) * it for it in (x, y)]
+        columns += [(1 - product / 4) * array for array in (x, y)]
         # A lens bends the sides of a tag by itself, and its corners do not show how.
         if windows.around.shape[1] == _FEWEST and np.median(windows.widths) * _BENT_PX < 1.0:
             columns += [y * slopes_of[0], x * slopes_of[1]]
@@ -662,8 +666,8 @@ def _crossing(
         edge_x * edge_y,
         np.multiply(signs * slope_x, edge_y),
         edge_x * slope_y,
-        *(signs * it * edge_y for it in wider_x),
-        *(edge_x * it for it in wider_y),
+        *(signs * array * edge_y for array in wider_x),
+        *(edge_x * array for array in wider_y),
     )
 
 

@@ -54,7 +54,7 @@ def to_png(sheet: Sheet, dpi: float) -> bytes:
 def not_in_font(text: str) -> str:
     """Gives the letters of a text that the sheets' font does not have."""
     font = get_font(findfont(_FONT))
-    return "".join(it for it in text if not font.get_char_index(ord(it)))
+    return "".join(name for name in text if not font.get_char_index(ord(name)))
 
 
 def _saved(

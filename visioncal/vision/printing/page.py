@@ -181,7 +181,9 @@ def largest_side_mm(target: Target, pages: tuple[Page, ...]) -> int:
         )
         pattern = draw_pattern(tried)
         rooms = [(_room(tried, pattern, page), page) for page in pages]
-        if any(it.width <= page.width_mm and it.height <= page.height_mm for it, page in rooms):
+        if any(
+            room.width <= page.width_mm and room.height <= page.height_mm for room, page in rooms
+        ):
             fits = middle
         else:
             fails = middle

@@ -38,14 +38,16 @@ def draw_pattern(target: Target) -> Pattern:
     Raises:
         DataError: It is a rig of points.
     """
-    (left, top), (right, bottom) = (it.tolist() for it in extent_m(target))
+    (left, top), (right, bottom) = (array.tolist() for array in extent_m(target))
     grids = dark_cells(target)
     loops = [
-        it.corner_m + it.cell_m * loop @ it.turn.T for it in grids for loop in outlines(it.dark)
+        grid.corner_m + grid.cell_m * loop @ grid.turn.T
+        for grid in grids
+        for loop in outlines(grid.dark)
     ]
-    loops += [it + target.diameter_m / 2 * _CIRCLE for it in dark_discs(target)]
+    loops += [disc + target.diameter_m / 2 * _CIRCLE for disc in dark_discs(target)]
     of_tags = target.kind in ("marker", "points")
-    quiet_m = max(it.cell_m for it in grids) if of_tags else _QUIET_M
+    quiet_m = max(grid.cell_m for grid in grids) if of_tags else _QUIET_M
     return Pattern(tuple(loops), (left, top, right, bottom), quiet_m)
 
 
