@@ -399,3 +399,22 @@ def test_arrow_does_not_load_pandas_while_a_command_runs():
     """
     done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_blas_begins_one_thread_in_commands():
+    code = """if True:
+        from visioncal.cli import app as application
+
+        def command():
+            import numpy, scipy.linalg, threadpoolctl
+            print({it["num_threads"] for it in threadpoolctl.threadpool_info()})
+
+        application.app = command
+        application.main()
+    """
+    limits = {"OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"}
+    environment = {it: value for it, value in os.environ.items() if it not in limits}
+    done = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True, env=environment
+    )
+    assert done.stdout.strip() == "{1}"

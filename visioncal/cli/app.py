@@ -78,6 +78,9 @@ def _options(
 
 def main() -> None:
     """Runs the command line; an error of the user's input ends with status 2 and one message."""
+    # Commands compute on one BLAS thread. Loaded by numpy and by scipy, it begins one a core, which
+    # takes as long as a small calibration's solve.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # A thousand modules make many objects that stay: looking for garbage among them as often as
     # Python does takes a twentieth of a small calibration's time, and finds none.
     gc.set_threshold(20_000)
