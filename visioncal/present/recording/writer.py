@@ -89,11 +89,12 @@ class RecordingWriter:
                 than an earlier view has by the same name, or the file cannot be written. The views
                 before stay as they are.
         """
-        view = self._checked(cells, image)
+        view = self._checked(cells)
+        digest = "" if image is None else self._digest_of(view, image)
         shown = image
         if image is not None and self._kept != "full":
             shown = faint_picture(image) if self._kept == "thumbnail" else None
-        self._log(view, "" if image is None else sha256(image), shown)
+        self._log(view, digest, shown)
 
     def _log(self, view: View, image_sha256: str, shown: bytes | None) -> None:
         row, recorder = len(self._numbers), self._recorder
@@ -131,7 +132,7 @@ class RecordingWriter:
         for view in session.views:
             cells = [view.cell(column) for column in session.columns]
             if isinstance(images, ImagesElsewhere):
-                checked = self._checked(cells, None)
+                checked = self._checked(cells)
                 self._log(checked, images.sha256(view.image), images.shown(view.image))
             else:
                 known = bool(view.image) and images.exists(view.image)
@@ -147,10 +148,15 @@ class RecordingWriter:
             log(self._recorder)
             self._recorder.keep()
 
-    def _checked(self, cells: Sequence[str], image: bytes | None) -> View:
-        """Refuses what could be written but not be read again."""
-        where = f"row {len(self._numbers) + 1}"
-        rows, corners = [Row(where, tuple(cells))], self._session.corner_table is not None
+    @property
+    def _where(self) -> str:
+        """What messages call the row that is added."""
+        return f"row {len(self._numbers) + 1}"
+
+    def _checked(self, cells: Sequence[str]) -> View:
+        """Refuses a row that could be written but not be read again."""
+        where, corners = self._where, self._session.corner_table is not None
+        rows = [Row(where, tuple(cells))]
         (view,) = read_views(self._session.columns, rows, "views.csv", with_corners=corners)
         check_images_can_be_used(self._session.declaration, [view])
         if view.number in self._numbers:
@@ -158,8 +164,11 @@ class RecordingWriter:
                 f"{where}: view {view.number} is already there; each view has a number of its own.",
                 culprits=[f"view {view.number}"],
             )
-        if image is None:
-            return view
+        return view
+
+    def _digest_of(self, view: View, image: bytes) -> str:
+        """SHA-256 of a view's image; refuses one without a name, or with another's."""
+        where = self._where
         if not view.image:
             raise DataError(f"{where}: it has an image but does not name it.", culprits=[where])
         digest = sha256(image)
@@ -168,7 +177,7 @@ class RecordingWriter:
                 f"{where}: another image is already there by the name {view.image}.",
                 culprits=[view.image],
             )
-        return view
+        return digest
 
     def __enter__(self) -> Self:
         return self

@@ -142,11 +142,11 @@ def _is_cut_short(data: bytes) -> bool:
 
 def _is_damaged_png(data: bytes) -> bool:
     """Checks the sums of a PNG's chunks: decoders go on past damage, with other pixels."""
-    at = 8
+    at, parts = 8, memoryview(data)
     while at + 12 <= len(data):
-        length = int.from_bytes(data[at : at + 4], "big")
+        length = int.from_bytes(parts[at : at + 4], "big")
         end = at + 8 + length
-        if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+        if zlib.crc32(parts[at + 4 : end]) != int.from_bytes(parts[end : end + 4], "big"):
             return True
         at = end + 4
     return False
